@@ -17,18 +17,18 @@ from typing import TYPE_CHECKING
 from copem_replay.core.compiled import cache_note as _cache_note
 
 if TYPE_CHECKING:
-    from copem_replay.cli.api import plot
-    from copem_replay.cli.api.fit import FittedPem, fit
-    from copem_replay.cli.api.recordings import (
+    from copem_replay.api import plot
+    from copem_replay.api.fit import FittedPem, fit
+    from copem_replay.api.recordings import (
         draft_experiment,
         inspect_recording,
         read_lists,
         read_recording,
         read_recordings,
     )
-    from copem_replay.cli.api.results import compare, load_results, view, write_report
-    from copem_replay.cli.api.run import StudyResult, fused_tracks, observations, run
-    from copem_replay.cli.api.study import load_experiment
+    from copem_replay.api.results import compare, load_results, view, write_report
+    from copem_replay.api.run import StudyResult, fused_tracks, observations, run
+    from copem_replay.api.study import load_experiment
     from copem_replay.communication.latency import LatencyModel
     from copem_replay.communication.link import LinkModel, SentLists
     from copem_replay.communication.reception import RadioPath, ReceptionModel
@@ -46,8 +46,8 @@ if TYPE_CHECKING:
     from copem_replay.core.tracks import CLASSES, Scene, Tracks
     from copem_replay.core.view_geometry import Errors, ViewGeometry
     from copem_replay.experiment.schema import Configuration, Experiment, Unit
-    from copem_replay.fusion.base import Inbox, ListFusion, StepFusion
-    from copem_replay.fusion.testing.check import FUSION_RULES, NonconformingError, check_fusion
+    from copem_replay.fusion.interface import Inbox, ListFusion, StepFusion
+    from copem_replay.fusion.testing import FUSION_RULES, NonconformingError, check_fusion
     from copem_replay.io.recording import Recording
     from copem_replay.metrics.braking.driver import Driver, Reaction
     from copem_replay.metrics.config import Measure
@@ -129,12 +129,12 @@ __all__ = [
 ]
 
 _PLACES = {
-    "cli.api": "plot",
-    "cli.api.fit": "FittedPem fit",
-    "cli.api.recordings": "draft_experiment inspect_recording read_lists read_recording read_recordings",
-    "cli.api.results": "compare load_results view write_report",
-    "cli.api.run": "StudyResult fused_tracks observations run",
-    "cli.api.study": "load_experiment",
+    "api": "plot",
+    "api.fit": "FittedPem fit",
+    "api.recordings": "draft_experiment inspect_recording read_lists read_recording read_recordings",
+    "api.results": "compare load_results view write_report",
+    "api.run": "StudyResult fused_tracks observations run",
+    "api.study": "load_experiment",
     "communication.latency": "LatencyModel",
     "communication.link": "LinkModel SentLists",
     "communication.reception": "RadioPath ReceptionModel",
@@ -145,8 +145,8 @@ _PLACES = {
     "core.tracks": "CLASSES Scene Tracks",
     "core.view_geometry": "Errors ViewGeometry",
     "experiment.schema": "Configuration Experiment Unit",
-    "fusion.base": "Inbox ListFusion StepFusion",
-    "fusion.testing.check": "FUSION_RULES NonconformingError check_fusion",
+    "fusion.interface": "Inbox ListFusion StepFusion",
+    "fusion.testing": "FUSION_RULES NonconformingError check_fusion",
     "io.recording": "Recording",
     "metrics.braking.driver": "Driver Reaction",
     "metrics.config": "Measure",
@@ -160,13 +160,13 @@ _PLACES = {
     "results.compare": "Comparison",
     "results.read": "Results",
 }
-"""By module the names it gives."""
+"""Exported names by the module that defines them."""
 _MODULE = {name: f"{__name__}.{module}" for module, names in _PLACES.items() for name in names.split()}
 
 _cache_note()  # before Numba is imported
 
 
-if not TYPE_CHECKING:  # type checkers would take every name to be there
+if not TYPE_CHECKING:  # with it type checkers would accept every name
 
     def __getattr__(name: str) -> object:
         if name not in _MODULE:

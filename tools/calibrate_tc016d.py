@@ -20,14 +20,14 @@ from typing import Final
 import numpy as np
 from scipy.optimize import minimize
 
-from copem_replay.experiment.file import load
-from copem_replay.experiment.validate import problems, read_logs
-from copem_replay.io.write.osi_trace import write_osi_trace
+from copem_replay.experiment.file import read_experiment_file
+from copem_replay.experiment.validate import find_problems, read_logs
+from copem_replay.io.write.osi import write_osi_trace
 from copem_replay.metrics.braking.driver import ConstantDeceleration, GammaReaction
-from copem_replay.metrics.braking.verdict import pass_probability, passing
-from copem_replay.metrics.intervals import wilson
-from copem_replay.pipeline.closed_form import distributions
-from copem_replay.pipeline.prepare import Replay, prepare
+from copem_replay.metrics.braking.verdict import find_passing_intervals, pass_probability
+from copem_replay.metrics.intervals import wilson_limits
+from copem_replay.pipeline.closed_form import compute_distributions
+from copem_replay.pipeline.prepare import Replay, prepare_log
 from make_logs import tc016d
 from paper import PASSED, RUNS
 
@@ -74,10 +74,10 @@ class Scenario:
     """The scenario with the truck's road side at `edge_m`: when each configuration detects the pedestrian, exactly."""
 
     def __init__(self, edge_m: float) -> None:
-        self.experiment, found = problems(load(ROOT / "logs/tc016d.yaml"))
+        self.experiment, found = find_problems(read_experiment_file(ROOT / "logs/tc016d.yaml"))
         assert self.experiment is not None, found
         self.replay = self._prepared(edge_m)
-        self.times = {name: distributions(self.replay, self.experiment, name)[0] for name in PASSED}
+        self.times = {name: compute_distributions(self.replay, self.experiment, name)[0] for name in PASSED}
 
     def _prepared(self, edge_m: float) -> Replay:
         with tempfile.TemporaryDirectory() as folder:
@@ -85,7 +85,7 @@ class Scenario:
             write_osi_trace(tc016d(edge_m), path)
             (recording,), refused = read_logs(self.experiment, [path], None)
         assert not refused
-        return prepare(recording, self.experiment)
+        return prepare_log(recording, self.experiment)
 
     @cached_property
     def latest_s(self) -> np.ndarray:
@@ -93,7 +93,9 @@ class Scenario:
         (encounter,) = self.replay.encounters
         latest = []
         for a in DECELERATIONS_MPS2:
-            ((_, until_s),) = passing(encounter, ConstantDeceleration(a_max_mps2=a), self.experiment.braking.margin_m)
+            ((_, until_s),) = find_passing_intervals(
+                encounter, ConstantDeceleration(a_max_mps2=a), self.experiment.braking.margin_m
+            )
             latest.append(until_s)
         return np.array(latest)
 
@@ -172,7 +174,7 @@ def page() -> str:
         "|---|---|---|---|---|",
     ]
     for name, passed in PASSED.items():
-        low, high = wilson(passed, RUNS)
+        low, high = wilson_limits(passed, RUNS)
         off = rates[name] - passed / RUNS
         lines.append(f"| {name} | {rates[name]:.4f} | {passed / RUNS:.3f} | {low:.4f} – {high:.4f} | {off:+.4f} |")
     lines += [

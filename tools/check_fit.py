@@ -23,13 +23,12 @@ from mcap.writer import Writer
 from osi3.osi_sensordata_pb2 import SensorData
 
 import copem_replay as cr
-from copem_replay.cli.api.fit import study_to_fit
-from copem_replay.core.yaml import without_notes
-from copem_replay.experiment.file import plain
-from copem_replay.perception.pem.detection import Table
-from copem_replay.pipeline.fit.estimate import Estimate
-from copem_replay.pipeline.fit.fit import How, fit
-from copem_replay.pipeline.fit.model import pem_of, unit_of
+from copem_replay.api.fit import read_study_to_fit
+from copem_replay.core.yaml import strip_comments
+from copem_replay.experiment.file import make_plain_source
+from copem_replay.fitting.estimate import Estimate
+from copem_replay.fitting.fit import FitOptions, build_pem, build_unit, fit_unit
+from copem_replay.perception.pem.detection import TableDetection
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
@@ -107,8 +106,7 @@ def write_lists(
     recording: cr.Recording, pem: Mapping[str, Any], outages: Mapping[str, float], seed: int, out: Path
 ) -> Path:
     """A recording with the lists of a unit of this PEM beside its truth, as if they had been recorded."""
-    from copem_replay.results.export import MCAP
-    from copem_replay.results.write import write_results
+    from copem_replay.results.write import MCAP, write_results
 
     unit = {"rsu": PLACE | {"pem": "rsu", "outages": dict(outages)}}
     fed = {"fed": {"units": ["rsu"], "latency_s": DELAY_S, "fusion": {"kind": "union"}}}
@@ -154,9 +152,9 @@ def fitted_to(path: Path) -> cr.FittedPem:
     """The unit's model as its recorded lists tell it."""
     unit = {"rsu": PLACE | {"recorded": {"topic": TOPIC}}}
     experiment = experiment_of(unit, {"recorded": {"units": ["rsu"]}}, logs=[str(path)])
-    study = study_to_fit(plain(experiment), "rsu")
-    how = How(truth="complete", other_gates=False)
-    return cr.FittedPem(study.experiment, study.recordings, fit(study.experiment, study.recordings, "rsu", how))
+    study = read_study_to_fit(make_plain_source(experiment), "rsu")
+    how = FitOptions(truth="complete", other_gates=False)
+    return cr.FittedPem(study.experiment, study.recordings, fit_unit(study.experiment, study.recordings, "rsu", how))
 
 
 def declared(fitted: cr.FittedPem, pem: Mapping[str, Any], outages: Mapping[str, float]) -> dict[str, float]:
@@ -185,7 +183,7 @@ def declared(fitted: cr.FittedPem, pem: Mapping[str, Any], outages: Mapping[str,
     for b in range(len(fitted.found.parts.errors.bins)):
         found |= {f"errors.bins.{b}.mean_m.{k}": 0.0 for k in range(2)}
         found |= {f"errors.bins.{b}.covariance_m2.{k}": v for k, v in enumerate((along, 0.0, across))}
-    model = Table.model_validate(couple["detection"])
+    model = TableDetection.model_validate(couple["detection"])
     for c, one in enumerate(fitted.found.parts.detection.couples):
         if one.azimuth_deg is not None or one.classes is not None or len(one.visible_share) < 2:
             continue  # of an average over what is seen there is no such number
@@ -207,10 +205,10 @@ def inside(
 def elsewhere(fitted: cr.FittedPem, pem: Mapping[str, Any], outages: Mapping[str, float], other: cr.Recording) -> Any:
     """The summary of the true model and of the fitted one on another recording."""
     where = {"at": [190.0, 290.0], "yaw_deg": 45.0, "height_m": 6.0}
-    unit = without_notes(unit_of(fitted.found, fitted.experiment, "fitted")) | where
+    unit = strip_comments(build_unit(fitted.found, fitted.experiment, "fitted")) | where
     data = {
         "version": 1, "runs": 50,
-        "pems": {"known": dict(pem), "fitted": without_notes(pem_of(fitted.found))},
+        "pems": {"known": dict(pem), "fitted": strip_comments(build_pem(fitted.found))},
         "units": {"known": where | {"pem": "known", "outages": dict(outages)}, "fitted": unit},
         "configurations": {name: {"units": [name]} for name in ("known", "fitted")},
         "measure": {

@@ -14,26 +14,28 @@ from pathlib import Path
 
 import numpy as np
 
-from copem_replay.core.interpolation import at_instants
-from copem_replay.io.recording import Recording, read
-from copem_replay.io.short_tracks import Entries, entries_of
-from copem_replay.io.time_offset import TimeOffset, time_offset
+from copem_replay.core.interpolation import interpolate_at_instants
+from copem_replay.io.clock_offset import TimeOffset, estimate_time_offset
+from copem_replay.io.recording import Recording, read_log
+from copem_replay.io.short_tracks import ListPoints, make_list_points
 
 SIGMA_M = 0.5
 
 
 def listed(
     recording: Recording, rng: np.random.Generator, rate_hz: float, found: float, *, ids: bool, ahead_s: float
-) -> Entries:
+) -> ListPoints:
     """What a unit lists of a recording whose clock is ahead: each object with probability `found`, with errors."""
     scene = recording.scene
     since_s = np.arange(rng.uniform(0, 1 / rate_hz), scene.end_s, 1 / rate_hz)
     stamps = scene.t0_ns + np.rint(since_s * 1e9).astype(np.int64)
-    world = entries_of(at_instants(recording.truth, stamps, t0_ns=scene.t0_ns, max_gap_s=0.5), scene.t0_ns)
+    world = make_list_points(
+        interpolate_at_instants(recording.truth, stamps, t0_ns=scene.t0_ns, max_gap_s=0.5), scene.t0_ns
+    )
     world = world.take(np.flatnonzero(rng.uniform(size=len(world.time_s)) < found))
     error_m = rng.normal(0, SIGMA_M, (2, len(world.time_s)))
     track = world.track if ids else np.full(len(world.time_s), -1)
-    return Entries(world.time_s + ahead_s, world.list_ix, world.x_m + error_m[0], world.y_m + error_m[1], track)
+    return ListPoints(world.time_s + ahead_s, world.list_ix, world.x_m + error_m[0], world.y_m + error_m[1], track)
 
 
 def tried(recording: Recording, seed: int, *, truth: bool) -> tuple[float, TimeOffset]:
@@ -44,7 +46,9 @@ def tried(recording: Recording, seed: int, *, truth: bool) -> tuple[float, TimeO
     ids = rng.uniform(size=2) < 0.5
     first = listed(recording, rng, rates_hz[0], shares[0], ids=bool(ids[0]), ahead_s=0.0)
     second = listed(recording, rng, rates_hz[1], shares[1], ids=bool(ids[1]), ahead_s=offset_s)
-    return offset_s, time_offset(entries_of(recording.truth, recording.scene.t0_ns) if truth else first, second)
+    return offset_s, estimate_time_offset(
+        make_list_points(recording.truth, recording.scene.t0_ns) if truth else first, second
+    )
 
 
 def main() -> None:
@@ -57,7 +61,7 @@ def main() -> None:
     seeds = range(options.first, options.first + options.seeds)
     print(f"{'recording':<24}{'against':<9}{'told':>6}{'inside':>8}{'rmse_s':>9}{'worst_s':>9}{'half_s':>9}")
     for path in options.recordings:
-        recording = read(path, name=path.stem)
+        recording = read_log(path, name=path.stem)
         for truth in (False, True):
             found = [tried(recording, seed, truth=truth) for seed in seeds]
             told = [(true_s, one) for true_s, one in found if one.untold is None]

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from city import EGO_RADIUS_M, MIDDLE_M, SPACING_M, STREETS
-from copem_replay.io.write.osi_trace import write_osi_trace
+from copem_replay.io.write.osi import write_osi_trace
 from make_logs import long_drive
 
 MINUTES, OBJECTS = 0.5, 80

@@ -22,8 +22,8 @@ import numpy as np
 import pandas as pd
 
 from copem_replay.core.tracks import Float
-from copem_replay.metrics.intervals import bootstrap_share, resamples, share_limits
-from copem_replay.metrics.summary_text import as_text
+from copem_replay.metrics.intervals import bootstrap_share, draw_resamples, share_limits
+from copem_replay.metrics.summary import format_table
 
 CLUSTERS: Final = (5, 8, 12, 20, 30, 60, 120)
 Draw = Callable[[np.random.Generator, int], Float]
@@ -61,7 +61,7 @@ WEIGHTS: Final[dict[str, Draw]] = {
 def held(design: Design, weights: str, clusters: int, trials: int, seed: int) -> dict[str, object]:
     """How many of the trials' intervals hold the true share, and their mean width."""
     rng = np.random.default_rng([seed, clusters, *design.name.encode(), *weights.encode()])
-    resampled = resamples([str(k) for k in range(clusters)], seed)
+    resampled = draw_resamples([str(k) for k in range(clusters)], seed)
     limits = np.empty((trials, 2, 2))
     for trial in range(trials):
         totals = WEIGHTS[weights](rng, clusters)
@@ -121,9 +121,9 @@ def main() -> None:
     parser.add_argument("--clusters", type=int, nargs="+", default=list(CLUSTERS))
     asked = parser.parse_args()
     table = coverage(asked.clusters, asked.trials, asked.seed)
-    print(as_text(table.round(3)))
+    print(format_table(table.round(3)))
     print("\nOver all shares of clusters:")
-    print(as_text(cost(table).round(3)))
+    print(format_table(cost(table).round(3)))
 
 
 if __name__ == "__main__":

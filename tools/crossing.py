@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from copem_replay.io.write.osi_trace import NANOS_PER_SECOND, OsiTrace
+from copem_replay.io.write.osi import NANOS_PER_SECOND, OsiTrace
 from make_logs import SOURCE, Body, ground_truth
 from make_logs import Kind as Vehicle
 

@@ -44,25 +44,25 @@ def outcome(path: Path, looked: Callable[[], None] = lambda: None) -> dict[str, 
     It is surveyed and read; `looked` is called then, and its other lists are read and its messages copied.
     """
     from copem_replay.core.errors import InputError, RecordingError
-    from copem_replay.experiment.draft.findings import as_json
-    from copem_replay.experiment.draft.survey import survey
-    from copem_replay.experiment.draft.survey_text import describe
+    from copem_replay.experiment.draft.findings import survey_as_json
+    from copem_replay.experiment.draft.survey import survey_recording
+    from copem_replay.experiment.draft.template import describe_survey
+    from copem_replay.io import recorded_lists as lists
     from copem_replay.io import recorded_lists as unit_lists
-    from copem_replay.io import recorded_osi as lists
     from copem_replay.io.open import open_log
-    from copem_replay.io.recording import read
+    from copem_replay.io.recording import read_log
     from copem_replay.io.schemas import osi_ground_truth as osi
-    from copem_replay.io.write.source import source_of
+    from copem_replay.io.write.source import open_source
 
     said: list[str] = []
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         try:
-            found = survey(path)
-            json.dumps(as_json(found), allow_nan=False)
-            said += [*describe(found), *([found.reason] if found.reason else [])]
+            found = survey_recording(path)
+            json.dumps(survey_as_json(found), allow_nan=False)
+            said += [*describe_survey(found), *([found.reason] if found.reason else [])]
             try:
-                recording = read(path, name="log")
+                recording = read_log(path, name="log")
                 said += recording.notes
                 end = READ
             except InputError as error:
@@ -78,11 +78,11 @@ def outcome(path: Path, looked: Callable[[], None] = lambda: None) -> dict[str, 
                         if topic[1] == osi.SENSOR_DATA:
                             lists.read_recorded(path, topic[0], recording.scene)
                         else:
-                            unit_lists.read_listed(path, topic[0], recording.scene, recording.around)
+                            unit_lists.read_described_lists(path, topic[0], recording.scene, recording.around)
                     except RecordingError as error:
                         said += error.problems
             try:
-                original = source_of(path)
+                original = open_source(path)
                 for _message in original.messages({number: number for number in original.channels}):
                     pass
             except RecordingError as error:

@@ -62,10 +62,10 @@ class Trial:
             return child
         try:
             from copem_replay.cli import main as cli
-            from copem_replay.results import place
+            from copem_replay.results import folder as place
 
             if self.two_steps:
-                place.exchange = lambda *_: False
+                place.exchange_folders = lambda *_: False
             nothing = os.open(os.devnull, os.O_RDWR)
             for fd in (1, 2):
                 os.dup2(nothing, fd)
@@ -73,7 +73,7 @@ class Trial:
             sys.argv = ["copem-replay", "run", str(self.experiment), "--overwrite", "--seed", str(seed)]
             sys.argv += ["--out", str(self.out), "--jobs", "1"]
             before()
-            os._exit(cli._ended())
+            os._exit(cli._run_to_exit_code())
         except BaseException:
             os._exit(99)
 
@@ -115,15 +115,15 @@ class Trial:
 
     def add_files(self) -> None:
         """A file of the user's, and one that was made of the results, as `report` makes it."""
-        from copem_replay.results.belongings import list_made
+        from copem_replay.results.folder import add_to_made_list
 
         (self.out / _NOTE).write_text("mine\n")
-        list_made(self.out, [self.out / _PAGE])
+        add_to_made_list(self.out, [self.out / _PAGE])
         (self.out / _PAGE).write_text("of the old results\n")
 
     def check(self, seeds: tuple[int | None, int], found: Found, what: str) -> None:
         """What a killed run left: it is that of one of two seeds (None: there was nothing)."""
-        from copem_replay.results.belongings import MADE
+        from copem_replay.results.folder import MADE
 
         found.leftovers += len(os.listdir(self.out.parent)) > self.out.exists() if self.out.parent.exists() else 0
         before, seed = seeds
@@ -167,15 +167,15 @@ def ended(child: int) -> int | None:
 def warmed(path: Path) -> None:
     """Import and load what a run needs, so that forks need not: all but Rerun's threads, which no fork would have."""
     import copem_replay.io.write.mcap  # noqa: F401
-    from copem_replay.experiment.file import load, log_paths
-    from copem_replay.experiment.validate import problems, read_logs
-    from copem_replay.pipeline.run import run
+    from copem_replay.experiment.file import log_paths, read_experiment_file
+    from copem_replay.experiment.validate import find_problems, read_logs
+    from copem_replay.pipeline.run import run_experiment
 
-    source = load(path)
-    experiment, _ = problems(source)
+    source = read_experiment_file(path)
+    experiment, _ = find_problems(source)
     assert experiment is not None
     recordings, _ = read_logs(experiment, log_paths(source)[0], source)
-    run(experiment, recordings)
+    run_experiment(experiment, recordings)
 
 
 def kill(

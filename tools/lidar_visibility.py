@@ -19,7 +19,7 @@ import pandas as pd
 
 from copem_replay.core.errors import CopemError
 from copem_replay.core.tracks import CLASSES, Float
-from copem_replay.io.recording import Recording, read
+from copem_replay.io.recording import Recording, read_log
 from copem_replay.perception.visibility import NO_STATICS, Flat, Observers, Surface, visible_shares
 
 WITHIN_M = 60.0
@@ -27,7 +27,7 @@ SENSOR_HEIGHT_M = 1.9
 
 
 def main(log: Path, points: Path) -> None:
-    recording = read(log, name=log.stem)
+    recording = read_log(log, name=log.stem)
     states = pedestrians(recording).merge(counted(points), on=["stamp_ns", "id"], how="inner")
     result: dict[str, float | int] = {"n": len(states)}
     for kind in ("surface", "flat"):

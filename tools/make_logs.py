@@ -21,7 +21,7 @@ from typing import Any, Final
 from osi3.osi_groundtruth_pb2 import GroundTruth
 from osi3.osi_object_pb2 import MovingObject, StationaryObject
 
-from copem_replay.io.write.osi_trace import NANOS_PER_SECOND, OsiTrace, empty_ground_truth, write_osi_trace
+from copem_replay.io.write.osi import NANOS_PER_SECOND, OsiTrace, empty_ground_truth, write_osi_trace
 
 Kind = MovingObject.VehicleClassification
 SOURCE: Final = "synthetic (tools/make_logs.py)"

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 import copem_replay as cr
-from copem_replay.metrics.lasting_survival import log_sequence
+from copem_replay.metrics.exact_survival import log_sequence
 
 P, TAU_S, AFTER_S, RUNS = 0.3, 1.0, 1.0, 4000
 RATES_HZ = (5, 10, 20, 50)

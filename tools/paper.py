@@ -14,8 +14,8 @@ from typing import Final
 
 import pandas as pd
 
-from copem_replay.metrics.intervals import wilson
-from copem_replay.metrics.summary_text import as_text
+from copem_replay.metrics.intervals import wilson_limits
+from copem_replay.metrics.summary import format_table
 
 RUNS: Final = 500
 PASSED: Final = {"GT": 500, "PEM": 426, "coPEM:0s": 499, "coPEM:0.5s": 474, "coPEM:1s": 323, "coPEM:1.5s": 0}
@@ -26,7 +26,7 @@ def beside(summary: pd.DataFrame) -> pd.DataFrame:
     rows = []
     for name, passed in PASSED.items():
         ours = summary.set_index("configuration").loc[name]
-        low, high = wilson(passed, RUNS)
+        low, high = wilson_limits(passed, RUNS)
         rows.append(
             {
                 "configuration": name,
@@ -51,7 +51,7 @@ def main() -> None:
     if not set(PASSED) <= set(summary["configuration"]) or "pass_share_exact" not in summary:
         parser.error(f"{folder}: expected the results of logs/tc016d.yaml")
     print("Success rates beside the paper's (calibrated to them: docs/reference/calibration.md)")
-    print(as_text(beside(summary)))
+    print(format_table(beside(summary)))
 
 
 if __name__ == "__main__":

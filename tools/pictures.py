@@ -71,52 +71,54 @@ def main() -> None:
 
 def _replay(folder: Path) -> None:
     """`copem-replay run logs/tc016d.yaml`, with the median run shown."""
-    from copem_replay.experiment.file import load, log_paths
-    from copem_replay.experiment.show_keys import Show
-    from copem_replay.experiment.validate import problems, read_logs
-    from copem_replay.pipeline.run import run
+    from copem_replay.experiment.file import log_paths, read_experiment_file
+    from copem_replay.experiment.schema import Show
+    from copem_replay.experiment.validate import find_problems, read_logs
+    from copem_replay.pipeline.run import run_experiment
     from copem_replay.results.write import write_results
-    from copem_replay.viewer.export import EXPORTERS
+    from copem_replay.viewer.rrd import EXPORTERS
 
-    source = load(ROOT / "logs/tc016d.yaml")
-    experiment, wrong = problems(source)
+    source = read_experiment_file(ROOT / "logs/tc016d.yaml")
+    experiment, wrong = find_problems(source)
     if experiment is None or wrong:
         sys.exit("\n".join(wrong))
     experiment = experiment.model_copy(update={"show": Show(run="median")})
     recordings, _ = read_logs(experiment, log_paths(source)[0], source)
-    write_results(folder, experiment, recordings, run(experiment, recordings), exporters=EXPORTERS)
+    write_results(folder, experiment, recordings, run_experiment(experiment, recordings), exporters=EXPORTERS)
 
 
 def _city(folder: Path) -> float:
     """The city's results; when some know of the object that tells most, and others do not."""
     import copem_replay as cr
     from city_traffic import experiment, write
-    from copem_replay.viewer.selection import measured
+    from copem_replay.viewer.sink import choose_measured_objects
 
     result = cr.run(experiment(write(folder.parent)))
     result.save(folder)
     table = result.detections
     table = table[table["run"] == next(iter(cr.load_results(folder).provenance.run_shown.values()))]
-    episodes = table[(table["object_id"] == measured(table, ["GT"])[0]) & (table["configuration"] != "GT")]
+    episodes = table[
+        (table["object_id"] == choose_measured_objects(table, ["GT"])[0]) & (table["configuration"] != "GT")
+    ]
     times = episodes["detection_s"].dropna()
     return float(times.min() + times.max()) / 2
 
 
 def _differences(folder: Path, out: Path) -> None:
     """`copem-replay compare --rrd`: two latencies beside the car's own perception."""
-    from copem_replay.viewer.side_by_side import write_beside
+    from copem_replay.viewer.side_by_side import write_side_by_side
 
-    write_beside(out, [folder], configurations=["coPEM:0.5s", "coPEM:1s"], baseline="PEM")
+    write_side_by_side(out, [folder], configurations=["coPEM:0.5s", "coPEM:1s"], baseline="PEM")
 
 
 def _drawn(folder: Path) -> Picture:
     """The figure of single runs of `copem-replay plot`."""
     from copem_replay.report.figures.selection import Selection
     from copem_replay.report.figures.single_runs import runs_figure
-    from copem_replay.results.read import load_results
+    from copem_replay.results.read import read_results
 
     content = io.BytesIO()
-    runs_figure(load_results(folder), Selection()).savefig(content, format="png", dpi=130)
+    runs_figure(read_results(folder), Selection()).savefig(content, format="png", dpi=130)
     return Image.open(content)
 
 

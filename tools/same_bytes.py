@@ -148,7 +148,10 @@ _PLACED = {
 CASES = (
     Case("words", "tc016d", _OF_COMMANDS),
     Case("tc016d", "tc016d", _OF_RESULTS),
-    *(Case(name, name) for name in ("tc016d_beyond", "crossing_radio", "crossing_share", "crossing_units")),
+    *(
+        Case(name, name)
+        for name in ("tc016d_beyond", "crossing_radio", "crossing_share", "crossing_units", "crossing_wall")
+    ),
     *(Case(name, name) for name in _RECORDED),
     *_modes("tc016d"),
     *_modes("crossing_radio"),

@@ -21,8 +21,7 @@ from osi3.osi_sensordata_pb2 import SensorData
 import copem_replay as cr
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.io.open import open_log
-from copem_replay.io.write.osi_sensor_data_writer import SensorDataWriter
-from copem_replay.io.write.osi_trace import NANOS_PER_SECOND, OsiTrace, write_osi_trace
+from copem_replay.io.write.osi import NANOS_PER_SECOND, OsiTrace, SensorDataWriter, write_osi_trace
 
 CROSSING: Final = Path(__file__).resolve().parents[1] / "logs" / "crossing.mcap"
 

@@ -1,4 +1,4 @@
-"""`copem-replay convert FORMAT SOURCE --out FILE`: a command per format, for each has options of its own."""
+"""`copem-replay convert FORMAT SOURCE --out FILE`: a command per format, because each has its own options."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from copem_replay.core.errors import InputError, printable
+from copem_replay.core.errors import InputError, escape_unprintable
 
 app = typer.Typer(
     help="Convert a data set or a simulation to a recording.\n\nIt is an MCAP file with OSI ground truth.",
@@ -21,7 +21,7 @@ Metres = tuple[float, float, float]
 
 
 @app.callback(invoke_without_command=True)
-def formats(context: typer.Context) -> None:
+def require_format(context: typer.Context) -> None:
     """Refuse a command without a format."""
     if context.invoked_subcommand is None:
         names = ", ".join(command.callback.__name__ for command in app.registered_commands if command.callback)
@@ -44,11 +44,11 @@ def argoverse2(
     """Argoverse 2: the folder of a sensor log."""
     options: dict[str, Any] = {}
     if ego_size_m is not None:
-        options["ego_size_m"] = tuple(_positive(value, "--ego-size-m") for value in ego_size_m)
+        options["ego_size_m"] = tuple(_check_positive(value, "--ego-size-m") for value in ego_size_m)
     if centre_from_rear_axle_m is not None:
         name = "--centre-from-rear-axle-m"
-        options["centre_from_rear_axle_m"] = tuple(_finite(value, name) for value in centre_from_rear_axle_m)
-    return _converted("argoverse2", source, out, overwrite, **options)
+        options["centre_from_rear_axle_m"] = tuple(_check_finite(value, name) for value in centre_from_rear_axle_m)
+    return _convert_sources("argoverse2", source, out, overwrite, **options)
 
 
 @app.command()
@@ -64,8 +64,8 @@ def scenarionet(
     ] = None,
 ) -> int:
     """ScenarioNet (nuScenes, Waymo, …): a pickle, or a folder."""
-    centre_m = None if ego_centre_m is None else _finite(ego_centre_m, "--ego-centre-m")
-    return _converted("scenarionet", source, out, overwrite, ego_centre_m=centre_m)
+    centre_m = None if ego_centre_m is None else _check_finite(ego_centre_m, "--ego-centre-m")
+    return _convert_sources("scenarionet", source, out, overwrite, ego_centre_m=centre_m)
 
 
 @app.command()
@@ -82,14 +82,14 @@ def openlabel(
     ] = None,
 ) -> int:
     """OpenLABEL (KITTI, TUMTraf, …): a JSON file, or a folder."""
-    rate_hz = None if rate_hz is None else _positive(rate_hz, "--rate-hz")
-    return _converted("openlabel", source, out, overwrite, rate_hz=rate_hz, source=from_system, target=to_system)
+    rate_hz = None if rate_hz is None else _check_positive(rate_hz, "--rate-hz")
+    return _convert_sources("openlabel", source, out, overwrite, rate_hz=rate_hz, source=from_system, target=to_system)
 
 
 @app.command()
 def commonroad(source: Source, out: Out, overwrite: Overwrite = False) -> int:
     """CommonRoad 2018b or 2020a: an XML file."""
-    return _converted("commonroad", source, out, overwrite)
+    return _convert_sources("commonroad", source, out, overwrite)
 
 
 @app.command()
@@ -103,37 +103,37 @@ def sumo(
     host: Annotated[str | None, typer.Option(metavar="ID", help="Vehicle that is the host.")] = None,
 ) -> int:
     """SUMO: the XML file of --fcd-output."""
-    return _converted("sumo", source, out, overwrite, type_files=types or (), host=host)
+    return _convert_sources("sumo", source, out, overwrite, type_files=types or (), host=host)
 
 
 @app.command()
 def csv(source: Source, out: Out, overwrite: Overwrite = False) -> int:
     """CSV: a table with units in the names of its columns."""
-    return _converted("csv", source, out, overwrite)
+    return _convert_sources("csv", source, out, overwrite)
 
 
-def _positive(value: float, option: str) -> float:
-    from copem_replay.io.convert.parse import positive
+def _check_positive(value: float, option: str) -> float:
+    from copem_replay.io.convert.conversion import parse_positive
 
-    return positive(value, option)
-
-
-def _finite(value: float, option: str) -> float:
-    from copem_replay.io.convert.parse import number
-
-    return number(value, option)
+    return parse_positive(value, option)
 
 
-def _converted(format: str, source: Path, out: Path, overwrite: bool, /, **options: Any) -> int:
-    """Convert, print a line per recording and the notes. Raises InputError with every problem at once."""
-    from copem_replay.io.convert.conversion import Conversion, convert_all, outputs
+def _check_finite(value: float, option: str) -> float:
+    from copem_replay.io.convert.conversion import parse_number
+
+    return parse_number(value, option)
+
+
+def _convert_sources(format: str, source: Path, out: Path, overwrite: bool, /, **options: Any) -> int:
+    """Convert, then print a line per recording and the notes. Raises InputError with all problems at once."""
+    from copem_replay.io.convert.conversion import Conversion, convert_all, plan_outputs
 
     conversion = Conversion()
-    asked = outputs(source, out, format=format, overwrite=overwrite)
-    for line in convert_all(asked, conversion, format=format, options=options):
-        print(printable(line))
+    outputs = plan_outputs(source, out, format=format, overwrite=overwrite)
+    for line in convert_all(outputs, conversion, format=format, options=options):
+        print(escape_unprintable(line))
     for note in conversion.note_lines():
-        print(printable(f"note: {note}"))
+        print(escape_unprintable(f"note: {note}"))
     if problems := conversion.problem_lines():
         raise InputError(problems)
     return 0

@@ -1,4 +1,4 @@
-"""The command that fits a perception error model: fit."""
+"""`copem-replay fit`: fit a perception error model to the recorded lists of a unit."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from typing import Annotated
 
 import typer
 
-from copem_replay.cli.options import ExperimentFile, listed
-from copem_replay.cli.terminal import complain, note, say, say_blocks
+from copem_replay.cli.terminal import ExperimentFile, print_blocks, print_line, print_notes, print_problems, split_names
 
 
 def fit(
@@ -43,23 +42,22 @@ def fit(
     Every number comes with an interval, or with the reason why the data cannot determine it. The exit code is 1 if the
     fitted model fails its replay check, or a page cannot be written.
     """
-    from copem_replay.cli.api.fit import fill, fitted, how_of, study_to_fit
-    from copem_replay.experiment.file import load
-    from copem_replay.results.fit_files import PEM, table_lines
-    from copem_replay.results.place import EXPERIMENT, check_inputs, taken
+    from copem_replay.api.fit import check_fit_options, fill_fit_folder, fit_study, read_study_to_fit
+    from copem_replay.experiment.file import read_experiment_file
+    from copem_replay.fitting.page import PEM, table_lines
+    from copem_replay.results.folder import EXPERIMENT, check_inputs, take_place
 
-    how = how_of(hold_out or (), folds, truth, listed(by) or (), not not_monotone, simplest)
-    with taken(out or Path("out") / f"{experiment.stem}_fit", overwrite=overwrite) as place:
-        note(place.notes)
+    options = check_fit_options(hold_out or (), folds, truth, split_names(by) or (), not not_monotone, simplest)
+    with take_place(out or Path("out") / f"{experiment.stem}_fit", overwrite=overwrite) as place:
+        print_notes(place.notes)
         place.notes.clear()
-        study = study_to_fit(load(experiment), unit)
+        study = read_study_to_fit(read_experiment_file(experiment), unit)
         check_inputs(place, [experiment, *(path for recording in study.recordings for path in recording.paths)])
-        found = fitted(study, unit, how)
-        fill(place, found)
-        note([*place.notes, *found.notes])
-        complain(place.failed)
-        say_blocks([table_lines(found.found)])
-        say(f"the model is in {place.shown / PEM}")
-    say(f"next: copem-replay run {shlex.quote(str(place.shown / EXPERIMENT))}")
-    unlike = found.found.checks is not None and found.found.checks.fails
-    return 1 if unlike or place.failed else 0
+        fitted = fit_study(study, unit, options)
+        fill_fit_folder(place, fitted)
+        print_notes([*place.notes, *fitted.notes])
+        print_problems(place.failed)
+        print_blocks([table_lines(fitted.found)])
+        print_line(f"the model is in {place.shown / PEM}")
+    print_line(f"next: copem-replay run {shlex.quote(str(place.shown / EXPERIMENT))}")
+    return 1 if place.failed or (fitted.found.checks is not None and fitted.found.checks.fails) else 0

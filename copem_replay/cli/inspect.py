@@ -1,23 +1,37 @@
-"""Commands that look at recordings and experiments: info, init, check, schema."""
+"""Commands before a replay: `info` and `init` on recordings, `check` and `schema` on experiments, `samples`."""
 
 from __future__ import annotations
 
 import json
+import shutil
 import sys
-from typing import TYPE_CHECKING, Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from copem_replay.cli.options import Ego, ExperimentFile, FromS, LogFiles, Logs, OneDrive, ToS
-from copem_replay.cli.terminal import complain, note, say, say_blocks, width_of
+from copem_replay.cli.terminal import (
+    Ego,
+    ExperimentFile,
+    FromS,
+    LogFiles,
+    Logs,
+    OneDrive,
+    ToS,
+    print_blocks,
+    print_line,
+    print_notes,
+    print_problems,
+    width_of,
+)
 from copem_replay.core.errors import InputError
+from copem_replay.core.files import atomic_files
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
-    from pathlib import Path
 
     from copem_replay.core.yaml import Key
-    from copem_replay.experiment.file import Source
+    from copem_replay.experiment.file import ExperimentSource
 
 
 def info(
@@ -31,33 +45,33 @@ def info(
     readable, else 2.
     """
     if together:
-        return _clocks(logs, as_json=as_json)
-    from copem_replay.experiment.draft.findings import as_json as plain
-    from copem_replay.experiment.draft.survey import survey
-    from copem_replay.experiment.draft.survey_text import describe
+        return _print_clocks(logs, as_json=as_json)
+    from copem_replay.experiment.draft.findings import survey_as_json
+    from copem_replay.experiment.draft.survey import survey_recording
+    from copem_replay.experiment.draft.template import describe_survey
 
-    surveys = [survey(log) for log in logs]
+    surveys = [survey_recording(log) for log in logs]
     if as_json:
-        print(json.dumps([plain(s) for s in surveys], indent=1, ensure_ascii=False))
+        print(json.dumps([survey_as_json(s) for s in surveys], indent=1, ensure_ascii=False))
     else:
-        say_blocks(describe(s, width_of(sys.stdout)) for s in surveys if s.topics)
-    complain(s.reason for s in surveys if s.reason is not None)
+        print_blocks(describe_survey(s, width_of(sys.stdout)) for s in surveys if s.topics)
+    print_problems(s.reason for s in surveys if s.reason is not None)
     return 0 if any(s.readable or any(u.problem is None for u in s.units) for s in surveys) else 2
 
 
-def _clocks(logs: Sequence[Path], *, as_json: bool) -> int:
-    """Say how far the clocks of recordings are ahead of the first one's."""
-    from copem_replay.experiment.draft.clocks import clocks
+def _print_clocks(logs: Sequence[Path], *, as_json: bool) -> int:
+    """Print the clock offset of each recording against the first one."""
+    from copem_replay.experiment.draft.survey import compare_clocks
 
     if len(logs) < 2:
         raise InputError(f"--together: expected several recordings of one drive, found {len(logs)}")
-    told = clocks(logs)
+    clocks = compare_clocks(logs)
     if as_json:
-        plain = [{"recording": str(one.path), "against": str(logs[0]), **one.plain()} for one in told]
+        plain = [{"recording": str(clock.path), "against": str(logs[0]), **clock.plain()} for clock in clocks]
         print(json.dumps(plain, indent=1, ensure_ascii=False))
         return 0
-    for found in told:
-        say(f"{found.path}: clock_offset_s against {logs[0]}: {found.words()}; by {' and '.join(found.lists)}")
+    for clock in clocks:
+        print_line(f"{clock.path}: clock_offset_s against {logs[0]}: {clock.words()}; by {' and '.join(clock.lists)}")
     return 0
 
 
@@ -68,17 +82,17 @@ def init(logs: LogFiles, together: OneDrive = False) -> int:
     schema, `read:` is proposed from the names of their fields. The exit code is 2 when no list of true objects is
     readable.
     """
-    from copem_replay.cli.api.recordings import draft_of, draft_together, encodable
-    from copem_replay.experiment.draft.template import unfinished
+    from copem_replay.api.recordings import check_encodable, draft_joint_recordings, draft_recording
+    from copem_replay.experiment.draft.template import format_unfinished_draft
 
     if len(logs) > 1 and not together:
         raise InputError(f"{logs[1]}: expected one recording, found {len(logs)}; `--together`: they are of one drive")
     for log in logs:
-        encodable(log)
-    text, found = draft_of(logs[0]) if len(logs) == 1 else draft_together(logs)
+        check_encodable(log)
+    text, survey = draft_recording(logs[0]) if len(logs) == 1 else draft_joint_recordings(logs)
     if text is None:
-        print(unfinished(found), end="")
-        raise InputError(found.reason or f"{logs[0]}: no list of true objects")
+        print(format_unfinished_draft(survey), end="")
+        raise InputError(survey.reason or f"{logs[0]}: no list of true objects")
     print(text, end="")
     return 0
 
@@ -94,14 +108,14 @@ def check(
 
     It reports all problems at once, and checks the experiment against its recordings, too.
     """
-    from copem_replay.cli.api.study import prepared, read_study
+    from copem_replay.api.study import prepare_study, read_study
 
-    study = read_study(source_with(experiment, {"ego": ego}, log or (), (from_s, to_s)))
-    from copem_replay.pipeline.notes import notes_of
+    study = read_study(override_source(experiment, {"ego": ego}, log or (), (from_s, to_s)))
+    from copem_replay.pipeline.notes import list_notes
 
-    ready, warnings = prepared(study)
-    note([*notes_of(study.recordings, ready, study.experiment, replayed=False), *warnings])
-    say(f"{experiment}: no problem found; logs: {', '.join(r.scene.log for r in study.recordings)}")
+    replays, warnings = prepare_study(study)
+    print_notes([*list_notes(study.recordings, replays, study.experiment, replayed=False), *warnings])
+    print_line(f"{experiment}: no problem found; logs: {', '.join(r.scene.log for r in study.recordings)}")
     return 0
 
 
@@ -112,33 +126,55 @@ def schema() -> int:
     """
     from copem_replay.experiment.schema import Experiment
 
-    described = Experiment.model_json_schema(by_alias=True) | {
-        "$schema": "https://json-schema.org/draft/2020-12/schema"
-    }
-    print(json.dumps(described, indent=1))
+    json_schema = Experiment.model_json_schema(by_alias=True)
+    print(json.dumps(json_schema | {"$schema": "https://json-schema.org/draft/2020-12/schema"}, indent=1))
     return 0
 
 
-def source_with(
+def override_source(
     path: Path,
     changes: Mapping[str, object],
     logs: Sequence[str],
     window_s: tuple[float | None, float | None],
-) -> Source:
-    """The experiment file, with the options that are given in the place of its keys."""
+) -> ExperimentSource:
+    """The experiment file with command-line options in place of its keys; None and empty `logs` leave its values."""
     from dataclasses import replace
 
-    from copem_replay.experiment.file import load, with_logs, without_settings
+    from copem_replay.experiment.file import drop_settings, read_experiment_file, replace_logs
 
-    source = load(path)
-    given = {name: value for name, value in changes.items() if value is not None}
-    options: dict[Key, str] = {(name,): f"--{name}" for name in given}
+    source = read_experiment_file(path)
+    values = {name: value for name, value in changes.items() if value is not None}
+    options: dict[Key, str] = {(name,): f"--{name}" for name in values}
     ends = {k: option for k, option in enumerate(("--from", "--to")) if window_s[k] is not None}
     if ends:
         written = source.data.get("window_s")
         window = written if isinstance(written, list) and len(written) == len(window_s) else [None, None]
-        given["window_s"] = [window_s[k] if k in ends else window[k] for k in range(len(window_s))]
+        values["window_s"] = [window_s[k] if k in ends else window[k] for k in range(len(window_s))]
         options |= {("window_s",): ", ".join(ends.values())} | {("window_s", k): o for k, o in ends.items()}
-    data = without_settings(source.data, [key for key in ("ego", "window_s") if key in given])
-    source = replace(source, data=data | given, options=options)
-    return with_logs(source, logs) if logs else source
+    data = drop_settings(source.data, [key for key in ("ego", "window_s") if key in values])
+    source = replace(source, data=data | values, options=options)
+    return replace_logs(source, logs) if logs else source
+
+
+_SAMPLES: Final = Path(__file__).with_name("sample_logs")
+"""What README and tutorial run, for an installation without the repository."""
+
+
+def samples(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder to write to.")] = Path("logs"),
+) -> int:
+    """Write the sample recordings and experiments into a folder.
+
+    The paper's scenario (tc016d) and a busy crossing. No file is replaced.
+    """
+    names = sorted(path.name for path in _SAMPLES.iterdir())
+    if existing := [name for name in names if (folder / name).exists()]:
+        raise InputError(
+            f"{folder / existing[0]}: expected no such file, found one; samples FOLDER names another folder"
+        )
+    with atomic_files(folder, names) as scratch:
+        for name in names:
+            shutil.copyfile(_SAMPLES / name, scratch / name)
+    print_line(f"{len(names)} files in {folder}")
+    print_line(f"next: copem-replay run {folder / 'tc016d.yaml'}")
+    return 0

@@ -1,14 +1,14 @@
-"""The command line: the commands of this folder, and one place where errors become exit codes.
+"""The command line `copem-replay`: its commands, and the one place where errors become exit codes.
 
-0 done · 1 done, but a log was skipped, a replay or page could not be written, or a fitted model is unlike what was
-recorded · 2 the input was wrong: plain lines on stderr · 70 internal error: traceback · 130 interrupted.
+0 done · 1 done, but a log was skipped, a replay or page could not be written, or a fitted model fails its replay check
+· 2 wrong input: plain lines on stderr · 70 internal error: traceback · 130 interrupted.
 """
 
 from __future__ import annotations
 
 import sys
 
-try:  # before `main` is there to catch it
+try:  # an interrupt during the imports, too, ends without a traceback
     import gc
     import io
     import os
@@ -19,8 +19,8 @@ try:  # before `main` is there to catch it
 
     import typer
 
-    from copem_replay.cli import convert, fit, inspect, results, run, samples
-    from copem_replay.cli.terminal import complain
+    from copem_replay.cli import convert, fit, inspect, results, run
+    from copem_replay.cli.terminal import print_problems
     from copem_replay.core.compiled import cache_note
     from copem_replay.core.errors import CopemError, InputError
 except KeyboardInterrupt:
@@ -64,7 +64,7 @@ for command in (
     results.view,
     results.layout,
     inspect.schema,
-    samples.samples,
+    inspect.samples,
 ):
     app.command()(command)
 app.add_typer(convert.app, name="convert")
@@ -72,47 +72,49 @@ app.add_typer(convert.app, name="convert")
 
 def main() -> None:
     """Entry point: runs a command and ends with its exit code."""
-    gc.set_threshold(100_000, 50, 100)  # a tenth of what imports take is looking for garbage that they do not make
+    gc.set_threshold(100_000, 50, 100)  # at Python's own thresholds a tenth of the imports' time is garbage collection
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # a terminal that has no “×” gets `\\xd7`
-    for number in (signal.SIGTERM, signal.SIGHUP):  # by way of what has to be tidied up
-        if number == signal.SIGTERM or signal.getsignal(number) != signal.SIG_IGN:  # nohup has it ignored
+            stream.reconfigure(errors="backslashreplace")  # a terminal without “×” gets `\\xd7`
+    for number in (signal.SIGTERM, signal.SIGHUP):  # SystemExit, so that unfinished files are removed
+        if number == signal.SIGTERM or signal.getsignal(number) != signal.SIG_IGN:  # nohup ignores SIGHUP
             signal.signal(number, lambda number, frame: sys.exit(128 + number))
-    code = _ended()
-    if (said := cache_note()) is not None and "numba" in sys.modules:  # something may have been compiled
-        complain([f"note: {said}"])
+    code = _run_to_exit_code()
+    if (note := cache_note()) is not None and "numba" in sys.modules:  # something may have been compiled
+        print_problems([f"note: {note}"])
     sys.exit(code)
 
 
-def _ended() -> int:
+def _run_to_exit_code() -> int:
     try:
-        code = _called(sys.argv[1:])
+        code = _call_command(sys.argv[1:])
         if sys.stdout is not None:
             sys.stdout.flush()
         return code
     except CopemError as error:
-        complain(error.problems)
+        print_problems(error.problems)
         return 2
     except (KeyboardInterrupt, typer.Abort) as error:
-        complain([str(error) or "interrupted"])
+        print_problems([str(error) or "interrupted"])
         return 130
-    except BrokenPipeError:  # the reader of our output has gone: `copem-replay info … | head`
+    except BrokenPipeError:  # the reader of the output has gone: `copem-replay info … | head`
         _discard_output()
         return 0
     except MemoryError:
-        complain(["copem-replay: not enough memory; take fewer runs, units or objects at a time"])
+        print_problems(["copem-replay: not enough memory; take fewer runs, units or objects at a time"])
         return 2
     except Exception as error:
-        if hasattr(error, "format_message"):  # typer's words on options and arguments
-            complain([f"copem-replay: {' '.join(error.format_message().split())}"])
+        if hasattr(error, "format_message"):  # typer on options and arguments
+            print_problems([f"copem-replay: {' '.join(error.format_message().split())}"])
             return 2
         if isinstance(error, OSError) and not isinstance(error, FileNotFoundError | FileExistsError):
-            _discard_output()  # a full disk, a device that fails, no permission: none of our doing
-            complain([f"copem-replay: {f'{error.filename}: ' if error.filename else ''}{error.strerror or error}"])
+            _discard_output()  # a full disk, a failing device, no permission: no internal error
+            print_problems(
+                [f"copem-replay: {f'{error.filename}: ' if error.filename else ''}{error.strerror or error}"]
+            )
             return 2
         if isinstance(error, RuntimeError) and str(error).startswith("cannot cache function"):  # Numba's words
-            complain(
+            print_problems(
                 ["copem-replay: no folder to cache compiled code in; set NUMBA_CACHE_DIR to one that can be written"]
             )
             return 2
@@ -121,10 +123,10 @@ def _ended() -> int:
         return 70
 
 
-def _called(arguments: list[str]) -> int:
-    """Run a command. Not by typer's own `main`, which has other ideas of what errors and interrupts look like."""
+def _call_command(arguments: list[str]) -> int:
+    """Run a command and return its exit code. Typer's own `main` would print errors and interrupts its own way."""
     command = typer.main.get_command(app)
-    _say_types_in_words(command)
+    _hide_argument_types(command)
     try:
         with command.make_context("copem-replay", arguments) as context:
             code = command.invoke(context)
@@ -133,17 +135,17 @@ def _called(arguments: list[str]) -> int:
     return code if isinstance(code, int) else 0
 
 
-def _say_types_in_words(command: Any) -> None:
-    """Arguments in `--help` without `<path>` and `list[Path]` beside their names, which say it in words."""
+def _hide_argument_types(command: Any) -> None:
+    """Leave `<path>` and `list[Path]` out of `--help` beside arguments: their help says it in words."""
     for under in getattr(command, "commands", {}).values():
-        _say_types_in_words(under)
+        _hide_argument_types(under)
     for parameter in command.params:
         if parameter.param_type_name == "argument" and hasattr(parameter, "display_type_rich"):
             parameter.display_type_rich = lambda ctx: None
 
 
 def _discard_output() -> None:
-    """Discard what is still to be printed: its reader has gone, or it cannot be written."""
+    """Discard output that is still buffered: nothing reads it, or it cannot be written."""
     with suppress(OSError, ValueError, AttributeError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 

@@ -1,4 +1,4 @@
-"""Commands on results folders: compare, plot, report, view, layout."""
+"""Commands on results folders: `compare`, `plot`, `report`, `view`, `layout`."""
 
 from __future__ import annotations
 
@@ -9,8 +9,16 @@ from typing import Annotated
 
 import typer
 
-from copem_replay.cli.options import Baseline, ResultsFolder, listed
-from copem_replay.cli.terminal import note, say, say_blocks, tidied, width_of
+from copem_replay.cli.terminal import (
+    Baseline,
+    ResultsFolder,
+    print_blocks,
+    print_line,
+    print_notes,
+    split_names,
+    tidy_leftovers,
+    width_of,
+)
 from copem_replay.core.errors import InputError
 
 
@@ -42,33 +50,43 @@ def compare(
 
     They are paired by log, object and run, within a results folder or across several.
     """
-    from copem_replay.cli.api.results import compare as compared
+    from copem_replay.api.results import compare as compare_results
     from copem_replay.results.compare import check_out, comparison_text, write_comparison
 
     if out is not None:
         check_out(out)
-    if rrd is not None:
-        from copem_replay.viewer.side_by_side import check_beside, write_beside
-
-        check_beside(rrd)
-    elif run is not None or log is not None:
-        raise InputError(f"--{'log' if run is None else 'run'}: expected --rrd FILE with it, found none")
-    names = listed(configurations)
-    comparison = compared(
+    _check_rrd_options(rrd, run, log)
+    names = split_names(configurations)
+    comparison = compare_results(
         folders, configurations=names, baseline=baseline, false_positives_per_min=false_positives_per_min
     )
     notes = list(comparison.notes)
     if rrd is not None:
-        notes += write_beside(rrd, folders, configurations=names, baseline=baseline, log=log, run=run)
-    note(notes)
-    say_blocks([comparison_text(comparison, width_of(sys.stdout)).splitlines()])
+        from copem_replay.viewer.side_by_side import write_side_by_side
+
+        notes += write_side_by_side(rrd, folders, configurations=names, baseline=baseline, log=log, run=run)
+    print_notes(notes)
+    print_blocks([comparison_text(comparison, width_of(sys.stdout)).splitlines()])
     if out is not None:
         write_comparison(comparison, out, folders)
-    for file in (out, rrd):
-        if file is not None:
-            tidied(file)
-            say(f"written to {file}")
+    _print_written(out, rrd)
     return 0
+
+
+def _check_rrd_options(rrd: Path | None, run: int | None, log: str | None) -> None:
+    if rrd is not None:
+        from copem_replay.viewer.side_by_side import check_side_by_side
+
+        check_side_by_side(rrd)
+    elif run is not None or log is not None:
+        raise InputError(f"--{'log' if run is None else 'run'}: expected --rrd FILE with it, found none")
+
+
+def _print_written(*files: Path | None) -> None:
+    for file in files:
+        if file is not None:
+            tidy_leftovers(file)
+            print_line(f"written to {file}")
 
 
 def plot(
@@ -91,15 +109,15 @@ def plot(
 
     Single runs, distances at detection, detection curves, where the time goes, sweeps.
     """
-    from copem_replay.cli.api.plot import write_figures
+    from copem_replay.api.plot import write_figures
 
-    names = listed(configurations)
+    names = split_names(configurations)
     files, notes = write_figures(folder, out, configurations=names, log=log, object_id=object, run=run)
-    note(notes)
+    print_notes(notes)
     figures = out or folder / "figures"
-    tidied(figures, figures)
-    tidied(figures)
-    say_blocks([[str(file) for file in files]])
+    tidy_leftovers(figures, figures)
+    tidy_leftovers(figures)
+    print_blocks([[str(file) for file in files]])
     return 0
 
 
@@ -112,11 +130,11 @@ def report(
 
     It has text, tables, figures and provenance, and opens offline.
     """
-    from copem_replay.cli.api.results import write_report
+    from copem_replay.api.results import write_report
 
     path = write_report(folder, out, baseline=baseline)
-    tidied(path)
-    say(f"report in {path}")
+    tidy_leftovers(path)
+    print_line(f"report in {path}")
     return 0
 
 
@@ -134,17 +152,17 @@ def layout(
     It shows the configurations side by side over the truth, with linked cameras, and when each knows an object.
     """
     from copem_replay.core.files import atomic_file
-    from copem_replay.io.write.foxglove_layout import layout_of
-    from copem_replay.results.belongings import MARK, list_made
+    from copem_replay.io.write.foxglove_layout import build_layout
+    from copem_replay.results.folder import MARK, add_to_made_list
 
     replay = folder / "replay.mcap" if folder.is_dir() else folder
-    made = layout_of(replay, listed(configurations) or ())
+    foxglove_layout = build_layout(replay, split_names(configurations) or ())
     path = out or replay.with_suffix(".foxglove.json")
-    of_results = next((place for place in replay.absolute().parents if (place / MARK).is_file()), replay.parent)
+    results_folder = next((place for place in replay.absolute().parents if (place / MARK).is_file()), replay.parent)
     with atomic_file(path) as scratch:
-        scratch.write_text(json.dumps(made, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-        list_made(of_results, [path])
-    say(f"layout in {path}")
+        scratch.write_text(json.dumps(foxglove_layout, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        add_to_made_list(results_folder, [path])
+    print_line(f"layout in {path}")
     return 0
 
 
@@ -158,7 +176,7 @@ def view(
 
     Each opens half a second before the first onset.
     """
-    from copem_replay.cli.api.results import view as opened
+    from copem_replay.api.results import view as view_results
 
-    opened(folder, web=web)
+    view_results(folder, web=web)
     return 0

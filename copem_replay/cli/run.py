@@ -1,24 +1,55 @@
-"""The command that replays: run."""
+"""`copem-replay run`: replay an experiment into a results folder, with progress, notes and summary in the terminal."""
 
 from __future__ import annotations
 
 import shlex
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 import typer
 
-from copem_replay.cli.cluster import crew_at, hint
-from copem_replay.cli.inspect import source_with
-from copem_replay.cli.options import Ego, ExperimentFile, FromS, Logs, ToS
-from copem_replay.cli.progress import with_progress
-from copem_replay.cli.terminal import complain, note, say, width_of
+from copem_replay.cli.inspect import override_source
+from copem_replay.cli.terminal import (
+    Ego,
+    ExperimentFile,
+    FromS,
+    Logs,
+    ToS,
+    print_line,
+    print_notes,
+    print_problems,
+    show_crew_progress,
+    show_progress,
+    width_of,
+)
 from copem_replay.core.errors import InputError
 
 if TYPE_CHECKING:
+    from copem_replay.api.run import StudyResult
+    from copem_replay.api.study import LoadedStudy
+    from copem_replay.experiment.file import ExperimentSource
     from copem_replay.experiment.schema import Experiment
+    from copem_replay.pipeline.crew import Crew
+    from copem_replay.pipeline.pieces import PieceCache
+    from copem_replay.results.folder import ResultsPlace
+
+Pieces: TypeAlias = Annotated[
+    str | None, typer.Option(metavar="FOLDER", help="Keep finished pieces here, and reuse them: a folder or a URL.")
+]
+Cluster: TypeAlias = Annotated[
+    str | None,
+    typer.Option(
+        metavar="WHERE",
+        help="Use Dask processes instead of threads: local, local:N, tcp://HOST:PORT, tls://… or scheduler.json.",
+    ),
+]
+
+ADVICE_AFTER_S, ADVICE_CORES = 60.0, 4
+"""Processes are advised for replays that take longer, on more cores: a study of seconds takes longer with them."""
 
 
 def run(
@@ -37,82 +68,149 @@ def run(
     skip_unreadable: Annotated[
         bool, typer.Option("--skip-unreadable", help="Leave out recordings that cannot be replayed.")
     ] = False,
-    pieces: Annotated[
-        str | None,
-        typer.Option(metavar="FOLDER", help="Keep finished pieces here, and reuse them: a folder or a URL."),
-    ] = None,
-    cluster: Annotated[
-        str | None,
-        typer.Option(
-            metavar="WHERE",
-            help="Use Dask processes instead of threads: local, local:N, tcp://HOST:PORT, tls://… or scheduler.json.",
-        ),
-    ] = None,
+    pieces: Pieces = None,
+    cluster: Cluster = None,
     report: Annotated[bool, typer.Option("--report", help="Also write report.html.")] = False,
     live: Annotated[bool, typer.Option("--live", help="Also show the replay in a running Rerun viewer.")] = False,
     viewer: Annotated[str | None, typer.Option(metavar="URL", help="Address of that viewer [on this machine].")] = None,
 ) -> int:
     """Replay an experiment, write its results, print the summary."""
-    from copem_replay.cli.api.run import pieces_in, with_crew, workers
-    from copem_replay.cli.api.study import Study, prepared, read_study
-    from copem_replay.pipeline.log_survey import LogSurvey
-    from copem_replay.results.place import check_inputs, taken
+    from copem_replay.results.folder import take_place
 
-    source = source_with(experiment, {"ego": ego, "runs": runs, "seed": seed}, log or (), (from_s, to_s))
+    source = override_source(experiment, {"ego": ego, "runs": runs, "seed": seed}, log or (), (from_s, to_s))
     out = out or Path("out") / experiment.stem
     if cluster is not None:
-        from copem_replay.pipeline.crew.dask_workers import check_address
+        from copem_replay.pipeline.dask_workers import check_address
 
         check_address(cluster)
         pieces = pieces or f"{out}.pieces"
-    with taken(out, overwrite=overwrite) as place:
-        note(place.notes)
+    with take_place(out, overwrite=overwrite) as place:
+        print_notes(place.notes)
         place.notes.clear()
-        kept = None if pieces is None else pieces_in(pieces)
-        with crew_at(cluster, kept) as crew:
-
-            def read() -> Study:
-                study = read_study(source, skip_unreadable=skip_unreadable, survey=LogSurvey(kept), crew=crew)
-                check_inputs(place, [experiment, *(path for recording in study.recordings for path in recording.paths)])
-                return study
-
-            study = read() if crew is None else with_crew(read, crew)
-        url = _viewer(study.experiment, viewer) if live or viewer is not None else None
-        from copem_replay.cli.api.run import fill, replayed
-        from copem_replay.metrics.summary_text import summary_text
-        from copem_replay.viewer.opening import recordings_of
-
-        ready, warnings = prepared(study)
-        note(warnings)
-        began_s = time.perf_counter()
-        result = with_progress("replaying", lambda progress: replayed(study, ready, jobs, progress, kept))
-        costs = list(result.replayed.costs)
-        if cluster is None:
-            costs += hint(time.perf_counter() - began_s, workers(jobs))
-        notes = fill(place, result, skipped=study.skipped, viewer=url)
-        if kept is not None:
-            note(sorted(kept.damaged))
-            complain([f"pieces: {kept.computed} computed, {kept.found} found in {kept.store.where}"])
-        skipped = [f"{path}: skipped: {reason}" for path, reason in study.skipped]
-        note([*place.notes, *skipped, *notes, *costs])
-        complain(place.failed)
-        print(summary_text(result.summary, width_of(sys.stdout)))
-        if result.sweep is not None:
-            say(f"sweep of {', '.join(dict.fromkeys(result.sweep['sweep']))} in {place.shown / 'sweep.csv'}")
-        say(f"results in {place.shown}")
+        cache = _open_pieces(pieces)
+        study = _read_study(place, experiment, source, skip_unreadable, cache, cluster)
+        url = _check_viewer(study.experiment, viewer) if live or viewer is not None else None
+        result, advice = _replay_study(study, jobs, cache, threads=cluster is None)
+        _write_results(place, study, result, advice, cache, url)
         if report:
-            from copem_replay.cli.api.results import write_report
+            from copem_replay.api.results import write_report
 
-            say(f"report in {write_report(place.shown)}")
-    say(f"next: copem-replay {'view' if recordings_of(place.shown) else 'report'} {shlex.quote(str(place.shown))}")
+            print_line(f"report in {write_report(place.shown)}")
+    _print_next(place.shown)
     return 1 if study.skipped or place.failed else 0
 
 
-def _viewer(experiment: Experiment, url: str | None) -> str:
-    """Where a viewer listens; refused before the replay where there is none, or nothing to show in it."""
+def _open_pieces(pieces: str | None) -> PieceCache | None:
+    from copem_replay.api.run import open_pieces
+
+    return None if pieces is None else open_pieces(pieces)
+
+
+def _read_study(
+    place: ResultsPlace, file: Path, source: ExperimentSource, skip_unreadable: bool, cache: PieceCache | None,
+    cluster: str | None,
+) -> LoadedStudy:  # fmt: skip
+    """The experiment and its recordings; with `cluster` every piece is computed when this returns."""
+    from copem_replay.api.run import read_with_crew
+    from copem_replay.api.study import read_study
+    from copem_replay.pipeline.study_log import LogSurvey
+    from copem_replay.results.folder import check_inputs
+
+    with connect_crew(cluster, cache) as crew:
+
+        def read() -> LoadedStudy:
+            study = read_study(source, skip_unreadable=skip_unreadable, survey=LogSurvey(cache), crew=crew)
+            check_inputs(place, [file, *(path for recording in study.recordings for path in recording.paths)])
+            return study
+
+        return read() if crew is None else read_with_crew(read, crew)
+
+
+def _replay_study(
+    study: LoadedStudy, jobs: int | None, cache: PieceCache | None, *, threads: bool
+) -> tuple[StudyResult, list[str]]:
+    """Replay with progress on stderr. Returns the result and, if `threads` do the work, the advice on `--cluster`."""
+    from copem_replay.api.run import count_workers, replay_study
+    from copem_replay.api.study import prepare_study
+
+    replays, warnings = prepare_study(study)
+    print_notes(warnings)
+    began_s = time.perf_counter()
+    result = show_progress("replaying", lambda progress: replay_study(study, replays, jobs, progress, cache))
+    return result, advise_cluster(time.perf_counter() - began_s, count_workers(jobs)) if threads else []
+
+
+def _write_results(
+    place: ResultsPlace, study: LoadedStudy, result: StudyResult, advice: list[str], cache: PieceCache | None,
+    viewer: str | None,
+) -> None:  # fmt: skip
+    """Fill the results folder, then print notes, problems and the summary."""
+    from copem_replay.api.run import fill_results_folder
+    from copem_replay.metrics.summary import format_summary
+
+    notes = fill_results_folder(place, result, skipped=study.skipped, viewer=viewer)
+    if cache is not None:
+        print_notes(sorted(cache.damaged))
+        print_problems([f"pieces: {cache.computed} computed, {cache.found} found in {cache.store.where}"])
+    skipped = [f"{path}: skipped: {reason}" for path, reason in study.skipped]
+    print_notes([*place.notes, *skipped, *notes, *result.replayed.costs, *advice])
+    print_problems(place.failed)
+    print(format_summary(result.summary, width_of(sys.stdout)))
+    if result.sweep is not None:
+        print_line(f"sweep of {', '.join(dict.fromkeys(result.sweep['sweep']))} in {place.shown / 'sweep.csv'}")
+    print_line(f"results in {place.shown}")
+
+
+def _print_next(folder: Path) -> None:
+    """Print the command to go on with: `view` if the folder has a recording for the viewer, else `report`."""
+    from copem_replay.viewer.open import list_rrd_files
+
+    print_line(f"next: copem-replay {'view' if list_rrd_files(folder) else 'report'} {shlex.quote(str(folder))}")
+
+
+def _check_viewer(experiment: Experiment, url: str | None) -> str:
+    """The address of the viewer for `--live`. Raises InputError before the replay: no viewer there, nothing to show."""
     from copem_replay.viewer import VIEWER, check_viewer
 
     if experiment.show is None or experiment.show.run is None:
         raise InputError("--live: nothing to show, the experiment says so (`show: null`, or its `run`)")
     check_viewer(url or VIEWER)
     return url or VIEWER
+
+
+# `--cluster`: Dask processes as a crew of workers, for as long as the study is read and computed.
+
+
+@contextmanager
+def connect_crew(address: str | None, pieces: PieceCache | None) -> Iterator[Crew | None]:
+    """The crew at an address; None without an address. Prints what became of its workers, also after an interrupt.
+
+    Raises CopemError: no scheduler at the address, workers of another version, or workers that do not see the pieces.
+    """
+    if address is None or pieces is None:
+        yield None
+        return
+    from copem_replay.api.run import count_workers
+    from copem_replay.pipeline.crew import Crew
+    from copem_replay.pipeline.dask_workers import DaskWorkers
+
+    workers = DaskWorkers(address, pieces, count_workers(None))
+    try:
+        with show_crew_progress() as show:
+            crew = Crew(workers, pieces, show)
+            yield crew
+        print_notes(crew.notes)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(crew.interrupted) from None
+    except SystemExit:  # of a signal
+        print_problems([crew.interrupted])
+        raise
+    finally:
+        workers.close()
+
+
+def advise_cluster(took_s: float, cores: int) -> list[str]:
+    """A line that recommends `--cluster` after a long replay in threads on many cores; else no line."""
+    if took_s <= ADVICE_AFTER_S or cores <= ADVICE_CORES:
+        return []
+    return [f"replaying took {took_s:.0f} s; `--cluster local` makes more of {cores} cores: its workers are processes"]

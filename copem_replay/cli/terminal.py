@@ -1,57 +1,209 @@
-"""The terminal: lines that fit it and that nothing in a name can break, notes and problems on stderr."""
+"""Output to the terminal: answers on stdout, notes, problems and progress on stderr; and options shared by commands.
+
+Lines fit the terminal's width, and control characters in names are escaped.
+"""
 
 from __future__ import annotations
 
 import shutil
 import sys
+import time
 import unicodedata
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TextIO
+from typing import TYPE_CHECKING, Annotated, TextIO, TypeAlias, TypeVar
 
-from copem_replay.core.text import wrapped
+import typer
+
+from copem_replay.core.errors import count_noun, wrap_line
+
+if TYPE_CHECKING:
+    from copem_replay.pipeline.crew import CrewProgress
 
 
-def printable(text: str) -> str:
-    """One line that no file name or key can break, colour or stop."""
+# Arguments and options of several commands.
+
+ExperimentFile: TypeAlias = Annotated[Path, typer.Argument(metavar="EXPERIMENT", help="Experiment file (YAML).")]
+ResultsFolder: TypeAlias = Annotated[Path, typer.Argument(metavar="FOLDER", help="Results folder.")]
+LogFiles: TypeAlias = Annotated[
+    list[Path], typer.Argument(metavar="LOG", help="Recordings: MCAP files, rosbag2 folders, .osi files.")
+]
+Logs: TypeAlias = Annotated[
+    list[str] | None,
+    typer.Option("--log", metavar="FILE", help="Use this recording instead of those in the experiment."),
+]
+Ego: TypeAlias = Annotated[str | None, typer.Option("--ego", metavar="ID", help="Id of the ego vehicle.")]
+FromS: TypeAlias = Annotated[
+    float | None,
+    typer.Option("--from", metavar="SECONDS", help="Start of the window to read, since the log's start [0]."),
+]
+ToS: TypeAlias = Annotated[
+    float | None,
+    typer.Option("--to", metavar="SECONDS", help="End of the window to read, since the log's start [its end]."),
+]
+OneDrive: TypeAlias = Annotated[
+    bool, typer.Option("--together", help="The recordings are of one drive: estimate their clock offsets.")
+]
+Baseline: TypeAlias = Annotated[
+    str | None, typer.Option("--baseline", metavar="NAME", help="Configuration to compare with [the one named ideal].")
+]
+
+
+def split_names(names: str | None) -> list[str] | None:
+    """The names between the commas, without spaces around them; None gives None."""
+    return None if names is None else [name.strip() for name in names.split(",")]
+
+
+def escape_controls(text: str) -> str:
+    """One line: control characters and line breaks of file names and keys become escapes."""
     harmful = {c for c in text if unicodedata.category(c)[0] == "C" or c in "\u2028\u2029"}
     return "".join(c.encode("unicode_escape").decode() if c in harmful else c for c in text)
 
 
 def width_of(stream: TextIO | None) -> int | None:
-    """How many characters a line may have; None where it is no terminal: files and pipes get lines whole."""
+    """Characters per line; None for files and pipes, which get every line unbroken."""
     return shutil.get_terminal_size().columns if stream is not None and stream.isatty() else None
 
 
-def say(line: str) -> None:
-    """Print a line of the answer."""
-    say_blocks([[line]])
+def print_line(line: str) -> None:
+    """Print a line on stdout."""
+    print_blocks([[line]])
 
 
-def say_blocks(blocks: Iterable[Sequence[str]]) -> None:
-    """Print blocks of lines, an empty line between them."""
+def print_blocks(blocks: Iterable[Sequence[str]]) -> None:
+    """Print blocks of lines on stdout, with an empty line between blocks."""
     width = width_of(sys.stdout)
-    print("\n\n".join("\n".join(_fitted(line, width) for line in block) for block in blocks))
+    print("\n\n".join("\n".join(_fit_line(line, width) for line in block) for block in blocks))
 
 
-def complain(lines: Iterable[str]) -> None:
+def print_problems(lines: Iterable[str]) -> None:
     """Print problems on stderr."""
     width = width_of(sys.stderr)
     for line in lines:
-        print(_fitted(line, width), file=sys.stderr)
+        print(_fit_line(line, width), file=sys.stderr)
 
 
-def _fitted(line: str, width: int | None) -> str:
-    return "\n".join(wrapped(printable(line), width))
+def _fit_line(line: str, width: int | None) -> str:
+    return "\n".join(wrap_line(escape_controls(line), width))
 
 
-def note(lines: Iterable[str]) -> None:
+def print_notes(lines: Iterable[str]) -> None:
     """Print notes on stderr."""
-    complain(f"note: {line}" for line in lines)
+    print_problems(f"note: {line}" for line in lines)
 
 
-def tidied(path: Path, place: Path | None = None) -> None:
-    """Remove what killed commands left of a file or folder beside it, or in `place`, and say so."""
-    from copem_replay.core.scratch import remove_leftovers
+def tidy_leftovers(path: Path, place: Path | None = None) -> None:
+    """Remove and note the scratch files of a file or folder that killed commands left beside it, or in `place`."""
+    from copem_replay.core.files import remove_leftovers
 
-    note(remove_leftovers(path, place))
+    print_notes(remove_leftovers(path, place))
+
+
+# Progress on stderr: a bar in a terminal; elsewhere a line a minute, from the first minute on.
+
+T = TypeVar("T")
+Progress = Callable[[int, int], None]
+EVERY_S = 60.0
+"""Interval of progress lines without a terminal: an hour of work is about a page of log."""
+_MINUTE_S, _HOUR_S = 60.0, 3600.0
+
+
+def show_progress(what: str, work: Callable[[Progress], T]) -> T:
+    """The result of `work`, which reports its progress: shown as what is done, per cent and time left."""
+    if sys.stderr is None or not sys.stderr.isatty():
+        return work(ProgressLines(what))
+    from rich.console import Console
+    from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bar
+
+    words = "{task.description}", "left"
+    columns = (TextColumn(words[0]), BarColumn(), TaskProgressColumn(), TimeRemainingColumn(), TextColumn(words[1]))
+    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(what, total=None)
+        return work(lambda done, total: bar.update(task, completed=done, total=total))
+
+
+class ProgressLines:
+    """Progress for logs and pipes: `replaying: 37 %, 4 minutes left`. `clock`: monotonic seconds."""
+
+    def __init__(self, what: str, clock: Callable[[], float] = time.monotonic) -> None:
+        self._what, self._clock = what, clock
+        self._begun_s = self._printed_s = clock()
+
+    def __call__(self, done: int, total: int) -> None:
+        """Print a line if the last one is at least `EVERY_S` old."""
+        now_s = self._clock()
+        if now_s - self._printed_s < EVERY_S or not 0 < done < total:
+            return
+        self._printed_s = now_s
+        left_s = (now_s - self._begun_s) * (total - done) / done
+        print_problems([f"{self._what}: {100 * done // total} %, {format_duration(left_s)} left"])
+
+
+@contextmanager
+def show_crew_progress() -> Iterator[Callable[[CrewProgress], None]]:
+    """A function that shows a crew's progress on stderr: as a bar in a terminal, else as lines."""
+    if sys.stderr is None or not sys.stderr.isatty():
+        yield CrewProgressLines()
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, TextColumn
+    from rich.progress import Progress as Bar
+
+    lines = CrewProgressLines()
+    with Bar(BarColumn(), TextColumn("{task.description}"), console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("", total=None)
+
+        def show(progress: CrewProgress) -> None:
+            words = lines.words(progress)
+            bar.update(task, completed=progress.done, total=progress.total, description=words)
+
+        yield show
+
+
+class CrewProgressLines:
+    """Progress of a crew in lines: `replaying: 412 of 5000 logs, 83 M rows, 9 minutes left, 1 worker lost`."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock, self._what = clock, ""
+        self._begun_s = self._printed_s = clock()
+
+    def __call__(self, progress: CrewProgress) -> None:
+        """Print a line if the last one is at least `EVERY_S` old."""
+        words = self.words(progress)
+        if self._clock() - self._printed_s >= EVERY_S and progress.done < progress.total:
+            self._printed_s = self._clock()
+            print_problems([words])
+
+    def words(self, progress: CrewProgress) -> str:
+        """The progress in one line; the time left is estimated from the time since this kind of work began."""
+        if progress.what != self._what:
+            self._what, self._begun_s = progress.what, self._clock()
+        parts = [f"{progress.what}: {progress.logs_done} of {count_noun(progress.logs, 'log')}"]
+        if progress.rows_done:
+            parts.append(f"{_round_count(progress.rows_done)} rows")
+        if 0 < progress.done < progress.total:
+            left_s = (self._clock() - self._begun_s) * (progress.total - progress.done) / progress.done
+            parts.append(f"{format_duration(left_s)} left")
+        if progress.lost:
+            parts.append(f"{count_noun(progress.lost, 'worker')} lost")
+        return ", ".join(parts)
+
+
+def _round_count(count: int) -> str:
+    """A count in three digits or fewer, with k, M or G."""
+    for size, letter in ((10**9, " G"), (10**6, " M"), (10**3, " k")):
+        if count >= size:
+            return f"{count // size}{letter}"
+    return str(count)
+
+
+def format_duration(time_s: float) -> str:
+    """A rounded time in words: `40 seconds`, `3 minutes`, `2 h 10 min`."""
+    if time_s < _MINUTE_S:
+        return count_noun(max(1, round(time_s)), "second")
+    minutes = round(time_s / _MINUTE_S)
+    if time_s < _HOUR_S:
+        return count_noun(minutes, "minute")
+    return f"{minutes // 60} h {minutes % 60} min"

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, GetJsonSchemaHandler, model_validator
 from pydantic_core import CoreSchema
 
-from copem_replay.core.components import Component, GivenError, Latency, Positive, Slot, asked
+from copem_replay.core.components import Component, GivenError, Latency, Positive, Slot, ask_component
 from copem_replay.core.tracks import Float
 
 
@@ -33,19 +33,19 @@ class LatencyModel(Component, ABC):
         return None
 
 
-def delays_of(model: LatencyModel, uniform: Float, where: str) -> Float:
-    """(K,) what a model says, checked. Raises InputError, naming `where` it stands, where these are no delays."""
+def ask_delays(model: LatencyModel, uniform: Float, where: str) -> Float:
+    """(K,) the delays that a model gives, checked. Raises InputError, naming `where` it stands, where they are none."""
 
     def checked() -> Float:
-        found = model.delays(uniform)
-        if not isinstance(found, np.ndarray) or found.shape != uniform.shape:
-            said = found.shape if isinstance(found, np.ndarray) else type(found).__name__
-            raise GivenError("delays", f"expected shape {uniform.shape}, found {said}")
-        if found.dtype.kind not in "fiu" or not ((found >= 0) & (found < np.inf)).all():
+        delays = model.delays(uniform)
+        if not isinstance(delays, np.ndarray) or delays.shape != uniform.shape:
+            found = delays.shape if isinstance(delays, np.ndarray) else type(delays).__name__
+            raise GivenError("delays", f"expected shape {uniform.shape}, found {found}")
+        if delays.dtype.kind not in "fiu" or not ((delays >= 0) & (delays < np.inf)).all():
             raise GivenError("delays", "expected seconds of 0 or more, found others")
-        return found
+        return delays
 
-    return asked(model, where, checked)
+    return ask_component(model, where, checked)
 
 
 class ConstantLatency(LatencyModel):
@@ -55,12 +55,12 @@ class ConstantLatency(LatencyModel):
     s: Latency = 0.0
 
     def delays(self, uniform: Float) -> Float:
-        """(K,) all the same."""
+        """(K,) `s` everywhere."""
         return np.full(len(uniform), self.s)
 
     @property
     def fixed_s(self) -> float:
-        """What it always is."""
+        """Always `s`."""
         return self.s
 
 
@@ -79,8 +79,8 @@ class GammaLatency(LatencyModel):
         return self
 
     def delays(self, uniform: Float) -> Float:
-        """(K,) quantiles."""
-        from scipy.special import gammaincinv  # it takes long to import
+        """(K,) quantiles of the distribution."""
+        from scipy.special import gammaincinv  # here, as its import takes long
 
         result: Float = self.min_s + (self.mean_s - self.min_s) / self.shape * gammaincinv(self.shape, uniform)
         return result
@@ -95,8 +95,8 @@ class LognormalLatency(LatencyModel):
     sigma: Annotated[float, Field(strict=True, ge=0, le=10)]
 
     def delays(self, uniform: Float) -> Float:
-        """(K,) quantiles."""
-        from scipy.special import ndtri  # as above
+        """(K,) quantiles of the distribution."""
+        from scipy.special import ndtri  # here, as its import takes long
 
         result: Float = self.min_s + self.median_s * np.exp(self.sigma * ndtri(uniform))
         return result
@@ -106,20 +106,21 @@ LATENCIES = {
     "constant": "copem_replay.communication.latency:ConstantLatency",
     "gamma": "copem_replay.communication.latency:GammaLatency",
     "lognormal": "copem_replay.communication.latency:LognormalLatency",
-    "recorded": "copem_replay.experiment.recorded_latency:RecordedLatency",  # reads recordings
+    "recorded": "copem_replay.experiment.drive:RecordedLatency",  # reads recordings
 }
+"""Built-in names of `latency: {kind: …}`."""
 
 
-def _seconds(value: object) -> object:
+def _as_constant_latency(value: object) -> object:
     return {"kind": "constant", "s": value} if isinstance(value, int | float) and not isinstance(value, bool) else value
 
 
-class _OrSeconds:
+class _NumberSchema:
     """JSON Schema: a number stands beside the components."""
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
         return {"anyOf": [{"type": "number", "minimum": 0, "maximum": 86_400}, *handler(schema)["anyOf"]]}
 
 
-Delay = Annotated[LatencyModel, Slot("latency", LATENCIES), BeforeValidator(_seconds), _OrSeconds()]
+Delay = Annotated[LatencyModel, Slot("latency", LATENCIES), BeforeValidator(_as_constant_latency), _NumberSchema()]
 """A latency model; a number is a constant one."""

@@ -1,4 +1,4 @@
-"""Links: when the receiver has each list. The delay of a link comes on top exactly, no rounding to a tick.
+"""Links: when the receiver has each list. The delay of a link is added exactly, without rounding to a tick.
 
 A modelled unit sends a list when it is ready, a recorded one when it was recorded.
 """
@@ -6,26 +6,33 @@ A modelled unit sends a list when it is ready, a recorded one when it was record
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Container, Hashable, Sequence
+from collections.abc import Callable, Container, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from copem_replay.core.components import Component, GivenError, Id, NotNegative, asked
-from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int, Tracks
+from copem_replay.communication.latency import LatencyModel, ask_delays
+from copem_replay.core.components import Component, GivenError, Id, NotNegative, ask_component
+from copem_replay.core.lasting import drop_unshared
+from copem_replay.core.random import CounterRng, RandomKey
+from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int, Tracks
 
 if TYPE_CHECKING:
     from copem_replay.communication.reception import RadioPath
-    from copem_replay.core.draws import Draws
+    from copem_replay.core.memory import UnitDraws
+
 
 LINKS = {"radio": "copem_replay.communication.radio:Radio"}
-_TOLERANCE_S = SAME_INSTANT_NS * 1e-9
+"""Built-in names of `link: {kind: …}`."""
 
 
 class KeptDraws:
-    """What links drew for the lists of one log, run by run: several configurations send by a link, and the columns
-    about links use the draws again. When there is no more room all is forgotten; it would only be drawn again.
+    """What links drew for the lists of one log, run by run.
+
+    Several configurations send by a link, and the columns about links use its draws again. When there is no more room
+    all is forgotten, and drawn again where it is needed.
     """
 
     def __init__(self, room_bytes: int = 64_000_000) -> None:
@@ -33,27 +40,27 @@ class KeptDraws:
         self._kept: dict[Hashable, list[tuple[LinkModel, tuple[Float, Bool]]]] = {}
 
     def of(self, link: LinkModel, lists: Hashable, drawn: Callable[[], tuple[Float, Bool]]) -> tuple[Float, Bool]:
-        """What a link drew for some lists of one run: `drawn`, if it was not before."""
-        for other, found in tuple(self._kept.get(lists, ())):
+        """What a link drew for some lists of one run; the result of `drawn`, the first time."""
+        for other, draws in tuple(self._kept.get(lists, ())):
             if other == link:
-                return found
-        made = drawn()
-        size = sum(column.nbytes for column in made)
+                return draws
+        draws_now = drawn()
+        size = sum(column.nbytes for column in draws_now)
         if self._held_bytes + size > self._room_bytes:
             self._kept, self._held_bytes = {}, 0
-        self._kept.setdefault(lists, []).append((link, made))
+        self._kept.setdefault(lists, []).append((link, draws_now))
         self._held_bytes += size
-        return made
+        return draws_now
 
 
 @dataclass(frozen=True)
-class Air:
-    """Further input of a link, of lists (F,) in one run: their numbers, their ways, and how many entries each has.
+class LinkInput:
+    """Further input of a link for lists (F,) in one run: random numbers, paths, and how many entries each list has.
 
     `path`, `objects`: None where no link of the experiment asks for them. `kept`: what was drawn for these lists.
     """
 
-    draws: Draws
+    draws: UnitDraws
     path: RadioPath | None
     objects: Int | None
     kept: KeptDraws = field(default_factory=KeptDraws)
@@ -74,7 +81,7 @@ class SentLists:
     captured_s: Float  # (F,)
     sent_s: Float  # (F,)
     made: Bool | None = None
-    air: Air | None = None
+    air: LinkInput | None = None
     where: str = "link"
 
 
@@ -132,17 +139,17 @@ class UnitLinks:
 
 @dataclass(frozen=True)
 class Delays:
-    """The delays that a link gives the lists (F,): `by_run_s (1, F)`. Raises GivenError where they are none."""
+    """The delays `by_run_s (1, F)` that a link gives F lists, checked. Raises GivenError where they are no delays."""
 
     by_run_s: Float
     lists: int
 
     def __post_init__(self) -> None:
-        given = self.by_run_s
-        if not isinstance(given, np.ndarray) or given.shape != (1, self.lists):
-            found = given.shape if isinstance(given, np.ndarray) else type(given).__name__
+        delays = self.by_run_s
+        if not isinstance(delays, np.ndarray) or delays.shape != (1, self.lists):
+            found = delays.shape if isinstance(delays, np.ndarray) else type(delays).__name__
             raise GivenError("delays_s", f"expected shape (1, {self.lists}), found {found}")
-        if given.dtype.kind not in "fiu" or not (given >= 0).all():  # NaN is not at least 0 either
+        if delays.dtype.kind not in "fiu" or not (delays >= 0).all():  # NaN is not at least 0 either
             raise GivenError("delays_s", "expected seconds of 0 or more (inf: never), found others")
 
 
@@ -151,35 +158,63 @@ def transmit(
     links: Sequence[UnitLinks],
     heard: Container[str] | None = None,
     *,
-    air: Air | None = None,
+    air: LinkInput | None = None,
 ) -> Tracks:
-    """The same tracks with the arrival times of their lists at the receiver, inf: never.
+    """The tracks with the arrival times of their lists at the receiver, inf: never.
 
     A list takes the delays of all `links` that its unit sends by, one after the other. `heard`: names of the units
     whose lists reach the receiver, None: all. Raises InputError, naming where a link stands, where an own one fails.
     """
     arrives_s = seen.common_arrives_s
     made = np.isfinite(arrives_s)  # a list that is not made is no concern of a link
-    for one in links:
+    for unit_link in links:
         sent_s = np.where(made, arrives_s, seen.captured_s)
-        sent = SentLists(seen.units, seen.frame_unit_ix, seen.captured_s, sent_s, made, air, one.where)
-        delay_s = asked(one.link, one.where, lambda: Delays(one.link.delays_s(sent), len(sent.sent_s)).by_run_s[0])  # noqa: B023
-        if one.units is not None:
-            delay_s = np.where(_of_units(seen, one.units), delay_s, 0.0)
+        sent = SentLists(seen.units, seen.frame_unit_ix, seen.captured_s, sent_s, made, air, unit_link.where)
+        delay_s = ask_component(unit_link.link, unit_link.where, partial(_check_delays, unit_link.link, sent))
+        if unit_link.units is not None:
+            delay_s = np.where(_is_of_units(seen, unit_link.units), delay_s, 0.0)
         arrives_s = arrives_s + delay_s
         made = made & np.isfinite(delay_s)
     if heard is not None:
-        arrives_s = np.where(_of_units(seen, heard), arrives_s, np.inf)
+        arrives_s = np.where(_is_of_units(seen, heard), arrives_s, np.inf)
     return seen.with_values(arrives_s=arrives_s[None])
 
 
-def taken_in(arriving: Tracks, rate_hz: float | None) -> Tracks:
-    """The same lists, each at the first of the instants k / rate at which it is there, or within a microsecond."""
+def _check_delays(link: LinkModel, sent: SentLists) -> Float:
+    """(F,) the delays that a link gives. Raises GivenError."""
+    delay_s: Float = Delays(link.delays_s(sent), len(sent.sent_s)).by_run_s[0]
+    return delay_s
+
+
+def sample_arrivals(arriving: Tracks, rate_hz: float | None) -> Tracks:
+    """The lists, each arriving at the first of the instants k / rate that is not before its arrival, within 1 µs."""
     if rate_hz is None:
         return arriving
-    return arriving.with_values(arrives_s=np.ceil((arriving.arrives_s - _TOLERANCE_S) * rate_hz) / rate_hz)
+    return arriving.with_values(arrives_s=np.ceil((arriving.arrives_s - SAME_INSTANT_S) * rate_hz) / rate_hz)
 
 
-def _of_units(seen: Tracks, names: Container[str]) -> Bool:
+def _is_of_units(seen: Tracks, names: Container[str]) -> Bool:
     """(F,) which lists are of these units."""
     return np.array([name in names for name in seen.units], dtype=bool)[seen.frame_unit_ix]
+
+
+def delay_until_ready(seen: Tracks, ready: Mapping[str, LatencyModel], rng: CounterRng, runs: Int) -> Tracks:
+    """The lists as each is ready to be sent: later by the time that its unit works on it (`ready`, by unit).
+
+    Times are drawn for one run, runs (1,). Raises InputError where a model of the user's own fails.
+    """
+    if not ready:
+        return seen
+    arrives_s = seen.common_arrives_s.copy()
+    for name, model in ready.items():
+        frames = np.flatnonzero(seen.frame_unit_ix == seen.units.index(name))
+        if model.fixed_s is not None:
+            arrives_s[frames] += model.fixed_s
+            continue
+        of_unit = np.zeros(len(frames), dtype=np.int64)
+        random_key = drop_unshared(
+            RandomKey((name,), of_unit, of_unit.astype(np.uint64), seen.stamp_ns[frames]), "unit"
+        )
+        [uniform] = rng.uniform("ready", random_key, runs)
+        arrives_s[frames] += ask_delays(model, uniform, f"units.{name}.ready")
+    return seen.with_values(arrives_s=arrives_s[None])

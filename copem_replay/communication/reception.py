@@ -9,14 +9,15 @@ from typing import Annotated, ClassVar, Literal, Protocol, Self
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from copem_replay.core.components import Component, GivenError, NotNegative, Number, Positive, Share, asked
-from copem_replay.core.grid import bilinear, check_grid
+from copem_replay.core.components import Component, GivenError, NotNegative, Number, Positive, Share, ask_component
+from copem_replay.core.interpolation import check_grid, interpolate_bilinear
 from copem_replay.core.tracks import Float
 
 NEAR_M = 3.0
-"""Nearer than this it is no different (the log of a distance has no end)."""
+"""Metres; nearer than this the path loss does not change, as the logarithm of a distance has no lower end."""
 BLOCKED = 0.05
-"""The way of a list is blocked where less than this share of its receiver shows (chosen)."""
+"""A path is blocked where less than this share of the receiver shows: a sliver beside a corner is no free path. Larger:
+more paths get `blocked_db`."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class RadioPath:
     visible_share: Float
 
 
-class Noise(Protocol):
+class UniformNoise(Protocol):
     """Uniform numbers in (0, 1) by name, (1, F): one for each list."""
 
     def __call__(self, name: str, *, lasts_s: float | None = None) -> Float:
@@ -57,27 +58,27 @@ class ReceptionModel(Component, ABC):
     """Whether it asks for the path: then the log needs a receiver, and units places."""
 
     @abstractmethod
-    def probability(self, path: RadioPath, noise: Noise) -> Float:
+    def probability(self, path: RadioPath, noise: UniformNoise) -> Float:
         """(F,) probability that each list arrives, 0 … 1, or (1, F); it may depend on numbers that `noise(name)` draws.
 
         `noise(name)` is (1, F): uniform numbers, one for each list.
         """
 
 
-def probability_of(model: ReceptionModel, path: RadioPath, noise: Noise, where: str) -> Float:
-    """(F,) what a model says, checked. Raises InputError, naming `where` it stands, where it is no probability."""
+def ask_reception_probability(model: ReceptionModel, path: RadioPath, noise: UniformNoise, where: str) -> Float:
+    """(F,) the probabilities that a model gives, checked. Raises InputError, naming `where` it stands, for others."""
     expected = path.distance_m.shape
 
     def checked() -> Float:
-        found = np.asarray(model.probability(path, noise), dtype=float)
-        if found.shape not in (expected, (1, *expected)):
-            raise GivenError("probability", f"expected shape {(1, *expected)}, found {found.shape}")
-        beyond = ~((found >= 0) & (found <= 1 + 1e-12))
+        probability = np.asarray(model.probability(path, noise), dtype=float)
+        if probability.shape not in (expected, (1, *expected)):
+            raise GivenError("probability", f"expected shape {(1, *expected)}, found {probability.shape}")
+        beyond = ~((probability >= 0) & (probability <= 1 + 1e-12))
         if beyond.any():
-            raise GivenError("probability", f"expected 0 … 1, found {found[beyond][0]}")
-        return found.reshape(expected)
+            raise GivenError("probability", f"expected 0 … 1, found {probability[beyond][0]}")
+        return probability.reshape(expected)
 
-    return asked(model, where, checked)
+    return ask_component(model, where, checked)
 
 
 class ConstantReception(ReceptionModel):
@@ -88,8 +89,8 @@ class ConstantReception(ReceptionModel):
     kind: Literal["constant"] = "constant"
     probability_: Annotated[Share, Field(alias="probability")] = 1.0
 
-    def probability(self, path: RadioPath, noise: Noise) -> Float:
-        """(F,) all the same."""
+    def probability(self, path: RadioPath, noise: UniformNoise) -> Float:
+        """(F,) `probability` everywhere."""
         return np.full(len(path.distance_m), self.probability_)
 
 
@@ -117,10 +118,12 @@ class TableReception(ReceptionModel):
         )
         return self
 
-    def probability(self, path: RadioPath, noise: Noise) -> Float:
-        """(F,) interpolated."""
+    def probability(self, path: RadioPath, noise: UniformNoise) -> Float:
+        """(F,) the table, interpolated."""
         distance_m = np.minimum(path.distance_m, self.distance_m[-1])
-        return bilinear(self.distance_m, self.visible_share, self.probability_, distance_m, path.visible_share)
+        return interpolate_bilinear(
+            self.distance_m, self.visible_share, self.probability_, distance_m, path.visible_share
+        )
 
 
 class Shadowing(ReceptionModel):
@@ -137,12 +140,12 @@ class Shadowing(ReceptionModel):
     sigma_db: Positive
     blocked_db: Number = 0.0
 
-    def probability(self, path: RadioPath, noise: Noise) -> Float:
+    def probability(self, path: RadioPath, noise: UniformNoise) -> Float:
         """(F,) the probability that the shadowing leaves enough."""
         with np.errstate(divide="ignore"):
             margin_db = 10 * self.exponent * np.log10(self.half_at_m / np.maximum(path.distance_m, NEAR_M))
         margin_db = margin_db - np.where(path.visible_share < BLOCKED, self.blocked_db, 0.0)
-        from scipy.special import ndtr  # it takes long to import
+        from scipy.special import ndtr  # here, as its import takes long
 
         result: Float = ndtr(margin_db / self.sigma_db)
         return result
@@ -163,8 +166,8 @@ class GilbertElliott(ReceptionModel):
     bad_share: Share
     bad_lasts_s: Annotated[float, Field(strict=True, ge=0.001, le=86_400)]
 
-    def probability(self, path: RadioPath, noise: Noise) -> Float:
-        """(1, F) by the state."""
+    def probability(self, path: RadioPath, noise: UniformNoise) -> Float:
+        """(1, F) 1 less the loss in the state of the channel."""
         bad = noise("state", lasts_s=self.bad_lasts_s) < self.bad_share
         return 1 - np.where(bad, self.bad_loss, self.good_loss)
 
@@ -175,3 +178,4 @@ RECEPTIONS = {
     "shadowing": "copem_replay.communication.reception:Shadowing",
     "gilbert_elliott": "copem_replay.communication.reception:GilbertElliott",
 }
+"""Built-in names of `reception: {kind: …}`."""

@@ -46,14 +46,14 @@ def check_latency(model: LatencyModel) -> None:
     """
     uniform = np.concatenate([np.logspace(-15, -2, 60), np.linspace(0.01, 0.99, 199), 1 - np.logspace(-2, -15, 60)])
 
-    def ask(some: Float) -> Float:
-        return _answer(model.kind, model.delays(some), some.shape, np.inf)
+    def ask(part: Float) -> Float:
+        return _ask_model(model.kind, model.delays(part), part.shape, np.inf)
 
     before = uniform.copy()
     delay_s = ask(uniform)
-    _same(model.kind, "inputs", uniform, before)
-    _same(model.kind, "again", ask(uniform), delay_s)
-    _same(model.kind, "alone", np.concatenate([ask(uniform[k : k + 1]) for k in range(len(uniform))]), delay_s)
+    _check_same(model.kind, "inputs", uniform, before)
+    _check_same(model.kind, "again", ask(uniform), delay_s)
+    _check_same(model.kind, "alone", np.concatenate([ask(uniform[k : k + 1]) for k in range(len(uniform))]), delay_s)
     if (fall := np.diff(delay_s)).min() < 0:
         k = int(np.argmin(fall))
         raise BrokenLinkRuleError(
@@ -73,32 +73,32 @@ def check_reception(model: ReceptionModel) -> None:
     path = RadioPath(distance_m.ravel(), share.ravel())
     rows = np.arange(len(path.distance_m))
 
-    def ask(some: np.ndarray) -> Float:
+    def ask(part_rows: np.ndarray) -> Float:
         def noise(name: str, *, lasts_s: float | None = None) -> Float:
-            return (((some + 1) * 0.381966) % 1)[None]
+            return (((part_rows + 1) * 0.381966) % 1)[None]
 
-        part = RadioPath(path.distance_m[some], path.visible_share[some])
-        found = _answer(model.kind, model.probability(part, noise), (1, len(some)), 1.0)
+        part = RadioPath(path.distance_m[part_rows], path.visible_share[part_rows])
+        probability_found = _ask_model(model.kind, model.probability(part, noise), (1, len(part_rows)), 1.0)
         for name in ("distance_m", "visible_share"):
-            _same(model.kind, "inputs", getattr(part, name), getattr(path, name)[some])
-        return found
+            _check_same(model.kind, "inputs", getattr(part, name), getattr(path, name)[part_rows])
+        return probability_found
 
     probability = ask(rows)
-    _same(model.kind, "again", ask(rows), probability)
-    _same(model.kind, "alone", np.concatenate([ask(rows[k : k + 1]) for k in rows]), probability)
+    _check_same(model.kind, "again", ask(rows), probability)
+    _check_same(model.kind, "alone", np.concatenate([ask(rows[k : k + 1]) for k in rows]), probability)
 
 
-def _answer(kind: str, found: object, shape: tuple[int, ...], most: float) -> Float:
-    """The answer (K,). Raises BrokenLinkRuleError where it is none."""
-    if not isinstance(found, np.ndarray) or found.shape not in (shape, shape[-1:]):
-        said = found.shape if isinstance(found, np.ndarray) else type(found).__name__
-        raise BrokenLinkRuleError("answer", kind, f"shape {said}, expected {shape}")
-    if found.dtype.kind not in "fiu" or not ((found >= 0) & (found <= most) & np.isfinite(found)).all():
+def _ask_model(kind: str, answer: object, shape: tuple[int, ...], most: float) -> Float:
+    """The answer of a model (K,). Raises BrokenLinkRuleError where shape or numbers are wrong."""
+    if not isinstance(answer, np.ndarray) or answer.shape not in (shape, shape[-1:]):
+        shape_found = answer.shape if isinstance(answer, np.ndarray) else type(answer).__name__
+        raise BrokenLinkRuleError("answer", kind, f"shape {shape_found}, expected {shape}")
+    if answer.dtype.kind not in "fiu" or not ((answer >= 0) & (answer <= most) & np.isfinite(answer)).all():
         raise BrokenLinkRuleError("answer", kind, f"what is not within 0 … {most:g}")
-    return np.array(found, dtype=float).reshape(shape[-1:])
+    return np.array(answer, dtype=float).reshape(shape[-1:])
 
 
-def _same(kind: str, rule: str, found: Float, expected: Float) -> None:
+def _check_same(kind: str, rule: str, found: Float, expected: Float) -> None:
     if not np.array_equal(found, expected):
         k = int(np.argmax(found != expected))
         raise BrokenLinkRuleError(rule, kind, f"{found[k]} in the place of {expected[k]}")

@@ -2,9 +2,9 @@
 
 A row or column left alone costs 0, so a pair of cost 0 or more is never chosen: callers take the price of leaving both
 alone off the cost of each pair. The price may differ between connected components of the pairs, which do not compete:
-`largest_around` is for that. A row and a column that are each other's only choice are settled at once; the rest is
-solved row after row by shortest augmenting paths over the allowed pairs, which never leave the row's connected
-component. Every row has, beside its pairs, a way out of its own at cost 0.
+`spread_component_maximum` gives each component its own. A row and a column that are each other's only choice are
+settled at once; the rest is solved row after row by shortest augmenting paths over the allowed pairs, which never leave
+the row's connected component. Every row has, beside its pairs, a way out of its own at cost 0.
 
 Ties: of equally good assignments one is chosen by the indices alone, whatever the order of the pairs. Rows enter in
 their order, and one with which the total would not fall stays alone; of columns that are worth as much to it, a row
@@ -22,7 +22,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from copem_replay.core.kernels import making
+from copem_replay.core.compiled import making
 from copem_replay.core.tracks import Float, Int
 
 
@@ -80,20 +80,20 @@ def assign_pairs(row: Int, col: Int, cost: Float, n: int, m: int, partner: Int) 
         if cost[k] < 0.0 and of_row[i] > 0:
             choice[fill[i]], price[fill[i]] = col[k], cost[k]
             fill[i] += 1
-    _augment(start, choice, price, n, m, partner)
+    _augment_rows(start, choice, price, n, m, partner)
 
 
 @nb.njit(cache=True, nogil=True)
-def largest_around(row: Int, col: Int, value: Float, n: int, m: int) -> None:
+def spread_component_maximum(row: Int, col: Int, value: Float, n: int, m: int) -> None:
     """Puts the largest `value (P,)` of its connected component in the place of each pair's own."""
     parent, top = np.empty(n, np.int64), np.empty(n)
     for i in range(n):
         parent[i], top[i] = i, -np.inf
     of_col = np.full(m, -1)  # a row of the component of each column
     for k in range(len(value)):
-        i, j = _root(parent, row[k]), col[k]
+        i, j = _find_root(parent, row[k]), col[k]
         if of_col[j] >= 0:
-            other = _root(parent, of_col[j])
+            other = _find_root(parent, of_col[j])
             if other != i:
                 parent[other] = i
                 if top[other] > top[i]:
@@ -102,11 +102,11 @@ def largest_around(row: Int, col: Int, value: Float, n: int, m: int) -> None:
         if value[k] > top[i]:
             top[i] = value[k]
     for k in range(len(value)):
-        value[k] = top[_root(parent, row[k])]
+        value[k] = top[_find_root(parent, row[k])]
 
 
 @nb.njit(cache=True, nogil=True)
-def _root(parent: Int, i: int) -> int:
+def _find_root(parent: Int, i: int) -> int:
     """The row that stands for the component of row i; the way there gets shorter."""
     while parent[i] != i:
         parent[i] = parent[parent[i]]
@@ -115,16 +115,19 @@ def _root(parent: Int, i: int) -> int:
 
 
 @making
-def _augment(start: Int, choice: Int, price: Float, n: int, m: int, partner: Int) -> None:
+def _augment_rows(start: Int, choice: Int, price: Float, n: int, m: int, partner: Int) -> None:
     """Enters row after row: the pairs of row i are `choice, price[start[i] : start[i + 1]]`; rows without are left.
 
     Duals u, v: price − u − v ≥ 0 for every pair of the rows entered so far, = 0 for the chosen; v ≤ 0, u ≤ 0.
     """
     u, v = np.zeros(n), np.zeros(m)
     owner = np.full(m, -1)
-    length = np.full(m, np.inf)  # of the shortest path to a column so far; −inf: found for good
+    length = np.full(m, np.inf)  # of the shortest path to a column so far; −inf: settled
     before = np.empty(m, np.int64)  # the row from which that path comes
-    seen, found = np.empty(m, np.int64), np.empty(m)  # columns seen, those found for good first, with their lengths
+    seen, settled_length = (
+        np.empty(m, np.int64),
+        np.empty(m),
+    )  # columns seen, the settled ones first, with their lengths
     for new in range(n):
         if start[new] == start[new + 1]:
             continue
@@ -156,7 +159,7 @@ def _augment(start: Int, choice: Int, price: Float, n: int, m: int, partner: Int
             if shortest >= out:
                 break
             seen[best], seen[done] = seen[done], j
-            reached = found[done] = shortest
+            reached = settled_length[done] = shortest
             length[j] = -np.inf
             done += 1
             if owner[j] < 0:
@@ -168,8 +171,8 @@ def _augment(start: Int, choice: Int, price: Float, n: int, m: int, partner: Int
         for q in range(done):
             j = seen[q]
             if owner[j] >= 0:
-                u[owner[j]] += end - found[q]
-                v[j] -= end - found[q]
+                u[owner[j]] += end - settled_length[q]
+                v[j] -= end - settled_length[q]
         for q in range(count):
             length[seen[q]] = np.inf
         # Along the path every row hands its column on to the row before.

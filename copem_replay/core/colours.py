@@ -1,4 +1,4 @@
-"""Colours of configurations: the same everywhere, told apart by colour-blind readers.
+"""Colours of configurations: one for each in all figures, told apart by colour-blind readers.
 
 Source: Okabe & Ito, "Color universal design" (2008), without black; the truth is grey.
 """
@@ -10,7 +10,8 @@ from collections.abc import Iterable
 Rgb = tuple[int, int, int]
 TRUTH: Rgb = (150, 150, 150)
 DARKEST = 0.14
-"""Relative luminance that no configuration's colour is below: a line is seen on dark grounds, too (chosen: 3:1)."""
+"""Least relative luminance of a configuration's colour: contrast 3:1 (WCAG 2.1) to grounds as dark as luminance
+0.013."""
 _CYCLE: tuple[Rgb, ...] = (
     (230, 159, 0),
     (86, 180, 233),
@@ -27,23 +28,23 @@ def configuration_colours(configurations: Iterable[str]) -> dict[str, Rgb]:
 
     `configurations`: all of an experiment, in its order, whichever of them are shown: so each keeps its colour.
     """
-    return {name: _shade(_CYCLE[k % len(_CYCLE)], k // len(_CYCLE)) for k, name in enumerate(configurations)}
+    return {name: _shade_colour(_CYCLE[k % len(_CYCLE)], k // len(_CYCLE)) for k, name in enumerate(configurations)}
 
 
-def luminance(colour: Rgb) -> float:
+def relative_luminance(colour: Rgb) -> float:
     """Relative luminance, 0 to 1. Source: WCAG 2.1."""
     red, green, blue = (c / 12.92 if c <= 0.03928 else ((c + 0.055) / 1.055) ** 2.4 for c in (v / 255 for v in colour))
     return 0.2126 * red + 0.7152 * green + 0.0722 * blue
 
 
-def _shade(colour: Rgb, lap: int) -> Rgb:
+def _shade_colour(colour: Rgb, lap: int) -> Rgb:
     share = 0.55 * (1 - 0.5 ** ((lap + 1) // 2)) if lap else 0.0
-    shaded = _towards(colour, 255 if lap % 2 else 0, share)
-    while luminance(shaded) < DARKEST:
-        shaded = _towards(shaded, 255, 0.05)
+    shaded = _mix_colours(colour, 255 if lap % 2 else 0, share)
+    while relative_luminance(shaded) < DARKEST:
+        shaded = _mix_colours(shaded, 255, 0.05)
     return shaded
 
 
-def _towards(colour: Rgb, end: int, share: float) -> Rgb:
+def _mix_colours(colour: Rgb, end: int, share: float) -> Rgb:
     red, green, blue = (round(c + (end - c) * share) for c in colour)
     return red, green, blue

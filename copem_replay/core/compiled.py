@@ -1,11 +1,17 @@
-"""Where compiled code is cached: by Numba beside the source or in the user's cache, else in a folder of the user's own
-under the system's temporary one.
+"""Compiled functions: decorators for the inner ones, and the place where their code is cached.
 
-An index in a cache names the classes of arguments. Numba reads it before it compares it with the source, so that one
-which names a class that has gone fails: indices older than their source are removed first.
+At each call Numba counts, atomically, references to each array that is handed over. For a function called for each
+entry this takes several times as long as its work. `borrowing` and `making` say whether references are counted; the
+option is private to Numba, and functions that are called inherit it:
+docs/develop/decisions/0039-counted-references.md.
 
-What is in a cache is run. So that folder has to be the user's, with no rights of others, and no link; where another is
-in its place, one of this process alone is made.
+Numba caches code beside the source or in the user's cache. Where neither can be written, the cache is a folder of the
+user's own under the system's temporary one. An index in a cache names the classes of arguments. Numba reads it before
+it compares it with the source, so an index that names a class that is gone fails: indices older than their source are
+removed first.
+
+Cached code is run. So the folder must be the user's, without rights for others, and no link; where something else is in
+its place, a folder of this process alone is made.
 """
 
 from __future__ import annotations
@@ -13,12 +19,35 @@ from __future__ import annotations
 import os
 import stat
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
+from typing import Any, TypeVar
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def borrowing(function: Function) -> Function:
+    """`nb.njit` for functions that make no array and return none: their arguments outlive them."""
+    return _compile(function, counts_references=False)
+
+
+def making(function: Function) -> Function:
+    """`nb.njit` for functions that make arrays and are called by borrowing ones."""
+    return _compile(function, counts_references=True)
+
+
+def _compile(function: Function, *, counts_references: bool) -> Function:
+    import numba  # by kernels alone: the place of the cache is prepared before, and `--help` needs no Numba
+
+    njit: Any = numba.njit  # whose stubs leave the option out
+    compiled: Function = njit(cache=True, nogil=True, _nrt=counts_references)(function)
+    return compiled
+
 
 VARIABLE = "NUMBA_CACHE_DIR"
+"""The environment variable that names Numba's cache."""
 
 
 @cache
@@ -28,13 +57,13 @@ def cache_note() -> str | None:
 
 
 def prepare_cache(package: Path, environment: Mapping[str, str] = os.environ) -> str | None:
-    """Have a place for compiled code, before Numba is imported. Returns a note for the user, or None."""
-    folders = _folders(package)
+    """Provide a place for compiled code, before Numba is imported. Returns a note for the user, or None."""
+    folders = _package_folders(package)
     _remove_stale(folders)
-    if _writable(environment.get(VARIABLE)) or all(_writable(f"{folder}/__pycache__") for folder in folders):
+    if _is_writable(environment.get(VARIABLE)) or all(_is_writable(f"{folder}/__pycache__") for folder in folders):
         return None
     home = environment.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    if _writable(f"{home}/numba"):
+    if _is_writable(f"{home}/numba"):
         return None
     try:
         folder, why = _own_folder()
@@ -47,7 +76,7 @@ def prepare_cache(package: Path, environment: Mapping[str, str] = os.environ) ->
     return f"{cached}; {VARIABLE} names another"
 
 
-def _folders(package: Path) -> list[str]:
+def _package_folders(package: Path) -> list[str]:
     """The package, and all packages in it."""
     return [folder for folder, _, files in os.walk(package) if "__init__.py" in files]
 
@@ -64,7 +93,7 @@ def _remove_stale(folders: list[str]) -> None:
                             os.remove(index.path)
 
 
-def _writable(folder: str | None) -> bool:
+def _is_writable(folder: str | None) -> bool:
     """Whether files can be made in a folder; it is made, as Numba makes it, where it is not there."""
     if not folder:
         return False
@@ -76,7 +105,7 @@ def _writable(folder: str | None) -> bool:
 
 
 def _own_folder() -> tuple[str, str]:
-    """A folder that no other user can write, and what is odd about it. Raises OSError."""
+    """A folder that no other user can write, and words on where it is, for the note. Raises OSError."""
     import atexit
     import shutil
     import tempfile
@@ -84,9 +113,9 @@ def _own_folder() -> tuple[str, str]:
     folder = f"{tempfile.gettempdir()}/copem_replay-{os.geteuid()}"
     with suppress(FileExistsError):
         os.mkdir(folder, 0o700)
-    found = os.lstat(folder)
-    if stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid() and not found.st_mode & 0o077:
+    status = os.lstat(folder)
+    if stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid() and not status.st_mode & 0o077:
         return folder, ""
-    mine = tempfile.mkdtemp(prefix=f"copem_replay-{os.geteuid()}-")
-    atexit.register(shutil.rmtree, mine, ignore_errors=True)
-    return mine, f" for this process alone ({folder} is not a folder of this user alone)"
+    own = tempfile.mkdtemp(prefix=f"copem_replay-{os.geteuid()}-")
+    atexit.register(shutil.rmtree, own, ignore_errors=True)
+    return own, f" for this process alone ({folder} is not a folder of this user alone)"

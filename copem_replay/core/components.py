@@ -2,7 +2,8 @@
 
 `kind:` is a built-in name, the name of an installed entry point (group `copem_replay.<slot>`), or
 `package.module:Class`. There is no registry and nothing happens on import: a class is looked up when an experiment
-names it.
+names it. A failure or a wrong answer of a user's own class is an InputError with file and line; that of a built-in one
+is a defect, and escapes.
 """
 
 from __future__ import annotations
@@ -30,14 +31,17 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError, core_schema
 
-from copem_replay.core.errors import InputError
-from copem_replay.core.own_code import FAILURES, failed, is_own, written_at
+from copem_replay.core.errors import FAILURES, InputError, describe_failure, describe_source_line, is_own
 from copem_replay.core.tracks import Float
 
 T = TypeVar("T")
+P = TypeVar("P")
+M = TypeVar("M", bound=BaseModel)
+
+# Failures and wrong answers of a user's own code: the file and the line.
 
 
-def described(schema: dict[str, Any]) -> None:
+def drop_python_examples(schema: dict[str, Any]) -> None:
     """Leave the examples for Python out of the descriptions of a JSON Schema."""
     if "description" in schema:
         schema["description"] = schema["description"].partition("\n\n>>> ")[0]
@@ -46,11 +50,9 @@ def described(schema: dict[str, Any]) -> None:
 class Frozen(BaseModel):
     """Base of all models: immutable, and a key that is not known is refused."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, json_schema_extra=described)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, json_schema_extra=drop_python_examples)
 
 
-P = TypeVar("P")
-M = TypeVar("M", bound=BaseModel)
 _FORM = Discriminator(lambda value: "mapping" if isinstance(value, dict | BaseModel) else "plain")
 Either = Annotated[Annotated[P, Tag("plain")] | Annotated[M, Tag("mapping")], _FORM]
 """A union of two models; errors name the one whose form the value has."""
@@ -70,7 +72,7 @@ class GivenError(TypeError):
         self.method = method
 
 
-def asked(component: Component, where: str, work: Callable[[], T]) -> T:
+def ask_component(component: Component, where: str, work: Callable[[], T]) -> T:
     """The answer of a component. Raises InputError where a user's own fails; a built-in one's is a defect."""
     try:
         return work()
@@ -78,16 +80,16 @@ def asked(component: Component, where: str, work: Callable[[], T]) -> T:
         if not is_own(type(component)):
             raise
         if isinstance(error, GivenError):
-            raise wrong(component, where, str(error), error.method) from error
-        raise InputError(f"{where}: {component.kind}: {failed(error, type(component))}") from error
+            raise wrong_answer_error(component, where, str(error), error.method) from error
+        raise InputError(f"{where}: {component.kind}: {describe_failure(error, type(component))}") from error
 
 
-def wrong(component: Component, where: str, message: str, *methods: str) -> InputError:
+def wrong_answer_error(component: Component, where: str, message: str, *methods: str) -> InputError:
     """The error for a wrong answer of a component, with file and line of the first of these methods that is own."""
-    return InputError(f"{where}: {component.kind}: {message}{written_at(type(component), *methods)}")
+    return InputError(f"{where}: {component.kind}: {message}{describe_source_line(type(component), *methods)}")
 
 
-def numbers_of(
+def ask_numbers(
     component: Component, where: str, call: str, answer: Callable[[], Any], shape: tuple[int, ...], said: str,
     most: float = np.finfo(np.float64).max,
 ) -> Float:  # fmt: skip
@@ -96,40 +98,40 @@ def numbers_of(
     `said`: what is expected of them.
     """
     method = call.partition("(")[0]
-    found = asked(component, where, lambda: np.asarray(answer(), dtype=np.float64))
-    if found.shape != shape:
-        raise wrong(component, where, f"{call}: expected shape {shape}, found {found.shape}", method)
-    beyond = ~((found >= 0) & (found <= most))
+    numbers = ask_component(component, where, lambda: np.asarray(answer(), dtype=np.float64))
+    if numbers.shape != shape:
+        raise wrong_answer_error(component, where, f"{call}: expected shape {shape}, found {numbers.shape}", method)
+    beyond = ~((numbers >= 0) & (numbers <= most))
     if beyond.any():
-        raise wrong(component, where, f"{call}: expected {said}, found {found[beyond][0]}", method)
-    return found
+        raise wrong_answer_error(component, where, f"{call}: expected {said}, found {numbers[beyond][0]}", method)
+    return numbers
 
 
 _LARGEST = 1e12
-"""Chosen: no quantity of an experiment is larger, and products of two such numbers are still numbers."""
+"""No quantity of an experiment is larger, and the product of two such numbers is far from overflow."""
 Number = Annotated[float, Field(strict=True, ge=-_LARGEST, le=_LARGEST)]
 """A number; text and true/false are refused."""
 Positive = Annotated[float, Field(strict=True, gt=0, le=_LARGEST)]
 NotNegative = Annotated[float, Field(strict=True, ge=0, le=_LARGEST)]
 Latency = Annotated[float, Field(strict=True, ge=0, le=86_400)]
-"""Seconds, a day at most (chosen: more is a mistake, and a stamp in nanoseconds has an end)."""
+"""Seconds, a day at most: more is a mistake, and a stamp in nanoseconds has an end."""
 Share = Annotated[float, Field(strict=True, ge=0, le=1)]
 Count = Annotated[int, Field(strict=True, ge=1, le=10**9)]
 Flag = Annotated[bool, Field(strict=True)]
 """True or false; `yes` is text."""
 
 
-def _identifier(value: object) -> object:
+def _id_as_text(value: object) -> object:
     """Ids may be numbers or text: `1` is `"1"`."""
     return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
 
-Id = Annotated[str, BeforeValidator(_identifier), WithJsonSchema({"type": ["string", "integer"]})]
+Id = Annotated[str, BeforeValidator(_id_as_text), WithJsonSchema({"type": ["string", "integer"]})]
 
 Pair = tuple[Number, Number]
 
 
-def _covariance(value: tuple[Pair, Pair]) -> tuple[Pair, Pair]:
+def _check_covariance(value: tuple[Pair, Pair]) -> tuple[Pair, Pair]:
     (a, b), (c, d) = value
     scale = max(abs(a), abs(d), 1e-12)
     if abs(b - c) > 1e-9 * scale:
@@ -139,7 +141,7 @@ def _covariance(value: tuple[Pair, Pair]) -> tuple[Pair, Pair]:
     return value
 
 
-Covariance = Annotated[tuple[Pair, Pair], AfterValidator(_covariance)]
+Covariance = Annotated[tuple[Pair, Pair], AfterValidator(_check_covariance)]
 
 
 class Slot:
@@ -175,13 +177,13 @@ class Slot:
                 component = self.find(kind)
             except PydanticCustomError:  # an entry point of another package that is broken: not to be had
                 continue
-            found = deepcopy(handler.resolve_ref_schema(handler(component.__pydantic_core_schema__)))
+            alternative = deepcopy(handler.resolve_ref_schema(handler(component.__pydantic_core_schema__)))
             if kind == self.default:
-                found["properties"]["kind"] = {"const": kind, "default": kind}
+                alternative["properties"]["kind"] = {"const": kind, "default": kind}
             else:
-                found["properties"]["kind"] = {"const": kind}
-                found["required"] = sorted({*found.get("required", []), "kind"})
-            alternatives.append(found)
+                alternative["properties"]["kind"] = {"const": kind}
+                alternative["required"] = sorted({*alternative.get("required", []), "kind"})
+            alternatives.append(alternative)
         own = {"type": "object", "properties": {"kind": {"type": "string", "pattern": ":"}}, "required": ["kind"]}
         return {"anyOf": [*alternatives, own]}
 
@@ -193,27 +195,27 @@ class Slot:
         """The class `kind` names. Raises PydanticCustomError, which reads as a problem of the experiment file."""
         if kind in self.built_in:
             target = self.built_in[kind]
-        elif found := [e for e in entry_points(group=f"copem_replay.{self.name}") if e.name == kind]:
-            target = found[0].value
+        elif installed := [e for e in entry_points(group=f"copem_replay.{self.name}") if e.name == kind]:
+            target = installed[0].value
         elif ":" in kind:
             target = kind
         else:
-            known = f"one of {', '.join(self.kinds())}, or " if self.kinds() else ""
-            raise _problem(f"kind: expected {known}package.module:Class; found {kind!r}")
+            kinds = f"one of {', '.join(self.kinds())}, or " if self.kinds() else ""
+            raise _pydantic_error(f"kind: expected {kinds}package.module:Class; found {kind!r}")
         module, _, name = target.partition(":")
         try:
             component = getattr(importlib.import_module(module), name)
         except FAILURES as error:  # whatever a module of the user's raises
-            away = isinstance(error, ModuleNotFoundError) and module.startswith(str(error.name))
-            hint = " (install it, or name its folder in PYTHONPATH)" if away else ""
-            raise _problem(f"kind: {kind!r} cannot be imported: {failed(error)}{hint}") from error
+            missing = isinstance(error, ModuleNotFoundError) and module.startswith(str(error.name))
+            hint = " (install it, or name its folder in PYTHONPATH)" if missing else ""
+            raise _pydantic_error(f"kind: {kind!r} cannot be imported: {describe_failure(error)}{hint}") from error
         if not (isinstance(component, type) and issubclass(component, self.base)) or component is self.base:
-            raise _problem(
+            raise _pydantic_error(
                 f"kind: {kind!r} is no kind of {self.base.__module__}.{self.base.__name__}; derive it from that"
             )
         if inspect.isabstract(component):
             lacking = ", ".join(sorted(vars(component)["__abstractmethods__"]))
-            raise _problem(f"kind: {kind!r} lacks {lacking}")
+            raise _pydantic_error(f"kind: {kind!r} lacks {lacking}")
         return component
 
     def build(self, value: object, context: Mapping[str, Any] | None = None) -> Component:
@@ -225,7 +227,7 @@ class Slot:
         if not isinstance(value, Mapping) or not isinstance(value.get("kind"), str):
             found = "nothing" if value is None else repr(value)
             kinds = f"one of {', '.join(self.kinds())}" if self.kinds() else "package.module:Class"
-            raise _problem(f"expected {{kind: …}}, kind {kinds}; found {found}")
+            raise _pydantic_error(f"expected {{kind: …}}, kind {kinds}; found {found}")
         component = self.find(value["kind"])
         try:
             return component.model_validate(dict(value), context=context)
@@ -234,14 +236,16 @@ class Slot:
         except FAILURES as error:  # of a constructor of the user's
             if not is_own(component):
                 raise
-            raise _problem(f"kind: {value['kind']!r} cannot be made: {failed(error, component)}") from error
+            raise _pydantic_error(
+                f"kind: {value['kind']!r} cannot be made: {describe_failure(error, component)}"
+            ) from error
 
 
-def at_key(key: str, message: str) -> ValidationError:
+def error_at_key(key: str, message: str) -> ValidationError:
     """The error for a wrong value at a key of a model, for the model's own validators to raise."""
-    return ValidationError.from_exception_data("key", [{"type": _problem(message), "loc": (key,), "input": key}])
+    return ValidationError.from_exception_data("key", [{"type": _pydantic_error(message), "loc": (key,), "input": key}])
 
 
-def _problem(message: str) -> PydanticCustomError:
+def _pydantic_error(message: str) -> PydanticCustomError:
     # The message is a constant to pydantic: braces of the text must not be read as fields.
     return PydanticCustomError("component", "{message}", {"message": message})

@@ -1,4 +1,4 @@
-"""The errors a user can meet.
+"""The errors a user can meet, the words their messages are made of, and files under URLs, which fail in one line.
 
     CopemError
     ├── InputError            what was given is wrong: one line per problem, exit code 2
@@ -13,15 +13,23 @@ Anything else that escapes is a defect of this project: traceback, exit code 70.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING
+import difflib
+import importlib
+import inspect
+import os
+import re
+import textwrap
+import traceback
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path, PurePosixPath
+from typing import Any
+from urllib.parse import unquote, urlsplit
 
-if TYPE_CHECKING:
-    from copem_replay.core.remote import Remote
 
-
-def printable(text: str) -> str:
+def escape_unprintable(text: str) -> str:
     """On one line, and without what a terminal would act on: names in a recording may hold anything."""
     return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
@@ -41,7 +49,7 @@ class CopemError(Exception):
 
     def __init__(self, problems: str | Sequence[str]) -> None:
         lines = (problems,) if isinstance(problems, str) else problems
-        self.problems: tuple[str, ...] = tuple(printable(line) for line in lines)
+        self.problems: tuple[str, ...] = tuple(escape_unprintable(line) for line in lines)
         super().__init__("\n".join(self.problems))
 
 
@@ -80,7 +88,7 @@ class RecordingError(InputError):
         self,
         reasons: str | Sequence[str],
         *,
-        path: Path | Remote | None = None,
+        path: Path | RemoteFile | None = None,
         topic: str | None = None,
         key: tuple[str | int, ...] = (),
     ) -> None:
@@ -88,14 +96,14 @@ class RecordingError(InputError):
         self.path, self.topic, self.key = path, topic, key
         super().__init__(self._lines(path, topic))
 
-    def _lines(self, path: Path | Remote | None, topic: str | None) -> list[str]:
+    def _lines(self, path: Path | RemoteFile | None, topic: str | None) -> list[str]:
         where = "".join(f"{place}: " for place in (path, topic, self._about) if place is not None)
         return [f"{where}{reason}" for reason in self.reasons]
 
     def within(self, path: Path, topic: str | None = None) -> list[str]:
         """Return the problems without the path and topic that are these, for messages that name them already."""
         lines = self._lines(None if self.path == path else self.path, None if self.topic == topic else self.topic)
-        return [printable(line) for line in lines]
+        return [escape_unprintable(line) for line in lines]
 
 
 class EgoError(RecordingError):
@@ -123,3 +131,242 @@ class OutputError(CopemError):
     Traceback (most recent call last):
     copem_replay.core.errors.OutputError: report.pdf: expected a name that ends with .html or .htm, found report.pdf
     """
+
+
+# Words of notes, messages and tables.
+
+
+def wrap_line(line: str, width: int | None) -> list[str]:
+    """A line in as many as it takes to fit, broken at spaces, the further ones indented; None: as it is.
+
+    What has no spaces stays whole, so that paths and addresses can be copied.
+    """
+    if width is None or len(line) <= width:
+        return [line]
+    indent = " " * (len(line) - len(line.lstrip()))
+    further = f"{indent}    "
+    return textwrap.wrap(
+        line, max(width, len(further) + 1), subsequent_indent=further,
+        break_long_words=False, break_on_hyphens=False, drop_whitespace=True,
+    )  # fmt: skip
+
+
+def count_noun(number: int, noun: str, plural: str = "") -> str:
+    """`1 message`, `2 messages`; `plural` where it is not the noun with an s."""
+    return f"{number} {noun if number == 1 else plural or noun + 's'}"
+
+
+def interval_words(kind: str, over: str) -> str:
+    """What limits are, by their kind and what they are over in `summary.csv`; an unknown kind is named as it is."""
+    words = {
+        "wilson": "Wilson interval over {}",
+        "bootstrap": "bootstrap interval over {}",
+        "bootstrap+exact": "bootstrap interval over {}, nowhere narrower than exact binomial limits",
+    }
+    return words.get(kind, f"{kind} interval over {{}}").format(over)
+
+
+def unknown_name_message(what: str, name: object, known: Iterable[str]) -> str:
+    """A message that a name is unknown, with the likely name, or else all known ones."""
+    names = list(dict.fromkeys(known))
+    near = difflib.get_close_matches(str(name), names, n=1)
+    hint = f"; did you mean {near[0]}?" if near else f"; there {'are ' + ', '.join(names) if names else 'are none'}"
+    return f"no {what} is named {str(name)!r}{hint}"
+
+
+# Files under URLs, which fsspec opens; it is not loaded where all files are on this machine. Access data (endpoints,
+# profiles, keys) are in fsspec's own environment and files, never in an experiment; a URL is written and shown without
+# its user and its query.
+
+_SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*)://")
+_STAMPS = ("ETag", "etag", "md5Hash", "Last-Modified", "LastModified", "last_modified", "updated", "created")
+"""Entries of a file system's listing that change with a file's content. Not `mtime`: the program that writes a file
+(`rsync -t`) can set it."""
+
+
+@dataclass(frozen=True, repr=False)
+class RemoteFile:
+    """A file under a URL. `info`: its entry in a listing; None: it was named, not listed."""
+
+    url: str  # as it was given
+    info: Mapping[str, Any] | None = field(default=None, compare=False)
+
+    def __str__(self) -> str:
+        """Without user and query, as it may be written."""
+        return strip_credentials(self.url)
+
+    __repr__ = __str__
+
+    @property
+    def path(self) -> PurePosixPath:
+        """Its path there, from the bucket or host on."""
+        return PurePosixPath("/" + str(self).partition("://")[2])
+
+    @property
+    def name(self) -> str:
+        """The last part of it."""
+        return self.path.name
+
+    @cached_property
+    def there(self) -> Mapping[str, Any] | None:
+        """Its entry in the file system; None: there is no such file. Raises InputError where that cannot be asked."""
+        if self.info is not None:
+            return self.info
+        fs, path = open_file_system(self.url)
+        with reraise_in_one_line(self.url):
+            fs.invalidate_cache()
+            try:
+                entry: Mapping[str, Any] = fs.info(path)
+            except FileNotFoundError as error:
+                if (cause := error.__cause__) is not None and self.url.lower().startswith("http"):
+                    raise cause from None  # the server may have failed for another reason
+                return None
+        return entry
+
+    @property
+    def stamp(self) -> tuple[int | None, str] | None:
+        """Size, and a tag that changes with the content; None: the file system has no such tag."""
+        entry = self.there or {}
+        tag = next((entry[key] for key in _STAMPS if entry.get(key)), None)
+        return None if tag is None else (entry.get("size"), str(tag))
+
+    def fetch(self, to: str) -> None:
+        """Copy it to a path on this machine. Raises InputError."""
+        fs, path = open_file_system(self.url)
+        with reraise_in_one_line(self.url):
+            fs.get_file(path, to)
+
+
+def is_url(text: str) -> bool:
+    """Whether this is a URL, not a path."""
+    return _SCHEME.match(text) is not None
+
+
+def local_path(text: str) -> str:
+    """A path as it is, and that of a `file://` URL, which is on this machine."""
+    return unquote(urlsplit(text).path) if text.lower().startswith("file://") else text
+
+
+def strip_credentials(url: str) -> str:
+    """A URL without user and query."""
+    scheme, _, rest = url.partition("://")
+    host, slash, path = rest.partition("?")[0].partition("/")
+    return f"{scheme}://{host.rpartition('@')[2]}{slash}{path}"
+
+
+def find_remote_files(pattern: str) -> list[RemoteFile]:
+    """The files that a URL names, sorted; with `*`, `**` or `[…]` those that match. Raises InputError."""
+    if not re.search(r"[*\[]", strip_credentials(pattern)):
+        return [RemoteFile(pattern)]
+    if pattern.startswith(("http://", "https://")):
+        raise InputError(
+            f"{strip_credentials(pattern)}: a web server lists nothing; expected the URL of a file, without `*`"
+        )
+    fs, path = open_file_system(pattern)
+    with reraise_in_one_line(pattern):
+        fs.invalidate_cache()
+        listing: dict[str, dict[str, Any]] = fs.glob(path, detail=True)
+    scheme = pattern.partition("://")[0]
+    files = {name: info for name, info in listing.items() if info.get("type") != "directory"}
+    return [RemoteFile(f"{scheme}://{name.lstrip('/')}", files[name]) for name in sorted(files)]
+
+
+def open_file_system(url: str, what: str = "") -> tuple[Any, str]:
+    """The file system of a URL, and the path of the file in it. Raises InputError that says what to install.
+
+    `what`: the beginning of the line.
+    """
+    protocol, place = url.partition("://")[0].lower(), f"{what}{strip_credentials(url)}"
+    try:
+        from fsspec.core import url_to_fs
+        from fsspec.registry import known_implementations
+    except ImportError:
+        raise InputError(f"{place}: fsspec is not installed: pip install 'copem-replay[cluster]'") from None
+    implementation = known_implementations.get(protocol)
+    try:
+        fs, path = url_to_fs(url)
+    except ImportError:
+        package = str((implementation or {}).get("class", protocol)).partition(".")[0]
+        if package == "fsspec":  # fsspec has the protocol, but not the package it needs
+            package = f"'fsspec[{'http' if protocol == 'https' else protocol}]'"
+        raise InputError(f"{place}: {protocol}:// is not installed: pip install {package}") from None
+    except ValueError as error:
+        if implementation is None:
+            reason = f"expected a protocol that fsspec knows (s3, gs, az, https, …), found {protocol!r}"
+            raise InputError(f"{place}: {reason}") from None
+        raise InputError(f"{place}: {_hide_credentials(str(error))}") from None
+    return fs, path
+
+
+@contextmanager
+def reraise_in_one_line(url: str, failed: type[CopemError] = InputError, what: str = "") -> Iterator[None]:
+    """Raise any failure with a URL as `failed`, in one line: errors of protocols' packages share no base."""
+    try:
+        yield
+    except CopemError:
+        raise
+    except FileNotFoundError:
+        raise failed(f"{what}{strip_credentials(url)}: no such file, folder or bucket") from None
+    except PermissionError as error:
+        raise failed(f"{what}{strip_credentials(url)}: access is denied ({_hide_credentials(str(error))})") from None
+    except Exception as error:
+        message = _hide_credentials(str(error))
+        raise failed(f"{what}{strip_credentials(url)}: {message or type(error).__name__}") from None
+
+
+def _hide_credentials(text: str) -> str:
+    """An error in one line, without users and queries of URLs in it."""
+    text = re.sub(r"://[^\s/@'\"]*@", "://", " ".join(text.split()))
+    return re.sub(r"(://[^\s?'\"]*)\?[^\s'\")]*", r"\1", text)[:300]
+
+
+# What code of the user's own raises.
+
+FAILURES = (Exception, SystemExit)
+"""Exceptions that a user's code may raise; an interrupt is none of them."""
+
+
+def is_own(component: type[Any]) -> bool:
+    """Whether a class is a user's own, not built in."""
+    return not component.__module__.startswith("copem_replay.")
+
+
+def describe_failure(error: BaseException, component: type[Any] | None = None) -> str:
+    """`ValueError: why (file:line)`: the innermost line in the file of the class, else the innermost of a user's."""
+    why = " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
+    if isinstance(error, SyntaxError):  # says where by itself
+        return why
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if not _is_machinery(f.filename)]
+    own_frames = [f for f in frames if f.filename == _source_file_of(component)]
+    place = [f"{f.filename}:{f.lineno}" for f in (own_frames or frames)[-1:]]
+    return f"{why} ({place[0]})" if place else why
+
+
+def describe_source_line(component: type[Any], *methods: str) -> str:
+    """` (file:line)` of the first of some methods that is a user's own, else of the class; empty for built-in ones."""
+    if not is_own(component):
+        return ""
+    for name in methods:
+        method = getattr(component, name, None)
+        code = getattr(inspect.unwrap(method), "__code__", None) if callable(method) else None
+        if code is not None and not _is_machinery(code.co_filename):
+            return f" ({code.co_filename}:{code.co_firstlineno})"
+    try:
+        return f" ({inspect.getsourcefile(component)}:{inspect.getsourcelines(component)[1]})"
+    except (OSError, TypeError):  # written where no file is
+        return ""
+
+
+def _source_file_of(component: type[Any] | None) -> str | None:
+    try:
+        return None if component is None else inspect.getfile(component)
+    except (OSError, TypeError):
+        return None
+
+
+_MACHINERY = (f"{Path(__file__).parents[1]}{os.sep}", f"{Path(importlib.__file__).parent}{os.sep}", "<frozen importlib")
+
+
+def _is_machinery(file: str) -> bool:
+    """Whether a file is of this package or Python's import, not a user's."""
+    return file.startswith(_MACHINERY)

@@ -1,14 +1,36 @@
-"""Files that are complete under their name, or not there."""
+"""Files that are complete under their name, or not there: they are written in a scratch folder and then moved.
+
+A scratch folder is `.NAME.xxxxxxxx.tmp` beside NAME, locked as long as its process lives, with a list of what is in it.
+When its process is killed it stays, its lock free; `remove_leftovers` then removes what its list names, and only that:
+docs/develop/decisions/0020-results-folder.md.
+"""
 
 from __future__ import annotations
 
+import errno
+import fcntl
+import filecmp
+import hashlib
+import json
 import os
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+import re
+import stat
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 from copem_replay.core.errors import OutputError
-from copem_replay.core.scratch import flush, flush_all, scratch_for
+
+MANIFEST = "files.json"
+"""In a scratch folder: its list, and its lock."""
+OLD = "old"
+"""In a scratch folder: what was under the final name, where folders cannot be exchanged in one step."""
+_RANDOM = r"\.[a-z0-9_]{8}\.tmp"
+_TEMPORARY = re.compile(r"\..+" + _RANDOM, re.DOTALL)
+_LONGEST = 200
+"""Bytes of the longest name that the names made of it keep whole: a name has 255 at most, and they are longer."""
 
 
 @contextmanager
@@ -19,12 +41,12 @@ def atomic_file(path: Path) -> Iterator[Path]:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with scratch_for(path) as scratch:
+        with make_scratch_folder(path) as scratch:
             scratch.will_hold([path.name])
             yield scratch.path / path.name
-            flush(scratch.path / path.name)
+            flush_file(scratch.path / path.name)
             os.replace(scratch.path / path.name, path)
-            flush(path.parent)
+            flush_file(path.parent)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
 
@@ -40,7 +62,7 @@ def atomic_files(folder: Path, names: Sequence[str], *, way_out: str = "") -> It
         if folder.exists() and not folder.is_dir():
             raise OutputError(f"{folder}: cannot be written: expected a folder, found a file{way_out}")
         folder.parent.mkdir(parents=True, exist_ok=True)
-        with scratch_for(folder, folder if folder.is_dir() else folder.parent) as scratch:
+        with make_scratch_folder(folder, folder if folder.is_dir() else folder.parent) as scratch:
             scratch.will_hold(names)
             yield scratch.path
             flush_all(scratch.path)
@@ -52,3 +74,196 @@ def atomic_files(folder: Path, names: Sequence[str], *, way_out: str = "") -> It
                     (folder / name).unlink(missing_ok=True)
     except OSError as error:
         raise OutputError(f"{folder}: cannot be written: {error.strerror or error}{way_out}") from error
+
+
+def try_lock(fd: int) -> bool | None:
+    """Whether the lock of an open file is now this process's. None: the file system has no locks."""
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:  # EACCES is how SMB says that it is held
+        return False if error.errno in (errno.EWOULDBLOCK, errno.EACCES) else None
+    return True
+
+
+def hidden_name(name: str) -> str:
+    """`.NAME`, the beginning of names of temporary files beside NAME; of a very long name its start and its digest."""
+    encoded = os.fsencode(name)
+    if len(encoded) <= _LONGEST:
+        return f".{name}"
+    return f".{os.fsdecode(encoded[:100])}~{hashlib.sha256(encoded).hexdigest()[:16]}"
+
+
+def is_scratch(folder: Path) -> bool:
+    """Whether a folder is a scratch folder, of this process, of another, or of one that was killed."""
+    return _TEMPORARY.fullmatch(folder.name) is not None and os.path.lexists(folder / MANIFEST)
+
+
+@dataclass(frozen=True)
+class ScratchFolder:
+    """A scratch folder. `fd`: its list, open and locked."""
+
+    path: Path
+    fd: int
+
+    def will_hold(self, files: Iterable[str], same: Mapping[str, str] | None = None) -> None:
+        """Note what is going to be in it, before it is: so a killed process leaves nothing unknown.
+
+        `files`: names in it that may be removed. `same`: names that may be removed if they are
+        equal to a file beside the scratch folder.
+        """
+        self._write_list({"files": sorted(files), "same": same or {}})
+
+    def add(self, files: Iterable[str] = (), same: Mapping[str, str] | None = None) -> None:
+        """Note more of what is going to be in it."""
+        known, known_same = _read_scratch_list(self.path)
+        self.will_hold(known.union(files), known_same | dict(same or {}))
+
+    def _write_list(self, content: object) -> None:
+        data = json.dumps(content).encode()
+        os.pwrite(self.fd, data, 0)
+        os.ftruncate(self.fd, len(data))
+
+
+@contextmanager
+def make_scratch_folder(path: Path, place: Path | None = None) -> Iterator[ScratchFolder]:
+    """A scratch folder for what is to become `path`, beside it or in `place`; removed in the end. Raises OSError."""
+    scratch = _create_scratch(place or path.parent, hidden_name(path.name))
+    try:
+        yield scratch
+    finally:
+        with suppress(OSError):
+            _remove_listed(scratch.path)
+        os.close(scratch.fd)
+
+
+def _create_scratch(place: Path, prefix: str) -> ScratchFolder:
+    while True:
+        path = Path(tempfile.mkdtemp(dir=place, prefix=f"{prefix}.", suffix=".tmp"))
+        try:
+            fd = os.open(path / MANIFEST, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
+        except FileNotFoundError:  # taken for a leftover before it had its lock
+            continue
+        if try_lock(fd) is not False and (path / MANIFEST).exists():
+            return ScratchFolder(path, fd)
+        os.close(fd)
+
+
+def remove_leftovers(path: Path, place: Path | None = None) -> list[str]:
+    """Remove what killed processes left of `path` beside it, or in `place`. Returns notes for the user.
+
+    A folder that one of them had moved away, to put another in its place, gets its name back.
+    """
+    notes = []
+    pattern = re.compile(re.escape(hidden_name(path.name)) + _RANDOM, re.DOTALL)
+    with suppress(OSError):
+        leftovers = sorted(each for each in (place or path.parent).iterdir() if pattern.fullmatch(each.name))
+        for leftover in leftovers:
+            with suppress(OSError):
+                notes += _remove_leftover(leftover, path)
+    return notes
+
+
+def _remove_leftover(left: Path, path: Path) -> list[str]:
+    """Remove one folder that may have been left; returns notes for the user. Raises OSError."""
+    if left.is_symlink() or not left.is_dir():
+        return []
+    notes = []
+    with _hold_lock(left) as free:
+        if not free:
+            return []
+        if (left / OLD).is_dir() and not os.path.lexists(path):
+            os.rename(left / OLD, path)
+            notes.append(f"{path}: put back, as a run was killed that was about to replace it")
+        if _remove_listed(left):
+            return [*notes, f"{left}: removed, left by a process that was killed"]
+    return [*notes, f"{left}: left by a process that was killed, and not removed: it holds what is not ours"]
+
+
+@contextmanager
+def _hold_lock(scratch: Path) -> Iterator[bool]:
+    """Hold the lock of a scratch folder, if it is free. One that has none yet is free."""
+    try:
+        fd = os.open(scratch / MANIFEST, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK)
+    except FileNotFoundError:
+        yield True
+        return
+    try:
+        yield try_lock(fd) is True
+    finally:
+        os.close(fd)
+
+
+def _remove_listed(scratch: Path) -> bool:
+    """Remove what the list of a scratch folder names; True where nothing is left. Raises OSError."""
+    if not os.path.lexists(scratch / MANIFEST):  # killed before it had a list, or about to get one
+        with suppress(OSError):
+            scratch.rmdir()
+        return not scratch.exists()
+    files, same = _read_scratch_list(scratch)
+
+    def cleared(folder: Path) -> bool:
+        kept = [entry.name for entry in sorted(os.scandir(folder), key=lambda entry: entry.name) if not gone(entry)]
+        return kept in ([], [MANIFEST]) if folder == scratch else not kept
+
+    def gone(entry: os.DirEntry[str]) -> bool:
+        place = Path(entry.path)
+        inside = place.relative_to(scratch).as_posix()
+        if entry.is_dir(follow_symlinks=False):
+            if is_scratch(place):  # that of a file in it
+                with _hold_lock(place) as free:
+                    return free and _remove_listed(place)
+            if not cleared(place):
+                return False
+            place.rmdir()
+            return True
+        if inside in files or (inside in same and _is_same_file(place, scratch.parent / same[inside])):
+            place.unlink()
+            return True
+        return False
+
+    if not cleared(scratch):
+        return False
+    (scratch / MANIFEST).unlink()
+    scratch.rmdir()
+    return True
+
+
+def _read_scratch_list(scratch: Path) -> tuple[set[str], dict[str, str]]:
+    """The names in the list of a scratch folder, `files` and `same`; empty where it cannot be read."""
+    try:
+        data = json.loads((scratch / MANIFEST).read_bytes())
+        return set(data["files"]), dict(data["same"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return set(), {}
+
+
+def _is_same_file(path: Path, other: Path) -> bool:
+    """Whether two names are of one file, of equal links, or of files with equal content."""
+    if not os.path.lexists(other):
+        return False
+    if path.is_symlink() or other.is_symlink():
+        return path.is_symlink() and other.is_symlink() and os.readlink(path) == os.readlink(other)
+    if os.path.samefile(path, other):
+        return True
+    return path.is_file() and other.is_file() and filecmp.cmp(path, other, shallow=False)
+
+
+def flush_all(folder: Path) -> None:
+    """Flush a folder and all that is in it to the disk. Raises OSError."""
+    for place, _, names in os.walk(folder):
+        for name in names:
+            if stat.S_ISREG(os.lstat(file := os.path.join(place, name)).st_mode):
+                flush_file(file)
+        flush_file(place)
+
+
+def flush_file(path: str | Path) -> None:
+    """Flush a file, or the names in a folder, to the disk. Raises OSError."""
+    fd = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(fd)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # folders of some network file systems
+            raise
+    finally:
+        os.close(fd)

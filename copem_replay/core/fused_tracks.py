@@ -1,4 +1,4 @@
-"""The receiver's fused tracks in one run or several: for files, for display, and for perceived conflicts."""
+"""Fused tracks of the receiver, in one run or several: for files, for display, and for perceived conflicts."""
 
 from __future__ import annotations
 
@@ -8,19 +8,17 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from copem_replay.core.agree import most_probable_of_each
-from copem_replay.core.kernels import borrowing
-from copem_replay.core.object_list import Entries
-from copem_replay.core.tracks import CLASSES, VALUES, Bool, Float, Int, Scene, Tracks
-from copem_replay.core.unit_faults import UnitFaults
+from copem_replay.core.compiled import borrowing
+from copem_replay.core.object_list import Entries, most_probable_classes
+from copem_replay.core.tracks import CLASSES, SAME_INSTANT_S, VALUES, Bool, Float, Int, Scene, Tracks, UnitFaults
 from copem_replay.core.view_geometry import ViewGeometry
 
-if TYPE_CHECKING:  # it takes long to import
+if TYPE_CHECKING:
     import pandas as pd
 
 
-class Sources(NamedTuple):
-    """Entries that units' lists hold, `valid (S, P)` and else (P,), and which of them make up each fused row."""
+class EntrySources(NamedTuple):
+    """Entries of units' lists, `valid (S, P)` and else (P,), and those that make up each fused row: see FusedTracks."""
 
     valid: Bool
     captured_s: Float
@@ -67,14 +65,14 @@ class FusedTracks:
         order = self.fused.by_frame[0]
         rows = order[self.fused.valid[0, order]]
         ids = np.array([*self.scene.object_ids, None], dtype=object)  # −1 is the last
-        said = self.said
+        entries = self.said
         columns: dict[str, object] = {
             "available_s": self.fused.common_arrives_s[self.fused.frame_ix[rows]],
             "captured_s": self.captured_s[0, rows],
             "object_id": ids[self.fused.row_object_ix[rows]],
-            "track_id": np.full(len(rows), -1) if said is None else said["track_id"][rows],
+            "track_id": np.full(len(rows), -1) if entries is None else entries["track_id"][rows],
             "object_class": np.array(CLASSES, dtype=object)[self.class_of(self.scene)[rows]],
-            "existence": np.full(len(rows), np.nan) if said is None else said["existence"][rows],
+            "existence": np.full(len(rows), np.nan) if entries is None else entries["existence"][rows],
         }
         for name in (*VALUES, "cov_ee_m2", "cov_en_m2", "cov_nn_m2"):
             values = getattr(self.fused, name)
@@ -82,7 +80,7 @@ class FusedTracks:
         return pd.DataFrame(columns)
 
     def arriving(self, heard: Tracks, issue_s: Float) -> FusedTracks:
-        """The same of lists that only arrived at other times; `issue_s (F,)`: when the fused ones are available."""
+        """These tracks with lists `heard` arriving at other times; `issue_s (F,)`: when fused lists are available."""
         return replace(self, heard=heard, fused=replace(self.fused, arrives_s=issue_s[None]))
 
     @cached_property
@@ -115,15 +113,15 @@ class FusedTracks:
     @cached_property
     def _newest_and_first(self) -> tuple[Float, Int]:
         newest_s, first = np.empty(self.fused.valid.shape), np.empty(self.fused.valid.shape, dtype=np.int64)
-        _of_each(self.sources, newest_s, first)
+        _find_of_each_row(self.sources, newest_s, first)
         return newest_s, first
 
     @property
-    def sources(self) -> Sources:
+    def sources(self) -> EntrySources:
         """What the rows are made of, for compiled code."""
         heard = self.heard
         arrives_s = heard.common_arrives_s[heard.frame_ix]
-        return Sources(heard.valid, heard.row_captured_s, arrives_s, heard.row_unit_ix, self.entries, self.start)
+        return EntrySources(heard.valid, heard.row_captured_s, arrives_s, heard.row_unit_ix, self.entries, self.start)
 
     @cached_property
     def _place(self) -> Int:
@@ -151,7 +149,7 @@ class FusedTracks:
     def class_of(self, scene: Scene) -> Int:
         """(P,) index into CLASSES: the true one, or what the fusion takes it for."""
         if self.said is not None:
-            likely: Int = most_probable_of_each(self.said["class_probability"])
+            likely: Int = most_probable_classes(self.said["class_probability"])
             return likely
         classes: Int = scene.object_class[self.fused.row_object_ix].astype(np.int64)
         return classes
@@ -160,8 +158,8 @@ class FusedTracks:
     def listed_rows(self) -> tuple[Int, Int]:
         """Rows of `fused` in the first run's lists, list by list, and where each list begins, (F + 1,)."""
         order, bounds = self.fused.by_frame
-        there = self.fused.valid[0, order]
-        return order[there], np.concatenate([[0], np.cumsum(there)])[bounds]
+        valid = self.fused.valid[0, order]
+        return order[valid], np.concatenate([[0], np.cumsum(valid)])[bounds]
 
     def listed(self, frame: int) -> list[int]:
         """Rows of `fused` that are in one list."""
@@ -171,21 +169,22 @@ class FusedTracks:
 
 
 @borrowing
-def newest_and_first(of: Sources, s: int, p: int) -> tuple[float, int]:
-    """Row p in run s: the newest capture, −inf: none, and the unit whose list arrived first, −1: none."""
+def find_newest_and_first(sources: EntrySources, s: int, p: int) -> tuple[float, int]:
+    """Of row p in run s the newest capture, −inf: none, and the unit whose list arrived first, −1: none."""
     newest_s, first, best_s = -np.inf, -1, np.inf
-    for c in range(of.start[p], of.start[p + 1]):
-        entry = of.entries[c]
-        if of.valid[s, entry]:
-            newest_s = max(newest_s, of.captured_s[entry])
+    for c in range(sources.start[p], sources.start[p + 1]):
+        entry = sources.entries[c]
+        if sources.valid[s, entry]:
+            newest_s = max(newest_s, sources.captured_s[entry])
             # Entries are in the order of units: of those that arrive together (within 1 µs) the first stays.
-            if of.arrives_s[entry] < best_s - 1e-6:
-                best_s, first = of.arrives_s[entry], of.unit_ix[entry]
+            if sources.arrives_s[entry] < best_s - SAME_INSTANT_S:
+                best_s, first = sources.arrives_s[entry], sources.unit_ix[entry]
     return newest_s, first
 
 
 @borrowing
-def _of_each(of: Sources, newest_s: Float, first: Int) -> None:
+def _find_of_each_row(sources: EntrySources, newest_s: Float, first: Int) -> None:
+    """Fill `newest_s (S, P)` and `first (S, P)` with what `find_newest_and_first` gives of each row."""
     for s in range(newest_s.shape[0]):
         for p in range(newest_s.shape[1]):
-            newest_s[s, p], first[s, p] = newest_and_first(of, s, p)
+            newest_s[s, p], first[s, p] = find_newest_and_first(sources, s, p)

@@ -1,33 +1,35 @@
-"""States between recorded frames.
+"""Interpolation: states between recorded frames, turning in space, and tables over two axes.
 
 A state between two frames of an object is interpolated linearly (yaw the short way round) over at most
 `max_gap_s`; in a longer gap the object is absent, and so it is before its first frame and after its last.
 Within 1 µs of a frame the recorded state itself is taken.
 
 Only where a list states another instant than that of its capture, an object that was there at the capture is there at
-the stated instant, too: its nearest recorded state is moved by its velocity (`at_stated_instants`).
+the stated instant, too: its nearest recorded state is moved by its velocity (`interpolate_at_stated_instants`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from copem_replay.core.tracks import SAME_INSTANT_NS, VALUES, Bool, Float, Int, Tracks, spliced
+from copem_replay.core.tracks import SAME_INSTANT_NS, VALUES, Bool, Float, Int, Tracks, splice_rows
 
 _AT_ONCE = 1 << 20
-"""States interpolated at a time, for memory's sake (chosen)."""
+"""States interpolated at a time: arrays of 8 MB each, however long the log. No result depends on it."""
 AROUND_S = 1e-3
-"""More than all tolerances of time together."""
+"""Seconds by which a stretch of a log is widened before it is cut: more than all tolerances of time together."""
 
 
-def at_instants(truth: Tracks, stamps_ns: Int, *, t0_ns: int, max_gap_s: float) -> Tracks:
+def interpolate_at_instants(truth: Tracks, stamps_ns: Int, *, t0_ns: int, max_gap_s: float) -> Tracks:
     """The world at other instants: one list per instant of `stamps_ns (F,)` (ascending), of all objects then there."""
-    if _as_it_is(truth, stamps_ns):
+    if _is_own_frames(truth, stamps_ns):
         return truth
-    first, last = _ends(truth)
+    first, last = _track_ends(truth)
     lo = np.searchsorted(stamps_ns, first - SAME_INSTANT_NS, side="left")
     hi = np.searchsorted(stamps_ns, last + SAME_INSTANT_NS, side="right")
     counts = np.maximum(hi - lo, 0)
@@ -54,30 +56,32 @@ def at_instants(truth: Tracks, stamps_ns: Int, *, t0_ns: int, max_gap_s: float) 
     )
 
 
-def at_stated_instants(
+def interpolate_at_stated_instants(
     truth: Tracks, stamps_ns: Int, captured_ns: tuple[Int, Int], *, t0_ns: int, max_gap_s: float
 ) -> Tracks:
     """The world at instants `stamps_ns (F,)`, ascending, that lists state, whose captures are others.
 
     `captured_ns`: the earliest and the latest capture (F,) of the lists that state each instant. An object that is
     there at the capture, but not at the stated instant, has the first state after it moved back by its velocity, or
-    the last state before it moved on, by at most `max_gap_s`. All else is as of `at_instants`.
+    the last state before it moved on, by at most `max_gap_s`. All else is as in `interpolate_at_instants`.
     """
-    world = at_instants(truth, stamps_ns, t0_ns=t0_ns, max_gap_s=max_gap_s)
+    world = interpolate_at_instants(truth, stamps_ns, t0_ns=t0_ns, max_gap_s=max_gap_s)
     if not len(truth.frame_ix):
         return world
-    row, frame = _beyond_stays(truth, stamps_ns, captured_ns, int(max_gap_s * 1e9))
-    return spliced([world, _moved_states(truth, world, row, frame)])[0] if len(row) else world
+    row, frame = _select_beyond_stays(truth, stamps_ns, captured_ns, int(max_gap_s * 1e9))
+    return splice_rows([world, _extrapolate_states(truth, world, row, frame)])[0] if len(row) else world
 
 
-def _beyond_stays(truth: Tracks, stamps_ns: Int, captured_ns: tuple[Int, Int], max_gap_ns: int) -> tuple[Int, Int]:
+def _select_beyond_stays(
+    truth: Tracks, stamps_ns: Int, captured_ns: tuple[Int, Int], max_gap_ns: int
+) -> tuple[Int, Int]:
     """Where states are moved: from which rows (K,) of the truth, to which instants (K,), by track and instant."""
     own_ns = truth.stamp_ns[truth.frame_ix]
     apart = np.diff(own_ns) > max_gap_ns + SAME_INSTANT_NS
     apart[truth.start[1:-1] - 1] = True
     first, last = np.flatnonzero(np.append(True, apart)), np.flatnonzero(np.append(apart, True))
     earliest_ns, latest_ns = captured_ns
-    found = []
+    pairs = []
     for row, from_ns, until_ns in (
         (first, own_ns[first] - max_gap_ns, own_ns[first] - SAME_INSTANT_NS),
         (last, own_ns[last] + SAME_INSTANT_NS + 1, own_ns[last] + max_gap_ns + 1),
@@ -87,13 +91,13 @@ def _beyond_stays(truth: Tracks, stamps_ns: Int, captured_ns: tuple[Int, Int], m
         rows = np.repeat(row, counts)
         frames = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts) + np.repeat(begin, counts)
         back = stamps_ns[frames] < own_ns[rows]
-        there = np.where(
+        captured_there = np.where(
             back,
             latest_ns[frames] >= own_ns[rows] - SAME_INSTANT_NS,
             earliest_ns[frames] <= own_ns[rows] + SAME_INSTANT_NS,
         )
-        found.append(np.stack([rows[there], frames[there]]))
-    rows, frames = np.concatenate(found, axis=1)
+        pairs.append(np.stack([rows[captured_there], frames[captured_there]]))
+    rows, frames = np.concatenate(pairs, axis=1)
     # In a gap both of its ends may be near: the nearer one counts, of two as near the earlier.
     order = np.lexsort((rows, np.abs(stamps_ns[frames] - own_ns[rows]), frames, truth.track_ix[rows]))
     rows, frames = rows[order], frames[order]
@@ -102,7 +106,7 @@ def _beyond_stays(truth: Tracks, stamps_ns: Int, captured_ns: tuple[Int, Int], m
     return rows[new], frames[new]
 
 
-def _moved_states(truth: Tracks, world: Tracks, row: Int, frame: Int) -> Tracks:
+def _extrapolate_states(truth: Tracks, world: Tracks, row: Int, frame: Int) -> Tracks:
     """Rows (K,) of the truth in lists (K,) of the world, by track and list: moved to its instants by their velocity."""
     values = {name: getattr(truth, name)[:, row] for name in VALUES}
     elapsed_s = (world.stamp_ns[frame] - truth.stamp_ns[truth.frame_ix[row]]) * 1e-9
@@ -120,7 +124,7 @@ def _moved_states(truth: Tracks, world: Tracks, row: Int, frame: Int) -> Tracks:
     )
 
 
-def _as_it_is(truth: Tracks, stamps_ns: Int) -> bool:
+def _is_own_frames(truth: Tracks, stamps_ns: Int) -> bool:
     """Whether these are the truth's own frames, and no object misses one of its stay: nothing is in between."""
     if not np.array_equal(stamps_ns, truth.stamp_ns) or (np.diff(stamps_ns) <= 2 * SAME_INSTANT_NS).any():
         return False
@@ -129,7 +133,7 @@ def _as_it_is(truth: Tracks, stamps_ns: Int) -> bool:
     return not missed.any()
 
 
-def states_at(
+def interpolate_states(
     truth: Tracks, object_ix: Int, time_s: Float, *, t0_ns: int, max_gap_s: float
 ) -> tuple[dict[str, Float], Bool]:
     """States of objects `(K,)` at times `(K,)`: a column `(K,)` per value, and whether the object is there then."""
@@ -141,7 +145,7 @@ def states_at(
     return _interpolate(truth, track, stamp_ns, max_gap_s)
 
 
-def _ends(truth: Tracks) -> tuple[Int, Int]:
+def _track_ends(truth: Tracks) -> tuple[Int, Int]:
     """(E,) first and last stamp of each track."""
     return truth.stamp_ns[truth.frame_ix[truth.start[:-1]]], truth.stamp_ns[truth.frame_ix[truth.start[1:] - 1]]
 
@@ -156,19 +160,22 @@ def _interpolate(truth: Tracks, track: Int, stamp_ns: Int, max_gap_s: float) -> 
     # One sorted axis for all tracks: each gets its own stretch, long enough for the whole log.
     origin, stretch = own_ns.min(), int(np.ptp(own_ns)) + 10 * SAME_INSTANT_NS
     axis = own_ns - origin + truth.track_ix * stretch
-    ends = _ends(truth)
+    ends = _track_ends(truth)
     for begin in range(0, len(track), _AT_ONCE):
         part = slice(begin, begin + _AT_ONCE)
-        states, present[part] = _between(truth, own_ns, axis, ends, track[part], stamp_ns[part], max_gap_s)
+        states, present[part] = _interpolate_rows(truth, own_ns, axis, ends, track[part], stamp_ns[part], max_gap_s)
         for name, values in states.items():
             columns[name][part] = values
     return columns, present
 
 
-def _between(
+def _interpolate_rows(
     truth: Tracks, own_ns: Int, axis: Int, ends: tuple[Int, Int], track: Int, stamp_ns: Int, max_gap_s: float
 ) -> tuple[dict[str, Float], Bool]:
-    """The same of some of them. `own_ns (P,)`: stamps of rows, `axis (P,)`: ascending over all tracks."""
+    """Columns (K,) of the state, NaN where absent, and presence (K,), as `_interpolate` joins them.
+
+    `own_ns (P,)`: stamps of rows; `axis (P,)`: the axis they are sorted on, ascending over all tracks.
+    """
     origin, stretch = own_ns.min(), int(np.ptp(own_ns)) + 10 * SAME_INSTANT_NS
     first, last = ends
     present = (track >= 0) & (stamp_ns >= first[track] - SAME_INSTANT_NS) & (stamp_ns <= last[track] + SAME_INSTANT_NS)
@@ -186,13 +193,86 @@ def _between(
         values = getattr(truth, name)[0]
         step = values[after] - values[before]
         if name == "yaw_rad":
-            step = wrap(step)
+            step = wrap_angles(step)
         value = values[before] + weight * step
         columns[name] = np.where(present, np.where(exact, values[before], value), np.nan)
-    columns["yaw_rad"] = np.where(exact, columns["yaw_rad"], wrap(columns["yaw_rad"]))
+    columns["yaw_rad"] = np.where(exact, columns["yaw_rad"], wrap_angles(columns["yaw_rad"]))
     return columns, present
 
 
-def wrap(angle_rad: Float) -> Float:
+def wrap_angles(angle_rad: Float) -> Float:
     """Angles brought to (−π, π]."""
     return np.pi - np.mod(np.pi - angle_rad, 2 * np.pi)
+
+
+# Rotations as unit quaternions (K, 4), or (4,): x, y, z, w. scipy.spatial has them, too, but its import takes as long
+# as reading a small recording.
+
+
+def rotate_vectors(rotation: Float, vector: Float) -> Float:
+    """Vectors (K, 3), turned by a rotation each, or all by one."""
+    axis, w = rotation[..., :3], rotation[..., 3:]
+    across = np.cross(axis, vector)
+    result: Float = vector + 2.0 * (w * across + np.cross(axis, across))
+    return result
+
+
+def compose_rotations(outer: Float, inner: Float) -> Float:
+    """The rotation (K, 4) by `inner`, then by `outer`."""
+    a, b, v, w = outer[..., :3], inner[..., :3], outer[..., 3:], inner[..., 3:]
+    axis = v * b + w * a + np.cross(a, b)
+    return np.concatenate([axis, v * w - (a * b).sum(axis=-1, keepdims=True)], axis=-1)
+
+
+def invert_rotation(rotation: Float) -> Float:
+    """The inverse rotation."""
+    result: Float = rotation * np.array([-1.0, -1.0, -1.0, 1.0])
+    return result
+
+
+def yaw_of(rotation: Float) -> Float:
+    """(K,) headings, radians, (−π, π]."""
+    x, y, z, w = rotation.T
+    yaw: Float = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return yaw
+
+
+# Tables of numbers over two axes, bilinear between the given values, constant beyond them.
+
+Axis = tuple[str, Sequence[float]]
+"""An axis of a table: its name, and its values."""
+
+
+def check_grid(first: Axis, second: Axis, name: str, rows: Sequence[Sequence[float]]) -> None:
+    """Raise ValueError unless both axes increase and `name` has a row for each value of the first, one number each."""
+    for axis_name, axis in (first, second):
+        if any(b <= a for a, b in pairwise(axis)):
+            raise ValueError(f"{axis_name}: expected increasing values, found {list(axis)}")
+    expected, widths = (len(first[1]), len(second[1])), {len(row) for row in rows}
+    if len(rows) != expected[0] or widths != {expected[1]}:
+        raise ValueError(
+            f"{name}: expected {expected[0]} rows ({first[0]}) of {expected[1]} values ({second[0]}), "
+            f"found {len(rows)} rows of {sorted(widths)}"
+        )
+
+
+def interpolate_bilinear(
+    first: Sequence[float], second: Sequence[float], rows: Sequence[Sequence[float]], x: Float, y: Float
+) -> Float:
+    """(P,) the table at x (P,) on its first axis and y (P,) on its second."""
+    table = np.array(rows)
+    i, a = locate_on_axis(np.array(first), x)
+    j, b = locate_on_axis(np.array(second), y)
+    i1, j1 = np.minimum(i + 1, table.shape[0] - 1), np.minimum(j + 1, table.shape[1] - 1)
+    low = table[i, j] * (1 - b) + table[i, j1] * b
+    high = table[i1, j] * (1 - b) + table[i1, j1] * b
+    result: Float = low * (1 - a) + high * a
+    return result
+
+
+def locate_on_axis(axis: Float, value: Float) -> tuple[Int, Float]:
+    """Cell (P,) and place within it (P,), 0 … 1, of values on an ascending axis; the ends hold beyond them."""
+    if len(axis) == 1:
+        return np.zeros(len(value), dtype=int), np.zeros(len(value))
+    cell = np.clip(np.searchsorted(axis, value, side="right") - 1, 0, len(axis) - 2)
+    return cell, np.clip((value - axis[cell]) / (axis[cell + 1] - axis[cell]), 0.0, 1.0)

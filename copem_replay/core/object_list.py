@@ -11,10 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from copem_replay.core.tracks import CLASSES, Float, Int
+from copem_replay.core.compiled import borrowing
+from copem_replay.core.tracks import CLASS_GROUPS, CLASSES, Bool, Float, Int
 
 ENTRY = np.dtype(
     [
@@ -48,17 +50,17 @@ TellsOf = Literal["capture", "now"]
 """The instant that an entry tells of: its newest capture, or the instant its list is available."""
 
 
-def taken(entries: Entries, rows: Int) -> Entries:
-    """The entries at these rows. As words of memory, several times as fast as NumPy copies them, field by field."""
-    return _words(entries)[rows].view(ENTRY)[:, 0]
+def take_entries(entries: Entries, rows: Int) -> Entries:
+    """The entries at these rows. Copied as words of memory: several times as fast as field by field."""
+    return _view_as_words(entries)[rows].view(ENTRY)[:, 0]
 
 
-def joined(parts: Sequence[Entries]) -> Entries:
-    """All entries one after the other, copied as `taken` does."""
-    return np.concatenate([_words(entries_of(0)), *map(_words, parts)]).view(ENTRY)[:, 0]
+def join_entries(parts: Sequence[Entries]) -> Entries:
+    """All entries one after the other, copied as `take_entries` does."""
+    return np.concatenate([_view_as_words(entries_of(0)), *map(_view_as_words, parts)]).view(ENTRY)[:, 0]
 
 
-def _words(entries: Entries) -> Int:
+def _view_as_words(entries: Entries) -> Int:
     words: Int = np.ascontiguousarray(entries).view(np.int64).reshape(len(entries), ENTRY.itemsize // 8)
     return words
 
@@ -127,3 +129,42 @@ class Inputs:
     arrived: Int  # (A,) lists in order of arrival; lists that never arrive are not among them
     arrived_start: Int  # (K + 1,) `arrived[arrived_start[k] : arrived_start[k + 1]]` arrive at instant k
     keeps_s: Float | None = None  # (U,) for how long an object that a unit's messages leave out may be there; None: 0
+
+
+# The classes of entries.
+
+_OTHER = CLASSES.index("other")
+
+
+def _build_agreement() -> Bool:
+    agree = np.eye(len(CLASSES), dtype=np.bool_)
+    vehicle = CLASSES.index("vehicle")
+    agree[_OTHER] = agree[:, _OTHER] = True
+    for name in CLASS_GROUPS["vehicles"]:
+        agree[vehicle, CLASSES.index(name)] = agree[CLASSES.index(name), vehicle] = True
+    return agree
+
+
+AGREE: Bool = _build_agreement()
+"""(C, C) by indices into CLASSES: the classes are equal, or one is `other`, which says nothing, or one is `vehicle`
+(not said which) and the other one of the vehicles. Symmetric, not transitive: a car and a bicycle both agree with
+`other`."""
+
+
+@borrowing
+def most_probable_class(probability: Float) -> int:
+    """Index of the largest of the probabilities `(C,)`, the first of equals; `other` where nothing is said."""
+    best = 0
+    for c in range(1, len(probability)):
+        if probability[c] > probability[best]:
+            best = c
+    return best if probability[best] > 0 else _OTHER
+
+
+@nb.njit(cache=True, nogil=True)
+def most_probable_classes(probability: Float) -> Int:
+    """(N,) `most_probable_class` of each row of `probability (N, C)`."""
+    best = np.empty(len(probability), np.int64)
+    for i in range(len(probability)):
+        best[i] = most_probable_class(probability[i])
+    return best

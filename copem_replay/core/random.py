@@ -27,9 +27,9 @@ from copem_replay.core.tracks import Bool, Float, Int
 Words = NDArray[np.uint64]
 
 
-@lru_cache(2**16, typed=True)  # of the same few units and objects, chunk after chunk
+@lru_cache(2**16, typed=True)  # few units and objects, asked for in every time chunk
 def stable_hash(*parts: str | int) -> int:
-    """A 64-bit hash that is the same on every machine and in every process."""
+    """A 64-bit hash that is equal on every machine and in every process."""
     return int.from_bytes(blake2b(json.dumps(parts).encode(), digest_size=8).digest(), "little")
 
 
@@ -51,7 +51,7 @@ class RandomKey:
     stamp_ns: Int
 
     def take(self, rows: Int) -> RandomKey:
-        """The same for some rows only: their numbers do not change."""
+        """The addresses of the rows `rows (K,)` alone: their numbers do not change."""
         return RandomKey(self.units, self.unit_ix[rows], self.object_word[rows], self.stamp_ns[rows])
 
 
@@ -65,20 +65,20 @@ class CounterRng:
     def uniform(self, purpose: str, random_key: RandomKey, runs: Int) -> Float:
         """(S, P) uniform in (0, 1), ends excluded, for runs (S,)."""
         out = np.empty((len(runs), len(random_key.stamp_ns)))
-        _uniform(*self.words(purpose, random_key, runs), out)
+        _draw_uniform(*self.words(purpose, random_key, runs), out)
         return out
 
     def bernoulli(self, purpose: str, random_key: RandomKey, runs: Int, probability: Float) -> Bool:
         """(S, P) True with `probability (P,)`: the addressed uniform is below it (0: never, 1: always)."""
         out = np.empty((len(runs), len(random_key.stamp_ns)), dtype=np.bool_)
-        _bernoulli(*self.words(purpose, random_key, runs), np.ascontiguousarray(probability), out)
+        _draw_bernoulli(*self.words(purpose, random_key, runs), np.ascontiguousarray(probability), out)
         return out
 
     def normal(self, purpose: str, random_key: RandomKey, runs: Int, where: Bool | None = None) -> Float:
         """(S, P) standard normal; 0 where `where (S, P)` is False, which costs nothing."""
         out = np.zeros((len(runs), len(random_key.stamp_ns)))
         mask = np.ones((1, 1), dtype=np.bool_) if where is None else where
-        _normal(*self.words(purpose, random_key, runs), mask, out)
+        _draw_normal(*self.words(purpose, random_key, runs), mask, out)
         return out
 
     def words(self, purpose: str, random_key: RandomKey, runs: Int) -> tuple[Words, Words, Words, Words]:
@@ -92,10 +92,12 @@ _LOW = np.uint64(0xFFFFFFFF)
 _SHIFT = np.uint64(32)
 _M0, _M1 = np.uint64(0xD2511F53), np.uint64(0xCD9E8D57)
 _W0, _W1 = np.uint64(0x9E3779B9), np.uint64(0xBB67AE85)
+"""Philox's multipliers, and its increments of the key."""
 _UNIT = 2.0**-52
 _MIDDLE = 0.425
+"""Within so much of the median `normal_quantile` has its central formula (AS 241)."""
 _WORTH_ALL = 6
-"""Of fewer numbers than one in so many it takes longer to draw all (measured)."""
+"""If fewer than one number in so many is wanted, drawing all takes longer than drawing each (measured)."""
 
 
 @nb.njit(inline="always")
@@ -121,21 +123,21 @@ def _unit_interval(key: np.uint64, word: np.uint64, stamp: np.uint64, run: np.ui
 
 
 @nb.njit(cache=True, nogil=True)
-def _uniform(key: Words, word: Words, stamp: Words, runs: Words, out: Float) -> None:
+def _draw_uniform(key: Words, word: Words, stamp: Words, runs: Words, out: Float) -> None:
     for s in range(out.shape[0]):
         for p in range(out.shape[1]):
             out[s, p] = _unit_interval(key[p], word[p], stamp[p], runs[s])
 
 
 @nb.njit(cache=True, nogil=True)
-def _bernoulli(key: Words, word: Words, stamp: Words, runs: Words, probability: Float, out: Bool) -> None:
+def _draw_bernoulli(key: Words, word: Words, stamp: Words, runs: Words, probability: Float, out: Bool) -> None:
     for s in range(out.shape[0]):
         for p in range(out.shape[1]):
             out[s, p] = _unit_interval(key[p], word[p], stamp[p], runs[s]) < probability[p]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")  # else a division is a branch, and loops are not vectorised
-def _normal(key: Words, word: Words, stamp: Words, runs: Words, where: Bool, out: Float) -> None:
+def _draw_normal(key: Words, word: Words, stamp: Words, runs: Words, where: Bool, out: Float) -> None:
     everywhere = where.shape[0] == 1 and where.shape[1] == 1
     uniform = np.empty(out.shape[1])
     for s in range(out.shape[0]):
@@ -144,11 +146,11 @@ def _normal(key: Words, word: Words, stamp: Words, runs: Words, where: Bool, out
                 if where[s, p]:
                     out[s, p] = normal_quantile(_unit_interval(key[p], word[p], stamp[p], runs[s]))
             continue
-        # All of them at once, as if none were in the tails, take less time than half of them one by one.
+        # To draw all at once, as if none were in the tails, takes less time than to draw half of them one by one.
         for p in range(out.shape[1]):
             uniform[p] = _unit_interval(key[p], word[p], stamp[p], runs[s])
         for p in range(out.shape[1]):
-            out[s, p] = _in_the_middle(uniform[p] - 0.5)
+            out[s, p] = _central_quantile(uniform[p] - 0.5)
         for p in range(out.shape[1]):
             if not (everywhere or where[s, p]):
                 out[s, p] = 0.0
@@ -157,8 +159,8 @@ def _normal(key: Words, word: Words, stamp: Words, runs: Words, where: Bool, out
 
 
 @nb.njit(inline="always")
-def _in_the_middle(q: float) -> float:
-    """Of `normal_quantile` what lies at most 0.425 from the median, at u = 0.5 + q."""
+def _central_quantile(q: float) -> float:
+    """`normal_quantile` at u = 0.5 + q, |q| ≤ 0.425."""
     r = 0.180625 - q * q
     num = 2.5090809287301226727e3
     num = num * r + 3.3430575583588128105e4
@@ -187,7 +189,7 @@ def normal_quantile(u: float) -> float:
     """
     q = u - 0.5
     if abs(q) <= _MIDDLE:
-        return _in_the_middle(q)
+        return _central_quantile(q)
     r = np.sqrt(-np.log(u if q < 0 else 1.0 - u))
     if r <= 5.0:
         r -= 1.6

@@ -52,7 +52,10 @@ NO_CAPTURE_NS = np.iinfo(np.int64).min
 """Stamp of a fused list at an instant at which no list is recent enough."""
 
 SAME_INSTANT_NS = 1_000
-"""Two instants closer than this are one (1 µs, from the contract)."""
+"""Two instants no farther apart than this are one: 1 µs, far below any interval of lists, far above rounding of
+stamps."""
+SAME_INSTANT_S = SAME_INSTANT_NS * 1e-9  # as stamps become seconds: a difference of 1 µs is one instant
+"""`SAME_INSTANT_NS` in seconds."""
 
 TRUTH = "truth"
 """Name of the unit that is no unit: the world as recorded."""
@@ -219,7 +222,7 @@ class Tracks:
         return np.lexsort((self.row_object_ix, self.x_m[0], self.frame_ix))
 
     def with_values(self, **columns: Any) -> Tracks:
-        """The same rows of the same lists with other arrivals or values: what is known of the rows is kept."""
+        """These rows in their lists with other arrivals or values; what has been computed about the rows is kept."""
         result = replace(self, **columns)
         vars(result).update({name: vars(self)[name] for name in _OF_ROWS if name in vars(self)})
         return result
@@ -263,7 +266,7 @@ class Tracks:
         return self.take_rows(np.sort(order[bounds[first] : bounds[after]]))
 
 
-def joined(units: tuple[str, ...], pieces: Sequence[Tracks]) -> Tracks:
+def join_tracks(units: tuple[str, ...], pieces: Sequence[Tracks]) -> Tracks:
     """Tracks of several units as one; each piece has lists, and units, of its own. `units`: of all, in their order.
 
     Values of a piece that all runs share are repeated where another's differ; a variance that only some have is 0 for
@@ -305,10 +308,10 @@ def joined(units: tuple[str, ...], pieces: Sequence[Tracks]) -> Tracks:
     )
 
 
-def spliced(pieces: Sequence[Tracks], *, states: bool = True) -> tuple[Tracks, Int]:
-    """Rows of the same lists as one, and where each comes from: its place (P,) in the pieces one after the other.
+def splice_rows(pieces: Sequence[Tracks], *, states: bool = True) -> tuple[Tracks, Int]:
+    """Rows of pieces that share their lists, as one; and (P,) the place of each among the rows of piece after piece.
 
-    `states=False`: states are not needed, they are 0.
+    `states=False`: states are not needed and become 0.
     """
     unit_ix, object_ix, frame_ix = (
         np.concatenate([getattr(piece, name) for piece in pieces])
@@ -339,4 +342,45 @@ VALUES = ("x_m", "y_m", "z_m", "yaw_rad", "vx_mps", "vy_mps", "length_m", "width
 UNCERTAINTIES = tuple(f.name for f in fields(Tracks) if f.default is None)
 _BY_RUN = ("arrives_s", "valid", *VALUES, *UNCERTAINTIES)
 _OF_ROWS = ("track_ix", "row_object_ix", "row_unit_ix", "row_captured_s", "by_frame")
-"""Properties that depend on neither arrivals nor values."""
+"""Properties of Tracks that depend on neither arrivals nor values."""
+
+
+def append_tracks(tracks: Tracks, others: Tracks) -> Tracks:
+    """The tracks and then the others, both of one run and in the lists that both have.
+
+    Variances that only one of them states are 0 in the other.
+    """
+    columns: dict[str, Any] = {}
+    for name in ("valid", *VALUES, *UNCERTAINTIES):
+        stated = [getattr(part, name) for part in (tracks, others)]
+        if all(column is None for column in stated):
+            continue
+        parts = zip((tracks, others), stated, strict=True)
+        filled = [np.zeros((1, len(part.frame_ix))) if column is None else column for part, column in parts]
+        columns[name] = np.concatenate(filled, axis=1)
+    for name in ("unit_ix", "object_ix", "frame_ix"):
+        columns[name] = np.concatenate([getattr(tracks, name), getattr(others, name)])
+    return replace(tracks, start=np.concatenate([tracks.start, others.start[1:] + tracks.start[-1]]), **columns)
+
+
+@dataclass(frozen=True)
+class TimeChunk:
+    """Instants from `from_s` on and before `until_s`, in seconds of the log."""
+
+    from_s: float = -np.inf
+    until_s: float = np.inf
+
+
+WHOLE = TimeChunk()
+"""The whole of a log."""
+
+
+@dataclass(frozen=True)
+class UnitFaults:
+    """Faults of units' lists in one run, for notes and display; no fusion knows of them.
+
+    `ghosts (G,)`: rows of the lists that are about no object. `not_made (F,)`: lists that are missing in an outage.
+    """
+
+    ghosts: Int
+    not_made: Bool

@@ -1,4 +1,4 @@
-"""Types that the engine and the models of a PEM exchange."""
+"""What models of a PEM are handed and give: how objects look from a unit, noise, and errors."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from copem_replay.core.tracks import Float, Int
 
 Noise = Callable[[str], Float]
-"""`noise(name)` → (S, P) standard normals, addressed: the same name gives the same numbers."""
+"""`noise(name)` → (S, P) standard normals, addressed by their name: asked for again, they are equal."""
 
 
 @dataclass(frozen=True)
 class ViewGeometry:
     """The view of each observation from its unit. All (P,); nothing here depends on the run.
 
-    `observations` gives the same as a table.
+    `cr.observations` gives these as a table.
 
     >>> view = cr.ViewGeometry(*np.full((10, 3), 0.5))
     >>> view.take(np.array([0, 2])).visible_share

@@ -1,4 +1,7 @@
-"""YAML 1.2 as plain data and back: `on`, `off`, `yes`, `no`, dates and 1_000 are text, and each key has its line."""
+"""YAML 1.2 as plain data and back.
+
+`on`, `off`, `yes`, `no`, dates and 1_000 are text, and each key has its line.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,7 @@ from ruamel.yaml.nodes import MappingNode, Node, ScalarNode
 from ruamel.yaml.scalarstring import DoubleQuotedScalarString
 
 Key = tuple[str | int, ...]
-"""The way to a value: keys and places in lists."""
+"""The path to a value: keys and places in lists."""
 
 
 class NotYamlError(Exception):
@@ -32,19 +35,19 @@ class AliasesError(NotYamlError):
     """A text is YAML, and its aliases stand for more than any use has."""
 
 
-def read(text: str) -> tuple[Any, dict[Key, int], list[tuple[Key, int, str]]]:
+def parse_yaml(text: str) -> tuple[Any, dict[Key, int], list[tuple[Key, int, str]]]:
     """Plain data, the line of each key, and problems that leave the rest readable (key, line, message).
 
     Raises NotYamlError, AliasesError.
     """
-    root = composed(text)
+    root = compose_nodes(text)
     if root is None:
         return None, {(): 1}, []
-    reading = _Reading()
+    reading = _NodeReader()
     return reading.plain(root, ()), reading.lines, reading.problems
 
 
-def composed(text: str) -> Node | None:
+def compose_nodes(text: str) -> Node | None:
     """The nodes of a text, None where it is empty. Raises NotYamlError."""
     line, why = 1, ""
     try:
@@ -79,13 +82,11 @@ _CORE: tuple[tuple[re.Pattern[str], Any], ...] = (
     (re.compile(r"\.nan|\.NaN|\.NAN"), lambda text: math.nan),
 )
 """What a plain scalar stands for: the core schema of YAML 1.2.2 (10.3.2). Everything else is text."""
-
-
 _PLAIN = re.compile(r"[A-Za-z0-9_./][A-Za-z0-9_./:+-]*[A-Za-z0-9_./]|[A-Za-z]")
 """Text that has no other meaning in YAML, in a list or out of it: written without quotes if it is no number."""
 
 
-def _core(text: str) -> Any:
+def _resolve_scalar(text: str) -> Any:
     for pattern, value_of in _CORE:
         if pattern.fullmatch(text):
             return value_of(text) if len(text) < 1000 else text  # Python's own limit on digits is a few thousand
@@ -93,11 +94,11 @@ def _core(text: str) -> Any:
 
 
 _REPEATED = 200_000
-"""Characters and values that aliases of one text may stand for (chosen: hundreds of PEMs written out again)."""
+"""Characters and values that aliases of one text may stand for: enough for hundreds of PEMs written out again."""
 
 
 @dataclass
-class _Reading:
+class _NodeReader:
     """Nodes into plain data: where each key stands, and what is wrong on the way."""
 
     lines: dict[Key, int] = field(default_factory=lambda: {(): 1})
@@ -108,7 +109,7 @@ class _Reading:
 
     def plain(self, node: Node, key: Key) -> Any:
         """A node as plain data. Raises AliasesError."""
-        if id(node) in self.seen:  # by way of an alias, of it or of what it is in
+        if id(node) in self.seen:  # reached by an alias, of it or of a value it is in
             self.repeated += 1 + (len(node.value) if isinstance(node, ScalarNode) else 0)
             if self.repeated > _REPEATED:
                 raise AliasesError(
@@ -157,7 +158,7 @@ class _Reading:
         if node.tag == "tag:yaml.org,2002:str":
             return node.value
         if str(node.tag).rpartition(":")[2] in ("null", "bool", "int", "float", "timestamp", "value", "merge"):
-            return _core(node.value)
+            return _resolve_scalar(node.value)
         self._problem(node, key, f"tag {node.tag} is not known here")
         return node.value
 
@@ -165,86 +166,88 @@ class _Reading:
         self.problems.append((key, node.start_mark.line + 1, message))
 
 
-def dump(data: dict[str, Any]) -> str:
+def dump_yaml(data: dict[str, Any]) -> str:
     """Plain data as YAML 1.2 text, keys in order; short lists on one line."""
     writer = YAML(typ="rt", pure=True)
     writer.default_flow_style = None
     writer.width = 110
     text = StringIO()
-    writer.dump(_quoted(data), text)
+    writer.dump(_quote_text(data), text)
     return text.getvalue()
 
 
-def _quoted(value: Any) -> Any:
-    """Text that would not be read as the same text is put in quotes."""
+def _quote_text(value: Any) -> Any:
+    """A value in which text is put in quotes where it would else be read as something other than itself."""
     if isinstance(value, str):
-        plain = _PLAIN.fullmatch(value) and isinstance(_core(value), str)
+        plain = _PLAIN.fullmatch(value) and isinstance(_resolve_scalar(value), str)
         return value if plain else DoubleQuotedScalarString(value)
     if isinstance(value, Mapping):
-        return {_quoted(name): _quoted(inner) for name, inner in value.items()}
-    return [_quoted(inner) for inner in value] if isinstance(value, list) else value
+        return {_quote_text(name): _quote_text(inner) for name, inner in value.items()}
+    return [_quote_text(inner) for inner in value] if isinstance(value, list) else value
 
 
 @dataclass(frozen=True)
-class Noted:
+class CommentedValue:
     """A value with a comment behind it, on its line."""
 
     value: Any
     words: str
 
 
-def commented(data: Mapping[str, Any]) -> str:
-    """Plain data in which values may be `Noted`, as YAML 1.2 text: with a line of its own for each that is."""
-    return "".join(f"{line}\n" for line in _block(data))
+def dump_with_comments(data: Mapping[str, Any]) -> str:
+    """Plain data in which values may be `CommentedValue`, each of which gets a line of its own, as YAML 1.2 text."""
+    return "".join(f"{line}\n" for line in _block_lines(data))
 
 
-def _block(value: Any) -> list[str]:
+def _block_lines(value: Any) -> list[str]:
     """The lines of a value that holds more than one line."""
     lines: list[str] = []
     items = value.items() if isinstance(value, Mapping) else ((None, item) for item in value)
     for key, item in items:
-        name = "-" if key is None else f"{flow(key)}:"
-        if isinstance(item, Noted):
-            lines += [f"{name} {flow(item.value)}  # {' '.join(item.words.split())}"]
-        elif not _noted(item):
-            lines += [f"{name} {flow(item)}"]
+        name = "-" if key is None else f"{dump_on_one_line(key)}:"
+        if isinstance(item, CommentedValue):
+            lines += [f"{name} {dump_on_one_line(item.value)}  # {' '.join(item.words.split())}"]
+        elif not _has_comments(item):
+            lines += [f"{name} {dump_on_one_line(item)}"]
         elif key is None:
-            first, *rest = _block(item)
+            first, *rest = _block_lines(item)
             lines += [f"- {first}", *(f"  {line}" for line in rest)]
         else:
-            lines += [name, *(f"  {line}" for line in _block(item))]
+            lines += [name, *(f"  {line}" for line in _block_lines(item))]
     return lines
 
 
-def _noted(value: Any) -> bool:
-    """Whether anything in a value is `Noted`."""
+def _has_comments(value: Any) -> bool:
+    """Whether anything in a value is a `CommentedValue`."""
     if isinstance(value, Mapping):
-        return any(map(_noted, value.values()))
-    return isinstance(value, Noted) or (isinstance(value, list | tuple) and any(map(_noted, value)))
+        return any(map(_has_comments, value.values()))
+    return isinstance(value, CommentedValue) or (isinstance(value, list | tuple) and any(map(_has_comments, value)))
 
 
-def flow(value: Any) -> str:
+def dump_on_one_line(value: Any) -> str:
     """Plain data on one line."""
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{flow(key)}: {flow(inner)}" for key, inner in value.items()) + "}"
+        return (
+            "{" + ", ".join(f"{dump_on_one_line(key)}: {dump_on_one_line(inner)}" for key, inner in value.items()) + "}"
+        )
     if isinstance(value, list | tuple):
-        return f"[{', '.join(map(flow, value))}]"
+        return f"[{', '.join(map(dump_on_one_line, value))}]"
     if isinstance(value, str):
-        plain = _PLAIN.fullmatch(value) and isinstance(_core(value), str)
-        return value if plain else f'"{"".join(map(_escaped, value))}"'
+        plain = _PLAIN.fullmatch(value) and isinstance(_resolve_scalar(value), str)
+        return value if plain else f'"{"".join(map(_escape_character, value))}"'
     return json.dumps(value)
 
 
-def _escaped(c: str) -> str:
+def _escape_character(c: str) -> str:
     if c in '"\\':
         return f"\\{c}"
     return c if c.isprintable() else f"\\U{ord(c):08x}"
 
 
-def without_notes(value: Any) -> Any:
-    """The same as plain data."""
-    if isinstance(value, Noted):
+def strip_comments(value: Any) -> Any:
+    """A value without its comments: plain data."""
+    if isinstance(value, CommentedValue):
         return value.value
     if isinstance(value, Mapping):
-        return {key: without_notes(inner) for key, inner in value.items()}
-    return [without_notes(inner) for inner in value] if isinstance(value, list | tuple) else value
+        return {key: strip_comments(inner) for key, inner in value.items()}
+    return [strip_comments(inner) for inner in value] if isinstance(value, list | tuple) else value

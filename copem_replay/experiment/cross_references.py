@@ -1,6 +1,6 @@
-"""What an experiment file names and does not have, and what in it does not go together: seen without any log.
+"""Cross-references of an experiment: undefined names, and keys that exclude each other, checked without any log.
 
-Checked on the file's plain data, so that a typo elsewhere does not hide it.
+The file's plain data is checked, so that a problem of shape elsewhere does not hide an undefined name.
 """
 
 from __future__ import annotations
@@ -8,60 +8,60 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from copem_replay.core.text import unknown
+from copem_replay.core.errors import unknown_name_message
 from copem_replay.core.yaml import Key
-from copem_replay.experiment.file import Source
-from copem_replay.metrics.config import LONGEST_CHAIN, requires
+from copem_replay.experiment.file import ExperimentSource
+from copem_replay.metrics.config import LONGEST_CHAIN, onset_requirement
 from copem_replay.metrics.onset import Requires
 
 NO_EGO = "none"
-"""`ego: none`: no ego in this study."""
+"""The value of `ego: none`: the study has no ego."""
 
 
-def references(source: Source) -> Iterator[str]:
-    """Names that nothing bears: PEMs, units, ids of units in latencies and in `distance_to`; a run that is not made."""
+def check_references(source: ExperimentSource) -> Iterator[str]:
+    """A line for every undefined name or number and for every key that does not go with the others."""
     data = source.data
-    pems, units = _names(data.get("pems")), _names(data.get("units"))
-    for name, unit in _items(data.get("units")):
+    pems, units = _mapping_names(data.get("pems")), _mapping_names(data.get("units"))
+    for name, unit in _mapping_items(data.get("units")):
         pem = unit.get("pem")
         if _is_name(pem) and str(pem) not in pems:
-            yield source.at(("units", name, "pem"), unknown("PEM", pem, pems))
-    for name, configuration in _items(data.get("configurations")):
-        yield from _configuration(source, ("configurations", name), configuration, units)
+            yield source.at(("units", name, "pem"), unknown_name_message("PEM", pem, pems))
+    for name, configuration in _mapping_items(data.get("configurations")):
+        yield from _check_configuration(source, ("configurations", name), configuration, units)
     measure = data.get("measure")
     if isinstance(measure, dict):
         place = measure.get("distance_to", "ego")
-        unit = dict(_items(data.get("units"))).get(str(place), {})
+        unit = dict(_mapping_items(data.get("units"))).get(str(place), {})
         if place != "ego" and unit.get("recorded") is not None and unit.get("at") is None and unit.get("on") is None:
             yield source.at(
                 ("measure", "distance_to"), f"unit {place!r} has no place; say `at: [x, y]` or `on: <object id>` of it"
             )
         if _is_name(place) and place != "ego" and str(place) not in units:
-            yield source.at(("measure", "distance_to"), unknown("unit", place, ["ego", *units]))
+            yield source.at(("measure", "distance_to"), unknown_name_message("unit", place, ["ego", *units]))
         onset = measure.get("onset")
         kind = onset.get("kind") if isinstance(onset, dict) else None
-        if isinstance(kind, str) and requires(kind) is Requires.UNIT and not _modelled(data):
+        if isinstance(kind, str) and onset_requirement(kind) is Requires.UNIT and not _list_modelled_units(data):
             yield source.at(("measure", "onset"), f"{kind}: there is no unit to see anything")
-    yield from _braking(source, data)
-    yield from _carried(source, data)
-    yield from _sweep(source, data, units)
-    yield from _settings(source, data, units, pems)
+    yield from _check_braking(source, data)
+    yield from _check_carried(source, data)
+    yield from _check_sweep(source, data, units)
+    yield from _check_settings(source, data, units, pems)
     show, runs = data.get("show"), data.get("runs", 1)
-    configurations = _names(data.get("configurations"))
-    chosen = show.get("configurations") if isinstance(show, dict) else None
-    for k, name in enumerate(chosen if isinstance(chosen, list) else []):
+    configurations = _mapping_names(data.get("configurations"))
+    shown_names = show.get("configurations") if isinstance(show, dict) else None
+    for k, name in enumerate(shown_names if isinstance(shown_names, list) else []):
         if _is_name(name) and str(name) not in configurations:
-            yield source.at(("show", "configurations", k), unknown("configuration", name, configurations))
+            yield source.at(("show", "configurations", k), unknown_name_message("configuration", name, configurations))
     run = show.get("run") if isinstance(show, dict) else None
     several = enumerate(run) if isinstance(run, list) else ()
-    places: list[tuple[Key, object]] = [(("show", "run", k), one) for k, one in several] or [(("show", "run"), run)]
-    for key, one in places:
-        if type(one) is int and isinstance(runs, int) and 1 <= runs <= one:
-            yield source.at(key, f"expected a run below {runs}, found {one}")
+    shown: list[tuple[Key, object]] = [(("show", "run", k), each) for k, each in several] or [(("show", "run"), run)]
+    for key, number in shown:
+        if type(number) is int and isinstance(runs, int) and 1 <= runs <= number:
+            yield source.at(key, f"expected a run below {runs}, found {number}")
 
 
-def _braking(source: Source, data: dict[str, Any]) -> Iterator[str]:
-    """What braking and exact times need, and what they do not go with."""
+def _check_braking(source: ExperimentSource, data: dict[str, Any]) -> Iterator[str]:
+    """Keys that braking and exact times need, and keys that exclude them."""
     braking, measure = data.get("braking"), data.get("measure")
     measure = measure if isinstance(measure, dict) else {}
     confirm = measure.get("confirm")
@@ -69,12 +69,12 @@ def _braking(source: Source, data: dict[str, Any]) -> Iterator[str]:
         match = measure.get("match")
         if isinstance(match, dict) and match.get("always") is True:
             yield source.at(("measure", "exact"), "matches depend on sampled errors and have no closed form")
-        recorded = [name for name, unit in _items(data.get("units")) if unit.get("recorded") is not None]
+        recorded = [name for name, unit in _mapping_items(data.get("units")) if unit.get("recorded") is not None]
         if recorded:
             yield source.at(
                 ("measure", "exact"), f"unit {recorded[0]!r} is recorded: nothing says how probable its lists were"
             )
-        off = [name for name, unit in _items(data.get("units")) if unit.get("outages") is not None]
+        off = [name for name, unit in _mapping_items(data.get("units")) if unit.get("outages") is not None]
         if off:
             yield source.at(
                 ("measure", "exact"),
@@ -103,12 +103,12 @@ def _braking(source: Source, data: dict[str, Any]) -> Iterator[str]:
         )
 
 
-def _carried(source: Source, data: dict[str, Any]) -> Iterator[str]:
-    """What units that only some runs have, or that leave objects out of messages, do not go with."""
+def _check_carried(source: ExperimentSource, data: dict[str, Any]) -> Iterator[str]:
+    """Keys that exclude units of some runs only, and units that leave objects out of messages."""
     measure = data.get("measure")
     measure = measure if isinstance(measure, dict) else {}
     hits = measure["confirm"].get("hits", 1) if isinstance(measure.get("confirm"), dict) else 1
-    for name, unit in _items(data.get("units")):
+    for name, unit in _mapping_items(data.get("units")):
         sends = unit.get("sends")
         leaves_out = isinstance(sends, dict) and (sends.get("kind") == "cpm" or sends.get("max_objects") is not None)
         if isinstance(hits, int) and hits > 1 and leaves_out:
@@ -134,34 +134,38 @@ def _carried(source: Source, data: dict[str, Any]) -> Iterator[str]:
             )
 
 
-def _sweep(source: Source, data: dict[str, Any], units: Sequence[str]) -> Iterator[str]:
-    """Names and numbers of a sweep that there are not."""
+def _check_sweep(source: ExperimentSource, data: dict[str, Any], units: Sequence[str]) -> Iterator[str]:
+    """Names that a sweep uses and are undefined, and quantities that nothing in the experiment has."""
     sweep = data.get("sweep")
     if not isinstance(sweep, dict):
         return
-    named, configurations = sweep.get("configurations"), _names(data.get("configurations"))
+    named, configurations = sweep.get("configurations"), _mapping_names(data.get("configurations"))
     by_quantity = named.items() if isinstance(named, dict) else [(None, named)]
     for quantity, names in by_quantity:
         where: Key = ("sweep", "configurations", *([] if quantity is None else [quantity]))
         for k, name in enumerate(names if isinstance(names, list) else []):
             if _is_name(name) and str(name) not in configurations:
-                yield source.at((*where, k), unknown("configuration", name, configurations))
-    carried = [name for name, unit in _items(data.get("units")) if isinstance(unit.get("on"), dict)]
+                yield source.at((*where, k), unknown_name_message("configuration", name, configurations))
+    carried = [name for name, unit in _mapping_items(data.get("units")) if isinstance(unit.get("on"), dict)]
     if sweep.get("penetration_rate") and not carried:
         yield source.at(("sweep", "penetration_rate"), "no unit is `on: {classes, penetration_rate}`")
     if sweep.get("rate_hz") and not units:
         yield source.at(("sweep", "rate_hz"), "the experiment has no units")
     if sweep.get("ghosts_in_list") and not any(
-        isinstance(pem, dict) and pem.get("ghosts") for _, pem in _items(data.get("pems"))
+        isinstance(pem, dict) and pem.get("ghosts") for _, pem in _mapping_items(data.get("pems"))
     ):
         yield source.at(("sweep", "ghosts_in_list"), "no PEM has `ghosts: […]`")
-    if sweep.get("correlation_s") and not any(_memories(data, name, "detection") for name in _names(data.get("pems"))):
+    if sweep.get("correlation_s") and not any(
+        _list_memories(data, name, "detection") for name in _mapping_names(data.get("pems"))
+    ):
         yield source.at(("sweep", "correlation_s"), "no PEM has `memory: {detection: […]}`")
     for kind in ("loss", "burst_s"):
         if sweep.get(kind):
-            chosen = named.get(kind) if isinstance(named, dict) else named
-            yield from _swept_links(source, kind, sweep[kind], chosen if isinstance(chosen, list) else configurations)
-    others = sum(1 for _, unit in _items(data.get("units")) if unit.get("on") != "ego")
+            names_of_kind = named.get(kind) if isinstance(named, dict) else named
+            yield from _check_swept_links(
+                source, kind, sweep[kind], names_of_kind if isinstance(names_of_kind, list) else configurations
+            )
+    others = sum(1 for _, unit in _mapping_items(data.get("units")) if unit.get("on") != "ego")
     counts = sweep.get("units")
     for k, count in enumerate(counts if isinstance(counts, list) else []):
         if isinstance(count, int) and count > others:
@@ -170,100 +174,110 @@ def _sweep(source: Source, data: dict[str, Any], units: Sequence[str]) -> Iterat
             )
 
 
-def _swept_links(source: Source, kind: str, values: object, chosen: Sequence[object]) -> Iterator[str]:
-    """Links of the configurations chosen whose loss is no one number to vary, or cannot be it; that there are none."""
-    found, used = False, set()
-    for name, configuration in _items(source.data.get("configurations")):
-        if name in map(str, chosen):
+def _check_swept_links(
+    source: ExperimentSource, kind: str, values: object, configurations: Sequence[object]
+) -> Iterator[str]:
+    """Links of the swept configurations whose loss cannot be varied, or not to a value; that there are none at all."""
+    varies, used_links = False, set()
+    for name, configuration in _mapping_items(source.data.get("configurations")):
+        if name in map(str, configurations):
             link = configuration.get("link")
-            used |= set(map(str, link.values())) if isinstance(link, dict) and "kind" not in link else {str(link)}
-    for name, link in _items(source.data.get("links")):
-        if name not in used:
+            used_links |= set(map(str, link.values())) if isinstance(link, dict) and "kind" not in link else {str(link)}
+    for name, link in _mapping_items(source.data.get("links")):
+        if name not in used_links:
             continue
         reception, memory = link.get("reception"), link.get("memory")
-        of = reception.get("kind") if isinstance(reception, dict) else "constant"
-        if kind == "loss" and of not in ("constant", "gilbert_elliott"):
-            message = f"links.{name}.reception: {of} has no loss to vary; use constant or gilbert_elliott"
+        loss_kind = reception.get("kind") if isinstance(reception, dict) else "constant"
+        if kind == "loss" and loss_kind not in ("constant", "gilbert_elliott"):
+            message = f"links.{name}.reception: {loss_kind} has no loss to vary; use constant or gilbert_elliott"
             yield source.at(("sweep", kind), message)
-        found |= kind == "loss" or of == "gilbert_elliott" or (isinstance(memory, dict) and "reception" in memory)
-        if kind == "loss" and of == "gilbert_elliott" and isinstance(reception, dict):
+        varies |= (
+            kind == "loss" or loss_kind == "gilbert_elliott" or (isinstance(memory, dict) and "reception" in memory)
+        )
+        if kind == "loss" and loss_kind == "gilbert_elliott" and isinstance(reception, dict):
             low, high = reception.get("good_loss", 0.0), reception.get("bad_loss", 1.0)
             for k, value in enumerate(values if isinstance(values, list) else []):
                 if all(isinstance(one, int | float) for one in (low, high, value)) and not low <= value <= high:
                     message = f"expected between good_loss and bad_loss of {name} ({low:g} … {high:g}), found {value:g}"
                     yield source.at(("sweep", kind, k), message)
-    if not found:
+    if not varies:
         what = "no link loses lists" if kind == "loss" else "no link has bursts (gilbert_elliott, or memory.reception)"
         yield source.at(("sweep", kind), what)
 
 
-def _settings(source: Source, data: dict[str, Any], units: Sequence[str], pems: Sequence[str]) -> Iterator[str]:
-    """What the settings of single logs name and is not there, and what they set that is swept."""
+def _check_settings(
+    source: ExperimentSource, data: dict[str, Any], units: Sequence[str], pems: Sequence[str]
+) -> Iterator[str]:
+    """Names that the settings of single logs use and are undefined, and keys that they set though they are swept."""
     logs, measure, swept = data.get("logs"), data.get("measure"), data.get("sweep")
     everywhere = measure.get("distance_to", "ego") if isinstance(measure, dict) else "ego"
     for k, entry in enumerate(logs if isinstance(logs, list) else []):
         if not isinstance(entry, dict):
             continue
-        mine, own = entry.get("units"), entry.get("measure")
-        for name, unit in mine.items() if isinstance(mine, dict) else ():
+        log_units, log_measure = entry.get("units"), entry.get("measure")
+        for name, unit in log_units.items() if isinstance(log_units, dict) else ():
             key: Key = ("logs", k, "units", name)
             if _is_name(name) and str(name) not in units:
-                yield source.at(key, unknown("unit", name, units))
+                yield source.at(key, unknown_name_message("unit", name, units))
             pem = unit.get("pem") if isinstance(unit, dict) else None
             if _is_name(pem) and str(pem) not in pems:
-                yield source.at((*key, "pem"), unknown("PEM", pem, pems))
-            for what, of in (("rate_hz", "rate_hz"), ("on", "penetration_rate")):
-                if isinstance(unit, dict) and what in unit and isinstance(swept, dict) and swept.get(of):
-                    yield source.at((*key, what), f"{of} is swept, in all logs alike; leave it out here")
-        place = own.get("distance_to", everywhere) if isinstance(own, dict) else everywhere
+                yield source.at((*key, "pem"), unknown_name_message("PEM", pem, pems))
+            for what, quantity in (("rate_hz", "rate_hz"), ("on", "penetration_rate")):
+                if isinstance(unit, dict) and what in unit and isinstance(swept, dict) and swept.get(quantity):
+                    yield source.at((*key, what), f"{quantity} is swept, in all logs alike; leave it out here")
+        place = log_measure.get("distance_to", everywhere) if isinstance(log_measure, dict) else everywhere
         if place not in ("ego", everywhere) and _is_name(place) and str(place) not in units:
-            yield source.at(("logs", k, "measure", "distance_to"), unknown("unit", place, ["ego", *units]))
-        elif isinstance(mine, dict) and place in mine and mine[place] is None:
+            yield source.at(("logs", k, "measure", "distance_to"), unknown_name_message("unit", place, ["ego", *units]))
+        elif isinstance(log_units, dict) and place in log_units and log_units[place] is None:
             message = f"the log lacks unit {place!r}, from which distances are measured; give the log its own"
             yield source.at(("logs", k, "units", str(place)), message + " `measure: {distance_to: …}`")
 
 
-def _configuration(source: Source, key: Key, configuration: dict[str, Any], units: Sequence[str]) -> Iterator[str]:
+def _check_configuration(
+    source: ExperimentSource, key: Key, configuration: dict[str, Any], units: Sequence[str]
+) -> Iterator[str]:
     if configuration.get("recorded") is not None:
-        yield from _inputs(source, key, configuration, units)
-    chosen = configuration.get("units")
-    if chosen == "all" and not _modelled(source.data):
+        yield from _check_inputs(source, key, configuration, units)
+    members = configuration.get("units")
+    if members == "all" and not _list_modelled_units(source.data):
         which = "modelled units; recorded ones are named" if units else "units"
         yield source.at((*key, "units"), f"all: the experiment has no {which}")
-    yield from _fusion(source, key, configuration, chosen)
-    given: list[str] = []
-    for k, unit in enumerate(chosen if isinstance(chosen, list) else []):
+    yield from _check_fusion(source, key, configuration, members)
+    named: list[str] = []
+    for k, unit in enumerate(members if isinstance(members, list) else []):
         if _is_name(unit) and str(unit) not in units:
-            yield source.at((*key, "units", k), unknown("unit", unit, units))
-        elif str(unit) in given:
+            yield source.at((*key, "units", k), unknown_name_message("unit", unit, units))
+        elif str(unit) in named:
             yield source.at((*key, "units", k), f"unit {str(unit)!r} named twice")
-        given.append(str(unit))
+        named.append(str(unit))
     latency = configuration.get("latency_s")
     for unit in latency if isinstance(latency, dict) else ():
         if unit not in [*units, "default", "truth"]:
-            yield source.at((*key, "latency_s", unit), unknown("unit", unit, [*units, "default"]))
-    yield from _link(source, (*key, "link"), configuration.get("link"), units)
+            yield source.at((*key, "latency_s", unit), unknown_name_message("unit", unit, [*units, "default"]))
+    yield from _check_link(source, (*key, "link"), configuration.get("link"), units)
 
 
-def _link(source: Source, key: Key, link: object, units: Sequence[str]) -> Iterator[str]:
-    """Links, and units that send by them, that there are not."""
-    there = _names(source.data.get("links"))
+def _check_link(source: ExperimentSource, key: Key, link: object, units: Sequence[str]) -> Iterator[str]:
+    """Undefined links, and undefined units that send by links."""
+    links = _mapping_names(source.data.get("links"))
     by_unit = isinstance(link, dict) and "kind" not in link
     for unit, name in link.items() if isinstance(link, dict) and by_unit else [(None, link)]:
         if by_unit and str(unit) not in [*units, "default", "truth"]:
-            yield source.at((*key, str(unit)), unknown("unit", unit, [*units, "default"]))
-        if _is_name(name) and str(name) not in [*there, "none"]:
-            known = f"there {'are' if len(there) > 1 else 'is'} {', '.join(there) or 'none'}"
-            yield source.at((*key, str(unit)) if by_unit else key, f"no link {str(name)!r} ({known})")
+            yield source.at((*key, str(unit)), unknown_name_message("unit", unit, [*units, "default"]))
+        if _is_name(name) and str(name) not in [*links, "none"]:
+            choices = f"there {'are' if len(links) > 1 else 'is'} {', '.join(links) or 'none'}"
+            yield source.at((*key, str(unit)) if by_unit else key, f"no link {str(name)!r} ({choices})")
 
 
-def _inputs(source: Source, key: Key, configuration: dict[str, Any], units: Sequence[str]) -> Iterator[str]:
-    """What a stack had, and cannot have had."""
-    given, modelled = configuration.get("inputs"), _modelled(source.data)
-    inputs = given if isinstance(given, list) else []
+def _check_inputs(
+    source: ExperimentSource, key: Key, configuration: dict[str, Any], units: Sequence[str]
+) -> Iterator[str]:
+    """Undefined inputs of a recorded output, and inputs that it cannot have had."""
+    listed, modelled = configuration.get("inputs"), _list_modelled_units(source.data)
+    inputs = listed if isinstance(listed, list) else []
     for k, unit in enumerate(inputs):
         if _is_name(unit) and str(unit) not in units:
-            yield source.at((*key, "inputs", k), unknown("unit", unit, units))
+            yield source.at((*key, "inputs", k), unknown_name_message("unit", unit, units))
         elif str(unit) in modelled:
             yield source.at((*key, "inputs", k), f"unit {str(unit)!r} has a PEM; a stack had what was `recorded`")
         elif unit in inputs[:k]:
@@ -273,16 +287,16 @@ def _inputs(source: Source, key: Key, configuration: dict[str, Any], units: Sequ
         yield source.at(("measure", "exact"), f"configuration {key[-1]!r}: a recorded output has no exact times")
 
 
-def _fusion(source: Source, key: Key, configuration: dict[str, Any], chosen: object) -> Iterator[str]:
-    """What fusions other than the ideal one do not go with."""
+def _check_fusion(source: ExperimentSource, key: Key, configuration: dict[str, Any], members: object) -> Iterator[str]:
+    """Keys that exclude fusions other than the ideal one."""
     fusion, measure = configuration.get("fusion"), source.data.get("measure")
     kind = fusion.get("kind") if isinstance(fusion, dict) else None
-    if isinstance(fusion, dict) and fusion.get("combine") == "posterior" and _remembers(source.data, chosen):
+    if isinstance(fusion, dict) and fusion.get("combine") == "posterior" and _has_memory(source.data, members):
         message = "posterior draws anew at each instant and has no memory; use samples"
         yield source.at((*key, "fusion", "combine"), message)
     if not isinstance(kind, str) or kind == "ideal":
         return
-    if chosen == "truth":
+    if members == "truth":
         yield source.at((*key, "fusion"), f"the truth is not fused; {kind} needs units")
     if isinstance(measure, dict) and measure.get("exact") is True:
         yield source.at(
@@ -292,16 +306,16 @@ def _fusion(source: Source, key: Key, configuration: dict[str, Any], chosen: obj
         )
 
 
-def _remembers(data: dict[str, Any], chosen: object) -> bool:
-    """Whether any draw of a configuration's units lasts, of their PEMs or of their own poses."""
-    named = map(str, chosen) if isinstance(chosen, list) else _modelled(data) if chosen == "all" else ()
-    units = dict(_items(data.get("units")))
-    heard = [units.get(name, {}) for name in named]
-    return any(unit.get("placed") is not None or _memories(data, str(unit.get("pem"))) for unit in heard)
+def _has_memory(data: dict[str, Any], members: object) -> bool:
+    """Whether any random draw of a configuration's units lasts, in their PEMs or in their own poses."""
+    names = map(str, members) if isinstance(members, list) else _list_modelled_units(data) if members == "all" else ()
+    units = dict(_mapping_items(data.get("units")))
+    unit_data = [units.get(name, {}) for name in names]
+    return any(unit.get("placed") is not None or _list_memories(data, str(unit.get("pem"))) for unit in unit_data)
 
 
-def _memories(data: dict[str, Any], name: str, quantity: str | None = None) -> list[dict[str, Any]]:
-    """What a PEM and its couples say of memory, of one quantity or of any."""
+def _list_memories(data: dict[str, Any], name: str, quantity: str | None = None) -> list[dict[str, Any]]:
+    """The `memory` mappings of a PEM and its couples that have a quantity, or any."""
     pems = data.get("pems")
     pem = {str(key): pem for key, pem in pems.items()}.get(name) if isinstance(pems, dict) else None
     couples = pem.get("couples") if isinstance(pem, dict) else pem
@@ -310,17 +324,17 @@ def _memories(data: dict[str, Any], name: str, quantity: str | None = None) -> l
     return [memory for memory in memories if memory and (quantity is None or quantity in memory)]
 
 
-def _modelled(data: dict[str, Any]) -> list[str]:
-    return [name for name, unit in _items(data.get("units")) if unit.get("recorded") is None]
+def _list_modelled_units(data: dict[str, Any]) -> list[str]:
+    return [name for name, unit in _mapping_items(data.get("units")) if unit.get("recorded") is None]
 
 
-def _items(mapping: object) -> Iterator[tuple[str, dict[str, Any]]]:
+def _mapping_items(mapping: object) -> Iterator[tuple[str, dict[str, Any]]]:
     for name, value in mapping.items() if isinstance(mapping, dict) else ():
         if isinstance(value, dict):
             yield name, value
 
 
-def _names(mapping: object) -> list[str]:
+def _mapping_names(mapping: object) -> list[str]:
     return [str(name) for name in mapping] if isinstance(mapping, dict) else []
 
 

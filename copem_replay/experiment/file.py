@@ -1,7 +1,8 @@
-"""Experiment files: every problem with file, line and key."""
+"""Experiment files: read as plain data, parsed, with every problem by file, line and key; the recordings they name."""
 
 from __future__ import annotations
 
+import difflib
 import glob
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -9,21 +10,172 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self, TypeAlias
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
-from copem_replay.core.errors import ExperimentError, InputError
-from copem_replay.core.remote import Remote, bare, is_url, local_path, matches
-from copem_replay.core.yaml import AliasesError, Key, NotYamlError, read
+from copem_replay.core.errors import (
+    ExperimentError,
+    InputError,
+    RemoteFile,
+    find_remote_files,
+    is_url,
+    local_path,
+    strip_credentials,
+)
+from copem_replay.core.yaml import AliasesError, Key, NotYamlError, parse_yaml
 from copem_replay.experiment.schema import Experiment, LogSettings
-from copem_replay.experiment.shape_problems import by_key
-from copem_replay.io.together import File, Place, Together, first_of
+from copem_replay.io.open import DriveRecordings, File, Place, first_recording
+
+# Problems of shape in the words of the file: the key, what was expected, what was found.
+
+
+def describe_by_key(
+    model: type[BaseModel], error: ValidationError, data: dict[str, Any], above: Key = ()
+) -> Iterator[tuple[Key, str]]:
+    """A message per key, which joins the alternatives of the key; those of a `kind` that is not meant are left out.
+
+    `data`: the validated value, which stands at the key `above` of the data that `model` describes.
+    """
+    items_by_key: dict[Key, list[Any]] = {}
+    for item in error.errors(include_url=False):
+        if item["type"] == "too_short" and len(item["input"]) >= item["ctx"]["min_length"]:
+            continue  # long enough, but its items were refused, which have their own lines
+        items_by_key.setdefault((*above, *_file_key(data, item)), []).append(item)
+    for part in reversed(above):
+        data = {str(part): data}
+    for key, items in items_by_key.items():
+        if any(other[: len(key)] == key and len(other) > len(key) for other in items_by_key):
+            continue  # another alternative fits so far, and its message names the deeper key
+        yield key, _problem_message(model, items, key, data)
+
+
+def _file_key(data: Any, item: Any) -> Key:
+    """The location that pydantic gives, without parts that are not in the file (names of alternatives, `[key]`)."""
+    key: list[str | int] = []
+    value, location = data, item["loc"]
+    for k, part in enumerate(location):
+        if isinstance(value, dict) and (part in value or (k == len(location) - 1 and item["type"] == "missing")):
+            key.append(part)
+            value = value.get(part)
+        elif isinstance(value, list) and isinstance(part, int):
+            key.append(part)
+            value = value[part] if part < len(value) else None
+    return tuple(key)
+
+
+_EXPECTED = {
+    "tuple_type": "a list",
+    "list_type": "a list",
+    "dict_type": "keys and values",
+    "model_type": "keys and values",
+    "model_attributes_type": "keys and values",
+    "string_type": "text",
+    "bool_type": "true or false",
+    "float_type": "a number",
+    "int_type": "a whole number",
+    "int_from_float": "a whole number",
+    "finite_number": "a finite number",
+    "greater_than": "more than {gt:g}",
+    "greater_than_equal": "at least {ge:g}",
+    "less_than": "less than {lt:g}",
+    "less_than_equal": "at most {le:g}",
+    "string_too_short": "at least {min_length} character",
+    "too_short": "at least {min_length} in the list",
+    "too_long": "at most {max_length} in the list",
+    "literal_error": "{expected}",
+}
+
+
+def _unit_hint(written: str, meant: str) -> str:
+    """A hint that the key that was meant has another unit, where only the units of the names differ; else empty."""
+    (name, _, unit), (other, _, right) = written.rpartition("_"), meant.rpartition("_")
+    return f" (in {right}, not {unit})" if name == other and name else ""
+
+
+def _problem_message(model: type[BaseModel], items: Sequence[Any], key: Key, data: Any) -> str:
+    first = items[0]
+    if first["type"] == "extra_forbidden":
+        known = _list_known_keys(model, key[:-1], data)
+        near = difflib.get_close_matches(str(key[-1]), known, n=1)
+        hint = (
+            f"did you mean {near[0]}?{_unit_hint(str(key[-1]), near[0])}" if near else f"known here: {', '.join(known)}"
+        )
+        if _RENAMED.get(str(key[-1])) in known:
+            return f"`{key[-1]}` is called `{_RENAMED[str(key[-1])]}` now"
+        if key[-1] in _DEVIATIONS and "covariance_m2" in known:
+            hint = f"{_variance_hint(first['input'])} says it"
+        return "unknown key" + (f"; {hint}" if known else "")
+    if first["type"] == "missing":
+        return "missing"
+    if own := [item for item in items if item["type"] not in _EXPECTED]:
+        return str(own[0]["msg"]).removeprefix("Value error, ")
+    if first["type"] == "too_short" and isinstance(first["input"], Mapping):
+        return "expected at least one, found none"
+    words = dict.fromkeys(_EXPECTED[item["type"]].format(**item.get("ctx", {})) for item in items)
+    return f"expected {', or '.join(words)}, found {_shorten_value(first['input'])}{_percent_hint(first)}"
+
+
+_RENAMED = {"share": "penetration_rate"}
+"""Keys of version 0.1 and their names now."""
+_DEVIATIONS = ("sigma_m", "sigma", "std_m", "std", "stddev_m", "stddev")
+
+
+def _variance_hint(sigma_m: object) -> str:
+    """The `covariance_m2` that stands for a standard deviation."""
+    variance = f"{sigma_m**2:g}" if isinstance(sigma_m, int | float) else "σ²"
+    return f"`covariance_m2: [[{variance}, 0], [0, {variance}]]`"
+
+
+def _percent_hint(item: Any) -> str:
+    """A hint where a share was probably given in per cent; else empty."""
+    is_share = item["type"] == "less_than_equal" and item["ctx"]["le"] == 1
+    if not is_share or not 2 < item["input"] <= 100:  # 1.5 or 2 is hardly a percentage
+        return ""
+    return f"; a fraction: {item['input']:g} % is {item['input'] / 100:g}"
+
+
+def _list_known_keys(model: type[BaseModel], key: Key, data: Any) -> list[str]:
+    """Names of the keys that are allowed at a place of the file, sorted."""
+    schema = model.model_json_schema()
+
+    def alternatives(part: Any) -> Iterator[dict[str, Any]]:
+        if isinstance(part, dict):
+            if "$ref" in part:
+                part = schema["$defs"][part["$ref"].rpartition("/")[2]]
+            yield part
+            for inner in (*part.get("anyOf", ()), *part.get("oneOf", ())):
+                yield from alternatives(inner)
+
+    places = [*alternatives(schema)]
+    for step in key:
+        data = data[step]
+        if isinstance(step, int):
+            inner = [p.get("items") or (p.get("prefixItems") or [{}])[0] for p in places]
+        else:
+            inner = [p.get("properties", {}).get(step) or p.get("additionalProperties") for p in places]
+        places = [found for part in inner for found in alternatives(part)]
+    names = [place["properties"] for place in places if "properties" in place]
+    meant = [place for place in names if _is_meant(place.get("kind", {}), data.get("kind"))]
+    return sorted({name for place in meant or names for name in place})
+
+
+def _is_meant(kinds: Mapping[str, Any], kind: object) -> bool:
+    """Whether an alternative has the `kind:` of the file, or is the default where the file has none."""
+    known = [kinds["const"]] if "const" in kinds else kinds.get("enum", [])
+    return kind in known or (kind is None and "default" in kinds)
+
+
+def _shorten_value(value: object) -> str:
+    words = {None: "nothing", True: "true", False: "false"}
+    text = words[value] if value is None or isinstance(value, bool) else repr(value)
+    return text if len(text) <= 60 else text[:57] + "…"
+
 
 Listed: TypeAlias = dict[str, list[File] | InputError]
-"""What URLs match, or why they cannot be asked, by the URL: asked once."""
+"""By URL the files that it matches, or why it cannot be listed; each is listed once."""
 
 
 class Problem(str):
-    """What is wrong with a file, in one line that names its place. `line`: which line of the file it names."""
+    """A problem of a file in one line of text that names its place. `line`: number of the line in the file."""
 
     line: int
 
@@ -35,51 +187,51 @@ class Problem(str):
 
 
 @dataclass(frozen=True)
-class Source:
-    """An experiment file as plain data, and where each key stands."""
+class ExperimentSource:
+    """An experiment file as plain data, with the line of each key."""
 
     path: Path
     data: dict[str, Any]
     lines: dict[Key, int]
-    problems: tuple[str, ...]  # of its YAML: the file is refused, but the rest is checked all the same
-    logs: tuple[str, ...] = ()  # to replay instead of those it names, relative to where we are
-    options: Mapping[Key, str] = field(default_factory=dict)  # of the command line: keys that they have set
+    problems: tuple[str, ...]  # of its YAML: the file is refused, but the rest is checked too
+    logs: tuple[str, ...] = ()  # replayed instead of those that it names, relative to the working folder
+    options: Mapping[Key, str] = field(default_factory=dict)  # of the command line, by the keys that they set
     listed: Listed = field(default_factory=dict)
 
     @property
     def logs_option(self) -> str:
-        """What `logs` were given by."""
+        """The option that `logs` came by."""
         return self.options.get(("logs",), "--log")
 
     def at(self, key: Key, message: str, line: int | None = None) -> str:
-        """`file:line: key: message`; by default the line of the key, or of what it should be in.
+        """`file:line: key: message`; by default the line of the key, or of the mapping that should have it.
 
-        Where an option set the key, `--option: message`.
+        For a key that an option set: `--option: message`.
         """
         if key in self.options:
             return f"{self.options[key]}: {message}"
         if line is None:
             line = next(self.lines[key[:n]] for n in range(len(key), -1, -1) if key[:n] in self.lines)
-        name = dotted(key)
+        name = format_key(key)
         return Problem(f"{self.path}:{line}: {name + ': ' if name else ''}{message}", line)
 
 
 @dataclass(frozen=True)
-class PlainSource(Source):
+class PlainSource(ExperimentSource):
     """An experiment that is made in Python and stands in no file: it need not name its logs, and keys have no line."""
 
     def at(self, key: Key, message: str, line: int | None = None) -> str:
-        """`experiment: key: message`; where an option set the key, `option: message`."""
-        name = self.options.get(key) or ": ".join(filter(None, (str(self.path), dotted(key))))
+        """`experiment: key: message`; for a key that an option set, `option: message`."""
+        name = self.options.get(key) or ": ".join(filter(None, (str(self.path), format_key(key))))
         return f"{name}: {message}"
 
 
-def plain(data: Mapping[str, Any]) -> PlainSource:
-    """The plain data of an experiment as a source. Paths of its logs are relative to the working folder."""
+def make_plain_source(data: Mapping[str, Any]) -> PlainSource:
+    """The plain data of an experiment as a source. The paths of its logs are relative to the working folder."""
     return PlainSource(Path("experiment"), dict(data), {(): 1}, ())
 
 
-def dotted(key: Key) -> str:
+def format_key(key: Key) -> str:
     """`units.ego.height_m`, `logs[0]`."""
     text = ""
     for part in key:
@@ -88,8 +240,8 @@ def dotted(key: Key) -> str:
     return text
 
 
-def load(path: Path) -> Source:
-    """A file as plain data. Raises ExperimentError when it cannot be read or is not YAML."""
+def read_experiment_file(path: Path) -> ExperimentSource:
+    """An experiment file as plain data. Raises ExperimentError when it cannot be read or is not YAML."""
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
@@ -102,7 +254,7 @@ def load(path: Path) -> Source:
     except OSError as error:
         raise ExperimentError(f"{path}: cannot be read: {error.strerror}") from None
     try:
-        data, lines, problems = read(text)
+        data, lines, problems = parse_yaml(text)
     except AliasesError as error:
         raise ExperimentError(f"{path}:{error.line}: {error.why}") from None
     except NotYamlError as error:
@@ -110,90 +262,90 @@ def load(path: Path) -> Source:
     if not isinstance(data, dict):
         found = "an empty file" if data is None else "a list" if isinstance(data, list) else "text"
         raise ExperimentError(f"{path}:1: expected keys and values such as `version: 1`, found {found}")
-    source = Source(path, data, lines, ())
+    source = ExperimentSource(path, data, lines, ())
     return replace(source, problems=tuple(source.at(key, message, line) for key, line, message in problems))
 
 
-def parse(source: Source) -> tuple[Experiment | None, list[str]]:
-    """The experiment, or None, and every problem of its shape."""
+def parse_experiment(source: ExperimentSource) -> tuple[Experiment | None, list[str]]:
+    """The experiment, None where there are problems of shape that prevent it, and all problems of shape."""
     problems = list(source.problems)
     try:
-        # What a plain experiment names is relative to where we are.
+        # The paths of a plain experiment are relative to the working folder.
         folder = None if isinstance(source, PlainSource) else source.path.parent
         experiment = Experiment.model_validate(source.data, context={"folder": folder})
     except ValidationError as error:
-        found = list(_problems(source, error))
-        first = sum(line == source.at(("version",), "missing") for line in found)  # in the order of the keys
-        return None, [*problems, *found[:first], *_logs_missing(source), *found[first:]]
+        shape = list(_list_problems(source, error))
+        head = sum(line == source.at(("version",), "missing") for line in shape)  # in the order of the keys
+        return None, [*problems, *shape[:head], *_logs_missing(source), *shape[head:]]
     missing = _logs_missing(source)
     return (None if missing else experiment), problems + missing
 
 
-def _logs_missing(source: Source) -> list[str]:
-    """That a file names no logs; they are optional in Python only."""
-    given = "logs" in source.data or isinstance(source, PlainSource)
-    return [] if given else [source.at(("logs",), "missing")]
+def _logs_missing(source: ExperimentSource) -> list[str]:
+    """The problem of a file that names no logs; they are optional in Python only."""
+    named = "logs" in source.data or isinstance(source, PlainSource)
+    return [] if named else [source.at(("logs",), "missing")]
 
 
-def _problems(source: Source, error: ValidationError) -> Iterator[str]:
-    for key, message in by_key(Experiment, error, source.data):
+def _list_problems(source: ExperimentSource, error: ValidationError) -> Iterator[str]:
+    for key, message in describe_by_key(Experiment, error, source.data):
         yield source.at(key, message)
 
 
-def log_paths(source: Source) -> tuple[dict[Place, Key | None], list[str]]:
-    """The recordings to replay and where the file names each, globs resolved (sorted); which patterns match none."""
+def log_paths(source: ExperimentSource) -> tuple[dict[Place, Key | None], list[str]]:
+    """The recordings to replay by the key that names each, globs resolved and sorted; problems of the patterns."""
     paths: dict[Place, Key | None] = {}
     problems: list[str] = []
-    for k, (key, pattern, named) in _patterns(source).items():
-        found = _places(source, k, pattern)
-        if why := _unasked(source, k, pattern):
-            problems.append(f"{source.logs_option}: {why}" if source.logs else source.at(key, why))
+    for k, (key, pattern, named) in _list_patterns(source).items():
+        places = _find_places(source, k, pattern)
+        if reason := _explain_unasked(source, k, pattern):
+            problems.append(f"{source.logs_option}: {reason}" if source.logs else source.at(key, reason))
             continue
-        paths |= dict.fromkeys(found, None if source.logs else ("logs", k))
-        if not found and source.logs:
+        paths |= dict.fromkeys(places, None if source.logs else ("logs", k))
+        if not places and source.logs:
             problems.append(f"{source.logs_option}: no file matches {pattern!r}")
-        elif not found:
+        elif not places:
             problems.append(source.at(key, f"no file matches {pattern!r}"))
-        elif named and len(found) > 1:
-            message = f"a name goes with one recording; {pattern!r} matches {len(found)}"
+        elif named and len(places) > 1:
+            message = f"a name goes with one recording; {pattern!r} matches {len(places)}"
             problems.append(source.at(("logs", k, "name"), message))
     return paths, problems
 
 
-def named_paths(source: Source) -> Iterator[tuple[str, Place]]:
-    """Each recording as often as it is named, and by what: `logs[0]`, `--log`."""
-    for k, (_, pattern, _) in _patterns(source).items():
+def list_named_paths(source: ExperimentSource) -> Iterator[tuple[str, Place]]:
+    """Each recording as often as it is named, with the key or option that names it: `logs[0]`, `--log`."""
+    for k, (_, pattern, _) in _list_patterns(source).items():
         name = source.logs_option if source.logs else f"logs[{k}]"
-        yield from ((name, place) for place in _places(source, k, pattern))
+        yield from ((name, place) for place in _find_places(source, k, pattern))
 
 
-def _places(source: Source, k: int, pattern: str | None) -> list[Place]:
-    """What an entry of `logs` names: files that match, or several recordings as one."""
+def _find_places(source: ExperimentSource, k: int, pattern: str | None) -> list[Place]:
+    """The places that an entry of `logs` names: the files that match, or several recordings as one."""
     if pattern is not None:
-        return list(matching(pattern, folder_of(source), source.listed))
+        return list(match_files(pattern, source_folder(source), source.listed))
     entry = source.data["logs"][k]
     offsets = entry.get("clock_offset_s")
-    return [together(entry["together"], offsets if isinstance(offsets, dict) else {}, folder_of(source))]
+    return [combine_recordings(entry["together"], offsets if isinstance(offsets, dict) else {}, source_folder(source))]
 
 
-def _unasked(source: Source, k: int, pattern: str | None) -> str | None:
-    """Why it cannot be told what an entry of `logs` names."""
+def _explain_unasked(source: ExperimentSource, k: int, pattern: str | None) -> str | None:
+    """Why the places of an entry of `logs` cannot be found; None: they can."""
     if pattern is None:
         elsewhere = filter(is_url, source.data["logs"][k]["together"])
-        return next((f"expected recordings on this machine, found {bare(url)}" for url in elsewhere), None)
+        return next((f"expected recordings on this machine, found {strip_credentials(url)}" for url in elsewhere), None)
     why = source.listed.get(pattern)
     return why.problems[0] if isinstance(why, InputError) else None
 
 
-def together(names: Sequence[str], offset_s: Mapping[str, object], folder: Path) -> Together:
-    """Several recordings, by paths relative to a folder, as one log; what is no offset counts as none."""
-    said = [offset_s.get(name, 0.0) for name in names]
-    ahead_s = tuple(float(one) if isinstance(one, int | float) else 0.0 for one in said)
-    return Together(tuple(folder / name for name in names), ahead_s)
+def combine_recordings(names: Sequence[str], offset_s: Mapping[str, object], folder: Path) -> DriveRecordings:
+    """Several recordings, by paths relative to a folder, as one log; an offset that is no number counts as 0."""
+    offsets = [offset_s.get(name, 0.0) for name in names]
+    ahead_s = tuple(float(offset) if isinstance(offset, int | float) else 0.0 for offset in offsets)
+    return DriveRecordings(tuple(folder / name for name in names), ahead_s)
 
 
-def _patterns(source: Source) -> dict[int, tuple[Key, str | None, bool]]:
-    """By its number what each entry of `logs` matches: its key, the pattern (None: several), whether it has a name."""
+def _list_patterns(source: ExperimentSource) -> dict[int, tuple[Key, str | None, bool]]:
+    """By number the key of each entry of `logs`, its pattern (None: several recordings), and whether it has a name."""
     entries = source.data.get("logs")
     result: dict[int, tuple[Key, str | None, bool]] = {}
     for k, entry in enumerate(entries if isinstance(entries, list | tuple) else []):
@@ -201,81 +353,87 @@ def _patterns(source: Source) -> dict[int, tuple[Key, str | None, bool]]:
             result[k] = (("logs", k), entry, False)
         elif isinstance(entry, dict) and isinstance(entry.get("file"), str):
             result[k] = (("logs", k, "file"), entry["file"], entry.get("name") is not None)
-        elif isinstance(entry, dict) and _all_text(entry.get("together")):
+        elif isinstance(entry, dict) and _are_texts(entry.get("together")):
             result[k] = (("logs", k, "together"), None, entry.get("name") is not None)
     return result
 
 
-def _all_text(names: object) -> bool:
+def _are_texts(names: object) -> bool:
     return isinstance(names, list | tuple) and len(names) > 1 and all(isinstance(name, str) for name in names)
 
 
-def entries_of(experiment: Experiment, source: Source) -> tuple[str | LogSettings, ...]:
+def resolve_entries(experiment: Experiment, source: ExperimentSource) -> tuple[str | LogSettings, ...]:
     """The entries of `logs`, a recording each, relative to the working folder."""
     entries: dict[Place, str | LogSettings] = {}
-    for k, (_, pattern, _) in _patterns(source).items():
+    for k, (_, pattern, _) in _list_patterns(source).items():
         entry = experiment.logs[k]
-        for place in _places(source, k, pattern):
-            alone = at_place(entry, place) if isinstance(entry, LogSettings) else address(first_of(place))
-            entries.setdefault(place, alone)
+        for place in _find_places(source, k, pattern):
+            resolved = (
+                relocate_settings(entry, place)
+                if isinstance(entry, LogSettings)
+                else recording_address(first_recording(place))
+            )
+            entries.setdefault(place, resolved)
     return tuple(entries.values())
 
 
-def address(file: File) -> str:
-    """What leads to a recording: a path, or a URL with all that lets us in."""
-    return file.url if isinstance(file, Remote) else str(file)
+def recording_address(file: File) -> str:
+    """The path of a recording, or its URL with user and query."""
+    return file.url if isinstance(file, RemoteFile) else str(file)
 
 
-def at_place(entry: LogSettings, place: Place, called: Callable[[File], str] = address) -> LogSettings:
-    """The settings of a recording, or of several as one, that lie elsewhere, or are called otherwise."""
-    if not isinstance(place, Together):
+def relocate_settings(
+    entry: LogSettings, place: Place, called: Callable[[File], str] = recording_address
+) -> LogSettings:
+    """The settings of an entry for the recording or recordings at `place`, named by `called`."""
+    if not isinstance(place, DriveRecordings):
         return entry.model_copy(update={"file": called(place)})
     names = tuple(called(path) for path in place.paths)
     offsets = {name: ahead_s for name, ahead_s in zip(names, place.ahead_s, strict=True) if ahead_s}
     return entry.model_copy(update={"together": names} | ({"clock_offset_s": offsets} if offsets else {}))
 
 
-def places_of(entry: LogSettings, folder: Path, listed: Listed | None = None) -> list[Place]:
-    """The recordings that settings are for."""
+def settings_places(entry: LogSettings, folder: Path, listed: Listed | None = None) -> list[Place]:
+    """The places of the recordings that settings are for."""
     if entry.file is not None:
-        return list(matching(entry.file, folder, listed))
-    return [together(entry.together or (), entry.clock_offset_s, folder)]
+        return list(match_files(entry.file, folder, listed))
+    return [combine_recordings(entry.together or (), entry.clock_offset_s, folder)]
 
 
-def identity(place: Place) -> str:
-    """The same for the same recordings, whatever leads there."""
-    if isinstance(place, Remote):
+def place_identity(place: Place) -> str:
+    """A text that identifies a recording, or several as one, whatever path or link leads there."""
+    if isinstance(place, RemoteFile):
         return place.url
     return os.path.realpath(place) if isinstance(place, Path) else "\n".join(map(os.path.realpath, place.paths))
 
 
-def folder_of(source: Source) -> Path:
-    """What the paths of its logs are relative to."""
+def source_folder(source: ExperimentSource) -> Path:
+    """The folder that the paths of the logs are relative to."""
     return Path() if source.logs else source.path.parent
 
 
-def with_logs(source: Source, paths: Sequence[str], option: str = "--log") -> Source:
-    """The source with other recordings to replay, relative to where we are; those it names keep their settings."""
+def replace_logs(source: ExperimentSource, paths: Sequence[str], option: str = "--log") -> ExperimentSource:
+    """The source with other recordings to replay, relative to the working folder; those it names keep settings."""
     named = source.data.get("logs")
-    mine = [
+    patterns = [
         (entry, entry.get("file")) for entry in (named if isinstance(named, list) else []) if isinstance(entry, dict)
     ]
     entries: list[object] = []
     for path in paths:
         real = path if is_url(path) else os.path.realpath(path)
-        same = (
+        matching = (
             entry
-            for entry, pattern in mine
+            for entry, pattern in patterns
             if isinstance(pattern, str)
-            and any(identity(found) == real for found in matching(pattern, source.path.parent, source.listed))
+            and any(place_identity(found) == real for found in match_files(pattern, source.path.parent, source.listed))
         )
-        entries.append({**entry, "file": path} if (entry := next(same, None)) is not None else path)
+        entries.append({**entry, "file": path} if (entry := next(matching, None)) is not None else path)
     options = dict(source.options) | ({("logs",): option} if option != "--log" else {})
     return replace(source, data=source.data | {"logs": entries}, logs=tuple(paths), options=options)
 
 
-def without_settings(data: dict[str, Any], keys: Sequence[str]) -> dict[str, Any]:
-    """The data of an experiment without these keys in the entries of its logs: options go before them."""
+def drop_settings(data: dict[str, Any], keys: Sequence[str]) -> dict[str, Any]:
+    """The data of an experiment without these keys in the entries of its logs, as options take precedence."""
     logs = data.get("logs")
     if not isinstance(logs, list):
         return data
@@ -283,31 +441,31 @@ def without_settings(data: dict[str, Any], keys: Sequence[str]) -> dict[str, Any
     return data | {"logs": bare}
 
 
-def matching(pattern: str, folder: Path, listed: Listed | None = None) -> list[File]:
-    """The files a path relative to `folder`, or a URL, names, sorted; without wildcards it names itself, there or not.
+def match_files(pattern: str, folder: Path, listed: Listed | None = None) -> list[File]:
+    """The files that a path relative to `folder`, or a URL, names, sorted. Without wildcards it need not exist.
 
-    `listed`: what URLs were found to match, or why they cannot be asked.
+    `listed`: URLs that were listed before; this one is added.
     """
     if is_url(pattern := local_path(pattern)):
         listed = {} if listed is None else listed
         if pattern not in listed:
             try:
-                listed[pattern] = list(matches(pattern))
+                listed[pattern] = list(find_remote_files(pattern))
             except InputError as error:
                 listed[pattern] = error
-        found = listed[pattern]
-        return [] if isinstance(found, InputError) else found
-    if is_there(folder / pattern) or not glob.has_magic(pattern):
+        files = listed[pattern]
+        return [] if isinstance(files, InputError) else files
+    if place_exists(folder / pattern) or not glob.has_magic(pattern):
         return [folder / pattern]
     return [folder / name for name in sorted(glob.glob(pattern, root_dir=folder, recursive=True))]
 
 
-def is_there(place: Place) -> bool:
-    """Whether there is something of this name; a name no file can have is none. Raises InputError."""
-    if isinstance(place, Remote):
+def place_exists(place: Place) -> bool:
+    """Whether there is a file or folder of this name; False for an impossible name. Raises InputError for a URL."""
+    if isinstance(place, RemoteFile):
         return place.there is not None
-    if isinstance(place, Together):
-        return all(map(is_there, place.paths))
+    if isinstance(place, DriveRecordings):
+        return all(map(place_exists, place.paths))
     try:
         return place.exists()
     except (OSError, ValueError):

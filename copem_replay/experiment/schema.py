@@ -1,7 +1,7 @@
-"""The experiment: what is replayed through what, and what is measured. Frozen models, defaults that run.
+"""The schema of an experiment: logs, units, links, configurations, sweeps. Frozen models, defaults that run.
 
-Units are in the names of keys. Cross-references (a unit's `pem`, a configuration's `units`)
-are checked in `experiment/validate.py`, which reports all problems of a file at once.
+Units are in the names of keys. References (a unit's `pem`, a configuration's `units`) are checked in
+`experiment/cross_references.py`, so that all problems of a file are reported at once.
 """
 
 from __future__ import annotations
@@ -13,38 +13,211 @@ from pydantic import (
     AfterValidator,
     BeforeValidator,
     ConfigDict,
+    Discriminator,
     Field,
     SerializerFunctionWrapHandler,
+    Tag,
     field_validator,
     model_serializer,
     model_validator,
 )
 
 from copem_replay.communication.latency import Delay
-from copem_replay.communication.link import ConstantLink, LinkModel, UnitLinks
+from copem_replay.communication.link import LINKS, ConstantLink, LinkModel, UnitLinks
 from copem_replay.communication.sends import Sends
-from copem_replay.core.components import Count, Either, Frozen, Id, Latency, Number, Positive, Slot, at_key, described
+from copem_replay.core.components import (
+    Count,
+    Either,
+    Frozen,
+    Id,
+    Latency,
+    Number,
+    Positive,
+    Share,
+    Slot,
+    drop_python_examples,
+    error_at_key,
+)
 from copem_replay.core.tracks import TRUTH
-from copem_replay.experiment.link_keys import AnyLink, IssueRate, LinkName, LinkOf
-from copem_replay.experiment.names import ConfigurationName, UnitName
-from copem_replay.experiment.show_keys import Show
-from copem_replay.experiment.sweep_keys import Sweep
 from copem_replay.fusion import FUSIONS
-from copem_replay.fusion.base import Fusion, Ideal
-from copem_replay.io.config import Ego, HowRead, Read, Recorded, RecordedOutput, WindowOf
+from copem_replay.fusion.interface import Fusion, IdealFusion
+from copem_replay.io.config import Ego, HowRead, RecordedOutput, RecordedTopic, TruthTopic, WindowOf
 from copem_replay.metrics.config import Braking, Measure
-from copem_replay.perception.config import Carriers, Obstacle, Placement
-from copem_replay.perception.pem.model import Pem
+from copem_replay.perception.config import Carriers, Obstacle, Placement, Rate
+from copem_replay.perception.pem.model import MeanNumber, Pem
 from copem_replay.perception.visibility import Surface, Visibility
 
+# Links.
 
-def _of_64_bits(value: int) -> int:
+
+def _check_link_name(value: str) -> str:
+    if value in ("none", "default", ""):
+        raise ValueError(f"{value!r} cannot be a link's name")
+    return value
+
+
+def _discriminate_link(value: object) -> str:
+    if isinstance(value, LinkModel) or (isinstance(value, dict) and "kind" in value):
+        return "link"
+    return "by unit" if isinstance(value, dict) else "name"
+
+
+LinkName = Annotated[Id, AfterValidator(_check_link_name)]
+AnyLink = Annotated[LinkModel, Slot("link", LINKS, "radio")]
+LinkOf = Annotated[
+    Annotated[AnyLink, Tag("link")] | Annotated[Id, Tag("name")] | Annotated[dict[Id, Id], Tag("by unit")],
+    Discriminator(_discriminate_link),
+]
+"""A link: its name, names by unit with `default`, or the link itself."""
+IssueRate = Annotated[float, Field(strict=True, ge=0.001, le=1000)]
+"""Fused lists per second."""
+
+
+# Names of units and configurations.
+
+
+def _check_unit_name(value: str) -> str:
+    if value in ("default", "truth", "all", ""):
+        raise ValueError(f"{value!r} cannot be a unit's name")
+    return value
+
+
+def _check_configuration_name(value: str) -> str:
+    # The name is part of topics and of entity paths.
+    if not value or "/" in value or not value.isprintable():
+        raise ValueError(f"expected a printable name without '/', found {value!r}")
+    return value
+
+
+UnitName = Annotated[Id, AfterValidator(_check_unit_name)]
+ConfigurationName = Annotated[Id, AfterValidator(_check_configuration_name)]
+
+
+# Runs that are shown.
+
+WhichRun = Annotated[int, Field(strict=True, ge=0)] | Literal["median", "worst", "best"]
+
+
+def _check_runs_unique(runs: tuple[WhichRun, ...]) -> tuple[WhichRun, ...]:
+    twice = [run for k, run in enumerate(runs) if run in runs[:k]]
+    if twice:
+        raise ValueError(f"expected each run once, found {twice[0]} twice")
+    return runs
+
+
+class Show(Frozen):
+    """Which logs, run or runs, and configurations (by default all) are written to MCAP and .rrd.
+
+    `run: null` writes none; `pipeline/one_run.py` says which run is `median`, `worst` or `best`.
+    """
+
+    logs: Annotated[tuple[Id, ...], Field(min_length=1)] = ("first",)
+    run: WhichRun | Annotated[tuple[WhichRun, ...], Field(min_length=1), AfterValidator(_check_runs_unique)] | None = 0
+    configurations: Annotated[tuple[Id, ...], Field(min_length=1)] | None = None
+
+    def asked(self) -> tuple[WhichRun, ...]:
+        """The runs in their order: several, one or none."""
+        if isinstance(self.run, tuple):
+            return self.run
+        return () if self.run is None else (self.run,)
+
+
+# Sweeps: values of one quantity at a time.
+
+
+def _check_is_count(value: object) -> object:
+    if isinstance(value, str | list | tuple):
+        raise ValueError(f"expected how many units beside the ego's, such as 2 (a count, no names), found {value!r}")
+    return value
+
+
+Units = Annotated[int, Field(strict=True, ge=0, le=10**6), BeforeValidator(_check_is_count)]
+
+
+def _check_unique(values: tuple[float, ...]) -> tuple[float, ...]:
+    for k, value in enumerate(values):
+        if value in values[:k]:
+            raise ValueError(f"expected each value once, found {value:g} twice")
+    return values
+
+
+def _check_correlation_time(value: float) -> float:
+    if 0 < value < 0.001:
+        raise ValueError(f"expected 0 or at least 0.001 (s), found {value:g}")
+    return value
+
+
+Lasting = Annotated[float, Field(strict=True, ge=0, le=86_400), AfterValidator(_check_correlation_time)]
+"""A correlation time in seconds; 0: nothing lasts."""
+_UNSAID: Any = Field(default=None, exclude_if=lambda value: value is None)
+SweptNames = Annotated[tuple[Id, ...], Field(min_length=1)]
+
+
+class SweptBy(Frozen):
+    """Which configurations each quantity changes, if these differ between quantities."""
+
+    latency_s: SweptNames | None = None
+    rate_hz: SweptNames | None = None
+    units: SweptNames | None = None
+    penetration_rate: SweptNames | None = None
+    correlation_s: SweptNames | None = _UNSAID
+    ghosts_in_list: SweptNames | None = _UNSAID
+    loss: SweptNames | None = _UNSAID
+    burst_s: SweptNames | None = _UNSAID
+
+
+Swept = Either[SweptNames, SweptBy]
+
+
+class Sweep(Frozen):
+    """Further values at which `configurations` (names, or names by quantity) are run, one quantity at a time.
+
+    By default a quantity changes all configurations that have it; `latency_s` those with a latency above 0 or by unit.
+    `latency_s`: of the whole list; if latencies are by unit, the `default` one. `rate_hz`: of every unit. `units`:
+    number of a configuration's units beside the ego's, taken in order. `penetration_rate`: share of possible carriers
+    with a unit. `correlation_s`: of the first part of `memory.detection`; 0: new in every list. `ghosts_in_list`: mean
+    number of ghosts of the first entry of `ghosts` in a list. `loss`: share of lists that links lose. `burst_s`: how
+    long losses last: `bad_lasts_s`, else the first part of `memory.reception`.
+    """
+
+    configurations: Swept | None = None
+    latency_s: Annotated[tuple[Latency, ...], Field(min_length=1), AfterValidator(_check_unique)] | None = None
+    rate_hz: Annotated[tuple[Rate, ...], Field(min_length=1), AfterValidator(_check_unique)] | None = None
+    units: Annotated[tuple[Units, ...], Field(min_length=1), AfterValidator(_check_unique)] | None = None
+    penetration_rate: Annotated[tuple[Share, ...], Field(min_length=1), AfterValidator(_check_unique)] | None = None
+    correlation_s: Annotated[tuple[Lasting, ...], Field(min_length=1), AfterValidator(_check_unique)] | None = _UNSAID
+    ghosts_in_list: Annotated[tuple[MeanNumber, ...], Field(min_length=1), AfterValidator(_check_unique)] | None = (
+        _UNSAID
+    )
+    loss: Annotated[tuple[Share, ...], Field(min_length=1), AfterValidator(_check_unique)] | None = _UNSAID
+    burst_s: Annotated[tuple[Lasting, ...], Field(min_length=1), AfterValidator(_check_unique)] | None = _UNSAID
+
+    @model_validator(mode="after")
+    def _some(self) -> Self:
+        names = list(SweptBy.model_fields)
+        if not any(getattr(self, name) for name in names):
+            known = f"{', '.join(names[:-1])} or {names[-1]}"
+            raise ValueError(f"expected values of {known}, such as `latency_s: [0, 0.5, 1]`")
+        for quantity in SweptBy.model_fields if isinstance(self.configurations, SweptBy) else ():
+            if self.chosen(quantity) and not getattr(self, quantity):
+                raise ValueError(f"configurations.{quantity}: expected values of {quantity} beside it, found none")
+        return self
+
+    def chosen(self, quantity: str) -> tuple[str, ...] | None:
+        """The configurations that a quantity changes; None: the default."""
+        if not isinstance(self.configurations, SweptBy):
+            return self.configurations
+        chosen: tuple[str, ...] | None = getattr(self.configurations, quantity)
+        return chosen
+
+
+def _check_64_bits(value: int) -> int:
     if not -(2**63) <= value < 2**64:
         raise ValueError(f"expected a whole number of 64 bits (-2^63 … 2^64 - 1), found {value}")
     return value
 
 
-def _version(value: object) -> object:
+def _check_version(value: object) -> object:
     if isinstance(value, bool):  # equals 1 to Python
         raise ValueError(f"expected 1, found {str(value).lower()}")
     return value
@@ -69,7 +242,7 @@ class Unit(Placement):
     True
     """
 
-    recorded: Recorded | None = None
+    recorded: RecordedTopic | None = None
     ready: Delay | None = Field(default=None, exclude_if=lambda ready: ready is None)
     sends: Sends | None = Field(default=None, exclude_if=lambda sends: sends is None)
 
@@ -80,7 +253,7 @@ class Unit(Placement):
         if self.recorded is not None:
             for key, why in _NOT_RECORDED.items():
                 if getattr(self, key) is not None:
-                    raise at_key(key, f"a recorded unit {why}; only for units with a pem")
+                    raise error_at_key(key, f"a recorded unit {why}; only for units with a pem")
             if self.rate_hz is not None or isinstance(self.on, Carriers) or (self.on and self.at):
                 raise ValueError("recorded: goes with one place, `on` an object or `at` a point, and without rate_hz")
             return self
@@ -113,7 +286,7 @@ class Configuration(Frozen):
     units: Literal["truth", "all"] | Annotated[tuple[Id, ...], Field(min_length=1)] = ()
     recorded: RecordedOutput | None = None
     inputs: Annotated[tuple[Id, ...], Field(min_length=1)] | None = None
-    fusion: Annotated[Fusion, Slot("fusion", FUSIONS, "ideal")] = Ideal()
+    fusion: Annotated[Fusion, Slot("fusion", FUSIONS, "ideal")] = IdealFusion()
     latency_s: Latency | dict[Id, Latency] = 0.0
     link: LinkOf | None = Field(default=None, exclude_if=lambda link: link is None)
     issue_hz: IssueRate | None = Field(default=None, exclude_if=lambda rate: rate is None)
@@ -132,7 +305,7 @@ class Configuration(Frozen):
 
     @model_serializer(mode="wrap")
     def _as_given(self, dump: Callable[[Any], dict[str, Any]]) -> dict[str, Any]:
-        """A recorded output without what does not go with it, any other configuration without what only that has."""
+        """A recorded output with its own keys only, any other configuration without them."""
         output = self.recorded is not None
         return {k: v for k, v in dump(self).items() if (k in ("recorded", "inputs")) == output and (v or not output)}
 
@@ -147,7 +320,7 @@ class Configuration(Frozen):
 
 
 MEASURED_PER_LOG = ("objects", "onset", "distance_to", "annotated")
-"""Keys of `measure` that a log may have its own of; the others say what the tables of all logs have in common."""
+"""Keys of `measure` that a log may set; the others define what the tables of all logs have in common."""
 
 
 class LogSettings(Frozen):
@@ -195,34 +368,44 @@ class LogSettings(Frozen):
 
     @model_serializer(mode="wrap")
     def _as_given(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Only keys that are given: a `null` would be one, too."""
+        """Only the keys that are given, as a `null` would also count as given."""
         written: dict[str, Any] = write(self)
         return {key: value for key, value in written.items() if key in self.model_fields_set}
 
 
 def output_unit(configuration: str) -> str:
-    """What the unit is called that stands for the recorded output of a configuration."""
+    """The name of the unit that stands for the recorded output of a configuration."""
     return f"{configuration} (recorded)"
 
 
 def ideal_over(configurations: Mapping[str, Configuration], inputs: Sequence[str]) -> str | None:
-    """The configuration that is ideal fusion of these very units without latency; None: there is none."""
-    for name, one in configurations.items():
-        alike = one.recorded is None and not isinstance(one.units, str) and set(one.units) == set(inputs)
-        if alike and one.fusion == Ideal() and one.link is None and not one.latency_s and one.issue_hz is None:
+    """The configuration that is ideal fusion of exactly these units, without latency or link; None: there is none."""
+    for name, configuration in configurations.items():
+        alike = (
+            configuration.recorded is None
+            and not isinstance(configuration.units, str)
+            and set(configuration.units) == set(inputs)
+        )
+        if (
+            alike
+            and configuration.fusion == IdealFusion()
+            and configuration.link is None
+            and not configuration.latency_s
+            and configuration.issue_hz is None
+        ):
             return name
     return None
 
 
-def _with_ideals(configurations: dict[str, Configuration]) -> dict[str, Configuration]:
-    """Beside each recorded output ideal fusion of its inputs, `<name>:ideal`, where there is none yet."""
+def _add_ideals(configurations: dict[str, Configuration]) -> dict[str, Configuration]:
+    """The configurations, with ideal fusion of the inputs of each recorded output, `<name>:ideal`, where it lacks."""
     result = dict(configurations)
-    for name, one in configurations.items():
-        if one.inputs is None or ideal_over(result, one.inputs) is not None:
+    for name, configuration in configurations.items():
+        if configuration.inputs is None or ideal_over(result, configuration.inputs) is not None:
             continue
         if f"{name}:ideal" in result:
             raise ValueError(f"{name}:ideal: expected ideal fusion of the inputs of {name}, found another; rename it")
-        result[f"{name}:ideal"] = Configuration(units=one.inputs)
+        result[f"{name}:ideal"] = Configuration(units=configuration.inputs)
     return result
 
 
@@ -230,9 +413,9 @@ LogEntry = Either[str, LogSettings]
 """A path, with wildcards or not, or a mapping with settings."""
 
 
-def _as_file(schema: dict[str, Any]) -> None:
-    """A file has to name its logs; only an experiment that is made in Python may leave them out."""
-    described(schema)
+def _require_logs(schema: dict[str, Any]) -> None:
+    """Require `logs` in the JSON schema: only an experiment that is made in Python may leave them out."""
+    drop_python_examples(schema)
     del schema["properties"]["logs"]["default"]
     schema["required"].insert(1, "logs")
 
@@ -248,16 +431,16 @@ class Experiment(Frozen):
     (50, 0)
     """
 
-    model_config = ConfigDict(json_schema_extra=_as_file)
+    model_config = ConfigDict(json_schema_extra=_require_logs)
 
-    version: Annotated[Literal[1], BeforeValidator(_version)]
+    version: Annotated[Literal[1], BeforeValidator(_check_version)]
     logs: Annotated[tuple[LogEntry, ...], Field(min_length=1)] = ()
-    read: HowRead = Read()
+    read: HowRead = TruthTopic()
     ego: Ego | None = None
     window_s: WindowOf | None = None
     max_gap_s: Positive = 0.5
     runs: Count = 1
-    seed: Annotated[int, Field(strict=True), AfterValidator(_of_64_bits)] = 0
+    seed: Annotated[int, Field(strict=True), AfterValidator(_check_64_bits)] = 0
     pems: dict[Id, Pem] = Field(default_factory=dict)
     units: dict[UnitName, Unit] = Field(default_factory=dict)
     obstacles: tuple[Obstacle, ...] = ()
@@ -272,7 +455,7 @@ class Experiment(Frozen):
     @field_validator("configurations", mode="after")
     @classmethod
     def _ideals(cls, configurations: dict[str, Configuration]) -> dict[str, Configuration]:
-        return _with_ideals(configurations)
+        return _add_ideals(configurations)
 
     @property
     def modelled(self) -> dict[str, Unit]:
@@ -280,7 +463,7 @@ class Experiment(Frozen):
         return {name: unit for name, unit in self.units.items() if unit.recorded is None}
 
     @property
-    def recorded(self) -> dict[str, Recorded]:
+    def recorded(self) -> dict[str, RecordedTopic]:
         """The units whose lists are recorded in the log."""
         return {name: unit.recorded for name, unit in self.units.items() if unit.recorded is not None}
 
@@ -290,7 +473,7 @@ class Experiment(Frozen):
         return {name: one.recorded for name, one in self.configurations.items() if one.recorded is not None}
 
     def units_of(self, configuration: Configuration) -> tuple[str, ...]:
-        """Names of the units of a configuration, in the experiment's order; none for the truth and a stack's output."""
+        """Names of the units of a configuration, in the experiment's order; none for the truth and recorded outputs."""
         if configuration.units == "truth":
             return ()
         if configuration.units == "all":
@@ -298,20 +481,21 @@ class Experiment(Frozen):
         return tuple(name for name in self.units if name in configuration.units)
 
     def links_of(self, name: str) -> list[UnitLinks]:
-        """The links of a configuration: those that its units send by, and last what `latency_s` adds."""
+        """The links of a configuration: those that its units send by, and last the one that adds `latency_s`."""
         configuration = self.configurations[name]
         units = self.units_of(configuration) or (TRUTH,)
         by_link: dict[str, list[str]] = {}
-        found: dict[str, LinkModel] = {}
+        links: dict[str, LinkModel] = {}
         for unit in units:
             link = configuration.link_of(unit)
             if link is not None:
                 where = f"links.{link}" if isinstance(link, str) else f"configurations.{name}.link"
-                found[where] = self.links[link] if isinstance(link, str) else link
+                links[where] = self.links[link] if isinstance(link, str) else link
                 by_link.setdefault(where, []).append(unit)
         every = len(by_link) == 1 and len(*by_link.values()) == len(units)
         added = UnitLinks(f"configurations.{name}.latency_s", ConstantLink(latency_s=configuration.latency_s))
-        return [UnitLinks(w, link, None if every else frozenset(by_link[w])) for w, link in found.items()] + [added]
+        senders = {where: None if every else frozenset(by_link[where]) for where in links}
+        return [*(UnitLinks(where, link, senders[where]) for where, link in links.items()), added]
 
     def has_way(self, name: str) -> bool:
         """Whether lists of a configuration come by a link, or of a unit with `ready` or `sends`."""
@@ -323,16 +507,16 @@ class Experiment(Frozen):
 
     def delay_of(self, name: str, unit: str) -> float | None:
         """Seconds from capture to arrival of the lists of a unit in a configuration; None: they differ."""
-        one = self.units.get(unit)
-        ready_s = one.ready.fixed_s if one is not None and one.ready is not None else 0.0
+        sender = self.units.get(unit)
+        ready_s = sender.ready.fixed_s if sender is not None and sender.ready is not None else 0.0
         links = [of.link.fixed_s(unit) for of in self.links_of(name) if of.units is None or unit in of.units]
         parts = [part for part in (ready_s, *links) if part is not None]
         return sum(parts) if len(parts) == len(links) + 1 else None
 
     def shown(self) -> dict[str, Configuration]:
         """The configurations that are written to MCAP and .rrd."""
-        wanted = self.show.configurations if self.show is not None else None
-        return {name: c for name, c in self.configurations.items() if wanted is None or name in wanted}
+        names = self.show.configurations if self.show is not None else None
+        return {name: c for name, c in self.configurations.items() if names is None or name in names}
 
     def as_written(self) -> dict[str, Any]:
         """The experiment with every default filled in, as plain data for YAML."""

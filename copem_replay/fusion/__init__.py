@@ -1,7 +1,9 @@
 """Fusion: the receiver's tracks, from the lists that have arrived (f of the paper's coPEM)."""
 
+from __future__ import annotations
+
 FUSIONS = {
-    "ideal": "copem_replay.fusion.base:Ideal",
+    "ideal": "copem_replay.fusion.interface:IdealFusion",
     "union": "copem_replay.fusion.union:Union",
     "nms": "copem_replay.fusion.nms:Nms",
     "gnn": "copem_replay.fusion.gnn:Gnn",

@@ -3,7 +3,7 @@
 Everywhere: means `x (n, d)`, covariances `cov (n, d, d)`, n ≥ 1, as n units state them; slices of larger arrays will
 do. Covariances are symmetric and positive definite (the caller floors their eigenvalues); *information* I is their
 inverse. Results are new arrays, the covariance symmetric and positive definite. The order of the inputs does not
-matter, beyond rounding. An input that wins alone comes back as it is, to the last bit.
+matter, beyond rounding. An input that wins alone is returned as it is, to the last bit.
 
 All in one file, because Numba's cache on disk only notices changes in the file of the function it compiled.
 """
@@ -18,14 +18,14 @@ import numpy as np
 from copem_replay.core.tracks import Bool, Float
 
 SMALLEST_VARIANCE_M2 = 1e-9
-"""Eigenvalues of a measurement's covariance below this count as this (the contract's)."""
+"""Smaller eigenvalues of a stated covariance count as this: exact positions have an inverse, too."""
 FLATTEST = 1e-12
-"""No eigenvalue counts as less than this share of the other (chosen): rounding could make it negative."""
+"""No eigenvalue counts as less than this share of the other, as rounding could make it negative."""
 
 
 @nb.njit(cache=True, nogil=True)
-def floored(ee: float, en: float, nn: float) -> tuple[float, float, float]:
-    """The covariance with the same axes whose eigenvalues are not too small."""
+def floor_eigenvalues(ee: float, en: float, nn: float) -> tuple[float, float, float]:
+    """The covariance (ee, en; en, nn) with its axes kept and eigenvalues that are too small raised."""
     middle, half = (ee + nn) / 2, math.hypot((ee - nn) / 2, en)
     high = max(middle + half, SMALLEST_VARIANCE_M2)
     low = max(middle - half, SMALLEST_VARIANCE_M2, FLATTEST * high)
@@ -39,22 +39,22 @@ def floored(ee: float, en: float, nn: float) -> tuple[float, float, float]:
 
 
 _GAP = 1e-12
-"""The optimum is found when no input could lower the criterion by more than this share of it (chosen)."""
+"""The search ends when no input could lower the criterion by more than this share of it: a few times rounding."""
 _RIDGE = 1e-9
-"""Added to the curvature, which is of the order of 1, for weights that change nothing or nearly so (chosen)."""
+"""Added to the curvature (of the order of 1), so that it can be inverted where weights change next to nothing."""
 _ALIKE = 1e-9
-"""Inputs that score this little less than the best may share its weight (chosen)."""
+"""Inputs that score this little less than the best may share its weight: above the rounding of scores."""
 _SOFT = 1e-12
-"""Square of how different inputs are, relative, that rather share alike than by what tells them apart (chosen)."""
+"""Square of a relative difference of inputs (1e-6) below which they share weight alike: it could be rounding."""
 _TIE = 1e-12
-"""Traces that differ by less than this share are equal: rounding (chosen)."""
+"""Traces that differ by less than this share are equal: it is rounding."""
 
 
 @nb.njit(cache=True, nogil=True)
 def inverse_variance(x: Float, cov: Float) -> tuple[Float, Float]:
     """Mean (d,) and covariance (d, d) of the summed information: optimal if and only if the errors are independent."""
-    information = inverses(cov)
-    return _combined(x, cov, information, np.ones(len(x)))
+    information = invert_all(cov)
+    return _combine_weighted(x, cov, information, np.ones(len(x)))
 
 
 @nb.njit(cache=True, nogil=True)
@@ -68,15 +68,15 @@ def covariance_intersection(x: Float, cov: Float, by_determinant: bool) -> tuple
     Source: S. Julier, J. Uhlmann, "A non-divergent estimation algorithm in the presence of unknown correlations",
     American Control Conference 1997. All inputs at once, not pair after pair, which would depend on their order.
     """
-    information = inverses(cov)
+    information = invert_all(cov)
     weight = _best_weights(information, by_determinant)
-    mean, covariance = _combined(x, cov, information, weight)
+    mean, covariance = _combine_weighted(x, cov, information, weight)
     return mean, covariance, weight
 
 
 @nb.njit(cache=True, nogil=True)
 def fast_covariance_intersection(x: Float, cov: Float, keep_best: bool) -> tuple[Float, Float, Float]:
-    """The same with weights in closed form: mean (d,), covariance (d, d), weights (n,).
+    """Covariance intersection with weights in closed form: mean (d,), covariance (d, d), weights (n,).
 
     The formula can end up worse than the best of its inputs. With `keep_best`, the input with the least trace is
     returned where that is less than the result's, with weight 1; several that tie share it, no worse than each alone.
@@ -84,16 +84,16 @@ def fast_covariance_intersection(x: Float, cov: Float, keep_best: bool) -> tuple
     Source: D. Fränken, A. Hüpper, "Improved fast covariance intersection for distributed data fusion", FUSION 2005.
     """
     n, d = x.shape
-    information = inverses(cov)
+    information = invert_all(cov)
     total = np.zeros((d, d))
     for k in range(n):
         total += information[k]
-    whole = _determinant(total)
+    whole = _safe_determinant(total)
     weight = np.empty(n)
     for k in range(n):
-        weight[k] = whole - _determinant(total - information[k]) + _determinant(information[k])
+        weight[k] = whole - _safe_determinant(total - information[k]) + _safe_determinant(information[k])
     weight /= weight.sum()
-    mean, covariance = _combined(x, cov, information, weight)
+    mean, covariance = _combine_weighted(x, cov, information, weight)
     if keep_best:
         trace = np.empty(n)
         for k in range(n):
@@ -102,12 +102,12 @@ def fast_covariance_intersection(x: Float, cov: Float, keep_best: bool) -> tuple
         if np.trace(covariance) > least * (1 + _TIE):
             weight = (trace <= least * (1 + _TIE)).astype(np.float64)
             weight /= weight.sum()
-            mean, covariance = _combined(x, cov, information, weight)
+            mean, covariance = _combine_weighted(x, cov, information, weight)
     return mean, covariance, weight
 
 
 @nb.njit(cache=True, nogil=True)
-def _combined(x: Float, cov: Float, information: Float, weight: Float) -> tuple[Float, Float]:
+def _combine_weighted(x: Float, cov: Float, information: Float, weight: Float) -> tuple[Float, Float]:
     """Mean and covariance where input i counts `weight` times."""
     n, d = x.shape
     only = -1
@@ -131,7 +131,7 @@ def _combined(x: Float, cov: Float, information: Float, weight: Float) -> tuple[
                 total[i, j] += part
                 # Relative to the first: information of 1e9 times kilometres would leave no digits for millimetres.
                 moment[i] += part * (x[k, j] - x[0, j])
-    invert(total, covariance)
+    invert_matrix(total, covariance)
     for i in range(d):
         mean[i] = 0.0
         for j in range(d):
@@ -140,7 +140,7 @@ def _combined(x: Float, cov: Float, information: Float, weight: Float) -> tuple[
     return mean, covariance
 
 
-# ---------------------------------------------------------------- the best weights
+# The best weights.
 #
 # The criterion is convex in the weights: the problem is that of optimal designs of experiments. With J = Σ wᵢIᵢ, the
 # *score* of input i is how fast the criterion falls as i gains weight, over its mean under w: tr(J⁻¹Iᵢ)/d for the
@@ -185,7 +185,7 @@ def _best_weights(information: Float, by_determinant: bool) -> Float:
             if enters < 0 or score[enters] <= 1 + _GAP:
                 break
             has[enters] = True
-        change = _newton(lever, score, has, 1.0 if by_determinant else 2.0)
+        change = _newton_step(lever, score, has, 1.0 if by_determinant else 2.0)
         longest = np.inf
         along = np.zeros((d, d))
         for k in range(n):
@@ -197,25 +197,25 @@ def _best_weights(information: Float, by_determinant: bool) -> Float:
         if not 0 < longest < np.inf:
             break
         # Close to the optimum plain steps: the slope along weights that change next to nothing is rounding.
-        step = _lowest(along, B, by_determinant, longest) if off > 1e-6 else min(1.0, longest)
+        step = _search_line(along, B, by_determinant, longest) if off > 1e-6 else min(1.0, longest)
         for k in range(n):
             gone = step == longest and change[k] < 0 and -weight[k] / change[k] <= longest * (1 + 1e-9)
             has[k] = has[k] and not gone
             weight[k] = max(weight[k] + step * change[k], 0.0) if has[k] else 0.0
         weight /= weight.sum()
-    _share(info, weight, has | (score >= 1 - _ALIKE))
+    _share_weight(info, weight, has | (score >= 1 - _ALIKE))
     return weight
 
 
 @nb.njit(cache=True, nogil=True)
-def _share(info: Float, weight: Float, among: Bool) -> None:
+def _share_weight(info: Float, weight: Float, among: Bool) -> None:
     """Of all weights `among` these inputs that give the same Σ wᵢIᵢ, take those with the least Σ wᵢ², in place.
 
     They are wᵢ = max(0, ⟨Λ, Iᵢ⟩) for some symmetric Λ, and Newton's method finds it, penalised by _SOFT · |Λ|²/2: of
     inputs that differ by less than 1e-6 it thus lets the sum be off a little, rather than amplify rounding.
     """
-    chosen = np.flatnonzero(among)
-    c, d = len(chosen), info.shape[1]
+    sharing = np.flatnonzero(among)
+    c, d = len(sharing), info.shape[1]
     if c == 1:
         return
     size = d * (d + 1) // 2
@@ -224,8 +224,8 @@ def _share(info: Float, weight: Float, among: Bool) -> None:
         e = 0
         for i in range(d):
             for j in range(i + 1):
-                entries[p, e] = info[chosen[p], i, j]
-                target[e] += weight[chosen[p]] * entries[p, e]
+                entries[p, e] = info[sharing[p], i, j]
+                target[e] += weight[sharing[p]] * entries[p, e]
                 largest = max(largest, abs(entries[p, e]))
                 e += 1
     soft = _SOFT * largest**2
@@ -243,7 +243,7 @@ def _share(info: Float, weight: Float, among: Bool) -> None:
                     for f in range(e + 1):
                         curvature[e, f] += entries[p, e] * entries[p, f]
         invert_root(curvature, root)
-        multiplier += solve(root, left)
+        multiplier += solve_with_root(root, left)
         settled += 1
         for p in range(c):
             total = 0.0
@@ -254,7 +254,7 @@ def _share(info: Float, weight: Float, among: Bool) -> None:
             share[p], above[p] = max(total, 0.0), total > 0
         if settled == 3:  # one step solves it, two more take off what rounding left
             for p in range(c):
-                weight[chosen[p]] = share[p]
+                weight[sharing[p]] = share[p]
             weight /= weight.sum()
             return
 
@@ -296,35 +296,35 @@ def _whiten(info: Float, weight: Float, B: Float, by_determinant: bool) -> None:
 
 
 @nb.njit(cache=True, nogil=True)
-def _newton(lever: Float, score: Float, has: Bool, times: float) -> Float:
+def _newton_step(lever: Float, score: Float, has: Bool, times: float) -> Float:
     """Newton's change of the weights (n,), its sum 0; inputs without weight keep none."""
-    chosen = np.flatnonzero(has)
-    c, d = len(chosen), lever.shape[1]
+    active = np.flatnonzero(has)
+    c, d = len(active), lever.shape[1]
     curvature, root = np.empty((c, c)), np.empty((c, c))
     for p in range(c):
         for q in range(p + 1):
             total = 0.0
             for i in range(d):
                 for j in range(d):
-                    total += lever[chosen[p], i, j] * lever[chosen[q], i, j]
+                    total += lever[active[p], i, j] * lever[active[q], i, j]
             curvature[p, q] = times * total
         curvature[p, p] += _RIDGE
     invert_root(curvature, root)
-    gain, one = solve(root, score[chosen] - 1), solve(root, np.ones(c))
-    shift = gain.sum() / one.sum()  # so that the changes sum to 0
+    gain, ones_solved = solve_with_root(root, score[active] - 1), solve_with_root(root, np.ones(c))
+    shift = gain.sum() / ones_solved.sum()  # so that the changes sum to 0
     change = np.zeros(len(has))
     for p in range(c):
-        change[chosen[p]] = gain[p] - shift * one[p]
+        change[active[p]] = gain[p] - shift * ones_solved[p]
     return change
 
 
 @nb.njit(cache=True, nogil=True)
-def _lowest(along: Float, B: Float, by_determinant: bool, longest: float) -> float:
+def _search_line(along: Float, B: Float, by_determinant: bool, longest: float) -> float:
     """How far to go from J = 1 along `along` until the criterion hardly falls any more: at most `longest`."""
-    first = _slope(0.0, along, B, by_determinant)
+    first = _criterion_slope(0.0, along, B, by_determinant)
     low, high, step = 0.0, np.inf, min(1.0, longest)
     for _ in range(60):
-        slope = _slope(step, along, B, by_determinant)
+        slope = _criterion_slope(step, along, B, by_determinant)
         if abs(slope) <= 0.1 * abs(first) or (slope < 0 and step == longest):
             return step
         if slope < 0:
@@ -336,7 +336,7 @@ def _lowest(along: Float, B: Float, by_determinant: bool, longest: float) -> flo
 
 
 @nb.njit(cache=True, nogil=True)
-def _slope(step: float, along: Float, B: Float, by_determinant: bool) -> float:
+def _criterion_slope(step: float, along: Float, B: Float, by_determinant: bool) -> float:
     """Derivative of the criterion by `step` at J = 1 + step · along, over its value at J = 1 (of the logarithm: /d)."""
     d = len(along)
     J, inverse = np.empty((d, d)), np.empty((d, d))
@@ -344,7 +344,7 @@ def _slope(step: float, along: Float, B: Float, by_determinant: bool) -> float:
         for j in range(d):
             J[i, j] = step * along[i, j]
         J[i, i] += 1.0
-    invert(J, inverse)
+    invert_matrix(J, inverse)
     total = 0.0
     if by_determinant:
         for i in range(d):
@@ -362,21 +362,21 @@ def _slope(step: float, along: Float, B: Float, by_determinant: bool) -> float:
     return total
 
 
-# ---------------------------------------------------------------- small symmetric positive definite matrices
+# Small symmetric positive definite matrices.
 
 
 @nb.njit(cache=True, nogil=True)
-def inverses(cov: Float) -> Float:
-    """Inverses (n, d, d)."""
+def invert_all(cov: Float) -> Float:
+    """Inverses (n, d, d) of covariances (n, d, d)."""
     information = np.empty(cov.shape)
     for k in range(len(cov)):
-        invert(cov[k], information[k])
+        invert_matrix(cov[k], information[k])
     return information
 
 
 @nb.njit(cache=True, nogil=True)
-def invert(matrix: Float, out: Float) -> None:
-    """The inverse, exactly symmetric."""
+def invert_matrix(matrix: Float, out: Float) -> None:
+    """Writes the inverse of a matrix (d, d) into `out`, exactly symmetric."""
     d = len(matrix)
     if d == 2:
         a, b, c = matrix[0, 0], (matrix[0, 1] + matrix[1, 0]) / 2, matrix[1, 1]
@@ -396,7 +396,7 @@ def invert(matrix: Float, out: Float) -> None:
 
 @nb.njit(cache=True, nogil=True)
 def invert_root(matrix: Float, out: Float) -> None:
-    """L⁻¹ where LLᵀ is the matrix, of which only the lower triangle is read (Cholesky)."""
+    """Writes L⁻¹ into `out`, where LLᵀ is the matrix, of which only the lower triangle is read (Cholesky)."""
     d = len(matrix)
     for i in range(d):
         for j in range(i + 1):
@@ -415,8 +415,8 @@ def invert_root(matrix: Float, out: Float) -> None:
 
 
 @nb.njit(cache=True, nogil=True)
-def solve(root: Float, right: Float) -> Float:
-    """What the matrix takes to `right`, given its L⁻¹."""
+def solve_with_root(root: Float, right: Float) -> Float:
+    """The solution (d,) of M y = `right`, given L⁻¹ of M = LLᵀ."""
     solution = np.zeros(len(right))
     for i in range(len(right)):
         total = 0.0
@@ -428,7 +428,7 @@ def solve(root: Float, right: Float) -> Float:
 
 
 @nb.njit(cache=True, nogil=True)
-def _determinant(matrix: Float) -> float:
+def _safe_determinant(matrix: Float) -> float:
     """The determinant; 0 where rounding leaves a matrix that is not positive definite."""
     d = len(matrix)
     if d == 2:

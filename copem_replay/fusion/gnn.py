@@ -1,22 +1,26 @@
-"""Global nearest neighbour: one optimal assignment per list, every instant for itself."""
+"""Global nearest neighbour fusion: one optimal assignment per list, every instant by itself."""
 
 from __future__ import annotations
 
 import math
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-import numpy as np
 from pydantic import Field, model_validator
 
-from copem_replay.core.agree import AGREE
 from copem_replay.core.components import NotNegative, Share
-from copem_replay.core.object_list import ENTRY, Entries, Inputs, ObjectLists
-from copem_replay.core.tracks import Float
-from copem_replay.fusion.base import ListFusion
-from copem_replay.fusion.combine_kernel import CROSS, INVERSE, SPLIT_BY_SHARE, SPLIT_BY_VARIANCE, combine_members
-from copem_replay.fusion.conflict_kernel import unite
-from copem_replay.fusion.gnn_kernel import Clusters, fuse_run, intersect
-from copem_replay.fusion.union import run_after_run
+from copem_replay.core.object_list import AGREE, Entries, Inputs, ObjectLists
+from copem_replay.fusion.combine import (
+    CROSS,
+    INVERSE,
+    SPLIT_BY_SHARE,
+    SPLIT_BY_VARIANCE,
+    combine_members,
+    unite_conflicting,
+)
+from copem_replay.fusion.gnn_kernel import EntryClusters, cluster_run, intersect_clusters
+from copem_replay.fusion.inputs import view_as_numbers
+from copem_replay.fusion.interface import ListFusion
+from copem_replay.fusion.union import join_runs
 
 Gate = Annotated[float, Field(strict=True, gt=0, lt=1)]
 
@@ -25,10 +29,10 @@ _KEYS_OF: dict[str, dict[str, float]] = {
     "cross_covariance": {"correlation": 0.5},
     "covariance_union": {"conflict_gate": 0.99},  # as wide as `gate`
 }
-"""Keys that only one way to combine has, and what they are by default (`dependent_m2` stands instead of the share)."""
+"""Keys that only one way to combine has, with their defaults (`dependent_m2` stands in place of the share)."""
 
 
-def _absent(value: object) -> bool:
+def _is_absent(value: object) -> bool:
     return value is None
 
 
@@ -64,11 +68,11 @@ class Gnn(ListFusion):
     minimise: Literal["trace", "determinant"] = "trace"
     gate: Gate = 0.99
     min_existence: Share = 0.0
-    # Chosen where they are not said: half of everything, and the gate.
-    dependent_share: Share | None = Field(None, exclude_if=_absent)
-    dependent_m2: NotNegative | None = Field(None, exclude_if=_absent)
-    correlation: Annotated[float, Field(strict=True, ge=0, lt=1)] | None = Field(None, exclude_if=_absent)
-    conflict_gate: Gate | None = Field(None, exclude_if=_absent)
+    # Defaults where they are absent: half of everything, and `gate` (see _KEYS_OF).
+    dependent_share: Share | None = Field(None, exclude_if=_is_absent)
+    dependent_m2: NotNegative | None = Field(None, exclude_if=_is_absent)
+    correlation: Annotated[float, Field(strict=True, ge=0, lt=1)] | None = Field(None, exclude_if=_is_absent)
+    conflict_gate: Gate | None = Field(None, exclude_if=_is_absent)
 
     resumable: ClassVar[bool] = True
 
@@ -99,7 +103,7 @@ class Gnn(ListFusion):
 
     @property
     def _method(self) -> tuple[int, float] | None:
-        """How members are combined whose errors hang together, and to what degree; None: in another way."""
+        """The method of `combine_members` and its setting; None: members are combined in another way."""
         if self.combine == "inverse_covariance_intersection":
             return INVERSE, 0.0
         for method, setting in (
@@ -110,15 +114,15 @@ class Gnn(ListFusion):
         return None
 
     def fuse(self, inputs: Inputs) -> ObjectLists:
-        """Every run by itself."""
+        """Fuse every run by itself."""
         runs = []
         method = self._method
         informed = method is None and self.combine not in ("covariance_intersection", "fast_covariance_intersection")
         for bounds in inputs.lists.start:
             entries = inputs.lists.entries[bounds[0] : bounds[-1]]
-            clusters, fused = fuse_run(
-                entries, numbers(entries), bounds - bounds[0], inputs.captured_s, inputs.arrives_s, inputs.newest,
-                AGREE, -2 * math.log1p(-self.gate), informed, self.min_existence,
+            clusters, fused = cluster_run(
+                entries, view_as_numbers(entries), bounds - bounds[0], inputs.captured_s, inputs.arrives_s,
+                inputs.newest, AGREE, -2 * math.log1p(-self.gate), informed, self.min_existence,
             )  # fmt: skip
             if method is not None:
                 combine_members(clusters, *method, self.minimise == "determinant", fused)
@@ -126,16 +130,13 @@ class Gnn(ListFusion):
                 clusters, fused = self._united(clusters, fused, entries, inputs)
             elif not informed:
                 fast = self.combine == "fast_covariance_intersection"
-                intersect(clusters, self.minimise == "determinant", fast, fused)
+                intersect_clusters(clusters, self.minimise == "determinant", fast, fused)
             runs.append((clusters.start, fused))
-        return run_after_run(runs, len(inputs.issue_s))
+        return join_runs(runs, len(inputs.issue_s))
 
-    def _united(self, clusters: Clusters, fused: Entries, entries: Entries, inputs: Inputs) -> tuple[Clusters, Entries]:
+    def _united(
+        self, clusters: EntryClusters, fused: Entries, entries: Entries, inputs: Inputs
+    ) -> tuple[EntryClusters, Entries]:
+        """The clusters and their entries, those in conflict joined."""
         gate = -2 * math.log1p(-(self.gate if self.conflict_gate is None else self.conflict_gate))
-        return unite(clusters, fused, entries, inputs.arrives_s, AGREE, gate)
-
-
-def numbers(entries: Entries) -> Float:
-    """The same memory as rows of numbers, x and y first; whatever is an integer is none of them (see WIDTH)."""
-    values: Float = np.ascontiguousarray(entries).view(np.float64).reshape(len(entries), ENTRY.itemsize // 8)
-    return values
+        return unite_conflicting(clusters, fused, entries, inputs.arrives_s, AGREE, gate)

@@ -1,8 +1,8 @@
-"""The compiled kernel of fusion/gnn.py: see there for what it computes.
+"""The compiled kernel of global nearest neighbour fusion: entries in clusters, and the entry of each cluster.
 
-How: the entries of every list are brought into an order that depends on their content only, once per run. At an
-instant the lists are taken up one after the other; candidates for pairs are found by sweeping entries and clusters in
-the order of x, in windows as wide as the gate can reach.
+The entries of every list are brought into an order that depends on their content only, once per run. At an instant the
+lists are taken up one after the other (fusion/gnn.py says by which rules); candidates for pairs are found by sweeping
+entries and clusters in the order of x, in windows as wide as the gate can reach.
 
 Letters: N entries of one run, F lists, K instants, U units, C classes, M entries of the lists that count.
 """
@@ -15,21 +15,16 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from copem_replay.core.agree import most_probable
-from copem_replay.core.assignment import assign_pairs, largest_around
-from copem_replay.core.object_list import ENTRY, Entries
+from copem_replay.core.assignment import assign_pairs, spread_component_maximum
+from copem_replay.core.object_list import Entries, most_probable_class
 from copem_replay.core.tracks import CLASSES, Bool, Float, Int
-from copem_replay.fusion.content_order import compare_rows, sort_rows
-from copem_replay.fusion.covariance import covariance_intersection, fast_covariance_intersection, floored
-
-WIDTH = 13 + len(CLASSES)
-"""So many numbers of an entry, from the first on, describe the object; the rest are times and ids."""
-assert list(ENTRY.names or ())[13:15] == ["class_probability", "captured_s"]
+from copem_replay.fusion.covariance import covariance_intersection, fast_covariance_intersection, floor_eigenvalues
+from copem_replay.fusion.inputs import WIDTH, compare_rows, sort_rows
 
 _OPPOSED = 1e-9
-"""Yaws whose mean vector is shorter than this cancel out (chosen: rounding)."""
+"""Yaws whose mean vector is shorter than this cancel out: what is left is rounding."""
 _SURPLUS = 1e-9
-"""By how much the dearest allowed pair beats none (chosen: any positive number does)."""
+"""By how much the dearest allowed pair beats none; any positive number does."""
 
 POINT = np.dtype(
     [
@@ -38,12 +33,12 @@ POINT = np.dtype(
         ("row", "i8"), ("list", "i8"),  # which entry it is, of which list; a cluster: its founder
     ]
 )  # fmt: skip
-"""What association goes by, of an entry or of a cluster so far."""
+"""What association uses of an entry, or of a cluster so far."""
 
 Points = NDArray[Any]
 
 
-class Clusters(NamedTuple):
+class EntryClusters(NamedTuple):
     """The entries of each cluster of each instant, in one run."""
 
     start: Int  # (K + 1,) where the clusters of each instant begin
@@ -53,18 +48,18 @@ class Clusters(NamedTuple):
 
 
 @nb.njit(cache=True, nogil=True)
-def fuse_run(
+def cluster_run(
     entries: Entries, numbers: Float, bounds: Int, captured_s: Float, arrives_s: Float, newest: Int,
     agree: Bool, gate: float, informed: bool, min_existence: float,
-) -> tuple[Clusters, Entries]:  # fmt: skip
-    """The clusters of one run, and what each says if its members are independent.
+) -> tuple[EntryClusters, Entries]:  # fmt: skip
+    """The clusters of one run, and the entry of each if its members are independent.
 
-    `entries (N,)`, `numbers` the same as rows of numbers, list f between `bounds[f]` and `bounds[f + 1]` (F + 1,);
+    `entries (N,)`, `numbers`: the entries as rows of numbers, list f between `bounds[f]` and `bounds[f + 1]` (F + 1,);
     `newest (K, U)`; `agree (C, C)`; `gate`: largest squared Mahalanobis distance of a pair; `informed`: the clusters'
     running states sum information, else they intersect pairwise.
     """
     content = numbers[:, :WIDTH]
-    points, first = _points(entries, content, bounds, newest, min_existence)
+    points, first = _collect_points(entries, content, bounds, newest, min_existence)
     instants, units = newest.shape
     most = total = 0
     for k in range(instants):
@@ -81,10 +76,10 @@ def fuse_run(
     member, fused = np.empty(total, np.int64), np.empty(most, entries.dtype)
     for k in range(instants):
         count = joined = 0
-        for q in range(_lists_in_order(newest[k], captured_s, arrives_s, points, first, content, lists)):
+        for q in range(_order_lists(newest[k], captured_s, arrives_s, points, first, content, lists)):
             a = first[lists[q]]
             entering = points[a : first[lists[q] + 1]]
-            row, col, cost, spread, pairs = _allowed_pairs(
+            row, col, cost, spread, pairs = _find_allowed_pairs(
                 entering, states, by_x[:count], agree, gate, row, col, cost, spread
             )
             assign_pairs(row[:pairs], col[:pairs], cost[:pairs], len(entering), count, partner)
@@ -95,27 +90,27 @@ def fuse_run(
                     states[c], class_sum[c] = point, 0.0
                     count += 1
                 else:
-                    join(states[c], point, informed)
+                    join_entry(states[c], point, informed)
                 for h in range(len(CLASSES)):
                     class_sum[c, h] += entries[point.row].class_probability[h]
                 if states[c].kind != point.kind:
-                    states[c].kind = most_probable(class_sum[c])
+                    states[c].kind = most_probable_class(class_sum[c])
                 joining[joined], claimed[joined] = a + i, c
                 joined += 1
             _sort_by_x(states, by_x[:count])
         s = start[k]
         start[k + 1] = s + count
-        _group(joining[:joined], claimed[:joined], member, begin[s : s + count + 1])
-        fused = _lengthened(fused, s, s + count)
+        _group_members(joining[:joined], claimed[:joined], member, begin[s : s + count + 1])
+        fused = _lengthen_entries(fused, s, s + count)
         for c in range(count):
             members = member[begin[s + c] : begin[s + c + 1]]
             write_entry(fused[s + c], states[c], class_sum[c], members, points, entries, arrives_s)
-    made = start[instants]
-    return Clusters(start, begin[: made + 1], member, points), fused[:made]
+    cluster_count = start[instants]
+    return EntryClusters(start, begin[: cluster_count + 1], member, points), fused[:cluster_count]
 
 
 @nb.njit(cache=True, nogil=True)
-def intersect(clusters: Clusters, by_determinant: bool, fast: bool, fused: Entries) -> None:
+def intersect_clusters(clusters: EntryClusters, by_determinant: bool, fast: bool, fused: Entries) -> None:
     """Positions and covariances of the clusters by covariance intersection of all members at once, in place."""
     for c in range(len(fused)):
         members = clusters.member[clusters.begin[c] : clusters.begin[c + 1]]
@@ -133,12 +128,14 @@ def intersect(clusters: Clusters, by_determinant: bool, fast: bool, fused: Entri
 
 
 @nb.njit(cache=True, nogil=True)
-def _points(entries: Entries, content: Float, bounds: Int, newest: Int, min_existence: float) -> tuple[Points, Int]:
+def _collect_points(
+    entries: Entries, content: Float, bounds: Int, newest: Int, min_existence: float
+) -> tuple[Points, Int]:
     """Entries that count, list by list, in order of content, (M,), and where those of each list begin, (F + 1,)."""
     needed = np.zeros(len(bounds) - 1, np.bool_)
-    for used in newest.flat:
-        if used >= 0:
-            needed[used] = True
+    for frame in newest.flat:
+        if frame >= 0:
+            needed[frame] = True
     first, rows = np.zeros(len(bounds), np.int64), np.empty(len(entries), np.int64)
     n = 0
     for f in range(len(bounds) - 1):
@@ -153,26 +150,26 @@ def _points(entries: Entries, content: Float, bounds: Int, newest: Int, min_exis
         for i in range(first[f], first[f + 1]):
             point, entry = points[i], entries[rows[i]]
             point.x_m, point.y_m = entry.x_m, entry.y_m
-            point.ee, point.en, point.nn = floored(entry.cov_ee_m2, entry.cov_en_m2, entry.cov_nn_m2)
-            point.kind = most_probable(entry.class_probability)
+            point.ee, point.en, point.nn = floor_eigenvalues(entry.cov_ee_m2, entry.cov_en_m2, entry.cov_nn_m2)
+            point.kind = most_probable_class(entry.class_probability)
             point.row, point.list = rows[i], f
     return points, first
 
 
 @nb.njit(cache=True, nogil=True)
-def _lists_in_order(
+def _order_lists(
     newest: Int, captured_s: Float, arrives_s: Float, points: Points, first: Int, content: Float, lists: Int
 ) -> int:
-    """Puts the lists to go by into `lists`: newest capture first, then longest, then by content. How many there are."""
+    """Puts the lists that count into `lists`: newest capture first, then longest, then by content; returns how many."""
     n = 0
     for f in newest:
         if f < 0 or first[f] == first[f + 1]:
             continue
-        at = n
-        while at > 0 and _list_before(f, lists[at - 1], captured_s, arrives_s, points, first, content):
-            lists[at] = lists[at - 1]
-            at -= 1
-        lists[at] = f
+        place = n
+        while place > 0 and _list_before(f, lists[place - 1], captured_s, arrives_s, points, first, content):
+            lists[place] = lists[place - 1]
+            place -= 1
+        lists[place] = f
         n += 1
     return n
 
@@ -181,6 +178,7 @@ def _lists_in_order(
 def _list_before(
     f: Any, g: Any, captured_s: Float, arrives_s: Float, points: Points, first: Int, content: Float
 ) -> bool:
+    """Whether list f comes before list g: see `_order_lists`."""
     if captured_s[f] != captured_s[g]:
         return bool(captured_s[f] > captured_s[g])
     n, m = first[f + 1] - first[f], first[g + 1] - first[g]
@@ -193,16 +191,16 @@ def _list_before(
     return bool(arrives_s[f] < arrives_s[g])
 
 
-# ---------------------------------------------------------------- association
+# Association.
 
 
 @nb.njit(cache=True, nogil=True)
-def _allowed_pairs(
+def _find_allowed_pairs(
     here: Points, clusters: Points, by_x: Int, agree: Bool, gate: float, row: Int, col: Int, cost: Float, spread: Float
 ) -> tuple[Int, Int, Float, Float, int]:
     """Pairs within the gate whose classes agree: entry, cluster, cost below 0, largest ln|S| of the component.
 
-    The arrays are those given, longer if need be.
+    The arrays returned are those handed in, or longer ones. The last number returned is that of the pairs.
     """
     n = low = 0
     widest = 0.0
@@ -211,7 +209,7 @@ def _allowed_pairs(
     for i in range(len(here)):
         entry = here[i]
         reach = np.sqrt(gate * (widest + entry.ee))
-        # Windows of later entries may begin further left where entries differ in certainty.
+        # The window of a later entry may begin further left where its covariance is larger.
         while low > 0 and clusters[by_x[low - 1]].x_m >= entry.x_m - reach:
             low -= 1
         while low < len(by_x) and clusters[by_x[low]].x_m < entry.x_m - reach:
@@ -234,14 +232,14 @@ def _allowed_pairs(
             volume = np.log(det)
             row[n], col[n], cost[n], spread[n] = i, by_x[p], d2 + volume, volume
             n += 1
-    largest_around(row[:n], col[:n], spread[:n], len(here), len(by_x))
+    spread_component_maximum(row[:n], col[:n], spread[:n], len(here), len(by_x))
     for p in range(n):
         cost[p] -= gate + spread[p] + _SURPLUS
     return row, col, cost, spread, n
 
 
 @nb.njit(cache=True, nogil=True)
-def join(cluster: Any, entry: Any, informed: bool) -> None:
+def join_entry(cluster: Any, entry: Any, informed: bool) -> None:
     """Takes an entry into a cluster's running state: P⁻¹ = αA⁻¹ + βB⁻¹, x = a + PβB⁻¹(b − a).
 
     α = β = 1, or in proportion to 1/tr A, 1/tr B with sum 1.
@@ -263,18 +261,18 @@ def join(cluster: Any, entry: Any, informed: bool) -> None:
 
 @nb.njit(cache=True, nogil=True)
 def _sort_by_x(clusters: Points, by_x: Int) -> None:
-    """By insertion: little has moved since the last time."""
+    """Sorts the clusters `by_x`, in place, by insertion: little has moved since the last time."""
     for p in range(1, len(by_x)):
-        c, at = by_x[p], p
-        while at > 0 and clusters[by_x[at - 1]].x_m > clusters[c].x_m:
-            by_x[at] = by_x[at - 1]
-            at -= 1
-        by_x[at] = c
+        c, place = by_x[p], p
+        while place > 0 and clusters[by_x[place - 1]].x_m > clusters[c].x_m:
+            by_x[place] = by_x[place - 1]
+            place -= 1
+        by_x[place] = c
 
 
 @nb.njit(cache=True, nogil=True)
-def _group(joining: Int, claimed: Int, member: Int, begin: Int) -> None:
-    """Enters joined entries into `member`: those of c between `begin[c]`, given for 0, and the next."""
+def _group_members(joining: Int, claimed: Int, member: Int, begin: Int) -> None:
+    """Writes joined entries into `member`, those of cluster c from `begin[c]` on; `begin[0]` is set before."""
     count = len(begin) - 1
     for c in range(count):
         begin[c + 1] = 0
@@ -289,8 +287,8 @@ def _group(joining: Int, claimed: Int, member: Int, begin: Int) -> None:
 
 
 @nb.njit(cache=True, nogil=True)
-def _lengthened(entries: Entries, used: int, needed: int) -> Entries:
-    """The same entries with room for as many as needed."""
+def _lengthen_entries(entries: Entries, used: int, needed: int) -> Entries:
+    """The entries, copied where there is no room for `needed` of them; the first `used` are kept."""
     if needed <= len(entries):
         return entries
     longer = np.empty(2 * needed, entries.dtype)
@@ -299,14 +297,14 @@ def _lengthened(entries: Entries, used: int, needed: int) -> Entries:
     return longer
 
 
-# ---------------------------------------------------------------- what a cluster says
+# The entry of a cluster.
 
 
 @nb.njit(cache=True, nogil=True)
 def write_entry(
     out: Any, state: Any, class_sum: Float, members: Int, points: Points, entries: Entries, arrives_s: Float
 ) -> None:
-    """The fused entry of one cluster, whose position is that of its running state."""
+    """Writes the fused entry of one cluster, its position that of the running state."""
     out.x_m, out.y_m = state.x_m, state.y_m
     out.cov_ee_m2, out.cov_en_m2, out.cov_nn_m2 = state.ee, state.en, state.nn
     total = sin = cos = z = vx = vy = length = width = height = 0.0

@@ -1,10 +1,11 @@
 """The Ideal Fusion Model (Piazzoni et al. 2022): matching by truth id, Σ = (Σₙ Σₙ⁻¹)⁻¹, μ = Σ · Σₙ Σₙ⁻¹ μₙ.
 
-It combines what the units said, stale or not: nothing is predicted. Of each unit and object it takes the newest entry
-among those of the unit's newest list and of all lists that the receiver takes in at the instant: each is information,
-and other fusions of the same lists must not know sooner. Assumes Gaussian errors, independent across units.
-Two ways with one law: the units' sampled errors are weighed (Σₙ Σ Σₙ⁻¹ εₙ), or ε ~ N(μ, Σ) is drawn once. What the
-paper leaves open is combined by inverse variance as well: yaw on the circle, size, speed; height above ground by mean.
+It combines the lists of the units, stale or not: nothing is predicted. Of each unit and object it takes the newest
+entry among those of the unit's newest list and of all lists that the receiver takes in at the instant: each is
+information, and no other fusion of these lists may know an object sooner. Assumes Gaussian errors, independent across
+units. Two ways with one law: the units' sampled errors are weighed (Σₙ Σ Σₙ⁻¹ εₙ), or ε ~ N(μ, Σ) is drawn once. What
+the paper leaves open is combined by inverse variance as well: yaw on the circle, size, speed; height above ground by
+mean.
 """
 
 from __future__ import annotations
@@ -14,45 +15,46 @@ from typing import NamedTuple
 
 import numpy as np
 
-from copem_replay.communication.arrivals import FusionSchedule, fusion_schedule
-from copem_replay.communication.kept import KeptEntries, Sent, kept_entries
+from copem_replay.communication.arrivals import FusionSchedule, KeptEntries, SentEntries, fusion_schedule, keep_entries
+from copem_replay.core.compiled import borrowing
 from copem_replay.core.fused_tracks import FusedTracks
-from copem_replay.core.kernels import borrowing
 from copem_replay.core.random import CounterRng, RandomKey, object_words
 from copem_replay.core.tracks import NO_CAPTURE_NS, UNCERTAINTIES, VALUES, Bool, Float, Int, Scene, Tracks
 from copem_replay.fusion.covariance import FLATTEST
 
 SMALLEST_VARIANCE = 1e-9
-"""A variance below this counts as this in weights (m², rad², m²/s²; the contract's)."""
+"""A smaller variance counts as this in weights (m², rad², m²/s²): states without error have weights, too."""
 
 
-def fuse(
+def fuse_ideal(
     heard: Tracks,
     *,
     max_age_s: float,
     without_object_ix: int = -1,
     at: FusionSchedule | None = None,
     kept: KeptEntries | None = None,
-    weighed: Weighed | None = None,
+    weighed: WeightedRows | None = None,
 ) -> FusedTracks:
     """One fused list per instant of the receiver, as tracks of the one unit `fused`. `at`: some of the instants.
 
-    `kept`: what the receiver has of units whose messages are partial, of `kept_by_object`; None: there are none.
-    `weighed`: of these rows, where it is known.
+    `kept`: the entries that `keep_by_object` keeps of units with partial messages; None: there are none. `weighed`:
+    weights of the rows of `heard`; None: they are computed.
 
     `heard`: lists with truth ids; arrival times common to all runs. `without_object_ix`: the receiver's own body,
     which it does not list. Frames are the receiver's instants: `arrives_s` is when the list is available,
-    `captured_s` the newest capture among the lists it goes by. NaN where an object is in none of them.
+    `captured_s` the newest capture among the lists that it uses. NaN where an object is in none of them.
     """
     at = at or fusion_schedule(heard, max_age_s=max_age_s)
-    beside = beside_newest(heard, at, kept)
-    rows, start, object_ix, instant = _contributions(heard, at, beside, without_object_ix, kept)
-    counts, rows, start = _newest_of_unit(heard, rows, start) if len(beside.frame) else (heard.valid, rows, start)
-    valid = _any(counts, rows, start)
+    beside = find_lists_beside_newest(heard, at, kept)
+    rows, start, object_ix, instant = _find_contributions(heard, at, beside, without_object_ix, kept)
+    counts, rows, start = (
+        _select_newest_entries(heard, rows, start) if len(beside.frame) else (heard.valid, rows, start)
+    )
+    valid = _any_valid(counts, rows, start)
     out = {name: np.full(valid.shape, np.nan) for name in ("x_m", "y_m", "cov_ee_m2", "cov_en_m2", "cov_nn_m2")}
-    weighed = weighed or Weighed.of(heard)
-    given = Positions(heard.x_m, heard.y_m, *weighed.covariances)
-    _combine_position(counts, given, weighed.information, rows, start, Positions(*out.values()))
+    weighed = weighed or WeightedRows.of(heard)
+    positions = Positions(heard.x_m, heard.y_m, *weighed.covariances)
+    _combine_position(counts, positions, weighed.information, rows, start, Positions(*out.values()))
     spread = _combine_scalars(heard, counts, weighed, rows, start, out)
     captured = np.where(at.newest >= 0, heard.captured_s[at.newest], -np.inf).max(axis=1, initial=-np.inf)
     stamps = np.where(at.newest >= 0, heard.stamp_ns[at.newest], NO_CAPTURE_NS).max(axis=1)
@@ -95,34 +97,39 @@ def draw_posterior(fused_tracks: FusedTracks, scene: Scene, seed: int, runs: Int
     return replace(fused_tracks, fused=drawn)
 
 
-def kept_by_object(
+def keep_by_object(
     heard: Tracks, partial: Bool, schedule: FusionSchedule, at: FusionSchedule, *, max_age_s: float
 ) -> KeptEntries:
-    """Of units (U,) whose messages are `partial` the newest row of each object, in one run; entries go by frame."""
+    """The newest row of each object of the units whose messages are `partial (U,)`, in one run, at the instants `at`.
+
+    Entries are counted list by list, as in `Tracks.by_frame`.
+    """
     order, bounds = heard.by_frame
-    known = heard.valid[0] & (heard.row_object_ix >= 0)
-    of = np.unique(np.stack([heard.row_unit_ix, heard.row_object_ix]), axis=1, return_inverse=True)[1].ravel()
-    return kept_entries(heard, Sent(bounds, np.where(known, of, -1)[order]), partial, schedule, at, max_age_s=max_age_s)
+    kept = heard.valid[0] & (heard.row_object_ix >= 0)
+    object_of = np.unique(np.stack([heard.row_unit_ix, heard.row_object_ix]), axis=1, return_inverse=True)[1].ravel()
+    return keep_entries(
+        heard, SentEntries(bounds, np.where(kept, object_of, -1)[order]), partial, schedule, at, max_age_s=max_age_s
+    )
 
 
-class Beside(NamedTuple):
-    """Lists (B,) that ideal fusion goes by at an instant beside the newest ones, each once."""
+class BesideNewest(NamedTuple):
+    """Lists (B,) that ideal fusion uses beside the newest ones: the instant and the list, each list once."""
 
     instant: Int
     frame: Int
 
 
-def beside_newest(heard: Tracks, at: FusionSchedule, kept: KeptEntries | None) -> Beside:
-    """Those of the instants `at`; what is kept of units whose messages are partial has theirs already."""
+def find_lists_beside_newest(heard: Tracks, at: FusionSchedule, kept: KeptEntries | None) -> BesideNewest:
+    """The lists beside the newest ones at the instants `at`, without those of partial messages, which `kept` holds."""
     instant, frame = at.beside_newest()
     if kept is not None:
         whole = ~kept.partial[heard.frame_unit_ix[frame]]
         instant, frame = instant[whole], frame[whole]
-    return Beside(instant, frame)
+    return BesideNewest(instant, frame)
 
 
-def _lists(heard: Tracks, at: FusionSchedule, beside: Beside, kept: KeptEntries | None) -> tuple[Int, Int]:
-    """Instants, ascending, and the lists that each goes by: unit by unit, the newest first."""
+def _select_lists(heard: Tracks, at: FusionSchedule, beside: BesideNewest, kept: KeptEntries | None) -> tuple[Int, Int]:
+    """Instants, ascending, and the lists that are used at each: unit by unit, the newest first."""
     newest = at.newest if kept is None else kept.newest
     instant, unit = np.nonzero(newest >= 0)
     frame = newest[newest >= 0]
@@ -134,19 +141,19 @@ def _lists(heard: Tracks, at: FusionSchedule, beside: Beside, kept: KeptEntries 
     return instant[order], frame[order]
 
 
-def _contributions(
-    heard: Tracks, at: FusionSchedule, beside: Beside, without_object_ix: int, kept: KeptEntries | None
+def _find_contributions(
+    heard: Tracks, at: FusionSchedule, beside: BesideNewest, without_object_ix: int, kept: KeptEntries | None
 ) -> tuple[Int, Int, Int, Int]:
-    """Which rows of `heard` make each fused row, grouped: rows (C,), start (P + 1,), object and instant (P,).
+    """Contributions: the rows (C,) of `heard` that make up each fused row, start (P + 1,), object and instant (P,).
 
-    Entries without truth id (of recorded units) are in none.
+    Entries without truth id (of recorded units) contribute to none.
     """
     order, bounds = heard.by_frame
     begin, count = bounds[:-1], np.diff(bounds)
     if kept is not None:
         begin, count = np.append(begin, kept.start[:-1] + len(order)), np.append(count, np.diff(kept.start))
         order = np.append(order, order[kept.entry])
-    instant, frame = _lists(heard, at, beside, kept)
+    instant, frame = _select_lists(heard, at, beside, kept)
     begin, count = begin[frame], count[frame]
     within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
     rows = order[np.repeat(begin, count) + within]
@@ -154,65 +161,68 @@ def _contributions(
     object_ix = heard.row_object_ix[rows]
     keep = (object_ix != without_object_ix) & (object_ix >= 0)
     rows, instant, object_ix = rows[keep], instant[keep], object_ix[keep]
-    # Of an object they are in order of instants already, and of units in these; small numbers are sorted in no time.
-    by = np.argsort(object_ix.astype(np.min_scalar_type(object_ix.max(initial=0))), kind="stable")
-    rows, instant, object_ix = rows[by], instant[by], object_ix[by]
+    # Rows of an object are in order of instants and units already; the sort of small integers is fast.
+    order_by_object = np.argsort(object_ix.astype(np.min_scalar_type(object_ix.max(initial=0))), kind="stable")
+    rows, instant, object_ix = rows[order_by_object], instant[order_by_object], object_ix[order_by_object]
     new = np.flatnonzero((np.diff(object_ix, prepend=-1) != 0) | (np.diff(instant, prepend=-1) != 0))
     return rows, np.append(new, len(rows)), object_ix[new], instant[new]
 
 
-def _newest_of_unit(heard: Tracks, rows: Int, start: Int) -> tuple[Bool, Int, Int]:
-    """Which rows count, (S, P): of a unit's entries of one object at an instant only the newest that there is.
+def _select_newest_entries(heard: Tracks, rows: Int, start: Int) -> tuple[Bool, Int, Int]:
+    """(S, P) the rows that count: of a unit's entries about one object at an instant only the newest that was detected.
 
-    And the contributions, as `_contributions` has them, without those that were detected and count in no run. A list
+    Also the contributions, as in `_find_contributions`, without those that were detected and count in no run. A list
     beside a newest one is at one instant only, so its rows count there or nowhere.
     """
     counts, unit_ix = heard.valid.copy(), heard.row_unit_ix
-    _take_older(heard.valid, rows, start, unit_ix, counts)
+    _drop_older_entries(heard.valid, rows, start, unit_ix, counts)
     stay = counts[:, rows].any(axis=0) | ~heard.valid[:, rows].any(axis=0)
     return counts, rows[stay], np.append(0, np.cumsum(stay))[start]
 
 
 @borrowing
-def _take_older(valid: Bool, rows: Int, start: Int, unit_ix: Int, counts: Bool) -> None:
-    # Contributions are in the order of units, and of each unit the newest is the first.
+def _drop_older_entries(valid: Bool, rows: Int, start: Int, unit_ix: Int, counts: Bool) -> None:
+    """Sets `counts` False at detected rows behind a newer detected one of their unit and object.
+
+    Contributions are in the order of units, and of each unit the newest is the first.
+    """
     for s in range(valid.shape[0]):
         for p in range(len(start) - 1):
-            unit, there = -1, False
+            unit, newer = -1, False
             for c in range(start[p], start[p + 1]):
                 r = rows[c]
                 if unit_ix[r] != unit:
-                    unit, there = unit_ix[r], False
-                if valid[s, r] and there:
+                    unit, newer = unit_ix[r], False
+                if valid[s, r] and newer:
                     counts[s, r] = False
-                there = there or valid[s, r]
+                newer = newer or valid[s, r]
 
 
-def _information(heard: Tracks) -> tuple[Float, Float, Float]:
-    """Inverse position covariances ee, en, nn (1 | S, P), of the same eigenvalues as `floored`."""
-    high, low, c2, s2 = _axes(*_covariances(heard))
+def _inverse_covariances(heard: Tracks) -> tuple[Float, Float, Float]:
+    """Inverse position covariances ee, en, nn (1 | S, P), with the eigenvalues of `floor_covariances` inverted."""
+    high, low, c2, s2 = _covariance_axes(*_stated_covariances(heard))
     mean, difference = (1 / high + 1 / low) / 2, (1 / high - 1 / low) / 2
     return mean + difference * c2, difference * s2, mean - difference * c2
 
 
-def floored(heard: Tracks) -> tuple[Float, Float, Float]:
-    """Position covariances ee, en, nn (1 | S, P) as stated, but no eigenvalue is too small: see combine.floored."""
-    given = _covariances(heard)
-    high, low, c2, s2 = _axes(*given)
+def floor_covariances(heard: Tracks) -> tuple[Float, Float, Float]:
+    """Position covariances ee, en, nn (1 | S, P) as stated, but no eigenvalue too small: see `floor_eigenvalues`."""
+    stated = _stated_covariances(heard)
+    high, low, c2, s2 = _covariance_axes(*stated)
     mean, difference = (high + low) / 2, (high - low) / 2
-    wide = low <= (given[0] + given[2]) / 2 - np.hypot((given[0] - given[2]) / 2, given[1])
+    wide = low <= (stated[0] + stated[2]) / 2 - np.hypot((stated[0] - stated[2]) / 2, stated[1])
     ee, en, nn = mean + difference * c2, difference * s2, mean - difference * c2
-    return np.where(wide, given[0], ee), np.where(wide, given[1], en), np.where(wide, given[2], nn)
+    return np.where(wide, stated[0], ee), np.where(wide, stated[1], en), np.where(wide, stated[2], nn)
 
 
-def _covariances(heard: Tracks) -> tuple[Float, Float, Float]:
+def _stated_covariances(heard: Tracks) -> tuple[Float, Float, Float]:
     """Position covariances ee, en, nn (1 | S, P) as stated, 0 where they are not."""
     none = np.zeros((1, len(heard.frame_ix)))
     ee, en, nn = (none if c is None else c for c in (heard.cov_ee_m2, heard.cov_en_m2, heard.cov_nn_m2))
     return ee, en, nn
 
 
-def _axes(a: Float, b: Float, d: Float) -> tuple[Float, Float, Float, Float]:
+def _covariance_axes(a: Float, b: Float, d: Float) -> tuple[Float, Float, Float, Float]:
     """Eigenvalues of position covariances, floored, larger first; cos 2φ and sin 2φ of the larger one's direction φ."""
     half, turn = (a + d) / 2, np.hypot((a - d) / 2, b)
     high = np.maximum(half + turn, SMALLEST_VARIANCE)
@@ -227,41 +237,44 @@ _ALIKE = len(_VARIANCES)
 _WEIGHED_BY = {
     "sin": 0, "cos": 0, "length_m": 1, "width_m": 1, "height_m": 1, "vx_mps": 2, "vy_mps": 2, "z_m": _ALIKE,
 }  # fmt: skip
-"""The scalars that are combined, and by which variance."""
+"""The scalars that are combined, and the variance in `_VARIANCES` that weighs each (`_ALIKE`: all count 1)."""
 
 
-class Weighed(NamedTuple):
-    """Of rows (P,) what is combined and how much it counts: the same whichever are listed."""
+class WeightedRows(NamedTuple):
+    """Values of rows (P,) and their weights, whichever rows are listed."""
 
     covariances: tuple[Float, Float, Float]
-    information: Information
+    information: PositionInformation
     scalars: Float  # (S | 1, P, V)
     weights: Float
 
     @classmethod
-    def of(cls, heard: Tracks) -> Weighed:
-        """Of these rows."""
+    def of(cls, heard: Tracks) -> WeightedRows:
+        """Values and weights of the rows of `heard`."""
         none = np.zeros((1, len(heard.frame_ix)))
-        by = [1 / np.maximum(none if one is None else one, SMALLEST_VARIANCE) for one in _stated(heard)]
-        given = {"sin": np.sin(heard.yaw_rad), "cos": np.cos(heard.yaw_rad)}
-        values = [given[name] if name in given else getattr(heard, name) for name in _WEIGHED_BY]
-        scalars, weights = _side_by_side(values), _side_by_side([*by, none + 1])
-        return cls(floored(heard), Information(*_information(heard)), scalars, weights)
+        information = [
+            1 / np.maximum(none if variance is None else variance, SMALLEST_VARIANCE)
+            for variance in _stated_variances(heard)
+        ]
+        yaw = {"sin": np.sin(heard.yaw_rad), "cos": np.cos(heard.yaw_rad)}
+        values = [yaw[name] if name in yaw else getattr(heard, name) for name in _WEIGHED_BY]
+        scalars, weights = _stack_columns(values), _stack_columns([*information, none + 1])
+        return cls(floor_covariances(heard), PositionInformation(*_inverse_covariances(heard)), scalars, weights)
 
     @staticmethod
-    def alike(one: Tracks, other: Tracks) -> bool:
-        """Whether it is the same of both, as all it goes by is: not a copy, but the very same."""
-        return all(getattr(one, name) is getattr(other, name) for name in (*VALUES[2:], *UNCERTAINTIES))
+    def alike(tracks: Tracks, other: Tracks) -> bool:
+        """Whether both have equal values and weights: True where their columns are identical arrays, not copies."""
+        return all(getattr(tracks, name) is getattr(other, name) for name in (*VALUES[2:], *UNCERTAINTIES))
 
 
-def _stated(heard: Tracks) -> list[Float | None]:
+def _stated_variances(heard: Tracks) -> list[Float | None]:
     return [getattr(heard, name) for name in _VARIANCES]
 
 
 def _combine_scalars(
-    heard: Tracks, counts: Bool, weighed: Weighed, rows: Int, start: Int, out: dict[str, Float]
+    heard: Tracks, counts: Bool, weighed: WeightedRows, rows: Int, start: Int, out: dict[str, Float]
 ) -> dict[str, Float]:
-    """Put inverse-variance means (S, P) of scalars over the contributions into `out`; returns their variances.
+    """Put inverse-variance means (S, P) of scalars over the contributions into `out`; return their variances.
 
     `counts (S, P)`: which rows contribute.
     """
@@ -269,29 +282,30 @@ def _combine_scalars(
     means, spreads = np.full((len(_WEIGHED_BY), *shape), np.nan), np.full((_ALIKE + 1, *shape), np.nan)
     scratch = np.empty(len(rows), np.int64), np.empty((shape[1], len(_WEIGHED_BY)), np.bool_)
     which = np.array([*_WEIGHED_BY.values()])
-    _scalars(counts, weighed.scalars, weighed.weights, which, rows, start, means, spreads, scratch)
-    found = dict(zip(_WEIGHED_BY, means, strict=True))
-    out["yaw_rad"] = np.arctan2(found.pop("sin"), found.pop("cos"))
-    out.update(found)
+    _sum_scalars(counts, weighed.scalars, weighed.weights, which, rows, start, means, spreads, scratch)
+    mean_of = dict(zip(_WEIGHED_BY, means, strict=True))
+    out["yaw_rad"] = np.arctan2(mean_of.pop("sin"), mean_of.pop("cos"))
+    out.update(mean_of)
     return {
         name: np.where(np.isnan(spread), np.nan, 0.0) if variance is None else spread
-        for name, variance, spread in zip(_VARIANCES, _stated(heard), spreads, strict=False)
+        for name, variance, spread in zip(_VARIANCES, _stated_variances(heard), spreads, strict=False)
     }
 
 
-def _side_by_side(columns: list[Float]) -> Float:
+def _stack_columns(columns: list[Float]) -> Float:
     """(S | 1, P, V) from V columns (S | 1, P)."""
     return np.stack(np.broadcast_arrays(*columns), axis=-1)
 
 
-def _any(valid: Bool, rows: Int, start: Int) -> Bool:
+def _any_valid(valid: Bool, rows: Int, start: Int) -> Bool:
+    """(S, P) whether any row that contributes is valid."""
     out = np.zeros((len(valid), len(start) - 1), dtype=np.bool_)
-    _any_of(valid, rows, start, out)
+    _fill_any_valid(valid, rows, start, out)
     return out
 
 
 @borrowing
-def _any_of(valid: Bool, rows: Int, start: Int, out: Bool) -> None:
+def _fill_any_valid(valid: Bool, rows: Int, start: Int, out: Bool) -> None:
     for s in range(out.shape[0]):
         for p in range(out.shape[1]):
             for c in range(start[p], start[p + 1]):
@@ -310,7 +324,7 @@ class Positions(NamedTuple):
     nn_m2: Float
 
 
-class Information(NamedTuple):
+class PositionInformation(NamedTuple):
     """Inverse covariances of positions, one row for all runs where these agree: (S | 1, P) each."""
 
     ee: Float
@@ -320,8 +334,9 @@ class Information(NamedTuple):
 
 @borrowing
 def _combine_position(
-    valid: Bool, given: Positions, information: Information, rows: Int, start: Int, out: Positions
+    valid: Bool, given: Positions, information: PositionInformation, rows: Int, start: Int, out: Positions
 ) -> None:
+    """Writes the combined positions and covariances (S, P) into `out`; rows without contribution stay as they are."""
     x, y, cov_ee, cov_en, cov_nn = given
     ee, en, nn = information
     out_x, out_y, out_ee, out_en, out_nn = out
@@ -351,13 +366,16 @@ def _combine_position(
 
 
 @borrowing
-def _scalars(
+def _sum_scalars(
     valid: Bool, values: Float, weights: Float, weighed_by: Int, rows: Int, start: Int, means: Float, spreads: Float,
     scratch: tuple[Int, Bool],
 ) -> None:  # fmt: skip
-    # Values (S | 1, P, V) and weights (S | 1, P, W), one row where all runs agree; out: what anything contributes to.
-    there, alike = scratch
-    for p in range(len(start) - 1):  # whether all that may contribute say the same, in any run
+    """Writes weighted means `(V, S, fused rows)` and variances `(W, S, fused rows)`, where anything contributes.
+
+    `values (S | 1, P, V)` and `weights (S | 1, P, W)` have one row where all runs agree.
+    """
+    contributing, alike = scratch
+    for p in range(len(start) - 1):  # whether all that may contribute agree, in any run
         for v in range(values.shape[2]):
             alike[p, v] = values.shape[0] == 1
             for c in range(start[p] + 1, start[p + 1]):
@@ -369,23 +387,23 @@ def _scalars(
             n = 0
             for c in range(start[p], start[p + 1]):
                 if valid[s, rows[c]]:
-                    there[n] = rows[c]
+                    contributing[n] = rows[c]
                     n += 1
             if n == 0:
                 continue
             for w in range(spreads.shape[0]):
                 total = 0.0
                 for c in range(n):
-                    total += weight[there[c], w]
+                    total += weight[contributing[c], w]
                 spreads[w, s, p] = 1 / total
             for v in range(means.shape[0]):
-                w, first = weighed_by[v], value[there[0], v]
+                w, first = weighed_by[v], value[contributing[0], v]
                 moment = 0.0
                 for c in range(1, 1 if alike[p, v] else n):
-                    moment += weight[there[c], w] * (value[there[c], v] - first)
+                    moment += weight[contributing[c], w] * (value[contributing[c], v] - first)
                 if moment != 0.0:
                     total = 0.0
                     for c in range(n):
-                        total += weight[there[c], w]
+                        total += weight[contributing[c], w]
                     moment /= total
                 means[v, s, p] = first + moment

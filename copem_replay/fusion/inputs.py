@@ -1,6 +1,6 @@
-"""From tracks with truth ids to lists without: what a real fusion sees of what the units heard in each run.
+"""The input of fusions without truth ids: the lists of the units in each run, made from tracks with truth ids.
 
-Nothing in a report tells which entries are of one object: the order within each list is drawn. The receiver's own body
+Nothing in the lists tells which entries are of one object: the order within each list is drawn. The receiver's own body
 is left out, since it knows where it is.
 """
 
@@ -12,16 +12,15 @@ from dataclasses import dataclass, replace
 import numba as nb
 import numpy as np
 
-from copem_replay.communication.arrivals import FusionSchedule, fusion_schedule
-from copem_replay.communication.kept import KeptEntries
-from copem_replay.core.object_list import COVARIANCES, ENTRY, Entries, Inputs, ObjectLists, joined, taken
-from copem_replay.core.tracks import VALUES, Bool, Float, Int, Tracks
-from copem_replay.fusion.ideal import floored
+from copem_replay.communication.arrivals import FusionSchedule, KeptEntries, fusion_schedule
+from copem_replay.core.object_list import COVARIANCES, ENTRY, Entries, Inputs, ObjectLists, join_entries, take_entries
+from copem_replay.core.tracks import CLASSES, VALUES, Bool, Float, Int, Tracks
+from copem_replay.fusion.ideal import floor_covariances
 
 
 @dataclass(frozen=True)
-class Claims:
-    """What entries say beside their states, row by row. (P,), `class_probability (P, C)`."""
+class EntryClaims:
+    """Claims of entries beside their states, row by row: (P,), `class_probability (P, C)`."""
 
     existence: Float
     class_probability: Float
@@ -29,17 +28,17 @@ class Claims:
 
 
 class RowEntries:
-    """Rows (P,) of lists in the runs (S,) as entries: what of them is the same in all runs is made once."""
+    """Rows (P,) of lists in the runs (S,) as entries; columns that all runs share are filled in once."""
 
-    def __init__(self, seen: Tracks, claims: Claims) -> None:
+    def __init__(self, seen: Tracks, claims: EntryClaims) -> None:
         self._columns = {name: getattr(seen, name) for name in VALUES}
-        self._columns |= zip(COVARIANCES, floored(seen), strict=True)
-        self._template = _template(seen, claims, self._columns)
+        self._columns |= zip(COVARIANCES, floor_covariances(seen), strict=True)
+        self._template = _make_template(seen, claims, self._columns)
 
     def lists(self, seen: Tracks, drawn: Float, s: int | None = None, *, without_object_ix: int) -> ObjectLists:
-        """The lists of all runs, or of run s alone: `seen` and `drawn` are of that, too. `drawn` orders entries."""
+        """The lists of all runs, or of run s alone, which `seen` and `drawn` are then of. `drawn` orders entries."""
         start, picked = listed_rows(seen, drawn, without_object_ix=without_object_ix)
-        entries = taken(self._template, picked)
+        entries = take_entries(self._template, picked)
         run = np.repeat(np.arange(len(start)) if s is None else s, start[:, -1] - start[:, 0])
         for name, values in self._columns.items():
             if len(values) > 1:
@@ -48,16 +47,16 @@ class RowEntries:
 
 
 def listed_rows(heard: Tracks, drawn: Float, *, without_object_ix: int) -> tuple[Int, Int]:
-    """Where each of these lists begins, (S, F + 1), and the row of each entry, (N,)."""
+    """(S, F + 1) where each list begins, and (N,) the row of each entry, in the order of `drawn (S, P)`."""
     valid = heard.valid if without_object_ix < 0 else heard.valid & (heard.row_object_ix != without_object_ix)
     order, bounds = heard.by_frame
     start = np.zeros((len(valid), len(bounds)), dtype=np.int64)
     picked = np.empty(int(valid.sum()), dtype=np.int64)
-    _pick(valid, drawn, order, bounds, start, picked)
+    _pick_rows(valid, drawn, order, bounds, start, picked)
     return start, picked
 
 
-def inputs(
+def make_inputs(
     heard: Tracks,
     lists: ObjectLists,
     *,
@@ -65,9 +64,9 @@ def inputs(
     at: FusionSchedule | None = None,
     captured_s: Float | None = None,
 ) -> Inputs:
-    """The same lists as one configuration's receiver has them: when each arrives, and which it goes by when.
+    """Lists as the input of a fusion: when the receiver of a configuration has each, and which it uses when.
 
-    `at`: some of the instants. `captured_s (F,)`: when they were captured, as fusion is told; None: the truth.
+    `at`: some of its instants; None: all. `captured_s (F,)`: the captures that fusion is told; None: the true ones.
     """
     at = at or fusion_schedule(heard, max_age_s=max_age_s)
     captured_s = heard.captured_s if captured_s is None else captured_s
@@ -77,8 +76,11 @@ def inputs(
     )  # fmt: skip
 
 
-def with_kept(told: Inputs, kept: KeptEntries, partial: Bool, max_age_s: float) -> Inputs:
-    """The same in one run with what the receiver has of units (U,) whose messages are `partial`, for `max_age_s`."""
+def add_kept_entries(told: Inputs, kept: KeptEntries, partial: Bool, max_age_s: float) -> Inputs:
+    """The input in one run, with the entries that the receiver keeps of units with partial messages, for `max_age_s`.
+
+    `partial (U,)`: those units.
+    """
     lists, frame = told.lists, kept.frame
     start = np.concatenate([lists.start[0], lists.start[0, -1] + kept.start[1:]])[None]
     return replace(
@@ -86,14 +88,14 @@ def with_kept(told: Inputs, kept: KeptEntries, partial: Bool, max_age_s: float) 
         unit_ix=np.append(told.unit_ix, told.unit_ix[frame]),
         captured_s=np.append(told.captured_s, told.captured_s[frame]),
         arrives_s=np.append(told.arrives_s, told.arrives_s[frame]),
-        lists=ObjectLists(start, joined([lists.entries, taken(lists.entries, kept.entry)])),
+        lists=ObjectLists(start, join_entries([lists.entries, take_entries(lists.entries, kept.entry)])),
         newest=kept.newest,
         keeps_s=np.where(partial, max_age_s, 0.0),
     )
 
 
-def _template(heard: Tracks, claims: Claims, columns: Mapping[str, Float]) -> Entries:
-    """(P,) all that is the same in all runs."""
+def _make_template(heard: Tracks, claims: EntryClaims, columns: Mapping[str, Float]) -> Entries:
+    """(P,) entries with all columns that the runs share."""
     entries = np.zeros(len(heard.frame_ix), dtype=ENTRY)
     for name, values in columns.items():
         if len(values) == 1:
@@ -105,7 +107,8 @@ def _template(heard: Tracks, claims: Claims, columns: Mapping[str, Float]) -> En
 
 
 @nb.njit(cache=True, nogil=True)
-def _pick(valid: Bool, drawn: Float, order: Int, bounds: Int, start: Int, picked: Int) -> None:
+def _pick_rows(valid: Bool, drawn: Float, order: Int, bounds: Int, start: Int, picked: Int) -> None:
+    """Fill `start (S, F + 1)` and `picked (N,)` with the valid rows, list by list, ordered by `drawn`."""
     n = 0
     for s in range(valid.shape[0]):
         start[s, 0] = n
@@ -115,10 +118,77 @@ def _pick(valid: Bool, drawn: Float, order: Int, bounds: Int, start: Int, picked
                 p = order[k]
                 if not valid[s, p]:
                     continue
-                at = n  # insertion by the number drawn
-                while at > first and drawn[s, picked[at - 1]] > drawn[s, p]:
-                    picked[at] = picked[at - 1]
-                    at -= 1
-                picked[at] = p
+                place = n  # insertion by the number drawn
+                while place > first and drawn[s, picked[place - 1]] > drawn[s, p]:
+                    picked[place] = picked[place - 1]
+                    place -= 1
+                picked[place] = p
                 n += 1
             start[s, f + 1] = n
+
+
+# An order of entries by their content alone: neither the order they came in nor their units matter.
+
+WIDTH = 13 + len(CLASSES)
+"""So many numbers of an entry, from the first on, describe the object; the rest are times and ids."""
+assert list(ENTRY.names or ())[13:15] == ["class_probability", "captured_s"]
+_BLOCK = 16
+"""Rows in a block that is sorted by insertion, before blocks are merged. It changes the time alone."""
+
+
+def view_as_numbers(entries: Entries) -> Float:
+    """Entries as rows of numbers (N, V), x and y first; only the first `WIDTH` are numbers, integers follow."""
+    values: Float = np.ascontiguousarray(entries).view(np.float64).reshape(len(entries), ENTRY.itemsize // 8)
+    return values
+
+
+@nb.njit(cache=True, nogil=True)
+def order_by_content(start: Int, content: Float) -> Int:
+    """Indices of the entries (N,), list by list, in order of their content, place first."""
+    rows = np.arange(start[-1])
+    for f in range(len(start) - 1):
+        sort_rows(content, rows[start[f] : start[f + 1]])
+    return rows
+
+
+@nb.njit(cache=True, nogil=True)
+def sort_rows(values: Float, order: Int) -> None:
+    """Sort `order`, indices of rows of `values (N, V)`, by the first column, then the second …; in place, stably."""
+    n = len(order)
+    # The first column nearly always decides: it is kept at hand.
+    key, other_key, other = np.empty(n), np.empty(n), np.empty(n, np.int64)
+    for p in range(n):
+        x, r, place = values[order[p], 0], order[p], p
+        while place % _BLOCK > 0 and (
+            x < key[place - 1] or (x == key[place - 1] and compare_rows(values, r, order[place - 1]) < 0)
+        ):
+            key[place], order[place] = key[place - 1], order[place - 1]
+            place -= 1
+        key[place], order[place] = x, r
+    block = _BLOCK
+    while block < n:
+        for left in range(0, n, 2 * block):
+            middle, right = min(left + block, n), min(left + 2 * block, n)
+            i, j = left, middle
+            for p in range(left, right):
+                later = j < right and i < middle
+                if later:
+                    later = key[j] < key[i] or (key[j] == key[i] and compare_rows(values, order[j], order[i]) < 0)
+                if later or i == middle:
+                    other_key[p], other[p] = key[j], order[j]
+                    j += 1
+                else:
+                    other_key[p], other[p] = key[i], order[i]
+                    i += 1
+        for p in range(n):
+            key[p], order[p] = other_key[p], other[p]
+        block *= 2
+
+
+@nb.njit(cache=True, nogil=True)
+def compare_rows(values: Float, a: int, b: int) -> int:
+    """−1, 0 or 1: row a comes before row b, equals it, or comes after it."""
+    for v in range(values.shape[1]):
+        if values[a, v] != values[b, v]:
+            return -1 if values[a, v] < values[b, v] else 1
+    return 0

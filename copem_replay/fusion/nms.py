@@ -7,16 +7,13 @@ from typing import Any, ClassVar, Literal
 import numba as nb
 import numpy as np
 
-from copem_replay.core.agree import AGREE, most_probable_of_each
 from copem_replay.core.components import Positive, Share
-from copem_replay.core.object_list import Entries, Inputs, ObjectLists
-from copem_replay.core.overlap import rotated_iou
+from copem_replay.core.geometry import rotated_iou
+from copem_replay.core.object_list import AGREE, Entries, Inputs, ObjectLists, most_probable_classes
 from copem_replay.core.tracks import Bool, Float, Int
-from copem_replay.fusion.base import ListFusion
-from copem_replay.fusion.content_order import sort_rows
-from copem_replay.fusion.gnn import numbers
-from copem_replay.fusion.gnn_kernel import WIDTH
-from copem_replay.fusion.union import run_after_run, side_by_side
+from copem_replay.fusion.inputs import WIDTH, sort_rows, view_as_numbers
+from copem_replay.fusion.interface import ListFusion
+from copem_replay.fusion.union import gather_newest_rows, join_runs
 
 
 class Nms(ListFusion):
@@ -41,34 +38,42 @@ class Nms(ListFusion):
     resumable: ClassVar[bool] = True
 
     def fuse(self, inputs: Inputs) -> ObjectLists:
-        """Every run by itself."""
+        """Fuse every run by itself."""
         runs = []
         for run in inputs.lists.start:
             bounds = run - run[0]
             entries = inputs.lists.entries[run[0] : run[-1]]
-            start, rows = side_by_side(bounds, inputs.newest, entries["existence"] >= self.min_existence)
-            kind = most_probable_of_each(entries["class_probability"])
-            # Closer than the sum of both reaches boxes may overlap, and centres do.
+            start, rows = gather_newest_rows(bounds, inputs.newest, entries["existence"] >= self.min_existence)
+            kind = most_probable_classes(entries["class_probability"])
+            # Entries closer than the sum of their reaches: boxes may overlap, centres are within the radius.
             reach_m = np.full(len(entries), self.radius_m / 2)
             if self.by == "iou":
                 reach_m = np.hypot(entries["length_m"], entries["width_m"]) / 2
             place = np.stack([entries["x_m"], entries["y_m"], reach_m])
-            start, kept = _keep(
-                entries, place, kind, _order(entries, bounds, inputs), start, rows, AGREE, self.by == "iou", self.iou
+            start, kept = _suppress_overlapping(
+                entries,
+                place,
+                kind,
+                _order_entries(entries, bounds, inputs),
+                start,
+                rows,
+                AGREE,
+                self.by == "iou",
+                self.iou,
             )
             runs.append((start, entries[kept]))
-        fused = run_after_run(runs, len(inputs.issue_s))
+        fused = join_runs(runs, len(inputs.issue_s))
         fused.entries["track_id"] = -1
         return fused
 
 
-def _order(entries: Entries, bounds: Int, inputs: Inputs) -> Int:
-    """(N,) in which entries are considered: by what they say, and of the very same the first to arrive."""
+def _order_entries(entries: Entries, bounds: Int, inputs: Inputs) -> Int:
+    """(N,) entries in the order in which they are considered: by their content, of equal ones the first to arrive."""
     f = np.repeat(np.arange(len(bounds) - 1), np.diff(bounds))
     keys = np.column_stack(
         [
             -entries["existence"], entries["cov_ee_m2"] + entries["cov_nn_m2"], -entries["captured_s"],
-            numbers(entries)[:, :WIDTH], inputs.arrives_s[f], inputs.unit_ix[f],
+            view_as_numbers(entries)[:, :WIDTH], inputs.arrives_s[f], inputs.unit_ix[f],
         ]
     )  # fmt: skip
     order = np.arange(len(entries))
@@ -77,10 +82,10 @@ def _order(entries: Entries, bounds: Int, inputs: Inputs) -> Int:
 
 
 @nb.njit(cache=True, nogil=True)
-def _keep(
+def _suppress_overlapping(
     entries: Entries, place: Float, kind: Int, order: Int, start: Int, rows: Int, agree: Bool, by_iou: bool, iou: float
 ) -> tuple[Int, Int]:
-    """Which of the `rows`, those of instant k between `start[k]` and `start[k + 1]`, are kept, and where each begin.
+    """Where the kept entries of each instant begin, (K + 1,), and their rows. `rows, start`: those of all.
 
     `place (3, N)`: x, y and reach.
     """
@@ -96,7 +101,7 @@ def _keep(
                 dx, dy, reach = place[0, r] - place[0, s], place[1, r] - place[1, s], place[2, r] + place[2, s]
                 if dx * dx + dy * dy > reach * reach or not agree[kind[r], kind[s]]:
                     continue
-                if not by_iou or _iou(entries[r], entries[s]) > iou:
+                if not by_iou or _iou_of_entries(entries[r], entries[s]) > iou:
                     free = False
                     break
             if free:
@@ -107,7 +112,7 @@ def _keep(
 
 
 @nb.njit(cache=True, nogil=True)
-def _iou(a: Any, b: Any) -> float:
+def _iou_of_entries(a: Any, b: Any) -> float:
     share: float = rotated_iou(
         a.x_m, a.y_m, a.yaw_rad, a.length_m, a.width_m, b.x_m, b.y_m, b.yaw_rad, b.length_m, b.width_m
     )

@@ -1,4 +1,4 @@
-"""Split covariance intersection: of each error a part may hang together with the others, the rest is independent.
+"""Split covariance intersection: a part of each error may be correlated with the others, the rest is independent.
 
 Everywhere: means `x (n, d)`, covariances of the dependent and of the independent parts `(n, d, d)`, n ≥ 1, symmetric;
 their sums are positive definite, and so are the dependent parts or all of them are 0.
@@ -17,14 +17,14 @@ import numba as nb
 import numpy as np
 
 from copem_replay.core.tracks import Bool, Float
-from copem_replay.fusion.covariance import FLATTEST, invert, invert_root, solve
+from copem_replay.fusion.covariance import FLATTEST, invert_matrix, invert_root, solve_with_root
 
 _GAP = 1e-10
-"""The optimum is found when no input could lower the criterion by more than this share of it (chosen)."""
+"""The search ends when no input could lower the criterion by more than this share of it: above rounding."""
 _CLOSE = 1e-6
-"""Scores that differ by less than this share: plain Newton steps, for the criterion's change is rounding (chosen)."""
+"""Where scores differ by less than this share, Newton steps are not shortened: the criterion's change is rounding."""
 _RIDGE = 1e-12
-"""Added to the curvature, relative, for weights that change next to nothing (chosen)."""
+"""Added to the curvature, relative, so that it can be inverted where weights change next to nothing."""
 
 
 @nb.njit(cache=True, nogil=True)
@@ -41,7 +41,7 @@ def split_covariance_intersection(
     n, d = x.shape
     weight = _best_weights(dependent, independent, by_determinant)
     information, total, P = np.zeros((n, d, d)), np.empty((d, d)), np.empty((d, d))
-    _criterion(dependent, independent, weight, by_determinant, information, total, P)
+    _evaluate_criterion(dependent, independent, weight, by_determinant, information, total, P)
     mean, independent_part, gain = x[0].copy(), np.zeros((d, d)), np.zeros((d, d))
     for k in range(n):
         if weight[k] == 1:
@@ -70,7 +70,7 @@ def split_by_share(cov: Float, share: float) -> tuple[Float, Float]:
 
 @nb.njit(cache=True, nogil=True)
 def split_by_variance(cov: Float, dependent_m2: float) -> tuple[Float, Float]:
-    """The same of covariances (n, 2, 2): the dependent part has this variance on every axis, or all there is of it."""
+    """Dependent and independent parts of covariances (n, 2, 2): `dependent_m2` on every axis at most; the rest."""
     dependent, independent = np.zeros(cov.shape), np.zeros(cov.shape)
     for k in range(len(cov)):
         ee, en, nn = cov[k, 0, 0], (cov[k, 0, 1] + cov[k, 1, 0]) / 2, cov[k, 1, 1]
@@ -91,7 +91,7 @@ def split_by_variance(cov: Float, dependent_m2: float) -> tuple[Float, Float]:
     return dependent, independent
 
 
-# ---------------------------------------------------------------- the best weights
+# The best weights.
 #
 # w ↦ (D/w + N)⁻¹ = w (D + wN)⁻¹ = J is concave, so trace and logarithm of the determinant of (Σ Jᵢ)⁻¹ are convex. The
 # *score* of an input is how fast the criterion falls as it gains weight. At the optimum, and only there, inputs with
@@ -102,6 +102,7 @@ def split_by_variance(cov: Float, dependent_m2: float) -> tuple[Float, Float]:
 
 @nb.njit(cache=True, nogil=True)
 def _best_weights(dependent: Float, independent: Float, by_determinant: bool) -> Float:
+    """Weights (n,) that minimise the determinant or the trace of P."""
     n, d = dependent.shape[:2]
     weight = np.full(n, 1.0 / n)
     if n == 1:
@@ -109,9 +110,9 @@ def _best_weights(dependent: Float, independent: Float, by_determinant: bool) ->
     has = np.ones(n, dtype=np.bool_)
     information, total, P = np.zeros((n, d, d)), np.empty((d, d)), np.empty((d, d))
     lever, score, bend = np.empty((n, d, d)), np.empty(n), np.empty(n)
-    value = _criterion(dependent, independent, weight, by_determinant, information, total, P)
+    value = _evaluate_criterion(dependent, independent, weight, by_determinant, information, total, P)
     for _ in range(40 + 4 * n):
-        _derive(dependent, independent, weight, by_determinant, P, lever, score, bend)
+        _derive_terms(dependent, independent, weight, by_determinant, P, lever, score, bend)
         mean = off = 0.0
         for k in range(n):
             mean += weight[k] * score[k]
@@ -127,7 +128,7 @@ def _best_weights(dependent: Float, independent: Float, by_determinant: bool) ->
             if enters < 0 or score[enters] <= (1 + _GAP) * mean:
                 break
             has[enters] = True
-        change = _newton(lever, score / mean, bend / mean, has, P, mean, by_determinant)
+        change = _newton_step(lever, score / mean, bend / mean, has, P, mean, by_determinant)
         longest, fall = np.inf, 0.0
         for k in range(n):
             fall += score[k] * change[k]
@@ -138,7 +139,7 @@ def _best_weights(dependent: Float, independent: Float, by_determinant: bool) ->
         step = min(1.0, longest)
         for _ in range(40):
             tried = np.maximum(weight + step * change, 0.0)
-            lower = _criterion(dependent, independent, tried, by_determinant, information, total, P)
+            lower = _evaluate_criterion(dependent, independent, tried, by_determinant, information, total, P)
             if off <= _CLOSE or lower <= value - 1e-4 * step * fall:
                 break
             step /= 2
@@ -147,12 +148,12 @@ def _best_weights(dependent: Float, independent: Float, by_determinant: bool) ->
             has[k] = has[k] and not gone
             weight[k] = max(weight[k] + step * change[k], 0.0) if has[k] else 0.0
         weight /= weight.sum()
-        value = _criterion(dependent, independent, weight, by_determinant, information, total, P)
+        value = _evaluate_criterion(dependent, independent, weight, by_determinant, information, total, P)
     return weight
 
 
 @nb.njit(cache=True, nogil=True)
-def _criterion(
+def _evaluate_criterion(
     dependent: Float, independent: Float, weight: Float, by_determinant: bool, information: Float, total: Float,
     P: Float,
 ) -> float:  # fmt: skip
@@ -167,9 +168,9 @@ def _criterion(
         for i in range(d):
             for j in range(d):
                 spread[i, j] = dependent[k, i, j] / weight[k] + independent[k, i, j]
-        invert(spread, information[k])
+        invert_matrix(spread, information[k])
         total += information[k]
-    invert(total, P)
+    invert_matrix(total, P)
     value = 0.0
     if by_determinant:
         invert_root(total, spread)
@@ -182,7 +183,7 @@ def _criterion(
 
 
 @nb.njit(cache=True, nogil=True)
-def _derive(
+def _derive_terms(
     dependent: Float, independent: Float, weight: Float, by_determinant: bool, P: Float, lever: Float, score: Float,
     bend: Float,
 ) -> None:  # fmt: skip
@@ -197,14 +198,14 @@ def _derive(
         if not spread[0, 0] > 0:  # nothing dependent, without weight
             lever[k] = 0.0
             continue
-        invert(spread, inverse)
-        _product(inverse, dependent[k], spread)
-        _product(spread, inverse, first)  # J′ = M⁻¹ D M⁻¹ with M = D + wN
-        _product(P, first, lever[k])
-        _product(inverse, independent[k], spread)
+        invert_matrix(spread, inverse)
+        _multiply_matrices(inverse, dependent[k], spread)
+        _multiply_matrices(spread, inverse, first)  # J′ = M⁻¹ D M⁻¹ with M = D + wN
+        _multiply_matrices(P, first, lever[k])
+        _multiply_matrices(inverse, independent[k], spread)
         second = np.empty((d, d))
-        _product(spread, first, second)  # J″ = −2 M⁻¹ N J′
-        _product(P, second, spread)
+        _multiply_matrices(spread, first, second)  # J″ = −2 M⁻¹ N J′
+        _multiply_matrices(P, second, spread)
         for i in range(d):
             if by_determinant:
                 score[k] += lever[k, i, i]
@@ -216,37 +217,40 @@ def _derive(
 
 
 @nb.njit(cache=True, nogil=True)
-def _newton(lever: Float, score: Float, bend: Float, has: Bool, P: Float, mean: float, by_determinant: bool) -> Float:
+def _newton_step(
+    lever: Float, score: Float, bend: Float, has: Bool, P: Float, mean: float, by_determinant: bool
+) -> Float:
     """Newton's change of the weights (n,), its sum 0; inputs without weight keep none. Scores and bends over `mean`."""
-    chosen = np.flatnonzero(has)
-    c, d = len(chosen), len(P)
+    active = np.flatnonzero(has)
+    c, d = len(active), len(P)
     curvature, root, half = np.empty((c, c)), np.empty((c, c)), np.empty((d, d))
     largest = 0.0
     for p in range(c):
         if not by_determinant:
-            _product(P, lever[chosen[p]], half)
+            _multiply_matrices(P, lever[active[p]], half)
         for q in range(p + 1):
             total = 0.0
             for i in range(d):
                 for j in range(d):
-                    one = lever[chosen[p], i, j] if by_determinant else 2 * half[i, j]
-                    total += one * lever[chosen[q], j, i]
+                    ones_solved = lever[active[p], i, j] if by_determinant else 2 * half[i, j]
+                    total += ones_solved * lever[active[q], j, i]
             curvature[p, q] = total / mean
-        curvature[p, p] += bend[chosen[p]]
+        curvature[p, p] += bend[active[p]]
         largest = max(largest, curvature[p, p])
     for p in range(c):
         curvature[p, p] += _RIDGE * largest
     invert_root(curvature, root)
-    gain, one = solve(root, score[chosen] - 1), solve(root, np.ones(c))
-    shift = gain.sum() / one.sum()  # so that the changes sum to 0
+    gain, ones_solved = solve_with_root(root, score[active] - 1), solve_with_root(root, np.ones(c))
+    shift = gain.sum() / ones_solved.sum()  # so that the changes sum to 0
     change = np.zeros(len(has))
     for p in range(c):
-        change[chosen[p]] = gain[p] - shift * one[p]
+        change[active[p]] = gain[p] - shift * ones_solved[p]
     return change
 
 
 @nb.njit(cache=True, nogil=True)
-def _product(a: Float, b: Float, out: Float) -> None:
+def _multiply_matrices(a: Float, b: Float, out: Float) -> None:
+    """Writes a · b into `out`."""
     d = len(a)
     for i in range(d):
         for j in range(d):

@@ -1,4 +1,4 @@
-"""The tracker: a Kalman filter per object over everything that arrives, with three answers to lists that come late."""
+"""The tracker: a Kalman filter per object over all lists that arrive, with three ways to use lists that come late."""
 
 from __future__ import annotations
 
@@ -9,19 +9,24 @@ from typing import Annotated, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from copem_replay.core.agree import AGREE
 from copem_replay.core.components import NotNegative, Positive, Share
-from copem_replay.core.interpolation import wrap
-from copem_replay.core.object_list import ENTRY, Inputs, ObjectLists, TellsOf
-from copem_replay.core.tracks import Float, Int
-from copem_replay.fusion.base import ListFusion
-from copem_replay.fusion.content_order import rows_in_order
-from copem_replay.fusion.tracker_kernel import PREDICT, REPLAY, STALE, Rules, Said, fuse_run
-from copem_replay.fusion.tracker_memory import Remembered, nothing_yet
-from copem_replay.fusion.union import run_after_run
+from copem_replay.core.interpolation import wrap_angles
+from copem_replay.core.object_list import AGREE, Inputs, ObjectLists, TellsOf
+from copem_replay.core.tracks import Int
+from copem_replay.fusion.inputs import WIDTH, order_by_content, view_as_numbers
+from copem_replay.fusion.interface import ListFusion
+from copem_replay.fusion.tracker_kernel import (
+    PREDICT,
+    REPLAY,
+    STALE,
+    HeardLists,
+    StoredMemory,
+    TrackerRules,
+    empty_memory,
+    track_run,
+)
+from copem_replay.fusion.union import join_runs
 
-_CONTENT = ENTRY.fields["captured_s"][1] // 8 if ENTRY.fields else 0
-"""So many numbers of an entry describe the object; times and ids stand behind them."""
 _LATE = {"stale": STALE, "predict": PREDICT, "replay": REPLAY}
 
 
@@ -54,7 +59,7 @@ class Tracker(ListFusion):
 
     kind: Literal["tracker"] = "tracker"
     late: Literal["stale", "predict", "replay"] = "predict"
-    # All numbers are chosen.
+    # The defaults are round numbers; for `gate` and `forget_s` see docs/develop/decisions/0015-fusions.md.
     acceleration_psd_m2ps3: Positive = 1.0
     speed_sigma_mps: Positive = 3.0
     gate: Annotated[float, Field(strict=True, gt=0, lt=1)] = 0.999
@@ -63,7 +68,7 @@ class Tracker(ListFusion):
     drop: Share = 0.05
     confirm_s: NotNegative = 0.1
     buffer_s: Positive = 2.0
-    # Left out: errors are fresh in every list, and independent.
+    # None: errors are fresh in every list, and independent.
     errors_last_s: Positive | None = Field(None, exclude_if=lambda value: value is None)
     common_share: Share | None = Field(None, exclude_if=lambda value: value is None)
 
@@ -74,50 +79,54 @@ class Tracker(ListFusion):
         return self
 
     resumable: ClassVar[bool] = True
-    # `stale`, too: what is late is taken for the present, so that is what it claims to show.
+    # `stale`, too: it takes late lists for the present, so it claims to show that.
     tells_of: ClassVar[TellsOf] = "now"
 
     @property
     def looks_back_s(self) -> float:
-        """How far back lists are heard again."""
+        """How far back (s) lists are heard again."""
         return self.buffer_s if self.late == "replay" else 0.0
 
     def fuse(self, inputs: Inputs) -> ObjectLists:
-        """Every run by itself, instant after instant."""
+        """Fuse every run by itself, instant after instant."""
         return self.resume(inputs, None)[0]
 
-    def resume(self, inputs: Inputs, memory: Sequence[Remembered] | None) -> tuple[ObjectLists, Sequence[Remembered]]:
-        """The same at the next instants. What is remembered is of each run its tracks."""
+    def resume(
+        self, inputs: Inputs, memory: Sequence[StoredMemory] | None
+    ) -> tuple[ObjectLists, Sequence[StoredMemory]]:
+        """The lists at the next instants, and what is remembered: the tracks of each run."""
         keeps_s = np.zeros(len(inputs.units)) if inputs.keeps_s is None else inputs.keeps_s
-        rules = Rules(
+        rules = TrackerRules(
             _LATE[self.late], self.acceleration_psd_m2ps3, self.speed_sigma_mps**2, -2 * math.log1p(-self.gate),
             self.forget_s, self.publish, self.drop, self.confirm_s, self.buffer_s, AGREE,
             self.errors_last_s or 0.0, self.common_share or 0.0, keeps_s, self.forget_s + keeps_s.max(initial=0.0),
         )  # fmt: skip
-        arrived, start = _gone_by(inputs) if self.late == "stale" else (inputs.arrived, inputs.arrived_start)
-        so_far = memory or [nothing_yet(len(inputs.units))] * len(inputs.lists.start)
-        runs = [fuse_run(_said(inputs, s), rules, one, inputs.issue_s, arrived, start) for s, one in enumerate(so_far)]
-        fused = run_after_run([(starts, entries) for starts, entries, _ in runs], len(inputs.issue_s))
-        fused.entries["yaw_rad"] = wrap(fused.entries["yaw_rad"])
-        return fused, [one for _, _, one in runs]
+        arrived, start = _select_arrivals(inputs) if self.late == "stale" else (inputs.arrived, inputs.arrived_start)
+        memories = memory or [empty_memory(len(inputs.units))] * len(inputs.lists.start)
+        runs = [
+            track_run(_gather_lists(inputs, s), rules, memory_of_run, inputs.issue_s, arrived, start)
+            for s, memory_of_run in enumerate(memories)
+        ]
+        fused = join_runs([(starts, entries) for starts, entries, _ in runs], len(inputs.issue_s))
+        fused.entries["yaw_rad"] = wrap_angles(fused.entries["yaw_rad"])
+        return fused, [memory_of_run for _, _, memory_of_run in runs]
 
 
-def _gone_by(inputs: Inputs) -> tuple[Int, Int]:
-    """What arrives, and where that of each instant begins, without what a newer list of its unit has outrun."""
+def _select_arrivals(inputs: Inputs) -> tuple[Int, Int]:
+    """(A,) lists that arrive before any newer one of their unit, and (K + 1,) where those of each instant begin."""
     instant = np.repeat(np.arange(len(inputs.issue_s)), np.diff(inputs.arrived_start))
     newest = inputs.newest[instant, inputs.unit_ix[inputs.arrived]]
     kept = newest == inputs.arrived
-    if inputs.keeps_s is not None:  # what is known of a unit with partial messages is no list that arrived
+    if inputs.keeps_s is not None:  # `newest` of a unit with partial messages is no list that arrived
         kept |= (newest >= 0) & (inputs.captured_s[newest] == inputs.captured_s[inputs.arrived])
     start = np.append(0, np.cumsum(np.bincount(instant[kept], minlength=len(inputs.issue_s))))
     return inputs.arrived[kept], start.astype(np.int64)
 
 
-def _said(inputs: Inputs, run: int) -> Said:
-    """What the units say in one run."""
+def _gather_lists(inputs: Inputs, run: int) -> HeardLists:
+    """The lists of the units in one run, entries in order of content."""
     lists = inputs.lists
     entries = np.ascontiguousarray(lists.entries[lists.start[run, 0] : lists.start[run, -1]])
     start = lists.start[run] - lists.start[run, 0]
-    numbers = entries.view(np.float64).reshape(len(entries), ENTRY.itemsize // 8)
-    content: Float = numbers[:, :_CONTENT]
-    return Said(start, rows_in_order(start, content), entries, content, inputs.captured_s, inputs.unit_ix)
+    content = view_as_numbers(entries)[:, :WIDTH]
+    return HeardLists(start, order_by_content(start, content), entries, content, inputs.captured_s, inputs.unit_ix)

@@ -1,7 +1,8 @@
-"""The compiled kernel of fusion/tracker.py: see there for what it does.
+"""The compiled kernel of the tracker: its memory, its Kalman filter, and one run list after list.
 
-Nothing here may depend on the order of units or of entries: lists and entries are brought into an order that only
-their content decides, and tracks stand in the order in which they were founded.
+fusion/tracker.py says what the tracker does. Nothing here may depend on the order of units or of entries: lists and
+entries are brought into an order that only their content decides, and tracks stand in the order in which they were
+founded.
 """
 
 from __future__ import annotations
@@ -13,31 +14,323 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from copem_replay.core.agree import most_probable
-from copem_replay.core.assignment import assign_pairs, largest_around
-from copem_replay.core.object_list import ENTRY, Entries
-from copem_replay.core.tracks import CLASSES, SAME_INSTANT_NS, Bool, Float, Int
-from copem_replay.fusion.content_order import compare_rows
-from copem_replay.fusion.covariance import floored
-from copem_replay.fusion.tracker_filter import carry, distance2, predict, update
-from copem_replay.fusion.tracker_memory import CLAIM, TRACK, Memory, Remembered, recalled, remembered
-from copem_replay.fusion.tracker_split import update_split
+from copem_replay.core.assignment import assign_pairs, spread_component_maximum
+from copem_replay.core.object_list import ENTRY, Entries, most_probable_class
+from copem_replay.core.tracks import CLASSES, SAME_INSTANT_S, Bool, Float, Int
+from copem_replay.fusion.covariance import floor_eigenvalues
+from copem_replay.fusion.inputs import compare_rows
+
+# Memory of one run, from instant to instant, and from one time chunk of instants to the next.
+
+TRACK = np.dtype(
+    [
+        ("state", "f8", (4,)),  # x, y, vx, vy at `at_s`
+        ("P", "f8", (4, 4)),
+        ("common", "f8", (4, 4)),  # the part of P that may be correlated with later entries; 0 without a share
+        ("at_s", "f8"),
+        ("ee", "f8"), ("en", "f8"), ("nn", "f8"),  # R of the entry heard last
+        ("z_m", "f8"),  # z and yaw of the newest entry
+        ("yaw_rad", "f8"),
+        ("length_m", "f8"),  # sums over all entries, sizes and class
+        ("width_m", "f8"),
+        ("height_m", "f8"),
+        ("class_probability", "f8", (len(CLASSES),)),
+        ("class_ix", "i8"),  # the most probable
+        ("count", "i8"),  # of entries
+        ("first_s", "f8"),  # captures of the first and the last list in support
+        ("last_s", "f8"),
+        ("unit_ix", "i8"),  # the unit that founded it
+        ("track_id", "i8"),
+    ]
+)  # fmt: skip
+CLAIM = np.dtype([("existence", "f8"), ("at_s", "f8")])
+"""The newest existence that a unit claimed of a track, and from when on it fades: its capture (`stale`: its arrival).
+No claim yet: 0, −inf."""
+
+
+class TrackerMemory(NamedTuple):
+    """Memory from one instant to the next; tracks stand in the order in which they were founded."""
+
+    tracks: NDArray[Any]  # (T,) of TRACK
+    claims: NDArray[Any]  # (T, U) of CLAIM
+    together_s: Float  # (T, T) when one list last held both; −inf: never
+
+
+class StoredMemory(NamedTuple):
+    """Memory from one time chunk of instants to the next; all but `memory` is for `late: replay` alone.
+
+    Lists captured at one instant have one memory before them. These are stored instant after instant: of instant b the
+    next `sizes[b]` of `tracks` and `claims`, and the square of that of `together_s`.
+    """
+
+    memory: TrackerMemory
+    heard: Int  # (H,) the lists heard of late, in order
+    sizes: Int  # (B,)
+    tracks: NDArray[Any]  # (Σ sizes,) of TRACK
+    claims: NDArray[Any]  # (Σ sizes, U) of CLAIM
+    together_s: Float  # (Σ sizes²,)
+
+
+def empty_memory(units: int) -> StoredMemory:
+    """The memory before the first instant."""
+    memory = TrackerMemory(np.empty(0, TRACK), np.empty((0, units), CLAIM), np.empty((0, 0)))
+    none = np.empty(0, np.int64)
+    return StoredMemory(memory, none, none, memory.tracks, memory.claims, np.empty(0))
+
+
+@nb.njit(cache=True, nogil=True)
+def recall_memory(so_far: StoredMemory, captured_s: Float) -> tuple[TrackerMemory, list[TrackerMemory], Int]:
+    """A copy of the memory, the memory before each of the lists heard of late, and these lists."""
+    memory = _copy_memory(so_far.memory)
+    before = [memory]
+    before.pop()
+    track = pair = b = 0
+    for h in range(len(so_far.heard)):
+        if h > 0 and captured_s[so_far.heard[h]] == captured_s[so_far.heard[h - 1]]:
+            before.append(before[h - 1])
+            continue
+        n = so_far.sizes[b]
+        together_s = so_far.together_s[pair : pair + n * n].copy().reshape(n, n)
+        before.append(
+            TrackerMemory(so_far.tracks[track : track + n].copy(), so_far.claims[track : track + n].copy(), together_s)
+        )
+        track, pair, b = track + n, pair + n * n, b + 1
+    return memory, before, so_far.heard.copy()
+
+
+@nb.njit(cache=True, nogil=True)
+def store_memory(memory: TrackerMemory, before: list[TrackerMemory], heard: Int, captured_s: Float) -> StoredMemory:
+    """What `recall_memory` gives, in the form in which it is stored."""
+    first = np.empty(len(heard), np.int64)
+    instants = tracks = pairs = 0
+    for h in range(len(heard)):
+        if h == 0 or captured_s[heard[h]] != captured_s[heard[h - 1]]:
+            first[instants] = h
+            n = len(before[h].tracks)
+            instants, tracks, pairs = instants + 1, tracks + n, pairs + n * n
+    kept = StoredMemory(
+        memory, heard.copy(), np.empty(instants, np.int64), np.empty(tracks, TRACK),
+        np.empty((tracks, memory.claims.shape[1]), CLAIM), np.empty(pairs),
+    )  # fmt: skip
+    track = pair = 0
+    for b in range(instants):
+        memory_before = before[first[b]]
+        n = len(memory_before.tracks)
+        kept.sizes[b] = n
+        kept.tracks[track : track + n], kept.claims[track : track + n] = memory_before.tracks, memory_before.claims
+        kept.together_s[pair : pair + n * n] = memory_before.together_s.copy().reshape(n * n)
+        track, pair = track + n, pair + n * n
+    return kept
+
+
+@nb.njit(cache=True, nogil=True)
+def _copy_memory(memory: TrackerMemory) -> TrackerMemory:
+    return TrackerMemory(memory.tracks.copy(), memory.claims.copy(), memory.together_s.copy())
+
+
+# Kalman filter of a point that moves at constant velocity, its position measured.
+#
+# State (x, y, vx, vy) with covariance P (4, 4); every kernel changes both in place and leaves P symmetric.
+# Acceleration is white noise of spectral density q [m²/s³] on each axis: Q = q [Δt³/3 Δt²/2; Δt²/2 Δt], so that two
+# steps are as good as one. Measured is z = (x, y) with covariance R = (ee, en; en, nn).
+#
+# Source: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation", Wiley
+# 2001 (Kalman filter and its Joseph form, continuous white noise acceleration, gate).
+
+
+@nb.njit(cache=True, nogil=True)
+def propagate_covariance(P: Float, dt_s: float) -> None:
+    """Lets `dt_s` ≥ 0 pass: P ← F P Fᵀ, in place, without acceleration."""
+    for i in range(2):
+        for j in range(2):
+            P[i, j] += dt_s * (P[i, 2 + j] + P[2 + i, j]) + dt_s * dt_s * P[2 + i, 2 + j]
+    for i in range(2):
+        for j in range(2):
+            P[i, 2 + j] += dt_s * P[2 + i, 2 + j]
+            P[2 + j, i] = P[i, 2 + j]
+
+
+@nb.njit(cache=True, nogil=True)
+def predict_state(state: Float, P: Float, dt_s: float, q_m2ps3: float) -> None:
+    """Lets `dt_s` ≥ 0 pass: x ← F x, P ← F P Fᵀ + Q."""
+    for i in range(2):
+        state[i] += dt_s * state[2 + i]
+    propagate_covariance(P, dt_s)
+    for i in range(2):
+        P[i, i] += q_m2ps3 * dt_s**3 / 3
+        P[i, 2 + i] += q_m2ps3 * dt_s**2 / 2
+        P[2 + i, i] = P[i, 2 + i]
+        P[2 + i, 2 + i] += q_m2ps3 * dt_s
+
+
+@nb.njit(cache=True, nogil=True)
+def update_state(state: Float, P: Float, x_m: float, y_m: float, ee: float, en: float, nn: float) -> None:
+    """Takes in a measured position: x ← x + K ν, P ← (I − K H) P (I − K H)ᵀ + K R Kᵀ."""
+    a, b, d = P[0, 0] + ee, P[0, 1] + en, P[1, 1] + nn
+    det = a * d - b * b
+    k_x = _gain_column(P, d / det, -b / det)
+    k_y = _gain_column(P, -b / det, a / det)
+    # I − K H in the measured rows is R S⁻¹: so written, nothing is left of a difference of nearly equal numbers.
+    r00, r01 = (ee * d - en * b) / det, (en * a - ee * b) / det
+    r10, r11 = (en * d - nn * b) / det, (nn * a - en * b) / det
+    dx, dy = x_m - state[0], y_m - state[1]
+    for i in range(4):
+        state[i] += k_x[i] * dx + k_y[i] * dy
+    for j in range(4):
+        p0, p1 = P[0, j], P[1, j]
+        P[0, j], P[1, j] = r00 * p0 + r01 * p1, r10 * p0 + r11 * p1
+        P[2, j] -= k_x[2] * p0 + k_y[2] * p1
+        P[3, j] -= k_x[3] * p0 + k_y[3] * p1
+    for i in range(4):
+        p0, p1 = P[i, 0], P[i, 1]
+        noise_x, noise_y = k_x[i] * ee + k_y[i] * en, k_x[i] * en + k_y[i] * nn
+        P[i, 0], P[i, 1] = r00 * p0 + r01 * p1, r10 * p0 + r11 * p1
+        P[i, 2] -= p0 * k_x[2] + p1 * k_y[2]
+        P[i, 3] -= p0 * k_x[3] + p1 * k_y[3]
+        for j in range(4):
+            P[i, j] += noise_x * k_x[j] + noise_y * k_y[j]
+    for i in range(4):
+        for j in range(i):
+            P[i, j] = P[j, i] = (P[i, j] + P[j, i]) / 2
+
+
+@nb.njit(cache=True, nogil=True)
+def _gain_column(P: Float, a: float, b: float) -> tuple[float, float, float, float]:
+    """A column of K = P Hᵀ S⁻¹, (a, b) being that column of S⁻¹."""
+    return (
+        P[0, 0] * a + P[0, 1] * b,
+        P[1, 0] * a + P[1, 1] * b,
+        P[2, 0] * a + P[2, 1] * b,
+        P[3, 0] * a + P[3, 1] * b,
+    )
+
+
+@nb.njit(cache=True, nogil=True)
+def mahalanobis2(dx_m: float, dy_m: float, a: float, b: float, d: float) -> float:
+    """Mahalanobis distance d² = νᵀ S⁻¹ ν of ν = (dx, dy), S = (a, b; b, d)."""
+    return (d * dx_m * dx_m - 2 * b * dx_m * dy_m + a * dy_m * dy_m) / (a * d - b * b)
+
+
+# The update where a part of the errors is common: a split covariance intersection filter.
+#
+# Of the covariance P (4, 4) a part C, `common`, may be correlated in any way with the common part of the measurement,
+# `share` · R; the rest of both is independent. With ω in (0, 1]: P₁ = C/ω + (P − C), R₁ = share · R/(1 − ω)
+# + (1 − share) · R, K = P₁Hᵀ(HP₁Hᵀ + R₁)⁻¹, x ← x + Kν, P ← (1 − KH)P₁; the independent part becomes (1 − KH)(P −
+# C)(1 − KH)ᵀ + K(1 − share)RKᵀ, the common part is the rest. ω is that of the least determinant of P, which is convex
+# in it.
+#
+# Source: H. Li, F. Nashashibi, M. Yang, "Split covariance intersection filter: theory and its application to vehicle
+# localization", IEEE T-ITS 14 (2013) 1860–1871.
+
+_LEAST = 1e-6
+"""ω is no smaller, and 1 − ω is 0 or no smaller: nearer to its ends the determinant no longer changes."""
+_ROUNDS = 30
+"""Golden sections: ω to .618³⁰ = 5e-7, where the determinant is flat."""
+_GOLDEN = (math.sqrt(5) - 1) / 2
+
+
+@nb.njit(cache=True, nogil=True)
+def update_split(state: Float, P: Float, common: Float, seen: Float, share: float, grown: float) -> None:
+    """Takes in a measured position, in place. `seen`: x, y, ee, en, nn; the independent part of R counts `grown` times.
+
+    `grown`: from 1 to infinity, where the measurement tells nothing new but its common part.
+    """
+    own = (1.0 - share) * min(grown, 1e12)
+    # The determinant is convex in ω: golden sections between its ends, which are then held against the best.
+    low, high = _LEAST, 1.0 - _LEAST
+    left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+    at_left, at_right = (
+        _updated_determinant(left, P, common, seen, share, own),
+        _updated_determinant(right, P, common, seen, share, own),
+    )
+    for _ in range(_ROUNDS):
+        if at_left <= at_right:
+            high, right, at_right = right, left, at_left
+            left = high - _GOLDEN * (high - low)
+            at_left = _updated_determinant(left, P, common, seen, share, own)
+        else:
+            low, left, at_left = left, right, at_right
+            right = low + _GOLDEN * (high - low)
+            at_right = _updated_determinant(right, P, common, seen, share, own)
+    omega = (low + high) / 2
+    if omega >= 1.0 - 2.0 * _LEAST:  # the measurement would not help: it is left out
+        return
+    independent, whole = np.empty((4, 4)), np.empty((4, 4))
+    for i in range(4):
+        for j in range(4):
+            independent[i, j] = P[i, j] - common[i, j]
+            whole[i, j] = common[i, j] / omega + independent[i, j]
+    scale = share / (1.0 - omega) + own
+    gain = _split_gain(whole, scale * seen[2], scale * seen[3], scale * seen[4])
+    update_state(state, whole, seen[0], seen[1], scale * seen[2], scale * seen[3], scale * seen[4])
+    left_over = _update_covariance(independent, gain, own * seen[2], own * seen[3], own * seen[4])
+    for i in range(4):
+        for j in range(4):
+            P[i, j] = whole[i, j]
+            common[i, j] = whole[i, j] - left_over[i, j]
+
+
+@nb.njit(cache=True, nogil=True)
+def _updated_determinant(omega: float, P: Float, common: Float, seen: Float, share: float, own: float) -> float:
+    """The determinant of P after the update: |P₁| |R₁| / |HP₁Hᵀ + R₁|, P₁ by blocks of position and velocity."""
+    more, scale = 1.0 / omega - 1.0, share / (1.0 - omega) + own
+    a, b, d = P[0, 0] + more * common[0, 0], P[0, 1] + more * common[0, 1], P[1, 1] + more * common[1, 1]
+    det = a * d - b * b
+    p, q = P[0, 2] + more * common[0, 2], P[1, 2] + more * common[1, 2]
+    r, s = P[0, 3] + more * common[0, 3], P[1, 3] + more * common[1, 3]
+    xx = P[2, 2] + more * common[2, 2] - (d * p * p - 2.0 * b * p * q + a * q * q) / det
+    xy = P[2, 3] + more * common[2, 3] - (d * p * r - b * (p * s + q * r) + a * q * s) / det
+    yy = P[3, 3] + more * common[3, 3] - (d * r * r - 2.0 * b * r * s + a * s * s) / det
+    ee, en, nn = scale * seen[2], scale * seen[3], scale * seen[4]
+    measured = (ee * nn - en * en) / ((a + ee) * (d + nn) - (b + en) * (b + en))
+    return float(det * (xx * yy - xy * xy) * measured)
+
+
+@nb.njit(cache=True, nogil=True)
+def _split_gain(whole: Float, ee: float, en: float, nn: float) -> Float:
+    """The gain K = P₁Hᵀ(HP₁Hᵀ + R₁)⁻¹, (4, 2), of P₁ `whole` and R₁ = (ee, en; en, nn)."""
+    a, b, d = whole[0, 0] + ee, whole[0, 1] + en, whole[1, 1] + nn
+    det = a * d - b * b
+    gain = np.empty((4, 2))
+    for i in range(4):
+        gain[i, 0] = (whole[i, 0] * d - whole[i, 1] * b) / det
+        gain[i, 1] = (whole[i, 1] * a - whole[i, 0] * b) / det
+    return gain
+
+
+@nb.njit(cache=True, nogil=True)
+def _update_covariance(independent: Float, gain: Float, ee: float, en: float, nn: float) -> Float:
+    """(1 − KH) N (1 − KH)ᵀ + K R Kᵀ, symmetric."""
+    half, out = np.empty((4, 4)), np.empty((4, 4))
+    for i in range(4):
+        for j in range(4):
+            half[i, j] = independent[i, j] - gain[i, 0] * independent[0, j] - gain[i, 1] * independent[1, j]
+    for i in range(4):
+        for j in range(i + 1):
+            out[i, j] = half[i, j] - half[i, 0] * gain[j, 0] - half[i, 1] * gain[j, 1]
+            out[i, j] += gain[i, 0] * (ee * gain[j, 0] + en * gain[j, 1])
+            out[i, j] += gain[i, 1] * (en * gain[j, 0] + nn * gain[j, 1])
+            out[j, i] = out[i, j]
+    return out
+
+
+# One run.
 
 STALE, PREDICT, REPLAY = 0, 1, 2
+"""Values of `TrackerRules.late`."""
 ENTRIES_PER_LIST = 65536
 """Track ids: number of the founding list × this + place of the founding entry in it."""
 SAME_OBJECT = 1.386
-"""Tracks whose next entries would be as close as this, d², can be of one object: the median of χ² with 2 degrees of
-freedom (chosen), so half of the pairs of entries of one object are closer."""
-_SAME_S = SAME_INSTANT_NS * 1e-9
+"""d² up to which two tracks can be of one object: the median of χ² with 2 degrees of freedom, so half of the pairs of
+entries of one object are closer. docs/develop/decisions/0015-fusions.md."""
 _NOTHING_NEW = 1e12
-"""An entry that counts as one of so many times the variance says nothing new: errors last too long (chosen)."""
+"""An entry that counts as one of so many times its variance changes no state: it is left out."""
 _LEAST_COST = 1e-6
-"""What the worst pair within the gate is better than none (chosen: small against the differences between pairs)."""
+"""By how much the worst pair within the gate is better than none: little beside the differences between pairs."""
 
 
-class Said(NamedTuple):
-    """What the units say in one run: lists f, `rows[start[f] : start[f + 1]]` their entries in order of content."""
+class HeardLists(NamedTuple):
+    """The lists of the units in one run; `rows[start[f] : start[f + 1]]`: the entries of list f in order of content."""
 
     start: Int  # (F + 1,)
     rows: Int  # (N,) indices into entries
@@ -47,8 +340,8 @@ class Said(NamedTuple):
     unit_ix: Int  # (F,)
 
 
-class Rules(NamedTuple):
-    """The tracker's settings, as the kernel wants them."""
+class TrackerRules(NamedTuple):
+    """The settings of the tracker, in the form that the kernel takes."""
 
     late: int
     q_m2ps3: float
@@ -62,83 +355,86 @@ class Rules(NamedTuple):
     agree: Bool  # (C, C)
     errors_last_s: float  # 0: errors are fresh in every list
     common_share: float
-    keeps_s: Float  # (U,) for how long what a unit's messages leave out may be there: no claim fades before
-    apart_s: float  # a list that held two tracks tells for so long that they are two
-
-
-# ------------------------------------------------------------------------------------------------------------- one run
+    keeps_s: Float  # (U,) for how long an object that a unit's messages leave out may be there: no claim fades before
+    apart_s: float  # for so long after a list held two tracks they are two objects
 
 
 @nb.njit(cache=True, nogil=True)
-def fuse_run(
-    said: Said, rules: Rules, so_far: Remembered, issue_s: Float, arrived: Int, arrived_start: Int
-) -> tuple[Int, Entries, Remembered]:
+def track_run(
+    unit_lists: HeardLists, rules: TrackerRules, so_far: StoredMemory, issue_s: Float, arrived: Int, arrived_start: Int
+) -> tuple[Int, Entries, StoredMemory]:
     """Fused lists of one run at the next instants: where each begins (K + 1,), their entries, and what to remember."""
-    memory, before, heard = recalled(so_far, said.captured_s)
+    memory, before, heard = recall_memory(so_far, unit_lists.captured_s)
     start, entries = np.zeros(len(issue_s) + 1, np.int64), np.zeros(256, ENTRY)
     for k in range(len(issue_s)):
-        came = _in_order(said, arrived[arrived_start[k] : arrived_start[k + 1]])
+        arriving = _order_by_capture(unit_lists, arrived[arrived_start[k] : arrived_start[k + 1]])
         if rules.late == REPLAY:
-            memory, before, heard = _replayed(memory, before, heard, came, said, rules)
+            memory, before, heard = _replay_memory(memory, before, heard, arriving, unit_lists, rules)
         else:
-            for f in came:
-                memory = _hear(memory, said, rules, f, issue_s[k])
-            memory = _settled(memory, rules, issue_s[k])
+            for f in arriving:
+                memory = _hear_list(memory, unit_lists, rules, f, issue_s[k])
+            memory = _settle_tracks(memory, rules, issue_s[k])
         if start[k] + len(memory.tracks) > len(entries):
             grown = np.zeros(2 * (start[k] + len(memory.tracks)), ENTRY)
             grown[: start[k]] = entries[: start[k]]
             entries = grown
-        start[k + 1] = start[k] + _publish(memory, rules, issue_s[k], entries[start[k] :])
-    return start, entries[: start[-1]].copy(), remembered(memory, before, heard, said.captured_s)
+        start[k + 1] = start[k] + _publish_tracks(memory, rules, issue_s[k], entries[start[k] :])
+    return start, entries[: start[-1]].copy(), store_memory(memory, before, heard, unit_lists.captured_s)
 
 
 @nb.njit(cache=True, nogil=True)
-def _replayed(
-    memory: Memory, before: list[Memory], heard: Int, came: Int, said: Said, rules: Rules
-) -> tuple[Memory, list[Memory], Int]:
-    """Memory as if the lists `came` had been heard when they were captured, and the lists heard of late.
+def _replay_memory(
+    memory: TrackerMemory,
+    before: list[TrackerMemory],
+    heard: Int,
+    arriving: Int,
+    unit_lists: HeardLists,
+    rules: TrackerRules,
+) -> tuple[TrackerMemory, list[TrackerMemory], Int]:
+    """The memory as if the lists `arriving` had been heard at their captures, those before each list, and these lists.
 
-    Goes back to `before` the first list captured when the oldest of them was, or later, and hears all again.
+    Goes back to the memory `before` the first list that was captured no earlier than the oldest `arriving`, and hears
+    all lists from there on again.
     """
     if len(heard):
-        oldest_s = said.captured_s[heard[-1]] - rules.buffer_s - _SAME_S
-        came = came[said.captured_s[came] >= oldest_s]
-    if len(came) == 0:
+        oldest_s = unit_lists.captured_s[heard[-1]] - rules.buffer_s - SAME_INSTANT_S
+        arriving = arriving[unit_lists.captured_s[arriving] >= oldest_s]
+    if len(arriving) == 0:
         return memory, before, heard
     back = len(heard)
-    while back > 0 and said.captured_s[heard[back - 1]] >= said.captured_s[came[0]]:
+    while back > 0 and unit_lists.captured_s[heard[back - 1]] >= unit_lists.captured_s[arriving[0]]:
         back -= 1
     while len(before) > back:
         memory = before.pop()
-    again = _in_order(said, np.concatenate((heard[back:], came)))
+    again = _order_by_capture(unit_lists, np.concatenate((heard[back:], arriving)))
     heard = np.concatenate((heard[:back], again))
     for k in range(len(again)):
-        now_s = said.captured_s[again[k]]
-        if k == 0 or said.captured_s[again[k - 1]] < now_s:
+        now_s = unit_lists.captured_s[again[k]]
+        if k == 0 or unit_lists.captured_s[again[k - 1]] < now_s:
             saved = memory
-            memory = Memory(saved.tracks.copy(), saved.claims.copy(), saved.together_s.copy())
+            memory = TrackerMemory(saved.tracks.copy(), saved.claims.copy(), saved.together_s.copy())
         before.append(saved)
-        memory = _hear(memory, said, rules, again[k], now_s)
-        if k + 1 == len(again) or said.captured_s[again[k + 1]] > now_s:
-            memory = _settled(memory, rules, now_s)
+        memory = _hear_list(memory, unit_lists, rules, again[k], now_s)
+        if k + 1 == len(again) or unit_lists.captured_s[again[k + 1]] > now_s:
+            memory = _settle_tracks(memory, rules, now_s)
     done = 0
-    while said.captured_s[heard[done]] < said.captured_s[heard[-1]] - rules.buffer_s - _SAME_S:
+    while unit_lists.captured_s[heard[done]] < unit_lists.captured_s[heard[-1]] - rules.buffer_s - SAME_INSTANT_S:
         done += 1
     return memory, before[done:], heard[done:]
 
 
 @nb.njit(cache=True, nogil=True)
-def _publish(memory: Memory, rules: Rules, now_s: float, out: Entries) -> int:
-    """Writes the tracks there are now to the front of `out`, and says how much that is."""
+def _publish_tracks(memory: TrackerMemory, rules: TrackerRules, now_s: float, out: Entries) -> int:
+    """Writes the tracks that are published now to the front of `out`; returns their number."""
     state, P = np.empty(4), np.empty((4, 4))
     n = 0
     for j in range(len(memory.tracks)):
         track = memory.tracks[j]
-        existence = _existence(memory.claims[j], rules, now_s)
-        if not existence > rules.publish or track.last_s - track.first_s < rules.confirm_s - _SAME_S:
+        existence = _track_existence(memory.claims[j], rules, now_s)
+        if not existence > rules.publish or track.last_s - track.first_s < rules.confirm_s - SAME_INSTANT_S:
             continue
         state[:], P[:] = track.state, track.P
-        predict(state, P, max(now_s - track.at_s, 0.0), rules.q_m2ps3)
+        predict_state(state, P, max(now_s - track.at_s, 0.0), rules.q_m2ps3)
         entry = out[n]
         n += 1
         entry.x_m, entry.y_m, entry.vx_mps, entry.vy_mps = state[0], state[1], state[2], state[3]
@@ -153,50 +449,59 @@ def _publish(memory: Memory, rules: Rules, now_s: float, out: Entries) -> int:
     return n
 
 
-# ------------------------------------------------------------------------------------------------------------ one list
+# One list.
 
 
 @nb.njit(cache=True, nogil=True)
-def _hear(memory: Memory, said: Said, rules: Rules, f: int, now_s: float) -> Memory:
+def _hear_list(
+    memory: TrackerMemory, unit_lists: HeardLists, rules: TrackerRules, f: int, now_s: float
+) -> TrackerMemory:
     """Takes in list f as of `now_s`: every track is predicted to then, updated, or founded."""
     for track in memory.tracks:
         if track.at_s < now_s:
-            predict(track.state, track.P, now_s - track.at_s, rules.q_m2ps3)
+            predict_state(track.state, track.P, now_s - track.at_s, rules.q_m2ps3)
             if rules.common_share > 0.0:
-                carry(track.common, now_s - track.at_s)
+                propagate_covariance(track.common, now_s - track.at_s)
             track.at_s = now_s
-    said_s = now_s if rules.late == STALE else said.captured_s[f]
-    seen = _seen(said, rules, f, now_s)
-    rows = said.rows[said.start[f] : said.start[f + 1]]
-    partner = _partners(memory.tracks, said, rules, rows, seen)
-    n = len(memory.tracks)
-    memory = _with_room(memory, int((partner < 0).sum()))
+    claimed_s = now_s if rules.late == STALE else unit_lists.captured_s[f]
+    seen = _entry_positions(unit_lists, rules, f, now_s)
+    rows = unit_lists.rows[unit_lists.start[f] : unit_lists.start[f + 1]]
+    partner = _assign_entries(memory.tracks, unit_lists, rules, rows, seen)
+    count = len(memory.tracks)
+    memory = _make_room(memory, int((partner < 0).sum()))
     for i in range(len(rows)):
-        entry, x, y, ee, en, nn = said.entries[rows[i]], seen[i, 0], seen[i, 1], seen[i, 2], seen[i, 3], seen[i, 4]
+        entry, x, y, ee, en, nn = (
+            unit_lists.entries[rows[i]],
+            seen[i, 0],
+            seen[i, 1],
+            seen[i, 2],
+            seen[i, 3],
+            seen[i, 4],
+        )
         if partner[i] >= 0:
             track = memory.tracks[partner[i]]
-            # As much as fresh errors of so much more variance would say: those of a unit last, about each object.
-            last_s = memory.claims[partner[i], said.unit_ix[f]].at_s
+            # Errors of a unit about one object last: the entry counts as one with fresh errors of more variance.
+            last_s = memory.claims[partner[i], unit_lists.unit_ix[f]].at_s
             grown = 1.0
             if rules.errors_last_s > 0.0 and last_s > -math.inf:
-                grown = math.tanh(abs(said_s - last_s) / (2.0 * rules.errors_last_s))
+                grown = math.tanh(abs(claimed_s - last_s) / (2.0 * rules.errors_last_s))
                 grown = 1.0 / grown if grown > 0.0 else math.inf
             if rules.common_share > 0.0:
                 update_split(track.state, track.P, track.common, seen[i], rules.common_share, grown)
             elif grown < _NOTHING_NEW:
-                update(track.state, track.P, x, y, grown * ee, grown * en, grown * nn)
+                update_state(track.state, track.P, x, y, grown * ee, grown * en, grown * nn)
         else:
-            partner[i] = n
-            n += 1
+            partner[i] = count
+            count += 1
             track = memory.tracks[partner[i]]
-            _found(track, entry, x, y, ee, en, nn, rules)
-            track.at_s, track.first_s, track.last_s = now_s, said.captured_s[f], said.captured_s[f]
-            track.unit_ix, track.track_id = said.unit_ix[f], f * ENTRIES_PER_LIST + i
+            _start_track(track, entry, x, y, ee, en, nn, rules)
+            track.at_s, track.first_s, track.last_s = now_s, unit_lists.captured_s[f], unit_lists.captured_s[f]
+            track.unit_ix, track.track_id = unit_lists.unit_ix[f], f * ENTRIES_PER_LIST + i
         track.ee, track.en, track.nn = ee, en, nn
-        _describe(track, entry, said.captured_s[f])
-        claim = memory.claims[partner[i], said.unit_ix[f]]
-        if said_s >= claim.at_s:
-            claim.existence, claim.at_s = entry.existence, said_s
+        _describe_track(track, entry, unit_lists.captured_s[f])
+        claim = memory.claims[partner[i], unit_lists.unit_ix[f]]
+        if claimed_s >= claim.at_s:
+            claim.existence, claim.at_s = entry.existence, claimed_s
     for j in partner:
         for k in partner:
             memory.together_s[j, k] = now_s
@@ -204,25 +509,25 @@ def _hear(memory: Memory, said: Said, rules: Rules, f: int, now_s: float) -> Mem
 
 
 @nb.njit(cache=True, nogil=True)
-def _seen(said: Said, rules: Rules, f: int, now_s: float) -> Float:
+def _entry_positions(unit_lists: HeardLists, rules: TrackerRules, f: int, now_s: float) -> Float:
     """Places and their covariances (n, 5): x, y, ee, en, nn of the entries of list f as of `now_s`."""
-    rows = said.rows[said.start[f] : said.start[f + 1]]
+    rows = unit_lists.rows[unit_lists.start[f] : unit_lists.start[f + 1]]
     seen = np.empty((len(rows), 5))
-    age_of_information_s = max(now_s - said.captured_s[f], 0.0) if rules.late == PREDICT else 0.0
+    age_of_information_s = max(now_s - unit_lists.captured_s[f], 0.0) if rules.late == PREDICT else 0.0
     grown = rules.q_m2ps3 * age_of_information_s**3 / 3
     for i in range(len(rows)):
-        entry = said.entries[rows[i]]
+        entry = unit_lists.entries[rows[i]]
         seen[i, 0], seen[i, 1] = (
             entry.x_m + age_of_information_s * entry.vx_mps,
             entry.y_m + age_of_information_s * entry.vy_mps,
         )
-        ee, en, nn = floored(entry.cov_ee_m2, entry.cov_en_m2, entry.cov_nn_m2)
+        ee, en, nn = floor_eigenvalues(entry.cov_ee_m2, entry.cov_en_m2, entry.cov_nn_m2)
         seen[i, 2], seen[i, 3], seen[i, 4] = ee + grown, en, nn + grown
     return seen
 
 
 @nb.njit(cache=True, nogil=True)
-def _partners(tracks: NDArray[Any], said: Said, rules: Rules, rows: Int, seen: Float) -> Int:
+def _assign_entries(tracks: NDArray[Any], unit_lists: HeardLists, rules: TrackerRules, rows: Int, seen: Float) -> Int:
     """The track of each entry (n,), −1: none. Least sum of d² + ln|S| over the pairs within the gate."""
     n, m = len(rows), len(tracks)
     partner = np.full(n, -1)
@@ -230,7 +535,7 @@ def _partners(tracks: NDArray[Any], said: Said, rules: Rules, rows: Int, seen: F
         return partner
     class_ix = np.empty(n, np.int64)
     for i in range(n):
-        class_ix[i] = most_probable(said.entries[rows[i]].class_probability)
+        class_ix[i] = most_probable_class(unit_lists.entries[rows[i]].class_probability)
     row, col = np.empty(n * m, np.int64), np.empty(n * m, np.int64)
     cost, spread, pairs = np.empty(n * m), np.empty(n * m), 0
     for j in range(m):
@@ -243,14 +548,14 @@ def _partners(tracks: NDArray[Any], said: Said, rules: Rules, rows: Int, seen: F
             # No eigenvalue of S is above its trace.
             if dx * dx + dy * dy > rules.gate * (a + d) or not agree[class_ix[i]]:
                 continue
-            d2 = distance2(dx, dy, a, b, d)
+            d2 = mahalanobis2(dx, dy, a, b, d)
             if d2 <= rules.gate:
                 row[pairs], col[pairs], spread[pairs] = i, j, math.log(a * d - b * b)
                 cost[pairs] = d2 + spread[pairs]
                 pairs += 1
     row, col, cost, spread = row[:pairs], col[:pairs], cost[:pairs], spread[:pairs]
-    # Alone costs 0: shifted so that any pair within the gate is better than none.
-    largest_around(row, col, spread, n, m)
+    # A row left alone costs 0: costs are shifted so that any pair within the gate is better than none.
+    spread_component_maximum(row, col, spread, n, m)
     for p in range(pairs):
         cost[p] -= rules.gate + spread[p] + _LEAST_COST
     assign_pairs(row, col, cost, n, m, partner)
@@ -258,8 +563,8 @@ def _partners(tracks: NDArray[Any], said: Said, rules: Rules, rows: Int, seen: F
 
 
 @nb.njit(cache=True, nogil=True)
-def _with_room(memory: Memory, more: int) -> Memory:
-    """The same memory with room for `more` tracks at its end, of which nothing is known."""
+def _make_room(memory: TrackerMemory, more: int) -> TrackerMemory:
+    """The memory with `more` tracks at its end, which are empty."""
     if more == 0:
         return memory
     n, units = memory.claims.shape
@@ -268,11 +573,14 @@ def _with_room(memory: Memory, more: int) -> Memory:
     for claim in claims[n:].flat:
         claim.at_s = -np.inf
     tracks[:n], claims[:n], together_s[:n, :n] = memory.tracks, memory.claims, memory.together_s
-    return Memory(tracks, claims, together_s)
+    return TrackerMemory(tracks, claims, together_s)
 
 
 @nb.njit(cache=True, nogil=True)
-def _found(track: Any, entry: Any, x: float, y: float, ee: float, en: float, nn: float, rules: Rules) -> None:
+def _start_track(
+    track: Any, entry: Any, x: float, y: float, ee: float, en: float, nn: float, rules: TrackerRules
+) -> None:
+    """Writes the state of a track that an entry founds; (x, y) and (ee, en; en, nn): its position as of now."""
     track.state[0], track.state[1], track.state[2], track.state[3] = x, y, entry.vx_mps, entry.vy_mps
     track.P[0, 0], track.P[0, 1], track.P[1, 0], track.P[1, 1] = ee, en, en, nn
     track.P[2, 2] = track.P[3, 3] = rules.speed_var_m2ps2
@@ -282,8 +590,8 @@ def _found(track: Any, entry: Any, x: float, y: float, ee: float, en: float, nn:
 
 
 @nb.njit(cache=True, nogil=True)
-def _describe(track: Any, entry: Any, captured_s: float) -> None:
-    """What the filter leaves out; of lists captured together the last one heard counts as the newest."""
+def _describe_track(track: Any, entry: Any, captured_s: float) -> None:
+    """Takes in what the filter leaves out; of lists captured together the last one heard counts as the newest."""
     if captured_s >= track.last_s:
         track.z_m, track.yaw_rad = entry.z_m, entry.yaw_rad
     track.first_s, track.last_s = min(track.first_s, captured_s), max(track.last_s, captured_s)
@@ -292,15 +600,15 @@ def _describe(track: Any, entry: Any, captured_s: float) -> None:
     track.height_m += entry.height_m
     for c in range(len(CLASSES)):
         track.class_probability[c] += entry.class_probability[c]
-    track.class_ix = most_probable(track.class_probability)
+    track.class_ix = most_probable_class(track.class_probability)
     track.count += 1
 
 
-# ------------------------------------------------------------------------------------------------------ life and death
+# Existence and ends of tracks.
 
 
 @nb.njit(cache=True, nogil=True)
-def _existence(claims: NDArray[Any], rules: Rules, now_s: float) -> float:
+def _track_existence(claims: NDArray[Any], rules: TrackerRules, now_s: float) -> float:
     """1 − Πᵤ (1 − cᵤ e^(−(now − tᵤ)/forget)) of one track, `claims (U,)`."""
     none = 1.0
     for u in range(len(claims)):
@@ -312,76 +620,81 @@ def _existence(claims: NDArray[Any], rules: Rules, now_s: float) -> float:
 
 
 @nb.njit(cache=True, nogil=True)
-def _settled(memory: Memory, rules: Rules, now_s: float) -> Memory:
-    """Without the tracks that have faded, and of two of one object without the younger (`now_s`: as of all tracks)."""
+def _settle_tracks(memory: TrackerMemory, rules: TrackerRules, now_s: float) -> TrackerMemory:
+    """The memory without tracks that have faded, and without the younger of two tracks of one object, as of `now_s`."""
     n, units = memory.claims.shape
     keep = np.empty(n, np.bool_)
     for j in range(n):
-        keep[j] = _existence(memory.claims[j], rules, now_s) > rules.drop
+        keep[j] = _track_existence(memory.claims[j], rules, now_s) > rules.drop
     for i in range(n):
         for j in range(i + 1, n):
-            if keep[i] and keep[j] and _one_object(memory, rules, i, j, now_s):
-                keep[_younger(memory.tracks, i, j)] = False
-    left = np.flatnonzero(keep)
-    if len(left) == n:
+            if keep[i] and keep[j] and _is_one_object(memory, rules, i, j, now_s):
+                keep[_younger_track(memory.tracks, i, j)] = False
+    kept = np.flatnonzero(keep)
+    if len(kept) == n:
         return memory
-    tracks, claims = np.empty(len(left), TRACK), np.empty((len(left), units), CLAIM)
-    together_s = np.empty((len(left), len(left)))
-    for a in range(len(left)):
-        tracks[a], claims[a] = memory.tracks[left[a]], memory.claims[left[a]]
-        together_s[a] = memory.together_s[left[a]][left]
-    return Memory(tracks, claims, together_s)
+    tracks, claims = np.empty(len(kept), TRACK), np.empty((len(kept), units), CLAIM)
+    together_s = np.empty((len(kept), len(kept)))
+    for a in range(len(kept)):
+        tracks[a], claims[a] = memory.tracks[kept[a]], memory.claims[kept[a]]
+        together_s[a] = memory.together_s[kept[a]][kept]
+    return TrackerMemory(tracks, claims, together_s)
 
 
 @nb.njit(cache=True, nogil=True)
-def _one_object(memory: Memory, rules: Rules, i: int, j: int, now_s: float) -> bool:
-    """Classes agree, no list held both of late, and the tracks are as close as two entries of one object would be."""
+def _is_one_object(memory: TrackerMemory, rules: TrackerRules, i: int, j: int, now_s: float) -> bool:
+    """Whether classes agree, no list held both of late, and the tracks are as close as two entries of one object."""
     a, b = memory.tracks[i], memory.tracks[j]
     dx, dy = a.state[0] - b.state[0], a.state[1] - b.state[1]
-    # Not only P: of two tracks that share the entries of one object each keeps to its side, and is too sure of it.
+    # P alone will not do: two tracks that share the entries of one object keep apart, and their P shrinks.
     ee, nn = a.P[0, 0] + a.ee + b.P[0, 0] + b.ee, a.P[1, 1] + a.nn + b.P[1, 1] + b.nn
     if dx * dx + dy * dy > SAME_OBJECT * (ee + nn) or not rules.agree[a.class_ix, b.class_ix]:
         return False
     if memory.together_s[i, j] >= now_s - rules.apart_s:
         return False
-    return distance2(dx, dy, ee, a.P[0, 1] + a.en + b.P[0, 1] + b.en, nn) <= SAME_OBJECT
+    return mahalanobis2(dx, dy, ee, a.P[0, 1] + a.en + b.P[0, 1] + b.en, nn) <= SAME_OBJECT
 
 
 @nb.njit(cache=True, nogil=True)
-def _younger(tracks: NDArray[Any], i: int, j: int) -> int:
-    """Of tracks i < j the later captured first, then the one of fewer entries, then the one founded later."""
+def _younger_track(tracks: NDArray[Any], i: int, j: int) -> int:
+    """Of tracks i < j the one with the later first capture, else with fewer entries, else founded later."""
     a, b = tracks[i], tracks[j]
     if a.first_s != b.first_s:
         return i if a.first_s > b.first_s else j
     return i if a.count < b.count else j
 
 
-# ------------------------------------------------------------------------------- an order that depends on content only
+# An order of lists that depends on their content only.
 
 
 @nb.njit(cache=True, nogil=True)
-def _comes_before(said: Said, f: int, g: int) -> bool:
-    if said.captured_s[f] != said.captured_s[g]:
-        return bool(said.captured_s[f] < said.captured_s[g])
-    n, m = said.start[f + 1] - said.start[f], said.start[g + 1] - said.start[g]
+def _comes_before(unit_lists: HeardLists, f: int, g: int) -> bool:
+    """Whether list f comes before list g: see `_order_by_capture`."""
+    if unit_lists.captured_s[f] != unit_lists.captured_s[g]:
+        return bool(unit_lists.captured_s[f] < unit_lists.captured_s[g])
+    n, m = unit_lists.start[f + 1] - unit_lists.start[f], unit_lists.start[g + 1] - unit_lists.start[g]
     if n != m:
         return bool(n > m)
     for k in range(n):
-        order = compare_rows(said.content, said.rows[said.start[f] + k], said.rows[said.start[g] + k])
+        order = compare_rows(
+            unit_lists.content, unit_lists.rows[unit_lists.start[f] + k], unit_lists.rows[unit_lists.start[g] + k]
+        )
         if order != 0:
             return bool(order < 0)
-    # They are equal: their order only decides which unit's the track counts as.
-    return bool(said.unit_ix[f] < said.unit_ix[g] or (said.unit_ix[f] == said.unit_ix[g] and f < g))
+    # The lists are equal: their order only decides which unit is stated for the track.
+    return bool(
+        unit_lists.unit_ix[f] < unit_lists.unit_ix[g] or (unit_lists.unit_ix[f] == unit_lists.unit_ix[g] and f < g)
+    )
 
 
 @nb.njit(cache=True, nogil=True)
-def _in_order(said: Said, lists: Int) -> Int:
-    """The same lists by capture, more entries first, then by content."""
+def _order_by_capture(unit_lists: HeardLists, lists: Int) -> Int:
+    """Lists ordered by capture, of equal ones those with more entries first, then by content."""
     lists = lists.copy()
     for k in range(1, len(lists)):
-        f, at = lists[k], k
-        while at > 0 and _comes_before(said, f, lists[at - 1]):
-            lists[at] = lists[at - 1]
-            at -= 1
-        lists[at] = f
+        f, place = lists[k], k
+        while place > 0 and _comes_before(unit_lists, f, lists[place - 1]):
+            lists[place] = lists[place - 1]
+            place -= 1
+        lists[place] = f
     return lists

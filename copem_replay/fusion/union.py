@@ -1,4 +1,4 @@
-"""The union of all lists: what fusion has to beat."""
+"""The union of all lists as a fusion: the baseline that other fusions have to beat; and lists of runs put together."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numba as nb
 import numpy as np
 
 from copem_replay.core.components import Share
-from copem_replay.core.object_list import Entries, Inputs, ObjectLists, joined, taken
+from copem_replay.core.object_list import Entries, Inputs, ObjectLists, join_entries, take_entries
 from copem_replay.core.tracks import Bool, Int
-from copem_replay.fusion.base import ListFusion
+from copem_replay.fusion.interface import ListFusion
 
 _APART, _LARGEST = np.int64(-7046029254386353131), np.int64(2**63 - 1)
-"""Numbers of units times the first lie far apart among those of 63 bits."""
+"""Ids of unit u are xored with u times the first, in 63 bits: so those of different units lie far apart."""
 
 
 class Union(ListFusion):
@@ -31,44 +31,46 @@ class Union(ListFusion):
     resumable: ClassVar[bool] = True
 
     def fuse(self, inputs: Inputs) -> ObjectLists:
-        """Every run by itself."""
+        """Fuse every run by itself."""
         runs = []
         for bounds in inputs.lists.start:
             entries = inputs.lists.entries[bounds[0] : bounds[-1]]
-            start, rows = side_by_side(bounds - bounds[0], inputs.newest, entries["existence"] >= self.min_existence)
-            runs.append((start, taken(entries, rows)))
-        fused = run_after_run(runs, len(inputs.issue_s))
-        fused.entries["track_id"] = _track_ids(fused)
+            start, rows = gather_newest_rows(
+                bounds - bounds[0], inputs.newest, entries["existence"] >= self.min_existence
+            )
+            runs.append((start, take_entries(entries, rows)))
+        fused = join_runs(runs, len(inputs.issue_s))
+        fused.entries["track_id"] = _renumber_track_ids(fused)
         return fused
 
 
-def _track_ids(lists: ObjectLists) -> Int:
-    """(N,) the ids that units keep, of each unit others: the first's as they are. −1 where a list has one twice."""
+def _renumber_track_ids(lists: ObjectLists) -> Int:
+    """(N,) track ids that differ between units, unchanged for the first unit; −1 where a list has an id twice."""
     ids, unit_ix = lists.entries["track_id"], lists.entries["unit_ix"]
-    told: Int = np.where(ids < 0, -1, ids ^ (unit_ix * _APART & _LARGEST))
+    track_id: Int = np.where(ids < 0, -1, ids ^ (unit_ix * _APART & _LARGEST))
     starts = np.append(lists.start[:, :-1].ravel(), lists.start[-1:, -1])
     list_ix = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
-    order = np.lexsort((told, list_ix))
-    again = (np.diff(told[order]) == 0) & (np.diff(list_ix[order]) == 0)
-    told[order[1:][again]] = told[order[:-1][again]] = -1
-    return told
+    order = np.lexsort((track_id, list_ix))
+    again = (np.diff(track_id[order]) == 0) & (np.diff(list_ix[order]) == 0)
+    track_id[order[1:][again]] = track_id[order[:-1][again]] = -1
+    return track_id
 
 
-def run_after_run(runs: Sequence[tuple[Int, Entries]], instants: int) -> ObjectLists:
-    """Lists of all runs from each run's, `start (K + 1,)` beginning at 0, and entries."""
+def join_runs(runs: Sequence[tuple[Int, Entries]], instants: int) -> ObjectLists:
+    """Lists of all runs from those of each: `start (K + 1,)`, from 0 on, and entries."""
     start = np.zeros((len(runs), instants + 1), dtype=np.int64)
     total = 0
-    for s, (one, _) in enumerate(runs):
-        start[s] = total + one
-        total += int(one[-1])
-    return ObjectLists(start, joined([entries for _, entries in runs]))
+    for s, (begin, _) in enumerate(runs):
+        start[s] = total + begin
+        total += int(begin[-1])
+    return ObjectLists(start, join_entries([entries for _, entries in runs]))
 
 
 @nb.njit(cache=True, nogil=True)
-def side_by_side(bounds: Int, newest: Int, counts: Bool) -> tuple[Int, Int]:
-    """Rows of the entries that count of all newest lists at each instant, (R,), and where each instant's begin.
+def gather_newest_rows(bounds: Int, newest: Int, counts: Bool) -> tuple[Int, Int]:
+    """Where the rows of each instant begin, (K + 1,), and (R,) the rows of its newest lists that count.
 
-    `bounds (F + 1,)` of the lists, `newest (K, U)`, `counts (N,)`; `start (K + 1,)`.
+    `bounds (F + 1,)` of the lists, `newest (K, U)`, `counts (N,)`.
     """
     start = np.zeros(len(newest) + 1, np.int64)
     for k in range(len(newest)):

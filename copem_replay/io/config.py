@@ -1,4 +1,4 @@
-"""What of a recording is read, and how: keys of the experiment file."""
+"""Keys of an experiment that say what is read of a recording: truth, ego, recorded units, window."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from copem_replay.core.components import Covariance, Either, Frozen, Id, Latency
 from copem_replay.io.schemas.object_lists import Fields
 
 
-class Recorded(Frozen):
+class RecordedTopic(Frozen):
     """The lists of a unit as they were recorded in the log on a topic, instead of a PEM.
 
     Used where the messages state none: `delay_s`, the time from the capture of a list to its stamp; `covariance_m2` of
@@ -23,7 +23,7 @@ class Recorded(Frozen):
     existence: Share = 0.9
 
 
-class RecordedOutput(Recorded):
+class RecordedOutput(RecordedTopic):
     """The fused lists of a stack as they were recorded, instead of units and a fusion.
 
     `delay_s`: the age of a list's states at its stamp, where its messages state none; with `tells_of: available` the
@@ -33,13 +33,13 @@ class RecordedOutput(Recorded):
     tells_of: Literal["stamp", "available"] = "stamp"
 
 
-class Read(Frozen):
+class TruthTopic(Frozen):
     """The topic of the truth in a recording that holds several object lists."""
 
     topic: str | None = None
 
 
-class ReadFields(Fields):
+class TruthFields(Fields):
     """The truth on a topic whose schema is not known by name: which of its fields hold what."""
 
     topic: Annotated[str, Field(min_length=1)]
@@ -58,22 +58,24 @@ class EgoTopic(Frozen):
     frame: str | None = None
 
 
-def _how_read(value: object) -> str:
-    named = isinstance(value, ReadFields) or (isinstance(value, dict) and len(value.keys() - {"topic"}) > 0)
+def _truth_key_form(value: object) -> str:
+    named = isinstance(value, TruthFields) or (isinstance(value, dict) and len(value.keys() - {"topic"}) > 0)
     return "fields" if named else "topic"
 
 
-HowRead = Annotated[Annotated[Read, Tag("topic")] | Annotated[ReadFields, Tag("fields")], Discriminator(_how_read)]
+HowRead = Annotated[
+    Annotated[TruthTopic, Tag("topic")] | Annotated[TruthFields, Tag("fields")], Discriminator(_truth_key_form)
+]
 
 
 Ego = Either[Id, EgoTopic]
 
 
-def _in_order(window_s: tuple[float | None, float | None]) -> tuple[float | None, float | None]:
+def _check_window_order(window_s: tuple[float | None, float | None]) -> tuple[float | None, float | None]:
     from_s, to_s = window_s
     if from_s is not None and to_s is not None and from_s > to_s:
         raise ValueError(f"expected [from, to], found one that ends ({to_s:g} s) before it begins ({from_s:g} s)")
     return window_s
 
 
-WindowOf = Annotated[tuple[NotNegative | None, NotNegative | None], AfterValidator(_in_order)]
+WindowOf = Annotated[tuple[NotNegative | None, NotNegative | None], AfterValidator(_check_window_order)]

@@ -1,42 +1,196 @@
-"""From the columns of a decoder to the truth: ordered, each object one track, corrected.
+"""Ground truth from the decoded messages of a log: in order of time, one track per object, corrected.
 
-Everything left out or put right is said in a line with its count.
+A note with a count tells of everything that is left out or corrected. `truth_digest` identifies the result.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+import hashlib
+import json
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from copem_replay.core.text import counted
+from copem_replay.core.errors import count_noun
 from copem_replay.core.tracks import CLASSES, SAME_INSTANT_NS, TRUTH, VALUES, Bool, Float, Int, Scene, Solid, Tracks
-from copem_replay.io import plausibility as repair
-from copem_replay.io.schemas.decoded import FARTHEST_M, DecodedObjects
 
-LONGEST_M = 1000.0  # no wall, train or building is longer, wider or higher (chosen)
+FARTHEST_M = 1e7
+"""A larger coordinate is no position: UTM northings end at 1e7."""
+
+
+@dataclass(frozen=True)
+class DecodedObjects:
+    """The lists of one topic: F messages in the order read, P rows message by message, N objects.
+
+    `values` are in the units and the frame of reference of `Tracks`, columns in the order of `tracks.VALUES`;
+    NaN where the message states none (or NaN).
+    """
+
+    stamp_ns: Int  # (F,)
+    stamped: Bool  # (F,) False: the message has no time stamp, `stamp_ns` is its log time
+    rows: Int  # (F,) number of rows of each message
+    object_ids: tuple[str, ...]  # N
+    moving: Bool  # (N,)
+    object_ix: Int  # (P,) index into object_ids
+    class_ix: NDArray[np.int8]  # (P,) index into CLASSES
+    values: Float  # (P, len(VALUES))
+    lane_boundaries: tuple[Float, ...] = ()  # (K, 3) each, in the truth's frame of reference: for showing only
+    solids: tuple[Solid, ...] = ()  # in the truth's frame of reference
+    hosts: tuple[str, ...] = ()  # the host vehicle's id, once per message that states one
+    notes: tuple[str, ...] = ()  # a line for each kind of state that was skipped or completed
+
+
+# Corrections of velocities and heights. Rows are those of the truth (P,), track by track (`start (E + 1,)`). Each
+# function returns new columns and a note for everything that it changed.
+
+MAX_GAP_S = 0.5
+"""No difference is taken across a longer gap: the default of an experiment's `max_gap_s`."""
+MOVING_MPS = 0.5
+"""An object that is faster by its positions moves: jitter of the positions of a standing one is slower."""
+FASTEST_MPS = 100.0
+"""A higher velocity is an error of the recording: no road user drives 360 km/h."""
+
+HEIGHTS_M = {
+    "pedestrian": (0.8, 1.75),
+    "bicycle": (0.8, 1.7),
+    "motorcycle": (0.8, 1.6),
+    "car": (1.0, 1.5),
+    "van": (1.4, 2.0),
+    "truck": (1.5, 3.2),
+    "bus": (2.0, 3.0),
+    "trailer": (0.5, 3.0),
+    "animal": (0.2, 0.7),
+    "other": (0.05, 1.0),
+    "vehicle": (0.5, 1.5),
+}
+"""The least plausible height and the typical one of each class, in m, rounded from those of real road users."""
+_LEAST_M = np.array([HEIGHTS_M[name][0] for name in CLASSES])
+_TYPICAL_M = np.array([HEIGHTS_M[name][1] for name in CLASSES])
+
+
+def correct_velocities(
+    start: Int, time_s: Float, x_m: Float, y_m: Float, vx_mps: Float, vy_mps: Float, moving: Bool
+) -> tuple[Float, Float, list[str]]:
+    """Velocities (P,) and notes, from those of the messages (NaN: not given); all columns are (P,).
+
+    A velocity is replaced by the central difference of the positions, one-sided at the ends of tracks and beside gaps,
+    if it is not given, above `FASTEST_MPS`, or exactly 0 although the way to every neighbour is faster than
+    `MOVING_MPS`. Objects not `moving` keep their velocities.
+    """
+    before, after = _find_neighbours(start, time_s)
+    dx, dy, apart_s = (a[after] - a[before] for a in (x_m, y_m, time_s))
+    with_both = np.maximum(apart_s, np.finfo(float).tiny)  # lone rows: 0 / tiny = 0
+    derived_x, derived_y = dx / with_both, dy / with_both
+
+    speed = np.hypot(vx_mps, vy_mps)
+    unset = moving & np.isnan(speed)
+    too_fast = moving & (speed > FASTEST_MPS)
+    frozen = moving & (speed == 0.0) & _is_moving(before, after, time_s, x_m, y_m)
+    derive = unset | too_fast | frozen
+    notes = [
+        f"velocity of {count_noun(int(rows.sum()), 'object state')} {what}: derived from the positions"
+        for rows, what in (
+            (unset, "is not given"),
+            (frozen, "is 0 though the object moves"),
+            (too_fast, f"exceeds {FASTEST_MPS:g} m/s"),
+        )
+        if rows.any()
+    ]
+    if (lone := int((derive & (before == after)).sum())) > 0:
+        notes.append(f"velocity of {count_noun(lone, 'object state')} cannot be derived (no neighbour): 0 taken")
+    vx, vy = np.where(derive, derived_x, vx_mps), np.where(derive, derived_y, vy_mps)
+    return vx, vy, notes
+
+
+def correct_heights(
+    object_ix: Int, object_class: Int, moving: Bool, z_m: Float, width_m: Float, height_m: Float
+) -> tuple[Float, Float, list[str]]:
+    """Heights of centres and of boxes (P,), and notes; all columns are (P,).
+
+    A height below the least plausible one of its class, or none (0), becomes the typical one; the bottom
+    of the box stays. If all boxes are centred on z = 0, they are stood on z = 0.
+    """
+    notes = []
+    height, z = height_m, z_m
+    if not z.any() and len(np.unique(height)) > 1:
+        z = height / 2.0
+        notes.append("every box is centred on z = 0: stood on z = 0")
+    of_moving = height[moving]
+    if len(np.unique(object_ix[moving])) >= 3 and (of_moving == width_m[moving]).all():
+        notes.append("the height of every moving object equals its width, a known defect of exporters")
+    low = height < _LEAST_M[object_class]
+    if low.any():
+        notes.append(f"height implausible or missing: {_count_by_class(object_ix, object_class, low)}")
+    typical = _TYPICAL_M[object_class]
+    return (
+        np.where(low, z + (typical - height) / 2.0, z),
+        np.where(low, typical, height),
+        notes,
+    )
+
+
+def _find_neighbours(start: Int, time_s: Float) -> tuple[Int, Int]:
+    """(P,) row before and row after each in its track; itself at the end of the track and beside a gap."""
+    row = np.arange(len(time_s))
+    joined = np.diff(time_s) <= MAX_GAP_S  # row k and k + 1
+    joined[start[1:-1] - 1] = False
+    before, after = row.copy(), row.copy()
+    before[1:] -= joined
+    after[:-1] += joined
+    return before, after
+
+
+def _is_moving(before: Int, after: Int, time_s: Float, x_m: Float, y_m: Float) -> Bool:
+    """(P,) whether an object moves to every neighbour of a row; at rest beside one of them it may stand."""
+    row = np.arange(len(time_s))
+    moves: Bool = before != after
+    for neighbour in (before, after):
+        apart_m = np.hypot(x_m - x_m[neighbour], y_m - y_m[neighbour])
+        apart_s = np.abs(time_s - time_s[neighbour])
+        moves &= (neighbour == row) | (apart_m > MOVING_MPS * apart_s)
+    return moves
+
+
+def _count_by_class(object_ix: Int, object_class: Int, rows: Bool) -> str:
+    """`3 pedestrian (1.75 m taken), 1 car (…)`: how many objects of each class have such rows."""
+    _, first = np.unique(object_ix[rows], return_index=True)
+    counts = np.bincount(object_class[rows][first], minlength=len(CLASSES))
+    return ", ".join(
+        f"{number} {name} ({HEIGHTS_M[name][1]:g} m taken)"
+        for number, name in zip(counts.tolist(), CLASSES, strict=True)
+        if number
+    )
+
+
+# Assembly: messages in order, usable rows, tracks.
+
+LONGEST_M = 1000.0
+"""A longer, wider or higher object is an error of the recording: no wall, train or building is."""
+_CLOCK_SLACK_NS = (
+    1_000_000_000  # log times this far outside the stamps may still be of their clock: latencies are shorter
+)
 _X, _Y, _Z, _YAW, _VX, _VY, _LENGTH, _WIDTH, _HEIGHT = range(len(VALUES))
 
 
-def assemble(
+def assemble_truth(
     columns: DecodedObjects, log: str
 ) -> tuple[Scene, Tracks, tuple[str, ...]] | tuple[None, None, tuple[str, ...]]:
     """Scene (without ego), truth and notes of the log named `log`. No scene where no object is usable."""
     notes: list[str] = []
-    kept_list, stamp_ns = _in_order(columns, notes)
+    kept_list, stamp_ns = _order_messages(columns, notes)
     frame_of_list = np.full(len(columns.stamp_ns), -1)
     frame_of_list[kept_list] = np.arange(len(kept_list))
     frame = np.repeat(frame_of_list, columns.rows)
-    row = np.flatnonzero(_usable(columns.values, frame >= 0, notes))
-    row = _once_per_list(row, frame, columns.object_ix, notes)
+    row = np.flatnonzero(_find_usable(columns.values, frame >= 0, notes))
+    row = _drop_repeated_objects(row, frame, columns.object_ix, notes)
     if not len(row):
         return None, None, tuple(notes)
 
-    object_ix, first_seen = _by_appearance(columns.object_ix[row])
+    object_ix, first_seen = _number_by_appearance(columns.object_ix[row])
     order = np.argsort(object_ix, kind="stable")  # rows are in order of capture: so are those of each track
     row, object_ix = row[order], object_ix[order]
-    object_class = _most_frequent(object_ix, columns.class_ix[row], notes)
+    object_class = _most_frequent_class(object_ix, columns.class_ix[row], notes)
     scene = Scene(
         log=log,
         t0_ns=int(stamp_ns[0]),
@@ -45,43 +199,47 @@ def assemble(
         object_class=object_class,
         moving=columns.moving[first_seen],
     )
-    tracks = _tracks(scene, stamp_ns, frame[row], object_ix, columns.values[row], notes)
-    return replace(scene, solids=_stood(columns.solids, columns.values[row, _Z], tracks.z_m)), tracks, tuple(notes)
+    tracks = _build_tracks(scene, stamp_ns, frame[row], object_ix, columns.values[row], notes)
+    return (
+        replace(scene, solids=_stand_solids_on_ground(columns.solids, columns.values[row, _Z], tracks.z_m)),
+        tracks,
+        tuple(notes),
+    )
 
 
-def _stood(solids: tuple[Solid, ...], said_z_m: Float, z_m: Float) -> tuple[Solid, ...]:
-    """The solids, those that are centred on z = 0 stood on it where the boxes were."""
-    if said_z_m.any() or not z_m.any():
+def _stand_solids_on_ground(solids: tuple[Solid, ...], stated_z_m: Float, z_m: Float) -> tuple[Solid, ...]:
+    """The solids; those centred on z = 0 are stood on it if the boxes were (`z_m`), all stated at z = 0."""
+    if stated_z_m.any() or not z_m.any():
         return solids
-    return tuple(one._replace(bottom_m=0.0) if 2 * one.bottom_m == -one.height_m else one for one in solids)
+    return tuple(solid._replace(bottom_m=0.0) if 2 * solid.bottom_m == -solid.height_m else solid for solid in solids)
 
 
-def _in_order(columns: DecodedObjects, notes: list[str]) -> tuple[Int, Int]:
-    """Which messages are kept, in order of time, and their stamps: (F,) each."""
+def _order_messages(columns: DecodedObjects, notes: list[str]) -> tuple[Int, Int]:
+    """(F,) indices of the messages that are kept, in order of time, and (F,) their stamps."""
     stamp_ns, use = columns.stamp_ns, np.ones(len(columns.stamp_ns), dtype=bool)
     if not columns.stamped.all():
         if columns.stamped.any():
             # Log times may run on another clock: one of 2026 in a simulation would be a gap of decades.
             stamped = stamp_ns[columns.stamped]
-            slack_ns = 1_000_000_000  # chosen
-            use = columns.stamped | ((stamp_ns >= stamped.min() - slack_ns) & (stamp_ns <= stamped.max() + slack_ns))
-        if taken := int((use & ~columns.stamped).sum()):
-            notes.append(f"{counted(taken, 'message')} without timestamp: the time of logging taken")
+            earliest_ns, latest_ns = stamped.min() - _CLOCK_SLACK_NS, stamped.max() + _CLOCK_SLACK_NS
+            use = columns.stamped | ((stamp_ns >= earliest_ns) & (stamp_ns <= latest_ns))
+        if log_timed := int((use & ~columns.stamped).sum()):
+            notes.append(f"{count_noun(log_timed, 'message')} without timestamp: the time of logging taken")
         if dropped := int((~use).sum()):
-            notes.append(f"{counted(dropped, 'message')} without timestamp, and logged at another time: skipped")
+            notes.append(f"{count_noun(dropped, 'message')} without timestamp, and logged at another time: skipped")
     kept = np.flatnonzero(use)
     if late := int((np.diff(stamp_ns[kept]) < 0).sum()):
-        notes.append(f"{counted(late, 'message')} stamped earlier than the one before: sorted by time")
+        notes.append(f"{count_noun(late, 'message')} stamped earlier than the one before: sorted by time")
     kept = kept[np.argsort(stamp_ns[kept], kind="stable")]
     again = np.diff(stamp_ns[kept], prepend=stamp_ns[kept[:1]] - SAME_INSTANT_NS) < SAME_INSTANT_NS
     if again.any():
-        notes.append(f"{counted(int(again.sum()), 'message')} with the time stamp of another: the first kept")
+        notes.append(f"{count_noun(int(again.sum()), 'message')} with the time stamp of another: the first kept")
     kept = kept[~again]
     return kept, stamp_ns[kept]
 
 
-def _usable(values: Float, kept: Bool, notes: list[str]) -> Bool:
-    """(P,) which of the rows `kept` so far have a place and a footprint."""
+def _find_usable(values: Float, kept: Bool, notes: list[str]) -> Bool:
+    """(P,) which of the rows `kept` so far have a position, a yaw and a size; `notes` gets the others."""
     usable = kept.copy()
     place, size = values[:, _X : _Z + 1], values[:, _LENGTH : _WIDTH + 1]
     with np.errstate(invalid="ignore"):
@@ -98,23 +256,23 @@ def _usable(values: Float, kept: Bool, notes: list[str]) -> Bool:
         }
     for what, rows in defects.items():
         if number := int((usable & rows).sum()):
-            notes.append(f"{counted(number, 'object state')} {what}: skipped")
+            notes.append(f"{count_noun(number, 'object state')} {what}: skipped")
         usable &= ~rows
     return usable
 
 
-def _once_per_list(row: Int, frame: Int, object_ix: Int, notes: list[str]) -> Int:
-    """`row (K,)` by time, as in the file within a message, each object once per message."""
+def _drop_repeated_objects(row: Int, frame: Int, object_ix: Int, notes: list[str]) -> Int:
+    """(K,) rows in order of time, as in the file within a message, each object once per message."""
     row = row[np.argsort(frame[row], kind="stable")]
     by_object = np.lexsort((frame[row], object_ix[row]))  # stable: the first of two stays the first
     same = np.zeros(len(row), dtype=bool)
     same[by_object[1:]] = (np.diff(object_ix[row][by_object]) == 0) & (np.diff(frame[row][by_object]) == 0)
     if same.any():
-        notes.append(f"{counted(int(same.sum()), 'object state')} of an id twice in a message: the first kept")
+        notes.append(f"{count_noun(int(same.sum()), 'object state')} of an id twice in a message: the first kept")
     return row[~same]
 
 
-def _by_appearance(object_ix: Int) -> tuple[Int, Int]:
+def _number_by_appearance(object_ix: Int) -> tuple[Int, Int]:
     """Objects renumbered by first appearance: the new numbers (P,), and the old number of each (N,)."""
     old, first, inverse = np.unique(object_ix, return_index=True, return_inverse=True)
     order = np.argsort(first)
@@ -123,36 +281,38 @@ def _by_appearance(object_ix: Int) -> tuple[Int, Int]:
     return new[inverse], old[order]
 
 
-def _most_frequent(object_ix: Int, class_ix: NDArray[np.int8], notes: list[str]) -> NDArray[np.int8]:
+def _most_frequent_class(object_ix: Int, class_ix: NDArray[np.int8], notes: list[str]) -> NDArray[np.int8]:
     """(N,) class of each object: the most frequent of its rows, of equally frequent ones the first."""
     pairs, first, counts = np.unique(object_ix * len(CLASSES) + class_ix, return_index=True, return_counts=True)
     owner, candidate = pairs // len(CLASSES), pairs % len(CLASSES)
     best_first = np.lexsort((first, -counts, owner))
     _, top = np.unique(owner[best_first], return_index=True)
     if changing := int((np.bincount(owner) > 1).sum()):
-        notes.append(f"{counted(changing, 'object')} of changing class: the most frequent taken")
+        notes.append(f"{count_noun(changing, 'object')} of changing class: the most frequent taken")
     majority: NDArray[np.int8] = candidate[best_first][top].astype(np.int8)
     return majority
 
 
-def _tracks(scene: Scene, stamp_ns: Int, frame: Int, object_ix: Int, values: Float, notes: list[str]) -> Tracks:
-    """Build the truth: rows track by track, corrected."""
+def _build_tracks(scene: Scene, stamp_ns: Int, frame: Int, object_ix: Int, values: Float, notes: list[str]) -> Tracks:
+    """The truth of rows that are in order of tracks, velocities and heights corrected; `notes` gets the corrections."""
     number = len(scene.object_ids)
     start = np.concatenate([[0], np.cumsum(np.bincount(object_ix, minlength=number))])
     captured_s = ((stamp_ns - scene.t0_ns) * 1e-9).astype(np.float64)
     moving, class_ix = scene.moving[object_ix], scene.object_class[object_ix].astype(np.int64)
     column: dict[str, Float] = dict(zip(VALUES, values.T, strict=True))
     x, y = column["x_m"], column["y_m"]
-    vx, vy, said = repair.velocities(start, captured_s[frame], x, y, column["vx_mps"], column["vy_mps"], moving)
-    notes += said
-    z, height, said = repair.heights(object_ix, class_ix, moving, column["z_m"], column["width_m"], column["height_m"])
-    notes += said
+    vx, vy, corrections = correct_velocities(start, captured_s[frame], x, y, column["vx_mps"], column["vy_mps"], moving)
+    notes += corrections
+    z, height, corrections = correct_heights(
+        object_ix, class_ix, moving, column["z_m"], column["width_m"], column["height_m"]
+    )
+    notes += corrections
     column |= {
         "vx_mps": vx,
         "vy_mps": vy,
         "z_m": z,
         "height_m": height,
-        "yaw_rad": _wrapped(column["yaw_rad"]),
+        "yaw_rad": _wrap_exceeding(column["yaw_rad"]),
     }
     return Tracks(
         units=(TRUTH,),
@@ -169,8 +329,33 @@ def _tracks(scene: Scene, stamp_ns: Int, frame: Int, object_ix: Int, values: Flo
     )
 
 
-def _wrapped(yaw_rad: Float) -> Float:
+def _wrap_exceeding(yaw_rad: Float) -> Float:
     """Angles in (−π, π]; those that are there already keep their bits."""
     wrapped = np.pi - np.mod(np.pi - yaw_rad, 2.0 * np.pi)
     wrapped = np.where(wrapped <= -np.pi, np.pi, wrapped)  # mod may round up to 2π
     return np.where((yaw_rad > -np.pi) & (yaw_rad <= np.pi), yaw_rad, wrapped)
+
+
+# Identity: two recordings with one digest are of one drive.
+
+
+def truth_digest(scene: Scene, truth: Tracks) -> str:
+    """SHA-256 of the truth: objects by id, their classes and states to the last bit, the ego, the span of time, solids.
+
+    It does not depend on the file, the topic, the other topics, or the order of the objects in the recording.
+    """
+    digest = hashlib.sha256()
+    ego = scene.object_ids[scene.ego_ix] if scene.ego_ix >= 0 else None
+    digest.update(json.dumps([scene.t0_ns, scene.end_ns, ego]).encode())
+    track_of = {int(object_ix): track for track, object_ix in enumerate(truth.object_ix)}
+    for object_ix in sorted(track_of, key=lambda k: scene.object_ids[k]):
+        track = track_of[object_ix]
+        rows = slice(int(truth.start[track]), int(truth.start[track + 1]))
+        header = [scene.object_ids[object_ix], int(scene.object_class[object_ix]), bool(scene.moving[object_ix])]
+        digest.update(json.dumps([*header, rows.stop - rows.start]).encode())
+        digest.update(truth.stamp_ns[truth.frame_ix[rows]].astype("<i8").tobytes())
+        for name in VALUES:
+            digest.update((np.asarray(getattr(truth, name)[0, rows], dtype="<f8") + 0.0).tobytes())  # no −0
+    if scene.solids:
+        digest.update(json.dumps(sorted(scene.solids)).encode())
+    return digest.hexdigest()

@@ -1,8 +1,8 @@
-"""A recording that was looked at: its channels, the payloads of some of them, what can be saved of a damaged file.
+"""A log: the channels and messages of an opened recording, including what can be read of a damaged file.
 
-Here it is an MCAP file; other containers (`io/open.py` lists them) derive from it. A file with a sound index is read
-through it. Everything else (no index, an index
-that lies, a file that was cut off, a checksum that fails) is read from start to end, as far as it goes.
+This is the log of an MCAP file; those of other containers (`io/open.py` lists them) derive from it. A file with a sound
+index is read through it. Any other (no index, a wrong index, a file that was cut off, a checksum that fails) is read
+from start to end, as far as it goes.
 """
 
 from __future__ import annotations
@@ -22,21 +22,92 @@ from mcap.records import Message
 from mcap.stream_reader import CRCValidationError
 from mcap.summary import Summary
 
-from copem_replay.core.errors import RecordingError
-from copem_replay.io.channel import Channel
-from copem_replay.io.containers.mcap_indexed import in_order, summary_of
-from copem_replay.io.containers.mcap_records import DAMAGE, without_trace
-from copem_replay.io.containers.mcap_recovery import FromStart
-from copem_replay.io.containers.unsupported import check_magic
-from copem_replay.io.together import AHEAD, PART
-from copem_replay.io.window import ALWAYS, Span, Window, kept
+from copem_replay.core.errors import EmptyWindowError, RecordingError, count_noun
+from copem_replay.io.channel import AHEAD, LAST_NS, PART, Channel
+from copem_replay.io.containers.mcap_records import (
+    DAMAGE,
+    MAGIC,
+    RecordsFromStart,
+    drop_traceback,
+    read_by_log_time,
+    read_summary,
+)
+from copem_replay.io.window import ALWAYS, Span, Window, WindowSeconds, describe_window, is_kept
+
+# Files that are not read: what they are by their first bytes and their names, and what to do about it.
+
+CONVERT = "`ros2 bag convert` makes MCAP of it (`storage_id: mcap` in its output options)"
+_UNPACKED_BY = {".xz": "xz", ".lzma": "xz", ".zst": "zstd", ".zstd": "zstd", ".gz": "gzip", ".bz2": "bzip2"}
+_LFS_POINTER = b"version https://git-lfs"
+_LOOKED_AT = 64  # bytes by which a file is told
+_SHOWN_BYTES = 16
+_CONVERTED = (".csv", ".tsv", ".json", ".xml")  # suffixes of files that `copem-replay convert` may read
+_MADE = "; docs/guide/data-sets.md says what makes a recording of such files"
+_ROS1 = b"#ROSBAG"
+_NEWER = "`rosbags-convert --src FILE --dst FOLDER --dst-storage mcap` makes a folder of it that is"
+_SQLITE = b"SQLite format 3\0"
+
+
+def check_magic(path: Path, file: IO[bytes]) -> None:
+    """Raises RecordingError where a file does not begin as MCAP does. Leaves the file at its start."""
+    start = file.read(_LOOKED_AT)
+    if not start.startswith(MAGIC):
+        raise unsupported_file_error("an MCAP file", path, start)
+    file.seek(0)
+
+
+def unpacking_advice(path: Path) -> str | None:
+    """What to do with a file that is compressed as a whole, None for one that is not, by its name."""
+    program = _UNPACKED_BY.get(path.suffix.lower())
+    return f"compressed as a whole, which is not read; unpack it first: {program} -d {path.name}" if program else None
+
+
+def unsupported_file_error(expected: str, path: Path, start: bytes) -> RecordingError:
+    """The error that says what a file is instead of what was expected; `start`: its first 64 bytes."""
+    return RecordingError(_describe_file(expected, path, start), path=path)
+
+
+def _describe_file(expected: str, path: Path, start: bytes) -> str:
+    if not start:
+        return "the file is empty"
+    if start.startswith(_LFS_POINTER):
+        return "a git-lfs pointer, not the recording itself (`git lfs pull` fetches it)"
+    if start.startswith(_SQLITE):
+        return f"a SQLite file, which is not read; of a rosbag2 folder, {CONVERT}"
+    if start.startswith(_ROS1):
+        return f"a bag of ROS 1, which is not read; {_NEWER}"
+    if advice := unpacking_advice(path):
+        return advice
+    if path.suffix.lower() in (".txt", ".txth"):
+        return "text, which is not read; OSI traces are read as .osi (messages in binary) or .mcap"
+    if path.name == "metadata.yaml":
+        return "the description of a rosbag2 folder; give the folder it is in"
+    return f"expected {expected}, found {_describe_content(path, start)}"
+
+
+def _describe_content(path: Path, start: bytes) -> str:
+    """The begin of a file of unknown kind: the columns of a table, its first line, or its first bytes."""
+    try:
+        text = start.decode("utf-8", errors="ignore" if len(start) == _LOOKED_AT else "strict")
+    except UnicodeDecodeError:
+        text = ""
+    line = text.strip().partition("\n")[0].strip()
+    whole = len(text.encode()) > len(start) - 4  # a character may be cut off at the end
+    if not line or not whole or not all(c.isprintable() or c in "\t\r\n" for c in text):
+        return f"a file whose first bytes are {start[:_SHOWN_BYTES].hex(' ')}"
+    if path.suffix.lower() in (".csv", ".tsv"):
+        return f"a table with the columns {line}{_MADE}"
+    return f"text that begins with {line!r}{_MADE if path.suffix.lower() in _CONVERTED else ''}"
+
+
+# The log of an MCAP file.
 
 _READ_AT_ONCE = 1 << 16
-"""Bytes (chosen: a call of Python's for as many takes no time beside reading them)."""
+"""Bytes of the buffer of a file: a call of Python for as many takes no time beside reading them."""
 
 
 class BrokenIndexError(Exception):
-    """An index that seemed sound is not, or what it points at is damaged: `Log.from_start` is the way."""
+    """An index that seemed sound is wrong, or what it points at is damaged; `Log.from_start` reads without it."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.reason = path, "the index cannot be used"
@@ -45,11 +116,10 @@ class BrokenIndexError(Exception):
 
 @dataclass(frozen=True)
 class Log:
-    """A recording that was looked at: an MCAP file; other containers do the same in their own way.
+    """An opened recording: an MCAP file; the logs of other containers override how messages are read.
 
-    `damage` says what is wrong with the file, None where nothing is; `complete` whether all messages can be
-    read all the same. `notes`: what else is to be said of the container. Counts of messages are those of the whole
-    recording, whatever the `window`.
+    `damage`: what is wrong with the file, None: nothing. `complete`: whether all messages can be read all the same.
+    `notes`: other lines about the container. Counts of messages are those of the whole recording, not of the `window`.
     """
 
     path: Path
@@ -59,23 +129,26 @@ class Log:
     complete: bool = True
     went_on: bool = False  # whether messages after the damage were read
     start_ns: int = 0  # log time of the first message
-    end_ns: int = ALWAYS[1]  # and of the last one
+    end_ns: int = ALWAYS[1]  # log time of the last message
     notes: tuple[str, ...] = ()
-    window: Window | None = None  # what is read of it, None: all
+    window: Window | None = None  # the log time that is read, None: all
 
     def within(self, window: Window | None) -> Log:
-        """The same recording, of which only a window is read."""
+        """The log restricted to a window; None: the whole recording."""
         return replace(self, window=window)
 
     def spans(self, numbers: Set[int]) -> dict[int, Span]:
-        """What is read of some channels, by their numbers."""
+        """The log time that is read of some channels, by their numbers."""
         if self.window is None:
             return dict.fromkeys(numbers, ALWAYS)
-        known = {c.number: self.window.span(c) for c in self.channels if c.number in numbers}
-        return dict.fromkeys(numbers, (self.window.from_ns, self.window.to_ns)) | known
+        kept = {c.number: self.window.span(c) for c in self.channels if c.number in numbers}
+        return dict.fromkeys(numbers, (self.window.from_ns, self.window.to_ns)) | kept
 
     def payloads(self, numbers: frozenset[int]) -> Iterator[tuple[int, int, bytes]]:
-        """Messages of some channels: channel number, log time in ns, payload. As `messages`."""
+        """Channel number, log time in ns and payload of the messages of some channels, in the order of `messages`.
+
+        Raises BrokenIndexError.
+        """
         for message in self.messages(numbers):
             yield message.channel_id, message.log_time, message.data
 
@@ -86,33 +159,33 @@ class Log:
         """
         spans = self.spans(numbers)
         with open_file(self.path) as file:
-            for message in self._by_index(file, spans) if self.indexed else FromStart(file):
-                if isinstance(message, Message) and kept(spans, message.channel_id, message.log_time):
+            for message in self._by_index(file, spans) if self.indexed else RecordsFromStart(file):
+                if isinstance(message, Message) and is_kept(spans, message.channel_id, message.log_time):
                     yield message
 
     def from_start(self, error: BrokenIndexError) -> Log:
-        """The same recording, read without the index that turned out to be broken. Raises RecordingError."""
-        return from_start(self.path, error.__cause__, self.channels).within(self.window)
+        """The recording opened without the index that turned out to be broken. Raises RecordingError."""
+        return open_from_start(self.path, error.__cause__, self.channels).within(self.window)
 
     def _by_index(self, file: IO[bytes], spans: Mapping[int, Span]) -> Iterator[Message]:
-        """Messages in order of log time. Raises BrokenIndexError, also where there are not as many as promised."""
+        """Messages in order of log time. Raises BrokenIndexError, also where their number is not the index's."""
         promised = sum(c.messages for c in self.channels if c.number in spans)
-        found = 0
+        count = 0
         try:
-            summary = summary_of(file)
+            summary = read_summary(file)
             if summary is None:
                 raise ValueError("the index is gone")
-            for message in in_order(file, summary, spans):
-                found += 1
+            for message in read_by_log_time(file, summary, spans):
+                count += 1
                 yield message
-            if found != promised and self.window is None:  # the index does not count a window's messages
-                raise ValueError(f"the index promises {promised} messages, and there are {found}")
+            if count != promised and self.window is None:  # the index does not count a window's messages
+                raise ValueError(f"the index promises {promised} messages, and there are {count}")
         except DAMAGE as error:
-            raise BrokenIndexError(self.path) from without_trace(error)
+            raise BrokenIndexError(self.path) from drop_traceback(error)
 
 
 class _File(io.FileIO):
-    """A file whose disk or network may fail: that is no damage of what is in it, and is said of it."""
+    """A file whose disk or network may fail: RecordingError then says so, since the content is not damaged."""
 
     def readinto(self, buffer: Any) -> int:
         try:
@@ -128,7 +201,7 @@ class _File(io.FileIO):
 
 
 def open_file(path: Path) -> IO[bytes]:
-    """Open a file to be read. Raises RecordingError, also later when it cannot be read."""
+    """Open a file for reading. Raises RecordingError, also later when it cannot be read."""
     try:
         return io.BufferedReader(_File(str(path)), _READ_AT_ONCE)
     except OSError as error:
@@ -136,7 +209,7 @@ def open_file(path: Path) -> IO[bytes]:
 
 
 def open_mcap(path: Path) -> Log:
-    """Look at an MCAP file. Raises RecordingError."""
+    """The log of an MCAP file, by its index or from start to end. Raises RecordingError."""
     if not path.exists():
         raise RecordingError("no such file", path=path)
     if not path.is_file():
@@ -146,33 +219,33 @@ def open_mcap(path: Path) -> Log:
     with open_file(path) as file:
         check_magic(path, file)
         try:
-            summary = summary_of(file)
+            summary = read_summary(file)
             if summary is not None and _index_is_sound(summary):
                 start_ns = min((c.message_start_time for c in summary.chunk_indexes), default=0)
                 end_ns = max((c.message_end_time for c in summary.chunk_indexes), default=0)
-                return Log(path, _channels_of(summary), indexed=True, start_ns=start_ns, end_ns=end_ns)
+                return Log(path, _make_channels(summary), indexed=True, start_ns=start_ns, end_ns=end_ns)
         except DAMAGE as error:
-            return from_start(path, error)
-    return from_start(path)
+            return open_from_start(path, error)
+    return open_from_start(path)
 
 
-def from_start(path: Path, index_error: BaseException | None = None, promised: tuple[Channel, ...] = ()) -> Log:
-    """Look at an MCAP file whose index is missing or wrong: from start to end, as far as it goes.
+def open_from_start(path: Path, index_error: BaseException | None = None, promised: tuple[Channel, ...] = ()) -> Log:
+    """The log of an MCAP file whose index is missing or wrong, read from start to end, as far as it goes.
 
-    `promised`: the channels as the index has them, where it could be read. Raises RecordingError where there
-    is damage and no message before it.
+    `index_error`: what is wrong with the index. `promised`: the channels as the index has them, where it could be read.
+    Raises RecordingError: the file is damaged and no message can be read.
     """
     counts: Counter[int] = Counter()
     start_ns, end_ns = 1 << 64, 0
     with open_file(path) as file:
-        stream = FromStart(file)
+        stream = RecordsFromStart(file)
         for record in stream:
             if isinstance(record, Message):
                 counts[record.channel_id] += 1
                 start_ns, end_ns = min(start_ns, record.log_time), max(end_ns, record.log_time)
     expected = {c.number: c.messages for c in promised}
     channels = tuple(
-        _channel(number, channel, stream.schemas.get(channel.schema_id), counts[number], expected.get(number))
+        _make_channel(number, channel, stream.schemas.get(channel.schema_id), counts[number], expected.get(number))
         for number, channel in sorted(stream.channels.items())
     )
     error = stream.error or index_error
@@ -180,7 +253,7 @@ def from_start(path: Path, index_error: BaseException | None = None, promised: t
         error = ValueError(
             f"the index promises {sum(expected.values())} messages, and there are {sum(counts.values())}"
         )
-    damage = _reason(error) if error else None
+    damage = _describe_error(error) if error else None
     if damage and not sum(counts.values()):
         raise RecordingError(f"damaged, and no message can be read ({damage})", path=path)
     if damage and stream.complete:
@@ -197,8 +270,8 @@ def from_start(path: Path, index_error: BaseException | None = None, promised: t
     )
 
 
-def _reason(error: BaseException) -> str:
-    """Say why reading failed."""
+def _describe_error(error: BaseException) -> str:
+    """Why reading failed, for a note."""
     if isinstance(error, EndOfFile | struct.error):
         return "the file ends too early"
     if isinstance(error, CRCValidationError):
@@ -209,7 +282,7 @@ def _reason(error: BaseException) -> str:
 
 
 def _index_is_sound(summary: Summary) -> bool:
-    """Whether the index tells all: counts, every channel, every schema, and where the chunks are."""
+    """Whether the index is complete: counts, every channel, every schema, and the places of the chunks."""
     statistics = summary.statistics
     return (
         statistics is not None
@@ -220,20 +293,20 @@ def _index_is_sound(summary: Summary) -> bool:
     )
 
 
-def _channels_of(summary: Summary) -> tuple[Channel, ...]:
+def _make_channels(summary: Summary) -> tuple[Channel, ...]:
     counts = summary.statistics.channel_message_counts if summary.statistics else {}
     return tuple(
-        _channel(number, channel, summary.schemas.get(channel.schema_id), counts.get(number, 0))
+        _make_channel(number, channel, summary.schemas.get(channel.schema_id), counts.get(number, 0))
         for number, channel in sorted(summary.channels.items())
     )
 
 
-def _ahead_ns(said: str) -> int:
-    """As the metadata of a channel has it that was written from several recordings."""
-    return int(said) if re.fullmatch(r"-?[0-9]{1,18}", said) else 0
+def _ahead_ns(text: str) -> int:
+    """`AHEAD` in the metadata of a channel, in ns; 0 for a text that is no whole number."""
+    return int(text) if re.fullmatch(r"-?[0-9]{1,18}", text) else 0
 
 
-def _channel(number: int, channel: Any, schema: Any, messages: int, expected: int | None = None) -> Channel:
+def _make_channel(number: int, channel: Any, schema: Any, messages: int, expected: int | None = None) -> Channel:
     return Channel(
         number=number,
         topic=channel.topic,
@@ -246,3 +319,81 @@ def _channel(number: int, channel: Any, schema: Any, messages: int, expected: in
         ahead_ns=_ahead_ns(channel.metadata.get(AHEAD, "")),
         part=channel.metadata.get(PART, ""),
     )
+
+
+@dataclass(frozen=True)
+class Messages:
+    """Payloads and log times of all messages of some channels, by channel number, in the order read."""
+
+    payloads: Mapping[int, list[bytes]]
+    log_time_ns: Mapping[int, list[int]]
+    skipped: int = 0  # messages with an impossible log time
+
+    def notes(self) -> tuple[str, ...]:
+        """A note on the messages that were skipped; none: nothing was."""
+        return (f"{count_noun(self.skipped, 'message')} logged at an impossible time: skipped",) if self.skipped else ()
+
+
+def gather_messages(log: Log, numbers: frozenset[int]) -> Messages:
+    """All messages of some channels in memory. Raises BrokenIndexError."""
+    payloads: dict[int, list[bytes]] = {number: [] for number in numbers}
+    times: dict[int, list[int]] = {number: [] for number in numbers}
+    skipped = 0
+    for number, log_time_ns, payload in log.payloads(numbers):
+        if log_time_ns > LAST_NS:
+            skipped += 1
+            continue
+        payloads[number].append(payload)
+        times[number].append(log_time_ns)
+    return Messages(payloads, times, skipped)
+
+
+# A window of a log, in seconds since the first message of the truth.
+
+_NEAR_END_NS = 10_000_000_000
+"""Time before the end in which the last message is sought first; if there is none, the whole recording is read."""
+
+
+def cut_window(log: Log, topic: str, window_s: WindowSeconds) -> Log:
+    """The log restricted to `window_s`, in seconds since the first message on the `topic` of its truth was logged.
+
+    Raises EmptyWindowError: the topic has no message in it; BrokenIndexError.
+    """
+    if window_s is None or window_s == (None, None) or log.window is not None:
+        return log
+    from_s, to_s = window_s
+    numbers = frozenset(c.number for c in log.channels if c.topic == topic and c.messages)
+    times_ns = (time_ns for _, time_ns, _ in log.payloads(numbers))
+    first_ns = next(times_ns, None) if log.indexed else min(times_ns, default=None)
+    if first_ns is None:  # all messages are lost: decoding them raises the error
+        return log
+    window = Window(
+        ALWAYS[0] if from_s is None else first_ns + round(from_s * 1e9),
+        ALWAYS[1] if to_s is None else first_ns + round(to_s * 1e9),
+    )
+    cut = log.within(window)
+    if next(cut.payloads(numbers), None) is None:
+        span_s = (_last_ns(log, numbers) - first_ns) * 1e-9
+        raise EmptyWindowError(
+            f"no message in the window {describe_window(from_s, to_s)}; there are some from 0 to {span_s:.10g} s",
+            path=log.path,
+            topic=topic,
+            key=("window_s",),
+        )
+    return cut
+
+
+def _last_ns(log: Log, numbers: frozenset[int]) -> int:
+    """Log time of the last message of some channels."""
+    for since_ns in (log.end_ns - _NEAR_END_NS, ALWAYS[0]):
+        times_ns = [time_ns for _, time_ns, _ in log.within(Window(since_ns)).payloads(numbers)]
+        if times_ns:
+            return max(times_ns)
+    return log.start_ns
+
+
+def window_notes(window_s: WindowSeconds) -> list[str]:
+    """A note that only a window is read; none: all is."""
+    if window_s is None or window_s == (None, None):
+        return []
+    return [f"window {describe_window(*window_s)} of the recording: seconds count from there"]

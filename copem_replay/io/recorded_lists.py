@@ -1,102 +1,386 @@
-"""Lists of a unit in any format but OSI's, as they were recorded: captured and arriving at their stamps.
+"""Object lists of a unit as they were recorded on one topic, in any format that is read, as tracks.
 
-What this project wrote beside its own lists (`…/detail`) says when they were captured, and what they have no fields
-for.
+Of osi3.SensorData a list is captured at its `last_measurement_time`, else at its time stamp, and arrives at its time
+stamp. Positions are in the world where the message has no host location, else they are transformed from the virtual
+sensor's frame. Lists of other formats are captured and arrive at their stamps; `io/frames.py` brings them into the
+world.
+
+`copem-replay` writes a topic `…/detail` beside its own lists: it holds what their messages have no fields for, such as
+captures and full covariances, and these are taken from there.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from google.protobuf.message import DecodeError
 
 from copem_replay.core.errors import RecordingError
-from copem_replay.core.tracks import UNCERTAINTIES, VALUES, Bool, Float, Int, Scene
-from copem_replay.io.channel import schema_name
-from copem_replay.io.encodings.columns import take_apart
-from copem_replay.io.encodings.definition import definition_of
-from copem_replay.io.encodings.raw_values import DefinitionError
-from copem_replay.io.log import BrokenIndexError, Log
-from copem_replay.io.messages import gathered
-from copem_replay.io.open import open_log
-from copem_replay.io.recorded_osi import RecordedLists, as_tracks, in_time, read_recorded
-from copem_replay.io.schemas.decoded import LAST_NS
+from copem_replay.core.interpolation import wrap_angles
+from copem_replay.core.tracks import CLASSES, UNCERTAINTIES, VALUES, Bool, Float, Int, Scene, Tracks
+from copem_replay.io.channel import LAST_NS, schema_name
+from copem_replay.io.encodings import make_definition
+from copem_replay.io.encodings.columns import DefinitionError, shred_messages
+from copem_replay.io.frames import LogContext, read_decoded_lists, read_log_context, transform_to_world
+from copem_replay.io.log import BrokenIndexError, Log, gather_messages
+from copem_replay.io.open import Local, open_log
+from copem_replay.io.schemas import osi_ground_truth as osi
 from copem_replay.io.schemas.object_lists import DecodedLists
-from copem_replay.io.schemas.registry import known_lists
-from copem_replay.io.together import Local
+from copem_replay.io.schemas.osi_ground_truth import SENSOR_DATA, load_sensor_data_class, osi_id
+from copem_replay.io.schemas.registry import DETAIL_SCHEMA, known_lists
 from copem_replay.io.window import Window
-from copem_replay.io.world_frame import LogContext, in_world, lists_of, log_context
-from copem_replay.io.write.ros2_definitions import STRING
+
+_LARGEST_ID = 2**63 - 1
+"""OSI's identifiers are unsigned: the highest bit of larger ones is dropped, so that they fit signed integers."""
 
 
-def lists_on(
-    path: Local, topic: str, scene: Scene, around: LogContext | None, window: Window | None = None
-) -> RecordedLists:
-    """The lists on `topic` in whatever format, with what their messages say and nothing else. Raises RecordingError."""
-    return read_listed(path, topic, scene, around, window) or read_recorded(path, topic, scene, window)
+@dataclass
+class _EntryRows:
+    """Entries of all lists, in the order of the messages."""
+
+    stamps: list[tuple[int, int]] = field(default_factory=list)  # captured, arrives
+    frame: list[int] = field(default_factory=list)
+    ident: list[int] = field(default_factory=list)  # ground truth id, −1: none
+    track: list[int] = field(default_factory=list)  # −1: none
+    values: list[tuple[float, ...]] = field(default_factory=list)
+    variances: list[tuple[float, ...]] = field(default_factory=list)
+    existence: list[float] = field(default_factory=list)  # NaN: not said
+    likely: list[dict[int, float]] = field(default_factory=list)  # probability by class, as far as stated
+    spread_said: list[bool] = field(default_factory=list)
+    capture_said: list[bool] = field(default_factory=list)  # of every list, as the next two
+    stamped: list[bool] = field(default_factory=list)
+    logged: list[int] = field(default_factory=list)
+
+
+def read_sensor_data(path: Local, topic: str, scene: Scene) -> Tracks:
+    """The lists on `topic`; each track has the index of its object in `scene`, −1 where the list names none of it.
+
+    Raises RecordingError when there is no such topic of osi3.SensorData, or a message of it cannot be decoded.
+    """
+    return _make_tracks(*_read_rows(path, topic), topic, scene)
+
+
+@dataclass(frozen=True)
+class RecordedLists:
+    """Lists as a unit made them. Every row of `tracks` is a track of its own, without truth id: (P,) each.
+
+    `existence` is NaN where the list does not state it; `class_probability (P, C)` sums to 1. `spread_said`: whether
+    the list states the covariance of the position, else it is 0. `capture_said (F,)`: whether the list states its
+    capture, `stamped (F,)`: whether it has a time stamp, `logged_ns (F,)`: the log time of its message.
+    """
+
+    tracks: Tracks
+    existence: Float
+    class_probability: Float
+    track_id: Int
+    spread_said: Bool
+    capture_said: Bool
+    stamped: Bool
+    logged_ns: Int
+    dropped: int  # entries without a position
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def read_listed(
-    path: Local, topic: str, scene: Scene, around: LogContext | None, window: Window | None = None
-) -> RecordedLists | None:
-    """The lists on `topic`, in the world of the truth; None: none of a known format is there. Raises RecordingError."""
+def read_recorded(path: Local, topic: str, scene: Scene, window: Window | None = None) -> RecordedLists:
+    """The lists of osi3.SensorData on `topic` with all that they state, except ids of the truth.
+
+    Raises RecordingError: no such topic of osi3.SensorData, or a message of it cannot be decoded.
+    """
+    rows, _ = _read_rows(path, topic, window)
+    stamps = np.array(rows.stamps, dtype=np.int64).reshape(-1, 2)
+    by_time, frame = order_by_time(stamps[:, 1], np.array(rows.frame, dtype=np.int64))
+    values = np.array(rows.values, dtype=float).reshape(-1, len(VALUES))
+    variances = np.array(rows.variances, dtype=float).reshape(-1, len(UNCERTAINTIES))
+    placed = np.isfinite(values[:, :2]).all(axis=1)
+    order = np.flatnonzero(placed)[np.argsort(frame[placed], kind="stable")]
+    values, variances = np.nan_to_num(values[order]), np.nan_to_num(variances[order])
+    probability = np.zeros((len(order), len(CLASSES)))
+    for p, k in enumerate(order):
+        for index, share in rows.likely[k].items():
+            probability[p, index] += share
+    none = probability.sum(axis=1) <= 0
+    probability[none, osi.OTHER] = 1.0
+    tracks = build_unit_tracks(
+        topic,
+        scene,
+        stamps[by_time],
+        np.arange(len(order) + 1),
+        np.full(len(order), -1),
+        frame[order],
+        values,
+        variances,
+    )
+    return RecordedLists(
+        tracks,
+        np.array(rows.existence, dtype=float)[order],
+        probability / probability.sum(axis=1, keepdims=True),
+        np.array(rows.track, dtype=np.int64)[order],
+        np.array(rows.spread_said, dtype=bool)[order],
+        np.array(rows.capture_said, dtype=bool)[by_time],
+        np.array(rows.stamped, dtype=bool)[by_time],
+        np.array(rows.logged, dtype=np.int64)[by_time],
+        int((~placed).sum()),
+    )
+
+
+def _read_rows(path: Local, topic: str, window: Window | None = None) -> tuple[_EntryRows, dict[int, dict[str, Any]]]:
+    """Entries on `topic`, and details by the time in ns at which their list was available, then by object id."""
     log = open_log(path).within(window)
     try:
-        return _read(log, topic, scene, around)
+        return _read_messages(log, topic)
     except BrokenIndexError as error:
-        return _read(log.from_start(error), topic, scene, around)
+        return _read_messages(log.from_start(error), topic)
 
 
-def _read(log: Log, topic: str, scene: Scene, around: LogContext | None) -> RecordedLists | None:
+def _no_lists_message(log: Log, topic: str) -> str:
+    """The error for a topic that holds no lists of a unit: what it holds, and which topics hold lists."""
+    list_topics = {c.topic for c in log.channels if c.schema == SENSOR_DATA} | {
+        c.topic for c in known_lists(log.channels)
+    }
+    schemas = sorted({c.schema or "no schema" for c in log.channels if c.topic == topic})
+    content = f"topic {topic!r} holds {', '.join(schemas)}" if schemas else f"no topic {topic!r}"
+    if not list_topics:
+        return f"{content}; no topic of this log holds lists of a unit"
+    return f"{content}; lists of units are on {', '.join(sorted(list_topics))}"
+
+
+def _read_messages(log: Log, topic: str) -> tuple[_EntryRows, dict[int, dict[str, Any]]]:
+    """As `_read_rows`, from an opened log. Raises RecordingError, BrokenIndexError."""
+    chosen = {c.number: c for c in log.channels if c.topic == topic and c.schema == SENSOR_DATA}
+    if not chosen:
+        raise RecordingError(_no_lists_message(log, topic), path=log.path)
+    detail_topic = f"{topic.removesuffix('/objects')}/detail"
+    beside = {c.number for c in log.channels if c.topic == detail_topic and c.schema == DETAIL_SCHEMA}
+    rows = _EntryRows()
+    details: dict[int, dict[str, Any]] = {}
+    for number, log_time_ns, payload in log.payloads(frozenset({*chosen, *beside})):
+        if number in beside:
+            content = json.loads(payload)
+            details[content["available_ns"]] = {item["id"]: item for item in content["objects"]}
+        else:
+            try:
+                message = load_sensor_data_class().FromString(payload)
+            except DecodeError as error:
+                raise RecordingError(f"a message cannot be decoded: {error}", path=log.path, topic=topic) from None
+            _add_message(rows, message, log_time_ns)
+            if chosen[number].ahead_ns:  # by the clock of the log times
+                by_message = message.HasField("timestamp"), message.HasField("last_measurement_time")
+                captured_ns, arrives_ns = rows.stamps[-1]
+                captured_ns -= chosen[number].ahead_ns * any(by_message)
+                rows.stamps[-1] = captured_ns, arrives_ns - chosen[number].ahead_ns * by_message[0]
+            if max(map(abs, rows.stamps[-1])) > LAST_NS:
+                raise RecordingError("a message has an impossible time stamp", path=log.path, topic=topic)
+    return rows, details
+
+
+def _add_message(rows: _EntryRows, message: Any, log_time_ns: int) -> None:
+    """Append one osi3.SensorData and its entries."""
+    stamp = message.timestamp
+    arrives_ns = stamp.seconds * 10**9 + stamp.nanos if message.HasField("timestamp") else log_time_ns
+    last = message.last_measurement_time
+    captured_ns = last.seconds * 10**9 + last.nanos if message.HasField("last_measurement_time") else arrives_ns
+    frame = len(rows.stamps)
+    rows.stamps.append((captured_ns, arrives_ns))
+    rows.capture_said.append(message.HasField("last_measurement_time"))
+    rows.stamped.append(message.HasField("timestamp"))
+    rows.logged.append(min(log_time_ns, LAST_NS))
+    for item in [*message.moving_object, *message.stationary_object]:
+        base, spread = item.base, item.base_rmse
+        place, size, speed = base.position, base.dimension, getattr(base, "velocity", None)
+        rows.frame.append(frame)
+        truth_ids = item.header.ground_truth_id
+        rows.ident.append(truth_ids[0].value if truth_ids else -1)
+        tracked = item.header.HasField("tracking_id")
+        rows.track.append(item.header.tracking_id.value & _LARGEST_ID if tracked else -1)
+        vx, vy = (speed.x, speed.y) if speed is not None else (0.0, 0.0)
+        x, y, z, yaw, vx, vy = _transform_entry(message, place.x, place.y, place.z, base.orientation.yaw, vx, vy)
+        if not base.HasField("position"):  # nowhere is not the origin
+            x = y = np.nan
+        rows.values.append((x, y, z, yaw, vx, vy, size.length, size.width, size.height))
+        fast = spread.velocity.x if speed is not None else 0.0
+        beside = (spread.orientation.yaw, spread.dimension.length, fast)
+        along, across, turn = spread.position.x**2, spread.position.y**2, _frame_yaw(message)
+        cos, sin = np.cos(turn), np.sin(turn)
+        rows.variances.append(
+            (
+                float(cos * cos * along + sin * sin * across),
+                float(cos * sin * (along - across)),
+                float(sin * sin * along + cos * cos * across),
+                *(s * s for s in beside),
+            )
+        )
+        header = item.header
+        has_existence = header.HasField("existence_probability")
+        rows.existence.append(header.existence_probability if has_existence else np.nan)
+        rows.likely.append(_class_probabilities(item))
+        rows.spread_said.append(spread.position.HasField("x") and spread.position.HasField("y"))
+
+
+def _class_probabilities(item: Any) -> dict[int, float]:
+    """Probability by index of class, as the unit states it for a moving object; empty for a stationary one."""
+    likely: dict[int, float] = {}
+    for candidate in getattr(item, "candidate", ()):
+        if not hasattr(candidate, "vehicle_classification"):  # a stationary object's
+            continue
+        vehicle = candidate.vehicle_classification
+        kind = osi.osi_class_index(
+            candidate.type, vehicle.type if candidate.HasField("vehicle_classification") else None
+        )
+        share = candidate.probability if candidate.HasField("probability") else 1.0
+        likely[kind] = likely.get(kind, 0.0) + max(share, 0.0)
+    return likely
+
+
+def _frame_yaw(message: Any) -> float:
+    """Yaw in rad of the frame of the entries in the world."""
+    if not message.HasField("host_vehicle_location"):
+        return 0.0
+    return float(message.mounting_position.orientation.yaw + message.host_vehicle_location.orientation.yaw)
+
+
+def _transform_entry(
+    message: Any, x: float, y: float, z: float, yaw: float, vx: float, vy: float
+) -> tuple[float, float, float, float, float, float]:
+    """A state in the world: transformed from the virtual sensor's frame, or as it is without a host location."""
+    if not message.HasField("host_vehicle_location"):
+        return x, y, z, yaw, vx, vy
+    for frame in (message.mounting_position, message.host_vehicle_location):
+        cos, sin, turn = np.cos(frame.orientation.yaw), np.sin(frame.orientation.yaw), frame.orientation.yaw
+        x, y, z = (
+            cos * x - sin * y + frame.position.x,
+            sin * x + cos * y + frame.position.y,
+            z + frame.position.z,
+        )
+        vx, vy, yaw = cos * vx - sin * vy, sin * vx + cos * vy, yaw + turn
+    return float(x), float(y), float(z), float(wrap_angles(np.array(yaw))), float(vx), float(vy)
+
+
+def _make_tracks(rows: _EntryRows, details: dict[int, dict[str, Any]], topic: str, scene: Scene) -> Tracks:
+    """Tracks by object of `scene` and track id, with the full covariances of `details` where there are any."""
+    stamps = np.array(rows.stamps, dtype=np.int64).reshape(-1, 2)
+    by_time, frame = order_by_time(stamps[:, 1], np.array(rows.frame, dtype=np.int64))
+    object_by_id = {osi_id(name): k for k, name in enumerate(scene.object_ids)}
+    object_ix = np.array([object_by_id.get(i, -1) for i in rows.ident], dtype=np.int64)
+    track = np.array(rows.track, dtype=np.int64)
+    order = np.lexsort((frame, track, object_ix))
+    new = np.ones(len(order), dtype=bool)
+    new[1:] = (np.diff(object_ix[order]) != 0) | (np.diff(track[order]) != 0)
+    first = np.flatnonzero(new)
+    values = np.array(rows.values, dtype=float).reshape(-1, len(VALUES))[order]
+    variances = np.array(rows.variances, dtype=float).reshape(-1, len(UNCERTAINTIES))[order]
+    for p, (k, f) in enumerate(zip(object_ix[order].tolist(), frame[order].tolist(), strict=True)):
+        item = details.get(int(stamps[by_time[f], 1]), {}).get(scene.object_ids[k]) if k >= 0 else None
+        if item is not None:
+            variances[p] = [np.nan if item[name] is None else item[name] for name in UNCERTAINTIES]
+    start = np.append(first, len(order))
+    return build_unit_tracks(
+        topic, scene, stamps[by_time], start, object_ix[order][first], frame[order], values, variances
+    )
+
+
+def order_by_time(stamps_ns: Int, frame: Int) -> tuple[Int, Int]:
+    """(F,) order of the lists by time, and (P,) the place in that order of the list `frame` of each row."""
+    by_time = np.argsort(stamps_ns, kind="stable")
+    place = np.empty_like(by_time)
+    place[by_time] = np.arange(len(by_time))
+    return by_time, place[frame]
+
+
+def build_unit_tracks(
+    topic: str, scene: Scene, stamps: Int, start: Int, object_ix: Int, frame_ix: Int, values: Float, variances: Float
+) -> Tracks:
+    """Tracks of one unit: `stamps (F, 2)` of capture and arrival, `start (E + 1,)`, `object_ix (E,)`, rows (P,)."""
+    seconds = (stamps - scene.t0_ns) * np.float64(1e-9)
+    return Tracks(
+        units=(topic,),
+        start=start,
+        unit_ix=np.zeros(len(object_ix), dtype=np.int64),
+        object_ix=object_ix,
+        frame_ix=frame_ix,
+        stamp_ns=stamps[:, 0],
+        captured_s=seconds[:, 0],
+        frame_unit_ix=np.zeros(len(stamps), dtype=np.int64),
+        arrives_s=seconds[None, :, 1],
+        valid=np.ones((1, len(frame_ix)), dtype=bool),
+        **{name: values[None, :, k] for k, name in enumerate(VALUES)},
+        **{name: variances[None, :, k] for k, name in enumerate(UNCERTAINTIES)},
+    )
+
+
+def read_unit_lists(
+    path: Local, topic: str, scene: Scene, around: LogContext | None, window: Window | None = None
+) -> RecordedLists:
+    """The lists on `topic` in whatever format is read, with what their messages state. Raises RecordingError."""
+    return read_described_lists(path, topic, scene, around, window) or read_recorded(path, topic, scene, window)
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def read_described_lists(
+    path: Local, topic: str, scene: Scene, around: LogContext | None, window: Window | None = None
+) -> RecordedLists | None:
+    """The lists on `topic` of a format other than OSI's, in the world of the truth; None: the topic has none.
+
+    Raises RecordingError.
+    """
+    log = open_log(path).within(window)
+    try:
+        return _read_described(log, topic, scene, around)
+    except BrokenIndexError as error:
+        return _read_described(log.from_start(error), topic, scene, around)
+
+
+def _read_described(log: Log, topic: str, scene: Scene, around: LogContext | None) -> RecordedLists | None:
     channels = [c for c in known_lists(log.channels) if c.topic == topic]
     if not channels:
         return None
-    mine = [c for c in channels if c.schema == channels[0].schema]
-    if log.window is not None and next(log.payloads(frozenset(c.number for c in mine)), None) is None:
+    same_schema = [c for c in channels if c.schema == channels[0].schema]
+    if log.window is not None and next(log.payloads(frozenset(c.number for c in same_schema)), None) is None:
         raise RecordingError("holds no list in the window", path=log.path, topic=topic)
-    around = around or log_context(log, None, seek_ego=False)
-    found = in_world(lists_of(log, mine, None), around, log.path, topic)
-    return _recorded(found, _details(log, topic), topic, scene)
+    around = around or read_log_context(log, None, seek_ego=False)
+    lists = transform_to_world(read_decoded_lists(log, same_schema, None), around, log.path, topic)
+    return _make_recorded_lists(lists, _read_details(log, topic), topic, scene)
 
 
-def _details(log: Log, topic: str) -> dict[int, dict[str, Any]]:
-    """What is beside the lists on a topic, by the time at which each was available."""
+def _read_details(log: Log, topic: str) -> dict[int, dict[str, Any]]:
+    """The content of the topic `…/detail` beside a topic, by the time in ns at which each list was available."""
     beside = f"{topic.removesuffix('/objects')}/detail"
+    from copem_replay.io.write.ros2 import STRING
+
     channels = [c for c in log.channels if c.topic == beside and c.messages and schema_name(c) == STRING]
-    found: dict[int, dict[str, Any]] = {}
+    details: dict[int, dict[str, Any]] = {}
     for channel in channels:
-        payloads = gathered(log, frozenset({channel.number})).payloads[channel.number]
+        payloads = gather_messages(log, frozenset({channel.number})).payloads[channel.number]
         try:
-            said = take_apart(definition_of(channel, payloads), payloads, texts=["data"])
+            columns = shred_messages(make_definition(channel, payloads), payloads, texts=["data"])
         except (DefinitionError, KeyError):  # some other String
             continue
-        for word in said.levels[""].texts["data"].words:
+        for word in columns.levels[""].texts["data"].words:
             try:
                 content = json.loads(word)
-                found[int(content["available_ns"])] = {**content, "objects": list(content["objects"])}
-            except (ValueError, TypeError, KeyError, RecursionError):  # not written by us
+                details[int(content["available_ns"])] = {**content, "objects": list(content["objects"])}
+            except (ValueError, TypeError, KeyError, RecursionError):  # not written by `copem-replay`
                 continue
-    return found
+    return details
 
 
-def _captured(stamps: Int, details: Mapping[int, Mapping[str, Any]]) -> tuple[Int, Bool]:
-    """(F,) when lists available at `stamps` were captured, and whether that is said."""
-    captured, known = stamps.copy(), np.zeros(len(stamps), dtype=bool)
+def _find_captures(stamps: Int, details: Mapping[int, Mapping[str, Any]]) -> tuple[Int, Bool]:
+    """(F,) captures of the lists available at `stamps`, and whether `details` state them; else the stamp itself."""
+    captured, stated = stamps.copy(), np.zeros(len(stamps), dtype=bool)
     for k, stamp in enumerate(stamps.tolist()):
-        said = details.get(stamp, {}).get("captured_ns")
-        if isinstance(said, int) and abs(said) <= LAST_NS:
-            captured[k], known[k] = said, True
-    return captured, known
+        captured_ns = details.get(stamp, {}).get("captured_ns")
+        if isinstance(captured_ns, int) and abs(captured_ns) <= LAST_NS:
+            captured[k], stated[k] = captured_ns, True
+    return captured, stated
 
 
-def _with_details(found: DecodedLists, details: Mapping[int, Mapping[str, Any]]) -> tuple[DecodedLists, Float]:
-    """The lists with sizes and existence as they were stated, and (P, uncertainties) variances, NaN: not said."""
-    columns = found.columns
-    values, existence = columns.values.copy(), found.existence.copy()
+def _add_details(lists: DecodedLists, details: Mapping[int, Mapping[str, Any]]) -> tuple[DecodedLists, Float]:
+    """The lists with sizes and existence of `details`, and (P, uncertainties) their variances, NaN: not stated."""
+    columns = lists.columns
+    values, existence = columns.values.copy(), lists.existence.copy()
     variances = np.full((len(values), len(UNCERTAINTIES)), np.nan)
     ends = np.cumsum(columns.rows)
     for stamp, number, end in zip(columns.stamp_ns.tolist(), columns.rows.tolist(), ends.tolist(), strict=True):
@@ -105,30 +389,32 @@ def _with_details(found: DecodedLists, details: Mapping[int, Mapping[str, Any]])
             continue
         for row, item in zip(range(end - number, end), items, strict=True):
             for name in ("length_m", "width_m"):
-                values[row, VALUES.index(name)] = _number(item, name, values[row, VALUES.index(name)])
-            existence[row] = _number(item, "existence", existence[row])
-            variances[row] = [_number(item, name, np.nan) for name in UNCERTAINTIES]
-    return replace(found, columns=replace(columns, values=values), existence=existence), variances
+                values[row, VALUES.index(name)] = _get_number(item, name, values[row, VALUES.index(name)])
+            existence[row] = _get_number(item, "existence", existence[row])
+            variances[row] = [_get_number(item, name, np.nan) for name in UNCERTAINTIES]
+    return replace(lists, columns=replace(columns, values=values), existence=existence), variances
 
 
-def _number(item: Any, name: str, otherwise: float) -> float:
+def _get_number(item: Any, name: str, otherwise: float) -> float:
     value = item.get(name) if isinstance(item, dict) else None
     return float(value) if isinstance(value, float) else otherwise
 
 
-def _recorded(found: DecodedLists, details: Mapping[int, Mapping[str, Any]], topic: str, scene: Scene) -> RecordedLists:
-    found, beside = _with_details(found, details)
-    columns = found.columns
-    by_time, frame = in_time(columns.stamp_ns, np.repeat(np.arange(len(columns.rows)), columns.rows))
+def _make_recorded_lists(
+    lists: DecodedLists, details: Mapping[int, Mapping[str, Any]], topic: str, scene: Scene
+) -> RecordedLists:
+    lists, beside = _add_details(lists, details)
+    columns = lists.columns
+    by_time, frame = order_by_time(columns.stamp_ns, np.repeat(np.arange(len(columns.rows)), columns.rows))
     placed = np.isfinite(columns.values[:, :2]).all(axis=1)
     order = np.flatnonzero(placed)[np.argsort(frame[placed], kind="stable")]
-    covariance = found.covariance_m2[order]
-    said = np.isfinite(covariance).all(axis=1) & (covariance[:, 0] > 0) & (covariance[:, 2] > 0)
+    covariance = lists.covariance_m2[order]
+    spread_said = np.isfinite(covariance).all(axis=1) & (covariance[:, 0] > 0) & (covariance[:, 2] > 0)
     variances = np.nan_to_num(beside[order])
-    variances[:, :3] = np.where(said[:, None], covariance, 0.0)  # turned with its list
+    variances[:, :3] = np.where(spread_said[:, None], covariance, 0.0)  # turned with its list
     stamps = columns.stamp_ns[by_time]
-    captured, capture_said = _captured(stamps, details)
-    tracks = as_tracks(
+    captured, capture_said = _find_captures(stamps, details)
+    tracks = build_unit_tracks(
         topic,
         scene,
         np.stack([captured, stamps], axis=1),
@@ -140,12 +426,12 @@ def _recorded(found: DecodedLists, details: Mapping[int, Mapping[str, Any]], top
     )
     return RecordedLists(
         tracks,
-        found.existence[order],
-        found.probability[order],
-        columns.object_ix[order] if found.named else np.full(len(order), -1),
-        said,
+        lists.existence[order],
+        lists.probability[order],
+        columns.object_ix[order] if lists.named else np.full(len(order), -1),
+        spread_said,
         capture_said,
         columns.stamped[by_time],
-        found.log_time_ns[by_time],
+        lists.log_time_ns[by_time],
         int((~placed).sum()),
     )

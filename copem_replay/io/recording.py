@@ -1,45 +1,50 @@
-"""Reading a recording: the world as the log has it.
+"""A recording in memory: scene, ground truth and notes, read from a log.
 
-Selects the truth by the names of schemas, decodes it, and says what it skipped, derived or corrected.
+The topic of the truth is found by the names of schemas, unless the experiment names it. Notes list what was skipped,
+derived or corrected.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from copem_replay.core.errors import EgoError, RecordingError, printable
-from copem_replay.core.remote import Remote
-from copem_replay.core.text import counted
+from copem_replay.core.errors import EgoError, RecordingError, RemoteFile, count_noun, escape_unprintable
 from copem_replay.core.tracks import CLASSES, Float, Scene, Tracks
 from copem_replay.io.channel import Channel
-from copem_replay.io.checksum import Stamps, check_unchanged, stamps_of
-from copem_replay.io.ground_truth import assemble
-from copem_replay.io.log import BrokenIndexError, Log
-from copem_replay.io.open import open_log, together_of
+from copem_replay.io.ground_truth import DecodedObjects, assemble_truth
+from copem_replay.io.log import BrokenIndexError, Log, cut_window, window_notes
+from copem_replay.io.open import (
+    DriveRecordings,
+    Local,
+    Place,
+    Stamps,
+    check_files_unchanged,
+    find_drive_recordings,
+    open_log,
+    read_file_stamps,
+)
 from copem_replay.io.schemas import osi_ground_truth as osi
-from copem_replay.io.schemas.decoded import DecodedObjects
-from copem_replay.io.schemas.pose_schemas import is_pose
+from copem_replay.io.schemas.poses import is_pose
 from copem_replay.io.schemas.registry import is_list, known_lists, names_objects
-from copem_replay.io.together import Local, Place, Together
-from copem_replay.io.window import Window, WindowSeconds, cut_out, window_notes
+from copem_replay.io.window import Window, WindowSeconds
 
-if TYPE_CHECKING:  # they import much that a look at a recording of OSI does not need
+if TYPE_CHECKING:
     from copem_replay.io.config import EgoTopic
-    from copem_replay.io.recorded_osi import RecordedLists
+    from copem_replay.io.frames import LogContext
+    from copem_replay.io.recorded_lists import RecordedLists
     from copem_replay.io.schemas.object_lists import Fields
-    from copem_replay.io.survey import Survey
-    from copem_replay.io.world_frame import LogContext
+
 
 _TOPIC = ("read", "topic")  # the key of an experiment that names the topic of the truth
-_SHOWN = 12  # ids or topics named in an error (chosen)
+_SHOWN = 12  # ids or topics named in an error; the rest is counted
 
 
 @dataclass(frozen=True)
@@ -60,18 +65,18 @@ class Recording:
     topic: str
     notes: tuple[str, ...]  # a line per kind of thing derived, corrected, skipped or ignored
     host_id: str | None
-    damage: str | None = None  # what is wrong with the file and how far it could be read; among the notes, too
+    damage: str | None = None  # what is wrong with the file and how far it could be read; it is among the notes, too
     lists: Mapping[str, RecordedLists] = field(default_factory=dict)  # of the recorded units, by their names
     around: LogContext | None = None  # frames of reference, where lists other than OSI's are read
     encoding: str = "protobuf"  # of the messages of the truth
-    world: str = ""  # name of the frame of reference of the truth, "": none is said, as by OSI
-    window: Window | None = None  # of log time, that was read; None: all
+    world: str = ""  # name of the frame of reference of the truth, "": none is named, as in OSI
+    window: Window | None = None  # the log time that was read; None: all
     lane_boundaries: tuple[Float, ...] = ()  # (K, 3) each, for showing only
-    together: Together | None = None  # the recordings of the drive, `path` being the first; None: it is one
-    remote: Remote | None = None  # where it lies, if not on this machine: `path` was a copy
-    sha256: str | None = None  # of what was read, where it is known already
+    together: DriveRecordings | None = None  # the recordings of the drive, `path` being the first; None: it is one
+    remote: RemoteFile | None = None  # where it lies, if not on this machine: `path` was a copy
+    sha256: str | None = None  # of the files that were read, where it is known already
     stamps: Stamps | None = None  # of its files on this machine before they were read; None: a copy, or not known
-    survey: Survey | None = None  # where it was not read, but is known from before: no truth, no lists (`survey.whole`)
+    survey: StoredSurvey | None = None  # of a recording that was not read: no truth, no lists (`read_whole_recording`)
 
     @property
     def place(self) -> Place:
@@ -85,18 +90,18 @@ class Recording:
 
     @property
     def object_states(self) -> int:
-        """How many states it has in memory, of the truth and of all recorded lists."""
-        return sum(len(one.frame_ix) for one in (self.truth, *(of.tracks for of in self.lists.values())))
+        """Number of states in memory, of the truth and of all recorded lists."""
+        return sum(len(tracks.frame_ix) for tracks in (self.truth, *(unit.tracks for unit in self.lists.values())))
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """The files or folders of this machine that it is read from."""
+        """The files or folders on this machine that it is read from; none of a remote one."""
         if self.remote is not None:
             return ()
         return (self.path,) if self.together is None else self.together.paths
 
 
-def read(
+def read_log(
     source: Local | str | Log,
     *,
     name: str,
@@ -108,30 +113,30 @@ def read(
 ) -> Recording:
     """Read the truth of the recording at a place, or of an opened log, as the log called `name`.
 
-    `ego`: id of the ego vehicle, or where its poses are; None for the host vehicle the log names, else the only
-    odometry's. `topic`: where the truth is, None where there is only one candidate; `fields`: and where its messages
-    have what, None where that is known. `beside`: topics that recorded units read.
+    `ego`: id of the ego vehicle, or the topic of its poses; None for the host vehicle that the log names, else that of
+    the only odometry. `topic`: that of the truth, None where there is only one candidate; `fields`: which fields of its
+    messages hold what, None where the schema is known. `beside`: topics that recorded units read.
     `window_s`: read only what was logged from one instant to another, both included, in seconds since the first message
     on the topic of the truth was logged; None: from the beginning, to the end.
     Raises RecordingError, one line: no such file, no MCAP file, no truth, no usable object, no such ego, no such topic,
     or several, a file that changes while it is read; EmptyWindowError.
     """
-    how = partial(_read, name=name, ego=ego, topic=topic, fields=fields, beside=beside, window_s=window_s)
+    read = partial(_read, name=name, ego=ego, topic=topic, fields=fields, beside=beside, window_s=window_s)
     if isinstance(source, Log):
-        return how(source)
-    at, stamps = Path(source) if isinstance(source, str) else source, None
-    with suppress(RecordingError):  # which is said when it is opened
-        stamps = stamps_of(at)
+        return read(source)
+    place, stamps = Path(source) if isinstance(source, str) else source, None
+    with suppress(RecordingError):  # opening it raises the error
+        stamps = read_file_stamps(place)
     try:
-        recording = how(open_log(at))
+        recording = read(open_log(place))
     except RecordingError:
-        check_unchanged(stamps or ())  # for this is why
+        check_files_unchanged(stamps or ())  # for this is why
         raise
-    check_unchanged(stamps or ())
+    check_files_unchanged(stamps or ())
     return replace(recording, stamps=stamps)
 
 
-@np.errstate(over="ignore", invalid="ignore")  # what is no number, or too large for one, is left out later, and said
+@np.errstate(over="ignore", invalid="ignore")  # a state that is not finite is left out later, with a note
 def _read(
     log: Log,
     *,
@@ -145,32 +150,32 @@ def _read(
     asked = None if isinstance(ego, str) else ego
     topic, ignored = choose_topic(log, topic, beside, fields, asked)
     try:
-        log = cut_out(log, topic, window_s)
-        columns, around, world = _columns(log, topic, fields, asked, seek_ego=ego is None)
+        log = cut_window(log, topic, window_s)
+        columns, around, world = _decode_world(log, topic, fields, asked, seek_ego=ego is None)
     except BrokenIndexError as error:
-        log = cut_out(log.from_start(error), topic, window_s)
-        columns, around, world = _columns(log, topic, fields, asked, seek_ego=ego is None)
-    scene, truth, found = assemble(columns, name)
-    notes = [*columns.notes, *found]
+        log = cut_window(log.from_start(error), topic, window_s)
+        columns, around, world = _decode_world(log, topic, fields, asked, seek_ego=ego is None)
+    scene, truth, truth_notes = assemble_truth(columns, name)
+    notes = [*columns.notes, *truth_notes]
     if scene is None or truth is None:
-        messages = counted(sum(c.messages for c in log.channels if c.topic == topic), "message")
+        messages = count_noun(sum(c.messages for c in log.channels if c.topic == topic), "message")
         inside = "the window" if log.window is not None else messages
-        damage = _damage(log, topic, None)
+        damage = _describe_damage(log, topic, None)
         why = "".join(f"; {note}" for note in ([damage] if damage else []) + notes)
         raise RecordingError(f"no usable object in {inside}{why}", path=log.path, topic=topic)
-    host, said = _host(columns.hosts)
-    ego_ix, more = _ego(log.path, scene, ego if isinstance(ego, str) else None, host)
-    damage = _damage(log, topic, scene.end_s)
-    cut = window_notes(window_s)
-    notes = [*([damage] if damage else []), *cut, *log.notes, *ignored, *notes, *said, *more]
+    host, host_notes = _find_host(columns.hosts)
+    ego_ix, ego_notes = _find_ego(log.path, scene, ego if isinstance(ego, str) else None, host)
+    damage = _describe_damage(log, topic, scene.end_s)
+    window_lines = window_notes(window_s)
+    notes = [*([damage] if damage else []), *window_lines, *log.notes, *ignored, *notes, *host_notes, *ego_notes]
     sized = around is None or around.ego is None or (asked is not None and asked.size_m is not None)
     scene = replace(scene, ego_ix=ego_ix, ego_sized=sized)
-    said_all = tuple(printable(note) for note in notes)
+    all_notes = tuple(escape_unprintable(note) for note in notes)
     encoding = next(c.encoding for c in log.channels if c.topic == topic and c.messages)
     return Recording(
-        scene, truth, log.path, topic, said_all, host, damage,
+        scene, truth, log.path, topic, all_notes, host, damage,
         around=around, encoding=encoding, world=world, window=log.window,
-        lane_boundaries=columns.lane_boundaries, together=together_of(log),
+        lane_boundaries=columns.lane_boundaries, together=find_drive_recordings(log),
     )  # fmt: skip
 
 
@@ -180,16 +185,16 @@ def is_truth(channel: Channel) -> bool:
 
 
 def truth_topics(log: Log) -> dict[str, str]:
-    """Topics with at least one message of the truth, and their schema: OSI's, else other lists of objects with ids."""
+    """Schema by topic, of topics with messages of the truth: OSI's, else other lists of objects with ids."""
     osis = {c.topic: c.schema for c in log.channels if is_truth(c) and c.messages}
     ours = {c.topic for c in log.channels if c.topic.startswith("copem/")}
-    if osis or not foreign(log):
+    if osis or not foreign_channels(log):
         return osis
     others = {c.topic: c.schema for c in known_lists(log.channels) if names_objects(c)}
     return {t: schema for t, schema in others.items() if t not in ours} or others
 
 
-def foreign(log: Log) -> list[Channel]:
+def foreign_channels(log: Log) -> list[Channel]:
     """Channels with messages that are not OSI's."""
     return [c for c in log.channels if c.messages and not c.schema.startswith("osi3.")]
 
@@ -201,23 +206,25 @@ def choose_topic(
     fields: Fields | None = None,
     asked: EgoTopic | None = None,
 ) -> tuple[str, list[str]]:
-    """Find the topic of the truth, and notes. Raises RecordingError: there is none, or a choice to make."""
+    """The topic of the truth, and notes on what is not read. Raises RecordingError: none, or several candidates."""
     if not any(c.messages for c in log.channels):
-        raise RecordingError(f"holds no message ({_listed(log.channels) or 'and no channel'})", path=log.path)
+        raise RecordingError(
+            f"holds no message ({_describe_channels(log.channels) or 'and no channel'})", path=log.path
+        )
     topics = truth_topics(log)
-    if topic is not None and foreign(log):
+    if topic is not None and foreign_channels(log):
         topics |= {c.topic: c.schema for c in known_lists(log.channels) if c.topic == topic}
     if fields is not None:
         topics = {c.topic: c.schema for c in log.channels if c.messages}
         if topic not in topics:
             raise RecordingError(
-                f"no true objects on topic {topic!r}; messages are on {_named(topics)}", path=log.path, key=_TOPIC
+                f"no true objects on topic {topic!r}; messages are on {_name_topics(topics)}", path=log.path, key=_TOPIC
             )
-        return topic, _ignored(log, topic, {topic: topics[topic]}, beside, poses_read=True)
+        return topic, _describe_ignored(log, topic, {topic: topics[topic]}, beside, poses_read=True)
     if not topics:
         units = any(c.messages and (c.schema == osi.SENSOR_DATA or is_list(c)) for c in log.channels)
         raise RecordingError(
-            f"no list of true objects; it holds {_listed(log.channels)}; "
+            f"no list of true objects; it holds {_describe_channels(log.channels)}; "
             + "beside a recording that has one its lists replay by `together: [THAT, THIS]`; " * units
             + "`read: {topic: …, objects: …, id: …}` names the fields of a list of any schema "
             "(docs/guide/recordings.md)",
@@ -225,47 +232,52 @@ def choose_topic(
         )
     if topic is not None and topic not in topics:
         raise RecordingError(
-            f"no true objects on topic {topic!r}; they are on {_named(topics)}", path=log.path, key=_TOPIC
+            f"no true objects on topic {topic!r}; they are on {_name_topics(topics)}", path=log.path, key=_TOPIC
         )
-    chosen = topic if topic is not None else _only(topics)
+    chosen = topic if topic is not None else _only_topic(topics)
     if chosen is None:
         raise RecordingError(
-            f"true objects on several topics, {_named(topics)}: choose one with `read: {{topic: …}}` in the experiment",
+            f"true objects on several topics, {_name_topics(topics)}: "
+            "choose one with `read: {topic: …}` in the experiment",
             path=log.path,
-            key=() if together_of(log) is None else ("together",),
+            key=() if find_drive_recordings(log) is None else ("together",),
         )
     poses_read = asked is not None or topics[chosen] not in osi.TRUTH_SCHEMAS
-    return chosen, _ignored(log, chosen, topics, beside, poses_read=poses_read)
+    return chosen, _describe_ignored(log, chosen, topics, beside, poses_read=poses_read)
 
 
-def _only(topics: dict[str, str]) -> str | None:
-    """Find the topic to take unasked: the only one, or the only GroundTruth beside SensorViews."""
+def _only_topic(topics: dict[str, str]) -> str | None:
+    """The topic to read where none is named: the only one, or the only GroundTruth beside SensorViews; else None."""
     truths = [t for t, schema in topics.items() if schema == osi.GROUND_TRUTH]
     candidates = truths or list(topics)
     return candidates[0] if len(candidates) == 1 else None
 
 
-def _ignored(log: Log, chosen: str, topics: dict[str, str], beside: Collection[str], *, poses_read: bool) -> list[str]:
-    """Say what is not read."""
+def _describe_ignored(
+    log: Log, chosen: str, topics: dict[str, str], beside: Collection[str], *, poses_read: bool
+) -> list[str]:
+    """Notes on topics and messages that are not read; `poses_read`: whether poses are."""
     notes = [f"topic {t} ({schema}) not read: {chosen} taken" for t, schema in topics.items() if t != chosen]
     skipped = Counter[str]()
     poses: set[int] = set()
-    if poses_read and (others := foreign(log)):
+    if poses_read and (others := foreign_channels(log)):
         poses = {c.number for c in others if is_pose(c)}
     for channel in log.channels:
-        there = channel.messages and channel.number not in poses
-        of_topic = is_truth(channel) or channel.schema == topics.get(
-            channel.topic
-        )  # else another kind of message on it
-        if there and not (channel.topic in topics and of_topic) and channel.topic not in beside:
+        has_messages = channel.messages and channel.number not in poses
+        # A topic of the truth may hold messages of another schema, too.
+        of_topic = is_truth(channel) or channel.schema == topics.get(channel.topic)
+        if has_messages and not (channel.topic in topics and of_topic) and channel.topic not in beside:
             skipped[channel.schema or f"no schema ({channel.encoding})"] += channel.messages
-    return notes + [f"{counted(number, 'message')} of {schema} not read" for schema, number in skipped.items()]
+    return notes + [f"{count_noun(number, 'message')} of {schema} not read" for schema, number in skipped.items()]
 
 
-def _columns(
+def _decode_world(
     log: Log, topic: str, fields: Fields | None, asked: EgoTopic | None, *, seek_ego: bool
 ) -> tuple[DecodedObjects, LogContext | None, str]:
-    """All that is on a topic, in the world, and the ego; the world's name. Raises RecordingError, BrokenIndexError."""
+    """The objects on a topic and the ego in the world, the frames of the log, and the name of the world's frame.
+
+    Raises RecordingError, BrokenIndexError.
+    """
     channels = [c for c in log.channels if c.topic == topic and c.messages]
     if fields is None and any(not is_truth(c) for c in channels):  # channels of one topic may be of several schemas
         channels = [c for c in channels if is_truth(c) or is_list(c)]
@@ -275,44 +287,44 @@ def _columns(
             f"no message can be read{f' ({log.damage})' if log.damage else ''}", path=log.path, topic=topic
         )
     if fields is None and any(is_truth(c) for c in channels):
-        columns = _decode(log, topic)
+        columns = _decode_topic(log, topic)
         if asked is None:
             return columns, None, ""
-        from copem_replay.io.ego_pose import with_ego
-        from copem_replay.io.world_frame import log_context
+        from copem_replay.io.frames import add_ego, read_log_context
 
-        around = log_context(log, asked, seek_ego=False)
-        return _with_notes(with_ego(columns, around.ego, around.asked), around), around, ""
-    from copem_replay.io.ego_pose import with_ego
-    from copem_replay.io.world_frame import in_world, lists_of, log_context
+        around = read_log_context(log, asked, seek_ego=False)
+        return _add_notes(add_ego(columns, around.ego, around.asked), around), around, ""
+    from copem_replay.io.frames import add_ego, read_decoded_lists, read_log_context, transform_to_world
 
-    around = log_context(log, asked, seek_ego=seek_ego)
-    mine = [c for c in channels if (c.schema, c.encoding) == (channels[0].schema, channels[0].encoding)]
-    found = lists_of(log, mine, fields)
-    if (fields is None and not names_objects(mine[0])) or (fields is not None and fields.id is None):
+    around = read_log_context(log, asked, seek_ego=seek_ego)
+    same_schema = [c for c in channels if (c.schema, c.encoding) == (channels[0].schema, channels[0].encoding)]
+    lists = read_decoded_lists(log, same_schema, fields)
+    if (fields is None and not names_objects(same_schema[0])) or (fields is not None and fields.id is None):
         raise RecordingError(
             "its objects have no ids; lists of a unit they can be, not the truth", path=log.path, topic=topic
         )
-    world = around.world_of(found)
-    found = in_world(found, around, log.path, topic)
-    return _with_notes(with_ego(found.columns, around.ego, around.asked), around), around, world
+    world = around.world_of(lists)
+    lists = transform_to_world(lists, around, log.path, topic)
+    return _add_notes(add_ego(lists.columns, around.ego, around.asked), around), around, world
 
 
-def _with_notes(columns: DecodedObjects, around: LogContext) -> DecodedObjects:
+def _add_notes(columns: DecodedObjects, around: LogContext) -> DecodedObjects:
     return replace(columns, notes=(*columns.notes, *around.notes))
 
 
-def _decode(log: Log, topic: str) -> DecodedObjects:
+def _decode_topic(log: Log, topic: str) -> DecodedObjects:
     """All messages of the truth on a topic. Raises BrokenIndexError."""
-    mine = {c.number: c for c in log.channels if c.topic == topic and is_truth(c)}
-    decoder = osi.Decoder()
-    for number, log_time_ns, payload in log.payloads(frozenset(mine)):
-        decoder.add(payload, schema=mine[number].schema, log_time_ns=log_time_ns, ahead_ns=mine[number].ahead_ns)
+    channels = {c.number: c for c in log.channels if c.topic == topic and is_truth(c)}
+    decoder = osi.GroundTruthDecoder()
+    for number, log_time_ns, payload in log.payloads(frozenset(channels)):
+        decoder.add(
+            payload, schema=channels[number].schema, log_time_ns=log_time_ns, ahead_ns=channels[number].ahead_ns
+        )
     return decoder.columns()
 
 
-def _damage(log: Log, topic: str, end_s: float | None) -> str | None:
-    """Say what is wrong with the file, and how far it could be read."""
+def _describe_damage(log: Log, topic: str, end_s: float | None) -> str | None:
+    """What is wrong with the file, and how far it could be read; None: nothing."""
     if log.damage is None:
         return None
     if log.complete:
@@ -327,18 +339,18 @@ def _damage(log: Log, topic: str, end_s: float | None) -> str | None:
     return f"{after}: {number}{of} messages read ({log.damage})"
 
 
-def _host(hosts: Sequence[str]) -> tuple[str | None, list[str]]:
-    """Find the host vehicle's id, None where no message says one, and notes."""
+def _find_host(hosts: Sequence[str]) -> tuple[str | None, list[str]]:
+    """The host vehicle's id, None where no message states one, and notes; `hosts`: one id per message."""
     if not hosts:
         return None, []
-    said = Counter(hosts).most_common()  # of equally frequent ones the first
-    if len(said) == 1:
-        return said[0][0], []
-    ids = ", ".join(f"{ident} in {counted(number, 'message')}" for ident, number in said[:_SHOWN])
-    return said[0][0], [f"the host vehicle changes ({ids}): the most frequent taken"]
+    counts = Counter(hosts).most_common()  # of equally frequent ones the first
+    if len(counts) == 1:
+        return counts[0][0], []
+    ids = ", ".join(f"{ident} in {count_noun(number, 'message')}" for ident, number in counts[:_SHOWN])
+    return counts[0][0], [f"the host vehicle changes ({ids}): the most frequent taken"]
 
 
-def _ego(path: Path, scene: Scene, ego: str | None, host: str | None) -> tuple[int, list[str]]:
+def _find_ego(path: Path, scene: Scene, ego: str | None, host: str | None) -> tuple[int, list[str]]:
     """Index of the ego vehicle, −1 without one, and notes. Raises RecordingError: no such moving object."""
     wanted = host if ego is None else ego
     index = -1 if wanted is None else scene.object_number.get(wanted, -1)
@@ -360,15 +372,34 @@ def moving_ids(scene: Scene, shown: int = _SHOWN) -> str:
     return f"{text}, … ({len(names)} in all)" if len(names) > shown else text or "none"
 
 
-def _named(topics: dict[str, str]) -> str:
+def _name_topics(topics: dict[str, str]) -> str:
     return ", ".join(f"{topic} ({schema})" for topic, schema in topics.items())
 
 
-def _listed(channels: Sequence[Channel]) -> str:
-    """Schemas and topics of a file, for an error."""
+def _describe_channels(channels: Sequence[Channel]) -> str:
+    """`osi3.GroundTruth on ground_truth, …`: schemas and topics of a file, for an error."""
     names = [
         f"{c.schema or 'no schema'}{'' if c.encoding == 'protobuf' else f' ({c.encoding})'} on {c.topic}"
         for c in channels
     ]
-    more = f", … ({counted(len(names), 'topic')} in all)" if len(names) > _SHOWN else ""
+    more = f", … ({count_noun(len(names), 'topic')} in all)" if len(names) > _SHOWN else ""
     return ", ".join(names[:_SHOWN]) + more
+
+
+# A recording whose facts were stored by an earlier run: it is read again only where its objects are needed.
+
+
+@dataclass(frozen=True)
+class StoredSurvey:
+    """The stored facts (`said`), how to read the recording (`read`), and the key they were found by (`about`)."""
+
+    said: Mapping[str, Any]
+    read: Callable[[], Recording]
+    about: str = ""
+
+
+def read_whole_recording(recording: Recording) -> Recording:
+    """The recording with its truth and its lists: itself, or read now where it is only a survey."""
+    if recording.survey is None:
+        return recording
+    return replace(recording.survey.read(), scene=recording.scene, notes=recording.notes)

@@ -1,7 +1,9 @@
-"""Object lists as points in time and space, followed from list to list and smoothed: place and velocity at any instant.
+"""Short tracks: entries of object lists followed from list to list and smoothed, with position and velocity at any
+instant.
 
-Ids are used where all entries have one; else an entry follows the one of an earlier list that it is nearest to where
-that was heading. States are of a parabola through what is near in time, so that errors of single entries average out.
+Ids are used where all entries have one; else an entry continues the track whose predicted position it is nearest to.
+States are those of a parabola through the entries near in time, so that errors of single entries average out.
+`tools/check_time_offsets.py` measures the clock offsets that are estimated with these constants.
 """
 
 from __future__ import annotations
@@ -14,20 +16,20 @@ import numpy as np
 from copem_replay.core.tracks import Float, Int, Tracks
 
 WINDOW_S = 0.75
-"""So far to both sides states are smoothed (chosen: errors of half a metre leave a velocity good to 0.3 m/s)."""
+"""Half width of smoothing: errors of half a metre leave a velocity good to 0.3 m/s."""
 SLOWEST_HZ = 0.5
-"""Lists that come less often are not followed (chosen)."""
+"""Lists that come less often are not followed: in 2 s between them a car moves farther than cars are apart."""
 GAP_LISTS, WINDOW_LISTS = 4.5, 4.0
-"""Of slow lists so many periods are a gap, and are smoothed over to each side: some miss an object (chosen)."""
-_EACH_SIDE = 2  # entries before and after an instant, at least: at the end of a track a velocity is a guess (chosen)
-_FASTEST_MPS = 60.0
-_SETTLED_S = 0.2  # so long it takes until an entry has changed where a track is taken to be (chosen)
-_APART_M = 1e5  # lists lie so far apart in the tree that no entry is near one of another list
+"""Periods of slow lists that are a gap, and the half width of smoothing in periods: some lists miss an object."""
+_EACH_SIDE = 2  # entries before and after an instant, at least: at the end of a track a velocity is a guess
+_FASTEST_MPS = 60.0  # a faster jump, beyond 3 m, is another object under the same id
+_SETTLED_S = 0.2  # time constant with which entries move a track; larger: smoother, but late in turns
+_APART_M = 1e5  # distance of lists in the tree along its third axis, so that no entry is near one of another list
 
 
 @dataclass(frozen=True)
-class Entries:
-    """Entries of object lists, (P,) each, in order of time. `list_ix`: of ascending lists, `track`: −1 without ids."""
+class ListPoints:
+    """Entries of object lists, (P,) each, in order of time. `list_ix` ascends; `track` is −1 without ids."""
 
     time_s: Float
     list_ix: Int
@@ -35,29 +37,29 @@ class Entries:
     y_m: Float
     track: Int
 
-    def thinned(self, most: int) -> Entries:
-        """About so many of them, whole lists."""
+    def thinned(self, most: int) -> ListPoints:
+        """About `most` of the entries: every n-th list, whole."""
         every = -(-len(self.time_s) // most)
         return self.take(np.flatnonzero(self.list_ix % every == 0)) if every > 1 else self
 
-    def take(self, rows: Int) -> Entries:
-        """Some of them."""
-        return Entries(self.time_s[rows], self.list_ix[rows], self.x_m[rows], self.y_m[rows], self.track[rows])
+    def take(self, rows: Int) -> ListPoints:
+        """The entries of `rows`."""
+        return ListPoints(self.time_s[rows], self.list_ix[rows], self.x_m[rows], self.y_m[rows], self.track[rows])
 
 
-def entries_of(tracks: Tracks, t0_ns: int, track: Int | None = None) -> Entries:
-    """Entries of lists, in seconds since `t0_ns`; `track`: the ids of rows, None: the tracks they are in."""
+def make_list_points(tracks: Tracks, t0_ns: int, track: Int | None = None) -> ListPoints:
+    """The entries of `tracks`, one run, in seconds since `t0_ns`; `track`: ids of the rows, None: `track_ix`."""
     ids = tracks.track_ix if track is None else track
     stamps, list_ix = np.unique(tracks.stamp_ns, return_inverse=True)
     of_row = list_ix[tracks.frame_ix]
     order = np.argsort(of_row, kind="stable")
     time_s = (stamps - t0_ns) * np.float64(1e-9)
     of_row = of_row[order]
-    return Entries(time_s[of_row], of_row, tracks.x_m[0, order], tracks.y_m[0, order], ids[order])
+    return ListPoints(time_s[of_row], of_row, tracks.x_m[0, order], tracks.y_m[0, order], ids[order])
 
 
 @dataclass(frozen=True)
-class States:
+class PointStates:
     """States of tracks, (K,) each; `velocity (2, K)`."""
 
     x_m: Float
@@ -68,7 +70,7 @@ class States:
 
 @dataclass(frozen=True)
 class ShortTracks:
-    """Smoothed states in order of tracks and time, (Q,) each; `gap_s`: states further apart say nothing in between."""
+    """Smoothed states in order of tracks and time, (Q,) each; between states further apart than `gap_s` is no state."""
 
     time_s: Float
     track: Int
@@ -76,10 +78,10 @@ class ShortTracks:
     y_m: Float
     velocity: Float  # (2, Q)
     gap_s: float
-    entries: Entries  # that they are of, in the same order, of which `track` numbers the tracks
+    entries: ListPoints  # the entries that were smoothed, in order of tracks and time; `track` numbers the tracks
 
-    def at(self, times_s: Float) -> tuple[States, Int]:
-        """States at instants (F,), ascending, of all tracks that are there, and which instant each is of."""
+    def at(self, times_s: Float) -> tuple[PointStates, Int]:
+        """(K,) states of all tracks that have one at the ascending instants (F,), and the index of its instant."""
         span = float(max(self.time_s.max(), times_s.max()) - min(self.time_s.min(), times_s.min())) + 10
         begin = np.flatnonzero(np.diff(self.track, prepend=-1))
         first, last = self.time_s[begin], self.time_s[np.append(begin[1:], len(self.track)) - 1]
@@ -92,59 +94,62 @@ class ShortTracks:
         before = np.clip(before, begin[track], len(axis) - 1)
         after = np.minimum(before + 1, np.append(begin[1:], len(axis))[track] - 1)
         long_s = self.time_s[after] - self.time_s[before]
-        there = long_s <= self.gap_s
+        near = long_s <= self.gap_s
         weight = (times_s[instant] - self.time_s[before]) / np.maximum(long_s, 1e-9)
-        before, after, weight = before[there], after[there], np.clip(weight[there], 0.0, 1.0)
+        before, after, weight = before[near], after[near], np.clip(weight[near], 0.0, 1.0)
 
         def between(values: Float) -> Float:
             mixed: Float = values[..., before] * (1 - weight) + values[..., after] * weight
             return mixed
 
-        states = States(between(self.x_m), between(self.y_m), between(self.velocity), self.track[before])
-        return states, instant[there]
+        states = PointStates(between(self.x_m), between(self.y_m), between(self.velocity), self.track[before])
+        return states, instant[near]
 
     def nearest(
-        self, other: Entries, offset_s: float, *, gate_m: float, faster_mps: float, mutual: bool = False
-    ) -> tuple[Int, States, Float]:
-        """Which entries, shifted back by an offset, lie near what of these is faster: rows, states there, distances."""
-        stamps_s, at = np.unique(other.time_s, return_inverse=True)
+        self, other: ListPoints, offset_s: float, *, gate_m: float, faster_mps: float, mutual: bool = False
+    ) -> tuple[Int, PointStates, Float]:
+        """Entries nearest to a moving track once shifted back by `offset_s`: rows, states, distances in m, (K,) each.
+
+        Only tracks faster than `faster_mps` count. `mutual`: the entry is the nearest to that state, too.
+        """
+        stamps_s, instant_ix = np.unique(other.time_s, return_inverse=True)
         states, instant = self.at(stamps_s - offset_s)
         moving = np.flatnonzero(np.hypot(*states.velocity) > faster_mps)
-        # What stands still is matched, too: it must not be taken for something that passes by.
-        mine = np.stack([other.x_m, other.y_m, at * _APART_M], axis=1)
-        theirs = np.stack([states.x_m, states.y_m, instant * _APART_M], axis=1)
+        # Entries are matched with standing tracks, too, so that these are not taken for one that passes by.
+        entries = np.stack([other.x_m, other.y_m, instant_ix * _APART_M], axis=1)
+        points = np.stack([states.x_m, states.y_m, instant * _APART_M], axis=1)
         if not len(moving):
             none = np.empty(0, dtype=np.int64)
-            return none, _taken(states, none), np.empty(0)
+            return none, _take_states(states, none), np.empty(0)
         from scipy.spatial import cKDTree  # it takes long to import
 
-        away_m, k = cKDTree(theirs).query(mine, distance_upper_bound=gate_m)
+        away_m, point = cKDTree(points).query(entries, distance_upper_bound=gate_m)
         rows = np.flatnonzero(np.isfinite(away_m))
         if mutual and len(rows):
-            _, back = cKDTree(mine).query(theirs[k[rows]], distance_upper_bound=gate_m)
-            rows = rows[back == rows]
-        rows = rows[np.isin(k[rows], moving)]
-        return rows, _taken(states, k[rows]), away_m[rows]
+            _, nearest_row = cKDTree(entries).query(points[point[rows]], distance_upper_bound=gate_m)
+            rows = rows[nearest_row == rows]
+        rows = rows[np.isin(point[rows], moving)]
+        return rows, _take_states(states, point[rows]), away_m[rows]
 
 
-def _taken(states: States, rows: Int) -> States:
-    return States(states.x_m[rows], states.y_m[rows], states.velocity[:, rows], states.track[rows])
+def _take_states(states: PointStates, rows: Int) -> PointStates:
+    return PointStates(states.x_m[rows], states.y_m[rows], states.velocity[:, rows], states.track[rows])
 
 
-def short_tracks(entries: Entries) -> ShortTracks:
-    """The tracks of object lists."""
+def short_tracks(entries: ListPoints) -> ShortTracks:
+    """The smoothed tracks of object lists."""
     step_s = _step_s(entries)
-    return _smoothed(chained(entries), max(WINDOW_S, WINDOW_LISTS * step_s), max(0.5, GAP_LISTS * step_s))
+    return _smooth_points(chain_points(entries), max(WINDOW_S, WINDOW_LISTS * step_s), max(0.5, GAP_LISTS * step_s))
 
 
-def chained(entries: Entries) -> Entries:
+def chain_points(entries: ListPoints) -> ListPoints:
     """Entries in order of tracks and time, `track` counting unbroken tracks; none where lists come too seldom."""
     step_s = _step_s(entries)
     gap_s = max(0.5, GAP_LISTS * step_s)
     if step_s > 1 / SLOWEST_HZ:
         entries = entries.take(np.empty(0, dtype=np.int64))
     elif len(entries.track) and entries.track.min() < 0:
-        entries = replace(entries, track=followed(entries, gap_s))
+        entries = replace(entries, track=follow_points(entries, gap_s))
     entries = entries.take(np.lexsort((entries.time_s, entries.track)))
     new = (np.diff(entries.track, prepend=-1) != 0) | (np.diff(entries.time_s, prepend=-np.inf) > gap_s)
     # A jump is another object under the same id.
@@ -153,14 +158,14 @@ def chained(entries: Entries) -> Entries:
     return replace(entries, track=np.cumsum(new) - 1)
 
 
-def _step_s(entries: Entries) -> float:
-    """The period of lists."""
+def _step_s(entries: ListPoints) -> float:
+    """The median period of lists in s; inf with fewer than two."""
     times_s = np.unique(entries.time_s)
     return float(np.median(np.diff(times_s))) if len(times_s) > 1 else np.inf
 
 
-def _smoothed(entries: Entries, window_s: float, gap_s: float) -> ShortTracks:
-    """Parabolas through what is near in time, where there is enough on both sides."""
+def _smooth_points(entries: ListPoints, window_s: float, gap_s: float) -> ShortTracks:
+    """States of parabolas through the entries within `window_s`, where both sides have enough of them."""
     time_s, track = entries.time_s, entries.track
     if not len(time_s):
         return ShortTracks(time_s, track, entries.x_m, entries.y_m, np.empty((2, 0)), gap_s, entries)
@@ -188,8 +193,8 @@ def _smoothed(entries: Entries, window_s: float, gap_s: float) -> ShortTracks:
     return ShortTracks(time_s[kept], track[kept], x_m, y_m, solved[:, 1].T, gap_s, entries)
 
 
-def followed(entries: Entries, gap_s: float) -> Int:
-    """(P,) tracks of entries without ids: each follows the track that is nearest to it where that was heading."""
+def follow_points(entries: ListPoints, gap_s: float) -> Int:
+    """(P,) tracks of entries without ids: an entry continues the track whose predicted position it is nearest to."""
     track = np.full(len(entries.time_s), -1)
     bounds = np.flatnonzero(np.diff(entries.list_ix, prepend=-1, append=-1))
     place, velocity, seen_s, names = np.empty((0, 2)), np.empty((0, 2)), np.empty(0), np.empty(0, dtype=np.int64)
@@ -199,22 +204,23 @@ def followed(entries: Entries, gap_s: float) -> Int:
         alive = now_s - seen_s <= gap_s
         place, velocity, seen_s, names, seen = (a[alive] for a in (place, velocity, seen_s, names, seen))
         since_s = now_s - seen_s
-        of = np.full(end - begin, -1)
+        follows = np.full(end - begin, -1)
         if len(names):
             away_m = np.hypot(*(here[:, None] - (place + velocity * since_s[:, None])[None]).transpose(2, 0, 1))
-            mine, theirs = away_m.argmin(axis=1), away_m.argmin(axis=0)
-            one = np.arange(end - begin)
-            both = (theirs[mine] == one) & (
-                away_m[one, mine] <= 2.5 + np.where(seen[mine] > 1, 5.0, 35.0) * since_s[mine]
+            nearest_track, nearest_entry = away_m.argmin(axis=1), away_m.argmin(axis=0)
+            rows = np.arange(end - begin)
+            mutual = (nearest_entry[nearest_track] == rows) & (
+                away_m[rows, nearest_track]
+                <= 2.5 + np.where(seen[nearest_track] > 1, 5.0, 35.0) * since_s[nearest_track]
             )
-            of[both] = mine[both]
-        old, fresh = np.flatnonzero(of >= 0), np.flatnonzero(of < 0)
+            follows[mutual] = nearest_track[mutual]
+        old, fresh = np.flatnonzero(follows >= 0), np.flatnonzero(follows < 0)
         if len(old):
-            k = of[old]
-            left, second = here[old] - (place[k] + velocity[k] * since_s[k, None]), (seen[k] == 1)[:, None]
+            k = follows[old]
+            residual, second = here[old] - (place[k] + velocity[k] * since_s[k, None]), (seen[k] == 1)[:, None]
             gain = np.clip(1 - np.exp(-since_s[k, None] / _SETTLED_S), 0.3, 0.7)
-            velocity[k] += np.where(second, 1.0, gain**2 / (2 - gain)) * left / np.maximum(since_s[k, None], 1e-3)
-            place[k] = np.where(second, here[old], here[old] - (1 - gain) * left)
+            velocity[k] += np.where(second, 1.0, gain**2 / (2 - gain)) * residual / np.maximum(since_s[k, None], 1e-3)
+            place[k] = np.where(second, here[old], here[old] - (1 - gain) * residual)
             seen_s[k] = now_s
             seen[k] += 1
             track[begin + old] = names[k]

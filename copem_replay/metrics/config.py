@@ -13,7 +13,7 @@ from copem_replay.core.components import Flag, Frozen, Id, NotNegative, Positive
 from copem_replay.metrics.braking.driver import DRIVERS, Driver
 from copem_replay.metrics.metric import RowMetric
 from copem_replay.metrics.onset import ONSETS, InRange, Onset, Requires
-from copem_replay.perception.config import InPlane, PerceptionSetup, simple_polygon
+from copem_replay.perception.config import InPlane, PerceptionSetup, check_polygon
 from copem_replay.perception.pem.condition import ClassNames
 
 
@@ -24,10 +24,10 @@ def _is_none(value: object) -> bool:
 Polygon = Annotated[tuple[InPlane, ...], Field(min_length=3)]
 
 
-def _only(self: BaseModel, *names: str) -> None:
-    given = [name for name in names if getattr(self, name) is not None]
-    if len(given) != 1:
-        raise ValueError(f"expected one of {', '.join(names)}, found {' and '.join(given) or 'none'}")
+def _check_exactly_one(self: BaseModel, *names: str) -> None:
+    present = [name for name in names if getattr(self, name) is not None]
+    if len(present) != 1:
+        raise ValueError(f"expected one of {', '.join(names)}, found {' and '.join(present) or 'none'}")
 
 
 class Within(Frozen):
@@ -44,14 +44,14 @@ class Within(Frozen):
 
     @model_validator(mode="after")
     def _one(self) -> Self:
-        _only(self, "polygon_m", "corridor_m", "conflict_s")
+        _check_exactly_one(self, "polygon_m", "corridor_m", "conflict_s")
         if self.polygon_m is not None:
-            simple_polygon(self.polygon_m)
+            check_polygon(self.polygon_m)
         return self
 
     @property
     def of_ego(self) -> bool:
-        """Whether it takes an ego."""
+        """Whether the condition needs an ego."""
         return self.polygon_m is None
 
 
@@ -63,9 +63,9 @@ class AnnotatedArea(Frozen):
 
     @model_validator(mode="after")
     def _one(self) -> Self:
-        _only(self, "polygon_m", "range_m")
+        _check_exactly_one(self, "polygon_m", "range_m")
         if self.polygon_m is not None:
-            simple_polygon(self.polygon_m)
+            check_polygon(self.polygon_m)
         return self
 
 
@@ -84,16 +84,15 @@ class Objects(Frozen):
 
 
 LONGEST_CHAIN = 12
-"""More capture instants than this have no exact times (chosen: the chain has 2¹¹ states)."""
+"""Over more capture instants there are no exact times: the chain has 2¹¹ states for 12, twice as many for each more."""
 
 Captures = Annotated[int, Field(strict=True, ge=1, le=1000)]
-
 
 _ONSET = Slot("onset", ONSETS)
 
 
-def requires(kind: str) -> Requires | None:
-    """What the onset of a kind needs of the experiment; None: there is no such onset."""
+def onset_requirement(kind: str) -> Requires | None:
+    """What the onset of a kind needs of the experiment; None: no onset has this name."""
     try:
         onset = _ONSET.find(kind)
     except PydanticCustomError:
@@ -115,7 +114,7 @@ class Confirm(Frozen):
 
 
 Margin = Annotated[float, Field(strict=True, ge=0, le=100)]
-"""Metres, a hundred at most (chosen: more is a mistake)."""
+"""Metres; more than a hundred is taken for a slip."""
 
 
 class Conflict(Frozen):
@@ -203,7 +202,7 @@ class MetricsSetup(PerceptionSetup, Protocol):
 
     @property
     def braking(self) -> Braking | None:
-        """What the declared driver does, if asked."""
+        """What the driver does; None: the experiment does not ask."""
 
     @property
     def recorded(self) -> Mapping[str, object]:

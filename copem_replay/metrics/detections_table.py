@@ -1,14 +1,15 @@
-"""The detections: one row per configuration × run × measured object. Never detected is kept, not dropped.
+"""The table of detections: one row per configuration × run × measured object, those never detected included.
 
 time_to_detection_s: from the onset to the instant the list that confirmed the object was available; null when never.
 distance_at_detection_m: true horizontal distance between the centres of object and ego at that instant.
-gap_at_detection_m: the same from box to box.
+gap_at_detection_m: true horizontal distance between the boxes of object and ego at that instant.
+A way of a detection (`Way`): when its list was captured, sent and received.
 Source: Piazzoni et al. 2022 (distance at detection); docs/guide/metrics.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, TypeVar
 
@@ -16,118 +17,201 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from copem_replay.core.interpolation import states_at
+from copem_replay.core.interpolation import interpolate_states
 from copem_replay.core.random import CounterRng, RandomKey, object_words
-from copem_replay.core.tracks import CLASSES, Float, Int, Scene, Tracks
-from copem_replay.metrics.braking.driver import delays_of
+from copem_replay.core.tracks import CLASSES, SAME_INSTANT_S, Float, Int, Scene, Tracks
+from copem_replay.metrics.braking.driver import reaction_delays
 from copem_replay.metrics.braking.encounter import Encounter
-from copem_replay.metrics.braking.verdict import Verdicts, judge
-from copem_replay.metrics.columns import beneath
+from copem_replay.metrics.braking.verdict import Verdicts, judge_braking
 from copem_replay.metrics.config import MetricsSetup
-from copem_replay.metrics.detection.by_truth_id import Detections
-from copem_replay.metrics.end_reason import texts_of
-from copem_replay.metrics.episodes import Episodes
-from copem_replay.metrics.reference import Reference, reference_at
-from copem_replay.metrics.way import WAY, Way
-from copem_replay.perception.visibility import rectangles
+from copem_replay.metrics.detection.by_truth_id import FirstDetections
+from copem_replay.metrics.episodes import Episodes, Reference, locate_reference
+from copem_replay.metrics.survival import end_reason_texts
+from copem_replay.perception.visibility import rectangle_corners
+
+
+def concatenate_columns(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Columns by name, those of each part one beneath the other. All parts have the columns of the first."""
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def build_frame(columns: Mapping[str, Any]) -> pd.DataFrame:
+    """Columns as a table; `braking_pass` is null where the episode is not in conflict."""
+    rows = dict(columns)
+    if "braking_pass" in rows:
+        rows["braking_pass"] = pd.arrays.BooleanArray(rows["braking_pass"], ~rows["conflict"])
+    return pd.DataFrame(rows)
+
+
+@dataclass(frozen=True)
+class Way:
+    """The way of each detection to the receiver. All (S | 1, M), NaN: there is none.
+
+    `listed_s`: capture of the first list of any unit that has the object, whether it was sent and arrived or not.
+    `sent_s`, `arrived_s`: of the list of the newest capture that contributed to the detection.
+    """
+
+    listed_s: Float
+    sent_s: Float
+    arrived_s: Float
+
+
+WAY = tuple(Way.__dataclass_fields__)
+"""Columns of `detections.parquet`, its last, where a configuration has a link or units with `ready` or `sends`."""
+
+
+def first_listed_s(seen: Tracks, episodes: Episodes, units: Collection[str], *, count_earlier: bool) -> Float:
+    """(S, M) capture of the first list of `units` that has the object of each episode; NaN: none."""
+    episode_of = np.full(int(max(episodes.object_ix.max(initial=-1), seen.object_ix.max(initial=-1))) + 2, -1)
+    episode_of[episodes.object_ix] = np.arange(len(episodes.object_ix))
+    episode, captured_s = episode_of[seen.row_object_ix], seen.row_captured_s
+    in_units = np.array([name in units for name in seen.units], dtype=bool)[seen.row_unit_ix]
+    rows = np.flatnonzero(in_units & (episode >= 0) & np.isfinite(seen.common_arrives_s)[seen.frame_ix])
+    during = captured_s[rows] <= episodes.ended_s[episode[rows]] + SAME_INSTANT_S
+    rows = rows[during & (count_earlier | (captured_s[rows] >= episodes.onset_s[episode[rows]] - SAME_INSTANT_S))]
+    first_s = np.full((len(seen.valid), len(episodes.object_ix)), np.inf)
+    for s, valid in enumerate(seen.valid):
+        listed = rows[valid[rows]]
+        np.minimum.at(first_s[s], episode[listed], captured_s[listed])
+    return np.where(np.isfinite(first_s), first_s, np.nan)
+
+
+def find_informing_list(heard: Tracks, known: FirstDetections) -> Int:
+    """(S | 1, M) index of the list (F,) that made each object known; −1: none.
+
+    Of the lists of that capture the last that the receiver had at the detection, of simultaneous ones that of the first
+    unit.
+    """
+    list_ix, latest_s = np.full(known.detection_s.shape, -1), np.full(known.detection_s.shape, -np.inf)
+    arrives_s = heard.common_arrives_s
+    for unit_ix in range(len(heard.units)):
+        frames = np.flatnonzero((heard.frame_unit_ix == unit_ix) & np.isfinite(arrives_s))
+        if not len(frames):
+            continue
+        frames = frames[np.argsort(heard.captured_s[frames], kind="stable")]
+        place = np.searchsorted(heard.captured_s[frames], known.captured_s - SAME_INSTANT_S)
+        frame = frames[np.minimum(place, len(frames) - 1)]
+        matches = np.abs(heard.captured_s[frame] - known.captured_s) <= SAME_INSTANT_S
+        matches &= arrives_s[frame] <= known.detection_s + SAME_INSTANT_S
+        later = arrives_s[frame] > latest_s + SAME_INSTANT_S
+        is_first_unit = (known.first_unit_ix == unit_ix) & (arrives_s[frame] >= latest_s - SAME_INSTANT_S)
+        list_ix = np.where(matches & (later | is_first_unit), frame, list_ix)
+        latest_s = np.where(matches & (later | is_first_unit), arrives_s[frame], latest_s)
+    return list_ix
+
+
+def pick_list_times(list_ix: Int, time_s: Float) -> Float:
+    """(S | 1, M) the times, of `time_s (F,)`, of the lists `list_ix (S | 1, M)`; NaN where that is −1."""
+    return np.where(list_ix >= 0, time_s[list_ix] if len(time_s) else np.nan, np.nan)
+
 
 T = TypeVar("T", bound=np.generic)
 
 
 @dataclass(frozen=True)
-class Events:
+class DetectionEvents:
     """Detections of one configuration, run by run: (S, M), or (1, M) where all runs agree.
 
-    `units`: names of those whose indices `detections` has. `in_sight_s`: when any of its units had the object in sight,
-    NaN: never, or not known. `conflict_known_s`: when a collision was implied, NaN: never. `way`: None where lists have
-    neither a link nor units that take their time or choose what they send.
+    `units`: names of the units that `detections` counts. `in_sight_s`: when any of its units had the object in sight,
+    NaN: never, or not known. `conflict_known_s`: when a list first implied a collision, NaN: never. `way`: None where
+    the configuration has neither a link nor units with `ready` or `sends`.
     """
 
     units: tuple[str, ...]
-    detections: Detections
+    detections: FirstDetections
     in_sight_s: Float
     conflict_known_s: Float | None = None
     way: Way | None = None
 
 
-def stacked(runs: Sequence[Mapping[str, Events]]) -> dict[str, Events]:
-    """Events by configuration of some runs after each other."""
-    return {name: _stacked([one[name] for one in runs]) for name in runs[0]} if len(runs) > 1 else dict(runs[0])
+def stack_events(blocks: Sequence[Mapping[str, DetectionEvents]]) -> dict[str, DetectionEvents]:
+    """Events by configuration, those of several blocks of runs one after the other."""
+    return (
+        {name: _stack_parts([block[name] for block in blocks]) for name in blocks[0]}
+        if len(blocks) > 1
+        else dict(blocks[0])
+    )
 
 
-def _stacked(parts: Sequence[Any]) -> Any:
+def _stack_parts(parts: Sequence[Any]) -> Any:
     first: Any = parts[0]
     if isinstance(first, np.ndarray):
         return np.concatenate(parts)
     if hasattr(first, "_fields"):
-        return type(first)(*map(_stacked, zip(*parts, strict=True)))
+        return type(first)(*map(_stack_parts, zip(*parts, strict=True)))
     if is_dataclass(first):
-        columns = {f.name: _stacked([getattr(part, f.name) for part in parts]) for f in fields(first)}
+        columns = {f.name: _stack_parts([getattr(part, f.name) for part in parts]) for f in fields(first)}
         return replace(first, **columns)  # type: ignore[type-var]
     assert all(part == first for part in parts), f"{type(first).__name__} is not of all runs alike"
     return first
 
 
-def table(
+def build_detection_columns(
     scene: Scene,
     truth: Tracks,
     experiment: MetricsSetup,
-    found: Episodes,
-    meeting: Sequence[Encounter],
+    episodes: Episodes,
+    encounters: Sequence[Encounter],
     runs: Int,
-    events: Mapping[str, Events],
+    events: Mapping[str, DetectionEvents],
 ) -> dict[str, Any]:
     """The columns of `detections.parquet` of one log and block of runs, by configuration, run and object."""
-    delay_s = _delays(scene, experiment, found, runs)
+    delay_s = _reaction_delays(scene, experiment, episodes, runs)
     parts = []
-    for name, known in events.items():
-        columns = _columns(scene, truth, experiment, found, runs, name, known)
+    for name, event in events.items():
+        columns = _configuration_columns(scene, truth, experiment, episodes, runs, name, event)
         if delay_s is not None:
-            columns |= _braking(experiment, found, meeting, delay_s, known)
-        if any(of.way is not None for of in events.values()):
-            shape, none = (len(runs), len(found.object_ix)), np.full((1, 1), np.nan)
-            way = {name: none if known.way is None else getattr(known.way, name) for name in WAY}
+            columns |= _braking_columns(experiment, episodes, encounters, delay_s, event)
+        if any(other.way is not None for other in events.values()):
+            shape, absent = (len(runs), len(episodes.object_ix)), np.full((1, 1), np.nan)
+            way = {name: absent if event.way is None else getattr(event.way, name) for name in WAY}
             columns |= {name: np.broadcast_to(values, shape).ravel() for name, values in way.items()}
         parts.append(columns)
-    return beneath(parts)
+    return concatenate_columns(parts)
 
 
-def _columns(
-    scene: Scene, truth: Tracks, experiment: MetricsSetup, found: Episodes, runs: Int, configuration: str, known: Events
+def _configuration_columns(
+    scene: Scene,
+    truth: Tracks,
+    experiment: MetricsSetup,
+    episodes: Episodes,
+    runs: Int,
+    configuration: str,
+    event: DetectionEvents,
 ) -> dict[str, Any]:
-    """Columns (S · M,) of one configuration: what was known, when and how far away."""
-    S, M = len(runs), len(found.object_ix)
+    """Columns (S · M,) of one configuration: whether, when and how far away each object is detected."""
+    S, M = len(runs), len(episodes.object_ix)
 
     def flat(values: NDArray[T]) -> NDArray[T]:
         return np.broadcast_to(values, (S, M)).ravel()
 
-    result = known.detections
-    detection_s = flat(result.detection_s)
-    distance_m, gap_m = distances(scene, truth, experiment, flat(found.object_ix), detection_s)
-    onset_s = flat(found.onset_s)
-    names = np.array([*known.units, None], dtype=object)  # −1: none
+    detections = event.detections
+    detection_s = flat(detections.detection_s)
+    distance_m, gap_m = measure_distances(scene, truth, experiment, flat(episodes.object_ix), detection_s)
+    onset_s = flat(episodes.onset_s)
+    names = np.array([*event.units, None], dtype=object)  # −1: none
     columns: dict[str, Any] = {
         "log": np.full(S * M, scene.log, dtype=object),
         "configuration": np.full(S * M, configuration, dtype=object),
         "run": np.repeat(runs, M),
-        "object_id": np.array(scene.object_ids, dtype=object)[flat(found.object_ix)],
-        "object_class": np.array(CLASSES, dtype=object)[scene.object_class[flat(found.object_ix)]],
+        "object_id": np.array(scene.object_ids, dtype=object)[flat(episodes.object_ix)],
+        "object_class": np.array(CLASSES, dtype=object)[scene.object_class[flat(episodes.object_ix)]],
         "onset_s": onset_s,
-        "onset_at_start": flat(found.onset_at_start),
+        "onset_at_start": flat(episodes.onset_at_start),
         "detected": ~np.isnan(detection_s),
         "detection_s": detection_s,
-        "captured_s": flat(result.captured_s),
-        "in_sight_s": flat(known.in_sight_s),
+        "captured_s": flat(detections.captured_s),
+        "in_sight_s": flat(event.in_sight_s),
         "time_to_detection_s": detection_s - onset_s,
         "distance_at_detection_m": distance_m,
         "gap_at_detection_m": gap_m,
-        "ended_s": flat(found.ended_s),
-        "ended_by": texts_of(flat(found.ended_by)),
-        "first_unit": names[flat(result.first_unit_ix)],
+        "ended_s": flat(episodes.ended_s),
+        "ended_by": end_reason_texts(flat(episodes.ended_by)),
+        "first_unit": names[flat(detections.first_unit_ix)],
     }
-    if known.conflict_known_s is not None:
-        conflict_known_s = flat(known.conflict_known_s)
-        away_m, _ = distances(scene, truth, experiment, flat(found.object_ix), conflict_known_s)
+    if event.conflict_known_s is not None:
+        conflict_known_s = flat(event.conflict_known_s)
+        away_m, _ = measure_distances(scene, truth, experiment, flat(episodes.object_ix), conflict_known_s)
         columns |= {
             "conflict_detected": ~np.isnan(conflict_known_s),
             "conflict_detection_s": conflict_known_s,
@@ -137,37 +221,43 @@ def _columns(
     return columns
 
 
-def _delays(scene: Scene, experiment: MetricsSetup, found: Episodes, runs: Int) -> Float | None:
+def _reaction_delays(scene: Scene, experiment: MetricsSetup, episodes: Episodes, runs: Int) -> Float | None:
     """(S, M) seconds the driver takes to react to each object, the same in every configuration. None without braking.
 
-    Addressed by the object and the onset's stamp: what is reacted to, not when it came to be known.
+    The random number is addressed by the object and the stamp of its onset, not by the instant of detection.
     """
     if experiment.braking is None:
         return None
-    none = np.zeros(len(found.object_ix), dtype=np.int64)
-    words = object_words([scene.object_ids[k] for k in found.object_ix])
-    stamp_ns = scene.t0_ns + np.rint(found.onset_s * 1e9).astype(np.int64)
-    uniform = CounterRng(experiment.seed, scene.log).uniform("reaction", RandomKey(("",), none, words, stamp_ns), runs)
-    return delays_of(experiment.braking.driver.reaction, uniform.ravel()).reshape(uniform.shape)
+    no_unit = np.zeros(len(episodes.object_ix), dtype=np.int64)
+    words = object_words([scene.object_ids[k] for k in episodes.object_ix])
+    stamp_ns = scene.t0_ns + np.rint(episodes.onset_s * 1e9).astype(np.int64)
+    uniform = CounterRng(experiment.seed, scene.log).uniform(
+        "reaction", RandomKey(("",), no_unit, words, stamp_ns), runs
+    )
+    return reaction_delays(experiment.braking.driver.reaction, uniform.ravel()).reshape(uniform.shape)
 
 
-def _braking(
-    experiment: MetricsSetup, found: Episodes, meeting: Sequence[Encounter], delay_s: Float, known: Events
+def _braking_columns(
+    experiment: MetricsSetup,
+    episodes: Episodes,
+    encounters: Sequence[Encounter],
+    delay_s: Float,
+    event: DetectionEvents,
 ) -> dict[str, Any]:
     """Columns (S · M,) of one configuration: the verdicts of the episodes in conflict; null for the others."""
     braking = experiment.braking
     assert braking is not None
     shape = delay_s.shape
-    event_s = known.detections.detection_s if braking.brakes_for == "object" else known.conflict_known_s
+    event_s = event.detections.detection_s if braking.brakes_for == "object" else event.conflict_known_s
     assert event_s is not None
-    # What is known before the onset is no hazard yet.
-    brake_s = np.maximum(np.broadcast_to(event_s, shape), found.onset_s) + delay_s
+    # Before its onset an object is no hazard yet.
+    brake_s = np.maximum(np.broadcast_to(event_s, shape), episodes.onset_s) + delay_s
     in_conflict = np.zeros(shape, dtype=bool)
     numbers = {name: np.full(shape, np.nan) for name in Verdicts.__dataclass_fields__}
-    for encounter in meeting:
+    for encounter in encounters:
         m = encounter.episode_ix
         in_conflict[:, m] = True
-        verdicts = judge(encounter, braking.driver, np.where(np.isnan(brake_s[:, m]), np.inf, brake_s[:, m]))
+        verdicts = judge_braking(encounter, braking.driver, np.where(np.isnan(brake_s[:, m]), np.inf, brake_s[:, m]))
         for name, values in numbers.items():
             values[:, m] = getattr(verdicts, name)
     return {
@@ -181,39 +271,41 @@ def _braking(
     }
 
 
-def distances(
+def measure_distances(
     scene: Scene, truth: Tracks, experiment: MetricsSetup, object_ix: Int, time_s: Float
 ) -> tuple[Float, Float]:
-    """Centre distance and gap of objects (K,) at times (K,); NaN where the time is, or where one is absent.
+    """Centre distance and gap (m) of objects (K,) at times (K,); NaN where the time is NaN, object or ego absent.
 
     Runs share objects and instants: each pair is computed once.
     """
     distance_m, gap_m = np.full(len(time_s), np.nan), np.full(len(time_s), np.nan)
-    known = np.flatnonzero(~np.isnan(time_s))
-    if not len(known):
+    timed = np.flatnonzero(~np.isnan(time_s))
+    if not len(timed):
         return distance_m, gap_m
     # By hash: most rows share their pair with many others, and sorting them all took most of the time.
-    number, times_s = pd.factorize(time_s[known])
-    back, pairs = pd.factorize(object_ix[known] * len(times_s) + number)
-    objects, at_s = pairs // len(times_s), times_s[pairs % len(times_s)]
-    ego = reference_at(scene, truth, experiment, at_s)
-    at, present = states_at(truth, objects, at_s, t0_ns=scene.t0_ns, max_gap_s=experiment.max_gap_s)
-    distance = np.where(present & ego.present, np.hypot(at["x_m"] - ego.x_m, at["y_m"] - ego.y_m), np.nan)
-    distance_m[known] = distance[back]
+    number, times_s = pd.factorize(time_s[timed])
+    pair_ix, pairs = pd.factorize(object_ix[timed] * len(times_s) + number)
+    objects, pair_s = pairs // len(times_s), times_s[pairs % len(times_s)]
+    ego = locate_reference(scene, truth, experiment, pair_s)
+    state, present = interpolate_states(truth, objects, pair_s, t0_ns=scene.t0_ns, max_gap_s=experiment.max_gap_s)
+    distance = np.where(present & ego.present, np.hypot(state["x_m"] - ego.x_m, state["y_m"] - ego.y_m), np.nan)
+    distance_m[timed] = distance[pair_ix]
     if scene.ego_sized or experiment.measure.distance_to != "ego":
-        gap_m[known] = box_gap(at, ego, present & ego.present)[back]
+        gap_m[timed] = box_gap(state, ego, present & ego.present)[pair_ix]
     return distance_m, gap_m
 
 
-def box_gap(at: Mapping[str, Float], ego: Reference, both: np.ndarray) -> Float:
-    """(K,) horizontal distance between the boxes, 0 where they touch; NaN where `both` is False."""
+def box_gap(state: Mapping[str, Float], ego: Reference, both: np.ndarray) -> Float:
+    """(K,) horizontal distance (m) between the boxes, 0 where they touch; NaN where `both` is False."""
     import shapely
 
     gap = np.full(len(both), np.nan)
-    k = np.flatnonzero(both)
-    box = shapely.polygons(rectangles(*(at[n][k] for n in ("x_m", "y_m", "yaw_rad", "length_m", "width_m"))))
-    corners = rectangles(*(getattr(ego, n)[k] for n in ("x_m", "y_m", "heading_rad", "length_m", "width_m")))
-    point = (ego.length_m[k] == 0) & (ego.width_m[k] == 0)
-    other = np.where(point, shapely.points(ego.x_m[k], ego.y_m[k]), shapely.polygons(corners))
-    gap[k] = shapely.distance(box, other)
+    rows = np.flatnonzero(both)
+    box = shapely.polygons(
+        rectangle_corners(*(state[n][rows] for n in ("x_m", "y_m", "yaw_rad", "length_m", "width_m")))
+    )
+    corners = rectangle_corners(*(getattr(ego, n)[rows] for n in ("x_m", "y_m", "heading_rad", "length_m", "width_m")))
+    point = (ego.length_m[rows] == 0) & (ego.width_m[rows] == 0)
+    other = np.where(point, shapely.points(ego.x_m[rows], ego.y_m[rows]), shapely.polygons(corners))
+    gap[rows] = shapely.distance(box, other)
     return gap

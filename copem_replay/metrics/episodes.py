@@ -1,27 +1,78 @@
-"""Episodes: from when, and until when, an object is observed.
+"""Episodes: from when until when each measured object is observed, and when units first have it in sight.
 
 Onset: the first frame at which its condition holds while the ego is in the log. The episode ends at the object's own
-last frame (`object_left`: not seen by then, it is never detected), the ego's (`ego_left`) or the log's (`log_end`);
-only the last two are censoring. Source of the meanings: docs/guide/metrics.md.
+last frame (`object_left`: an object that leaves undetected is never detected), the ego's (`ego_left`) or the log's
+(`log_end`); only the last two are censoring. An object is in sight of a unit when a list of the unit, at whatever range
+and in whatever field of view, has a visible share of it above 0, detected or not. Definitions: docs/guide/metrics.md.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int, Scene, Tracks, class_indices
+from copem_replay.core.errors import ExperimentError
+from copem_replay.core.interpolation import interpolate_states, wrap_angles
+from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int, Scene, Tracks, class_indices
 from copem_replay.metrics.config import Measure, MetricsSetup
-from copem_replay.metrics.end_reason import END_REASONS, EndReason
-from copem_replay.metrics.onset import OnsetView, holds
-from copem_replay.metrics.reference import reference_at
+from copem_replay.metrics.onset import OnsetView, evaluate_onset
+from copem_replay.metrics.survival import END_REASONS, EndReason
 from copem_replay.perception.config import Carriers
-from copem_replay.perception.sensor_poses import carrier, observers, poses, unit_ground
+from copem_replay.perception.observation import Observations
+from copem_replay.perception.sensor_poses import (
+    compute_unit_poses,
+    find_carrier,
+    make_observers,
+    offset_places,
+    unit_ground,
+)
 from copem_replay.perception.visibility import Statics, visible_shares
 
-_TOLERANCE_S = SAME_INSTANT_NS * 1e-9
+
+@dataclass(frozen=True)
+class Reference:
+    """The place that distances are measured from: the ego, or a unit when there is no ego. All (K,), NaN where absent.
+
+    Its box is `length_m × width_m` around its place; a unit is a point.
+    """
+
+    x_m: Float
+    y_m: Float
+    heading_rad: Float
+    length_m: Float
+    width_m: Float
+    present: Bool
+
+
+def locate_reference(scene: Scene, truth: Tracks, experiment: MetricsSetup, time_s: Float) -> Reference:
+    """The place that distances are measured from, at times (K,), s. Raises ExperimentError when there is none."""
+    n = len(time_s)
+    name = experiment.measure.distance_to
+    if name == "ego":
+        if scene.ego_ix < 0:
+            raise ExperimentError(
+                f"{scene.log}: no ego to measure distances from; give `ego:` or `distance_to: <unit>`"
+            )
+        state, present = _interpolate_state(scene, truth, scene.ego_ix, time_s, experiment.max_gap_s)
+        return Reference(state["x_m"], state["y_m"], state["yaw_rad"], state["length_m"], state["width_m"], present)
+    unit = experiment.units[name]
+    point = np.zeros(n)
+    if unit.at is not None:
+        heading = np.full(n, np.deg2rad(unit.yaw_deg))
+        x, y = offset_places(np.full(n, unit.at[0]), np.full(n, unit.at[1]), heading, unit.offset_m)
+        return Reference(x, y, heading, point, point, np.ones(n, dtype=bool))
+    state, present = _interpolate_state(scene, truth, find_carrier(scene, unit), time_s, experiment.max_gap_s)
+    x, y = offset_places(state["x_m"], state["y_m"], state["yaw_rad"], unit.offset_m)
+    return Reference(x, y, wrap_angles(state["yaw_rad"] + np.deg2rad(unit.yaw_deg)), point, point, present)
+
+
+def _interpolate_state(
+    scene: Scene, truth: Tracks, object_ix: int, time_s: Float, max_gap_s: float
+) -> tuple[dict[str, Float], Bool]:
+    return interpolate_states(truth, np.full(len(time_s), object_ix), time_s, t0_ns=scene.t0_ns, max_gap_s=max_gap_s)
 
 
 @dataclass(frozen=True)
@@ -37,78 +88,78 @@ class Episodes:
 
 def measured_objects(scene: Scene, measure: Measure) -> Int:
     """Indices of the objects to measure, ascending: by default all moving ones but the ego."""
-    chosen = np.zeros(len(scene.object_ids), dtype=bool)
+    measured = np.zeros(len(scene.object_ids), dtype=bool)
     if measure.objects.ids is not None:
-        chosen[[scene.object_number[i] for i in measure.objects.ids if i in scene.object_number]] = True
+        measured[[scene.object_number[i] for i in measure.objects.ids if i in scene.object_number]] = True
     elif measure.objects.classes is not None:
-        chosen = np.isin(scene.object_class, class_indices(measure.objects.classes))
+        measured = np.isin(scene.object_class, class_indices(measure.objects.classes))
     else:
-        chosen = scene.moving.copy()
+        measured = scene.moving.copy()
     if scene.ego_ix >= 0:
-        chosen[scene.ego_ix] = False
-    return np.flatnonzero(chosen)
+        measured[scene.ego_ix] = False
+    return np.flatnonzero(measured)
 
 
-def episodes(scene: Scene, truth: Tracks, static: Statics, experiment: MetricsSetup) -> Episodes:
-    """Onset and end of every measured object that has an onset (`truth`: the world at its own frames)."""
+def find_episodes(scene: Scene, truth: Tracks, static: Statics, experiment: MetricsSetup) -> Episodes:
+    """Onset and end of every measured object that has an onset. `truth`: the world at its own frames."""
     measure = experiment.measure
-    wanted = np.isin(truth.object_ix, measured_objects(scene, measure))
-    world = truth.take_tracks(wanted)
+    is_measured = np.isin(truth.object_ix, measured_objects(scene, measure))
+    world = truth.take_tracks(is_measured)
     ego_first_s, ego_last_s, ego_there = _ego_stay(scene, truth)
     first_s, last_s = world.row_captured_s[world.start[:-1]], world.row_captured_s[world.start[1:] - 1]
     instant_s = measure.onset.instant_s
     if instant_s is not None:
         onset_s = np.full(len(first_s), instant_s)
-        found = (onset_s >= first_s - _TOLERANCE_S) & (onset_s <= last_s + _TOLERANCE_S)
-        found &= (onset_s >= ego_first_s - _TOLERANCE_S) & (onset_s <= ego_last_s + _TOLERANCE_S)
-        at_start = onset_s <= first_s + _TOLERANCE_S
+        has_onset = (onset_s >= first_s - SAME_INSTANT_S) & (onset_s <= last_s + SAME_INSTANT_S)
+        has_onset &= (onset_s >= ego_first_s - SAME_INSTANT_S) & (onset_s <= ego_last_s + SAME_INSTANT_S)
+        at_start = onset_s <= first_s + SAME_INSTANT_S
     else:
         possible = ego_there[world.frame_ix]
         view = OnsetView(
             world,
-            lambda of: _distance(scene, truth, world, experiment, of),
-            lambda of: _best_share(scene, truth, static, experiment, of)[wanted[truth.track_ix]],
+            lambda place: _measure_distance(scene, truth, world, experiment, place),
+            lambda seen_by: _find_best_share(scene, truth, static, experiment, seen_by)[is_measured[truth.track_ix]],
         )
-        onset_row, found = _first_true(holds(measure.onset, view) & possible, world.start)
-        first_possible, _ = _first_true(possible, world.start)
+        onset_row, has_onset = _find_first_true(evaluate_onset(measure.onset, view) & possible, world.start)
+        first_possible, _ = _find_first_true(possible, world.start)
         onset_s = world.row_captured_s[onset_row]
-        # Held already when it could first be asked: at the object's first frame that the ego shares.
+        # The condition holds already at the object's first frame that the ego shares.
         at_start = onset_row == first_possible
     end_s = scene.end_s
     ended_s = np.minimum(np.minimum(last_s, ego_last_s), end_s)
-    object_left = (last_s < end_s - _TOLERANCE_S) & (last_s <= ego_last_s + _TOLERANCE_S)
-    ego_left = ~object_left & (ego_last_s < end_s - _TOLERANCE_S)
+    object_left = (last_s < end_s - SAME_INSTANT_S) & (last_s <= ego_last_s + SAME_INSTANT_S)
+    ego_left = ~object_left & (ego_last_s < end_s - SAME_INSTANT_S)
     reasons = EndReason.OBJECT_LEFT, EndReason.EGO_LEFT, EndReason.LOG_END
     left, ego, end = (END_REASONS.index(reason) for reason in reasons)
     ended_by = np.where(object_left, left, np.where(ego_left, ego, end))
-    order = np.flatnonzero(found)
+    order = np.flatnonzero(has_onset)
     order = order[np.argsort(world.object_ix[order], kind="stable")]
     return Episodes(world.object_ix[order], onset_s[order], at_start[order], ended_s[order], ended_by[order])
 
 
 def _ego_stay(scene: Scene, truth: Tracks) -> tuple[float, float, Bool]:
-    """First and last instant of the ego, and at which frames (F,) it is there. Without an ego: the whole log."""
+    """First and last instant of the ego, and whether it is there at each frame (F,). Without an ego: the whole log."""
     if scene.ego_ix < 0:
         return 0.0, scene.end_s, np.ones(len(truth.stamp_ns), dtype=bool)
     frames = truth.frame_ix[truth.row_object_ix == scene.ego_ix]
-    there = np.zeros(len(truth.stamp_ns), dtype=bool)
-    there[frames] = True
-    return float(truth.captured_s[frames[0]]), float(truth.captured_s[frames[-1]]), there
+    present = np.zeros(len(truth.stamp_ns), dtype=bool)
+    present[frames] = True
+    return float(truth.captured_s[frames[0]]), float(truth.captured_s[frames[-1]]), present
 
 
-def _first_true(flags: Bool, start: Int) -> tuple[Int, Bool]:
+def _find_first_true(flags: Bool, start: Int) -> tuple[Int, Bool]:
     """First True row of every track (E,), and whether there is one."""
     rows = np.flatnonzero(flags)
-    at = np.searchsorted(rows, start[:-1])
-    found = at < len(rows)
-    first = rows[np.minimum(at, len(rows) - 1)] if len(rows) else start[:-1]
-    found &= first < start[1:]
-    return np.where(found, first, start[:-1]), found
+    place = np.searchsorted(rows, start[:-1])
+    exists = place < len(rows)
+    first = rows[np.minimum(place, len(rows) - 1)] if len(rows) else start[:-1]
+    exists &= first < start[1:]
+    return np.where(exists, first, start[:-1]), exists
 
 
-def _distance(scene: Scene, truth: Tracks, world: Tracks, experiment: MetricsSetup, from_: str) -> Float:
+def _measure_distance(scene: Scene, truth: Tracks, world: Tracks, experiment: MetricsSetup, from_: str) -> Float:
     """(P,) distance of each row, infinite where there is nothing to measure from."""
-    per_frame = reference_at(scene, truth, experiment, truth.captured_s)
+    per_frame = locate_reference(scene, truth, experiment, truth.captured_s)
     f = world.frame_ix
     dx, dy = world.x_m[0] - per_frame.x_m[f], world.y_m[0] - per_frame.y_m[f]
     if from_ == "front":
@@ -119,27 +170,59 @@ def _distance(scene: Scene, truth: Tracks, world: Tracks, experiment: MetricsSet
     return np.where(per_frame.present[f], distance, np.inf)
 
 
-def _best_share(
-    scene: Scene, truth: Tracks, static: Statics, experiment: MetricsSetup, of: Literal["ego", "any"]
+def _find_best_share(
+    scene: Scene, truth: Tracks, static: Statics, experiment: MetricsSetup, seen_by: Literal["ego", "any"]
 ) -> Float:
     """(P,) the largest visible share any unit (of the ego) has of each row of the truth; 0 where there is none.
 
     Units that only some runs have do not count: an onset is the same in all of them.
     """
     ego_carriers = {"ego", scene.object_ids[scene.ego_ix]} if scene.ego_ix >= 0 else set()
-    chosen = {
+    units = {
         name: unit
         for name, unit in experiment.units.items()
-        if not isinstance(unit.on, Carriers) and (of == "any" or unit.on in ego_carriers)
+        if not isinstance(unit.on, Carriers) and (seen_by == "any" or unit.on in ego_carriers)
     }
-    if not chosen:
+    if not units:
         return np.zeros(len(truth.frame_ix))
-    places = [poses(scene, u, truth, unit_ground(truth, n, u)) for n, u in chosen.items()]
+    places = [compute_unit_poses(scene, u, truth, unit_ground(truth, n, u)) for n, u in units.items()]
     shares = visible_shares(
         truth,
         static,
-        observers(places, np.array([carrier(scene, u) for u in chosen.values()])),
+        make_observers(places, np.array([find_carrier(scene, u) for u in units.values()])),
         experiment.visibility,
     )
     best: Float = np.max(np.where(np.isnan(shares), 0.0, shares), axis=0)
     return best
+
+
+def first_sights(observations: Observations, episodes: Episodes) -> Float:
+    """(U, M) capture of each modelled unit's first list of an episode that has the object in sight; inf: none."""
+    tracks = observations.tracks
+    episode_of = np.full(int(max(episodes.object_ix.max(initial=-1), tracks.object_ix.max(initial=-1))) + 1, -1)
+    episode_of[episodes.object_ix] = np.arange(len(episodes.object_ix))
+    episode, captured_s = episode_of[tracks.row_object_ix], tracks.row_captured_s
+    rows = np.flatnonzero((episode >= 0) & (observations.view.visible_share > 0))
+    during = captured_s[rows] >= episodes.onset_s[episode[rows]] - SAME_INSTANT_S
+    rows = rows[during & (captured_s[rows] <= episodes.ended_s[episode[rows]] + SAME_INSTANT_S)]
+    first_s = np.full((len(tracks.units), len(episodes.object_ix)), np.inf)
+    np.minimum.at(first_s, (tracks.row_unit_ix[rows], episode[rows]), captured_s[rows])
+    return first_s
+
+
+def earliest_sight_s(first_s: Float, experiment: MetricsSetup, names: Sequence[str], equipped: Bool | None) -> Float:
+    """(S | 1, M) the first instant at which any of the units `names` has the object of each episode in sight.
+
+    NaN: never, or not known (for the truth, and with recorded units). `first_s` as from `first_sights`; `equipped (S,
+    U)`: which of the experiment's units each run has, None: all.
+    """
+    unknown = np.full((1, first_s.shape[1]), np.nan)
+    if not names or any(name in experiment.recorded for name in names):
+        return unknown
+    modelled, all_units = list(experiment.modelled), list(experiment.units)
+    unit_s = first_s[None, [modelled.index(name) for name in names]]
+    if equipped is not None:
+        present = equipped[:, [all_units.index(name) for name in names]]
+        unit_s = np.where(present[:, :, None], unit_s, np.inf)
+    seen_s = unit_s.min(axis=1)
+    return np.where(np.isfinite(seen_s), seen_s, np.nan)

@@ -1,4 +1,4 @@
-"""Distances of a list from the truth: GOSPA (α = 2) with its parts, and OSPA, of positions without identities.
+"""GOSPA (α = 2) with its parts, and OSPA: distances of a list from the truth, of positions without identities.
 
 Both are metrics between finite sets of points, with a cut-off c and a power p ≥ 1. A true and an estimated object may
 be paired where they are nearer than c, and the pairs are those of least total cost:
@@ -22,12 +22,12 @@ import numba as nb
 import numpy as np
 
 from copem_replay.core.assignment import assign_pairs
-from copem_replay.core.kernels import making
+from copem_replay.core.compiled import making
 from copem_replay.core.tracks import Float, Int
 
 
 @dataclass(frozen=True)
-class Gospa:
+class GospaDistance:
     """GOSPA and what it is made of: `value_m ** power == localisation + missed + false`."""
 
     value_m: float
@@ -39,7 +39,7 @@ class Gospa:
     partner: Int  # (n,) the estimated object of each truth, −1: missed
 
 
-def gospa(truth: Float, estimates: Float, *, cutoff_m: float, power: float) -> Gospa:
+def gospa(truth: Float, estimates: Float, *, cutoff_m: float, power: float) -> GospaDistance:
     """GOSPA between `truth (n, 2)` and `estimates (m, 2)`, metres.
 
     Raises ValueError for other shapes, for positions that are not finite, for a cut-off not above 0, for a power
@@ -51,14 +51,14 @@ def gospa(truth: Float, estimates: Float, *, cutoff_m: float, power: float) -> G
     >>> found.value_m, found.localisation, found.missed_count
     (8.0, 5.0, 1)
     """
-    x, y = _points("truth", truth), _points("estimates", estimates)
-    unit = _unit(cutoff_m, power)
+    x, y = _check_points("truth", truth), _check_points("estimates", estimates)
+    unit = _cutoff_cost(cutoff_m, power)
     n, m = x.shape[1], y.shape[1]
     partner = np.empty(n, dtype=np.int64)
     localisation, pairs = gospa_pairs(x[0], x[1], y[0], y[1], float(cutoff_m), float(power), partner)
     missed, false = unit / 2 * (n - pairs), unit / 2 * (m - pairs)
     value_m = (localisation + missed + false) ** (1 / power)
-    return Gospa(value_m, localisation, missed, false, n - pairs, m - pairs, partner)
+    return GospaDistance(value_m, localisation, missed, false, n - pairs, m - pairs, partner)
 
 
 def ospa(truth: Float, estimates: Float, *, cutoff_m: float, power: float) -> float:
@@ -76,7 +76,7 @@ def ospa(truth: Float, estimates: Float, *, cutoff_m: float, power: float) -> fl
     m = n - result.missed_count + result.false_count
     if max(n, m) == 0:
         return 0.0
-    alone = _unit(cutoff_m, power) * max(result.missed_count, result.false_count)
+    alone = _cutoff_cost(cutoff_m, power) * max(result.missed_count, result.false_count)
     return float(((result.localisation + alone) / max(n, m)) ** (1 / power))
 
 
@@ -103,14 +103,14 @@ def gospa_pairs(
         for j in range(m):
             squared = (tx[i] - bx[j]) ** 2 + (ty[i] - by[j]) ** 2
             if squared < cutoff_m * cutoff_m:
-                row[k], col[k], cost[k] = i, j, _to_the(power, squared) - unit
+                row[k], col[k], cost[k] = i, j, _raise_to_power(power, squared) - unit
                 k += 1
     assign_pairs(row, col, cost, n, m, partner)
     localisation, pairs = 0.0, 0
     for i in range(n):
         j = partner[i]
         if j >= 0:
-            localisation += _to_the(power, (tx[i] - bx[j]) ** 2 + (ty[i] - by[j]) ** 2)
+            localisation += _raise_to_power(power, (tx[i] - bx[j]) ** 2 + (ty[i] - by[j]) ** 2)
             pairs += 1
     return localisation, pairs
 
@@ -120,18 +120,18 @@ def gospas_m(truth: Float, starts: Int, estimates: Float, begins: Int, cutoff_m:
 
     `starts` and `begins` have one entry more, the end of the last list. Raises ValueError as `gospa` does.
     """
-    unit = _unit(cutoff_m, power)
+    unit = _cutoff_cost(cutoff_m, power)
     if not (np.isfinite(truth).all() and np.isfinite(estimates).all()):
         raise ValueError("expected finite positions")
-    tx, ty, bx, by = (np.ascontiguousarray(of, dtype=np.float64) for of in (*truth, *estimates))
+    tx, ty, bx, by = (np.ascontiguousarray(column, dtype=np.float64) for column in (*truth, *estimates))
     total = np.empty(len(starts) - 1)
-    _totals(tx, ty, starts, bx, by, begins, float(cutoff_m), float(power), unit, total)
+    _sum_gospa(tx, ty, starts, bx, by, begins, float(cutoff_m), float(power), unit, total)
     value_m: Float = total ** (1 / power)
     return value_m
 
 
 @nb.njit(cache=True, nogil=True)
-def _totals(
+def _sum_gospa(
     tx: Float, ty: Float, starts: Int, bx: Float, by: Float, begins: Int,
     cutoff_m: float, power: float, unit: float, total: Float,
 ) -> None:  # fmt: skip
@@ -144,15 +144,15 @@ def _totals(
 
 
 @nb.njit(cache=True, inline="always")
-def _to_the(power: float, squared: float) -> float:
+def _raise_to_power(power: float, squared: float) -> float:
     """A distance to the power p, from its square."""
     if power == 2.0:
         return squared
     return float(np.sqrt(squared)) if power == 1.0 else float(squared ** (power / 2))
 
 
-def _points(name: str, points: Float) -> Float:
-    """Checked, as contiguous columns `(2, n)`."""
+def _check_points(name: str, points: Float) -> Float:
+    """The points as contiguous columns (2, n). Raises ValueError for another shape, or a position not finite."""
     points = np.asarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2:
         raise ValueError(f"{name}: expected points (n, 2), found shape {points.shape}")
@@ -161,8 +161,8 @@ def _points(name: str, points: Float) -> Float:
     return np.ascontiguousarray(points.T)
 
 
-def _unit(cutoff_m: float, power: float) -> float:
-    """The cut-off to the power p, checked: twice what one object without a partner costs in GOSPA."""
+def _cutoff_cost(cutoff_m: float, power: float) -> float:
+    """The cut-off to the power p, twice the cost of one object without a partner in GOSPA. Raises ValueError."""
     if not 0 < cutoff_m < math.inf:
         raise ValueError(f"cutoff_m: expected a distance above 0, found {cutoff_m}")
     if not 1 <= power < math.inf:

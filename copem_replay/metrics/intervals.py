@@ -1,12 +1,15 @@
-"""Intervals over independent rows (`wilson`), and over whole clusters of rows that hang together: logs, objects, runs.
+"""Intervals: of shares over independent rows (Wilson), and over whole clusters of dependent rows: logs, objects or
+runs.
 
-*Resample*: as many clusters as there are, drawn with replacement. Below `DRAWN_FROM` clusters there are so few that
-each is worked out once and counts as often as it would be drawn; else `RESAMPLES` are drawn by the dice, addressed by
-the clusters' names: all configurations and metrics resample the same clusters, at every call.
+*Resample*: as many clusters as there are, drawn with replacement. Below `DRAWN_FROM` clusters all resamples that differ
+are enumerated, each counting as often as it would be drawn; else `RESAMPLES` are drawn, by random numbers that are
+addressed by the clusters' names: all configurations and metrics resample the same clusters, at every call.
 *Percentile limits*: quantiles of a figure over all resamples, widened for few clusters.
 *Exact limits*: of k successes in n trials (Clopper–Pearson). Clusters count as n = (Σw)²/Σw² trials, w being their
 numbers of rows (Kish's effective size), and k = share · n. A cluster is no more extreme than all or nothing, so the
-limits are wide enough for whatever is in between; percentiles see no spread where all clusters are alike.
+limits are wide enough for any share in between; percentiles see no spread where all clusters are alike.
+*Nothing drawn*: where no random number is behind a result it is equal in every run, and an interval over runs tells
+nothing (`find_fixed_outcomes`).
 
 Letters of the shapes: R resamples, K clusters.
 """
@@ -14,35 +17,36 @@ Letters of the shapes: R resamples, K clusters.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import combinations_with_replacement
 from statistics import NormalDist
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
 from copem_replay.core.random import CounterRng, RandomKey, object_words
-from copem_replay.core.tracks import Float, Int
+from copem_replay.core.tracks import TRUTH, Float, Int
 
 Counts = NDArray[np.uint32]
 
 RESAMPLES = 2000
-"""Bootstrap resamples (chosen)."""
+"""Bootstrap resamples: the share beyond a 95 % limit is then off by .0035 (one standard error)."""
 DRAWN_FROM = 8
-"""So many clusters are drawn; of seven there are 1,716 different resamples, of eight 6,435."""
+"""From so many clusters on resamples are drawn: of seven there are 1,716 different ones, of eight 6,435."""
 EXACT_BELOW = 100
 """Over fewer clusters, by effective size, a share's limits are never narrower than the exact ones (decision 19)."""
 FEWEST_EACH = 10
-"""Nor where fewer clusters than this, by effective size, succeed or fail (chosen; `tools/coverage.py`)."""
+"""Nor where fewer clusters than this, by effective size, succeed or fail: coverage by `tools/coverage.py`."""
 FEWEST_CLUSTERS = 5
-"""Fewer logs or objects than this are not resampled (the contract's)."""
+"""Fewer logs or objects are not resampled: coverage is measured from five clusters on (`tools/coverage.py`)."""
 _CELLS = 4_000_000
-"""Numbers held at a time (chosen: 32 MB)."""
+"""Numbers held at a time, 32 MB: the size of blocks, which changes no result."""
 _ROUNDING = 1e-9
-"""Numbers of clusters this close are the same."""
+"""Effective numbers of clusters that differ by rounding only are equal."""
 
 
 @dataclass(frozen=True)
@@ -53,34 +57,34 @@ class Resamples:
     times: Int
 
 
-def clusters(table: pd.DataFrame) -> tuple[str | None, pd.Series]:
-    """What is resampled whole (`runs`, `logs`, `objects`; None: too few of either), and each row's cluster (n,).
+def choose_clusters(table: pd.DataFrame) -> tuple[str | None, pd.Series]:
+    """The kind of cluster that is resampled (`runs`, `logs`, `objects`; None: too few), and each row's cluster (n,).
 
-    Rows of a tally are of several runs: where runs are resampled they are of one cluster.
+    Rows of a tally stand for several runs: where runs are resampled they form one cluster.
     """
     log = table["log"].astype(str)
-    thing = log + "\n" + table["object_id"].astype(str)
-    if thing.nunique() == 1:
-        return "runs", table["run"].astype(str) if "run" in table else thing
+    episode = log + "\n" + table["object_id"].astype(str)
+    if episode.nunique() == 1:
+        return "runs", table["run"].astype(str) if "run" in table else episode
     if log.nunique() >= FEWEST_CLUSTERS:
         return "logs", log
-    return ("objects" if thing.nunique() >= FEWEST_CLUSTERS else None), thing
+    return ("objects" if episode.nunique() >= FEWEST_CLUSTERS else None), episode
 
 
-def resamples(names: Sequence[str], seed: int, number: int = RESAMPLES) -> Resamples:
-    """All resamples of clusters of these names where they are few, else so many of them."""
+def draw_resamples(names: Sequence[str], seed: int, number: int = RESAMPLES) -> Resamples:
+    """All resamples of the named clusters below `DRAWN_FROM` clusters, else `number` drawn ones."""
     if len(names) < DRAWN_FROM:
-        return every_resample(len(names))
+        return list_resamples(len(names))
     zeros = np.zeros(len(names), dtype=np.int64)
     random_key, rng = RandomKey(("",), zeros, object_words(names), zeros), CounterRng(seed, "summary")
     size = max(1, _CELLS // len(names))
     blocks = [np.arange(r, min(r + size, number)) for r in range(0, number, size)]
-    count = np.concatenate([multiplicities(rng.uniform("bootstrap", random_key, block)) for block in blocks])
+    count = np.concatenate([count_multiplicities(rng.uniform("bootstrap", random_key, block)) for block in blocks])
     return Resamples(count, np.ones(number, dtype=np.int64))
 
 
 @cache
-def every_resample(clusters: int) -> Resamples:
+def list_resamples(clusters: int) -> Resamples:
     """All resamples of K clusters that differ, the order of drawing aside; `times` add up to K^K."""
     numbers = np.arange(clusters)
     drawn = np.array(list(combinations_with_replacement(range(clusters), clusters)))
@@ -91,7 +95,7 @@ def every_resample(clusters: int) -> Resamples:
     return Resamples(count, times)
 
 
-def multiplicities(uniform: Float) -> Counts:
+def count_multiplicities(uniform: Float) -> Counts:
     """(R, K) how often each cluster is drawn: of `uniform (R, K)`, between 0 and 1, u draws cluster ⌊u·K⌋."""
     R, K = uniform.shape
     drawn = (uniform * K).astype(np.int64) + K * np.arange(R)[:, None]
@@ -101,27 +105,27 @@ def multiplicities(uniform: Float) -> Counts:
 def percentile_limits(values: Float, resampled: Resamples, *, confidence: float = 0.95) -> tuple[float, float]:
     """Quantiles of a figure (R,) of each resample, linear between neighbours: (low, high).
 
-    At the levels of a confidence, widened for few clusters (`expanded_tail`). A resample that stands for several counts
-    as often: the limits are those of all of them written out.
+    At the levels of a confidence, widened for few clusters (`expand_tail`). A resample that stands for several counts
+    as often.
 
-    NaN among them had nothing to give and are left out; both limits are NaN where nothing is left. An infinite limit,
-    or NaN between −∞ and ∞, says that there is none.
+    Resamples without a figure, NaN, are left out; both limits are NaN where none is left. A limit that is infinite, or
+    NaN between −∞ and ∞, does not exist.
 
     Source: B. Efron, "Nonparametric standard errors and confidence intervals", Canad. J. Statist. 9 (1981) 139–158
     (percentile method).
     """
-    tail = expanded_tail(confidence, resampled.count.shape[1])
-    known = ~np.isnan(values)
-    if not known.any():
+    tail = expand_tail(confidence, resampled.count.shape[1])
+    defined = ~np.isnan(values)
+    if not defined.any():
         return math.nan, math.nan
-    order = np.argsort(values[known], kind="stable")
-    ranked, until = values[known][order], np.cumsum(resampled.times[known][order])
-    low, high = (_quantile(ranked, until, level) for level in (tail, 1.0 - tail))
+    order = np.argsort(values[defined], kind="stable")
+    ranked, until = values[defined][order], np.cumsum(resampled.times[defined][order])
+    low, high = (_weighted_quantile(ranked, until, level) for level in (tail, 1.0 - tail))
     return low, high
 
 
-def _quantile(ranked: Float, until: Int, level: float) -> float:
-    """Of values (R,), ascending, that stand for so many up to each, `until (R,)`."""
+def _weighted_quantile(ranked: Float, until: Int, level: float) -> float:
+    """The quantile at `level` of values (R,), ascending; `until (R,)`: how many resamples they stand for up to each."""
     place = level * (int(until[-1]) - 1)
     first = math.floor(place)
     below, above = (
@@ -131,8 +135,8 @@ def _quantile(ranked: Float, until: Int, level: float) -> float:
     return below if below == above or place == first else below + (above - below) * (place - first)
 
 
-def expanded_tail(confidence: float, clusters: int) -> float:
-    """The probability beyond each limit of a percentile interval over so many clusters; below (1 − confidence)/2.
+def expand_tail(confidence: float, clusters: int) -> float:
+    """The probability beyond each limit of a percentile interval over `clusters` clusters, at most (1 − confidence)/2.
 
     A resample of K clusters varies less than K fresh ones would, by √((K − 1)/K), and its quantiles are normal ones
     where Student's are due: with 5 clusters plain percentiles hold the truth 86 times of 100, not 95. The level is
@@ -153,8 +157,8 @@ def expanded_tail(confidence: float, clusters: int) -> float:
 def exact_limits(successes: float, n: float, *, confidence: float = 0.95) -> tuple[float, float]:
     """Bound the probability of success given `successes` of `n` independent trials exactly: (low, high), shares.
 
-    All p with which so few successes, and so many, have at least half of what the confidence leaves out. Neither number
-    need be whole: the limits are quantiles of beta distributions, which have a value in between, too.
+    The limits enclose all p with which so few successes, and so many, have a probability of at least
+    (1 − confidence)/2. Neither number need be whole: the limits are quantiles of beta distributions.
 
     Source: C. J. Clopper, E. S. Pearson, "The use of confidence or fiducial limits illustrated in the case of the
     binomial", Biometrika 26 (1934) 404–413.
@@ -168,7 +172,7 @@ def exact_limits(successes: float, n: float, *, confidence: float = 0.95) -> tup
 
 
 def effective_number(weights: Float | Int) -> float:
-    """As how many equal clusters these count, of weights (K,) ≥ 0, one of them above: (Σw)²/Σw², from 1 to K.
+    """The number of equal clusters that weights (K,) ≥ 0, one of them above 0, amount to: (Σw)²/Σw², from 1 to K.
 
     Source: L. Kish, "Survey Sampling", Wiley 1965, section 11.2.
     """
@@ -194,17 +198,17 @@ def bootstrap_share(
 
 
 def share_limits(successes: Float | Int, totals: Float | Int, resampled: Resamples) -> tuple[str, float, float]:
-    """Bound Σ successes / Σ totals: of which kind, low, high.
+    """Bound Σ successes / Σ totals: (kind, low, high).
 
-    `bootstrap`: `bootstrap_share`, over many clusters of which enough succeed and fail; else `bootstrap+exact`: on each
-    side the wider of it and the exact limits.
+    Kind `bootstrap`: the limits of `bootstrap_share`, over many clusters of which enough succeed and fail; else
+    `bootstrap+exact`: on each side the wider of these and the exact limits.
     """
     limits = bootstrap_share(successes, totals, resampled)
-    return widened(limits, float(successes.sum()) / float(totals.sum()), effective_number(totals))
+    return widen_limits(limits, float(successes.sum()) / float(totals.sum()), effective_number(totals))
 
 
-def widened(limits: tuple[float, float], share: float, n: float) -> tuple[str, float, float]:
-    """Limits of a share over `n` clusters, nowhere narrower than the exact ones unless many succeed and many fail."""
+def widen_limits(limits: tuple[float, float], share: float, n: float) -> tuple[str, float, float]:
+    """(kind, low, high) of a share over `n` clusters, as wide as the exact limits unless many succeed and many fail."""
     k = min(n * share, n)
     if min(n - EXACT_BELOW, k - FEWEST_EACH, n - k - FEWEST_EACH) >= -_ROUNDING:
         return "bootstrap", *limits
@@ -215,8 +219,9 @@ def widened(limits: tuple[float, float], share: float, n: float) -> tuple[str, f
 def alike_limits(difference: float, n: float) -> tuple[float, float]:
     """Bound a difference of two shares, −1 … 1, that is the same in all of `n` clusters: (low, high).
 
-    Exact on each side: as if |difference| · n of n favoured the one, the rest neither; of these any number may favour
-    the other that none of n leaves possible. So of five at 0 [−.522, .522], of five at 1 [.478, 1].
+    Exact on each side: as if |difference| · n of n clusters favoured the one and the rest neither; of the rest, any
+    share that is possible where none of n does may favour the other. Five clusters at 0: [−.522, .522], at 1: [.478,
+    1].
     """
     size = min(abs(difference), 1.0)
     low, high = exact_limits(size * n, n)
@@ -224,7 +229,7 @@ def alike_limits(difference: float, n: float) -> tuple[float, float]:
     return (low, high) if difference >= 0 else (-high, -low)
 
 
-def wilson(successes: int, n: int, *, confidence: float = 0.95) -> tuple[float, float]:
+def wilson_limits(successes: int, n: int, *, confidence: float = 0.95) -> tuple[float, float]:
     """Bound the probability of success given `successes` of `n` independent trials: (low, high), shares.
 
     All p for which |successes/n − p| ≤ z·√(p(1 − p)/n), z the two-sided normal quantile. Low is exactly 0
@@ -241,3 +246,68 @@ def wilson(successes: int, n: int, *, confidence: float = 0.95) -> tuple[float, 
     low = 0.0 if successes == 0 else centre - half
     high = 1.0 if successes == n else centre + half
     return low, high
+
+
+# Outcomes that are equal in every run.
+
+NOTHING_DRAWN = "nothing drawn"
+"""The kind of an interval that does not exist as all runs are equal."""
+
+
+@dataclass(frozen=True)
+class FixedOutcomes:
+    """`lists`: configurations whose lists are equal in every run; `reaction`: whether the driver's delay is."""
+
+    lists: frozenset[str] = frozenset()
+    reaction: bool = False
+
+    def known(self, configuration: str) -> bool:
+        """Whether the configuration's detections are equal in every run."""
+        return configuration in self.lists
+
+    def passes(self, configuration: str) -> bool:
+        """Whether the configuration's verdicts on braking are equal in every run."""
+        return self.reaction and configuration in self.lists
+
+
+def find_fixed_outcomes(experiment: Mapping[str, Any]) -> FixedOutcomes:
+    """The outcomes that are equal in every run of an experiment, given as plain data with every default filled in.
+
+    By kind of unit: lists of the truth and of recorded units are not drawn; those of a unit with a PEM are, and so are
+    its carriers, even where probabilities are 0 or 1. A driver's delay is drawn, except with the `constant` reaction.
+    Missing keys count as drawn.
+    """
+    units = _as_mapping(experiment.get("units"))
+    links = _as_mapping(experiment.get("links"))
+    recorded = {name for name, unit in units.items() if _as_mapping(unit).get("recorded")}
+    lists = set()
+    for name, configuration in _as_mapping(experiment.get("configurations")).items():
+        settings = _as_mapping(configuration)
+        undrawn = _is_undrawn(settings.get("units"), recorded) and not _is_link_random(settings.get("link"), links)
+        if settings.get("recorded") or undrawn:
+            lists.add(str(name))
+    driver = _as_mapping(_as_mapping(experiment.get("braking")).get("driver"))
+    reaction = driver.get("reaction")  # left out: no delay
+    return FixedOutcomes(
+        frozenset(lists), bool(driver) and (not reaction or _as_mapping(reaction).get("kind") == "constant")
+    )
+
+
+def _is_undrawn(units: Any, recorded: set[str]) -> bool:
+    return units == TRUTH or (isinstance(units, list) and set(units) <= recorded)
+
+
+def _is_link_random(link: Any, links: Mapping[str, Any]) -> bool:
+    """Whether a configuration's link, or any of those by unit, delays or loses lists by chance."""
+    by_unit = link.values() if isinstance(link, dict) and "kind" not in link else [link]
+    for unit_link in by_unit:
+        radio = _as_mapping(links.get(unit_link) if isinstance(unit_link, str) else unit_link)
+        latency, reception = _as_mapping(radio.get("latency")), _as_mapping(radio.get("reception"))
+        certain = latency.get("kind") == "constant" and reception == {"kind": "constant", "probability": 1.0}
+        if radio.get("kind") == "radio" and not (certain and not radio.get("channel")):
+            return True
+    return False
+
+
+def _as_mapping(value: Any) -> Mapping[str, Any]:
+    return value if isinstance(value, dict) else {}

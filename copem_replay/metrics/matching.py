@@ -1,11 +1,11 @@
-"""Matches of fused entries with true objects: list by list, for every fusion without truth ids.
+"""Matches of fused entries with true objects, list by list, for every fusion without truth ids.
 
 An entry *tells of* one instant: of its newest capture, or, where the fusion brings its entries to the present, of the
 instant the list is available (`ListFusion.tells_of`). An object is *within the gate* of an entry when it is there at
-that instant, the horizontal distance of their centres is at most the gate, and their classes agree (`core/agree.py`; of
-the entry the most probable one). In a gap of the truth the object is absent; but where a clock states another instant
-than that of the capture, an object that was there at the capture is there. All true objects of the instant count,
-measured or not, moving or not, the ego too: an entry at one of them is no ghost.
+that instant, the horizontal distance of their centres is at most the gate, and their classes agree
+(`AGREE` in `core/object_list.py`; of the entry the most probable one). In a gap of the truth the object is absent; but
+where a clock states another instant than that of the capture, an object that was there at the capture is there. All
+true objects of the instant count, measured or not, moving or not, the ego too: an entry at one of them is no ghost.
 
 1. Every entry belongs to the nearest object within its gate. Of several at one object the *preferred* one is its
    match: the highest existence, then the first unit's (last where it is not said), then the smaller x, the smaller y;
@@ -15,10 +15,10 @@ measured or not, moving or not, the ego too: an entry at one of them is no ghost
 3. What is then left is a duplicate of its nearest object, or a ghost where there is none within the gate.
 
 Entries of one list may tell of different instants; an object has one match in a list, whichever they are. The order of
-the entries in a list does not matter. Source: the contract, "What the words mean".
+the entries in a list does not matter. Definitions: docs/guide/metrics.md.
 
-What a list is worth *now* is another question: there all entries are taken as if they told of the instant the list is
-available. Holding on to what has long been gone does not pay.
+What a list is worth *now* is a second question, for which all entries are taken as if they told of the instant the list
+is available: an entry about an object that has left since is then a false positive.
 """
 
 from __future__ import annotations
@@ -30,22 +30,20 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from copem_replay.core.agree import AGREE
-from copem_replay.core.agree import most_probable as most_probable_class
-from copem_replay.core.kernels import borrowing
-from copem_replay.core.object_list import Entries, ObjectLists, TellsOf
-from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int, Scene, Tracks
+from copem_replay.core.compiled import borrowing
+from copem_replay.core.object_list import AGREE, Entries, ObjectLists, TellsOf, most_probable_class
+from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int, Scene, Tracks
 
 MATCH, DUPLICATE, GHOST = 0, 1, 2
 """Roles of entries."""
 
 _TOLERANCE_M = 1e-9
-_TOLERANCE_S = SAME_INSTANT_NS * 1e-9
+"""An object at exactly the gate is within it, whatever the rounding of the distance."""
 
 
 @dataclass(frozen=True)
 class Matches:
-    """What each entry of Lists is. All (N,)."""
+    """What each entry of `ObjectLists` is about. All (N,)."""
 
     object_ix: Int  # the object it is about, −1: none
     role: NDArray[np.int8]  # MATCH, DUPLICATE or GHOST
@@ -54,34 +52,36 @@ class Matches:
     class_ix: NDArray[np.int8]  # its own most probable class
 
 
-def match(lists: ObjectLists, world: Tracks, scene: Scene, *, gate_m: float, tells_of: TellsOf = "now") -> Matches:
+def match_entries(
+    lists: ObjectLists, world: Tracks, scene: Scene, *, gate_m: float, tells_of: TellsOf = "now"
+) -> Matches:
     """What the entries of K lists in S runs are about, at the instants they tell of.
 
     `world`: the truth. Where entries tell of `now` its frame k is at the instant list k is available, where they tell
     of their `capture` frames are ascending, at all captures that these entries name, at least.
     """
-    out = _nothing(lists)
-    rows = _rows(world, scene, by_frame=tells_of == "now")
-    _match(lists.start, lists.entries, rows, rows, AGREE, gate_m + _TOLERANCE_M, out, out)
+    out = _allocate_matches(lists)
+    rows = _sort_truth_rows(world, scene, by_frame=tells_of == "now")
+    _match_lists(lists.start, lists.entries, rows, rows, AGREE, gate_m + _TOLERANCE_M, out, out)
     return Matches(*out)
 
 
-def match_both(
+def match_at_both_times(
     lists: ObjectLists, then: Tracks, now: Tracks, scene: Scene, *, gate_m: float
 ) -> tuple[Matches, Matches]:
     """What entries that tell of their `capture` are about; and what they would be about if they told of `now`.
 
-    `then`, `now`: the truth, as `match` has it for these.
+    `then`, `now`: the truth, as `match_entries` takes it for `capture` and for `now`.
     """
-    about = _nothing(lists)
-    at_once = _nothing(lists)._replace(class_ix=about.class_ix)
-    rows = _rows(then, scene, by_frame=False), _rows(now, scene, by_frame=True)
-    _match(lists.start, lists.entries, *rows, AGREE, gate_m + _TOLERANCE_M, about, at_once)
+    about = _allocate_matches(lists)
+    at_once = _allocate_matches(lists)._replace(class_ix=about.class_ix)
+    rows = _sort_truth_rows(then, scene, by_frame=False), _sort_truth_rows(now, scene, by_frame=True)
+    _match_lists(lists.start, lists.entries, *rows, AGREE, gate_m + _TOLERANCE_M, about, at_once)
     return Matches(*about), Matches(*at_once)
 
 
-class _Out(NamedTuple):
-    # As `Matches`.
+class _MatchColumns(NamedTuple):
+    # The columns of `Matches`, to be filled.
     object_ix: Int
     role: NDArray[np.int8]
     x_m: Float
@@ -89,13 +89,13 @@ class _Out(NamedTuple):
     class_ix: NDArray[np.int8]
 
 
-def _nothing(lists: ObjectLists) -> _Out:
+def _allocate_matches(lists: ObjectLists) -> _MatchColumns:
     N = len(lists.entries)
-    none = np.full(N, GHOST, dtype=np.int8)
-    return _Out(np.full(N, -1), none, np.empty(N), np.empty(N), np.empty(N, dtype=np.int8))
+    role = np.full(N, GHOST, dtype=np.int8)
+    return _MatchColumns(np.full(N, -1), role, np.empty(N), np.empty(N), np.empty(N, dtype=np.int8))
 
 
-class _Rows(NamedTuple):
+class _TruthRows(NamedTuple):
     # The truth: frame f, at `frame_s[f]`, is rows `bounds[f] : bounds[f + 1]`, in each from west to east.
     by_frame: bool  # frame k goes with list k, whatever its entries tell of
     frame_s: Float
@@ -107,40 +107,47 @@ class _Rows(NamedTuple):
     match_of: Int  # by object its match in the list at hand, −1: none
 
 
-def _rows(world: Tracks, scene: Scene, *, by_frame: bool) -> _Rows:
+def _sort_truth_rows(world: Tracks, scene: Scene, *, by_frame: bool) -> _TruthRows:
     _, bounds = world.by_frame
     order = world.west_to_east
     object_ix = world.row_object_ix[order]
-    return _Rows(
+    return _TruthRows(
         by_frame, world.captured_s, bounds, object_ix, scene.object_class[object_ix], world.x_m[0, order],
         world.y_m[0, order], np.full(int(object_ix.max(initial=-1)) + 1, -1),
     )  # fmt: skip
 
 
 @borrowing
-def most_probable(entries: Entries, i: int) -> int:
+def most_probable_entry_class(entries: Entries, i: int) -> int:
     """The most probable class of entry i; of equally probable ones the first, `other` where nothing is said."""
     return most_probable_class(entries[i].class_probability)
 
 
 @nb.njit(cache=True, nogil=True)
-def _match(
-    start: Int, entries: Entries, rows: _Rows, now: _Rows, agree: Bool, gate_m: float, about: _Out, at_once: _Out
+def _match_lists(
+    start: Int,
+    entries: Entries,
+    rows: _TruthRows,
+    now: _TruthRows,
+    agree: Bool,
+    gate_m: float,
+    about: _MatchColumns,
+    at_once: _MatchColumns,
 ) -> None:
-    # `now`, `at_once`: the second question; the same as the first one where there is none.
+    # `now`, `at_once`: truth and matches of the second question; those of the first one where there is no second.
     longest = 0
     for s in range(len(start)):
         for k in range(start.shape[1] - 1):
             longest = max(longest, start[s, k + 1] - start[s, k])
-    # Of the list at hand: with which frame each entry is compared, and those that are to be asked again.
+    # Of the list at hand: the frame each entry is compared with, and the entries that go through step 2.
     frame, others = np.empty(longest, np.int64), np.empty(longest, np.int64)
-    _each_list(start, entries, rows, now, agree, gate_m, about, at_once, (frame, others))
+    _match_each_list(start, entries, rows, now, agree, gate_m, about, at_once, (frame, others))
 
 
 @borrowing
-def _each_list(
-    start: Int, entries: Entries, rows: _Rows, now: _Rows, agree: Bool, gate_m: float, about: _Out, at_once: _Out,
-    scratch: tuple[Int, Int],
+def _match_each_list(
+    start: Int, entries: Entries, rows: _TruthRows, now: _TruthRows, agree: Bool, gate_m: float,
+    about: _MatchColumns, at_once: _MatchColumns, scratch: tuple[Int, Int],
 ) -> None:  # fmt: skip
     frame, others = scratch
     both = rows.by_frame != now.by_frame
@@ -152,16 +159,16 @@ def _each_list(
             frame[:n] = k
             if not rows.by_frame:
                 _find_frames(entries, first, rows.frame_s, frame[:n])
-            _one_list(entries, first, frame[:n], others, rows, agree, gate_m, about)
+            _match_list(entries, first, frame[:n], others, rows, agree, gate_m, about)
             if not both:
                 continue
-            # At one instant the truth of both may differ: a clock that is fast tells of an object that has left.
-            there, late = now.bounds[k + 1] - now.bounds[k], False
+            # At one instant the truths may differ: a clock that is fast tells of an object that has left.
+            objects, late = now.bounds[k + 1] - now.bounds[k], False
             for f in frame[:n]:
-                late |= f < 0 or rows.frame_s[f] != now.frame_s[k] or rows.bounds[f + 1] - rows.bounds[f] != there
+                late |= f < 0 or rows.frame_s[f] != now.frame_s[k] or rows.bounds[f + 1] - rows.bounds[f] != objects
             if late:
                 frame[:n] = k
-                _one_list(entries, first, frame[:n], others, now, agree, gate_m, at_once)
+                _match_list(entries, first, frame[:n], others, now, agree, gate_m, at_once)
             else:
                 for i in range(first, first + n):
                     at_once.object_ix[i], at_once.role[i] = about.object_ix[i], about.role[i]
@@ -170,35 +177,42 @@ def _each_list(
 
 @borrowing
 def _find_frames(entries: Entries, first: int, frame_s: Float, out: Int) -> None:
-    # The frame at the capture of each entry of a list, −1: there is none.
+    # Out: the frame at the capture of each entry of a list; −1: none.
     f, last = 0, len(frame_s) - 1
     for j in range(len(out)):
-        at_s = entries[first + j].captured_s
-        if last >= 0 and frame_s[f] != at_s:  # entries of one list were mostly captured together
-            f = min(np.searchsorted(frame_s, at_s), last)
-            if f > 0 and at_s - frame_s[f - 1] < frame_s[f] - at_s:
+        captured_s = entries[first + j].captured_s
+        if last >= 0 and frame_s[f] != captured_s:  # entries of one list were mostly captured together
+            f = min(np.searchsorted(frame_s, captured_s), last)
+            if f > 0 and captured_s - frame_s[f - 1] < frame_s[f] - captured_s:
                 f -= 1
-        out[j] = f if last >= 0 and abs(frame_s[f] - at_s) <= _TOLERANCE_S else -1
+        out[j] = f if last >= 0 and abs(frame_s[f] - captured_s) <= SAME_INSTANT_S else -1
 
 
 @borrowing
-def _one_list(
-    entries: Entries, first: int, frame: Int, others: Int, rows: _Rows, agree: Bool, gate_m: float, out: _Out
+def _match_list(
+    entries: Entries,
+    first: int,
+    frame: Int,
+    others: Int,
+    rows: _TruthRows,
+    agree: Bool,
+    gate_m: float,
+    out: _MatchColumns,
 ) -> None:
     bounds, row_object_ix, row_class_ix = rows.bounds, rows.object_ix, rows.class_ix
     row_x_m, row_y_m = rows.x_m, rows.y_m
     object_ix, role, class_ix, match_of = out.object_ix, out.role, out.class_ix, rows.match_of
     n = 0
     for again in range(2):
-        # At first all, then those at an object whose match is another: most of them have no other one near, and only
-        # those that have are put in order.
+        # At first all entries, then those at an object whose match is another entry: most of these have no other
+        # object near, and only those that have one are sorted.
         for j in range(len(frame)):
             i = first + j
             if again and (role[i] != DUPLICATE or match_of[object_ix[i]] == i):
                 continue
             p = -1
             if frame[j] >= 0:
-                p = _nearest(
+                p = _find_nearest(
                     entries[i].x_m, entries[i].y_m, class_ix[i], bounds[frame[j]], bounds[frame[j] + 1], gate_m, agree,
                     row_object_ix, row_class_ix, row_x_m, row_y_m, match_of, again == 1,
                 )  # fmt: skip
@@ -210,15 +224,15 @@ def _one_list(
                 continue
             o = row_object_ix[p]
             object_ix[i], role[i], out.x_m[i], out.y_m[i] = o, DUPLICATE, row_x_m[p], row_y_m[p]
-            if match_of[o] < 0 or _preferred(entries, i, match_of[o]):
+            if match_of[o] < 0 or _is_preferred(entries, i, match_of[o]):
                 match_of[o] = i
     for i in range(first, first + len(frame)):
         if role[i] == DUPLICATE and match_of[object_ix[i]] == i:
             role[i] = MATCH
-    _in_order_of_preference(entries, others, n)
+    _sort_by_preference(entries, others, n)
     for i in others[:n]:
         f = frame[i - first]
-        p = _nearest(
+        p = _find_nearest(
             entries[i].x_m, entries[i].y_m, class_ix[i], bounds[f], bounds[f + 1], gate_m, agree,
             row_object_ix, row_class_ix, row_x_m, row_y_m, match_of, True,
         )  # fmt: skip
@@ -232,12 +246,12 @@ def _one_list(
 
 
 @borrowing
-def _nearest(
-    x: float, y: float, of: int, first: int, high: int, gate_m: float, agree: Bool, object_ix: Int,
+def _find_nearest(
+    x: float, y: float, entry_class_ix: int, first: int, high: int, gate_m: float, agree: Bool, object_ix: Int,
     class_ix: NDArray[np.int8], x_m: Float, y_m: Float, match_of: Int, only_free: bool,
 ) -> int:  # fmt: skip
     # The row, of first … high − 1, nearest to a place and within the gate (at a tie the western), of a class that
-    # agrees with `of`; −1: none.
+    # agrees with the entry's; −1: none.
     least, best, west_m = gate_m * gate_m, -1, x - gate_m
     left = high - first
     while left > 0:  # the first row that is not too far west; without branches, which cannot be predicted
@@ -248,7 +262,7 @@ def _nearest(
     for p in range(first, high):
         if x_m[p] > x + gate_m:
             break
-        if not agree[of, class_ix[p]] or (only_free and match_of[object_ix[p]] >= 0):
+        if not agree[entry_class_ix, class_ix[p]] or (only_free and match_of[object_ix[p]] >= 0):
             continue
         square = (x_m[p] - x) ** 2 + (y_m[p] - y) ** 2
         if square < least or (square == least and best < 0):
@@ -257,7 +271,7 @@ def _nearest(
 
 
 @borrowing
-def _preferred(entries: Entries, i: int, j: int) -> bool:
+def _is_preferred(entries: Entries, i: int, j: int) -> bool:
     a, b = entries[i], entries[j]
     if a.existence != b.existence:
         return bool(a.existence > b.existence)
@@ -267,25 +281,25 @@ def _preferred(entries: Entries, i: int, j: int) -> bool:
         return bool(a.x_m < b.x_m)
     if a.y_m != b.y_m:
         return bool(a.y_m < b.y_m)
-    # At the very same place anything else, so that the order in the list never decides.
+    # At the very same place the rest decides, so that the order in the list never does.
     if a.captured_s != b.captured_s:
         return bool(a.captured_s > b.captured_s)
     if a.track_id != b.track_id:
         return bool(a.track_id < b.track_id)
-    return most_probable(entries, i) < most_probable(entries, j)
+    return most_probable_entry_class(entries, i) < most_probable_entry_class(entries, j)
 
 
 @borrowing
-def _in_order_of_preference(entries: Entries, those: Int, n: int) -> None:
+def _sort_by_preference(entries: Entries, rows: Int, n: int) -> None:
     # Shell's sort with the gaps of Knuth, (3ʰ − 1) / 2.
     gap = 1
     while gap < n:
         gap = 3 * gap + 1
     while gap > 0:
-        for at in range(gap, n):
-            i, to = those[at], at
-            while to >= gap and _preferred(entries, i, those[to - gap]):
-                those[to] = those[to - gap]
-                to -= gap
-            those[to] = i
+        for place in range(gap, n):
+            i, hole = rows[place], place
+            while hole >= gap and _is_preferred(entries, i, rows[hole - gap]):
+                rows[hole] = rows[hole - gap]
+                hole -= gap
+            rows[hole] = i
         gap //= 3

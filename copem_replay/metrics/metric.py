@@ -1,29 +1,31 @@
-"""A metric: one column of `summary.csv`, with all that is said of it in one place.
+"""A metric: one column of `summary.csv` with its statistics, its value and its words in one place.
 
-Its statistics are sums over runs, objects, lists and logs (quantiles: tables of times), and its value is made of them
-last. An own metric derives from `RowMetric`; the experiment names it in `measure: {metrics: [{kind: …}]}`.
+Statistics are sums over runs, objects, lists and logs (for quantiles: tables of times); the value is computed from them
+last. An own metric derives from `RowMetric`; the experiment names it in `measure: {metrics: [{kind: …}]}`. The metrics
+of lists on links (`LINK`) and of recorded outputs (`OUTPUT`) stand here beside their sums; the others are in
+`metrics/summary_metrics.py` and `metrics/accuracy/metrics.py`.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
-from copem_replay.core.components import Component, GivenError, asked
-from copem_replay.core.tracks import Float
+from copem_replay.communication.arrivals import find_out_of_sequence, find_overtaken_lists
+from copem_replay.core.components import Component, GivenError, ask_component
+from copem_replay.core.tracks import Float, Tracks
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from copem_replay.metrics.accuracy.statistics import Total
-    from copem_replay.metrics.link_times import LinkTimes
-    from copem_replay.metrics.output_times import OutputTimes
+    from copem_replay.metrics.accuracy.statistics import AccuracyTotal
+
 
 Value = float | int | str | None
 OwnSums = dict[str, float]
@@ -31,13 +33,13 @@ OwnSums = dict[str, float]
 
 
 @dataclass(frozen=True)
-class Given:
-    """What the statistics of one configuration are made from, over all logs, runs and measured objects.
+class MetricInputs:
+    """What the statistics of one configuration are computed from, over all logs, runs and measured objects.
 
-    `rows`: its rows of `tally.parquet` of being detected, log by log; `conflicts`: of a collision being implied, None
-    where that is not asked for. `lists_fixed`, `reaction_fixed`: known alike, braking alike in every run. `accuracy`,
-    `exact`: None where the experiment asks for neither. `output`: of a stack's recorded output. `link`: of the lists
-    that come by one. `own`: sums of own metrics, by name.
+    `rows`: its rows of `tally.parquet` for detections, log by log; `conflicts`: those for implied collisions, None
+    where the experiment does not ask for them. `lists_fixed`, `reaction_fixed`: detections, and braking, are equal in
+    every run. `accuracy`, `exact`: None where the experiment does not ask for it. `output`: times of a recorded output,
+    `link`: of the lists on links; None: the configuration has none. `own`: sums of own metrics, by name.
     """
 
     rows: pd.DataFrame
@@ -46,7 +48,7 @@ class Given:
     horizon_s: float | None
     lists_fixed: bool = False
     reaction_fixed: bool = False
-    accuracy: Total | None = None
+    accuracy: AccuracyTotal | None = None
     exact: pd.DataFrame | None = None  # its rows of exact.parquet
     output: OutputTimes | None = None
     conflicts: pd.DataFrame | None = None
@@ -58,14 +60,14 @@ class Given:
 class Metric:
     """One column of `summary.csv`.
 
-    `statistics`: sums; None: the experiment does not ask for this metric, which then has no column. Metrics that share
-    them share the function, which is called once. `value`: made of the sums; None: there is nothing to make it of.
-    `better`: 1 more, −1 less, 0 neither. `part`: the table that shows it on the terminal and in the report; empty:
-    none. `compared`: what its difference to a baseline is; empty: it is not compared.
+    `statistics`: gives the sums; None: the experiment does not ask for this metric, which then has no column. Metrics
+    with equal statistics share the function, which is called once. `value`: computes the value from the sums; None: no
+    sample. `better`: 1 more, −1 less, 0 neither. `part`: the table that shows the metric on the terminal and in the
+    report; empty: none. `compared`: what its difference to a baseline is; empty: it is not compared.
     """
 
     name: str
-    statistics: Callable[[Given], Any]
+    statistics: Callable[[MetricInputs], Any]
     value: Callable[[Any], Value]
     better: Literal[-1, 0, 1]
     help: str
@@ -73,20 +75,20 @@ class Metric:
     compared: str = ""
 
 
-def values(metrics: Iterable[Metric], given: Given) -> dict[str, Value]:
-    """The columns of one configuration."""
-    made: dict[Hashable, Any] = {}
+def evaluate_metrics(metrics: Iterable[Metric], inputs: MetricInputs) -> dict[str, Value]:
+    """The columns of one configuration, by name; None: no sample."""
+    sums: dict[Hashable, Any] = {}
     row: dict[str, Value] = {}
     for metric in metrics:
-        if metric.statistics not in made:
-            made[metric.statistics] = metric.statistics(given)
-        if made[metric.statistics] is not None:
-            row[metric.name] = metric.value(made[metric.statistics])
+        if metric.statistics not in sums:
+            sums[metric.statistics] = metric.statistics(inputs)
+        if sums[metric.statistics] is not None:
+            row[metric.name] = metric.value(sums[metric.statistics])
     return row
 
 
 OWN = "own"
-"""The part of metrics that an experiment names."""
+"""The `part` of own metrics."""
 
 
 class RowMetric(Component, ABC):
@@ -116,27 +118,27 @@ class RowMetric(Component, ABC):
 
     @abstractmethod
     def value(self, sums: Mapping[str, float]) -> float | None:
-        """The value made of the sums; None or NaN: there is nothing to make it of. Without rows it is not asked."""
+        """The value of the sums; None or NaN: no sample. Without rows it is not called."""
 
 
 def own_metrics(components: Sequence[RowMetric]) -> tuple[Metric, ...]:
     """The columns of own metrics."""
-    return tuple(_column(k, component) for k, component in enumerate(components))
+    return tuple(_own_metric_column(k, component) for k, component in enumerate(components))
 
 
-def _column(k: int, own: RowMetric) -> Metric:
+def _own_metric_column(k: int, own: RowMetric) -> Metric:
     def value(sums: OwnSums) -> float | None:
-        found = asked(own, _where(k), lambda: _number(own.value(sums))) if sums else None
-        return None if found is None or np.isnan(found) else found
+        number = ask_component(own, _own_metric_key(k), lambda: _check_number(own.value(sums))) if sums else None
+        return None if number is None or np.isnan(number) else number
 
     return Metric(own.name, lambda given: given.own.get(own.name, {}), value, own.better, own.help, OWN)
 
 
-def _where(k: int) -> str:
+def _own_metric_key(k: int) -> str:
     return f"measure.metrics[{k}]"
 
 
-def _number(value: Any) -> float | None:
+def _check_number(value: Any) -> float | None:
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):
@@ -145,18 +147,142 @@ def _number(value: Any) -> float | None:
 
 
 def own_sums(components: Sequence[RowMetric], rows: pd.DataFrame) -> dict[str, OwnSums]:
-    """By the names of own metrics their sums over rows of `detections.parquet`, of one configuration in one log."""
+    """Sums of own metrics, by name, over the rows of `detections.parquet` of one configuration in one log."""
     if not len(rows):
         return {}
     rows = rows.reset_index(drop=True)
-    return {own.name: asked(own, _where(k), partial(_sums, own, rows)) for k, own in enumerate(components)}
+    return {
+        own.name: ask_component(own, _own_metric_key(k), partial(_sum_own_metric, own, rows))
+        for k, own in enumerate(components)
+    }
 
 
-def _sums(own: RowMetric, rows: pd.DataFrame) -> OwnSums:
+def _sum_own_metric(own: RowMetric, rows: pd.DataFrame) -> OwnSums:
     sums: OwnSums = {}
-    for name, of_rows in own.statistics(rows).items():
-        column = np.asarray(of_rows, dtype=float)
+    for name, values in own.statistics(rows).items():
+        column = np.asarray(values, dtype=float)
         if column.shape != (len(rows),):
             raise GivenError("statistics", f"{name}: expected shape ({len(rows)},), found {column.shape}")
         sums[name] = float(column.sum())
     return sums
+
+
+# Lists on links, for configurations that name one.
+
+
+@dataclass(frozen=True)
+class LinkTimes:
+    """Sums over the lists that units send: how many, lost, and overtaken by a newer one of their unit.
+
+    `from_s`, `to_s (N,)`: the age of the newest list of a unit at its arrival, and when a newer one replaced it.
+    """
+
+    sent: int
+    lost: int
+    overtaken: int
+    from_s: Float
+    to_s: Float
+
+    def __add__(self, other: LinkTimes) -> LinkTimes:
+        return LinkTimes(
+            self.sent + other.sent, self.lost + other.lost, self.overtaken + other.overtaken,
+            np.concatenate([self.from_s, other.from_s]), np.concatenate([self.to_s, other.to_s]),
+        )  # fmt: skip
+
+    def age_s(self, q: float) -> float | None:
+        """The q-quantile over time of the age of the newest list, of all units and runs; None: no list arrived."""
+        ages = np.concatenate([self.from_s, self.to_s])
+        order = np.argsort(ages, kind="stable")
+        step = np.concatenate([np.ones(len(self.from_s)), -np.ones(len(self.to_s))])[order]
+        passed = np.concatenate([[0.0], np.cumsum(np.cumsum(step)[:-1] * np.diff(ages[order]))]) if len(ages) else ages
+        return float(np.interp(q * passed[-1], passed, ages[order])) if len(ages) and passed[-1] > 0 else None
+
+
+def link_times(seen: Tracks, arriving: Tracks, heard: Tracks, units: Collection[str], end_s: float) -> LinkTimes:
+    """Sums over the lists that `units` send in one run, up to the end of the log, `end_s`.
+
+    `seen`: the lists as they are sent; `arriving`: as they arrive, which decides whether they are overtaken; `heard`:
+    as the receiver takes them in.
+    """
+    arrives_s, late = heard.common_arrives_s, find_out_of_sequence(heard)
+    sent = np.isfinite(seen.common_arrives_s)
+    sent &= np.array([name in units for name in heard.units], dtype=bool)[heard.frame_unit_ix]
+    arrived = sent & np.isfinite(arrives_s)
+    ages: list[tuple[Float, Float]] = []
+    for unit in np.unique(heard.frame_unit_ix[sent]):
+        frames = np.flatnonzero((heard.frame_unit_ix == unit) & ~late & (arrives_s <= end_s))
+        frames = frames[np.argsort(arrives_s[frames], kind="stable")]
+        until_s = np.append(arrives_s[frames][1:], end_s)
+        ages.append((arrives_s[frames] - heard.captured_s[frames], until_s - heard.captured_s[frames]))
+    from_s, to_s = (np.concatenate([np.empty(0), *(part[k] for part in ages)]) for k in (0, 1))
+    return LinkTimes(
+        int(sent.sum()),
+        int((sent & ~arrived).sum()),
+        int((arrived & find_overtaken_lists(arriving)).sum()),
+        from_s,
+        to_s,
+    )
+
+
+def _get_link_times(inputs: MetricInputs) -> LinkTimes | None:
+    return inputs.link
+
+
+def _divide_share(part: int, whole: int) -> float | None:
+    return part / whole if whole else None
+
+
+_row = partial(Metric, statistics=_get_link_times, better=-1, part="link")
+LINK = (
+    _row("lost_share", value=lambda of: _divide_share(of.lost, of.sent),
+         help="share of the lists sent by a link that it loses"),
+    _row("age_of_information_p50_s", value=lambda of: of.age_s(0.5),
+         help="age since capture of a unit's newest list that arrived by a link: at most this for 50 % of the time"),
+    _row("age_of_information_p95_s", value=lambda of: of.age_s(0.95), help="the same for 95 % of the time"),
+    _row("overtaken_share", value=lambda of: _divide_share(of.overtaken, of.sent - of.lost),
+         help="share of the arriving lists that come after a newer one of their unit; ideal fusion and trackers still "
+              "use them, and all fusions do where messages are partial"),
+)  # fmt: skip
+"""Columns of `summary.csv` where a configuration has a link."""
+
+
+# Ages of a stack's recorded output, for configurations that are `recorded`.
+
+
+@dataclass(frozen=True)
+class OutputTimes:
+    """Sums (s) over the lists of a stack that become available while a log lasts, and over how many lists each is.
+
+    `latency_s`: available − stamp of the state, where the messages say both; `delay_s`: that stamp − instant of the
+    state, from `delay_s` of the experiment; `input_age_s`: available − newest capture among the inputs that had
+    arrived.
+    """
+
+    latency_s: float = 0.0
+    with_latency: int = 0
+    delay_s: float = 0.0
+    with_delay: int = 0
+    input_age_s: float = 0.0
+    with_input: int = 0
+
+    def __add__(self, other: OutputTimes) -> OutputTimes:
+        return OutputTimes(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(OutputTimes)))
+
+
+def _get_output_times(inputs: MetricInputs) -> OutputTimes | None:
+    return inputs.output
+
+
+def _divide_total(total_s: float, lists: int) -> float | None:
+    return total_s / lists if lists else None
+
+
+OUTPUT = (
+    Metric("output_latency_s", _get_output_times, lambda of: _divide_total(of.latency_s, of.with_latency), -1,
+           "a stack's lists: available − the stamp of the state, mean; a dash: not in the messages", "output"),
+    Metric("output_delay_s", _get_output_times, lambda of: _divide_total(of.delay_s, of.with_delay), -1,
+           "a stack's lists: that stamp − the instant of the state, by `delay_s` of the experiment", "output"),
+    Metric("input_age_s", _get_output_times, lambda of: _divide_total(of.input_age_s, of.with_input), -1,
+           "available − the newest capture of an input that had arrived: its age, not a latency", "output"),
+)  # fmt: skip
+"""Columns of `summary.csv` where a configuration is recorded."""

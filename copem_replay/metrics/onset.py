@@ -1,4 +1,4 @@
-"""Onsets: the condition that starts the clock of a measured object, as components.
+"""Onsets, as components: the condition that starts the clock of a measured object.
 
 An own onset derives from `Onset` and answers `holds`; the experiment names it with `kind: package.module:Class`. The
 meanings of the built-in ones: docs/guide/metrics.md.
@@ -15,10 +15,11 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from copem_replay.core.components import Component, NotNegative, Positive, Share, asked, wrong
+from copem_replay.core.components import Component, NotNegative, Positive, Share, ask_component, wrong_answer_error
 from copem_replay.core.tracks import Bool, Float, Tracks
 
 _TOLERANCE_M = 1e-6
+"""Far below any distance that matters, far above the rounding of coordinates."""
 
 
 class Requires(Enum):
@@ -31,7 +32,7 @@ class Requires(Enum):
 
 @dataclass(frozen=True)
 class OnsetView:
-    """What an onset's condition reads. Rows P: each measured object at the truth's own frames, object after object.
+    """What an onset's condition reads. Rows (P,): each measured object at the truth's own frames, object after object.
 
     `tracks`: the states, one object a track. `distance_m("centre" | "front") (P,)`: metres to the place that
     `measure.distance_to` names, from its centre or along its heading from its front; infinite where it is absent.
@@ -87,19 +88,21 @@ class Onset(Component, ABC):
         return self.kind.rpartition(":")[2]
 
     def described(self, near: str) -> str:
-        """When the clock of an object starts, for the report. `near`: the place that distances are measured from."""
+        """A clause for the report: when the clock of an object starts. `near`: where distances are measured from."""
         return f"at its onset “{self.label('object')}”"
 
 
-def holds(onset: Onset, view: OnsetView) -> Bool:
+def evaluate_onset(onset: Onset, view: OnsetView) -> Bool:
     """(P,) where an onset's condition holds, checked. Raises InputError when an own onset fails."""
     where = "measure.onset"
-    found = asked(onset, where, lambda: np.asarray(onset.holds(view)))
+    holding = ask_component(onset, where, lambda: np.asarray(onset.holds(view)))
     expected = view.time_s.shape
-    if found.shape != expected or found.dtype != np.bool_:
-        said = f"{found.dtype} {found.shape}"
-        raise wrong(onset, where, f"holds(view): expected true or false of shape {expected}, found {said}", "holds")
-    return found
+    if holding.shape != expected or holding.dtype != np.bool_:
+        answer = f"{holding.dtype} {holding.shape}"
+        raise wrong_answer_error(
+            onset, where, f"holds(view): expected true or false of shape {expected}, found {answer}", "holds"
+        )
+    return holding
 
 
 class StartsMoving(Onset):
@@ -118,11 +121,11 @@ class StartsMoving(Onset):
         return moving & (view.distance_m(self.from_) <= self.within_m + _TOLERANCE_M)
 
     def label(self, object_class: str) -> str:
-        """A pedestrian walks."""
+        """`walking starts` of a pedestrian, else `starts to move`."""
         return "walking starts" if object_class == "pedestrian" else "starts to move"
 
     def described(self, near: str) -> str:
-        """The speed, and how near."""
+        """The speed, and the distance if there is one."""
         within = ""
         if self.within_m is not None:
             within = f" within {self.within_m:g} m of {near}{'’s front' if self.from_ == 'front' else ''}"
@@ -135,15 +138,15 @@ class Appears(Onset):
     kind: Literal["appears"] = "appears"
 
     def holds(self, view: OnsetView) -> Bool:
-        """(P,) always."""
+        """(P,) true."""
         return np.ones(len(view.time_s), dtype=bool)
 
     def label(self, object_class: str) -> str:
-        """Says it appears."""
+        """`appears`."""
         return "appears"
 
     def described(self, near: str) -> str:
-        """Says it appears."""
+        """That it appears."""
         return "when it appears in the log"
 
 
@@ -158,11 +161,11 @@ class InRange(Onset):
         return view.distance_m("centre") <= self.range_m + _TOLERANCE_M
 
     def label(self, object_class: str) -> str:
-        """The range."""
+        """The range in metres."""
         return f"within {self.range_m:g} m"
 
     def described(self, near: str) -> str:
-        """The range, and of what."""
+        """The range, and the place it is measured from."""
         return f"when it comes within {self.range_m:g} m of {near}"
 
 
@@ -208,19 +211,19 @@ class At(Onset):
 
     @property
     def instant_s(self) -> float:
-        """That instant."""
+        """The instant, `time_s`."""
         return self.time_s
 
     def holds(self, view: OnsetView) -> Bool:
-        """(P,) from then on."""
+        """(P,) true from the instant on."""
         return view.time_s >= self.time_s
 
     def label(self, object_class: str) -> str:
-        """Says the clock starts."""
+        """`clock starts`."""
         return "clock starts"
 
     def described(self, near: str) -> str:
-        """The instant."""
+        """The instant in seconds since the log's start."""
         return f"{self.time_s:g} s after the log’s start"
 
 

@@ -1,6 +1,8 @@
-"""Summary: one row per configuration, over all logs, runs and measured objects.
+"""The summary: one row per configuration, over all logs, runs and measured objects; its tally, and its plain text.
 
-Its columns are metrics: metrics/summary_metrics.py, and the own ones of the experiment.
+Its columns are metrics: metrics/summary_metrics.py, and the own ones of the experiment. They are computed from the
+tally, which counts in how many runs each object is detected at each instant, or never: whole numbers, so that counts of
+any runs in any order add up to the same. `compare` reads the tally too.
 """
 
 from __future__ import annotations
@@ -8,61 +10,141 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
+from copem_replay.core.errors import interval_words, wrap_line
+from copem_replay.core.tracks import Int
 from copem_replay.metrics.accuracy.metrics import beyond_gate_share
-from copem_replay.metrics.accuracy.statistics import Total
-from copem_replay.metrics.fixed import Fixed
-from copem_replay.metrics.intervals import FEWEST_CLUSTERS, clusters
-from copem_replay.metrics.link_times import LinkTimes
-from copem_replay.metrics.metric import Given, OwnSums, RowMetric, own_metrics, own_sums, values
-from copem_replay.metrics.output_times import OutputTimes
-from copem_replay.metrics.summary_metrics import METRICS
-from copem_replay.metrics.tally import CONFLICT, DETECTED, tally
+from copem_replay.metrics.accuracy.statistics import AccuracyTotal
+from copem_replay.metrics.intervals import FEWEST_CLUSTERS, NOTHING_DRAWN, FixedOutcomes, choose_clusters
+from copem_replay.metrics.metric import (
+    LinkTimes,
+    MetricInputs,
+    OutputTimes,
+    OwnSums,
+    RowMetric,
+    evaluate_metrics,
+    own_metrics,
+    own_sums,
+)
+from copem_replay.metrics.summary_metrics import METRIC, METRICS
+
+DETECTED = "detected"
+"""The event of the first list that confirms the object."""
+CONFLICT = "conflict"
+"""The event of the first list that implies a collision."""
+
+_EVENT_COLUMNS = {
+    DETECTED: {
+        "detection_s": "detection_s",
+        "time_to_detection_s": "time_to_detection_s",
+        "distance_at_detection_m": "distance_at_detection_m",
+        "gap_at_detection_m": "gap_at_detection_m",
+    },
+    CONFLICT: {
+        "detection_s": "conflict_detection_s",
+        "time_to_detection_s": "time_to_conflict_detection_s",
+        "distance_at_detection_m": "distance_at_conflict_detection_m",
+    },
+}
+"""By event the columns of the tally, and their names in `detections.parquet`; null in the row for never."""
+_OBJECT_COLUMNS = ("object_id", "object_class", "onset_s", "ended_s", "ended_by")
+
+
+def tally_rows(rows: pd.DataFrame) -> pd.DataFrame:
+    """The tally of rows of `detections.parquet`, in their order of logs, configurations and objects.
+
+    Rows of one object that is detected at one instant differ in nothing but the run: one of them stands for `runs`.
+    """
+    parts = [_tally_event(rows, event) for event in _EVENT_COLUMNS if event == DETECTED or "conflict_detected" in rows]
+    tallied = pd.concat(parts, ignore_index=True)
+    order = np.lexsort([pd.factorize(tallied[name])[0] for name in ("configuration", "log")])  # stable: events stay
+    return tallied.iloc[order].reset_index(drop=True)
+
+
+def _tally_event(rows: pd.DataFrame, event: str) -> pd.DataFrame:
+    columns = {name: source for name, source in _EVENT_COLUMNS[event].items() if source in rows}
+    time_s = rows[columns["time_to_detection_s"]].to_numpy(dtype=float)
+    happened = rows["detected" if event == DETECTED else "conflict_detected"].to_numpy(dtype=bool)
+    time_s = np.where(happened, time_s + 0.0, np.inf)  # −0 is 0, and never comes last
+    episode = np.zeros(len(rows), dtype=np.int64)
+    for name in ("log", "configuration", "object_id"):
+        episode = _number_pairs(episode, rows[name])[0]
+    group, number, instant_s = _number_pairs(episode, time_s)
+    first_of = np.empty(len(number), dtype=np.int64)
+    first_of[group[::-1]] = np.arange(len(rows))[::-1]
+    order = np.lexsort((instant_s, number))
+    first_of, runs = first_of[order], np.bincount(group, minlength=len(order))[order]
+    tallied = {
+        **{name: rows[name].take(first_of).to_numpy() for name in ("log", "configuration")},
+        "event": np.full(len(order), event, dtype=object),
+        **{name: rows[name].take(first_of).to_numpy() for name in _OBJECT_COLUMNS if name in rows},
+        **{name: rows[source].take(first_of).to_numpy() for name, source in columns.items()},
+        "runs": runs,
+    }
+    if "conflict" in rows:
+        passed = rows["braking_pass"].fillna(False).to_numpy(dtype=bool)
+        tallied["in_conflict"] = rows["conflict"].to_numpy(dtype=bool)[first_of]
+        tallied["passed"] = np.bincount(group, passed, minlength=len(order)).astype(np.int64)[order]
+    return pd.DataFrame(tallied)
+
+
+def _number_pairs(number: Int, values: Any) -> tuple[Int, Int, Any]:
+    """The number of each row's pair of number and value (n,), as pairs appear, and the pairs' numbers and values.
+
+    By hash, which does not sort.
+    """
+    value_ix, distinct = pd.factorize(values)
+    pair, pairs = pd.factorize(number * max(len(distinct), 1) + value_ix)
+    return pair, pairs // max(len(distinct), 1), distinct[pairs % max(len(distinct), 1)]
+
 
 MUCH_BEYOND = 0.01
-"""From this share of errors beyond the gate on it is said (chosen)."""
+"""From this share of errors beyond the gate on there is a note: the NEES of a true, round covariance is then 1.91, not
+2.
+"""
 
 
 def horizon_s(table: pd.DataFrame, given_s: float | None) -> float | None:
-    """The horizon of restricted means: as given, or the longest episode at any measured object."""
+    """The horizon of restricted means in seconds: as given, else the longest episode; None without rows."""
     if given_s is not None:
         return given_s
     return float((table["ended_s"] - table["onset_s"]).max()) if len(table) else None
 
 
 Sums = Mapping[str, Mapping[str, OwnSums]]
-"""Of own metrics, by configuration and name."""
+"""Sums of own metrics, by configuration and by name."""
 
 
-def summary(
+def summarise_rows(
     rows: pd.DataFrame, configurations: Sequence[str], list_rate_hz: Mapping[str, float | None], **given: Any
 ) -> tuple[pd.DataFrame, list[str]]:
-    """The rows of `summary.csv` of rows of `detections.parquet`, otherwise as `summary_of`."""
-    own, asked = own_sums_of(rows, given.get("own", ())), "conflict_detected" in rows
-    return summary_of(tally(rows), configurations, list_rate_hz, sums=own, conflicts_asked=asked, **given)
+    """The rows of `summary.csv`, and notes, from rows of `detections.parquet`. `given`: as for `summarise_tally`."""
+    own, asked = own_sums_by_log(rows, given.get("own", ())), "conflict_detected" in rows
+    return summarise_tally(tally_rows(rows), configurations, list_rate_hz, sums=own, conflicts_asked=asked, **given)
 
 
-def own_sums_of(rows: pd.DataFrame, own: Sequence[RowMetric]) -> dict[str, dict[str, OwnSums]]:
-    """Of rows of `detections.parquet`, log by log."""
+def own_sums_by_log(rows: pd.DataFrame, own: Sequence[RowMetric]) -> dict[str, dict[str, OwnSums]]:
+    """Sums of own metrics by configuration and name, over rows of `detections.parquet`, added log by log."""
     sums: dict[str, dict[str, OwnSums]] = {}
     for (_, name), part in rows.groupby(["log", "configuration"], sort=False) if own else ():
-        sums = added(sums, {str(name): own_sums(own, part)})
+        sums = add_own_sums(sums, {str(name): own_sums(own, part)})
     return sums
 
 
-def added(sums: Sums, more: Sums) -> dict[str, dict[str, OwnSums]]:
-    """Sums of own metrics over some logs, and those of one more."""
-    result = {configuration: dict(of) for configuration, of in sums.items()}
-    for configuration, of in more.items():
-        mine = result.setdefault(configuration, {})
-        for metric, one in of.items():
-            before = mine.get(metric, {})
-            mine[metric] = before | {name: before.get(name, 0.0) + value for name, value in one.items()}
+def add_own_sums(sums: Sums, more: Sums) -> dict[str, dict[str, OwnSums]]:
+    """Sums of own metrics, by configuration and name, of `sums` and `more` together."""
+    result = {configuration: dict(metrics) for configuration, metrics in sums.items()}
+    for configuration, metrics in more.items():
+        totals = result.setdefault(configuration, {})
+        for metric, added in metrics.items():
+            before = totals.get(metric, {})
+            totals[metric] = before | {name: before.get(name, 0.0) + value for name, value in added.items()}
     return result
 
 
-def summary_of(
+def summarise_tally(
     tallied: pd.DataFrame,
     configurations: Sequence[str],
     list_rate_hz: Mapping[str, float | None],
@@ -70,79 +152,205 @@ def summary_of(
     seed: int,
     horizon_s: float | None,
     exact: pd.DataFrame | None = None,
-    accuracy: Mapping[str, Total] | None = None,
-    fixed: Fixed | None = None,
+    accuracy: Mapping[str, AccuracyTotal] | None = None,
+    fixed: FixedOutcomes | None = None,
     own: Sequence[RowMetric] = (),
     sums: Sums | None = None,
     outputs: Mapping[str, OutputTimes] | None = None,
     conflicts_asked: bool = False,
     links: Mapping[str, LinkTimes] | None = None,
 ) -> tuple[pd.DataFrame, list[str]]:
-    """The rows of `summary.csv`, and what has to be said about them, of the rows of `tally.parquet`.
+    """The rows of `summary.csv`, and notes about them, from the rows of `tally.parquet`.
 
-    `exact`: the rows of `exact.parquet`. `accuracy`: by configuration the sums its figures are made of.
-    `fixed`: what is the same in every run; None: nothing. `own`: the experiment's own metrics, whose columns come last,
-    and `sums`, what they are made of. `outputs`: how old the recorded outputs are, by configuration; `links`: what
-    becomes of lists, of those with a link. `conflicts_asked`: whether it is measured when lists imply a collision.
+    `exact`: the rows of `exact.parquet`. `accuracy`: its sums, by configuration. `fixed`: which outcomes are equal in
+    every run; None: none. `own`: the experiment's own metrics, whose columns come last; `sums`: their sums. `outputs`:
+    ages of recorded outputs, by configuration; `links`: sums over lists on links, by configuration.
+    `conflicts_asked`: whether the experiment measures when lists imply a collision.
     """
-    notes: list[str] = []
-    fixed = fixed or Fixed()
-    known, implied = (tallied[tallied["event"] == event] for event in (DETECTED, CONFLICT))
-    judged = known[known["in_conflict"]] if "in_conflict" in known else known.iloc[:0]
-    for what, rows_of, those in (("detected", known, "measured objects"), ("pass", judged, "objects in conflict")):
-        if len(rows_of) and clusters(rows_of)[0] is None:
-            notes.append(
-                f"no interval of the {what} share: fewer than {FEWEST_CLUSTERS} logs and fewer than {FEWEST_CLUSTERS} "
-                f"{those}, and more runs say nothing about other traffic"
-            )
-    parts, conflicts = _by_configuration(known), _by_configuration(implied)
-    exactly = _by_configuration(exact) if exact is not None else {}
-    notes += _beyond_the_gate(accuracy or {})
-    notes += _not_annotated(accuracy or {})
+    fixed = fixed or FixedOutcomes()
+    detections, implying = (tallied[tallied["event"] == event] for event in (DETECTED, CONFLICT))
+    detections_of, conflicts_of = _split_by_configuration(detections), _split_by_configuration(implying)
+    exact_of = _split_by_configuration(exact) if exact is not None else {}
+    notes = [*_note_no_interval(detections), *_note_beyond_gate(accuracy or {}), *_note_unannotated(accuracy or {})]
     columns = (*METRICS, *own_metrics(own))
     rows = []
     for name in configurations:
-        given = Given(
-            parts.get(name, known.iloc[:0]),
+        inputs = MetricInputs(
+            detections_of.get(name, detections.iloc[:0]),
             list_rate_hz[name],
             seed,
             horizon_s,
             lists_fixed=fixed.known(name),
             reaction_fixed=fixed.passes(name),
             accuracy=accuracy[name] if accuracy else None,
-            exact=exactly.get(name, exact.iloc[:0]) if exact is not None else None,
+            exact=exact_of.get(name, exact.iloc[:0]) if exact is not None else None,
             output=(outputs or {}).get(name),
-            conflicts=conflicts.get(name, implied.iloc[:0]) if conflicts_asked else None,
+            conflicts=conflicts_of.get(name, implying.iloc[:0]) if conflicts_asked else None,
             own=(sums or {}).get(name, {}),
             link=(links or {}).get(name),
         )
-        rows.append({"configuration": name, **values(columns, given)})
+        rows.append({"configuration": name, **evaluate_metrics(columns, inputs)})
     return pd.DataFrame(rows), notes
 
 
-def _beyond_the_gate(accuracy: Mapping[str, Total]) -> list[str]:
+def _note_no_interval(detections: pd.DataFrame) -> list[str]:
+    """Which shares have no interval, from the rows of the tally for detections."""
+    conflicts = detections[detections["in_conflict"]] if "in_conflict" in detections else detections.iloc[:0]
+    shares = (("detected", detections, "measured objects"), ("pass", conflicts, "objects in conflict"))
+    return [
+        f"no interval of the {share} share: fewer than {FEWEST_CLUSTERS} logs and fewer than {FEWEST_CLUSTERS} "
+        f"{objects}, and more runs say nothing about other traffic"
+        for share, rows, objects in shares
+        if len(rows) and choose_clusters(rows)[0] is None
+    ]
+
+
+def _note_beyond_gate(accuracy: Mapping[str, AccuracyTotal]) -> list[str]:
     """Which configurations claim covariances so large that the gate cuts off some errors."""
     shares = {name: beyond_gate_share(of) or 0.0 for name, of in accuracy.items()}
     cut = {name: share for name, share in shares.items() if share >= MUCH_BEYOND}
     if not cut:
         return []
     gate_m = accuracy[next(iter(cut))].settings.gate_m
-    said = ", ".join(f"{name} {100 * share:.2g} %" for name, share in cut.items())
+    words = ", ".join(f"{name} {100 * share:.2g} %" for name, share in cut.items())
     return [
-        f"position errors expected beyond the gate of {gate_m:g} m, by the claimed covariances: {said}; RMSE and NEES "
+        f"position errors expected beyond the gate of {gate_m:g} m, by the claimed covariances: {words}; RMSE and NEES "
         "are without them, so true covariances have a NEES of nees_expected, not 2 (a larger `measure: {match: "
         "{gate_m: …}}` keeps them)"
     ]
 
 
-def _not_annotated(accuracy: Mapping[str, Total]) -> list[str]:
+def _note_unannotated(accuracy: Mapping[str, AccuracyTotal]) -> list[str]:
     """How many entries are no ghosts because the truth is not annotated there."""
     counts = {name: int(of.runs["unannotated"]) for name, of in accuracy.items()}
     if not any(counts.values()):
         return []
-    said = ", ".join(f"{name} {count}" for name, count in counts.items())
-    return [f"entries at no object where the truth is not annotated, no ghosts, in all lists of all runs: {said}"]
+    words = ", ".join(f"{name} {count}" for name, count in counts.items())
+    return [f"entries at no object where the truth is not annotated, no ghosts, in all lists of all runs: {words}"]
 
 
-def _by_configuration(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
+def _split_by_configuration(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
     return {str(name): part for name, part in table.groupby("configuration", sort=False)}
+
+
+# Tables as plain text, nothing cut off: whole in a pipe, in blocks that fit the width of a terminal.
+
+_GAP = "  "
+SETUP = ("n", "list_rate_hz", "n_conflict")
+"""Columns of the set-up, not of results: written once, below the table, where all configurations are alike."""
+
+
+def format_summary(summary: pd.DataFrame, width: int | None = None) -> str:
+    """The summary for a terminal: detections, then conflicts, braking, recorded outputs and own metrics.
+
+    `width`: of the terminal, in characters; None: lines of any length.
+    """
+    lines = _part_lines(summary, "summary", width, "detected_share")
+    lines += describe_intervals(summary, "interval")
+    horizon = summary["ttd_rmst_horizon_s"].dropna()
+    if len(horizon):
+        lines.append(
+            f"ttd_rmst_s: mean time to detection, never detected counting as {format_cell(float(horizon.iloc[0]))} s"
+        )
+    if "conflict_detected_share" in summary:
+        lines += ["", *_part_lines(summary, "conflict", width)]
+        lines.append("conflict_*: the same for the first list that implies a collision")
+    if "pass_share" in summary and summary["n_conflict"].any():
+        lines += ["", *_part_lines(summary, "braking", width, "pass_share")]
+        lines += describe_intervals(summary, "pass_interval")
+        lines.append("pass_share: share of conflicts that the configured driver avoids when braking after detection")
+    if "output_latency_s" in summary:
+        lines += ["", *_part_lines(summary[summary["output_delay_s"].notna()], "output", width)]
+        lines.append("output_latency_s: available − the stamp of the state; output_delay_s: that stamp − the state")
+    own = [name for name in summary if name not in ("configuration", *METRIC)]
+    if own:
+        lines += ["", format_table(summary[["configuration", *own]], width)]
+    return "\n".join(part for line in lines for part in (wrap_line(line, width) if "\n" not in line else [line]))
+
+
+def _part_lines(summary: pd.DataFrame, part: str, width: int | None, share: str = "") -> list[str]:
+    """The columns of a part, the limits of its share beside it; below them the set-up that all have alike."""
+    names = ["configuration", *(metric.name for metric in METRICS if metric.part == part and metric.name in summary)]
+    alike = {name: format_cell(summary[name].iloc[0]) for name in names if name in SETUP and _is_alike(summary[name])}
+    names = [name for name in names if name not in alike]
+    if share:
+        summary = summary.assign(**{"95 %": _interval_lines(summary, share)})
+        names.insert(names.index(share) + 1, "95 %")
+    below = [f"all configurations: {', '.join(f'{name} {value}' for name, value in alike.items())}"] if alike else []
+    return [format_table(summary[names], width), *below]
+
+
+def _is_alike(column: pd.Series) -> bool:
+    return len(column) > 1 and len({format_cell(value) for value in column}) == 1
+
+
+def _interval_lines(summary: pd.DataFrame, share: str) -> list[str]:
+    limits = zip(summary[f"{share}_low"], summary[f"{share}_high"], strict=True)
+    return [f"[{format_cell(low)}, {format_cell(high)}]" if pd.notna(low) else "–" for low, high in limits]
+
+
+def describe_intervals(summary: pd.DataFrame, name: str) -> list[str]:
+    """Lines on the kind of the limits, from the column `name`, and on the rows without limits as nothing is drawn."""
+    limited = summary.dropna(subset=f"{name}_over").drop_duplicates([name, f"{name}_over"])
+    kinds = [interval_words(*of) for of in limited[[name, f"{name}_over"]].itertuples(index=False)]
+    lines = [f"95 %: {'; '.join(kinds)}"] if kinds else []
+    undrawn = summary.loc[summary[name] == NOTHING_DRAWN, "configuration"]
+    if len(undrawn):
+        lines.append(f"no 95 % of {', '.join(undrawn)}: nothing drawn, every run is the same")
+    return lines
+
+
+def format_table(table: pd.DataFrame, width: int | None = None) -> str:
+    """A table with aligned columns; numbers to four significant digits, nulls as a dash.
+
+    Where it is wider than `width`, it comes in blocks: each has the first column, and as many others as fit.
+    """
+    cells = [[format_cell(value) for value in row] for row in table.itertuples(index=False)]
+    columns: list[tuple[str, ...]] = list(zip(list(map(str, table.columns)), *cells, strict=True))
+    first, *others = (
+        _align_column(column, to_left=k == 0 or not pd.api.types.is_numeric_dtype(table[table.columns[k]]))
+        for k, column in enumerate(columns)
+    )
+    if not others:
+        return "\n".join(first)
+    return "\n\n".join("\n".join(_block_lines(first, block, width)) for block in _split_columns(first, others, width))
+
+
+def _align_column(column: Sequence[str], *, to_left: bool) -> list[str]:
+    widest = max(map(len, column))
+    return [text.ljust(widest) if to_left else text.rjust(widest) for text in column]
+
+
+def _split_columns(first: Sequence[str], others: Sequence[list[str]], width: int | None) -> list[list[list[str]]]:
+    """The other columns in groups that fit beside the first one; each group has at least one."""
+    blocks: list[list[list[str]]] = []
+    used = 0
+    for column in others:
+        size = len(_GAP) + len(column[0])
+        if not blocks or (width is not None and used + size > width and blocks[-1]):
+            blocks.append([])
+            used = len(first[0])
+        blocks[-1].append(column)
+        used += size
+    return blocks
+
+
+def _block_lines(first: Sequence[str], others: Sequence[list[str]], width: int | None) -> list[str]:
+    """The lines of a block; where even one column is too wide, the values below the names of their rows."""
+    rows = [_GAP.join(row).rstrip() for row in zip(first, *others, strict=True)]
+    if width is None or max(map(len, rows)) <= width:
+        return rows
+    return [line for row in zip(first, *others, strict=True) for line in (row[0].rstrip(), *_indent_values(row[1:]))]
+
+
+def _indent_values(values: Sequence[str]) -> list[str]:
+    return [f"  {value.strip()}" for value in values if value.strip()]
+
+
+def format_cell(value: object) -> str:
+    """A number to four significant digits, a null as a dash, anything else as it is."""
+    if value is None or value is pd.NA or value != value:
+        return "–"
+    if not isinstance(value, float):
+        return str(value)
+    return "0" if abs(value) < 1e-12 else f"{value:.4g}"

@@ -1,4 +1,4 @@
-"""The metrics of `summary.csv`, in the order of its columns: what each is made of, and what is said of it.
+"""The metrics of `summary.csv`, in the order of its columns: the statistics of each, its value and its words.
 
 Shares, times and distances are defined in metrics/survival.py. Times are cumulative incidences with departure
 competing: an object that leaves undetected counts as never detected, and only the end of the ego or of the log censors.
@@ -19,17 +19,14 @@ from numpy.typing import NDArray
 from copem_replay.core.tracks import Bool, Float
 from copem_replay.metrics.accuracy.metrics import ACCURACY
 from copem_replay.metrics.braking.driver import UNRESOLVED
-from copem_replay.metrics.end_reason import competes
-from copem_replay.metrics.fixed import NOTHING_DRAWN
-from copem_replay.metrics.intervals import clusters, resamples, share_limits, wilson
-from copem_replay.metrics.link_times import LINK
-from copem_replay.metrics.metric import Given, Metric
-from copem_replay.metrics.output_times import OUTPUT
+from copem_replay.metrics.intervals import NOTHING_DRAWN, choose_clusters, draw_resamples, share_limits, wilson_limits
+from copem_replay.metrics.metric import LINK, OUTPUT, Metric, MetricInputs
 from copem_replay.metrics.survival import (
     CENSORED,
     DETECTED,
     LEFT,
     cumulative_incidence,
+    is_competing,
     quantile_time,
     quantile_with_never,
     restricted_mean,
@@ -37,10 +34,10 @@ from copem_replay.metrics.survival import (
 
 
 @dataclass(frozen=True)
-class Detections:
-    """Statistics of an event: a table of the times at which it happens, and rows ranked by distance.
+class DetectionStatistics:
+    """Statistics of an event: its cumulative incidence over time, and the rows with their distances.
 
-    Without rows: no times, and every figure is None.
+    Without rows there are no times, and every figure is None.
     """
 
     times_s: Float  # (M,) distinct times
@@ -52,62 +49,64 @@ class Detections:
     rows: bool
 
     def quantile_s(self, q: float) -> float | None:
-        """The time by which a share q is detected; None: that many never are."""
+        """Seconds by which a share q is detected; None: a smaller share ever is."""
         return quantile_time(self.times_s, self.incidence, q) if self.rows else None
 
     def mean_s(self) -> float | None:
-        """The mean, never detected counting as the horizon."""
+        """Mean time in seconds, never detected counting as the horizon; None without rows or horizon."""
         if not self.rows or self.horizon_s is None:
             return None
         return restricted_mean(self.times_s, self.incidence, self.horizon_s)
 
     def distance_quantile_m(self, q: float) -> float | None:
-        """The distance above which a share 1 − q is detected; never detected ranks below every distance."""
+        """Metres above which a share 1 − q is detected; never detected ranks below every distance."""
         if not len(self.detected):
             return None
         return quantile_with_never(self.distance_m, self.detected, q, self.weight)
 
 
-def _detections(
+def _detection_statistics(
     part: pd.DataFrame, detected: Bool, weight: Float, horizon_s: float | None, least: float = 1e-12
-) -> Detections:
-    """Statistics of rows, which count by `weight (n,)`."""
+) -> DetectionStatistics:
+    """Statistics of rows (n,), each counting by its `weight`. `least`: as for `cumulative_incidence`."""
     if not len(part):
         nothing = np.empty(0)
-        return Detections(nothing, nothing, nothing, np.empty(0, dtype=bool), nothing, None, rows=False)
-    ending = np.where(detected, DETECTED, np.where(competes(part["ended_by"]), LEFT, CENSORED))
+        return DetectionStatistics(nothing, nothing, nothing, np.empty(0, dtype=bool), nothing, None, rows=False)
+    ending = np.where(detected, DETECTED, np.where(is_competing(part["ended_by"]), LEFT, CENSORED))
     looked_s = (part["ended_s"] - part["onset_s"]).to_numpy(dtype=float)
     # To a nanosecond: of equal times detections come first, and 1 − 0.8 is less than 0.2 − 0.
     time_s = np.round(np.where(detected, part["time_to_detection_s"].to_numpy(dtype=float), looked_s), 9)
     times, incidence = cumulative_incidence(time_s, ending, weight, least=least)
     distance_m = part["distance_at_detection_m"].to_numpy(dtype=float)
     placed = ~detected | ~np.isnan(distance_m)  # detected during a gap of the truth: no distance to rank
-    return Detections(times, incidence, distance_m[placed], detected[placed], weight[placed], horizon_s, rows=True)
+    return DetectionStatistics(
+        times, incidence, distance_m[placed], detected[placed], weight[placed], horizon_s, rows=True
+    )
 
 
-def _of_tally(rows: pd.DataFrame, horizon_s: float | None) -> Detections:
-    return _detections(rows, _known(rows), rows["runs"].to_numpy(dtype=float), horizon_s)
+def _tally_statistics(rows: pd.DataFrame, horizon_s: float | None) -> DetectionStatistics:
+    return _detection_statistics(rows, _is_known(rows), rows["runs"].to_numpy(dtype=float), horizon_s)
 
 
-def _known(rows: pd.DataFrame) -> Bool:
-    """(n,) whether rows are of an instant, not of never."""
+def _is_known(rows: pd.DataFrame) -> Bool:
+    """(n,) whether a row of the tally is for an instant, not for never."""
     known: Bool = rows["time_to_detection_s"].notna().to_numpy(dtype=bool)
     return known
 
 
-def detections(given: Given) -> Detections:
-    """When objects are detected, and how far away."""
-    return _of_tally(given.rows, given.horizon_s)
+def summarise_detections(inputs: MetricInputs) -> DetectionStatistics:
+    """Statistics of the first list that confirms the object."""
+    return _tally_statistics(inputs.rows, inputs.horizon_s)
 
 
-def conflicts(given: Given) -> Detections | None:
-    """The same of the second event: the first list that implies a collision."""
-    return None if given.conflicts is None else _of_tally(given.conflicts, given.horizon_s)
+def summarise_conflicts(inputs: MetricInputs) -> DetectionStatistics | None:
+    """Statistics of the first list that implies a collision; None where the experiment does not ask for it."""
+    return None if inputs.conflicts is None else _tally_statistics(inputs.conflicts, inputs.horizon_s)
 
 
 @dataclass(frozen=True)
-class Share:
-    """A share of rows and its 95 % limits: of which kind they are, and over what (None: there are none)."""
+class ShareEstimate:
+    """A share of rows and its 95 % limits, their kind, and the clusters they are over (None: there are none)."""
 
     n: int
     share: float | None
@@ -117,82 +116,84 @@ class Share:
     high: float | None
 
 
-def _share(part: pd.DataFrame, successes: NDArray[np.int64], seed: int, *, fixed: bool) -> Share:
-    """Of rows of a tally so many successes (n,). `fixed`: they are the same in every run."""
+def _estimate_share(part: pd.DataFrame, successes: NDArray[np.int64], seed: int, *, fixed: bool) -> ShareEstimate:
+    """The share of `successes (n,)` among the runs of the tally's rows (n,). `fixed`: equal in every run."""
     n, total = int(part["runs"].sum()), int(successes.sum())
     share = total / n if n else None
-    over, cluster = clusters(part)
+    over, cluster = choose_clusters(part)
     if over is None or not n:
-        return Share(n, share, None, None, None, None)
+        return ShareEstimate(n, share, None, None, None, None)
     if over == "runs":
         if fixed:
-            return Share(n, share, NOTHING_DRAWN, None, None, None)
-        return Share(n, share, "wilson", over, *wilson(total, n))
+            return ShareEstimate(n, share, NOTHING_DRAWN, None, None, None)
+        return ShareEstimate(n, share, "wilson", over, *wilson_limits(total, n))
     columns = pd.DataFrame({"sum": successes, "count": part["runs"].to_numpy()})
     counted = columns.groupby(cluster.to_numpy(), sort=True).sum()
     # Addressed by the clusters' names: every configuration resamples the same logs or objects.
-    resampled = resamples([str(name) for name in counted.index], seed)
+    resampled = draw_resamples([str(name) for name in counted.index], seed)
     kind, low, high = share_limits(
         counted["sum"].to_numpy(dtype=float), counted["count"].to_numpy(dtype=float), resampled
     )
-    return Share(n, share, kind, over, low, high)
+    return ShareEstimate(n, share, kind, over, low, high)
 
 
-def detected(given: Given) -> Share:
-    """The rows that are detected."""
-    runs = given.rows["runs"].to_numpy()
-    return _share(given.rows, np.where(_known(given.rows), runs, 0), given.seed, fixed=given.lists_fixed)
+def estimate_detected_share(inputs: MetricInputs) -> ShareEstimate:
+    """The share of the rows that are detected."""
+    runs = inputs.rows["runs"].to_numpy()
+    return _estimate_share(
+        inputs.rows, np.where(_is_known(inputs.rows), runs, 0), inputs.seed, fixed=inputs.lists_fixed
+    )
 
 
-def foreseen(given: Given) -> float | None:
+def estimate_foreseen_share(inputs: MetricInputs) -> float | None:
     """The share of the rows in which a list implies a collision; NaN without rows."""
-    if given.conflicts is None:
+    if inputs.conflicts is None:
         return None
-    runs = given.conflicts["runs"].to_numpy()
-    return int(runs[_known(given.conflicts)].sum()) / int(runs.sum()) if len(runs) else np.nan
+    runs = inputs.conflicts["runs"].to_numpy()
+    return int(runs[_is_known(inputs.conflicts)].sum()) / int(runs.sum()) if len(runs) else np.nan
 
 
-def passed(given: Given) -> Share | None:
-    """The rows in conflict that pass."""
-    if "in_conflict" not in given.rows:
+def estimate_passed_share(inputs: MetricInputs) -> ShareEstimate | None:
+    """The share of the rows in conflict that pass; None without braking."""
+    if "in_conflict" not in inputs.rows:
         return None
-    part = given.rows[given.rows["in_conflict"]]
-    return _share(part, part["passed"].to_numpy(), given.seed, fixed=given.reaction_fixed)
+    part = inputs.rows[inputs.rows["in_conflict"]]
+    return _estimate_share(part, part["passed"].to_numpy(), inputs.seed, fixed=inputs.reaction_fixed)
 
 
 @dataclass(frozen=True)
-class Exact:
-    """What the runs tend to: every episode counts the same, its rows of `exact.parquet` by their probability."""
+class ExactStatistics:
+    """The limit for many runs: all episodes count alike, the rows of `exact.parquet` of each by their probability."""
 
     share: float | None
-    times: Detections
+    times: DetectionStatistics
     missed: dict[str, float | None]
 
 
-def exact(given: Given) -> Exact | None:
-    """Statistics of `exact.parquet`.
+def summarise_exact(inputs: MetricInputs) -> ExactStatistics | None:
+    """Statistics of `exact.parquet`; None where the experiment does not ask for exact times.
 
-    Among n rows less than one is none: with censoring, an episode that is still open with probability 10⁻⁹ would
-    otherwise stand for all that were censored before.
+    Less than one of the n rows of the runs counts as none: with censoring, an episode that is still open with
+    probability 10⁻⁹ would otherwise stand for all that were censored before.
     """
-    part = given.exact
+    part = inputs.exact
     if part is None:
         return None
-    missed = _missed(part[part["detection_s"].isna()])
+    missed = _summarise_missed(part[part["detection_s"].isna()])
     if not len(part):
-        return Exact(None, _detections(part, np.empty(0, dtype=bool), np.empty(0), None), missed)
+        return ExactStatistics(None, _detection_statistics(part, np.empty(0, dtype=bool), np.empty(0), None), missed)
     part = part[part["probability"] > 0]
     weight = part["probability"].to_numpy(dtype=float)
     known = part["detection_s"].notna().to_numpy()
-    times = _detections(part, known, weight, given.horizon_s, 1 / int(given.rows["runs"].sum()))
-    return Exact(weight[known].sum() / weight.sum(), times, missed)
+    times = _detection_statistics(part, known, weight, inputs.horizon_s, 1 / int(inputs.rows["runs"].sum()))
+    return ExactStatistics(weight[known].sum() / weight.sum(), times, missed)
 
 
-def _missed(never: pd.DataFrame) -> dict[str, float | None]:
+def _summarise_missed(never: pd.DataFrame) -> dict[str, float | None]:
     """How probably an episode misses its object, from the rows of `exact.parquet` for never: one per episode.
 
-    In logarithms; the derivative by the log-odds of detection is that of the mean, so episodes
-    count by their share of it.
+    Base-10 logarithms of the mean probability. Its derivative by the log-odds of detection weighs each episode by its
+    share of the mean.
     """
     names = ("miss_log10", "miss_log10_half_odds")
     if not never["miss_log10"].notna().any():
@@ -207,11 +208,11 @@ def _missed(never: pd.DataFrame) -> dict[str, float | None]:
     return row | {"miss_per_logit": float(weight @ slope / weight.sum())}
 
 
-def judged(given: Given) -> tuple[float | None, float | None] | None:
-    """The shares that pass and that fail, of `exact.parquet`; too rare a failure to be resolved has no share."""
-    if given.exact is None or "conflict" not in given.exact:
+def exact_verdict_shares(inputs: MetricInputs) -> tuple[float | None, float | None] | None:
+    """The shares that pass and that fail, from `exact.parquet`; None: no conflict, or a failure too rare to resolve."""
+    if inputs.exact is None or "conflict" not in inputs.exact:
         return None
-    part = given.exact[given.exact["conflict"]]
+    part = inputs.exact[inputs.exact["conflict"]]
     if not len(part):
         return None, None
     weight = part["probability"].to_numpy(dtype=float)
@@ -221,16 +222,18 @@ def judged(given: Given) -> tuple[float | None, float | None] | None:
     return float(weight @ passes / weight.sum()), failed
 
 
-def _itself(given: Given) -> Given:
-    return given
+def _return_inputs(inputs: MetricInputs) -> MetricInputs:
+    return inputs
 
 
-def _number(value: float) -> float | None:
+def _number_or_none(value: float) -> float | None:
     return None if np.isnan(value) else value
 
 
-def _limits(of: str, statistics: Callable[[Given], Share | None], prefix: str = "") -> tuple[Metric, ...]:
-    """Columns beside a share: its limits, of which kind they are, and over what."""
+def _limit_metrics(
+    of: str, statistics: Callable[[MetricInputs], ShareEstimate | None], prefix: str = ""
+) -> tuple[Metric, ...]:
+    """The columns beside a share: its limits, their kind, and the clusters they are over."""
     row = partial(Metric, statistics=statistics, better=0)
     return (
         row(f"{of}_low", value=attrgetter("low"), help=f"lower limit of {of}, 95 %"),
@@ -248,55 +251,57 @@ _DISTANCE = "median distance at detection, centre to centre; never detected rank
 _PASSES = "share of conflicts that the configured driver avoids when braking after detection, [95 % interval]"
 
 _DETECTION_METRICS = (
-    Metric("n", _itself, lambda of: int(of.rows["runs"].sum()), 0, "rows: runs × measured objects × logs", "summary"),
-    Metric("list_rate_hz", _itself, lambda of: of.list_rate_hz, 0, "fused lists per second", "summary"),
-    Metric("detected_share", detected, lambda of: of.share, 1,
+    Metric("n", _return_inputs, lambda of: int(of.rows["runs"].sum()), 0,
+           "rows: runs × measured objects × logs", "summary"),
+    Metric("list_rate_hz", _return_inputs, lambda of: of.list_rate_hz, 0, "fused lists per second", "summary"),
+    Metric("detected_share", estimate_detected_share, lambda of: of.share, 1,
            "share of the rows that were detected, [95 % interval]", "summary", "share detected"),
-    *_limits("detected_share", detected),
-    Metric("ttd_p5_s", detections, lambda of: of.quantile_s(0.05), -1,
+    *_limit_metrics("detected_share", estimate_detected_share),
+    Metric("ttd_p5_s", summarise_detections, lambda of: of.quantile_s(0.05), -1,
            "time to detection by which 5 % of the rows were detected"),
-    Metric("ttd_median_s", detections, lambda of: of.quantile_s(0.5), -1,
+    Metric("ttd_median_s", summarise_detections, lambda of: of.quantile_s(0.5), -1,
            "median time to detection", "summary"),
-    Metric("ttd_p95_s", detections, lambda of: of.quantile_s(0.95), -1,
+    Metric("ttd_p95_s", summarise_detections, lambda of: of.quantile_s(0.95), -1,
            "time to detection by which 95 % were detected; a dash: fewer were ever detected", "summary"),
-    Metric("ttd_rmst_s", detections, lambda of: of.mean_s(), -1,
+    Metric("ttd_rmst_s", summarise_detections, lambda of: of.mean_s(), -1,
            "mean time to detection, never detected counting as the horizon", "summary",
            "mean time to detection, never detected counting as the horizon"),
-    Metric("ttd_rmst_horizon_s", detections, lambda of: of.horizon_s, 0, "the horizon of ttd_rmst_s"),
-    Metric("dad_median_m", detections, lambda of: of.distance_quantile_m(0.5), 1, _DISTANCE, "summary",
+    Metric("ttd_rmst_horizon_s", summarise_detections, lambda of: of.horizon_s, 0, "the horizon of ttd_rmst_s"),
+    Metric("dad_median_m", summarise_detections, lambda of: of.distance_quantile_m(0.5), 1, _DISTANCE, "summary",
            "median of the differences of distances at detection"),
-    Metric("dad_p5_m", detections, lambda of: of.distance_quantile_m(0.05), 1,
+    Metric("dad_p5_m", summarise_detections, lambda of: of.distance_quantile_m(0.05), 1,
            "distance at detection that 95 % of the rows exceed", "summary"),
 )  # fmt: skip
 
 _CONFLICT_METRICS = (
-    Metric("conflict_detected_share", foreseen, _number, 1,
+    Metric("conflict_detected_share", estimate_foreseen_share, _number_or_none, 1,
            "share of the rows in which a list implied a collision", "conflict"),
-    Metric("conflict_ttd_median_s", conflicts, lambda of: of.quantile_s(0.5), -1,
+    Metric("conflict_ttd_median_s", summarise_conflicts, lambda of: of.quantile_s(0.5), -1,
            "median time to the first list that implied a collision", "conflict"),
-    Metric("conflict_ttd_p95_s", conflicts, lambda of: of.quantile_s(0.95), -1,
+    Metric("conflict_ttd_p95_s", summarise_conflicts, lambda of: of.quantile_s(0.95), -1,
            "time by which 95 % of the rows had such a list", "conflict"),
-    Metric("conflict_ttd_rmst_s", conflicts, lambda of: of.mean_s(), -1,
+    Metric("conflict_ttd_rmst_s", summarise_conflicts, lambda of: of.mean_s(), -1,
            "mean time to such a list, never counting as the horizon", "conflict"),
-    Metric("conflict_dad_median_m", conflicts, lambda of: of.distance_quantile_m(0.5), 1,
+    Metric("conflict_dad_median_m", summarise_conflicts, lambda of: of.distance_quantile_m(0.5), 1,
            "median distance at such a list", "conflict"),
 )  # fmt: skip
 
 _BRAKING_METRICS = (
-    Metric("n_conflict", passed, lambda of: of.n, 0,
+    Metric("n_conflict", estimate_passed_share, lambda of: of.n, 0,
            "rows in conflict: without braking the ego would come too near", "braking"),
-    Metric("pass_share", passed, lambda of: of.share, 1, _PASSES, "braking", "share of conflicts that pass"),
-    *_limits("pass_share", passed, "pass_"),
+    Metric("pass_share", estimate_passed_share, lambda of: of.share, 1, _PASSES,
+           "braking", "share of conflicts that pass"),
+    *_limit_metrics("pass_share", estimate_passed_share, "pass_"),
 )  # fmt: skip
 
 
-def _exact_metric(name: str, value: Callable[[Exact], float | None], better: Literal[-1, 0, 1]) -> Metric:
-    return Metric(f"{name}_exact", exact, value, better, f"{name} in closed form, the limit for many runs")
+def _exact_metric(name: str, value: Callable[[ExactStatistics], float | None], better: Literal[-1, 0, 1]) -> Metric:
+    return Metric(f"{name}_exact", summarise_exact, value, better, f"{name} in closed form, the limit for many runs")
 
 
 def _exact_missed(name: str, help: str) -> Metric:
     find = itemgetter(name)
-    return Metric(name, exact, lambda of: find(of.missed), -1, help)
+    return Metric(name, summarise_exact, lambda of: find(of.missed), -1, help)
 
 
 _EXACT_METRICS = (
@@ -311,10 +316,19 @@ _EXACT_METRICS = (
     _exact_missed("miss_log10_half_odds", "the same with the odds of every detection halved"),
     _exact_missed("miss_per_logit", "derivative of ln of that probability by the log-odds of every detection"),
     Metric(
-        "pass_share_exact", judged, itemgetter(0), 1, "pass_share in closed form, the limit for many runs", "braking"
+        "pass_share_exact",
+        exact_verdict_shares,
+        itemgetter(0),
+        1,
+        "pass_share in closed form, the limit for many runs",
+        "braking",
     ),
     Metric(
-        "fail_share_exact", judged, itemgetter(1), -1, "share of conflicts that fail, in closed form; null below 10⁻¹⁵"
+        "fail_share_exact",
+        exact_verdict_shares,
+        itemgetter(1),
+        -1,
+        "share of conflicts that fail, in closed form; null below 10⁻¹⁵",
     ),
 )
 

@@ -1,26 +1,28 @@
-"""Curves, quantiles and means over many rows. Pure functions; nothing here draws a random number.
+"""Cumulative incidence of detection: curve, quantiles and restricted means over many rows, and why observation ended.
 
 *Time to detection* T: seconds from the onset to the detection, negative where the object was known before.
-Looking ends in one of three ways: the object is detected (`DETECTED`); it departs undetected (`LEFT`) and so
-is never detected, T = ∞; or observation stops while it is still there (`CENSORED`), and of T is known only that
-it is later.
+Observation ends in one of three ways: the object is detected (`DETECTED`); it departs undetected (`LEFT`) and so is
+never detected, T = ∞; or observation stops while the object is still there (`CENSORED`), and T is known only to be
+later.
 *Cumulative incidence* F(t): the probability that T ≤ t. Departure competes with detection, it does not
 censor: F may stay below 1 for ever, and a quantile above its last value does not exist (None).
 *Restricted mean* at a horizon h: the mean of min(T, h), in which never counts as h.
 *Distance at detection*: far is good, so a row that was never detected ranks below every distance.
-Intervals: metrics/intervals.py.
+Intervals: metrics/intervals.py. No function here draws a random number.
 
 Letters of the shapes: n rows, M distinct times of detection.
 """
 
 from __future__ import annotations
 
+from enum import Enum
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
-from copem_replay.core.tracks import Bool, Float
+from copem_replay.core.tracks import Bool, Float, Int
 
 CENSORED = 0
 """The ego left or the log ended: the object was still there to be detected."""
@@ -40,7 +42,7 @@ def cumulative_incidence(
 ) -> tuple[Float, Float]:
     """Estimate the cumulative incidence of detection, departure competing: a right-continuous step function.
 
-    `time_s (n,)`: seconds from the onset to the detection, or to when looking ended; finite, may be negative.
+    `time_s (n,)`: seconds from the onset to the detection, or to the end of observation; finite, may be negative.
     `ending (n,)`: `DETECTED` (1), `LEFT` (2) or `CENSORED` (0). Of equal times, detections and departures come before
     censorings: a row that is censored at t was observed until t, t included.
     `weight (n,)`: how much each row counts, ≥ 0 (probabilities, multiplicities); None: all alike. `least`: the
@@ -60,6 +62,33 @@ def cumulative_incidence(
     (array([0.5, 2. ]), array([0.5 , 0.75]))
     """
     weight = np.ones(len(time_s)) if weight is None else weight
+    _check_rows(time_s, ending, weight)
+    detected, censored = ending == DETECTED, ending == CENSORED
+    # The estimator adds S(t−)·d/r at each time of detection: d of the r still looked at are detected, S is the
+    # probability that nothing has happened yet. Between censorings r shrinks by exactly those to which something
+    # happens, so the product S(t−) telescopes to r/n, times (r' + c)/r' for each earlier time at which c are censored
+    # and r' > 0 remain. A detection thus weighs these factors over n: a censored row hands its weight on, in equal
+    # parts, to all that remain. Without censoring the weights are 1 and the incidence is a ratio of whole numbers,
+    # which a product over millions of times is not.
+    times_s, detections = _total_weights(time_s[detected], weight[detected])
+    lost_s, lost = _total_weights(time_s[censored], weight[censored])
+    order = np.argsort(time_s, kind="stable")
+    until = np.concatenate([[0.0], np.cumsum(weight[order])])
+    total = until[-1]
+    if total <= 0:
+        raise ValueError("cumulative_incidence: expected a weight above 0")
+    remaining = total - until[np.searchsorted(time_s[order], lost_s, side="right")]
+    # Where no row remains, the weight is not handed on.
+    remains = remaining >= least * total * (1 - 1e-9)
+    factors = 1.0 + lost[remains] / remaining[remains]
+    weights = np.append(1.0, np.cumprod(factors))
+    handed = weights[np.minimum(np.searchsorted(lost_s, times_s, side="left"), len(factors))]
+    incidence = np.cumsum(detections * handed) / total
+    return times_s, np.minimum(incidence, 1.0)
+
+
+def _check_rows(time_s: Float, ending: NDArray[np.integer[Any]], weight: Float) -> None:
+    """Raise ValueError where the rows of `cumulative_incidence` have other shapes or impossible values."""
     for column in (ending, weight):
         if time_s.ndim != 1 or column.shape != time_s.shape:
             raise ValueError(f"expected two columns of equal length, found {time_s.shape} and {column.shape}")
@@ -69,33 +98,11 @@ def cumulative_incidence(
         raise ValueError("expected weights of at least 0")
     if not np.isfinite(time_s).all():
         raise ValueError("cumulative_incidence: expected finite times")
-    detected, censored = ending == DETECTED, ending == CENSORED
-    if not (detected | censored | (ending == LEFT)).all():
+    if not np.isin(ending, (DETECTED, LEFT, CENSORED)).all():
         raise ValueError("cumulative_incidence: expected endings DETECTED, LEFT or CENSORED")
-    # The estimator adds S(t−)·d/r at each time of detection: d of the r still looked at are detected, S is the
-    # probability that nothing has happened yet. Between censorings r shrinks by exactly those to which something
-    # happens, so the product S(t−) telescopes to r/n, times (r' + c)/r' for each earlier time at which c are censored
-    # and r' > 0 remain. A detection thus weighs these factors over n: a censored row hands its weight on, in equal
-    # parts, to all that remain. Without censoring the weights are 1 and the incidence is a ratio of whole numbers,
-    # which a product over millions of times is not.
-    times_s, detections = _totals(time_s[detected], weight[detected])
-    lost_s, lost = _totals(time_s[censored], weight[censored])
-    order = np.argsort(time_s, kind="stable")
-    until = np.concatenate([[0.0], np.cumsum(weight[order])])
-    total = until[-1]
-    if total <= 0:
-        raise ValueError("cumulative_incidence: expected a weight above 0")
-    remaining = total - until[np.searchsorted(time_s[order], lost_s, side="right")]
-    # Where no row remains, the weight is not handed on.
-    there = remaining >= least * total * (1 - 1e-9)
-    factors = 1.0 + lost[there] / remaining[there]
-    weights = np.append(1.0, np.cumprod(factors))
-    handed = weights[np.minimum(np.searchsorted(lost_s, times_s, side="left"), len(factors))]
-    incidence = np.cumsum(detections * handed) / total
-    return times_s, np.minimum(incidence, 1.0)
 
 
-def _totals(value: Float, weight: Float) -> tuple[Float, Float]:
+def _total_weights(value: Float, weight: Float) -> tuple[Float, Float]:
     """Distinct values, ascending, and the weight on each."""
     distinct, place = np.unique(value, return_inverse=True)
     totals: Float = np.bincount(place, weights=weight, minlength=len(distinct)).astype(float)
@@ -105,7 +112,7 @@ def _totals(value: Float, weight: Float) -> tuple[Float, Float]:
 def quantile_time(times_s: Float, incidence: Float, q: float) -> float | None:
     """Find the smallest time at which the incidence is at least `q` (to 1e-12), seconds.
 
-    None when it is never reached: the quantile falls among the never detected, or beyond what was looked at.
+    None when it is never reached: the quantile falls among the never detected, or beyond the observed times.
     `times_s (M,)`, `incidence (M,)` as from `cumulative_incidence`, M may be 0; 0 < `q` ≤ 1.
     """
     first = int(np.searchsorted(incidence, q - SHARE_TOLERANCE, side="left"))
@@ -134,9 +141,57 @@ def quantile_with_never(values: Float, detected: Bool, q: float, weight: Float |
     `weight (n,)`: how much each row counts, None: all alike.
     """
     weight = np.ones(len(values)) if weight is None else weight
-    known = values[detected]
-    order = np.argsort(known, kind="stable")
+    ranked_values = values[detected]
+    order = np.argsort(ranked_values, kind="stable")
     below = np.concatenate([[weight[~detected].sum()], weight[~detected].sum() + np.cumsum(weight[detected][order])])
     place = int(np.searchsorted(below, (q - SHARE_TOLERANCE) * weight.sum(), side="left"))
     place = max(place, 0 if below[0] > 0 else 1)
-    return float(known[order[min(place, len(known)) - 1]]) if place > 0 else None
+    return float(ranked_values[order[min(place, len(ranked_values)) - 1]]) if place > 0 else None
+
+
+# Why observation of an object ended: the column `ended_by`.
+
+
+class EndReason(Enum):
+    """Why observation of an object ended; the values are the texts of `ended_by`."""
+
+    OBJECT_LEFT = "object_left"
+    EGO_LEFT = "ego_left"
+    LOG_END = "log_end"
+
+    @property
+    def censors(self) -> bool:
+        """Whether the object could still have been detected. An object that leaves undetected is never detected."""
+        return self is not EndReason.OBJECT_LEFT
+
+    @property
+    def label(self) -> str:
+        """Two words for figures."""
+        return _WORDS[self][0]
+
+    @property
+    def past(self) -> str:
+        """A clause about the object, in the past tense."""
+        return _WORDS[self][1]
+
+
+_WORDS = {
+    EndReason.OBJECT_LEFT: ("object leaves", "it left"),
+    EndReason.EGO_LEFT: ("ego leaves", "the ego left"),
+    EndReason.LOG_END: ("log ends", "the log ended"),
+}
+END_REASONS = tuple(EndReason)
+"""`Episodes.ended_by` holds positions in this tuple."""
+COMPETES = tuple(reason.value for reason in END_REASONS if not reason.censors)
+"""Texts of the reasons that are competing risks, not censoring."""
+
+
+def end_reason_texts(position: Int) -> np.ndarray:
+    """(n,) texts of `ended_by` for positions (n,) in `END_REASONS`."""
+    return np.array([reason.value for reason in END_REASONS], dtype=object)[position]
+
+
+def is_competing(ended_by: pd.Series) -> Bool:
+    """(n,) whether texts (n,) are those of a reason that is no censoring."""
+    competing: Bool = ended_by.isin(COMPETES).to_numpy(dtype=bool)
+    return competing

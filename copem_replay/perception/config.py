@@ -1,32 +1,91 @@
-"""Where perception units stand and when they list: keys of the experiment file, and what perception reads of it."""
+"""Units in the experiment file: where they stand, when they list, how they err beside their PEM; and obstacles.
+
+`PerceptionSetup` is all that perception reads of an experiment.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Protocol, Self
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, field_validator, model_validator
 
-from copem_replay.core.components import Either, Frozen, Id, NotNegative, Number, Positive, Share
+from copem_replay.core.components import Either, Flag, Frozen, Id, NotNegative, Number, Positive, Share
+from copem_replay.core.memory import MemoryPart, Parts
 from copem_replay.perception.pem.condition import ClassNames
-from copem_replay.perception.unit_errors import Clock, Outages, PoseError
 from copem_replay.perception.visibility import VisibilityModel
 
 if TYPE_CHECKING:
     from copem_replay.perception.pem.model import Pem
 
+
+# Errors of a unit beside its PEM: its own pose, its clock, and outages, drawn in perception/perceive.py.
+# docs/guide/unit-errors.md.
+
+
+class PoseError(Frozen):
+    """Errors of a unit's own position and heading, from mounting or localisation.
+
+    `position_sigma_m` applies to easting and to northing, `yaw_sigma_deg` to the heading. `memory`: the parts that
+    last, for the unit, or with `of: all` shared by all units; the rest is new in every list. `stated`: the unit's
+    stated covariances include these errors.
+    """
+
+    position_sigma_m: NotNegative = 0.0
+    yaw_sigma_deg: NotNegative = 0.0
+    stated: Flag = False
+    memory: Parts | None = Field(default=None, exclude_if=lambda memory: memory is None)
+
+    @field_validator("memory")
+    @classmethod
+    def _of_units(cls, parts: tuple[MemoryPart, ...] | None) -> tuple[MemoryPart, ...] | None:
+        if any(part.of == "object" for part in parts or ()):
+            raise ValueError("of: object: a pose is of no object; expected unit or all")
+        return parts
+
+    @property
+    def parts(self) -> tuple[MemoryPart, ...]:
+        """The parts of `memory`; `of: pair` means the unit."""
+        return tuple(p.model_copy(update={"of": "unit"}) if p.of == "pair" else p for p in self.memory or ())
+
+
+class ClockError(Frozen):
+    """Errors of a unit's clock: offset, and drift since the log's start, as standard deviations over the runs.
+
+    Within a run both are constant. A fusion sees captures in this clock.
+    """
+
+    offset_sigma_s: NotNegative = 0.0
+    drift_sigma_ppm: NotNegative = 0.0
+
+
+class Outages(Frozen):
+    """Times without lists: `down_share` of the time, each for `lasts_s` on average."""
+
+    down_share: Annotated[float, Field(strict=True, ge=0, le=0.999)]
+    lasts_s: Annotated[float, Field(strict=True, ge=0.001, le=86_400)]
+
+    @property
+    def correlation_s(self) -> float:
+        """Mean time between renewals of a uniform number; the unit is down while the number is below `down_share`.
+
+        1 − `down_share` of the renewals are above and end the outage: after `lasts_s` on average.
+        """
+        return self.lasts_s * (1 - self.down_share)
+
+
 Point = tuple[Number, Number]
 
 
-def _two(value: object) -> object:
+def _check_two_numbers(value: object) -> object:
     if isinstance(value, list | tuple) and len(value) == 3:
         found = ", ".join(str(number) for number in value)
         raise ValueError(f"expected two numbers, in the plane, found [{found}]; the height above ground is `height_m`")
     return value
 
 
-InPlane = Annotated[Point, BeforeValidator(_two)]
-"""A point beside which a height may stand."""
+InPlane = Annotated[Point, BeforeValidator(_check_two_numbers)]
+"""A point in the plane; three numbers are refused with a pointer to `height_m`."""
 
 Rate = Annotated[float, Field(strict=True, ge=0.001, le=1000)]
 """Lists per second."""
@@ -59,28 +118,29 @@ class Placement(Frozen):
     rate_hz: Rate | None = None
     phase_s: NotNegative = 0.0
     placed: PoseError | None = Field(default=None, exclude_if=lambda placed: placed is None)
-    clock: Clock | None = Field(default=None, exclude_if=lambda clock: clock is None)
+    clock: ClockError | None = Field(default=None, exclude_if=lambda clock: clock is None)
     outages: Outages | None = Field(default=None, exclude_if=lambda outages: outages is None)
 
 
-_AROUND = "the corners in order around an area, each once"
-
-
-def _crooked(reason: str) -> str:
-    """What is wrong with a polygon, of which shapely says `Self-intersection[5 5]`."""
+def _describe_polygon_fault(reason: str) -> str:
+    """What is wrong with a polygon, from the reason that shapely gives, such as `Self-intersection[5 5]`."""
     what, _, place = reason.rstrip("]").partition("[")
-    at = f" at [{', '.join(place.split())}]" if place else ""
-    words = {"Self-intersection": f"edges that cross or overlap{at}", "Ring Self-intersection": f"edges that meet{at}"}
+    where = f" at [{', '.join(place.split())}]" if place else ""
+    words = {
+        "Self-intersection": f"edges that cross or overlap{where}",
+        "Ring Self-intersection": f"edges that meet{where}",
+    }
     return words.get(what, "corners without an area between them")
 
 
-def simple_polygon(points_m: tuple[Point, ...]) -> tuple[Point, ...]:
+def check_polygon(points_m: tuple[Point, ...]) -> tuple[Point, ...]:
     """The corners of an area. Raises ValueError where its edges cross, or there is nothing between them."""
     import shapely
 
     polygon = shapely.Polygon(points_m)
     if not polygon.is_valid or polygon.area <= 0:
-        raise ValueError(f"polygon_m: expected {_AROUND}, found {_crooked(shapely.is_valid_reason(polygon))}")
+        fault = _describe_polygon_fault(shapely.is_valid_reason(polygon))
+        raise ValueError(f"polygon_m: expected the corners in order around an area, each once, found {fault}")
     return points_m
 
 
@@ -93,7 +153,7 @@ class Obstacle(Frozen):
 
     @model_validator(mode="after")
     def _simple(self) -> Self:
-        simple_polygon(self.polygon_m)
+        check_polygon(self.polygon_m)
         return self
 
 
@@ -102,11 +162,11 @@ class PerceptionSetup(Protocol):
 
     @property
     def seed(self) -> int:
-        """Of all draws."""
+        """The seed of all draws."""
 
     @property
     def max_gap_s(self) -> float:
-        """States further apart than this (s) are not interpolated between."""
+        """Seconds; between states further apart than this nothing is interpolated."""
 
     @property
     def visibility(self) -> VisibilityModel:
@@ -122,7 +182,7 @@ class PerceptionSetup(Protocol):
 
     @property
     def modelled(self) -> Mapping[str, Placement]:
-        """Those with a PEM."""
+        """The units with a PEM, by name."""
 
     @property
     def obstacles(self) -> tuple[Obstacle, ...]:

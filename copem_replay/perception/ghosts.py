@@ -1,8 +1,9 @@
 """Ghosts in the lists of units: entries about no object, which are born, last for a while and are gone.
 
-Births are Poisson points in time, so how many there are and how long they last does not depend on the list rate. Draws
-of a ghost have addresses of their own; it is listed like an object: with the error of the couple that applies where it
-is, and moved by the unit's pose error. A ghost stands: in the frame of the unit, in the world, or beside its object.
+Births are Poisson points in time, so the number of ghosts and how long they last do not depend on the list rate. Draws
+of a ghost have addresses of their own. It is listed like an object: with the error of the couple that applies where it
+is, and moved by the unit's pose error. A ghost stands still: in the frame of the unit, in the world, or beside its
+object.
 """
 
 from __future__ import annotations
@@ -13,36 +14,35 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from copem_replay.core.draws import Draws
-from copem_replay.core.followed import followed_by
-from copem_replay.core.interpolation import wrap
-from copem_replay.core.lasting import ListTimes, births, shared
+from copem_replay.core.interpolation import wrap_angles
+from copem_replay.core.lasting import ListStamps, draw_births, drop_unshared
+from copem_replay.core.memory import UnitDraws
 from copem_replay.core.random import CounterRng, RandomKey, Words, object_words, stable_hash
-from copem_replay.core.tracks import CLASSES, Float, Int, Scene, Tracks, class_indices
+from copem_replay.core.tracks import CLASSES, Float, Int, Scene, Tracks, append_tracks, class_indices
 from copem_replay.core.view_geometry import ViewGeometry
-from copem_replay.perception.observation import Observations, view_from
-from copem_replay.perception.pem.classes import drawn_class, row_of
-from copem_replay.perception.pem.condition import applies
-from copem_replay.perception.pem.ghosts import Beside, Ghosts
+from copem_replay.perception.observation import Observations, compute_view
+from copem_replay.perception.pem.condition import find_couples
+from copem_replay.perception.pem.model import GhostModel, ObjectSidePlace, class_row, draw_classes
 
 if TYPE_CHECKING:
     from copem_replay.perception.config import PerceptionSetup
     from copem_replay.perception.sensor_poses import SensorPoses, UnitPoses
+
 
 SIZES_M = {
     "pedestrian": (0.6, 0.6, 1.7), "bicycle": (1.8, 0.6, 1.7), "motorcycle": (2.2, 0.8, 1.6), "car": (4.5, 1.9, 1.6),
     "van": (5.2, 2.0, 2.1), "truck": (8.5, 2.5, 3.2), "bus": (12.0, 2.5, 3.2), "trailer": (7.0, 2.4, 2.8),
     "animal": (0.8, 0.4, 0.7), "other": (1.0, 1.0, 1.0), "vehicle": (4.5, 1.9, 1.6),
 }  # fmt: skip
-"""Length, width and height of what is listed, by class (chosen)."""
+"""Length, width and height of a listed ghost, by class: typical sizes, to which error models add errors."""
 assert tuple(SIZES_M) == CLASSES
 _NUMBER_BITS = np.uint64(52)
-"""In a ghost's word its number in the list begins here: below are 52 days of births, and no list has 4,096 ghosts."""
+"""Bits of a ghost's word below its number in the list: they hold 52 days of births, and no list has 4,096 ghosts."""
 
 
 @dataclass(frozen=True)
 class GhostRows:
-    """The ghosts in the lists of one run, row by row (P,): as observations of no object, which are all listed.
+    """The ghosts in the lists of one run, row by row (P,): observations of no object, all of which are listed.
 
     `words`: their addresses. `sort`: the place of each in its PEM's `ghosts`. `couple_ix`: the couple whose error each
     has, the one that applies where it is, else the first.
@@ -54,8 +54,8 @@ class GhostRows:
 
 
 @dataclass(frozen=True)
-class _Lists:
-    """The lists of one unit that are asked for, (L,): their numbers, stamps, and where the unit is at each."""
+class _UnitLists:
+    """The lists (L,) of one unit that are asked for: their indices, stamps, and where the unit is at each."""
 
     unit_ix: int
     name: str
@@ -67,9 +67,10 @@ class _Lists:
 
 @dataclass(frozen=True)
 class _Born:
-    """Ghosts of one sort: their words (B,), one of each birth; their rows (R,), ghost by ghost in order of time.
+    """Ghosts of one sort: `words (B,)`, one for each birth, and their rows (R,), ghost by ghost in order of time.
 
-    `list_ix`: of the unit's lists that are asked for. `host`: the row of the object beside which the ghost is, or −1.
+    `ghost`: the birth of each row; `list_ix`: its list, among those of the unit that are asked for; `host`: the row of
+    the object that the ghost is beside, −1: none.
     """
 
     words: Words
@@ -78,7 +79,7 @@ class _Born:
     host: Int
 
 
-def ghosts_in(
+def draw_ghosts(
     scene: Scene,
     found: Observations,
     setup: PerceptionSetup,
@@ -93,48 +94,53 @@ def ghosts_in(
     from_s, until_s = between_s
     if not any(setup.pems[str(unit.pem)].ghosts for unit in setup.modelled.values()):
         return None
-    rng, runs, pieces = CounterRng(setup.seed, scene.log), np.array([run]), [_none(found)]
+    rng, runs, pieces = CounterRng(setup.seed, scene.log), np.array([run]), [_no_ghosts(found)]
     for u, (name, unit) in enumerate(setup.modelled.items()):
         frames = np.flatnonzero(found.tracks.frame_unit_ix == u)
         poses = placed.poses[name]
         captured_s = found.tracks.captured_s[frames]
         asked = (captured_s >= from_s) & (captured_s < until_s)
         stamps = found.tracks.stamp_ns[frames[asked]]
-        lists = _Lists(u, name, frames[asked], stamps, poses, np.flatnonzero(poses.present)[asked])
+        lists = _UnitLists(u, name, frames[asked], stamps, poses, np.flatnonzero(poses.present)[asked])
         for n, sort in enumerate(setup.pems[str(unit.pem)].ghosts):
             if sort.in_list > 0 and len(stamps):
-                born = _born(rng, scene, found, lists, (n, sort), runs)
+                born = _draw_born(rng, scene, found, lists, (n, sort), runs)
                 if len(born.ghost):
                     couples = setup.pems[str(unit.pem)].couples
-                    tracks, view = _states(rng, found.tracks, lists, (n, sort), runs, born)
-                    couple_ix = np.maximum(applies(couples, view), 0)
+                    tracks, view = _place_ghosts(rng, found.tracks, lists, (n, sort), runs, born)
+                    couple_ix = np.maximum(find_couples(couples, view), 0)
                     sure = np.ones(len(couple_ix))
                     rows = Observations(tracks, view, couple_ix, sure, sure)
                     pieces.append(GhostRows(rows, born.words[born.ghost], np.full(len(sure), n)))
-    return _joined(pieces)
+    return _join_ghosts(pieces)
 
 
-def ghost_draws(scene: Scene, ghosts: GhostRows, setup: PerceptionSetup, run: int) -> Draws:
-    """The numbers of each ghost's rows."""
+def make_ghost_draws(scene: Scene, ghosts: GhostRows, setup: PerceptionSetup, run: int) -> UnitDraws:
+    """The random numbers of the rows of ghosts in one run."""
     tracks = ghosts.found.tracks
     random_key = RandomKey(tracks.units, tracks.row_unit_ix, ghosts.words, tracks.stamp_ns[tracks.frame_ix])
-    lists = ListTimes(tracks.stamp_ns, tracks.frame_unit_ix, tracks.frame_ix)
-    return Draws(CounterRng(setup.seed, scene.log), random_key, lists, np.array([run]))
+    lists = ListStamps(tracks.stamp_ns, tracks.frame_unit_ix, tracks.frame_ix)
+    return UnitDraws(CounterRng(setup.seed, scene.log), random_key, lists, np.array([run]))
 
 
-def _born(
-    rng: CounterRng, scene: Scene, found: Observations, lists: _Lists, numbered: tuple[int, Ghosts], runs: Int
+def _draw_born(
+    rng: CounterRng,
+    scene: Scene,
+    observations: Observations,
+    lists: _UnitLists,
+    numbered: tuple[int, GhostModel],
+    runs: Int,
 ) -> _Born:
     """The ghosts of one sort that are in any of the lists."""
     n, sort = numbered
-    hosts = _hosts(scene, found, lists, sort)
+    hosts = _find_hosts(scene, observations, lists, sort)
     none = np.zeros(len(hosts.words), dtype=np.int64)
     random_key = RandomKey((lists.name,), none, hosts.words, none)
     salt = np.uint64(stable_hash("ghosts", n))
     if sort.lasts_s == 0:
-        return _fresh(rng, hosts, lists, numbered, runs, salt)
+        return _draw_fresh(rng, hosts, lists, numbered, runs, salt)
     stamps = lists.stamp_ns
-    alive = births(
+    alive = draw_births(
         rng, f"ghosts {n}", random_key, runs, every_s=sort.lasts_s / sort.in_list, lasts_s=sort.lasts_s,
         from_ns=int(stamps[0]), until_ns=int(stamps[-1]) + 1,
     )  # fmt: skip
@@ -143,26 +149,30 @@ def _born(
     list_ix = np.arange(len(ghost)) - np.repeat(np.cumsum(after - first) - (after - first), after - first)
     list_ix += first[ghost]
     host = hosts.row[alive.row_ix[ghost], list_ix] if hosts.row is not None else np.full(len(ghost), -1)
-    there = host >= 0 if hosts.row is not None else np.ones(len(ghost), dtype=bool)
+    beside_host = host >= 0 if hosts.row is not None else np.ones(len(ghost), dtype=bool)
     words = hosts.words[alive.row_ix] + alive.address_ns.astype(np.uint64) + salt
-    return _Born(words, ghost[there], list_ix[there], host[there])
+    return _Born(words, ghost[beside_host], list_ix[beside_host], host[beside_host])
 
 
 @dataclass(frozen=True)
 class _Hosts:
-    """The objects beside ghosts: words (H,), and the row of each in each list (H, L), −1: none; None: no objects."""
+    """Objects that ghosts are beside: words (H,), and the row of each in each list (H, L), −1: none.
+
+    `row` None: ghosts are beside no objects; the one word is then that of the unit.
+    """
 
     words: Words
     row: Int | None
 
 
-def _hosts(scene: Scene, found: Observations, lists: _Lists, sort: Ghosts) -> _Hosts:
-    if not isinstance(sort.where, Beside):
+def _find_hosts(scene: Scene, observations: Observations, lists: _UnitLists, sort: GhostModel) -> _Hosts:
+    """The objects that ghosts of a sort may be beside in the lists of a unit."""
+    if not isinstance(sort.where, ObjectSidePlace):
         zero = np.zeros(1, dtype=np.int64)
-        of_all = shared(RandomKey((lists.name,), zero, zero.astype(np.uint64), zero), "unit")
+        of_all = drop_unshared(RandomKey((lists.name,), zero, zero.astype(np.uint64), zero), "unit")
         return _Hosts(of_all.object_word, None)
-    tracks = found.tracks
-    of_class = np.isin(found.view.class_ix, class_indices(sort.where.classes)) & (found.probability > 0)
+    tracks = observations.tracks
+    of_class = np.isin(observations.view.class_ix, class_indices(sort.where.classes)) & (observations.probability > 0)
     rows = np.flatnonzero((tracks.row_unit_ix == lists.unit_ix) & of_class)
     rows = rows[(tracks.frame_ix[rows] >= lists.frame_ix[0]) & (tracks.frame_ix[rows] <= lists.frame_ix[-1])]
     objects, which = np.unique(tracks.row_object_ix[rows], return_inverse=True)
@@ -171,12 +181,12 @@ def _hosts(scene: Scene, found: Observations, lists: _Lists, sort: Ghosts) -> _H
     return _Hosts(object_words(scene.object_ids)[objects], row)
 
 
-def _fresh(
-    rng: CounterRng, hosts: _Hosts, lists: _Lists, numbered: tuple[int, Ghosts], runs: Int, salt: np.uint64
+def _draw_fresh(
+    rng: CounterRng, hosts: _Hosts, lists: _UnitLists, numbered: tuple[int, GhostModel], runs: Int, salt: np.uint64
 ) -> _Born:
-    """Others in every list: how many by one number of each list (of each host in it), drawn at its capture.
+    """New ghosts in every list: their number follows from one uniform of each list (and host), drawn at its capture.
 
-    A ghost's word has the capture, its instant of birth: ids, and draws that last, are its own.
+    A ghost's word contains the capture, its instant of birth: so ids, and draws that last, are its own.
     """
     from scipy.stats import poisson
 
@@ -184,8 +194,8 @@ def _fresh(
     H, L = len(hosts.words), len(lists.stamp_ns)
     host_ix, list_ix = np.divmod(np.arange(H * L), L)
     if hosts.row is not None:
-        there = hosts.row.ravel() >= 0
-        host_ix, list_ix = host_ix[there], list_ix[there]
+        present = hosts.row.ravel() >= 0
+        host_ix, list_ix = host_ix[present], list_ix[present]
     none = np.zeros(len(host_ix), dtype=np.int64)
     random_key = RandomKey((lists.name,), none, hosts.words[host_ix], lists.stamp_ns[list_ix])
     [uniform] = rng.uniform(f"ghosts {n}", random_key, runs)
@@ -198,26 +208,26 @@ def _fresh(
     return _Born(words, np.arange(len(which)), list_ix[which], host)
 
 
-def _states(
-    rng: CounterRng, true: Tracks, lists: _Lists, numbered: tuple[int, Ghosts], runs: Int, born: _Born
+def _place_ghosts(
+    rng: CounterRng, true: Tracks, lists: _UnitLists, numbered: tuple[int, GhostModel], runs: Int, born: _Born
 ) -> tuple[Tracks, ViewGeometry]:
-    """Ghosts without any error, a track of each, and how they look from the unit: wholly visible."""
+    """Ghosts without any error, a track for each, and their view geometry from the unit: wholly visible."""
     n, sort = numbered
     none = np.zeros(len(born.words), dtype=np.int64)
     random_key = RandomKey((lists.name,), none, born.words, none)
     place = np.stack([rng.uniform(f"ghosts {n} place {k}", random_key, runs)[0] for k in range(3)])
     turn_rad = 2 * np.pi * rng.uniform(f"ghosts {n} turn", random_key, runs)[0]
-    shares = row_of(sort.classes)[None]
-    class_ix = drawn_class(shares, none, rng.uniform(f"ghosts {n} class", random_key, runs)[0])[born.ghost]
-    at, poses, host = lists.at[born.list_ix], lists.poses, born.host
-    x_m, y_m, heading_rad = poses.x_m[at], poses.y_m[at], poses.heading_rad[at]
-    ground_m, length_m, width_m = poses.ground_m[at], np.zeros(len(born.words)), np.zeros(len(born.words))
+    shares = class_row(sort.classes)[None]
+    class_ix = draw_classes(shares, none, rng.uniform(f"ghosts {n} class", random_key, runs)[0])[born.ghost]
+    pose_ix, poses, host = lists.at[born.list_ix], lists.poses, born.host
+    x_m, y_m, heading_rad = poses.x_m[pose_ix], poses.y_m[pose_ix], poses.heading_rad[pose_ix]
+    ground_m, length_m, width_m = poses.ground_m[pose_ix], np.zeros(len(born.words)), np.zeros(len(born.words))
     if sort.where.frame == "world":
-        x_m = y_m = heading_rad = np.zeros(len(at))
+        x_m = y_m = heading_rad = np.zeros(len(pose_ix))
     elif sort.where.frame == "object":
         x_m, y_m, heading_rad = true.x_m[0, host], true.y_m[0, host], true.yaw_rad[0, host]
         ground_m = true.z_m[0, host] - true.height_m[0, host] / 2
-        # An object is as large in all lists: any row of its ghost tells.
+        # An object has one size in all lists, so any row of its ghost gives it.
         length_m[born.ghost], width_m[born.ghost] = true.length_m[0, host], true.width_m[0, host]
     ahead_m, left_m = sort.where.places_m(place, length_m, width_m)[:, born.ghost]
     cos, sin = np.cos(heading_rad), np.sin(heading_rad)
@@ -226,19 +236,19 @@ def _states(
         "x_m": x_m + cos * ahead_m - sin * left_m,
         "y_m": y_m + sin * ahead_m + cos * left_m,
         "z_m": ground_m + size_m[:, 2] / 2,
-        "yaw_rad": wrap(heading_rad + turn_rad[born.ghost]),
-        "vx_mps": np.zeros(len(at)),
-        "vy_mps": np.zeros(len(at)),
+        "yaw_rad": wrap_angles(heading_rad + turn_rad[born.ghost]),
+        "vx_mps": np.zeros(len(pose_ix)),
+        "vy_mps": np.zeros(len(pose_ix)),
         "length_m": size_m[:, 0],
         "width_m": size_m[:, 1],
         "height_m": size_m[:, 2],
     }
-    tracks = _as_tracks(true, lists, born, values)
-    return tracks, view_from(tracks, poses, at, np.ones(len(at)), class_ix.astype(np.int8))
+    tracks = _make_ghost_tracks(true, lists, born, values)
+    return tracks, compute_view(tracks, poses, pose_ix, np.ones(len(pose_ix)), class_ix.astype(np.int8))
 
 
-def _as_tracks(true: Tracks, lists: _Lists, born: _Born, values: dict[str, Float]) -> Tracks:
-    """One run's rows as tracks in the lists of `true`, one of each ghost."""
+def _make_ghost_tracks(true: Tracks, lists: _UnitLists, born: _Born, values: dict[str, Float]) -> Tracks:
+    """Rows of one run as tracks in the lists of `true`, a track for each ghost."""
     start = np.append(np.flatnonzero(np.diff(born.ghost, prepend=-1)), len(born.ghost))
     return Tracks(
         units=true.units,
@@ -255,23 +265,25 @@ def _as_tracks(true: Tracks, lists: _Lists, born: _Born, values: dict[str, Float
     )
 
 
-def _none(found: Observations) -> GhostRows:
-    none = found.take_rows(np.empty(0, dtype=np.int64))
+def _no_ghosts(observations: Observations) -> GhostRows:
+    none = observations.take_rows(np.empty(0, dtype=np.int64))
     return GhostRows(none, np.empty(0, dtype=np.uint64), np.empty(0, dtype=np.int64))
 
 
-def _joined(pieces: Sequence[GhostRows]) -> GhostRows:
+def _join_ghosts(pieces: Sequence[GhostRows]) -> GhostRows:
     """Rows of several sorts and units one after the other."""
     tracks = pieces[0].found.tracks
     for piece in pieces[1:]:
-        tracks = followed_by(tracks, piece.found.tracks)
+        tracks = append_tracks(tracks, piece.found.tracks)
 
     def rows(name: str) -> Float:
         return np.concatenate([getattr(piece.found, name) for piece in pieces])
 
     view = ViewGeometry.joined([piece.found.view for piece in pieces])
     couple_ix = np.concatenate([piece.found.couple_ix for piece in pieces])
-    found = Observations(tracks, view, couple_ix, rows("probability"), rows("existence"))
+    observations = Observations(tracks, view, couple_ix, rows("probability"), rows("existence"))
     return GhostRows(
-        found, np.concatenate([piece.words for piece in pieces]), np.concatenate([piece.sort for piece in pieces])
+        observations,
+        np.concatenate([piece.words for piece in pieces]),
+        np.concatenate([piece.sort for piece in pieces]),
     )

@@ -1,30 +1,36 @@
-"""Perceive: what each unit lists of the world, and with which errors (W̃_n = PEM_n(W), the paper's eq. for one unit).
+"""Perceive: the lists of each unit, with their errors (W̃_n = PEM_n(W), the paper's equation for one unit).
 
-Detection is decided first, then the error is sampled, as in the paper.
+Detection is decided first, then the error is sampled, as in the paper. Beside the states: claims of existence, class
+and track id, and the errors of a unit's own pose, of its clock, and outages.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from copem_replay.core.draws import Draws
-from copem_replay.core.interpolation import wrap
-from copem_replay.core.lasting import ListTimes
-from copem_replay.core.memory import Part, Parts
+from copem_replay.core.interpolation import wrap_angles
+from copem_replay.core.lasting import ListStamps, draw_held_uniforms, drop_capture, drop_unshared, renewal_stamps
+from copem_replay.core.memory import MemoryPart, Parts, UnitDraws
 from copem_replay.core.random import CounterRng, RandomKey, object_words
-from copem_replay.core.tracks import Bool, Float, Int, Scene, Tracks
+from copem_replay.core.tracks import CLASSES, Bool, Float, Int, Scene, Tracks
+from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.perception.config import PerceptionSetup
 from copem_replay.perception.observation import Observations, rows_by_unit
-from copem_replay.perception.pem.error import errors_of
-from copem_replay.perception.pem.memory import quantity_of
-from copem_replay.perception.pose_error import misplaced
+from copem_replay.perception.pem.condition import Claimed, ExistenceScores, noise_quantity
+from copem_replay.perception.pem.error import ask_errors
+
+if TYPE_CHECKING:
+    from copem_replay.perception.config import PoseError
+    from copem_replay.perception.pem.model import Pem
+
 
 SMALLEST_SIZE_M = 0.05
-"""A size error never makes a box smaller than this (chosen)."""
+"""A size error never makes a box smaller than this, so that each box keeps an area to overlap with."""
 
 
 def perceive(
@@ -42,18 +48,18 @@ def perceive(
     detection times by truth id need), the expected ones (true state plus the mean error) or sampled. What was listed
     does not depend on `states`.
     """
-    tracks, draws = found.tracks, draws_of(scene, found, experiment, runs)
-    valid = _listed(found, experiment, draws)
+    tracks, draws = found.tracks, make_draws(scene, found, experiment, runs)
+    valid = _draw_detected(found, experiment, draws)
     if equipped is not None:
         valid &= equipped[:, tracks.row_unit_ix]
     seen = tracks.with_values(valid=valid)
     if states == "true":
         return seen
-    return with_states(scene, seen, found, experiment, None if states == "expected" else draws)
+    return add_states(scene, seen, found, experiment, None if states == "expected" else draws)
 
 
-def draws_of(scene: Scene, found: Observations, experiment: PerceptionSetup, runs: Int) -> Draws:
-    """The numbers of the rows of objects (P,) in the runs (S,)."""
+def make_draws(scene: Scene, found: Observations, experiment: PerceptionSetup, runs: Int) -> UnitDraws:
+    """The random numbers of the rows of objects (P,) in the runs (S,)."""
     tracks = found.tracks
     random_key = RandomKey(
         tracks.units,
@@ -61,27 +67,27 @@ def draws_of(scene: Scene, found: Observations, experiment: PerceptionSetup, run
         object_words(scene.object_ids)[tracks.row_object_ix],
         tracks.stamp_ns[tracks.frame_ix],
     )
-    lists = ListTimes(tracks.stamp_ns, tracks.frame_unit_ix, tracks.frame_ix)
-    return Draws(CounterRng(experiment.seed, scene.log), random_key, lists, runs)
+    lists = ListStamps(tracks.stamp_ns, tracks.frame_unit_ix, tracks.frame_ix)
+    return UnitDraws(CounterRng(experiment.seed, scene.log), random_key, lists, runs)
 
 
-def with_states(
-    scene: Scene, seen: Tracks, found: Observations, experiment: PerceptionSetup, draws: Draws | None
+def add_states(
+    scene: Scene, seen: Tracks, found: Observations, experiment: PerceptionSetup, draws: UnitDraws | None
 ) -> Tracks:
-    """What was listed with the errors of its couples and of the units' poses; `draws` None: the expected ones."""
-    seen = _with_errors(seen, found, experiment, draws)
-    return seen if draws is None else misplaced(scene, seen, found.tracks, found.view, experiment, draws.runs)
+    """The lists with the errors of their couples and of the units' poses; `draws` None: with the mean errors alone."""
+    seen = _add_errors(seen, found, experiment, draws)
+    return seen if draws is None else apply_pose_errors(scene, seen, found.tracks, found.view, experiment, draws.runs)
 
 
-def _listed(found: Observations, experiment: PerceptionSetup, draws: Draws) -> Bool:
-    """(S, P) what is detected: its addressed uniform is below its probability (0: never, 1: always)."""
+def _draw_detected(found: Observations, experiment: PerceptionSetup, draws: UnitDraws) -> Bool:
+    """(S, P) which rows are detected: the addressed uniform is below the probability (0: never, 1: always)."""
     P = len(found.probability)
-    by_parts: dict[tuple[Part, ...], list[Int]] = {}
-    for unit, mine in zip(experiment.modelled.values(), rows_by_unit(found.tracks), strict=True):
+    by_parts: dict[tuple[MemoryPart, ...], list[Int]] = {}
+    for unit, unit_rows in zip(experiment.modelled.values(), rows_by_unit(found.tracks), strict=True):
         pem = experiment.pems[str(unit.pem)]
         for c in range(len(pem.couples)):
             if parts := pem.memory_of(c).get("detection", ()):
-                by_parts.setdefault(parts, []).append(mine[found.couple_ix[mine] == c])
+                by_parts.setdefault(parts, []).append(unit_rows[found.couple_ix[unit_rows] == c])
     if not by_parts:
         return draws.rng.bernoulli("detection", draws.random_key, draws.runs, found.probability)
     valid = np.empty((len(draws.runs), P), dtype=np.bool_)
@@ -95,19 +101,20 @@ def _listed(found: Observations, experiment: PerceptionSetup, draws: Draws) -> B
     return valid
 
 
-def _noise(draws: Draws | None, memory: Mapping[str, Parts], valid: Bool, name: str) -> Float:
-    """What an error model is handed for its rows: standard normals where listed; zeros where no draws are wanted."""
+def _draw_noise(draws: UnitDraws | None, memory: Mapping[str, Parts], valid: Bool, name: str) -> Float:
+    """The noise of an error model for its rows: standard normals where listed; zeros without `draws`."""
     if draws is None:
         return np.zeros(valid.shape)
-    return draws.normal(f"error {name}", memory.get(quantity_of(name), ()), np.ascontiguousarray(valid))
+    return draws.normal(f"error {name}", memory.get(noise_quantity(name), ()), np.ascontiguousarray(valid))
 
 
-def _with_errors(seen: Tracks, found: Observations, experiment: PerceptionSetup, draws: Draws | None) -> Tracks:
+def _add_errors(seen: Tracks, found: Observations, experiment: PerceptionSetup, draws: UnitDraws | None) -> Tracks:
+    """The lists with the errors of the couples that apply, and the variances that units state."""
     S, P = seen.valid.shape
     columns: dict[str, Any] = {}
 
     def per_run(name: str) -> Float:
-        # What has no error keeps its one row for all runs.
+        # A value without error keeps its one row for all runs.
         if name not in columns:
             columns[name] = np.repeat(getattr(seen, name), S, axis=0)
         column: Float = columns[name]
@@ -117,37 +124,259 @@ def _with_errors(seen: Tracks, found: Observations, experiment: PerceptionSetup,
         name: np.zeros((1, P))
         for name in ("cov_ee_m2", "cov_en_m2", "cov_nn_m2", "yaw_var_rad2", "size_var_m2", "speed_var_m2ps2")
     }
-    for unit, mine in zip(experiment.modelled.values(), rows_by_unit(seen), strict=True):
+    for unit, unit_rows in zip(experiment.modelled.values(), rows_by_unit(seen), strict=True):
         pem = experiment.pems[str(unit.pem)]
         for c, couple in enumerate(pem.couples):
-            rows = mine[found.couple_ix[mine] == c]
+            rows = unit_rows[found.couple_ix[unit_rows] == c]
             if couple.error is None or not len(rows):
                 continue
             where = f"pems.{unit.pem}[{c}].error"
             drawn = None if draws is None else draws.take(rows)
-            # Rows one after the other are looked at in place, others copied.
-            at = slice(rows[0], rows[-1] + 1) if rows[-1] - rows[0] < len(rows) else rows
-            noise = partial(_noise, drawn, pem.memory_of(c), seen.valid[:, at])
-            errors = errors_of(couple.error, found.view.take(rows), noise, S, where)
-            per_run("x_m")[:, at] += errors.east_m
-            per_run("y_m")[:, at] += errors.north_m
+            # Consecutive rows are a view, others a copy.
+            columns_at = slice(rows[0], rows[-1] + 1) if rows[-1] - rows[0] < len(rows) else rows
+            noise = partial(_draw_noise, drawn, pem.memory_of(c), seen.valid[:, columns_at])
+            errors = ask_errors(couple.error, found.view.take(rows), noise, S, where)
+            per_run("x_m")[:, columns_at] += errors.east_m
+            per_run("y_m")[:, columns_at] += errors.north_m
             for name in ("cov_ee_m2", "cov_en_m2", "cov_nn_m2"):
-                spread[name][0, at] = getattr(errors, name)
+                spread[name][0, columns_at] = getattr(errors, name)
             if errors.yaw_rad is not None:
                 yaw = per_run("yaw_rad")
-                yaw[:, at] = wrap(yaw[:, at] + errors.yaw_rad)
-                spread["yaw_var_rad2"][0, at] = errors.yaw_var_rad2
+                yaw[:, columns_at] = wrap_angles(yaw[:, columns_at] + errors.yaw_rad)
+                spread["yaw_var_rad2"][0, columns_at] = errors.yaw_var_rad2
             if errors.size_m is not None:
                 for axis, name in enumerate(("length_m", "width_m", "height_m")):
                     size = per_run(name)
-                    size[:, at] = np.maximum(size[:, at] + errors.size_m[axis], SMALLEST_SIZE_M)
-                spread["size_var_m2"][0, at] = errors.size_var_m2
+                    size[:, columns_at] = np.maximum(size[:, columns_at] + errors.size_m[axis], SMALLEST_SIZE_M)
+                spread["size_var_m2"][0, columns_at] = errors.size_var_m2
             if errors.speed_mps is not None:
-                speed = found.view.speed_mps[rows]
-                # Along the direction of travel; of the heading where the object stands.
-                east = np.where(speed > 0, seen.vx_mps[0, at] / np.maximum(speed, 1e-9), np.cos(seen.yaw_rad[0, at]))
-                north = np.where(speed > 0, seen.vy_mps[0, at] / np.maximum(speed, 1e-9), np.sin(seen.yaw_rad[0, at]))
-                per_run("vx_mps")[:, at] += errors.speed_mps * east
-                per_run("vy_mps")[:, at] += errors.speed_mps * north
-                spread["speed_var_m2ps2"][0, at] = errors.speed_var_m2ps2
+                east, north = _travel_direction(seen, found.view.speed_mps[rows], columns_at)
+                per_run("vx_mps")[:, columns_at] += errors.speed_mps * east
+                per_run("vy_mps")[:, columns_at] += errors.speed_mps * north
+                spread["speed_var_m2ps2"][0, columns_at] = errors.speed_var_m2ps2
     return seen.with_values(**columns, **spread)
+
+
+def _travel_direction(seen: Tracks, speed_mps: Float, columns_at: Any) -> tuple[Float, Float]:
+    """East and north (K,) of the direction of travel, of the heading where an object stands."""
+    moving, divisor = speed_mps > 0, np.maximum(speed_mps, 1e-9)
+    yaw_rad = seen.yaw_rad[0, columns_at]
+    east = np.where(moving, seen.vx_mps[0, columns_at] / divisor, np.cos(yaw_rad))
+    north = np.where(moving, seen.vy_mps[0, columns_at] / divisor, np.sin(yaw_rad))
+    return east, north
+
+
+# Claims of entries: existence, class probabilities, and the unit's own track id. Claims that are drawn are asked for
+# one run at a time; the others are equal in all runs.
+
+TRACK_ID_BITS = 52
+"""Bits of a track id: numbers in JSON are exact up to 53; of a million ids two are equal with probability 1e-4."""
+
+
+@dataclass(frozen=True)
+class DrawnClaims:
+    """Row by row: existence (P,), class probabilities (P, C) and track ids (P,), −1: none."""
+
+    existence: Float
+    class_probability: Float
+    track_id: Int
+
+
+def draw_claims(
+    found: Observations, setup: PerceptionSetup, draws: UnitDraws, ghost_sort: Int | None = None
+) -> DrawnClaims:
+    """The claims of the units about rows (P,) in one run, that of `draws`.
+
+    `ghost_sort (P,)`: the rows are ghosts, of these sorts of their PEMs; None: they are objects.
+    """
+    claims = DrawnClaims(
+        found.existence.copy(), np.eye(len(CLASSES))[found.view.class_ix], np.full(len(found.couple_ix), -1)
+    )
+    for unit, rows in zip(setup.modelled.values(), rows_by_unit(found.tracks), strict=True):
+        pem = setup.pems[str(unit.pem)]
+        if not len(rows) or not pem.draws_claims:
+            continue
+        unit_draws = draws.take(rows)
+        sort = None if ghost_sort is None else ghost_sort[rows]
+        claims.existence[rows] = _claim_existence(pem, found, rows, unit_draws, sort)
+        claims.class_probability[rows] = _claim_classes(pem, found, rows, unit_draws, of_ghosts=sort is not None)
+        if pem.tracks is not None:
+            claims.track_id[rows] = _claim_track_ids(unit_draws, pem.tracks.lasts_s)
+    return claims
+
+
+def _claim_existence(pem: Pem, found: Observations, rows: Int, draws: UnitDraws, sort: Int | None) -> Float:
+    """(P,) existence as claimed of rows of one unit; `sort`: the rows are ghosts of these sorts, None: objects."""
+    existence = found.existence[rows]
+    couple_ix = found.couple_ix[rows]
+    for c, couple in enumerate(pem.couples):
+        for n in range(1 if sort is None else len(pem.ghosts)):
+            of_sort = np.flatnonzero((couple_ix == c) & (True if sort is None else sort == n))
+            claimed: Claimed = couple.existence
+            if sort is not None and (own := pem.ghosts[n].existence) is not None:
+                claimed = own
+            if not len(of_sort):
+                continue
+            if isinstance(claimed, ExistenceScores):
+                [uniform] = draws.take(of_sort).uniform("existence", pem.memory_of(c).get("existence", ()))
+                existence[of_sort] = claimed.claimed(
+                    uniform, of_ghosts=sort is not None, ghosts_in_list=pem.ghosts_in_list
+                )
+            else:
+                existence[of_sort] = found.view.visible_share[rows[of_sort]] if claimed == "visible_share" else claimed
+    return existence
+
+
+def _claim_classes(pem: Pem, found: Observations, rows: Int, draws: UnitDraws, *, of_ghosts: bool) -> Float:
+    """(P, C) class probabilities of rows of one unit; the listed class of a ghost is drawn at its birth."""
+    class_ix = found.view.class_ix[rows].astype(np.int64)
+    if pem.classes is None:
+        return np.eye(len(CLASSES))[class_ix]
+    if pem.classes.confusion and not of_ghosts:
+        couple_ix, true = found.couple_ix[rows], class_ix.copy()
+        for c in range(len(pem.couples)):
+            of_couple = np.flatnonzero(couple_ix == c)
+            if len(of_couple):
+                [uniform] = draws.take(of_couple).uniform("class", pem.memory_of(c).get("class", ()))
+                class_ix[of_couple] = pem.classes.listed(true[of_couple], uniform)
+    return pem.classes.stated(class_ix)
+
+
+def _claim_track_ids(draws: UnitDraws, lasts_s: float) -> Int:
+    """(P,) track ids: a number drawn for each renewal; an id lasts from one renewal to the next."""
+    key, run = draws.random_key, draws.runs
+    [renewal] = renewal_stamps(draws.rng, "track id", key, run, lasts_s)
+    drawn = draws.rng.uniform("track id number", RandomKey(key.units, key.unit_ix, key.object_word, renewal), run)
+    ids: Int = (drawn[0] * 2.0**TRACK_ID_BITS).astype(np.int64)
+    return ids
+
+
+# Pose errors: a unit takes itself to be elsewhere, and turned, so all of a list shifts and turns alike. Visibility
+# follows the true pose; lists follow the pose that the unit takes for its own: x' = x + δ + (R(δθ) − 1)(x − p),
+# yaw' = yaw + δθ, v' = R(δθ) v, with p the true place of the unit.
+
+
+def apply_pose_errors(
+    scene: Scene, seen: Tracks, true: Tracks, view: ViewGeometry, setup: PerceptionSetup, runs: Int
+) -> Tracks:
+    """The lists of the units in the runs (S,), moved by the errors of the units about their own poses.
+
+    `seen`: rows (P,) without these errors; `true`: the rows without any error; `view`: their view geometry.
+    """
+    for name, unit in setup.modelled.items():
+        if (placed := unit.placed) is None:
+            continue
+        rows = np.flatnonzero(seen.row_unit_ix == seen.units.index(name))
+        frames, of_row = np.unique(seen.frame_ix[rows], return_inverse=True)
+        drawn = _draw_pose_errors(scene, seen, frames, placed, (setup.seed, name, runs))
+        # From the true place of the unit.
+        from_unit_m = view.range_m[rows] * np.stack([np.cos(view.bearing_rad[rows]), np.sin(view.bearing_rad[rows])])
+        at_m = np.stack([true.x_m[0, rows], true.y_m[0, rows]]) - from_unit_m
+        seen = _shift_rows(seen, rows, at_m, tuple(error[:, of_row] for error in drawn))
+        if placed.stated:
+            seen = _state_pose_covariance(seen, rows, from_unit_m, placed)
+    return seen
+
+
+def _shift_rows(seen: Tracks, rows: Int, at_m: Float, off: tuple[Float, ...]) -> Tracks:
+    """Some rows (K,) shifted and turned about `at_m` (2, K), by `off`: east, north (m) and turn (rad), (S, K) each."""
+    east_m, north_m, turn_rad = off
+    shape = (len(turn_rad), len(seen.frame_ix))
+    columns: dict[str, Any] = {name: np.array(np.broadcast_to(getattr(seen, name), shape)) for name in _MOVED}
+    cos, sin = np.cos(turn_rad), np.sin(turn_rad)
+    dx_m, dy_m = columns["x_m"][:, rows] - at_m[0], columns["y_m"][:, rows] - at_m[1]
+    # Written so that without shift and turn no bit changes.
+    columns["x_m"][:, rows] += east_m + ((cos - 1) * dx_m - sin * dy_m)
+    columns["y_m"][:, rows] += north_m + (sin * dx_m + (cos - 1) * dy_m)
+    columns["yaw_rad"][:, rows] = wrap_angles(columns["yaw_rad"][:, rows] + turn_rad)
+    vx_mps, vy_mps = columns["vx_mps"][:, rows], columns["vy_mps"][:, rows]
+    columns["vx_mps"][:, rows], columns["vy_mps"][:, rows] = cos * vx_mps - sin * vy_mps, sin * vx_mps + cos * vy_mps
+    return replace(seen, **columns)
+
+
+_MOVED = ("x_m", "y_m", "yaw_rad", "vx_mps", "vy_mps")
+
+
+def _state_pose_covariance(seen: Tracks, rows: Int, from_unit_m: Float, placed: PoseError) -> Tracks:
+    """The rows with J Σ Jᵀ of the pose added to their stated covariances, J = [1 | (−dy, dx)] of the true geometry."""
+    position_m2, turn_rad2 = placed.position_sigma_m**2, np.deg2rad(placed.yaw_sigma_deg) ** 2
+    dx_m, dy_m = from_unit_m
+    more: dict[str, Any] = {
+        "cov_ee_m2": position_m2 + turn_rad2 * dy_m**2,
+        "cov_en_m2": -turn_rad2 * dx_m * dy_m,
+        "cov_nn_m2": position_m2 + turn_rad2 * dx_m**2,
+        "yaw_var_rad2": np.full(len(rows), turn_rad2),
+    }
+    for name, added in more.items():
+        stated = getattr(seen, name)
+        more[name] = np.zeros((1, len(seen.frame_ix))) if stated is None else stated.copy()
+        more[name][:, rows] += added
+    return replace(seen, **more)
+
+
+def _draw_pose_errors(
+    scene: Scene, seen: Tracks, frames: Int, placed: PoseError, address: tuple[int, str, Int]
+) -> tuple[Float, Float, Float]:
+    """Easting, northing (m) and heading (rad) of some lists of a unit: (S, K) each. `address`: seed, unit, runs."""
+    seed, name, runs = address
+    unit_frames = np.flatnonzero(seen.frame_unit_ix == seen.units.index(name))
+    lists = ListStamps(
+        seen.stamp_ns[unit_frames], np.zeros(len(unit_frames), dtype=np.int64), np.searchsorted(unit_frames, frames)
+    )
+    of_unit = np.zeros(len(frames), dtype=np.int64)
+    random_key = drop_unshared(RandomKey((name,), of_unit, of_unit.astype(np.uint64), seen.stamp_ns[frames]), "unit")
+    draws = UnitDraws(CounterRng(seed, scene.log), random_key, lists, runs)
+    east, north, yaw = (draws.normal(f"placed {what}", placed.parts) for what in ("east", "north", "yaw"))
+    sigma_m, sigma_rad = placed.position_sigma_m, np.deg2rad(placed.yaw_sigma_deg)
+    return sigma_m * east, sigma_m * north, sigma_rad * yaw
+
+
+# Clocks: a unit states captures by its own clock, whose offset and drift are constant in a run.
+
+
+def clock_errors_s(
+    scene: Scene, units: tuple[str, ...], setup: PerceptionSetup, captured_s: Float, unit_ix: Int, run: int
+) -> Float | None:
+    """(F,) seconds that the clocks of units (U,) add to the captures of lists (F,) in one run; None: no clock errs."""
+    clocks = {name: unit.clock for name, unit in setup.modelled.items() if unit.clock is not None and name in units}
+    if not clocks:
+        return None
+    rng, zero = CounterRng(setup.seed, scene.log), np.zeros(1, dtype=np.int64)
+    error_s = np.zeros(len(captured_s))
+    for name, clock in clocks.items():
+        random_key = drop_capture(drop_unshared(RandomKey((name,), zero, zero.astype(np.uint64), zero), "unit"))
+        [[offset]] = rng.normal("clock offset", random_key, np.array([run]))
+        [[drift]] = rng.normal("clock drift", random_key, np.array([run]))
+        of_unit = unit_ix == units.index(name)
+        error_s[of_unit] = clock.offset_sigma_s * offset + 1e-6 * clock.drift_sigma_ppm * drift * captured_s[of_unit]
+    return error_s
+
+
+# Outages: for a while a unit makes no list at all, not even an empty one.
+
+
+def remove_outages(scene: Scene, seen: Tracks, setup: PerceptionSetup, runs: Int) -> Tracks:
+    """The lists of the units in one run, runs (1,), without those that are not made: they never arrive."""
+    down = lists_not_made(scene, seen, setup, runs)
+    if down is None:
+        return seen
+    [missing] = down
+    arrives_s = np.where(missing, np.inf, seen.arrives_s)
+    return seen.with_values(arrives_s=arrives_s, valid=seen.valid & ~missing[seen.frame_ix])
+
+
+def lists_not_made(scene: Scene, tracks: Tracks, setup: PerceptionSetup, runs: Int) -> Bool | None:
+    """(S, F) lists of `tracks` that are not made in the runs (S,), as their unit is down; None: all are made."""
+    outages_by_unit = {name: unit.outages for name, unit in setup.modelled.items() if unit.outages is not None}
+    if not outages_by_unit:
+        return None
+    down: Bool = np.zeros((len(runs), len(tracks.stamp_ns)), dtype=bool)
+    for name, outages in outages_by_unit.items():
+        frames = np.flatnonzero(tracks.frame_unit_ix == tracks.units.index(name))
+        of_unit = np.zeros(len(frames), dtype=np.int64)
+        random_key = drop_unshared(
+            RandomKey((name,), of_unit, of_unit.astype(np.uint64), tracks.stamp_ns[frames]), "unit"
+        )
+        drawn = draw_held_uniforms(CounterRng(setup.seed, scene.log), "outage", random_key, runs, outages.correlation_s)
+        down[:, frames] = drawn < outages.down_share
+    return down

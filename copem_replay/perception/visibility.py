@@ -1,11 +1,10 @@
 """The visible share of an upright box, seen from a unit: exact to rounding.
 
-`surface`: uniform in azimuth over the target's angular extent; at each azimuth the share of the column of the
-target's nearest face, bottom to top, that no body in front of it covers. `flat`: the same with infinitely high
-bodies. A box whose footprint overlaps the target's does not hide it; an obstacle hides wherever its face is nearer than
-the target's. A unit inside the target's footprint sees 1; a unit inside another body, between its bottom and its top,
-ignores that body; a unit's own carrier neither hides nor is seen.
-The integration is in perception/visibility_kernel.py.
+`surface`: uniform in azimuth over the target's angular extent; at each azimuth the share of the column of the target's
+nearest face, bottom to top, that no body in front of it covers. `flat`: the same with infinitely high bodies. A box
+whose footprint overlaps the target's does not hide it; an obstacle hides wherever its face is nearer than the target's.
+A unit inside the target's footprint sees 1; a unit inside another body, between its bottom and its top, ignores that
+body; a unit's own carrier neither hides nor is seen. The integration is in perception/visibility_kernel.py.
 """
 
 from __future__ import annotations
@@ -20,18 +19,18 @@ import numpy as np
 from pydantic import BeforeValidator, PlainSerializer, WithJsonSchema
 from pydantic_core import PydanticKnownError
 
-from copem_replay.core.components import Component, Slot, asked, wrong
-from copem_replay.core.own_code import is_own
+from copem_replay.core.components import Component, Slot, ask_component, wrong_answer_error
+from copem_replay.core.errors import is_own
 from copem_replay.core.tracks import Float, Int, Tracks
-from copem_replay.perception.visibility_kernel import Boxes, views
+from copem_replay.perception.visibility_kernel import Boxes, compute_shares
 from copem_replay.perception.visibility_kernel import Observers as Observers
 from copem_replay.perception.visibility_kernel import Statics as Statics
 
 _ROWS_PER_THREAD = 20_000
-"""Below this many views a thread costs more than it brings (chosen)."""
+"""Views that a thread computes at least: with fewer it costs more than it brings. No result depends on it."""
 
 
-def statics(polygons: Sequence[Float], bottom_m: Sequence[float], height_m: Sequence[float]) -> Statics:
+def make_statics(polygons: Sequence[Float], bottom_m: Sequence[float], height_m: Sequence[float]) -> Statics:
     """Static obstacles from simple polygons, each (K, 2), convex or not, any order of corners."""
     import shapely
 
@@ -89,34 +88,34 @@ class VisibilityModel(Component, ABC):
         return f"{self.kind} ({', '.join(f'{key}: {value}' for key, value in said.items())})" if said else self.kind
 
 
-class _BuiltIn(VisibilityModel):
-    """The shares are NaN where the unit is absent or the carrier."""
+class _BuiltInModel(VisibilityModel):
+    """Base of the built-in models: their shares are NaN where the unit is absent, and for its carrier."""
 
     flat: ClassVar[bool]
 
     def shares(self, world: Tracks, static: Statics, observers: Observers) -> Float:
         order, _bounds = world.by_frame
-        seen, _blocker = _views(world, static, observers, flat=self.flat, blockers=False)
+        seen, _blocker = _compute_views(world, static, observers, flat=self.flat, blockers=False)
         shares = np.empty_like(seen)
         shares[:, order] = seen
         return shares
 
     def hidden_by(self, world: Tracks, static: Statics, observers: Observers) -> Int:
         order, _bounds = world.by_frame
-        _seen, found = _views(world, static, observers, flat=self.flat, blockers=True)
-        blocker = np.empty_like(found)
-        blocker[:, order] = np.where(found >= 0, order[found], found) if len(order) else found
+        _seen, listed = _compute_views(world, static, observers, flat=self.flat, blockers=True)
+        blocker = np.empty_like(listed)
+        blocker[:, order] = np.where(listed >= 0, order[listed], listed) if len(order) else listed
         return blocker
 
 
-class Surface(_BuiltIn):
+class Surface(_BuiltInModel):
     """The share of the surface that faces the unit, with bodies as high as they are."""
 
     kind: Literal["surface"] = "surface"
     flat: ClassVar[bool] = False
 
 
-class Flat(_BuiltIn):
+class Flat(_BuiltInModel):
     """The share of the outline seen from above, with infinitely high bodies."""
 
     kind: Literal["flat"] = "flat"
@@ -124,10 +123,11 @@ class Flat(_BuiltIn):
 
 
 BUILT_IN: dict[str, VisibilityModel] = {"surface": Surface(), "flat": Flat()}
+"""The models that plain words stand for."""
 
 
-def _named(value: object) -> object:
-    """The model that a plain word stands for; what is said of a user's own is left to its slot."""
+def _model_from_word(value: object) -> object:
+    """The model that a plain word stands for; the keys of a user's own are left to its slot."""
     if isinstance(value, VisibilityModel | Mapping):
         return value
     if not isinstance(value, str) or value not in BUILT_IN:
@@ -135,15 +135,15 @@ def _named(value: object) -> object:
     return BUILT_IN[value]
 
 
-def _said(model: VisibilityModel) -> object:
+def _model_as_data(model: VisibilityModel) -> object:
     return model.kind if model.kind in BUILT_IN else model.model_dump(mode="json", by_alias=True)
 
 
 Visibility = Annotated[
     VisibilityModel,
     Slot("visibility", {}),
-    BeforeValidator(_named),
-    PlainSerializer(_said),
+    BeforeValidator(_model_from_word),
+    PlainSerializer(_model_as_data),
     WithJsonSchema(
         {
             "anyOf": [
@@ -162,37 +162,43 @@ def visible_shares(world: Tracks, static: Statics, observers: Observers, model: 
     Raises InputError where a model of the user's own fails, or gives no shares.
     """
     expected = (len(observers.carrier_ix), len(world.frame_ix))
-    if not expected[1]:  # a model is not asked about nothing
+    if not expected[1]:  # a model is not asked about no rows
         return np.zeros(expected)
-    found = asked(model, "visibility", lambda: np.asarray(model.shares(world, static, observers), dtype=float))
+    shares = ask_component(model, "visibility", lambda: np.asarray(model.shares(world, static, observers), dtype=float))
     if not is_own(type(model)):
-        return found
-    if found.shape != expected:
-        raise wrong(model, "visibility", f"shares: expected shape {expected}, found {found.shape}", "shares")
+        return shares
+    if shares.shape != expected:
+        raise wrong_answer_error(
+            model, "visibility", f"shares: expected shape {expected}, found {shares.shape}", "shares"
+        )
     seen = observers.present[:, world.frame_ix] & (world.row_object_ix != observers.carrier_ix[:, None])
-    beyond = seen & ~((found >= 0) & (found <= 1 + 1e-12))
+    beyond = seen & ~((shares >= 0) & (shares <= 1 + 1e-12))
     if beyond.any():
-        raise wrong(model, "visibility", f"shares: expected 0 … 1, found {found[beyond][0]}", "shares")
-    return np.where(seen, found, np.nan)
+        raise wrong_answer_error(model, "visibility", f"shares: expected 0 … 1, found {shares[beyond][0]}", "shares")
+    return np.where(seen, shares, np.nan)
 
 
-def hidden_by(world: Tracks, static: Statics, observers: Observers, model: VisibilityModel) -> Int:
+def find_blockers(world: Tracks, static: Statics, observers: Observers, model: VisibilityModel) -> Int:
     """Which body alone would hide most of each row of the world from each unit: (U, P), a row of the world.
 
     −1: none hides any of it; −2 − k: the obstacle k. Raises InputError where a model of the user's own fails.
     """
-    found = asked(model, "visibility", lambda: np.asarray(model.hidden_by(world, static, observers)))
+    blockers = ask_component(model, "visibility", lambda: np.asarray(model.hidden_by(world, static, observers)))
     if is_own(type(model)):
         expected = (len(observers.carrier_ix), len(world.frame_ix))
         least = -2 - int(static.body.max(initial=-1))
-        whole = found.shape == expected and found.dtype.kind in "iu"
-        if not whole or ((found < least) | (found >= max(expected[1], 1))).any():
+        whole = blockers.shape == expected and blockers.dtype.kind in "iu"
+        if not whole or ((blockers < least) | (blockers >= max(expected[1], 1))).any():
             message = f"hidden_by: expected whole numbers {least} … {expected[1] - 1} of shape {expected}"
-            raise wrong(model, "visibility", f"{message}, found {found.dtype.name} of shape {found.shape}", "hidden_by")
-    return found
+            raise wrong_answer_error(
+                model, "visibility", f"{message}, found {blockers.dtype.name} of shape {blockers.shape}", "hidden_by"
+            )
+    return blockers
 
 
-def _views(world: Tracks, static: Statics, observers: Observers, *, flat: bool, blockers: bool) -> tuple[Float, Int]:
+def _compute_views(
+    world: Tracks, static: Statics, observers: Observers, *, flat: bool, blockers: bool
+) -> tuple[Float, Int]:
     """Shares and blockers (U, P), rows list by list; blockers empty unless asked for."""
     order, bounds = world.by_frame
     n_units, n_frames = observers.present.shape
@@ -211,17 +217,20 @@ def _views(world: Tracks, static: Statics, observers: Observers, *, flat: bool, 
     edges = [0, *sorted(int(c) for c in cuts), n_frames]
     with ThreadPoolExecutor(threads) as pool:
         list(
-            pool.map(lambda k: views(edges[k], edges[k + 1], boxes, static, places, flat, out, blocker), range(pieces))
+            pool.map(
+                lambda k: compute_shares(edges[k], edges[k + 1], boxes, static, places, flat, out, blocker),
+                range(pieces),
+            )
         )
     return out, blocker
 
 
 def box_corners(tracks: Tracks) -> Float:
     """Corners of the boxes' footprints in the first run, counter-clockwise: (P, 4, 2)."""
-    return rectangles(tracks.x_m[0], tracks.y_m[0], tracks.yaw_rad[0], tracks.length_m[0], tracks.width_m[0])
+    return rectangle_corners(tracks.x_m[0], tracks.y_m[0], tracks.yaw_rad[0], tracks.length_m[0], tracks.width_m[0])
 
 
-def rectangles(x_m: Float, y_m: Float, yaw_rad: Float, length_m: Float, width_m: Float) -> Float:
+def rectangle_corners(x_m: Float, y_m: Float, yaw_rad: Float, length_m: Float, width_m: Float) -> Float:
     """Corners of rectangles, counter-clockwise: (P, 4, 2)."""
     cos, sin = np.cos(yaw_rad)[:, None], np.sin(yaw_rad)[:, None]
     forward = length_m[:, None] / 2 * np.array([1.0, -1.0, -1.0, 1.0])

@@ -1,9 +1,9 @@
-"""The compiled kernel of perception/visibility.py: see there for what it computes.
+"""The compiled kernel of visible shares: the integration over azimuth (perception/visibility.py defines the share).
 
-How: between the azimuths of two neighbouring corners, the inverse distance to the face a ray enters by (or leaves
+Between the azimuths of two neighbouring corners, the inverse distance to the face a ray enters by (or leaves
 by) is linear in the ray's direction u, so the slope at which each body begins and ends to cover is linear in u too.
-Slopes are equal where a linear function of u vanishes: these azimuths are found in closed form and split the interval.
-What is left is a smooth ratio of two linear functions, integrated with three Gauss points.
+Slopes are equal where a linear function of u vanishes: these azimuths are computed in closed form and split the
+interval. What is left is a smooth ratio of two linear functions, integrated with three Gauss points.
 
 A box that overlaps the target does not hide it. A part of an obstacle may overlap it: it hides where its face is nearer
 than the target's, so the azimuths at which the two outlines cross split the interval, too.
@@ -61,7 +61,7 @@ class Observers(NamedTuple):
     carrier_ix: Int
 
 
-class Columns(NamedTuple):
+class FaceColumns(NamedTuple):
     """Columns of a target's face between two azimuths `a` and `b`, (ux, uy) half way between them."""
 
     a: float
@@ -86,21 +86,22 @@ BODY = np.dtype(
 observer: bearing and distance of the middle, and the extent in azimuth about it."""
 
 _CORNERS = 4
-"""Of a target."""
+"""Corners of a target."""
 _OVERLAP_M = 1e-6
-"""Footprints that enter each other by less than this only touch (chosen)."""
+"""Footprints that enter each other by less than this only touch: above rounding, below any overlap of objects."""
 _ON_TOP_M = 0.01
-"""A unit so little above a box touches it (chosen: heights in logs are rounded)."""
+"""A unit so little above a box touches it: heights in logs are rounded."""
 _SURELY = 1e-6
-"""By how much, in rad, m and of slopes, a body that hides all of another exceeds it (chosen: far above rounding)."""
+"""A body that surely hides all of another exceeds it by this, in rad, m and slope: far above rounding. Larger: slower,
+no result changes."""
 _STEEP = 1e6
-"""Slope, in heights of the target's face by its distance, that stands for straight down and straight up (chosen)."""
+"""Height (m) at the target's face of a slope that stands for straight down or straight up: beyond any target."""
 _MAX_PIECES = 512
-"""Azimuth pieces per view (chosen): 60 bodies in front of one target need about 250."""
+"""Azimuth pieces per view: 60 bodies in front of one target need about 250."""
 
 
 @nb.njit(cache=True, nogil=True)
-def views(
+def compute_shares(
     f0: int, f1: int, boxes: Boxes, obstacles: Statics, places: Observers, flat: bool, out: Float, blocker: Int
 ) -> None:
     """Visible shares `out (U, P)` of the lists f0 … f1 − 1.
@@ -123,7 +124,7 @@ def views(
     of = np.empty(most, BODY)
     hides, inside, over = np.empty(most, dtype=np.bool_), np.empty(most, dtype=np.bool_), np.empty(most, dtype=np.bool_)
     near, alone = np.empty(most, dtype=np.int64), np.empty(1, dtype=np.int64)
-    work = _workspace(most, widest)
+    work = _make_workspace(most, widest)
 
     for f in range(f0, f1):
         first = bounds[f]
@@ -155,8 +156,8 @@ def views(
                 continue
             ox, oy, oz = observer_m[u, f, 0], observer_m[u, f, 1], observer_m[u, f, 2]
             for b in range(bodies):
-                # Who touches a box is in it: some logs hold the mast, too. Who touches an obstacle is in front of it:
-                # some cameras are fixed to walls, or stand on roofs.
+                # A unit that touches a box is in it: some logs hold the mast, too. A unit that touches an obstacle is
+                # in front of it: some cameras are fixed to walls, or stand on roofs.
                 dx, dy = of[b].x_m - ox, of[b].y_m - oy
                 of[b].bearing, of[b].distance_m = np.arctan2(dy, dx), np.sqrt(dx * dx + dy * dy)
                 inside[b] = of[b].distance_m <= of[b].radius_m + _SURELY and _contains(
@@ -175,7 +176,7 @@ def views(
                         vx, vy = xy[b, k, 0] - ox, xy[b, k, 1] - oy
                         angle = np.arctan2(dx * vy - dy * vx, dx * vx + dy * vy)
                         of[b].lo, of[b].hi = min(of[b].lo, angle), max(of[b].hi, angle)
-            for b in range(n, bodies):  # inside one part of an obstacle is inside the obstacle
+            for b in range(n, bodies):  # a unit inside one part of an obstacle is inside the obstacle
                 if inside[b] and not over[b]:
                     for c in range(n, bodies):
                         if of[c].owner == of[b].owner:
@@ -205,13 +206,13 @@ def views(
                 elif _hidden_by_one(t, near, count, of, oz, flat):
                     out[u, first + t] = 0.0
                 else:
-                    out[u, first + t] = _share(t, near, count, xy, of, (ox, oy, oz), flat, work)
+                    out[u, first + t] = _visible_share(t, near, count, xy, of, (ox, oy, oz), flat, work)
                 if blocker.shape[0] == 0:
                     continue
                 least = 1.0 - 1e-9
                 for i in range(count):
                     alone[0] = near[i]
-                    left = _share(t, alone, 1, xy, of, (ox, oy, oz), flat, work)
+                    left = _visible_share(t, alone, 1, xy, of, (ox, oy, oz), flat, work)
                     if left < least:
                         least = left
                         blocker[u, first + t] = first + near[i] if near[i] < n else -2 - of[near[i]].owner
@@ -219,7 +220,7 @@ def views(
 
 @nb.njit(cache=True, nogil=True)
 def _hidden_by_one(t: int, near: Int, count: int, of: Any, oz: float, flat: bool) -> bool:
-    # Whether one body surely hides all of target t, by bounds alone: what `_share` would find, in far less time.
+    # Whether one body surely hides all of target t, by bounds alone: what `_visible_share` gives, in far less time.
     nearest, farthest = of[t].distance_m - of[t].radius_m, of[t].distance_m + of[t].radius_m
     z0, z1 = of[t].bottom_m - oz, of[t].top_m - oz
     lowest = z0 / nearest if z0 < 0.0 else z0 / farthest  # slopes between which the target is
@@ -245,7 +246,7 @@ def _hidden_by_one(t: int, near: Int, count: int, of: Any, oz: float, flat: bool
 
 @nb.njit(inline="always")
 def _contains(polygon: Float, size: int, px: float, py: float, depth_m: float) -> bool:
-    # Whether a place is inside by so much.
+    # Whether a place is inside a polygon by at least depth_m.
     for k in range(size):
         m = k + 1 if k + 1 < size else 0
         ex, ey = polygon[m, 0] - polygon[k, 0], polygon[m, 1] - polygon[k, 1]
@@ -256,8 +257,8 @@ def _contains(polygon: Float, size: int, px: float, py: float, depth_m: float) -
 
 
 @nb.njit(cache=True, nogil=True)
-def _separated(a: Float, na: int, b: Float, nb_: int) -> bool:
-    # An edge of a with all of b on its outer side (or touching it).
+def _are_separated(a: Float, na: int, b: Float, nb_: int) -> bool:
+    # Whether some edge of a has all of b on its outer side (or touching it).
     for k in range(na):
         m = k + 1 if k + 1 < na else 0
         ex, ey = a[m, 0] - a[k, 0], a[m, 1] - a[k, 1]
@@ -281,8 +282,8 @@ def _drop_overlapping_boxes(t: int, near: Int, count: int, xy: Float, of: Any) -
         if (
             of[b].owner >= 0
             or not _may_meet(of, b, t)
-            or _separated(xy[t], of[t].size, xy[b], of[b].size)
-            or _separated(xy[b], of[b].size, xy[t], of[t].size)
+            or _are_separated(xy[t], of[t].size, xy[b], of[b].size)
+            or _are_separated(xy[b], of[b].size, xy[t], of[t].size)
         ):
             near[kept] = b
             kept += 1
@@ -296,7 +297,7 @@ def _may_meet(of: Any, a: int, b: int) -> bool:
 
 
 @nb.njit(cache=True, nogil=True)
-def _workspace(most: int, widest: int) -> Work:
+def _make_workspace(most: int, widest: int) -> Work:
     return (
         np.empty((most + 1, widest, 2)),  # corners in the frame of the view: observer at 0, target along +x
         np.empty((1 + _CORNERS) * most * widest + widest + 2),  # azimuths of corners, and of edges that cross
@@ -307,7 +308,9 @@ def _workspace(most: int, widest: int) -> Work:
 
 
 @nb.njit(inline="always")
-def _faces(polygon: Float, size: int, ux: float, uy: float) -> tuple[bool, float, float, float, float, float]:
+def _crossing_distances(
+    polygon: Float, size: int, ux: float, uy: float
+) -> tuple[bool, float, float, float, float, float]:
     # Inverse distances of entry and exit along u, as vectors g with 1/d = g·u; hit is False where the ray misses.
     enter, leave = -np.inf, np.inf
     nx = ny = fx = fy = 0.0
@@ -334,7 +337,7 @@ def _faces(polygon: Float, size: int, ux: float, uy: float) -> tuple[bool, float
 
 
 @nb.njit(cache=True, nogil=True)
-def _insert(values: Float, count: int, value: float) -> int:
+def _insert_sorted(values: Float, count: int, value: float) -> int:
     # Keeps values[:count] ascending.
     k = count
     while k > 0 and values[k - 1] > value:
@@ -361,7 +364,7 @@ def _insert_crossings(a: Float, na: int, b: Float, nb_: int, lo: float, hi: floa
             if 0.0 <= p <= 1.0 and 0.0 <= q <= 1.0:
                 angle = np.arctan2(a[k, 1] + p * ey, a[k, 0] + p * ex)
                 if lo < angle < hi:
-                    count = _insert(breaks, count, angle)
+                    count = _insert_sorted(breaks, count, angle)
     return count
 
 
@@ -374,12 +377,12 @@ def _equal_at(
     if va * vb >= 0.0:
         return a
     va, vb = abs(va), abs(vb)
-    at = np.arctan2(sin_a * vb + sin_b * va, cos_a * vb + cos_b * va)
-    return float(min(max(at, a), b))
+    angle = np.arctan2(sin_a * vb + sin_b * va, cos_a * vb + cos_b * va)
+    return float(min(max(angle, a), b))
 
 
 @nb.njit(cache=True, nogil=True)
-def _share(
+def _visible_share(
     t: int, near: Int, count: int, xy: Float, of: Any, eye_m: tuple[float, float, float], flat: bool, work: Work
 ) -> float:
     # The share of target t that the bodies near[:count] leave visible: the open azimuths, column by column.
@@ -387,8 +390,8 @@ def _share(
     ox, oy, oz = eye_m
     bearing, lo, hi = of[t].bearing, of[t].lo, of[t].hi
     cos, sin = np.cos(bearing), np.sin(bearing)
-    n_breaks = _insert(breaks, 0, lo)
-    n_breaks = _insert(breaks, n_breaks, hi)
+    n_breaks = _insert_sorted(breaks, 0, lo)
+    n_breaks = _insert_sorted(breaks, n_breaks, hi)
     for i in range(count + 1):  # the target last
         b = near[i] if i < count else t
         for k in range(of[b].size):
@@ -397,7 +400,7 @@ def _share(
             local[i, k, 0], local[i, k, 1] = vx, vy
             angle = np.arctan2(vy, vx)
             if lo < angle < hi:
-                n_breaks = _insert(breaks, n_breaks, angle)
+                n_breaks = _insert_sorted(breaks, n_breaks, angle)
     for i in range(count):
         if of[near[i]].owner >= 0 and _may_meet(of, near[i], t):
             n_breaks = _insert_crossings(local[i], of[near[i]].size, local[count], of[t].size, lo, hi, breaks, n_breaks)
@@ -408,15 +411,15 @@ def _share(
         if b - a < 1e-12:
             continue
         ux, uy = np.cos((a + b) / 2), np.sin((a + b) / 2)
-        hit, face, tx, ty, _fx, _fy = _faces(local[count], of[t].size, ux, uy)
+        hit, face, tx, ty, _fx, _fy = _crossing_distances(local[count], of[t].size, ux, uy)
         if not hit:  # rounding at a grazing corner
             continue
-        columns = Columns(a, b, ux, uy, face, tx, ty, z0, z1)
-        active = _active(near, count, local, of, oz, columns, flat, begin, end)
+        columns = FaceColumns(a, b, ux, uy, face, tx, ty, z0, z1)
+        active = _find_covering_bodies(near, count, local, of, oz, columns, flat, begin, end)
         if active == 0:
             seen += b - a
         elif active > 0:
-            n_splits = _split(active, begin, end, tx, ty, z0, z1, a, b, splits)
+            n_splits = _split_azimuths(active, begin, end, tx, ty, z0, z1, a, b, splits)
             for k in range(n_splits - 1):
                 width = splits[k + 1] - splits[k]
                 if width < 1e-12:
@@ -424,13 +427,13 @@ def _share(
                 for g in range(3):
                     theta = splits[k] + width * (0.5 + (g - 1) * 0.3872983346207417)  # √0.15: Gauss–Legendre
                     weight = (8.0 if g == 1 else 5.0) / 18.0
-                    seen += width * weight * _open(active, begin, end, tx, ty, z0, z1, theta, low, high)
+                    seen += width * weight * _open_share(active, begin, end, tx, ty, z0, z1, theta, low, high)
     return float(min(max(seen / (hi - lo), 0.0), 1.0))
 
 
 @nb.njit(inline="always")
-def _active(
-    near: Int, count: int, local: Float, of: Any, oz: float, columns: Columns, flat: bool, begin: Float, end: Float
+def _find_covering_bodies(
+    near: Int, count: int, local: Float, of: Any, oz: float, columns: FaceColumns, flat: bool, begin: Float, end: Float
 ) -> int:
     # Bodies that cover a part of the columns between the azimuths a and b: how many, their slopes in begin and end.
     # −1 where one of them covers all of it. Linear in u: what holds at both ends holds throughout.
@@ -440,7 +443,7 @@ def _active(
     active = 0
     for i in range(count):
         body = near[i]
-        hit, enter, nx, ny, fx, fy = _faces(local[i], of[body].size, ux, uy)
+        hit, enter, nx, ny, fx, fy = _crossing_distances(local[i], of[body].size, ux, uy)
         if not hit or enter >= face:
             continue
         of_obstacle = of[body].owner >= 0
@@ -474,13 +477,13 @@ def _active(
 
 
 @nb.njit(cache=True, nogil=True)
-def _split(
+def _split_azimuths(
     active: int, begin: Float, end: Float, tx: float, ty: float, z0: float, z1: float, a: float, b: float, splits: Float
 ) -> int:
     # The azimuths from a to b between which no slope crosses another, nor an end of the column; how many.
     cos_a, sin_a, cos_b, sin_b = np.cos(a), np.sin(a), np.cos(b), np.sin(b)
-    n_splits = _insert(splits, 0, a)
-    n_splits = _insert(splits, n_splits, b)
+    n_splits = _insert_sorted(splits, 0, a)
+    n_splits = _insert_sorted(splits, n_splits, b)
     for i in range(active):
         for edge in range(2):
             gx = begin[i, 0] if edge == 0 else end[i, 0]
@@ -495,14 +498,14 @@ def _split(
                     hx, hy = begin[other // 2, 0], begin[other // 2, 1]
                 else:
                     hx, hy = end[other // 2, 0], end[other // 2, 1]
-                at = _equal_at(gx - hx, gy - hy, a, b, cos_a, sin_a, cos_b, sin_b)
-                if at > a and n_splits < _MAX_PIECES:
-                    n_splits = _insert(splits, n_splits, at)
+                angle = _equal_at(gx - hx, gy - hy, a, b, cos_a, sin_a, cos_b, sin_b)
+                if angle > a and n_splits < _MAX_PIECES:
+                    n_splits = _insert_sorted(splits, n_splits, angle)
     return n_splits
 
 
 @nb.njit(inline="always")
-def _open(
+def _open_share(
     active: int, begin: Float, end: Float, tx: float, ty: float, z0: float, z1: float, theta: float,
     low: Float, high: Float,
 ) -> float:  # fmt: skip

@@ -1,41 +1,229 @@
 """Exact detection times: their distribution in closed form, without a single draw.
 
 Lists are independent given the truth, and with ideal fusion an object is known when any list that has arrived holds
-it: P(T > t) = Π (1 − p) over all lists that have arrived by t. Where detection lasts, lists that go by one number are
-not independent, and a filter gives the factors (metrics/lasting_survival.py). Confirmation by k of n is a Markov
-chain over the last n − 1 capture instants where all units capture together and their lists arrive together, in the
-order of their captures; elsewhere it has no such form, and is refused. Both are worked out in
-metrics/log_survival.py. With the distribution of the reaction follow the probabilities to pass and to fail.
-docs/guide/metrics.md has the definitions.
+it: P(T > t) = Π (1 − p) over all lists that have arrived by t. Where detection lasts, lists that share a held number
+are not independent, and a filter gives the factors. Confirmation by k of n is a Markov chain over the last n − 1
+capture instants where all units capture together and their lists arrive together, in the order of their captures;
+elsewhere it has no such form, and is refused. Both are worked out in `metrics/exact_survival.py`. The probabilities to
+pass and to fail follow with the distribution of the reaction. Definitions: docs/guide/metrics.md.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from copem_replay.core.errors import ExperimentError
-from copem_replay.core.tracks import CLASSES, SAME_INSTANT_NS, TRUTH, Float, Int, Tracks
-from copem_replay.experiment.drive import of_log
+from copem_replay.communication.link import UnitLinks, delay_until_ready, sample_arrivals, transmit
+from copem_replay.communication.radio import Radio
+from copem_replay.communication.reception import ConstantReception, RadioPath, ask_reception_probability
+from copem_replay.core.errors import ExperimentError, count_noun
+from copem_replay.core.memory import MemoryPart
+from copem_replay.core.random import CounterRng
+from copem_replay.core.tracks import CLASSES, SAME_INSTANT_S, TRUTH, Float, Int, Tracks
+from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.braking.driver import Reaction
 from copem_replay.metrics.braking.verdict import fail_probability, pass_probability
 from copem_replay.metrics.detection.by_truth_id import capture_instants
-from copem_replay.metrics.detections_table import distances
-from copem_replay.metrics.end_reason import texts_of
-from copem_replay.metrics.lasting_survival import Lasting
-from copem_replay.metrics.log_survival import FirstKnown, confirmed, first_of
-from copem_replay.pipeline.exact_links import exactly_heard
+from copem_replay.metrics.detections_table import measure_distances
+from copem_replay.metrics.exact_survival import FirstKnown, LastingDetection, first_confirmed, first_known
+from copem_replay.metrics.survival import end_reason_texts
+from copem_replay.perception.observation import rows_by_unit
+from copem_replay.perception.pem.model import Pem
 from copem_replay.pipeline.expansion import ExpandedExperiment
-from copem_replay.pipeline.lasting_detection import check_lasting, lasting
 from copem_replay.pipeline.prepare import Replay
-from copem_replay.pipeline.receiver import by_truth
+from copem_replay.pipeline.receiver import has_truth_ids
+from copem_replay.pipeline.sweep import list_points
 
-_TOLERANCE_S = SAME_INSTANT_NS * 1e-9
+# Detection that lasts: which units share a held number, and whether that has a closed form.
+
+
+def check_lasting(experiment: ExpandedExperiment, name: str, hits: int) -> bool:
+    """Whether detection lasts in a configuration. Raises ExperimentError where that has no closed form."""
+    return bool(_find_processes(experiment, name, hits))
+
+
+def find_lasting_detection(
+    replay: Replay, experiment: ExpandedExperiment, name: str, heard: Tracks
+) -> LastingDetection | None:
+    """How the detection of each row (P,) lasts in what a configuration hears; None: no detection lasts.
+
+    Raises ExperimentError where detection lasts in a way that has no closed form.
+    """
+    of_unit = _find_processes(experiment, name, 1)
+    if not of_unit:
+        return None
+    found = replay.measured
+    P, keys = len(found.probability), list(dict.fromkeys(key for key, _ in of_unit.values()))
+    process, share, tau_s = np.full(P, -1), np.zeros(P), np.full(P, np.inf)
+    for (unit, settings), rows in zip(experiment.modelled.items(), rows_by_unit(found.tracks), strict=True):
+        if unit not in of_unit:
+            continue
+        key, time_s = of_unit[unit]
+        pem = experiment.pems[str(settings.pem)]
+        by_couple = np.array(
+            [*(sum(part.share for part in _list_lasting_parts(pem, c)) for c in range(len(pem.couples))), 0.0]
+        )
+        process[rows], share[rows], tau_s[rows] = keys.index(key), by_couple[found.couple_ix[rows]], time_s
+    for number in range(len(keys)):
+        units = [unit for unit, (key, _) in of_unit.items() if keys.index(key) == number]
+        _check_order(replay, experiment, name, heard, units)
+    return LastingDetection(process, share, tau_s, heard.row_captured_s)
+
+
+def _find_processes(experiment: ExpandedExperiment, name: str, hits: int) -> dict[str, tuple[str, float]]:
+    """By unit whose detection lasts: the key of the held number it uses, and its correlation time."""
+    configuration = experiment.configurations[name]
+    processes: dict[str, tuple[str, float]] = {}
+    for unit in () if configuration.units == TRUTH else experiment.units_of(configuration):
+        settings = experiment.units[unit]
+        if settings.pem is None:
+            continue
+        part = _find_lasting_part(experiment.pems[settings.pem], name, unit)
+        if part is None:
+            continue
+        if hits > 1:
+            why = f"detection of unit {unit} lasts, and confirmation by several hits then has no closed form"
+            raise _refuse_lasting(name, f"{why}; confirm with one hit")
+        tau_s = np.inf if isinstance(part.correlation_s, str) else part.correlation_s
+        key = f"{part.of} {unit}" if part.of in ("pair", "unit") else part.of
+        for other, (number_key, other_s) in processes.items():
+            if number_key == key and other_s != tau_s:
+                shared = f"units {other} and {unit} have the numbers of `of: {part.of}` in common"
+                why = f"{shared} with two correlation times, which has no closed form; give them one"
+                raise _refuse_lasting(name, why)
+        processes[unit] = key, tau_s
+        if part.of in ("object", "all") and experiment.share[list(experiment.units).index(unit)] < 1:
+            why = f"detection of `of: {part.of}` that lasts then has no closed form"
+            raise _refuse_lasting(name, f"unit {unit} is only in some runs, and {why}")
+    return processes
+
+
+def _find_lasting_part(pem: Pem, name: str, unit: str) -> MemoryPart | None:
+    """The one part of a unit's detection that lasts; None: detection does not last."""
+    by_couple = [parts for c in range(len(pem.couples)) if (parts := _list_lasting_parts(pem, c))]
+    if not by_couple:
+        return None
+    most = max(by_couple, key=len)
+    if len(most) > 1:
+        count = f"{_count_in_words(len(most))} lasting parts"
+        why = f"detection of unit {unit} has {count}, which has no closed form here; leave one"
+        raise _refuse_lasting(name, why)
+    [first, *others] = [parts[0] for parts in by_couple]
+    if any((part.correlation_s, part.of, part.path) != (first.correlation_s, first.of, first.path) for part in others):
+        why = f"detection of unit {unit} lasts otherwise from couple to couple, which has no closed form"
+        raise _refuse_lasting(name, f"{why}; give all one correlation_s and `of`")
+    if first.path not in (None, "held") and first.correlation_s != "always":
+        raise _refuse_lasting(
+            name, f"detection of unit {unit} {first.path}, which has no closed form; use `path: held`"
+        )
+    return first
+
+
+def _list_lasting_parts(pem: Pem, couple: int) -> list[MemoryPart]:
+    return [part for part in pem.memory_of(couple).get("detection", ()) if part.share > 0]
+
+
+def _count_in_words(count: int) -> str:
+    return {2: "two", 3: "three"}.get(count, str(count))
+
+
+def _check_order(replay: Replay, experiment: ExpandedExperiment, name: str, heard: Tracks, units: list[str]) -> None:
+    """Raises ExperimentError unless lists that share a held number arrive as they were captured."""
+    ixs = [list(experiment.units).index(unit) for unit in units]
+    frames = np.flatnonzero(np.isin(heard.frame_unit_ix, ixs) & np.isfinite(heard.common_arrives_s))
+    arrives_s: Float = heard.common_arrives_s[frames[np.argsort(heard.captured_s[frames], kind="stable")]]
+    late: Int = np.flatnonzero(arrives_s < np.maximum.accumulate(arrives_s) - SAME_INSTANT_S)
+    if len(late):
+        senders = f"unit {units[0]}" if len(units) == 1 else f"the {count_noun(len(units), 'unit')} {', '.join(units)}"
+        order = f"lists of {senders} arrive in another order than they were captured in"
+        why = f"{order}, and detection that lasts then has no closed form; give them one constant latency"
+        raise _refuse_lasting(name, why, replay.scene.log)
+
+
+def _refuse_lasting(name: str, why: str, log: str = "") -> ExperimentError:
+    return ExperimentError(f"{log + ': ' if log else ''}exact: configuration {name}: {why}, or leave exact out")
+
+
+# Links: when lists arrive, and how probably, without a draw.
+
+
+def hear_without_loss(replay: Replay, experiment: ExpandedExperiment, name: str, hits: int) -> tuple[Tracks, Float]:
+    """What reaches the receiver of a configuration if no list is lost, and the probability that each (F,) is not.
+
+    `hits`: how many confirm an object. Raises ExperimentError where drawn arrivals have no closed form.
+    """
+    configuration, units = experiment.configurations[name], set(experiment.units_of(experiment.configurations[name]))
+    for unit in sorted(units & experiment.ready.keys()):
+        if experiment.ready[unit].fixed_s is None:
+            why = "`ready` is drawn, and then lists have no common instants; make it constant"
+            raise _refuse_link(name, f"unit {unit}: {why}")
+    of_truth = configuration.units == TRUTH
+    seen = replay.truth if of_truth else replay.measured.tracks
+    if not of_truth:
+        rng = CounterRng(experiment.seed, replay.scene.log)
+        seen = delay_until_ready(seen, experiment.ready, rng, np.zeros(1, dtype=np.int64))
+    received = np.ones(len(seen.stamp_ns))
+    lossless: list[UnitLinks] = []
+    for unit_links in experiment.links_of(name):
+        if unit_links.link.drawn:
+            assert isinstance(unit_links.link, Radio)  # links of the user's own are not drawn
+            _check_link(unit_links, unit_links.link, name, hits)
+            share = _reception_probability(replay, seen, unit_links, unit_links.link, name)
+            if unit_links.units is not None:
+                concerned = np.array([unit in unit_links.units for unit in seen.units], dtype=bool)[seen.frame_unit_ix]
+                share = np.where(concerned, share, 1.0)
+            received *= share
+            unit_links = replace(unit_links, link=unit_links.link.model_copy(update={"reception": ConstantReception()}))
+        lossless.append(unit_links)
+    return sample_arrivals(transmit(seen, lossless, None if of_truth else units), configuration.issue_hz), received
+
+
+def _check_link(unit_links: UnitLinks, link: Radio, name: str, hits: int) -> None:
+    which = f"link {unit_links.where.removeprefix('links.')}"
+    if link.latency.fixed_s is None:
+        raise _refuse_link(
+            name, f"{which}: latency is drawn, and then lists have no common instants; use a constant one"
+        )
+    if link.channel is not None:
+        raise _refuse_link(name, f"{which}: lists queue, each as long as the lists before it are; use no `channel`")
+    if link.memory.get("reception"):
+        raise _refuse_link(name, f"{which}: losses last, and lists are then lost together; use no `memory`")
+    if hits > 1:
+        why = "a lost list is no capture to the receiver, and confirmation by several hits then has no closed form"
+        raise _refuse_link(name, f"{which}: {why}; confirm with one hit")
+
+
+def _reception_probability(replay: Replay, seen: Tracks, unit_links: UnitLinks, link: Radio, name: str) -> Float:
+    """(F,) the probability that each list arrives."""
+    F = len(seen.stamp_ns)
+    path = replay.paths if link.reception.by_path else None
+    nowhere = np.full(F, np.nan)
+    path = RadioPath(nowhere, nowhere) if path is None else RadioPath(path.distance_m[:F], path.visible_share[:F])
+
+    noises: list[str] = []
+
+    def noise(name: str, *, lasts_s: float | None = None) -> Float:
+        noises.append(name)
+        return np.full((1, F), 0.5)
+
+    share = ask_reception_probability(link.reception, path, noise, f"{unit_links.where}.reception")
+    if noises:
+        why = "losses come in bursts, and lists are then lost together; use a constant reception"
+        raise _refuse_link(name, f"link {unit_links.where.removeprefix('links.')}: {why}")
+    return share
+
+
+def _refuse_link(name: str, why: str) -> ExperimentError:
+    return ExperimentError(f"exact: configuration {name}: {why}, or leave exact out")
+
+
+# The distributions and the table.
 
 
 def exact_table(replay: Replay, experiment: Experiment) -> pd.DataFrame:
@@ -52,20 +240,20 @@ def exact_table(replay: Replay, experiment: Experiment) -> pd.DataFrame:
     _check_truth_ids(experiment)
     parts = []
     for name in experiment.configurations:
-        columns = _columns(replay, experiment, name, distributions(replay, experiment, name))
+        columns = _exact_columns(replay, experiment, name, compute_distributions(replay, experiment, name))
         if braking is not None:
-            columns |= _passing(replay, columns, braking.driver.reaction)
+            columns |= _verdict_columns(replay, columns, braking.driver.reaction)
         parts.append(pd.DataFrame(columns).drop(columns="episode"))
     return pd.concat(parts, ignore_index=True)
 
 
 def _check_truth_ids(experiment: Experiment) -> None:
-    """Raises ExperimentError for a configuration of which it is not known how probable its detections are."""
+    """Raises ExperimentError for a configuration whose probabilities of detection are not known."""
     for name, configuration in experiment.configurations.items():
         recorded = set(experiment.units_of(configuration)) & experiment.recorded.keys()
         if configuration.recorded is not None:
             why = "it is recorded, and nothing says how probable its lists were"
-        elif not by_truth(configuration) or experiment.measure.match.always:
+        elif not has_truth_ids(configuration) or experiment.measure.match.always:
             why = "what is matched with the truth depends on sampled errors"
         elif recorded:
             why = f"unit {min(recorded)} is recorded, and nothing says how probable its lists were"
@@ -79,37 +267,37 @@ def _check_truth_ids(experiment: Experiment) -> None:
 
 
 def check_exact(ready: Sequence[Replay], experiment: Experiment) -> None:
-    """Raises ExperimentError for a configuration that has no closed form."""
+    """Raises ExperimentError where exact times are asked for of a configuration that has no closed form."""
     if not experiment.measure.exact:
         return
     _check_truth_ids(experiment)
     hits = experiment.measure.confirm.hits
     for replay in ready:
-        units = replay.expanded.with_(of_log(experiment, replay.scene.log))
+        units = replay.expanded.with_(resolve_for_log(experiment, replay.scene.log))
         for name in units.configurations:
             lasts = check_lasting(units, name, hits)
             if hits == 1 and not lasts and not units.arrivals_differ:
                 continue
-            heard, received = exactly_heard(replay, units, name, hits)
+            heard, received = hear_without_loss(replay, units, name, hits)
             if hits > 1:
-                _shared_instants(replay, heard, name)
+                _number_shared_instants(replay, heard, name)
             else:
-                _lasting(replay, units, name, heard, received)
+                _find_lasting(replay, units, name, heard, received)
 
 
-def distributions(replay: Replay, experiment: Experiment, name: str) -> list[FirstKnown]:
-    """For each episode when it is first known."""
+def compute_distributions(replay: Replay, experiment: Experiment, name: str) -> list[FirstKnown]:
+    """For each episode the distribution of the instant at which its object is first known."""
     units, episodes, confirm = replay.expanded.with_(experiment), replay.episodes, experiment.measure.confirm
     configuration = units.configurations[name]
-    heard, received = exactly_heard(replay, units, name, confirm.hits)
+    heard, received = hear_without_loss(replay, units, name, confirm.hits)
     # A model of the user's own may be above 1 by rounding.
     listed = (
         np.ones(len(heard.frame_ix)) if configuration.units == TRUTH else np.minimum(replay.measured.probability, 1)
     )
     if (received < 1).any():
         listed = listed * received[heard.frame_ix]
-    instants = _shared_instants(replay, heard, name) if confirm.hits > 1 else None
-    lasts = None if instants is not None else _lasting(replay, units, name, heard, received)
+    instants = _number_shared_instants(replay, heard, name) if confirm.hits > 1 else None
+    lasting = None if instants is not None else _find_lasting(replay, units, name, heard, received)
     arrives_s = heard.common_arrives_s[heard.frame_ix]
     by_object = np.argsort(heard.row_object_ix, kind="stable")
     first, last = (
@@ -118,57 +306,57 @@ def distributions(replay: Replay, experiment: Experiment, name: str) -> list[Fir
     result = []
     for m in range(len(episodes.object_ix)):
         rows = by_object[first[m] : last[m]]
-        counts = arrives_s[rows] <= episodes.ended_s[m] + _TOLERANCE_S
+        counts = arrives_s[rows] <= episodes.ended_s[m] + SAME_INSTANT_S
         if not experiment.measure.count_earlier:
-            counts &= heard.row_captured_s[rows] >= episodes.onset_s[m] - _TOLERANCE_S
+            counts &= heard.row_captured_s[rows] >= episodes.onset_s[m] - SAME_INSTANT_S
         rows = rows[counts]
         if instants is None:
             share = replay.expanded.share if configuration.units != TRUTH else np.ones(1)
-            of_rows = None if lasts is None else lasts.take(rows)
-            result.append(first_of(arrives_s[rows], listed[rows], heard.row_unit_ix[rows], share, of_rows))
+            lasting_rows = None if lasting is None else lasting.take(rows)
+            result.append(first_known(arrives_s[rows], listed[rows], heard.row_unit_ix[rows], share, lasting_rows))
         else:
             instant = instants[heard.frame_ix[rows]]
-            result.append(confirmed(instant, arrives_s[rows], listed[rows], confirm.hits, confirm.of))
+            result.append(first_confirmed(instant, arrives_s[rows], listed[rows], confirm.hits, confirm.of))
     return result
 
 
-def _lasting(
+def _find_lasting(
     replay: Replay, experiment: ExpandedExperiment, name: str, heard: Tracks, received: Float
-) -> Lasting | None:
-    """How detection lasts. Raises ExperimentError where lists, `received (F,)` with a probability, are lost, too."""
-    lasts = lasting(replay, experiment, name, heard)
-    if lasts is not None and (received < 1).any():
+) -> LastingDetection | None:
+    """How detection lasts. Raises ExperimentError if lists are lost, too: by `received (F,)`, probabilities."""
+    lasting = find_lasting_detection(replay, experiment, name, heard)
+    if lasting is not None and (received < 1).any():
         raise ExperimentError(
             f"exact: configuration {name}: detection lasts and lists are lost, and both together have no closed form "
             "here; leave one of them, or leave exact out"
         )
-    return lasts
+    return lasting
 
 
-def _shared_instants(replay: Replay, heard: Tracks, name: str) -> Int:
+def _number_shared_instants(replay: Replay, heard: Tracks, name: str) -> Int:
     """(F,) the capture instant of each list. Raises ExperimentError unless all units share all of them."""
-    came = np.isfinite(heard.common_arrives_s)
-    if heard.units != (TRUTH,) and (replay.expanded.share[heard.frame_unit_ix[came]] < 1).any():
+    arrived = np.isfinite(heard.common_arrives_s)
+    if heard.units != (TRUTH,) and (replay.expanded.share[heard.frame_unit_ix[arrived]] < 1).any():
         raise ExperimentError(
             f"{replay.scene.log}: exact: configuration {name}: some units are only in some runs, and "
             "confirmation by several hits then has no closed form; confirm with one hit, or leave `exact` out"
         )
     instants = capture_instants(heard)
-    of_all = np.unique(instants[came])
-    for unit in np.unique(heard.frame_unit_ix[came]):
-        mine = came & (heard.frame_unit_ix == unit)
-        if not np.array_equal(np.unique(instants[mine]), of_all):
+    instants_of_all = np.unique(instants[arrived])
+    for unit in np.unique(heard.frame_unit_ix[arrived]):
+        of_unit = arrived & (heard.frame_unit_ix == unit)
+        if not np.array_equal(np.unique(instants[of_unit]), instants_of_all):
             raise ExperimentError(
                 f"{replay.scene.log}: exact: configuration {name}: unit {heard.units[unit]} does not list at "
                 "every instant at which another does, and confirmation over such lists has no closed form; give all "
                 "units one rate_hz and phase_s, confirm with one hit, or leave `exact` out"
             )
     latest_s = -np.inf
-    for instant in of_all:
-        arrivals = heard.common_arrives_s[came & (instants == instant)]
-        if np.ptp(arrivals) > _TOLERANCE_S:
+    for instant in instants_of_all:
+        arrivals = heard.common_arrives_s[arrived & (instants == instant)]
+        if np.ptp(arrivals) > SAME_INSTANT_S:
             how = f"lists captured together arrive up to {np.ptp(arrivals):g} s apart"
-        elif arrivals.min() < latest_s - _TOLERANCE_S:
+        elif arrivals.min() < latest_s - SAME_INSTANT_S:
             how = f"lists arrive up to {latest_s - arrivals.min():g} s after lists captured later"
         else:
             latest_s = max(latest_s, arrivals.max())
@@ -180,8 +368,10 @@ def _shared_instants(replay: Replay, heard: Tracks, name: str) -> Int:
     return instants
 
 
-def _columns(replay: Replay, experiment: Experiment, name: str, distributions: list[FirstKnown]) -> dict[str, Any]:
-    """Columns of one configuration: a row per episode and instant, and one, without instant, for never."""
+def _exact_columns(
+    replay: Replay, experiment: Experiment, name: str, distributions: list[FirstKnown]
+) -> dict[str, Any]:
+    """Columns of one configuration: a row per episode and instant, and one without an instant for never."""
     scene, episodes = replay.scene, replay.episodes
     episode = np.repeat(np.arange(len(distributions)), [len(of.time_s) + 1 for of in distributions])
 
@@ -193,7 +383,7 @@ def _columns(replay: Replay, experiment: Experiment, name: str, distributions: l
 
     detection_s = rows(np.append(of.time_s, np.nan) for of in distributions)
     object_ix = episodes.object_ix[episode]
-    distance_m, gap_m = distances(scene, replay.truth, experiment, object_ix, detection_s)
+    distance_m, gap_m = measure_distances(scene, replay.truth, experiment, object_ix, detection_s)
     return {
         "log": scene.log,
         "configuration": name,
@@ -211,16 +401,16 @@ def _columns(replay: Replay, experiment: Experiment, name: str, distributions: l
         "distance_at_detection_m": distance_m,
         "gap_at_detection_m": gap_m,
         "ended_s": episodes.ended_s[episode],
-        "ended_by": texts_of(episodes.ended_by[episode]),
+        "ended_by": end_reason_texts(episodes.ended_by[episode]),
     }
 
 
 def _log10(log: float) -> float:
-    """Of a natural logarithm; NaN where that is −inf, as detection is certain."""
+    """log10 of what has the natural logarithm `log`; NaN where that is −inf, as detection is certain."""
     return log / math.log(10) if log > -np.inf else np.nan
 
 
-def _passing(replay: Replay, columns: Mapping[str, Any], reaction: Reaction) -> dict[str, Any]:
+def _verdict_columns(replay: Replay, columns: Mapping[str, Any], reaction: Reaction) -> dict[str, Any]:
     """Whether each row's episode is in conflict, and the probabilities to pass and to fail if it is detected then."""
     episode = columns["episode"]
     detection_s = columns["detection_s"]
@@ -231,3 +421,11 @@ def _passing(replay: Replay, columns: Mapping[str, Any], reaction: Reaction) -> 
         passes[rows] = pass_probability(between, known_s[rows], reaction)
         fails[rows] = fail_probability(between, known_s[rows], reaction)
     return {"conflict": ~np.isnan(passes), "pass_probability": passes, "fail_probability": fails}
+
+
+def check_closed_form(ready: Sequence[Replay], experiment: Experiment) -> None:
+    """Raises ExperimentError where exact times are asked for, also along a sweep, and have no closed form."""
+    check_exact(ready, experiment)
+    for point in list_points(experiment):
+        if point.same_units:
+            check_exact(ready, point.experiment)

@@ -1,36 +1,50 @@
-"""The time a run takes: printed on the terminal and written nowhere, for results are the same on any machine."""
+"""The cost of a run: its time, printed on the terminal alone as results are the same on any machine, and its memory.
+
+Whether the rows of a replay fit in free memory is checked before the first run.
+"""
 
 from __future__ import annotations
 
+import re
+import resource
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias
 
+import numpy as np
 from numba.core.event import Event, Listener, install_listener
 
-from copem_replay.pipeline.blocks import Outcome
+from copem_replay.core.errors import ExperimentError
+from copem_replay.experiment.schema import Experiment
+from copem_replay.pipeline.notes import measure_list_rates
+from copem_replay.pipeline.prepare import Replay
+from copem_replay.pipeline.replay import BlockOutcome
+
+# Time.
 
 MOSTLY = 0.5
 LONG_S = 10.0
-"""Of runs that take longer than this it is said what takes more than that share of it (chosen)."""
+"""A run that takes longer than this gets a note on what takes more than that share of it; shorter ones need none."""
 
 
 @dataclass
-class Cost:
+class RunCost:
     """Seconds of a run: all of it, and what its workers did, of which some was measuring accuracy.
 
     `compiled`: kernels had to be compiled, so the next run takes less.
     """
 
     total_s: float = 0.0
-    in_blocks_s: float = 0.0  # while blocks were computed, by however many workers
-    worked_s: float = 0.0  # by all of them together
+    in_blocks_s: float = 0.0  # wall-clock time in which blocks were computed
+    worked_s: float = 0.0  # summed over workers
     accuracy_s: float = 0.0
     compiled: bool = False
 
     def notes(self) -> tuple[str, ...]:
-        """Accuracy, where it is most of a run that takes long, and how to leave it out."""
+        """A note on accuracy where it is most of a long run, and how to leave it out."""
         if self.compiled or self.total_s <= LONG_S or self.worked_s <= 0:
             return ()
         share = self.accuracy_s / self.worked_s * self.in_blocks_s / self.total_s
@@ -41,24 +55,24 @@ class Cost:
             "`measure: {accuracy: false}` leaves it out",
         )
 
-    def add(self, in_blocks_s: float, outcomes: Sequence[Outcome]) -> None:
-        """Take in blocks that were computed within so many seconds."""
+    def add(self, in_blocks_s: float, outcomes: Sequence[BlockOutcome]) -> None:
+        """Take in blocks that were computed within `in_blocks_s` seconds."""
         self.in_blocks_s += in_blocks_s
         self.worked_s += sum(outcome.worked_s for outcome in outcomes)
         self.accuracy_s += sum(outcome.accuracy_s for outcome in outcomes)
 
 
 @contextmanager
-def watched() -> Iterator[Cost]:
-    """The cost of what is done meanwhile; `total_s` and `compiled` are known afterwards."""
-    cost, began, compiling = Cost(), time.perf_counter(), _Compiling()
+def watch_cost() -> Iterator[RunCost]:
+    """The cost of the `with` block; `total_s` and `compiled` are set at its end."""
+    cost, began, compiling = RunCost(), time.perf_counter(), _Compiling()
     with install_listener("numba:compile", compiling):
         yield cost
     cost.total_s, cost.compiled = time.perf_counter() - began, compiling.happened
 
 
 class _Compiling(Listener):
-    """Whether any kernel was compiled: what is read from Numba's cache is not."""
+    """Whether any kernel was compiled; kernels read from Numba's cache do not count."""
 
     happened = False
 
@@ -67,3 +81,100 @@ class _Compiling(Listener):
 
     def on_end(self, event: Event) -> None:
         pass
+
+
+# Memory.
+
+AT_LEAST_BYTES = {False: (250, 0), True: (400, 16)}
+"""Bytes of a row of `detections.parquet`, and of each list of its object's stay, without accuracy and with it, while
+all tables are put together (measured: a row has 146 and 234; a list two numbers of four bytes; both held twice)."""
+ABOUT_BYTES = {False: (1000, 0), True: (3000, 45)}
+"""Bytes of a row and of each list with all intermediate results and statistics. Measured: by how much the peak of `run`
+without `show` and `sweep` grows from one number of runs to the other, in bytes a row:
+
+| | runs | lists a row | grows by |
+|---|---|---|---|
+| crossing_share.yaml without accuracy | 120, 480 | 0 | 650 |
+| tc016d.yaml | 2000, 10 000 | 76 | 6000 |
+| crossing_share.yaml | 120, 480 | 431 | 23 500 |
+| crossing.yaml | 10, 80 | 979 | 41 200 |
+"""
+
+
+Size: TypeAlias = tuple[int, float]
+"""Of one run of a log: rows, and with accuracy about how many lists the stays of these rows have."""
+
+
+def estimate_size(replay: Replay) -> Size:
+    """The rows and lists that one run of a log gives."""
+    written = replay.expanded.written
+    lists = _lists_per_run(replay) if written.measure.accuracy else 0.0
+    return len(replay.episodes.object_ix) * len(written.configurations), lists
+
+
+def memory_notes(ready: Sequence[Replay], experiment: Experiment, others: Sequence[Size] = ()) -> list[str]:
+    """A note where the runs may take more memory than is free. Raises ExperimentError where they certainly do.
+
+    `others`: sizes of further logs.
+    """
+    accuracy, free = experiment.measure.accuracy, free_bytes()
+    sizes = [*map(estimate_size, ready), *others]
+    rows_a_run, lists_a_run = sum(rows for rows, _ in sizes), sum(lists for _, lists in sizes)
+    about, least = (
+        round(rows_a_run * row[accuracy][0] + lists_a_run * row[accuracy][1]) for row in (ABOUT_BYTES, AT_LEAST_BYTES)
+    )
+    if free is None or about * experiment.runs <= free:
+        return []
+    few = max(free // about, 1)
+    rows = f"{experiment.runs} runs of {rows_a_run} {'row' if rows_a_run == 1 else 'rows'} each"
+    if least * experiment.runs > free and experiment.runs > 1:
+        size = _format_gb(least * experiment.runs)
+        raise ExperimentError(f"{rows} take at least {size}, and {_format_gb(free)} are free; take {few} or fewer")
+    return [f"{rows} may take {_format_gb(about * experiment.runs)}, and {_format_gb(free)} are free"]
+
+
+def _lists_per_run(replay: Replay) -> float:
+    """About how many lists the stays of a run's rows have: from first frame to end of episode."""
+    truth, episodes = replay.truth, replay.episodes
+    first_s = np.full(len(replay.scene.object_ids), np.inf)
+    np.minimum.at(first_s, truth.row_object_ix, truth.captured_s[truth.frame_ix])
+    stays_s = float((episodes.ended_s - first_s[episodes.object_ix]).sum())
+    once = replay.expanded.written.model_copy(update={"runs": 1})
+    rates = (times.rate_hz or 0.0 for times in measure_list_rates(replay, once).values())
+    return stays_s * sum(rates)
+
+
+def free_bytes() -> int | None:
+    """Memory that this process can still get: the least of machine, control group and own limit; None: unknown."""
+    limits = [_free_machine_bytes(), _free_group_bytes(), _free_process_bytes()]
+    return min((free for free in limits if free is not None), default=None)
+
+
+def _free_machine_bytes() -> int | None:
+    sizes_kb = re.findall(r"^(?:MemAvailable|SwapFree):\s+(\d+) kB$", _read_text("/proc/meminfo"), re.MULTILINE)
+    return sum(map(int, sizes_kb)) * 1024 if sizes_kb else None
+
+
+def _free_group_bytes() -> int | None:
+    most, used = (_read_text(f"/sys/fs/cgroup/memory.{name}").strip() for name in ("max", "current"))
+    cached = re.search(r"^file (\d+)$", _read_text("/sys/fs/cgroup/memory.stat"), re.MULTILINE)
+    if not (most.isdecimal() and used.isdecimal()):  # no limit ("max"), or no control groups of version 2
+        return None
+    return max(int(most) - int(used) + (int(cached[1]) if cached else 0), 0)
+
+
+def _free_process_bytes() -> int | None:
+    most, _ = resource.getrlimit(resource.RLIMIT_AS)
+    used = re.search(r"^VmSize:\s+(\d+) kB$", _read_text("/proc/self/status"), re.MULTILINE)
+    return None if most == resource.RLIM_INFINITY or used is None else max(most - int(used[1]) * 1024, 0)
+
+
+def _read_text(path: str) -> str:
+    try:
+        return Path(path).read_text(encoding="utf-8")
+    except OSError:
+        return ""
+
+
+def _format_gb(size: int) -> str:
+    return f"{size / 1e9:.3g} GB"

@@ -1,15 +1,14 @@
 """An experiment over one log: a unit for every object that may carry one, and one for the output of each stack.
 
-Fleets: units that some objects carry and others don't, each by an addressed draw of its own in every run.
+`on: {classes, penetration_rate}` stands for one unit per object of those classes, without the ego. In a run an object
+carries its unit if its random number is below the share: an object that carries one at 30 % does so at 50 %, too.
 
-`on: {classes, penetration_rate}` stands for one unit per object of those classes (but the ego). In a run an object
-carries its unit when its number is below the share, so that a carrier at 30 % is one at 50 %, too.
-
-A stack's recorded output is a recorded unit that its configuration alone hears, handed on as it is.
+The recorded output of a stack is a recorded unit that only its configuration hears, and that is handed on as it is.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -22,9 +21,8 @@ from copem_replay.core.errors import ExperimentError
 from copem_replay.core.random import CounterRng, RandomKey, object_words
 from copem_replay.core.tracks import TRUTH, Bool, Float, Int, Scene, class_indices
 from copem_replay.experiment.schema import Configuration, Experiment, Unit, output_unit
-from copem_replay.fusion.as_recorded import AsPredicted, AsRecorded
-from copem_replay.fusion.base import ListFusion
-from copem_replay.io.config import Recorded, RecordedOutput
+from copem_replay.fusion.interface import ListFusion, PredictedFusion, RecordedFusion
+from copem_replay.io.config import RecordedOutput, RecordedTopic
 from copem_replay.metrics.config import Braking, Measure
 from copem_replay.perception.config import Carriers, Obstacle
 from copem_replay.perception.pem.model import Pem
@@ -35,8 +33,8 @@ from copem_replay.perception.visibility import VisibilityModel
 class ExpandedExperiment:
     """An experiment over one log, with a unit for every object that may carry one. U units.
 
-    `written`: the experiment as it was. `named (U,)`: its name of each unit, `carrier (U,)`: id of the object that may
-    carry the unit (else empty), `share (U,)`: the probability that it does, 1 for all others.
+    `written`: the experiment before. `named (U,)`: the name that each unit has there. `carrier (U,)`: id of the object
+    that may carry the unit, else empty. `share (U,)`: the probability that the unit is there, 1 without a carrier.
     """
 
     written: Experiment
@@ -47,7 +45,7 @@ class ExpandedExperiment:
 
     @property
     def units(self) -> dict[str, Unit]:
-        """(U,) all units by name: none is carried by a share of some classes."""
+        """(U,) all units by name, each on one object or at one place."""
         return self._expanded.units
 
     @property
@@ -56,7 +54,7 @@ class ExpandedExperiment:
         return self._expanded.modelled
 
     @property
-    def recorded(self) -> dict[str, Recorded]:
+    def recorded(self) -> dict[str, RecordedTopic]:
         """The units whose lists are recorded in the log."""
         return self._expanded.recorded
 
@@ -81,7 +79,7 @@ class ExpandedExperiment:
 
     @property
     def visibility(self) -> VisibilityModel:
-        """How much of each object shows."""
+        """The model of visible shares."""
         return self.written.visibility
 
     @property
@@ -101,7 +99,7 @@ class ExpandedExperiment:
 
     @property
     def braking(self) -> Braking | None:
-        """What the declared driver does, if asked."""
+        """The driver of which verdicts are asked for; None: no verdicts."""
         return self.written.braking
 
     @property
@@ -116,12 +114,12 @@ class ExpandedExperiment:
 
     @property
     def ready(self) -> dict[str, LatencyModel]:
-        """How long units take until a list is there to be sent, of those that take any time."""
+        """By unit the time from capture until a list can be sent, of those that state one."""
         return {name: unit.ready for name, unit in self.modelled.items() if unit.ready is not None}
 
     @property
     def sends(self) -> dict[str, Sends]:
-        """What units send of their lists, of those that do not send them as they are."""
+        """By unit the rules of what it sends, of those that do not send all of their lists."""
         return {name: unit.sends for name, unit in self.modelled.items() if unit.sends is not None}
 
     @property
@@ -138,13 +136,13 @@ class ExpandedExperiment:
         return {name: self._expanded.links_of(name) for name in self.configurations}
 
     def linked(self, name: str) -> list[str]:
-        """The units that send by a link in one of these configurations; of the truth TRUTH."""
+        """The units that send by a link in one of these configurations; TRUTH stands for the truth."""
         configuration = self.configurations[name]
         return [unit for unit in self.units_of(configuration) or (TRUTH,) if configuration.link_of(unit) is not None]
 
     @cached_property
     def arrivals_differ(self) -> bool:
-        """Whether lists arrive otherwise from run to run: each run then has lists, and instants, of its own."""
+        """Whether lists, or their arrivals, differ from run to run: each run then has receiver instants of its own."""
         return (
             self.outages
             or bool(self.sends)
@@ -154,7 +152,7 @@ class ExpandedExperiment:
 
     @property
     def runs_apart(self) -> bool:
-        """Whether lists differ from run to run in more than the states of their rows: a block then has one run."""
+        """Whether runs are replayed one by one, as lists differ in more than the presence and states of their rows."""
         return self.arrivals_differ or any(
             isinstance(configuration.fusion, ListFusion)
             and any(self._apart(self.units[name]) for name in self.units_of(configuration))
@@ -170,48 +168,50 @@ class ExpandedExperiment:
         return unit.clock is not None or (unit.pem is not None and self.pems[unit.pem].draws_claims)
 
     def with_(self, experiment: Experiment) -> ExpandedExperiment:
-        """The same units in an experiment that differs in its configurations, or in what is measured.
+        """These units in another experiment, which differs in its configurations or in what is measured.
 
-        Raises ValueError where its units are others.
+        Raises ValueError where it has other units.
         """
         if experiment is self.written:
             return self
         if experiment.units != self.written.units:
             raise ValueError("expected an experiment with the units that the log was prepared for")
-        return _expanded(experiment, self.units, self.named, self.carrier, self.share)
+        return _replace_units(experiment, self.units, self.named, self.carrier, self.share)
 
     def equipped(self, log: str, runs: Int) -> Bool | None:
-        """(S, U) which units there are in each of the runs (S,); None: all."""
+        """(S, U) which units there are in each of the runs (S,); None: all units in all runs."""
         if self.same_in_all_runs:
             return None
-        # No list and no instant to go by: the carrier and the unit's name in the experiment are the address.
+        # A carrier has no list and no instant: its id and the unit's name in the experiment are the address.
         units = tuple(dict.fromkeys(self.named))
         which = np.array([units.index(name) for name in self.named])
         random_key = RandomKey(units, which, object_words(self.carrier), np.zeros(len(which), dtype=np.int64))
         return CounterRng(self.seed, log).bernoulli("carries", random_key, runs, self.share)
 
 
-def expand(experiment: Experiment, scene: Scene) -> ExpandedExperiment:
-    """An experiment's units over one log, one for every object that may carry one, last those of recorded outputs.
+def expand_experiment(experiment: Experiment, scene: Scene) -> ExpandedExperiment:
+    """An experiment's units over one log, with one for every object that may carry one, and for each recorded output.
 
-    Raises ExperimentError where another unit has such a name.
+    Raises ExperimentError where a name that a unit gets is taken.
     """
-    fleet = _with_carriers(experiment, scene)
+    fleet = _expand_carriers(experiment, scene)
     if not experiment.outputs:
         return fleet
     units = dict(fleet.units)
     for name, output in experiment.outputs.items():
-        one = output_unit(name)
-        if one in units:
-            raise ExperimentError(f"units: {one} is what the recorded output of {name} is called; choose another name")
-        units[one] = Unit(recorded=output)
+        unit = output_unit(name)
+        if unit in units:
+            raise ExperimentError(f"units: {unit} is what the recorded output of {name} is called; choose another name")
+        units[unit] = Unit(recorded=output)
     added = tuple(units)[len(fleet.named) :]
-    none, sure = ("",) * len(added), np.ones(len(added))
-    return _expanded(experiment, units, (*fleet.named, *added), (*fleet.carrier, *none), np.append(fleet.share, sure))
+    no_carrier, certain = ("",) * len(added), np.ones(len(added))
+    return _replace_units(
+        experiment, units, (*fleet.named, *added), (*fleet.carrier, *no_carrier), np.append(fleet.share, certain)
+    )
 
 
-def _with_carriers(experiment: Experiment, scene: Scene) -> ExpandedExperiment:
-    """The same without those of recorded outputs."""
+def _expand_carriers(experiment: Experiment, scene: Scene) -> ExpandedExperiment:
+    """An experiment's units over one log, with one for every object that may carry one."""
     units: dict[str, Unit] = {}
     named: list[str] = []
     carriers: list[str] = []
@@ -225,51 +225,53 @@ def _with_carriers(experiment: Experiment, scene: Scene) -> ExpandedExperiment:
         for k in np.flatnonzero(of_class):
             if k == scene.ego_ix:
                 continue
-            one = scene.object_ids[k]
-            if f"{name}:{one}" in experiment.units:
+            object_id = scene.object_ids[k]
+            if f"{name}:{object_id}" in experiment.units:
                 raise ExperimentError(
-                    f"units: {name}:{one} is what {name} is called on object {one}; choose another name"
+                    f"units: {name}:{object_id} is what {name} is called on object {object_id}; choose another name"
                 )
-            units[f"{name}:{one}"] = unit.model_copy(update={"on": one})
-            named, carriers, share = [*named, name], [*carriers, one], [*share, unit.on.penetration_rate]
-    return _expanded(experiment, units, tuple(named), tuple(carriers), np.array(share))
+            units[f"{name}:{object_id}"] = unit.model_copy(update={"on": object_id})
+            named, carriers, share = [*named, name], [*carriers, object_id], [*share, unit.on.penetration_rate]
+    return _replace_units(experiment, units, tuple(named), tuple(carriers), np.array(share))
 
 
-def _expanded(
+def _replace_units(
     experiment: Experiment, units: dict[str, Unit], named: tuple[str, ...], carrier: tuple[str, ...], share: Float
 ) -> ExpandedExperiment:
-    """An experiment with these units in the place of its own."""
+    """An experiment with these units instead of its own, in `units` and in the configurations."""
     if units.keys() == experiment.units.keys():
         return ExpandedExperiment(experiment, experiment, named, carrier, share)
     members = {name: [unit for unit, of in zip(units, named, strict=True) if of == name] for name in experiment.units}
-    configurations = _members_for(experiment.configurations, members)
+    configurations = _replace_members(experiment.configurations, members)
     for name, output in experiment.outputs.items():
         if output_unit(name) in units:
-            configurations[name] = _heard_alone(configurations[name], name, output)
+            configurations[name] = _relay_unit(configurations[name], name, output)
     changed = {"units": units, "configurations": configurations}
     return ExpandedExperiment(experiment, experiment.model_copy(update=changed), named, carrier, share)
 
 
-def _heard_alone(configuration: Configuration, name: str, output: RecordedOutput) -> Configuration:
-    """A configuration that hands on what its unit lists."""
-    fusion = AsPredicted() if output.tells_of == "available" else AsRecorded()
+def _relay_unit(configuration: Configuration, name: str, output: RecordedOutput) -> Configuration:
+    """A configuration that hands on what the unit of a recorded output lists."""
+    fusion = PredictedFusion() if output.tells_of == "available" else RecordedFusion()
     return configuration.model_copy(update={"units": (output_unit(name),), "fusion": fusion, "recorded": None})
 
 
-def of_run(experiment: Experiment, scene: Scene, run: int) -> Experiment:
-    """The experiment as it is in one run: with the units that are carried in it."""
-    expanded = _with_carriers(experiment, scene)  # outputs are added when the run is made ready
-    there = expanded.equipped(scene.log, np.array([run]))
-    if there is None and expanded.units.keys() == experiment.units.keys():
+def resolve_for_run(experiment: Experiment, scene: Scene, run: int) -> Experiment:
+    """The experiment in one run: with the units that objects carry in this run."""
+    expanded = _expand_carriers(experiment, scene)  # `prepare_log` adds the outputs
+    equipped = expanded.equipped(scene.log, np.array([run]))
+    if equipped is None and expanded.units.keys() == experiment.units.keys():
         return experiment
-    kept = {n: u for k, (n, u) in enumerate(expanded.units.items()) if there is None or there[0, k]}
+    kept = {n: u for k, (n, u) in enumerate(expanded.units.items()) if equipped is None or equipped[0, k]}
     members = {name: [name] if name in kept else [] for name in expanded.units}
-    changed = {"units": kept, "configurations": _members_for(expanded.configurations, members)}
+    changed = {"units": kept, "configurations": _replace_members(expanded.configurations, members)}
     return experiment.model_copy(update=changed)
 
 
-def _members_for(configurations: dict[str, Configuration], members: dict[str, list[str]]) -> dict[str, Configuration]:
-    """Configurations with units replaced by others: their lists of units, and their latencies by unit."""
+def _replace_members(
+    configurations: dict[str, Configuration], members: dict[str, list[str]]
+) -> dict[str, Configuration]:
+    """Configurations with units replaced by their `members`: in lists of units, and in latencies and links by unit."""
     result = {}
     for name, configuration in configurations.items():
         changed: dict[str, object] = {}
@@ -285,3 +287,39 @@ def _members_for(configurations: dict[str, Configuration], members: dict[str, li
             }
         result[name] = configuration.model_copy(update=changed)
     return result
+
+
+# Presence: which units there are in the runs of a block.
+
+
+@dataclass(frozen=True)
+class Presence:
+    """Which of U units list objects, run by run: `listing (S | 1, U)`; and which send lists: `sending (U,)`.
+
+    A unit that is only in some runs of a block sends empty lists in the others. That is right where only the entries of
+    lists count. Where the lists themselves count, all runs of a block need the same units: `parts` splits it.
+    """
+
+    listing: Bool
+    sending: Bool
+
+    @classmethod
+    def same(cls, present: Bool) -> Presence:
+        """Every run with the units that are `present (U,)`."""
+        return cls(present[None], present)
+
+    @classmethod
+    def of(cls, expanded: ExpandedExperiment, log: str, runs: Int) -> Presence:
+        """Each of the runs (S,) with its own units."""
+        equipped = expanded.equipped(log, runs)
+        present = np.ones(len(expanded.named), dtype=bool)
+        return cls.same(present) if equipped is None else cls(equipped, present)
+
+    def parts(self, runs: Int) -> Iterator[tuple[Int, Presence]]:
+        """The runs (S,) in parts; the runs of a part have the same units."""
+        if len(self.listing) != len(runs):  # one row stands for all
+            yield runs, self
+            return
+        patterns, which = np.unique(self.listing, axis=0, return_inverse=True)
+        for k, present in enumerate(patterns):
+            yield runs[which == k], Presence.same(present)

@@ -1,48 +1,182 @@
-"""Notes on what is odd about a log and an experiment together: before any run, from `check` and `run` alike."""
+"""Notes on what is odd about a log and an experiment together: before any run, alike in `check` and `run`.
+
+Beside them the facts that results need of a log in addition to its rows: with these a log whose pieces are all kept is
+not read.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from copem_replay.core.interpolation import wrap
-from copem_replay.core.text import counted
-from copem_replay.core.tracks import CLASSES, TRUTH, Bool, Scene, Tracks, class_indices
+from copem_replay.communication.arrivals import receiver_instants
+from copem_replay.communication.link import sample_arrivals
+from copem_replay.core.errors import count_noun
+from copem_replay.core.interpolation import wrap_angles
+from copem_replay.core.tracks import CLASSES, SAME_INSTANT_S, TRUTH, WHOLE, Bool, Scene, Solid, Tracks, class_indices
 from copem_replay.core.view_geometry import ViewGeometry
-from copem_replay.experiment.drive import of_log, settings_notes
-from copem_replay.experiment.schema import Experiment
-from copem_replay.fusion.base import Ideal
+from copem_replay.experiment.drive import resolve_for_log, settings_notes
+from copem_replay.experiment.schema import Experiment, ideal_over, output_unit
+from copem_replay.fusion.interface import IdealFusion
 from copem_replay.io.recording import Recording
+from copem_replay.metrics.detection.conflict import describe_excluded
 from copem_replay.metrics.episodes import measured_objects
-from copem_replay.metrics.within import in_words
+from copem_replay.metrics.metric import LinkTimes, OutputTimes, link_times
 from copem_replay.perception.config import Carriers
-from copem_replay.perception.observation import worlds
-from copem_replay.perception.pem.ghosts import Beside
-from copem_replay.perception.pem.model import Pem
+from copem_replay.perception.observation import interpolate_worlds
+from copem_replay.perception.pem.model import ObjectSidePlace, Pem
 from copem_replay.perception.sensor_poses import UnitPoses
-from copem_replay.pipeline.output_times import notes_on_outputs
-from copem_replay.pipeline.sweep import without_points
+from copem_replay.pipeline.receiver import hear_units, perceive_all_units
+from copem_replay.pipeline.sweep import describe_unswept
+from copem_replay.pipeline.world import WorldChunk
 
 if TYPE_CHECKING:
     from copem_replay.pipeline.prepare import Replay
 
+
+# List rates: how often each receiver issues a fused list, and what its links do to the lists it is sent.
+
+
+@dataclass(frozen=True)
+class ListRate:
+    """The fused lists of one configuration: intervals between them, the seconds these cover, and what its links do."""
+
+    intervals: int
+    covered_s: float
+    links: LinkTimes | None
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Fused lists per second; None: there are fewer than two."""
+        return self.intervals / self.covered_s if self.covered_s > 0 else None
+
+    @classmethod
+    def read(cls, data: dict[str, Any]) -> Self:
+        """From plain data, as `LogFacts.as_json` gives it."""
+        links = data["links"]
+        if links is not None:
+            links = LinkTimes(**links | {name: np.array(links[name]) for name in ("from_s", "to_s")})
+        return cls(data["intervals"], data["covered_s"], links)
+
+
+def measure_list_rates(replay: Replay, experiment: Experiment) -> dict[str, ListRate]:
+    """By configuration the lists of all runs, or of the one that stands for all.
+
+    Units that only some runs have count as there in all.
+    """
+    world = replay.lists_only(experiment)
+    units, result, seen = world.experiment, dict[str, list[ListRate]](), None
+    differ = units.outages or units.sends or any(ready.fixed_s is None for ready in units.ready.values())
+    for run in range(experiment.runs if units.arrivals_differ else 1):
+        one_run = np.array([run])
+        world_of_run = replace(world, on_air=replay.on_air(experiment, one_run))
+        if seen is None or differ:
+            seen = perceive_all_units(world_of_run, one_run, states="true")
+        _add_run(result, world_of_run, seen)
+    return {name: join_list_rates(runs) for name, runs in result.items()}
+
+
+def join_list_rates(times: Iterable[ListRate]) -> ListRate:
+    """The sum over runs and logs of one configuration."""
+    rates = list(times)
+    links = [one.links for one in rates if one.links is not None]
+    added = sum(links[1:], links[0]) if links else None
+    return ListRate(sum(one.intervals for one in rates), sum(one.covered_s for one in rates), added)
+
+
+def _add_run(result: dict[str, list[ListRate]], world: WorldChunk, seen: Tracks) -> None:
+    """Append to `result` the rate of each configuration in one run, whose lists are `seen`."""
+    end_s = world.scene.end_s
+    for name, configuration in world.experiment.configurations.items():
+        arriving = hear_units(seen, world, name, ticks=False)
+        heard = sample_arrivals(arriving, configuration.issue_hz)
+        issue_s = receiver_instants(heard)
+        issue_s = issue_s[(issue_s >= -SAME_INSTANT_S) & (issue_s <= end_s + SAME_INSTANT_S)]
+        covered_s = float(issue_s[-1] - issue_s[0]) if len(issue_s) > 1 else 0.0
+        links = None
+        if linked := world.experiment.linked(name):
+            sent = world.truth if configuration.units == TRUTH else seen
+            links = link_times(sent, arriving, heard, linked, end_s)
+        result.setdefault(name, []).append(ListRate(max(len(issue_s) - 1, 0), covered_s, links))
+
+
+# Output times: how old the recorded outputs of stacks are when they are available, as the recordings tell.
+
+
+def sum_output_times(recordings: Sequence[Recording], experiment: Experiment) -> dict[str, OutputTimes]:
+    """By configuration the sums over all recordings."""
+    return {
+        name: sum((_sum_log_times(recording, experiment, name) for recording in recordings), OutputTimes())
+        for name in experiment.outputs
+    }
+
+
+def _sum_log_times(recording: Recording, experiment: Experiment, name: str) -> OutputTimes:
+    lists = recording.lists[output_unit(name)]
+    available_s, captured_s = lists.tracks.common_arrives_s, lists.tracks.captured_s
+    while_it_lasts = (available_s >= -SAME_INSTANT_S) & (available_s <= recording.scene.end_s + SAME_INSTANT_S)
+    delay_s = np.where(lists.capture_said, 0.0, experiment.outputs[name].delay_s)[while_it_lasts]
+    has_capture = (lists.capture_said | lists.stamped)[while_it_lasts]
+    # Rounded to a nanosecond, as stamps are: 0.7 − 0.57 − 0.13 is not 0.
+    latency_s = np.round((available_s - captured_s)[while_it_lasts] - delay_s, 9)
+    age_s = available_s[while_it_lasts] - _newest_input_s(recording, experiment, name, available_s[while_it_lasts])
+    has_age = np.isfinite(age_s)
+    return OutputTimes(
+        float(latency_s[has_capture].sum()), int(has_capture.sum()), float(delay_s.sum()), len(delay_s),
+        float(age_s[has_age].sum()), int(has_age.sum()),
+    )  # fmt: skip
+
+
+def _newest_input_s(recording: Recording, experiment: Experiment, name: str, instants_s: np.ndarray) -> np.ndarray:
+    """(K,) the newest capture of any input that has arrived by each instant; −inf: there is none."""
+    newest_s = np.full(len(instants_s), -np.inf)
+    for unit in experiment.configurations[name].inputs or ():
+        if unit not in recording.lists:  # the log lacks this input
+            continue
+        lists = recording.lists[unit].tracks
+        order = np.argsort(lists.common_arrives_s, kind="stable")
+        so_far_s = np.append(-np.inf, np.maximum.accumulate(lists.captured_s[order]))
+        arrived = np.searchsorted(lists.common_arrives_s[order], instants_s + SAME_INSTANT_S, side="right")
+        newest_s = np.maximum(newest_s, so_far_s[arrived])
+    return newest_s
+
+
+def notes_on_output_regret(experiment: Experiment) -> Iterator[str]:
+    """A note on the baseline of the regret of each recorded output."""
+    for name in experiment.outputs:
+        inputs = experiment.configurations[name].inputs
+        if inputs is None:
+            yield f"configuration {name}: no regret, for it has no `inputs`: ideal fusion of what it had is not known"
+            continue
+        ideal = ideal_over(experiment.configurations, inputs)
+        yield f"configuration {name}: its regret is the difference to {ideal}, ideal fusion of {', '.join(inputs)}"
+
+
+# Notes.
+
 FAR_M = 2000.0
-"""A place farther away from all objects is taken for a mistake (chosen: no sensor beside a road sees so far)."""
+"""A place farther away from all objects is taken for a mistake: no sensor beside a road sees so far."""
 
-_NAMED = 3  # of the logs of which the same is said, so many are named (chosen)
-_ROWS = 500_000  # object states looked at in one piece (chosen: some ten MB)
-_SAMPLE = 16  # one in so many is looked at first (chosen)
+_NAMED = 3
+"""Logs that are named where several have the same note: more would fill the terminal."""
+_ROWS = 500_000
+"""Object states that are examined at once: some ten MB."""
+_SAMPLE = 16
+"""One row in so many is examined first: a condition that is met at all is mostly met by many rows."""
 
 
-def notes_of(
+def list_notes(
     recordings: Sequence[Recording], ready: Sequence[Replay], experiment: Experiment, *, replayed: bool
 ) -> list[str]:
-    """Notes on the recordings, and on them and the experiment together: after a replay, or before."""
+    """Notes on the recordings and on the experiment over them. `replayed`: whether conditions are known to be met."""
     odd = {
-        replay.scene.log: oddities(replay, of_log(experiment, replay.scene.log), replay.ever_met if replayed else None)
+        replay.scene.log: list_oddities(
+            replay, resolve_for_log(experiment, replay.scene.log), replay.ever_met if replayed else None
+        )
         for replay in ready
     }
     return study_notes(recordings, odd, experiment)
@@ -51,62 +185,62 @@ def notes_of(
 def study_notes(
     recordings: Sequence[Recording], oddities_of: Mapping[str, Iterable[str]], experiment: Experiment
 ) -> list[str]:
-    """The same, with what is odd about each log."""
-    notes = _by_log((recording.scene.log, note) for recording in recordings for note in recording.notes)
-    notes += _by_log((log, note) for log, odd in oddities_of.items() for note in odd)
+    """Notes on the recordings and on the experiment over them; `oddities_of`: the lines of `list_oddities` by log."""
+    notes = _group_by_log((recording.scene.log, note) for recording in recordings for note in recording.notes)
+    notes += _group_by_log((log, note) for log, odd in oddities_of.items() for note in odd)
     notes += settings_notes(experiment)
-    notes += without_points(experiment)
-    notes += _remembered_in_vain(experiment)
-    notes += notes_on_outputs(experiment)
+    notes += describe_unswept(experiment)
+    notes += _find_unused_memory(experiment)
+    notes += notes_on_output_regret(experiment)
     return notes
 
 
-def _by_log(said: Iterable[tuple[str, str]]) -> list[str]:
-    """A line for each log and what is said of it; one line for what is said of more than three."""
-    pairs = list(dict.fromkeys(said))
-    whose: dict[str, list[str]] = {}
+def _group_by_log(notes: Iterable[tuple[str, str]]) -> list[str]:
+    """A line for each log and note; a note that more than three logs have is one line."""
+    pairs = list(dict.fromkeys(notes))
+    logs_of: dict[str, list[str]] = {}
     for log, note in pairs:
-        whose.setdefault(note, []).append(log)
+        logs_of.setdefault(note, []).append(log)
     lines = []
     for log, note in pairs:
-        first, more = whose[note][:_NAMED], len(whose[note]) - _NAMED
+        first, more = logs_of[note][:_NAMED], len(logs_of[note]) - _NAMED
         if more <= 0:
             lines.append(f"{log}: {note}")
         elif log == first[0]:
-            lines.append(f"{', '.join(first)} and {counted(more, 'other log')}: {note}")
+            lines.append(f"{', '.join(first)} and {count_noun(more, 'other log')}: {note}")
     return lines
 
 
-def _remembered_in_vain(experiment: Experiment) -> Iterator[str]:
-    """Quantities that a PEM remembers and that nothing of it draws."""
+def _find_unused_memory(experiment: Experiment) -> Iterator[str]:
+    """Quantities in the memory of a PEM that none of its couples draws."""
     for name, pem in experiment.pems.items():
         for quantity in pem.in_vain():
             what = f"a {quantity} error" if quantity in ("position", "yaw", "speed", "size") else f"{quantity} drawn"
             yield f"pems.{name}.memory.{quantity}: no couple has {what}, nothing to remember"
 
 
-def same_instants(ready: Sequence[Replay]) -> bool:
+def has_same_instants(ready: Sequence[Replay]) -> bool:
     """Whether all runs have the same units, and lists at the same instants."""
     return all(replay.expanded.same_in_all_runs and not replay.expanded.arrivals_differ for replay in ready)
 
 
-def oddities(replay: Replay, experiment: Experiment, met: Bool | None = None) -> Iterator[str]:
-    """One line each.
+def list_oddities(replay: Replay, experiment: Experiment, met: Bool | None = None) -> Iterator[str]:
+    """What is odd about a log in an experiment, a line each.
 
-    `met (U,)`: whether an object ever meets a condition of each modelled unit's PEM; None: as far as that can be told
-    by range, azimuth and class.
+    `met (U,)`: whether an object ever meets a condition of each modelled unit's PEM; None: judged by range, azimuth and
+    class alone.
     """
     if met is None:
         met = could_meet(replay)
     yield from replay.placed.notes
-    yield from _far_away(replay, experiment)
-    yield from _idle(replay, experiment, met)
-    yield from _unmeasured(replay, experiment)
+    yield from _find_far_units(replay, experiment)
+    yield from _find_idle_units(replay, experiment, met)
+    yield from _explain_unmeasured(replay, experiment)
     for name, unit in experiment.units.items():
         if isinstance(unit.on, Carriers) and name not in replay.expanded.named:
             yield f"unit {name}: the log has no object to carry it ({', '.join(unit.on.classes)})"
-    yield from _clocks(experiment)
-    yield from _beside_no_object(replay, experiment)
+    yield from _find_clock_errors(experiment)
+    yield from _find_missing_hosts(replay, experiment)
     end_s = replay.scene.end_s
     for name, configuration in experiment.configurations.items():
         units = experiment.units_of(configuration) or (TRUTH,)
@@ -115,27 +249,29 @@ def oddities(replay: Replay, experiment: Experiment, met: Bool | None = None) ->
             yield f"configuration {name}: the latency of {', '.join(late)} is longer than the log"
 
 
-def _clocks(experiment: Experiment) -> Iterator[str]:
-    """Which configurations know the true captures although a unit's clock is off."""
+def _find_clock_errors(experiment: Experiment) -> Iterator[str]:
+    """Configurations whose fusion knows the true captures although the clock of a unit is off."""
     for name, configuration in experiment.configurations.items():
         off = [unit for unit in experiment.units_of(configuration) if experiment.units[unit].clock is not None]
-        if off and isinstance(configuration.fusion, Ideal):
+        if off and isinstance(configuration.fusion, IdealFusion):
             yield f"configuration {name}: ideal fusion uses true captures, ignoring clock errors of {', '.join(off)}"
 
 
-def _beside_no_object(replay: Replay, experiment: Experiment) -> Iterator[str]:
+def _find_missing_hosts(replay: Replay, experiment: Experiment) -> Iterator[str]:
     """Ghosts beside objects that the log does not have."""
-    there = set(replay.scene.object_class.tolist())
+    classes = set(replay.scene.object_class.tolist())
     for name, pem in experiment.pems.items():
         for n, sort in enumerate(pem.ghosts):
-            if isinstance(sort.where, Beside) and not there & set(class_indices(sort.where.classes).tolist()):
+            if isinstance(sort.where, ObjectSidePlace) and not classes & set(
+                class_indices(sort.where.classes).tolist()
+            ):
                 yield f"pems.{name}.ghosts[{n}].where: beside: no {' or '.join(sort.where.classes)} in this log"
 
 
 def could_meet(replay: Replay) -> Bool:
     """(U,) whether an object ever has range, azimuth and class of a condition of each modelled unit's PEM.
 
-    Without a look at what hides what: where nothing is met here, no replay meets anything. Piece by piece of the log.
+    Visibility is left out: where no condition is met here, no replay meets one.
     """
     experiment, scene = replay.expanded, replay.scene
     met = dict.fromkeys(experiment.modelled, False)
@@ -146,7 +282,7 @@ def could_meet(replay: Replay) -> Bool:
     for from_s, until_s in pairwise(cuts):
         if all(met.values()):
             break
-        for names, world in worlds(scene, replay.truth, experiment, replay.placed, from_s, until_s):
+        for names, world in interpolate_worlds(scene, replay.truth, experiment, replay.placed, from_s, until_s):
             for name in names:
                 if not met[name]:
                     pem = experiment.pems[str(experiment.units[name].pem)]
@@ -154,31 +290,31 @@ def could_meet(replay: Replay) -> Bool:
     return np.array(list(met.values()), dtype=bool)
 
 
-def _meets(pem: Pem, scene: Scene, world: Tracks, at: UnitPoses, carrier_ix: int) -> bool:
+def _meets(pem: Pem, scene: Scene, world: Tracks, poses: UnitPoses, carrier_ix: int) -> bool:
     """Whether any object of a world is where a condition holds, at a list that the unit makes."""
-    there = np.flatnonzero(at.present)
+    lists = np.flatnonzero(poses.present)
     order, bounds = world.by_frame
-    if not len(there):
+    if not len(lists):
         return False
-    rows = order[bounds[there[0]] : bounds[there[-1] + 1]]
-    anyhow = [couple.when.model_copy(update={"visible_share": None}) for couple in pem.couples]
-    for some in (rows[::_SAMPLE], rows):  # of what is met at all, much is
-        frame = world.frame_ix[some]
-        kept = at.present[frame] & (world.row_object_ix[some] != carrier_ix)
-        some, frame = some[kept], frame[kept]
-        dx_m, dy_m = world.x_m[0, some] - at.x_m[frame], world.y_m[0, some] - at.y_m[frame]
-        bearing_rad, none = np.arctan2(dy_m, dx_m), np.zeros(len(some))
+    rows = order[bounds[lists[0]] : bounds[lists[-1] + 1]]
+    conditions = [couple.when.model_copy(update={"visible_share": None}) for couple in pem.couples]
+    for examined in (rows[::_SAMPLE], rows):
+        frame = world.frame_ix[examined]
+        kept = poses.present[frame] & (world.row_object_ix[examined] != carrier_ix)
+        examined, frame = examined[kept], frame[kept]
+        dx_m, dy_m = world.x_m[0, examined] - poses.x_m[frame], world.y_m[0, examined] - poses.y_m[frame]
+        bearing_rad, none = np.arctan2(dy_m, dx_m), np.zeros(len(examined))
         view = ViewGeometry(
-            np.hypot(dx_m, dy_m), wrap(bearing_rad - at.heading_rad[frame]), bearing_rad, none,
-            scene.object_class[world.row_object_ix[some]], none, none, none, none, none,
+            np.hypot(dx_m, dy_m), wrap_angles(bearing_rad - poses.heading_rad[frame]), bearing_rad, none,
+            scene.object_class[world.row_object_ix[examined]], none, none, none, none, none,
         )  # fmt: skip
-        if any(bool(condition.holds(view).any()) for condition in anyhow):
+        if any(bool(condition.holds(view).any()) for condition in conditions):
             return True
     return False
 
 
-def _far_away(replay: Replay, experiment: Experiment) -> Iterator[str]:
-    """Units that stand where no object ever is."""
+def _find_far_units(replay: Replay, experiment: Experiment) -> Iterator[str]:
+    """Units whose place is far from all objects."""
     x_m, y_m = replay.truth.x_m[0], replay.truth.y_m[0]
     if not len(x_m):
         return
@@ -195,7 +331,7 @@ def _far_away(replay: Replay, experiment: Experiment) -> Iterator[str]:
             )
 
 
-def _idle(replay: Replay, experiment: Experiment, met: Bool) -> Iterator[str]:
+def _find_idle_units(replay: Replay, experiment: Experiment, met: Bool) -> Iterator[str]:
     """Units that list nothing in any run: those of one fleet in one line."""
     expanded = replay.expanded
     modelled = dict(zip(expanded.modelled, met.tolist(), strict=True))
@@ -209,29 +345,29 @@ def _idle(replay: Replay, experiment: Experiment, met: Bool) -> Iterator[str]:
             (unmet, f"no object ever meets a condition of its PEM {unit.pem!r}"),
         ):
             if which:
-                yield f"unit {name}{_on(which, members)}: {what}"
+                yield f"unit {name}{_count_carriers(which, members)}: {what}"
 
 
-def _on(which: list[str], members: list[str]) -> str:
-    """Of a fleet on how many carriers."""
+def _count_carriers(which: list[str], members: list[str]) -> str:
+    """On how many of its carriers a fleet is; empty for a single unit."""
     if len(members) == 1 and ":" not in members[0]:
         return ""
-    return f", on {len(which)} of its {counted(len(members), 'carrier')}"
+    return f", on {len(which)} of its {count_noun(len(members), 'carrier')}"
 
 
-def _unmeasured(replay: Replay, experiment: Experiment) -> Iterator[str]:
-    """Why there are no rows, or no verdicts."""
+def _explain_unmeasured(replay: Replay, experiment: Experiment) -> Iterator[str]:
+    """Why a log gives no rows, or no verdicts."""
     scene, measure, episodes = replay.scene, experiment.measure, replay.episodes
     asked, outside = measure.objects.within, len(replay.outside_ix)
     if asked is not None and outside:
-        of = counted(outside + len(episodes.object_ix), "object")
-        yield f"objects.within: {outside} of {of} with an onset left out, {in_words(asked)}"
+        with_onset = count_noun(outside + len(episodes.object_ix), "object")
+        yield f"objects.within: {outside} of {with_onset} with an onset left out, {describe_excluded(asked)}"
     if not len(measured_objects(scene, measure)):
         others = np.arange(len(scene.object_class)) != scene.ego_ix
-        there = sorted({CLASSES[k] for k in scene.object_class[others]}) or ["no other object"]
+        logged = sorted({CLASSES[k] for k in scene.object_class[others]}) or ["no other object"]
         wanted = measure.objects.classes or measure.objects.ids or ("moving objects but the ego",)
         beside = " beside the ego" if scene.ego_ix >= 0 else ""
-        yield f"no rows: nothing to measure ({', '.join(wanted)}); the log has {', '.join(there)}{beside}"
+        yield f"no rows: nothing to measure ({', '.join(wanted)}); the log has {', '.join(logged)}{beside}"
     elif (instant_s := measure.onset.instant_s) is not None and instant_s > scene.end_s:
         yield f"no rows: the onset at {instant_s:g} s lies after the log's end, {scene.end_s:g} s"
     elif not len(episodes.object_ix) and outside:
@@ -245,3 +381,74 @@ def _unmeasured(replay: Replay, experiment: Experiment) -> Iterator[str]:
             f"more than {experiment.braking.margin_m:g} m from all measured objects"
             + ("; `ego: constant_speed` assumes that it had not braked" if recorded else "")
         )
+
+
+# Facts of a log, and its scene, as plain data.
+
+
+@dataclass(frozen=True)
+class LogFacts:
+    """What results say of one log in one experiment beside its rows. `times`: as `measure_list_rates` gives them.
+
+    `episodes`: rows of a run and configuration. `listable`: observation rows, by which the time of a run is estimated.
+    """
+
+    episodes: int
+    same_instants: bool
+    oddities: tuple[str, ...]
+    times: dict[str, ListRate]
+    outputs: dict[str, OutputTimes]
+    listable: int
+
+    @classmethod
+    def of(cls, recording: Recording, replay: Replay, experiment: Experiment) -> Self:
+        """The facts of a prepared log; `experiment`: resolved for it."""
+        return cls(
+            len(replay.episodes.object_ix),
+            has_same_instants([replay]),
+            tuple(list_oddities(replay, experiment, replay.ever_met)),
+            measure_list_rates(replay, experiment),
+            sum_output_times([recording], experiment),
+            len((replay.found(WHOLE) if replay.chunks == (WHOLE,) else replay.measured).tracks.frame_ix),
+        )
+
+    @classmethod
+    def read(cls, data: dict[str, Any]) -> Self:
+        """From plain data, as `as_json` gives it."""
+        return cls(
+            data["episodes"],
+            data["same_instants"],
+            tuple(data["oddities"]),
+            {name: ListRate.read(times) for name, times in data["times"].items()},
+            {name: OutputTimes(**sums) for name, sums in data["outputs"].items()},
+            data["listable"],
+        )
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        data = asdict(self)
+        for times in data["times"].values():
+            if times["links"] is not None:
+                times["links"] |= {name: times["links"][name].tolist() for name in ("from_s", "to_s")}
+        return data
+
+
+def scene_as_json(scene: Scene) -> dict[str, Any]:
+    """A scene as plain data for JSON."""
+    values = {f.name: getattr(scene, f.name) for f in fields(Scene)}
+    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()}
+
+
+def scene_from_json(data: dict[str, Any]) -> Scene:
+    """The scene of plain data that `scene_as_json` gave."""
+    return Scene(
+        **data
+        | {
+            "object_ids": tuple(data["object_ids"]),
+            "object_class": np.array(data["object_class"], dtype=np.int8),
+            "moving": np.array(data["moving"], dtype=bool),
+            "solids": tuple(
+                Solid(name, tuple((x, y) for x, y in corners), *rest) for name, corners, *rest in data["solids"]
+            ),
+        }
+    )

@@ -1,31 +1,36 @@
-"""One run of one log: the receiver's fused lists, configuration by configuration."""
+"""One run of one log: which runs are shown, their fused tracks by configuration, and curves of visible share."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 
 from copem_replay.core.errors import ExperimentError
 from copem_replay.core.fused_tracks import FusedTracks
-from copem_replay.core.time_chunk import WHOLE
-from copem_replay.core.tracks import TRUTH, Bool, Tracks
+from copem_replay.core.tracks import SAME_INSTANT_S, TRUTH, WHOLE, Bool, Float, Int, Tracks
 from copem_replay.experiment.schema import Experiment
-from copem_replay.pipeline.chunking import ROWS_HELD, observation_rows
-from copem_replay.pipeline.conversions import as_fused_tracks
-from copem_replay.pipeline.prepare import Replay
-from copem_replay.pipeline.presence import Presence
-from copem_replay.pipeline.receiver import Receivers
+from copem_replay.io.recording import Recording
+from copem_replay.perception.observation import Observations
+from copem_replay.perception.sensor_poses import find_carrier
+from copem_replay.pipeline.expansion import Presence, resolve_for_run
+from copem_replay.pipeline.prepare import ROWS_HELD, Replay, observation_rows, prepare_log
+from copem_replay.pipeline.receiver import Receivers, convert_to_tracks
 from copem_replay.pipeline.scoring import match_lists
+
+if TYPE_CHECKING:
+    from copem_replay.pipeline.run import ExperimentResult
 
 
 @dataclass(frozen=True)
 class RunTracks:
-    """The receiver's fused tracks in one run, configuration by configuration, chunk after chunk.
+    """The receiver's fused tracks in one run, by configuration, chunk after chunk.
 
-    As often as one likes; of a log that is one time chunk they are kept, of a longer one made anew each time.
+    Can be iterated several times: the tracks of a log in one time chunk are kept, those of a longer one computed anew.
     """
 
     replay: Replay
@@ -36,10 +41,10 @@ class RunTracks:
         if len(self.replay.chunks) == 1:
             yield self._all
         else:
-            yield from self._made()
+            yield from self._compute()
 
     def whole(self) -> dict[str, FusedTracks]:
-        """All of it at once. Raises ExperimentError where that is too much."""
+        """The tracks of the whole log. Raises ExperimentError where the log is too long for that."""
         replay = self.replay
         if len(replay.chunks) == 1:
             return self._all
@@ -49,37 +54,163 @@ class RunTracks:
 
     @cached_property
     def _all(self) -> dict[str, FusedTracks]:
-        return next(self._made())
+        return next(self._compute())
 
-    def _made(self) -> Iterator[dict[str, FusedTracks]]:
+    def _compute(self) -> Iterator[dict[str, FusedTracks]]:
         replay, runs = self.replay, np.array([self.run])
         [(_, presence)] = Presence.of(replay.expanded, replay.scene.log, runs).parts(runs)
         receivers = Receivers(runs, presence.sending)
         for world in replay.worlds(self.experiment, runs, presence):
-            around = replay.truth_cache_of(world.chunk)
+            truth_cache = replay.truth_cache_of(world.chunk)
             result = {}
-            for name, one in receivers.receive(world):
-                if one.fused_tracks is not None:
-                    result[name] = one.fused_tracks
+            for name, output in receivers.receive(world):
+                if output.fused_tracks is not None:
+                    result[name] = output.fused_tracks
                 else:
-                    matches = match_lists(around, one, self.experiment.measure)
-                    result[name] = as_fused_tracks(one.lists, 0, matches, one.heard, one.at.issue_s, one.at.newest)
-                if one.faults is not None:
-                    result[name] = replace(result[name], faults=one.faults)
+                    matches = match_lists(truth_cache, output, self.experiment.measure)
+                    result[name] = convert_to_tracks(
+                        output.lists, 0, matches, output.heard, output.at.issue_s, output.at.newest
+                    )
+                if output.faults is not None:
+                    result[name] = replace(result[name], faults=output.faults)
                 if linked := world.experiment.linked(name):
-                    result[name] = replace(result[name], by_link=_by_link(one.sent, linked, presence))
+                    result[name] = replace(result[name], by_link=_is_sent_by_link(output.sent, linked, presence))
             yield result
 
 
-def _by_link(sent: Tracks, linked: list[str], presence: Presence) -> Bool:
-    """(F,) which lists the units of this run send by a link."""
+def _is_sent_by_link(sent: Tracks, linked: list[str], presence: Presence) -> Bool:
+    """(F,) which lists a unit that is there in this run sends by a link."""
     sending = np.array([name in linked for name in sent.units])
     if sent.units != (TRUTH,):
         sending &= presence.sending
-    there: Bool = sending[sent.frame_unit_ix] & np.isfinite(sent.common_arrives_s)
-    return there
+    sent_by_link: Bool = sending[sent.frame_unit_ix] & np.isfinite(sent.common_arrives_s)
+    return sent_by_link
 
 
 def tracks_of_run(replay: Replay, experiment: Experiment, run: int) -> dict[str, FusedTracks]:
     """The receiver's fused tracks in one run of a log that is not long."""
     return RunTracks(replay, experiment, run).whole()
+
+
+# Shown runs: which runs of which logs are written to MCAP and .rrd, and under which names.
+
+STEM = "replay"
+"""The stem of the first run's files; those of further runs are `replay_<number, median, worst or best>`."""
+
+
+@dataclass(frozen=True)
+class ShownRun:
+    """One run that is shown: its number, why it is selected (empty: asked for by number), its files' stem."""
+
+    run: int
+    why: str
+    stem: str
+
+
+def select_shown_runs(experiment: Experiment, result: ExperimentResult, log: str) -> tuple[ShownRun, ...]:
+    """The runs of a log that are written to MCAP and .rrd, in the order of the experiment; none with `run: null`.
+
+    `median` (of an even number the lower), `worst` and `best` go by the time to detection summed over all
+    configurations and measured objects, where never detected counts as the horizon; of equal runs the first is taken.
+    Of a log without rows it is the first run.
+    """
+    asked = experiment.show.asked() if experiment.show is not None else ()
+    stems = [STEM if k == 0 else f"{STEM}_{one}" for k, one in enumerate(asked)]
+    rows = result.tables.rows(log)
+    return tuple(
+        ShownRun(one, "", stem) if isinstance(one, int) else ShownRun(*_rank_run(rows, result.horizon_s, one), stem)
+        for one, stem in zip(asked, stems, strict=True)
+    )
+
+
+def _rank_run(rows: pd.DataFrame, horizon_s: float | None, rank: str) -> tuple[int, str]:
+    """The run that is `median`, `worst` or `best` among the rows of a log, and why."""
+    if not len(rows):
+        return 0, f"first, not {rank}, as no measured object has an onset"
+    time_s = rows["time_to_detection_s"].fillna(horizon_s)
+    total = np.rint(time_s.groupby(rows["run"]).sum() / SAME_INSTANT_S)
+    ranked = np.sort(total.to_numpy())
+    position = {"best": 0, "median": (len(ranked) - 1) // 2, "worst": -1}[rank]
+    equal = total.index[total == ranked[position]]
+    over = (_format_count(rows[name].nunique(), what) for name, what in _SUMMED.items())
+    why = f"{rank} of {len(ranked)} by time to detection summed over {' and '.join(over)}"
+    return int(equal[0]), why + (f", the first of {len(equal)} equal" if len(equal) > 1 else "")
+
+
+_SUMMED = {"configuration": "configuration", "object_id": "object"}
+
+
+def _format_count(number: int, what: str) -> str:
+    return f"{number} {what}{'s' if number != 1 else ''}"
+
+
+def select_shown_logs(experiment: Experiment, result: ExperimentResult) -> list[str]:
+    """Names of the logs that are written to MCAP and .rrd."""
+    names = [log.name for log in result.logs] or [replay.scene.log for replay in result.replays]
+    if experiment.show is None or not experiment.show.asked():
+        return []
+    asked = experiment.show.logs
+    if "all" in asked:
+        return names
+    return [name for k, name in enumerate(names) if name in asked or (k == 0 and "first" in asked)]
+
+
+@dataclass(frozen=True)
+class ReplayedRun:
+    """The fused tracks of one run of one log, and the replay and experiment with the units there were in it."""
+
+    replay: Replay
+    experiment: Experiment
+    run_tracks: RunTracks
+
+
+def replay_run(recording: Recording, experiment: Experiment, run: int, replay: Replay | None = None) -> ReplayedRun:
+    """One run again, with the same draws and lists. `replay`: the prepared log; None: it is prepared here."""
+    alone = resolve_for_run(experiment, recording.scene, run)
+    if replay is None or alone is not experiment:
+        replay = prepare_log(recording, alone, onsets_of=experiment)
+    return ReplayedRun(replay, alone, RunTracks(replay, alone, run))
+
+
+# Curves: the visible share of an object over time, from the ego's units and from all.
+
+BY_EGO, BY_ANY = "ego", "any unit"
+"""Names of curves: the best share of the ego's units, and of all."""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Visible share of one object at instants (K,); NaN where no unit has a list of it."""
+
+    elapsed_ns: Int
+    share: Float
+
+
+def share_curves(replay: Replay, found: Observations, object_ix: int) -> dict[str, Curve]:
+    """The curves of an object by name, without those that have no unit. `found`: its observation rows, at least."""
+    scene, experiment, tracks = replay.scene, replay.expanded, found.tracks
+    stamps, newest = _newest_lists(tracks, experiment.max_gap_s)
+    carriers = np.array([find_carrier(scene, unit) for unit in experiment.modelled.values()], dtype=np.int64)
+    own = (carriers == scene.ego_ix) & (scene.ego_ix >= 0)
+    share = np.full(len(tracks.stamp_ns) + 1, np.nan)  # one more: what −1 points at
+    rows = np.flatnonzero(tracks.row_object_ix == object_ix)
+    share[tracks.frame_ix[rows]] = found.view.visible_share[rows]
+    # NaN of a unit without a list of the object does not count: the best of the others does.
+    return {
+        name: Curve(stamps - scene.t0_ns, np.fmax.reduce(share[newest[units]], axis=0))
+        for name, units in ((BY_EGO, own), (BY_ANY, np.ones_like(own)))
+        if units.any()
+    }
+
+
+def _newest_lists(tracks: Tracks, max_gap_s: float) -> tuple[Int, Int]:
+    """All capture instants (K,), and the newest list of each unit then (U, K); −1: none in the last `max_gap_s`."""
+    stamps = np.unique(tracks.stamp_ns)
+    newest = np.full((len(tracks.units), len(stamps)), -1)
+    for unit in range(len(tracks.units)):
+        frames = np.flatnonzero(tracks.frame_unit_ix == unit)  # in order of capture
+        position = np.searchsorted(tracks.stamp_ns[frames], stamps, side="right") - 1
+        recent = position >= 0
+        recent[recent] = stamps[recent] - tracks.stamp_ns[frames[position[recent]]] <= max_gap_s * 1e9
+        newest[unit, recent] = frames[position[recent]]
+    return stamps, newest

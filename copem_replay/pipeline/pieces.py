@@ -1,47 +1,334 @@
-"""Pieces that are kept: in a folder or under a URL, what was computed once is found again by the key of its recipe.
+"""Pieces: what one log gives in one configuration and range of runs is kept, and found again by the key of its recipe.
 
     pieces/ab/<key>.parquet        rows of `detections.parquet`, and what stands beside them; the recipe in the metadata
     pieces/ab/<key>.sums.parquet   a row per run, sums of accuracy in the metadata; written first
-    logs/<key>.json                what is known of a log, so that it need not be read again
+    logs/<key>.json                the facts of a log, so that it need not be read again
 
-A piece is done when its `.parquet` is there. Two that write the same piece write the same bytes.
+They are in a folder or under a URL. A piece is complete when its `.parquet` exists. Two processes that write the same
+piece write the same bytes. The recipe is all that a piece is made of, as canonical JSON: the log's resolved experiment
+without what cannot change a row, NOT_OF_A_PIECE. That is right as draws have addresses, and as adding a unit, a
+configuration or an object changes no other draw (docs/develop/decisions/0031-pieces.md).
 """
 
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
-from collections.abc import Callable, Iterator, Mapping
+import os
+import platform
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, fields
+from functools import cache, cached_property
+from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
+from urllib.parse import urlsplit
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
 from pyarrow import parquet
+from pydantic import BaseModel
 
-from copem_replay.metrics.accuracy.statistics import BAND, EXISTENCE, OBJECT, RUN, Settings, Total
-from copem_replay.pipeline.log_tables import BESIDE, RUNS, LogTables
-from copem_replay.pipeline.recipe import canonical, key_of
-from copem_replay.pipeline.store import Store, store_at
+from copem_replay.core.components import Component
+from copem_replay.core.errors import (
+    InputError,
+    OutputError,
+    is_own,
+    is_url,
+    local_path,
+    open_file_system,
+    reraise_in_one_line,
+    strip_credentials,
+)
+from copem_replay.experiment.drive import RecordedLatency, cache_last_experiment
+from copem_replay.experiment.schema import Configuration, Experiment
+from copem_replay.metrics.accuracy.statistics import BAND, EXISTENCE, OBJECT, RUN, AccuracySettings, AccuracyTotal
+from copem_replay.metrics.onset import Requires
+from copem_replay.pipeline.tables import BESIDE, RUNS, LogTables
+
+# Stores: bytes by name, in a folder or under a URL. A name is complete or missing. A store is pickled as its address:
+# every process opens its own.
+
+_OPTION = "--pieces: "
+MARK = "pieces.txt"
+"""Written once under a URL: a bucket that is missing, or cannot be written, is found out before any run."""
+
+
+class Store(Protocol):
+    """Bytes by name. `where`: its address without credentials, for messages."""
+
+    where: str
+
+    def exists(self, name: str) -> bool:
+        """Whether there is such a name."""
+
+    def read(self, name: str) -> bytes | None:
+        """The bytes under a name; None: there is no such name. Raises InputError, OSError."""
+
+    def write(self, name: str, content: bytes) -> None:
+        """Keep bytes under a name. Raises OutputError."""
+
+    def names(self) -> set[str]:
+        """All names, listed anew, with those that other processes have written."""
+
+    def refresh(self) -> None:
+        """From now on find what other processes have written."""
+
+
+def open_store(address: str | Path) -> Store:
+    """The store in a folder, or under a URL. Raises InputError, OutputError."""
+    if isinstance(address, Path) or not is_url(address := local_path(address)):
+        return FolderStore(Path(address))
+    return BucketStore(address)
+
+
+class FolderStore:
+    """A folder of this machine or a shared one. Files are written under a temporary name and renamed."""
+
+    def __init__(self, root: Path) -> None:
+        self.root, self.where = root, str(root)
+        try:
+            for name in ("pieces", "logs"):
+                (root / name).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"{_OPTION}{root}: cannot be written: {error.strerror or error}") from error
+
+    def exists(self, name: str) -> bool:
+        """Whether there is such a file."""
+        return (self.root / name).is_file()
+
+    def read(self, name: str) -> bytes | None:
+        """The content of a file; None: there is none. Raises OSError."""
+        try:
+            return (self.root / name).read_bytes()
+        except FileNotFoundError:
+            return None
+
+    def write(self, name: str, content: bytes) -> None:
+        """Write a file: complete, or not at all. Raises OutputError."""
+        place = self.root / name
+        try:
+            place.parent.mkdir(exist_ok=True)
+            with tempfile.NamedTemporaryFile(dir=place.parent, prefix=f".{place.name}.", delete=False) as file:
+                try:
+                    file.write(content)  # not synced: the seal of a file that a crash damages is wrong
+                    file.close()
+                    os.replace(file.name, place)
+                except BaseException:
+                    Path(file.name).unlink(missing_ok=True)
+                    raise
+        except OSError as error:
+            raise OutputError(f"{place}: cannot be written: {error.strerror or error}") from error
+
+    def names(self) -> set[str]:
+        """All files but those that are being written."""
+        files = (path for path in self.root.rglob("[!.]*") if path.is_file())
+        return {path.relative_to(self.root).as_posix() for path in files}
+
+    def refresh(self) -> None:
+        """Nothing to do: files are looked up when they are asked for."""
+
+
+class BucketStore:
+    """Object storage, by fsspec: one request writes a whole object, and one listing gives all names."""
+
+    def __init__(self, url: str) -> None:
+        self.url, self.where = url.rstrip("/"), strip_credentials(url).rstrip("/")
+        if urlsplit(url).query:
+            raise InputError(f"{_OPTION}{self.where}: expected a URL without a query, names are put behind it")
+        if MARK not in self._listed:
+            self.write(MARK, b"pieces of copem-replay\n")
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The address alone: connections belong to one process."""
+        return {"url": self.url, "where": self.where}
+
+    @cached_property
+    def _opened(self) -> tuple[Any, str]:
+        fs, path = open_file_system(self.url, _OPTION)
+        return fs, path.rstrip("/")
+
+    @cached_property
+    def _listed(self) -> set[str]:
+        return self.names()
+
+    def exists(self, name: str) -> bool:
+        """Whether the last listing has the name, or this process has written it since."""
+        return name in self._listed
+
+    def read(self, name: str) -> bytes | None:
+        """The content of an object; None: the last listing lacks it. Raises InputError."""
+        fs, path = self._opened
+        if name not in self._listed:
+            return None
+        with reraise_in_one_line(f"{self.url}/{name}", what=_OPTION):
+            try:
+                content: bytes = fs.cat_file(f"{path}/{name}")
+            except FileNotFoundError:  # removed after the listing
+                return None
+        return content
+
+    def write(self, name: str, content: bytes) -> None:
+        """Write an object in one request: complete, or not at all. Raises OutputError."""
+        fs, path = self._opened
+        with reraise_in_one_line(f"{self.url}/{name}", OutputError, _OPTION):
+            fs.pipe_file(f"{path}/{name}", content)
+        if "_listed" in self.__dict__:
+            self._listed.add(name)
+
+    def names(self) -> set[str]:
+        """The names of all objects, listed anew. Raises InputError."""
+        fs, path = self._opened
+        with reraise_in_one_line(self.url, what=_OPTION):
+            fs.invalidate_cache()
+            paths = fs.find(path)
+        self._listed = {name.partition(f"{path}/")[2] for name in paths}
+        return self._listed
+
+    def refresh(self) -> None:
+        """List anew."""
+        self.names()
+
+
+# Recipes, and the keys that name them.
+
+NOT_OF_A_PIECE: Mapping[str, str] = {
+    "logs": "which log, and how it is read, is in the recipe itself; other logs are not",
+    "runs": "the range of runs is in the recipe itself",
+    "show": "what is shown is replayed after gathering",
+    "sweep": "each of its points is an experiment of its own",
+    "configurations": "only the piece's own, without its name",
+    "units": "only those that the configuration, the onset or the reference of distances goes by",
+    "pems": "only those of these units",
+    "links": "only those that the configuration sends by",
+    "measure.horizon_s": "restricted means are taken of all rows",
+    "measure.exact": "closed forms draw nothing",
+    "measure.metrics": "own metrics are taken of all rows",
+}
+"""Keys of the experiment that are not in a recipe as they are, and why."""
+_LIBRARIES = ("numba", "numpy", "pandas", "pyarrow", "scipy", "shapely")
+
+
+def canonical_json(data: Any) -> str:
+    """JSON: keys sorted, numbers as short as they read back, UTF-8."""
+    return json.dumps(data, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
+
+
+def recipe_key(recipe: str) -> str:
+    """The key of a recipe: its BLAKE2b digest, 160 bits, in hexadecimal digits."""
+    return hashlib.blake2b(recipe.encode(), digest_size=20).hexdigest()
+
+
+@cache
+def take_fingerprint() -> dict[str, str]:
+    """What numbers depend on beside the recipe: versions of this package and its sources, libraries, Python, libc."""
+    package = Path(__file__).parents[1]
+    digest = hashlib.blake2b(digest_size=20)
+    for path in sorted(package.rglob("*.py")):
+        digest.update(f"{path.relative_to(package)}\n".encode())
+        digest.update(hashlib.blake2b(path.read_bytes()).digest())
+    return {
+        "copem_replay": f"{version('copem-replay')} {digest.hexdigest()}",
+        **{name: version(name) for name in _LIBRARIES},
+        "python": f"{sys.version_info.major}.{sys.version_info.minor}",
+        "machine": platform.machine(),
+        "libc": " ".join(platform.libc_ver()),
+    }
+
+
+def write_recipe(experiment: Experiment, name: str, log: Mapping[str, Any], runs: tuple[int, int] | None) -> str:
+    """The recipe of a configuration of an experiment that is resolved for one log (`resolve_for_log`).
+
+    `log`: `StudyLog.identity`. `runs`: from, up to; None for closed forms, which draw nothing.
+    """
+    data, own = _recipe_parts(experiment, name)
+    return canonical_json(data | {"log": dict(log), "runs": runs, "own": file_digests(own)})
+
+
+@cache_last_experiment
+def _recipe_parts(experiment: Experiment, name: str) -> tuple[dict[str, Any], list[Component]]:
+    data = experiment.as_written()
+    configuration = experiment.configurations[name]
+    units, members = _list_dependencies(experiment, configuration), experiment.units_of(configuration)
+    pems = [pem for unit in units if (pem := experiment.units[unit].pem) is not None]
+    links = [link for unit in members if isinstance(link := configuration.link_of(unit), str)]
+    of_piece = {
+        "piece": 1,
+        "fingerprint": take_fingerprint(),
+        "configuration": data["configurations"][name] | ({"units": members} if members else {}),
+        "units": [(unit, data["units"][unit]) for unit in units],  # in the experiment's order, which decides ties
+        "pems": {pem: data["pems"][pem] for pem in pems},
+        "links": {link: data["links"][link] for link in links},
+    }
+    own = own_components(
+        configuration, experiment.visibility, experiment.measure.model_copy(update={"metrics": ()}),
+        experiment.braking, *(experiment.pems[pem] for pem in pems),
+        *(experiment.units[unit] for unit in units), *(experiment.links[link] for link in links),
+    )  # fmt: skip
+    for key in NOT_OF_A_PIECE:
+        within, _, last = key.rpartition(".")
+        (data[within] if within else data).pop(last, None)
+    return data | of_piece, own
+
+
+def _list_dependencies(experiment: Experiment, configuration: Configuration) -> list[str]:
+    """The units that rows of a configuration depend on, in the experiment's order."""
+    measure, members = experiment.measure, experiment.units_of(configuration)
+    if measure.onset.requires is not Requires.NOTHING or is_own(
+        type(measure.onset)
+    ):  # such onsets may ask for visibility
+        return list(experiment.units)
+    return [name for name in experiment.units if name in members or name == measure.distance_to]
+
+
+def own_components(*models: BaseModel | None) -> list[Component]:
+    """Components of models that depend on files: the user's own ones, and recorded latencies."""
+    components = (one for model in models for one in _find_components(model))
+    return [one for one in components if is_own(type(one)) or isinstance(one, RecordedLatency)]
+
+
+def file_digests(own: Sequence[Component]) -> dict[str, str]:
+    """SHA-256 of the files that define own components (not of what they import), and of recorded latencies."""
+    files = {kind: Path(inspect.getfile(kind)) for kind in {type(one) for one in own if is_own(type(one))}}
+    contents = {f"{k.__module__}:{k.__qualname__}": f.read_bytes() for k, f in files.items()}
+    contents |= {one.file: repr(one.sorted_s).encode() for one in own if isinstance(one, RecordedLatency)}
+    return {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
+
+
+def _find_components(value: object) -> Iterator[Component]:
+    if isinstance(value, Component):
+        yield value
+    if isinstance(value, BaseModel):
+        value = [getattr(value, name) for name in type(value).model_fields]
+    if isinstance(value, Mapping):
+        value = list(value.values())
+    if isinstance(value, list | tuple):
+        for one in value:
+            yield from _find_components(one)
+
+
+# Pieces as files.
 
 ROWS_A_PIECE = 250_000
-"""Rows of a range of runs at most (chosen: some MB)."""
+"""Rows of a range of runs at most: some MB."""
 FIRST_RUNS = 64
-"""Runs of the first range (chosen)."""
+"""Runs of the first range. More: an experiment of few runs shares fewer pieces with a longer one; no result changes."""
 _BESIDE = "beside:"
-"""Before names of columns that stand beside rows."""
+"""Prefix of the columns of `LogTables.beside`."""
 _SEAL, _ZEROS = b"seal:", b"0" * 40
 _WHOSE = ("log", "configuration")
 _RECORDS = {"episodes": OBJECT, "runs": RUN, "ghosts_at": np.dtype("i8"), "by_distance": BAND, "by_time": BAND,
             "by_existence": EXISTENCE}  # fmt: skip
 
 
-def ranges(runs: int, episodes: int) -> Iterator[tuple[int, int]]:
-    """The ranges of runs that are pieces: of 64, 64, 128, … up to a power of two, then of as many, the last cut.
+def split_runs(runs: int, episodes: int) -> Iterator[tuple[int, int]]:
+    """The ranges of runs that are pieces: 64, 64, 128, … runs up to a power of two, then as many each, the last cut.
 
-    They depend on nothing but the log and what is measured in it, so that more runs find what is there.
+    Whole ranges depend only on the log and what is measured in it: more runs find the pieces of fewer.
     """
     most = max(1, ROWS_A_PIECE // max(episodes, 1))
     most = 1 << most.bit_length() - 1
@@ -52,142 +339,149 @@ def ranges(runs: int, episodes: int) -> Iterator[tuple[int, int]]:
         size = min(begin, most)
 
 
-class Pieces:
-    """What is kept at an address: a folder or a URL. `found`, `computed`: how many of a study; `damaged`: those that
-    had to be computed again. Raises InputError, OutputError where nothing can be kept.
+class PieceCache:
+    """The pieces at an address, a folder or a URL. Raises InputError, OutputError where it cannot be used.
+
+    `found`, `computed`: how many pieces of a study. `damaged`: a line for each that had to be computed again.
     """
 
     def __init__(self, address: str | Path) -> None:
         self.address = str(address)
-        self.store: Store = store_at(address)
+        self.store: Store = open_store(address)
         self.found = self.computed = 0
         self.damaged: list[str] = []
 
     def read(self, recipe: str, log: str, configuration: str) -> LogTables | None:
-        """A piece of a log and configuration; None: it is not there, or damaged. Raises InputError."""
-        name = name_of(recipe)
+        """A piece of a log and configuration; None: it is missing or damaged. Raises InputError."""
+        name = piece_name(recipe)
         try:
             content = self.store.read(name)
-            return None if content is None else _read(content, self.store, recipe, log, configuration)
+            return None if content is None else _read_piece(content, self.store, recipe, log, configuration)
         except (OSError, ValueError, KeyError, TypeError) as error:  # what Arrow raises derives from these
-            said = " ".join(str(error).split())[:120]
-            self.damaged.append(f"{self.store.where}/{name}: damaged, computed again ({said})")
+            why = " ".join(str(error).split())[:120]
+            self.damaged.append(f"{self.store.where}/{name}: damaged, computed again ({why})")
             return None
 
     def write(self, recipe: str, piece: LogTables) -> LogTables:
         """Keep a piece. Returns it as it will be read. Raises OutputError."""
         assert isinstance(piece.rows, pd.DataFrame)
-        name, rows = name_of(recipe), pa.Table.from_pandas(piece.rows, preserve_index=False)
-        said = {b"recipe": recipe.encode()}
+        name, rows = piece_name(recipe), pa.Table.from_pandas(piece.rows, preserve_index=False)
+        metadata = {b"recipe": recipe.encode()}
         table = rows.drop_columns(list(_WHOSE))
         if piece.beside is not None and piece.runs is not None:
-            totals = canonical([[count, _as_json(of)] for nodes in piece.totals.values() for count, of in nodes])
-            sums = _sealed(piece.runs.drop_columns(list(_WHOSE)), {b"sums": totals.encode()})
-            self.store.write(_sums_of(name), sums)
-            said[b"sums"] = _digest(sums)
+            totals = canonical_json(
+                [[count, _total_as_json(of)] for nodes in piece.totals.values() for count, of in nodes]
+            )
+            sums = _seal_table(piece.runs.drop_columns(list(_WHOSE)), {b"sums": totals.encode()})
+            self.store.write(_sums_name(name), sums)
+            metadata[b"sums"] = _compute_digest(sums)
             for column in piece.beside.column_names:
                 table = table.append_column(_BESIDE + column, piece.beside[column])
-        self.store.write(name, _sealed(table, said))
+        self.store.write(name, _seal_table(table, metadata))
         self.computed += 1
         return LogTables(piece.log, rows, piece.beside, piece.runs, piece.totals)
 
     def keys(self) -> Callable[[str], bool]:
-        """Whether there is a piece, by its key. Under a URL all is listed anew, what other processes wrote, too."""
+        """Whether a piece exists, by its key. Under a URL all names are listed anew, with those of other processes."""
         self.store.refresh()
-        return lambda key: self.store.exists(_name(key))
+        return lambda key: self.store.exists(_object_name(key))
 
     def known(self, about: str) -> dict[str, Any] | None:
-        """What is known of a log, by all that it was made of; None: nothing."""
+        """The facts of a log, kept under `about`, all that they depend on; None: missing or damaged."""
         try:
-            said: Any = json.loads(self.store.read(f"logs/{key_of(about)}.json") or b"")
-            digest = said.pop("digest")
+            facts: Any = json.loads(self.store.read(f"logs/{recipe_key(about)}.json") or b"")
+            digest = facts.pop("digest")
         except (OSError, ValueError, KeyError, AttributeError):
             return None
-        return said if digest == key_of(canonical(said)) else None
+        return facts if digest == recipe_key(canonical_json(facts)) else None
 
     def keep(self, about: str, said: Mapping[str, Any]) -> None:
-        """And for the next time. Raises OutputError."""
-        text = canonical(dict(said) | {"digest": key_of(canonical(said))})
-        self.store.write(f"logs/{key_of(about)}.json", text.encode())
+        """Keep facts of a log under `about`. Raises OutputError."""
+        text = canonical_json(dict(said) | {"digest": recipe_key(canonical_json(said))})
+        self.store.write(f"logs/{recipe_key(about)}.json", text.encode())
 
     def forget(self, about: str) -> None:
-        """Know nothing of a log by this any more. Raises OutputError."""
-        self.store.write(f"logs/{key_of(about)}.json", b"")
+        """Remove the facts of a log under `about`. Raises OutputError."""
+        self.store.write(f"logs/{recipe_key(about)}.json", b"")
 
 
-def name_of(recipe: str) -> str:
-    """What the piece that is made by a recipe is called in a store."""
-    return _name(key_of(recipe))
+def piece_name(recipe: str) -> str:
+    """The name of a recipe's piece in a store."""
+    return _object_name(recipe_key(recipe))
 
 
-def _name(key: str) -> str:
+def _object_name(key: str) -> str:
     return f"pieces/{key[:2]}/{key}.parquet"
 
 
-def _sums_of(name: str) -> str:
+def _sums_name(name: str) -> str:
     return name.removesuffix(".parquet") + ".sums.parquet"
 
 
-def _digest(content: bytes) -> bytes:
+def _compute_digest(content: bytes) -> bytes:
     return hashlib.blake2b(content, digest_size=20).hexdigest().encode()
 
 
-def _sealed(table: pa.Table, said: Mapping[bytes, bytes]) -> bytes:
+def _seal_table(table: pa.Table, metadata: Mapping[bytes, bytes]) -> bytes:
     """A table as Parquet with its own digest in the metadata: that of the file with zeros in the digest's place."""
     stream = pa.BufferOutputStream()
-    table = table.replace_schema_metadata({**said, _SEAL[:-1]: _SEAL + _ZEROS}).combine_chunks()
+    table = table.replace_schema_metadata({**metadata, _SEAL[:-1]: _SEAL + _ZEROS}).combine_chunks()
     parquet.write_table(table, stream, compression="zstd")
     content: bytes = stream.getvalue().to_pybytes()
-    return content.replace(_SEAL + _ZEROS, _SEAL + _digest(content))
+    return content.replace(_SEAL + _ZEROS, _SEAL + _compute_digest(content))
 
 
-def _opened(content: bytes) -> pa.Table:
-    """And back. Raises ValueError where a bit of it is another."""
+def _unseal_table(content: bytes) -> pa.Table:
+    """The table of what `_seal_table` gave. Raises ValueError where any bit differs."""
     begin, _, end = content.partition(_SEAL)
-    if _digest(begin + _SEAL + _ZEROS + end[len(_ZEROS) :]) != end[: len(_ZEROS)]:
+    if _compute_digest(begin + _SEAL + _ZEROS + end[len(_ZEROS) :]) != end[: len(_ZEROS)]:
         raise ValueError("another content")
-    return parquet.ParquetFile(pa.BufferReader(content)).read(use_threads=False)  # for so little they only cost time
+    return parquet.ParquetFile(pa.BufferReader(content)).read(
+        use_threads=False
+    )  # threads cost more time than they save
 
 
-def _read(content: bytes, store: Store, recipe: str, log: str, configuration: str) -> LogTables:
-    """Raises ValueError, KeyError, TypeError or OSError where anything is not as it was written."""
-    table = _opened(content)
-    said = table.schema.metadata
-    if said[b"recipe"] != recipe.encode():
+def _read_piece(content: bytes, store: Store, recipe: str, log: str, configuration: str) -> LogTables:
+    """The piece in a file. Raises ValueError, KeyError, TypeError or OSError where it is not as it was written."""
+    table = _unseal_table(content)
+    metadata = table.schema.metadata
+    if metadata[b"recipe"] != recipe.encode():
         raise ValueError("another recipe")
     names = [name for name in table.column_names if not name.startswith(_BESIDE)]
-    rows = _whose(table.select(names), log, configuration)
-    if b"sums" not in said:
+    rows = _piece_columns(table.select(names), log, configuration)
+    if b"sums" not in metadata:
         return LogTables(log, rows)
-    beside_it = store.read(_sums_of(name_of(recipe)))
-    if beside_it is None or _digest(beside_it) != said[b"sums"]:
+    sums_content = store.read(_sums_name(piece_name(recipe)))
+    if sums_content is None or _compute_digest(sums_content) != metadata[b"sums"]:
         raise ValueError("other sums")
-    sums = _opened(beside_it)
-    nodes = [(count, _total(of)) for count, of in json.loads(sums.schema.metadata[b"sums"])]
+    sums = _unseal_table(sums_content)
+    nodes = [(count, _total_from_json(of)) for count, of in json.loads(sums.schema.metadata[b"sums"])]
     beside = table.select([name for name in table.column_names if name.startswith(_BESIDE)])
     beside = beside.rename_columns([name.removeprefix(_BESIDE) for name in beside.column_names])
-    runs = _whose(sums.replace_schema_metadata(None), log, configuration).cast(RUNS)
-    beside = beside.replace_schema_metadata(None).cast(BESIDE)  # which calls what is in lists as it was called
+    runs = _piece_columns(sums.replace_schema_metadata(None), log, configuration).cast(RUNS)
+    beside = beside.replace_schema_metadata(None).cast(BESIDE)  # restores the names of list items
     return LogTables(log, rows, beside, runs, {configuration: nodes} if nodes else {})
 
 
-def _whose(table: pa.Table, *whose: str) -> pa.Table:
+def _piece_columns(table: pa.Table, *whose: str) -> pa.Table:
     for k, (name, value) in enumerate(zip(_WHOSE, whose, strict=True)):
         table = table.add_column(k, name, pa.repeat(pa.scalar(value, pa.string()), len(table)))
     return table
 
 
-def _as_json(of: Total) -> dict[str, Any]:
-    arrays = {name: np.ascontiguousarray(getattr(of, name)).tobytes().hex() for name in _RECORDS}
-    return {f.name: getattr(of, f.name) for f in fields(Total)} | {"settings": asdict(of.settings)} | arrays
+def _total_as_json(total: AccuracyTotal) -> dict[str, Any]:
+    arrays = {name: np.ascontiguousarray(getattr(total, name)).tobytes().hex() for name in _RECORDS}
+    return (
+        {f.name: getattr(total, f.name) for f in fields(AccuracyTotal)} | {"settings": asdict(total.settings)} | arrays
+    )
 
 
-def _total(said: dict[str, Any]) -> Total:
-    settings: dict[str, Any] = {n: _tuples(v) for n, v in said["settings"].items()}
-    arrays = {name: np.frombuffer(bytes.fromhex(said[name]), dtype=kind) for name, kind in _RECORDS.items()}
-    one = {name: arrays[name].reshape(()) for name in ("episodes", "runs")}
-    return Total(**said | {"settings": Settings(**settings)} | arrays | one)
+def _total_from_json(data: dict[str, Any]) -> AccuracyTotal:
+    settings: dict[str, Any] = {n: _lists_to_tuples(v) for n, v in data["settings"].items()}
+    arrays = {name: np.frombuffer(bytes.fromhex(data[name]), dtype=kind) for name, kind in _RECORDS.items()}
+    scalars = {name: arrays[name].reshape(()) for name in ("episodes", "runs")}
+    return AccuracyTotal(**data | {"settings": AccuracySettings(**settings)} | arrays | scalars)
 
 
-def _tuples(value: Any) -> Any:
-    return tuple(map(_tuples, value)) if isinstance(value, list) else value
+def _lists_to_tuples(value: Any) -> Any:
+    return tuple(map(_lists_to_tuples, value)) if isinstance(value, list) else value

@@ -1,44 +1,155 @@
-"""Prepare: one log made ready for its runs. Nothing here depends on the run or on a configuration's fusion."""
+"""Prepare: what all runs and configurations of one log share, once and chunk by chunk.
+
+A long log is replayed in time chunks, so that memory does not grow with its length. What is cut are the receiver's
+instants: a time chunk has those from `from_s` on and before `until_s`. Its lists, what is fused of them, matched and
+measured are made, used and dropped before the next chunk; what a receiver must remember across a cut stays. No result
+depends on where the cuts are.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
+from copem_replay.communication.arrivals import fusion_schedule
 from copem_replay.communication.link import KeptDraws
 from copem_replay.communication.reception import RadioPath
 from copem_replay.core.errors import ExperimentError
-from copem_replay.core.interpolation import at_instants
-from copem_replay.core.time_chunk import WHOLE, TimeChunk
-from copem_replay.core.tracks import Bool, Float, Int, Scene, Tracks
-from copem_replay.experiment.schema import Experiment
-from copem_replay.io.recorded_units import RecordedUnits, recorded_units
+from copem_replay.core.interpolation import AROUND_S, interpolate_at_instants
+from copem_replay.core.tracks import WHOLE, Bool, Float, Int, Scene, TimeChunk, Tracks
+from copem_replay.experiment.schema import Configuration, Experiment
+from copem_replay.fusion.interface import ListFusion
+from copem_replay.io.recorded_units import RecordedUnits, join_recorded_units
 from copem_replay.io.recording import Recording
-from copem_replay.metrics.braking.ego_path import EgoPath
-from copem_replay.metrics.braking.encounter import Encounter, encounters
-from copem_replay.metrics.braking.verdict import passing
-from copem_replay.metrics.episodes import Episodes, episodes
-from copem_replay.metrics.line_of_sight import first_sights
-from copem_replay.metrics.within import only_within
-from copem_replay.perception.observation import KeptShares, Observations, joined_chunks, observations
-from copem_replay.perception.sensor_poses import SensorPoses, place
-from copem_replay.pipeline.chunking import Reach, time_chunks
-from copem_replay.pipeline.expansion import ExpandedExperiment, expand
-from copem_replay.pipeline.on_air import OnAir, asks_for_path, has_channel, paths
-from copem_replay.pipeline.perceived import Perceived
-from copem_replay.pipeline.presence import Presence
-from copem_replay.pipeline.receiver import WorldChunk, ghosts_of, listen, seen_by_all
+from copem_replay.metrics.braking.encounter import EgoPath, Encounter, find_encounters
+from copem_replay.metrics.braking.verdict import find_passing_intervals
+from copem_replay.metrics.detection.conflict import keep_episodes_within
+from copem_replay.metrics.episodes import Episodes, find_episodes, first_sights
+from copem_replay.perception.observation import KeptShares, Observations, join_observations, observe_objects
+from copem_replay.perception.sensor_poses import SensorPoses, list_instants, place_units
+from copem_replay.pipeline.expansion import ExpandedExperiment, Presence, expand_experiment
+from copem_replay.pipeline.receiver import (
+    StatedCaptures,
+    draw_shown_ghosts,
+    hear_units,
+    perceive_all_units,
+    state_captures,
+)
 from copem_replay.pipeline.scoring import TruthCache
-from copem_replay.pipeline.sent import ClaimedRows, claimed_rows, sent_objects
-from copem_replay.pipeline.stated_captures import stated_captures
+from copem_replay.pipeline.world import (
+    ClaimedRows,
+    OnAir,
+    Perceived,
+    WorldChunk,
+    asks_for_path,
+    claim_rows,
+    find_radio_paths,
+    has_channel,
+    select_sent_objects,
+)
+
+# Time chunks.
+
+ROWS_AT_ONCE = 500_000
+"""Observation rows up to which a log is one time chunk: with one run shown it takes about 1 GB."""
+ROWS_A_CHUNK = 250_000
+"""Observation rows of a time chunk of a longer log: a few hundred MB."""
+ROWS_HELD = 4_000_000
+"""Observation rows up to which a log is held at once by what needs all of it: some GB."""
+_AFTER = 0.381966
+"""Where between two frames a cut is: 1 − 1/φ, where latencies of round numbers hardly ever bring a list."""
+
+
+def time_chunks(scene: Scene, truth: Tracks, experiment: ExpandedExperiment) -> tuple[TimeChunk, ...]:
+    """A log in time chunks of about as many observation rows each."""
+    if not _can_be_cut(experiment.configurations.values()):
+        return (WHOLE,)
+    rows = observation_rows(scene, truth, experiment)
+    if rows <= ROWS_AT_ONCE:
+        return (WHOLE,)
+    _, bounds = truth.by_frame
+    pieces = int(-(-rows // ROWS_A_CHUNK))
+    frames = np.unique(np.searchsorted(bounds, np.linspace(0, len(truth.frame_ix), pieces + 1)[1:-1]))
+    frames = frames[(frames > 0) & (frames < len(truth.stamp_ns))]
+    before_s, after_s = truth.captured_s[frames - 1], truth.captured_s[frames]
+    # Between two frames: no cut comes between lists of different configurations that are available together.
+    cuts = [-np.inf, *(before_s + _AFTER * (after_s - before_s)).tolist(), np.inf]
+    return tuple(TimeChunk(*pair) for pair in pairwise(cuts))
+
+
+def observation_rows(scene: Scene, truth: Tracks, experiment: ExpandedExperiment) -> float:
+    """About how many observation rows a log has, with those of the truth, which is perceived like a unit."""
+    lists = sum(len(list_instants(scene, truth, unit)) for unit in experiment.modelled.values())
+    return len(truth.frame_ix) * (1 + lists / max(len(truth.stamp_ns), 1))
+
+
+def _can_be_cut(configurations: Iterable[Configuration]) -> bool:
+    return all(fusion.resumable for c in configurations if isinstance(fusion := c.fusion, ListFusion))
+
+
+class Reach:
+    """The earliest captures that the receivers need in a time chunk: of lists that arrive, are kept, or looked back to.
+
+    `heard`: by configuration the lists that its receiver hears, whatever is in them. `stated`: the captures that their
+    units state, None where these are true.
+    """
+
+    def __init__(
+        self,
+        experiment: ExpandedExperiment,
+        heard: Mapping[str, Tracks],
+        stated: Mapping[str, StatedCaptures | None] | None = None,
+    ) -> None:
+        self._oldest: list[tuple[Float, Float]] = []  # instants, and the oldest capture that each needs
+        self._again: list[tuple[Float, Float]] = []
+        for name, configuration in experiment.configurations.items():
+            lists = heard[name]
+            schedule = fusion_schedule(lists, max_age_s=configuration.max_age_s)
+            if not len(schedule.issue_s):
+                continue
+            # The lists that arrive at an instant, and those that are fused beside them.
+            oldest_s = np.minimum.reduceat(lists.captured_s[schedule.arrived], schedule.arrived_start[:-1])
+            used_s = np.where(schedule.newest >= 0, lists.captured_s[schedule.newest], np.inf).min(axis=1)
+            if partial := {
+                n for n, of in experiment.modelled.items() if of.sends is not None and of.sends.partial
+            }:  # entries are kept for max_age_s after a message that leaves them out
+                of_partial = np.array([unit in partial for unit in lists.units], dtype=bool)[lists.frame_unit_ix]
+                way_s = np.where(
+                    of_partial & np.isfinite(lists.common_arrives_s), lists.common_arrives_s - lists.captured_s, 0.0
+                )
+                used_s = np.minimum(used_s, schedule.issue_s - configuration.max_age_s - way_s.max(initial=0.0))
+            self._oldest.append((schedule.issue_s, np.minimum(oldest_s, used_s)))
+            fusion = configuration.fusion
+            if isinstance(fusion, ListFusion) and fusion.looks_back_s > 0:
+                arrives_s, captured_s = lists.common_arrives_s[schedule.arrived], lists.captured_s[schedule.arrived]
+                ahead_s = 0.0
+                if (
+                    stated is not None and (stated_captures := stated[name]) is not None
+                ):  # it looks back in stated captures
+                    captured_s, ahead_s = stated_captures.stated_s[schedule.arrived], stated_captures.ahead_s
+                newest_s = np.maximum.accumulate(captured_s)
+                self._again.append((arrives_s, newest_s - ahead_s - fusion.looks_back_s - AROUND_S))
+
+    def earliest_s(self, chunk: TimeChunk) -> float:
+        """The earliest capture that a time chunk needs."""
+        earliest_s = chunk.from_s
+        for issue_s, oldest_s in self._oldest:
+            first, after = np.searchsorted(issue_s, (chunk.from_s, chunk.until_s))
+            earliest_s = min(earliest_s, float(oldest_s[first:after].min(initial=np.inf)) - AROUND_S)
+        for arrives_s, needed_s in self._again:
+            arrived = int(np.searchsorted(arrives_s, chunk.from_s))
+            if arrived:
+                earliest_s = min(earliest_s, float(needed_s[arrived - 1]))
+        return earliest_s
 
 
 @dataclass(frozen=True)
 class Replay:
-    """One log made ready: nothing in it depends on the run or on a configuration."""
+    """One log made ready for its runs: nothing in it depends on the run or on a configuration's fusion."""
 
     scene: Scene
     expanded: ExpandedExperiment  # the experiment's units over this log
@@ -49,20 +160,24 @@ class Replay:
     episodes: Episodes
     encounters: tuple[Encounter, ...]  # those in conflict
     lane_boundaries: tuple[Float, ...] = ()  # (K, 3) each, for showing only
-    outside_ix: Int = field(default_factory=lambda: np.empty(0, dtype=np.int64))  # (K,) what `within` leaves out
+    outside_ix: Int = field(
+        default_factory=lambda: np.empty(0, dtype=np.int64)
+    )  # (K,) objects that `within` leaves out
 
     @cached_property
     def ego(self) -> EgoPath:
-        """How the ego drives through the log. There has to be one."""
+        """The ego's way through the log, which must have an ego."""
         return EgoPath(self.scene, self.truth, self.expanded.max_gap_s)
 
     @cached_property
     def passing_s(self) -> dict[int, Float]:
-        """For each episode in conflict the beginnings of braking (K, 2), from and to, with which the ego passes."""
+        """By episode in conflict the intervals (K, 2) in which the ego may begin to brake and passes."""
         braking = self.expanded.braking
         if braking is None:
             return {}
-        return {each.episode_ix: passing(each, braking.driver, braking.margin_m) for each in self.encounters}
+        return {
+            each.episode_ix: find_passing_intervals(each, braking.driver, braking.margin_m) for each in self.encounters
+        }
 
     @property
     def first_sights_s(self) -> Float:
@@ -90,7 +205,7 @@ class Replay:
         return TruthCache(self.scene, self.truth, self.expanded)
 
     def truth_cache_of(self, chunk: TimeChunk) -> TruthCache:
-        """The truth that configurations share: of a whole log it is kept, of a part of one it is made anew."""
+        """The truth that configurations share: of a whole log it is kept, of a time chunk it is made anew."""
         if chunk == WHOLE:
             return self.truth_cache
         return TruthCache(self.scene, self.truth, self.expanded)
@@ -101,22 +216,22 @@ class Replay:
 
     @cached_property
     def _whole(self) -> Observations:
-        return observations(self.scene, self.truth, self.expanded, self.placed)
+        return observe_objects(self.scene, self.truth, self.expanded, self.placed)
 
     @cached_property
     def measured(self) -> Observations:
-        """The rows of objects that are looked at."""
+        """The observation rows of objects that have an episode."""
         return self.rows_of(self.episodes.object_ix)
 
     def rows_of(self, object_ix: Int) -> Observations:
         """The observation rows of some objects."""
-        return joined_chunks([self.found(chunk).of_objects(object_ix) for chunk in self.chunks])
+        return join_observations([self.found(chunk).of_objects(object_ix) for chunk in self.chunks])
 
     def found(self, chunk: TimeChunk, from_s: float | None = None) -> Observations:
-        """The observation rows captured in a time chunk, or since an earlier instant. Those of a whole log are kept."""
+        """The observation rows captured in a time chunk, or from `from_s` on. Those of a whole log are kept."""
         if chunk == WHOLE:
             return self._whole
-        return observations(
+        return observe_objects(
             self.scene,
             self.truth,
             self.expanded,
@@ -128,7 +243,7 @@ class Replay:
         )
 
     def world(self, experiment: Experiment) -> WorldChunk:
-        """The log as the units of an experiment have it, by configuration."""
+        """The whole log as the units of an experiment perceive it."""
         units = self.expanded.with_(experiment)
         return WorldChunk(self.scene, self.truth, self._whole.listable, self.recorded, units, placed=self.placed)
 
@@ -141,9 +256,10 @@ class Replay:
         measured_only: bool = False,
         perceived: Perceived | None = None,
     ) -> Iterator[WorldChunk]:
-        """The same chunk by chunk, all of it or what is looked at, for runs (S,) that have the same lists.
+        """The log as units perceive it, chunk by chunk, for runs (S,) that have the same lists.
 
-        `presence`: which units there are; `perceived`: of a log in one chunk what they list in these and other runs.
+        `presence`: which units there are. `measured_only`: of objects with an episode. `perceived`: of a log in one
+        chunk what units list in these and other runs.
         """
         sending, equipped = presence.sending, presence.listing
         if self.chunks == (WHOLE,):
@@ -152,11 +268,11 @@ class Replay:
             yield replace(whole, found=self.measured.listable) if measured_only else whole
             return
         lists = self.lists_only(experiment, runs[:1], equipped)
-        units, seen = lists.experiment, seen_by_all(lists, runs[:1], states="true")
-        heard = {name: listen(seen, lists, name, sending) for name in units.configurations}
+        units, seen = lists.experiment, perceive_all_units(lists, runs[:1], states="true")
+        heard = {name: hear_units(seen, lists, name, sending) for name in units.configurations}
         stated = None
         if units.runs_apart:
-            stated = {name: stated_captures(self.scene, of, units, int(runs[0])) for name, of in heard.items()}
+            stated = {name: state_captures(self.scene, of, units, int(runs[0])) for name, of in heard.items()}
         reach = Reach(units, heard, stated)
         for chunk in self.chunks:
             earliest_s = reach.earliest_s(chunk)
@@ -174,9 +290,9 @@ class Replay:
             )
 
     def lists_only(self, experiment: Experiment, runs: Int | None = None, equipped: Bool | None = None) -> WorldChunk:
-        """The same without what is in the lists. Of runs (S,), of which there is one where arrivals are drawn."""
+        """The lists of the whole log without entries. `runs (S,)`: one if arrivals are drawn; None: no draws."""
         none = np.empty(0, dtype=np.int64)
-        found = observations(self.scene, self.truth, self.expanded, self.placed, from_s=np.inf)
+        found = observe_objects(self.scene, self.truth, self.expanded, self.placed, from_s=np.inf)
         recorded = None if self.recorded is None else self.recorded.captured_between(np.inf, np.inf)
         units = self.expanded.with_(experiment)
         on_air = None if runs is None else self.on_air(experiment, runs, equipped)
@@ -185,7 +301,7 @@ class Replay:
     def on_air(
         self, experiment: Experiment, runs: Int, equipped: Bool | None = None, perceived: Perceived | None = None
     ) -> OnAir | None:
-        """What drawn links go by in one run (1,); None: none is drawn. `equipped (1, U)`: which units list."""
+        """The input of drawn links in one run (1,); None: no link is drawn. `equipped (1, U)`: which units list."""
         units = self.expanded.with_(experiment)
         if not units.arrivals_differ:
             return None
@@ -199,7 +315,7 @@ class Replay:
         path = self.paths if asks_for_path(units, self.scene) else None
         on_air = OnAir(int(runs[0]), path, None, kept=self._drawn)
         if units.sends:
-            on_air = replace(on_air, sent=sent_objects(units, self._listed_in(units, runs, equipped, perceived)))
+            on_air = replace(on_air, sent=select_sent_objects(units, self._listed_in(units, runs, equipped, perceived)))
         if has_channel(units):
             on_air = replace(on_air, objects=self._counts(units, runs, equipped, on_air, perceived))
         return on_air
@@ -217,9 +333,9 @@ class Replay:
             world = WorldChunk(
                 self.scene, self.truth, found, None, units, chunk, self.placed, chunk.from_s, perceived=perceived
             )
-            ghosts = ghosts_of(world, runs)
-            seen = seen_by_all(world, runs, states="sampled", equipped=equipped, ghosts=ghosts)
-            yield world, seen, claimed_rows(world, runs, ghosts)
+            ghosts = draw_shown_ghosts(world, runs)
+            seen = perceive_all_units(world, runs, states="sampled", equipped=equipped, ghosts=ghosts)
+            yield world, seen, claim_rows(world, runs, ghosts)
 
     def _counts(
         self, units: ExpandedExperiment, runs: Int, equipped: Bool | None, on_air: OnAir, perceived: Perceived | None
@@ -232,38 +348,44 @@ class Replay:
             world = WorldChunk(
                 self.scene, self.truth, found, recorded, units, chunk, self.placed, chunk.from_s, on_air, perceived
             )
-            seen = seen_by_all(world, runs, states="true", equipped=equipped, ghosts=ghosts_of(world, runs))
+            seen = perceive_all_units(
+                world, runs, states="true", equipped=equipped, ghosts=draw_shown_ghosts(world, runs)
+            )
             of_chunk = np.bincount(seen.frame_ix[seen.valid[0]], minlength=len(seen.stamp_ns))
             counts = of_chunk + counts if len(counts) else of_chunk
         return counts
 
     @cached_property
     def paths(self) -> RadioPath:
-        """The way of each list of all units to the ego."""
-        lists = seen_by_all(self.lists_only(self.expanded.written), np.zeros(1, dtype=np.int64), states="true")
-        return paths(self.rows_of(np.array([self.scene.ego_ix])), self.scene, self.expanded, lists)
+        """The radio path of each list of all units to the ego."""
+        lists = perceive_all_units(self.lists_only(self.expanded.written), np.zeros(1, dtype=np.int64), states="true")
+        return find_radio_paths(self.rows_of(np.array([self.scene.ego_ix])), self.scene, self.expanded, lists)
 
 
-def prepare(recording: Recording, experiment: Experiment, *, onsets_of: Experiment | None = None) -> Replay:
+def prepare_log(recording: Recording, experiment: Experiment, *, onsets_of: Experiment | None = None) -> Replay:
     """Everything about a log that all runs and configurations share. Raises ExperimentError where an ego is missing.
 
-    `onsets_of`: whose onsets they are, where units of the experiment are only in this run (`expansion.of_run`).
+    `onsets_of`: the experiment that onsets are of, where `experiment` has the units of one run (`resolve_for_run`).
     """
     scene = recording.scene
     if scene.ego_ix < 0:
         for key, asked in (("braking", experiment.braking), ("measure.conflict", experiment.measure.conflict)):
             if asked is not None:
                 raise ExperimentError(f"{scene.log}: {key}: no ego in this study to brake or collide")
-    expanded = expand(experiment, scene)
-    truth = at_instants(recording.truth, recording.truth.stamp_ns, t0_ns=scene.t0_ns, max_gap_s=experiment.max_gap_s)
-    placed = place(scene, truth, expanded)
+    expanded = expand_experiment(experiment, scene)
+    truth = interpolate_at_instants(
+        recording.truth, recording.truth.stamp_ns, t0_ns=scene.t0_ns, max_gap_s=experiment.max_gap_s
+    )
+    placed = place_units(scene, truth, expanded)
     lists = {name: found for name, found in recording.lists.items() if name in expanded.units}
-    recorded = recorded_units(
+    recorded = join_recorded_units(
         lists, scene, truth, gate_m=experiment.measure.match.gate_m, max_gap_s=experiment.max_gap_s
     )
-    on, outside_ix = only_within(
-        scene, truth, episodes(scene, truth, placed.static, onsets_of or experiment), onsets_of or experiment
+    episodes, outside_ix = keep_episodes_within(
+        scene, truth, find_episodes(scene, truth, placed.static, onsets_of or experiment), onsets_of or experiment
     )
-    meeting = encounters(scene, truth, on, experiment)
-    cut = time_chunks(scene, truth, expanded)
-    return Replay(scene, expanded, truth, placed, cut, recorded, on, meeting, recording.lane_boundaries, outside_ix)
+    encounters = find_encounters(scene, truth, episodes, experiment)
+    chunks = time_chunks(scene, truth, expanded)
+    return Replay(
+        scene, expanded, truth, placed, chunks, recorded, episodes, encounters, recording.lane_boundaries, outside_ix
+    )

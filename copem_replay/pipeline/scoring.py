@@ -1,8 +1,8 @@
 """Scoring: how good a configuration's fused lists are.
 
-What is said of an object is matched with the truth at the instant it tells of, what a list is worth now with the truth
-at the instant it was available (`metrics/matching.py`). Where a unit's clock is off, an entry may tell of an instant
-before its object's first frame, or after its last: it is held against the state moved there (`core/interpolation.py`).
+Entries are matched with the truth at the instant they tell of, and for the accuracy of a list now with the truth at the
+instant it is available (`metrics/matching.py`). Where a unit's clock is off, an entry may tell of an instant before its
+object's first frame, or after its last: it is compared with the state moved there (`core/interpolation.py`).
 """
 
 from __future__ import annotations
@@ -14,42 +14,42 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from copem_replay.core.agree import AGREE
-from copem_replay.core.interpolation import AROUND_S, at_instants, at_stated_instants
+from copem_replay.core.interpolation import AROUND_S, interpolate_at_instants, interpolate_at_stated_instants
+from copem_replay.core.object_list import AGREE
 from copem_replay.core.tracks import CLASSES, Bool, Float, Int, Scene, Tracks, class_indices
 from copem_replay.metrics.accuracy.aggregator import Aggregator
-from copem_replay.metrics.accuracy.statistics import Accuracy, Settings, for_runs
+from copem_replay.metrics.accuracy.statistics import Accuracy, AccuracySettings, repeat_for_runs
 from copem_replay.metrics.config import AnnotatedArea, Measure, MetricsSetup
-from copem_replay.metrics.detection.by_match import FirstMatches, Steps, captures_of
-from copem_replay.metrics.detection.by_truth_id import Detections
-from copem_replay.metrics.episodes import Episodes, measured_objects
-from copem_replay.metrics.matching import Matches, match, match_both
-from copem_replay.metrics.reference import Reference, reference_at
+from copem_replay.metrics.detection.by_match import DetectionSteps, FirstMatches, collect_captures
+from copem_replay.metrics.detection.by_truth_id import FirstDetections
+from copem_replay.metrics.episodes import Episodes, Reference, locate_reference, measured_objects
+from copem_replay.metrics.matching import Matches, match_at_both_times, match_entries
 
 if TYPE_CHECKING:
     from copem_replay.pipeline.receiver import ReceiverOutput
 
 
 KEPT = 64
-"""Of so many sets of instants the truth is kept (chosen: where arrivals are drawn each run has its own)."""
+"""Sets of instants of which the truth is kept. More take more memory, and where arrivals are drawn no set comes again:
+each run has its own. No result depends on it."""
 
 T = TypeVar("T")
 
 
-def _kept(known: dict[bytes, T], time_s: Float, made: Callable[[Float], T]) -> T:
-    """What is known of some instants, or is `made` and kept in the place of what was made first."""
+def _cache_instants(cache: dict[bytes, T], time_s: Float, compute: Callable[[Float], T]) -> T:
+    """What the cache has of these instants, else what `compute` gives, which replaces the oldest entry."""
     key = time_s.tobytes()
-    found = known.get(key)
-    if found is None:
-        found = known[key] = made(time_s)
-        for oldest in list(known)[:-KEPT]:
-            known.pop(oldest, None)
-    return found
+    value = cache.get(key)
+    if value is None:
+        value = cache[key] = compute(time_s)
+        for oldest in list(cache)[:-KEPT]:
+            cache.pop(oldest, None)
+    return value
 
 
 @dataclass(frozen=True)
 class TruthCache:
-    """One log's truth at the instants of fused lists. What configurations share is computed once."""
+    """One log's truth at the instants of fused lists; configurations with the same instants share it."""
 
     scene: Scene
     truth: Tracks
@@ -59,20 +59,20 @@ class TruthCache:
 
     def at(self, time_s: Float) -> Tracks:
         """The truth at instants (K,), ascending."""
-        return _kept(self._worlds, time_s, self._at)
+        return _cache_instants(self._worlds, time_s, self._at)
 
     def at_stated(self, time_s: Float, captured_s: tuple[Float, Float]) -> Tracks:
-        """The truth at stated instants (K,), ascending; `captured_s`: when what they state was captured, from, to."""
-        return _kept(self._worlds, np.stack([time_s, *captured_s]), self._at_stated)
+        """The truth at stated instants (K,), ascending; `captured_s`: the earliest and latest true capture of each."""
+        return _cache_instants(self._worlds, np.stack([time_s, *captured_s]), self._at_stated)
 
     def _at(self, time_s: Float) -> Tracks:
-        return at_instants(
+        return interpolate_at_instants(
             self._near(time_s), self._stamps(time_s), t0_ns=self.scene.t0_ns, max_gap_s=self.experiment.max_gap_s
         )
 
     def _at_stated(self, times_s: Float) -> Tracks:
         stamps, earliest, latest = self._stamps(times_s)
-        return at_stated_instants(
+        return interpolate_at_stated_instants(
             self._near(times_s[0]), stamps, (earliest, latest), t0_ns=self.scene.t0_ns,
             max_gap_s=self.experiment.max_gap_s,
         )  # fmt: skip
@@ -81,7 +81,7 @@ class TruthCache:
         return self.scene.t0_ns + np.rint(time_s * 1e9).astype(np.int64)
 
     def _near(self, time_s: Float) -> Tracks:
-        """The truth as far as states at instants (K,) need it."""
+        """The part of the truth that interpolation at instants (K,) needs."""
         if not len(time_s):
             return self.truth
         gap_s = self.experiment.max_gap_s + AROUND_S
@@ -89,23 +89,23 @@ class TruthCache:
 
     def reference(self, time_s: Float) -> Reference:
         """From where distances are measured, at instants (K,)."""
-        return _kept(
-            self._references, time_s, lambda time_s: reference_at(self.scene, self.truth, self.experiment, time_s)
+        return _cache_instants(
+            self._references, time_s, lambda time_s: locate_reference(self.scene, self.truth, self.experiment, time_s)
         )
 
     def classes(self, measure: Measure) -> Bool:
-        """(C,) which classes are measured: only of these are entries that nothing true belongs to ghosts."""
+        """(C,) which classes are measured: an entry without a true object is a ghost only if it is of one of these."""
         measured: Bool = np.zeros(len(CLASSES), dtype=bool)
         measured[self.scene.object_class[measured_objects(self.scene, measure)]] = True
         if measure.objects.ids is None and measure.objects.classes is not None:
             measured[class_indices(measure.objects.classes)] = True
-        # A `vehicle`, not said which, may be a car; what is not classified at all may be anything.
-        alike: Bool = np.array(AGREE[:, measured].any(axis=1))
-        alike[CLASSES.index("other")] = measured[CLASSES.index("other")]
-        return alike
+        # A `vehicle` may be a car; an entry without a class (`other`) may be anything.
+        may_be_measured: Bool = np.array(AGREE[:, measured].any(axis=1))
+        may_be_measured[CLASSES.index("other")] = measured[CLASSES.index("other")]
+        return may_be_measured
 
     def since_s(self, episodes: Episodes) -> Float:
-        """(M,) when each object that is looked at first is in the log."""
+        """(M,) when the object of each episode first is in the log."""
         first = np.full(len(self.scene.object_ids), np.inf)
         np.minimum.at(first, self.truth.row_object_ix, self.truth.row_captured_s)
         since: Float = first[episodes.object_ix]
@@ -113,47 +113,46 @@ class TruthCache:
 
 
 @dataclass(frozen=True)
-class Scores:
-    """Of one configuration in the runs (S,), or in the one that stands for all.
+class ConfigurationScores:
+    """The scores of one configuration in the runs (S,), or in the one that stands for all.
 
-    `issue_s (K,)`: when each list was available. `detections` and `steps`: as matches tell, whatever the fusion.
+    `issue_s (K,)`: when each list is available. `detections`, `steps`: by match, whatever the fusion.
     """
 
     issue_s: Float
-    detections: Detections
-    steps: Steps
+    detections: FirstDetections
+    steps: DetectionSteps
     accuracy: Accuracy | None
 
 
 def match_lists(around: TruthCache, output: ReceiverOutput, measure: Measure) -> Matches:
     """Which true object each entry of the fused lists is about, at the instant it tells of."""
-    world = around.at(output.at.issue_s) if output.tells_of == "now" else _world_told(around, output)
-    return match(output.told, world, around.scene, gate_m=measure.match.gate_m, tells_of=output.tells_of)
+    world = around.at(output.at.issue_s) if output.tells_of == "now" else _interpolate_told_world(around, output)
+    return match_entries(output.told, world, around.scene, gate_m=measure.match.gate_m, tells_of=output.tells_of)
 
 
-def _match_both(around: TruthCache, output: ReceiverOutput, measure: Measure) -> tuple[Matches, Matches]:
-    """The same, and if all entries told of the instant their list is available."""
+def _match_at_both_times(around: TruthCache, output: ReceiverOutput, measure: Measure) -> tuple[Matches, Matches]:
+    """Matches at the instants that entries tell of, and at the instants at which their lists are available."""
     if output.tells_of == "now":
         matches = match_lists(around, output, measure)
         return matches, matches
-    then, now = _world_told(around, output), around.at(output.at.issue_s)
-    return match_both(output.told, then, now, around.scene, gate_m=measure.match.gate_m)
+    then, now = _interpolate_told_world(around, output), around.at(output.at.issue_s)
+    return match_at_both_times(output.told, then, now, around.scene, gate_m=measure.match.gate_m)
 
 
-def _world_told(around: TruthCache, output: ReceiverOutput) -> Tracks:
+def _interpolate_told_world(around: TruthCache, output: ReceiverOutput) -> Tracks:
     """The truth at the captures that entries tell of."""
-    captures_s = _captures(output)
+    captures_s = _list_captures(output)
     if output.stated is None:
         return around.at(captures_s)
     return around.at_stated(captures_s, output.stated.captured_between_s(captures_s))
 
 
-def _captures(output: ReceiverOutput) -> Float:
-    """Captures, ascending: all that the entries name, at least; of a log in one piece all that were heard."""
+def _list_captures(output: ReceiverOutput) -> Float:
+    """Captures, ascending: all that were heard; in a time chunk those about the captures that entries name."""
     captures: Float = np.unique(output.captures_told_s)
     if output.whole:
         return captures
-    # Those next to what is named, before and after.
     after = np.searchsorted(captures, output.told.entries["captured_s"])
     used = np.zeros(len(captures) + 1, dtype=bool)
     used[after] = used[np.maximum(after - 1, 0)] = True
@@ -161,66 +160,69 @@ def _captures(output: ReceiverOutput) -> Float:
 
 
 class Scorer:
-    """Measures a configuration's lists, chunk by chunk; `issue_s (K,)`: when all of the log's are available."""
+    """Measures a configuration's lists, chunk by chunk; `issue_s (K,)`: when those of the whole log are available."""
 
     def __init__(
         self, around: TruthCache, episodes: Episodes, output: ReceiverOutput, issue_s: Float, measure: Measure
     ) -> None:
         self._issue_s, self._measure = issue_s, measure
         self.accuracy_s = 0.0
-        """How long measuring accuracy took, matching not counted."""
+        """Seconds that measuring accuracy took, without matching."""
         runs = len(output.lists.start)
         self._known = FirstMatches(
             episodes, runs=runs, confirm=measure.confirm, count_earlier=measure.count_earlier,
-            captures=captures_of(output.heard, instants=measure.confirm.hits > 1),
+            captures=collect_captures(output.heard, instants=measure.confirm.hits > 1),
         )  # fmt: skip
         self._aggregator = None
         if measure.accuracy:
             self._aggregator = Aggregator(
                 issue_s, around.scene, episodes, around.since_s(episodes), around.reference(issue_s),
-                around.classes(measure), settings=settings_of(measure, around.scene.end_s), runs=runs,
+                around.classes(measure), settings=accuracy_settings(measure, around.scene.end_s), runs=runs,
             )  # fmt: skip
 
     def add(self, around: TruthCache, output: ReceiverOutput) -> Matches:
-        """Take in the lists of a time chunk; what they are about."""
+        """Take in the lists of a time chunk. Returns their matches."""
         lists, issue_s = output.lists, output.at.issue_s
         if self._aggregator is None:
-            about = match_lists(around, output, self._measure)
+            matches = match_lists(around, output, self._measure)
         else:
             began_s = time.perf_counter()
-            about, now = _match_both(around, output, self._measure)
-            self._aggregator.add(lists, about, now, around.at(issue_s))
+            matches, now = _match_at_both_times(around, output, self._measure)
+            self._aggregator.add(lists, matches, now, around.at(issue_s))
             self.accuracy_s += time.perf_counter() - began_s
-        self._known.add(lists, about, issue_s)
-        return about
+        self._known.add(lists, matches, issue_s)
+        return matches
 
-    def result(self, runs: int) -> Scores:
-        """All of it, for each of so many runs."""
+    def result(self, runs: int) -> ConfigurationScores:
+        """The scores in this number of runs."""
         detections, steps = self._known.result()
         aggregator = self._aggregator
-        accuracy = None if aggregator is None else for_runs(aggregator.result(), runs)
-        return Scores(self._issue_s, detections, steps, accuracy)
+        accuracy = None if aggregator is None else repeat_for_runs(aggregator.result(), runs)
+        return ConfigurationScores(self._issue_s, detections, steps, accuracy)
 
+
+# What accuracy is measured by: bands of distance, time and existence.
 
 DISTANCE_EDGES_M = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 75.0, 100.0, 150.0, 200.0)
-"""Of bands of distance (chosen)."""
+"""Edges of the bands of distance: finer where most entries of a roadside or vehicle unit are. Round values."""
 
 TIME_BANDS = 120
-"""At most so many bands of time, of whole seconds (chosen)."""
+"""Bands of time at most, each of whole seconds: two minutes by the second; longer logs have longer bands."""
 
 EXISTENCE_THRESHOLDS = (
     0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.89, 0.91, 0.95,
     0.98, 0.992, 0.9992, 0.99992, 0.999992,
 )  # fmt: skip
-"""At which ghosts are counted (chosen: the last ones tell two, three, … units of existence 0.9 from fewer)."""
+"""Existence from which on ghosts are counted: twentieths, and above 0.85 values that tell one, two, three, … units of
+existence 0.9 that agree from fewer (1 − 0.1ⁿ)."""
 
 
-def settings_of(measure: Measure, end_s: float) -> Settings:
+def accuracy_settings(measure: Measure, end_s: float) -> AccuracySettings:
     """Parameters of the accuracy for a log that ends at `end_s`."""
     cutoff_m = measure.gospa.cutoff_m if measure.gospa.cutoff_m is not None else measure.match.gate_m
     step_s = max(1, int(np.ceil(end_s / TIME_BANDS)))
     area = measure.annotated or AnnotatedArea.model_construct()
-    return Settings(
+    return AccuracySettings(
         cutoff_m,
         measure.match.gate_m,
         measure.gospa.power,

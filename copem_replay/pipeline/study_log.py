@@ -1,4 +1,7 @@
-"""One log of a study: read and made ready where its objects are needed, and else known from before."""
+"""A log of a study: read and prepared where its objects are needed, else known by the facts that were kept of it.
+
+The survey of a study's logs: each is read and checked before any run, and not all of them stay in memory.
+"""
 
 from __future__ import annotations
 
@@ -6,26 +9,40 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
 import numpy as np
 
 from copem_replay.core.components import Component
-from copem_replay.core.errors import RecordingError
-from copem_replay.core.remote import Remote
+from copem_replay.core.errors import ExperimentError, RecordingError, RemoteFile
 from copem_replay.core.tracks import TRUTH, VALUES, Tracks
-from copem_replay.experiment.drive import for_all_logs, of_log
+from copem_replay.experiment.drive import cache_last_experiment, resolve_for_log
 from copem_replay.experiment.schema import Experiment
-from copem_replay.io.checksum import Stamps, check_unchanged, sha256_of, stamps_of
-from copem_replay.io.recording import Recording
-from copem_replay.io.survey import Survey, whole
-from copem_replay.io.together import Place, Together, first_of
-from copem_replay.io.truth_digest import truth_digest
-from copem_replay.pipeline.facts import Facts, scene_as_json, scene_of
-from copem_replay.pipeline.pieces import Pieces
-from copem_replay.pipeline.prepare import Replay, prepare
-from copem_replay.pipeline.recipe import canonical, digests, fingerprint, key_of, own_components
+from copem_replay.io.ground_truth import truth_digest
+from copem_replay.io.open import (
+    DriveRecordings,
+    Place,
+    Stamps,
+    check_files_unchanged,
+    first_recording,
+    read_file_stamps,
+    sha256_of,
+)
+from copem_replay.io.recording import Recording, StoredSurvey, read_whole_recording
+from copem_replay.pipeline.notes import LogFacts, scene_as_json, scene_from_json
+from copem_replay.pipeline.pieces import (
+    PieceCache,
+    canonical_json,
+    file_digests,
+    own_components,
+    recipe_key,
+    take_fingerprint,
+)
+from copem_replay.pipeline.prepare import Replay, prepare_log
+
+if TYPE_CHECKING:
+    from copem_replay.pipeline.cost import Size
 
 Stamp = tuple[object, ...]
 _NOT_OF_A_SURVEY = ("logs", "show", "sweep")
@@ -33,50 +50,50 @@ _NOT_OF_A_SURVEY = ("logs", "show", "sweep")
 
 @dataclass
 class StudyLog:
-    """`experiment`: of the study, for which the log is made `ready`."""
+    """A log of a study. `experiment`: the study's. `ready`: the log prepared for it; None: not yet, or dropped."""
 
     recording: Recording
     experiment: Experiment
-    pieces: Pieces | None = None
+    pieces: PieceCache | None = None
     ready: Replay | None = None
-    _whole: Recording | None = None  # while a log that does not stay in memory is there
-    _facts: tuple[Experiment, Facts] | None = None  # those that were asked for last
+    _whole: Recording | None = None  # the recording with its truth, until `drop`
+    _facts: tuple[Experiment, LogFacts] | None = None  # of the last experiment that was asked for
 
     @property
     def name(self) -> str:
-        """What the log is called."""
+        """The name of the log."""
         return self.recording.scene.log
 
     def replay(self) -> Replay:
-        """The log made ready."""
+        """The prepared log."""
         if self.ready is None:
-            self.ready = prepare(self.whole(), of_log(self.experiment, self.name))
+            self.ready = prepare_log(self.whole(), resolve_for_log(self.experiment, self.name))
         return self.ready
 
     def whole(self) -> Recording:
         """The recording with its truth and its lists."""
         if self._whole is None:
-            read = whole(self.recording)
+            read = read_whole_recording(self.recording)
             self._check_same(read)
             self._whole = read
         return self._whole
 
     def _check_same(self, read: Recording) -> None:
-        """Raise RecordingError where what was read again is not what is known, which is forgotten then."""
+        """Raises RecordingError where the content differs from that of the kept facts, which are then removed."""
         survey = self.recording.survey
-        if survey is None or (found := content_of(read)) == self.digests["sha256"]:
+        if survey is None or (found := read_content_digest(read)) == self.digests["sha256"]:
             return
         if self.pieces is not None and survey.about:
             self.pieces.forget(survey.about)
-        known = self.digests["sha256"]
+        expected = self.digests["sha256"]
         raise RecordingError(
-            f"expected the content that it had when it was read before, SHA-256 {known[:12]}…, found {found[:12]}…; "
+            f"expected the content that it had when it was read before, SHA-256 {expected[:12]}…, found {found[:12]}…; "
             "run the command again, and it is replayed as it is now",
-            path=first_of(read.place),
+            path=first_recording(read.place),
         )
 
     def drop(self) -> None:
-        """Let go of what was read again: a log that stays in memory does, any other is read where it is needed."""
+        """Drop from memory what can be read again; a recording that the survey holds stays."""
         if self.recording.survey is not None:
             self.ready = self._whole = None
 
@@ -85,112 +102,170 @@ class StudyLog:
         """SHA-256 of the content, and of the truth."""
         if self.recording.survey is not None:
             return {name: self.recording.survey.said[name] for name in ("sha256", "truth")}
-        return digests_of(self.recording)
+        return compute_log_digests(self.recording)
 
     @cached_property
     def identity(self) -> dict[str, Any]:
-        """What of the log is in the recipes of its pieces: by its name draws are addressed."""
+        """What of the log is in the recipes of its pieces: its name, by which draws are addressed, and its content."""
         together = self.recording.together
         ahead_ns = [] if together is None else list(together.ahead_ns)
         named = {"name": self.name, "sha256": self.digests["sha256"], "topic": self.recording.topic}
         return named | {"ahead_ns": ahead_ns}
 
-    def facts(self, experiment: Experiment) -> Facts:
-        """What the results say of the log beside its rows, in an experiment; kept for the next time."""
+    def facts(self, experiment: Experiment) -> LogFacts:
+        """What the results say of the log beside its rows, in an experiment; kept with the pieces."""
         if self._facts is None or self._facts[0] is not experiment:
-            self._facts = experiment, self._found(of_log(experiment, self.name))
+            self._facts = experiment, self._find_facts(resolve_for_log(experiment, self.name))
         return self._facts[1]
 
-    def _found(self, alone: Experiment) -> Facts:
+    def _find_facts(self, alone: Experiment) -> LogFacts:
         if self.pieces is None:
-            return Facts.of(self.whole(), self.replay(), alone)
-        one, survey = self.recording, self.recording.survey
-        seen = None if one.stamps is None else _named_by(one.stamps)
-        about = survey_key(one.place, alone, seen)
-        said = survey.said if survey is not None and survey.about == about else self.pieces.known(about)
-        if said is not None and said["scene"]["log"] == self.name:
-            return Facts.read(said["facts"])
+            return LogFacts.of(self.whole(), self.replay(), alone)
+        recording, survey = self.recording, self.recording.survey
+        seen = None if recording.stamps is None else _drop_paths(recording.stamps)
+        about = survey_key(recording.place, alone, seen)
+        kept = survey.said if survey is not None and survey.about == about else self.pieces.known(about)
+        if kept is not None and kept["scene"]["log"] == self.name:
+            return LogFacts.read(kept["facts"])
         replay = self.replay()
-        found = Facts.of(self.whole(), replay, alone)
-        self.pieces.keep(about, self._survey() | {"facts": found.as_json()})
-        return found
+        facts = LogFacts.of(self.whole(), replay, alone)
+        self.pieces.keep(about, self._describe() | {"facts": facts.as_json()})
+        return facts
 
-    def _survey(self) -> dict[str, Any]:
-        one = self.recording
-        said = {"scene": scene_as_json(one.scene), "topic": one.topic, "notes": list(one.notes), "host": one.host_id}
-        return said | dict(self.digests)
+    def _describe(self) -> dict[str, Any]:
+        scene, notes = scene_as_json(self.recording.scene), list(self.recording.notes)
+        data = {"scene": scene, "topic": self.recording.topic, "notes": notes, "host": self.recording.host_id}
+        return data | dict(self.digests)
 
 
-def digests_of(recording: Recording) -> dict[str, str]:
+def compute_log_digests(recording: Recording) -> dict[str, str]:
     """SHA-256 of the content of a recording that was read, and of its truth."""
-    return {"sha256": content_of(recording), "truth": truth_digest(recording.scene, recording.truth)}
+    return {"sha256": read_content_digest(recording), "truth": truth_digest(recording.scene, recording.truth)}
 
 
-def content_of(recording: Recording) -> str:
-    """SHA-256 of what was read. Raises RecordingError where the files have changed since, so that nothing tells it."""
+def read_content_digest(recording: Recording) -> str:
+    """SHA-256 of the content that was read. Raises RecordingError where the files have changed since."""
     if recording.sha256 is not None:
         return recording.sha256
-    found = sha256_of(recording.local)
-    check_unchanged(recording.stamps or ())
-    return found
+    digest = sha256_of(recording.local)
+    check_files_unchanged(recording.stamps or ())
+    return digest
 
 
-def dropped(recording: Recording, read: Callable[[], Recording]) -> Recording:
-    """A recording without its truth and its lists, which are read again where they are needed."""
-    survey = Survey(digests_of(recording), read)
-    return replace(recording, truth=_nothing(), lists={}, around=None, lane_boundaries=(), survey=survey)
+def drop_content(recording: Recording, read: Callable[[], Recording]) -> Recording:
+    """A recording without its truth and its lists, which `read` reads again where they are needed."""
+    survey = StoredSurvey(compute_log_digests(recording), read)
+    return replace(recording, truth=_empty_tracks(), lists={}, around=None, lane_boundaries=(), survey=survey)
 
 
 def survey_key(place: Place, experiment: Experiment, seen: Sequence[Stamp] | None = None) -> str:
-    """All that is known of a log depends on: its files as they were `seen`, and the experiment, resolved for it.
+    """All that the facts of a log depend on: its files and the experiment, resolved for it, as canonical JSON.
 
-    `seen`: None: as they are now.
+    `seen`: the stamps of the files when they were read; None: those that they have now.
     """
-    of_all, own = _of_every_log(experiment)
-    ahead_ns = place.ahead_ns if isinstance(place, Together) else ()
-    return canonical(
-        {"files": stamps(place) if seen is None else seen, "ahead_ns": ahead_ns, "of": of_all, "own": digests(own)}
+    of_all, own = _survey_parts(experiment)
+    ahead_ns = place.ahead_ns if isinstance(place, DriveRecordings) else ()
+    return canonical_json(
+        {
+            "files": file_stamps(place) if seen is None else seen,
+            "ahead_ns": ahead_ns,
+            "of": of_all,
+            "own": file_digests(own),
+        }
     )
 
 
-@for_all_logs
-def _of_every_log(experiment: Experiment) -> tuple[str, list[Component]]:
+@cache_last_experiment
+def _survey_parts(experiment: Experiment) -> tuple[str, list[Component]]:
     data = {key: value for key, value in experiment.as_written().items() if key not in _NOT_OF_A_SURVEY}
-    of_all = key_of(canonical({"survey": 2, "fingerprint": fingerprint(), "experiment": data}))
+    of_all = recipe_key(canonical_json({"survey": 2, "fingerprint": take_fingerprint(), "experiment": data}))
     return of_all, own_components(experiment)
 
 
-def stamps(place: Place) -> list[Stamp]:
-    """Which files they are, their sizes, and what changes with their content. Raises RecordingError, InputError."""
-    if isinstance(place, Remote):  # which is not asked for a content that it does not tell from another
+def file_stamps(place: Place) -> list[Stamp]:
+    """The identity and size of each file, and what changes with its content. Raises RecordingError, InputError."""
+    if isinstance(place, RemoteFile):  # without a stamp no content is ever taken for the same
         return [(str(place), *(place.stamp or (uuid4().hex,)))]
-    return _named_by(stamps_of(place))
+    return _drop_paths(read_file_stamps(place))
 
 
-def _named_by(files: Stamps) -> list[Stamp]:
-    return [tuple(one[1:]) for one in files]  # whatever path led to them
+def _drop_paths(files: Stamps) -> list[Stamp]:
+    return [tuple(stamp[1:]) for stamp in files]  # the same files by any path
 
 
-def known_log(pieces: Pieces, place: Place, experiment: Experiment, read: Callable[[], Recording]) -> Recording | None:
-    """A recording as it is known from before, in an experiment that is resolved for it; None: it has to be read."""
+def recall_log(
+    pieces: PieceCache, place: Place, experiment: Experiment, read: Callable[[], Recording]
+) -> Recording | None:
+    """A recording by the facts that are kept of it, in an experiment that is resolved for it; None: none are kept."""
     try:
         about = survey_key(place, experiment)
-    except RecordingError:  # which is said when it is read
+    except RecordingError:  # reading the recording reports it
         return None
-    if (said := pieces.known(about)) is None:
+    if (kept := pieces.known(about)) is None:
         return None
-    together, remote = place if isinstance(place, Together) else None, place if isinstance(place, Remote) else None
-    first = first_of(place)
+    first = first_recording(place)
     return Recording(
-        scene_of(said["scene"]), _nothing(), Path(first.name) if isinstance(first, Remote) else first, said["topic"],
-        tuple(said["notes"]), said["host"], together=together, remote=remote, survey=Survey(said, read, about),
-    )  # fmt: skip
+        scene_from_json(kept["scene"]),
+        _empty_tracks(),
+        Path(first.name) if isinstance(first, RemoteFile) else first,
+        kept["topic"],
+        tuple(kept["notes"]),
+        kept["host"],
+        together=place if isinstance(place, DriveRecordings) else None,
+        remote=place if isinstance(place, RemoteFile) else None,
+        survey=StoredSurvey(kept, read, about),
+    )
 
 
-def _nothing() -> Tracks:
+def _empty_tracks() -> Tracks:
     """Tracks of no object."""
     none, values = np.empty(0, dtype=np.int64), np.empty((1, 0))
     return Tracks(
         (TRUTH,), np.zeros(1, dtype=np.int64), none, none, none, none, np.empty(0), none, values,
         np.empty((1, 0), dtype=bool), **dict.fromkeys(VALUES, values),
     )  # fmt: skip
+
+
+# The survey of a study's logs.
+
+STATES_HELD = 250_000
+"""Object states of logs that stay in memory from the survey on: some 20 drives of 20 s, 200 MB. The first log always
+stays; others are read again when it is their turn. No result depends on it."""
+
+
+class LogSurvey:
+    """Reads and checks the logs of a study before any run. `sizes`: of the logs that are dropped.
+
+    `problems`: why logs that are dropped have no closed form, where one is asked for.
+    """
+
+    def __init__(self, pieces: PieceCache | None = None) -> None:
+        self.pieces = pieces
+        self.sizes: list[Size] = []
+        self.problems: list[str] = []
+        self._states = 0
+
+    def known(self, place: Place, experiment: Experiment, read: Callable[[], Recording]) -> Recording | None:
+        """A recording by the facts that are kept of it; None: it has to be read."""
+        return None if self.pieces is None else recall_log(self.pieces, place, experiment, read)
+
+    def kept(self, recording: Recording, experiment: Experiment, read: Callable[[], Recording]) -> Recording:
+        """A recording that was read, in the experiment resolved for it: as it is, or without its truth and lists.
+
+        Its SHA-256 is taken now, while its files are what was read. Raises ExperimentError, RecordingError.
+        """
+        recording = replace(recording, sha256=read_content_digest(recording))
+        if not self._states or self._states + recording.object_states <= STATES_HELD:
+            self._states += recording.object_states
+            return recording
+        # Imported here: only studies of many logs need them.
+        from copem_replay.pipeline.closed_form import check_closed_form
+        from copem_replay.pipeline.cost import estimate_size
+
+        replay = prepare_log(recording, alone := experiment.model_copy(update={"logs": ()}))
+        try:
+            check_closed_form([replay], alone)
+        except ExperimentError as error:
+            self.problems += (problem for problem in error.problems if problem not in self.problems)
+        self.sizes.append(estimate_size(replay))
+        return drop_content(recording, read)

@@ -1,10 +1,10 @@
-"""Sweeps: the same experiment at many values of one quantity, everything else as it is, with common random numbers.
+"""Sweeps: an experiment at several values of one quantity, everything else unchanged, with common random numbers.
 
-A sweep of `latency_s` or `units` only varies configurations, one of `rate_hz` or `penetration_rate` the units
-themselves, one of `correlation_s` what their PEMs remember, one of `ghosts_in_list` their ghosts, of which the truth
-and ideal fusion never know. Configurations that it leaves as they are, or makes equal to one before, are left out. A
-latency is varied only where there is one (above 0, or by unit) or where the configuration is named: one that hears no
-unit over the air has none.
+A sweep of `latency_s` or `units` varies configurations alone, one of `rate_hz` or `penetration_rate` units, one of
+`correlation_s` the memory of PEMs, one of `ghosts_in_list` their ghosts, which the truth and ideal fusion never have,
+one of `loss` or `burst_s` links: with common draws more loss only removes lists. Configurations that a sweep does not
+change, or makes equal to one before, are left out. A latency is varied only where a configuration has one (above 0, or
+by unit) or is named: one that hears no unit over the air has none.
 """
 
 from __future__ import annotations
@@ -13,22 +13,63 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from copem_replay.communication.link import LinkModel
+from copem_replay.communication.radio import Radio
+from copem_replay.communication.reception import ConstantReception, GilbertElliott
 from copem_replay.core.memory import Memory
 from copem_replay.core.tracks import TRUTH
-from copem_replay.experiment.schema import Configuration, Experiment, Unit
-from copem_replay.experiment.sweep_keys import SweptBy
-from copem_replay.fusion.base import ListFusion
+from copem_replay.experiment.schema import Configuration, Experiment, SweptBy, Unit
+from copem_replay.fusion.interface import ListFusion
 from copem_replay.metrics.config import Measure
 from copem_replay.perception.config import Carriers
 from copem_replay.perception.pem.model import Pem
-from copem_replay.pipeline.swept_links import link_at, varies
+
+# Links at one value of a sweep.
+
+SHORTEST_S = 0.001
+"""A burst of 0 s is one of a millisecond, shorter than any interval of lists: the state is new in every list."""
+
+
+def can_vary(link: LinkModel | None, kind: str) -> bool:
+    """Whether a link has what a sweep of `loss` or `burst_s` varies."""
+    if not isinstance(link, Radio):
+        return False
+    if isinstance(link.reception, GilbertElliott):
+        return True
+    return isinstance(link.reception, ConstantReception) if kind == "loss" else bool(link.memory.get("reception"))
+
+
+def set_link(link: LinkModel, kind: str, value: float) -> LinkModel:
+    """A link at one value of a sweep; unchanged where the sweep does not vary it."""
+    if kind not in ("loss", "burst_s") or not isinstance(link, Radio) or not can_vary(link, kind):
+        return link
+    reception, changed = link.reception, link.reception
+    if kind == "loss" and isinstance(reception, GilbertElliott):
+        changed = reception.model_copy(update={"bad_share": _bad_share(reception, value)})
+    elif kind == "loss":
+        changed = reception.model_copy(update={"probability_": 1 - value})
+    elif isinstance(reception, GilbertElliott):
+        changed = reception.model_copy(update={"bad_lasts_s": max(float(value), SHORTEST_S)})
+    else:
+        first, *others = link.memory["reception"]
+        parts = (first.model_copy(update={"correlation_s": float(value)}), *others)
+        return link.model_copy(update={"memory": link.memory | {"reception": parts}})
+    return link.model_copy(update={"reception": changed})
+
+
+def _bad_share(reception: GilbertElliott, loss: float) -> float:
+    """The share of time in the bad state, 0 … 1, at which the mean loss is `loss`."""
+    good, bad = reception.good_loss, reception.bad_loss
+    return min(max((loss - good) / (bad - good), 0.0), 1.0) if bad != good else reception.bad_share
+
+
+# Points of a sweep.
 
 KINDS = ("latency_s", "rate_hz", "units", "penetration_rate", "correlation_s", "ghosts_in_list", "loss", "burst_s")
 
 
 @dataclass(frozen=True)
-class Point:
-    """One value of one sweep: `experiment` at that value, with the configurations it changes."""
+class SweepPoint:
+    """One value of one sweep: `experiment` at that value, with the configurations that the sweep changes."""
 
     sweep: str
     value: float
@@ -36,58 +77,60 @@ class Point:
 
     @property
     def same_units(self) -> bool:
-        """Whether what is prepared for the experiment serves this point, too."""
+        """Whether a log that is prepared for the experiment can be used at this point, too."""
         return self.sweep not in ("rate_hz", "penetration_rate")
 
 
-def points(experiment: Experiment) -> Iterator[Point]:
+def list_points(experiment: Experiment) -> Iterator[SweepPoint]:
     """The points of all sweeps of an experiment, sweep by sweep in the order of their values."""
     if experiment.sweep is None:
         return
     for kind in KINDS:
         values = getattr(experiment.sweep, kind) or ()
-        curves = _curves(experiment, kind, values)
+        curves = _sweep_configurations(experiment, kind, values)
         for k, value in enumerate(values):
-            at = experiment.model_copy(
+            swept = experiment.model_copy(
                 update={
                     "configurations": {name: c for name, curve in curves.items() if (c := curve[k]) is not None},
-                    "units": _units_at(experiment.units, kind, value),
-                    "pems": _pems_at(experiment.pems, kind, value),
-                    "links": {name: link_at(link, kind, value) for name, link in experiment.links.items()},
+                    "units": _set_units(experiment.units, kind, value),
+                    "pems": _set_pems(experiment.pems, kind, value),
+                    "links": {name: set_link(link, kind, value) for name, link in experiment.links.items()},
                     "sweep": None,
-                    "measure": _measured(experiment),
+                    "measure": _reduce_measure(experiment),
                 }
             )
-            if at.configurations:
-                yield Point(kind, float(value), at)
+            if swept.configurations:
+                yield SweepPoint(kind, float(value), swept)
 
 
-def resolved(experiment: Experiment) -> Experiment:
-    """The same experiment with `sweep.configurations` said: the list, or one for each quantity where they differ."""
+def resolve_sweep(experiment: Experiment) -> Experiment:
+    """The experiment with explicit `sweep.configurations`: one list, or one for each quantity where they differ."""
     sweep = experiment.sweep
     if sweep is None or isinstance(sweep.configurations, tuple):
         return experiment
     swept = {kind: values for kind in KINDS if (values := getattr(sweep, kind))}
     names = {
         kind: sweep.chosen(kind)
-        or tuple(name for name, curve in _curves(experiment, kind, values).items() if any(curve))
+        or tuple(name for name, curve in _sweep_configurations(experiment, kind, values).items() if any(curve))
         for kind, values in swept.items()
     }
     first, *others = names.values()
     if not any(names.values()):
         return experiment
-    alike = all(other == first for other in others)
-    said = first if alike else SweptBy(**{kind: of_kind for kind, of_kind in names.items() if of_kind})
-    return experiment.model_copy(update={"sweep": sweep.model_copy(update={"configurations": said})})
+    all_equal = all(other == first for other in others)
+    configurations = first if all_equal else SweptBy(**{kind: of_kind for kind, of_kind in names.items() if of_kind})
+    return experiment.model_copy(update={"sweep": sweep.model_copy(update={"configurations": configurations})})
 
 
-def without_points(experiment: Experiment) -> list[str]:
-    """Sweeps of an experiment that no configuration is changed by, and what would help; what no sweep changes."""
+def describe_unswept(experiment: Experiment) -> list[str]:
+    """Notes: sweeps that change no configuration, with what helps, and recorded outputs, which no sweep changes."""
     if experiment.sweep is None:
         return []
-    there = {point.sweep for point in points(experiment)}
-    none = [kind for kind in KINDS if getattr(experiment.sweep, kind) and kind not in there]
-    notes = [f"sweep of {kind}: it changes no configuration{_unstated(experiment, kind)}" for kind in none]
+    effective = {point.sweep for point in list_points(experiment)}
+    without_effect = [kind for kind in KINDS if getattr(experiment.sweep, kind) and kind not in effective]
+    notes = [
+        f"sweep of {kind}: it changes no configuration{_explain_unstated(experiment, kind)}" for kind in without_effect
+    ]
     if experiment.outputs:
         notes.append(
             f"sweep: leaves {', '.join(experiment.outputs)} out, for the output of a stack is as it was recorded"
@@ -95,7 +138,7 @@ def without_points(experiment: Experiment) -> list[str]:
     return notes
 
 
-def _unstated(experiment: Experiment, kind: str) -> str:
+def _explain_unstated(experiment: Experiment, kind: str) -> str:
     assert experiment.sweep is not None
     heard = [c for c in experiment.configurations.values() if c.units != TRUTH and not c.latency_s]
     if kind != "latency_s" or experiment.sweep.chosen(kind) or not heard:
@@ -103,33 +146,33 @@ def _unstated(experiment: Experiment, kind: str) -> str:
     return "; none states a latency above 0 or by unit, and `sweep: {configurations: […]}` does not name any"
 
 
-def _measured(experiment: Experiment) -> Measure:
-    """Perceived conflicts take time, and are not asked for unless the driver brakes for them; accuracy never is."""
+def _reduce_measure(experiment: Experiment) -> Measure:
+    """What sweeps measure: no accuracy; perceived conflicts, which take time, only if the driver brakes for them."""
     needed = experiment.braking is not None and experiment.braking.brakes_for == "conflict"
     conflict = experiment.measure.conflict if needed else None
     return experiment.measure.model_copy(update={"conflict": conflict, "accuracy": False})
 
 
-def _curves(
+def _sweep_configurations(
     experiment: Experiment, kind: str, values: tuple[float, ...]
 ) -> dict[str, tuple[Configuration | None, ...]]:
-    """What becomes of each configuration at each value; None: it has no such value."""
+    """Each configuration at each value; None: it has no such value, as a number of units that it does not hear."""
     curves: dict[str, tuple[Configuration | None, ...]] = {}
     assert experiment.sweep is not None
     chosen = experiment.sweep.chosen(kind)
     for name, configuration in experiment.configurations.items():
-        # A latency that is not above 0 is one only where it is given by unit, or the configuration is named.
+        # A configuration has a latency if it is above 0 or by unit; else it is varied only by name.
         wanted = name in chosen if chosen is not None else kind != "latency_s" or bool(configuration.latency_s)
         recorded = configuration.recorded is not None
-        if not wanted or recorded or configuration.units == TRUTH or not _concerns(experiment, configuration, kind):
+        if not wanted or recorded or configuration.units == TRUTH or not _is_concerned(experiment, configuration, kind):
             continue
-        curve = tuple(_configuration_at(experiment, configuration, kind, value) for value in values)
+        curve = tuple(_set_configuration(experiment, configuration, kind, value) for value in values)
         if curve not in curves.values():
             curves[name] = curve
     return curves
 
 
-def _concerns(experiment: Experiment, configuration: Configuration, kind: str) -> bool:
+def _is_concerned(experiment: Experiment, configuration: Configuration, kind: str) -> bool:
     units = [experiment.units[name] for name in experiment.units_of(configuration)]
     if kind == "units":
         return any(not _is_ego(unit) for unit in units)
@@ -137,7 +180,7 @@ def _concerns(experiment: Experiment, configuration: Configuration, kind: str) -
         return any(name not in configuration.latency_s for name in experiment.units_of(configuration))
     if kind in ("loss", "burst_s"):
         links = [configuration.link_of(name) for name in experiment.units_of(configuration)]
-        return any(varies(experiment.links[one] if isinstance(one, str) else one, kind) for one in links)
+        return any(can_vary(experiment.links[one] if isinstance(one, str) else one, kind) for one in links)
     if kind == "rate_hz":
         return any(unit.recorded is None for unit in units)
     if kind == "correlation_s":
@@ -153,7 +196,7 @@ def _is_ego(unit: Unit) -> bool:
     return unit.on == "ego"
 
 
-def _configuration_at(
+def _set_configuration(
     experiment: Experiment, configuration: Configuration, kind: str, value: float
 ) -> Configuration | None:
     if kind == "latency_s":
@@ -161,7 +204,7 @@ def _configuration_at(
         late = by_unit | {"default": value} if isinstance(by_unit, dict) else value
         return configuration.model_copy(update={"latency_s": late})
     if kind in ("loss", "burst_s") and isinstance(configuration.link, LinkModel):
-        return configuration.model_copy(update={"link": link_at(configuration.link, kind, value)})
+        return configuration.model_copy(update={"link": set_link(configuration.link, kind, value)})
     if kind != "units":
         return configuration
     heard = experiment.units_of(configuration)
@@ -172,7 +215,7 @@ def _configuration_at(
     return configuration.model_copy(update={"units": tuple(kept)})
 
 
-def _units_at(units: Mapping[str, Unit], kind: str, value: float) -> dict[str, Unit]:
+def _set_units(units: Mapping[str, Unit], kind: str, value: float) -> dict[str, Unit]:
     if kind == "rate_hz":
         return {
             name: unit if unit.recorded else unit.model_copy(update={"rate_hz": value}) for name, unit in units.items()
@@ -187,9 +230,9 @@ def _units_at(units: Mapping[str, Unit], kind: str, value: float) -> dict[str, U
     return dict(units)
 
 
-def _pems_at(pems: Mapping[str, Pem], kind: str, value: float) -> dict[str, Pem]:
+def _set_pems(pems: Mapping[str, Pem], kind: str, value: float) -> dict[str, Pem]:
     if kind == "ghosts_in_list":
-        return {name: _with_ghosts(pem, value) for name, pem in pems.items()}
+        return {name: _set_ghosts(pem, value) for name, pem in pems.items()}
     if kind != "correlation_s":
         return dict(pems)
 
@@ -209,8 +252,8 @@ def _pems_at(pems: Mapping[str, Pem], kind: str, value: float) -> dict[str, Pem]
     return result
 
 
-def _with_ghosts(pem: Pem, in_list: float) -> Pem:
-    """A PEM with so many of the first of its sorts of ghosts."""
+def _set_ghosts(pem: Pem, in_list: float) -> Pem:
+    """A PEM whose first sort of ghosts has `in_list` entries in a list on average."""
     if not pem.ghosts:
         return pem
     first, *others = pem.ghosts

@@ -1,15 +1,18 @@
-"""Report: what a results folder says, in one file that opens without a network.
+"""Report: figures of a results folder, and a page with figures, tables and words that opens without a network.
 
-| module | does |
+| module | holds |
 |---|---|
-| `html/study` | what is read: results, provenance, comparisons, the baseline |
-| `html/conclusions`, `html/setup` | the question and the answer in words; what was compared |
-| `html/tables`, `html/missed_objects`, `html/latency_breakdown`, `html/provenance` | tables |
-| `figures/registry` | all figures, for `plot` and for the page |
-| `html/embedded`, `html/swatches`, `html/markup` | figures in a page; HTML that takes no text of users literally |
-| `html/page`, `html/write` | the page, and the file |
+| `figures/registry` | all figures, for `plot` and for the page; a module per figure beside it |
+| `figures/style`, `figures/selection` | how configurations look; which object, run and configurations are drawn |
+| `html/study` | the data of a report: results, provenance, comparisons, the baseline |
+| `html/conclusions`, `html/setup` | the answer in words; the question, the configurations, the provenance |
+| `html/tables` | summary, differences, missed objects, stages of the latency |
+| `html/markup` | HTML in which texts of users are escaped |
+| `html/page` | the page with its sections, and the file |
 """
 
-from copem_replay.report.html.write import REPORT, check_report, write_report
+from __future__ import annotations
 
-__all__ = ["REPORT", "check_report", "write_report"]
+from copem_replay.report.html.page import REPORT, check_report, write_html_report
+
+__all__ = ["REPORT", "check_report", "write_html_report"]

@@ -1,53 +1,174 @@
-"""A results folder, read back: one reader for figures, reports, recordings and comparisons."""
+"""A results folder, read back: one reader for figures, reports, recordings and comparisons.
+
+Comparisons read log by log: of a table of any size only the rows of one log are in memory. The place of each log's rows
+is known from a pass over the names alone; they may be in one file or in one for each log, in any order.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pandas as pd
 
-from copem_replay.core.errors import ExperimentError, InputError
-from copem_replay.core.remote import Remote, is_url
+from copem_replay.core.errors import ExperimentError, InputError, RecordingError, RemoteFile, is_url
 from copem_replay.core.tracks import TRUTH
-from copem_replay.experiment.file import Source, load, parse, places_of
+from copem_replay.experiment.drive import resolve_for_log
+from copem_replay.experiment.file import ExperimentSource, parse_experiment, read_experiment_file, settings_places
 from copem_replay.experiment.schema import Experiment
-from copem_replay.io.together import File, Place, first_of
-from copem_replay.metrics.fixed import Fixed, fixed_in
-from copem_replay.metrics.intervals import clusters
-from copem_replay.metrics.tally import DETECTED
-from copem_replay.results.belongings import MARK, check_still
-from copem_replay.results.by_log import LogRows, log_rows
-from copem_replay.results.provenance import Provenance, read_provenance
-from copem_replay.results.tables import (
+from copem_replay.experiment.validate import read_logs
+from copem_replay.io.open import File, Place, fetch_place, first_recording, read_file_stamps, sha256_of
+from copem_replay.io.recording import Recording
+from copem_replay.metrics.config import Objects
+from copem_replay.metrics.intervals import FixedOutcomes, choose_clusters, find_fixed_outcomes
+from copem_replay.metrics.summary import DETECTED
+from copem_replay.pipeline.prepare import Replay, prepare_log
+from copem_replay.pipeline.study_log import read_content_digest
+from copem_replay.results.folder import MARK, check_unchanged
+from copem_replay.results.schema import (
     AGAIN,
     BRAKING,
     CONFLICT,
     DETECTIONS,
     EXACT,
+    MAY_HAVE,
     OPTIONAL,
     ROWS,
     TALLY,
     VERDICTS,
-    file_of,
+    Provenance,
+    check_kind,
+    check_text,
     read_csv,
     read_frame,
+    read_provenance,
+    table_file,
 )
 
 if TYPE_CHECKING:
     import pyarrow as pa
+
+    from copem_replay.results.schema import RecordedLog
+
+
+@dataclass(frozen=True, eq=False)
+class LogRows:
+    """One table: the kinds of its columns, and the place of each log's rows: file, row group, from, to."""
+
+    place: Path
+    kinds: Mapping[str, str]
+    where: Mapping[str, Sequence[tuple[Path, int, int, int]]]
+    counts: Mapping[tuple[str, str], int]  # rows by log and configuration, in the order of both
+    without_rows: pa.Table
+    _last: dict[tuple[Path, int], pa.Table] = field(default_factory=dict)
+
+    def of(self, log: str) -> pa.Table:
+        """A log's rows without the column `log`, text as `string`. Raises InputError where they are damaged."""
+        import pyarrow as pa
+        from pyarrow import parquet
+
+        names, parts = [name for name in self.kinds if name != "log"], []
+        for file, k, begin, end in self.where.get(log, ()):
+            if (file, k) not in self._last:
+                self._last.clear()
+                with _report_damage(self.place):
+                    self._last[file, k] = parquet.ParquetFile(file).read_row_group(k, names)
+            parts.append(self._last[file, k].slice(begin, end - begin))
+        table = pa.concat_tables(parts) if parts else self.without_rows.select(names)
+        for k, name in enumerate(names):
+            if self.kinds[name] == "text":
+                check_text(self.place, name, table[name])
+                table = table.set_column(k, name, table[name].cast(pa.string()))
+        return table
+
+    @property
+    def configurations(self) -> tuple[str, ...]:
+        """The configurations that have rows, in their order."""
+        return tuple(dict.fromkeys(configuration for _, configuration in self.counts))
+
+    def only(self, names: Iterable[str]) -> LogRows:
+        """The table with those of the named columns that it has."""
+        columns = self.without_rows.column_names
+        return replace(self, kinds={name: self.kinds.get(name, "") for name in names if name in columns}, _last={})
+
+    def renamed(self, to: Mapping[str, str]) -> LogRows:
+        """The table with its logs renamed, `to` by the old names."""
+        where = {to.get(log, log): places for log, places in self.where.items()}
+        counts = {(to.get(log, log), configuration): n for (log, configuration), n in self.counts.items()}
+        return replace(self, where=where, counts=counts, _last={})
+
+
+def log_rows(place: Path, kinds: Mapping[str, str], files: Sequence[Path] = ()) -> LogRows:
+    """A table with the place of each log's rows. `files`: those of a table that is a folder.
+
+    Raises InputError where the table cannot be read, lacks a column, or has one of another kind.
+    """
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    names, schema = ["log", "configuration"], pa.schema([])
+    where: dict[str, list[tuple[Path, int, int, int]]] = {}
+    counts: Counter[tuple[str, str]] = Counter()
+    for path in files or [place]:
+        with _report_damage(place):
+            file = parquet.ParquetFile(path, read_dictionary=names)
+            schema = file.schema_arrow
+        if missing := [name for name in kinds if name not in schema.names]:
+            raise InputError(f"{place}: expected the column {missing[0]}, found none; {AGAIN}")
+        kinds = dict(kinds) | {name: k for name, k in MAY_HAVE.get(place.name, {}).items() if name in schema.names}
+        for name, kind in kinds.items():
+            column_type = schema.field(name).type
+            if file.metadata.num_rows or not pa.types.is_null(column_type):  # without rows columns may have no types
+                check_kind(place, name, kind, column_type)
+        for k in range(file.num_row_groups if file.metadata.num_rows else 0):
+            with _report_damage(place):
+                group = file.read_row_group(k, names).unify_dictionaries()
+            for name in names:
+                check_text(place, name, group[name])
+            sizes = group.group_by(names, use_threads=False).aggregate([([], "count_all")]).to_pydict()
+            counts.update(
+                dict(zip(zip(sizes["log"], sizes["configuration"], strict=True), sizes["count_all"], strict=True))
+            )
+            for log, begin, end in _find_stretches(group["log"].combine_chunks()):
+                where.setdefault(log, []).append((path, k, begin, end))
+    return LogRows(place, kinds, where, counts, schema.empty_table())
+
+
+@contextmanager
+def _report_damage(place: Path) -> Iterator[None]:
+    """Raise InputError where Arrow cannot read a table."""
+    try:
+        yield
+    except (OSError, ValueError) as error:  # what Arrow raises derives from these
+        why = " ".join(str(error).split())
+        raise InputError(f"{place}: expected a table that can be read, found damage: {why}; {AGAIN}") from None
+
+
+def _find_stretches(names: pa.Array) -> Iterator[tuple[str, int, int]]:
+    """Stretches of equal names: name, first row, row after the last."""
+    import pyarrow as pa
+
+    column = names if pa.types.is_dictionary(names.type) else names.dictionary_encode()
+    name_ix, distinct = column.indices.to_numpy(), column.dictionary.to_pylist()
+    ends = np.append(np.flatnonzero(np.diff(name_ix)) + 1, len(name_ix)).tolist()
+    for begin, end in zip([0, *ends], ends, strict=False):
+        yield distinct[name_ix[begin]], begin, end
+
 
 _MAY_BE_FOLDERS = ("detections.parquet", "tally.parquet")
 
 
 @dataclass(frozen=True, eq=False)
 class Results:
-    """A results folder. Its files are read when they are first asked for, which raises InputError where one is damaged
-    or is by now that of other results.
+    """A results folder. A file is read when it is first used, which raises InputError where it is damaged, or where
+    other results have taken the place of the folder.
 
     >>> results = cr.load_results("out/tc016d")
     >>> results.name, results.experiment.runs, results.sweep is None
@@ -64,47 +185,47 @@ class Results:
         return self.folder.resolve().name
 
     @cached_property
-    def source(self) -> Source:
+    def source(self) -> ExperimentSource:
         """`experiment.yaml` as plain data."""
         try:
-            source = load(self.folder / "experiment.yaml")
+            source = read_experiment_file(self.folder / "experiment.yaml")
         except ExperimentError as error:
             why = error.problems[0].removeprefix(f"{self.folder / 'experiment.yaml'}:").strip()
             raise InputError(
                 f"{self.folder / 'experiment.yaml'}: expected the experiment of the results, found damage: {why}; "
                 f"{AGAIN}"
             ) from None
-        check_still(self.folder, self.seen)
+        check_unchanged(self.folder, self.seen)
         return source
 
     @cached_property
     def experiment(self) -> Experiment:
         """The experiment, with components of the user's own."""
-        experiment, problems = parse(self.source)
+        experiment, problems = parse_experiment(self.source)
         if experiment is None or problems:
             raise InputError(problems)
         return experiment
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """`detections.parquet` as a whole, for users: figures take `known` or `each`, whatever its size."""
-        return self._frame("detections.parquet", _columns(self.experiment))
+        """`detections.parquet` as a whole, for users; figures take `known` or `each`, which hold less in memory."""
+        return self._frame("detections.parquet", _required_columns(self.experiment))
 
     @cached_property
     def rows(self) -> LogRows:
-        """Where the rows of each log are in `detections.parquet`."""
+        """`detections.parquet` with the place of each log's rows."""
         place = self.folder / "detections.parquet"
-        found = log_rows(place, self._compared, self._files(place))
-        check_still(self.folder, self.seen)
-        return found
+        rows = log_rows(place, self._compared, self._files(place))
+        check_unchanged(self.folder, self.seen)
+        return rows
 
     def each(self, *columns: str, log: str | None = None) -> Iterator[pd.DataFrame]:
-        """Rows log by log, or of one log, with these of the columns; none named: all but the log's name."""
+        """Rows log by log, or of one log, with the named columns; none named: all but the log's name."""
         rows = self.rows.only(columns or [name for name in self.rows.without_rows.column_names if name != "log"])
-        for one in self.rows.where if log is None else [log]:
-            found = rows.of(one)
-            check_still(self.folder, self.seen)
-            yield found.to_pandas()
+        for name_of_log in self.rows.where if log is None else [log]:
+            table = rows.of(name_of_log)
+            check_unchanged(self.folder, self.seen)
+            yield table.to_pandas()
 
     @cached_property
     def tally(self) -> pd.DataFrame:
@@ -113,9 +234,9 @@ class Results:
 
     @cached_property
     def known(self) -> pd.DataFrame:
-        """In how many `runs` each object is detected when; of one object alone run by run, for these are resampled."""
+        """The tally of detections; for a single object a row per run, as runs are then resampled."""
         tally = self.tally[self.tally["event"] == DETECTED]
-        if not len(tally) or clusters(tally)[0] != "runs":
+        if not len(tally) or choose_clusters(tally)[0] != "runs":
             return tally
         columns = [name for name in TALLY if name not in ("log", "event", "runs")]
         (rows,) = self.each(*columns, "run", log=str(tally["log"].iloc[0]))
@@ -155,65 +276,65 @@ class Results:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What had to be said of the recordings and of the runs: one line each."""
+        """Notes on the recordings and the runs, a line each."""
         notes = self.provenance.data.get("notes", [])
         return tuple(map(str, notes)) if isinstance(notes, list) else ()
 
     @cached_property
     def by_log(self) -> dict[str, LogRows]:
-        """The tables that comparisons read, by file name, those that are there."""
+        """By file name the tables that comparisons read, those that exist."""
         rows = self.rows.only(self._compared)
         if not rows.where:
             raise InputError(f"{self.folder}: nothing can be compared: no measured object has an onset")
         if unknown := set(rows.where) - {log.name for log in self.provenance.logs}:
             raise InputError(f"{rows.place}: expected the logs of provenance.json, found {min(unknown)!r}")
         tables = {rows.place.name: rows}
-        there = {name: kinds for name, kinds in OPTIONAL.items() if (self.folder / name).is_file()}
-        tables |= {name: log_rows(self.folder / name, kinds) for name, kinds in there.items()}
-        check_still(self.folder, self.seen)
+        present = {name: kinds for name, kinds in OPTIONAL.items() if (self.folder / name).is_file()}
+        tables |= {name: log_rows(self.folder / name, kinds) for name, kinds in present.items()}
+        check_unchanged(self.folder, self.seen)
         return tables
 
     def rows_of(self, log: str, *names: str) -> dict[str, pa.Table]:
-        """A log's rows of some of these tables, by default of all."""
+        """A log's rows of the named tables, by default of all that comparisons read."""
         tables = {name: rows.of(log) for name, rows in self.by_log.items() if not names or name in names}
-        check_still(self.folder, self.seen)
+        check_unchanged(self.folder, self.seen)
         return tables
 
     @cached_property
-    def fixed(self) -> Fixed:
-        """What is the same in every run."""
-        return fixed_in(self.source.data)
+    def fixed(self) -> FixedOutcomes:
+        """The outcomes that are equal in every run."""
+        return find_fixed_outcomes(self.source.data)
 
     @cached_property
     def by_truth_id(self) -> frozenset[str]:
         """Configurations that detect by truth id: the truth, and ideal fusion."""
         if self.provenance.measure["match"].get("always"):
             return frozenset()
-        return frozenset(name for name, said in self._configurations if _knows_ids(said))
+        return frozenset(name for name, configuration in self._configurations if _knows_ids(configuration))
 
     @cached_property
     def truth(self) -> frozenset[str]:
         """Configurations that are the truth."""
-        return frozenset(name for name, said in self._configurations if said.get("units") == TRUTH)
+        return frozenset(name for name, configuration in self._configurations if configuration.get("units") == TRUTH)
 
     @property
     def _configurations(self) -> Iterator[tuple[str, dict[str, Any]]]:
-        """What `experiment.yaml` says of each configuration, as plain data."""
-        said = self.source.data.get("configurations")
-        for name, one in said.items() if isinstance(said, dict) else ():
-            if isinstance(one, dict):
-                yield str(name), one
+        """Names and plain data of the configurations in `experiment.yaml`."""
+        configurations = self.source.data.get("configurations")
+        for name, configuration in configurations.items() if isinstance(configurations, dict) else ():
+            if isinstance(configuration, dict):
+                yield str(name), configuration
 
     def log_place(self, log: str) -> Place:
-        """Where the recording of a log, or the several that it is made of, are expected."""
+        """The place where the recording of a log, or the several that it is made of, are expected."""
         entry = self.experiment.logs[[file.name for file in self.provenance.logs].index(log)]
         if isinstance(entry, str):
-            return Remote(entry) if is_url(entry) else self.folder / entry
-        return places_of(entry, self.folder)[0]
+            return RemoteFile(entry) if is_url(entry) else self.folder / entry
+        return settings_places(entry, self.folder)[0]
 
     def log_path(self, log: str) -> File:
-        """Where the recording of a log is expected."""
-        return first_of(self.log_place(log))
+        """The file where the recording of a log, or the first of several, is expected."""
+        return first_recording(self.log_place(log))
 
     def chosen(self, configurations: Sequence[str] | None) -> tuple[str, ...]:
         """The configurations to draw, each once; None: all. Raises InputError for a name that is not there."""
@@ -229,39 +350,41 @@ class Results:
         return DETECTIONS | (VERDICTS if self.provenance.braking is not None else {})
 
     def _files(self, place: Path) -> list[Path]:
-        """Of a table that is a folder, in the order of the logs; none: it is a file."""
+        """The files of a table that is a folder, in the order of the logs; empty: the table is a file."""
         if not place.is_dir():
             return []
-        return [path for log in self.provenance.logs if (path := file_of(place, log.name)).is_file()]
+        return [path for log in self.provenance.logs if (path := table_file(place, log.name)).is_file()]
 
     def _frame(self, name: str, columns: Sequence[str]) -> pd.DataFrame:
         def as_frame(place: Path) -> pd.DataFrame:
             from pyarrow import parquet
 
             table = parquet.read_table(self._files(place) or place)
-            return table.to_pandas(split_blocks=True, self_destruct=True)  # column by column, none of them twice
+            return table.to_pandas(
+                split_blocks=True, self_destruct=True
+            )  # column by column, so that no column is in memory twice
 
         table = read_frame(self.folder / name, read_csv if name.endswith(".csv") else as_frame, columns)
-        check_still(self.folder, self.seen)
+        check_unchanged(self.folder, self.seen)
         return table
 
 
 def open_results(folder: Path | str, *more: str) -> Results:
-    """A results folder of which nothing but the provenance is read yet.
+    """A results folder of which only the provenance is read yet.
 
-    `more`: files that have to be there besides what every comparison needs. Raises InputError, one line: no such
+    `more`: files that have to exist besides those that every comparison needs. Raises InputError, one line: no such
     folder, no results, or a damaged provenance.
     """
     folder = Path(folder)
     if not folder.is_dir():
         found = "a file" if folder.exists() else "no such folder"
         raise InputError(f"{folder}: expected a results folder, found {found}; `copem-replay run` writes one")
-    _check_there(folder, MARK, "experiment.yaml", "detections.parquet", *more)
+    _check_exists(folder, MARK, "experiment.yaml", "detections.parquet", *more)
     seen = os.stat(folder)
     return Results(folder, seen, read_provenance(folder / MARK))
 
 
-def _check_there(folder: Path, *names: str) -> None:
+def _check_exists(folder: Path, *names: str) -> None:
     for name in names:
         if not (folder / name).is_file() and not (name in _MAY_BE_FOLDERS and (folder / name).is_dir()):
             raise InputError(
@@ -269,22 +392,22 @@ def _check_there(folder: Path, *names: str) -> None:
             )
 
 
-def load_results(folder: Path | str, *, rowless: bool = False) -> Results:
-    """Read a results folder, without rows only if `rowless`.
+def read_results(folder: Path | str, *, rowless: bool = False) -> Results:
+    """A results folder, checked; one without rows only if `rowless`.
 
     Raises InputError, one line: no such folder, no results, or damaged ones.
     """
-    return complete(open_results(folder, "summary.csv"), rowless=rowless)
+    return check_complete(open_results(folder, "summary.csv"), rowless=rowless)
 
 
-def complete(results: Results, *, rowless: bool = False) -> Results:
-    """The same, with rows held against the experiment, and every other table read. Raises InputError."""
-    _check_there(results.folder, "summary.csv", "tally.parquet")
+def check_complete(results: Results, *, rowless: bool = False) -> Results:
+    """The results, with rows checked against the experiment and every other table read. Raises InputError."""
+    _check_exists(results.folder, "summary.csv", "tally.parquet")
     experiment, rows = results.experiment, results.rows
-    if missing := [name for name in _columns(experiment) if name not in rows.kinds]:
+    if missing := [name for name in _required_columns(experiment) if name not in rows.kinds]:
         raise InputError(f"{rows.place}: expected the column {missing[0]}, found none; {AGAIN}")
     if rows.where or not rowless:
-        _check(rows, experiment)
+        _check_rows(rows, experiment)
     counts = results.known.groupby(["log", "configuration"])["runs"].sum()
     if counts.to_dict() != rows.counts:
         expected, found = sum(rows.counts.values()), int(counts.sum())
@@ -302,14 +425,14 @@ def complete(results: Results, *, rowless: bool = False) -> Results:
     return results
 
 
-def _columns(experiment: Experiment) -> tuple[str, ...]:
+def _required_columns(experiment: Experiment) -> tuple[str, ...]:
     """Columns that `detections.parquet` has to have."""
     conflict = experiment.measure.conflict
     return tuple(ROWS | (BRAKING if experiment.braking else {}) | (CONFLICT if conflict else {}))
 
 
-def _check(rows: LogRows, experiment: Experiment) -> None:
-    """Raise InputError where the rows are of another experiment, are not all there, or there are none."""
+def _check_rows(rows: LogRows, experiment: Experiment) -> None:
+    """Raise InputError where rows are of another experiment or missing, or where there are none."""
     unknown = [name for name in rows.configurations if name not in experiment.configurations]
     if unknown:
         raise InputError(f"{rows.place}: expected the configurations of experiment.yaml, found {unknown[0]!r}; {AGAIN}")
@@ -317,18 +440,67 @@ def _check(rows: LogRows, experiment: Experiment) -> None:
         raise InputError(f"{rows.place}: expected rows to draw, found none: no measured object has an onset")
     # A configuration that has none of its units in a log is left out of that log.
     counts = [*rows.counts.values(), *[0] * (set(experiment.configurations) != set(rows.configurations))]
-    of_log: dict[str, set[int]] = {}
+    counts_of: dict[str, set[int]] = {}
     for (log, _), count in rows.counts.items():
-        of_log.setdefault(log, set()).add(count)
-    if 0 in counts or any(len(of) > 1 for of in of_log.values()):
+        counts_of.setdefault(log, set()).add(count)
+    if 0 in counts or any(len(sizes) > 1 for sizes in counts_of.values()):
         raise InputError(
             f"{rows.place}: expected as many rows of each configuration, found {min(counts)} to {max(counts)}; {AGAIN}"
         )
 
 
 def _knows_ids(configuration: dict[str, Any]) -> bool:
-    """Whether a configuration needs no match with the truth to know an object."""
+    """Whether a configuration detects by truth id, without matches."""
     fusion = configuration.get("fusion")
     if configuration.get("recorded"):
         return False
     return fusion is None or bool(fusion.get("kind", "ideal") == "ideal")
+
+
+# Logs, read again: figures of single runs need the recording, which a results folder names but does not hold.
+
+
+def reread_log(results: Results, log: str, object_id: str) -> Replay:
+    """One log, prepared again for replay with one measured object only.
+
+    Raises RecordingError, one line, where the recording is missing or not the one that was replayed, or has no ego.
+    """
+    of_log = resolve_for_log(results.experiment, log)
+    measure = of_log.measure.model_copy(update={"objects": Objects(ids=(object_id,))})
+    experiment = of_log.model_copy(update={"measure": measure})
+    recording = reread_recording(results, log, experiment)
+    if recording.scene.ego_ix < 0:
+        raise RecordingError("no ego in this study, whose runs could be drawn", path=recording.path)
+    return prepare_log(recording, experiment)
+
+
+def reread_recording(results: Results, log: str, experiment: Experiment) -> Recording:
+    """The recording of a log of the results, read again as an experiment, theirs or one made of it, has it.
+
+    Raises RecordingError, one line, where the recording is missing or not the one that was replayed.
+    """
+    file = next(file for file in results.provenance.logs if file.name == log)
+    path, place = results.log_path(log), results.log_place(log)
+    try:
+        with fetch_place(place) as here:
+            stamps, digest = read_file_stamps(here), sha256_of(here)
+    except InputError as error:
+        raise RecordingError(f"{error}; put the log back to draw its runs") from None
+    _check_same_content(digest, file, path)
+    recordings, refused = read_logs(resolve_for_log(experiment, log), [place], None)
+    if refused:
+        raise RecordingError([f"{refusal.path}: {refusal.reason}" for refusal in refused])
+    if recordings[0].stamps != stamps:  # a copy of its own, or it has changed since
+        _check_same_content(read_content_digest(recordings[0]), file, path)
+    # Draws are addressed by the log's name, which depends on what else was replayed.
+    return replace(recordings[0], scene=replace(recordings[0].scene, log=log))
+
+
+def _check_same_content(digest: str, file: RecordedLog, path: File) -> None:
+    """Raise RecordingError where a recording is another than the one that was replayed."""
+    if digest != file.sha256:
+        raise RecordingError(
+            f"expected the log that was replayed, SHA-256 {file.sha256[:12]}…, found {digest[:12]}…; "
+            "put that log back, or run the experiment again",
+            path=path,
+        )

@@ -1,36 +1,133 @@
-"""The results folder: complete under its name, or not there at all.
+"""The results folder is written: complete under its name, or not at all.
 
-Everything is written into a folder beside it first, which then takes its name (`results/place.py`). Same input, same
-seed: the same bytes in all but the .rrd.
+Everything is written into a folder beside it first, which then takes its name (`results/folder.py`). Equal input and
+seed give equal bytes in all files but the .rrd. The MCAP of a shown run has the truth as a scene for Foxglove and
+Lichtblick.
 """
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pandas as pd
 
-from copem_replay.core.csv_names import for_spreadsheets
-from copem_replay.core.errors import OutputError
-from copem_replay.core.yaml import dump
-from copem_replay.experiment.drive import of_log
+from copem_replay.core.colours import configuration_colours
+from copem_replay.core.errors import OutputError, RecordingError
+from copem_replay.core.tracks import CLASSES, Scene, Tracks
+from copem_replay.core.yaml import dump_yaml
+from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.experiment.schema import Experiment
+from copem_replay.io.open import (
+    File,
+    check_files_unchanged,
+    fetch_place,
+    first_recording,
+    list_recordings,
+    read_file_stamps,
+    sha256_of,
+)
 from copem_replay.io.recording import Recording
-from copem_replay.io.together import File, paths_of
-from copem_replay.pipeline.run import Result, log_path_of
-from copem_replay.pipeline.selected_runs import ShownRun, one_run, shown_logs, shown_runs
-from copem_replay.pipeline.sweep import resolved
-from copem_replay.results import tables
-from copem_replay.results.belongings import MARK
-from copem_replay.results.contents import TableFile, log_entries, versions, write_parquet, written_name
-from copem_replay.results.export import Exporter, RunToExport
-from copem_replay.results.place import EXPERIMENT, Place, check_inputs, taken
+from copem_replay.io.write.message_family import EGO_FRAME, MIDDLE_FRAME
+from copem_replay.io.write.scene import Ellipse, Entity, Line, Pose, Rgba, Text, TruthFrame, TruthScene
+from copem_replay.io.write.scene import Place as ScenePlace
+from copem_replay.perception.sensor_poses import UnitPoses, couple_outlines, mounting_height
+from copem_replay.pipeline.one_run import ReplayedRun, ShownRun, replay_run, select_shown_logs, select_shown_runs
+from copem_replay.pipeline.run import ExperimentResult, find_log_path
+from copem_replay.pipeline.sweep import resolve_sweep
+from copem_replay.results.folder import EXPERIMENT, MARK, ResultsPlace, check_inputs, take_place
+from copem_replay.results.schema import (
+    FORMAT,
+    MANY_ROWS,
+    TableFile,
+    list_versions,
+    log_entries,
+    quote_formulas,
+    recording_name,
+    table_file,
+    write_parquet,
+)
+
+if TYPE_CHECKING:
+    from copem_replay.experiment.schema import Configuration
+
+
+# Exporters: each writes one shown run of one log as a file of its own kind.
+
+
+@dataclass(frozen=True)
+class RunToExport:
+    """One run of one log, in the configurations that are shown.
+
+    `one`: the replayed run. `every`: all configurations of the experiment, whose order determines colours. `table`: the
+    rows of `detections.parquet` of this log and run. `summary`: over all logs and runs. `manifest`: the provenance that
+    the file states.
+    """
+
+    recording: Recording
+    shown: ShownRun
+    one: ReplayedRun
+    every: Mapping[str, Configuration]
+    table: pd.DataFrame
+    summary: pd.DataFrame
+    manifest: dict[str, str]
+
+
+@dataclass(frozen=True)
+class Exporter:
+    """A kind of file. `suffix`: with the dot. `write`: writes the file and returns notes for the user.
+
+    `names`: gives the files for a stem and a number of configurations, where there may be several.
+
+    `write` raises OutputError where the file cannot be written, and RecordingError where the recording cannot be read:
+    the results are then without it, and say so.
+    """
+
+    suffix: str
+    write: Callable[[Path, RunToExport], list[str]]
+    names: Callable[[str, int], list[str]] | None = None
+
+    def files(self, stem: str, configurations: int) -> list[str]:
+        """Names of the files, relative to the folder that the stem is relative to."""
+        return [stem + self.suffix] if self.names is None else self.names(stem, configurations)
+
+
+def _write_mcap(path: Path, run: RunToExport) -> list[str]:
+    from copem_replay.io.write.mcap import write_mcap
+    from copem_replay.io.write.message_family import find_family
+
+    recording = run.recording
+    with fetch_place(recording.place) as here:
+        stamps = read_file_stamps(here)
+        has_digest = recording.sha256 is not None or recording.stamps is not None
+        if has_digest and stamps != recording.stamps and sha256_of(here) != recording.sha256:
+            raise RecordingError("it is no longer what was replayed", path=first_recording(recording.place))
+        notes = write_mcap(
+            path,
+            here,
+            run.one.replay.scene,
+            run.one.run_tracks,
+            run.table,
+            run.manifest,
+            find_family(recording),
+            recording.window,
+            truth_scene(run.one, run.table),
+            configuration_colours(run.every),
+        )
+        check_files_unchanged(stamps)
+    return notes
+
+
+MCAP = Exporter(".mcap", _write_mcap)
+"""The recording with the fused lists added, as MCAP."""
+
 
 _ACCURACY = ("accuracy", "instants", "lists", "thresholds")
 
@@ -39,7 +136,7 @@ def write_results(
     folder: Path,
     experiment: Experiment,
     recordings: Sequence[Recording],
-    result: Result,
+    result: ExperimentResult,
     *,
     exporters: Sequence[Exporter],
     skipped: Sequence[tuple[File, str]] = (),
@@ -50,7 +147,7 @@ def write_results(
     `exporters`: each writes every shown run (`show` in the experiment) as a file, `MCAP` and `RRD` for instance.
     `skipped`: recordings that are left out, and why.
     """
-    with taken(folder, overwrite=overwrite) as place:
+    with take_place(folder, overwrite=overwrite) as place:
         check_inputs(place, [path for recording in recordings for path in recording.paths])
         notes = fill_place(place, experiment, recordings, result, exporters=exporters, skipped=skipped)
     if place.failed:
@@ -59,26 +156,26 @@ def write_results(
 
 
 def fill_place(
-    place: Place,
+    place: ResultsPlace,
     experiment: Experiment,
     recordings: Sequence[Recording],
-    result: Result,
+    result: ExperimentResult,
     *,
     exporters: Sequence[Exporter],
     skipped: Sequence[tuple[File, str]] = (),
 ) -> list[str]:
-    """Write results into a place that is taken. Returns notes for the user. Raises OutputError.
+    """Write results into a place that is locked. Returns notes for the user. Raises OutputError.
 
-    The place's `folder` and `notes` may change; `failed`: exporters' files that could not be written.
+    The place's `folder` and `notes` may change; `failed` has the exporters' files that could not be written.
     """
-    files = _files(experiment, recordings, result, exporters)
+    files = _list_files(experiment, recordings, result, exporters)
     try:
         place.will_hold(files)
-        _fill(place, experiment, recordings, result)
+        _write_files(place, experiment, recordings, result)
         notes = [*result.notes, *_export(place, experiment, recordings, result, exporters)]
         files = [name for name in files if name not in place.left_out]
-        write_csv(_logs(place.folder, result, skipped), place.new / "logs.csv")
-        provenance = provenance_of(experiment, recordings, result, skipped, notes) | {"files": files}
+        write_csv(_logs_table(place.folder, result, skipped), place.new / "logs.csv")
+        provenance = build_provenance(experiment, recordings, result, skipped, notes) | {"files": files}
         (place.new / MARK).write_text(json.dumps(provenance, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
         place.finish(files)
     except OSError as error:
@@ -86,42 +183,44 @@ def fill_place(
     return notes
 
 
-def _files(
-    experiment: Experiment, recordings: Sequence[Recording], result: Result, exporters: Sequence[Exporter]
+def _list_files(
+    experiment: Experiment, recordings: Sequence[Recording], result: ExperimentResult, exporters: Sequence[Exporter]
 ) -> list[str]:
-    """What is going to be in the folder, by names relative to it."""
+    """The files that the folder will have, by names relative to it."""
     files = [EXPERIMENT, MARK, "summary.csv", "logs.csv"]
-    files += _named("detections.parquet", result.tables.counts)
-    files += _named("tally.parquet", dict(result.tally["log"].value_counts(sort=False)))
+    files += _table_files("detections.parquet", result.tables.counts)
+    files += _table_files("tally.parquet", dict(result.tally["log"].value_counts(sort=False)))
     files += ["exact.parquet"] * (result.exact is not None) + ["sweep.csv"] * (result.sweep is not None)
     if result.bands is not None:
         files += [f"{name}.parquet" for name in _ACCURACY] + ["bands.csv"]
-    for log in shown_logs(experiment, result):
-        for shown in shown_runs(experiment, result, log):
-            stem, shown_count = _target(shown, log, recordings), len(experiment.shown())
+    for log in select_shown_logs(experiment, result):
+        for shown in select_shown_runs(experiment, result, log):
+            stem, shown_count = _run_stem(shown, log, recordings), len(experiment.shown())
             files += [name for exporter in exporters for name in exporter.files(stem, shown_count)]
     return sorted(files)
 
 
-def _named(name: str, counts: Mapping[str, int]) -> list[str]:
-    """The file of a table of which each log has so many rows, or those of its logs where it has many."""
-    if sum(counts.values()) <= tables.MANY_ROWS:
+def _table_files(name: str, counts: Mapping[str, int]) -> list[str]:
+    """The file of a table, or one per log where it has many rows. `counts`: rows by log."""
+    if sum(counts.values()) <= MANY_ROWS:
         return [name]
-    return [str(tables.file_of(Path(name), log)) for log, count in counts.items() if count]
+    return [str(table_file(Path(name), log)) for log, count in counts.items() if count]
 
 
-def _target(shown: ShownRun, log: str, recordings: Sequence[Recording]) -> str:
-    """What the files of a run that is shown are called, relative to the folder, without their suffix."""
+def _run_stem(shown: ShownRun, log: str, recordings: Sequence[Recording]) -> str:
+    """The name of a shown run's files, relative to the folder, without suffix."""
     return shown.stem if len(recordings) == 1 else f"{shown.stem}/{log}"
 
 
-def _fill(place: Place, experiment: Experiment, recordings: Sequence[Recording], result: Result) -> None:
-    """Write the experiment and all tables but that of the logs."""
-    data, scratch = resolved(experiment).as_written(), place.new
+def _write_files(
+    place: ResultsPlace, experiment: Experiment, recordings: Sequence[Recording], result: ExperimentResult
+) -> None:
+    """Write the experiment and all tables except `logs.csv`."""
+    data, scratch = resolve_sweep(experiment).as_written(), place.new
     data["logs"] = log_entries(experiment.logs, recordings, place.folder)
-    for of in _recorded_latencies(data):
-        of["file"] = os.path.relpath(of["file"], place.folder)
-    (scratch / EXPERIMENT).write_text(dump(data), encoding="utf-8")
+    for latency in _find_recorded_latencies(data):
+        latency["file"] = os.path.relpath(latency["file"], place.folder)
+    (scratch / EXPERIMENT).write_text(dump_yaml(data), encoding="utf-8")
     _write_rows(result, scratch)
     write_csv(result.summary, scratch / "summary.csv")
     if result.exact is not None:
@@ -133,39 +232,45 @@ def _fill(place: Place, experiment: Experiment, recordings: Sequence[Recording],
 
 
 def _export(
-    place: Place, experiment: Experiment, recordings: Sequence[Recording], result: Result, exporters: Sequence[Exporter]
+    place: ResultsPlace,
+    experiment: Experiment,
+    recordings: Sequence[Recording],
+    result: ExperimentResult,
+    exporters: Sequence[Exporter],
 ) -> list[str]:
-    """Write the runs that are shown. Returns notes for the user; what cannot be written is among those that failed."""
+    """Write the shown runs. Returns notes for the user; files that cannot be written go to the place's `failed`."""
     notes: list[str] = []
-    for log in shown_logs(experiment, result) if exporters else ():
-        for shown in shown_runs(experiment, result, log):
-            stem, shown_count = _target(shown, log, recordings), len(experiment.shown())
+    for log in select_shown_logs(experiment, result) if exporters else ():
+        for shown in select_shown_runs(experiment, result, log):
+            stem, shown_count = _run_stem(shown, log, recordings), len(experiment.shown())
             files = [exporter.files(stem, shown_count) for exporter in exporters]
             with place.may_fail([name for names in files for name in names]):
-                run = _run_to_export(log, shown, experiment, recordings, result)
+                run = _make_run_to_export(log, shown, experiment, recordings, result)
                 (place.new / stem).parent.mkdir(parents=True, exist_ok=True)
                 for exporter, names in zip(exporters, files, strict=True):
                     with place.may_fail(names):
-                        said = exporter.write(place.new / f"{stem}{exporter.suffix}", run)
-                        notes += [f"{log}: {line}" for line in said if f"{log}: {line}" not in notes]
+                        lines = exporter.write(place.new / f"{stem}{exporter.suffix}", run)
+                        notes += [f"{log}: {line}" for line in lines if f"{log}: {line}" not in notes]
         next(one for one in result.logs if one.name == log).drop()
     return notes
 
 
-def _recorded_latencies(data: dict[str, Any]) -> list[dict[str, Any]]:
-    """The latencies of an experiment, as plain data, that are read off files."""
+def _find_recorded_latencies(data: dict[str, Any]) -> list[dict[str, Any]]:
+    """The recorded latencies of an experiment given as plain data."""
     configurations = [c.get("link") for c in data["configurations"].values()]
     links = [link for link in (*data.get("links", {}).values(), *configurations) if isinstance(link, dict)]
-    found = [*(link.get("latency") for link in links), *(unit.get("ready") for unit in data["units"].values())]
-    return [one for one in found if isinstance(one, dict) and one.get("kind") == "recorded"]
+    latencies = [*(link.get("latency") for link in links), *(unit.get("ready") for unit in data["units"].values())]
+    return [one for one in latencies if isinstance(one, dict) and one.get("kind") == "recorded"]
 
 
-def _logs(folder: Path, result: Result, skipped: Sequence[tuple[File, str]]) -> pd.DataFrame:
-    """The rows of `logs.csv`: what became of each log."""
+def _logs_table(folder: Path, result: ExperimentResult, skipped: Sequence[tuple[File, str]]) -> pd.DataFrame:
+    """The rows of `logs.csv`: the replayed logs and the skipped recordings."""
     rows = [
         {
             "log": log.name,
-            "path": _utf8(" + ".join(written_name(one, folder) for one in paths_of(log.recording.place))),
+            "path": _escape_name(
+                " + ".join(recording_name(one, folder) for one in list_recordings(log.recording.place))
+            ),
             "sha256": log.digests["sha256"],
             "episodes": facts.episodes,
             "rows": result.tables.counts[log.name],
@@ -174,7 +279,12 @@ def _logs(folder: Path, result: Result, skipped: Sequence[tuple[File, str]]) -> 
         for log, facts in zip(result.logs, result.facts, strict=True)
     ]
     rows += [
-        {"log": None, "path": _utf8(written_name(path, folder)), "state": "skipped", "reason": _utf8(why)}
+        {
+            "log": None,
+            "path": _escape_name(recording_name(path, folder)),
+            "state": "skipped",
+            "reason": _escape_name(why),
+        }
         for path, why in skipped
     ]
     columns = {"log": "object", "path": "object", "sha256": "object", "episodes": "Int64", "rows": "Int64",
@@ -182,19 +292,21 @@ def _logs(folder: Path, result: Result, skipped: Sequence[tuple[File, str]]) -> 
     return pd.DataFrame(rows, columns=list(columns)).astype(columns)
 
 
-def _run_to_export(
-    log: str, shown: ShownRun, experiment: Experiment, recordings: Sequence[Recording], result: Result
+def _make_run_to_export(
+    log: str, shown: ShownRun, experiment: Experiment, recordings: Sequence[Recording], result: ExperimentResult
 ) -> RunToExport:
     """One run of one log, in the configurations that the experiment shows."""
-    of_study = next(one for one in result.logs if one.name == log)
-    replay, recording = of_study.replay(), of_study.whole()
-    experiment = of_log(experiment, log)
-    chosen = experiment.model_copy(update={"configurations": experiment.shown()})
-    names = list(chosen.configurations)
+    study_log = next(one for one in result.logs if one.name == log)
+    replay, recording = study_log.replay(), study_log.whole()
+    experiment = resolve_for_log(experiment, log)
+    shown_experiment = experiment.model_copy(update={"configurations": experiment.shown()})
+    names = list(shown_experiment.configurations)
     rows = result.tables.rows(log)
     manifest = {
         "copem_replay": version("copem-replay"),
-        "experiment": dump(resolved(experiment).as_written() | {"logs": [log_path_of(recordings, log).name]}),
+        "experiment": dump_yaml(
+            resolve_sweep(experiment).as_written() | {"logs": [find_log_path(recordings, log).name]}
+        ),
         "log": log,
         "run": str(shown.run),
         "run_is": shown.why,
@@ -202,7 +314,7 @@ def _run_to_export(
     return RunToExport(
         recording,
         shown,
-        one_run(recording, chosen, shown.run, replay),
+        replay_run(recording, shown_experiment, shown.run, replay),
         experiment.configurations,
         rows[(rows["run"] == shown.run) & rows["configuration"].isin(names)],
         result.summary[result.summary["configuration"].isin(names)],
@@ -210,25 +322,25 @@ def _run_to_export(
     )
 
 
-def provenance_of(
+def build_provenance(
     experiment: Experiment,
     recordings: Sequence[Recording],
-    result: Result,
+    result: ExperimentResult,
     skipped: Sequence[tuple[File, str]],
     notes: Sequence[str],
 ) -> dict[str, object]:
-    """What made these results: versions, logs, seed, metric parameters; no clock, no host."""
-    shown = {log: shown_runs(experiment, result, log) for log in shown_logs(experiment, result)}
+    """The provenance of results: versions, logs, seed, metric parameters; no clock, no host."""
+    shown = {log: select_shown_runs(experiment, result, log) for log in select_shown_logs(experiment, result)}
     return {
-        "format": tables.FORMAT,
-        **versions(),
+        "format": FORMAT,
+        **list_versions(),
         "seed": experiment.seed,
         "runs": experiment.runs,
         "logs": [
             {"log": log.name, "topic": log.recording.topic, **{n: log.digests[n] for n in ("sha256", "truth")}}
             for log in result.logs
         ],
-        "logs_skipped": [{"log": _utf8(path.name), "reason": reason} for path, reason in skipped],
+        "logs_skipped": [{"log": _escape_name(path.name), "reason": reason} for path, reason in skipped],
         "visibility": experiment.visibility.label,
         "max_gap_s": experiment.max_gap_s,
         "window_s": experiment.window_s,
@@ -243,13 +355,13 @@ def provenance_of(
     }  # fmt: skip
 
 
-def _utf8(name: str) -> str:
+def _escape_name(name: str) -> str:
     """A file's name as text that can be written: bytes that are not UTF-8 escaped."""
     return name.encode(errors="backslashreplace").decode()
 
 
-def _write_rows(result: Result, scratch: Path) -> None:
-    """The tables of logs, of which all or those of one are in memory, and the tally."""
+def _write_rows(result: ExperimentResult, scratch: Path) -> None:
+    """Write the tables of rows, part by part as they are in memory, and the tally."""
     with ExitStack() as open_files:
         files: dict[str, TableFile] = {}
 
@@ -259,7 +371,7 @@ def _write_rows(result: Result, scratch: Path) -> None:
             files[name].add(table)
 
         for rows, of_logs in result.tables.parts():
-            if sum(result.tables.counts.values()) <= tables.MANY_ROWS:
+            if sum(result.tables.counts.values()) <= MANY_ROWS:
                 add("detections.parquet", rows)
             else:
                 _write_by_log(rows, scratch / "detections.parquet")
@@ -267,19 +379,133 @@ def _write_rows(result: Result, scratch: Path) -> None:
                 accuracy = result.accuracy_of(of_logs, rows)
                 for name in _ACCURACY:
                     add(f"{name}.parquet", getattr(accuracy, name))
-    if len(result.tally) <= tables.MANY_ROWS:
+    if len(result.tally) <= MANY_ROWS:
         write_parquet(result.tally, scratch / "tally.parquet")
     else:
         _write_by_log(result.tally, scratch / "tally.parquet")
 
 
 def _write_by_log(rows: pd.DataFrame, folder: Path) -> None:
-    """A file for each log."""
+    """Write a file for each log."""
     folder.mkdir(exist_ok=True)
     for log, part in rows.groupby("log", sort=False):
-        write_parquet(part, tables.file_of(folder, str(log)))
+        write_parquet(part, table_file(folder, str(log)))
 
 
 def write_csv(table: pd.DataFrame, path: Path) -> None:
-    """A table as CSV: nulls empty, numbers with nine significant digits, names quoted for spreadsheets."""
-    for_spreadsheets(table).to_csv(path, index=False, float_format="%.9g", lineterminator="\n")
+    """Write a table as CSV: nulls empty, numbers with nine significant digits, names quoted for spreadsheets."""
+    quote_formulas(table).to_csv(path, index=False, float_format="%.9g", lineterminator="\n")
+
+
+# The truth of a run as a scene: outlines, units, fields of view, texts, the ego.
+
+BODY: Rgba = (0.62, 0.62, 0.62, 1.0)
+UNIT: Rgba = (0.85, 0.85, 0.85, 1.0)
+FIELD: Rgba = (0.45, 0.45, 0.38, 1.0)
+STATIC: Rgba = (0.4, 0.4, 0.4, 1.0)
+"""Greys: the truth is thin and neutral, so that the colours of configurations stand out."""
+NAMED_OBJECTS = 6
+"""Measured objects with a name, at most: those that configurations detect at the most different times."""
+MANY_MOVING = 8
+"""With more moving units than this their fields of view are not drawn, as they would cover the scene."""
+_MARK_M, _ABOVE_M = 0.5, 0.05
+
+
+def truth_scene(one: ReplayedRun, table: pd.DataFrame) -> TruthScene:
+    """The truth of a run; `table`: the rows of `detections.parquet` of its log and run."""
+    stamps_ns = one.replay.placed.stamps_ns
+    fixed = [name for name, unit in one.experiment.modelled.items() if unit.at is not None and len(stamps_ns[name])]
+    units = [_draw_unit(one, name, _unit_pose(one.replay.placed.poses[name], 0)) for name in fixed]
+    follow = EGO_FRAME if one.replay.scene.ego_ix >= 0 else MIDDLE_FRAME
+    return TruthScene([*_draw_obstacles(one), *units], _Frames(one, choose_named_objects(table)), follow)
+
+
+def choose_named_objects(table: pd.DataFrame) -> list[str]:
+    """Ids of the objects that are named: those that configurations detect at the most different times."""
+    time_s = table["time_to_detection_s"].fillna(table["ended_s"] - table["onset_s"])
+    apart = time_s.groupby(table["object_id"], sort=False).agg(lambda times: times.max() - times.min())
+    return list(apart.sort_values(ascending=False, kind="stable").index[:NAMED_OBJECTS])
+
+
+class _Frames:
+    """The frames of the truth, made one at a time; it can be iterated repeatedly."""
+
+    def __init__(self, one: ReplayedRun, names: Sequence[str]) -> None:
+        self._one, self._names = one, {one.replay.scene.object_number[name] for name in names}
+        moving = [name for name, unit in one.experiment.modelled.items() if unit.at is None]
+        self._moving = moving if len(moving) <= MANY_MOVING else []
+        self._marked = moving
+        self._middle = _scene_centre(one.replay.truth) if one.replay.scene.ego_ix < 0 else None
+
+    def __iter__(self) -> Iterator[TruthFrame]:
+        scene, truth = self._one.replay.scene, self._one.replay.truth
+        order, bounds = truth.by_frame
+        for frame, time_ns in enumerate(truth.stamp_ns.tolist()):
+            rows = order[bounds[frame] : bounds[frame + 1]]
+            rows = rows[truth.valid[0, rows]].tolist()
+            bodies = [_draw_body(scene, truth, row, named=int(truth.row_object_ix[row]) in self._names) for row in rows]
+            own = [row for row in rows if truth.row_object_ix[row] == scene.ego_ix]
+            followed = _truth_pose(truth, own[0]) if own else self._middle
+            yield TruthFrame(time_ns, [*bodies, *self._units(time_ns)], followed)
+
+    def _units(self, time_ns: int) -> Iterator[Entity]:
+        """Marks of carried units, at their poses of the newest list."""
+        placed = self._one.replay.placed
+        for name in self._marked:
+            newest = int(np.searchsorted(placed.stamps_ns[name], time_ns, side="right")) - 1
+            if newest >= 0 and placed.poses[name].present[newest]:
+                pose = _unit_pose(placed.poses[name], newest)
+                yield _draw_unit(self._one, name, pose, field=name in self._moving)
+
+
+def _scene_centre(truth: Tracks) -> Pose | None:
+    """The median of all places of all objects; None: there are none."""
+    valid = truth.valid[0]
+    if not valid.any():
+        return None
+    return Pose(*(float(np.median(getattr(truth, name)[0, valid])) for name in ("x_m", "y_m", "z_m")))
+
+
+def _draw_body(scene: Scene, truth: Tracks, row: int, *, named: bool) -> Entity:
+    """The outline of an object: the footprint, up one edge, and around the roof."""
+    k = int(truth.row_object_ix[row])
+    half = [float(getattr(truth, name)[0, row]) / 2 for name in ("length_m", "width_m", "height_m")]
+    around = [(half[0] * a, half[1] * b) for a, b in ((1, 1), (-1, 1), (-1, -1), (1, -1), (1, 1))]
+    points: list[ScenePlace] = [(x, y, z) for z in (-half[2], half[2]) for x, y in around]
+    pose, kind = _truth_pose(truth, row), CLASSES[int(scene.object_class[k])]
+    metadata = {"object": scene.object_ids[k], "class": kind}
+    over = Pose(pose.x_m, pose.y_m, pose.z_m + half[2] + _MARK_M)
+    texts = [Text(f"{scene.object_ids[k]} {kind}", BODY, over)] if named or k == scene.ego_ix else []
+    return Entity(scene.object_ids[k], metadata, [Line(points, BODY, pose)], texts)
+
+
+def _draw_unit(one: ReplayedRun, name: str, pose: Pose, *, field: bool = True) -> Entity:
+    """A mark at a unit, its name over it, and its field of view on the ground under it."""
+    replay, unit = one.replay, one.experiment.modelled[name]
+    lines = []
+    if field:
+        down_m = _ABOVE_M - mounting_height(replay.scene, replay.truth, unit)
+        for border in couple_outlines(one.experiment.pems[str(unit.pem)].couples):
+            lines.append(Line([(x, y, down_m) for x, y in border.tolist()], FIELD, pose))
+    over = Pose(pose.x_m, pose.y_m, pose.z_m + _MARK_M)
+    mark = Ellipse((_MARK_M, _MARK_M, _MARK_M / 2), UNIT, pose)
+    return Entity(f"unit {name}", {"unit": name}, lines, [Text(name, UNIT, over)], [mark])
+
+
+def _draw_obstacles(one: ReplayedRun) -> Iterator[Entity]:
+    """Outlines of the convex parts of obstacles, at the bottom and at the top."""
+    static, solids = one.replay.placed.static, one.replay.placed.solids
+    for part in range(len(static.body)):
+        corners = static.xy_m[static.start[part] : static.start[part + 1]].tolist()
+        around = [*corners, *corners[:1]]
+        solid = solids[static.body[part]]
+        lines = [Line([(x, y, z) for x, y in around], STATIC) for z in (solid.bottom_m, solid.top_m)]
+        yield Entity(f"{solid.name}:{part}", {"obstacle": solid.name.split()[-1]}, lines)
+
+
+def _truth_pose(truth: Tracks, row: int) -> Pose:
+    return Pose(*(float(getattr(truth, name)[0, row]) for name in ("x_m", "y_m", "z_m", "yaw_rad")))
+
+
+def _unit_pose(poses: UnitPoses, k: int) -> Pose:
+    return Pose(*(float(column[k]) for column in (poses.x_m, poses.y_m, poses.z_m, poses.heading_rad)))

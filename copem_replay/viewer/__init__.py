@@ -1,32 +1,35 @@
-"""Show: one run of one log as a Rerun recording (.rrd), the truth beside every configuration, a blueprint inside.
+"""Viewer: one run of one log as a Rerun recording (.rrd) that holds truth, configurations and a blueprint.
 
-| entity | is |
+| entity | what it shows |
 |---|---|
-| `world/truth/boxes`, `ego`, `paths`, `onsets` | the log; of the shown objects, ways, and places at their onsets |
+| `world/truth/boxes`, `ego`, `paths`, `onsets` | the log; paths of the shown objects, and their places at the onsets |
 | `world/truth/lanes` | boundaries of lanes, where the log has them |
-| `world/static/obstacles`, `grid` | obstacles, and lines on the ground every 10 m |
+| `world/static/obstacles`, `grid` | obstacles; lines on the ground every 10 m |
 | `world/units/<unit>`, `world/fields/<unit>` | units, and the fields of view of their PEMs |
-| `world/<configuration>/boxes`, `covariance` | the receiver's fused tracks, paler the older; 2σ of where |
-| `world/<configuration>/status`, `hiding`, `listings` | at each: known or why not; what hides it; its first unit |
-| `world/<configuration>/marks`, `marks/from`, `marks/from/line` | where it was first known, and from how far away |
-| `world/eyes/ego`, `world/eyes/<object>` | origins of the views that follow |
-| `lanes/<object>/<place>_<configuration>` | how far it has come (`viewer/status.py`), a mark at the onset |
-| `lists/<place>_<configuration>/<unit>` | lists that were lost, late or overtaken, of a unit that sends by a link |
-| `plots/visible_share/<object>/…` | how much of it is seen by the ego's units, and by the best of all |
+| `world/<configuration>/boxes`, `covariance` | the receiver's fused tracks, paler the older; 2σ of the position |
+| `world/<configuration>/status`, `hiding`, `listings` | per object: known or why not; what hides it; its first unit |
+| `world/<configuration>/marks`, `marks/from`, `marks/from/line` | where an object was first known, and how far away |
+| `world/eyes/ego`, `world/eyes/<object>` | origins of the views that follow ego or object |
+| `lanes/<object>/<place>_<configuration>` | the object's status (`viewer/status.py`), a mark at the onset |
+| `lists/<place>_<configuration>/<unit>` | lost, late and overtaken lists of a unit that sends by a link |
+| `plots/visible_share/<object>/…` | visible share from the ego's units, and from the best of all units |
 | `plots/visible_share/<object>/mark_1`, … | onset and detections on these curves |
 | `plots/position_error/<object>/<configuration>` | fused to true position: running quartiles |
-| `plots/gospa/<configuration>`, `plots/known/<configuration>` | over all measured objects: GOSPA, how many are known |
-| `…/difference/…`, `plots/error_difference` | differences to a baseline (`viewer/differences.py`) |
+| `plots/gospa/<configuration>`, `plots/known/<configuration>` | of all measured objects: GOSPA, number known |
+| `…/difference/…`, `plots/error_difference` | differences to a baseline (`viewer/curves.py`) |
 | `legend/…` | the colour of each configuration |
-| `events/onsets`, `events/<configuration>`, `…/lists`, `difference`, `summary`, `words` | in words |
+| `events/onsets`, `events/<configuration>`, `…/lists`, `difference`, `summary`, `words` | texts |
 
-`<object>` is `6_pedestrian`. Of more than six configurations there are further files (`viewer/selection.py`).
+`<object>` is for example `6_pedestrian`. More than six configurations go into several files (`viewer/sink.py`).
 
-Columns are sent in slices of time, an entity holds all its objects: hundreds of entities slow the viewer down. It shows
-the newest row of an entity until the next one, so an instant at which there is nothing has an empty row of its own.
+An entity holds all its objects, because hundreds of entities slow the viewer down. The viewer shows the newest row of
+an entity until the next one, so an instant at which there is nothing to show has an empty row. Columns are sent in
+slices of time, so that little is held in memory.
 """
 
+from __future__ import annotations
+
 from copem_replay.viewer.rrd import write_rrd
-from copem_replay.viewer.stream import VIEWER, check_viewer
+from copem_replay.viewer.sink import VIEWER, check_viewer
 
 __all__ = ["VIEWER", "check_viewer", "write_rrd"]

@@ -1,37 +1,403 @@
-"""The blueprint: a page per question."""
+"""Blueprint: the layout of a recording in the viewer, with a page per question, and its legend."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from copem_replay.viewer import pages
-from copem_replay.viewer.pages import Content
-from copem_replay.viewer.sink import ELAPSED, digest, ns
+import numpy as np
+import pandas as pd
 
-if TYPE_CHECKING:  # a second to import: only where something is written
+from copem_replay.core.colours import TRUTH as TRUTH_COLOUR
+from copem_replay.core.colours import Rgb
+from copem_replay.core.tracks import CLASSES, TRUTH
+from copem_replay.experiment.schema import Experiment
+from copem_replay.pipeline.prepare import Replay
+from copem_replay.viewer.camera import Camera
+from copem_replay.viewer.lanes import UnitLists, select_list_lanes
+from copem_replay.viewer.sink import (
+    EGO,
+    ELAPSED,
+    GROUND,
+    HIDES,
+    NOTICED,
+    RecordingSink,
+    configuration_part,
+    digest_texts,
+    entity_names,
+    make_entity_path,
+    object_lanes_path,
+    short_ids,
+    to_nanoseconds,
+)
+
+if TYPE_CHECKING:
     import rerun.blueprint as rrb
+
+
+# Legend: bars in the colours of configurations, and of lines and boxes, with names on them, in a view of their own.
+
+_MARKS: tuple[tuple[str, Rgb, float], ...] = (
+    ("truth", TRUTH_COLOUR, 1.0),
+    ("ego", EGO, 6.0),
+    ("hides it", HIDES, 2.0),
+)
+_BAR_POINTS, _WIDE, _GAP = 7.0, 4.0, 1.0
+"""Half the height of a bar in points; its width and the gap beside it in rows."""
+LEGEND_X, LEGEND_Y = (-0.5, 2 * _WIDE + _GAP + 0.5), (-1.0, 6.0)
+"""Bounds of the legend's view: two columns and six rows."""
+
+
+def write_legend_bars(out: RecordingSink, colours: Mapping[str, Rgb]) -> None:
+    """Write a bar per configuration with its name, and in a second column those common to all configurations."""
+    import rerun as rr
+
+    columns = ([(name, colour, _BAR_POINTS) for name, colour in colours.items()], list(_MARKS))
+    rows = [(*row, c * (_WIDE + _GAP), float(k)) for c, column in enumerate(columns) for k, row in enumerate(column)]
+    drawn = rr.LineStrips2D(
+        [[[x, y], [x + _WIDE, y]] for _, _, _, x, y in rows],
+        colors=[colour for _, colour, *_ in rows],
+        radii=rr.Radius.ui_points([points for _, _, points, *_ in rows]),
+    )
+    out.static(["legend", "bars"], drawn)
+    # A label stands below its point: a point a little higher puts it on the bar.
+    names = rr.Points2D(
+        [[x + _WIDE / 2, y - 0.4] for *_, x, y in rows],
+        labels=[name for name, *_ in rows],
+        colors=[NOTICED],
+        radii=rr.Radius.ui_points(0.0),
+        show_labels=True,
+    )
+    out.static(["legend", "names"], names)
+
+
+# Pages.
+
+SMALL = 3
+"""Most views beside each other: a view narrower than 400 points is too small."""
+NEAR_BY = 4
+"""Most objects with views that follow them: each view takes some kilobytes of the file."""
+BESIDE = 4
+"""Objects with lanes on one page: the lanes of six configurations fit into a height of 720 points."""
+BESIDE_LISTS = 2
+"""Objects on one page if lanes of lists are under theirs: thirteen lanes fit into a height of 720 points."""
+MANY = 4
+"""More configurations than this need half of the overview's height for their lanes."""
+
+
+@dataclass(frozen=True)
+class RecordingContent:
+    """What one file shows: a run, its configurations in order, and the shown objects, the most telling one first.
+
+    `episodes`: rows of the table by object; `axes_s`: first and last second of each object's axis.
+    Camera `eye` follows the ego, if there is one, `eyes` the objects; `above` looks at the units, of which `named` have
+    names. `lists`: lists that units send by a link, by configuration.
+    """
+
+    replay: Replay
+    experiment: Experiment
+    table: pd.DataFrame
+    episodes: Mapping[int, pd.DataFrame]
+    configurations: Sequence[str]
+    objects: Sequence[int]
+    axes_s: Mapping[int, tuple[float, float]]
+    eye: Camera
+    eyes: Sequence[Camera]
+    above: Camera
+    named: Sequence[str]
+    lists: Mapping[str, Sequence[UnitLists]]
+    baseline: str | None = None
+
+    def id_of(self, object_ix: int) -> str:
+        """Id of an object as drawn, with its class."""
+        return f"{short_ids(self.replay.scene)[object_ix]} {CLASSES[self.replay.scene.object_class[object_ix]]}"
+
+    def axis(self, object_ix: int) -> rrb.TimeAxis:
+        """The time axis of an object's lanes and curves."""
+        return make_time_axis(*self.axes_s[object_ix])
+
+    def under(self, object_ix: int) -> list[str]:
+        """Entities of the lanes of lists under those of an object."""
+        return [make_entity_path(*path) for path in select_list_lanes(self.lists, self.axes_s[object_ix])]
+
+    def heard(self, configuration: str) -> tuple[str, ...]:
+        """The units of a configuration, by name."""
+        return self.experiment.units_of(self.experiment.configurations[configuration])
+
+
+def make_time_axis(first_s: float, last_s: float) -> rrb.TimeAxis:
+    """A time axis that first shows these seconds."""
+    import rerun.blueprint as rrb
+
+    bound = rrb.TimeRangeBoundary.absolute
+    return rrb.TimeAxis(view_range=rrb.TimeRange(start=bound(seconds=first_s), end=bound(seconds=last_s)))
+
+
+def overview_page(content: RecordingContent) -> rrb.Container:
+    """The fused tracks of each configuration; below them lanes, and the table of times to detection."""
+    import rerun.blueprint as rrb
+
+    views, lower_row, shares = (
+        list[rrb.View](tracks_views(content)),
+        list[rrb.Container | rrb.View]([difference_view()]),
+        [4.0],
+    )
+    if content.objects:
+        lower_row.insert(0, rrb.Tabs(*(lanes_view(content, k) for k in content.objects)))
+        shares.append(4.0)
+    columns = count_columns(len(views))
+    if len(views) % columns:
+        views.append(legend_view())  # into the free cell
+    else:
+        lower_row[-1] = rrb.Tabs(difference_view(), legend_view())
+    return rrb.Vertical(
+        rrb.Grid(*views, grid_columns=columns),
+        rrb.Horizontal(*lower_row, column_shares=shares),
+        row_shares=[3, 2] if len(content.configurations) <= MANY else [11, 10],
+        name="Overview",
+    )
+
+
+def lanes_page(content: RecordingContent) -> rrb.Container:
+    """The lanes of every shown object, with those of lists, and the table of times to detection."""
+    import rerun.blueprint as rrb
+
+    beside = BESIDE_LISTS if any(content.under(k) for k in content.objects) else BESIDE
+    groups = [content.objects[k : k + beside] for k in range(0, len(content.objects), beside)]
+    grids = [
+        rrb.Grid(
+            *(lanes_view(content, k, content.under(k)) for k in group),
+            grid_columns=min(len(group), 2),
+            name=", ".join(map(content.id_of, group)),
+        )
+        for group in groups
+    ]
+    return rrb.Horizontal(
+        grids[0] if len(grids) == 1 else rrb.Tabs(*grids), difference_view(), column_shares=[3, 2], name="Who knew when"
+    )
+
+
+def reasons_page(content: RecordingContent) -> rrb.Container:
+    """Per object close views of the configurations that knew it last and first, with its lanes and visible share."""
+    import rerun.blueprint as rrb
+
+    pages = []
+    for k, eye in zip(content.objects[:NEAR_BY], content.eyes, strict=False):
+        views = [
+            world_view(content, name, title, eye, units=content.heard(name), fields=True)
+            for name, title in _last_and_first(content, k)
+        ]
+        origin = make_entity_path("plots", "visible_share", entity_names(content.replay.scene)[k])
+        share = _curves_view(
+            origin, "Visible share (white: ego, grey: any unit)", content.axis(k), values=(-0.05, 1.05)
+        )
+        lower_row = rrb.Horizontal(lanes_view(content, k), share, column_shares=[3, 2])
+        pages.append(rrb.Vertical(rrb.Horizontal(*views), lower_row, row_shares=[3, 2], name=content.id_of(k)))
+    return rrb.Tabs(*pages, name="Why not earlier")
+
+
+def _last_and_first(content: RecordingContent, object_ix: int) -> list[tuple[str, str]]:
+    """Names and titles of the configurations with units that knew an object last (or never) and first.
+
+    For a single shown object also the one in the middle.
+    """
+    episodes = content.episodes[object_ix]
+    perceiving = [name for name in content.configurations if content.experiment.configurations[name].units != TRUTH]
+    episodes = episodes[episodes["configuration"].isin(perceiving or list(content.configurations))]
+    when_s = dict(zip(episodes["configuration"], episodes["time_to_detection_s"].fillna(np.inf), strict=True))
+    if not when_s:
+        return []
+    ranked = sorted(when_s, key=lambda name: when_s[name], reverse=True)
+    between = [ranked[len(ranked) // 2]] if len(content.objects) == 1 else []
+    chosen = dict.fromkeys([ranked[0], *between, ranked[-1]])
+    label = content.id_of(object_ix)
+    titles = {
+        name: f"{name}: {label} known {s:.2f} s after its onset" if np.isfinite(s) else f"{name}: {label} never known"
+        for name, s in when_s.items()
+    }
+    return [(name, titles[name]) for name in chosen]
+
+
+def tracks_page(content: RecordingContent) -> rrb.Container:
+    """A view per configuration, as large as possible."""
+    import rerun.blueprint as rrb
+
+    views: list[rrb.View] = list(tracks_views(content, " believes"))
+    columns = count_columns(len(views))
+    if len(views) % columns:
+        return rrb.Grid(*views, legend_view(), grid_columns=columns, name="What each believes")
+    return rrb.Grid(*views, grid_columns=columns, name="What each believes")
+
+
+def errors_page(content: RecordingContent) -> rrb.Container:
+    """Position errors of every shown object; GOSPA and number of known objects over all measured ones."""
+    import rerun.blueprint as rrb
+
+    names = entity_names(content.replay.scene)
+    plots = []
+    for k in content.objects:
+        kinds = {"position_error": f"{content.id_of(k)}: position error, m"}
+        if content.baseline is not None:
+            kinds = {"error_difference": f"{content.id_of(k)}: more error than {content.baseline}, m"} | kinds
+        views = [
+            _curves_view(make_entity_path("plots", kind, names[k]), title, content.axis(k))
+            for kind, title in kinds.items()
+        ]
+        plots.append(views[0] if len(views) == 1 else rrb.Tabs(*views))
+    all_time = make_time_axis(0.0, content.replay.scene.end_s)
+    overall = [
+        _curves_view("plots/gospa", "GOSPA of all measured objects, m", all_time, legend=True),
+        _curves_view("plots/known", "Measured objects known (grey: there are)", all_time),
+    ]
+    if not plots:
+        return rrb.Horizontal(*overall, name="How far off")
+    return rrb.Horizontal(
+        rrb.Grid(*plots, grid_columns=min(len(plots), 2)),
+        rrb.Vertical(*overall),
+        column_shares=[5, 3],
+        name="How far off",
+    )
+
+
+def units_page(content: RecordingContent) -> rrb.Container:
+    """The configuration with most units from above: units, fields of view, fused tracks."""
+    import rerun.blueprint as rrb
+
+    largest = max(content.configurations, key=lambda name: len(content.heard(name)))
+    units = content.heard(largest)
+    title = f"In colour: what {largest} lists. Grey: the truth. Pale ground: fields of view. Lines: listed it first"
+    view = world_view(
+        content, largest, title, content.above, units=units, fields=True, named=[n for n in content.named if n in units]
+    )
+    return rrb.Tabs(view, name="Units")
+
+
+def text_page() -> rrb.Container:
+    """Events, the summary of all runs, and the legend in words."""
+    import rerun.blueprint as rrb
+
+    # The text names the configuration, since the column of entity paths would be cut off.
+    kinds = [rrb.encodings.TextLogColumn(kind) for kind in ("LogLevel", "Body")]
+    return rrb.Horizontal(
+        rrb.TextLogView(origin="events", name="Events", columns=rrb.TextLogColumns(text_log_columns=kinds)),
+        rrb.Tabs(
+            rrb.TextDocumentView(origin="summary", name="Summary of all runs"),
+            rrb.TextDocumentView(origin="words", name="What all of it means"),
+        ),
+        name="In words",
+    )
+
+
+def tracks_views(content: RecordingContent, title_suffix: str = "") -> list[rrb.Spatial3DView]:
+    """A view of the fused tracks per configuration, from the ego's side."""
+    marks = len(content.objects) == 1
+    return [
+        world_view(content, name, name + title_suffix, content.eye, units=content.heard(name), marks=marks)
+        for name in content.configurations
+    ]
+
+
+def count_columns(views: int) -> int:
+    """The number of columns for this many views."""
+    return SMALL if views in (3, 5, 6) else min(views, 2)
+
+
+def world_view(
+    content: RecordingContent, configuration: str, title: str, eye: Camera, *, units: Sequence[str],
+    fields: bool = False, marks: bool = False, named: Sequence[str] = (),
+) -> rrb.Spatial3DView:  # fmt: skip
+    """A view of truth and one configuration, with `units` as points and, with `fields`, their fields of view.
+
+    `marks`: with the lasting lines to the places of objects at their detection. `named`: units with visible names.
+    """
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+    kinds = ("units", "fields") if fields else ("units",)
+    contents = [f"+ {make_entity_path('world', kind, unit)}" for unit in units for kind in kinds]
+    part = make_entity_path("world", configuration_part(configuration))
+    contents += [f"+ {part}/**"] if marks else [f"+ {part}/**", f"- {part}/marks/**"]
+    shown = rr.Points3D.from_fields(show_labels=True)
+    contents += [f"- {part}/status"] if named else []  # there the names are the only labels
+    return rrb.Spatial3DView(
+        origin=make_entity_path(*eye.path),
+        name=title,
+        contents=["+ world/truth/**", "+ world/static/**", *contents],
+        eye_controls=rrb.EyeControls3D(
+            position=eye.place_m.tolist(), look_target=eye.target_m.tolist(), eye_up=(0, 0, 1)
+        ),
+        overrides={make_entity_path("world", "units", unit): shown for unit in named},
+        line_grid=False,
+        background=GROUND,
+    )
+
+
+def lanes_view(content: RecordingContent, object_ix: int, under: Sequence[str] = ()) -> rrb.StateTimelineView:
+    """The lanes of one object, and the entities `under` them."""
+    import rerun.blueprint as rrb
+
+    scene, onset_s = content.replay.scene, float(content.episodes[object_ix]["onset_s"].iloc[0])
+    return rrb.StateTimelineView(
+        origin=make_entity_path(*object_lanes_path(scene, object_ix)),
+        contents=["+ $origin/**", *(f"+ {path}" for path in under)] if under else "$origin/**",
+        name=f"{content.id_of(object_ix)}, onset {onset_s:.1f} s",
+        time_view=content.axis(object_ix),
+    )
+
+
+def difference_view() -> rrb.TextDocumentView:
+    """The table of times to detection."""
+    import rerun.blueprint as rrb
+
+    return rrb.TextDocumentView(origin="difference", name="What difference it made")
+
+
+def legend_view() -> rrb.Spatial2DView:
+    """The legend."""
+    import rerun.blueprint as rrb
+
+    bounds = rrb.VisualBounds2D(x_range=LEGEND_X, y_range=LEGEND_Y)
+    return rrb.Spatial2DView(origin="legend", name="Legend", background=GROUND, visual_bounds=bounds)
+
+
+def _curves_view(
+    origin: str, title: str, axis: rrb.TimeAxis, *, legend: bool = False, values: tuple[float, float] | None = None
+) -> rrb.TimeSeriesView:
+    """A view of curves over time, on the dark ground."""
+    import rerun.blueprint as rrb
+
+    return rrb.TimeSeriesView(
+        origin=origin,
+        name=title,
+        axis_x=axis,
+        axis_y=None if values is None else rrb.ScalarAxis(range=values),
+        plot_legend=rrb.PlotLegend(visible=legend),
+        background=rrb.archetypes.PlotBackground(color=GROUND),
+    )
+
 
 LAYOUT = 4
-"""Counts up when the blueprint changes: the viewer keeps one per application id and prefers what it has."""
+"""Version of the blueprint, raised with every change: a viewer prefers the one it has kept for an application id."""
 ALL_VIEWS = 3.1
-"""How much wider than high all views together are (chosen)."""
+"""Width by height of all views together: they have three fifths of a 16:9 window's height, less its bars."""
 
 
-def blueprint(of: Content) -> tuple[rrb.Blueprint, str]:
-    """All pages; and a digest of all that they depend on."""
+def build_blueprint(content: RecordingContent) -> tuple[rrb.Blueprint, str]:
+    """The blueprint, and a digest of everything that it depends on."""
     import rerun.blueprint as rrb
 
-    scene = of.replay.scene
-    made = [pages.overview(of)]
-    if of.objects:
-        made += [pages.who_knew_when(of), pages.why_not_earlier(of)]
-    made += [pages.what_each_believes(of), pages.how_far_off(of)]
-    if any(of.heard(name) for name in of.configurations):
-        made.append(pages.where_units_are(of))
-    made.append(pages.in_words())
-    onset_ns = int(ns(of.table["onset_s"].min())) if len(of.table) else 0
+    scene = content.replay.scene
+    pages = [overview_page(content)]
+    if content.objects:
+        pages += [lanes_page(content), reasons_page(content)]
+    pages += [tracks_page(content), errors_page(content)]
+    if any(content.heard(name) for name in content.configurations):
+        pages.append(units_page(content))
+    pages.append(text_page())
+    onset_ns = int(to_nanoseconds(content.table["onset_s"].min())) if len(content.table) else 0
     end_ns = max(scene.end_ns - scene.t0_ns, onset_ns)
-    # No blueprint can place the time cursor, but playing begins where the selection does: at the first onset.
+    # A blueprint cannot set the time cursor, but playing begins with the selection: at the first onset.
     panel = rrb.TimePanel(
         timeline=ELAPSED,
         play_state="paused",
@@ -39,32 +405,35 @@ def blueprint(of: Content) -> tuple[rrb.Blueprint, str]:
         state="collapsed",
         time_selection=rrb.components.AbsoluteTimeRange(onset_ns, end_ns),
     )
-    whole = rrb.Blueprint(
-        rrb.Tabs(*made, active_tab=0),
+    blueprint = rrb.Blueprint(
+        rrb.Tabs(*pages, active_tab=0),
         panel,
         rrb.SelectionPanel(state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
         auto_layout=False,
         auto_views=False,
     )
-    eyes = [(eye.place_m.tolist(), eye.target_m.tolist(), eye.object_ix) for eye in (of.eye, *of.eyes, of.above)]
+    eyes = [
+        (eye.place_m.tolist(), eye.target_m.tolist(), eye.object_ix)
+        for eye in (content.eye, *content.eyes, content.above)
+    ]
     parts = (
         LAYOUT,
-        list(of.configurations),
-        [of.heard(name) for name in of.configurations],
-        [scene.object_ids[k] for k in of.objects],
+        list(content.configurations),
+        [content.heard(name) for name in content.configurations],
+        [scene.object_ids[k] for k in content.objects],
         eyes,
-        [of.axes_s[k] for k in of.objects],
-        list(of.named),
+        [content.axes_s[k] for k in content.objects],
+        list(content.named),
         onset_ns,
         end_ns,
-        of.baseline,
-        *([under] if any(under := [of.under(k) for k in of.objects]) else []),
+        content.baseline,
+        *([under] if any(under := [content.under(k) for k in content.objects]) else []),
     )
-    return whole, digest(repr(parts))
+    return blueprint, digest_texts(repr(parts))
 
 
-def aspect(views: int) -> float:
-    """How much wider than high each of so many views is."""
-    across = pages.columns(views)
+def view_aspect(views: int) -> float:
+    """Width by height of each of this many views."""
+    across = count_columns(views)
     return ALL_VIEWS * -(-views // across) / across

@@ -1,4 +1,4 @@
-"""Eyes: where they are, what they look at, and what they follow: the ego, or one of the shown objects."""
+"""Cameras of the 3-D views: place, target, and what they follow: the ego or one of the shown objects."""
 
 from __future__ import annotations
 
@@ -7,36 +7,35 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from copem_replay.core.interpolation import states_at
+from copem_replay.core.interpolation import interpolate_states
 from copem_replay.core.tracks import Float, Int, Scene
 from copem_replay.experiment.schema import Experiment
-from copem_replay.perception.sensor_poses import carrier, moved
+from copem_replay.perception.sensor_poses import find_carrier, offset_places
 from copem_replay.pipeline.prepare import Replay
-from copem_replay.viewer.sink import Out, entity_names, f32, ns
+from copem_replay.viewer.sink import RecordingSink, entity_names, stack_float32, to_nanoseconds
 
 FARTHEST_BESIDE_M = 16.0
-"""So far from the ego, towards the object, the eye looks at most (chosen: the ego stays in the picture)."""
+"""Farthest target from the ego, on the way to the object, so that the ego stays in the picture."""
 AROUND_UNIT_M = 40.0
-"""Of ways past a fixed unit from which distances are measured so much is in view (chosen)."""
+"""Radius in view around a fixed unit from which distances are measured: all of long paths would be too small."""
 EYES = ("world", "eyes")
 TURNED_RAD, DOWN_RAD = np.deg2rad((65.0, 65.0))
-"""The eye looks this far to the right of the ego's heading, and down (chosen: from above few words overlap)."""
+"""Direction of view, right of the ego's heading and down: from so high few words overlap."""
 ABOVE_RAD = np.deg2rad(75.0)
-"""The eye on the units looks so far down (chosen: fields of view are hardly foreshortened)."""
+"""Downward angle of the camera on the units: fields of view are hardly foreshortened."""
 EYE_RAD, MARGIN_M = np.deg2rad(55.0), 2.5
-"""The viewer's vertical field of view, and room around places (chosen)."""
+"""The viewer's vertical field of view, and room around centres: half the length of a car."""
 NEAR_FAR_M, FOLLOWING_M, CLOSE_M = (20.0, 150.0), (18.0, 48.0), (20.0, 38.0)
-"""How far the eye is from what it looks at, at least and at most; of an ego that it follows; of an object that it
-follows (chosen: from farther away people are a few pixels)."""
+"""Least and greatest distance from camera to target: not following, following the ego, following an object. From
+farther away people are a few pixels."""
 
 
 @dataclass(frozen=True)
-class Eye:
-    """Where it is and what it looks at, `(3,)` each; what it follows: an object by its index, or a place
-    beside it, metres `ahead_m` and `left_m` of it.
+class Camera:
+    """Place and target of a camera, `(3,)` each, as seen from the entity `path`.
 
-    An eye that follows is as seen from the entity `path`, which moves: a view with that origin shows the same whenever
-    it is first drawn. `at_m`: what it looks at in the world, at the onset.
+    A camera that follows has a `path` that moves with object `object_ix`, `ahead_m` and `left_m` of it: a view with
+    that origin shows the same whenever it is first drawn. `at_m`: the target in the world, at the onset.
     """
 
     place_m: Float
@@ -48,86 +47,90 @@ class Eye:
     path: tuple[str, ...] = ("world",)
 
 
-def eye_on(replay: Replay, experiment: Experiment, table: pd.DataFrame, first: int | None, wide: float) -> Eye:
-    """So that the object `first` is in view from the ego's side at the log's start and at its onset.
+def camera_on_object(
+    replay: Replay, experiment: Experiment, table: pd.DataFrame, first: int | None, aspect: float
+) -> Camera:
+    """A camera with object `first` in view, from the ego's side, at the log's start and at the object's onset.
 
-    Where no ego or unit is followed: so that the ways of all objects of the table are. `wide`: how much wider a view is
-    than high.
+    Without an ego or a carried unit to follow, the paths of all objects of the table are in view. `wide`: width of a
+    view by its height.
     """
-    truth, scene, unit = replay.truth, replay.scene, _followed(replay.scene, experiment)
+    truth, scene, unit = replay.truth, replay.scene, _followed_unit(replay.scene, experiment)
     episodes = table.drop_duplicates("object_id")
-    on = carrier(scene, experiment.units[unit]) if unit is not None else -1
-    of_first = episodes["onset_s"][episodes["object_id"] == (scene.object_ids[first] if first is not None else None)]
-    if on >= 0 and first is not None and len(of_first):
-        # The onset first: the eye is turned as the ego is then.
-        time_s = np.array([float(of_first.iloc[0]), 0.0])
-        own, other = (_states(replay, experiment, np.full(2, k), time_s) for k in (on, first))
-        shared = np.flatnonzero(~np.isnan(own[0]) & ~np.isnan(other[0]))
+    on = find_carrier(scene, experiment.units[unit]) if unit is not None else -1
+    first_onset_s = episodes["onset_s"][
+        episodes["object_id"] == (scene.object_ids[first] if first is not None else None)
+    ]
+    if on >= 0 and first is not None and len(first_onset_s):
+        # The onset first: its heading of the ego turns the camera.
+        time_s = np.array([float(first_onset_s.iloc[0]), 0.0])
+        own, followed = (_interpolate_states(replay, experiment, np.full(2, k), time_s) for k in (on, first))
+        shared = np.flatnonzero(~np.isnan(own[0]) & ~np.isnan(followed[0]))
         if len(shared):
             yaw_rad = own[3, shared[0]]
-            off = other[:3, shared] - own[:3, shared]
+            off = followed[:3, shared] - own[:3, shared]
             cos, sin = np.cos(own[3, shared]), np.sin(own[3, shared])
             half = np.array([cos[0] * off[0, 0] + sin[0] * off[1, 0], cos[0] * off[1, 0] - sin[0] * off[0, 0]]) / 2
             half *= min(1.0, FARTHEST_BESIDE_M / max(float(np.hypot(*half)), 1e-9))
             ahead_m, left_m = (round(float(way), 1) for way in half)
             middle = np.stack([ahead_m * cos - left_m * sin, ahead_m * sin + left_m * cos, 0 * cos])
             places = np.concatenate([off - middle, -middle], axis=1)
-            at_m, towards = own[:3, shared[0]] + middle[:, 0], _ahead(yaw_rad)
-            place = -_distance(places, towards, FOLLOWING_M, wide) * towards
-            return Eye(np.round(place, 1), np.zeros(3), at_m, on, ahead_m, left_m, (*EYES, "ego"))
+            at_m, towards = own[:3, shared[0]] + middle[:, 0], _view_direction(yaw_rad)
+            place = -_fitting_distance(places, towards, FOLLOWING_M, aspect) * towards
+            return Camera(np.round(place, 1), np.zeros(3), at_m, on, ahead_m, left_m, (*EYES, "ego"))
     measured = episodes["object_id"].map(scene.object_number).to_numpy(dtype=np.int64)
     rows = np.flatnonzero(np.isin(truth.row_object_ix, measured if len(measured) else truth.object_ix))
     place = np.stack([truth.x_m[0, rows], truth.y_m[0, rows], truth.z_m[0, rows]])
-    named = experiment.units.get(experiment.measure.distance_to)
-    if named is not None and named.at is not None:
-        unit_at = np.array([*named.at, place[2].mean() if place.size else 0.0])[:, None]
+    distance_unit = experiment.units.get(experiment.measure.distance_to)
+    if distance_unit is not None and distance_unit.at is not None:
+        unit_at = np.array([*distance_unit.at, place[2].mean() if place.size else 0.0])[:, None]
         near = np.hypot(*(place - unit_at)[:2]) <= AROUND_UNIT_M
         place = np.concatenate([place[:, near if near.any() else slice(None)], unit_at], axis=1)
     if not place.size:
-        return Eye(np.array([-14.0, 0.0, 30.0]), np.zeros(3), np.zeros(3))
-    target, towards = place.mean(axis=1), _ahead(0.0)
-    eye = target - _distance(place - target[:, None], towards, NEAR_FAR_M, wide) * towards
-    return Eye(np.round(eye, 1), np.round(target, 1), target)
+        return Camera(np.array([-14.0, 0.0, 30.0]), np.zeros(3), np.zeros(3))
+    target, towards = place.mean(axis=1), _view_direction(0.0)
+    eye = target - _fitting_distance(place - target[:, None], towards, NEAR_FAR_M, aspect) * towards
+    return Camera(np.round(eye, 1), np.round(target, 1), target)
 
 
-def eye_after(replay: Replay, experiment: Experiment, table: pd.DataFrame, object_ix: int) -> Eye:
-    """One that follows an object of the table, so near that the ego is in view at the onset, if it can be."""
+def camera_following(replay: Replay, experiment: Experiment, table: pd.DataFrame, object_ix: int) -> Camera:
+    """A camera that follows an object of the table, with the ego in view at the onset if `CLOSE_M` allows."""
     scene = replay.scene
     onset_s = table["onset_s"][table["object_id"] == scene.object_ids[object_ix]].to_numpy(dtype=float)[:1]
-    target = _states(replay, experiment, np.array([object_ix]), onset_s)[:3, 0]
-    unit = _followed(scene, experiment)
-    on = carrier(scene, experiment.units[unit]) if unit is not None else -1
-    own = _states(replay, experiment, np.array([max(on, 0)]), onset_s)[:, 0]
-    there = on >= 0 and not np.isnan(own[0])
-    towards = _ahead(own[3] if there else 0.0)
-    away_m = float(np.clip(np.hypot(*(own - np.append(target, 0))[:2]) if there else 0.0, *CLOSE_M))
+    target = _interpolate_states(replay, experiment, np.array([object_ix]), onset_s)[:3, 0]
+    unit = _followed_unit(scene, experiment)
+    on = find_carrier(scene, experiment.units[unit]) if unit is not None else -1
+    own = _interpolate_states(replay, experiment, np.array([max(on, 0)]), onset_s)[:, 0]
+    has_ego = on >= 0 and not np.isnan(own[0])
+    towards = _view_direction(own[3] if has_ego else 0.0)
+    away_m = float(np.clip(np.hypot(*(own - np.append(target, 0))[:2]) if has_ego else 0.0, *CLOSE_M))
     path = (*EYES, entity_names(scene)[object_ix])
-    return Eye(np.round(-away_m * towards, 1), np.zeros(3), np.nan_to_num(target), object_ix, path=path)
+    return Camera(np.round(-away_m * towards, 1), np.zeros(3), np.nan_to_num(target), object_ix, path=path)
 
 
-def eye_above(places_m: Float, other: Eye) -> Eye:
-    """One that looks down on places (3, K) and on what another eye looks at, turned as that is; it follows nothing."""
-    place = np.concatenate([places_m, other.at_m[:, None]], axis=1)
+def camera_above(places_m: Float, eye: Camera) -> Camera:
+    """A camera that looks down on places (3, K) and on the target of `eye`, in its direction; it follows nothing."""
+    place = np.concatenate([places_m, eye.at_m[:, None]], axis=1)
     target = (place.min(axis=1) + place.max(axis=1)) / 2
-    turned = float(np.arctan2(*(other.target_m - other.place_m)[[1, 0]]))
+    turned = float(np.arctan2(*(eye.target_m - eye.place_m)[[1, 0]]))
     towards = np.array([np.cos(turned), np.sin(turned), -np.tan(ABOVE_RAD)])
     towards /= np.linalg.norm(towards)
-    away_m = _distance(place - target[:, None], towards, NEAR_FAR_M, 1.5)
-    return Eye(np.round(target - away_m * towards, 1), np.round(target, 1), target)
+    away_m = _fitting_distance(place - target[:, None], towards, NEAR_FAR_M, 1.5)
+    return Camera(np.round(target - away_m * towards, 1), np.round(target, 1), target)
 
 
-def seen_from(eye: Eye, offset_m: Float, wide: float) -> bool:
-    """Whether a place (3,), as seen from what the eye looks at, is in the picture."""
+def is_in_picture(eye: Camera, offset_m: Float, aspect: float) -> bool:
+    """Whether a place (3,), relative to the camera's target, is in the picture."""
     towards = (eye.target_m - eye.place_m) / np.linalg.norm(eye.target_m - eye.place_m)
     right = np.array([towards[1], -towards[0], 0]) / np.hypot(*towards[:2])
     depth = float(np.linalg.norm(eye.target_m - eye.place_m) + offset_m @ towards)
     high = depth * np.tan(EYE_RAD / 2)
     up = np.cross(right, towards)
-    return bool(depth > 0 and abs(up @ offset_m) <= high and abs(right @ offset_m) <= wide * high)
+    return bool(depth > 0 and abs(up @ offset_m) <= high and abs(right @ offset_m) <= aspect * high)
 
 
-def follow(out: Out, replay: Replay, eye: Eye) -> None:
-    """Where the eye's origin is: on the ground at or beside what it follows; not turned."""
+def write_camera_origin(out: RecordingSink, replay: Replay, eye: Camera) -> None:
+    """Write the entity that a camera follows: on the ground at or beside the object, not rotated."""
     import rerun as rr
 
     if eye.object_ix is None:
@@ -135,42 +138,44 @@ def follow(out: Out, replay: Replay, eye: Eye) -> None:
     truth = replay.truth
     rows = np.flatnonzero(truth.row_object_ix == eye.object_ix)
     yaw_rad = truth.yaw_rad[0, rows]
-    x_m, y_m = moved(truth.x_m[0, rows], truth.y_m[0, rows], yaw_rad, (eye.ahead_m, eye.left_m))
-    place = f32(x_m, y_m, truth.z_m[0, rows] - truth.height_m[0, rows] / 2)
-    elapsed = ns(truth.row_captured_s[rows])
-    if elapsed[0] > 0:  # before it comes the eye waits for it
+    x_m, y_m = offset_places(truth.x_m[0, rows], truth.y_m[0, rows], yaw_rad, (eye.ahead_m, eye.left_m))
+    place = stack_float32(x_m, y_m, truth.z_m[0, rows] - truth.height_m[0, rows] / 2)
+    elapsed = to_nanoseconds(truth.row_captured_s[rows])
+    if elapsed[0] > 0:  # before the object comes, the camera waits where it will
         elapsed, place = np.append(0, elapsed), np.concatenate([place[:1], place])
     out.columns(eye.path, elapsed, rr.Transform3D.columns(translation=place))
 
 
-def _followed(scene: Scene, experiment: Experiment) -> str | None:
-    """The ego's first unit; without an ego the unit from which distances are measured, if it is carried."""
+def _followed_unit(scene: Scene, experiment: Experiment) -> str | None:
+    """The first unit on the ego; without an ego the unit from which distances are measured, if it is carried."""
     for name, unit in experiment.modelled.items():
-        if carrier(scene, unit) == scene.ego_ix >= 0:
+        if find_carrier(scene, unit) == scene.ego_ix >= 0:
             return name
     to = experiment.measure.distance_to
     carried = to in experiment.units and experiment.units[to].on is not None
-    return to if scene.ego_ix < 0 and carried and carrier(scene, experiment.units[to]) >= 0 else None
+    return to if scene.ego_ix < 0 and carried and find_carrier(scene, experiment.units[to]) >= 0 else None
 
 
-def _states(replay: Replay, experiment: Experiment, objects: Int, time_s: Float) -> Float:
-    """(4, K) places and headings of objects at times, NaN where they are not there."""
-    at, _ = states_at(replay.truth, objects, time_s, t0_ns=replay.scene.t0_ns, max_gap_s=experiment.max_gap_s)
-    return np.stack([at["x_m"], at["y_m"], at["z_m"], at["yaw_rad"]])
+def _interpolate_states(replay: Replay, experiment: Experiment, objects: Int, time_s: Float) -> Float:
+    """(4, K) x, y, z and heading of objects at times, NaN while absent."""
+    states, _ = interpolate_states(
+        replay.truth, objects, time_s, t0_ns=replay.scene.t0_ns, max_gap_s=experiment.max_gap_s
+    )
+    return np.stack([states["x_m"], states["y_m"], states["z_m"], states["yaw_rad"]])
 
 
-def _ahead(yaw_rad: float) -> Float:
-    """Where the eye looks: along the ego's way, from its left, down. Views are wide, so ways should run across."""
+def _view_direction(yaw_rad: float) -> Float:
+    """(3,) the direction of view, down and from the ego's left: its path runs across the picture, which is wide."""
     turned = yaw_rad - TURNED_RAD
     ahead = np.array([np.cos(turned), np.sin(turned), -np.tan(DOWN_RAD)])
     unit: Float = ahead / np.linalg.norm(ahead)
     return unit
 
 
-def _distance(place_m: Float, ahead: Float, within_m: tuple[float, float], wide: float) -> float:
-    """From how far the places (3, K) around the middle of the picture are all in it."""
+def _fitting_distance(place_m: Float, ahead: Float, within_m: tuple[float, float], aspect: float) -> float:
+    """The distance, within `within_m`, from which all places (3, K), relative to the target, are in the picture."""
     right = np.array([ahead[1], -ahead[0], 0]) / np.hypot(*ahead[:2])
     up = np.cross(right, ahead)
-    beside = (np.abs(right @ place_m) + MARGIN_M) / (wide * np.tan(EYE_RAD / 2))
+    beside = (np.abs(right @ place_m) + MARGIN_M) / (aspect * np.tan(EYE_RAD / 2))
     above = (np.abs(up @ place_m) + MARGIN_M) / np.tan(EYE_RAD / 2)
     return float(np.clip((np.maximum(beside, above) - ahead @ place_m).max(), *within_m))

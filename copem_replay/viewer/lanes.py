@@ -1,13 +1,16 @@
-"""Lanes: what each shown object is to each configuration over time, changes too short to follow left out.
+"""Lanes: the status of each shown object in each configuration over time, and lost, late and overtaken lists of units.
 
-An entity per object and configuration, `lanes/6_pedestrian/2_PEM`; its number is its place among those of the file. A
-white mark ends at the onset. Nothing is said while the object is absent. Known begins at `detection_s`, to the
-nanosecond, whatever is left out around it.
+An entity per object and configuration, such as `lanes/6_pedestrian/2_PEM`; the number is the configuration's place in
+the file. Changes too short to follow are left out, but known begins exactly at `detection_s`. A white mark ends at the
+onset. A lane is empty while the object is absent.
+
+An entity per configuration and unit, such as `lists/2_bursts/rsu1`, under the lanes of the objects, shows lists sent by
+a link, if one did not come in time; events say it in words.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -15,108 +18,286 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pyarrow as pa
 
+from copem_replay.communication.arrivals import find_overtaken_lists
 from copem_replay.core.colours import Rgb
-from copem_replay.core.tracks import TRUTH, Int, Scene
+from copem_replay.core.fused_tracks import FusedTracks
+from copem_replay.core.tracks import SAME_INSTANT_S, TRUTH, Float, Int, Scene
 from copem_replay.experiment.schema import Experiment
-from copem_replay.viewer.palette import ONSET, status_colour
-from copem_replay.viewer.reasons import body_name, lane_text
-from copem_replay.viewer.sink import Out, lane_path, short_ids
-from copem_replay.viewer.statuses import ABSENT, HIDDEN, KNOWN
+from copem_replay.viewer.sink import (
+    ABSENT,
+    CAPTURED,
+    HIDDEN,
+    KNOWN,
+    ONSET,
+    STATUS,
+    UNMATCHED,
+    RecordingSink,
+    configuration_part,
+    lane_path,
+    make_distinct,
+    plain_part,
+    short_ids,
+    status_colour,
+    to_nanoseconds,
+)
+from copem_replay.viewer.sink import LOST as LIST_LOST
+from copem_replay.viewer.status import EpisodeClocks, Status, body_name, lane_text
 
 if TYPE_CHECKING:
     from copem_replay.viewer.line_of_sight import Sight
-    from copem_replay.viewer.status import Clock, Status
+
 
 STEADY_S = 0.4
-"""What lasts less than this is told with what is around it (chosen: shorter words are not read)."""
+"""Shorter spans become part of those around them: their words could not be read."""
 MARK = 1 / 80
-"""How long the mark is that ends at the onset, as a share of the axis (chosen: it is seen)."""
+"""Length of the mark that ends at the onset, as a share of the axis: just wide enough to be visible."""
 ONSET_IS = "onset"
 _STEADY_NS = round(STEADY_S * 1e9)
 
 
 @dataclass(frozen=True)
 class Span:
-    """The status in the instants from `first` to before `end`, for the most part."""
+    """The prevailing status of the instants `first` to `end`, without `end`."""
 
     first: int
     end: int
     status: int
 
 
-def lanes(
-    out: Out, scene: Scene, experiment: Experiment, seen: Sight, made: Mapping[str, Status],
-    colours: Mapping[str, Rgb], clocks: Mapping[str, Clock], axes: Mapping[int, tuple[float, float]],
+def write_lanes(
+    out: RecordingSink, scene: Scene, experiment: Experiment, sight: Sight, statuses: Mapping[str, Status],
+    colours: Mapping[str, Rgb], clocks: Mapping[str, EpisodeClocks], axes: Mapping[int, tuple[float, float]],
 ) -> None:  # fmt: skip
-    """Of each shown object a lane per configuration, with a mark that ends at the onset. `axes`: from when to when each
-    object is looked at (s).
+    """Write a lane per shown object and configuration, with a mark that ends at the onset.
+
+    `axes`: first and last second of each object's axis, by its index.
     """
     import rerun as rr
 
     ids, units = short_ids(scene), [*experiment.units, TRUTH]
-    for m, k in enumerate(seen.object_ix.tolist()):
+    for m, k in enumerate(sight.object_ix.tolist()):
         mark_ns = round((axes[k][1] - axes[k][0]) * MARK * 1e9)
-        for place, (name, of) in enumerate(made.items()):
-            if not len(of.elapsed_ns):
+        for place, (name, status) in enumerate(statuses.items()):
+            if not len(status.elapsed_ns):
                 continue
-            spans = steady(of.elapsed_ns, of.status[:, m])
-            texts = [_text(ids, units, seen, of, m, span) for span in spans]
+            spans = smooth_status(status.elapsed_ns, status.status[:, m])
+            texts = [_span_text(ids, units, sight, status, m, span) for span in spans]
             tints = [status_colour(span.status, colours[name]) if span.status else ONSET for span in spans]
             style = {text: tint for text, tint in zip(texts, tints, strict=True) if text} | {ONSET_IS: ONSET}
-            begins = of.elapsed_ns[[span.first for span in spans]]
-            elapsed, texts = _with_onset(begins, texts, int(clocks[name].onset_ns[k]), mark_ns)
+            begins = status.elapsed_ns[[span.first for span in spans]]
+            elapsed, texts = _insert_onset(begins, texts, int(clocks[name].onset_ns[k]), mark_ns)
             path = lane_path(scene, k, place, name)
-            said = [text for text in texts if text is not None]  # while it is absent the row is empty
-            states = rr.StateChange.columns(state=pa.array(said, pa.string()))
+            labels = [text for text in texts if text is not None]  # the row is empty while the object is absent
+            states = rr.StateChange.columns(state=pa.array(labels, pa.string()))
             out.columns(path, elapsed, states.partition(np.array([text is not None for text in texts], dtype=np.int64)))
             values = list(style)
             out.static(path, rr.StateConfiguration(values=values, labels=values, colors=list(style.values())))
 
 
-def steady(elapsed_ns: Int, status: Int) -> list[Span]:
-    """A status (K,) without what passes sooner than `STEADY_S`.
+def smooth_status(elapsed_ns: Int, status: Int) -> list[Span]:
+    """The spans of a status (K,), none shorter than `STEADY_S`.
 
-    Statuses that follow on each other faster are one span, of the one that lasts longest of all of them; what is too
-    short even then goes on as what was before. The first time that the object is known is told, however short.
+    A sequence of shorter statuses becomes one span, of the status with the longest total duration. A sequence that is
+    too short as a whole continues the span before. The first span in which the object is known stays, however short.
     """
     first = np.flatnonzero(np.diff(status, prepend=-1))
-    what, lasts = status[first], np.diff(elapsed_ns[first], append=elapsed_ns[-1] + _STEADY_NS)
-    told = lasts >= _STEADY_NS
-    told[np.flatnonzero(what == KNOWN)[:1]] = True
+    values, lasts = status[first], np.diff(elapsed_ns[first], append=elapsed_ns[-1] + _STEADY_NS)
+    long_enough = lasts >= _STEADY_NS
+    long_enough[np.flatnonzero(values == KNOWN)[:1]] = True
     spans: list[Span] = []
     k = 0
     while k < len(first):
         end = k + 1
-        if not told[k]:
-            end = next((n for n in range(k, len(first)) if told[n]), len(first))
-        of_each = np.bincount(what[k:end], weights=lasts[k:end])
-        if told[k] or not spans or of_each.sum() >= _STEADY_NS:
-            spans.append(Span(int(first[k]), len(status), int(of_each.argmax())))
+        if not long_enough[k]:
+            end = next((n for n in range(k, len(first)) if long_enough[n]), len(first))
+        duration_by_status = np.bincount(values[k:end], weights=lasts[k:end])
+        if long_enough[k] or not spans or duration_by_status.sum() >= _STEADY_NS:
+            spans.append(Span(int(first[k]), len(status), int(duration_by_status.argmax())))
         k = end
-    kept = [span for n, span in enumerate(spans) if n == 0 or span.status != spans[n - 1].status]
-    return [replace(span, end=after.first) for span, after in pairwise([*kept, Span(len(status), 0, 0)])]
+    merged = [span for n, span in enumerate(spans) if n == 0 or span.status != spans[n - 1].status]
+    return [replace(span, end=after.first) for span, after in pairwise([*merged, Span(len(status), 0, 0)])]
 
 
-def _text(ids: Sequence[str], units: Sequence[str], seen: Sight, of: Status, m: int, span: Span) -> str | None:
-    """The text of a span: the unit, or what hides the object, for the most part of it."""
+def _span_text(
+    ids: Sequence[str], units: Sequence[str], sight: Sight, status: Status, m: int, span: Span
+) -> str | None:
+    """The text of a span, with its most frequent unit and hiding body; None while the object is absent."""
     if span.status == ABSENT:
         return None
     rows = np.arange(span.first, span.end)
-    rows = rows[of.status[rows, m] == span.status]
-    unit = of.unit_ix[rows, m]
-    body = seen.body_ix[unit, np.maximum(of.frame[rows], 0), m] if span.status == HIDDEN else np.zeros_like(unit)
+    rows = rows[status.status[rows, m] == span.status]
+    unit = status.unit_ix[rows, m]
+    body = sight.body_ix[unit, np.maximum(status.frame[rows], 0), m] if span.status == HIDDEN else np.zeros_like(unit)
     pairs, count = np.unique(np.stack([unit, body]), axis=1, return_counts=True)
     by, what = pairs[:, count.argmax()].tolist()
-    return lane_text(span.status, units[by], body_name(ids, seen.solids, what))
+    return lane_text(span.status, units[by], body_name(ids, sight.solids, what))
 
 
-def _with_onset(
+def _insert_onset(
     elapsed_ns: Int, texts: Sequence[str | None], onset_ns: int, mark_ns: int
 ) -> tuple[Int, list[str | None]]:
-    """A mark before the onset, and from there on what holds then; none where the log begins with it."""
+    """Instants and texts with a mark before the onset, unless the lane begins later than the mark would."""
     begin = onset_ns - mark_ns
     if not elapsed_ns[0] <= begin:
         return elapsed_ns, list(texts)
     before, after = int(np.searchsorted(elapsed_ns, begin)), int(np.searchsorted(elapsed_ns, onset_ns, side="right"))
     instants = np.concatenate([elapsed_ns[:before], [begin, onset_ns], elapsed_ns[after:]])
     return instants, [*texts[:before], ONSET_IS, texts[after - 1], *texts[after:]]
+
+
+# Lists that units send by a link, in the shown run: lost, late or overtaken.
+
+FATES = ("in time", "lost", "late", "overtaken")
+IN_TIME, LOST, LATE, OVERTAKEN = range(len(FATES))
+COLOURS: dict[int, Rgb] = {LOST: STATUS[LIST_LOST], LATE: STATUS[CAPTURED], OVERTAKEN: STATUS[UNMATCHED]}
+"""Colours in lanes, as in an object's lane: lost, captured (under way) and unmatched."""
+QUIET_S, TOLD_S = 1.0, 5.0
+"""Lists of one fate share a row of the events if they are no more than the first apart, up to the second after the
+row's first list, or if no other list is between them. A burst is a row, ten minutes of single losses are 120."""
+LANES = 13
+"""Most lanes of configurations and units under one object: as many fit into a height of 720 points."""
+
+
+@dataclass(frozen=True)
+class UnitLists:
+    """The lists (L,) that one unit sends by a link in one run, in order of capture.
+
+    `arrives_s`: inf for a lost list. `fate`: index into FATES. `path`: the entity of the lane.
+    """
+
+    unit: str
+    path: tuple[str, ...]
+    captured_s: Float
+    arrives_s: Float
+    fate: Int
+    interval_s: float
+
+    @property
+    def elapsed_ns(self) -> Int:
+        """(L,) captures, ns since the log's start."""
+        result: Int = to_nanoseconds(self.captured_s)
+        return result
+
+
+def find_linked_lists(fused_tracks: FusedTracks, place: int, name: str, max_age_s: float) -> list[UnitLists]:
+    """The lists of each unit that sends by a link in a configuration; `place`: index of the configuration in the file.
+
+    Late: on its way for longer than `max_age_s`, or for longer than the median by more than one interval of the unit's
+    lists. Overtaken: arrives later than a newer list of the unit; lists that arrive at one tick arrive together.
+    """
+    heard, by_link = fused_tracks.heard, fused_tracks.by_link
+    if by_link is None:
+        return []
+    late_after_newer, linked = find_overtaken_lists(heard), []
+    for k, entity in enumerate(make_distinct([plain_part(unit) for unit in heard.units])):
+        frames = np.flatnonzero(by_link & (heard.frame_unit_ix == k))
+        if not len(frames):
+            continue
+        frames = frames[np.argsort(heard.captured_s[frames], kind="stable")]
+        captured_s, arrives_s = heard.captured_s[frames], heard.common_arrives_s[frames]
+        latency_s, arrived = arrives_s - captured_s, np.isfinite(arrives_s)
+        interval_s = float(np.median(np.diff(captured_s))) if len(frames) > 1 else np.inf
+        usual_s = float(np.median(latency_s[arrived])) if arrived.any() else np.inf
+        late = latency_s > min(max_age_s, usual_s + interval_s) + SAME_INSTANT_S
+        fate = np.select([~arrived, late_after_newer[frames], late], [LOST, OVERTAKEN, LATE], IN_TIME)
+        path = ("lists", f"{place + 1}_{plain_part(name)}", entity)
+        linked.append(UnitLists(heard.units[k], path, captured_s, arrives_s, fate, interval_s))
+    return linked
+
+
+def write_list_fates(out: RecordingSink, name: str, lists: Sequence[UnitLists]) -> None:
+    """Write an event for each lost, late or overtaken list of a configuration, or for several such lists in a row."""
+    import rerun as rr
+
+    rows = sorted(
+        (
+            float(unit_lists.captured_s[group[0]]),
+            "WARN" if fate == LOST else "INFO",
+            f"{name}: {_describe_fates(unit_lists, fate, group)}",
+        )
+        for unit_lists in lists
+        for fate in (LOST, LATE, OVERTAKEN)
+        for group in _group_fates(unit_lists, fate)
+    )
+    columns = rr.TextLog.columns(text=[text for _, _, text in rows], level=[level for _, level, _ in rows])
+    out.columns(
+        ["events", configuration_part(name), "lists"], to_nanoseconds([time_s for time_s, _, _ in rows]), columns
+    )
+
+
+def _group_fates(unit_lists: UnitLists, fate: int) -> Iterator[list[int]]:
+    """Indices of the lists of one fate that share a row."""
+    group: list[int] = []
+    for k in np.flatnonzero(unit_lists.fate == fate).tolist():
+        if group and k != group[-1] + 1:
+            since_s = unit_lists.captured_s[k] - unit_lists.captured_s[[group[-1], group[0]]] - SAME_INSTANT_S
+            if since_s[0] > QUIET_S or since_s[1] > TOLD_S:
+                yield group
+                group = []
+        group.append(k)
+    if group:
+        yield group
+
+
+def _describe_fates(unit_lists: UnitLists, fate: int, group: list[int]) -> str:
+    """“rsu1: 7 lists lost, captured 3.20 to 3.80 s, next arrival 3.95 s”."""
+    first, last, n = group[0], group[-1], len(group)
+    count = f"{n} of {last - first + 1} lists" if last - first >= n else f"{n} lists" if n > 1 else "list"
+    parts = [f"{unit_lists.unit}: {count} {FATES[fate]}", f"captured {_format_times(unit_lists.captured_s[group])}"]
+    if fate == LOST:
+        next_s = unit_lists.arrives_s[last + 1 :].min(initial=np.inf)
+        parts.append(f"next arrival {next_s:.2f} s" if np.isfinite(next_s) else "none arrives after")
+    else:
+        parts.append(f"arrived {_format_times(unit_lists.arrives_s[group])}")
+    return ", ".join(parts)
+
+
+def _format_times(time_s: Float) -> str:
+    first, last = f"{time_s.min():.2f}", f"{time_s.max():.2f}"
+    return f"{first} s" if first == last else f"{first} to {last} s"
+
+
+def write_list_lanes(out: RecordingSink, lists: Sequence[UnitLists]) -> None:
+    """Write a lane for each unit with a lost, late or overtaken list, which lasts until the next capture."""
+    import rerun as rr
+
+    for unit_lists in lists:
+        if not unit_lists.fate.any():
+            continue
+        first = np.flatnonzero(np.diff(unit_lists.fate, prepend=IN_TIME))
+        counts = np.diff(first, append=len(unit_lists.fate))
+        fate, begins = unit_lists.fate[first], unit_lists.elapsed_ns[first]
+        texts = [FATES[f] if n == 1 else f"{n} {FATES[f]}" for f, n in zip(fate.tolist(), counts.tolist(), strict=True)]
+        if fate[-1] != IN_TIME:  # the last list ends after an interval
+            fate, begins = (
+                np.append(fate, IN_TIME),
+                np.append(begins, unit_lists.elapsed_ns[-1] + to_nanoseconds(min(unit_lists.interval_s, 1.0))),
+            )
+        marked = fate != IN_TIME
+        labels = [text for text, is_told in zip(texts, marked.tolist(), strict=False) if is_told]
+        states = rr.StateChange.columns(state=pa.array(labels, pa.string()))
+        out.columns(unit_lists.path, begins, states.partition(marked.astype(np.int64)))
+        style = dict(zip(labels, (COLOURS[f] for f in fate[marked].tolist()), strict=True))
+        values = list(style)
+        out.static(unit_lists.path, rr.StateConfiguration(values=values, labels=values, colors=list(style.values())))
+
+
+def select_list_lanes(lists: Mapping[str, Sequence[UnitLists]], axis_s: tuple[float, float]) -> list[tuple[str, ...]]:
+    """Entities of the lanes of lists shown under an object with this time axis, in the order of configurations.
+
+    Lanes with marks on the axis; of too many for `LANES`, those with the most.
+    """
+    marked = [
+        (
+            int(
+                np.count_nonzero(
+                    unit_lists.fate[(unit_lists.captured_s >= axis_s[0]) & (unit_lists.captured_s <= axis_s[1])]
+                )
+            ),
+            unit_lists.path,
+        )
+        for units in lists.values()
+        for unit_lists in units
+    ]
+    most = sorted(marked, key=lambda entry: -entry[0])[: LANES - len(lists)]
+    return [path for count, path in marked if count and (count, path) in most]

@@ -1,52 +1,66 @@
-"""The `.rrd` file: complete under its name, or not there."""
+"""Write one run of one log as a Rerun recording (`.rrd`), with all that the viewer shows of it."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
 from copem_replay.core.colours import Rgb, configuration_colours
 from copem_replay.core.fused_tracks import FusedTracks
-from copem_replay.core.tracks import TRUTH, Float, Int
+from copem_replay.core.object_list import Entries
+from copem_replay.core.tracks import TRUTH, Bool, Float, Int, Tracks, splice_rows
 from copem_replay.experiment.schema import Experiment
 from copem_replay.perception.observation import Observations
+from copem_replay.pipeline.one_run import share_curves
 from copem_replay.pipeline.prepare import Replay
-from copem_replay.pipeline.visibility_curves import share_curves
-from copem_replay.viewer import (
-    boxes,
-    curves,
-    differences,
-    event_markers,
-    lanes,
-    legend,
-    sensors,
-    status_drawing,
-    text_panels,
+from copem_replay.results.write import MCAP, Exporter, RunToExport
+from copem_replay.viewer import boxes, curves, lanes, sensors
+from copem_replay.viewer.blueprint import NEAR_BY, RecordingContent, build_blueprint, view_aspect, write_legend_bars
+from copem_replay.viewer.camera import camera_above, camera_following, camera_on_object, write_camera_origin
+from copem_replay.viewer.curves import write_differences
+from copem_replay.viewer.events import (
+    mark_curves,
+    mark_detections,
+    mark_onsets,
+    write_difference_text,
+    write_event_texts,
+    write_legend_text,
+    write_onset_texts,
+    write_summary_text,
 )
-from copem_replay.viewer.axes import axis_s
-from copem_replay.viewer.blueprint import aspect, blueprint
-from copem_replay.viewer.camera import eye_above, eye_after, eye_on, follow
-from copem_replay.viewer.kept import Kept
-from copem_replay.viewer.line_of_sight import Sight, sight
-from copem_replay.viewer.linked_lists import UnitLists, linked_lists, list_lanes, lists_in_words
-from copem_replay.viewer.pages import NEAR_BY, Content
-from copem_replay.viewer.selection import Part, in_parts, measured
-from copem_replay.viewer.sensors import named_units
-from copem_replay.viewer.sink import Out, digest, entity_names, part_of
-from copem_replay.viewer.status import clock_of, status_of
-from copem_replay.viewer.stream import Live, file_stream
-from copem_replay.viewer.unit_faults import FaultsShown
+from copem_replay.viewer.lanes import UnitLists, find_linked_lists, write_list_fates, write_list_lanes
+from copem_replay.viewer.line_of_sight import Sight, compute_sight
+from copem_replay.viewer.sensors import FaultsShown, choose_named_units
+from copem_replay.viewer.sink import (
+    RecordingPart,
+    RecordingSink,
+    ViewerStream,
+    axis_s,
+    choose_measured_objects,
+    configuration_part,
+    digest_texts,
+    entity_names,
+    file_stream,
+    split_into_files,
+)
+from copem_replay.viewer.status import (
+    compute_status,
+    read_episode_clocks,
+    write_hiding_lines,
+    write_listing_lines,
+    write_status_words,
+)
 
-if TYPE_CHECKING:  # a second to import: only where something is written
-    from rerun import blueprint as rrb
+if TYPE_CHECKING:
+    from rerun import build_blueprint as rrb
 
 
 def write_rrd(
@@ -62,190 +76,204 @@ def write_rrd(
     baseline: str | None = None,
     viewer: str | None = None,
 ) -> list[str]:
-    """Write one run of one log, and send it to a viewer, too. Returns notes for the user. Raises OutputError.
+    """Write one run of one log to a file and, with an address, to a viewer. Returns notes. Raises OutputError.
 
-    Of more than six configurations there are further files beside it, `replay.configurations_7-12.rrd`. Colours go by
-    the place among the experiment's configurations, whichever of them are written.
+    More than six configurations go into several files, such as `replay.configurations_7-12.rrd`. Colours depend on the
+    places of all of the experiment's configurations, also of those that are not written.
 
-    `run_tracks`: one time chunk after the other, per configuration the receiver's fused tracks in this run, a frame per
-    list it issued (one unit, values (1, P)). `table`: the rows of `detections.parquet` of this log and run. `summary`:
-    of all logs and runs. `run_is`: why it is this run, part of the recording's name. `baseline`: the configuration
-    differences to which are marked.
+    `run_tracks`: by time chunk, the receiver's fused tracks of each configuration in this run, with a frame per issued
+    list (one unit, values (1, P)). `table`: the rows of `detections.parquet` of this log and run. `summary`: over all
+    logs and runs. `run_is`: why this run is shown, part of the recording's name. `baseline`: the configuration to which
+    differences are marked.
     """
-    rest = iter(run_tracks)
-    first = next(rest)
-    parts = in_parts(list(first), baseline)
-    asked = experiment.configurations
-    every = configuration_colours(experiment.configurations)  # by place, so the same in all files of the experiment
-    told = Kept(_measured(replay, experiment, table))
+    later_chunks = iter(run_tracks)
+    first = next(later_chunks)
+    parts = split_into_files(list(first), baseline)
+    colours = configuration_colours(experiment.configurations)  # by place, so equal in all files of the experiment
+    collector = TrackCollector(_measured_indices(replay, experiment, table))
+    objects = collector.object_ix.tolist()
     with ExitStack() as stack:
         files = []
         for part in parts:
-            lists = {
-                name: linked_lists(first[name], k, name, asked[name].max_age_s)
-                for k, name in enumerate(part.configurations)
-            }
-            objects = told.object_ix.tolist()
-            content = _content(replay, experiment, table, part.configurations, objects, lists, baseline)
-            panels, appearance = blueprint(content)
-            what = (experiment.model_dump_json(), replay.scene.log, str(run), run_is, part.infix)
+            content = _build_content(replay, experiment, table, part.configurations, objects, first, baseline)
+            panels, appearance = build_blueprint(content)
+            identity = (experiment.model_dump_json(), replay.scene.log, str(run), run_is, part.infix)
             # The viewer takes two files of one identity for one recording.
-            ids = f"copem_replay:{appearance}", digest(*what)
-            out = stack.enter_context(_streams(part.path(path), ids, replay.scene.t0_ns, viewer))
-            files.append(_File(out, content, {name: every[name] for name in part.configurations}))
-            _begin(files[-1], panels, summary, run, run_is, [p.path(path).name for p in parts if p != part])
-        chunks = chain(iter([first]), rest)
+            ids = f"copem_replay:{appearance}", digest_texts(*identity)
+            out = stack.enter_context(_open_streams(part.path(path), ids, replay.scene.t0_ns, viewer))
+            files.append(_RecordingFile(out, content, {name: colours[name] for name in part.configurations}))
+            _begin_file(files[-1], panels, summary, run, run_is, [p.path(path).name for p in parts if p != part])
         if baseline is not None:  # of all objects at once: such a log is not long
             for file in files:
-                of = file.content
-                kept = {name: first[name] for name in file.colours}
-                differences.differences(file.out, replay, experiment, kept, table, baseline, of.objects, file.colours)
-        faults = [FaultsShown(file.out, replay, experiment) for file in files]
-        del first  # one chunk's is held at a time
-        for chunk in chunks:
-            for file, shown in zip(files, faults, strict=True):
-                _fused(file, chunk)
-                shown.add(chunk)
-            told.add(chunk)
-        whole, found = told.whole(), replay.rows_of(told.object_ix)
-        seen = sight(replay, experiment, told.object_ix.tolist(), found)
-        for file in files:
-            _knowledge(file, whole, seen)
-            _shares(file, found)
-    return list(_notes(path, parts, [file.out.live for file in files]))
+                shown = {name: first[name] for name in file.colours}
+                write_differences(file.out, replay, experiment, shown, table, baseline, objects, file.colours)
+        chunks = chain(iter([first]), later_chunks)
+        del first  # so that only one chunk is held at a time
+        _write_chunks(files, chunks, replay, experiment, collector)
+    return list(_list_notes(path, parts, [file.out.live for file in files]))
 
 
 @dataclass(frozen=True)
-class _File:
-    """One of the files: where it goes, what it shows, and the colours of its configurations, in order.
+class _RecordingFile:
+    """One of the files: its streams, its content, and the colours of its configurations, in order.
 
-    `last_gospa`: by configuration the last point of its curve in the time chunks so far.
+    `last_gospa`: by configuration, the last point of its curve in the time chunks so far.
     """
 
-    out: Out
-    content: Content
+    out: RecordingSink
+    content: RecordingContent
     colours: dict[str, Rgb]
     last_gospa: dict[str, tuple[Int, Float]] = field(default_factory=dict)
 
 
-def _measured(replay: Replay, experiment: Experiment, table: pd.DataFrame) -> list[int]:
-    """Indices of the objects that words, lanes and curves are about: the same in all files."""
+def _measured_indices(replay: Replay, experiment: Experiment, table: pd.DataFrame) -> list[int]:
+    """Indices of the objects that words, lanes and curves are about; all files have the same ones."""
     truths = [name for name, asked in experiment.configurations.items() if asked.units == TRUTH]
-    return [replay.scene.object_number[name] for name in measured(table, truths)]
+    return [replay.scene.object_number[name] for name in choose_measured_objects(table, truths)]
 
 
-def _content(
+def _build_content(
     replay: Replay, experiment: Experiment, table: pd.DataFrame, configurations: Sequence[str], shown: Sequence[int],
-    lists: Mapping[str, Sequence[UnitLists]], baseline: str | None,
-) -> Content:  # fmt: skip
-    wide = aspect(len(configurations))
-    eye = eye_on(replay, experiment, table, shown[0] if len(shown) else None, wide)
-    eyes = [eye_after(replay, experiment, table, k) for k in shown[:NEAR_BY]]
+    first: Mapping[str, FusedTracks], baseline: str | None,
+) -> RecordingContent:  # fmt: skip
+    """What a file with these configurations shows. `first`: fused tracks of the first time chunk, with all lists."""
+    by_name = experiment.configurations
+    lists: dict[str, list[UnitLists]] = {
+        name: find_linked_lists(first[name], k, name, by_name[name].max_age_s) for k, name in enumerate(configurations)
+    }
+    aspect = view_aspect(len(configurations))
+    eye = camera_on_object(replay, experiment, table, shown[0] if len(shown) else None, aspect)
+    eyes = [camera_following(replay, experiment, table, k) for k in shown[:NEAR_BY]]
     scene = replay.scene
     episodes = {k: table[table["object_id"] == scene.object_ids[k]] for k in shown}
     onset_s = float(episodes[shown[0]]["onset_s"].iloc[0]) if len(shown) else 0.0
-    axes_s = {k: axis_s(of_one, scene.end_s) for k, of_one in episodes.items()}
-    named = named_units(replay, experiment, eye.at_m, onset_s)
-    above = eye_above(np.stack([*named.values(), eye.at_m], axis=1), eye)
-    return Content(
-        replay, experiment, table, episodes, configurations, shown, axes_s, eye, eyes, above, list(named), lists,
+    axes_s = {k: axis_s(rows, scene.end_s) for k, rows in episodes.items()}
+    named_units = choose_named_units(replay, experiment, eye.at_m, onset_s)
+    above = camera_above(np.stack([*named_units.values(), eye.at_m], axis=1), eye)
+    return RecordingContent(
+        replay, experiment, table, episodes, configurations, shown, axes_s, eye, eyes, above, list(named_units), lists,
         baseline,
     )  # fmt: skip
 
 
 @contextmanager
-def _streams(path: Path, ids: tuple[str, str], t0_ns: int, viewer: str | None) -> Iterator[Out]:
-    """The file, and the viewer if there is one, for as long as a recording is written. Raises OutputError."""
+def _open_streams(path: Path, ids: tuple[str, str], t0_ns: int, viewer: str | None) -> Iterator[RecordingSink]:
+    """A sink into the file and, with an address, into the viewer; closed at the end. Raises OutputError."""
     import rerun as rr
 
     live = None
     strict = rr.strict_mode()
-    rr.set_strict_mode(True)  # else a column that does not fit is left out with a warning
+    rr.set_strict_mode(True)  # otherwise a wrong column is left out with a warning
     try:
         with file_stream(path, *ids) as rec:
-            live = Live(viewer, *ids) if viewer is not None else None
-            yield Out(rec, t0_ns, live)
+            live = ViewerStream(viewer, *ids) if viewer is not None else None
+            yield RecordingSink(rec, t0_ns, live)
     finally:
         rr.set_strict_mode(strict)
         if live is not None:
             live.close()
 
 
-def _begin(
-    file: _File, panels: rrb.Blueprint, summary: pd.DataFrame, run: int, run_is: str, further: Sequence[str]
+def _begin_file(
+    file: _RecordingFile, panels: rrb.Blueprint, summary: pd.DataFrame, run: int, run_is: str, further: Sequence[str]
 ) -> None:
-    """The layout, made active so that no viewer puts its own guess in its place, and what holds for all of the log."""
+    """Write the layout and everything that does not depend on fused tracks.
+
+    The layout is made active, so that no viewer replaces it by a guess.
+    """
     import rerun as rr
 
-    out, of = file.out, file.content
-    replay, experiment, scene = of.replay, of.experiment, of.replay.scene
+    out, content = file.out, file.content
+    replay, experiment, scene = content.replay, content.experiment, content.replay.scene
     out.send(lambda rec: rec.send_blueprint(panels, make_active=True))
-    for eye in (of.eye, *of.eyes):
-        follow(out, replay, eye)
-    _properties(out, replay, experiment, list(of.configurations), run, run_is)
+    for eye in (content.eye, *content.eyes):
+        write_camera_origin(out, replay, eye)
+    _write_properties(out, replay, experiment, list(content.configurations), run, run_is)
     out.static([], rr.ViewCoordinates.RIGHT_HAND_Z_UP, boxes.names_and_colours(scene))
-    mine = of.table[of.table["configuration"].isin(list(of.configurations))]
-    text_panels.differences(out, replay, mine, of.objects, further)
-    text_panels.summary(out, replay, experiment, summary, run, further)
-    text_panels.legend(out, any(of.lists.values()))
-    legend.bars(out, file.colours)
-    text_panels.onsets(out, scene, of.table)
-    boxes.grid(out, replay.truth)
-    boxes.solids(out, replay.placed)
-    boxes.lane_boundaries(out, replay.lane_boundaries)
-    sensors.units(out, replay, experiment)
-    event_markers.onsets(out, replay, experiment, of.table, of.objects)
-    boxes.truth(out, scene, replay.truth, of.objects)
+    rows = content.table[content.table["configuration"].isin(list(content.configurations))]
+    write_difference_text(out, replay, rows, content.objects, further)
+    write_summary_text(out, replay, experiment, summary, run, further)
+    write_legend_text(out, any(content.lists.values()))
+    write_legend_bars(out, file.colours)
+    write_onset_texts(out, scene, content.table)
+    boxes.write_grid(out, replay.truth)
+    boxes.write_solids(out, replay.placed)
+    boxes.write_lane_boundaries(out, replay.lane_boundaries)
+    sensors.write_units(out, replay, experiment)
+    mark_onsets(out, replay, experiment, content.table, content.objects)
+    boxes.write_truth(out, scene, replay.truth, content.objects)
     for name, colour in file.colours.items():
-        text_panels.events(out, scene, name, of.table[of.table["configuration"] == name])
-        event_markers.detections(out, replay, experiment, of.table, name, of.objects, colour)
-        lists_in_words(out, name, of.lists[name])
-        list_lanes(out, of.lists[name])
+        write_event_texts(out, scene, name, content.table[content.table["configuration"] == name])
+        mark_detections(out, replay, experiment, content.table, name, content.objects, colour)
+        write_list_fates(out, name, content.lists[name])
+        write_list_lanes(out, content.lists[name])
     if len(replay.episodes.object_ix):
-        curves.known(out, replay, "truth", replay.truth)
+        curves.write_known_count(out, replay, "truth", replay.truth)
 
 
-def _fused(file: _File, run_tracks: Mapping[str, FusedTracks]) -> None:
-    """What each configuration knew in a time chunk, of all objects."""
-    out, of = file.out, file.content
+def _write_chunks(
+    files: Sequence[_RecordingFile], chunks: Iterable[Mapping[str, FusedTracks]], replay: Replay,
+    experiment: Experiment, collector: TrackCollector,
+) -> None:  # fmt: skip
+    """Write every time chunk, then what needs the whole log: status, reasons and curves of the shown objects."""
+    faults = [FaultsShown(file.out, replay, experiment) for file in files]
+    for chunk in chunks:
+        for file, shown in zip(files, faults, strict=True):
+            _write_fused(file, chunk)
+            shown.add(chunk)
+        collector.add(chunk)
+    fused_tracks, observed = collector.whole(), replay.rows_of(collector.object_ix)
+    sight = compute_sight(replay, experiment, collector.object_ix.tolist(), observed)
+    for file in files:
+        _write_knowledge(file, fused_tracks, sight)
+        _write_shares(file, observed)
+
+
+def _write_fused(file: _RecordingFile, run_tracks: Mapping[str, FusedTracks]) -> None:
+    """Write boxes, GOSPA and number of known objects of each configuration in a time chunk."""
+    out, content = file.out, file.content
     for name, colour in file.colours.items():
-        boxes.fused_boxes(out, ["world", part_of(name)], of.replay.scene, run_tracks[name], colour)
-        if len(of.replay.episodes.object_ix):
+        boxes.write_fused_boxes(
+            out, ["world", configuration_part(name)], content.replay.scene, run_tracks[name], colour
+        )
+        if len(content.replay.episodes.object_ix):
             before = file.last_gospa.get(name, curves.NO_LIST)
-            file.last_gospa[name] = curves.gospas(out, of.replay, of.experiment, name, run_tracks[name], colour, before)
-            since_ns = clock_of(of.replay.scene, of.table, name).known_ns
-            curves.known(out, of.replay, name, run_tracks[name].fused, colour, since_ns)
+            file.last_gospa[name] = curves.write_gospa(
+                out, content.replay, content.experiment, name, run_tracks[name], colour, before
+            )
+            since_ns = read_episode_clocks(content.replay.scene, content.table, name).known_ns
+            curves.write_known_count(out, content.replay, name, run_tracks[name].fused, colour, since_ns)
 
 
-def _knowledge(file: _File, run_tracks: Mapping[str, FusedTracks], seen: Sight) -> None:
-    """Why, since when, and how far off. `run_tracks`: of the shown objects, over all of the log."""
-    out, of = file.out, file.content
-    replay, experiment, scene = of.replay, of.experiment, of.replay.scene
-    made, clocks = {}, {}
+def _write_knowledge(file: _RecordingFile, run_tracks: Mapping[str, FusedTracks], sight: Sight) -> None:
+    """Write status, reasons and position errors. `run_tracks`: of the shown objects, over the whole log."""
+    out, content = file.out, file.content
+    replay, experiment, scene = content.replay, content.experiment, content.replay.scene
+    statuses, clocks = {}, {}
     for name, colour in file.colours.items():
-        fused_tracks, clock = run_tracks[name], clock_of(scene, of.table, name)
-        made[name], clocks[name] = status_of(replay, experiment, name, fused_tracks, seen, clock), clock
-        status_drawing.words(out, name, replay, experiment, seen, made[name], clock)
-        status_drawing.hiding(out, name, seen, made[name])
-        mine = of.table[(of.table["configuration"] == name) & of.table["detected"]]
-        first_unit = dict(zip(mine["object_id"].map(scene.object_number), mine["first_unit"], strict=True))
-        status_drawing.listings(out, name, replay, experiment, fused_tracks, seen, colour, first_unit)
-        curves.position_errors(out, replay, experiment, name, fused_tracks.fused, of.objects, colour)
-    lanes.lanes(out, scene, experiment, seen, made, file.colours, clocks, of.axes_s)
+        fused_tracks, clock = run_tracks[name], read_episode_clocks(scene, content.table, name)
+        statuses[name], clocks[name] = compute_status(replay, experiment, name, fused_tracks, sight, clock), clock
+        write_status_words(out, name, replay, experiment, sight, statuses[name], clock)
+        write_hiding_lines(out, name, sight, statuses[name])
+        detections = content.table[(content.table["configuration"] == name) & content.table["detected"]]
+        first_unit = dict(zip(detections["object_id"].map(scene.object_number), detections["first_unit"], strict=True))
+        write_listing_lines(out, name, replay, experiment, fused_tracks, sight, colour, first_unit)
+        curves.write_position_errors(out, replay, experiment, name, fused_tracks.fused, content.objects, colour)
+    lanes.write_lanes(out, scene, experiment, sight, statuses, file.colours, clocks, content.axes_s)
 
 
-def _shares(file: _File, found: Observations) -> None:
-    """How much is seen of each shown object."""
-    out, of = file.out, file.content
-    names = entity_names(of.replay.scene)
-    for k in of.objects:
-        shares = share_curves(of.replay, found, k)
-        curves.visible_share(out, names[k], shares)
-        object_id = of.replay.scene.object_ids[k]
-        event_markers.on_curves(out, of.replay, of.experiment, of.table, object_id, shares, file.colours)
+def _write_shares(file: _RecordingFile, observed: Observations) -> None:
+    """Write the visible share of each shown object, with marks."""
+    out, content = file.out, file.content
+    names = entity_names(content.replay.scene)
+    for k in content.objects:
+        shares = share_curves(content.replay, observed, k)
+        curves.write_visible_share(out, names[k], shares)
+        object_id = content.replay.scene.object_ids[k]
+        mark_curves(out, content.replay, content.experiment, content.table, object_id, shares, file.colours)
 
 
-def _notes(path: Path, parts: Sequence[Part], lives: Sequence[Live | None]) -> Iterator[str]:
+def _list_notes(path: Path, parts: Sequence[RecordingPart], lives: Sequence[ViewerStream | None]) -> Iterator[str]:
     for part in parts[1:]:
         yield f"{path.name}: {', '.join(part.configurations)} in {part.path(path).name}"
     gone = next((live for live in lives if live is not None and live.gone), None)
@@ -253,8 +281,8 @@ def _notes(path: Path, parts: Sequence[Part], lives: Sequence[Live | None]) -> I
         yield f"{path.name}: the viewer at {gone.url} went before it had everything; the file is complete"
 
 
-def _properties(
-    out: Out, replay: Replay, experiment: Experiment, configurations: list[str], run: int, run_is: str
+def _write_properties(
+    out: RecordingSink, replay: Replay, experiment: Experiment, configurations: list[str], run: int, run_is: str
 ) -> None:
     import rerun as rr
 
@@ -272,3 +300,128 @@ def _properties(
         rerun_sdk=version("rerun-sdk"),
     )
     out.send(lambda rec: rec.send_property("replay", values))
+
+
+# Recordings of a results folder.
+
+
+def make_rrd_exporter(viewer: str | None) -> Exporter:
+    """The exporter of `.rrd` files; it also sends each recording to the Rerun viewer at this address, if any."""
+
+    def write(path: Path, run: RunToExport) -> list[str]:
+        shown = run.one.experiment.configurations
+        configurations = {name: shown.get(name, configuration) for name, configuration in run.every.items()}
+        return write_rrd(
+            path,
+            run.one.replay,
+            run.one.experiment.model_copy(update={"configurations": configurations}),
+            run.one.run_tracks,
+            run.table,
+            run.summary,
+            run.shown.run,
+            run_is=run.shown.why,
+            viewer=viewer,
+        )
+
+    return Exporter(".rrd", write, _list_file_names)
+
+
+def _list_file_names(stem: str, configurations: int) -> list[str]:
+    path = Path(f"{stem}.rrd")
+    return [part.path(path).as_posix() for part in split_into_files([str(k) for k in range(configurations)])]
+
+
+EXPORTERS = (MCAP, make_rrd_exporter(None))
+"""Exporters of the files that `copem-replay run` writes of a shown run."""
+
+
+# Fused tracks of a few objects over a whole log of any length: their rows of all time chunks, joined.
+
+
+@dataclass
+class _TrackPieces:
+    """Rows of one configuration by time chunk: rows of units' lists (P,) with their keys, and fused rows (R,).
+
+    `source_keys`: keys of the rows of units' lists that each fused row is made of, `count` (R,) of them.
+    """
+
+    heard: list[Tracks] = field(default_factory=list)
+    keys: list[Int] = field(default_factory=list)
+    fused: list[Tracks] = field(default_factory=list)
+    source_keys: list[Int] = field(default_factory=list)
+    count: list[Int] = field(default_factory=list)
+    said: list[Entries] = field(default_factory=list)
+
+
+class TrackCollector:
+    """Collects the fused tracks (1, P) of some objects in one run, chunk by chunk in order of time."""
+
+    def __init__(self, object_ix: Sequence[int]) -> None:
+        self.object_ix = np.array(object_ix, dtype=np.int64)
+        self._pieces: dict[str, _TrackPieces] = {}
+
+    def add(self, run_tracks: Mapping[str, FusedTracks]) -> None:
+        """Add the next time chunk's fused tracks, by configuration; rows are copied."""
+        for name, fused_tracks in run_tracks.items():
+            pieces = self._pieces.setdefault(name, _TrackPieces())
+            self._add_heard(pieces, fused_tracks.heard)
+            rows = np.flatnonzero(self._is_of_objects(fused_tracks.fused))
+            count = np.diff(fused_tracks.start)[rows]
+            within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+            entries = fused_tracks.entries[np.repeat(fused_tracks.start[rows], count) + within]
+            pieces.fused.append(fused_tracks.fused.take_rows(rows))
+            pieces.source_keys.append(self._key(fused_tracks.heard)[entries])
+            pieces.count.append(count)
+            if fused_tracks.said is not None:
+                pieces.said.append(fused_tracks.said[rows])
+
+    def whole(self) -> dict[str, FusedTracks]:
+        """By configuration, the fused tracks of all time chunks as those of one; without view geometry."""
+        return {name: _join_pieces(pieces) for name, pieces in self._pieces.items()}
+
+    def _add_heard(self, pieces: _TrackPieces, heard: Tracks) -> None:
+        """Add rows of units' lists that no earlier chunk had: rows captured before a chunk may be in it again."""
+        of_objects, key = self._is_of_objects(heard), self._key(heard)
+        before = np.concatenate([np.empty(0, dtype=np.int64), *pieces.keys])
+        fresh = np.flatnonzero(of_objects & ~np.isin(key, before))
+        rows = heard.take_rows(fresh)
+        if pieces.heard:  # every time chunk has the lists of the whole log: they are kept once
+            first = pieces.heard[0]
+            lists = ("stamp_ns", "captured_s", "frame_unit_ix", "arrives_s")
+            rows = replace(rows, **{column: getattr(first, column) for column in lists})
+        pieces.heard.append(rows)
+        pieces.keys.append(key[fresh])
+
+    def _is_of_objects(self, tracks: Tracks) -> Bool:
+        """(P,) whether each row is about one of the objects."""
+        return np.asarray(np.isin(tracks.row_object_ix, self.object_ix))
+
+    @staticmethod
+    def _key(tracks: Tracks) -> Int:
+        """(P,) a number per pair of list and object, for rows about an object."""
+        return tracks.row_object_ix * len(tracks.stamp_ns) + tracks.frame_ix
+
+
+def _join_pieces(pieces: _TrackPieces) -> FusedTracks:
+    heard, order = splice_rows(pieces.heard)
+    keys = np.concatenate(pieces.keys)[order]
+    fused, order = _concatenate_lists(pieces.fused)
+    count = np.concatenate(pieces.count)
+    begin = np.cumsum(count) - count
+    start = np.concatenate([[0], np.cumsum(count[order])])
+    within = np.arange(start[-1]) - np.repeat(start[:-1], count[order])
+    source_keys = np.concatenate(pieces.source_keys)[np.repeat(begin[order], count[order]) + within]
+    by_key = np.argsort(keys, kind="stable")
+    entries = by_key[np.searchsorted(keys[by_key], source_keys)]
+    said = np.concatenate(pieces.said)[order] if pieces.said else None
+    return FusedTracks(fused, heard, entries, start, said=said)
+
+
+def _concatenate_lists(fused: Sequence[Tracks]) -> tuple[Tracks, Int]:
+    """Tracks with the lists of all time chunks, and the order of their rows, as `splice_rows` gives it."""
+    frames: dict[str, Any] = {
+        name: np.concatenate([getattr(piece, name) for piece in fused], axis=-1)
+        for name in ("stamp_ns", "captured_s", "frame_unit_ix", "arrives_s")
+    }
+    before = np.cumsum([0, *(len(piece.stamp_ns) for piece in fused)])
+    return splice_rows([replace(piece, frame_ix=piece.frame_ix + before[k], **frames) for k, piece in enumerate(fused)])

@@ -1,37 +1,45 @@
-"""The experiment's units: where they are, and the fields of view of their PEMs."""
+"""Units in the scene: their places, the fields of view of their PEMs, their ghosts and outages."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from copem_replay.core.interpolation import states_at
-from copem_replay.core.tracks import Float, Tracks
+from copem_replay.core.colours import Rgb
+from copem_replay.core.fused_tracks import FusedTracks
+from copem_replay.core.interpolation import interpolate_states
+from copem_replay.core.tracks import Bool, Float, Int, Tracks, UnitFaults
 from copem_replay.experiment.schema import Experiment, Unit
-from copem_replay.perception.field_of_view import outlines
 from copem_replay.perception.pem.condition import Couple
-from copem_replay.perception.sensor_poses import UnitPoses, carrier, list_instants, mounting_height, unit_ground
+from copem_replay.perception.sensor_poses import (
+    UnitPoses,
+    couple_outlines,
+    find_carrier,
+    list_instants,
+    mounting_height,
+    unit_ground,
+)
 from copem_replay.pipeline.prepare import Replay
-from copem_replay.viewer.palette import EGO, FIELD
-from copem_replay.viewer.sink import Out, f32, upright
+from copem_replay.viewer.sink import EGO, FIELD, RecordingSink, stack_float32, upright_quaternions
 
-if TYPE_CHECKING:  # a second to import: only where something is written
+if TYPE_CHECKING:
     import rerun as rr
 
+
 NAMED_UNITS = 6
-"""So many units are named in the view of the units (chosen: no view has more labels)."""
+"""Most units with names in the view of the units: more labels cover it."""
 APART_M, NAMED_WITHIN_M = 12.0, 110.0
-"""Names lie on each other where units are nearer than the first; farther away than the second is out of the picture."""
+"""Names overlap where units are nearer than the first; units farther away than the second are out of the picture."""
 FIELD_ALPHA = 10
-"""How opaque the ground is in a field of view: where many see, it is brighter (chosen)."""
+"""Opacity of a field of view on the ground, of 255: low, because the fields of many units add up."""
 
-_ABOVE_GROUND_M = 0.05
+_ABOVE_GROUND_M = 0.05  # outlines are clear of the grid
 
 
-def units(out: Out, replay: Replay, experiment: Experiment) -> None:
-    """A point and a field of view for each unit; neither while its carrier is absent. Names only when selected."""
+def write_units(out: RecordingSink, replay: Replay, experiment: Experiment) -> None:
+    """A point and a field of view for each unit; neither while its carrier is absent. Names show on selection."""
     import rerun as rr
 
     for name, unit in experiment.units.items():
@@ -40,34 +48,38 @@ def units(out: Out, replay: Replay, experiment: Experiment) -> None:
         style = rr.Points3D.from_fields(colors=[EGO], radii=mark, labels=[name], show_labels=False)
         if unit.recorded is not None:
             stamps = replay.truth.stamp_ns if unit.on is not None else replay.truth.stamp_ns[:1]
-            place = _recorded_place(replay, experiment, unit, (stamps - replay.scene.t0_ns) * np.float64(1e-9))
-            there = ~np.isnan(place[:, 0])
-            if there.any():
-                columns = rr.Points3D.columns(positions=f32(*place[there].T)).partition(there.astype(np.int64))
+            place = _locate_recorded_unit(replay, experiment, unit, (stamps - replay.scene.t0_ns) * np.float64(1e-9))
+            present = ~np.isnan(place[:, 0])
+            if present.any():
+                columns = rr.Points3D.columns(positions=stack_float32(*place[present].T)).partition(
+                    present.astype(np.int64)
+                )
                 out.columns(path, stamps - replay.scene.t0_ns, columns)
                 out.static(path, style)
             continue
-        at = replay.placed.poses[name]
-        place, there = f32(at.x_m, at.y_m, at.z_m), at.present
+        poses = replay.placed.poses[name]
+        place, present = stack_float32(poses.x_m, poses.y_m, poses.z_m), poses.present
         elapsed_ns = list_instants(replay.scene, replay.truth, unit) - replay.scene.t0_ns
         if unit.at is not None:
             out.static(path, rr.Points3D.from_fields(positions=place[:1]))
         else:
-            out.columns(path, elapsed_ns, rr.Points3D.columns(positions=place[there]).partition(there.astype(np.int64)))
+            out.columns(
+                path, elapsed_ns, rr.Points3D.columns(positions=place[present]).partition(present.astype(np.int64))
+            )
         out.static(path, style)
         height_m = mounting_height(replay.scene, replay.truth, unit)
-        _field(out, name, unit, at, elapsed_ns, experiment.pems[str(unit.pem)].couples, height_m)
+        _write_field(out, name, unit, poses, elapsed_ns, experiment.pems[str(unit.pem)].couples, height_m)
 
 
-def named_units(replay: Replay, experiment: Experiment, at_m: Float, time_s: float) -> dict[str, Float]:
-    """Which units are named, and where they are then (3,): the ego's, then those nearest to a place, names apart."""
+def choose_named_units(replay: Replay, experiment: Experiment, at_m: Float, time_s: float) -> dict[str, Float]:
+    """Names and places (3,) of the units to be named: the ego's, then those nearest to `at_m`, none `APART_M` near."""
     place = {}
     for name in experiment.modelled:
-        at = replay.placed.poses[name]
+        poses = replay.placed.poses[name]
         stamp = replay.scene.t0_ns + round(time_s * 1e9)
         row = int(np.searchsorted(replay.placed.stamps_ns[name], stamp, side="right")) - 1
-        if row >= 0 and at.present[row]:
-            place[name] = np.array([at.x_m[row], at.y_m[row], at.z_m[row]])
+        if row >= 0 and poses.present[row]:
+            place[name] = np.array([poses.x_m[row], poses.y_m[row], poses.z_m[row]])
     order = sorted(place, key=lambda name: (experiment.units[name].on != "ego", np.hypot(*(place[name] - at_m)[:2])))
     chosen: dict[str, Float] = {}
     for name in order:
@@ -77,68 +89,77 @@ def named_units(replay: Replay, experiment: Experiment, at_m: Float, time_s: flo
     return chosen
 
 
-def unit_places(replay: Replay, experiment: Experiment, heard: Tracks) -> Float:
-    """(F, 3) where the unit of each list was at capture; NaN where that is not known, as of the truth."""
-    place = np.full((len(heard.stamp_ns), 3), np.nan)
-    for k, name in enumerate(heard.units):
-        mine = np.flatnonzero(heard.frame_unit_ix == k)
-        if name not in experiment.units or not len(mine):
+def unit_places(replay: Replay, experiment: Experiment, lists: Tracks) -> Float:
+    """(F, 3) place of each list's unit at capture; NaN if unknown, and for lists of the truth."""
+    place = np.full((len(lists.stamp_ns), 3), np.nan)
+    for k, name in enumerate(lists.units):
+        frames = np.flatnonzero(lists.frame_unit_ix == k)
+        if name not in experiment.units or not len(frames):
             continue
         unit = experiment.units[name]
         if unit.recorded is not None:
-            place[mine] = _recorded_place(replay, experiment, unit, heard.captured_s[mine])
+            place[frames] = _locate_recorded_unit(replay, experiment, unit, lists.captured_s[frames])
             continue
-        at = replay.placed.poses[name]
-        row = np.searchsorted(list_instants(replay.scene, replay.truth, unit), heard.stamp_ns[mine])
-        place[mine] = np.stack([at.x_m, at.y_m, at.z_m], axis=-1)[row]
+        poses = replay.placed.poses[name]
+        row = np.searchsorted(list_instants(replay.scene, replay.truth, unit), lists.stamp_ns[frames])
+        place[frames] = np.stack([poses.x_m, poses.y_m, poses.z_m], axis=-1)[row]
     return place
 
 
-def _recorded_place(replay: Replay, experiment: Experiment, unit: Unit, time_s: Float) -> Float:
-    """(K, 3) where a unit is whose lists are recorded: on its carrier, or at its place, if it is given."""
+def _locate_recorded_unit(replay: Replay, experiment: Experiment, unit: Unit, time_s: Float) -> Float:
+    """(K, 3) place of a unit with recorded lists: on its carrier, or at its stated place; NaN without either."""
     place = np.full((len(time_s), 3), np.nan)
     if unit.at is not None:
         ground_m = unit_ground(replay.truth, "", unit)
         place[:] = (*unit.at, ground_m + (unit.height_m or 0.0))
     elif unit.on is not None:
-        on = np.full(len(time_s), carrier(replay.scene, unit))
-        at, there = states_at(
+        on = np.full(len(time_s), find_carrier(replay.scene, unit))
+        carrier, present = interpolate_states(
             replay.truth, on, time_s, t0_ns=replay.scene.t0_ns, max_gap_s=experiment.max_gap_s
         )  # fmt: skip
-        high_m = at["height_m"] / 2 if unit.height_m is None else unit.height_m - at["height_m"] / 2
-        place[there] = np.stack([at["x_m"], at["y_m"], at["z_m"] + high_m], axis=-1)[there]
+        high_m = carrier["height_m"] / 2 if unit.height_m is None else unit.height_m - carrier["height_m"] / 2
+        place[present] = np.stack([carrier["x_m"], carrier["y_m"], carrier["z_m"] + high_m], axis=-1)[present]
     return place
 
 
-def _field(
-    out: Out, name: str, unit: Unit, at: UnitPoses, elapsed_ns: np.ndarray, pem: tuple[Couple, ...], height_m: float
+def _write_field(
+    out: RecordingSink,
+    name: str,
+    unit: Unit,
+    poses: UnitPoses,
+    elapsed_ns: np.ndarray,
+    pem: tuple[Couple, ...],
+    height_m: float,
 ) -> None:
-    """The outlines in the unit's own frame, which moves; on the ground under it."""
+    """The outlines of a field of view on the ground, in the unit's frame, which moves."""
     import rerun as rr
 
     down_m = _ABOVE_GROUND_M - height_m
-    strips = [f32(*line.T, np.full(len(line), down_m)) for line in outlines(pem)]
-    if not strips or not at.present.any():
+    strips = [stack_float32(*line.T, np.full(len(line), down_m)) for line in couple_outlines(pem)]
+    if not strips or not poses.present.any():
         return
-    path, there = ["world", "fields", name], np.flatnonzero(at.present)
-    place, turn = f32(at.x_m[there], at.y_m[there], at.z_m[there]), upright(at.heading_rad[there])
+    path, rows = ["world", "fields", name], np.flatnonzero(poses.present)
+    place, turn = (
+        stack_float32(poses.x_m[rows], poses.y_m[rows], poses.z_m[rows]),
+        upright_quaternions(poses.heading_rad[rows]),
+    )
     if unit.at is not None:
         out.static(path, rr.Transform3D.from_fields(translation=place[0], quaternion=turn[0]))
-        out.static(path, rr.LineStrips3D.from_fields(strips=strips), _ground(strips))
+        out.static(path, rr.LineStrips3D.from_fields(strips=strips), _field_mesh(strips))
     else:
-        out.columns(path, elapsed_ns[there], rr.Transform3D.columns(translation=place, quaternion=turn))
-        # Without a transform it would be drawn at the origin: the outlines come and go with the carrier.
-        changes = np.flatnonzero(np.diff(at.present, prepend=False))
-        comes = at.present[changes]
+        out.columns(path, elapsed_ns[rows], rr.Transform3D.columns(translation=place, quaternion=turn))
+        # The outlines come and go with the carrier: without a transform they would be drawn at the origin.
+        changes = np.flatnonzero(np.diff(poses.present, prepend=False))
+        comes = poses.present[changes]
         lines = rr.LineStrips3D.columns(strips=strips * int(comes.sum())).partition(len(strips) * comes)
         out.columns(path, elapsed_ns[changes], lines)
-        if there.all() and len(there) == len(elapsed_ns):
-            out.static(path, _ground(strips))
+        if rows.all() and len(rows) == len(elapsed_ns):
+            out.static(path, _field_mesh(strips))
     out.static(path, rr.LineStrips3D.from_fields(colors=[FIELD], radii=rr.Radius.ui_points(0.75)))
 
 
-def _ground(strips: Sequence[np.ndarray]) -> rr.Mesh3D:
-    """What lies within the outermost outline, brightened a little: triangles from the unit to each piece of it."""
+def _field_mesh(strips: Sequence[np.ndarray]) -> rr.Mesh3D:
+    """The area within the outermost outline: triangles from the unit to each piece of the line."""
     import rerun as rr
 
     arc = max(strips, key=lambda line: float(np.hypot(*line[:, :2].T).max()))
@@ -149,3 +170,65 @@ def _ground(strips: Sequence[np.ndarray]) -> rr.Mesh3D:
     return rr.Mesh3D(
         vertex_positions=np.concatenate([arc, middle]), triangle_indices=fan, albedo_factor=(*FIELD, FIELD_ALPHA)
     )
+
+
+# Ghosts and outages.
+
+FALSE: Rgb = (255, 90, 90)
+"""Colour of ghosts and outages of every unit."""
+
+
+class FaultsShown:
+    """Writes ghosts and outages of the units of one run, time chunk by time chunk, each list once."""
+
+    def __init__(self, out: RecordingSink, replay: Replay, experiment: Experiment) -> None:
+        self._out, self._replay, self._experiment = out, replay, experiment
+        self._shown_until_ns: dict[str, int] = {}
+
+    def add(self, run_tracks: Mapping[str, FusedTracks]) -> None:
+        """Write those of the next time chunk; `run_tracks`: fused tracks by configuration."""
+        candidates = [fused_tracks for fused_tracks in run_tracks.values() if fused_tracks.faults is not None]
+        if not candidates:
+            return
+        # Ideal fusion gets no ghosts; every other fusion gets all of them.
+        fullest = max(
+            candidates,
+            key=lambda fused_tracks: len(fused_tracks.faults.ghosts) if fused_tracks.faults is not None else 0,
+        )
+        lists, faults = fullest.heard, fullest.faults
+        assert faults is not None
+        until_ns = int(lists.stamp_ns[lists.frame_ix].max(initial=np.iinfo(np.int64).min))
+        for unit_ix, name in enumerate(lists.units):
+            if name in self._experiment.modelled:
+                last_ns = self._shown_until_ns.get(name, np.iinfo(np.int64).min)
+                new = (lists.stamp_ns > last_ns) & (lists.stamp_ns <= until_ns)
+                frames = np.flatnonzero((lists.frame_unit_ix == unit_ix) & new)
+                if len(frames):
+                    self._shown_until_ns[name] = int(lists.stamp_ns[frames[-1]])
+                    self._write_unit(name, lists, faults, frames)
+
+    def _write_unit(self, name: str, lists: Tracks, faults: UnitFaults, frames: Int) -> None:
+        import rerun as rr
+
+        elapsed_ns = lists.stamp_ns[frames] - self._replay.scene.t0_ns
+        unit, path = self._experiment.units[name], ["world", "units", name]
+        if self._experiment.pems[str(unit.pem)].ghosts:
+            rows = faults.ghosts[np.isin(lists.frame_ix[faults.ghosts], frames) & lists.valid[0, faults.ghosts]]
+            rows = rows[np.argsort(lists.frame_ix[rows], kind="stable")]
+            place = stack_float32(*(getattr(lists, axis)[0, rows] for axis in ("x_m", "y_m", "z_m")))
+            count = np.bincount(np.searchsorted(frames, lists.frame_ix[rows]), minlength=len(frames))
+            self._out.columns([*path, "ghosts"], elapsed_ns, rr.Points3D.columns(positions=place).partition(count))
+            mark = rr.Radius.ui_points(4)
+            self._out.static([*path, "ghosts"], rr.Points3D.from_fields(colors=[FALSE], radii=mark, labels=["false"]))
+        if unit.outages is not None:
+            self._write_outages(path, lists, frames, faults.not_made[frames], elapsed_ns)
+
+    def _write_outages(self, path: list[str], lists: Tracks, frames: Int, down: Bool, elapsed_ns: Int) -> None:
+        import rerun as rr
+
+        place = unit_places(self._replay, self._experiment, lists)[frames[down]]
+        columns = rr.Points3D.columns(positions=stack_float32(*place.T)).partition(down.astype(np.int64))
+        self._out.columns([*path, "outage"], elapsed_ns, columns)
+        mark = rr.Radius.ui_points(6)
+        style = rr.Points3D.from_fields(colors=[FALSE], radii=mark, labels=["makes no lists"], show_labels=True)
+        self._out.static([*path, "outage"], style)

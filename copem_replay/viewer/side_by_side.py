@@ -1,7 +1,8 @@
-"""Beside each other: one run in the configurations that are compared, of one or several folders, in one recording.
+"""Side by side: one run in compared configurations, of one or several results folders, as one Rerun recording.
 
-A results folder holds no lists, but what made them: experiment, logs, seed. So the run is computed once more, and held
-against the table of the folder.
+A results folder holds no lists, but experiment, logs and seed, which determine them. So the run is computed again and
+checked against the table of its folder. The experiments of the folders are joined into one; nothing is drawn with it,
+since random keys hold names of units, and different units of one name get other names in it.
 """
 
 from __future__ import annotations
@@ -13,35 +14,104 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from copem_replay.communication.link import LinkModel
 from copem_replay.core.errors import InputError, OutputError
-from copem_replay.core.tracks import SAME_INSTANT_NS
-from copem_replay.experiment.drive import of_log
-from copem_replay.experiment.schema import Configuration, Experiment
-from copem_replay.pipeline.blocks import replay_block
-from copem_replay.pipeline.prepare import prepare
-from copem_replay.pipeline.selected_runs import STEM, OneRun, one_run
-from copem_replay.results.belongings import list_made
-from copem_replay.results.compare.comparable import check_comparable
-from copem_replay.results.compare.inputs import read_folders
-from copem_replay.results.compare.labels import Named, chosen, named
-from copem_replay.results.read import Results, complete
-from copem_replay.results.reread import read_again
-from copem_replay.viewer.merge_experiments import Part, merged
-from copem_replay.viewer.selection import in_parts
+from copem_replay.core.tracks import SAME_INSTANT_S
+from copem_replay.experiment.drive import resolve_for_log
+from copem_replay.experiment.schema import Configuration, Experiment, Unit
+from copem_replay.io.recording import Recording
+from copem_replay.perception.pem.model import Pem
+from copem_replay.pipeline.one_run import STEM, ReplayedRun, replay_run
+from copem_replay.pipeline.prepare import prepare_log
+from copem_replay.pipeline.replay import replay_block
+from copem_replay.results.compare.compare import check_comparable, read_folders
+from copem_replay.results.compare.labels import LabelledConfiguration, choose_configurations, label_configurations
+from copem_replay.results.folder import add_to_made_list
+from copem_replay.results.read import Results, check_complete, reread_recording
+from copem_replay.viewer.sink import split_into_files
+
+
+@dataclass(frozen=True)
+class ComparedExperiment:
+    """An experiment, the name of its folder, and the labels of its configurations in the joined experiment."""
+
+    name: str
+    experiment: Experiment
+    labels: Mapping[str, str]
+
+
+def join_experiments(parts: Sequence[ComparedExperiment]) -> Experiment:
+    """The first experiment with units, PEMs, links and configurations of all."""
+    units: dict[str, Unit] = {}
+    pems: dict[str, Pem] = {}
+    configurations: dict[str, Configuration] = {}
+    links: dict[str, LinkModel] = {}
+    for part in parts:
+        unit_names: dict[str, str] = {}
+        for name, unit in part.experiment.units.items():
+            pem = None if unit.pem is None else part.experiment.pems[unit.pem]
+            unit_names[name] = _choose_unit_name(name, part.name, unit, pem, units, pems)
+            units[unit_names[name]] = unit if pem is None else unit.model_copy(update={"pem": unit_names[name]})
+            if pem is not None:
+                pems[unit_names[name]] = pem
+        part_links = part.experiment.links
+        link_names = {
+            name: name if links.get(name, link) == link else f"{part.name}:{name}" for name, link in part_links.items()
+        }
+        links |= {link_names[name]: link for name, link in part_links.items()}
+        for name, label in part.labels.items():
+            configurations[label] = _rename_members(
+                part.experiment, part.experiment.configurations[name], unit_names, link_names
+            )
+    changed = {"units": units, "pems": pems, "links": links, "configurations": configurations, "sweep": None}
+    return parts[0].experiment.model_copy(update=changed)
+
+
+def _choose_unit_name(
+    name: str, folder: str, unit: Unit, pem: Pem | None, units: Mapping[str, Unit], pems: Mapping[str, Pem]
+) -> str:
+    """The unit's own name if it is free or belongs to an equal unit; else with the folder's name before it."""
+    choice = name
+    while choice in units:
+        same = units[choice].model_copy(update={"pem": None}) == unit.model_copy(update={"pem": None})
+        if same and pems.get(choice) == pem:
+            break
+        choice = f"{folder}:{choice}"
+    return choice
+
+
+def _rename_members(
+    experiment: Experiment, configuration: Configuration, unit_names: Mapping[str, str], link_names: Mapping[str, str]
+) -> Configuration:
+    """A configuration with the names of units and links in the joined experiment."""
+    changed: dict[str, object] = {}
+    if configuration.units != "truth":
+        changed["units"] = tuple(unit_names[name] for name in experiment.units_of(configuration))
+    if configuration.inputs is not None:
+        changed["inputs"] = tuple(unit_names[name] for name in configuration.inputs)
+    if isinstance(configuration.latency_s, dict):
+        changed["latency_s"] = {unit_names.get(unit, unit): late for unit, late in configuration.latency_s.items()}
+    if isinstance(configuration.link, str):
+        changed["link"] = link_names.get(configuration.link, configuration.link)
+    if isinstance(configuration.link, dict):
+        changed["link"] = {
+            unit_names.get(unit, unit): link_names.get(link, link) for unit, link in configuration.link.items()
+        }
+    return configuration.model_copy(update=changed)
 
 
 @dataclass(frozen=True)
 class _Side:
-    """What a folder has of the run. `labels`: by configuration of the folder, what it is called here."""
+    """One folder's part of the run: replayed tracks and rows of its table. `labels`: by name of its configurations."""
 
     results: Results
     labels: Mapping[str, str]
-    one: OneRun
+    one: ReplayedRun
     rows: pd.DataFrame
 
 
-def check_beside(path: Path) -> None:
-    """Raise OutputError where a recording cannot be written under this name."""
+def check_side_by_side(path: Path) -> None:
+    """Raise OutputError for a path that is no .rrd, or belongs to the recordings of a results folder."""
     if path.suffix.lower() != ".rrd":
         raise OutputError(f"{path}: expected a name that ends with .rrd, found {path.name}")
     of_results = path.name == f"{STEM}.rrd" or path.name.startswith(f"{STEM}_")
@@ -49,7 +119,7 @@ def check_beside(path: Path) -> None:
         raise OutputError(f"{path}: expected another name, found that of a recording of the results in that folder")
 
 
-def write_beside(
+def write_side_by_side(
     path: Path,
     folders: Sequence[Path],
     *,
@@ -58,131 +128,152 @@ def write_beside(
     log: str | None = None,
     run: int | None = None,
 ) -> list[str]:
-    """Write one run (None: the one that the baseline's folder shows) as a recording, differences marked.
+    """Write one run (None: the one shown in the baseline's folder) as a recording with marked differences.
 
-    Configurations and baseline as in `compare`. Returns notes. Raises InputError, RecordingError where a
-    log is not the one that was replayed, OutputError.
+    Configurations and baseline as in `compare`. Returns notes. Raises InputError; RecordingError if a log is not the
+    one that was replayed; OutputError.
     """
     from copem_replay.viewer import write_rrd
 
-    check_beside(path)
-    read = read_folders(folders)
-    check_comparable(read)
-    wanted = chosen(named(read), configurations, baseline)
-    _check_one_recording(list(dict.fromkeys(one.results for one in wanted)))
-    used = [complete(results) for results in dict.fromkeys(one.results for one in wanted)]
-    log, number = _which(used[0], used, log, run)
-    for one in wanted:
-        if one.configuration not in of_log(one.results.experiment, log).configurations:
-            raise InputError(
-                f"configuration {one.label}: log {log} has none of its units; choose another log with --log"
-            )
-    sides = [_side(results, [one for one in wanted if one.results is results], log, number) for results in used]
-    parts = [Part(side.results.name, side.one.experiment, side.labels) for side in sides]
-    experiment = merged(parts)
-    experiment = experiment.model_copy(
-        update={"configurations": {one.label: experiment.configurations[one.label] for one in wanted}}
-    )
-    recording = read_again(sides[0].results, log, experiment)
-    for side in sides:
-        if side.one.replay.scene.object_ids != recording.scene.object_ids:
-            where = sides[0].results.folder
-            raise InputError(f"{side.results.folder}: log {log}: expected the objects of {where}: `read` differs")
-    run_tracks = {
-        side.labels[name]: fused_tracks for side in sides for name, fused_tracks in side.one.run_tracks.whole().items()
-    }
+    check_side_by_side(path)
+    all_results = read_folders(folders)
+    check_comparable(all_results)
+    chosen = choose_configurations(label_configurations(all_results), configurations, baseline)
+    labels = [choice.label for choice in chosen]
+    _check_one_recording(list(dict.fromkeys(choice.results for choice in chosen)))
+    used = [check_complete(results) for results in dict.fromkeys(choice.results for choice in chosen)]
+    log, shown_run = _choose_run(used[0], used, log, run)
+    sides = _replay_sides(used, chosen, log, shown_run)
+    experiment = _join_sides(sides, labels)
+    recording = _reread_truth(sides, log, experiment)
+    run_tracks = {side.labels[name]: fused for side in sides for name, fused in side.one.run_tracks.whole().items()}
     table = pd.concat([side.rows.assign(configuration=side.rows["configuration"].map(side.labels)) for side in sides])
     for folder in folders:
-        list_made(folder, [part.path(path) for part in in_parts([one.label for one in wanted], wanted[0].label)])
+        add_to_made_list(folder, [part.path(path) for part in split_into_files(labels, labels[0])])
     write_rrd(
         path,
-        prepare(recording, experiment, onsets_of=of_log(sides[0].results.experiment, log)),
-        experiment.model_copy(update={"configurations": _every(read, experiment)}),
-        [{one.label: run_tracks[one.label] for one in wanted}],
+        prepare_log(recording, experiment, onsets_of=resolve_for_log(sides[0].results.experiment, log)),
+        experiment.model_copy(update={"configurations": _list_configurations(all_results, experiment)}),
+        [{label: run_tracks[label] for label in labels}],
         table.reset_index(drop=True),
-        _summary(sides, wanted),
-        number,
-        run_is=f"differences to {wanted[0].label}",
-        baseline=wanted[0].label,
+        _join_summaries(sides, labels),
+        shown_run,
+        run_is=f"differences to {labels[0]}",
+        baseline=labels[0],
     )
-    return [f"{path}: {line}" for line in _one_world(sides)]
+    return [f"{path}: {line}" for line in _note_other_worlds(sides)]
 
 
-def _every(read: Sequence[Results], experiment: Experiment) -> dict[str, Configuration]:
-    """All configurations of all folders, in their order, those that are shown as in `experiment`.
+def _replay_sides(used: Sequence[Results], chosen: Sequence[LabelledConfiguration], log: str, run: int) -> list[_Side]:
+    """The run of every folder. Raises InputError for a configuration without units in the log."""
+    for choice in chosen:
+        if choice.configuration not in resolve_for_log(choice.results.experiment, log).configurations:
+            raise InputError(
+                f"configuration {choice.label}: log {log} has none of its units; choose another log with --log"
+            )
+    return [
+        _replay_side(results, [choice for choice in chosen if choice.results is results], log, run) for results in used
+    ]
 
-    Colours go by their places: those of a folder's own files, as far as it is the first.
+
+def _join_sides(sides: Sequence[_Side], labels: Sequence[str]) -> Experiment:
+    """The experiments of all folders as one, with the labelled configurations in their order."""
+    parts = [ComparedExperiment(side.results.name, side.one.experiment, side.labels) for side in sides]
+    experiment = join_experiments(parts)
+    configurations = {label: experiment.configurations[label] for label in labels}
+    return experiment.model_copy(update={"configurations": configurations})
+
+
+def _reread_truth(sides: Sequence[_Side], log: str, experiment: Experiment) -> Recording:
+    """The first folder's recording. Raises InputError if another folder read other objects from it."""
+    recording = reread_recording(sides[0].results, log, experiment)
+    for side in sides:
+        if side.one.replay.scene.object_ids != recording.scene.object_ids:
+            first_folder = sides[0].results.folder
+            raise InputError(
+                f"{side.results.folder}: log {log}: expected the objects of {first_folder}: `read` differs"
+            )
+    return recording
+
+
+def _list_configurations(all_results: Sequence[Results], experiment: Experiment) -> dict[str, Configuration]:
+    """All configurations of all folders in their order, shown ones as in `experiment`.
+
+    Colours depend on this order: configurations of the first folder have the colours of its own files.
     """
-    label_of = {(one.results, one.configuration): one.label for one in named(read)}
-    found: dict[str, Configuration] = {}
-    for results in read:
-        for name, asked in results.experiment.configurations.items():
+    labelled = label_configurations(all_results)
+    label_of = {(choice.results, choice.configuration): choice.label for choice in labelled}
+    configurations: dict[str, Configuration] = {}
+    for results in all_results:
+        for name, configuration in results.experiment.configurations.items():
             label = label_of.get((results, name), f"{results.name}:{name}")
-            found[label] = experiment.configurations.get(label, asked)
-    return found
+            configurations[label] = experiment.configurations.get(label, configuration)
+    return configurations
 
 
 def _check_one_recording(used: Sequence[Results]) -> None:
-    """Raise InputError where folders are of several recordings of a drive: one picture has what one of them holds."""
+    """Raise InputError if folders are of different recordings of a drive: a picture holds the truth of one."""
     expected = {(log.name, log.sha256) for log in used[0].provenance.logs}
-    for other in used[1:]:
-        for log in other.provenance.logs:
+    for results in used[1:]:
+        for log in results.provenance.logs:
             if (log.name, log.sha256) not in expected:
-                where = used[0].folder
+                first_folder = used[0].folder
                 raise InputError(
-                    f"{other.folder}: log {log.name}: expected the recording of {where}, found another of the same "
-                    "drive: they cannot be shown together; compare them without --rrd"
+                    f"{results.folder}: log {log.name}: expected the recording of {first_folder}, found another "
+                    "of the same drive: they cannot be shown together; compare them without --rrd"
                 )
 
 
-def _which(first: Results, every: Sequence[Results], log: str | None, run: int | None) -> tuple[str, int]:
-    """The log and the run, as asked for or as the first folder shows them. Raises InputError."""
+def _choose_run(first: Results, all_results: Sequence[Results], log: str | None, run: int | None) -> tuple[str, int]:
+    """Log and run: the given ones, else those that the first folder shows. Raises InputError for others than it has."""
     names = [file.name for file in first.provenance.logs]
     if log is not None and log not in names:
         raise InputError(f"--log: expected one of {', '.join(names)}, found {log!r}")
     log = log if log is not None else next((name for name in names if name in first.provenance.run_shown), names[0])
     number = run if run is not None else first.provenance.run_shown.get(log, 0)
-    runs = min(results.experiment.runs for results in every)
+    runs = min(results.experiment.runs for results in all_results)
     if not 0 <= number < runs:
         raise InputError(f"--run: expected 0 to {runs - 1}, the runs that all folders have, found {number}")
     return log, number
 
 
-def _side(results: Results, wanted: Sequence[Named], log: str, run: int) -> _Side:
-    """One folder's part of the run, computed once more. Raises InputError where its table says otherwise."""
-    labels = {one.configuration: one.label for one in wanted}
-    alone = of_log(results.experiment, log)
-    kept = {name: configuration for name, configuration in alone.configurations.items() if name in labels}
-    experiment = alone.model_copy(update={"configurations": kept, "sweep": None})
-    one = one_run(read_again(results, log, experiment), experiment, run)
-    (every,) = results.each(log=log)
-    rows = every[(every["run"] == run) & every["configuration"].isin(list(kept))].assign(log=log)
-    again = replay_block(one.replay, one.experiment, np.array([run]))
+def _replay_side(results: Results, chosen: Sequence[LabelledConfiguration], log: str, run: int) -> _Side:
+    """One folder's part of the run, computed again. Raises InputError if its table differs."""
+    labels = {replayed.configuration: replayed.label for replayed in chosen}
+    alone = resolve_for_log(results.experiment, log)
+    configurations = {name: configuration for name, configuration in alone.configurations.items() if name in labels}
+    experiment = alone.model_copy(update={"configurations": configurations, "sweep": None})
+    replayed = replay_run(reread_recording(results, log, experiment), experiment, run)
+    (detections,) = results.each(log=log)
+    rows = detections[(detections["run"] == run) & detections["configuration"].isin(list(configurations))].assign(
+        log=log
+    )
+    again = replay_block(replayed.replay, replayed.experiment, np.array([run]))
     keys = ["configuration", "object_id"]
     times = [table.set_index(keys)["detection_s"].sort_index() for table in (rows, again)]
     same = times[0].index.equals(times[1].index) and np.allclose(
-        times[0], times[1], rtol=0, atol=SAME_INSTANT_NS / 1e9, equal_nan=True
+        times[0], times[1], rtol=0, atol=SAME_INSTANT_S, equal_nan=True
     )
     if not same:
         raise InputError(
             f"{results.folder}: log {log}: run {run} comes out otherwise than in detections.parquet: another version "
             "made it; run the experiment again with --overwrite"
         )
-    return _Side(results, labels, one, rows)
+    return _Side(results, labels, replayed, rows)
 
 
-def _summary(sides: Sequence[_Side], wanted: Sequence[Named]) -> pd.DataFrame:
-    """The summaries, one under the other, in the order of the configurations."""
+def _join_summaries(sides: Sequence[_Side], labels: Sequence[str]) -> pd.DataFrame:
+    """The rows of the folders' summaries, in the order of the configurations."""
     tables = []
     for side in sides:
-        mine = side.results.summary
-        mine = mine[mine["configuration"].isin(list(side.labels))]
-        tables.append(mine.assign(configuration=mine["configuration"].map(side.labels)))
-    return pd.concat(tables).set_index("configuration").loc[[one.label for one in wanted]].reset_index()
+        summary = side.results.summary
+        summary = summary[summary["configuration"].isin(list(side.labels))]
+        tables.append(summary.assign(configuration=summary["configuration"].map(side.labels)))
+    return pd.concat(tables).set_index("configuration").loc[list(labels)].reset_index()
 
 
-def _one_world(sides: Sequence[_Side]) -> list[str]:
-    """What of the world the folders do not share: it can be shown only once."""
+def _note_other_worlds(sides: Sequence[_Side]) -> list[str]:
+    """Notes on settings of the world that differ between folders: only the first folder's are shown."""
     first = sides[0].results
     return [
         f"{key} differ; those of {first.folder} are shown"

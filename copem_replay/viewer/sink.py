@@ -1,61 +1,237 @@
-"""The recording as it is written: its streams, its paths, and values as the viewer has them."""
+"""Sink: where a Rerun recording is written, and what all its parts share.
+
+Streams to a file and to a running viewer, entity paths, colours and statuses, values in the viewer's types, and the
+choice of what is shown of many configurations and objects.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import os
 import re
+import socket
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from pathlib import Path
+from threading import Thread
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
 
+from copem_replay.core.colours import Rgb
+from copem_replay.core.errors import InputError, OutputError
+from copem_replay.core.files import atomic_file
 from copem_replay.core.tracks import CLASSES, Bool, Float, Int, Scene, Tracks
-from copem_replay.viewer.stream import Live
 
-if TYPE_CHECKING:  # a second to import: only where something is written
+if TYPE_CHECKING:
     import rerun as rr
 
+
+# Statuses of an object in a configuration, by number; `viewer/status.py` defines them.
+
+STATUSES = (
+    "absent", "not listed", "out of view", "hidden", "visible", "lost", "captured", "unmatched",
+    "listed before the onset", "listed, not confirmed", "listed too late", "known",
+)  # fmt: skip
+(
+    ABSENT, UNLISTED, OUT, HIDDEN, VISIBLE, LOST, CAPTURED, UNMATCHED, EARLY, UNCONFIRMED, TOO_LATE, KNOWN,
+) = range(len(STATUSES))  # fmt: skip
+
+
+# Colours of everything but configurations: ground, truth, statuses, words.
+#
+# Lines have a contrast of 3:1 or more to the dark ground, words 4.5:1, and 3:1 to the grey plate behind words in the
+# viewer's light theme; deuteranopes can tell the statuses apart. Tests compute all of it. Every 3-D view and plot sets
+# the ground, so that it is dark in the light theme, too.
+
+GROUND: Rgb = (18, 19, 23)
+GRID: Rgb = (36, 38, 44)
+"""Grid on the ground: fainter than any line that carries information."""
+EGO: Rgb = (240, 240, 240)
+"""The ego and all units."""
+STANDING: Rgb = (112, 112, 112)
+"""True objects that never move; moving ones have the truth's grey."""
+LANE: Rgb = (104, 104, 114)
+"""Boundaries of lanes: visible, but less than everything else."""
+FIELD: Rgb = (150, 146, 118)
+"""Outlines of fields of view."""
+ONSET: Rgb = (255, 255, 255)
+HIDES: Rgb = (255, 110, 95)
+"""Lines to what hides an object."""
+NOTICED: Rgb = (255, 255, 255)
+WAITING: Rgb = (226, 226, 226)
+BEHIND: Rgb = (255, 205, 196)
+"""Words over known, other and hidden objects. Not the configuration's colour: some are too dark to be read. All are
+bright, because the viewer puts words on a grey plate in its light theme."""
+DIFFERENCE: Rgb = (255, 255, 255)
+"""Marks of objects that only one of two configurations holds."""
+STATUS: dict[int, Rgb] = {
+    OUT: (52, 60, 80),
+    UNLISTED: (88, 76, 54),
+    HIDDEN: (152, 126, 82),
+    VISIBLE: (106, 112, 122),
+    LOST: (208, 192, 158),
+    CAPTURED: (118, 140, 192),
+    UNMATCHED: (190, 202, 228),
+}
+"""Statuses in which the receiver's list does not hold the object; one colour for all configurations."""
+HALF = 0.5
+"""Strength of a configuration's colour where the object is listed but not known: darker than known, still a colour."""
+
+
+def status_colour(status: int, colour: Rgb) -> Rgb:
+    """Colour of a status in a lane: neutral until the object is listed, then `colour`, at `HALF` until known."""
+    if status < EARLY:
+        return STATUS[status]
+    return colour if status == KNOWN else _scale_colour(colour, HALF)
+
+
+def _scale_colour(colour: Rgb, share: float) -> Rgb:
+    red, green, blue = (round(channel * share) for channel in colour)
+    return red, green, blue
+
+
+# Streams: into a file, with little of it held in memory, and to a running viewer.
+
+VIEWER = "rerun+http://127.0.0.1:9876/proxy"
+"""Where a Rerun viewer listens by default."""
+ANSWERS_S, TAKES_S = 2.0, 60.0
+"""Time for a viewer to answer, and to take a piece of the recording: longest delays by a viewer that hangs."""
+_PIPE_BYTES = 1 << 20
+
+
+@contextmanager
+def file_stream(path: Path, application_id: str, recording_id: str) -> Iterator[rr.RecordingStream]:
+    """A stream into a file that in the end is complete under its name, or does not exist. Raises OutputError.
+
+    Rerun writes into a pipe, and a thread copies the pipe into the file. Rerun's own file sink waits for ever on a full
+    disk or leaves half a file without an error, and its memory sink gives a long recording only as several files.
+    """
+    import rerun as rr
+
+    with atomic_file(path) as scratch:
+        out, into = os.pipe()
+        pump = _Pump(out, scratch)
+        rec = rr.RecordingStream(application_id, recording_id=recording_id, send_properties=False)
+        try:
+            if not rr.is_enabled(rec):
+                raise OutputError(f"{path}: not written, Rerun is switched off (RERUN=off in the environment?)")
+            rec.save(f"/dev/fd/{into}")
+            yield rec
+        finally:
+            rec.disconnect()  # writes the end of the file
+            os.close(into)
+            pump.join()
+        if pump.error is not None:
+            raise pump.error
+
+
+class _Pump(Thread):
+    """Copies a pipe into a file. After an error (`error`) it reads on, so that the writer at the other end goes on."""
+
+    def __init__(self, out: int, path: Path) -> None:
+        super().__init__()
+        self.error: OSError | None = None
+        self._out, self._path = out, path
+        self.start()
+
+    def run(self) -> None:
+        try:
+            with self._path.open("wb") as file:
+                while piece := os.read(self._out, _PIPE_BYTES):
+                    file.write(piece)
+        except OSError as error:
+            self.error = error
+        while os.read(self._out, _PIPE_BYTES):
+            pass
+        os.close(self._out)
+
+
+class ViewerStream:
+    """A stream to a running viewer. When the viewer ends (`gone`), nothing more is sent."""
+
+    def __init__(self, url: str, application_id: str, recording_id: str) -> None:
+        import rerun as rr
+
+        self.url, self.gone = url, False
+        self._rec = rr.RecordingStream(application_id, recording_id=recording_id, send_properties=False)
+        self._rec.connect_grpc(url)
+
+    def send(self, write: Callable[[rr.RecordingStream], None]) -> None:
+        """Send what `write` puts into a stream, and wait until the viewer has it."""
+        if self.gone:
+            return
+        try:
+            write(self._rec)
+            self._rec.flush(timeout_sec=TAKES_S)
+        except RuntimeError:  # Rerun raises it for a broken connection
+            self.gone = True
+
+    def close(self) -> None:
+        """End the stream."""
+        with suppress(RuntimeError):
+            self._rec.disconnect()
+
+
+def check_viewer(url: str) -> None:
+    """Raise InputError for an address that is no viewer's, or at which nothing listens."""
+    try:
+        place = urlsplit(url)
+        host, port = place.hostname, place.port
+    except ValueError:
+        host = port = None
+    if not url.startswith(("rerun+http://", "rerun://", "rerun+https://")) or not host or place.path != "/proxy":
+        raise InputError(f"--viewer: expected an address such as {VIEWER}, found {url!r}")
+    try:
+        socket.create_connection((host, port or 443), timeout=ANSWERS_S).close()
+    except OSError as error:
+        reason = error.strerror or error
+        raise InputError(f"--live: no viewer at {url} ({reason}); start one first: python -m rerun") from None
+
+
 ELAPSED, TIME = "elapsed", "time"
-"""The two timelines: since the log's start, and the log's own clock."""
+"""The two timelines: time since the log's start, and the log's own clock."""
 SLICE_ROWS = 100_000
-"""Boxes that are made and sent at a time (chosen: some ten megabytes)."""
+"""Boxes that are made and sent at a time: some ten megabytes."""
 LONG_ID = 12
-"""Ids of more letters than this are shortened where they are drawn (chosen: a UUID has 36)."""
+"""Longer ids are shortened where they are drawn: the 36 letters of a UUID would cover the scene."""
 
 _RESERVED = ("truth", "static", "units", "fields", "eyes", "names")
+"""Parts of entity paths that no configuration may have as its name."""
 
 
 @dataclass(frozen=True)
-class Out:
-    """Where everything goes: the file's stream, and a running viewer's if there is one."""
+class RecordingSink:
+    """Target of all writing: the stream of the file, and that of a running viewer, if any."""
 
     rec: rr.RecordingStream
     t0_ns: int
-    live: Live | None = None
+    live: ViewerStream | None = None
 
-    def send(self, what: Callable[[rr.RecordingStream], None]) -> None:
-        """To the file, and to the viewer if there is one."""
-        what(self.rec)
+    def send(self, write: Callable[[rr.RecordingStream], None]) -> None:
+        """Write to the file, and to the viewer if there is one."""
+        write(self.rec)
         if self.live is not None:
-            self.live.send(what)
+            self.live.send(write)
 
     def flush(self) -> None:
-        """Returns when all that was sent has left this program: so that little of it is held at a time."""
+        """Wait until all that was sent has left this process, so that little of it is held in memory."""
         self.rec.flush()
 
     def static(self, path: Sequence[str], *what: Any) -> None:
-        """What holds at all times."""
+        """Write components that hold at all times."""
         import rerun as rr
 
         self.send(lambda rec: rec.log(rr.new_entity_path(list(path)), *what, static=True))
 
     def columns(self, path: Sequence[str], elapsed_ns: Int, columns: Any) -> None:
-        """A row per instant (F,)."""
+        """Write columns with a row per instant (F,), ns since the log's start."""
         import rerun as rr
 
         if len(elapsed_ns):
@@ -66,60 +242,60 @@ class Out:
             self.send(lambda rec: rec.send_columns(rr.new_entity_path(list(path)), times, columns))
 
 
-def part_of(configuration: str) -> str:
-    """A configuration's part of entity paths; not one that is taken."""
+def configuration_part(configuration: str) -> str:
+    """The part of entity paths that names a configuration: its name, unless that is reserved."""
     taken = configuration in _RESERVED or configuration.startswith("configuration ")
     return f"configuration {configuration}" if taken else configuration
 
 
-def path_of(*parts: str) -> str:
-    """An entity path in one piece, names escaped."""
+def make_entity_path(*parts: str) -> str:
+    """An entity path as one text, with names escaped."""
     import rerun as rr
 
     return rr.new_entity_path(list(parts))
 
 
-def plain(name: str) -> str:
+def plain_part(name: str) -> str:
     """A name as a part of an entity path that needs no escapes: “coPEM_0.5s”."""
     return re.sub(r"[^0-9A-Za-z_.-]+", "_", name)
 
 
 def entity_names(scene: Scene) -> list[str]:
-    """(N,) what objects are called in entity paths, “6_pedestrian”; a number after those that would be the same."""
+    """(N,) names of objects in entity paths, “6_pedestrian”; equal names get a number."""
     names = zip(short_ids(scene), scene.object_class, strict=True)
-    return distinct([f"{plain(name)}_{CLASSES[k]}" for name, k in names])
+    return make_distinct([f"{plain_part(name)}_{CLASSES[k]}" for name, k in names])
 
 
-def distinct(names: Sequence[str]) -> list[str]:
-    """The names, with a number after those that are there twice."""
+def make_distinct(names: Sequence[str]) -> list[str]:
+    """The names, with their index after those that occur more than once."""
     twice = {name for name, count in Counter(names).items() if count > 1}
     return [f"{name}_{k}" if name in twice else name for k, name in enumerate(names)]
 
 
-def lanes_of(scene: Scene, object_ix: int) -> list[str]:
-    """The entity that has all lanes of an object."""
+def object_lanes_path(scene: Scene, object_ix: int) -> list[str]:
+    """The entity above all lanes of an object."""
     return ["lanes", entity_names(scene)[object_ix]]
 
 
 def lane_path(scene: Scene, object_ix: int, place: int, configuration: str) -> list[str]:
-    """The entity of one lane; `place`: of the configuration among those of the file, from 0."""
-    return [*lanes_of(scene, object_ix), f"{place + 1}_{plain(configuration)}"]
+    """The entity of one lane; `place`: index of the configuration in the file."""
+    return [*object_lanes_path(scene, object_ix), f"{place + 1}_{plain_part(configuration)}"]
 
 
 def table_rows(table: pd.DataFrame) -> list[SimpleNamespace]:
-    """The rows of a table, with its columns by name; `itertuples` makes a class for every table, which takes longer."""
+    """The rows of a table, with columns as attributes. Faster than `itertuples`, which makes a class per table."""
     names = list(table.columns)
     columns = [table[name].tolist() for name in names]
     return [SimpleNamespace(**dict(zip(names, row, strict=True))) for row in zip(*columns, strict=True)]
 
 
-def digest(*texts: str) -> str:
-    """A short name for the texts."""
+def digest_texts(*texts: str) -> str:
+    """The first 16 hex digits of the SHA-256 of the texts."""
     return hashlib.sha256("\n".join(texts).encode()).hexdigest()[:16]
 
 
 def short_ids(scene: Scene) -> tuple[str, ...]:
-    """(N,) ids as they are drawn: of long ones as much of the beginning as tells them apart, four letters at least."""
+    """(N,) ids as drawn: long ones cut to the shortest beginning, of four letters or more, that keeps them distinct."""
     ids = scene.object_ids
     if max(map(len, ids), default=0) <= LONG_ID:
         return ids
@@ -128,21 +304,21 @@ def short_ids(scene: Scene) -> tuple[str, ...]:
 
 
 def object_labels(scene: Scene) -> pa.Array:
-    """(N,) what each object is called."""
+    """(N,) labels of objects: id and class."""
     names = [f"{name} {CLASSES[k]}" for name, k in zip(short_ids(scene), scene.object_class, strict=True)]
     return pa.array(names, pa.string())
 
 
-def by_frame(tracks: Tracks, kept: Bool) -> tuple[Int, Int]:
-    """The kept rows list by list, and how many each list holds (F,)."""
+def sort_by_frame(tracks: Tracks, kept: Bool) -> tuple[Int, Int]:
+    """The rows (P,) with `kept`, list by list, and their number per list (F,)."""
     order, _ = tracks.by_frame
     rows = order[kept[order]]
     return rows, np.bincount(tracks.frame_ix[rows], minlength=len(tracks.stamp_ns))
 
 
-def slices(tracks: Tracks, kept: Bool) -> Iterator[tuple[Int, Int, Int]]:
-    """`by_frame` in pieces of whole lists, so that little is made at a time; with the instants of each piece."""
-    rows, counts = by_frame(tracks, kept)
+def slice_by_frame(tracks: Tracks, kept: Bool) -> Iterator[tuple[Int, Int, Int]]:
+    """`sort_by_frame` in pieces of whole lists, of about `SLICE_ROWS` rows; with the instants of each piece (ns)."""
+    rows, counts = sort_by_frame(tracks, kept)
     ends = np.cumsum(counts)
     available_ns = elapsed_ns(tracks)
     frame = row = 0
@@ -152,23 +328,113 @@ def slices(tracks: Tracks, kept: Bool) -> Iterator[tuple[Int, Int, Int]]:
         frame, row = last, int(ends[last - 1])
 
 
-def ns(time_s: Any) -> Any:
+def to_nanoseconds(time_s: Any) -> Any:
     """Seconds as whole nanoseconds."""
     return np.rint(np.asarray(time_s) * 1e9).astype(np.int64)
 
 
 def elapsed_ns(tracks: Tracks) -> Int:
-    """(F,) when each list is available, since the log's start."""
-    elapsed: Int = ns(tracks.common_arrives_s)
+    """(F,) when each list is available, ns since the log's start."""
+    elapsed: Int = to_nanoseconds(tracks.common_arrives_s)
     return elapsed
 
 
-def f32(*columns: Float) -> np.ndarray:
-    """Columns (K,) side by side, as the viewer has them."""
+def stack_float32(*columns: Float) -> np.ndarray:
+    """Columns (K,) as one array (K, n) of 32-bit floats, the viewer's type."""
     return np.stack(columns, axis=-1).astype(np.float32)
 
 
-def upright(yaw_rad: Float) -> np.ndarray:
-    """Quaternions xyzw (K, 4) of turns about the vertical."""
+def upright_quaternions(yaw_rad: Float) -> np.ndarray:
+    """Quaternions xyzw (K, 4) of rotations about the vertical."""
     zero = np.zeros(len(yaw_rad))
-    return f32(zero, zero, np.sin(yaw_rad / 2), np.cos(yaw_rad / 2))
+    return stack_float32(zero, zero, np.sin(yaw_rad / 2), np.cos(yaw_rad / 2))
+
+
+# Selection: which configurations a file holds, and which objects words, lines, lanes and plots are about.
+
+SHOWN_OBJECTS = 6
+"""Most measured objects with words, lines, lanes and plots: more would cover each other and slow the viewer down."""
+VIEWED = 6
+"""Most configurations of a file: more views beside each other are too small."""
+
+
+@dataclass(frozen=True)
+class RecordingPart:
+    """The configurations of one file, and what its name has before the suffix."""
+
+    configurations: tuple[str, ...]
+    infix: str = ""
+
+    def path(self, path: Path) -> Path:
+        """The path of this file; `path`: that of the first file."""
+        return path.with_name(f"{path.stem}{self.infix}{path.suffix}")
+
+
+def split_into_files(configurations: Sequence[str], baseline: str | None = None) -> list[RecordingPart]:
+    """All configurations in their order, six per file: `replay.rrd`, `replay.configurations_7-12.rrd` and so on.
+
+    The baseline of a comparison is in every file, and the first of it.
+    """
+    shared = tuple(name for name in configurations if name == baseline)
+    others = [name for name in configurations if name != baseline]
+    per_file = VIEWED - len(shared)
+    parts = [RecordingPart((*shared, *others[:per_file]) if shared else tuple(others[:per_file]))]
+    for first in range(per_file, len(others), per_file):
+        names = others[first : first + per_file]
+        begin = first + len(shared) + 1
+        last = f"-{begin + len(names) - 1}" if len(names) > 1 else ""
+        parts.append(RecordingPart((*shared, *names), f".configurations_{begin}{last}"))
+    return parts
+
+
+def choose_measured_objects(table: pd.DataFrame, baselines: Sequence[str]) -> list[str]:
+    """Ids of the objects that words, lanes and curves are about, the most telling one first."""
+    return sorted(
+        choose_telling_objects(table, baselines, SHOWN_OBJECTS),
+        key=choose_telling_objects(table, baselines, 1).__contains__,
+        reverse=True,
+    )
+
+
+def choose_telling_objects(table: pd.DataFrame, baselines: Sequence[str], most: int) -> list[str]:
+    """Ids of up to `most` objects that tell configurations apart, in the table's order.
+
+    Objects in conflict with the ego rank first, then by the spread of their times to detection over configurations,
+    then by the latest of them. An object that was never known counts as known at the end of its episode. `baselines`
+    are left out, unless there are no other configurations.
+    """
+    others = table[~table["configuration"].isin(baselines)]
+    episodes = others if len(others) else table
+    time_s = episodes["time_to_detection_s"].fillna(episodes["ended_s"] - episodes["onset_s"])
+    by_object = time_s.groupby(episodes["object_id"], sort=False)
+    conflict = episodes["conflict"] if "conflict" in episodes else pd.Series(False, index=episodes.index)
+    rank = pd.DataFrame(
+        {
+            "conflict": conflict.fillna(False).astype(bool).groupby(episodes["object_id"], sort=False).any(),
+            "apart": by_object.max() - by_object.min(),
+            "late": by_object.max(),
+        }
+    )
+    rank = rank.loc[list(dict.fromkeys(episodes["object_id"]))]
+    chosen = set(rank.sort_values(["conflict", "apart", "late"], ascending=False, kind="stable").index[:most])
+    return [name for name in dict.fromkeys(table["object_id"]) if name in chosen]
+
+
+# Time axes of an object's lanes and curves.
+
+BEFORE_S, AFTER_S, LEAST_S = 0.5, 0.5, 2.0
+"""Margins before the onset and after the last detection, and the shortest axis: longer ones make changes narrow."""
+UNKNOWN_S = 10.0
+"""Length after the onset, if no configuration detects the object; it ends earlier with the episode."""
+
+
+def axis_s(episodes: pd.DataFrame, end_s: float) -> tuple[float, float]:
+    """First and last second of an object's axis: 0.5 s before the onset to 0.5 s after the last detection.
+
+    `episodes`: rows of one object and run, of all configurations.
+    """
+    onset_s = float(episodes["onset_s"].iloc[0])
+    detected_s = episodes["detection_s"][episodes["detected"]]
+    last_s = float(detected_s.max()) if len(detected_s) else min(float(episodes["ended_s"].max()), onset_s + UNKNOWN_S)
+    first_s = max(min(onset_s, float(detected_s.min()) if len(detected_s) else onset_s) - BEFORE_S, 0.0)
+    return first_s, min(max(last_s + AFTER_S, first_s + LEAST_S), max(end_s, first_s + AFTER_S))

@@ -1,62 +1,76 @@
-"""How far each shown object has come in a configuration: hidden, visible, captured by a unit, known to the receiver.
+"""Status of each shown object in a configuration, hidden, captured by a unit or known to the receiver; and its words.
 
-Known is what the table says: from `detection_s` on, and never before.
-
-At an instant, of an object and the units of a configuration, the last of these that holds:
+An object is known from `detection_s` of the table on, and never before. The status at an instant is the last of these
+that holds for the object and the units of the configuration:
 
 | status | holds when |
 |---|---|
-| absent | the object is not in the log then |
-| not listed | it is; nothing is known of what the units can see: their lists are recorded |
-| out of view | it is in no field of view of the units |
-| hidden | of those in whose field it is, none sees more of it than `CLEAR_ABOVE` |
-| visible | one does, but no list under way holds it |
-| lost | a unit's newest list held it, and will never arrive |
+| absent | the object is not in the log |
+| not listed | it is; the lists of the units are recorded, so what they can see is unknown |
+| out of view | no unit has it in its field of view |
+| hidden | units have, but none sees more than `CLEAR_ABOVE` of it |
+| visible | a unit sees more, but no list under way holds it |
+| lost | a unit's newest list holds it, and never arrives |
 | captured | a list that holds it is under way |
-| unmatched | a unit's newest list that has arrived holds it; of the fused list no entry is matched with it |
-| listed before the onset | the receiver's newest list holds it, as it was before the onset, which does not count |
-| listed, not confirmed | it does, since the onset, or whenever counts; `confirm` asks for more |
-| listed too late | it does, and was not there before the episode ended |
-| known | it does, at or after `detection_s` |
+| unmatched | a unit's newest list that arrived holds it, but no entry of the fused list is matched with it |
+| listed before the onset | the receiver's newest list holds it, captured before the onset, which does not count |
+| listed, not confirmed | the newest list counts, but `confirm` asks for more lists |
+| listed too late | the newest list became available after the episode's end |
+| known | the newest list holds it, at or after `detection_s` |
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 
+from copem_replay.communication.arrivals import fusion_schedule
+from copem_replay.core.colours import Rgb
 from copem_replay.core.fused_tracks import FusedTracks
-from copem_replay.core.interpolation import states_at
+from copem_replay.core.interpolation import interpolate_states
 from copem_replay.core.tracks import SAME_INSTANT_NS, TRUTH, Bool, Float, Int, Scene, Tracks
 from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.viewer.line_of_sight import CLEAR_ABOVE, Sight
-from copem_replay.viewer.sink import elapsed_ns, ns
-from copem_replay.viewer.statuses import (
+from copem_replay.viewer.sensors import unit_places
+from copem_replay.viewer.sink import (
     ABSENT,
+    BEHIND,
     CAPTURED,
     EARLY,
     HIDDEN,
+    HIDES,
     KNOWN,
     LOST,
+    NOTICED,
     OUT,
+    STATUSES,
     TOO_LATE,
     UNCONFIRMED,
     UNLISTED,
     UNMATCHED,
     VISIBLE,
+    WAITING,
+    RecordingSink,
+    configuration_part,
+    elapsed_ns,
+    short_ids,
+    stack_float32,
+    to_nanoseconds,
 )
 
 NEVER_NS = np.iinfo(np.int64).max
 
 
 @dataclass(frozen=True)
-class Clock:
-    """What the table says, by object (N + 1,), the last: no object. Never: NEVER_NS.
+class EpisodeClocks:
+    """Onset, detection in one configuration and end of each object's episode, (N + 1,) ns since the log's start.
 
-    Episodes are the same in all configurations, `known_ns` is of one.
+    NEVER_NS if there is none. The last element is for entries without an object.
     """
 
     onset_ns: Int
@@ -64,150 +78,405 @@ class Clock:
     ended_ns: Int
 
 
-def clock_of(scene: Scene, table: pd.DataFrame, configuration: str) -> Clock:
-    """When each object's episode begins and ends, and when it is known; `table`: rows of one log and run."""
-    known = table[(table["configuration"] == configuration) & table["detected"]]
-    times = (table, "onset_s"), (known, "detection_s"), (table, "ended_s")
-    made = []
+def read_episode_clocks(scene: Scene, table: pd.DataFrame, configuration: str) -> EpisodeClocks:
+    """The clocks of all objects in a configuration; `table`: rows of one log and run."""
+    detections = table[(table["configuration"] == configuration) & table["detected"]]
+    times = (table, "onset_s"), (detections, "detection_s"), (table, "ended_s")
+    clocks = []
     for part, name in times:
-        of_each = np.full(len(scene.object_ids) + 1, NEVER_NS)
-        of_each[part["object_id"].map(scene.object_number).to_numpy(dtype=np.int64)] = ns(part[name])
-        made.append(of_each)
-    return Clock(*made)
+        times_ns = np.full(len(scene.object_ids) + 1, NEVER_NS)
+        times_ns[part["object_id"].map(scene.object_number).to_numpy(dtype=np.int64)] = to_nanoseconds(part[name])
+        clocks.append(times_ns)
+    return EpisodeClocks(*clocks)
 
 
 @dataclass(frozen=True)
 class Status:
-    """Of one configuration at instants (K,), of the objects of Sight (M,). All (K, M); what does not apply: −1, NaN."""
+    """Status in one configuration, (K, M): instants (K,) by objects of Sight (M,). −1 or NaN: does not apply."""
 
     elapsed_ns: Int  # (K,)
-    frame: Int  # (K,) of Sight, −1: before the first
+    frame: Int  # (K,), of Sight, −1 before the first
     status: Int  # index into STATUSES
-    unit_ix: Int  # of the experiment: the unit that sees most of it, or has a list under way
-    until_s: Float  # until a list under way arrives
-    age_of_information_s: Float  # of what is listed
-    x_m: Float  # where it truly is, or its fused position while absent
+    unit_ix: Int  # unit of the experiment that sees most of it, or has a list under way
+    until_s: Float  # time until a list under way arrives
+    age_of_information_s: Float  # of the entry in the newest list
+    x_m: Float  # true position, or fused position while absent
     y_m: Float
-    top_m: Float
+    top_m: Float  # height of the top of the box
 
 
-def status_of(
-    replay: Replay, experiment: Experiment, configuration: str, fused_tracks: FusedTracks, seen: Sight, clock: Clock
+def compute_status(
+    replay: Replay,
+    experiment: Experiment,
+    configuration: str,
+    fused_tracks: FusedTracks,
+    sight: Sight,
+    clock: EpisodeClocks,
 ) -> Status:
-    """The status of all shown objects at every instant at which any of them may change."""
+    """The status of all shown objects at every instant at which one may change."""
     heard, numbers = fused_tracks.heard, {name: u for u, name in enumerate(experiment.units)}
-    asked = experiment.configurations[configuration]
-    of_truth = asked.units == TRUTH
-    heard_of = [TRUTH] if of_truth else [name for name in experiment.units_of(asked) if name in heard.units]
+    asked_configuration = experiment.configurations[configuration]
+    of_truth = asked_configuration.units == TRUTH
+    heard_of = (
+        [TRUTH] if of_truth else [name for name in experiment.units_of(asked_configuration) if name in heard.units]
+    )
     modelled = [numbers[name] for name in heard_of if name in experiment.modelled]
-    listed = [[_lists(heard, heard.units.index(name), k) for name in heard_of] for k in seen.object_ix]
-    instants = _instants(seen, fused_tracks.fused, listed, clock, replay.scene.end_ns - replay.scene.t0_ns)
-    frame = np.searchsorted(seen.elapsed_ns, instants + SAME_INSTANT_NS, side="right") - 1
-    shape = (len(instants), len(seen.object_ix))
-    made = Status(
+    listed = [[_find_object_lists(heard, heard.units.index(name), k) for name in heard_of] for k in sight.object_ix]
+    instants = _find_instants(sight, fused_tracks.fused, listed, clock, replay.scene.end_ns - replay.scene.t0_ns)
+    frame = np.searchsorted(sight.elapsed_ns, instants + SAME_INSTANT_NS, side="right") - 1
+    shape = (len(instants), len(sight.object_ix))
+    statuses = Status(
         instants, frame, np.full(shape, ABSENT), np.full(shape, -1), *(np.full(shape, np.nan) for _ in range(5))
     )
-    for m, k in enumerate(seen.object_ix.tolist()):
-        at, there = states_at(
+    for m, k in enumerate(sight.object_ix.tolist()):
+        states, present = interpolate_states(
             replay.truth, np.full(len(instants), k), instants * np.float64(1e-9),
             t0_ns=replay.scene.t0_ns, max_gap_s=experiment.max_gap_s,
         )  # fmt: skip
-        made.x_m[:, m], made.y_m[:, m], made.top_m[:, m] = at["x_m"], at["y_m"], at["z_m"] + at["height_m"] / 2
-        made.status[there, m] = VISIBLE if of_truth else OUT if modelled else UNLISTED
+        statuses.x_m[:, m], statuses.y_m[:, m], statuses.top_m[:, m] = (
+            states["x_m"],
+            states["y_m"],
+            states["z_m"] + states["height_m"] / 2,
+        )
+        statuses.status[present, m] = VISIBLE if of_truth else OUT if modelled else UNLISTED
         if modelled and len(instants):
-            _measured(seen, modelled, m, there & (frame >= 0), made)
+            _find_best_unit(sight, modelled, m, present & (frame >= 0), statuses)
         for name, (captured_ns, arrives_ns, stamps_ns) in zip(heard_of, listed[m], strict=True):
-            _under_way(captured_ns, arrives_ns, stamps_ns, numbers.get(name, -1), m, made)
-        _held(fused_tracks, k, m, clock, experiment.measure.count_earlier, made)
-    return made
+            _mark_under_way(captured_ns, arrives_ns, stamps_ns, numbers.get(name, -1), m, statuses)
+        _mark_held(fused_tracks, k, m, clock, experiment.measure.count_earlier, statuses)
+    return statuses
 
 
-def _measured(seen: Sight, units: list[int], m: int, there: Bool, made: Status) -> None:
-    """Which of some units sees most of object m. Out: its column of `made`."""
-    share = seen.share[units][:, np.maximum(made.frame, 0), m]
+def _find_best_unit(sight: Sight, units: list[int], m: int, present: Bool, statuses: Status) -> None:
+    """Fill column m of `statuses` with the unit that sees most of the object, as hidden or visible."""
+    share = sight.share[units][:, np.maximum(statuses.frame, 0), m]
     best = np.argmax(np.nan_to_num(share, nan=-1.0), axis=0)
-    most = share[best, np.arange(len(best))]
-    looked = there & ~np.isnan(most)
-    made.status[looked, m] = np.where(most[looked] > CLEAR_ABOVE, VISIBLE, HIDDEN)
-    made.unit_ix[looked, m] = np.array(units)[best[looked]]
+    largest = share[best, np.arange(len(best))]
+    looked = present & ~np.isnan(largest)
+    statuses.status[looked, m] = np.where(largest[looked] > CLEAR_ABOVE, VISIBLE, HIDDEN)
+    statuses.unit_ix[looked, m] = np.array(units)[best[looked]]
 
 
-def _lists(heard: Tracks, unit: int, object_ix: int) -> tuple[Int, Float, Int]:
-    """When a unit's lists that hold an object were captured and arrive (K,), in order; and when it captured any."""
-    rows = np.flatnonzero((heard.row_object_ix == object_ix) & (heard.row_unit_ix == unit) & heard.valid[0])
-    frames = np.unique(heard.frame_ix[rows])
-    frames = frames[np.argsort(heard.captured_s[frames], kind="stable")]
-    arrives_s = heard.common_arrives_s[frames]
+def _find_object_lists(lists: Tracks, unit: int, object_ix: int) -> tuple[Int, Float, Int]:
+    """Captures and arrivals (K,) of a unit's lists that hold an object, and captures (F,) of all its lists, in ns.
+
+    In order of capture; the arrival of a lost list is inf.
+    """
+    rows = np.flatnonzero((lists.row_object_ix == object_ix) & (lists.row_unit_ix == unit) & lists.valid[0])
+    frames = np.unique(lists.frame_ix[rows])
+    frames = frames[np.argsort(lists.captured_s[frames], kind="stable")]
+    arrives_s = lists.common_arrives_s[frames]
     arrives_ns = np.where(np.isfinite(arrives_s), np.rint(arrives_s * 1e9), np.inf)
-    every = np.sort(ns(heard.captured_s[heard.frame_unit_ix == unit]))
-    return ns(heard.captured_s[frames]), arrives_ns, every
+    all_captured_ns = np.sort(to_nanoseconds(lists.captured_s[lists.frame_unit_ix == unit]))
+    return to_nanoseconds(lists.captured_s[frames]), arrives_ns, all_captured_ns
 
 
-def _instants(seen: Sight, fused: Tracks, listed: list[list[tuple[Int, Float, Int]]], clock: Clock, end_ns: int) -> Int:
-    """(K,) frames of the truth with a shown object and the one after, captures and arrivals of their lists, onsets."""
+def _find_instants(
+    sight: Sight, fused: Tracks, listed: list[list[tuple[Int, Float, Int]]], clock: EpisodeClocks, end_ns: int
+) -> Int:
+    """(K,) instants of frames with a shown object and the next frames, captures, arrivals, onsets, detections."""
     captured = [captured_ns for of_object in listed for captured_ns, _, _ in of_object]
-    rows = np.isin(fused.row_object_ix, seen.object_ix) & fused.valid[0]
+    rows = np.isin(fused.row_object_ix, sight.object_ix) & fused.valid[0]
     frames = np.unique(fused.frame_ix[rows])
     available = elapsed_ns(fused)[np.union1d(frames, np.minimum(frames + 1, len(fused.stamp_ns) - 1))]
-    gone = seen.elapsed_ns[np.flatnonzero(np.diff(seen.elapsed_ns, append=0) > 1.5 * _period(seen.elapsed_ns))]
-    after = [gone + _period(seen.elapsed_ns), seen.elapsed_ns[-1:] + _period(seen.elapsed_ns)]
+    gone = sight.elapsed_ns[
+        np.flatnonzero(np.diff(sight.elapsed_ns, append=0) > 1.5 * _frame_period_ns(sight.elapsed_ns))
+    ]
+    after = [gone + _frame_period_ns(sight.elapsed_ns), sight.elapsed_ns[-1:] + _frame_period_ns(sight.elapsed_ns)]
     after = [np.minimum(instant, end_ns) for instant in after]
-    told = np.concatenate([clock.onset_ns[seen.object_ix], clock.known_ns[seen.object_ix]])
-    told = told[told != NEVER_NS]
-    return np.unique(np.concatenate([seen.elapsed_ns, *after, *captured, available, told]).astype(np.int64))
+    clocks_ns = np.concatenate([clock.onset_ns[sight.object_ix], clock.known_ns[sight.object_ix]])
+    clocks_ns = clocks_ns[clocks_ns != NEVER_NS]
+    return np.unique(np.concatenate([sight.elapsed_ns, *after, *captured, available, clocks_ns]).astype(np.int64))
 
 
-def _period(elapsed_ns: Int) -> int:
-    """Nanoseconds from one frame to the next, mostly."""
+def _frame_period_ns(elapsed_ns: Int) -> int:
+    """The median time between frames, in ns; 0.1 s for a single frame."""
     return int(np.median(np.diff(elapsed_ns))) if len(elapsed_ns) > 1 else 100_000_000
 
 
-def _under_way(captured_ns: Int, arrives_ns: Float, stamps_ns: Int, unit: int, m: int, made: Status) -> None:
-    """Where a list of one unit that holds object m is under way, or was lost. Out: its column of `made`."""
+def _mark_under_way(captured_ns: Int, arrives_ns: Float, stamps_ns: Int, unit: int, m: int, statuses: Status) -> None:
+    """Fill column m of `statuses` where a list of one unit that holds the object is lost, under way or unmatched."""
     if not len(captured_ns):
         return
-    now, status = made.elapsed_ns + SAME_INSTANT_NS, made.status[:, m]
+    now, status = statuses.elapsed_ns + SAME_INSTANT_NS, statuses.status[:, m]
     sent = np.searchsorted(captured_ns, now, side="right")
     newest = np.maximum(sent - 1, 0)
-    # Until the unit captures its next list.
+    # A lost list counts until the unit captures its next one.
     still = np.searchsorted(stamps_ns, now, "right") == np.searchsorted(stamps_ns, captured_ns[newest], "right")
     lost = (sent > 0) & still & np.isinf(arrives_ns[newest]) & (status < LOST)
-    made.status[lost, m], made.unit_ix[lost, m] = LOST, unit
+    statuses.status[lost, m], statuses.unit_ix[lost, m] = LOST, unit
     travels = np.isfinite(arrives_ns)
     sent = np.searchsorted(captured_ns[travels], now, side="right")
     arrivals = np.sort(arrives_ns[travels])
     arrived = np.searchsorted(arrivals, now, side="right")
-    left_s = (np.append(arrivals, np.inf)[arrived] - made.elapsed_ns) * 1e-9
-    soonest = (sent > arrived) & ~(made.until_s[:, m] <= left_s)
-    soonest &= made.status[:, m] < UNMATCHED
-    made.status[soonest, m], made.unit_ix[soonest, m], made.until_s[soonest, m] = CAPTURED, unit, left_s[soonest]
+    left_s = (np.append(arrivals, np.inf)[arrived] - statuses.elapsed_ns) * 1e-9
+    soonest = (sent > arrived) & ~(statuses.until_s[:, m] <= left_s)
+    soonest &= statuses.status[:, m] < UNMATCHED
+    statuses.status[soonest, m], statuses.unit_ix[soonest, m], statuses.until_s[soonest, m] = (
+        CAPTURED,
+        unit,
+        left_s[soonest],
+    )
     if travels.any():
-        # Gone by until a list that was captured later has been as long on its way.
+        # An arrived list is the newest until a list captured later has been on its way for as long.
         newest = np.maximum(arrived - 1, 0)
         held_ns, took_ns = captured_ns[travels][newest], (arrives_ns - captured_ns)[travels][newest]
         newer = np.searchsorted(stamps_ns, now - took_ns, "right") > np.searchsorted(stamps_ns, held_ns, "right")
-        heard = (arrived > 0) & ~newer & (made.status[:, m] != ABSENT)
-        made.status[heard, m], made.unit_ix[heard, m] = UNMATCHED, unit
+        unmatched = (arrived > 0) & ~newer & (statuses.status[:, m] != ABSENT)
+        statuses.status[unmatched, m], statuses.unit_ix[unmatched, m] = UNMATCHED, unit
 
 
-def _held(fused_tracks: FusedTracks, object_ix: int, m: int, clock: Clock, count_earlier: bool, made: Status) -> None:
-    """Where the receiver's newest list holds the object, and its fused position if it is gone. Out: as before."""
+def _mark_held(
+    fused_tracks: FusedTracks, object_ix: int, m: int, clock: EpisodeClocks, count_earlier: bool, statuses: Status
+) -> None:
+    """Fill column m of `statuses` where the receiver's newest list holds the object."""
     fused = fused_tracks.fused
-    row_of = np.full(len(fused.stamp_ns) + 1, -1)  # one more: there was no list yet
+    row_of = np.full(len(fused.stamp_ns) + 1, -1)  # the element more, index −1: no list yet
     rows = np.flatnonzero((fused.row_object_ix == object_ix) & fused.valid[0])
     row_of[fused.frame_ix[rows]] = rows
-    row = row_of[np.searchsorted(elapsed_ns(fused), made.elapsed_ns + SAME_INSTANT_NS, side="right") - 1]
+    row = row_of[np.searchsorted(elapsed_ns(fused), statuses.elapsed_ns + SAME_INSTANT_NS, side="right") - 1]
     held = np.flatnonzero(row >= 0)
     row = row[held]
     captured_s = fused_tracks.captured_s[0, row]
-    made.age_of_information_s[held, m] = made.elapsed_ns[held] * 1e-9 - captured_s
-    gone = np.isnan(made.x_m[held, m])  # whatever is under way
+    statuses.age_of_information_s[held, m] = statuses.elapsed_ns[held] * 1e-9 - captured_s
+    gone = np.isnan(statuses.x_m[held, m])  # absent: the fused position is used
     top_m = fused.z_m[0] + fused.height_m[0] / 2
-    for column, value in ((made.x_m, fused.x_m[0]), (made.y_m, fused.y_m[0]), (made.top_m, top_m)):
+    for column, value in ((statuses.x_m, fused.x_m[0]), (statuses.y_m, fused.y_m[0]), (statuses.top_m, top_m)):
         column[held[gone], m] = value[row[gone]]
     too_late = elapsed_ns(fused)[fused.frame_ix[row]] - SAME_INSTANT_NS > clock.ended_ns[object_ix]
     status = np.where(too_late, TOO_LATE, UNCONFIRMED)
     if not count_earlier:
         status[captured_s * 1e9 < clock.onset_ns[object_ix] - SAME_INSTANT_NS] = EARLY
-    status[made.elapsed_ns[held] >= clock.known_ns[object_ix]] = KNOWN
-    made.status[held, m] = status
+    status[statuses.elapsed_ns[held] >= clock.known_ns[object_ix]] = KNOWN
+    statuses.status[held, m] = status
+
+
+# Reasons in words why a configuration knows an object or not: a label in the picture, a sentence on selection.
+
+OLD_S = 0.05
+"""Greatest age that words leave out: less than the time from list to list."""
+
+
+@dataclass(frozen=True)
+class Reasons:
+    """Label over an object and sentence on its selection, for pairs (P,) of instant and object.
+
+    `number`: equal for equal sentences.
+    """
+
+    labels: pa.Array
+    sentences: pa.Array
+    number: Int
+
+
+def explain_status(
+    scene: Scene, experiment: Experiment, sight: Sight, statuses: Status, rows: Int, column: Int, started: Bool
+) -> Reasons:
+    """Words for (P,) pairs; each distinct sentence is made once. `started` (P,): whether the onset has passed."""
+    frame, status, unit = (
+        np.maximum(statuses.frame[rows], 0),
+        statuses.status[rows, column],
+        statuses.unit_ix[rows, column],
+    )
+    hidden = np.flatnonzero(status == HIDDEN)
+    by = unit[hidden], frame[hidden], column[hidden]
+    share, body = np.zeros(len(rows)), np.zeros(len(rows), dtype=np.int64)
+    share[hidden], body[hidden] = sight.share[by], sight.body_ix[by]
+    time_s = np.nan_to_num(
+        np.where(status >= EARLY, statuses.age_of_information_s[rows, column], statuses.until_s[rows, column])
+    )
+    near = sight.in_range[:, frame, column].any(axis=0)
+    whole = [np.rint(value).astype(np.int64) for value in (time_s * 10, share * 100)]
+    columns = np.stack([column, status, unit, *whole, body, near, started], axis=-1)
+    keys, which = _find_distinct_rows(columns)
+    ids, units = short_ids(scene), [*experiment.units, TRUTH]  # index −1: the truth, or no unit
+    details = [
+        (ids[sight.object_ix[key[0]]], units[key[2]], body_name(ids, sight.solids, key[5]), key)
+        for key in keys.tolist()
+    ]
+    picked = pa.array(which)
+    labels = [_format_label(name, unit, hider, key) for name, unit, hider, key in details]
+    sentences = [_format_sentence(name, unit, hider, key) for name, unit, hider, key in details]
+    return Reasons(pa.array(labels, pa.string()).take(picked), pa.array(sentences, pa.string()).take(picked), which)
+
+
+def body_name(ids: Sequence[str], solids: Sequence[str], body: int) -> str:
+    """Name of a hiding body: id of the object with this index, or name of the solid k for −1 − k."""
+    return ids[body] if body >= 0 else solids[-1 - body]
+
+
+def _find_distinct_rows(columns: Int) -> tuple[Int, Int]:
+    """The distinct rows (D, C), and the index (P,) of each row among them. Rows become numbers, which sort faster."""
+    low = columns.min(axis=0, initial=0)
+    span = columns.max(axis=0, initial=0) - low + 1
+    packed = np.ravel_multi_index(tuple((columns - low).T), tuple(span.tolist()))
+    _, first, which = np.unique(packed, return_index=True, return_inverse=True)
+    return columns[first], which.reshape(-1)
+
+
+def _format_label(name: str, unit: str, hider: str, key: list[int]) -> str:
+    """“58 behind 41”; only the name of a known object."""
+    _, status, _, _, _, _, near, started = key
+    words = {
+        KNOWN: "",
+        EARLY: " listed, onset not known" if started else " listed",
+        UNCONFIRMED: " not confirmed",
+        TOO_LATE: " too late",
+        CAPTURED: " on its way",
+        UNMATCHED: " unmatched",
+        LOST: " list lost",
+        UNLISTED: " not listed",
+        VISIBLE: " not listed yet" if unit == TRUTH else " not listed",
+        HIDDEN: f" behind {hider}",
+    }
+    return name + words.get(status, " out of view" if near else " out of range")
+
+
+def _format_sentence(name: str, unit: str, hider: str, key: list[int]) -> str:
+    """“58 hidden from ego by 41 (share 0.21)”."""
+    _, status, _, tenths, hundredths, _, near, started = key
+    if status >= EARLY:
+        old = "" if tenths * 0.1 <= OLD_S else f", {tenths / 10:.1f} s old"
+        early = ", onset not known yet" if started else ""
+        after = {EARLY: f"{old}{early}", UNCONFIRMED: f"{old}, not confirmed yet", TOO_LATE: f" too late{old}"}
+        return f"{name} known{old}" if status == KNOWN else f"{name} listed{after[status]}"
+    if status == CAPTURED:
+        return f"{name} listed by {unit}, arrives in {tenths / 10:.1f} s"
+    if status == UNMATCHED:
+        return f"{name} listed by {unit}, no entry matched"
+    if status == LOST:
+        return f"{name} listed by {unit}, list lost"
+    if status == VISIBLE:
+        return f"{name} not listed yet" if unit == TRUTH else f"{name} seen by {unit}, not listed"
+    if status == UNLISTED:
+        return f"{name} not listed"
+    if status == HIDDEN:
+        return f"{name} hidden from {unit} by {hider} (share {hundredths / 100:.2f})"
+    return f"{name} outside fields of view" if near else f"{name} out of range"
+
+
+def lane_text(status: int, unit: str, hider: str) -> str:
+    """The text of a span in a lane: “behind 41 (from ego)”."""
+    if status == HIDDEN:
+        return f"behind {hider} (from {unit})"
+    if status == VISIBLE:
+        return "not listed yet" if unit == TRUTH else f"seen by {unit}, not listed"
+    if status == CAPTURED:
+        return f"on its way from {unit}"
+    return "listed, captured before the onset" if status == EARLY else STATUSES[status]
+
+
+# Words over the shown objects, lines to hiding bodies, lines of sight of the units that listed objects first.
+
+ABOVE_M = 2.0
+"""Height of words above the top of an object, clear of its box."""
+RAY_ALPHA = 110
+"""Opacity of lines of sight, of 255: what is behind them stays visible."""
+
+
+def write_status_words(
+    out: RecordingSink,
+    name: str,
+    replay: Replay,
+    experiment: Experiment,
+    sight: Sight,
+    statuses: Status,
+    clock: EpisodeClocks,
+) -> None:
+    """Write over the true place of each object “58 behind 41”, and a sentence that selecting it shows."""
+    import rerun as rr
+
+    rows, column = np.nonzero((statuses.status != ABSENT) & ~np.isnan(statuses.x_m))
+    place = stack_float32(*(getattr(statuses, n)[rows, column] for n in ("x_m", "y_m", "top_m")))
+    place[:, 2] += ABOVE_M
+    colours = np.full((len(rows), 3), WAITING, dtype=np.uint8)
+    status = statuses.status[rows, column]
+    colours[status == HIDDEN], colours[status == KNOWN] = BEHIND, NOTICED
+    started = statuses.elapsed_ns[rows] >= clock.onset_ns[sight.object_ix[column]]
+    reasons = explain_status(replay.scene, experiment, sight, statuses, rows, column, started)
+    counts = np.bincount(rows, minlength=len(statuses.elapsed_ns))
+    numbers = np.full(statuses.status.shape, -1)
+    numbers[rows, column] = reasons.number
+    changes = np.append(True, (numbers[1:] != numbers[:-1]).any(axis=1))[: len(numbers)]
+    # Words move with the boxes at frames of the truth; at other instants a row is needed only for a change.
+    drawn = changes | np.isin(statuses.elapsed_ns, sight.elapsed_ns)
+    drawn_rows = drawn[rows]
+    columns = rr.Points3D.columns(
+        positions=place[drawn_rows], labels=reasons.labels.filter(pa.array(drawn_rows)), colors=colours[drawn_rows]
+    )
+    path = ["world", configuration_part(name), "status"]
+    out.columns(path, statuses.elapsed_ns[drawn], columns.partition(counts[drawn]))
+    out.static(path, rr.Points3D.from_fields(radii=rr.Radius.ui_points(1.5), show_labels=True))
+    # Sentences have rows only where one changes: the viewer shows the newest.
+    told_then = reasons.sentences.filter(pa.array(changes[rows]))
+    sentences = rr.DynamicArchetype.columns(archetype="why", components={"why": told_then})
+    out.columns(path, statuses.elapsed_ns[changes], sentences.partition(counts[changes]))
+
+
+def write_hiding_lines(out: RecordingSink, name: str, sight: Sight, statuses: Status) -> None:
+    """Write lines from the unit that sees most of a hidden object to the body that hides it."""
+    import rerun as rr
+
+    rows, column = np.nonzero(statuses.status == HIDDEN)
+    if not len(rows):
+        return
+    by, frame = statuses.unit_ix[rows, column], statuses.frame[rows]
+    lines = np.stack([sight.place_m[by, frame], sight.body_m[by, frame, column]], axis=1)
+    counts = np.bincount(rows, minlength=len(statuses.elapsed_ns))
+    instants = np.flatnonzero((counts > 0) | (np.append(0, counts[:-1]) > 0))  # one empty row ends the lines
+    path = ["world", configuration_part(name), "hiding"]
+    columns = rr.LineStrips3D.columns(strips=lines.astype(np.float32)).partition(counts[instants])
+    out.columns(path, statuses.elapsed_ns[instants], columns)
+    out.static(path, rr.LineStrips3D.from_fields(colors=[HIDES], radii=rr.Radius.ui_points(1.25)))
+
+
+def write_listing_lines(
+    out: RecordingSink, name: str, replay: Replay, experiment: Experiment, fused_tracks: FusedTracks, sight: Sight,
+    colour: Rgb, first_unit: Mapping[int, str],
+) -> None:  # fmt: skip
+    """Write lines from a unit's place at capture to its entry of each shown object, for the unit that listed it first.
+
+    `first_unit`: that unit by object, from the table; for other objects it is the unit whose list arrived first.
+    """
+    import rerun as rr
+
+    if not len(sight.object_ix):
+        return
+    lists = fused_tracks.heard
+    schedule = fusion_schedule(lists, max_age_s=experiment.configurations[name].max_age_s)
+    place = unit_places(replay, experiment, lists)
+    row_of = np.full((len(lists.stamp_ns) + 1, len(sight.object_ix)), -1)  # the row more, index −1: no list
+    rows = np.flatnonzero(np.isin(lists.row_object_ix, sight.object_ix) & lists.valid[0])
+    column = (lists.row_object_ix[rows, None] == sight.object_ix).argmax(axis=1)
+    rows, column = (part[_is_of_first_unit(lists, rows, column, sight, first_unit)] for part in (rows, column))
+    row_of[lists.frame_ix[rows], column] = rows
+    row_of[:-1][np.isnan(place[:, 0])] = -1
+    k, u, m = np.nonzero(row_of[schedule.newest] >= 0)
+    rows = row_of[schedule.newest[k, u], m]
+    if not len(rows):
+        return
+    ends = stack_float32(lists.x_m[0, rows], lists.y_m[0, rows], lists.z_m[0, rows])
+    lines = np.stack([place[lists.frame_ix[rows]].astype(np.float32), ends], axis=1)
+    counts = np.bincount(k, minlength=len(schedule.issue_s))
+    instants = np.flatnonzero((counts > 0) | (np.append(0, counts[:-1]) > 0))
+    path = ["world", configuration_part(name), "listings"]
+    out.columns(
+        path,
+        to_nanoseconds(schedule.issue_s[instants]),
+        rr.LineStrips3D.columns(strips=lines).partition(counts[instants]),
+    )
+    out.static(path, rr.LineStrips3D.from_fields(colors=[(*colour, RAY_ALPHA)], radii=rr.Radius.ui_points(0.75)))
+
+
+def _is_of_first_unit(lists: Tracks, rows: Int, column: Int, sight: Sight, first_unit: Mapping[int, str]) -> Bool:
+    """(P,) whether each row is of the unit that listed its object first."""
+    unit = lists.frame_unit_ix[lists.frame_ix[rows]]
+    kept = np.zeros(len(rows), dtype=bool)
+    for m, k in enumerate(sight.object_ix.tolist()):
+        object_rows = np.flatnonzero(column == m)
+        if not len(object_rows):
+            continue
+        name = first_unit.get(k)
+        soonest = object_rows[np.argmin(lists.common_arrives_s[lists.frame_ix[rows[object_rows]]])]
+        kept[object_rows] = unit[object_rows] == (lists.units.index(name) if name in lists.units else unit[soonest])
+    return kept

@@ -16,7 +16,7 @@ import pytest
 
 import copem_replay as cr
 from copem_replay.cli import main as cli
-from copem_replay.viewer import opening
+from copem_replay.viewer import open as opening
 from tests.helpers.experiments import TEXT, drive
 
 ROOT = Path(__file__).parents[2]
@@ -62,7 +62,7 @@ class TestNames:
         )
         check = [sys.executable, "-m", "mypy", "--config-file", ROOT / "pyproject.toml", tmp_path / "page.py"]
         said = subprocess.run(check, cwd=ROOT, capture_output=True, text=True).stdout
-        assert "-> copem_replay.cli.api.run.StudyResult" in said
+        assert "-> copem_replay.api.run.StudyResult" in said
         assert 'has type "StudyResult", variable has type "int"' in said
         assert 'Module has no attribute "rum"' in said
 
@@ -75,7 +75,7 @@ class TestNames:
     def test_help_imports_nothing_heavy(self) -> None:
         code = (
             "import sys\nfrom copem_replay.cli import main as cli\nsys.argv = ['copem-replay', '--help']\n"
-            f"cli._ended()\nsys.exit(str({HEAVY} & sys.modules.keys() or ''))"
+            f"cli._run_to_exit_code()\nsys.exit(str({HEAVY} & sys.modules.keys() or ''))"
         )
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
         assert done.stderr.strip() == ""
@@ -124,7 +124,7 @@ class TestLoadExperiment:
 class TestRun:
     def test_same_folder_as_the_command(self, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(sys, "argv", ["copem-replay", "run", "e.yaml"])
-        assert cli._ended() == 0
+        assert cli._run_to_exit_code() == 0
         done: list[tuple[int, int]] = []
         result = cr.run("e.yaml", jobs=2, progress=lambda *at: done.append(at))
         assert done[-1][0] == done[-1][1] > 0

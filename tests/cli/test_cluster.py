@@ -8,16 +8,16 @@ from pathlib import Path
 
 import pytest
 
-from copem_replay.cli.cluster import hint
-from copem_replay.cli.progress import CrewLines
-from copem_replay.pipeline.crew.crew import CrewProgress
+from copem_replay.cli.run import advise_cluster
+from copem_replay.cli.terminal import CrewProgressLines
+from copem_replay.pipeline.crew import CrewProgress
 
 ROOT = Path(__file__).parents[2]
 
 
 def test_a_line_a_minute_with_logs_rows_time_left_and_lost_workers(capsys: pytest.CaptureFixture[str]) -> None:
     now_s = [0.0]
-    lines = CrewLines(lambda: now_s[0])
+    lines = CrewProgressLines(lambda: now_s[0])
     surveyed = CrewProgress("surveying", 100, 5000)
     lines(surveyed)
     now_s[0] = 61.0
@@ -35,12 +35,14 @@ def test_a_line_a_minute_with_logs_rows_time_left_and_lost_workers(capsys: pytes
 
 @pytest.mark.parametrize(("count", "words"), [(999, "999 rows"), (12_345, "12 k rows"), (2_100_000_000, "2 G rows")])
 def test_rows_in_three_digits(count: int, words: str) -> None:
-    assert words in CrewLines(lambda: 0.0).words(CrewProgress("replaying", 1, 2, count, 3 * count))
+    assert words in CrewProgressLines(lambda: 0.0).words(CrewProgress("replaying", 1, 2, count, 3 * count))
 
 
 def test_the_hint_is_given_where_it_helps() -> None:
-    assert hint(60.0, 8) == hint(61.0, 4) == []
-    assert hint(75.2, 8) == ["replaying took 75 s; `--cluster local` makes more of 8 cores: its workers are processes"]
+    assert advise_cluster(60.0, 8) == advise_cluster(61.0, 4) == []
+    assert advise_cluster(75.2, 8) == [
+        "replaying took 75 s; `--cluster local` makes more of 8 cores: its workers are processes"
+    ]
 
 
 def test_without_dask_a_line_says_what_to_type() -> None:

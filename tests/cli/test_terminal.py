@@ -16,9 +16,9 @@ import pytest
 
 import copem_replay as cr
 from copem_replay.cli import main as cli
-from copem_replay.cli.progress import Lines, duration, with_progress
-from copem_replay.core.text import wrapped
-from copem_replay.metrics.summary_text import as_text, summary_text
+from copem_replay.cli.terminal import ProgressLines, format_duration, show_progress
+from copem_replay.core.errors import wrap_line
+from copem_replay.metrics.summary import format_summary, format_table
 from tests.helpers.experiments import changed, drive
 from tests.helpers.recordings import Topic, truth_topic, write_recording
 
@@ -126,7 +126,7 @@ class TestWidth:
     def test_what_was_wrapped_says_the_same(self, show: Show, here: Path, width: int) -> None:
         cr.run("e.yaml").save("out/e")
         summary = cr.load_results("out/e").summary
-        whole, fitted = summary_text(summary), summary_text(summary, width)
+        whole, fitted = format_summary(summary), format_summary(summary, width)
         assert max(map(len, fitted.splitlines())) <= width
         assert set(whole.split()) == set(fitted.split())
 
@@ -158,40 +158,40 @@ class TestTables:
 
     def test_whole_where_it_fits(self) -> None:
         whole = "name  first  second\na         1  x\nbb     22.5  y"
-        assert as_text(self.TABLE) == as_text(self.TABLE, 19) == whole
+        assert format_table(self.TABLE) == format_table(self.TABLE, 19) == whole
 
     def test_in_blocks_where_it_does_not(self) -> None:
-        assert as_text(self.TABLE, 18) == "name  first\na         1\nbb     22.5\n\nname  second\na     x\nbb    y"
+        assert format_table(self.TABLE, 18) == "name  first\na         1\nbb     22.5\n\nname  second\na     x\nbb    y"
 
     def test_values_under_names_where_not_even_one_fits(self) -> None:
-        assert as_text(self.TABLE[["name", "first"]], 8) == "name\n  first\na\n  1\nbb\n  22.5"
+        assert format_table(self.TABLE[["name", "first"]], 8) == "name\n  first\na\n  1\nbb\n  22.5"
 
     def test_what_all_have_alike_is_said_once(self, here: Path) -> None:
         cr.run("e.yaml").save("out/e")
         summary = cr.load_results("out/e").summary
-        lines = summary_text(summary).splitlines()
+        lines = format_summary(summary).splitlines()
         assert lines[0].split()[:2] == ["configuration", "detected_share"]
         assert "all configurations: n 4, list_rate_hz 10" in lines
-        one = summary_text(summary.head(1)).splitlines()
+        one = format_summary(summary.head(1)).splitlines()
         assert one[0].split()[:3] == ["configuration", "n", "list_rate_hz"]
         summary.loc[0, "n"] = 5
-        assert "all configurations: list_rate_hz 10" in summary_text(summary).splitlines()
+        assert "all configurations: list_rate_hz 10" in format_summary(summary).splitlines()
 
 
 class TestWrapped:
     def test_at_spaces_and_indented(self) -> None:
-        assert wrapped("  one two three four", 11) == ["  one two", "      three", "      four"]
+        assert wrap_line("  one two three four", 11) == ["  one two", "      three", "      four"]
 
     def test_whole_without_spaces_or_without_a_width(self) -> None:
-        assert wrapped("x" * 30, 10) == ["x" * 30]
-        assert wrapped("a path/that/stays-whole", 10) == ["a", "    path/that/stays-whole"]
-        assert wrapped("one two", None) == ["one two"]
+        assert wrap_line("x" * 30, 10) == ["x" * 30]
+        assert wrap_line("a path/that/stays-whole", 10) == ["a", "    path/that/stays-whole"]
+        assert wrap_line("one two", None) == ["one two"]
 
 
 class TestProgress:
     def test_a_line_a_minute_after_the_first(self, capsys: pytest.CaptureFixture[str]) -> None:
         now_s = 1000.0
-        lines = Lines("replaying", lambda: now_s)
+        lines = ProgressLines("replaying", lambda: now_s)
         said = {}
         for second in range(10, 201, 10):
             now_s = 1000.0 + second
@@ -206,21 +206,21 @@ class TestProgress:
 
     def test_nothing_when_it_is_done_or_not_begun(self, capsys: pytest.CaptureFixture[str]) -> None:
         now_s = 0.0
-        lines = Lines("replaying", lambda: now_s)
+        lines = ProgressLines("replaying", lambda: now_s)
         now_s = 100.0
         lines(0, 10)
         lines(10, 10)
         assert capsys.readouterr().err == ""
 
     def test_in_a_pipe_it_is_lines(self) -> None:
-        assert with_progress("replaying", lambda progress: progress).__class__ is Lines
+        assert show_progress("replaying", lambda progress: progress).__class__ is ProgressLines
 
     def test_on_a_terminal_a_bar_with_what_is_done(self, monkeypatch: pytest.MonkeyPatch) -> None:
         screen = Terminal()
         monkeypatch.setattr(sys, "stderr", screen)
         monkeypatch.setenv("TERM", "xterm")
         monkeypatch.setenv("COLUMNS", "80")
-        with_progress("replaying", lambda progress: progress(3, 4))
+        show_progress("replaying", lambda progress: progress(3, 4))
         shown = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", screen.getvalue())
         assert "replaying" in shown
         assert "75%" in shown
@@ -231,4 +231,4 @@ class TestProgress:
         [(0.2, "1 second"), (59.4, "59 seconds"), (60, "1 minute"), (3500, "58 minutes"), (7800, "2 h 10 min")],
     )
     def test_durations(self, time_s: float, said: str) -> None:
-        assert duration(time_s) == said
+        assert format_duration(time_s) == said

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from copem_replay.communication.arrivals import FusionSchedule, fusion_schedule
-from copem_replay.communication.kept import Sent, kept_entries
+from copem_replay.communication.arrivals import FusionSchedule, SentEntries, fusion_schedule, keep_entries
 from copem_replay.core.tracks import Float, Int, Tracks
 
 
@@ -49,7 +48,7 @@ def test_of_each_object_the_newest_entry_that_is_not_too_old(seed: int) -> None:
     schedule = fusion_schedule(heard, max_age_s=0.4)
     cut_s = schedule.issue_s[len(schedule.issue_s) // 3]
     for at in (schedule, schedule.between(cut_s, np.inf)):
-        kept = kept_entries(heard, Sent(start, same), np.array([True, False]), schedule, at, max_age_s=0.4)
+        kept = keep_entries(heard, SentEntries(start, same), np.array([True, False]), schedule, at, max_age_s=0.4)
         np.testing.assert_array_equal(kept.newest[:, 1], at.newest[:, 1])
         for k, now_s in enumerate(at.issue_s):
             known: dict[int, int] = {}

@@ -13,10 +13,10 @@ from copem_replay.communication.link import ConstantLink, LinkModel, SentLists, 
 from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import Float
 from copem_replay.experiment.schema import Experiment
-from copem_replay.pipeline import chunking
-from copem_replay.pipeline.run import Result, run
-from copem_replay.pipeline.sweep import points, without_points
-from copem_replay.report import write_report
+from copem_replay.pipeline import prepare as chunking
+from copem_replay.pipeline.run import ExperimentResult, run_experiment
+from copem_replay.pipeline.sweep import describe_unswept, list_points
+from copem_replay.report import write_html_report
 from tests.helpers import scenes
 from tests.helpers.report_pages import Page, changed, replayed
 from tests.helpers.scenes import experiment
@@ -65,8 +65,8 @@ def linked(link: dict[str, Any], **changes: Any) -> Experiment:
     return experiment(configurations={"PEM": {"units": ["ego"], "link": link}}, **changes)
 
 
-def outcome(plan: Experiment) -> Result:
-    return run(plan, [scenes.oncoming_car()])
+def outcome(plan: Experiment) -> ExperimentResult:
+    return run_experiment(plan, [scenes.oncoming_car()])
 
 
 class TestOneFromOutside:
@@ -112,7 +112,7 @@ class TestOneFromOutside:
         text = (folder / "experiment.yaml").read_text(encoding="utf-8")
         assert f"{HERE}:Filling" in text
         assert text.count(" link:") == 1, "where there is none, none is written"
-        write_report(folder, tmp_path / "report.html")
+        write_html_report(folder, tmp_path / "report.html")
         page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
         assert any(f"{HERE}:Filling" in cell for row in page.rows["configurations"] for cell in row)
 
@@ -128,8 +128,8 @@ class TestOneFromOutside:
 
     def test_a_sweep_of_latency_adds_to_it(self) -> None:
         plan = linked({"kind": f"{HERE}:Filling"}, sweep={"latency_s": [0, 1], "configurations": ["PEM"]})
-        assert without_points(plan) == []
-        [swept] = [outcome(point.experiment).table["detection_s"] for point in points(plan) if point.value == 1]
+        assert describe_unswept(plan) == []
+        [swept] = [outcome(point.experiment).table["detection_s"] for point in list_points(plan) if point.value == 1]
         assert swept.tolist() == pytest.approx([6.1])
 
 

@@ -17,11 +17,11 @@ from scipy import stats
 
 import copem_replay as cr
 from copem_replay.communication.latency import Delay, LatencyModel
-from copem_replay.communication.link import Air, SentLists
+from copem_replay.communication.link import LinkInput, SentLists
 from copem_replay.communication.radio import Radio
 from copem_replay.communication.reception import RadioPath, ReceptionModel
-from copem_replay.core.draws import Draws
-from copem_replay.core.lasting import ListTimes, dwelling
+from copem_replay.core.lasting import ListStamps, draw_dwelling_uniforms
+from copem_replay.core.memory import UnitDraws
 from copem_replay.core.random import CounterRng, RandomKey
 from copem_replay.core.tracks import Float
 
@@ -35,8 +35,10 @@ def lists(count: int, period_s: float = 0.1, units: int = 1, run: int = 0, **mor
     names = tuple(f"u{k}" for k in range(units))
     stamp_ns = T0_NS + np.rint(captured_s * 1e9).astype(np.int64)
     key = RandomKey(names, unit_ix, np.full(len(unit_ix), 7, dtype=np.uint64), stamp_ns)
-    draws = Draws(CounterRng(1, "log"), key, ListTimes(stamp_ns, unit_ix, np.arange(len(unit_ix))), np.array([run]))
-    air = Air(draws, more.pop("path", None), more.pop("objects", None))
+    draws = UnitDraws(
+        CounterRng(1, "log"), key, ListStamps(stamp_ns, unit_ix, np.arange(len(unit_ix))), np.array([run])
+    )
+    air = LinkInput(draws, more.pop("path", None), more.pop("objects", None))
     return replace(SentLists(names, unit_ix, captured_s, captured_s, air=air), **more)
 
 
@@ -197,10 +199,14 @@ class TestBursts:
     def test_the_number_behind_is_uniform_wherever_one_begins(self) -> None:
         key = lists(50).air.draws.random_key  # type: ignore[union-attr]
         rng, runs = CounterRng(1, "log"), np.arange(3000)
-        found = dwelling(rng, "p", key, runs, 0.7)
+        found = draw_dwelling_uniforms(rng, "p", key, runs, 0.7)
         assert stats.kstest(found[:, 20], "uniform").pvalue > 1e-3
-        np.testing.assert_array_equal(dwelling(rng, "p", key.take(np.arange(30, 50)), runs, 0.7), found[:, 30:])
-        np.testing.assert_array_equal(dwelling(rng, "p", key.take(np.array([7])), runs[5:6], 0.7), found[5:6, 7:8])
+        np.testing.assert_array_equal(
+            draw_dwelling_uniforms(rng, "p", key.take(np.arange(30, 50)), runs, 0.7), found[:, 30:]
+        )
+        np.testing.assert_array_equal(
+            draw_dwelling_uniforms(rng, "p", key.take(np.array([7])), runs[5:6], 0.7), found[5:6, 7:8]
+        )
 
 
 class TestOrderAndQueue:

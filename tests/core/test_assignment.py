@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 
-from copem_replay.core.assignment import assign, assign_pairs, largest_around
+from copem_replay.core.assignment import assign, assign_pairs, spread_component_maximum
 from tests.oracles.gnn import largest_around as largest_by_scipy
 
 Cost = npt.NDArray[np.float64]
@@ -203,7 +203,7 @@ def test_the_largest_around_is_that_of_the_connected_component(n: int, m: int, s
     expected = largest_by_scipy(allowed, value)
     order = rng.permutation(len(row))
     found = value[order]
-    largest_around(row[order], col[order], found, n, m)
+    spread_component_maximum(row[order], col[order], found, n, m)
     assert found.tolist() == expected[order].tolist()
 
 
@@ -211,5 +211,5 @@ def test_a_chain_is_one_component_and_its_end_is_heard_at_the_other():
     row, col = np.repeat(np.arange(500), 2)[1:], np.repeat(np.arange(500), 2)[:-1]
     for order in (slice(None), slice(None, None, -1)):
         value = np.arange(len(row), dtype=float)
-        largest_around(row[order], col[order], value, 500, 500)
+        spread_component_maximum(row[order], col[order], value, 500, 500)
         assert (value == len(row) - 1).all()

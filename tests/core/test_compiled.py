@@ -108,7 +108,7 @@ def test_the_users_cache_is_taken_as_ever(run: Run, tmp_path: Path) -> None:
 
 def test_not_even_a_temporary_folder(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
     error = RuntimeError("cannot cache function 'assign': no locator available for file 'core/assignment.py'")
-    monkeypatch.setattr("copem_replay.experiment.draft.survey.survey", raising(error))
+    monkeypatch.setattr("copem_replay.experiment.draft.survey.survey_recording", raising(error))
     line = "copem-replay: no folder to cache compiled code in; set NUMBA_CACHE_DIR to one that can be written"
     assert call("info", "drive.mcap") == (2, "", [line])
 

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from copem_replay.core.object_list import ENTRY, Entries, entries_of, joined, taken
+from copem_replay.core.object_list import ENTRY, Entries, entries_of, join_entries, take_entries
 
 
 def drawn(seed: int, count: int) -> Entries:
@@ -16,10 +16,10 @@ def drawn(seed: int, count: int) -> Entries:
 @given(st.integers(0, 99), st.integers(0, 9), st.lists(st.integers(0, 8), max_size=20))
 def test_taken(seed: int, count: int, rows: list[int]) -> None:
     entries, picked = drawn(seed, count), np.array([r for r in rows if r < count], dtype=np.int64)
-    found = taken(entries, picked)
+    found = take_entries(entries, picked)
     assert found.dtype == ENTRY
     assert found.tobytes() == entries[picked].tobytes()
-    assert taken(entries[::2], picked[:0]).shape == (0,)
+    assert take_entries(entries[::2], picked[:0]).shape == (0,)
     found["x_m"] = 1.0  # its own memory
     assert entries.tobytes() == drawn(seed, count).tobytes()
 
@@ -27,8 +27,8 @@ def test_taken(seed: int, count: int, rows: list[int]) -> None:
 @given(st.lists(st.integers(0, 5), max_size=4))
 def test_joined(counts: list[int]) -> None:
     parts = [drawn(seed, count) for seed, count in enumerate(counts)]
-    found = joined(parts)
+    found = join_entries(parts)
     assert found.dtype == ENTRY
     assert found.flags.c_contiguous
     assert found.tobytes() == b"".join(one.tobytes() for one in parts)
-    assert joined([drawn(1, 6)[::2]]).tobytes() == drawn(1, 6)[::2].tobytes()
+    assert join_entries([drawn(1, 6)[::2]]).tobytes() == drawn(1, 6)[::2].tobytes()

@@ -7,7 +7,7 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from copem_replay.core.overlap import rotated_iou
+from copem_replay.core.geometry import rotated_iou
 
 Box = tuple[float, float, float, float, float]
 """x, y, yaw, length, width."""

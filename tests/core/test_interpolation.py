@@ -12,7 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from copem_replay.core.interpolation import at_instants, at_stated_instants, states_at, wrap
+from copem_replay.core.interpolation import (
+    interpolate_at_instants,
+    interpolate_at_stated_instants,
+    interpolate_states,
+    wrap_angles,
+)
 from copem_replay.core.tracks import TRUTH, VALUES, Tracks
 from tests.helpers.scenes import T0_NS
 
@@ -90,7 +95,9 @@ def same(found: dict[str, float], expected: dict[str, float]) -> None:
 
 def at(world: Tracks, t_ns: int, object_ix: int = 0) -> dict[str, float] | None:
     """`states_at` of one object at one instant."""
-    columns, there = states_at(world, np.array([object_ix]), np.array([t_ns * 1e-9]), t0_ns=T0_NS, max_gap_s=MAX_GAP_S)
+    columns, there = interpolate_states(
+        world, np.array([object_ix]), np.array([t_ns * 1e-9]), t0_ns=T0_NS, max_gap_s=MAX_GAP_S
+    )
     assert set(columns) == set(VALUES)
     assert all(np.isnan(column[0]) != there[0] for column in columns.values())
     return {name: float(column[0]) for name, column in columns.items()} if there[0] else None
@@ -99,7 +106,8 @@ def at(world: Tracks, t_ns: int, object_ix: int = 0) -> dict[str, float] | None:
 def in_lists(world: Tracks, stamps_ns: list[int]) -> list[dict[int, dict[str, float]]]:
     """`at_instants`, list by list: the objects in it and their states."""
     return by_list(
-        at_instants(world, T0_NS + np.array(stamps_ns, dtype=np.int64), t0_ns=T0_NS, max_gap_s=MAX_GAP_S), stamps_ns
+        interpolate_at_instants(world, T0_NS + np.array(stamps_ns, dtype=np.int64), t0_ns=T0_NS, max_gap_s=MAX_GAP_S),
+        stamps_ns,
     )
 
 
@@ -163,7 +171,7 @@ class TestByHand:
     def test_another_longest_gap(self) -> None:
         world = truth({0: [sighting(0), sighting(200 * MS)]})
         for max_gap_s, there in ((0.19, False), (0.2, True), (3.0, True)):
-            _, present = states_at(world, np.array([0]), np.array([0.1]), t0_ns=T0_NS, max_gap_s=max_gap_s)
+            _, present = interpolate_states(world, np.array([0]), np.array([0.1]), t0_ns=T0_NS, max_gap_s=max_gap_s)
             assert present.tolist() == [there]
 
     @pytest.mark.parametrize("beyond_ns", [1_001, 2_000, MS, 10_000 * MS])
@@ -200,7 +208,7 @@ class TestByHand:
 
     def test_lists_of_nothing_stay_and_objects_never_there_go(self) -> None:
         world = truth({0: [sighting(0)], 1: [sighting(300 * MS), sighting(400 * MS)]})
-        found = at_instants(world, T0_NS + np.array([100 * MS, 350 * MS]), t0_ns=T0_NS, max_gap_s=0.5)
+        found = interpolate_at_instants(world, T0_NS + np.array([100 * MS, 350 * MS]), t0_ns=T0_NS, max_gap_s=0.5)
         assert found.object_ix.tolist() == [1]
         assert found.frame_ix.tolist() == [1]
         assert len(found.stamp_ns) == 2
@@ -221,10 +229,10 @@ def test_states_of_many_in_any_order() -> None:
     objects = np.array([3, 0, 1, 3, 1, 4, 3, 2, 1, 3, 3])
     times = np.array([1.3, 1.1, 1.1, 0.1, 0.9, 0.0, 1.3, 1.0, 1.4, 2.0, 2.1])
     expected = [1.3, None, 9.0, 0.1, None, None, 1.3, None, 9.0, 2.0, None]
-    columns, there = states_at(world, objects, times, t0_ns=T0_NS, max_gap_s=MAX_GAP_S)
+    columns, there = interpolate_states(world, objects, times, t0_ns=T0_NS, max_gap_s=MAX_GAP_S)
     found = [float(x) if here else None for x, here in zip(columns["x_m"], there, strict=True)]
     assert found == pytest.approx(expected)
-    columns, there = states_at(world, objects[:0], times[:0], t0_ns=T0_NS, max_gap_s=MAX_GAP_S)
+    columns, there = interpolate_states(world, objects[:0], times[:0], t0_ns=T0_NS, max_gap_s=MAX_GAP_S)
     assert len(there) == len(columns["x_m"]) == 0
 
 
@@ -236,8 +244,8 @@ def test_who_has_no_truth_id_is_nobody() -> None:
 @pytest.mark.parametrize("turns", [-3, -1, 0, 1, 2])
 def test_wrap(turns: int) -> None:
     angles = np.array([-3.0, -1e-9, 0.0, 1.0, 3.14])
-    assert wrap(angles + turns * 2 * np.pi) == pytest.approx(angles, abs=1e-12)
-    assert wrap(np.array([np.pi, -np.pi])).tolist() == [np.pi, np.pi], "the angle behind is π, not −π"
+    assert wrap_angles(angles + turns * 2 * np.pi) == pytest.approx(angles, abs=1e-12)
+    assert wrap_angles(np.array([np.pi, -np.pi])).tolist() == [np.pi, np.pi], "the angle behind is π, not −π"
 
 
 values = st.tuples(*[st.floats(-100, 100)] * 3, st.floats(-7, 7), *[st.floats(-30, 30)] * 2, *[st.floats(0.1, 9)] * 3)
@@ -271,7 +279,7 @@ def test_against_the_oracle(seen: dict[int, list[Sighting]], data: st.DataObject
         for object_ix, state in expected.items():
             same(held[object_ix], state)
     asked = [(o, t) for t in instants for o in range(8)]
-    columns, there = states_at(
+    columns, there = interpolate_states(
         world,
         np.array([o for o, _ in asked], dtype=int),
         np.array([t for _, t in asked], dtype=float) * 1e-9,
@@ -295,7 +303,7 @@ def test_a_frame_that_one_object_misses_is_filled_at_the_truths_own_instants(ask
         }
     )
     instants = world.stamp_ns if asked is None else T0_NS + np.array(asked) * MS
-    found = at_instants(world, instants, t0_ns=T0_NS, max_gap_s=MAX_GAP_S)
+    found = interpolate_at_instants(world, instants, t0_ns=T0_NS, max_gap_s=MAX_GAP_S)
     rows = found.row_object_ix == 1
     assert found.frame_ix[rows].tolist() == [0, 1, 2, 3]
     assert found.x_m[0, rows] == pytest.approx([0, 1, 2, 3])
@@ -305,7 +313,7 @@ def test_a_frame_that_one_object_misses_is_filled_at_the_truths_own_instants(ask
 def stated(world: Tracks, told: list[tuple[int, int, int]]) -> list[dict[int, dict[str, float]]]:
     """`at_stated_instants`, list by list. `told`: the stated instant, the earliest and the latest capture."""
     stamps, earliest, latest = (T0_NS + np.array(column, dtype=np.int64) for column in zip(*told, strict=True))
-    found = at_stated_instants(world, stamps, (earliest, latest), t0_ns=T0_NS, max_gap_s=MAX_GAP_S)
+    found = interpolate_at_stated_instants(world, stamps, (earliest, latest), t0_ns=T0_NS, max_gap_s=MAX_GAP_S)
     return by_list(found, [at_ns for at_ns, _, _ in told])
 
 
@@ -377,6 +385,9 @@ def test_stated_instants_against_the_oracle(seen: dict[int, list[Sighting]], dat
 def test_where_no_clock_is_off_nothing_is_another_bit(seen: dict[int, list[Sighting]], at_ns: list[int]) -> None:
     world, stamps = truth(seen, frames_ns=[0]), T0_NS + np.array(sorted(at_ns), dtype=np.int64)
     asked: dict[str, Any] = {"t0_ns": T0_NS, "max_gap_s": MAX_GAP_S}
-    one, other = at_instants(world, stamps, **asked), at_stated_instants(world, stamps, (stamps, stamps), **asked)
+    one, other = (
+        interpolate_at_instants(world, stamps, **asked),
+        interpolate_at_stated_instants(world, stamps, (stamps, stamps), **asked),
+    )
     for name in ("start", "object_ix", "frame_ix", "stamp_ns", *VALUES):
         assert np.array_equal(getattr(one, name), getattr(other, name)), name

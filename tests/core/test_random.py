@@ -14,12 +14,12 @@ from scipy.special import ndtri
 from copem_replay.core.random import CounterRng, RandomKey, normal_quantile, object_words, philox4x32, stable_hash
 from copem_replay.core.tracks import Tracks
 from copem_replay.io.recording import Recording
-from copem_replay.metrics.columns import frame
-from copem_replay.pipeline.accuracy_tables import with_accuracy
-from copem_replay.pipeline.blocks import blocks, outcomes
+from copem_replay.metrics.detections_table import build_frame
 from copem_replay.pipeline.one_run import tracks_of_run
-from copem_replay.pipeline.prepare import prepare
-from copem_replay.pipeline.run import run
+from copem_replay.pipeline.prepare import prepare_log
+from copem_replay.pipeline.replay import cut_blocks, replay_outcomes
+from copem_replay.pipeline.run import run_experiment
+from copem_replay.pipeline.tables import add_row_accuracy
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
 
 
@@ -147,39 +147,39 @@ def rows_of(table: Any, **wanted: Any) -> Any:
 
 def test_a_run_alone_is_the_same_run_in_a_batch_and_in_any_block() -> None:
     log = busy_log()
-    whole = run(plan(), [log]).table
-    ready = prepare(log, plan())
+    whole = run_experiment(plan(), [log]).table
+    ready = prepare_log(log, plan())
     for cut in ([0], [5], [11], [3, 4, 5], [0, 7]):
-        part = pd.concat([frame(with_accuracy(one)) for one in outcomes(ready, plan(), np.array(cut))])
+        part = pd.concat([build_frame(add_row_accuracy(one)) for one in replay_outcomes(ready, plan(), np.array(cut))])
         expected = rows_of(whole, run=cut)
         keys = ["configuration", "run", "object_id"]
         assert part.sort_values(keys).reset_index(drop=True).equals(expected.sort_values(keys).reset_index(drop=True))
     for jobs in (1, 2, 5):
-        assert (len(blocks(ready, plan(), jobs)) > 1) == (jobs > 1)
-        assert run(plan(), [log], jobs=jobs).table.equals(whole)
+        assert (len(cut_blocks(ready, plan(), jobs)) > 1) == (jobs > 1)
+        assert run_experiment(plan(), [log], jobs=jobs).table.equals(whole)
 
 
 def test_a_runs_states_do_not_depend_on_how_many_runs_there_are() -> None:
     log = busy_log()
-    a, b = (tracks_of_run(prepare(log, plan(runs)), plan(runs), 3)["both"].fused for runs in (4, 12))
+    a, b = (tracks_of_run(prepare_log(log, plan(runs)), plan(runs), 3)["both"].fused for runs in (4, 12))
     for name in ("valid", "x_m", "y_m"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
 
 def test_adding_a_unit_or_a_configuration_changes_no_other_draw() -> None:
     log = busy_log()
-    before = run(plan(), [log]).table
+    before = run_experiment(plan(), [log]).table
     units = {"new": {"on": "c1", "height_m": 1.5, "pem": "sure"}, **UNITS}
     configurations = {"first": {"units": ["new"]}, **CONFIGURATIONS, "last": {"units": "all"}}
-    after = run(plan(units=units, configurations=configurations), [log]).table
+    after = run_experiment(plan(units=units, configurations=configurations), [log]).table
     assert rows_of(after, configuration=["PEM", "both"]).equals(before)
 
 
 def test_adding_or_removing_an_object_changes_no_draw_of_the_others() -> None:
     """The probabilities are constant here, so nothing but the dice could make a difference."""
-    before = run(plan(), [busy_log()]).table
+    before = run_experiment(plan(), [busy_log()]).table
     for other in (busy_log(more=True), busy_log(without="p2")):
-        after = run(plan(), [other]).table
+        after = run_experiment(plan(), [other]).table
         shared = sorted(set(before["object_id"]) & set(after["object_id"]))
         assert rows_of(after, object_id=shared).equals(rows_of(before, object_id=shared))
 
@@ -195,14 +195,14 @@ def tracks_at(fused: Tracks, log: Recording) -> dict[tuple[str, int], tuple[floa
 
 def test_cropping_the_log_changes_no_draw() -> None:
     whole, cropped = busy_log(), busy_log(from_s=1.5)
-    a, b = (tracks_at(tracks_of_run(prepare(log, plan()), plan(), 2)["PEM"].fused, log) for log in (whole, cropped))
+    a, b = (tracks_at(tracks_of_run(prepare_log(log, plan()), plan(), 2)["PEM"].fused, log) for log in (whole, cropped))
     assert b
     assert {key: value for key, value in a.items() if key[1] >= cropped.scene.t0_ns} == b
 
 
 def test_another_log_has_other_dice() -> None:
     a, b = (
-        tracks_at(tracks_of_run(prepare(log, plan()), plan(), 2)["PEM"].fused, log)
+        tracks_at(tracks_of_run(prepare_log(log, plan()), plan(), 2)["PEM"].fused, log)
         for log in (busy_log("a"), busy_log("b"))
     )
     assert set(a) != set(b)
@@ -213,5 +213,5 @@ def test_configurations_share_their_draws() -> None:
     """The ego's unit alone, and in company: what it listed itself is in both, run by run."""
     log, both = busy_log(), plan(configurations={"PEM": {"units": ["ego"]}, "all": {"units": "all"}})
     for number in range(5):
-        fused = tracks_of_run(prepare(log, both), both, number)
+        fused = tracks_of_run(prepare_log(log, both), both, number)
         assert set(tracks_at(fused["PEM"].fused, log)) <= set(tracks_at(fused["all"].fused, log))

@@ -10,8 +10,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from copem_replay.core.followed import followed_by
-from copem_replay.core.tracks import CLASS_GROUPS, CLASSES, UNCERTAINTIES, VALUES, Scene, Tracks, class_indices
+from copem_replay.core.tracks import (
+    CLASS_GROUPS,
+    CLASSES,
+    UNCERTAINTIES,
+    VALUES,
+    Scene,
+    Tracks,
+    append_tracks,
+    class_indices,
+)
 
 Seen = dict[str, list[list[str]]]
 """What each unit lists: its lists in order of capture, each the objects it holds."""
@@ -222,7 +230,11 @@ class TestClasses:
 def test_what_follows_without_variances_has_none_to_speak_of() -> None:
     seen = {"a": [["anna"], ["bert"]]}
     stating, exact = tracks(seen, runs=1), tracks(seen, runs=1, exact=UNCERTAINTIES)
-    one_way, other_way, never = followed_by(stating, exact), followed_by(exact, stating), followed_by(exact, exact)
+    one_way, other_way, never = (
+        append_tracks(stating, exact),
+        append_tracks(exact, stating),
+        append_tracks(exact, exact),
+    )
     for name in UNCERTAINTIES:
         stated = getattr(stating, name)[0].tolist()
         assert getattr(one_way, name).tolist() == [[*stated, 0.0, 0.0]]

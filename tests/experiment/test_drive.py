@@ -14,8 +14,8 @@ from typer.testing import CliRunner
 
 import copem_replay as cr
 from copem_replay.cli.main import app
-from copem_replay.experiment.drive import of_log, settings_notes
-from copem_replay.experiment.file import parse
+from copem_replay.experiment.drive import resolve_for_log, settings_notes
+from copem_replay.experiment.file import parse_experiment
 from tests.experiment.test_validate import against_logs, without_logs
 from tests.helpers.experiments import changed, drive, source_of
 
@@ -28,7 +28,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def experiment(folder: Path, *changes: str) -> cr.Experiment:
-    found, problems = parse(source_of(folder, changed(*changes)))
+    found, problems = parse_experiment(source_of(folder, changed(*changes)))
     assert problems == []
     assert found is not None
     return found
@@ -113,19 +113,19 @@ def test_an_option_goes_before_the_settings(folder: Path) -> None:
 
 def test_a_key_takes_the_place_of_the_one_it_excludes(folder: Path) -> None:
     logs = "logs: [{file: drive.mcap, name: a, units: {ego: {at: [0, 1]}, mast: {on: 2}}}]"
-    alone = of_log(experiment(folder, logs), "a")
+    alone = resolve_for_log(experiment(folder, logs), "a")
     ego, mast = alone.units["ego"], alone.units["mast"]
     assert (ego.on, ego.at, mast.on, mast.at) == (None, (0.0, 1.0), "2", None)
-    assert of_log(alone, "a") is alone
+    assert resolve_for_log(alone, "a") is alone
 
 
 def test_latencies_of_absent_units_go_with_them(folder: Path) -> None:
     logs = "logs: [{file: drive.mcap, name: a, units: {mast: null}}, two.mcap]"
     late = "  coPEM: {units: [ego, mast], latency_s: {mast: 0.3, default: 0.1}}"
     wanted = experiment(folder, logs, late)
-    alone = of_log(wanted, "a").configurations["coPEM"]
+    alone = resolve_for_log(wanted, "a").configurations["coPEM"]
     assert (alone.units, alone.latency_s) == (("ego",), {"default": 0.1})
-    assert of_log(wanted, "two") is wanted
+    assert resolve_for_log(wanted, "two") is wanted
     assert list(settings_notes(wanted)) == ["configuration coPEM: without unit mast in 1 of 2 logs (a)"]
 
 

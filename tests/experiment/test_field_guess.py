@@ -13,8 +13,8 @@ from google.protobuf import descriptor_pb2
 from mcap.writer import Writer
 
 from copem_replay.core import yaml as plain_yaml
-from copem_replay.experiment.draft.field_guess import propose
-from copem_replay.experiment.draft.survey import survey
+from copem_replay.experiment.draft.fields import propose_fields
+from copem_replay.experiment.draft.survey import survey_recording
 from tests.experiment.test_template import Call, call, replayed  # noqa: F401
 from tests.helpers.messages import SEPARATOR, serialised
 from tests.io.test_columns import in_protobuf, schema
@@ -28,7 +28,7 @@ def numbers(*paths: str, texts: tuple[str, ...] = ()) -> dict[str, str]:
 
 
 def read_of(offers: dict[str, str], said: dict[str, list[str]] | None = None, at: int = START_NS) -> dict[str, Any]:
-    found = propose(offers, said or {}, [at])
+    found = propose_fields(offers, said or {}, [at])
     assert found is not None
     read, missing = found
     assert missing == []
@@ -89,7 +89,7 @@ def test_of_several_the_likeliest() -> None:
 
 @pytest.mark.parametrize("names", [[], ["id", "label"], ["velocity.x", "velocity.y", "id", "length", "width"]])
 def test_lists_of_no_objects(names: list[str]) -> None:
-    assert propose({f"o[].{p}": "number" for p in names} | {"x": "number"}, {}, []) is None
+    assert propose_fields({f"o[].{p}": "number" for p in names} | {"x": "number"}, {}, []) is None
 
 
 @pytest.mark.parametrize(
@@ -169,7 +169,7 @@ def test_what_init_proposes_runs(encoded: Any, tmp_path: Path, call: Call, monke
     assert call("check", "e.yaml").code == 0
     run = call("run", "e.yaml", "--runs", "2", "--jobs", "1")
     assert run.code == 0, run.err
-    data, _lines, problems = plain_yaml.read(made.out)
+    data, _lines, problems = plain_yaml.parse_yaml(made.out)
     assert problems == []
     assert data["read"] == {
         "topic": "/my/things",
@@ -200,7 +200,7 @@ def test_what_is_missing_is_said(tmp_path: Path, call: Call) -> None:  # noqa: F
     assert lines[0] == "# /my/things (my.Things) may be a list of objects:"
     assert "#   # width_m: …   # needed, and not found: a path, or one number for all" in lines
     assert all(line.startswith("#") for line in lines)
-    (proposal,) = survey(tmp_path / "log.mcap").proposals
+    (proposal,) = survey_recording(tmp_path / "log.mcap").proposals
     assert (proposal.missing, proposal.truth) == (["width_m"], None)
     assert "things[].length" in proposal.offers
 

@@ -18,11 +18,11 @@ from copem_replay.core.errors import ExperimentError
 from copem_replay.core.object_list import Entries
 from copem_replay.core.tracks import Float
 from copem_replay.core.view_geometry import ViewGeometry
-from copem_replay.experiment.file import load, log_paths, parse
+from copem_replay.experiment.file import log_paths, parse_experiment, read_experiment_file
 from copem_replay.experiment.schema import Experiment
-from copem_replay.fusion.base import Ideal, Inbox, StepFusion
+from copem_replay.fusion.interface import IdealFusion, Inbox, StepFusion
 from copem_replay.fusion.tracker import Tracker
-from copem_replay.perception.pem.detection import Constant, DetectionModel, VisibleShare
+from copem_replay.perception.pem.detection import ConstantDetection, DetectionModel, VisibleShare
 from copem_replay.perception.pem.error import ErrorModel
 from tests.helpers.experiments import TEXT, changed, source_of
 
@@ -84,7 +84,7 @@ class Newest(StepFusion):
 
 
 def experiment(folder: Path, text: str) -> Experiment:
-    found, problems = parse(source_of(folder, text))
+    found, problems = parse_experiment(source_of(folder, text))
     assert problems == []
     assert found is not None
     return found
@@ -93,7 +93,7 @@ def experiment(folder: Path, text: str) -> Experiment:
 def problems(folder: Path, text: str) -> list[str]:
     """`line: key: message` of each problem."""
     source = source_of(folder, text)
-    _, found = parse(source)
+    _, found = parse_experiment(source)
     start = f"{source.path}:"
     assert all(line.startswith(start) for line in found)
     return [line.removeprefix(start) for line in found]
@@ -104,7 +104,7 @@ def refusal(folder: Path, text: str | bytes) -> str:
     path = folder / "experiment.yaml"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(ExperimentError) as error:
-        load(path)
+        read_experiment_file(path)
     (problem,) = error.value.problems
     assert problem.startswith(f"{path}:")
     return problem.removeprefix(f"{path}:")
@@ -116,8 +116,8 @@ WORDS = "on off yes no On NO y 1_000 1:30 2020-01-01 2020-13-45 = 1e 0b1 + . ..5
 class TestYaml:
     @pytest.mark.parametrize("word", WORDS.split())
     def test_is_text(self, word: str) -> None:
-        assert plain_yaml.read(f"key: {word}")[0] == {"key": word}
-        assert plain_yaml.read(f"{word}: 1")[0] == {word: 1}
+        assert plain_yaml.parse_yaml(f"key: {word}")[0] == {"key": word}
+        assert plain_yaml.parse_yaml(f"{word}: 1")[0] == {word: 1}
 
     @pytest.mark.parametrize(
         ("word", "value"),
@@ -126,28 +126,28 @@ class TestYaml:
          ("!!int '7'", 7), ("!!str 7", "7"), ("'7'", "7"), ('"on"', "on"), ("!!float 7", 7)],
     )  # fmt: skip
     def test_is_not_text(self, word: str, value: object) -> None:
-        (found,) = plain_yaml.read(f"key: {word}")[0].values()
+        (found,) = plain_yaml.parse_yaml(f"key: {word}")[0].values()
         assert found == value
         assert type(found) is type(value)
 
     def test_old_yaml_by_directive_reads_the_same(self) -> None:
-        assert plain_yaml.read("%YAML 1.1\n---\nkey: [on, 1_000, 010]")[0] == {"key": ["on", "1_000", 10]}
+        assert plain_yaml.parse_yaml("%YAML 1.1\n---\nkey: [on, 1_000, 010]")[0] == {"key": ["on", "1_000", 10]}
 
     def test_not_a_number_is_one(self) -> None:
-        assert math.isnan(plain_yaml.read("key: .NaN")[0]["key"])
+        assert math.isnan(plain_yaml.parse_yaml("key: .NaN")[0]["key"])
 
     def test_a_number_longer_than_python_reads_is_text(self) -> None:
-        assert isinstance(plain_yaml.read("key: " + "9" * 5000)[0]["key"], str)
+        assert isinstance(plain_yaml.parse_yaml("key: " + "9" * 5000)[0]["key"], str)
 
     def test_byte_order_mark(self, tmp_path: Path) -> None:
         assert experiment(tmp_path, "\ufeff" + TEXT) == experiment(tmp_path, TEXT)
 
     def test_windows_line_ends(self, tmp_path: Path) -> None:
         (tmp_path / "experiment.yaml").write_bytes(changed("runs: x").replace("\n", "\r\n").encode())
-        assert "experiment.yaml:3: runs" in parse(load(tmp_path / "experiment.yaml"))[1][0]
+        assert "experiment.yaml:3: runs" in parse_experiment(read_experiment_file(tmp_path / "experiment.yaml"))[1][0]
 
     def test_every_key_has_its_line(self) -> None:
-        data, lines, found = plain_yaml.read("a:\n  - b: 1\n    c: 2\n  - [3,\n     4]\n")
+        data, lines, found = plain_yaml.parse_yaml("a:\n  - b: 1\n    c: 2\n  - [3,\n     4]\n")
         assert data == {"a": [{"b": 1, "c": 2}, [3, 4]]}
         assert found == []
         at_a = {("a",): 1, ("a", 0): 2, ("a", 0, "b"): 2, ("a", 0, "c"): 3, ("a", 1): 4, ("a", 1, 0): 4, ("a", 1, 1): 5}
@@ -160,7 +160,7 @@ class TestYaml:
         assert experiment(tmp_path, text).pems["onboard"] == experiment(tmp_path, text).pems["roadside"]
 
     def test_an_anchor_name_may_be_used_again(self) -> None:
-        assert plain_yaml.read("a: &x 1\nb: &x 2\nc: *x")[0] == {"a": 1, "b": 2, "c": 2}
+        assert plain_yaml.parse_yaml("a: &x 1\nb: &x 2\nc: *x")[0] == {"a": 1, "b": 2, "c": 2}
 
     @given(st.recursive(
         st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
@@ -168,12 +168,12 @@ class TestYaml:
         max_leaves=8,
     ))  # fmt: skip
     def test_what_is_written_is_read(self, value: Any) -> None:
-        data, _, found = plain_yaml.read(plain_yaml.dump({"key": value}))
+        data, _, found = plain_yaml.parse_yaml(plain_yaml.dump_yaml({"key": value}))
         assert found == []
         assert data == {"key": as_read(value)}
 
     def test_a_list_goes_on_in_the_next_line_past_110_characters(self) -> None:
-        assert plain_yaml.dump({"a": [10] * 28}) == "a: [" + "10, " * 26 + "10,\n  10]\n"
+        assert plain_yaml.dump_yaml({"a": [10] * 28}) == "a: [" + "10, " * 26 + "10,\n  10]\n"
 
 
 def as_read(value: Any) -> Any:
@@ -209,15 +209,15 @@ class TestNotAnExperimentFile:
 
     def test_absent(self, tmp_path: Path) -> None:
         with pytest.raises(ExperimentError, match=r"^.*/none\.yaml: no such file$"):
-            load(tmp_path / "none.yaml")
+            read_experiment_file(tmp_path / "none.yaml")
 
     def test_folder(self, tmp_path: Path) -> None:
         with pytest.raises(ExperimentError, match="is a folder; expected an experiment file"):
-            load(tmp_path)
+            read_experiment_file(tmp_path)
 
     def test_name_that_is_too_long(self, tmp_path: Path) -> None:
         with pytest.raises(ExperimentError, match=r"cannot be read: File name too long$"):
-            load(tmp_path / ("x" * 300))
+            read_experiment_file(tmp_path / ("x" * 300))
 
 
 class TestStrangeYaml:
@@ -662,7 +662,7 @@ class TestProblems:
 class TestComponents:
     def test_built_in(self, tmp_path: Path) -> None:
         (couple,) = experiment(tmp_path, TEXT).pems["onboard"].couples
-        assert couple.detection == Constant(kind="constant", probability=0.5)
+        assert couple.detection == ConstantDetection(kind="constant", probability=0.5)
 
     def test_class_of_a_module(self, tmp_path: Path) -> None:
         kind = f"{__name__}:Always"
@@ -729,15 +729,15 @@ class TestComponents:
         """Ideal fusion needs no name; a class of one's own is named like that of a model."""
         kind = f"{__name__}:Newest"
         for text, expected in (
-            ("", Ideal()),
-            ("fusion: {}", Ideal()),
-            ("fusion: {combine: posterior}", Ideal(combine="posterior")),
+            ("", IdealFusion()),
+            ("fusion: {}", IdealFusion()),
+            ("fusion: {combine: posterior}", IdealFusion(combine="posterior")),
             ("fusion: {kind: tracker, late: replay}", Tracker(late="replay")),
             (f"fusion: {{kind: '{kind}', surely: false}}", Newest(kind=kind, surely=False)),
         ):
             assert experiment(tmp_path, changed(at(COPEM, text))).configurations["coPEM"].fusion == expected
         (problem,) = problems(tmp_path, changed(at(COPEM, f"fusion: {{kind: '{__name__}:Always'}}")))
-        assert "is no kind of copem_replay.fusion.base.Fusion" in problem
+        assert "is no kind of copem_replay.fusion.interface.Fusion" in problem
 
     def test_the_schema_asks_for_the_kind_of_all_but_ideal_fusion(self) -> None:
         fusion = Experiment.model_json_schema()["$defs"]["Configuration"]["properties"]["fusion"]
@@ -762,7 +762,7 @@ def installed(monkeypatch: pytest.MonkeyPatch, **points: str) -> None:
 
 class TestLogs:
     def paths(self, folder: Path, *patterns: str) -> tuple[list[str], list[str]]:
-        source = source_of(folder, plain_yaml.dump({"version": 1, "logs": list(patterns)}))
+        source = source_of(folder, plain_yaml.dump_yaml({"version": 1, "logs": list(patterns)}))
         found, wrong = log_paths(source)
         return [str(path.relative_to(folder)) for path in found], [line.rpartition("yaml:")[2] for line in wrong]
 
@@ -804,10 +804,10 @@ class TestRoundTrip:
     )
     def test_written_with_all_defaults_it_is_the_same(self, tmp_path: Path, text: str) -> None:
         first = experiment(tmp_path, text)
-        written = plain_yaml.dump(first.as_written())
+        written = plain_yaml.dump_yaml(first.as_written())
         again = experiment(tmp_path, written)
         assert again == first
-        assert plain_yaml.dump(again.as_written()) == written
+        assert plain_yaml.dump_yaml(again.as_written()) == written
 
     def test_every_kind_of_key(self, tmp_path: Path) -> None:
         more = "frame: line_of_sight, mean_m: [1, -1], yaw_sigma_deg: 5"
@@ -833,7 +833,7 @@ class TestRoundTrip:
             "read: {topic: /a b/ü}",
         ).replace("configurations:", f"  cameras: {{on: 67, recorded: {{{recorded}}}}}\nconfigurations:", 1)
         first = experiment(tmp_path, text)
-        assert experiment(tmp_path, plain_yaml.dump(first.as_written())) == first
+        assert experiment(tmp_path, plain_yaml.dump_yaml(first.as_written())) == first
         assert first.ego == "on"
         assert first.show is not None
         assert first.show.logs == ("first", "7")
@@ -845,7 +845,7 @@ class TestRoundTrip:
 
     def test_own_component(self, tmp_path: Path) -> None:
         first = experiment(tmp_path, changed(at(DETECTION, f"kind: '{__name__}:Always', sure: false")))
-        again = experiment(tmp_path, plain_yaml.dump(first.as_written()))
+        again = experiment(tmp_path, plain_yaml.dump_yaml(first.as_written()))
         assert again == first
 
     @given(st.lists(st.text(min_size=1, max_size=90), min_size=1, max_size=4, unique=True), SEEDS, st.text())
@@ -863,11 +863,11 @@ class TestRoundTrip:
                 "configurations": {name: {"units": names or "truth", "latency_s": {"default": 0.1}} for name in shown},
             }
         )
-        text = plain_yaml.dump(first.as_written())
-        assert Experiment.model_validate(plain_yaml.read(text)[0]) == first
+        text = plain_yaml.dump_yaml(first.as_written())
+        assert Experiment.model_validate(plain_yaml.parse_yaml(text)[0]) == first
 
     def test_reads_well(self, tmp_path: Path) -> None:
-        text = plain_yaml.dump(experiment(tmp_path, CONTRACT).as_written())
+        text = plain_yaml.dump_yaml(experiment(tmp_path, CONTRACT).as_written())
         assert text.startswith("version: 1\nlogs: [tc016d.mcap]\n")
         assert "  coPEM:0.5s:\n" in text
         assert "!!" not in text

@@ -10,9 +10,9 @@ import pytest
 from typer.testing import CliRunner
 
 from copem_replay.cli.main import app
-from copem_replay.experiment.draft.findings import as_json
-from copem_replay.experiment.draft.survey import survey
-from copem_replay.experiment.draft.survey_text import describe
+from copem_replay.experiment.draft.findings import survey_as_json
+from copem_replay.experiment.draft.survey import survey_recording
+from copem_replay.experiment.draft.template import describe_survey
 from tests.helpers.recordings import SHARED, Obj, Topic, pedestrian, truth_topic, write_mcap, write_recording
 
 # A car at 10 m/s for 1.5 s, a pedestrian who is there at 0, 0.25 and 1.5 s, a cone; no list at 1 s.
@@ -32,7 +32,7 @@ def path(tmp_path: Path) -> Path:
 
 def test_survey(path):
     write_recording(path, FRAMES, host=4, more=[RSU, ODOMETRY])
-    found = as_json(survey(path))
+    found = survey_as_json(survey_recording(path))
     assert found == {
         "recording": "log.mcap",
         "readable": True,
@@ -109,12 +109,12 @@ def test_survey(path):
         "units": [],
     }
     assert json.loads(json.dumps(found, allow_nan=False)) == found
-    assert as_json(survey(path)) == found
+    assert survey_as_json(survey_recording(path)) == found
 
 
 def test_describe(path):
     write_recording(path, FRAMES, host=4, more=[RSU, ODOMETRY])
-    assert describe(survey(path)) == [
+    assert describe_survey(survey_recording(path)) == [
         "log.mcap",
         "  topic  schema                 encoding  messages",
         "  truth  osi3.GroundTruth       protobuf         6  the truth",
@@ -136,35 +136,35 @@ def test_describe(path):
 
 def test_no_ego_says_how_to_give_one(path):
     write_recording(path, FRAMES)
-    (truth,) = survey(path).truth
+    (truth,) = survey_recording(path).truth
     assert (truth.ego, truth.host_id) == (None, None)
     assert truth.missing == [
         "no ego vehicle: the log names no host vehicle; "
         "give `ego: <id>` in the experiment, or `--ego <id>`, of 4 (car), 7 (pedestrian)"
     ]
-    assert f"  missing: {truth.missing[0]}" in describe(survey(path))
+    assert f"  missing: {truth.missing[0]}" in describe_survey(survey_recording(path))
 
 
 def test_a_host_that_is_nobody(path):
     write_recording(path, FRAMES, host=114)
-    (truth,) = survey(path).truth
+    (truth,) = survey_recording(path).truth
     assert (truth.ego, truth.host_id) == (None, "114")
     assert truth.missing[0].startswith("no ego vehicle: the host vehicle 114 is no moving object; give `ego: <id>`")
 
 
 def test_one_frame_has_neither_rate_nor_gap(path):
     write_recording(path, FRAMES[:1], host=4)
-    (truth,) = survey(path).truth
+    (truth,) = survey_recording(path).truth
     assert (truth.rate_hz, truth.longest_gap_s, truth.longest_gap_at_s) == (None, None, None)
-    assert "  1 frame, 0.000 s" in describe(survey(path))
+    assert "  1 frame, 0.000 s" in describe_survey(survey_recording(path))
 
 
 def test_a_choice_between_truths_shows_them_all(path):
     write_recording(path, FRAMES, more=[truth_topic(FRAMES[:2], name="other")])
-    found = survey(path)
+    found = survey_recording(path)
     assert found.readable
     assert [(t.topic, t.frames) for t in found.truth] == [("truth", 6), ("other", 2)]
-    lines = describe(found)
+    lines = describe_survey(found)
     assert "truth: other" in lines
     assert found.choice in lines
     assert found.choice.endswith("choose one with `read: {topic: …}` in the experiment")
@@ -173,7 +173,7 @@ def test_a_choice_between_truths_shows_them_all(path):
 def test_several_truths_and_none_usable(path):
     empty = [(0.0, [])]
     write_recording(path, empty, more=[truth_topic(empty, name="other")])
-    found = survey(path)
+    found = survey_recording(path)
     assert not found.readable
     assert found.reason == (
         f"{path}: truth: no usable object in 1 message; {path}: other: no usable object in 1 message"
@@ -182,12 +182,12 @@ def test_several_truths_and_none_usable(path):
 
 def test_sensor_views_beside_a_ground_truth_are_not_looked_into(path):
     write_recording(path, FRAMES, more=[truth_topic(FRAMES, name="view", schema="osi3.SensorView")])
-    assert [t.topic for t in survey(path).truth] == ["truth"]
+    assert [t.topic for t in survey_recording(path).truth] == ["truth"]
 
 
 def test_no_truth_says_what_there_is(path):
     write_mcap(path, [ODOMETRY, RSU])
-    found = survey(path)
+    found = survey_recording(path)
     assert not found.readable
     reason = found.reason
     assert reason == (
@@ -195,7 +195,7 @@ def test_no_truth_says_what_there_is(path):
         "beside a recording that has one its lists replay by `together: [THAT, THIS]`; "
         "`read: {topic: …, objects: …, id: …}` names the fields of a list of any schema (docs/guide/recordings.md)"
     )
-    assert describe(found) == [
+    assert describe_survey(found) == [
         "log.mcap",
         "  topic  schema                 encoding  messages",
         "  /odom  nav_msgs/msg/Odometry  cdr              1  poses",
@@ -228,7 +228,7 @@ def test_every_topic_has_a_role(path):
         Topic("/camera", "sensor_msgs/msg/Image", [(0, b"")], "cdr"),
     ]
     write_recording(path, FRAMES, host=4, more=more)
-    found = survey(path)
+    found = survey_recording(path)
     assert {t.topic: t.role for t in found.topics} == {
         "truth": "truth",
         "view": "truth",
@@ -242,7 +242,7 @@ def test_every_topic_has_a_role(path):
     }
     (truth,) = found.truth
     assert [(u.topic, u.problem is None) for u in truth.units] == [("rsu", True), ("/tracks", False)]
-    lines = describe(found)
+    lines = describe_survey(found)
     assert [line.split("  ")[-1] for line in lines[2:4]] == ["the truth", "lists of a unit, for `recorded: {topic: …}`"]
     assert any(line.startswith("  view ") and line.endswith("truth, too, but not taken") for line in lines)
     assert any(line.startswith("  unit /tracks: ") for line in lines)
@@ -251,7 +251,7 @@ def test_every_topic_has_a_role(path):
 
 def test_truth_without_usable_objects(path):
     write_recording(path, [(0, [Obj(length=0)])])
-    found = survey(path)
+    found = survey_recording(path)
     assert not found.readable
     assert found.reason.startswith(f"{path}: truth: no usable object in 1 message; 1 object state whose length")
     assert found.topics[0].role == "truth"
@@ -262,18 +262,18 @@ FOLDER = "expected a recording, found a folder without metadata.yaml"
 
 def test_files_that_are_none(path, tmp_path):
     for where, why in ((path, "no such file"), (tmp_path, FOLDER)):
-        found = survey(where)
+        found = survey_recording(where)
         assert (found.readable, found.topics, found.truth) == (False, [], [])
         assert found.reason == f"{where}: {why}"
-        assert describe(found) == [where.name]
+        assert describe_survey(found) == [where.name]
 
 
 def test_damage_is_said_once(path):
     write_recording(path, FRAMES, host=4, chunk_size=1, finish=False)
-    found = survey(path)
+    found = survey_recording(path)
     assert found.readable
     assert found.damage == "damaged after 1.500 s: 6 messages read (the file ends too early)"
-    assert [line for line in describe(found) if "damaged" in line] == [f"  note: {found.damage}"]
+    assert [line for line in describe_survey(found) if "damaged" in line] == [f"  note: {found.damage}"]
 
 
 def test_survey_is_quick_and_light(path):
@@ -281,8 +281,9 @@ def test_survey_is_quick_and_light(path):
     frames = [(k / 10, [Obj(id=i, x=i * 9 + k, vx=10) for i in range(30)]) for k in range(300)]
     write_recording(path, frames, host=0)
     code = (
-        "import sys; from copem_replay.experiment.draft.survey import survey; "
-        "from copem_replay.experiment.draft.survey_text import describe; describe(survey(sys.argv[1]));"
+        "import sys; from copem_replay.experiment.draft.survey import survey_recording; "
+        "from copem_replay.experiment.draft.template import describe_survey; "
+        "describe_survey(survey_recording(sys.argv[1]));"
         "print([m for m in ('pandas', 'numba', 'scipy', 'pydantic', 'shapely', 'rerun') if m in sys.modules])"
     )
     began = time.perf_counter()
@@ -295,8 +296,8 @@ def test_survey_is_quick_and_light(path):
 def test_real_recordings_fit_a_screen(path):
     if path is None:
         pytest.skip("shared/data with recordings is not beside the project")
-    found = survey(path)
+    found = survey_recording(path)
     assert found.readable
-    json.dumps(as_json(found), allow_nan=False)
+    json.dumps(survey_as_json(found), allow_nan=False)
     assert "unread" not in [t.role for t in found.topics if "Map" not in t.schema]
-    assert len(describe(found)) <= 30
+    assert len(describe_survey(found)) <= 30

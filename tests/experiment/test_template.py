@@ -17,8 +17,8 @@ from osi3.osi_sensordata_pb2 import SensorData
 from copem_replay.cli import main as cli
 from copem_replay.core import yaml as plain_yaml
 from copem_replay.experiment.draft.findings import Mast
-from copem_replay.experiment.draft.survey import survey
-from copem_replay.experiment.draft.template import commented, quoted
+from copem_replay.experiment.draft.survey import survey_recording
+from copem_replay.experiment.draft.template import format_draft, quote_yaml
 from tests.helpers.experiments import drive
 from tests.helpers.recordings import SHARED, Obj, Topic, ns, pedestrian, truth_topic, write_mcap, write_recording
 
@@ -42,7 +42,7 @@ def call(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tm
     def called(*arguments: str | Path) -> Ended:
         monkeypatch.setattr(sys, "argv", ["copem-replay", *map(str, arguments)])
         capsys.readouterr()
-        code = cli._ended()
+        code = cli._run_to_exit_code()
         out, err = capsys.readouterr()
         return Ended(code, out, err.splitlines())
 
@@ -62,7 +62,7 @@ def replayed(call: Call, tmp_path: Path) -> Callable[[str | Path], dict[str, Any
         run = call("run", "begun.yaml", "--runs", "2", "--jobs", "1", "--overwrite")
         assert run.code == 0, run.err
         assert [line for line in checked.err if line not in run.err] == [], "check says nothing that run does not"
-        data, _lines, problems = plain_yaml.read(made.out)
+        data, _lines, problems = plain_yaml.parse_yaml(made.out)
         assert problems == []
         return data  # type: ignore[no-any-return]
 
@@ -91,13 +91,15 @@ def test_the_host_of_the_log_is_the_ego(tmp_path: Path, replayed: Callable[..., 
     assert experiment["units"]["ego"]["on"] == "ego"
     assert list(experiment["configurations"]) == ["GT", "PEM", "coPEM:0s", "coPEM:0.5s", "gnn:0.5s"]
     assert experiment["measure"]["objects"] == {"classes": ["vru"]}
-    assert "# ego: <id>   # left out: the log names its host vehicle: 2 (car)" in commented(survey("log.mcap"))
+    assert "# ego: <id>   # left out: the log names its host vehicle: 2 (car)" in format_draft(
+        survey_recording("log.mcap")
+    )
 
 
 def test_the_mast_stands_beside_whom_it_looks_at(tmp_path: Path) -> None:
     """Pedestrian 7 is at (30, 6), all drive along y = 0 and −4: 10 m to his north-east nobody else is nearer."""
     write_recording(tmp_path / "log.mcap", street(), host=1)
-    (truth,) = survey(tmp_path / "log.mcap").truth
+    (truth,) = survey_recording(tmp_path / "log.mcap").truth
     first, second = truth.suggested.masts
     assert first == Mast(at=[37.1, 13.1], yaw_deg=-135)
     assert second == Mast(at=[22.9, -1.1], yaw_deg=45)
@@ -107,7 +109,7 @@ def test_without_a_host_whoever_drives_longest_and_it_is_said(tmp_path: Path, re
     """Car 3 is there as long as car 1, but stands."""
     write_recording(tmp_path / "log.mcap", street())
     assert replayed("log.mcap")["ego"] == 1
-    lines = commented(survey("log.mcap")).splitlines()
+    lines = format_draft(survey_recording("log.mcap")).splitlines()
     at = next(k for k, line in enumerate(lines) if line.startswith("ego: "))
     assert lines[at - 1 : at + 2] == [
         "# the log names no host vehicle; of the vehicles that drive, 1 (car) is there longest, 0.0 – 4.0 s",
@@ -119,7 +121,7 @@ def test_without_a_host_whoever_drives_longest_and_it_is_said(tmp_path: Path, re
 def test_a_host_that_is_nobody(tmp_path: Path, replayed: Callable[..., Any]) -> None:
     write_recording(tmp_path / "log.mcap", street(), host=9)
     assert replayed("log.mcap")["ego"] == 1
-    assert "# the log's host vehicle 9 is no moving object; of the" in commented(survey("log.mcap"))
+    assert "# the log's host vehicle 9 is no moving object; of the" in format_draft(survey_recording("log.mcap"))
 
 
 def test_the_only_one_that_moves_is_measured_not_the_ego(tmp_path: Path, replayed: Callable[..., Any]) -> None:
@@ -141,7 +143,7 @@ def test_a_roadside_unit_has_no_ego(tmp_path: Path, replayed: Callable[..., Any]
         frames.append((t, [pedestrian(7, 30, 6), *there, *([Obj(id=1, x=9 * t, vx=9)] if t <= last_s else [])]))
     write_recording(tmp_path / "log.mcap", frames)
     assert replayed("log.mcap")["ego"] == ego
-    text = commented(survey("log.mcap"))
+    text = format_draft(survey_recording("log.mcap"))
     assert ("1 (car) is there longest, 0.0 – 4.4 s of 6.0 s, and an ego is there nearly" in text) == (ego == "none")
     assert "# ego: <id>   # of 2 (car), 1 (car), 3 (car), 4 (car), 7 (pedestrian)" in text
 
@@ -183,7 +185,7 @@ def test_nothing_to_measure_runs_all_the_same(
 def test_of_several_truths_the_fullest_and_the_others_are_named(tmp_path: Path, replayed: Callable[..., Any]) -> None:
     write_recording(tmp_path / "log.mcap", street()[:3], host=1, more=[truth_topic(street(), name="full", host=1)])
     assert replayed("log.mcap")["read"] == {"topic": "full"}
-    assert "# read: {topic: truth}   # could be it, too" in commented(survey("log.mcap"))
+    assert "# read: {topic: truth}   # could be it, too" in format_draft(survey_recording("log.mcap"))
 
 
 def unit(name: str, *, covariance: bool = False, captured: bool = False) -> Topic:
@@ -224,7 +226,7 @@ def test_lists_of_the_log_become_units(tmp_path: Path, replayed: Callable[..., A
     assert experiment["configurations"]["recorded"]["units"] == ["rsu", "front", "ego_recorded"]
     assert "with ego_recorded" not in experiment["configurations"]
     assert experiment["configurations"]["with rsu"] == {"units": ["ego", "rsu"], "fusion": {"kind": "gnn"}}
-    assert "  # broken cannot be a unit: " in commented(survey("log.mcap"))
+    assert "  # broken cannot be a unit: " in format_draft(survey_recording("log.mcap"))
 
 
 def test_what_a_stack_made_of_lists_is_no_unit_beside_them(tmp_path: Path, replayed: Callable[..., Any]) -> None:
@@ -296,7 +298,7 @@ def test_poses_may_be_the_egos(tmp_path: Path, replayed: Callable[..., Any], cal
     experiment = replayed("log.mcap")
     assert experiment["ego"] == {"topic": "/pose"}
     assert experiment["measure"]["objects"] == {"classes": ["vru"]}
-    text = commented(survey("log.mcap"))
+    text = format_draft(survey_recording("log.mcap"))
     assert "ego:   # the log names no host vehicle; these poses may be the ego's\n  topic: /pose\n  # size_m: " in text
     shown = call("info", "log.mcap").out
     assert "the truth\n" in shown
@@ -387,7 +389,7 @@ def test_usage(call: Call, tmp_path: Path) -> None:
 
 @given(st.text(st.characters(exclude_categories=["Cs"])))
 def test_quoted_text_reads_as_the_same_text(text: str) -> None:
-    data, _lines, problems = plain_yaml.read(f"a: [{quoted(text)}]\nb: {quoted(text)}   # c\n")
+    data, _lines, problems = plain_yaml.parse_yaml(f"a: [{quote_yaml(text)}]\nb: {quote_yaml(text)}   # c\n")
     assert problems == []
     for value in (data["a"][0], data["b"]):
         assert (value if isinstance(value, str) else str(value)) == text
@@ -397,7 +399,7 @@ def test_quoted_text_reads_as_the_same_text(text: str) -> None:
 def test_real_recordings(replayed: Callable[..., Any], path: Path | None) -> None:
     if path is None:
         pytest.skip(f"{SHARED} is not there")
-    found = survey(path)
+    found = survey_recording(path)
     place = np.array([mast.at for mast in found.truth[0].suggested.masts])
     (x0, x1), (y0, y1) = found.truth[0].x_m, found.truth[0].y_m
     assert ((place >= [x0 - 10, y0 - 10]) & (place <= [x1 + 10, y1 + 10])).all()

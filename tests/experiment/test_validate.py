@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from copem_replay.experiment.file import log_paths
-from copem_replay.experiment.validate import across_logs, log_names, problems, read_logs
+from copem_replay.experiment.validate import check_across_logs, find_problems, log_names, read_logs
 from copem_replay.io.recording import Recording
 from tests.helpers.experiments import TEXT, changed, drive, source_of
 from tests.helpers.recordings import Obj, Topic, truth_topic, write_mcap, write_recording
@@ -18,7 +18,7 @@ def without_logs(folder: Path, text: str) -> list[str]:
     """`line: key: message` of each problem that shows without a look at the logs (`drive.mcap` is there)."""
     (folder / "drive.mcap").touch()
     source = source_of(folder, text)
-    _, found = problems(source)
+    _, found = find_problems(source)
     assert all(line.startswith(f"{source.path}:") for line in found)
     return [line.removeprefix(f"{source.path}:") for line in found]
 
@@ -26,17 +26,17 @@ def without_logs(folder: Path, text: str) -> list[str]:
 def against_logs(folder: Path, text: str) -> list[str]:
     """Each problem with the logs, the folder left out of all paths."""
     source = source_of(folder, text)
-    experiment, found = problems(source)
+    experiment, found = find_problems(source)
     assert found == []
     assert experiment is not None
     recordings, refused = read_logs(experiment, log_paths(source)[0], source)
-    lines = [log.said(source) for log in refused] + list(across_logs(experiment, recordings, source))
+    lines = [log.said(source) for log in refused] + list(check_across_logs(experiment, recordings, source))
     return [line.replace(f"{folder}/", "").removeprefix("experiment.yaml:") for line in lines]
 
 
 def recordings_of(folder: Path, text: str) -> list[Recording]:
     source = source_of(folder, text)
-    experiment, found = problems(source)
+    experiment, found = find_problems(source)
     assert found == []
     assert experiment is not None
     recordings, refused = read_logs(experiment, log_paths(source)[0], source)
@@ -380,7 +380,7 @@ class TestSeveralLogs:
         (tmp_path / "b").mkdir()
         (tmp_path / "b" / "drive.mcap").touch()
         source = source_of(tmp_path, changed("logs: ['*/drive.mcap']"))
-        experiment, _ = problems(source)
+        experiment, _ = find_problems(source)
         assert experiment is not None
         (recording,), (refused,) = read_logs(experiment, log_paths(source)[0], source)
         assert recording.scene.log == "drive"

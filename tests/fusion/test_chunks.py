@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 from copem_replay.core.errors import InputError
 from copem_replay.core.object_list import Entries, Inputs, ObjectLists, entries_of
-from copem_replay.fusion.base import Inbox, ListFusion, StepFusion, fused_by, resumed_by
 from copem_replay.fusion.gnn import Gnn
+from copem_replay.fusion.interface import Inbox, ListFusion, StepFusion, ask_fusion, ask_resumed_fusion
 from copem_replay.fusion.nms import Nms
-from copem_replay.fusion.testing.chunks import chunk, needed_lists, one_after_another
+from copem_replay.fusion.testing import cut_chunk, join_chunks, needed_lists
 from copem_replay.fusion.tracker import Tracker
 from copem_replay.fusion.union import Union
 from tests.fusion.test_tracker import street
@@ -73,16 +73,16 @@ def world(number: int) -> Inputs:
 
 @functools.cache
 def at_once(which: int, number: int) -> ObjectLists:
-    return fused_by(FUSIONS[which], world(number), "fusion")
+    return ask_fusion(FUSIONS[which], world(number), "fusion")
 
 
 def in_chunks(fusion: ListFusion, told: Inputs, places: list[tuple[int, int]], looks_back_s: float) -> ObjectLists:
     memory: Any = None
     parts = []
     for a, b in places:
-        found, memory = resumed_by(fusion, chunk(told, a, b, looks_back_s), memory, "fusion")
+        found, memory = ask_resumed_fusion(fusion, cut_chunk(told, a, b, looks_back_s), memory, "fusion")
         parts.append(found)
-    return one_after_another(parts)
+    return join_chunks(parts)
 
 
 @settings(max_examples=120)
@@ -110,7 +110,7 @@ def test_a_track_goes_on_over_a_cut(late: str) -> None:
     fusion = Tracker(late=late)
     memory = None
     for a, b in ((0, 2), (2, 2), (2, 3), (3, 4)):
-        found, memory = resumed_by(fusion, chunk(told, a, b, fusion.looks_back_s), memory, "fusion")
+        found, memory = ask_resumed_fusion(fusion, cut_chunk(told, a, b, fusion.looks_back_s), memory, "fusion")
     assert found.entries["track_id"].tolist() == [0]
     # Four entries at one variance: of a filter begun anew it would be the entry's own, and not yet confirmed.
     assert found.entries["cov_ee_m2"][0] < 0.8
@@ -119,7 +119,7 @@ def test_a_track_goes_on_over_a_cut(late: str) -> None:
 def test_whoever_hears_again_needs_what_was_heard_of_late() -> None:
     fusion, told = Tracker(late="replay"), world(2)
     each = list(pairwise(range(len(told.issue_s) + 1)))
-    found, expected = in_chunks(fusion, told, each, 0.0), fused_by(fusion, told, "fusion")
+    found, expected = in_chunks(fusion, told, each, 0.0), ask_fusion(fusion, told, "fusion")
     assert not np.array_equal(found.start, expected.start) or found.entries.tobytes() != expected.entries.tobytes()
 
 
@@ -149,7 +149,7 @@ def test_the_lists_a_chunk_needs(
         if looks_back_s > 0:
             expected |= {f for f in earlier if captured[f] >= max(captured[g] for g in earlier) - looks_back_s}
     assert set(np.flatnonzero(needed_lists(told.captured_s, told, a, b, looks_back_s)).tolist()) == expected
-    one = chunk(told, a, b, looks_back_s)
+    one = cut_chunk(told, a, b, looks_back_s)
     for s in (0, 1):
         assert [len(one.lists.of(s, f)) for f in range(len(lists))] == [f in expected for f in range(len(lists))]
         assert all(one.lists.of(s, f)["x_m"] == [f] for f in expected)
@@ -223,13 +223,13 @@ HERE = r" \(.*test_chunks.py:\d+\)$"
 )
 def test_a_wrong_answer_is_named_by_its_place(fusion: type[ListFusion], said: str) -> None:
     with pytest.raises(InputError, match=rf"^configurations.mine.fusion: tests.fusion.test_chunks:{said}"):
-        resumed_by(fusion(), chunk(world(0), 0, 2, 0.0), None, "configurations.mine.fusion")
+        ask_resumed_fusion(fusion(), cut_chunk(world(0), 0, 2, 0.0), None, "configurations.mine.fusion")
 
 
 def test_nothing_but_the_chunk_is_changed() -> None:
     told = world(1)
-    one = chunk(told, 2, 5, 0.5)
+    one = cut_chunk(told, 2, 5, 0.5)
     same = ("units", "unit_ix", "captured_s", "arrives_s")
     assert all(getattr(one, name) is getattr(told, name) for name in same)
-    whole = chunk(replace(told), 0, len(told.issue_s), 0.0)
+    whole = cut_chunk(replace(told), 0, len(told.issue_s), 0.0)
     assert whole.lists.entries.tobytes() == told.lists.entries.tobytes()  # all arrive

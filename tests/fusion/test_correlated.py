@@ -9,15 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from copem_replay.fusion.combine import combine_by_cross_covariance, covariance_union, inverse_covariance_intersection
 from copem_replay.fusion.covariance import covariance_intersection, inverse_variance
-from copem_replay.fusion.covariance_union import covariance_union
-from copem_replay.fusion.cross_covariance import by_cross_covariance
-from copem_replay.fusion.inverse_intersection import inverse_covariance_intersection
-from copem_replay.fusion.split_intersection import (
-    split_by_share,
-    split_by_variance,
-    split_covariance_intersection,
-)
+from copem_replay.fusion.split_intersection import split_by_share, split_by_variance, split_covariance_intersection
 from tests.oracles import correlated as oracle
 
 Array = npt.NDArray[np.float64]
@@ -60,7 +54,7 @@ def all_methods(x: Array, cov: Array) -> list[tuple[Array, Array]]:
         split(x, cov, 0.3)[:2],
         split(x, cov, 0.8, True)[:2],
         split_covariance_intersection(x, *split_by_variance(cov, 0.3), False)[:2],
-        by_cross_covariance(x, cov, 0.4),
+        combine_by_cross_covariance(x, cov, 0.4),
     ]
 
 
@@ -116,14 +110,14 @@ def test_split_of_crossed_ones_half_of_which_is_common(by_determinant: bool):
 
 
 def test_cross_covariance_of_crossed_ones():
-    mean, P = by_cross_covariance(*CROSSED, 0.4)
+    mean, P = combine_by_cross_covariance(*CROSSED, 0.4)
     assert mean == pytest.approx([0.941176, 0.058824], abs=1e-6)
     assert pytest.approx(0.988235 * np.eye(2), abs=1e-6) == P
 
 
 def test_one_position_stays_as_it_is_by_cross_covariance():
     x, cov = np.array([[3.0, -4.0]]), np.array([[[2.0, 0.5], [0.5, 1.0]]])
-    mean, P = by_cross_covariance(x, cov, 0.4)
+    mean, P = combine_by_cross_covariance(x, cov, 0.4)
     assert mean.tolist() == [3.0, -4.0]
     assert P.tolist() == cov[0].tolist()
 
@@ -132,7 +126,7 @@ def test_one_position_stays_as_it_is_by_cross_covariance():
 def test_equal_circles_by_cross_covariance(n: int):
     # The mean of n unit variances correlated by ρ has (1 + (n − 1)ρ)/n.
     x = np.stack([np.arange(n), np.zeros(n)], axis=1).astype(float)
-    mean, P = by_cross_covariance(x, np.array([np.eye(2)] * n), 0.9)
+    mean, P = combine_by_cross_covariance(x, np.array([np.eye(2)] * n), 0.9)
     assert mean == pytest.approx([(n - 1) / 2, 0])
     assert pytest.approx((1 + (n - 1) * 0.9) / n * np.eye(2)) == P
 
@@ -189,7 +183,7 @@ def test_all_dependent_is_covariance_intersection(by_determinant: bool, given_: 
 @given(several)
 def test_no_correlation_is_inverse_variance(given_: tuple[Array, Array]):
     x, cov = given_
-    mean, P = by_cross_covariance(x, cov, 0.0)
+    mean, P = combine_by_cross_covariance(x, cov, 0.0)
     expected = inverse_variance(x, cov)
     assert mean == pytest.approx(expected[0], rel=1e-9, abs=1e-9)
     assert pytest.approx(expected[1], rel=1e-9, abs=1e-12) == P
@@ -265,7 +259,7 @@ def test_split_is_the_one_written_out(seed: int, n: int, by_determinant: bool):
 
 @given(several, st.floats(0, 0.99))
 def test_cross_covariance_is_the_best_linear_estimate(given_: tuple[Array, Array], correlation: float):
-    mean, P = by_cross_covariance(*given_, correlation)
+    mean, P = combine_by_cross_covariance(*given_, correlation)
     expected = oracle.by_correlation(*given_, correlation)
     assert mean == pytest.approx(expected[0], rel=1e-6, abs=1e-6)
     assert pytest.approx(expected[1], rel=1e-6, abs=1e-9) == P
@@ -276,7 +270,7 @@ def test_of_two_cross_covariance_is_bar_shaloms_and_campos(given_: tuple[Array, 
     (a, b), (A, B) = given_
     C = correlation * np.real(oracle.sqrtm(A)) @ np.real(oracle.sqrtm(B))
     K = (A - C) @ np.linalg.inv(A + B - C - C.T)
-    mean, P = by_cross_covariance(*given_, correlation)
+    mean, P = combine_by_cross_covariance(*given_, correlation)
     assert mean == pytest.approx(a + K @ (b - a), rel=1e-6, abs=1e-6)
     assert pytest.approx(A - K @ (A - C).T, rel=1e-6, abs=1e-9) == P
 
@@ -353,7 +347,7 @@ def test_the_order_does_not_matter_to_those_that_take_all_at_once(given_: tuple[
     x, cov = given_
     order = list(range(len(x)))
     random.shuffle(order)
-    for method in (lambda x, cov: split(x, cov, 0.4)[:2], lambda x, cov: by_cross_covariance(x, cov, 0.4)):
+    for method in (lambda x, cov: split(x, cov, 0.4)[:2], lambda x, cov: combine_by_cross_covariance(x, cov, 0.4)):
         for one, other in zip(method(x, cov), method(x[order], cov[order]), strict=True):
             assert other == pytest.approx(one, rel=1e-4, abs=1e-4)
 

@@ -10,8 +10,8 @@ from pydantic import ValidationError
 
 from copem_replay.core.object_list import ENTRY, Entries, Inputs, ObjectLists, entries_of
 from copem_replay.core.tracks import CLASSES
-from copem_replay.fusion.content_order import sort_rows
 from copem_replay.fusion.gnn import Gnn
+from copem_replay.fusion.inputs import sort_rows
 from tests.helpers.reports import entry, inputs_of, joined
 from tests.oracles import gnn as gnn_oracle
 from tests.oracles.gnn import in_any_order, random_reports

@@ -18,9 +18,9 @@ from copem_replay.communication.arrivals import fusion_schedule
 from copem_replay.communication.link import ConstantLink, UnitLinks, transmit
 from copem_replay.core.tracks import UNCERTAINTIES, VALUES, Tracks
 from copem_replay.experiment.schema import Experiment
-from copem_replay.fusion.ideal import draw_posterior, fuse
+from copem_replay.fusion.ideal import draw_posterior, fuse_ideal
 from copem_replay.io.recording import Recording
-from copem_replay.perception.observation import observations
+from copem_replay.perception.observation import observe_objects
 from copem_replay.perception.perceive import perceive
 from tests.helpers.scenes import EGO_UNIT, Thing, experiment, recording, standing
 
@@ -72,7 +72,7 @@ def heard(units: dict[str, ObjectLists], latency_s: dict[str, float] | None = No
 
 def issued(of: Tracks, max_age_s: float = 1.0, **more: Any) -> list[dict[str, Any]]:
     """The fused lists: when issued, captured when, and what each says of each object in the first run."""
-    fused = fuse(of, max_age_s=max_age_s, **more).fused
+    fused = fuse_ideal(of, max_age_s=max_age_s, **more).fused
     found: list[dict[str, Any]] = [
         {"at": float(at), "captured": float(captured), "stamp": int(stamp), "holds": {}}
         for at, captured, stamp in zip(fused.arrives_s[0], fused.captured_s, fused.stamp_ns, strict=True)
@@ -288,11 +288,11 @@ def laws() -> list[tuple[Array, Array]]:
 def run_tracks(probability: float, log: Recording, without: int = -1) -> dict[str, Tracks]:
     """What is believed in all runs, by either way of combining."""
     plan = three_units(probability)
-    found = observations(log.scene, log.truth, plan)
+    found = observe_objects(log.scene, log.truth, plan)
     result = {}
     for combine in ("samples", "posterior"):
         seen = perceive(log.scene, found, plan, RUNS, states="sampled" if combine == "samples" else "expected")
-        fused_tracks = fuse(
+        fused_tracks = fuse_ideal(
             transmit(seen, [UnitLinks("link", ConstantLink())]), max_age_s=1.0, without_object_ix=without
         )
         drawn = draw_posterior(fused_tracks, log.scene, plan.seed, RUNS) if combine == "posterior" else fused_tracks
@@ -360,7 +360,7 @@ class TestLaw:
     def test_it_is_the_law_of_those_that_saw(self) -> None:
         """Each unit lists with 0.6: per run μ and Σ of the units that did; believed in 1 − 0.4³ of the runs."""
         log, plan = watched(), three_units(0.6)
-        found = observations(log.scene, log.truth, plan)
+        found = observe_objects(log.scene, log.truth, plan)
         valid = perceive(log.scene, found, plan, RUNS, states="true").valid
         rows = [int(np.flatnonzero((found.tracks.row_object_ix == WALKER) & (found.tracks.row_unit_ix == u))[0])
                 for u in range(3)]  # fmt: skip
@@ -445,7 +445,7 @@ class TestStaleLists:
             "a": [(0.0, {0: gauss(0, 0, SMALL, valid=[True, True, False, False])})],
             "b": [(0.0, {0: gauss(4, 0, SMALL, valid=[True, False, True, False])})],
         }
-        fused = fuse(heard(listing, runs=4), max_age_s=1.0).fused
+        fused = fuse_ideal(heard(listing, runs=4), max_age_s=1.0).fused
         assert fused.valid[:, 0].tolist() == [True, True, True, False]
         assert fused.x_m[:3, 0].tolist() == [2, 0, 4]
         assert fused.cov_ee_m2 is not None
@@ -541,7 +541,7 @@ def test_against_the_words(
     units, latency = world
     in_seconds: dict[str, ObjectLists] = {u: [(t / 1000, held) for t, held in its] for u, its in units.items()}
     of = heard(in_seconds, {u: late / 1000 for u, late in latency.items()}, runs=2)
-    fused = fuse(of, max_age_s=max_age / 1000, without_object_ix=own).fused
+    fused = fuse_ideal(of, max_age_s=max_age / 1000, without_object_ix=own).fused
     instants = sorted({t + latency[u] for u, its in units.items() for t, _ in its})
     assert fused.arrives_s[0] == pytest.approx([t / 1000 for t in instants])
     rows = {(int(f), int(o)): p for p, (f, o) in enumerate(zip(fused.frame_ix, fused.row_object_ix, strict=True))}

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from copem_replay.core.object_list import Entries, Inputs, ObjectLists, entries_of
-from copem_replay.fusion.base import Inbox, ListFusion, StepFusion
 from copem_replay.fusion.gnn import Gnn
+from copem_replay.fusion.interface import Inbox, ListFusion, StepFusion
 from copem_replay.fusion.nms import Nms
-from copem_replay.fusion.testing.check import FUSION_RULES, NonconformingError, check_fusion
+from copem_replay.fusion.testing import FUSION_RULES, NonconformingError, check_fusion
 from copem_replay.fusion.tracker import Tracker
 from copem_replay.fusion.union import Union
 

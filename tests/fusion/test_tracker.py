@@ -13,10 +13,17 @@ import pytest
 from pydantic import ValidationError
 from scipy.optimize import linear_sum_assignment
 
-from copem_replay.core.agree import AGREE, most_probable, most_probable_of_each
-from copem_replay.core.object_list import Entries, Inputs, ObjectLists, entries_of
+from copem_replay.core.object_list import (
+    AGREE,
+    Entries,
+    Inputs,
+    ObjectLists,
+    entries_of,
+    most_probable_class,
+    most_probable_classes,
+)
 from copem_replay.core.tracks import CLASSES
-from copem_replay.fusion.base import fused_by
+from copem_replay.fusion.interface import ask_fusion
 from copem_replay.fusion.tracker import Tracker
 from tests.helpers.reports import entry, inputs_of, joined, lists_of
 from tests.oracles.gnn import largest_around
@@ -28,7 +35,7 @@ AT_ONCE: dict[str, Any] = {"confirm_s": 0.0}
 
 def fuse(inputs: Inputs, **settings: Any) -> list[list[Entries]]:
     """Fused lists [run][instant]; all that is asked of any fusion is checked."""
-    lists = fused_by(Tracker(**settings), inputs, "fusion")
+    lists = ask_fusion(Tracker(**settings), inputs, "fusion")
     return [[lists.of(s, k) for k in range(lists.start.shape[1] - 1)] for s in range(len(lists.start))]
 
 
@@ -625,8 +632,8 @@ def test_the_most_probable_class_is_the_first_of_equals_and_other_where_nothing_
     said[2, [3, 4]] = 0.4, 0.6
     said[3, other] = 1e-3
     said[4, [0, 4]] = 0.5
-    assert [most_probable(one) for one in said] == [other, 3, 4, other, 0]
-    assert most_probable_of_each(said).tolist() == [other, 3, 4, other, 0]
+    assert [most_probable_class(one) for one in said] == [other, 3, 4, other, 0]
+    assert most_probable_classes(said).tolist() == [other, 3, 4, other, 0]
 
 
 def test_classes_that_agree():
@@ -687,7 +694,7 @@ def test_exact_lists_are_taken_as_exact_as_the_smallest_variance_allows():
 
 def test_nothing_heard_nothing_said():
     nothing = inputs_of([[], []], [], [], [], names=["a"])
-    lists = fused_by(Tracker(), nothing, "fusion")
+    lists = ask_fusion(Tracker(), nothing, "fusion")
     assert lists.start.tolist() == [[0], [0]]
     assert len(lists.entries) == 0
     for late in LATE:

@@ -15,8 +15,7 @@ from scipy.optimize import minimize_scalar
 
 from copem_replay.core.object_list import Entries, Inputs
 from copem_replay.fusion.tracker import Tracker
-from copem_replay.fusion.tracker_filter import carry
-from copem_replay.fusion.tracker_split import update_split
+from copem_replay.fusion.tracker_kernel import propagate_covariance, update_split
 from tests.fusion.test_tracker import LATE, fuse, fuse_one, street
 from tests.helpers.reports import entry, inputs_of
 
@@ -136,7 +135,7 @@ def test_the_common_part_passes_time_without_noise():
     common = root @ root.T
     F = np.eye(4) + 0.3 * np.eye(4, k=2)
     expected = F @ common @ F.T
-    carry(common, 0.3)
+    propagate_covariance(common, 0.3)
     assert common == pytest.approx(expected)
 
 

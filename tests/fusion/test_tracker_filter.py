@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from copem_replay.fusion.covariance import floored
-from copem_replay.fusion.tracker_filter import distance2, predict, update
+from copem_replay.fusion.covariance import floor_eigenvalues
+from copem_replay.fusion.tracker_kernel import mahalanobis2, predict_state, update_state
 
 Array = npt.NDArray[np.float64]
 H = np.eye(2, 4)
@@ -42,7 +42,7 @@ def covariance(east_m2: float, north_m2: float, turned_rad: float) -> Array:
 
 
 def measured(state: Array, cov: Array, z: Array, R: Array) -> None:
-    update(state, cov, float(z[0]), float(z[1]), float(R[0, 0]), float(R[0, 1]), float(R[1, 1]))
+    update_state(state, cov, float(z[0]), float(z[1]), float(R[0, 0]), float(R[0, 1]), float(R[1, 1]))
 
 
 variances = st.floats(-9.0, 6.0).map(lambda power: 10.0**power)
@@ -57,7 +57,7 @@ def test_a_prediction_is_that_of_the_matrices(seed: int, dt_s: float, q: float):
     state, cov = drawn(seed)
     F = transition(dt_s)
     expected, spread = F @ state, F @ cov @ F.T + process_noise(dt_s, q)
-    predict(state, cov, dt_s, q)
+    predict_state(state, cov, dt_s, q)
     assert state == pytest.approx(expected, rel=1e-12, abs=1e-12)
     assert cov == pytest.approx(spread, rel=1e-12, abs=1e-12)
     assert (cov == cov.T).all()
@@ -79,9 +79,9 @@ def test_an_update_is_that_of_the_matrices(seed: int, first_m2: float, second_m2
 def test_two_steps_are_one(seed: int, first_s: float, second_s: float):
     once, cov_once = drawn(seed)
     twice, cov_twice = drawn(seed)
-    predict(once, cov_once, first_s + second_s, 0.7)
-    predict(twice, cov_twice, first_s, 0.7)
-    predict(twice, cov_twice, second_s, 0.7)
+    predict_state(once, cov_once, first_s + second_s, 0.7)
+    predict_state(twice, cov_twice, first_s, 0.7)
+    predict_state(twice, cov_twice, second_s, 0.7)
     assert twice == pytest.approx(once, rel=1e-12, abs=1e-12)
     assert cov_twice == pytest.approx(cov_once, rel=1e-12, abs=1e-12)
 
@@ -108,7 +108,7 @@ def along_x(steps: list[tuple[float, float | None]]) -> tuple[Array, Array]:
     """Position and speed along x, and their covariance, after steps of (seconds that pass, then what is measured)."""
     state, cov = start()
     for dt_s, z in steps:
-        predict(state, cov, dt_s, 1.0)
+        predict_state(state, cov, dt_s, 1.0)
         if z is not None:
             measured(state, cov, np.array([z, 0.0]), 0.25 * np.eye(2))
     return state[[0, 2]], cov[np.ix_([0, 2], [0, 2])]
@@ -137,9 +137,9 @@ def test_with_the_late_measurement_taken_for_a_current_one():
 def test_covariances_stay_symmetric_and_positive_definite(steps: list[tuple[float, float, float, float]]):
     state, cov = np.array([1e6, -1e6, 20.0, 0.0]), np.diag([1.0, 1.0, 9.0, 9.0])
     for dt_s, first_m2, second_m2, turned_rad in steps:
-        ee, en, nn = floored(*covariance(first_m2, second_m2, turned_rad)[[0, 0, 1], [0, 1, 1]].tolist())
-        predict(state, cov, dt_s, 1.0)
-        update(state, cov, 1e6, -1e6, ee, en, nn)
+        ee, en, nn = floor_eigenvalues(*covariance(first_m2, second_m2, turned_rad)[[0, 0, 1], [0, 1, 1]].tolist())
+        predict_state(state, cov, dt_s, 1.0)
+        update_state(state, cov, 1e6, -1e6, ee, en, nn)
         assert (cov == cov.T).all()
         assert np.isfinite(state).all()
         # Scaled to ones on the diagonal: variances differ by many powers of ten.
@@ -163,7 +163,7 @@ def test_what_is_wide_enough_is_left_as_it_is(first_m2: float, second_m2: float,
     given_ = covariance(first_m2 + 2e-9, second_m2 + 2e-9, turned_rad)
     if min(first_m2, second_m2) < 1e-10 * max(first_m2, second_m2):
         return
-    assert floored(*given_[[0, 0, 1], [0, 1, 1]].tolist()) == tuple(given_[[0, 0, 1], [0, 1, 1]].tolist())
+    assert floor_eigenvalues(*given_[[0, 0, 1], [0, 1, 1]].tolist()) == tuple(given_[[0, 0, 1], [0, 1, 1]].tolist())
 
 
 @pytest.mark.parametrize(
@@ -179,11 +179,11 @@ def test_what_is_wide_enough_is_left_as_it_is(first_m2: float, second_m2: float,
     ],
 )
 def test_what_is_too_narrow_is_widened_along_its_axes(given_: tuple[float, ...], expected: tuple[float, ...]):
-    assert floored(*given_) == pytest.approx(expected, rel=1e-12, abs=1e-15)
+    assert floor_eigenvalues(*given_) == pytest.approx(expected, rel=1e-12, abs=1e-15)
 
 
 @given(st.floats(-50.0, 50.0), st.floats(-50.0, 50.0), st.floats(0.01, 9.0), st.floats(0.01, 9.0), angles)
 def test_the_distance_is_that_of_the_inverse(dx: float, dy: float, first_m2: float, second_m2: float, turned: float):
     S = covariance(first_m2, second_m2, turned)
     expected = np.array([dx, dy]) @ np.linalg.solve(S, np.array([dx, dy]))
-    assert distance2(dx, dy, S[0, 0], S[0, 1], S[1, 1]) == pytest.approx(expected, rel=1e-9, abs=1e-12)
+    assert mahalanobis2(dx, dy, S[0, 0], S[0, 1], S[1, 1]) == pytest.approx(expected, rel=1e-9, abs=1e-12)

@@ -5,13 +5,12 @@ from __future__ import annotations
 from copem_replay.core.object_list import ObjectLists
 from copem_replay.core.tracks import Bool, Float, Scene, Tracks
 from copem_replay.metrics.accuracy.aggregator import Aggregator
-from copem_replay.metrics.accuracy.statistics import Accuracy, Settings
+from copem_replay.metrics.accuracy.statistics import Accuracy, AccuracySettings
 from copem_replay.metrics.config import Confirm
-from copem_replay.metrics.detection.by_match import Captures, FirstMatches, Steps
-from copem_replay.metrics.detection.by_truth_id import Detections
-from copem_replay.metrics.episodes import Episodes
+from copem_replay.metrics.detection.by_match import CaptureInstants, DetectionSteps, FirstMatches
+from copem_replay.metrics.detection.by_truth_id import FirstDetections
+from copem_replay.metrics.episodes import Episodes, Reference
 from copem_replay.metrics.matching import Matches
-from copem_replay.metrics.reference import Reference
 
 
 def assess(
@@ -26,7 +25,7 @@ def assess(
     reference: Reference,
     measured_class: Bool,
     *,
-    settings: Settings,
+    settings: AccuracySettings,
 ) -> Accuracy:
     """Add up how far off all lists are at once: what `Aggregator` is given."""
     whole = Aggregator(
@@ -44,8 +43,8 @@ def first_matches(
     *,
     confirm: Confirm,
     count_earlier: bool,
-    captures: Captures,
-) -> tuple[Detections, Steps]:
+    captures: CaptureInstants,
+) -> tuple[FirstDetections, DetectionSteps]:
     """The same of all lists at once."""
     whole = FirstMatches(
         episodes, runs=len(lists.start), confirm=confirm, count_earlier=count_earlier, captures=captures

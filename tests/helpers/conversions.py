@@ -15,8 +15,8 @@ from osi3.osi_groundtruth_pb2 import GroundTruth
 
 from copem_replay.cli import main as cli
 from copem_replay.core.tracks import CLASSES
-from copem_replay.io.convert.ground_truth import RECORD
-from copem_replay.io.recording import Recording, read
+from copem_replay.io.convert.conversion import RECORD
+from copem_replay.io.recording import Recording, read_log
 
 ROOT = Path(__file__).parents[2]
 
@@ -24,7 +24,7 @@ ROOT = Path(__file__).parents[2]
 def convert(*words: str | Path) -> int:
     """Run `copem-replay convert` in this process; the exit code."""
     with patch.object(sys, "argv", ["copem-replay", "convert", *map(str, words)]):
-        return cli._ended()
+        return cli._run_to_exit_code()
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Runner:
             records = {record.name: record.metadata for record in reader.iter_metadata()}
         assert set(records) == {"net.asam.osi.trace", RECORD}
         assert list(self.output.parent.iterdir()) == [self.output]
-        return Converted(read(self.output, name="converted"), messages, records[RECORD], printed.out)
+        return Converted(read_log(self.output, name="converted"), messages, records[RECORD], printed.out)
 
     def refused(self, kind: str, source: Path, *options: str | Path) -> str:
         """Return the one line on stderr."""

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from copem_replay.core.view_geometry import ViewGeometry
-from copem_replay.pipeline.fit.rows import FitLists, FitRows
+from copem_replay.fitting.rows import FitLists, FitRows
 
 PERIOD_S = 0.1
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from copem_replay.experiment.file import Source, load
+from copem_replay.experiment.file import ExperimentSource, read_experiment_file
 from tests.helpers.recordings import Obj, write_recording
 
 TEXT = """\
@@ -64,10 +64,10 @@ def changed(*changes: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def source_of(folder: Path, text: str) -> Source:
+def source_of(folder: Path, text: str) -> ExperimentSource:
     path = folder / "experiment.yaml"
     path.write_text(text, encoding="utf-8")
-    return load(path)
+    return read_experiment_file(path)
 
 
 def files(folder: str) -> dict[str, bytes]:

@@ -9,7 +9,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from copem_replay.core.tracks import CLASSES, VALUES
 from copem_replay.io.encodings.cdr import CdrDefinition
-from copem_replay.io.encodings.columns import Texts
+from copem_replay.io.encodings.columns import DistinctTexts
 from copem_replay.io.schemas.object_lists import DecodedLists
 
 SEPARATOR = "=" * 80 + "\n"
@@ -42,7 +42,7 @@ def serialised(text: str, message: dict[str, Any], *, little: bool = True, name:
     return bytes(store.serialize_cdr(made(name, message), name, little_endian=little))
 
 
-def texts(column: Texts) -> list[str | None]:
+def texts(column: DistinctTexts) -> list[str | None]:
     return [column.words[k] if k >= 0 else None for k in column.code]
 
 

@@ -15,14 +15,14 @@ from pathlib import Path
 
 import pandas as pd
 
-from copem_replay.experiment.file import load, log_paths
-from copem_replay.experiment.validate import problems, read_logs
-from copem_replay.metrics.tally import tally
-from copem_replay.pipeline.run import run
-from copem_replay.results.contents import write_parquet
-from copem_replay.results.read import Results, load_results
+from copem_replay.experiment.file import log_paths, read_experiment_file
+from copem_replay.experiment.validate import find_problems, read_logs
+from copem_replay.metrics.summary import tally_rows
+from copem_replay.pipeline.run import run_experiment
+from copem_replay.results.read import Results, read_results
+from copem_replay.results.schema import write_parquet
 from copem_replay.results.write import write_results
-from copem_replay.viewer.export import EXPORTERS
+from copem_replay.viewer.rrd import EXPORTERS
 from tests.helpers.recordings import Obj, pedestrian, write_recording
 
 TEXT = """\
@@ -86,12 +86,14 @@ def replayed(place: Path, text: str = TEXT, *logs: str) -> Path:
     for log in logs or ("drive.mcap",):
         drive(place / log)
     (place / "e.yaml").write_text(text, encoding="utf-8")
-    source = load(place / "e.yaml")
-    experiment, found = problems(source)
+    source = read_experiment_file(place / "e.yaml")
+    experiment, found = find_problems(source)
     assert experiment is not None, found
     recordings, refused = read_logs(experiment, log_paths(source)[0], source)
     assert not refused + found
-    write_results(place / "results", experiment, recordings, run(experiment, recordings), exporters=EXPORTERS)
+    write_results(
+        place / "results", experiment, recordings, run_experiment(experiment, recordings), exporters=EXPORTERS
+    )
     return place / "results"
 
 
@@ -99,8 +101,8 @@ def with_rows(results: Results, table: pd.DataFrame, folder: Path) -> Results:
     """A copy of results with other rows of `detections.parquet`, tallied."""
     shutil.copytree(results.folder, folder)
     write_parquet(table, folder / "detections.parquet")
-    write_parquet(tally(table), folder / "tally.parquet")
-    return load_results(folder)
+    write_parquet(tally_rows(table), folder / "tally.parquet")
+    return read_results(folder)
 
 
 @dataclass

@@ -12,8 +12,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from copem_replay.io.encodings.cdr import CdrDefinition
-from copem_replay.io.encodings.columns import Shredded, level_of, rows_above, take_apart
-from copem_replay.io.encodings.raw_values import DefinitionError
+from copem_replay.io.encodings.columns import (
+    DefinitionError,
+    ShreddedMessages,
+    ancestor_rows,
+    list_level,
+    shred_messages,
+)
 from tests.helpers.messages import SEPARATOR, defined, serialised, texts
 
 NUSCENES = Path(__file__).parents[3] / "shared/data/nuscenes_scene0916_autoware_ros2.mcap"
@@ -59,7 +64,7 @@ def test_numbers_of_every_kind_are_aligned_to_their_size() -> None:
         message |= {f"before{k}": k, f"v{k}": 1 if kind == "bool" else k + 0.5 if "float" in kind else k + 1}
     text = "\n".join(lines)
     for little in (True, False):
-        found = take_apart(defined(text), [serialised(text, message, little=little)] * 2, list(message))
+        found = shred_messages(defined(text), [serialised(text, message, little=little)] * 2, list(message))
         assert found.decoded.all()
         for name, value in message.items():
             assert found.levels[""].numbers[name].tolist() == [value, value], name
@@ -68,7 +73,7 @@ def test_numbers_of_every_kind_are_aligned_to_their_size() -> None:
 def test_least_and_most() -> None:
     text = "int8 a\nint64 b\nuint64 c\nfloat64 d\nfloat32 e"
     message = {"a": -128, "b": -(2**63), "c": 2**64 - 1, "d": math.nan, "e": -math.inf}
-    level = take_apart(defined(text), [serialised(text, message)], "abcde", "abcde").levels[""]
+    level = shred_messages(defined(text), [serialised(text, message)], "abcde", "abcde").levels[""]
     assert [level.numbers[n][0] for n in "abce"] == [-128, -(2.0**63), 2.0**64, -math.inf]
     assert np.isnan(level.numbers["d"][0])
     assert [texts(level.texts[n])[0] for n in "abcde"] == ["-128", str(-(2**63)), str(2**64 - 1), "nan", "-inf"]
@@ -78,7 +83,7 @@ def test_texts_and_numbers_as_texts() -> None:
     text = "bool a\nstring b\nstring<=9 c\nfloat64 d\nfloat64 e\nbyte[3] f\nuint8[] g\nstring h"
     message = {"a": True, "b": "Fußgänger", "c": "", "d": 1533151603.123456, "e": 7.0, "h": "12.5"}
     message |= {"f": [0, 255, 16], "g": [1, 2]}
-    found = take_apart(defined(text), [serialised(text, message)], ["a", "b", "h", "f"], "abcdefgh").levels[""]
+    found = shred_messages(defined(text), [serialised(text, message)], ["a", "b", "h", "f"], "abcdefgh").levels[""]
     assert [texts(found.texts[n])[0] for n in "abcdefgh"] == [
         "true",
         "Fußgänger",
@@ -97,7 +102,7 @@ def test_each_distinct_text_is_kept_once() -> None:
     definition = defined("string a")
     said = [b"car\0", b"car", b"bus\0", b"\xff\0", b"\xfe\0"]
     payloads = [b"\0\1\0\0" + struct.pack("<I", len(s)) + s for s in said]
-    column = take_apart(definition, payloads, texts=["a"]).levels[""].texts["a"]
+    column = shred_messages(definition, payloads, texts=["a"]).levels[""].texts["a"]
     assert texts(column) == ["car", "car", "bus", "�", "�"]
     assert len(set(column.words)) == len(column.words) == 3
 
@@ -107,7 +112,7 @@ def test_an_id_as_text_its_items_and_one_of_them_at_once() -> None:
     message = {"before": 1, "id": [1, 2, 3, 4], "after": 2.5, "more": [9, 8], "last": 77}
     payload = serialised(text, message)
     paths = ["id[]", "id[2]", "after", "more[]", "more[1]", "last"]
-    found = take_apart(defined(text), [payload, payload], paths, ["id", "more"])
+    found = shred_messages(defined(text), [payload, payload], paths, ["id", "more"])
     assert texts(found.levels[""].texts["id"]) == ["01020304"] * 2
     assert texts(found.levels[""].texts["more"]) == ["0908"] * 2
     assert found.levels["id[]"].numbers["id[]"].tolist() == [1, 2, 3, 4] * 2
@@ -123,7 +128,7 @@ def test_items_of_lists_of_numbers() -> None:
         {"x": 2, "c": range(10, 19), "d": [], "e": [-7, -8, -9]},
     ]
     paths = ["b[].c[8]", "b[].c[0]", "b[].c[7]", "b[].d[0]", "b[].e[1]", "b[].x", "b[].c[9]", "b[1].x", "b[0].c[3]"]
-    found = take_apart(defined(text), [serialised(text, {"b": rows})], paths)
+    found = shred_messages(defined(text), [serialised(text, {"b": rows})], paths)
     level = found.levels["b[]"].numbers
     assert level["b[].c[8]"].tolist() == [8, 18]
     assert level["b[].c[0]"].tolist() == [0, 10]
@@ -139,7 +144,7 @@ def test_items_of_lists_of_numbers() -> None:
 def test_an_empty_structure_is_a_byte() -> None:
     text = "E e\nE[2] f\nE[] g\nuint8 x\n" + SEPARATOR + "MSG: p/E\n"
     payload = b"\0\1\0\0" + bytes(1 + 2 + 1) + struct.pack("<I", 3) + bytes(3) + b"\x2a"
-    found = take_apart(defined(text), [payload], ["x"])
+    found = shred_messages(defined(text), [payload], ["x"])
     assert found.decoded.all()
     assert found.levels[""].numbers["x"].tolist() == [42]
 
@@ -155,7 +160,7 @@ def test_xcdr2() -> None:
         items = struct.pack(order + "B3xqB3xq", 4, -4, 5, -5)
         body += struct.pack(order + "I", len(items)) + items
         paths = ["a", "b", "d[]", "e[].x", "e[].y"]
-        found = take_apart(defined(text), [bytes([0, ident, 0, 0]) + body], paths, ["c[]"])
+        found = shred_messages(defined(text), [bytes([0, ident, 0, 0]) + body], paths, ["c[]"])
         assert found.decoded.all()
         assert [found.levels[""].numbers[n].tolist() for n in "ab"] == [[1], [2.5]]
         assert texts(found.levels["c[]"].texts["c[]"]) == ["n"]
@@ -198,7 +203,7 @@ def test_idl() -> None:
     message = {"o": 1, "b": b, "bs": [b, b], "v": [1, 2, 3], "yes": True, "u": 9, "s": "t", "f": 0.5, "k": 2}
     definition = defined(text, encoding="ros2idl")
     assert definition.offers() == defined(same_in_msg).offers()
-    found = take_apart(
+    found = shred_messages(
         definition, [serialised(same_in_msg, message)], ["o", "b.x", "bs[].c", "v[2]", "yes", "u"], ["s"]
     )
     assert found.decoded.all()
@@ -264,14 +269,14 @@ def definitions(draw: st.DrawFn) -> Made:
     return Made(SEPARATOR.join(parts), [value("A") for _ in range(draw(st.integers(1, 4)))])
 
 
-def check(definition: CdrDefinition, made: list[dict[str, Any]], found: Shredded, paths: list[str]) -> None:
+def check(definition: CdrDefinition, made: list[dict[str, Any]], found: ShreddedMessages, paths: list[str]) -> None:
     """All values are those that were serialised, and all rows have their parents."""
     for path in paths:
-        level = level_of(path)
+        level = list_level(path)
         expected = [v for m in made for v in walk(m, path)]
         of_message = [k for k, m in enumerate(made) for _ in walk(m, path)]
         column = found.levels[level]
-        assert found.levels[""].parent[rows_above(found, level, "")].tolist() == of_message
+        assert found.levels[""].parent[ancestor_rows(found, level, "")].tolist() == of_message
         if definition.offers()[path] == "number":
             same(column.numbers[path], expected)
         elif all(isinstance(v, str) for v in expected):
@@ -291,7 +296,7 @@ def test_what_was_serialised_is_found(made: Made, little: bool, data: st.DataObj
     wanted = data.draw(st.lists(st.sampled_from(sorted(offered)), min_size=1, unique=True))
     for paths in (list(offered), wanted):
         numbers, said = [p for p in paths if offered[p] == "number"], [p for p in paths if offered[p] == "text"]
-        found = take_apart(definition, payloads, numbers, said)
+        found = shred_messages(definition, payloads, numbers, said)
         assert found.decoded.all()
         check(definition, made.messages, found, paths)
 
@@ -311,11 +316,11 @@ def test_damaged_messages_are_told_and_the_others_unharmed(made: Made, data: st.
     bad = data.draw(st.sampled_from([bad, data.draw(st.binary(max_size=64)), whole + bytes(9)]))
     numbers = [p for p in offered if offered[p] == "number"]
     said = [p for p in offered if offered[p] == "text"]
-    alone, mixed = (take_apart(definition, p, numbers, said) for p in (payloads, [bad, *payloads, bad]))
+    alone, mixed = (shred_messages(definition, p, numbers, said) for p in (payloads, [bad, *payloads, bad]))
     assert mixed.decoded[1:-1].all()
     assert mixed.decoded[0] == mixed.decoded[-1]
     for name, level in alone.levels.items():
-        message = mixed.levels[""].parent[rows_above(mixed, name, "")]
+        message = mixed.levels[""].parent[ancestor_rows(mixed, name, "")]
         good = (message > 0) & (message <= len(payloads))
         if not mixed.decoded[0]:
             assert good.all()
@@ -330,9 +335,9 @@ def test_batches_of_messages_are_one_table(monkeypatch: pytest.MonkeyPatch) -> N
     made = [{"n": str(k % 3), "b": [{"x": k + j / 10, "s": [f"{k}-{j}"] * j} for j in range(k % 4)]} for k in range(20)]
     payloads = [serialised(text, m) for m in made]
     payloads.insert(7, b"\0\1\0\0")
-    one = take_apart(defined(text), payloads, ["b[].x"], ["n", "b[].s[]"])
+    one = shred_messages(defined(text), payloads, ["b[].x"], ["n", "b[].s[]"])
     monkeypatch.setattr("copem_replay.io.encodings.columns.BATCH_BYTES", 60)
-    many = take_apart(defined(text), payloads, ["b[].x"], ["n", "b[].s[]"])
+    many = shred_messages(defined(text), payloads, ["b[].x"], ["n", "b[].s[]"])
     assert one.decoded.tolist() == many.decoded.tolist() == [k != 7 for k in range(21)]
     for name, level in one.levels.items():
         assert level.parent.tolist() == many.levels[name].parent.tolist()
@@ -355,13 +360,13 @@ def test_lengths_that_cannot_be() -> None:
         b"\0\1\0\0" + struct.pack("<III", 0, 0, 2**32 - 1) + bytes(100),
         b"\0\1\0\0" + struct.pack("<I", 1000) + bytes(1200),
     ):
-        found = take_apart(definition, [payload], ["b[].x[].z", "c[]"], ["d"])
+        found = shred_messages(definition, [payload], ["b[].x[].z", "c[]"], ["d"])
         assert not found.decoded.any()
         assert all(len(level.parent) == 0 for level in found.levels.values())
 
 
 def test_no_messages() -> None:
-    found = take_apart(defined("B[] b\n" + SEPARATOR + "MSG: p/B\nuint8 z\nstring s"), [], ["b[].z"], ["b[].s"])
+    found = shred_messages(defined("B[] b\n" + SEPARATOR + "MSG: p/B\nuint8 z\nstring s"), [], ["b[].z"], ["b[].s"])
     assert found.levels["b[]"].numbers["b[].z"].tolist() == []
     assert texts(found.levels["b[]"].texts["b[].s"]) == []
 
@@ -409,7 +414,7 @@ def test_anything_as_a_definition(text: bytes) -> None:
             definition = CdrDefinition("p/msg/A", encoding, text)
         except DefinitionError:
             continue
-        take_apart(definition, [b"", b"\0\1\0\0" + bytes(40)], [], list(definition.offers()))
+        shred_messages(definition, [b"", b"\0\1\0\0" + bytes(40)], [], list(definition.offers()))
 
 
 def test_a_constant_of_gigabytes() -> None:
@@ -429,16 +434,16 @@ def test_lists_as_deep_as_they_may_be() -> None:
     definition = defined(text)
     (path,) = definition.offers()
     payload = b"\0\1\0\0" + struct.pack("<I", 1) * 31 + struct.pack("<I", 2) + b"x\0"
-    found = take_apart(definition, [payload], [], [path])
+    found = shred_messages(definition, [payload], [], [path])
     assert found.decoded.all()
-    assert texts(found.levels[level_of(path)].texts[path]) == ["x"]
-    assert not take_apart(definition, [b"\0\1\0\0" + b"\2\0\0\0" * 40], [], [path]).decoded.any()
+    assert texts(found.levels[list_level(path)].texts[path]) == ["x"]
+    assert not shred_messages(definition, [b"\0\1\0\0" + b"\2\0\0\0" * 40], [], [path]).decoded.any()
 
 
 def test_a_path_that_is_not_there() -> None:
     for path in ("b", "a.x", "a[]", "a[0]", "", "[]", "a]"):
         with pytest.raises(KeyError):
-            take_apart(defined("uint8 a"), [], [path])
+            shred_messages(defined("uint8 a"), [], [path])
 
 
 # ------------------------------------------------------------------------------------------------ a real recording
@@ -459,12 +464,12 @@ def test_a_recording_against_mcap_ros2_support() -> None:
         offers = definition.offers()
         numbers = [p for p, kind in offers.items() if kind == "number"]
         said = [p for p, kind in offers.items() if kind == "text"]
-        found = take_apart(definition, payloads, numbers, said)
+        found = shred_messages(definition, payloads, numbers, said)
         assert found.decoded.all()
         assert len(offers) > 10
         for path in offers:
             expected = [v for m in decoded for v in walk_objects(m, path)]
-            level = found.levels[level_of(path)]
+            level = found.levels[list_level(path)]
             if path in numbers:
                 same(level.numbers[path], expected)
             else:

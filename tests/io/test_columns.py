@@ -15,19 +15,19 @@ from hypothesis import strategies as st
 
 from copem_replay.io.encodings.columns import (
     Definition,
-    Level,
-    Shredded,
-    above,
-    as_text,
+    DefinitionError,
+    LevelRows,
+    ShreddedMessages,
+    ancestor_rows,
     common_level,
-    level_of,
-    levels_to,
-    rows_above,
-    take_apart,
+    format_number,
+    list_level,
+    list_levels,
+    parent_level,
+    shred_messages,
 )
 from copem_replay.io.encodings.json import JsonDefinition
 from copem_replay.io.encodings.protobuf import ProtobufDefinition
-from copem_replay.io.encodings.raw_values import DefinitionError
 from tests.helpers.messages import SEPARATOR, defined, serialised, texts
 
 Kinds = descriptor_pb2.FieldDescriptorProto
@@ -42,9 +42,9 @@ def in_json(*messages: Any) -> tuple[JsonDefinition, list[bytes]]:
     return JsonDefinition(payloads), payloads
 
 
-def column(found: Shredded, path: str) -> list[Any]:
+def column(found: ShreddedMessages, path: str) -> list[Any]:
     """Numbers with None for NaN, or texts."""
-    level = found.levels[level_of(path)]
+    level = found.levels[list_level(path)]
     if path in level.numbers:
         return [None if math.isnan(v) else v for v in level.numbers[path]]
     return texts(level.texts[path])
@@ -92,17 +92,17 @@ def in_protobuf(file: Any, name: str) -> tuple[ProtobufDefinition, Callable[[dic
 
 
 def test_levels() -> None:
-    assert level_of("a.b") == ""
-    assert level_of("a[].b[].c.d") == "a[].b[]"
-    assert [above(level) for level in ("a[].b[]", "a[]", "a[][]", "[]")] == ["a[]", "", "a[]", ""]
-    assert levels_to(["a[].b[].c", "d[].e", "f"]) == ["", "a[]", "d[]", "a[].b[]"]
+    assert list_level("a.b") == ""
+    assert list_level("a[].b[].c.d") == "a[].b[]"
+    assert [parent_level(level) for level in ("a[].b[]", "a[]", "a[][]", "[]")] == ["a[]", "", "a[]", ""]
+    assert list_levels(["a[].b[].c", "d[].e", "f"]) == ["", "a[]", "d[]", "a[].b[]"]
     assert common_level("a[].b[]", "a[].c[]") == "a[]"
     assert common_level("a[]", "b[]") == ""
     assert common_level("a[].b[]", "a[].b[]") == "a[].b[]"
 
 
 def test_numbers_as_text_lose_nothing() -> None:
-    assert [as_text(v) for v in (1.0, -0.0, 3, 2**63, 1533151603.123456, 1e300, math.nan)] == [
+    assert [format_number(v) for v in (1.0, -0.0, 3, 2**63, 1533151603.123456, 1e300, math.nan)] == [
         "1",
         "0",
         "3",
@@ -128,7 +128,7 @@ def test_json() -> None:
         "objects[].p.x": "text",
         "objects[].tags[]": "text",
     }
-    found = take_apart(definition, payloads, ["t", "objects[].p.x"], ["objects[].id", "objects[].tags[]"])
+    found = shred_messages(definition, payloads, ["t", "objects[].p.x"], ["objects[].id", "objects[].tags[]"])
     assert found.decoded.all()
     assert column(found, "t") == [5, 6, 7]
     assert column(found, "objects[].p.x") == [1.5, 2.5, None, None, None]
@@ -140,7 +140,7 @@ def test_json() -> None:
 
 def test_json_that_is_a_list() -> None:
     definition, payloads = in_json([{"x": 1}, {"x": 2}], [], [{"x": 3}])
-    found = take_apart(definition, payloads, ["[].x", "[1].x"])
+    found = shred_messages(definition, payloads, ["[].x", "[1].x"])
     assert column(found, "[].x") == [1, 2, 3]
     assert column(found, "[1].x") == [2, None, None]
     assert found.levels["[]"].parent.tolist() == [0, 0, 2]
@@ -148,7 +148,7 @@ def test_json_that_is_a_list() -> None:
 
 def test_lists_in_lists() -> None:
     definition, payloads = in_json({"a": [[1, 2], [], [3]]}, {"a": [[4, 5, 6]]})
-    found = take_apart(definition, payloads, ["a[][]", "a[][1]", "a[0][2]", "a[0][]"])
+    found = shred_messages(definition, payloads, ["a[][]", "a[][1]", "a[0][2]", "a[0][]"])
     assert column(found, "a[][]") == [1, 2, 3, 4, 5, 6]
     assert column(found, "a[][1]") == [2, None, None, 5]
     assert column(found, "a[0][2]") == [None, 6]
@@ -178,7 +178,7 @@ def test_messages_unlike_the_others() -> None:
     ]
     (payload,) = encoded(good)
     mixed = [p for one in bad for p in (one, payload)]
-    found = take_apart(definition, mixed, ["objects[].x", "objects[].p.y"], ["objects[].x"])
+    found = shred_messages(definition, mixed, ["objects[].x", "objects[].p.y"], ["objects[].x"])
     assert found.decoded.tolist() == [False, True] * len(bad)
     assert found.levels[""].parent.tolist() == list(range(1, len(mixed), 2))
     assert found.levels["objects[]"].parent.tolist() == list(range(len(bad)))
@@ -188,14 +188,14 @@ def test_messages_unlike_the_others() -> None:
 def test_values_of_mixed_kinds() -> None:
     values = [1, 2.5, "3", "x", True, None, math.nan, 10**17, -math.inf, 0.1]
     definition, payloads = in_json(*({"v": v} for v in values))
-    both = take_apart(definition, payloads, ["v"], ["v"]).levels[""]
+    both = shred_messages(definition, payloads, ["v"], ["v"]).levels[""]
     assert texts(both.texts["v"]) == ["1", "2.5", "3", "x", "true", None, "nan", str(10**17), "-inf", "0.1"]
     np.testing.assert_array_equal(both.numbers["v"], [1, 2.5, 3, np.nan, 1, np.nan, np.nan, 1e17, -np.inf, 0.1])
 
 
 def test_half_a_surrogate_is_no_text() -> None:
     payloads = [b'{"v": "a\\ud800"}', '{"v": "\U0001f6b2ü"}'.encode()]
-    found = take_apart(JsonDefinition(payloads), payloads, [], ["v"])
+    found = shred_messages(JsonDefinition(payloads), payloads, [], ["v"])
     assert column(found, "v") == ["a?", "\U0001f6b2ü"]
 
 
@@ -229,9 +229,9 @@ def test_any_json(value: Any, data: st.DataObject) -> None:
     definition = JsonDefinition(payloads)
     paths = sorted(definition.offers())
     wanted = data.draw(st.lists(st.sampled_from(paths))) if paths else []
-    found = take_apart(definition, payloads, wanted, paths)
+    found = shred_messages(definition, payloads, wanted, paths)
     for name, level in found.levels.items():
-        assert found.decoded[found.levels[""].parent[rows_above(found, name, "")]].all()
+        assert found.decoded[found.levels[""].parent[ancestor_rows(found, name, "")]].all()
         for path in level.texts:
             assert len(level.texts[path].code) == len(level.parent)
 
@@ -269,20 +269,20 @@ def test_one_item_of_a_list(content: list[Any], data: st.DataObject) -> None:
     steps = [data.draw(st.sampled_from(["[]", "[0]", "[1]", "[2]"])) for _ in range(3)]
     path = "a{}.b{}.c{}".format(*steps)
     definition, payloads = in_json(other, message, other)
-    found = take_apart(definition, payloads, [path])
+    found = shred_messages(definition, payloads, [path])
     assert column(found, path) == [v for m in (other, message, other) for v in oracle(m, path)]
-    level = level_of(path)
-    of_message = found.levels[""].parent[rows_above(found, level, "")]
+    level = list_level(path)
+    of_message = found.levels[""].parent[ancestor_rows(found, level, "")]
     assert of_message.tolist() == [k for k, m in enumerate((other, message, other)) for _ in oracle(m, path)]
     text = f"A[] a\n{SEPARATOR}MSG: p/A2\n"
     text = f"B[] a\n{SEPARATOR}MSG: p/B\nC[] b\n{SEPARATOR}MSG: p/C\nint32[] c"
-    in_cdr = take_apart(defined(text), [serialised(text, m) for m in (other, message, other)], [path])
+    in_cdr = shred_messages(defined(text), [serialised(text, m) for m in (other, message, other)], [path])
     assert column(in_cdr, path) == column(found, path)
 
 
 def test_an_item_and_the_whole_list() -> None:
     definition, payloads = in_json({"a": [{"x": 1, "n": "p"}, {"x": 2, "n": "q"}]})
-    found = take_apart(definition, payloads, ["a[].x", "a[1].x", "a[7].x"], ["a[0].n", "a[].n"])
+    found = shred_messages(definition, payloads, ["a[].x", "a[1].x", "a[7].x"], ["a[0].n", "a[].n"])
     assert column(found, "a[].x") == [1, 2]
     assert column(found, "a[1].x") == [2]
     assert column(found, "a[7].x") == [None]
@@ -293,9 +293,9 @@ def test_paths_that_are_not_offered() -> None:
     definition, payloads = in_json({"a": [{"x": 1}]})
     for path in ("a[].y", "a[]", "a[0]", "a", "", "a[].x[0]", "a[-1].x", "a[" + "9" * 5000 + "].x"):
         with pytest.raises(KeyError):
-            take_apart(definition, payloads, [path])
+            shred_messages(definition, payloads, [path])
         with pytest.raises(KeyError):
-            take_apart(definition, payloads, [], [path])
+            shred_messages(definition, payloads, [], [path])
 
 
 # ------------------------------------------------------------------------------------------------ protobuf
@@ -328,7 +328,7 @@ def test_protobuf() -> None:
     first = {"id": "a", "place": {"x": 1.5}, "speed": 0, "kind": "CAR", "raw": "AP8=", "seen": True, "length": 0.1}
     messages = [{"t": str(2**63 + 1), "objects": [first, {"kind": 5}], "kinds": ["PERSON", "CAR"]}, {}]
     numbers = [p for p in definition.offers() if p != "objects[].id"]
-    found = take_apart(definition, [payload(m) for m in messages], numbers, ["t", "objects[].raw"])
+    found = shred_messages(definition, [payload(m) for m in messages], numbers, ["t", "objects[].raw"])
     assert column(found, "objects[].speed") == [0, None]  # optional: 0 is said, or it is not
     assert column(found, "objects[].place.x") == [1.5, None]
     assert column(found, "objects[].place.y") == [0, None]
@@ -336,7 +336,9 @@ def test_protobuf() -> None:
     assert column(found, "objects[].seen") == [1, 0]
     assert texts(found.levels[""].texts["t"]) == [str(2**63 + 1), "0"]
     assert texts(found.levels["objects[]"].texts["objects[].raw"]) == ["00ff", ""]
-    named = take_apart(definition, [payload(m) for m in messages], [], ["objects[].kind", "kinds[]", "objects[].seen"])
+    named = shred_messages(
+        definition, [payload(m) for m in messages], [], ["objects[].kind", "kinds[]", "objects[].seen"]
+    )
     assert column(named, "objects[].kind") == ["CAR", "5"]
     assert column(named, "kinds[]") == ["PERSON", "CAR"]
     assert column(named, "objects[].seen") == ["true", "false"]
@@ -345,7 +347,7 @@ def test_protobuf() -> None:
 def test_damaged_protobuf() -> None:
     definition, payload = in_protobuf(OBJECTS, "List")
     good = payload({"t": "3", "objects": [{"id": "a"}]})
-    found = take_apart(definition, [good, b"\xff\xff\xff", good[:-1], b"", good], ["t"], ["objects[].id"])
+    found = shred_messages(definition, [good, b"\xff\xff\xff", good[:-1], b"", good], ["t"], ["objects[].id"])
     assert found.decoded.tolist() == [True, False, False, True, True]
     assert column(found, "objects[].id") == ["a", "a"]
 
@@ -359,7 +361,7 @@ def test_maps_are_left_out() -> None:
     file.message_type[0].field.add(name="tags", number=2, label=3, type=Kinds.TYPE_MESSAGE, type_name=".m.A.TagsEntry")
     definition, payload = in_protobuf(file, "A")
     assert definition.offers() == {"x": "number"}
-    assert column(take_apart(definition, [payload({"x": 2, "tags": {"a": "b"}})], ["x"]), "x") == [2]
+    assert column(shred_messages(definition, [payload({"x": 2, "tags": {"a": "b"}})], ["x"]), "x") == [2]
 
 
 def test_definitions_that_refer_to_themselves() -> None:
@@ -367,7 +369,7 @@ def test_definitions_that_refer_to_themselves() -> None:
     definition, payload = in_protobuf(file, "A")
     assert len(definition.offers()) == 12
     path = "children[].children[].x"
-    found = take_apart(definition, [payload({"x": 1, "children": [{"x": 2, "children": [{"x": 3}]}]})], [path])
+    found = shred_messages(definition, [payload({"x": 1, "children": [{"x": 2, "children": [{"x": 3}]}]})], [path])
     assert column(found, path) == [3]
     many, _ = in_protobuf(schema("r", {"A": "double x\n" + "\n".join(f"A a{k}" for k in range(30))}), "A")
     assert {"x", "a29.x", "a3.a4.x"} <= set(many.offers())
@@ -388,7 +390,7 @@ def test_a_schema_of_another_encoding() -> None:
 @given(st.binary(max_size=60))
 def test_any_bytes_as_protobuf(payload: bytes) -> None:
     definition, _ = in_protobuf(OBJECTS, "List")
-    take_apart(definition, [payload], ["objects[].place.x", "t"], list(definition.offers()))
+    shred_messages(definition, [payload], ["objects[].place.x", "t"], list(definition.offers()))
 
 
 # ------------------------------------------------------------------------------------------------ three encodings
@@ -428,7 +430,7 @@ def test_the_same_content_gives_the_same_columns(content: Sequence[list[dict[str
     }
     numbers = ["t", "things[].x", "things[].f", "things[].n", "things[].yes", "things[].v[]", "things[].v[1]"]
     said = ["things[].name", "things[].n", "things[].x", "things[].f", "things[].yes", "things[1].name"]
-    found = {name: take_apart(*one, numbers, said) for name, one in made.items()}
+    found = {name: shred_messages(*one, numbers, said) for name, one in made.items()}
     offers = [definition.offers() for definition, _ in made.values()]
     assert offers[0] == offers[1] == offers[2]
     for other in ("protobuf", "cdr"):
@@ -436,7 +438,7 @@ def test_the_same_content_gives_the_same_columns(content: Sequence[list[dict[str
             same_level(level, found[other].levels[name])
 
 
-def same_level(one: Level, other: Level) -> None:
+def same_level(one: LevelRows, other: LevelRows) -> None:
     np.testing.assert_array_equal(one.parent, other.parent)
     assert one.numbers.keys() == other.numbers.keys()
     assert one.texts.keys() == other.texts.keys()
@@ -449,9 +451,9 @@ def same_level(one: Level, other: Level) -> None:
 def test_single_precision_is_the_same_text() -> None:
     """Of a float32 the number is said that it is, not the one it was meant for."""
     text = "float32 f"
-    in_cdr = take_apart(defined(text), [serialised(text, {"f": 0.1})], ["f"], ["f"])
+    in_cdr = shred_messages(defined(text), [serialised(text, {"f": 0.1})], ["f"], ["f"])
     definition, payload = in_protobuf(schema("f", {"A": "float f"}), "A")
-    in_proto = take_apart(definition, [payload({"f": 0.1})], ["f"], ["f"])
+    in_proto = shred_messages(definition, [payload({"f": 0.1})], ["f"], ["f"])
     exact = struct.unpack("<f", struct.pack("<f", 0.1))[0]
     assert in_cdr.levels[""].numbers["f"].tolist() == in_proto.levels[""].numbers["f"].tolist() == [exact]
     assert column(in_cdr, "f") == column(in_proto, "f")

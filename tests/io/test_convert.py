@@ -13,7 +13,7 @@ import typer
 from osi3.osi_object_pb2 import MovingObject
 
 from copem_replay.cli import convert as convert_command
-from copem_replay.experiment.draft.survey import survey
+from copem_replay.experiment.draft.survey import survey_recording
 from tests.helpers.conversions import ROOT, Runner, convert, run
 
 __all__ = ["run"]
@@ -30,7 +30,7 @@ def test_the_file_is_whole_the_same_again_and_read_by_info(run: Runner) -> None:
     first = run.output.read_bytes()
     run("csv", source)
     assert run.output.read_bytes() == first
-    found = survey(run.output)
+    found = survey_recording(run.output)
     assert found.readable
     assert [topic.topic for topic in found.topics] == ["ground_truth"]
 
@@ -108,7 +108,7 @@ def test_what_is_there_already_is_replaced_only_when_that_is_asked_for(
     assert capsys.readouterr().err == f"{there}: is there already; give another name, or --overwrite\n"
     assert there.read_text() == "of another day"
     assert convert(*words, "--overwrite") == 0
-    assert survey(there).readable
+    assert survey_recording(there).readable
     assert sorted(path.name for path in run.folder.iterdir()) == ["table.csv", "there.mcap"]
 
 
@@ -189,7 +189,7 @@ def test_csv_of_another_encoding(run: Runner) -> None:
 
 def test_the_page_shows_commands_that_are_understood_and_a_table_that_converts(run: Runner) -> None:
     from copem_replay.io.convert import csv_rows
-    from copem_replay.io.convert.kinds import KINDS
+    from copem_replay.io.convert.conversion import KINDS
 
     group = typer.main.get_group(convert_command.app)
     page = (ROOT / "docs/guide/data-sets.md").read_text(encoding="utf-8")
@@ -320,12 +320,12 @@ def test_xml_with_entities_is_refused(run: Runner, kind: str) -> None:
 
 
 def test_sumo_is_read_time_step_by_time_step(run: Runner) -> None:
-    from copem_replay.io.convert.ground_truth import Report
+    from copem_replay.io.convert.conversion import ConversionReport
     from copem_replay.io.convert.sumo import frames
 
     step = '<vehicle id="a" x="1" y="0" angle="90"/>' + " " * 70_000  # each more than a block
     source = run.file("f.xml", fcd(step, step)[: -len("</timestep></fcd-export>")])
-    reading = frames(source, Report())
+    reading = frames(source, ConversionReport())
     assert [box.id for box in next(reading).boxes] == [1]  # though the end of the file is missing
 
 
@@ -480,10 +480,10 @@ def test_commonroad_refuses(run: Runner, text: str, line: str) -> None:
 
 def test_every_kind_is_of_the_class_its_name_says() -> None:
     from copem_replay.core.tracks import CLASSES
-    from copem_replay.io.convert.kinds import KINDS
-    from copem_replay.io.schemas.osi_ground_truth import class_of
+    from copem_replay.io.convert.conversion import KINDS
+    from copem_replay.io.schemas.osi_ground_truth import osi_class_index
 
-    found = {name: CLASSES[class_of(kind.type, kind.vehicle)] for name, kind in KINDS.items() if kind.moving}
+    found = {name: CLASSES[osi_class_index(kind.type, kind.vehicle)] for name, kind in KINDS.items() if kind.moving}
     others = {
         "tractor": "truck",
         "scooter": "bicycle",

@@ -17,7 +17,7 @@ from osi3.osi_object_pb2 import StationaryObject
 
 from copem_replay.core.errors import InputError
 from copem_replay.io.convert import restricted_pickle
-from copem_replay.io.recording import read
+from copem_replay.io.recording import read_log
 from tests.helpers.conversions import Runner, convert, run
 
 __all__ = ["run"]
@@ -106,7 +106,7 @@ def test_argoverse2_ego_of_another_size(run: Runner) -> None:
 
 def test_argoverse2_every_category_of_the_data_set_is_known() -> None:
     from copem_replay.io.convert.argoverse2 import _KIND
-    from copem_replay.io.convert.kinds import KINDS
+    from copem_replay.io.convert.conversion import KINDS
 
     assert len(_KIND) == 30  # AnnotationCategories of av2-api
     static = {name for name, kind in _KIND.items() if not KINDS[kind].moving}
@@ -272,7 +272,7 @@ def counting(**more: Any) -> dict[str, Any]:
 def test_scenarionet_of_waymo_counts_with_a_defaultdict(run: Runner, protocol: int) -> None:
     path = run.file("w.pkl", pickle.dumps(counting(), protocol=protocol))
     assert run("scenarionet", path).class_of("1") == "car"
-    found = restricted_pickle.load(path)["metadata"]["number_summary"]
+    found = restricted_pickle.load_pickle(path)["metadata"]["number_summary"]
     assert found == {"moving": {"VEHICLE": 1}, "by type": {"VEHICLE": [{}]}}
     assert type(found["moving"]) is dict  # nothing that makes up what it is asked for
 
@@ -292,7 +292,7 @@ def test_scenarionet_whole_folder(run: Runner, capsys: pytest.CaptureFixture[str
     assert printed[:2] == [f"{out / f'sd_waymo_{name}.mcap'}: 4 frames, 1 car" for name in "ab"]
     assert "note: 8 states of the ego vehicle with length and width swapped (1.73×4.08 m): put right" in printed
     assert sorted(path.name for path in out.iterdir()) == ["sd_waymo_a.mcap", "sd_waymo_b.mcap"]
-    assert read(out / "sd_waymo_b.mcap", name="b").host_id == "1"
+    assert read_log(out / "sd_waymo_b.mcap", name="b").host_id == "1"
     # The same again is refused before anything is read, and done with --overwrite, to the same bytes.
     before = (out / "sd_waymo_a.mcap").read_bytes()
     assert convert(*words) == 2
@@ -408,7 +408,7 @@ def test_a_pickle_says_nothing_that_numpy_would_believe(tmp_path: Path, hostile:
     for protocol in range(2, 6):
         path.write_bytes(pickle.dumps({"metadata": hostile}, protocol=protocol))
         with pytest.raises(InputError, match=what):
-            restricted_pickle.load(path)
+            restricted_pickle.load_pickle(path)
 
 
 def test_an_array_is_filled_once(tmp_path: Path) -> None:
@@ -418,7 +418,7 @@ def test_an_array_is_filled_once(tmp_path: Path) -> None:
     state = pickle.dumps((1, (1,), np.dtype("f8"), False, b"A" * 8), 2)
     path.write_bytes(filled[:-1] + state[2:-1] + b"b.")
     with pytest.raises(InputError, match=r"an array of shape \(1,\)$"):
-        restricted_pickle.load(path)
+        restricted_pickle.load_pickle(path)
 
 
 def test_a_pickle_cannot_hold_one_thing_too_often(tmp_path: Path) -> None:
@@ -434,18 +434,18 @@ def test_a_pickle_cannot_hold_one_thing_too_often(tmp_path: Path) -> None:
     for hostile in (bomb, [text] * 10_000, [np.zeros(1000)] * 1000, shared, named):
         path.write_bytes(pickle.dumps(hostile))
         with pytest.raises(InputError, match="far more content than it has bytes"):
-            restricted_pickle.load(path)
+            restricted_pickle.load_pickle(path)
     # Nor make it anew, each time in the place of the one before.
     content, dtype = bytes(8000), np.dtype("f8")
     for anew in (lambda: Shell(set, items), lambda: hostile_array(dtype, (1000,), content)):
         path.write_bytes(pickle.dumps(Anew([anew() for _ in range(1000)])))
         with pytest.raises(InputError, match="far more content than it has bytes"):
-            restricted_pickle.load(path)
+            restricted_pickle.load_pickle(path)
     path.write_bytes(pickle.dumps(circle))
     with pytest.raises(InputError, match="containers in each other, more than 100 deep"):
-        restricted_pickle.load(path)
+        restricted_pickle.load_pickle(path)
     path.write_bytes(pickle.dumps({"same": [items, items]}))  # a few times is no harm
-    assert restricted_pickle.load(path) == {"same": [items, items]}
+    assert restricted_pickle.load_pickle(path) == {"same": [items, items]}
 
 
 @pytest.mark.parametrize("protocol", range(6))
@@ -473,7 +473,7 @@ def test_a_pickle_may_hold_containers_numbers_strings_and_arrays(tmp_path: Path)
     }
     for protocol in range(6):
         path.write_bytes(pickle.dumps(fine, protocol=protocol))
-        found = restricted_pickle.load(path)
+        found = restricted_pickle.load_pickle(path)
         for one, other in zip(found.pop("arrays"), fine["arrays"], strict=True):
             assert one.dtype.newbyteorder("=") == other.dtype.newbyteorder("=")  # numpy itself may turn bytes
             np.testing.assert_array_equal(one, other)
@@ -481,11 +481,11 @@ def test_a_pickle_may_hold_containers_numbers_strings_and_arrays(tmp_path: Path)
     for bad in (np.zeros(2, dtype=[("a", "f8")]), np.array(["2020-01-01"], dtype="M8[D]")):
         path.write_bytes(pickle.dumps(bad))
         with pytest.raises(InputError, match="expected a pickle, found something else: an array of"):
-            restricted_pickle.load(path)
+            restricted_pickle.load_pickle(path)
     # A name is looked up whole: nothing hangs below one that is allowed.
     path.write_bytes(b"\x80\x04\x8c\x05numpy\x8c\x0cndarray.dump\x93.")
     with pytest.raises(InputError, match=r"the pickle names numpy\.ndarray\.dump"):
-        restricted_pickle.load(path)
+        restricted_pickle.load_pickle(path)
 
 
 @pytest.mark.parametrize(
@@ -504,17 +504,17 @@ def test_a_pickle_cannot_ask_for_gigabytes(tmp_path: Path, program: bytes, what:
     path = tmp_path / "p.pkl"
     path.write_bytes(program)
     with pytest.raises(InputError, match=what):
-        restricted_pickle.load(path)
+        restricted_pickle.load_pickle(path)
 
 
 def test_scenarionet_arrays_of_nothing_in_any_shape(run: Runner) -> None:
     huge = np.lib.stride_tricks.as_strided(np.zeros(1), shape=(10**11,), strides=(0,))
-    from copem_replay.io.convert.scenarionet import _array, _stamps
+    from copem_replay.io.convert.scenarionet import _read_array, _read_stamps
 
     with pytest.raises(InputError, match="ts: expected times in seconds"):
-        _stamps({"ts": huge}, "m")
+        _read_stamps({"ts": huge}, "m")
     with pytest.raises(InputError, match=r"x: expected 4 steps of up to 16, .* found shape \(100000000000,\)"):
-        _array({"x": huge}, "x", 4, 0, "t")
+        _read_array({"x": huge}, "x", 4, 0, "t")
 
 
 # OpenLABEL --------------------------------------------------------------------------------------------------

@@ -11,12 +11,12 @@ from mcap.reader import make_reader
 
 from copem_replay.cli import main as cli
 from copem_replay.core.errors import InputError
-from copem_replay.experiment.file import load, log_paths
-from copem_replay.experiment.validate import problems, read_logs
-from copem_replay.io.write.foxglove_layout import _split, layout_of
-from copem_replay.pipeline.run import run
+from copem_replay.experiment.file import log_paths, read_experiment_file
+from copem_replay.experiment.validate import find_problems, read_logs
+from copem_replay.io.write.foxglove_layout import _split_panels, build_layout
+from copem_replay.pipeline.run import run_experiment
 from copem_replay.results.write import write_results
-from copem_replay.viewer.export import EXPORTERS
+from copem_replay.viewer.rrd import EXPORTERS
 from tests.io.test_write_ros2 import EXPERIMENT, drive
 
 ROOT = Path(__file__).parents[2]
@@ -26,13 +26,13 @@ KEPT = ROOT / "logs/tc016d.foxglove.json"
 @pytest.fixture(scope="module")
 def replay(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The sample experiment's replay.mcap: of its first run, as five hundred would have it."""
-    source = load(ROOT / "logs/tc016d.yaml")
-    experiment, wrong = problems(source)
+    source = read_experiment_file(ROOT / "logs/tc016d.yaml")
+    experiment, wrong = find_problems(source)
     assert experiment is not None, wrong
     once = experiment.model_copy(update={"runs": 1})
     recordings, _ = read_logs(once, log_paths(source)[0], source)
     folder = tmp_path_factory.mktemp("layout") / "tc016d"
-    write_results(folder, once, recordings, run(once, recordings), exporters=EXPORTERS)
+    write_results(folder, once, recordings, run_experiment(once, recordings), exporters=EXPORTERS)
     return folder / "replay.mcap"
 
 
@@ -64,7 +64,7 @@ NAMES = ["GT", "PEM", "coPEM:0s", "coPEM:0.5s", "coPEM:1s", "coPEM:1.5s"]
 
 
 def test_a_panel_for_every_scene(replay: Path) -> None:
-    layout = layout_of(replay)
+    layout = build_layout(replay)
     scenes = panels_of(layout, "3D!")
     assert [config["foxglovePanelTitle"] for config in scenes.values()] == NAMES, "in the order of the experiment"
     for config in scenes.values():
@@ -84,7 +84,7 @@ def test_a_panel_for_every_scene(replay: Path) -> None:
 
 
 def test_lanes_and_curves_name_what_is_in_the_statuses(replay: Path) -> None:
-    layout = layout_of(replay)
+    layout = build_layout(replay)
     (lanes,) = panels_of(layout, "StateTransitions!").values()
     (curves,) = panels_of(layout, "Plot!").values()
     asked = [f'copem/{name}/status.objects[:]{{id=="2"}}' for name in NAMES]
@@ -94,7 +94,7 @@ def test_lanes_and_curves_name_what_is_in_the_statuses(replay: Path) -> None:
 
 
 def test_two_compared_are_over_each_other_and_alone(replay: Path) -> None:
-    layout = layout_of(replay, ["PEM", "coPEM:1s"])
+    layout = build_layout(replay, ["PEM", "coPEM:1s"])
     titles = [config["foxglovePanelTitle"] for config in panels_of(layout, "3D!").values()]
     assert titles == ["PEM and coPEM:1s", "PEM", "coPEM:1s"]
     both = layout["configById"]["3D!0"]["topics"]
@@ -103,7 +103,7 @@ def test_two_compared_are_over_each_other_and_alone(replay: Path) -> None:
     (lanes,) = panels_of(layout, "StateTransitions!").values()
     assert [path["label"] for path in lanes["paths"]] == ["PEM: 2", "coPEM:1s: 2"]
     with pytest.raises(InputError, match="no configuration is named 'PME'; did you mean PEM"):
-        layout_of(replay, ["PME"])
+        build_layout(replay, ["PME"])
 
 
 def test_the_sample_layout_is_what_the_command_makes(
@@ -115,36 +115,36 @@ def test_the_sample_layout_is_what_the_command_makes(
         cli.main()
     assert (ended.value.code, capsys.readouterr().out) == (0, f"layout in {out}\n")
     assert out.read_bytes() == KEPT.read_bytes()
-    assert json.loads(KEPT.read_text(encoding="utf-8")) == layout_of(replay)
+    assert json.loads(KEPT.read_text(encoding="utf-8")) == build_layout(replay)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 5])
 def test_parts_of_a_split_are_alike(count: int) -> None:
-    found = leaves(_split("row", [str(k) for k in range(count)]))
+    found = leaves(_split_panels("row", [str(k) for k in range(count)]))
     assert [panel for panel, *_ in found] == [str(k) for k in range(count)]
     assert [wide for _, wide, _ in found] == pytest.approx([1 / count] * count, abs=1e-4)
 
 
 def test_what_has_no_scene_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"tc016d.mcap: expected topics copem/<configuration>/scene"):
-        layout_of(ROOT / "logs/tc016d.mcap")
+        build_layout(ROOT / "logs/tc016d.mcap")
     with pytest.raises(InputError, match=r"none.mcap: cannot be read"):
-        layout_of(tmp_path / "none.mcap")
+        build_layout(tmp_path / "none.mcap")
     (tmp_path / "text.mcap").write_text("no recording")
     with pytest.raises(InputError, match=r"text.mcap: cannot be read"):
-        layout_of(tmp_path / "text.mcap")
+        build_layout(tmp_path / "text.mcap")
 
 
 def test_a_replay_of_a_ros_2_recording(tmp_path: Path) -> None:
     """Scenes in CDR, in the frame of reference of the recording."""
     drive(tmp_path / "drive.mcap", "square")
     (tmp_path / "e.yaml").write_text(EXPERIMENT)
-    source = load(tmp_path / "e.yaml")
-    experiment, wrong = problems(source)
+    source = read_experiment_file(tmp_path / "e.yaml")
+    experiment, wrong = find_problems(source)
     assert experiment is not None, wrong
     recordings, _ = read_logs(experiment, log_paths(source)[0], source)
-    write_results(tmp_path / "out", experiment, recordings, run(experiment, recordings), exporters=EXPORTERS)
-    layout = layout_of(tmp_path / "out/replay.mcap")
+    write_results(tmp_path / "out", experiment, recordings, run_experiment(experiment, recordings), exporters=EXPORTERS)
+    layout = build_layout(tmp_path / "out/replay.mcap")
     panels = panels_of(layout, "3D!").values()
     assert [panel["foxglovePanelTitle"] for panel in panels] == ["GT", "PEM", "coPEM", "gnn"]
     assert {panel["followTf"] for panel in panels} == {"copem_ego"}

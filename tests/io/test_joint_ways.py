@@ -6,22 +6,21 @@ import numpy as np
 import pytest
 
 from copem_replay.core.tracks import Float
-from copem_replay.io.joint_ways import PIECE_S, JointWays, Pieces, pieces
-from copem_replay.io.short_tracks import Entries
-from copem_replay.io.time_offset import time_offset
+from copem_replay.io.clock_offset import PIECE_S, JointWays, TrackPieces, cut_into_pieces, estimate_time_offset
+from copem_replay.io.short_tracks import ListPoints
 
 SPEED_MPS, LONG_S = 10.0, 3 * PIECE_S
 
 
-def steady(count: int, ahead_s: float = 0.0, error_m: Float | float = 0.0) -> Entries:
+def steady(count: int, ahead_s: float = 0.0, error_m: Float | float = 0.0) -> ListPoints:
     """A car at one speed, listed so many times by a clock that is ahead."""
     time_s = (np.arange(count) + 0.5) * LONG_S / count
     x_m, y_m = np.stack([SPEED_MPS * time_s, np.zeros(count)]) + error_m
-    return Entries(time_s + ahead_s, np.arange(count), x_m, y_m, np.zeros(count, dtype=np.int64))
+    return ListPoints(time_s + ahead_s, np.arange(count), x_m, y_m, np.zeros(count, dtype=np.int64))
 
 
-def cut(first: Entries, other: Entries, offset_s: float, faster_mps: float = 1.0) -> Pieces | None:
-    return pieces(first, other, np.zeros(len(other.time_s), dtype=np.int64), offset_s, faster_mps)
+def cut(first: ListPoints, other: ListPoints, offset_s: float, faster_mps: float = 1.0) -> TrackPieces | None:
+    return cut_into_pieces(first, other, np.zeros(len(other.time_s), dtype=np.int64), offset_s, faster_mps)
 
 
 def test_exact_lists_tell_the_offset_from_wherever_the_search_begins() -> None:
@@ -63,11 +62,11 @@ def test_intervals_hold_the_offset_whether_errors_last_or_not(lasting_s: float) 
         speed_mps = np.array([6.0, -8.0, 10.0, 12.0])[:, None]
         x_m, y_m = speed_mps * time_s, np.broadcast_to(40.0 * np.arange(4)[:, None], (4, len(time_s)))
 
-        def of(east: Float, north: Float, ahead_s: float, stamps: Float = time_s) -> Entries:
+        def of(east: Float, north: Float, ahead_s: float, stamps: Float = time_s) -> ListPoints:
             list_ix, track = np.repeat(np.arange(len(stamps)), 4), np.tile(np.arange(4), len(stamps))
-            return Entries(stamps[list_ix] + ahead_s, list_ix, east.T.ravel(), north.T.ravel(), track)
+            return ListPoints(stamps[list_ix] + ahead_s, list_ix, east.T.ravel(), north.T.ravel(), track)
 
-        found = time_offset(of(x_m, y_m, 0.0), of(x_m + error_m[0], y_m + error_m[1], 0.2))
+        found = estimate_time_offset(of(x_m, y_m, 0.0), of(x_m + error_m[0], y_m + error_m[1], 0.2))
         assert found.untold is None
         inside += found.low_s <= 0.2 <= found.high_s
     assert inside >= 36

@@ -9,13 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from copem_replay.experiment.draft.survey import survey
-from copem_replay.experiment.draft.template import commented
-from copem_replay.io.config import Recorded
-from copem_replay.io.list_checks import captured_before, delay_of, delay_words, odd_about
-from copem_replay.io.recorded_osi import RecordedLists, read_recorded
-from copem_replay.io.recorded_units import recorded_unit, with_truth_ids
-from copem_replay.io.recording import Recording, read
+from copem_replay.experiment.draft.survey import survey_recording
+from copem_replay.experiment.draft.template import format_draft
+from copem_replay.io.config import RecordedTopic
+from copem_replay.io.recorded_lists import RecordedLists, read_recorded
+from copem_replay.io.recorded_units import (
+    assign_truth_ids,
+    delay_words,
+    describe_oddities,
+    estimate_delay,
+    read_recorded_unit,
+    shift_captures,
+)
+from copem_replay.io.recording import Recording, read_log
 from tests.helpers.recordings import SHARED, Obj, Topic, write_recording
 from tests.io.test_recorded_units import car, list_of
 
@@ -49,20 +55,20 @@ def path(tmp_path: Path) -> Path:
 
 
 def lists_of(path: Path) -> tuple[Recording, RecordedLists]:
-    recording = read(path, name="drive")
+    recording = read_log(path, name="drive")
     topic = "rsu" if path.name == "drive.mcap" else "mcity.RSU.SensorData"
     return recording, read_recorded(path, topic, recording.scene)
 
 
 def odd(recording: Recording, found: RecordedLists, delay_s: float) -> list[str]:
-    shifted = captured_before(found, recording.scene, delay_s)
-    told = with_truth_ids(shifted, recording.scene, recording.truth, gate_m=3.0, max_gap_s=0.5)
-    return list(odd_about(found, told.row_object_ix, recording.scene))
+    shifted = shift_captures(found, recording.scene, delay_s)
+    told = assign_truth_ids(shifted, recording.scene, recording.truth, gate_m=3.0, max_gap_s=0.5)
+    return list(describe_oddities(found, told.row_object_ix, recording.scene))
 
 
 def test_the_delay_is_the_one_that_was_put_in(path: Path) -> None:
     recording, found = lists_of(path)
-    delay = delay_of(found, recording.scene, recording.truth)
+    delay = estimate_delay(found, recording.scene, recording.truth)
     assert delay.untold is None
     assert delay.low_s < DELAY_S < delay.high_s
     assert delay.offset_s == pytest.approx(DELAY_S, abs=0.02)
@@ -71,7 +77,7 @@ def test_the_delay_is_the_one_that_was_put_in(path: Path) -> None:
 def test_lists_that_say_when_they_were_captured_are_not_asked(path: Path) -> None:
     recording, found = lists_of(path)
     said = replace(found, capture_said=np.ones_like(found.capture_said))
-    assert delay_words(delay_of(said, recording.scene, recording.truth)).startswith("cannot be told: ")
+    assert delay_words(estimate_delay(said, recording.scene, recording.truth)).startswith("cannot be told: ")
 
 
 def test_ids_that_change_and_others_than_the_truth(path: Path) -> None:
@@ -93,18 +99,18 @@ def test_velocities_that_point_backwards_in_many_entries(path: Path) -> None:
 
 @pytest.mark.parametrize(("delay_s", "noted"), [(0.0, True), (0.2, False), (0.4, True)])
 def test_a_run_notes_a_delay_that_the_data_belie(path: Path, delay_s: float, noted: bool) -> None:
-    asked = Recorded(topic="rsu", delay_s=delay_s, covariance_m2=((0.04, 0.0), (0.0, 0.04)))
-    _, notes = recorded_unit(read(path, name="drive"), "rsu", asked)
+    asked = RecordedTopic(topic="rsu", delay_s=delay_s, covariance_m2=((0.04, 0.0), (0.0, 0.04)))
+    _, notes = read_recorded_unit(read_log(path, name="drive"), "rsu", asked)
     belied = [note for note in notes if note.startswith(f"unit rsu: delay_s is {delay_s:g}, but its entries fit the")]
     assert len(belied) == noted
 
 
 def test_a_draft_has_the_delay_with_its_interval(path: Path) -> None:
-    found = survey(path)
+    found = survey_recording(path)
     (unit,) = found.truth[0].units
     assert unit.delay_s is not None
     assert unit.delay_interval_s is not None
-    line = next(line for line in commented(found).splitlines() if "recorded: {" in line)
+    line = next(line for line in format_draft(found).splitlines() if "recorded: {" in line)
     assert f"delay_s: {unit.delay_s}," in line
     assert f"# delay_s {unit.delay_s:.3f} s (95 %: {unit.delay_interval_s[0]:.3f} …" in line
 
@@ -120,7 +126,7 @@ def test_of_a_roadside_unit(trial: str, near_s: float, confounded: bool) -> None
     if not path.is_file():
         pytest.skip(f"{path.name} is not here: a recording of third parties")
     recording, found = lists_of(path)
-    delay = delay_of(found, recording.scene, recording.truth)
+    delay = estimate_delay(found, recording.scene, recording.truth)
     assert delay.untold is None
     assert delay.offset_s == pytest.approx(near_s, abs=0.003)
     assert delay.unbiased == confounded

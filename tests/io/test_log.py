@@ -12,7 +12,7 @@ from copem_replay.core.errors import RecordingError
 from copem_replay.io import log
 from copem_replay.io.containers.mcap_records import MAGIC
 from copem_replay.io.open import open_log
-from copem_replay.io.recording import Recording, read
+from copem_replay.io.recording import Recording, read_log
 from tests.helpers.recordings import Obj, Topic, truth_topic, write_mcap, write_recording
 
 # Ten frames 0.1 s apart; with `chunk_size=1` every message has a chunk of its own.
@@ -28,7 +28,7 @@ def path(tmp_path: Path) -> Path:
 def problem(path: Path) -> str:
     """The one line that says why a file cannot be read."""
     with pytest.raises(RecordingError) as caught:
-        read(path, name="log")
+        read_log(path, name="log")
     (line,) = caught.value.problems
     assert "\n" not in line
     assert line.startswith(f"{path}: ")
@@ -38,7 +38,7 @@ def problem(path: Path) -> str:
 def outcome(path: Path) -> Recording | tuple[str, ...]:
     """What reading gives: a recording, or the lines that say why not. Anything else is a defect."""
     try:
-        return read(path, name="log")
+        return read_log(path, name="log")
     except RecordingError as error:
         return error.problems
 
@@ -172,7 +172,7 @@ def test_a_disk_that_fails_is_no_damage(path, monkeypatch):
     ids=str,
 )
 def test_all_kinds_of_files_read_the_same_and_need_no_note(path, options):
-    recording = read(write_recording(path, FRAMES, **options), name="log")
+    recording = read_log(write_recording(path, FRAMES, **options), name="log")
     assert recording.truth.x_m[0].tolist() == [0, 10, 20, 30, 40, 50, 60, 70, 80, 90]
     assert recording.notes == ()
     assert recording.damage is None
@@ -182,7 +182,7 @@ def test_channels_of_one_topic_and_of_one_schema_name_are_kept_apart(path):
     topics = [truth_topic(FRAMES[:5]), truth_topic(FRAMES[5:]), Topic("truth", "", [(0, b"x")], "json")]
     write_mcap(path, topics)
     assert [c.messages for c in open_log(path).channels] == [5, 5, 1]
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert len(recording.truth.stamp_ns) == 10
     assert recording.notes == ("1 message of no schema (json) not read",)
 
@@ -199,7 +199,7 @@ def last_chunk_start(path: Path) -> int:
 def test_cut_off_in_a_chunk(path):
     write_recording(path, FRAMES, chunk_size=1)
     path.write_bytes(path.read_bytes()[: last_chunk_start(path) + 30])
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert recording.truth.x_m[0].tolist() == [0, 10, 20, 30, 40, 50, 60, 70, 80]
     assert recording.damage == f"damaged after 0.800 s: 9 messages read ({CUT_OFF})"
     assert recording.notes == (recording.damage,)
@@ -208,7 +208,7 @@ def test_cut_off_in_a_chunk(path):
 def test_cut_off_between_records(path):
     write_recording(path, FRAMES, chunk_size=1)
     path.write_bytes(path.read_bytes()[: last_chunk_start(path)])
-    assert read(path, name="log").damage == f"damaged after 0.800 s: 9 messages read ({CUT_OFF})"
+    assert read_log(path, name="log").damage == f"damaged after 0.800 s: 9 messages read ({CUT_OFF})"
 
 
 def test_cut_off_in_the_only_chunk(path):
@@ -225,7 +225,7 @@ def test_of_a_chunk_that_is_cut_off_what_is_there_is_read(path, compression):
     write_recording(path, frames, compression=compression, chunk_size=1 << 24)
     content = path.read_bytes()
     path.write_bytes(content[: len(content) * 6 // 10])
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     count = len(recording.truth.stamp_ns)
     assert 800 < count < 1300
     assert recording.damage == f"damaged after {(count - 1) / 10:.3f} s: {count} messages read ({CUT_OFF})"
@@ -240,7 +240,7 @@ def test_after_a_damaged_chunk_the_next_is_read(path):
     data = bytearray(path.read_bytes())
     data[fourth + 9 + 8 + 8 + 8 + 4 + 4 + 8 + 50] ^= 0x10
     path.write_bytes(data)
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert recording.truth.x_m[0].tolist() == [0, 10, 20, 40, 50, 60, 70, 80, 90]
     assert recording.damage == "damaged: 9 of 10 messages read (the checksum of a Chunk record fails)"
 
@@ -250,12 +250,12 @@ def test_cut_off_in_a_message_without_chunks(path):
     data = path.read_bytes()
     end_of_data = data.rindex(FRAMES_LAST := truth_topic(FRAMES).messages[-1][1]) + len(FRAMES_LAST)
     path.write_bytes(data[: end_of_data - 3])
-    assert read(path, name="log").damage == f"damaged after 0.800 s: 9 messages read ({CUT_OFF})"
+    assert read_log(path, name="log").damage == f"damaged after 0.800 s: 9 messages read ({CUT_OFF})"
 
 
 def test_recorder_was_killed(path):
     write_recording(path, FRAMES, chunk_size=1, finish=False)
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert len(recording.truth.stamp_ns) == 10
     assert recording.damage == f"damaged after 0.900 s: 10 messages read ({CUT_OFF})"
 
@@ -263,7 +263,7 @@ def test_recorder_was_killed(path):
 def test_last_bytes_missing(path):
     write_recording(path, FRAMES)
     path.write_bytes(path.read_bytes()[:-10])
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert len(recording.truth.stamp_ns) == 10
     assert recording.damage == (
         f"damaged: its index cannot be used ({CUT_OFF}): read from start to end, no message is lost"
@@ -275,7 +275,7 @@ def test_hit_in_the_index(path):
     data = bytearray(path.read_bytes())
     data[data.rindex(b"osi3.GroundTruth")] ^= 1  # the schema's name is no longer that of the truth
     path.write_bytes(data)
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert len(recording.truth.stamp_ns) == 10
     assert recording.damage == (
         "damaged: its index cannot be used (the checksum of the index fails): "
@@ -288,7 +288,7 @@ def test_hit_in_a_chunk_that_the_index_points_at(path):
     data = bytearray(path.read_bytes())
     data[last_chunk_start(path) + 9 + 8 + 8 + 8 + 4 + 4 + 8 + 50] ^= 0x10  # inside the records of the chunk
     path.write_bytes(data)
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert len(recording.truth.stamp_ns) == 9
     assert recording.damage == ("damaged after 0.800 s: 9 of 10 messages read (the checksum of a Chunk record fails)")
 

@@ -12,14 +12,14 @@ from pydantic import ValidationError
 from copem_replay.core.tracks import CLASSES, VALUES
 from copem_replay.io.encodings.json import JsonDefinition
 from copem_replay.io.schemas.object_lists import (
-    Class,
+    ClassField,
     DecodedLists,
     Description,
     Fields,
     FieldsError,
     Stamp,
     Yaw,
-    listed,
+    decode_lists,
 )
 from tests.helpers.messages import SEPARATOR, classes, defined, ids, quaternion, serialised, values
 from tests.io.test_columns import OBJECTS, in_protobuf
@@ -32,7 +32,7 @@ def read(fields: dict[str, Any], *messages: Any, logged: list[int] | None = None
     payloads = [m if isinstance(m, bytes) else json.dumps(m).encode() for m in messages]
     description = Description(Fields.model_validate({**LEAST, **fields}), **more)
     times = np.array(logged or [1000 + k for k in range(len(payloads))], dtype=np.int64)
-    return listed(JsonDefinition(payloads), description, payloads, times)
+    return decode_lists(JsonDefinition(payloads), description, payloads, times)
 
 
 def one(fields: dict[str, Any], *objects: dict[str, Any], **more: Any) -> DecodedLists:
@@ -133,7 +133,7 @@ def test_class_map() -> None:
     found = one({"class": mapped}, *({"c": c} for c in (1, "1", 1.0, "seven", "truck", "bus", 2)))
     assert classes(found) == ["car", "car", "car", "pedestrian", "other", "bus", "other"]
     with pytest.raises(ValidationError, match=r"expected one of pedestrian, .* found 'lorry'"):
-        Class.model_validate({"path": "c", "map": {1: "lorry"}})
+        ClassField.model_validate({"path": "c", "map": {1: "lorry"}})
 
 
 def test_class_probabilities() -> None:
@@ -164,7 +164,7 @@ def test_enumerations_by_number_and_by_name() -> None:
     said = {"path": "kind", "map": {1: "truck", "PERSON": "animal", 7: "bus", 5: "trailer", "0": "van"}}
     fields = {"objects": "objects[]", "x_m": "place.x", "y_m": "place.y", "length_m": 4, "width_m": 2, "class": said}
     description = Description(Fields.model_validate(fields))
-    found = listed(definition, description, [payload(content)], np.array([1]))
+    found = decode_lists(definition, description, [payload(content)], np.array([1]))
     assert classes(found) == ["truck", "animal", "van", "trailer"]  # a name goes before a number
 
 
@@ -414,7 +414,7 @@ def test_ros_2_in_the_same_words() -> None:
     )
     message = {"t": {"sec": 3, "nanosec": 4}, "f": "map", "o": [{"id": [1, 255], "x": 5, "y": 6, "c": 7}]}
     fields = {**LEAST, "id": "id", "stamp": "t", "frame": "f", "class": {"path": "c", "map": {7: "pedestrian"}}}
-    found = listed(
+    found = decode_lists(
         defined(text), Description(Fields.model_validate(fields)), [serialised(text, message)], np.array([9])
     )
     assert found.columns.stamp_ns.tolist() == [3 * 10**9 + 4]

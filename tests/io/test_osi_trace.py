@@ -17,10 +17,10 @@ from osi3trace.osi_trace import OSITrace
 from copem_replay.cli.main import main
 from copem_replay.core.errors import RecordingError
 from copem_replay.experiment.draft.findings import TopicFound
-from copem_replay.experiment.draft.survey import survey
+from copem_replay.experiment.draft.survey import survey_recording
 from copem_replay.io.open import open_log
-from copem_replay.io.recorded_osi import read_recorded
-from copem_replay.io.recording import read
+from copem_replay.io.recorded_lists import read_recorded
+from copem_replay.io.recording import read_log
 from copem_replay.io.write.mcap import OSI_RECORD
 from tests.helpers.experiments import changed
 from tests.helpers.recordings import SHARED, Obj, ground_truth, pedestrian, sensor_view, write_recording
@@ -62,9 +62,9 @@ def trace(folder: Path, messages: Sequence[Any], name: str = "log.osi") -> Path:
 def problem(path: Path) -> str:
     """The one line that says why a trace cannot be read; looking at it says the same."""
     with pytest.raises(RecordingError) as caught:
-        read(path, name="log")
+        read_log(path, name="log")
     (line,) = caught.value.problems
-    assert survey(path).reason == line
+    assert survey_recording(path).reason == line
     return line.removeprefix(f"{path}: ")
 
 
@@ -78,7 +78,7 @@ TAKEN = "taken for osi3.{} by its messages: the name of the file {}"
 def test_truth(tmp_path, messages, kind, short, name):
     """The same as in MCAP; what it was taken for is said where the name does not."""
     path = trace(tmp_path, messages, name.format(short))
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert recording.topic == kind
     assert recording.host_id == "1"
     assert recording.scene.object_ids == ("1", "2")
@@ -91,11 +91,11 @@ def test_truth(tmp_path, messages, kind, short, name):
 
 def test_lists_of_a_unit(tmp_path):
     path = trace(tmp_path, LISTS)
-    truth = read(trace(tmp_path, TRUTHS, "truth.osi"), name="log")
+    truth = read_log(trace(tmp_path, TRUTHS, "truth.osi"), name="log")
     lists = read_recorded(path, "SensorData", truth.scene)
     assert lists.tracks.x_m[0].tolist() == [12.0] * 30
     assert lists.existence.tolist() == [0.75] * 30
-    assert survey(path).topics == [
+    assert survey_recording(path).topics == [
         TopicFound(topic="SensorData", schema="osi3.SensorData", encoding="protobuf", messages=30, role="unit")
     ]
     assert problem(path).startswith("no list of true objects; it holds osi3.SensorData on SensorData; ")
@@ -151,7 +151,7 @@ def test_kinds_that_are_not_read(tmp_path):
 
 def test_mcap_by_another_name(tmp_path):
     path = write_recording(tmp_path / "log.mcap", FRAMES).rename(tmp_path / "log.osi")
-    assert read(path, name="log").topic == "truth"
+    assert read_log(path, name="log").topic == "truth"
 
 
 def test_out_of_order(tmp_path):
@@ -183,7 +183,9 @@ def test_every_cut(tmp_path):
 def test_cut_is_said(tmp_path):
     path = tmp_path / BY_NAME.format("gt")
     path.write_bytes(packed(TRUTHS)[:-1])
-    assert read(path, name="log").damage == "damaged after 2.800 s: 29 of 30 messages read (the file ends too early)"
+    assert (
+        read_log(path, name="log").damage == "damaged after 2.800 s: 29 of 30 messages read (the file ends too early)"
+    )
 
 
 @pytest.mark.parametrize("length", [2**32 - 1, 2**31, 10**6])
@@ -193,7 +195,7 @@ def test_hostile_length(tmp_path, length):
     path.write_bytes(packed(TRUTHS[:7]) + struct.pack("<I", length) + packed(TRUTHS[8:]))
     tracemalloc.start()
     try:
-        recording = read(path, name="log")
+        recording = read_log(path, name="log")
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
@@ -207,13 +209,13 @@ def test_sparse_file_of_one_message(tmp_path):
     path.write_bytes(packed(TRUTHS) + struct.pack("<I", 2**31))
     with path.open("ab") as file:
         file.truncate(2**31 + 10**5)
-    assert read(path, name="log").damage == "damaged after 2.900 s: 30 messages read (something that is no message)"
+    assert read_log(path, name="log").damage == "damaged after 2.900 s: 30 messages read (something that is no message)"
 
 
 def test_zeros(tmp_path):
     path = tmp_path / "log.osi"
     path.write_bytes(packed(TRUTHS[:3]) + bytes(1000))
-    assert read(path, name="log").damage == "damaged after 0.200 s: 3 messages read (something that is no message)"
+    assert read_log(path, name="log").damage == "damaged after 0.200 s: 3 messages read (something that is no message)"
 
 
 def test_messages_that_are_none(tmp_path):
@@ -221,7 +223,7 @@ def test_messages_that_are_none(tmp_path):
     late.timestamp.seconds = 2**40
     before = ground_truth(0, FRAMES[0][1])
     before.timestamp.seconds = -1
-    recording = read(
+    recording = read_log(
         trace(tmp_path, [*TRUTHS, b"\xff\xff", ground_truth(None, FRAMES[0][1]), late, before]), name="log"
     )
     assert len(recording.truth.stamp_ns) == 30
@@ -282,7 +284,7 @@ def test_replay_is_a_multi_channel_trace(tmp_path, monkeypatch, capsys):
     read_back = OSITrace(str(replay), "GroundTruth", topic="GroundTruth")
     assert [message.timestamp.nanos for message in read_back][:3] == [0, 10**8, 2 * 10**8]
     read_back.close()
-    assert len(read(replay, name="log").truth.stamp_ns) == 30
+    assert len(read_log(replay, name="log").truth.stamp_ns) == 30
 
 
 def test_info_and_init(tmp_path, monkeypatch, capsys):

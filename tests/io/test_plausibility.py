@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from copem_replay.core.tracks import CLASSES
-from copem_replay.io.plausibility import HEIGHTS_M, heights, velocities
+from copem_replay.io.ground_truth import HEIGHTS_M, correct_heights, correct_velocities
 
 NAN = float("nan")
 
@@ -15,7 +15,7 @@ def along_x(time_s, x_m, vx_mps, *, start=None, moving=True):
     """Velocities along x of objects that move along x; y counts down as x counts up, to see both."""
     time_s, x_m, vx_mps = (np.array(a, dtype=float) for a in (time_s, x_m, vx_mps))
     start = np.array([0, len(x_m)] if start is None else start)
-    vx, vy, notes = velocities(start, time_s, x_m, -x_m, vx_mps, -vx_mps, np.full(len(x_m), moving))
+    vx, vy, notes = correct_velocities(start, time_s, x_m, -x_m, vx_mps, -vx_mps, np.full(len(x_m), moving))
     assert vy.tolist() == (-vx).tolist()
     return vx.tolist(), notes
 
@@ -73,7 +73,7 @@ def test_slow_drift_is_standing():
 
 def test_one_component_of_zero_is_a_velocity():
     zeros = np.zeros(3)
-    vx, vy, notes = velocities(
+    vx, vy, notes = correct_velocities(
         np.array([0, 3]), np.arange(3) / 4, np.arange(3.0), zeros, zeros, np.ones(3), np.ones(3, dtype=bool)
     )
     assert vx.tolist() == [0, 0, 0]
@@ -146,7 +146,7 @@ def test_backwards_in_time_everything_moves_the_other_way(steps):
 def stand(rows):
     """Heights of rows (object, class, z, width, height), all moving: (z, height) per row, and notes."""
     obj, name, z, width, height = zip(*rows, strict=True)
-    z, height, notes = heights(
+    z, height, notes = correct_heights(
         np.array(obj),
         np.array([CLASSES.index(n) for n in name]),
         np.ones(len(rows), dtype=bool),

@@ -13,15 +13,15 @@ from osi3.osi_detectedobject_pb2 import DetectedMovingObject
 from osi3.osi_sensordata_pb2 import SensorData
 
 from copem_replay.cli import main as cli
-from copem_replay.core.interpolation import states_at
+from copem_replay.core.interpolation import interpolate_states
 from copem_replay.core.tracks import CLASSES
-from copem_replay.core.yaml import dump
+from copem_replay.core.yaml import dump_yaml
 from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import read_logs
 from copem_replay.io.recording import Recording
-from copem_replay.pipeline.prepare import prepare
-from copem_replay.pipeline.receiver import ReceiverOutput, receive
-from copem_replay.pipeline.run import Result, run
+from copem_replay.pipeline.prepare import prepare_log
+from copem_replay.pipeline.receiver import ReceiverOutput, run_receivers
+from copem_replay.pipeline.run import ExperimentResult, run_experiment
 from tests.helpers.recordings import CAR, PEDESTRIAN, SHARED, VEHICLE, Obj, Topic, ns, write_recording
 
 
@@ -89,27 +89,27 @@ def refused(path: Path, **changes: Any) -> str:
     return found.reason
 
 
-def replayed(path: Path, **changes: Any) -> Result:
-    return run(plan_of(path, **changes), [read(path, **changes)])
+def replayed(path: Path, **changes: Any) -> ExperimentResult:
+    return run_experiment(plan_of(path, **changes), [read(path, **changes)])
 
 
 def told(path: Path, **changes: Any) -> dict[str, ReceiverOutput]:
     plan = plan_of(path, **changes)
-    return dict(receive(prepare(read(path, **changes), plan).world(plan), np.arange(2), None))
+    return dict(run_receivers(prepare_log(read(path, **changes), plan).world(plan), np.arange(2), None))
 
 
-def figure(result: Result, name: str, configuration: str = "union") -> float:
+def figure(result: ExperimentResult, name: str, configuration: str = "union") -> float:
     return float(result.summary.set_index("configuration").loc[configuration, name])
 
 
-def row(result: Result, configuration: str) -> pd.Series:
+def row(result: ExperimentResult, configuration: str) -> pd.Series:
     """Of the other car."""
     return result.table[result.table["object_id"] == "2"].set_index("configuration").loc[configuration]
 
 
 def about(path: Path, **changes: Any) -> list[list[str | None]]:
     """The truth ids of entries, list by list."""
-    ready = prepare(read(path, **changes), plan_of(path, **changes))
+    ready = prepare_log(read(path, **changes), plan_of(path, **changes))
     assert ready.recorded is not None
     ids, tracks = [*ready.scene.object_ids, None], ready.recorded.tracks
     return [[ids[k] for k in tracks.row_object_ix[tracks.frame_ix == f]] for f in range(len(tracks.stamp_ns))]
@@ -240,8 +240,8 @@ class TestWhoItIs:
         result = replayed(path, unit={"delay_s": 0.5})
         for name in ("ideal", "union"):
             assert row(result, name)["detection_s"] == pytest.approx(0.9)
-        assert figure(result, "false_positives_per_min") == pytest.approx(600), "one in each of 10 lists per s"
-        assert figure(result, "stale_false_positives_per_min") == pytest.approx(600)
+        assert figure(result, "false_positives_per_min") == pytest.approx(1200), "two in the 0.1 s from list to list"
+        assert figure(result, "stale_false_positives_per_min") == pytest.approx(1200)
         assert figure(result, "position_rmse_m") == pytest.approx(10.0)
 
     def test_the_receivers_own_body_is_left_out(self, tmp_path: Path) -> None:
@@ -300,7 +300,7 @@ class TestInARun:
         path = drive(tmp_path / "a.mcap", *lists)
         for classes, per_list in ((["car"], 1), (["vru"], 2), (["car", "vru"], 3), (None, 1)):
             result = replayed(path, measure={"objects": {"classes": classes}})
-            assert figure(result, "false_positives_per_min") == pytest.approx(600 * per_list)
+            assert figure(result, "false_positives_per_min") == pytest.approx(630 * per_list), "21 lists in 2.0 s"
 
     def test_without_an_ego_distances_are_from_the_units_place(self, tmp_path: Path) -> None:
         path = drive(tmp_path / "a.mcap", list_of(0.5, car(30)), list_of(0.6, car(31)))
@@ -322,12 +322,12 @@ class TestInARun:
 
     def test_its_results_run_again(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         path = drive(tmp_path / "a.mcap", *(list_of(k / 10, car(30 + k % 3)) for k in range(21)))
-        (tmp_path / "e.yaml").write_text(dump(plan_of(path, show={"run": 0}).as_written()))
+        (tmp_path / "e.yaml").write_text(dump_yaml(plan_of(path, show={"run": 0}).as_written()))
         (tmp_path / "deep").mkdir()
         tables = []
         for experiment, out in ((tmp_path / "e.yaml", "deep/one"), (tmp_path / "deep/one/experiment.yaml", "two")):
             monkeypatch.setattr(sys, "argv", ["copem-replay", "run", str(experiment), "--out", str(tmp_path / out)])
-            assert cli._ended() == 0
+            assert cli._run_to_exit_code() == 0
             tables.append(pd.read_parquet(tmp_path / out / "detections.parquet"))
         pd.testing.assert_frame_equal(tables[0], tables[1], check_exact=True)
         assert (tmp_path / "two" / "replay.mcap").exists()
@@ -344,13 +344,15 @@ def test_a_real_roadside_unit(trial: int, mean_m: float, pairs: int) -> None:
     unit = {"topic": "mcity.RSU.SensorData", "delay_s": 0.132, "covariance_m2": [[0.4, 0.0], [0.0, 0.4]]}
     units = {"rsu": {"at": [0, 0], "recorded": unit}}
     more: Any = {"units": units, "ego": "none", "measure": {"distance_to": "rsu"}}
-    ready = prepare(read(path, **more), plan_of(path, **more))
+    ready = prepare_log(read(path, **more), plan_of(path, **more))
     assert ready.recorded is not None
     tracks = ready.recorded.tracks
     mine = np.flatnonzero(tracks.row_object_ix >= 0)
 
     def off_m(time_s: Any) -> Any:
-        at, there = states_at(ready.truth, np.zeros(len(mine), int), time_s, t0_ns=ready.scene.t0_ns, max_gap_s=0.5)
+        at, there = interpolate_states(
+            ready.truth, np.zeros(len(mine), int), time_s, t0_ns=ready.scene.t0_ns, max_gap_s=0.5
+        )
         assert there.all()
         return np.hypot(tracks.x_m[0, mine] - at["x_m"], tracks.y_m[0, mine] - at["y_m"])
 

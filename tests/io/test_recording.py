@@ -13,8 +13,8 @@ from osi3.osi_sensorview_pb2 import SensorView
 
 from copem_replay.core.errors import RecordingError
 from copem_replay.core.tracks import CLASSES, TRUTH, VALUES
-from copem_replay.io.recording import Recording, read
-from copem_replay.pipeline.facts import scene_as_json, scene_of
+from copem_replay.io.recording import Recording, read_log
+from copem_replay.pipeline.notes import scene_as_json, scene_from_json
 from tests.helpers.recordings import (
     ANIMAL,
     PEDESTRIAN,
@@ -43,7 +43,7 @@ def path(tmp_path: Path) -> Path:
 def problem(path: Path, **how: str) -> str:
     """The one line that says why a file cannot be read."""
     with pytest.raises(RecordingError) as caught:
-        read(path, name="log", **how)
+        read_log(path, name="log", **how)
     (line,) = caught.value.problems
     assert "\n" not in line
     return line.removeprefix(f"{path}: ")
@@ -77,7 +77,7 @@ def test_everything_of_a_log_without_defects(path):
         (5.5, [Obj(id=7, x=10, y=2.5, vx=20, vy=-1, **car)]),
     ]
     write_recording(path, frames, host=7)
-    recording = read(str(path), name="crossing")
+    recording = read_log(str(path), name="crossing")
     scene, truth = recording.scene, recording.truth
     assert (scene.log, scene.t0_ns, scene.end_ns) == ("crossing", 5_000_000_000, 5_500_000_000)
     assert scene.object_ids == ("7", "3")
@@ -113,12 +113,12 @@ def test_everything_of_a_log_without_defects(path):
 
 def test_objects_are_numbered_by_appearance_then_as_in_the_file(path):
     write_recording(path, [(0, [Obj(id=9), Obj(id=4, x=9)]), (0.1, [Obj(id=1, x=5), Obj(id=9), Obj(id=4, x=9)])])
-    assert read(path, name="log").scene.object_ids == ("9", "4", "1")
+    assert read_log(path, name="log").scene.object_ids == ("9", "4", "1")
 
 
 def test_a_track_that_goes_and_comes_back_stays_one_track(path):
     write_recording(path, [(k, [Obj(id=1, x=k, vx=1)] if k != 2 else []) for k in range(4)])
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert states(recording) == {"1": [(0, 0), (1, 1), (3, 3)]}
     assert len(recording.truth.stamp_ns) == 4  # an empty list is a list
 
@@ -128,7 +128,7 @@ def test_a_track_that_goes_and_comes_back_stays_one_track(path):
 
 def test_sensor_view(path):
     write_recording(path, ONE_CAR, schema="osi3.SensorView", host=1)
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert states(recording) == {"1": [(0, 0), (0.1, 1)]}
     assert recording.scene.ego_ix == 0
     assert recording.notes == ()
@@ -138,7 +138,7 @@ def test_sensor_view_without_ground_truth_is_skipped(path):
     good = truth_topic(ONE_CAR, schema="osi3.SensorView").messages
     empty = (ns(0.05), sensor_view(0.05, None).SerializeToString())
     write_mcap(path, [Topic("view", "osi3.SensorView", [*good, empty])])
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert len(recording.truth.stamp_ns) == 2
     assert recording.notes == ("1 message without global_ground_truth: skipped",)
 
@@ -147,16 +147,16 @@ def test_the_stamp_of_a_sensor_view_is_its_own_else_that_of_the_ground_truth(pat
     both = (ns(9), sensor_view(2.5, ground_truth(2.0, [Obj()])).SerializeToString())
     inner = (ns(9), sensor_view(None, ground_truth(3.0, [Obj()])).SerializeToString())
     write_mcap(path, [Topic("view", "osi3.SensorView", [both, inner])])
-    assert read(path, name="log").truth.stamp_ns.tolist() == [2_500_000_000, 3_000_000_000]
+    assert read_log(path, name="log").truth.stamp_ns.tolist() == [2_500_000_000, 3_000_000_000]
 
 
 def test_ground_truth_is_taken_before_sensor_views(path):
     view = truth_topic(ONE_CAR[:1], name="view", schema="osi3.SensorView")
     write_recording(path, ONE_CAR, more=[view])
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert recording.topic == "truth"
     assert recording.notes == ("topic view (osi3.SensorView) not read: truth taken",)
-    chosen = read(path, name="log", topic="view")
+    chosen = read_log(path, name="log", topic="view")
     assert (chosen.topic, len(chosen.truth.stamp_ns)) == ("view", 1)
 
 
@@ -166,12 +166,12 @@ def test_several_truths_are_a_choice(path):
         "true objects on several topics, truth (osi3.GroundTruth), other (osi3.GroundTruth): "
         "choose one with `read: {topic: …}` in the experiment"
     )
-    assert len(read(path, name="log", topic="other").truth.stamp_ns) == 1
+    assert len(read_log(path, name="log", topic="other").truth.stamp_ns) == 1
 
 
 def test_a_topic_without_messages_is_no_choice(path):
     write_recording(path, ONE_CAR, more=[Topic("empty", "osi3.GroundTruth")])
-    assert read(path, name="log").topic == "truth"
+    assert read_log(path, name="log").topic == "truth"
 
 
 def test_topic_that_is_not_there(path):
@@ -191,7 +191,7 @@ def test_other_schemas_are_skipped_and_counted(path):
         Topic("silent", "tf2_msgs/msg/TFMessage", [], "cdr"),
     ]
     write_recording(path, ONE_CAR, more=more, by_time=False)
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert states(recording) == {"1": [(0, 0), (0.1, 1)]}
     assert recording.notes == (
         "1 message of osi3.MapAsamOpenDrive not read",
@@ -242,7 +242,7 @@ def test_no_usable_object(path):
 def test_a_payload_that_does_not_decode_is_skipped(path):
     good = truth_topic(ONE_CAR).messages
     write_mcap(path, [Topic("truth", "osi3.GroundTruth", [*good, (ns(0.05), good[0][1][:-3])])])
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert states(recording) == {"1": [(0, 0), (0.1, 1)]}
     assert recording.notes == ("1 message cannot be decoded: skipped",)
 
@@ -252,7 +252,7 @@ def test_a_payload_that_does_not_decode_is_skipped(path):
 
 def test_the_stamp_counts_not_the_time_of_logging(path):
     write_recording(path, ONE_CAR, log_s=[99.7, 99.8])
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert recording.truth.stamp_ns.tolist() == [0, 100_000_000]
     assert recording.notes == ()
 
@@ -260,7 +260,7 @@ def test_the_stamp_counts_not_the_time_of_logging(path):
 def test_file_order_and_logging_order_need_not_be_time_order(path):
     frames = [(t, [Obj(x=10 * t, vx=10)]) for t in (0.2, 0.0, 0.3, 0.1)]
     write_recording(path, frames, log_s=[1, 2, 3, 4])
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert states(recording) == {"1": [(0, 0), (0.1, 1), (0.2, 2), (0.3, 3)]}
     assert recording.notes == ("2 messages stamped earlier than the one before: sorted by time",)
 
@@ -270,20 +270,20 @@ def test_stamps_as_floats_cut_them(path):
     stamps = [0, 99_999_999, 200_000_000, 300_000_000, 399_999_999]
     messages = [(s, ground_truth(s / 1e9, [Obj(vx=None)]).SerializeToString()) for s in stamps]
     write_mcap(path, [Topic("truth", "osi3.GroundTruth", messages)])
-    assert read(path, name="log").truth.stamp_ns.tolist() == stamps
+    assert read_log(path, name="log").truth.stamp_ns.tolist() == stamps
 
 
 def test_two_messages_of_one_instant_the_first_is_kept(path):
     frames = [(0, [Obj(x=0)]), (0.1, [Obj(x=1)]), (0.1, [Obj(x=500)]), (0.1 + 9e-7, [Obj(x=600)]), (0.2, [Obj(x=2)])]
     write_recording(path, [(t, [Obj(x=o.x, vx=10) for o in objs]) for t, objs in frames])
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert states(recording) == {"1": [(0, 0), (0.1, 1), (0.2, 2)]}
     assert recording.notes == ("2 messages with the time stamp of another: the first kept",)
 
 
 def test_messages_without_timestamp_are_taken_when_they_were_logged(path):
     write_recording(path, [(None, [Obj(x=0, vx=10)]), (None, [Obj(x=1, vx=10)])], log_s=[7, 7.1])
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert recording.scene.t0_ns == 7_000_000_000
     assert states(recording) == {"1": [(0, 0), (0.1, 1)]}
     assert recording.notes == ("2 messages without timestamp: the time of logging taken",)
@@ -293,7 +293,7 @@ def test_some_messages_without_timestamp(path):
     # One logged between its neighbours is taken; one logged by a clock of another epoch would make a log of decades.
     frames = [(0.0, [Obj(x=0, vx=10)]), (None, [Obj(x=1, vx=10)]), (0.2, [Obj(x=2, vx=10)]), (None, [Obj(x=9)])]
     write_recording(path, frames, log_s=[0, 0.1, 0.2, 1.7e9])
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert states(recording) == {"1": [(0, 0), (0.1, 1), (0.2, 2)]}
     assert recording.notes == (
         "1 message without timestamp: the time of logging taken",
@@ -307,7 +307,7 @@ def test_an_impossible_stamp_is_skipped(path):
     write_mcap(
         path, [Topic("truth", "osi3.GroundTruth", [*truth_topic(ONE_CAR).messages, (5, absurd.SerializeToString())])]
     )
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert states(recording) == {"1": [(0, 0), (0.1, 1)]}
     assert recording.notes == ("1 message with an impossible time stamp: skipped",)
 
@@ -315,14 +315,14 @@ def test_an_impossible_stamp_is_skipped(path):
 @pytest.mark.parametrize("start_s", [0.0, 0.3, 1_695_000_000.0, 315_900_000.0])
 def test_a_log_may_start_at_any_time(path, start_s):
     write_recording(path, [(start_s, [Obj(x=0, vx=10)]), (start_s + 0.5, [Obj(x=5, vx=10)])])
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert recording.scene.t0_ns == ns(start_s)
     assert recording.truth.captured_s.tolist() == [0, 0.5]
 
 
 def test_one_message_is_a_log(path):
     write_recording(path, ONE_CAR[:1])
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert recording.scene.end_s == 0
     assert states(recording, "vx_mps") == {"1": [(0, 10)]}
 
@@ -359,7 +359,7 @@ def test_one_message_is_a_log(path):
 )
 def test_classes(path, kind, vehicle, expected):
     write_recording(path, [(0, [Obj(type=kind, vehicle=vehicle)])])
-    assert classes(read(path, name="log")) == {"1": expected}
+    assert classes(read_log(path, name="log")) == {"1": expected}
 
 
 def test_enum_values_that_do_not_exist(path):
@@ -372,7 +372,7 @@ def test_enum_values_that_do_not_exist(path):
     thing.ClearField("type")
     thing.MergeFromString(bytes([3 << 3, 77]))
     write_mcap(path, [Topic("truth", "osi3.GroundTruth", [(0, message.SerializeToString())])])
-    assert classes(read(path, name="log")) == {"1": "pedestrian", "2": "vehicle", "3": "other"}
+    assert classes(read_log(path, name="log")) == {"1": "pedestrian", "2": "vehicle", "3": "other"}
 
 
 def test_class_is_the_most_frequent_and_of_equals_the_first(path):
@@ -381,7 +381,7 @@ def test_class_is_the_most_frequent_and_of_equals_the_first(path):
         (k / 10, [Obj(id=i, x=10 * i, vehicle=v, height=2.5) for i, v in enumerate(row)])
         for k, row in enumerate(vehicles)
     ]
-    recording = read(write_recording(path, frames), name="log")
+    recording = read_log(write_recording(path, frames), name="log")
     assert classes(recording) == {"0": "car", "1": "bus", "2": "truck", "3": "car"}
     assert recording.notes == ("3 objects of changing class: the most frequent taken",)
 
@@ -390,7 +390,7 @@ def test_stationary_objects(path):
     cone = {"length": 0.4, "width": 0.4, "height": 0.7, "z": 0.35, "stationary": True}
     objects = [Obj(id=5, x=0), Obj(id=5, x=20, **cone), Obj(id=6, x=30, **cone)]
     write_recording(path, [(0, objects), (0.1, objects)])
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert classes(recording) == {"5": "car", "stationary:5": "other", "6": "other"}
     assert recording.scene.moving.tolist() == [True, False, False]
     assert states(recording) == {
@@ -411,13 +411,13 @@ def test_a_stationary_object_with_a_base_polygon_is_a_solid_of_that_outline(path
     """A triangle, half of its box, turned by 90°: (x, y) of its own is (15 − y, 10 + x) of the world."""
     house = Obj(**HOUSE, yaw=math.pi / 2, polygon=TRIANGLE + TRIANGLE[: int(closed)])
     write_recording(path, [(0, [Obj(id=1), house]), (0.1, [Obj(id=1), house])])
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert recording.scene.object_ids == ("1",)
     [solid] = recording.scene.solids
     assert (solid.name, solid.bottom_m, solid.top_m) == ("object 9", 1.0, 9.0)
     assert np.array(solid.corners_m) == pytest.approx(np.array([(25, 0), (5, 20), (5, 0)]))
     assert recording.notes == ("1 stationary object with a base_polygon: hides as that prism, and is no object",)
-    assert scene_of(json.loads(json.dumps(scene_as_json(recording.scene)))).solids == recording.scene.solids
+    assert scene_from_json(json.loads(json.dumps(scene_as_json(recording.scene)))).solids == recording.scene.solids
 
 
 @pytest.mark.parametrize(
@@ -433,7 +433,7 @@ def test_a_stationary_object_with_a_base_polygon_is_a_solid_of_that_outline(path
 )
 def test_a_base_polygon_that_is_none_leaves_the_box(path, polygon):
     write_recording(path, [(0, [Obj(id=1), Obj(**HOUSE, polygon=polygon)])] * 2)
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert (recording.scene.object_ids, recording.scene.solids) == (("1", "9"), ())
     assert recording.notes[0] == "1 stationary object whose base_polygon is no simple polygon: its box taken"
 
@@ -441,13 +441,13 @@ def test_a_base_polygon_that_is_none_leaves_the_box(path, polygon):
 def test_a_solid_without_a_height_or_a_place_is_the_box_that_is_said_to_be_wrong(path):
     flat, nowhere = Obj(**HOUSE | {"height": None}, polygon=TRIANGLE), Obj(**HOUSE | {"id": 8, "x": None})
     write_recording(path, [(0, [Obj(id=1), flat, nowhere])])
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert (recording.scene.object_ids, recording.scene.solids) == (("1", "9"), ())
 
 
 def test_solids_on_z_0_are_stood_on_it_as_boxes_are(path):
     write_recording(path, [(0, [Obj(id=1, z=0), pedestrian(2, 9, z=0), Obj(**HOUSE | {"z": 0}, polygon=TRIANGLE)])])
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert "every box is centred on z = 0: stood on z = 0" in recording.notes
     assert [(solid.bottom_m, solid.top_m) for solid in recording.scene.solids] == [(0.0, 8.0)]
 
@@ -455,17 +455,17 @@ def test_solids_on_z_0_are_stood_on_it_as_boxes_are(path):
 def test_a_stationary_object_whose_id_moves_only_later_keeps_one_name(path):
     still = Obj(id=5, x=20, stationary=True)
     write_recording(path, [(0, [Obj(id=1), still]), (0.1, [Obj(id=1), still, Obj(id=5, x=40)])])
-    assert read(path, name="log").scene.object_ids == ("1", "stationary:5", "5")
+    assert read_log(path, name="log").scene.object_ids == ("1", "stationary:5", "5")
 
 
 def test_large_ids(path):
     write_recording(path, [(0, [Obj(id=2**64 - 1), Obj(id=2**64 - 2, x=9)])])
-    assert read(path, name="log").scene.object_ids == (str(2**64 - 1), str(2**64 - 2))
+    assert read_log(path, name="log").scene.object_ids == (str(2**64 - 1), str(2**64 - 2))
 
 
 def test_an_id_twice_in_a_message_the_first_is_kept(path):
     write_recording(path, [(0, [Obj(x=0, vx=10), Obj(x=70)]), (0.1, [Obj(x=1, vx=10), Obj(x=80)])])
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert states(recording) == {"1": [(0, 0), (0.1, 1)]}
     assert recording.notes == ("2 object states of an id twice in a message: the first kept",)
 
@@ -489,7 +489,7 @@ def test_unusable_states_are_skipped_by_reason(path):
         Obj(id=13, height=5000),
     ]
     write_recording(path, [(0, [*bad, good])])
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert recording.scene.object_ids == ("1",)
     assert recording.notes == (
         "1 object state without an id: skipped",
@@ -503,19 +503,19 @@ def test_unusable_states_are_skipped_by_reason(path):
 
 def test_an_object_at_the_origin_is_there(path):
     write_recording(path, [(0, [Obj(x=0, y=0, z=0, yaw=0)])])
-    assert read(path, name="log").notes == ()
+    assert read_log(path, name="log").notes == ()
 
 
 def test_coordinates_of_a_city(path):
     write_recording(path, [(0, [Obj(x=-7_123.25, y=5_400_000.5, z=-25.0)])])
-    truth = read(path, name="log").truth
+    truth = read_log(path, name="log").truth
     assert (truth.x_m[0, 0], truth.y_m[0, 0], truth.z_m[0, 0]) == (-7_123.25, 5_400_000.5, -25.0)
 
 
 def test_yaw_is_wrapped_and_what_is_inside_keeps_its_bits(path):
     given = [3.5, -3.5, math.pi, -math.pi, 7.0, 0.1, np.nextafter(math.pi, 4)]
     write_recording(path, [(k / 10, [Obj(yaw=yaw)]) for k, yaw in enumerate(given)])
-    yaw = read(path, name="log").truth.yaw_rad[0]
+    yaw = read_log(path, name="log").truth.yaw_rad[0]
     assert (yaw > -math.pi).all()
     assert (yaw <= math.pi).all()
     expected = [3.5 - 2 * math.pi, 2 * math.pi - 3.5, math.pi, math.pi, 7 - 2 * math.pi, 0.1, math.pi]
@@ -525,7 +525,7 @@ def test_yaw_is_wrapped_and_what_is_inside_keeps_its_bits(path):
 
 def test_no_orientation_is_yaw_0_and_said(path):
     write_recording(path, [(0, [Obj(id=1, yaw=None), Obj(id=2, x=9), Obj(id=3, x=30, yaw=None, stationary=True)])])
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert recording.truth.yaw_rad[0].tolist() == [0, 0, 0]
     assert recording.notes == ("2 object states without orientation: yaw 0 taken",)
 
@@ -535,31 +535,31 @@ def test_no_orientation_is_yaw_0_and_said(path):
 
 def test_velocity_that_is_not_set(path):
     write_recording(path, [(k / 4, [Obj(id=1, x=5 * k, vx=None)]) for k in range(3)])
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert states(recording, "vx_mps") == {"1": [(0, 20), (0.25, 20), (0.5, 20)]}
     assert recording.notes == ("velocity of 3 object states is not given: derived from the positions",)
 
 
 def test_velocity_that_is_no_number_counts_as_not_set(path):
     write_recording(path, [(k / 4, [Obj(id=1, x=5 * k, vx=math.nan if k else 20)]) for k in range(3)])
-    assert states(read(path, name="log"), "vx_mps") == {"1": [(0, 20), (0.25, 20), (0.5, 20)]}
+    assert states(read_log(path, name="log"), "vx_mps") == {"1": [(0, 20), (0.25, 20), (0.5, 20)]}
 
 
 def test_velocity_0_in_the_first_and_last_frame_of_a_track(path):
     write_recording(path, [(k / 4, [Obj(id=1, x=5 * k, vx=20 if 0 < k < 3 else 0)]) for k in range(4)])
-    assert states(read(path, name="log"), "vx_mps") == {"1": [(0, 20), (0.25, 20), (0.5, 20), (0.75, 20)]}
+    assert states(read_log(path, name="log"), "vx_mps") == {"1": [(0, 20), (0.25, 20), (0.5, 20), (0.75, 20)]}
 
 
 def test_velocities_are_derived_in_order_of_time_not_of_the_file(path):
     frames = [(k / 4, [Obj(id=1, x=5 * k, vx=None), Obj(id=2, x=99 - k, vx=None)]) for k in (2, 0, 1)]
     write_recording(path, frames)
-    assert read(path, name="log").truth.vx_mps[0].tolist() == [20, 20, 20, -4, -4, -4]
+    assert read_log(path, name="log").truth.vx_mps[0].tolist() == [20, 20, 20, -4, -4, -4]
 
 
 def test_heights_of_an_exporter_that_writes_the_width(path):
     frames = [(0, [pedestrian(1, 0, width=0.5, height=0.5, z=0.25)] + [Obj(id=k, x=9 * k, height=2.0) for k in (2, 3)])]
     write_recording(path, frames)
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert recording.truth.height_m[0].tolist() == [1.75, 2.0, 2.0]
     assert recording.truth.z_m[0].tolist() == [0.875, 0.75, 0.75]
     assert recording.notes == (
@@ -570,7 +570,7 @@ def test_heights_of_an_exporter_that_writes_the_width(path):
 
 def test_a_log_without_heights_of_centres(path):
     write_recording(path, [(0, [pedestrian(1, 0, z=0), Obj(id=2, x=9, z=0)])])
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert recording.truth.z_m[0].tolist() == [0.9, 0.75]
     assert recording.notes == ("every box is centred on z = 0: stood on z = 0",)
 
@@ -580,7 +580,7 @@ def test_a_log_without_heights_of_centres(path):
 
 def test_host_0_is_a_host(path):
     write_recording(path, [(0, [Obj(id=3, x=9), Obj(id=0)])], host=0)
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert recording.host_id == "0"
     assert recording.scene.object_ids[recording.scene.ego_ix] == "0"
 
@@ -591,7 +591,7 @@ def test_host_0_is_a_host(path):
 def test_host_of_the_ground_truth_before_that_of_the_sensor_view(path, host, view_host, expected):
     frames = [(0, [Obj(id=1), Obj(id=2, x=9)])]
     write_recording(path, frames, schema="osi3.SensorView", host=host, view_host=view_host)
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert recording.host_id == expected
     assert recording.scene.ego_ix == {"1": 0, "2": 1, None: -1}[expected]
     assert recording.notes == ()
@@ -599,7 +599,7 @@ def test_host_of_the_ground_truth_before_that_of_the_sensor_view(path, host, vie
 
 def test_host_that_is_nobody(path):
     write_recording(path, ONE_CAR, host=114)
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert (recording.host_id, recording.scene.ego_ix) == ("114", -1)
     assert recording.notes == ("the host vehicle 114 is not among the moving objects: no ego vehicle",)
 
@@ -608,17 +608,17 @@ def test_host_that_changes(path):
     objects = [Obj(id=1), Obj(id=2, x=9)]
     messages = [(ns(k), ground_truth(k, objects, host).SerializeToString()) for k, host in enumerate((1, 2, 2, None))]
     write_mcap(path, [Topic("truth", "osi3.GroundTruth", messages)])
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert (recording.host_id, recording.scene.ego_ix) == ("2", 1)
     assert recording.notes == ("the host vehicle changes (2 in 2 messages, 1 in 1 message): the most frequent taken",)
 
 
 def test_the_ego_one_asks_for(path):
     write_recording(path, [(0, [Obj(id=1), Obj(id=2, x=9)])], host=1)
-    recording = read(path, name="log", ego="2")
+    recording = read_log(path, name="log", ego="2")
     assert recording.scene.ego_ix == 1
     assert recording.host_id == "1"
-    assert read(path, name="log", ego="2", topic="truth").scene.ego_ix == 1
+    assert read_log(path, name="log", ego="2", topic="truth").scene.ego_ix == 1
 
 
 def test_an_ego_that_is_not_there_lists_those_that_are(path):
@@ -681,7 +681,7 @@ def plain_states(path: Path) -> dict[tuple[int, bool, int], tuple[float, ...]]:
 @pytest.mark.parametrize("name", REAL)
 def test_real_recordings_against_a_plain_loop(name):
     path = real(name)
-    recording = read(path, name=name)
+    recording = read_log(path, name=name)
     scene, truth = recording.scene, recording.truth
     expected = plain_states(path)
     row_object = truth.row_object_ix
@@ -711,7 +711,7 @@ def test_real_recordings_against_a_plain_loop(name):
 
 @pytest.mark.parametrize("name", REAL)
 def test_real_recordings_hold_what_is_known_of_them(name):
-    recording = read(real(name), name=name)
+    recording = read_log(real(name), name=name)
     scene, truth = recording.scene, recording.truth
     objects, frames, rows, span_s, ego = REAL[name]
     assert (int(scene.moving.sum()), len(scene.object_ids)) == objects
@@ -744,11 +744,11 @@ REAL_NOTES = {
 
 @pytest.mark.parametrize("name", REAL_NOTES)
 def test_notes_on_real_recordings(name):
-    assert read(real(name), name=name).notes == REAL_NOTES[name]
+    assert read_log(real(name), name=name).notes == REAL_NOTES[name]
 
 
 def test_two_writers_of_one_simulation_give_one_truth():
-    one, other = (read(real(n), name="log") for n in ("pedestrian_esmini", "pedestrian_esmini_betterosi"))
+    one, other = (read_log(real(n), name="log") for n in ("pedestrian_esmini", "pedestrian_esmini_betterosi"))
     assert Counter(classes(one).values()) == {"car": 1, "pedestrian": 1}
     assert classes(one) == classes(other)
     for value in VALUES:
@@ -756,7 +756,7 @@ def test_two_writers_of_one_simulation_give_one_truth():
 
 
 def test_derived_velocities_of_a_real_drive_are_those_of_a_car():
-    recording = read(real("drone_swerve"), name="log")
+    recording = read_log(real("drone_swerve"), name="log")
     speed = np.hypot(recording.truth.vx_mps, recording.truth.vy_mps)
     assert 10 < np.median(speed) < 20
     assert speed.max() < 30
@@ -764,8 +764,8 @@ def test_derived_velocities_of_a_real_drive_are_those_of_a_car():
 
 def test_the_same_drive_as_ros_2_and_as_osi():
     """The worlds lie differently, and the ego is the odometry's: classes, number of states and speeds are the same."""
-    ros = read(real("nuscenes_scene0916_autoware_ros2"), name="log")
-    osi = read(real("nuscenes_scene0916"), name="log")
+    ros = read_log(real("nuscenes_scene0916_autoware_ros2"), name="log")
+    osi = read_log(real("nuscenes_scene0916"), name="log")
     assert ros.scene.object_ids[ros.scene.ego_ix] == "ego"
     kinds = [np.bincount(r.scene.object_class, minlength=11).tolist() for r in (ros, osi)]
     assert kinds[0] == kinds[1]
@@ -793,5 +793,5 @@ def test_boundaries_of_lanes(tmp_path: Path) -> None:
                 point.x, point.y, point.z = x, y, z
         messages.append((k * 10**8, truth.SerializeToString()))
     write_mcap(tmp_path / "a.mcap", [Topic("truth", "osi3.GroundTruth", messages)])
-    lines = read(tmp_path / "a.mcap", name="a").lane_boundaries
+    lines = read_log(tmp_path / "a.mcap", name="a").lane_boundaries
     assert [line.tolist() for line in lines] == [[[0, 2, 0], [50, 2, 0], [90, 3, 0.5]], [[0, 9, 0], [5, 9, 0]]]

@@ -13,7 +13,7 @@ import pytest
 from copem_replay.io import open as containers
 from copem_replay.io.log import open_mcap
 from copem_replay.io.open import CONTAINERS, Container
-from copem_replay.io.recording import read
+from copem_replay.io.recording import read_log
 from tests.io.test_world_frame import fields, own_recording
 
 MODULE = """
@@ -118,6 +118,6 @@ def test_a_container_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     path.write_text(str(own_recording(tmp_path)))
     link = Container("link", lambda p: p.suffix == ".link", lambda p: open_mcap(Path(p.read_text())))
     monkeypatch.setattr(containers, "CONTAINERS", (link, *CONTAINERS))
-    found = read(path, name="a", topic="/boxes", fields=fields())
+    found = read_log(path, name="a", topic="/boxes", fields=fields())
     assert sorted(found.scene.object_ids) == ["7", "8"]
     assert found.path == tmp_path / "a.mcap"

@@ -17,8 +17,8 @@ from copem_replay.io.encodings.cdr import CdrDefinition
 from copem_replay.io.encodings.columns import Definition
 from copem_replay.io.encodings.json import JsonDefinition
 from copem_replay.io.encodings.protobuf import ProtobufDefinition
-from copem_replay.io.schemas.foxglove import description
-from copem_replay.io.schemas.object_lists import DecodedLists, listed
+from copem_replay.io.schemas.formats import description
+from copem_replay.io.schemas.object_lists import DecodedLists, decode_lists
 from copem_replay.io.schemas.registry import SCHEMAS
 from tests.helpers.messages import SEPARATOR, classes, ids, quaternion, serialised, values
 
@@ -56,7 +56,7 @@ def written(name: str, text: str, *messages: dict[str, Any], encoding: str = "ro
     definition = CdrDefinition(name, encoding, (idl or text).encode())
     payloads = [serialised(text, m, name=name) for m in messages]
     made = SCHEMAS[name].description(definition.offers())
-    return listed(definition, made, payloads, np.arange(len(payloads), dtype=np.int64))
+    return decode_lists(definition, made, payloads, np.arange(len(payloads), dtype=np.int64))
 
 
 def xyz(x: float = 0, y: float = 0, z: float = 0) -> dict[str, float]:
@@ -455,7 +455,7 @@ def in_json() -> tuple[Definition, list[bytes]]:
 @pytest.mark.parametrize("encoded", [in_ros2, in_protobuf, in_json])
 def test_scene_updates(encoded: Any) -> None:
     definition, payloads = encoded()
-    found = listed(definition, description(definition.offers()), payloads, np.array([5, 6]))
+    found = decode_lists(definition, description(definition.offers()), payloads, np.array([5, 6]))
     assert ids(found) == ["a", "b"]
     assert classes(found) == ["car", "pedestrian"]
     assert found.columns.rows.tolist() == [2, 0]
@@ -479,7 +479,7 @@ def test_the_largest_cube_of_an_entity() -> None:
     cubes = [[body(1), body(3, 5), body(2)], [body(2, 6), body(2, 7)], [{**body(9), "size": {"x": 9}}, body(1, 8)]]
     entities = [{"id": str(k), "cubes": of} for k, of in enumerate(cubes)]
     definition = JsonDefinition(payloads := [json.dumps({"entities": entities}).encode()])
-    found = listed(definition, description(definition.offers()), payloads, np.array([5]))
+    found = decode_lists(definition, description(definition.offers()), payloads, np.array([5]))
     assert ids(found) == ["0", "1", "2"]
     assert values(found, "x_m") == [5, 6, 8]
     assert found.columns.notes == ("4 cubes beside a larger one of the same entity: left out",)
@@ -504,7 +504,7 @@ def test_entities_that_are_not_said_again(messages: list[str], notes: tuple[str,
         said.append(json.dumps({"entities": entities}).encode())
     definition = JsonDefinition(said)
     logged = np.arange(len(said)) * 10**9
-    found = listed(definition, description(definition.offers()), said, logged)
+    found = decode_lists(definition, description(definition.offers()), said, logged)
     assert found.columns.rows.tolist() == [len(text.split()) for text in messages]
     assert found.columns.notes == notes
 
@@ -513,7 +513,7 @@ def test_json_scenes_may_leave_out_much() -> None:
     cube = {"pose": {"position": xyz(1, 2, 3), "orientation": quaternion(0)}, "size": xyz(4, 2, 1.5)}
     payloads = [json.dumps({"entities": [{"cubes": [cube]}]}).encode()]
     definition = JsonDefinition(payloads)
-    found = listed(definition, description(definition.offers()), payloads, np.array([5]))
+    found = decode_lists(definition, description(definition.offers()), payloads, np.array([5]))
     assert classes(found) == ["other"]
     assert found.columns.stamp_ns.tolist() == [5]
     assert found.frames == ()

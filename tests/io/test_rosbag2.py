@@ -20,12 +20,12 @@ from rosbags.rosbag2 import Writer as RosWriter
 
 from copem_replay.cli.main import main
 from copem_replay.core.errors import RecordingError
-from copem_replay.experiment.draft.survey import survey
-from copem_replay.experiment.draft.survey_text import describe
-from copem_replay.io.containers.rosbag2 import merged
+from copem_replay.experiment.draft.survey import survey_recording
+from copem_replay.experiment.draft.template import describe_survey
+from copem_replay.io.containers.rosbag2 import merge_streams
 from copem_replay.io.log import Log
 from copem_replay.io.open import open_log
-from copem_replay.io.recording import Recording, read
+from copem_replay.io.recording import Recording, read_log
 from tests.helpers.experiments import changed
 from tests.helpers.recordings import Obj, Topic, truth_topic, write_mcap, write_recording
 from tests.helpers.ros2 import STORE, odometry
@@ -62,15 +62,15 @@ def x_m(recording: Recording) -> list[float]:
 def problem(path: Path) -> str:
     """The one line that says why a folder cannot be read; looking at it says the same."""
     with pytest.raises(RecordingError) as caught:
-        read(path, name="log")
+        read_log(path, name="log")
     (line,) = caught.value.problems
     assert line.isprintable()
-    assert survey(path).reason == line
+    assert survey_recording(path).reason == line
     return line.replace(f"{path}", "BAG")
 
 
 def test_files_of_a_folder_are_one_recording(bag):
-    recording = read(bag, name="log")
+    recording = read_log(bag, name="log")
     assert recording.scene.object_ids == ("1", "2")
     assert len(recording.truth.start) == 3  # two tracks: nothing is cut where a file ends
     assert x_m(recording) == [1.0 * k for k in range(30)]
@@ -101,7 +101,7 @@ def test_channels_are_joined_by_what_they_are_not_by_their_numbers(bag):
     write_mcap(bag / "bag_1.mcap", [Topic("truth", "", [(10**9, b"x")], "json"), frames])
     channels = open_log(bag).channels
     assert [(c.topic, c.schema, c.messages) for c in channels] == [("truth", "osi3.GroundTruth", 30), ("truth", "", 1)]
-    assert len(read(bag, name="log").truth.stamp_ns) == 30
+    assert len(read_log(bag, name="log").truth.stamp_ns) == 30
 
 
 def test_only_the_files_that_are_at_their_time_are_open(bag, monkeypatch):
@@ -125,7 +125,7 @@ def test_only_the_files_that_are_at_their_time_are_open(bag, monkeypatch):
 def test_merged_is_a_stable_sort(streams):
     """Of equal times the first stream's come first, and each stream keeps its order."""
     messages = [[Message(k, t, b"", t, n) for n, t in enumerate(times)] for k, times in enumerate(streams)]
-    found = list(merged([(times[0], list(of).__iter__) for times, of in zip(streams, messages, strict=True)]))
+    found = list(merge_streams([(times[0], list(of).__iter__) for times, of in zip(streams, messages, strict=True)]))
     assert found == sorted(itertools.chain(*messages), key=lambda m: m.log_time)
 
 
@@ -165,7 +165,7 @@ def test_file_compressed_by_rosbags_is_refused(tmp_path):
 def test_files_that_were_unpacked_are_read(bag):
     """`zstd -d` leaves the description as it was."""
     described(bag, [f"bag_{k}.mcap.zstd" for k in range(3)], "  compression_format: zstd\n  compression_mode: FILE\n")
-    assert len(read(bag, name="log").truth.stamp_ns) == 30
+    assert len(read_log(bag, name="log").truth.stamp_ns) == 30
 
 
 # ------------------------------------------------------------------------------- descriptions
@@ -174,12 +174,12 @@ def test_files_that_were_unpacked_are_read(bag):
 def test_files_may_be_named_under_files_only(bag):
     names = "".join(f"    - path: bag_{k}.mcap\n      message_count: 10\n" for k in range(3))
     (bag / "metadata.yaml").write_text(f"rosbag2_bagfile_information:\n  version: 5\n  files:\n{names}")
-    assert len(read(bag, name="log").truth.stamp_ns) == 30
+    assert len(read_log(bag, name="log").truth.stamp_ns) == 30
 
 
 def test_files_that_are_not_named_are_said(bag):
     described(bag, ["bag_0.mcap"])
-    recording = read(bag, name="log")
+    recording = read_log(bag, name="log")
     assert len(recording.truth.stamp_ns) == 10
     assert recording.notes == ("2 files that metadata.yaml does not name not read: bag_1.mcap …",)
 
@@ -267,7 +267,7 @@ def cut_off(path: Path) -> None:
 def test_damage_is_said_of_its_file(bag):
     """The last file lost its end: what is before it is read."""
     cut_off(bag / "bag_2.mcap")
-    recording = read(bag, name="log")
+    recording = read_log(bag, name="log")
     assert recording.damage == "damaged after 2.600 s: 27 messages read (bag_2.mcap: the file ends too early)"
     assert len(recording.truth.stamp_ns) == 27
     assert recording.notes == (recording.damage,)
@@ -280,7 +280,7 @@ def test_damage_in_the_middle(bag):
     content = bytearray(first.read_bytes())
     content[chunk.chunk_start_offset + chunk.chunk_length - 3] ^= 0xFF
     first.write_bytes(content)
-    recording = read(bag, name="log")
+    recording = read_log(bag, name="log")
     assert recording.damage is not None
     assert recording.damage.startswith("damaged: 29 of 30 messages read (bag_0.mcap: ")
     assert len(recording.truth.start) == 3  # one frame is gone, the tracks are not cut
@@ -289,7 +289,7 @@ def test_damage_in_the_middle(bag):
 def test_file_that_cannot_be_read_at_all(bag):
     """As a recorder leaves the last one when the power fails."""
     (bag / "bag_2.mcap").write_bytes(b"")
-    recording = read(bag, name="log")
+    recording = read_log(bag, name="log")
     assert recording.damage == "damaged: 20 messages read (bag_2.mcap: the file is empty)"
 
 
@@ -408,7 +408,7 @@ def test_name_of_a_folder_however_it_is_named(bag, monkeypatch, capsys, where):
 
 def test_info_and_init_of_a_folder(bag, monkeypatch, capsys):
     monkeypatch.chdir(bag.parent)
-    lines = describe(survey(Path("drive.2026")))
+    lines = describe_survey(survey_recording(Path("drive.2026")))
     assert lines[0] == "drive.2026"
     assert "experiment: copem-replay init drive.2026 > experiment.yaml" in lines
     assert run("init", "drive.2026", monkeypatch=monkeypatch) == 0

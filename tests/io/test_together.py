@@ -14,17 +14,15 @@ from typer.testing import CliRunner
 
 import copem_replay as cr
 from copem_replay.cli.main import app
-from copem_replay.experiment.draft.clocks import ClockFound, clocks
-from copem_replay.io.containers.joined import labels_of
+from copem_replay.experiment.draft.survey import ClockFound, compare_clocks
+from copem_replay.io.clock_offset import TimeOffset
+from copem_replay.io.frames import read_decoded_lists, read_log_context, transform_to_world
 from copem_replay.io.log import Log
-from copem_replay.io.open import open_log
-from copem_replay.io.recorded_osi import read_recorded
-from copem_replay.io.recording import read
-from copem_replay.io.schemas.decoded import X, Y
-from copem_replay.io.time_offset import TimeOffset
-from copem_replay.io.together import Together
+from copem_replay.io.open import DriveRecordings, label_files, open_log
+from copem_replay.io.recorded_lists import read_recorded
+from copem_replay.io.recording import read_log
+from copem_replay.io.schemas.description import X, Y
 from copem_replay.io.window import Window
-from copem_replay.io.world_frame import in_world, lists_of, log_context
 from tests.experiment.test_validate import against_logs, without_logs
 from tests.helpers.experiments import changed
 from tests.helpers.recordings import Obj, Topic, ns, truth_topic, write_mcap
@@ -57,8 +55,8 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def place(folder: Path, ahead_s: float = AHEAD_S) -> Together:
-    return Together((folder / "ego.mcap", folder / "rsu.mcap"), (0.0, ahead_s))
+def place(folder: Path, ahead_s: float = AHEAD_S) -> DriveRecordings:
+    return DriveRecordings((folder / "ego.mcap", folder / "rsu.mcap"), (0.0, ahead_s))
 
 
 PLAN: dict[str, Any] = {
@@ -97,7 +95,7 @@ def test_messages_come_in_order_of_time_and_topics_are_told_apart(folder: Path) 
 
 
 def test_lists_are_by_the_first_clock(folder: Path) -> None:
-    recording = read(place(folder), name="drive")
+    recording = read_log(place(folder), name="drive")
     assert recording.path == folder / "ego.mcap"
     found, expected = (
         read_recorded(at, "rsu:objects", recording.scene).tracks for at in (place(folder), folder / "drive.mcap")
@@ -129,7 +127,7 @@ def test_what_is_written_is_one_file_that_replays_as_the_drive_did(folder: Path)
 
 
 def test_nothing_is_moved_unasked(folder: Path) -> None:
-    recording = read(place(folder, 0.0), name="drive")
+    recording = read_log(place(folder, 0.0), name="drive")
     found = read_recorded(place(folder, 0.0), "rsu:objects", recording.scene).tracks
     assert found.stamp_ns[0] == ns(10.05 + AHEAD_S)
 
@@ -143,8 +141,8 @@ def test_a_window_is_by_the_first_clock(folder: Path) -> None:
 
 
 def test_labels_are_as_long_as_they_need_to_be(tmp_path: Path) -> None:
-    assert labels_of([tmp_path / "ego.mcap", tmp_path / "rsu.mcap"]) == ["ego", "rsu"]
-    assert labels_of([tmp_path / "a/x.mcap", tmp_path / "b/x.mcap"]) == ["a/x", "b/x"]
+    assert label_files([tmp_path / "ego.mcap", tmp_path / "rsu.mcap"]) == ["ego", "rsu"]
+    assert label_files([tmp_path / "a/x.mcap", tmp_path / "b/x.mcap"]) == ["a/x", "b/x"]
 
 
 def traffic(folder: Path, ahead_s: float, *, captured: bool = False, truth: bool = True) -> tuple[Path, Path]:
@@ -176,7 +174,7 @@ def traffic(folder: Path, ahead_s: float, *, captured: bool = False, truth: bool
 class TestClocks:
     def test_info_tells_the_offset_and_init_writes_it(self, tmp_path: Path) -> None:
         logs = [str(path) for path in traffic(tmp_path, -0.4)]
-        (found,) = clocks([Path(log) for log in logs])
+        (found,) = compare_clocks([Path(log) for log in logs])
         assert found.lists == ("ego:truth", "rsu:objects")
         assert found.offset.low_s < -0.4 < found.offset.high_s
         assert found.offset.offset_s == pytest.approx(-0.4, abs=0.02)
@@ -196,13 +194,13 @@ class TestClocks:
         assert study.together == tuple(logs)
 
     def test_lists_of_an_unknown_delay_come_last_however_narrow_their_interval(self, tmp_path: Path) -> None:
-        (found,) = clocks(traffic(tmp_path, 0.3, captured=True))
+        (found,) = compare_clocks(traffic(tmp_path, 0.3, captured=True))
         assert found.lists == ("ego:truth", "rsu:objects")
         assert found.offset.offset_s == pytest.approx(0.3, abs=0.03)
         assert "included" not in found.words()
 
     def test_a_delay_that_is_in_the_offset_is_said(self, tmp_path: Path) -> None:
-        (found,) = clocks(traffic(tmp_path, 0.3, captured=True, truth=False))
+        (found,) = compare_clocks(traffic(tmp_path, 0.3, captured=True, truth=False))
         assert found.offset.offset_s == pytest.approx(0.3 - 0.2, abs=0.01)
         assert found.words().endswith(", the delay of ego:stack included, which does not say when captured")
 
@@ -213,7 +211,7 @@ class TestClocks:
 
     def test_what_cannot_be_told_is_said(self, folder: Path) -> None:
         write_mcap(folder / "rsu.mcap", [Topic("objects", "osi3.SensorData", rsu(0.0).messages[:3])])
-        (found,) = clocks([folder / "ego.mcap", folder / "rsu.mcap"])
+        (found,) = compare_clocks([folder / "ego.mcap", folder / "rsu.mcap"])
         assert found.words().startswith("cannot be told: ")
         assert found.words().endswith(found.plain()["untold"])
         assert found.plain()["clock_offset_s"] is found.plain()["interval_s"] is None
@@ -304,7 +302,7 @@ class TestFrames:
         return bag("ego", lambda t: (10 * t, 0.0, 0.0)), bag("mast", lambda t: (50.0, 20.0, 180.0))
 
     def test_each_list_goes_by_the_transforms_of_its_own_bag(self, tmp_path: Path) -> None:
-        log = open_log(Together(self.bags(tmp_path), (0.0, 0.0)))
+        log = open_log(DriveRecordings(self.bags(tmp_path), (0.0, 0.0)))
         assert self.places(log) == {"ego:/scene": (10 * 0.5 + 2 + 5, 0.0), "mast:/scene": (50.0 - 2 - 5, 20.0)}
 
     def test_a_frame_that_one_bag_alone_places_is_known_to_both(self, tmp_path: Path) -> None:
@@ -314,17 +312,17 @@ class TestFrames:
         mount = made(kind, transforms=[transform(0.0, "base_link", "lidar", 3.0, 0.0)])
         boxes = json_topic("/scene", [(0.1 * k, cubes(0.1 * k)) for k in range(11)], schema="foxglove.SceneUpdate")
         write_mcap(mast, [topic("/tf_static", kind, [(0.0, mount)]), boxes])
-        places = self.places(open_log(Together((ego, mast), (0.0, 0.0))))
+        places = self.places(open_log(DriveRecordings((ego, mast), (0.0, 0.0))))
         assert places == {"ego:/scene": (10 * 0.5 + 2 + 5, 0.0), "mast:/scene": (10 * 0.5 + 3 + 5, 0.0)}
 
     @staticmethod
     def places(log: Log) -> dict[str, tuple[float, float]]:
         """Where the box of each list is after half a second."""
-        around = log_context(log, None, seek_ego=False)
+        around = read_log_context(log, None, seek_ego=False)
         found = {}
         for channel in log.channels:
             if channel.schema == "foxglove.SceneUpdate":
-                lists = in_world(lists_of(log, [channel], None), around, log.path, channel.topic)
+                lists = transform_to_world(read_decoded_lists(log, [channel], None), around, log.path, channel.topic)
                 at = lists.columns.values[5]
                 found[channel.topic] = (round(float(at[X]), 6), round(float(at[Y]), 6))
         return found

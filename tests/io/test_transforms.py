@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from copem_replay.core.rotation import yaw_of
+from copem_replay.core.interpolation import yaw_of
+from copem_replay.io.frames import FrameTree, SampledPoses, make_pose_track
 from copem_replay.io.schemas.poses import Poses
-from copem_replay.io.transforms import Frames, PosesAt, pose_track_of
 
 Sample = tuple[float, float, float, float]
 """Seconds, x, y, yaw in degrees."""
@@ -34,16 +34,16 @@ def at(*seconds: float) -> np.ndarray:
     return np.array([round(s * 1e9) for s in seconds], dtype=np.int64)
 
 
-def flat(placed: PosesAt | None) -> list[list[float]]:
+def flat(placed: SampledPoses | None) -> list[list[float]]:
     """x, y and yaw in degrees."""
     assert placed is not None
     found = np.column_stack([placed.position_m[:, :2], np.rad2deg(yaw_of(placed.rotation))])
     return np.round(found, 9).tolist()
 
 
-def moving() -> Frames:
+def moving() -> FrameTree:
     """The car drives east from (10, 0), 10 m/s, then turns to the north; a lidar 2 m ahead looks to the left."""
-    frames = Frames()
+    frames = FrameTree()
     frames.add(poses("map", "base", (0.0, 10, 0, 0), (0.1, 11, 0, 0), (0.2, 11, 0, 90)))
     frames.add(poses("base", "lidar", (5.0, 2, 0, 90)), static=True)
     return frames
@@ -55,13 +55,13 @@ def test_a_chain_of_transforms() -> None:
 
 
 def test_between_samples_positions_are_linear_and_turns_the_short_way_round() -> None:
-    frames = Frames()
+    frames = FrameTree()
     frames.add(poses("map", "base", (0.0, 0, 0, 170), (0.2, 4, 0, -170)))
     assert flat(frames.place("base", "map", at(0.1))) in ([[2, 0, 180]], [[2, 0, -180]])
 
 
 def test_nothing_is_known_before_after_and_in_a_long_gap() -> None:
-    frames = Frames()
+    frames = FrameTree()
     frames.add(poses("map", "base", (1.0, 0, 0, 0), (1.5, 5, 0, 0), (2.1, 11, 0, 0)))
     placed = frames.place("base", "map", at(0.99, 1.0, 1.25, 1.5, 1.8, 2.1, 2.2))
     assert placed is not None
@@ -86,7 +86,7 @@ def test_the_world_is_the_outermost_frame_that_something_moves_in() -> None:
 
 
 def test_a_circle_has_an_end() -> None:
-    frames = Frames()
+    frames = FrameTree()
     frames.add(poses("a", "b", (0, 1, 0, 0)))
     frames.add(poses("b", "a", (0, 1, 0, 0)))
     assert frames.chain("a") == ["a", "b"]
@@ -94,11 +94,11 @@ def test_a_circle_has_an_end() -> None:
 
 
 def test_of_several_samples_at_an_instant_the_first() -> None:
-    course = pose_track_of(poses("map", "base", (0.2, 3, 0, 0), (0.1, 1, 0, 0), (0.1, 2, 0, 0)))
+    course = make_pose_track(poses("map", "base", (0.2, 3, 0, 0), (0.1, 1, 0, 0), (0.1, 2, 0, 0)))
     assert course is not None
     assert course.stamp_ns.tolist() == [100_000_000, 200_000_000]
     assert course.position_m[:, 0].tolist() == [1.0, 3.0]
-    assert pose_track_of(poses("map", "base", (0, 0, 0, 0)), np.array([False])) is None
+    assert make_pose_track(poses("map", "base", (0, 0, 0, 0)), np.array([False])) is None
 
 
 ANGLE = st.floats(-180, 180)
@@ -108,7 +108,7 @@ PLACE = st.floats(-100, 100)
 @given(chain=st.lists(st.tuples(PLACE, PLACE, ANGLE), min_size=1, max_size=4))
 def test_there_and_back_is_nowhere(chain: Sequence[tuple[float, float, float]]) -> None:
     """By complex numbers: each frame turns and moves what is in it."""
-    frames = Frames()
+    frames = FrameTree()
     for k, (x, y, yaw) in enumerate(chain):
         frames.add(poses(f"f{k}", f"f{k + 1}", (0.0, x, y, yaw)))
     last = f"f{len(chain)}"

@@ -21,16 +21,15 @@ from mcap.writer import CompressionType, Writer
 from copem_replay.cli import main as cli
 from copem_replay.core.errors import EmptyWindowError, RecordingError
 from copem_replay.core.tracks import VALUES
-from copem_replay.core.yaml import dump
-from copem_replay.core.yaml import read as read_yaml
+from copem_replay.core.yaml import dump_yaml
+from copem_replay.core.yaml import parse_yaml as read_yaml
 from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import read_logs
 from copem_replay.io import log as container
-from copem_replay.io.containers import mcap_indexed as indexed
 from copem_replay.io.containers import mcap_records as chunks
 from copem_replay.io.open import open_log
-from copem_replay.io.recording import Recording, read
-from copem_replay.pipeline.run import run
+from copem_replay.io.recording import Recording, read_log
+from copem_replay.pipeline.run import run_experiment
 from tests.helpers.experiments import changed
 from tests.helpers.recordings import SHARED, Obj, Topic, ns, pedestrian, truth_topic, write_mcap, write_recording
 from tests.helpers.ros2 import header, made, odometry, pose, topic, transform
@@ -134,7 +133,7 @@ def replayed(path: Path, **changes: Any) -> tuple[Recording, pd.DataFrame]:
     wanted = plan(**changes)
     recordings, refused = read_logs(wanted, [path], None)
     assert not refused, refused
-    return recordings[0], run(wanted, recordings).table
+    return recordings[0], run_experiment(wanted, recordings).table
 
 
 def check_same(cut: tuple[Recording, pd.DataFrame], whole: tuple[Recording, pd.DataFrame]) -> None:
@@ -186,8 +185,8 @@ def test_ends_that_are_left_out_and_bounds(tmp_path: Path, window_s: tuple[float
 
 def test_a_window_without_bounds_is_none(tmp_path: Path) -> None:
     path = drive(tmp_path / "a.mcap")
-    recording = read(path, name="a", window_s=(None, None))
-    assert (recording.window, recording.notes) == (None, read(path, name="a").notes)
+    recording = read_log(path, name="a", window_s=(None, None))
+    assert (recording.window, recording.notes) == (None, read_log(path, name="a").notes)
 
 
 def test_seconds_count_from_the_first_message_of_the_truth(tmp_path: Path) -> None:
@@ -196,7 +195,7 @@ def test_seconds_count_from_the_first_message_of_the_truth(tmp_path: Path) -> No
     early = Topic("other", "my.Schema", [(ns(START_S - 5 + k / 10), b"") for k in range(100)])
     log_s = [START_S + k / 10 for k in range(50)]
     path = write_recording(tmp_path / "a.mcap", frames, log_s=log_s, more=[early], chunk_size=1)
-    recording = read(path, name="a", window_s=(1.0, 1.2))
+    recording = read_log(path, name="a", window_s=(1.0, 1.2))
     assert recording.truth.x_m[0].tolist() == [10.0, 11.0, 12.0]
     assert recording.scene.t0_ns == ns(501.0)
 
@@ -239,7 +238,7 @@ class TestRos2:
         topics[1] = replace(topics[1], messages=topics[1].messages[:30])
         path = write_mcap(tmp_path / "a.mcap", topics)
         with pytest.raises(RecordingError) as caught:
-            read(path, name="a", window_s=(9.0, 10.0))
+            read_log(path, name="a", window_s=(9.0, 10.0))
         assert str(caught.value) == f"{path}: ego: no pose on topic '/odom' in the window"
 
     @pytest.mark.parametrize("encoding", ["cdr", "json"])
@@ -290,19 +289,20 @@ def test_a_trace(tmp_path: Path) -> None:
 def watched(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """When the chunks that are decompressed through an index begin, in ns."""
     begun: list[int] = []
+    read_chunk = chunks.read_chunk
 
-    def watching(body: bytes, allowance: chunks.Allowance) -> Iterator[Any]:
+    def watching(body: bytes, allowance: chunks.ChunkAllowance) -> Iterator[Any]:
         begun.append(struct.unpack_from("<Q", body)[0])
-        return chunks.in_chunk(body, allowance)
+        return read_chunk(body, allowance)
 
-    monkeypatch.setattr(indexed, "in_chunk", watching)
+    monkeypatch.setattr(chunks, "read_chunk", watching)
     return begun
 
 
 def test_other_chunks_are_not_decompressed(tmp_path: Path, watched: list[int]) -> None:
     """One message a chunk: the first, by which seconds are counted, and those of the window."""
     path = drive(tmp_path / "a.mcap", chunk_size=1)
-    read(path, name="a", window_s=(3.0, 3.4))
+    read_log(path, name="a", window_s=(3.0, 3.4))
     assert {round(t / 1e9 - START_S, 3) for t in watched} == {0.0, 3.0, 3.1, 3.2, 3.3, 3.4}
 
 
@@ -333,7 +333,7 @@ class TestDamage:
         """Frames of 4.0 and 4.5 s, and what is between, are lost."""
         path = drive(tmp_path / "a.mcap", chunk_size=1)
         spoilt(path, 80, 91)
-        recording = read(path, name="a", window_s=(3.0, 6.0))
+        recording = read_log(path, name="a", window_s=(3.0, 6.0))
         assert recording.damage is not None
         assert recording.damage.startswith("damaged: what is lost may be of the window (")
         assert len(recording.truth.stamp_ns) == 31 - 6
@@ -345,7 +345,7 @@ class TestRefused:
     def test_beyond_the_end(self, tmp_path: Path, finish: bool) -> None:
         path = drive(tmp_path / "a.mcap", chunk_size=500, finish=finish)
         with pytest.raises(EmptyWindowError) as caught:
-            read(path, name="a", window_s=(10.01, 20.0))
+            read_log(path, name="a", window_s=(10.01, 20.0))
         assert str(caught.value) == (
             f"{path}: truth: no message in the window 10.01 – 20 s; there are some from 0 to 10 s"
         )
@@ -356,7 +356,7 @@ class TestRefused:
         frames = [(START_S + k / 10, [Obj(id=1)]) for k in range(11)]
         path = write_recording(tmp_path / "a.mcap", frames, more=[others], chunk_size=1)
         with pytest.raises(EmptyWindowError, match=r"window from 1\.5 s on; there are some from 0 to 1 s$"):
-            read(path, name="a", window_s=(1.5, None))
+            read_log(path, name="a", window_s=(1.5, None))
 
 
 # ---------------------------------------------------------------------------------------------- the command line
@@ -372,7 +372,7 @@ def call(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
     def called(*words: str) -> tuple[int, str, str]:
         monkeypatch.setattr("sys.argv", ["copem-replay", *words])
         capsys.readouterr()
-        code = cli._ended()
+        code = cli._run_to_exit_code()
         return code, *capsys.readouterr()
 
     return called
@@ -515,7 +515,7 @@ def test_a_window_of_each_of_several_logs(call: Callable[..., Any], tmp_path: Pa
     (tmp_path / "e.yaml").write_text(changed("logs: [drive.mcap, short.mcap]", "window_s: [2, 2.5]"))
     assert call("run", "e.yaml", "--out", "cut")[0] == 0
     data, _, _ = read_yaml((tmp_path / "cut/experiment.yaml").read_text())
-    assert dump(data).count("window_s") == 1
+    assert dump_yaml(data).count("window_s") == 1
     code, _, said = call("run", "e.yaml", "--from", "4", "--to", "5", "--skip-unreadable", "--out", "one")
     assert code == 1
     assert "note: short.mcap: skipped: truth: no message in the window 4 – 5 s; there are some from 0 to 3 s" in said
@@ -554,7 +554,7 @@ NUSCENES = SHARED / "nuscenes_scene0916_autoware_ros2.mcap"
 @pytest.mark.skipif(not NUSCENES.exists(), reason="the recording is not there")
 def test_a_recorded_drive() -> None:
     """States in the window are those of the whole, where nothing is derived from what is outside."""
-    whole, cut = (read(NUSCENES, name="a", window_s=w) for w in (None, (5.0, 9.0)))
+    whole, cut = (read_log(NUSCENES, name="a", window_s=w) for w in (None, (5.0, 9.0)))
     assert 0 < len(cut.truth.stamp_ns) < len(whole.truth.stamp_ns)
     kept = np.isin(whole.truth.stamp_ns[whole.truth.frame_ix], cut.truth.stamp_ns)
     assert int(kept.sum()) == len(cut.truth.frame_ix)

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from copem_replay.core.errors import RecordingError
-from copem_replay.core.interpolation import states_at
+from copem_replay.core.interpolation import interpolate_states
 from copem_replay.core.tracks import CLASSES
-from copem_replay.io.config import EgoTopic, ReadFields
-from copem_replay.io.recording import Recording, read
+from copem_replay.io.config import EgoTopic, TruthFields
+from copem_replay.io.recording import Recording, read_log
 from tests.helpers.recordings import SHARED, Topic, ns, write_mcap
 from tests.helpers.ros2 import made, odometry, topic, transform
 
@@ -58,13 +58,13 @@ def own_recording(path: Path, *more: Topic) -> Path:
     return write_mcap(path / "a.mcap", [json_topic("/boxes", [(t, own(t)) for t in TIMES]), *more])
 
 
-def fields(**changes: Any) -> ReadFields:
-    return ReadFields.model_validate(FIELDS | changes)
+def fields(**changes: Any) -> TruthFields:
+    return TruthFields.model_validate(FIELDS | changes)
 
 
 def state(recording: Recording, name: str, t_s: float) -> dict[str, float]:
     scene = recording.scene
-    at, there = states_at(
+    at, there = interpolate_states(
         recording.truth, np.array([scene.object_number[name]]), np.array([t_s]), t0_ns=scene.t0_ns, max_gap_s=0.5
     )
     assert there.all()
@@ -78,7 +78,7 @@ def classes(recording: Recording) -> dict[str, str]:
 
 class TestAnySchema:
     def test_by_naming_its_fields(self, tmp_path: Path) -> None:
-        found = read(own_recording(tmp_path), name="a", topic="/boxes", fields=fields())
+        found = read_log(own_recording(tmp_path), name="a", topic="/boxes", fields=fields())
         assert classes(found) == {"7": "pedestrian", "8": "truck"}
         assert state(found, "7", 0.45) == {
             "x_m": 5.0, "y_m": 0.45, "z_m": 0.9, "yaw_rad": round(np.pi / 2, 6), "vx_mps": 0.0, "vy_mps": 1.0,
@@ -90,7 +90,7 @@ class TestAnySchema:
     def test_a_field_that_is_not_there(self, tmp_path: Path) -> None:
         path = own_recording(tmp_path)
         with pytest.raises(RecordingError) as caught:
-            read(path, name="a", topic="/boxes", fields=fields(x_m="position.x"))
+            read_log(path, name="a", topic="/boxes", fields=fields(x_m="position.x"))
         (line,) = caught.value.problems
         assert line.startswith(
             f"{path}: /boxes: read.x_m: the messages have no 'boxes[].position.x'; they have boxes[]."
@@ -98,11 +98,11 @@ class TestAnySchema:
         with pytest.raises(
             RecordingError, match=r"no true objects on topic '/box'; messages are on /boxes \(my.Boxes\)"
         ):
-            read(path, name="a", topic="/box", fields=fields(topic="/box"))
+            read_log(path, name="a", topic="/box", fields=fields(topic="/box"))
 
     def test_objects_without_ids_are_not_the_truth(self, tmp_path: Path) -> None:
         with pytest.raises(RecordingError, match="have no ids"):
-            read(own_recording(tmp_path), name="a", topic="/boxes", fields=fields(id=None))
+            read_log(own_recording(tmp_path), name="a", topic="/boxes", fields=fields(id=None))
 
 
 class TestEgo:
@@ -117,7 +117,7 @@ class TestEgo:
         return write_mcap(path / "a.mcap", [json_topic("/boxes", lists), poses, *more], profile="ros2")
 
     def test_the_only_odometry_is_the_egos(self, tmp_path: Path) -> None:
-        found = read(self.drive(tmp_path), name="a", topic="/boxes", fields=fields())
+        found = read_log(self.drive(tmp_path), name="a", topic="/boxes", fields=fields())
         scene = found.scene
         assert (scene.object_ids[scene.ego_ix], scene.ego_sized) == ("ego", False)
         assert state(found, "ego", 0.5)["x_m"] == 5.0
@@ -127,7 +127,7 @@ class TestEgo:
 
     def test_its_size_and_its_centre(self, tmp_path: Path) -> None:
         asked = EgoTopic(topic="/odom", size_m=(4.6, 1.9, 1.5), centre_from_rear_axle_m=1.4)
-        found = read(self.drive(tmp_path), name="a", topic="/boxes", fields=fields(), ego=asked)
+        found = read_log(self.drive(tmp_path), name="a", topic="/boxes", fields=fields(), ego=asked)
         ego = state(found, "ego", 0.5)
         assert [ego[k] for k in ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m")] == [
             6.4,
@@ -144,10 +144,10 @@ class TestEgo:
         with pytest.raises(
             RecordingError, match=r"ego: no poses on topic '/pose'; poses are on: /odom \(nav_msgs/msg/Odometry\)"
         ):
-            read(self.drive(tmp_path), name="a", topic="/boxes", fields=fields(), ego=EgoTopic(topic="/pose"))
+            read_log(self.drive(tmp_path), name="a", topic="/boxes", fields=fields(), ego=EgoTopic(topic="/pose"))
 
     def test_lists_in_the_egos_frame_are_brought_into_the_world(self, tmp_path: Path) -> None:
-        found = read(self.drive(tmp_path, list_frame="base_link"), name="a", topic="/boxes", fields=fields())
+        found = read_log(self.drive(tmp_path, list_frame="base_link"), name="a", topic="/boxes", fields=fields())
         assert state(found, "7", 0.5)["x_m"] == 10.0  # 5 m ahead of an ego at 5 m
         assert state(found, "7", 0.5)["vx_mps"] == 10.0
         assert "lists in the frame base_link: brought into map" in found.notes
@@ -158,7 +158,7 @@ class TestEgo:
             "/tf_static", "tf2_msgs/msg/TFMessage",
             [(0.0, made("tf2_msgs/msg/TFMessage", transforms=[transform(0.0, "base_link", "lidar", 2.0, 0.0, 90.0)]))],
         )  # fmt: skip
-        found = read(self.drive(tmp_path, static, list_frame="lidar"), name="a", topic="/boxes", fields=fields())
+        found = read_log(self.drive(tmp_path, static, list_frame="lidar"), name="a", topic="/boxes", fields=fields())
         walker = state(found, "7", 0.5)  # at (5, 0.5) of the lidar
         assert (walker["x_m"], walker["y_m"]) == (5.0 + 2.0 - 0.5, 5.0)
         assert abs(walker["yaw_rad"]) == pytest.approx(np.pi)
@@ -166,7 +166,7 @@ class TestEgo:
     def test_a_frame_that_nothing_places(self, tmp_path: Path) -> None:
         path = self.drive(tmp_path, list_frame="camera")
         with pytest.raises(RecordingError) as caught:
-            read(path, name="a", topic="/boxes", fields=fields())
+            read_log(path, name="a", topic="/boxes", fields=fields())
         assert caught.value.problems == (
             f"{path}: /boxes: lists are in the frame 'camera', the ego in 'map', and no transform of the recording "
             "says how they lie",
@@ -191,7 +191,7 @@ def scene_update(t_s: float) -> dict[str, Any]:
 def test_scene_updates_in_json(tmp_path: Path) -> None:
     messages = [(t, scene_update(t)) for t in TIMES]
     path = write_mcap(tmp_path / "a.mcap", [json_topic("/scene", messages, schema="foxglove.SceneUpdate")])
-    found = read(path, name="a")
+    found = read_log(path, name="a")
     assert classes(found) == {"c1": "car"}
     assert state(found, "c1", 0.5)["x_m"] == 12.5
     assert state(found, "c1", 0.5)["vx_mps"] == 5.0
@@ -201,9 +201,9 @@ def test_the_same_drive_as_osi_and_as_ros_2() -> None:
     paths = [SHARED / f"nuscenes_scene0916{kind}.mcap" for kind in ("", "_autoware_ros2")]
     if not all(path.exists() for path in paths):
         pytest.skip(f"no {paths[1].name} in {SHARED}")
-    osi = read(paths[0], name="a")
+    osi = read_log(paths[0], name="a")
     size = tuple(float(getattr(osi.truth, n)[0, 0]) for n in ("length_m", "width_m", "height_m"))
-    ros = read(paths[1], name="a", ego=EgoTopic(topic="/localization/kinematic_state", size_m=size))
+    ros = read_log(paths[1], name="a", ego=EgoTopic(topic="/localization/kinematic_state", size_m=size))
     assert len(osi.scene.object_ids) == len(ros.scene.object_ids)
     assert len(osi.truth.frame_ix) == len(ros.truth.frame_ix)
     np.testing.assert_allclose(osi.truth.captured_s, ros.truth.captured_s, atol=1e-6)

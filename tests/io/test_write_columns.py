@@ -14,12 +14,11 @@ from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.object_list import ENTRY
 from copem_replay.core.tracks import CLASSES, NO_CAPTURE_NS, UNCERTAINTIES, VALUES, Int, Scene, Tracks
 from copem_replay.core.view_geometry import ViewGeometry
-from copem_replay.io.write import foxglove_scene, list_blocks
-from copem_replay.io.write.detail_json_writer import DetailWriter
-from copem_replay.io.write.foxglove_scene import SceneWriter
-from copem_replay.io.write.osi_sensor_data_writer import SensorDataWriter
-from copem_replay.io.write.status import Statuses, StatusWriter
-from copem_replay.io.write.uncertainty import UncertaintyWriter, axes
+from copem_replay.io.encodings import column_bytes as list_blocks
+from copem_replay.io.write import scene as foxglove_scene
+from copem_replay.io.write.detail import DetailWriter, Statuses, StatusWriter
+from copem_replay.io.write.osi import SensorDataWriter
+from copem_replay.io.write.scene import FoxgloveSceneWriter, UncertaintyWriter, principal_axes
 from tests.oracles import messages as plain
 
 T0_NS = 1_700_000_000_123_456_789
@@ -117,7 +116,7 @@ def test_sensor_data(fused_tracks: FusedTracks) -> None:
 @given(LISTS, st.sampled_from(["global", ""]))
 @settings(deadline=None)
 def test_scene_updates(fused_tracks: FusedTracks, frame_id: str) -> None:
-    writer = SceneWriter(SCENE, fused_tracks, "gnn", COLOUR, frame_id)
+    writer = FoxgloveSceneWriter(SCENE, fused_tracks, "gnn", COLOUR, frame_id)
     same(
         writer.messages(available_of(fused_tracks)),
         fused_tracks,
@@ -130,9 +129,9 @@ def test_scene_updates(fused_tracks: FusedTracks, frame_id: str) -> None:
 def test_ellipses(fused_tracks: FusedTracks) -> None:
     fused = fused_tracks.fused
     none = np.zeros(len(fused.frame_ix))
-    of = axes(*(none if c is None else c[0] for c in (fused.cov_ee_m2, fused.cov_en_m2, fused.cov_nn_m2)))
+    of = principal_axes(*(none if c is None else c[0] for c in (fused.cov_ee_m2, fused.cov_en_m2, fused.cov_nn_m2)))
     writer = UncertaintyWriter(
-        SCENE, fused_tracks, COLOUR, lambda *what: foxglove_scene.ellipses(*what, frame_id="map")
+        SCENE, fused_tracks, COLOUR, lambda *what: foxglove_scene.encode_ellipses(*what, frame_id="map")
     )
     same(
         writer.messages(available_of(fused_tracks)),

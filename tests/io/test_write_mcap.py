@@ -24,18 +24,18 @@ from copem_replay.core.colours import configuration_colours
 from copem_replay.core.errors import OutputError, RecordingError
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import NO_CAPTURE_NS, UNCERTAINTIES, VALUES
-from copem_replay.experiment.file import load, log_paths
+from copem_replay.experiment.file import log_paths, read_experiment_file
 from copem_replay.experiment.schema import Experiment
-from copem_replay.experiment.validate import problems, read_logs
-from copem_replay.io.recorded_osi import read_lists
-from copem_replay.io.recording import read
-from copem_replay.io.write import osi_sensor_data as sensor_data
-from copem_replay.io.write.detail_json_writer import DetailWriter
+from copem_replay.experiment.validate import find_problems, read_logs
+from copem_replay.io.recorded_lists import read_sensor_data
+from copem_replay.io.recording import read_log
+from copem_replay.io.write import osi as sensor_data
+from copem_replay.io.write.detail import DetailWriter
 from copem_replay.io.write.mcap import OSI_RECORD, RUN_RECORD, atomic_mcap, write_mcap
-from copem_replay.io.write.message_family import family_of
-from copem_replay.pipeline.blocks import replay_block
+from copem_replay.io.write.message_family import find_family
 from copem_replay.pipeline.one_run import tracks_of_run
-from copem_replay.pipeline.prepare import Replay, prepare
+from copem_replay.pipeline.prepare import Replay, prepare_log
+from copem_replay.pipeline.replay import replay_block
 from tests.oracles import messages as plain
 
 ROOT = Path(__file__).parents[2]
@@ -47,7 +47,7 @@ class Written:
     """The sample scenario, written once for all tests: every kind of error, late and fresh units."""
 
     def __init__(self, folder: Path) -> None:
-        source = load(ROOT / "logs/tc016d.yaml")
+        source = read_experiment_file(ROOT / "logs/tc016d.yaml")
         error = {
             "kind": "gaussian", "covariance_m2": [[1.0, 0.3], [0.3, 0.5]], "yaw_sigma_deg": 3, "size_sigma_m": 0.05,
             "speed_sigma_mps": 0.4,
@@ -55,11 +55,11 @@ class Written:
         for pem in source.data["pems"].values():
             pem[0]["error"] = error
         source.data["configurations"]["mixed"] = {"units": "all", "latency_s": {"ego": 0, "default": 0.25}}
-        experiment, found = problems(source)
+        experiment, found = find_problems(source)
         assert experiment is not None, found
         self.experiment: Experiment = experiment
         (self.recording,) = read_logs(experiment, log_paths(source)[0], source)[0]
-        self.replay: Replay = prepare(self.recording, experiment)
+        self.replay: Replay = prepare_log(self.recording, experiment)
         self.run_tracks: dict[str, FusedTracks] = tracks_of_run(self.replay, experiment, RUN)
         self.table: pd.DataFrame = replay_block(self.replay, experiment, np.array([RUN]))
         self.path = folder / "replay.mcap"
@@ -261,7 +261,7 @@ def test_a_list_of_nothing_was_captured_never(written: Written) -> None:
 
 
 def test_read_back_as_a_log_it_is_the_input(written: Written) -> None:
-    a, b = written.recording, read(written.path, name="again")
+    a, b = written.recording, read_log(written.path, name="again")
     assert a.scene.object_ids == b.scene.object_ids
     assert a.scene.ego_ix == b.scene.ego_ix
     for name in ("stamp_ns", "start", "frame_ix", "object_ix", *VALUES):
@@ -279,7 +279,7 @@ def rows_by_key(tracks: Any) -> dict[tuple[int, int], int]:
 @pytest.mark.parametrize("configuration", ["GT", "PEM", "coPEM:0.5s", "mixed"])
 def test_read_back_as_lists_every_column_is_there(written: Written, configuration: str) -> None:
     fused = written.run_tracks[configuration].fused
-    back = read_lists(written.path, f"copem/{configuration}/objects", written.replay.scene)
+    back = read_sensor_data(written.path, f"copem/{configuration}/objects", written.replay.scene)
     np.testing.assert_array_equal(back.stamp_ns, fused.stamp_ns)
     np.testing.assert_allclose(back.arrives_s, fused.arrives_s, atol=1e-9)
     np.testing.assert_allclose(back.captured_s, fused.captured_s, atol=1e-9)
@@ -297,12 +297,12 @@ def test_lists_of_a_real_unit_are_read() -> None:
     path = ROOT.parent / "shared/data/msight_trial3.mcap"
     if not path.exists():
         pytest.skip("shared/data with recordings is not beside the project")
-    scene = read(path, name="trial3").scene
-    lists = read_lists(path, "mcity.RSU.SensorData", scene)
+    scene = read_log(path, name="trial3").scene
+    lists = read_sensor_data(path, "mcity.RSU.SensorData", scene)
     assert len(lists.stamp_ns) == 278
     assert (np.diff(lists.arrives_s[0]) >= 0).all()
     with pytest.raises(RecordingError, match=r"mcity\.RSU\.SensorData"):
-        read_lists(path, "nowhere", scene)
+        read_sensor_data(path, "nowhere", scene)
 
 
 def test_lists_that_cannot_be_decoded_and_a_foreign_detail_topic(written: Written, tmp_path: Path) -> None:
@@ -319,9 +319,9 @@ def test_lists_that_cannot_be_decoded_and_a_foreign_detail_topic(written: Writte
         bad = writer.register_channel("bad", "protobuf", writer.register_schema("osi3.SensorData", "protobuf", b"2"))
         writer.add_message(bad, 8, b"\xff\xff", 8)
         writer.finish()
-    assert read_lists(path, "u/objects", written.replay.scene).stamp_ns.tolist() == [7]
+    assert read_sensor_data(path, "u/objects", written.replay.scene).stamp_ns.tolist() == [7]
     with pytest.raises(RecordingError, match="bad: a message cannot be decoded"):
-        read_lists(path, "bad", written.replay.scene)
+        read_sensor_data(path, "bad", written.replay.scene)
 
 
 def test_the_same_bytes_again(written: Written, tmp_path: Path) -> None:
@@ -331,7 +331,7 @@ def test_the_same_bytes_again(written: Written, tmp_path: Path) -> None:
 
 def test_a_recording_of_osi_is_written_as_ever(written: Written, tmp_path: Path) -> None:
     """Channels and records in their places: what is written for other families moves nothing here."""
-    family = family_of(written.recording)
+    family = find_family(written.recording)
     manifest = {"experiment": "version: 1", "run": str(RUN)}
     path = tmp_path / "out.mcap"
     write_mcap(path, SOURCE, written.replay.scene, [written.run_tracks], written.table, manifest, family)

@@ -17,20 +17,20 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import CLASSES, NO_CAPTURE_NS, UNCERTAINTIES, VALUES, Scene
-from copem_replay.experiment.file import load, log_paths
+from copem_replay.experiment.file import log_paths, read_experiment_file
 from copem_replay.experiment.schema import Experiment
-from copem_replay.experiment.validate import problems, read_logs
-from copem_replay.io.recorded_lists import read_listed
-from copem_replay.io.recording import Recording, read
-from copem_replay.io.write.autoware_objects import LABELS
+from copem_replay.experiment.validate import find_problems, read_logs
+from copem_replay.io.recorded_lists import read_described_lists
+from copem_replay.io.recording import Recording, read_log
 from copem_replay.io.write.mcap import OSI_RECORD, RUN_RECORD, write_mcap
-from copem_replay.io.write.message_family import OSI, family_of
-from copem_replay.pipeline.blocks import replay_block
+from copem_replay.io.write.message_family import OSI, find_family
+from copem_replay.io.write.ros2 import LABELS
 from copem_replay.pipeline.one_run import tracks_of_run
-from copem_replay.pipeline.prepare import Replay, prepare
-from copem_replay.pipeline.run import run
+from copem_replay.pipeline.prepare import Replay, prepare_log
+from copem_replay.pipeline.replay import replay_block
+from copem_replay.pipeline.run import run_experiment
 from copem_replay.results.write import write_results
-from copem_replay.viewer.export import EXPORTERS
+from copem_replay.viewer.rrd import EXPORTERS
 from tests.helpers.recordings import SHARED, Obj, ns, write_recording
 
 TRACKED = """\
@@ -179,12 +179,12 @@ class Written:
     def __init__(self, folder: Path) -> None:
         self.folder, self.source = folder, drive(folder / "drive.mcap")
         (folder / "e.yaml").write_text(EXPERIMENT)
-        source = load(folder / "e.yaml")
-        experiment, found = problems(source)
+        source = read_experiment_file(folder / "e.yaml")
+        experiment, found = find_problems(source)
         assert experiment is not None, found
         self.experiment: Experiment = experiment
         (self.recording,) = read_logs(experiment, log_paths(source)[0], source)[0]
-        self.replay: Replay = prepare(self.recording, experiment)
+        self.replay: Replay = prepare_log(self.recording, experiment)
         self.run_tracks: dict[str, FusedTracks] = tracks_of_run(self.replay, experiment, 0)
         self.table: pd.DataFrame = replay_block(self.replay, experiment, np.array([0]))
         self.path = folder / "replay.mcap"
@@ -198,7 +198,7 @@ class Written:
             [self.run_tracks],
             self.table,
             {"run": "0"},
-            family_of(self.recording),
+            find_family(self.recording),
         )
 
 
@@ -344,7 +344,7 @@ def test_scene_updates_draw_each_list_anew(written: Written) -> None:
 def test_read_back_as_the_lists_of_a_unit(written: Written, configuration: str) -> None:
     fused_tracks, scene = written.run_tracks[configuration], written.replay.scene
     fused = fused_tracks.fused
-    back = read_listed(written.path, f"copem/{configuration}/objects", scene, None)
+    back = read_described_lists(written.path, f"copem/{configuration}/objects", scene, None)
     assert back is not None
     rows = [p for frame in range(len(fused.stamp_ns)) for p in fused_tracks.listed(frame)]
     assert len(back.tracks.frame_ix) == len(rows) > 0
@@ -369,7 +369,7 @@ def test_read_back_as_the_lists_of_a_unit(written: Written, configuration: str) 
 
 
 def test_read_back_as_a_log_it_is_the_input(written: Written) -> None:
-    a, b = written.recording, read(written.path, name="again", ego=written.experiment.ego)
+    a, b = written.recording, read_log(written.path, name="again", ego=written.experiment.ego)
     assert (a.topic, a.world, a.encoding) == (b.topic, b.world, b.encoding) == (TOPIC, "map", "cdr")
     assert a.scene.object_ids == b.scene.object_ids
     for name in ("stamp_ns", "start", "frame_ix", "object_ix", *VALUES):
@@ -388,9 +388,9 @@ def test_the_same_bytes_again_and_into_its_own_output(written: Written, tmp_path
 def test_names_of_any_length_do_not_shift_what_follows(written: Written, tmp_path: Path, frame_id: str) -> None:
     source = drive(tmp_path / "drive.mcap", frame_id)
     (tmp_path / "e.yaml").write_text(EXPERIMENT)
-    recording = read(source, name="drive", ego=written.experiment.ego)
+    recording = read_log(source, name="drive", ego=written.experiment.ego)
     target = tmp_path / "out.mcap"
-    write_mcap(target, source, written.replay.scene, [written.run_tracks], written.table, {}, family_of(recording))
+    write_mcap(target, source, written.replay.scene, [written.run_tracks], written.table, {}, find_family(recording))
     lists = [m for _, _, m in decoded(target) if hasattr(m, "header")]
     assert {m.header.frame_id for m in lists} == {frame_id.lstrip("/") or "map"}
     assert sum(len(m.objects) for m in lists) == sum(int(b.fused.valid.sum()) for b in written.run_tracks.values())
@@ -398,11 +398,13 @@ def test_names_of_any_length_do_not_shift_what_follows(written: Written, tmp_pat
 
 def folder_of(path: Path) -> tuple[Recording, Path]:
     """The results folder of the experiment at `path`."""
-    source = load(path)
-    experiment, found = problems(source)
+    source = read_experiment_file(path)
+    experiment, found = find_problems(source)
     assert experiment is not None, found
     recordings = read_logs(experiment, log_paths(source)[0], source)[0]
-    write_results(path.parent / "out", experiment, recordings, run(experiment, recordings), exporters=EXPORTERS)
+    write_results(
+        path.parent / "out", experiment, recordings, run_experiment(experiment, recordings), exporters=EXPORTERS
+    )
     return recordings[0], path.parent / "out" / "replay.mcap"
 
 
@@ -424,9 +426,9 @@ def test_the_results_folder_has_it(tmp_path: Path) -> None:
 def test_a_recording_of_osi_gets_messages_of_osi(tmp_path: Path) -> None:
     frames = [(k / 10, [Obj(id=1), Obj(id=2, x=30.0 - k)]) for k in range(11)]
     path = write_recording(tmp_path / "drive.mcap", frames, host=1)
-    recording = read(path, name="drive")
+    recording = read_log(path, name="drive")
     assert (recording.encoding, recording.world) == ("protobuf", "")
-    assert family_of(recording).func is OSI  # type: ignore[attr-defined]
+    assert find_family(recording).func is OSI  # type: ignore[attr-defined]
 
 
 def scene_updates(path: Path) -> Path:

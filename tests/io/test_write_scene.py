@@ -17,12 +17,12 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.reader import make_reader
 
 import copem_replay as cr
-from copem_replay.io.write import foxglove_scene, foxglove_scene_ros2
-from copem_replay.io.write.drawing import Ellipse, Entity, Line, Pose, Text
+from copem_replay.io.write import scene as foxglove_scene
+from copem_replay.io.write import scene as foxglove_scene_ros2
+from copem_replay.io.write.detail import KNOWN, LISTED, NOT_LISTED
 from copem_replay.io.write.message_family import STATUS, TRANSFORM
-from copem_replay.io.write.ros2_definitions import SCENE_UPDATE, definition
-from copem_replay.io.write.status import KNOWN, LISTED, NOT_LISTED
-from copem_replay.io.write.uncertainty import axes
+from copem_replay.io.write.ros2 import SCENE_UPDATE, message_definition
+from copem_replay.io.write.scene import Ellipse, Entity, Line, Pose, Text, principal_axes
 from tests.helpers.experiments import changed, drive
 
 mcap_ros2 = pytest.importorskip(
@@ -161,7 +161,7 @@ class TestUncertainty:
         ],
     )
     def test_axes(self, covariance: tuple[float, float, float], expected: tuple[float, float, float]) -> None:
-        found = axes(*(np.array([value]) for value in covariance))
+        found = principal_axes(*(np.array([value]) for value in covariance))
         assert [float(value[0]) for value in found] == pytest.approx(expected)
 
     def test_ellipses_of_two_sigma_where_a_covariance_is_claimed(self, results: Path) -> None:
@@ -178,9 +178,9 @@ class TestUncertainty:
 
 
 def test_both_families_draw_the_same() -> None:
-    ours = SceneUpdate.FromString(foxglove_scene.drawn(DRAWN, 1_500_000_000, "map"))
-    decode = mcap_ros2.generate_dynamic(SCENE_UPDATE, definition(SCENE_UPDATE).decode())[SCENE_UPDATE]
-    theirs = decode(foxglove_scene_ros2.drawn(DRAWN, 1_500_000_000, "map"))
+    ours = SceneUpdate.FromString(foxglove_scene.encode_scene(DRAWN, 1_500_000_000, "map"))
+    decode = mcap_ros2.generate_dynamic(SCENE_UPDATE, message_definition(SCENE_UPDATE).decode())[SCENE_UPDATE]
+    theirs = decode(foxglove_scene_ros2.encode_ros2_scene(DRAWN, 1_500_000_000, "map"))
     assert [e.id for e in theirs.entities] == ["odd", "nothing", "text alone"]
     for one, other in zip(ours.entities, theirs.entities, strict=True):
         assert (other.timestamp.sec, other.timestamp.nanosec, other.frame_id) == (1, 500_000_000, "map")
@@ -203,12 +203,12 @@ def test_both_families_draw_the_same() -> None:
 
 def test_both_families_place_a_frame_alike() -> None:
     pose = Pose(1.0, 2.0, 3.0, math.pi / 3)
-    ours = FrameTransform.FromString(foxglove_scene.transform("map", pose, 2_000_000_001, "copem_ego"))
-    decode = mcap_ros2.generate_dynamic(TRANSFORM, definition(TRANSFORM).decode())[TRANSFORM]
-    theirs = decode(foxglove_scene_ros2.transform("map", pose, 2_000_000_001, "copem_ego"))
+    ours = FrameTransform.FromString(foxglove_scene.encode_transform("map", pose, 2_000_000_001, "copem_ego"))
+    decode = mcap_ros2.generate_dynamic(TRANSFORM, message_definition(TRANSFORM).decode())[TRANSFORM]
+    theirs = decode(foxglove_scene_ros2.encode_ros2_transform("map", pose, 2_000_000_001, "copem_ego"))
     for found in (ours, theirs):
         assert (found.parent_frame_id, found.child_frame_id) == ("map", "copem_ego")
         assert (found.translation.x, found.translation.y, found.translation.z) == (1.0, 2.0, 3.0)
         assert (found.rotation.x, found.rotation.z, found.rotation.w) == pytest.approx((0, 0.5, math.sqrt(0.75)))
     assert (ours.timestamp.seconds, ours.timestamp.nanos) == (theirs.timestamp.sec, theirs.timestamp.nanosec) == (2, 1)
-    assert "string status" in definition(STATUS).decode()
+    assert "string status" in message_definition(STATUS).decode()

@@ -17,11 +17,18 @@ from copem_replay.core.object_list import Entries, ObjectLists
 from copem_replay.core.tracks import CLASSES
 from copem_replay.metrics.accuracy import metrics as accuracy_figures
 from copem_replay.metrics.accuracy.aggregator import Aggregator
+from copem_replay.metrics.accuracy.kernel import expect_gated_nees
 from copem_replay.metrics.accuracy.metrics import ACCURACY
-from copem_replay.metrics.accuracy.nees import expected
-from copem_replay.metrics.accuracy.statistics import Accuracy, Settings, Total, for_runs, joined, total
+from copem_replay.metrics.accuracy.statistics import (
+    Accuracy,
+    AccuracySettings,
+    AccuracyTotal,
+    join_totals,
+    repeat_for_runs,
+    sum_accuracy,
+)
 from copem_replay.metrics.gospa import gospa, ospa
-from copem_replay.metrics.matching import Matches, match, match_both
+from copem_replay.metrics.matching import Matches, match_at_both_times, match_entries
 from tests.helpers.at_once import assess
 from tests.helpers.reports import between, chunks, entry, lists_of
 from tests.helpers.reports import joined as one_list
@@ -60,12 +67,13 @@ def assessed(
     at_ego = [(0.0, 0.0)] * K if ego is None else list(ego)
     truth = {EGO: at_ego, **places}
     world, scene, lists = truth_of(truth, times.tolist(), velocity), scene_of(*of), lists_of(runs)
-    about = now = match(lists, world, scene, gate_m=GATE_M)
+    about = now = match_entries(lists, world, scene, gate_m=GATE_M)
     if captures is not None:
-        about, now = match_both(lists, truth_of(captures[1], captures[0]), world, scene, gate_m=GATE_M)
+        about, now = match_at_both_times(lists, truth_of(captures[1], captures[0]), world, scene, gate_m=GATE_M)
+    settings = AccuracySettings(**({"cutoff_m": 3.0, "gate_m": GATE_M} | given))
     return assess(
         lists, about, now, times, world, scene, episodes_of(episodes), np.full(len(episodes), since_s),
-        reference_of(at_ego), classes(*measured), settings=Settings(**({"cutoff_m": 3.0, "gate_m": GATE_M} | given)),
+        reference_of(at_ego), classes(*measured), settings=settings,
     )  # fmt: skip
 
 
@@ -73,7 +81,7 @@ FIGURES = {metric.name: metric for metric in ACCURACY}
 
 
 def figure(name: str, of: Accuracy) -> float | None:
-    return FIGURES[name].value(total([of]))
+    return FIGURES[name].value(sum_accuracy([of]))
 
 
 def standing(x_m: float, y_m: float, count: int) -> list[tuple[float, float]]:
@@ -237,7 +245,7 @@ def test_the_gate_cuts_the_mean_and_the_spread_of_true_covariances() -> None:
 @example(4.0, 0.5, 0.3)  # next to nothing is within
 def test_what_is_expected_within_the_gate_as_integrals_have_it(large: float, less: float, gate_m: float) -> None:
     one, two = 10.0**large, 10.0 ** max(large - less, -9.0)
-    found = expected(one, two, gate_m)
+    found = expect_gated_nees(one, two, gate_m)
     wanted = expected_of(entry(0, cov=(one, 0.0, two))[0], gate_m)
     np.testing.assert_allclose(found, wanted, rtol=5e-5, atol=2e-9)
 
@@ -511,12 +519,12 @@ def test_time_of_irregular_lists_and_of_one() -> None:
 def test_totals_of_logs_add() -> None:
     first = assessed([entry(11)] * 2, places={CAR: standing(10, 0, 2)}, episodes={CAR: (0, 1)})
     other = assessed([entry(12)], [NOTHING], places={CAR: [(10, 0)], OTHER_CAR: [(20, 0)]}, episodes={CAR: (0, 0), 2: (0, 0)})  # fmt: skip # noqa: E501
-    both = total([first]) + total([other])
+    both = sum_accuracy([first]) + sum_accuracy([other])
     assert accuracy_figures.position_rmse_m(both) == pytest.approx(math.sqrt((1 + 1 + 4) / 3))
     assert (both.rows, both.matched_rows) == (5, 2)
     assert accuracy_figures.gospa_m(both) == pytest.approx(math.sqrt((1 + 1 + 4 + 3 * 4.5) / 4))
     with pytest.raises(ValueError, match="same settings"):
-        total([first]) + total([assessed([entry(1)], places={}, episodes={}, cutoff_m=4.0)])
+        sum_accuracy([first]) + sum_accuracy([assessed([entry(1)], places={}, episodes={}, cutoff_m=4.0)])
 
 
 def test_one_run_that_stands_for_all_counts_as_often_as_there_are_runs() -> None:
@@ -526,9 +534,9 @@ def test_one_run_that_stands_for_all_counts_as_often_as_there_are_runs() -> None
         "time_edges_s": (0.0, 2.0), "existence_thresholds": (0.5,),
     }  # fmt: skip
     one, three = assessed(lists, **given), assessed(lists, lists, lists, **given)
-    assert_same(for_runs(one, 3), three)
-    assert_equal_totals(total([for_runs(one, 3)]), total([three]))
-    assert for_runs(three, 3) is three
+    assert_same(repeat_for_runs(one, 3), three)
+    assert_equal_totals(sum_accuracy([repeat_for_runs(one, 3)]), sum_accuracy([three]))
+    assert repeat_for_runs(three, 3) is three
 
 
 class Scenery:
@@ -557,7 +565,7 @@ class Scenery:
         self.measured = classes(*rng.choice(CLASSES, 8))
         self.lists = lists_of([[self._list(rng, k, way) for k in range(K)] for _ in range(S)])
         self.world = truth_of(self.places, self.times.tolist(), self.velocity)
-        self.settings = Settings(
+        self.settings = AccuracySettings(
             cutoff_m=2.5, gate_m=2.0, power=float(rng.choice([1.0, 2.0, 3.0])),
             distance_edges_m=(0.0, 3.0, 6.0, np.inf), time_edges_s=(0.2, 1.0, 1.5),
             existence_thresholds=(0.25, 0.5, 0.9),
@@ -573,9 +581,9 @@ class Scenery:
 
     def matched(self, lists: ObjectLists) -> tuple[Matches, Matches]:
         if self.tells_of_now:
-            found = match(lists, self.world, self.scene, gate_m=2.0)
+            found = match_entries(lists, self.world, self.scene, gate_m=2.0)
             return found, found
-        return match_both(lists, self.captured, self.world, self.scene, gate_m=2.0)
+        return match_at_both_times(lists, self.captured, self.world, self.scene, gate_m=2.0)
 
     def _list(self, rng: np.random.Generator, k: int, way: Any) -> Entries:
         found = [place for o in self.places if (place := self.places[o][k]) is not None and rng.uniform() < 0.8]
@@ -682,8 +690,8 @@ def assert_same(found: Accuracy, expected: Accuracy, *, exactly: bool = True) ->
                 np.testing.assert_allclose(a, b, rtol=digits, atol=1e-9, err_msg=f"{column} {name}")
 
 
-def assert_equal_totals(found: Total, expected: Total) -> None:
-    for column in (f.name for f in fields(Total) if f.name != "settings"):
+def assert_equal_totals(found: AccuracyTotal, expected: AccuracyTotal) -> None:
+    for column in (f.name for f in fields(AccuracyTotal) if f.name != "settings"):
         got, want = np.asarray(getattr(found, column)), np.asarray(getattr(expected, column))
         assert (got.dtype, got.shape, got.tobytes()) == (want.dtype, want.shape, want.tobytes()), column
 
@@ -711,7 +719,7 @@ def test_runs_by_themselves_are_those_of_all_and_the_order_of_entries_does_not_m
         lists, its = one_run(made.lists, s)
         parts.append(made.of(lists, (taken(made.found[0], its), taken(made.found[1], its))))
         assert_same(parts[s], whole.of_run(s))
-    assert_equal_totals(total(parts), total([whole]))
+    assert_equal_totals(sum_accuracy(parts), sum_accuracy([whole]))
     shuffled, _, _ = permuted(made.lists, None, made.rng)
     assert_same(made.of(shuffled, made.matched(shuffled)), whole, exactly=False)
 
@@ -764,7 +772,7 @@ def test_blocks_of_many_runs_are_summed_as_the_whole_to_the_last_bit(cut: int) -
     }  # fmt: skip
     whole = assessed(*runs, **given)
     blocks = [assessed(*runs[s : s + cut], **given) for s in range(0, len(runs), cut)]
-    assert_equal_totals(total(blocks), total([whole]))
+    assert_equal_totals(sum_accuracy(blocks), sum_accuracy([whole]))
 
 
 def tree(values: list[float]) -> float:
@@ -784,12 +792,12 @@ def test_runs_add_up_as_the_leaves_of_a_tree(runs: int, step: int) -> None:
     given: dict[str, Any] = {"places": {CAR: standing(10, 10, 2)}, "episodes": {CAR: (0, 1)}}
     of_runs = [assessed([entry(10 + x, 10 + y) for x, y in of_run], **given) for of_run in off_m]
     expected = tree([float(one.by_object["square_m2"][0, 0]) for one in of_runs])
-    whole = total(of_runs)
+    whole = sum_accuracy(of_runs)
     assert whole.episodes["square_m2"] == expected
     borders = [k for k in (0, *(1 << e for e in range(4))) if k <= step] + list(range(2 * step, runs, step))
     borders = [k for k in borders if k < runs] + [runs]
-    pieces = [(b - a, total(of_runs[a:b])) for a, b in pairwise(borders)]
-    assert_equal_totals(joined(pieces), whole)
+    pieces = [(b - a, sum_accuracy(of_runs[a:b])) for a, b in pairwise(borders)]
+    assert_equal_totals(join_totals(pieces), whole)
 
 
 @settings(max_examples=25)

@@ -10,7 +10,7 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from copem_replay.metrics.area import corners, in_area, in_areas, in_polygon
+from copem_replay.core.geometry import are_in_area, is_in_area, is_in_polygon, polygon_corners
 
 L_SHAPE = ((0.0, 0.0), (10.0, 0.0), (10.0, 4.0), (4.0, 4.0), (4.0, 10.0), (0.0, 10.0))
 
@@ -24,7 +24,7 @@ L_SHAPE = ((0.0, 0.0), (10.0, 0.0), (10.0, 4.0), (4.0, 4.0), (4.0, 10.0), (0.0, 
 )  # fmt: skip
 @pytest.mark.parametrize("turned", [1, -1])
 def test_an_l_by_hand(place: tuple[float, float], expected: bool, turned: int) -> None:
-    assert in_polygon(*place, corners(L_SHAPE[::turned])) is expected
+    assert is_in_polygon(*place, polygon_corners(L_SHAPE[::turned])) is expected
 
 
 @given(
@@ -40,13 +40,13 @@ def test_as_shapely_has_it(angles_deg: list[int], radii: list[float], place: tup
     edge_m = shapely.distance(polygon.exterior, shapely.Point(place))
     if not polygon.is_valid or abs(edge_m - 1e-6) < 1e-9:
         return
-    assert in_polygon(*place, corners(star)) is bool(polygon.covers(shapely.Point(place)) or edge_m <= 1e-6)
+    assert is_in_polygon(*place, polygon_corners(star)) is bool(polygon.covers(shapely.Point(place)) or edge_m <= 1e-6)
 
 
 def test_a_range_and_a_polygon() -> None:
-    square = corners(((0, 0), (4, 0), (4, 4), (0, 4)))
-    assert in_area(3.0, 0.0, 0.0, 0.0, square, 3.0)
-    assert not in_area(3.1, 0.0, 0.0, 0.0, square, 3.0)
-    assert in_area(100.0, 0.0, 0.0, 0.0, corners(None), np.inf)
+    square = polygon_corners(((0, 0), (4, 0), (4, 4), (0, 4)))
+    assert is_in_area(3.0, 0.0, 0.0, 0.0, square, 3.0)
+    assert not is_in_area(3.1, 0.0, 0.0, 0.0, square, 3.0)
+    assert is_in_area(100.0, 0.0, 0.0, 0.0, polygon_corners(None), np.inf)
     x_m = np.array([1.0, 5.0, 3.0])
-    assert in_areas(x_m, x_m, np.zeros(3), np.zeros(3), square, 2.0).tolist() == [True, False, False]
+    assert are_in_area(x_m, x_m, np.zeros(3), np.zeros(3), square, 2.0).tolist() == [True, False, False]

@@ -22,12 +22,11 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from mpmath import mpf
 
-from copem_replay.core.box_distance import box_distance, nearest, pose_on, turning
 from copem_replay.core.errors import InputError
+from copem_replay.core.geometry import box_distance, corner_travel, find_smallest_distances, pose_on_path
 from copem_replay.core.tracks import Float
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
-from copem_replay.metrics.braking.blocked import blocked
 from copem_replay.metrics.braking.driver import (
     ConstantDeceleration,
     ConstantReaction,
@@ -36,11 +35,17 @@ from copem_replay.metrics.braking.driver import (
     LognormalReaction,
     Reaction,
 )
-from copem_replay.metrics.braking.encounter import Encounter
-from copem_replay.metrics.braking.verdict import braked, fail_probability, judge, pass_probability, passing
-from copem_replay.pipeline.blocks import replay_block
-from copem_replay.pipeline.prepare import prepare
-from copem_replay.pipeline.run import run
+from copem_replay.metrics.braking.encounter import Encounter, find_blocked_stretches
+from copem_replay.metrics.braking.verdict import (
+    fail_probability,
+    find_passing_intervals,
+    judge_braking,
+    pass_probability,
+    simulate_braking,
+)
+from copem_replay.pipeline.prepare import prepare_log
+from copem_replay.pipeline.replay import replay_block
+from copem_replay.pipeline.run import run_experiment
 from tests.helpers.scenes import EGO_UNIT, SEES_ALL, Thing, driving, experiment, recording, standing
 from tests.oracles.braking import Motion, corners, outcome
 
@@ -64,7 +69,7 @@ def plan(*, driver: dict[str, Any] | None = None, margin_m: float = 0.5, ego: st
 
 def meeting(log: Recording, wanted: Experiment) -> Encounter | None:
     """The one encounter of a log, None where it is not in conflict."""
-    found = prepare(log, wanted).encounters
+    found = prepare_log(log, wanted).encounters
     assert len(found) <= 1
     return found[0] if found else None
 
@@ -77,7 +82,7 @@ def in_conflict(log: Recording, wanted: Experiment | None = None) -> Encounter:
 
 def rows(log: Recording, wanted: Experiment, runs: int = 1) -> pd.DataFrame:
     """The rows of `detections.parquet`."""
-    return replay_block(prepare(log, wanted), wanted, np.arange(runs))
+    return replay_block(prepare_log(log, wanted), wanted, np.arange(runs))
 
 
 def straight_ego(speed_mps: float = 10.0) -> Thing:
@@ -109,7 +114,7 @@ CAREFUL = ConstantDeceleration(a_max_mps2=0.774 * G, build_up_s=0.6)
 def drives_on(driver: Driver, speed_mps: float, until_s: float = 20.0) -> tuple[Float, Float, Float]:
     """Instants, way and speed of who begins to brake at 0 s, every 10 ms."""
     encounter = in_conflict(in_the_way(speed_mps * until_s / 2, speed_mps=speed_mps, until_s=until_s))
-    way, speed = braked(encounter, driver, np.array([0.0]))
+    way, speed = simulate_braking(encounter, driver, np.array([0.0]))
     return encounter.time_s, way[0], speed[0]
 
 
@@ -309,7 +314,9 @@ def test_distances_of_boxes_by_hand(b: Box, distance: float) -> None:
 def test_stopping_in_time_and_not() -> None:
     # 20 m ahead. Braking at 0.5 s it stops after 5 + 6.25 m. At 1.5 s 5 m are left: 10² − 2·8·5 = 20, so it hits with
     # √20 m/s, (10 − √20) / 8 s later. At 2 s the front is there; whoever brakes later has hit at 10 m/s at 2 s.
-    found = judge(in_conflict(in_the_way(20)), ConstantDeceleration(a_max_mps2=8.0), np.array([0.5, 1.5, 3.0, NEVER]))
+    found = judge_braking(
+        in_conflict(in_the_way(20)), ConstantDeceleration(a_max_mps2=8.0), np.array([0.5, 1.5, 3.0, NEVER])
+    )
     np.testing.assert_allclose(found.min_distance_m, [8.75, 0, 0, 0], atol=1e-3)
     late_s, late_mps = 1.5 + (10 - math.sqrt(20)) / 8, math.sqrt(20)
     np.testing.assert_allclose(found.impact_s, [np.nan, late_s, 2, 2], atol=2e-3)
@@ -322,11 +329,11 @@ def test_the_object_has_left_the_way() -> None:
     # after 25 m, and gets there after (5 − √7.25) / 0.5 = 4.61 s, long after he left the margin.
     encounter = in_conflict(crossing(speed_mps=5.0))
     driver = ConstantDeceleration(a_max_mps2=0.5)
-    found = judge(encounter, driver, np.array([0.0, NEVER]))
+    found = judge_braking(encounter, driver, np.array([0.0, NEVER]))
     assert found.min_distance_m[0] > 0.5
     assert found.min_distance_m[1] == pytest.approx(0.3 * 5 / math.sqrt(26), abs=1e-3)
     assert np.isnan(found.impact_s).all()
-    way, speed = braked(encounter, driver, np.array([0.0]))
+    way, speed = simulate_braking(encounter, driver, np.array([0.0]))
     there_s = (5 - math.sqrt(7.25)) / 0.5
     assert np.interp(there_s, encounter.time_s, way[0]) == pytest.approx(17.75, abs=1e-3)
     assert np.interp(there_s, encounter.time_s, speed[0]) == pytest.approx(math.sqrt(7.25), abs=1e-3), "it drives on"
@@ -337,7 +344,7 @@ def test_walking_into_the_standing_ego() -> None:
     walker = Thing("walker", "pedestrian", driving(10, 0, -1.5))
     log = recording([Thing("ego", "car", standing(0, 0)), walker], until_s=8.0)
     for ego in ("recorded", "constant_speed"):
-        found = judge(
+        found = judge_braking(
             in_conflict(log, plan(ego=ego)), ConstantDeceleration(a_max_mps2=8.0), np.array([0.0, 3.0, NEVER])
         )
         np.testing.assert_array_equal(found.min_distance_m, 0)
@@ -348,7 +355,7 @@ def test_walking_into_the_standing_ego() -> None:
 def test_no_deceleration_helps_who_stands_in_the_way() -> None:
     walker = Thing("walker", "pedestrian", driving(10, 0, -1.5))
     encounter = in_conflict(recording([Thing("ego", "car", standing(0, 0)), walker], until_s=8.0))
-    found = judge(encounter, ConstantDeceleration(a_max_mps2=8.0), np.array([0.0, 3.0, NEVER]))
+    found = judge_braking(encounter, ConstantDeceleration(a_max_mps2=8.0), np.array([0.0, 3.0, NEVER]))
     np.testing.assert_array_equal(found.min_distance_m, 0)
     np.testing.assert_array_equal(found.required_mps2, [np.inf, np.inf, np.nan])
 
@@ -356,7 +363,7 @@ def test_no_deceleration_helps_who_stands_in_the_way() -> None:
 def test_too_late_for_who_walks_into_its_side() -> None:
     # Braking with 50 m/s² at 1.7 s, 0.75 m before him, it would take 1 m: it hits with √(100 − 75) m/s. Of the margin
     # 0.25 m are left: 10² / 2 · 0.25. At 1.8 s its front is past his line, and he walks into its side: nothing helps.
-    found = judge(in_conflict(crossing()), ConstantDeceleration(a_max_mps2=50.0), np.array([1.7, 1.8]))
+    found = judge_braking(in_conflict(crossing()), ConstantDeceleration(a_max_mps2=50.0), np.array([1.7, 1.8]))
     np.testing.assert_array_equal(found.min_distance_m, 0)
     np.testing.assert_allclose(found.impact_s, [1.8, 1.775], atol=2e-3)
     np.testing.assert_allclose(found.impact_speed_mps, [5, 10], atol=0.05)
@@ -370,13 +377,13 @@ def test_too_late_for_who_walks_into_its_side() -> None:
 def test_required_deceleration_of_the_paper(margin_m: float, needed: tuple[float, ...]) -> None:
     """20 m ahead, known after 0, 0.5, 1 and 1.5 s: v² / 2 (20 − 10 l − margin)."""
     encounter = in_conflict(in_the_way(20), plan(margin_m=margin_m))
-    found = judge(encounter, ConstantDeceleration(a_max_mps2=8.0), np.array([0.0, 0.5, 1.0, 1.5]))
+    found = judge_braking(encounter, ConstantDeceleration(a_max_mps2=8.0), np.array([0.0, 0.5, 1.0, 1.5]))
     np.testing.assert_allclose(found.required_mps2, needed, rtol=1e-3)
 
 
 def test_required_deceleration_when_the_gap_is_spent() -> None:
     # 19.5 m up to the margin: at 1.95 s nothing is left.
-    found = judge(
+    found = judge_braking(
         in_conflict(in_the_way(20)), ConstantDeceleration(a_max_mps2=8.0), np.array([1.94, 1.951, 2.5, NEVER])
     )
     assert found.required_mps2[0] == pytest.approx(100 / 2 / 0.1, rel=1e-3)
@@ -387,7 +394,9 @@ def test_required_deceleration_to_let_him_pass() -> None:
     # The walker of `crossing` is within 0.5 m before the side of the ego until 3.25 s, and beside it until 3.75 s; then
     # its front may be there: 10 · 3.75 − a/2 · 3.75² = 17.25 (2.88 m/s²), a little less as the corner rounds; and by
     # 3.25 s it has to be short of that: 10 · 3.25 − a/2 · 3.25² = 17.25.
-    (found,) = judge(in_conflict(crossing()), ConstantDeceleration(a_max_mps2=8.0), np.array([0.0])).required_mps2
+    (found,) = judge_braking(
+        in_conflict(crossing()), ConstantDeceleration(a_max_mps2=8.0), np.array([0.0])
+    ).required_mps2
     assert 2 * (32.5 - 17.25) / 3.25**2 <= found <= 100 / 2 / 17.25
 
 
@@ -395,7 +404,7 @@ def test_required_deceleration_behind_a_slower_car() -> None:
     # 16 m of way to the margin behind a car at 6 m/s: 4 m/s too fast, so 4² / 2 · 16 = 0.5 m/s².
     ahead = Thing("ahead", "car", driving(4 + 16.5, 0, 6))
     log = recording([straight_ego(), ahead], until_s=20.0)
-    found = judge(in_conflict(log), ConstantDeceleration(a_max_mps2=8.0), np.array([0.0, 1.0, 2.0]))
+    found = judge_braking(in_conflict(log), ConstantDeceleration(a_max_mps2=8.0), np.array([0.0, 1.0, 2.0]))
     # Each second of delay takes 4 m.
     np.testing.assert_allclose(found.required_mps2, [16 / 32, 16 / 24, 16 / 16], rtol=2e-3)
 
@@ -554,11 +563,11 @@ def test_passes_just_when_it_can_brake_harder_than_required(case: Case, begins: 
     too_near_s = near[unbraked.distance(near) <= 0.5 + 0.1]
     assume(len(too_near_s) and too_near_s[0] > 0)
     brake_s = begins * too_near_s[0]
-    (needed,) = judge(encounter, ConstantDeceleration(a_max_mps2=8.0), np.array([brake_s])).required_mps2
+    (needed,) = judge_braking(encounter, ConstantDeceleration(a_max_mps2=8.0), np.array([brake_s])).required_mps2
     for a in (a_max, needed * 1.01, needed * 0.99):
         if 0.01 <= a <= 100 and abs(a - needed) > 0.005 * needed:
             driver = ConstantDeceleration(a_max_mps2=a)
-            (least,) = judge(encounter, driver, np.array([brake_s])).min_distance_m
+            (least,) = judge_braking(encounter, driver, np.array([brake_s])).min_distance_m
             # Found for instants 10 ms apart; between two of them corners come nearer by (v · 5 ms)² / 2 · 0.5 m.
             if abs(least - 0.5) > 0.01:
                 assert (least > 0.5) == (needed < a)
@@ -567,7 +576,7 @@ def test_passes_just_when_it_can_brake_harder_than_required(case: Case, begins: 
 def agree(case: Case, driver: ConstantDeceleration, margin_m: float, brake_s: Float) -> bool:
     """Hold the verdicts of one encounter against the oracle; False where it is not in conflict."""
     log, wanted = case.log(), case.plan(driver, margin_m)
-    ready = prepare(log, wanted)
+    ready = prepare_log(log, wanted)
     if not len(ready.episodes.object_ix):
         return False
     onset_s = float(ready.episodes.onset_s[0])
@@ -578,7 +587,7 @@ def agree(case: Case, driver: ConstantDeceleration, margin_m: float, brake_s: Fl
     if not ready.encounters:
         return False
     brake_s = np.maximum(brake_s, onset_s)
-    found = judge(ready.encounters[0], driver, brake_s)
+    found = judge_braking(ready.encounters[0], driver, brake_s)
     for k, begin_s in enumerate(brake_s):
         expected = outcome(
             *pair, onset_s=onset_s, brake_s=float(begin_s), a_max_mps2=driver.a_max_mps2,
@@ -661,11 +670,11 @@ def test_verdicts_do_not_depend_on_where_the_world_is(case: Case, angle: float, 
     )
     here, there = meeting(log, wanted), meeting(replace(log, truth=moved), wanted)
     if here is None or there is None:
-        found = [judge(e, driver, np.array([NEVER])).min_distance_m[0] for e in (here, there) if e is not None]
+        found = [judge_braking(e, driver, np.array([NEVER])).min_distance_m[0] for e in (here, there) if e is not None]
         assert found == [] or found[0] == pytest.approx(0.5, abs=1e-5)
         return
     brake_s = np.array([0.0, 0.5, 1.0, 2.0, NEVER])
-    a, b = judge(here, driver, brake_s), judge(there, driver, brake_s)
+    a, b = judge_braking(here, driver, brake_s), judge_braking(there, driver, brake_s)
     np.testing.assert_allclose(a.min_distance_m, b.min_distance_m, atol=1e-5)
     touched = (a.min_distance_m == 0) & (b.min_distance_m == 0)
     if touched.any():  # where they touch softly, a rounded place may be another instant: not all of them do
@@ -692,11 +701,15 @@ def test_instants_to_begin_at() -> None:
     # Braking at b the front stops at 8.25 + 10 b: short of the first place when that is below 21.5 (b < 1.325), and
     # clear of the second when the front is below 11.25 (b < 0.3), or the rear, 4 m behind, above 12.75 (b > 0.85).
     encounter, driver = in_conflict(back_and_forth()), ConstantDeceleration(a_max_mps2=8.0)
-    np.testing.assert_allclose(passing(encounter, driver, 0.5), [[-np.inf, 0.3], [0.85, 1.325]], atol=1e-4)
+    np.testing.assert_allclose(
+        find_passing_intervals(encounter, driver, 0.5), [[-np.inf, 0.3], [0.85, 1.325]], atol=1e-4
+    )
     # With 4 m/s² it stops at 14.5 + 10 b: short of the first place for b < 0.7, behind the second for b > 0.225.
-    np.testing.assert_allclose(passing(encounter, ConstantDeceleration(a_max_mps2=4.0), 0.5), [[0.225, 0.7]], atol=1e-4)
+    np.testing.assert_allclose(
+        find_passing_intervals(encounter, ConstantDeceleration(a_max_mps2=4.0), 0.5), [[0.225, 0.7]], atol=1e-4
+    )
     # With 2 m/s² it needs 25 m.
-    assert passing(encounter, ConstantDeceleration(a_max_mps2=2.0), 0.5).shape == (0, 2)
+    assert find_passing_intervals(encounter, ConstantDeceleration(a_max_mps2=2.0), 0.5).shape == (0, 2)
 
 
 @settings(SOME, max_examples=25)
@@ -706,11 +719,11 @@ def test_passing_is_what_is_judged(case: Case, a_max: float, build_up_s: float, 
     encounter = meeting(case.log(), case.plan(driver, 0.5))
     assume(encounter is not None)
     assert encounter is not None
-    between_s = passing(encounter, driver, 0.5)
+    between_s = find_passing_intervals(encounter, driver, 0.5)
     assert (np.diff(between_s.ravel()) >= 0).all()
     last_s = encounter.time_s[-1]
     brake_s = np.append(np.random.default_rng(seed).uniform(encounter.time_s[0], last_s, 300), [last_s, NEVER])
-    near = judge(encounter, driver, brake_s).min_distance_m
+    near = judge_braking(encounter, driver, brake_s).min_distance_m
     within = ((between_s[:, 0] <= brake_s[:, None]) & (brake_s[:, None] <= between_s[:, 1])).any(axis=1)
     wrong = brake_s[within != (near > 0.5)]
     # Two borders within 5 ms of each other are not looked for, and the border itself may fall to either side.
@@ -723,12 +736,12 @@ def test_passing_is_what_is_judged(case: Case, a_max: float, build_up_s: float, 
 def test_instants_to_begin_at_without_a_margin() -> None:
     # 20.012 m of way, of which stopping takes 6.25 m; to touch is no pass.
     encounter, driver = in_conflict(in_the_way(20.012), plan(margin_m=0.0)), ConstantDeceleration(a_max_mps2=8.0)
-    np.testing.assert_allclose(passing(encounter, driver, 0.0), [[-np.inf, 1.3762]], atol=1e-4)
+    np.testing.assert_allclose(find_passing_intervals(encounter, driver, 0.0), [[-np.inf, 1.3762]], atol=1e-4)
 
 
 def test_probability_to_pass_with_one_interval() -> None:
     # `in_the_way`: with 8 m/s² it passes when it begins before 1.325 s (2 + 10 b + 6.25 = 21.5).
-    between_s = passing(in_conflict(in_the_way(20)), ConstantDeceleration(a_max_mps2=8.0), 0.5)
+    between_s = find_passing_intervals(in_conflict(in_the_way(20)), ConstantDeceleration(a_max_mps2=8.0), 0.5)
     np.testing.assert_allclose(between_s, [[-np.inf, 1.325]], atol=1e-4)
     known_s = np.array([0.0, 0.3, 1.0, 1.3249, 1.33, 5.0, NEVER])
     left_s = between_s[0, 1] - known_s
@@ -830,8 +843,8 @@ def test_probability_to_pass_with_two_intervals() -> None:
     gamma = GammaReaction(shape=2.0, mean_s=0.6)
     known_s, draws = np.array([0.0, 0.1, 0.6, 1.0]), 4000
     delays = np.random.default_rng(11).gamma(2.0, 0.3, draws)
-    near = judge(encounter, driver, (known_s[:, None] + delays).ravel()).min_distance_m.reshape(4, draws)
-    found = pass_probability(passing(encounter, driver, 0.5), known_s, gamma)
+    near = judge_braking(encounter, driver, (known_s[:, None] + delays).ravel()).min_distance_m.reshape(4, draws)
+    found = pass_probability(find_passing_intervals(encounter, driver, 0.5), known_s, gamma)
     np.testing.assert_allclose(found, (near > 0.5).mean(axis=1), atol=4 * math.sqrt(0.25 / draws))
     law = scipy.stats.gamma(2.0, scale=0.3)
     assert found[0] == pytest.approx(law.cdf(0.3) + law.cdf(1.325) - law.cdf(0.85), abs=1e-3)
@@ -854,7 +867,7 @@ def test_who_brakes_earlier_is_never_farther(
     assume(encounter is not None)
     assert encounter is not None
     brake_s = np.maximum(np.array([*sorted(begins_s), NEVER]), encounter.time_s[0])
-    (early, late, free), _ = braked(encounter, driver, brake_s)
+    (early, late, free), _ = simulate_braking(encounter, driver, brake_s)
     rounding = a_max * 0.01**2
     assert (early <= late + rounding).all()
     assert (late <= free + 1e-9).all()
@@ -960,7 +973,7 @@ def test_an_ego_that_was_recorded_braking() -> None:
     assert blind.impact_speed_mps == pytest.approx(10.0)
     # From an onset while it brakes: at 2 s, after 17.5 m, it has 5 m/s and 7.5 m to go, and hits 1.5 s later.
     later = plan(ego="constant_speed", onset={"kind": "at", "time_s": 2.0})
-    found = judge(in_conflict(log, later), ConstantDeceleration(a_max_mps2=8.0), np.array([NEVER]))
+    found = judge_braking(in_conflict(log, later), ConstantDeceleration(a_max_mps2=8.0), np.array([NEVER]))
     assert found.impact_s[0] == pytest.approx(3.5, abs=5e-3)
     assert found.impact_speed_mps[0] == pytest.approx(5.0, abs=0.01)
 
@@ -970,7 +983,7 @@ def test_the_declared_driver_never_gets_farther_than_was_driven() -> None:
     walker = Thing("walker", "pedestrian", standing(2 + 20.2 + 0.25, 0))
     log = recording([Thing("ego", "car", Drive(10, slows_s=1.0, deceleration=5.0).at), walker], until_s=6.0)
     encounter = in_conflict(log)
-    (weak,), _ = braked(encounter, ConstantDeceleration(a_max_mps2=2.0), np.array([0.5]))
+    (weak,), _ = simulate_braking(encounter, ConstantDeceleration(a_max_mps2=2.0), np.array([0.5]))
     # At 1 s it is 0.25 m behind with 9 m/s, and 1/6 m more when after 1/3 s both have 8⅓ m/s; from there as recorded.
     np.testing.assert_allclose(weak[-1], 20 - 1 / 4 - 1 / 6, atol=0.01)
     assert (weak <= encounter.course.along_m + 1e-9).all()
@@ -981,7 +994,7 @@ def test_nor_where_its_speedometer_exaggerates() -> None:
     log = in_the_way(20)
     exaggerating = replace(log, truth=replace(log.truth, vx_mps=log.truth.vx_mps * 1.1))
     encounter = in_conflict(exaggerating)
-    (way,), _ = braked(encounter, ConstantDeceleration(a_max_mps2=0.01), np.array([1.0]))
+    (way,), _ = simulate_braking(encounter, ConstantDeceleration(a_max_mps2=0.01), np.array([1.0]))
     assert (way <= encounter.course.along_m + 1e-9).all()
 
 
@@ -997,7 +1010,7 @@ def test_one_reaction_for_all_configurations_and_in_any_batch() -> None:
             "late": {"units": "all", "latency_s": 0.35},
         },
     )
-    ready = prepare(in_the_way(30), wanted)
+    ready = prepare_log(in_the_way(30), wanted)
     batch = replay_block(ready, wanted, np.arange(40))
     delay_s = (batch["brake_s"] - batch["detection_s"]).to_numpy().reshape(3, 40)
     np.testing.assert_allclose(delay_s[1:], delay_s[[0, 0]], atol=1e-9)
@@ -1022,7 +1035,7 @@ def test_every_row_is_judged_by_its_own_instant() -> None:
     found = rows(log, wanted, 30)
     assert 0 < found["braking_pass"].sum() < 30
     for row in found.itertuples():
-        one = judge(in_conflict(log, wanted), wanted.braking.driver, np.array([row.brake_s]))  # type: ignore[union-attr]
+        one = judge_braking(in_conflict(log, wanted), wanted.braking.driver, np.array([row.brake_s]))  # type: ignore[union-attr]
         assert row.min_distance_m == one.min_distance_m[0]
         assert row.braking_pass == (one.min_distance_m[0] > 0.5)
         np.testing.assert_array_equal(row.impact_s, one.impact_s[0])
@@ -1164,7 +1177,7 @@ def test_a_driver_and_a_reaction_of_ones_own() -> None:
     # It comes to rest 10 / 2 m after it began, but for 10 / 2 · e^(−2 · 5.4) m and the millimetre of steps of 10 ms.
     early = found[found["brake_s"] < 0.4].iloc[0]
     assert early["min_distance_m"] == pytest.approx(20 - 2 - 5, abs=2e-3)
-    between_s = passing(in_conflict(in_the_way(20), plan(driver=own)), Coasts(kind="x", per_s=2.0), 0.5)
+    between_s = find_passing_intervals(in_conflict(in_the_way(20), plan(driver=own)), Coasts(kind="x", per_s=2.0), 0.5)
     assert pass_probability(between_s, np.array([1.0]), Attentive(kind="x")) == pytest.approx(0.5)
 
 
@@ -1251,7 +1264,7 @@ def test_an_object_that_is_back_for_its_last_frame_only() -> None:
     # 28 m ahead, gone from 1 s on and back at 3 s for one frame. Braking at 0.5 s, the ego stands 16.5 m before him.
     there: Callable[[float], bool] = lambda t: t < 1.01 or t > 2.99  # noqa: E731
     log = recording([straight_ego(), Thing("walker", "pedestrian", standing(30, 0), there=there)], until_s=3.0)
-    found = judge(in_conflict(log), ConstantDeceleration(a_max_mps2=8.0), np.array([0.5]))
+    found = judge_braking(in_conflict(log), ConstantDeceleration(a_max_mps2=8.0), np.array([0.5]))
     assert found.min_distance_m[0] == pytest.approx(30 - 0.25 - 2 - 11.25, abs=1e-3)
     assert np.isnan(found.impact_s[0])
 
@@ -1285,14 +1298,14 @@ def test_an_object_of_one_frame_that_is_touched() -> None:
 def test_who_is_hit_is_hit_with_some_speed(there: Callable[[float], bool], touch_s: float, x_m: float) -> None:
     ego = Thing("ego", "car", driving(0, 0, 10), there=there)
     log = recording([ego, Thing("walker", "pedestrian", standing(x_m, 0))], until_s=3.0)
-    found = judge(in_conflict(log), ConstantDeceleration(a_max_mps2=8.0), np.array([NEVER]))
+    found = judge_braking(in_conflict(log), ConstantDeceleration(a_max_mps2=8.0), np.array([NEVER]))
     assert found.impact_s[0] == pytest.approx(touch_s)
     assert found.impact_speed_mps[0] == pytest.approx(10.0)
 
 
 def test_no_deceleration_helps_who_was_hit_before() -> None:
     # `crossing` is hit at 1.775 s, and out of the way at 4 s.
-    found = judge(in_conflict(crossing()), ConstantDeceleration(a_max_mps2=8.0), np.array([4.0]))
+    found = judge_braking(in_conflict(crossing()), ConstantDeceleration(a_max_mps2=8.0), np.array([4.0]))
     assert found.min_distance_m[0] == 0
     assert found.required_mps2[0] == np.inf
 
@@ -1309,10 +1322,10 @@ def test_required_deceleration_for_who_overtakes() -> None:
 
     log = recording([straight_ego(), Thing("bicycle", "bicycle", rides, size_m=(1.8, 0.6, 1.8))], until_s=7.0)
     encounter = in_conflict(log)
-    (needed,) = judge(encounter, ConstantDeceleration(a_max_mps2=8.0), np.array([0.5])).required_mps2
+    (needed,) = judge_braking(encounter, ConstantDeceleration(a_max_mps2=8.0), np.array([0.5])).required_mps2
     assert 0.01 < needed < 8
     for a_max, passes in ((needed * 1.01, True), (needed * 0.99, False)):
-        found = judge(encounter, ConstantDeceleration(a_max_mps2=a_max), np.array([0.5]))
+        found = judge_braking(encounter, ConstantDeceleration(a_max_mps2=a_max), np.array([0.5]))
         assert (found.min_distance_m[0] > 0.5) == passes
 
 
@@ -1327,7 +1340,7 @@ def test_required_deceleration_when_the_ego_comes_back() -> None:
 
     walker = Thing("walker", "pedestrian", lambda t: (6.0, max(6 - 1.2 * t, 0.0)))
     encounter = in_conflict(recording([Thing("ego", "car", turns), walker], until_s=12.0))
-    found = judge(encounter, ConstantDeceleration(a_max_mps2=8.0), np.array([7.0, NEVER]))
+    found = judge_braking(encounter, ConstantDeceleration(a_max_mps2=8.0), np.array([7.0, NEVER]))
     assert found.min_distance_m[0] > 0.5
     assert found.impact_s[1] == pytest.approx(6 + 6.75 / 2)
     assert found.required_mps2[0] == pytest.approx(4 / 2 / 4.25, rel=1e-2)
@@ -1340,7 +1353,7 @@ def test_required_deceleration_for_who_comes_back() -> None:
     """
     encounter, begin_s = in_conflict(back_and_forth()), np.array([0.0])
     for a_max, passes in ((2.55, False), (2.6, True), (2.9, True), (4.0, False), (6.0, True)):
-        found = judge(encounter, ConstantDeceleration(a_max_mps2=a_max), begin_s)
+        found = judge_braking(encounter, ConstantDeceleration(a_max_mps2=a_max), begin_s)
         assert (found.min_distance_m[0] > 0.5) == passes, a_max
         assert found.required_mps2[0] == pytest.approx(100 / 2 / 19.5, rel=1e-2)
 
@@ -1350,7 +1363,7 @@ def test_stretches_that_a_post_beside_the_way_blocks() -> None:
     path, size, post = np.array([[0.0, 0, 0, 0], [60.0, 60, 0, 0]]), np.array([4.0, 2.0]), np.array([1.0, 1.0])
     for y, blocks in ((1.9, True), (-2.0, True), (2.8, False)):
         other, stretch_m = np.array([[20.0], [y], [np.pi / 6]]), np.empty((2, 2, 1))
-        blocked(path, size, other, post, 0.5, 0.0, np.array([60.0]), stretch_m)
+        find_blocked_stretches(path, size, other, post, 0.5, 0.0, np.array([60.0]), stretch_m)
         tried_m = np.arange(14.0, 26.0, 1e-3)
         left_m = [in_shapely((s, 0.0, 0.0, 4.0, 2.0), (20.0, y, np.pi / 6, 1.0, 1.0)) - 0.5 for s in tried_m]
         within_m = tried_m[np.array(left_m) <= 0]
@@ -1362,8 +1375,8 @@ def test_stretches_that_a_post_beside_the_way_blocks() -> None:
 
 def test_probability_to_pass_without_delay_at_the_onset() -> None:
     encounter, driver = in_conflict(in_the_way(20)), ConstantDeceleration(a_max_mps2=8.0)
-    between_s = passing(encounter, driver, 0.5)
-    assert judge(encounter, driver, np.array([0.0])).min_distance_m[0] > 0.5
+    between_s = find_passing_intervals(encounter, driver, 0.5)
+    assert judge_braking(encounter, driver, np.array([0.0])).min_distance_m[0] > 0.5
     assert pass_probability(between_s, np.array([0.0]), ConstantReaction()).tolist() == [1.0]
 
 
@@ -1385,7 +1398,7 @@ def test_the_ego_does_not_jump_when_it_leaves() -> None:
     ego = Thing("ego", "car", Drive(10, slows_s=1.0, deceleration=8.0).at, there=lambda t: t < 2.31)
     log = recording([ego, Thing("walker", "pedestrian", standing(16.25 + 2.25 + 0.4, 0))], until_s=5.0)
     encounter = in_conflict(log)
-    (way,), _ = braked(encounter, ConstantDeceleration(a_max_mps2=2.0), np.array([0.5]))
+    (way,), _ = simulate_braking(encounter, ConstantDeceleration(a_max_mps2=2.0), np.array([0.5]))
     assert np.diff(way).max() <= 10.0 * 0.01 + 1e-6
     # Behind by 0.25 m at 1 s, and by 1/12 m more when both have 8⅔ m/s.
     assert way[-1] == pytest.approx(16.25 - 1 / 4 - 1 / 12, abs=0.02)
@@ -1401,7 +1414,7 @@ def test_who_brakes_earlier_is_never_farther_where_the_ego_slowed_down() -> None
 
     log = recording([Thing("ego", "car", drives), Thing("walker", "pedestrian", standing(45, 0))], until_s=9.0)
     encounter = in_conflict(log)
-    (early, late), _ = braked(encounter, ConstantDeceleration(a_max_mps2=2.0), np.array([1.0, 2.0]))
+    (early, late), _ = simulate_braking(encounter, ConstantDeceleration(a_max_mps2=2.0), np.array([1.0, 2.0]))
     assert late[-1] == pytest.approx(17.0, abs=0.05), "from 16 m at 2 m/s"
     assert early[-1] <= late[-1] + 1e-6
 
@@ -1423,7 +1436,7 @@ def test_noise_of_a_place_is_no_reversing(back_m: float, meets: bool) -> None:
 def test_two_in_conflict_have_no_interval_and_it_is_said() -> None:
     """Two stand in the way, one behind the other: too few to resample, and their runs are no other traffic."""
     things = [straight_ego(), *(Thing(name, "pedestrian", standing(x, 0)) for name, x in (("a", 20), ("b", 25)))]
-    result = run(plan(runs=3), [recording(things, until_s=4.0)])
+    result = run_experiment(plan(runs=3), [recording(things, until_s=4.0)])
     assert result.summary["pass_interval"].isna().all()
     assert any("no interval of the pass share: fewer than 5 logs and fewer than 5 objects" in n for n in result.notes)
 
@@ -1440,16 +1453,16 @@ def test_an_impact_is_no_pass_though_the_margin_is_0() -> None:
 
 def test_beyond_its_ends_a_path_goes_straight_on() -> None:
     path = np.array([[0.0, 0, 0, 0.2], [10.0, 10, 0, 0.7]])  # arc length, x, y, yaw
-    assert pose_on(path, 5.0) == pytest.approx((5, 0, 0.45))
-    assert pose_on(path, 20.0) == pytest.approx((20, 0, 0.7)), "turned no further"
-    assert pose_on(path, -10.0) == pytest.approx((-10, 0, 0.2))
+    assert pose_on_path(path, 5.0) == pytest.approx((5, 0, 0.45))
+    assert pose_on_path(path, 20.0) == pytest.approx((20, 0, 0.7)), "turned no further"
+    assert pose_on_path(path, -10.0) == pytest.approx((-10, 0, 0.2))
 
 
 def test_how_far_a_corner_moves_while_the_ego_turns() -> None:
     # 4 m × 3 m: a corner is 2.5 m from the middle, half a radian on the second metre moves it by 1.25 m more.
     path = np.array([[0.0, 0, 0, 0], [1.0, 1, 0, 0], [2.0, 2, 0, -0.5]])
-    assert turning(path, np.array([4.0, 3.0])) == pytest.approx(2.25)
-    assert turning(path[:2], np.array([4.0, 3.0])) == 1.0
+    assert corner_travel(path, np.array([4.0, 3.0])) == pytest.approx(2.25)
+    assert corner_travel(path[:2], np.array([4.0, 3.0])) == 1.0
 
 
 def test_who_passes_between_two_instants_and_turns_away_is_as_near_as_it_passed() -> None:
@@ -1457,7 +1470,7 @@ def test_who_passes_between_two_instants_and_turns_away_is_as_near_as_it_passed(
     path, box = np.array([[0.0, 0, 0, 0], [1e-6, 1e-6, 0, 0]]), np.array([2.0, 2.0])
     near, touch = np.empty(1), np.empty(1)
     other = np.array([[-5.0, 15.0, -15.0], [3.0, 3.0, 20.0], [0.0, 0.0, 0.0]])  # x, y, yaw
-    nearest(np.zeros((1, 3)), path, box, other, box, near, touch)
+    find_smallest_distances(np.zeros((1, 3)), path, box, other, box, near, touch)
     assert (near[0], touch[0]) == (pytest.approx(1.0), np.inf)
 
 
@@ -1469,10 +1482,12 @@ def test_a_bar_that_turns_on_the_spot_hits_what_it_sweeps_over(who: str) -> None
     near, touch = np.empty(1), np.empty(1)
     if who == "ego":
         path = np.array([[0.0, 0, 0, 0], [1e-6, 1e-6, 0, math.pi]])
-        nearest((instants * 1e-6)[None], path, bar, np.stack([still, still + 4.0, still]), box, near, touch)
+        find_smallest_distances(
+            (instants * 1e-6)[None], path, bar, np.stack([still, still + 4.0, still]), box, near, touch
+        )
     else:
         path = np.array([[0.0, 0, 4, 0], [1e-6, 1e-6, 4, 0]])
-        nearest(still[None], path, box, np.stack([still, still, instants * math.pi]), bar, near, touch)
+        find_smallest_distances(still[None], path, box, np.stack([still, still, instants * math.pi]), bar, near, touch)
     assert near[0] == 0
     # A long side, half a metre from the middle, meets the box's lower corner at (±1, 3), √10 m away, where the corner's
     # bearing from the bar is asin(0.5 / √10): at atan2(3, 1) less that.

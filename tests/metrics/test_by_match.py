@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from copem_replay.core.object_list import ObjectLists
 from copem_replay.metrics.config import Confirm
-from copem_replay.metrics.detection.by_match import Captures, FirstMatches, Steps, captures_of
+from copem_replay.metrics.detection.by_match import CaptureInstants, DetectionSteps, FirstMatches, collect_captures
 from copem_replay.metrics.matching import DUPLICATE, GHOST, MATCH, Matches
 from tests.helpers.at_once import first_matches
 from tests.helpers.reports import between, chunks, entry, joined, lists_of
@@ -47,10 +47,10 @@ def listed(runs: Sequence[Sequence[Sequence[Item]]]) -> tuple[ObjectLists, Match
     return lists, matches_of([e.object_ix for e in flat], [e.role for e in flat])
 
 
-def of_one_unit(captured_s: Sequence[float]) -> Captures:
+def of_one_unit(captured_s: Sequence[float]) -> CaptureInstants:
     """Each capture an instant of its own."""
     times = np.array(captured_s, dtype=float)
-    return Captures(times, np.zeros(len(times), dtype=int), np.arange(len(times)))
+    return CaptureInstants(times, np.zeros(len(times), dtype=int), np.arange(len(times)))
 
 
 def found(
@@ -141,7 +141,7 @@ def test_a_match_from_before_the_onset_is_no_hit() -> None:
     assert found(lists, times, hits=2, of=2, count_earlier=True)[0] == (1.1, 1.1, 0)
 
 
-def of_two_units(lists: Sequence[Sequence[Item]], issue_s: Sequence[float], captures: Captures) -> float | None:
+def of_two_units(lists: Sequence[Sequence[Item]], issue_s: Sequence[float], captures: CaptureInstants) -> float | None:
     """When object 7 is confirmed by two of three."""
     found_lists, matches = listed([lists])
     detections, _ = first_matches(
@@ -155,20 +155,22 @@ def of_two_units(lists: Sequence[Sequence[Item]], issue_s: Sequence[float], capt
 def test_a_blind_unit_confirms_nothing_and_takes_nothing_away() -> None:
     """A mast lists every 0.8 s, a blind ego every 0.1 s: the mast's own two of three, and not before."""
     ego_s, mast_s = np.arange(20) / 10, np.array([0.0, 0.8, 1.6])
-    captures = Captures(np.append(ego_s, mast_s), np.repeat([0, 1], [20, 3]), np.append(np.arange(20), [0, 8, 16]))
+    captures = CaptureInstants(
+        np.append(ego_s, mast_s), np.repeat([0, 1], [20, 3]), np.append(np.arange(20), [0, 8, 16])
+    )
     lists = [[Item(7, mast_s[np.searchsorted(mast_s, t + 1e-9) - 1], unit_ix=1)] for t in ego_s]
     assert of_two_units(lists, ego_s.tolist(), captures) == 0.8
 
 
 def test_captures_of_two_units_within_half_a_period_are_one_hit() -> None:
-    captures = Captures(np.array([1.0, 2.0, 1.3, 2.3]), np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1]))
+    captures = CaptureInstants(np.array([1.0, 2.0, 1.3, 2.3]), np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1]))
     lists = [[Item(7, 1.0)], [Item(7, 1.3, unit_ix=1)], [Item(7, 2.3, unit_ix=1)]]
     assert of_two_units(lists[:2], [1.0, 1.3], captures) is None
     assert of_two_units(lists, [1.0, 1.3, 2.3], captures) == 2.3
 
 
 def test_one_capture_is_one_hit_though_it_is_its_units_first_and_another_unit_was_earlier() -> None:
-    captures = Captures(np.array([2.0, 3.0, 1.0]), np.array([0, 0, 1]), np.array([1, 2, 0]))
+    captures = CaptureInstants(np.array([2.0, 3.0, 1.0]), np.array([0, 0, 1]), np.array([1, 2, 0]))
     lists = [[], [Item(7, 2.0)], [Item(7, 3.0)]]
     assert of_two_units(lists[:2], [1.0, 2.0], captures) is None
     assert of_two_units(lists, [1.0, 2.0, 3.0], captures) == 3.0
@@ -186,7 +188,7 @@ def test_captures_are_those_that_were_heard() -> None:
     a = Unit(100, ((300, holds()), (1300, holds())))
     heard = tracks(World({"b": b, "a": a, "lost": Unit(0, ((900, holds()),))}, {}))
     arrives_s = np.where(heard.captured_s == 0.9, np.inf, heard.arrives_s)
-    captures = captures_of(replace(heard, arrives_s=arrives_s))
+    captures = collect_captures(replace(heard, arrives_s=arrives_s))
     assert captures.captured_s.tolist() == [0.0, 1.0, 2.0, 0.3, 1.3]
     assert captures.unit_ix.tolist() == [0, 0, 0, 1, 1]
     assert captures.instant.tolist() == [0, 1, 2, 0, 1]
@@ -225,8 +227,8 @@ def test_no_looks_and_no_lists() -> None:
 
 
 def plainly(
-    run: Sequence[Sequence[Item]], object_ix: int, episode: tuple[float, float], captures: Captures, confirm: Confirm,
-    count_earlier: bool, at_least: float,
+    run: Sequence[Sequence[Item]], object_ix: int, episode: tuple[float, float], captures: CaptureInstants,
+    confirm: Confirm, count_earlier: bool, at_least: float,
 ) -> float | None:  # fmt: skip
     """One look of one run, list k available at k seconds, of entries of at least some existence."""
     instants: set[int] = set()
@@ -260,7 +262,7 @@ def plainly(
     return None
 
 
-def asked_for(steps: Steps, run: int, episode: int, at_least: float) -> float | None:
+def asked_for(steps: DetectionSteps, run: int, episode: int, at_least: float) -> float | None:
     mine = (steps.run_ix == run) & (steps.episode_ix == episode)
     enough = steps.detection_s[mine][steps.existence[mine] >= at_least]
     return float(enough[0]) if len(enough) else None
@@ -308,7 +310,7 @@ def test_as_the_sentences_have_it(
     # Whole seconds: what two units captured in the same one is one instant.
     together = sorted(first | second)
     captured = [*sorted(first), *sorted(second)]
-    captures = Captures(
+    captures = CaptureInstants(
         np.array(captured, dtype=float),
         np.repeat([0, 1], [len(first), len(second)]),
         np.array([together.index(t) for t in captured], dtype=int),

@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from copem_replay.core.tracks import VALUES, Tracks
-from copem_replay.fusion.ideal import fuse
+from copem_replay.fusion.ideal import fuse_ideal
 from copem_replay.metrics.config import Confirm
-from copem_replay.metrics.detection.by_truth_id import capture_instants, detect
+from copem_replay.metrics.detection.by_truth_id import capture_instants, detect_by_truth_id
 from copem_replay.metrics.episodes import Episodes
 
 NEVER = None
@@ -95,7 +95,7 @@ def episodes(world: World) -> Episodes:
 
 def detected(world: World, heard: Tracks | None = None) -> dict[tuple[int, int], Found | None]:
     """What `detect` says for each run and object, in milliseconds."""
-    result = detect(
+    result = detect_by_truth_id(
         tracks(world) if heard is None else heard,
         episodes(world),
         confirm=Confirm(hits=world.hits, of=world.of),
@@ -393,7 +393,7 @@ def test_detected_when_the_ideal_fusion_first_lists_it(world: World) -> None:
     heard = tracks(world)
     for o, (onset, end) in world.episodes.items():
         counted = (heard.row_captured_s >= onset / 1000 - 1e-6) | world.count_earlier
-        fused = fuse(replace(heard, valid=heard.valid & counted), max_age_s=world.max_age / 1000).fused
+        fused = fuse_ideal(replace(heard, valid=heard.valid & counted), max_age_s=world.max_age / 1000).fused
         for run in range(world.runs):
             rows = np.flatnonzero((fused.row_object_ix == o) & fused.valid[run])
             times = fused.arrives_s[0, fused.frame_ix[rows]]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pandas as pd
 import pytest
 
-from copem_replay.metrics.intervals import clusters
+from copem_replay.metrics.intervals import choose_clusters
 
 
 def rows(logs: int, objects: int, runs: int = 2) -> pd.DataFrame:
@@ -28,7 +28,7 @@ def rows(logs: int, objects: int, runs: int = 2) -> pd.DataFrame:
     ],
 )
 def test_what_is_resampled(logs: int, objects: int, over: str | None, many: int) -> None:
-    found, cluster = clusters(rows(logs, objects))
+    found, cluster = choose_clusters(rows(logs, objects))
     assert found == over
     assert cluster.nunique() == many
     assert len(cluster) == logs * objects * 2

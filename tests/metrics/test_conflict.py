@@ -27,15 +27,15 @@ from copem_replay.cli import main as cli
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import Float
 from copem_replay.experiment.schema import Experiment
-from copem_replay.experiment.validate import problems
+from copem_replay.experiment.validate import find_problems
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.braking.encounter import EgoPath
 from copem_replay.metrics.config import Conflict
-from copem_replay.metrics.detection.conflict import _will_be_in, corridors
-from copem_replay.pipeline.blocks import replay_block
+from copem_replay.metrics.detection.conflict import _will_enter, build_corridors
 from copem_replay.pipeline.one_run import tracks_of_run
-from copem_replay.pipeline.prepare import prepare
-from copem_replay.pipeline.run import run
+from copem_replay.pipeline.prepare import prepare_log
+from copem_replay.pipeline.replay import replay_block
+from copem_replay.pipeline.run import run_experiment
 from tests.helpers import scenes
 from tests.helpers.experiments import changed, source_of
 from tests.helpers.recordings import Obj, pedestrian, write_recording
@@ -61,7 +61,7 @@ def plan(*, horizon_s: float = 3.0, margin_m: float = 0.5, measure: dict[str, An
 
 def rows(log: Recording, wanted: Experiment) -> pd.DataFrame:
     """The rows of `detections.parquet`, by configuration, run and object."""
-    return run(wanted, [log]).table.set_index(["configuration", "run", "object_id"]).sort_index()
+    return run_experiment(wanted, [log]).table.set_index(["configuration", "run", "object_id"]).sort_index()
 
 
 def event(log: Recording, wanted: Experiment, configuration: str = "GT", thing: str = "walker") -> float:
@@ -322,7 +322,7 @@ class TestOracle:
         standing_there = boxes(0.0, 0.0, yaws[1], *piece)[0]
         near_m = float(shapely.distance(moved, standing_there).min())
         other = np.array([far_m, -far_m, yaws[1], *piece])
-        found = _will_be_in(place[0] + far_m, place[1] - far_m, yaws[0], *velocity, *size, other, horizon_s)
+        found = _will_enter(place[0] + far_m, place[1] - far_m, yaws[0], *velocity, *size, other, horizon_s)
         # Between two steps it moves less than this; and rounding.
         step_m = math.hypot(*velocity) * horizon_s / 200 + 1e-6
         smaller = boxes(0.0, 0.0, yaws[1], piece[0] - 2e-6, piece[1] - 2e-6)[0]
@@ -333,15 +333,15 @@ class TestOracle:
 
     @pytest.mark.parametrize(("y_m", "expected"), [(2.0, True), (2.001, False)])
     def test_boxes_that_stand_side_by_side_meet_where_they_touch(self, y_m: float, expected: bool) -> None:
-        assert _will_be_in(0.0, y_m, 0.0, 0.0, 0.0, 4.0, 2.0, np.array([0.0, 0.0, 0.0, 4.0, 2.0]), 3.0) is expected
+        assert _will_enter(0.0, y_m, 0.0, 0.0, 0.0, 4.0, 2.0, np.array([0.0, 0.0, 0.0, 4.0, 2.0]), 3.0) is expected
 
     @given(drawn=logs(), horizon_s=st.floats(0.1, 4), margin_m=st.floats(0, 1.5))
     @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
     def test_corridor_is_what_the_ego_sweeps(self, drawn: Drawn, horizon_s: float, margin_m: float) -> None:
-        ready = prepare(drawn.log, plan())
+        ready = prepare_log(drawn.log, plan())
         now_s = np.array([-0.1, 0.0, 0.33, 1.2, 2.0, 2.95, 3.0, 3.1])
         ego = EgoPath(ready.scene, ready.truth, 0.5)
-        pieces, bounds = corridors(ego, now_s, Conflict(horizon_s=horizon_s, margin_m=margin_m))
+        pieces, bounds = build_corridors(ego, now_s, Conflict(horizon_s=horizon_s, margin_m=margin_m))
         for k, now in enumerate(now_s):
             found = shapely.union_all(boxes(*pieces[bounds[k] : bounds[k + 1]].T))
             exact = corridor_of(drawn.log, now, horizon_s)
@@ -392,7 +392,7 @@ class TestOracle:
             },
             measure={"onset": onset, "confirm": confirm, "count_earlier": count_earlier},
         )
-        ready = prepare(drawn.log, wanted)
+        ready = prepare_log(drawn.log, wanted)
         known: dict[tuple[float, float], np.ndarray] = {}
         table = replay_block(ready, wanted, np.arange(2))
         for number in range(2):
@@ -693,8 +693,8 @@ class TestRecordedEgo:
     def test_on_a_slant(self) -> None:
         """It drives 10 m/s ahead and 2 m/s to the left, heading straight ahead: all it sweeps is in its corridor."""
         log = recording([Thing("ego", "car", driving(0, 0, 10, 2))], until_s=4.0)
-        ready = prepare(log, plan())
-        pieces, _ = corridors(EgoPath(ready.scene, ready.truth, 0.5), np.array([0.5]), Conflict())
+        ready = prepare_log(log, plan())
+        pieces, _ = build_corridors(EgoPath(ready.scene, ready.truth, 0.5), np.array([0.5]), Conflict())
         found = shapely.union_all(boxes(*pieces.T))
         swept_there = shapely.union_all(corridor_of(log, 0.5, 3.0).boxes(0.5 - 1e-6))
         assert shapely.difference(swept_there, found).area < 1e-9
@@ -999,7 +999,7 @@ class TestErrors:
                 runs=5,
                 measure={"onset": onset, "count_earlier": count_earlier},
             )
-            found = run(wanted, [log.log]).table
+            found = run_experiment(wanted, [log.log]).table
             known = found[found["conflict_detected"]]
             assert known["detected"].all()
             assert (known["conflict_detection_s"] >= known["detection_s"] - 1e-9).all()
@@ -1024,7 +1024,7 @@ class TestRuns:
     )  # fmt: skip
 
     def test_alone_in_blocks_or_together(self) -> None:
-        ready = prepare(self.LOG, self.WANTED)
+        ready = prepare_log(self.LOG, self.WANTED)
         key = ["configuration", "run", "object_id"]
         together = replay_block(ready, self.WANTED, np.arange(12)).sort_values(key, ignore_index=True)
         for blocks in ([[k] for k in range(12)], [[0, 1, 2, 3, 4], [5], [6, 7, 8, 9, 10, 11]], [[11, 3], [*range(3)],
@@ -1034,19 +1034,19 @@ class TestRuns:
             pd.testing.assert_frame_equal(apart, together, check_exact=True)
 
     def test_whatever_the_number_of_workers_and_of_runs(self) -> None:
-        one, two = (run(self.WANTED, [self.LOG], jobs=jobs).table for jobs in (1, 2))
+        one, two = (run_experiment(self.WANTED, [self.LOG], jobs=jobs).table for jobs in (1, 2))
         pd.testing.assert_frame_equal(one, two, check_exact=True)
-        fewer = run(self.WANTED.model_copy(update={"runs": 5}), [self.LOG]).table
+        fewer = run_experiment(self.WANTED.model_copy(update={"runs": 5}), [self.LOG]).table
         first = one[one["run"] < 5].reset_index(drop=True)
         pd.testing.assert_frame_equal(fewer, first, check_exact=True)
 
     @pytest.mark.parametrize("kept", [["GT"], ["PEM"], ["two"], ["drawn"], ["drawn", "PEM"], ["two", "drawn", "GT"]])
     def test_configurations_do_not_disturb_one_another(self, kept: list[str]) -> None:
-        everything = run(self.WANTED, [self.LOG]).table.set_index(["configuration", "run", "object_id"])
+        everything = run_experiment(self.WANTED, [self.LOG]).table.set_index(["configuration", "run", "object_id"])
         fewer = self.WANTED.model_copy(
             update={"configurations": {name: self.WANTED.configurations[name] for name in kept}}
         )
-        alone = run(fewer, [self.LOG]).table.set_index(["configuration", "run", "object_id"])
+        alone = run_experiment(fewer, [self.LOG]).table.set_index(["configuration", "run", "object_id"])
         for name in kept:
             pd.testing.assert_frame_equal(alone.loc[[name]], everything.loc[[name]], check_exact=True)
 
@@ -1066,9 +1066,11 @@ class TestRuns:
             pems=ERRORS, units=TWO_UNITS, configurations=FOUR, runs=12,
             measure={"confirm": {"hits": 2, "of": 3}, "onset": {"kind": "at", "time_s": 0.25}},
         )  # fmt: skip
-        plain = run(without, [self.LOG]).table
+        plain = run_experiment(without, [self.LOG]).table
         assert not set(COLUMNS) & set(plain.columns)
-        pd.testing.assert_frame_equal(run(self.WANTED, [self.LOG]).table[plain.columns], plain, check_exact=True)
+        pd.testing.assert_frame_equal(
+            run_experiment(self.WANTED, [self.LOG]).table[plain.columns], plain, check_exact=True
+        )
 
     def test_summary(self) -> None:
         """Implied at 1.3 s, 32.3 m away, and at 2.3 s, 22.5 m away, and never."""
@@ -1078,7 +1080,7 @@ class TestRuns:
             Thing("second", "pedestrian", driving(45, -7, 0, 1)),
             Thing("third", "pedestrian", standing(45, -7)),
         ]
-        result = run(plan(measure={"horizon_s": 2.8}), [recording(things, until_s=3.0)])
+        result = run_experiment(plan(measure={"horizon_s": 2.8}), [recording(things, until_s=3.0)])
         found = result.summary.set_index("configuration").loc["GT"]
         assert found["detected_share"] == 1
         assert found["conflict_detected_share"] == pytest.approx(2 / 3)
@@ -1092,14 +1094,14 @@ class TestRuns:
             pems=ERRORS, units=TWO_UNITS, configurations=FOUR, runs=3, measure={"objects": {"classes": ["bus"]}},
             braking=BRAKING | {"brakes_for": "conflict"},
         )  # fmt: skip
-        result = run(wanted, [self.LOG])
+        result = run_experiment(wanted, [self.LOG])
         assert len(result.table) == 0
         assert set(COLUMNS) <= set(result.table.columns)
         assert result.summary["n"].tolist() == [0, 0, 0, 0]
 
     def test_one_log_of_two_has_nobody(self) -> None:
         empty = recording([Thing("ego", "car", driving(0, 0, 10))], until_s=1.0, log="empty")
-        found = run(plan(pems=ERRORS, units=TWO_UNITS, configurations=FOUR), [empty, self.LOG]).table
+        found = run_experiment(plan(pems=ERRORS, units=TWO_UNITS, configurations=FOUR), [empty, self.LOG]).table
         assert len(found) == 4
         assert found["conflict_detected"].dtype == bool
         assert found["conflict_detection_s"].dtype == float
@@ -1218,7 +1220,7 @@ class TestFile:
     def said(self, folder: Path, *changes: str) -> list[str]:
         (folder / "drive.mcap").touch()
         source = source_of(folder, changed(*changes))
-        return [line.removeprefix(f"{source.path}:") for line in problems(source)[1]]
+        return [line.removeprefix(f"{source.path}:") for line in find_problems(source)[1]]
 
     @pytest.mark.parametrize(
         "measure", ["measure: {}", "measure: {conflict: null}", "measure: {onset: {kind: appears}}"]
@@ -1234,7 +1236,7 @@ class TestFile:
     def test_the_defaults(self, tmp_path: Path, given_as: str) -> None:
         (tmp_path / "drive.mcap").touch()
         text = changed(f"measure: {{conflict: {given_as}}}", f"braking: {{{BRAKES}, brakes_for: conflict}}")
-        read, found = problems(source_of(tmp_path, text))
+        read, found = find_problems(source_of(tmp_path, text))
         assert found == []
         assert read is not None
         assert read.measure.conflict == Conflict(horizon_s=3.0, margin_m=0.5)
@@ -1284,7 +1286,7 @@ class TestCommand:
 
     def called(self, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
         monkeypatch.setattr(sys, "argv", ["copem-replay", *arguments])
-        return cli._ended()
+        return cli._run_to_exit_code()
 
     def test_results(self, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         text = changed(

@@ -10,9 +10,9 @@ import pytest
 
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
-from copem_replay.metrics.detections_table import distances
-from copem_replay.metrics.end_reason import END_REASONS, competes, texts_of
-from copem_replay.metrics.episodes import episodes
+from copem_replay.metrics.detections_table import measure_distances
+from copem_replay.metrics.episodes import find_episodes
+from copem_replay.metrics.survival import END_REASONS, end_reason_texts, is_competing
 from copem_replay.perception.visibility import NO_STATICS
 from tests.helpers import scenes
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
@@ -20,11 +20,16 @@ from tests.helpers.scenes import Thing, driving, experiment, recording, standing
 
 def looked(log: Recording, **changes: object) -> dict[str, tuple[float, bool, float, str]]:
     """Onset, whether it held from the first, end and why, of each object."""
-    found = episodes(log.scene, log.truth, NO_STATICS, experiment(**changes))
+    found = find_episodes(log.scene, log.truth, NO_STATICS, experiment(**changes))
     return {
         log.scene.object_ids[k]: (float(onset_s), bool(at_start), float(ended_s), str(why))
         for k, onset_s, at_start, ended_s, why in zip(
-            found.object_ix, found.onset_s, found.onset_at_start, found.ended_s, texts_of(found.ended_by), strict=True
+            found.object_ix,
+            found.onset_s,
+            found.onset_at_start,
+            found.ended_s,
+            end_reason_texts(found.ended_by),
+            strict=True,
         )
     }
 
@@ -81,12 +86,12 @@ def test_what_is_wholly_visible_reaches_a_share_of_one(share: float, expected_s:
 
 def test_only_an_object_that_leaves_is_never_detected() -> None:
     """The ends of the ego and of the log censor; positions are those of the texts, in any shape."""
-    assert competes(pd.Series(["log_end", "object_left", "ego_left"])).tolist() == [False, True, False]
-    assert competes(pd.Series([], dtype=object)).tolist() == []
+    assert is_competing(pd.Series(["log_end", "object_left", "ego_left"])).tolist() == [False, True, False]
+    assert is_competing(pd.Series([], dtype=object)).tolist() == []
     assert {reason.value: reason.censors for reason in END_REASONS} == {
         "object_left": False, "ego_left": True, "log_end": True,
     }  # fmt: skip
-    assert texts_of(np.array([2, 0, 1, 0])).tolist() == ["log_end", "object_left", "ego_left", "object_left"]
+    assert end_reason_texts(np.array([2, 0, 1, 0])).tolist() == ["log_end", "object_left", "ego_left", "object_left"]
 
 
 def without_a_size(distance_to: str) -> tuple[Recording, Experiment]:
@@ -104,6 +109,6 @@ def test_the_gap_to_a_unit_is_known_where_the_ego_has_no_size(
     """At 2 s the car is at 80 m, its front 2 m nearer; a unit is a point, an ego of unknown size has no gap."""
     log, plan = without_a_size(distance_to)
     other = np.array([log.scene.object_number["other"]])
-    distance, gap = distances(log.scene, log.truth, plan, other, np.array([2.0]))
+    distance, gap = measure_distances(log.scene, log.truth, plan, other, np.array([2.0]))
     assert distance.tolist() == [pytest.approx(distance_m)]
     assert np.isnan(gap[0]) if gap_m is None else gap[0] == pytest.approx(gap_m)

@@ -8,13 +8,13 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from copem_replay.metrics.fixed import fixed_in
-from copem_replay.metrics.summary_text import summary_text
+from copem_replay.metrics.intervals import find_fixed_outcomes
+from copem_replay.metrics.summary import format_summary
 from copem_replay.report.figures.detection_curves import curves_figure
-from copem_replay.report.html.page import page
+from copem_replay.report.html.page import build_page
 from copem_replay.report.html.study import load_study
-from copem_replay.results.compare import compare, comparison_text
-from copem_replay.results.read import load_results
+from copem_replay.results.compare import compare_folders, comparison_text
+from copem_replay.results.read import read_results
 from tests.helpers.report_pages import ONE, Page, changed, replayed
 
 DRAWN_REACTION = ("{kind: constant, delay_s: 0.2}", "{kind: gamma, shape: 4.0, mean_s: 0.2}")
@@ -58,7 +58,7 @@ def test_a_reaction_that_is_drawn_gives_the_truth_an_interval_of_what_passes(rea
 
 
 def test_the_table_says_which_have_none(made: Path) -> None:
-    lines = summary_text(summary_of(made).reset_index()).splitlines()
+    lines = format_summary(summary_of(made).reset_index()).splitlines()
     (gt,) = (line for line in lines[:6] if line.startswith("GT"))
     assert gt.split()[1:3] == ["1", "–"]
     said = "no 95 % of GT, hit: nothing drawn, every run is the same"
@@ -67,7 +67,7 @@ def test_the_table_says_which_have_none(made: Path) -> None:
 
 
 def test_differences_of_what_is_not_drawn_have_no_interval(made: Path) -> None:
-    table = compare([made], configurations=["hit", "late"], baseline="GT").table
+    table = compare_folders([made], configurations=["hit", "late"], baseline="GT").table
     hit = table[table["configuration"] == "hit"]
     assert set(hit["metric"]) >= {"detected_share", "ttd_rmst_s", "pass_share", "gospa_m"}
     assert (hit["interval"] == "nothing drawn").all()
@@ -80,13 +80,13 @@ def test_differences_of_what_is_not_drawn_have_no_interval(made: Path) -> None:
 
 
 def test_what_passes_depends_on_a_drawn_reaction(reacting: Path) -> None:
-    table = compare([reacting], configurations=["hit"], baseline="GT").table.set_index("metric")
+    table = compare_folders([reacting], configurations=["hit"], baseline="GT").table.set_index("metric")
     assert table.loc["ttd_rmst_s", "interval"] == "nothing drawn"
     assert table.loc["pass_share", "interval"] in ("bootstrap", "exact")
 
 
 def test_why_there_is_none_is_said_once(made: Path) -> None:
-    comparison = compare([made], configurations=["hit"], baseline="GT")
+    comparison = compare_folders([made], configurations=["hit"], baseline="GT")
     text = comparison_text(comparison)
     assert "+0.5 (nothing drawn)" in text
     assert "(nothing drawn): every run is the same, so an interval over runs has no meaning" in text
@@ -99,13 +99,13 @@ def test_reports_and_figures_do_without(tmp_path: Path) -> None:
     head, _, tail = text.partition("pems:")
     tail = "\n".join(line for line in tail.splitlines() if not line.startswith(("  late", "  half: {u", "  never")))
     folder = replayed(tmp_path, head + tail[tail.index("configurations:") :] + "\n")
-    found = Page(page(load_study(folder)))
+    found = Page(build_page(load_study(folder)))
     assert any(line.startswith("There are no intervals: every run is the same") for line in found.lines())
     assert "Detected: no 95 % interval of GT, hit: nothing drawn, every run is the same." in found.words
     cell = found.tables["summary"]["GT"]["detected_share"]
     assert (cell.text.strip(), cell.low, cell.high) == ("100", None, None)
     assert "(nothing drawn)" in found.tables["regret"]["hit"]["ttd_rmst_s"].text
-    figure = curves_figure(load_results(folder))
+    figure = curves_figure(read_results(folder))
     assert not figure.axes[0].collections
     assert "No bands: nothing drawn, every run is the same" in " ".join(figure.texts[-1].get_text().split())
 
@@ -134,7 +134,7 @@ UNITS = {"rsu": {"recorded": {"topic": "rsu"}, "pem": None}, "ego": {"pem": "p",
 def test_what_is_fixed_goes_by_the_kind_of_units_and_of_the_reaction(
     experiment: dict[str, Any], lists: set[str], reaction: bool
 ) -> None:
-    found = fixed_in(experiment)
+    found = find_fixed_outcomes(experiment)
     assert (found.lists, found.reaction) == (lists, reaction)
     assert found.known("t") == ("t" in lists)
     assert found.passes("t") == (reaction and "t" in lists)

@@ -18,17 +18,16 @@ from copem_replay.metrics.intervals import (
     Resamples,
     alike_limits,
     bootstrap_share,
+    count_multiplicities,
+    draw_resamples,
     effective_number,
-    every_resample,
     exact_limits,
-    expanded_tail,
-    multiplicities,
+    expand_tail,
+    list_resamples,
     percentile_limits,
-    resamples,
     share_limits,
 )
-from copem_replay.metrics.summary import summary
-from copem_replay.metrics.summary_text import summary_text
+from copem_replay.metrics.summary import format_summary, summarise_rows
 from tests.helpers.compare_folders import limits_of, widened
 
 Array = npt.NDArray[np.float64]
@@ -36,7 +35,7 @@ Array = npt.NDArray[np.float64]
 
 def of(uniform: Array) -> Resamples:
     """The resamples that these numbers draw."""
-    return Resamples(multiplicities(uniform), np.ones(len(uniform), dtype=np.int64))
+    return Resamples(count_multiplicities(uniform), np.ones(len(uniform), dtype=np.int64))
 
 
 def columns(clusters: list[tuple[int, int]]) -> list[npt.NDArray[np.int64]]:
@@ -52,23 +51,23 @@ def test_of_few_clusters_every_resample_is_there_as_often_as_it_is_drawn():
             tuple(some.count(k) for k in range(clusters))
             for some in itertools.product(range(clusters), repeat=clusters)
         )
-        found = every_resample(clusters)
+        found = list_resamples(clusters)
         assert dict(zip(map(tuple, found.count.tolist()), found.times.tolist(), strict=True)) == drawn
-    assert len(every_resample(7).times) == 1716  # 13 over 7
-    assert every_resample(7).times.sum() == 7**7
+    assert len(list_resamples(7).times) == 1716  # 13 over 7
+    assert list_resamples(7).times.sum() == 7**7
 
 
 def test_seven_clusters_are_worked_out_and_eight_are_drawn():
-    seven, eight = (resamples([f"log{k}" for k in range(K)], 3) for K in (7, 8))
-    assert seven is resamples(list("abcdefg"), 4)  # whatever their names and the seed
+    seven, eight = (draw_resamples([f"log{k}" for k in range(K)], 3) for K in (7, 8))
+    assert seven is draw_resamples(list("abcdefg"), 4)  # whatever their names and the seed
     assert (eight.count.shape, eight.times.sum()) == ((2000, 8), 2000)
     assert (eight.count.sum(axis=1) == 8).all()
-    assert (resamples([f"log{k}" for k in range(8)], 4).count != eight.count).any()
+    assert (draw_resamples([f"log{k}" for k in range(8)], 4).count != eight.count).any()
 
 
 def test_many_clusters_are_drawn_part_by_part_as_well_as_at_once():
     names = [f"object {k}" for k in range(3000)]  # of which 2000 resamples are more than is held at a time
-    drawn = resamples(names, 5).count
+    drawn = draw_resamples(names, 5).count
     assert (drawn.sum(axis=1) == 3000).all()
     zeros = np.zeros(3000, dtype=np.int64)
     uniform = CounterRng(5, "summary").uniform(
@@ -80,7 +79,7 @@ def test_many_clusters_are_drawn_part_by_part_as_well_as_at_once():
 @given(st.lists(st.integers(-20, 20), min_size=2, max_size=5), st.floats(0.5, 0.99))
 def test_limits_are_those_of_all_resamples_written_out(values: list[int], confidence: float):
     """A resample that stands for many counts as often: the quantile of K^K figures, linear between neighbours."""
-    every = every_resample(len(values))
+    every = list_resamples(len(values))
     means = [sum(some) / len(some) for some in itertools.product(values, repeat=len(values))]
     found = percentile_limits(every.count @ np.array(values) / len(values), every, confidence=confidence)
     assert found == pytest.approx(np.quantile(means, widened(len(values), confidence)), abs=1e-9)
@@ -88,7 +87,7 @@ def test_limits_are_those_of_all_resamples_written_out(values: list[int], confid
 
 def test_two_clusters_by_hand():
     # 0 and 1: the means 0, 1/2 twice, 1; at Φ(−√2 · tan(π/4)) = 0.0786496, of three steps 0.2359488.
-    every = every_resample(2)
+    every = list_resamples(2)
     low, high = percentile_limits(every.count @ np.array([0.0, 1.0]) / 2, every, confidence=0.5)
     assert (low, high) == pytest.approx((0.2359488 / 2, 1 - 0.2359488 / 2), abs=1e-7)
 
@@ -111,7 +110,7 @@ def test_four_resamples_by_hand():
 
 @pytest.mark.parametrize(("clusters", "tail"), [(1, 0.025), (2, 0.0), (5, 0.00095), (10, 0.00855), (10**6, 0.025)])
 def test_few_clusters_widen_the_tails(clusters, tail):
-    assert expanded_tail(0.95, clusters) == pytest.approx(tail, abs=5e-6)
+    assert expand_tail(0.95, clusters) == pytest.approx(tail, abs=5e-6)
 
 
 @pytest.mark.long
@@ -122,7 +121,7 @@ def test_intervals_over_few_clusters_hold_the_mean_as_often_as_they_say():
     for _ in range(400):
         shares = rng.beta(4, 4, 5)
         successes, totals = np.rint(shares * 10_000).astype(int), np.full(5, 10_000)
-        low, high = bootstrap_share(successes, totals, every_resample(5))
+        low, high = bootstrap_share(successes, totals, list_resamples(5))
         held += low <= 0.5 <= high
     assert held >= 0.91 * 400
 
@@ -169,14 +168,14 @@ def test_over_every_resample_the_limits_are_its_ordered_shares(clusters: list[tu
         below = math.floor(steps)
         above = min(below + 1, len(shares) - 1)
         expected.append(float(shares[below] + (steps - below) * (shares[above] - shares[below])))
-    found = bootstrap_share(*columns(clusters), every_resample(len(clusters)), confidence=1 - tail / 20)
+    found = bootstrap_share(*columns(clusters), list_resamples(len(clusters)), confidence=1 - tail / 20)
     assert found == pytest.approx(expected, abs=1e-12)
 
 
 @given(tallies, st.integers(2, 50))
 def test_more_rows_of_the_same_kind_in_each_cluster_teach_nothing(clusters: list[tuple[int, int]], copies: int):
     successes, totals = columns(clusters)
-    every = every_resample(len(clusters))
+    every = list_resamples(len(clusters))
     once = bootstrap_share(successes, totals, every, confidence=0.9)
     often = bootstrap_share(successes * copies, totals * copies, every, confidence=0.9)
     assert often == pytest.approx(once, abs=1e-14)
@@ -246,7 +245,7 @@ def test_effective_numbers_by_hand():
 
 
 def limits(clusters: list[tuple[int, int]]) -> tuple[str, float, float]:
-    return share_limits(*columns(clusters), resamples([str(k) for k in range(len(clusters))], 1))
+    return share_limits(*columns(clusters), draw_resamples([str(k) for k in range(len(clusters))], 1))
 
 
 def test_five_that_are_alike_are_no_certainty():
@@ -265,7 +264,7 @@ def test_a_cluster_that_outweighs_the_others_is_nearly_all_there_is():
 def test_limits_are_the_wider_of_both_on_each_side():
     # One of five succeeds, and half of another: the exact limits of 1.5 of 5 are wider below, as they are above.
     clusters = [(2, 2), (1, 2), (0, 2), (0, 2), (0, 2)]
-    drawn = bootstrap_share(*columns(clusters), every_resample(5))
+    drawn = bootstrap_share(*columns(clusters), list_resamples(5))
     kind, low, high = limits(clusters)
     exact = exact_limits(1.5, 5)
     assert (kind, low, high) == ("bootstrap+exact", min(drawn[0], exact[0]), max(drawn[1], exact[1]))
@@ -279,7 +278,7 @@ def test_many_clusters_of_which_enough_succeed_and_fail_are_only_resampled():
     clusters = [(int(k), 10) for k in rng.integers(0, 11, 120)]
     assert limits(clusters) == (
         "bootstrap",
-        *bootstrap_share(*columns(clusters), resamples(list(map(str, range(120))), 1)),
+        *bootstrap_share(*columns(clusters), draw_resamples(list(map(str, range(120))), 1)),
     )
     # Of 120 nine succeed: fewer than ten.
     assert limits([(1, 1)] * 9 + [(0, 1)] * 111)[0] == "bootstrap+exact"
@@ -290,7 +289,7 @@ def test_many_clusters_of_which_enough_succeed_and_fail_are_only_resampled():
 @given(st.lists(st.tuples(st.integers(0, 4), st.integers(4, 6)), min_size=1, max_size=6))
 def test_limits_of_a_share_are_never_narrower_than_either(clusters: list[tuple[int, int]]):
     _, low, high = limits(clusters)
-    for narrower in (bootstrap_share(*columns(clusters), every_resample(len(clusters))),):
+    for narrower in (bootstrap_share(*columns(clusters), list_resamples(len(clusters))),):
         assert low <= narrower[0]
         assert narrower[1] <= high
     successes, totals = columns(clusters)
@@ -314,11 +313,11 @@ def rows_of(detected: list[list[bool]]) -> pd.DataFrame:
 
 
 def test_the_summary_of_five_objects_that_are_always_detected() -> None:
-    table, notes = summary(rows_of([[True] * 20] * 5), ["c"], {"c": 10.0}, seed=1, horizon_s=2.0)
+    table, notes = summarise_rows(rows_of([[True] * 20] * 5), ["c"], {"c": 10.0}, seed=1, horizon_s=2.0)
     (row,) = table.to_dict("records")
     assert (row["detected_share_low"], row["detected_share_high"]) == (pytest.approx(0.025**0.2), 1.0)
     assert (row["interval"], row["interval_over"], notes) == ("bootstrap+exact", "objects", [])
-    lines = summary_text(table).splitlines()
+    lines = format_summary(table).splitlines()
     assert "[0.4782, 1]" in lines[1]
     assert "95 %: bootstrap interval over objects, nowhere narrower than exact binomial limits" in lines
 

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from mpmath import mp, mpf
 
 from copem_replay.core.tracks import Float
-from copem_replay.metrics.lasting_survival import Lasting, log_sequence, moved_odds
-from copem_replay.metrics.log_survival import first_of
+from copem_replay.metrics.exact_survival import LastingDetection, first_known, log_sequence, scale_odds
 
 P = np.array([0.2, 0.5, 0.3, 0.6])
 GAP = np.array([0.0, 0.1, 0.1, 0.1])
@@ -131,11 +130,13 @@ def test_a_hidden_markov_model_says_the_same() -> None:
 def test_log_odds_by_central_difference() -> None:
     """Against differences of the 60-digit sum, five lists of two units, one of which is not remembered."""
     p = np.array([0.2, 0.5, 0.3, 0.6, 0.7])
-    lasts = Lasting(np.array([0, 0, 0, 0, -1]), np.full(5, 0.8), np.full(5, 0.5), np.array([0, 0.1, 0.2, 0.3, 0.15]))
-    known = first_of(lasts.captured_s, p, np.array([0, 0, 0, 0, 1]), np.ones(2), lasts)
+    lasts = LastingDetection(
+        np.array([0, 0, 0, 0, -1]), np.full(5, 0.8), np.full(5, 0.5), np.array([0, 0.1, 0.2, 0.3, 0.15])
+    )
+    known = first_known(lasts.captured_s, p, np.array([0, 0, 0, 0, 1]), np.ones(2), lasts)
 
     def plain(delta: float) -> float:
-        moved = moved_odds(p, math.exp(delta))
+        moved = scale_odds(p, math.exp(delta))
         gap = np.array([0.0, 0.1, 0.1, 0.1])
         return float(mp.log(brute(moved[:4], [0] * 4, gap, 0.8, 0.5))) + math.log1p(-moved[4])
 
@@ -147,8 +148,8 @@ def test_log_odds_by_central_difference() -> None:
 
 def test_a_unit_that_may_not_be_there() -> None:
     """P(never) = (1 − q) + q F, by instant as well; q of the unit that lasts."""
-    lasts = Lasting(np.zeros(4, dtype=np.int64), np.ones(4), np.full(4, 0.8), np.cumsum(GAP))
-    known = first_of(np.cumsum(GAP) + 0.5, P, np.zeros(4, dtype=np.int64), np.array([0.3]), lasts)
+    lasts = LastingDetection(np.zeros(4, dtype=np.int64), np.ones(4), np.full(4, 0.8), np.cumsum(GAP))
+    known = first_known(np.cumsum(GAP) + 0.5, P, np.zeros(4, dtype=np.int64), np.array([0.3]), lasts)
     survival = 0.7 + 0.3 * np.array(CASES[1.0, 0.8][0])
     np.testing.assert_allclose(1 - np.cumsum(known.probability), survival, atol=1e-6)
     assert math.exp(known.log_never) == pytest.approx(survival[-1], abs=1e-6)

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from copem_replay.experiment.schema import Experiment
-from copem_replay.io.recording import read
-from copem_replay.metrics.line_of_sight import in_sight_s
-from copem_replay.pipeline.run import run
+from copem_replay.io.recording import read_log
+from copem_replay.metrics.episodes import earliest_sight_s
+from copem_replay.pipeline.run import run_experiment
 from tests.helpers.recordings import Obj, pedestrian, write_recording
 
 EXPERIMENT = {
@@ -51,7 +51,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_in_sight_is_when_the_first_list_shows_it_whatever_is_made_of_it(log: Path) -> None:
-    result = run(Experiment.model_validate(EXPERIMENT), [read(log, name="drive")])
+    result = run_experiment(Experiment.model_validate(EXPERIMENT), [read_log(log, name="drive")])
     rows = result.table.set_index("configuration")
     found = {name: rows.loc[name, ["in_sight_s", "captured_s", "detection_s"]].tolist() for name in rows.index}
     assert np.isnan(found["GT"][0]), "the truth needs no sight"
@@ -64,7 +64,7 @@ def test_what_is_never_in_sight_is_null(log: Path) -> None:
     measure = EXPERIMENT["measure"] | {"onset": {"kind": "at", "time_s": 0.0}}  # type: ignore[operator]
     wall = [{"polygon_m": [[12.0, -9.0], [13.0, -9.0], [13.0, 9.0], [12.0, 9.0]], "height_m": 9.0, "ground_z_m": 0.0}]
     chosen = Experiment.model_validate(EXPERIMENT | {"measure": measure, "obstacles": wall})
-    rows = run(chosen, [read(log, name="drive")]).table.set_index("configuration")
+    rows = run_experiment(chosen, [read_log(log, name="drive")]).table.set_index("configuration")
     assert np.isnan(rows.loc["alone", "in_sight_s"])
     assert rows.loc["both", "in_sight_s"] == 0.0
 
@@ -88,7 +88,7 @@ def test_only_units_that_are_there_in_a_run_have_it_in_sight() -> None:
     equipped = np.array([[True, True, True, True], [True, False, False, True], [False, True, True, True]])
 
     def of(name: str, there: np.ndarray | None) -> list[list[float]]:
-        found = in_sight_s(first_s, chosen, chosen.units_of(chosen.configurations[name]), there)
+        found = earliest_sight_s(first_s, chosen, chosen.units_of(chosen.configurations[name]), there)
         return [[float(v) for v in row] for row in found]
 
     nan = pytest.approx(np.nan, nan_ok=True)

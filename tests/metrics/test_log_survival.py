@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mpmath import mp, mpf
 
-from copem_replay.metrics.log_survival import FirstKnown, confirmed, first_of
+from copem_replay.metrics.exact_survival import FirstKnown, first_confirmed, first_known
 
 SOME = settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 DIGITS = 450
@@ -105,12 +105,12 @@ def assert_near(found: float, expected: Any, rtol: float = 1e-11) -> None:
 
 def is_known(lists: ObjectLists, share: Sequence[float]) -> FirstKnown:
     instant, p, unit = (np.array(column) for column in zip(*lists, strict=True))
-    return first_of(instant * 0.1, p.astype(float), unit.astype(np.int64), np.array(share))
+    return first_known(instant * 0.1, p.astype(float), unit.astype(np.int64), np.array(share))
 
 
 def is_confirmed(lists: ObjectLists, numbers: Sequence[int], hits: int, of: int) -> FirstKnown:
     instant, p, _ = (np.array(column) for column in zip(*lists, strict=True))
-    return confirmed(np.array(numbers)[instant], np.array(numbers)[instant] * 0.1, p.astype(float), hits, of)
+    return first_confirmed(np.array(numbers)[instant], np.array(numbers)[instant] * 0.1, p.astype(float), hits, of)
 
 
 # Certain, rare, and anything between; 1 − 10⁻¹⁵ is the nearest to 1 that is written, 10⁻⁴⁰ is lost beside 1.
@@ -208,8 +208,8 @@ def test_what_is_certain_only_if_it_is_there(share: float) -> None:
 def test_no_list_at_all() -> None:
     none = np.empty(0, dtype=np.int64)
     for found in (
-        first_of(np.empty(0), np.empty(0), none, np.ones(1)),
-        confirmed(none, np.empty(0), np.empty(0), 2, 3),
+        first_known(np.empty(0), np.empty(0), none, np.ones(1)),
+        first_confirmed(none, np.empty(0), np.empty(0), 2, 3),
     ):
         assert len(found.time_s) == 0
         assert (found.log_never, found.per_logit, found.log_never_half) == (0, 0, 0)

@@ -10,10 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from copem_replay.core.agree import AGREE
-from copem_replay.core.object_list import Entries
+from copem_replay.core.object_list import AGREE, Entries
 from copem_replay.core.tracks import CLASSES
-from copem_replay.metrics.matching import DUPLICATE, GHOST, MATCH, Matches, match
+from copem_replay.metrics.matching import DUPLICATE, GHOST, MATCH, Matches, match_entries
 from tests.helpers.reports import entry, joined, lists_of
 from tests.oracles.accuracy import likely, one_run, permuted, scene_of, truth_of
 
@@ -24,7 +23,7 @@ GATE_M = 3.0
 def of_one_list(*entries: Entries, objects: dict[tuple[float, float], str], gate_m: float = GATE_M) -> Found:
     """Object and role of each entry of one list; the objects, by place, are numbered from 0."""
     world = truth_of({o: [place] for o, place in enumerate(objects)}, [0.0])
-    return pairs(match(lists_of([[joined(*entries)]]), world, scene_of(*objects.values()), gate_m=gate_m))
+    return pairs(match_entries(lists_of([[joined(*entries)]]), world, scene_of(*objects.values()), gate_m=gate_m))
 
 
 def pairs(found: Matches) -> Found:
@@ -137,17 +136,17 @@ def test_an_entry_at_the_ego_or_at_something_standing_is_no_ghost() -> None:
 def test_an_object_counts_only_at_instants_at_which_it_is_there() -> None:
     world = truth_of({0: [(0, 0), None, (50, 0)]}, [0.0, 1.0, 2.0])
     lists = lists_of([[entry(0), entry(0), joined(entry(0), entry(50))]])
-    found = match(lists, world, scene_of("car"), gate_m=GATE_M)
+    found = match_entries(lists, world, scene_of("car"), gate_m=GATE_M)
     assert pairs(found) == [(0, MATCH), (-1, GHOST), (-1, GHOST), (0, MATCH)]
 
 
 def test_nothing_to_match() -> None:
     nobody = truth_of({}, [0.0, 1.0])
-    assert pairs(match(lists_of([[entry(0), joined()]]), nobody, scene_of(), gate_m=GATE_M)) == [(-1, GHOST)]
+    assert pairs(match_entries(lists_of([[entry(0), joined()]]), nobody, scene_of(), gate_m=GATE_M)) == [(-1, GHOST)]
     one = truth_of({0: [(0, 0)]}, [0.0])
-    assert pairs(match(lists_of([[joined()]]), one, scene_of("car"), gate_m=GATE_M)) == []
+    assert pairs(match_entries(lists_of([[joined()]]), one, scene_of("car"), gate_m=GATE_M)) == []
     no_instant = truth_of({}, [])
-    assert pairs(match(lists_of([[], []]), no_instant, scene_of("car"), gate_m=GATE_M)) == []
+    assert pairs(match_entries(lists_of([[], []]), no_instant, scene_of("car"), gate_m=GATE_M)) == []
 
 
 def preference(e: Any) -> tuple[Any, ...]:
@@ -204,17 +203,17 @@ def test_lists_as_the_rules_have_it(
         ]
     )
     scene = scene_of(*classes)
-    found = match(lists, world, scene, gate_m=gate_m)
+    found = match_entries(lists, world, scene, gate_m=gate_m)
     for s in range(len(runs)):
         for k in (0, 1):
             objects = {o: at for o, (_, places) in enumerate(things) if (at := places[k]) is not None}
             of_list = slice(lists.start[s, k], lists.start[s, k + 1])
             assert pairs(found)[of_list] == plainly(lists.of(s, k), objects, classes, gate_m)
         alone, its = one_run(lists, s)
-        assert pairs(match(alone, world, scene, gate_m=gate_m)) == pairs(found)[its]
+        assert pairs(match_entries(alone, world, scene, gate_m=gate_m)) == pairs(found)[its]
     # Equal entries may change places: they are told apart by nothing.
     shuffled, _, _ = permuted(lists, None, np.random.default_rng(seed))
-    again = match(shuffled, world, scene, gate_m=gate_m)
+    again = match_entries(shuffled, world, scene, gate_m=gate_m)
 
     def as_sets(entries: Entries, what: Found) -> list[list[tuple[Any, ...]]]:
         told = [(*preference(e), *w) for e, w in zip(entries, what, strict=True)]

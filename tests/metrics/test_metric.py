@@ -16,10 +16,9 @@ from copem_replay.core import components
 from copem_replay.core.errors import InputError
 from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.metric import RowMetric
-from copem_replay.metrics.summary import summary
+from copem_replay.metrics.summary import format_summary, summarise_rows
 from copem_replay.metrics.summary_metrics import METRICS, PARTS
-from copem_replay.metrics.summary_text import summary_text
-from copem_replay.report.html.page import page
+from copem_replay.report.html.page import build_page
 from copem_replay.report.html.study import load_study
 from copem_replay.results.compare.metrics import METRICS as COMPARED
 from tests.experiment.test_validate import without_logs
@@ -86,11 +85,11 @@ def test_an_own_metric_is_in_summary_and_report(tmp_path: Path) -> None:
     table = pd.read_parquet(folder / "detections.parquet")
     half = table[(table["configuration"] == "half") & table["detected"]]
     assert rows.loc["half", "late_share"] == pytest.approx((half["time_to_detection_s"] > 1).mean())
-    found = Page(page(load_study(folder)))
+    found = Page(build_page(load_study(folder)))
     assert found.tables["own"]["hit"]["late_share"].value == "1"
     assert found.tables["own"]["never"]["late_share"].text.strip() == "–"
     assert "of the detected, how many are known too late" in found.words
-    printed = summary_text(rows.reset_index()).splitlines()
+    printed = format_summary(rows.reset_index()).splitlines()
     assert ["hit", "1"] in [line.split() for line in printed]
     assert "metrics:" in (folder / "experiment.yaml").read_text()
 
@@ -111,7 +110,7 @@ def rows_of(*logs: str) -> pd.DataFrame:
 def test_statistics_are_sums_over_logs() -> None:
     """Late: one of two rows in each of the logs; without rows there is no value."""
     late = LateShare(kind="x:LateShare", name="late_share", late_s=2.0)
-    table, _ = summary(
+    table, _ = summarise_rows(
         rows_of("a", "b", "b2"), ["c", "none"], {"c": 1.0, "none": None}, seed=0, horizon_s=5.0, own=[late]
     )
     assert table["late_share"].iloc[0] == 0.5
@@ -128,7 +127,7 @@ def test_statistics_are_sums_over_logs() -> None:
 )
 def test_an_own_metric_that_fails_is_named(kind: type[RowMetric], said: str) -> None:
     with pytest.raises(InputError, match=rf"^measure\.metrics\[0\]: own:X: {said}"):
-        summary(rows_of("a"), ["c"], {"c": 1.0}, seed=0, horizon_s=5.0, own=[kind(kind="own:X", name="x")])
+        summarise_rows(rows_of("a"), ["c"], {"c": 1.0}, seed=0, horizon_s=5.0, own=[kind(kind="own:X", name="x")])
 
 
 @pytest.mark.parametrize(

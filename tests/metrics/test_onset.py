@@ -13,14 +13,14 @@ import pytest
 from copem_replay.core import components
 from copem_replay.core.errors import InputError
 from copem_replay.experiment.schema import Experiment
-from copem_replay.metrics.episodes import episodes
+from copem_replay.metrics.episodes import find_episodes
 from copem_replay.metrics.onset import ONSETS, Onset, OnsetView, Requires
 from copem_replay.perception.visibility import NO_STATICS
 from copem_replay.report.figures.selection import Selection
 from copem_replay.report.figures.single_runs import runs_figure
-from copem_replay.report.html.page import page
+from copem_replay.report.html.page import build_page
 from copem_replay.report.html.study import load_study
-from copem_replay.results.read import load_results
+from copem_replay.results.read import read_results
 from tests.experiment.test_validate import against_logs, drive, without_logs
 from tests.helpers import experiments, scenes
 from tests.helpers.report_pages import Page, changed, replayed
@@ -94,9 +94,9 @@ def test_an_own_onset_is_in_detections_report_and_figure(tmp_path: Path) -> None
     assert set(table["object_id"]) == {"2"}
     assert table["onset_s"].to_numpy() == pytest.approx(1.0)
     assert not table["onset_at_start"].any()
-    words = Page(page(load_study(folder))).words
+    words = Page(build_page(load_study(folder))).words
     assert "The clock of an object starts when it is in the lane, 20 m from the ego." in words
-    figure = runs_figure(load_results(folder), Selection(["late"]))
+    figure = runs_figure(read_results(folder), Selection(["late"]))
     assert any("pedestrian in lane" in text.get_text() for axes in figure.axes for text in axes.texts)
 
 
@@ -105,7 +105,7 @@ def test_an_own_onset_needs_nothing_but_its_condition(tmp_path: Path) -> None:
     table = pd.read_parquet(folder / "detections.parquet")
     assert set(table["object_id"]) == {"2", "3"}
     assert table["onset_s"].to_numpy() == pytest.approx(0.8), "the first frame from 0.75 s on"
-    assert "The clock of an object starts at its onset “Bare”." in Page(page(load_study(folder))).words
+    assert "The clock of an object starts at its onset “Bare”." in Page(build_page(load_study(folder))).words
 
 
 def test_the_schema_has_built_in_and_installed_onsets(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -133,7 +133,7 @@ def test_an_own_onset_that_fails_is_named(name: str, said: str) -> None:
     log = scenes.oncoming_car()
     plan = scenes.experiment(measure={"onset": {"kind": f"{__name__}:{name}"}})
     with pytest.raises(InputError, match=rf"^measure\.onset: {__name__}:{name}: {said}"):
-        episodes(log.scene, log.truth, NO_STATICS, plan)
+        find_episodes(log.scene, log.truth, NO_STATICS, plan)
 
 
 def test_what_an_own_onset_requires_is_checked(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from copem_replay.metrics.intervals import wilson
+from copem_replay.metrics.intervals import wilson_limits
 from copem_replay.metrics.survival import (
     CENSORED,
     DETECTED,
@@ -351,16 +351,16 @@ def test_a_distance_in_other_units_is_the_same_distance(distances: list[int | No
     ],
 )
 def test_intervals_of_the_published_shares_of_500(successes: int, low: float, high: float):
-    assert wilson(successes, 500) == pytest.approx((low, high), abs=5e-5)
+    assert wilson_limits(successes, 500) == pytest.approx((low, high), abs=5e-5)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 7, 500, 999_983])
 @pytest.mark.parametrize("confidence", [0.5, 0.9, 0.95, 0.999])
 def test_the_ends_are_exact(n: int, confidence: float):
-    low, high = wilson(0, n, confidence=confidence)
+    low, high = wilson_limits(0, n, confidence=confidence)
     assert low == 0.0
     assert 0.0 < high < 1.0
-    low, high = wilson(n, n, confidence=confidence)
+    low, high = wilson_limits(n, n, confidence=confidence)
     assert 0.0 < low < 1.0
     assert high == 1.0
 
@@ -370,7 +370,7 @@ def test_the_limits_solve_the_equation_that_defines_them(n: int, data: st.DataOb
     successes = data.draw(st.integers(0, n))
     # Quantiles of the normal distribution as tabulated.
     for confidence, z in ((0.90, 1.6448536269514722), (0.95, 1.959963984540054), (0.99, 2.5758293035489004)):
-        low, high = wilson(successes, n, confidence=confidence)
+        low, high = wilson_limits(successes, n, confidence=confidence)
         assert low <= successes / n <= high
         for p in (low, high):
             assert (successes / n - p) ** 2 == pytest.approx(z * z * p * (1 - p) / n, abs=1e-13)
@@ -379,8 +379,8 @@ def test_the_limits_solve_the_equation_that_defines_them(n: int, data: st.DataOb
 @given(st.integers(1, 2000), st.data())
 def test_failures_have_the_mirrored_interval(n: int, data: st.DataObject):
     successes = data.draw(st.integers(0, n))
-    low, high = wilson(successes, n)
-    assert wilson(n - successes, n) == pytest.approx((1 - high, 1 - low), abs=1e-14)
+    low, high = wilson_limits(successes, n)
+    assert wilson_limits(n - successes, n) == pytest.approx((1 - high, 1 - low), abs=1e-14)
 
 
 # --------------------------------------------------------------------------- what is not accepted

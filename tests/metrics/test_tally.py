@@ -8,9 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from copem_replay.metrics.intervals import wilson
-from copem_replay.metrics.summary import summary
-from copem_replay.metrics.tally import tally
+from copem_replay.metrics.intervals import wilson_limits
+from copem_replay.metrics.summary import summarise_rows, tally_rows
 from tests.oracles.summary import figures
 
 REASONS = ("object_left", "ego_left", "log_end")
@@ -50,7 +49,7 @@ def tables(draw: st.DrawFn) -> pd.DataFrame:
 
 @given(tables())
 def test_the_summary_of_the_tally_is_that_of_the_rows(table: pd.DataFrame) -> None:
-    found, _ = summary(table, ["a", "b"], {"a": 1.0, "b": 2.0}, seed=3, horizon_s=7.3)
+    found, _ = summarise_rows(table, ["a", "b"], {"a": 1.0, "b": 2.0}, seed=3, horizon_s=7.3)
     for name, row in found.set_index("configuration").iterrows():
         rows = table[table["configuration"] == name]
         for metric, value in (figures(rows, 7.3) | figures(rows, 7.3, "conflict_")).items():
@@ -60,14 +59,14 @@ def test_the_summary_of_the_tally_is_that_of_the_rows(table: pd.DataFrame) -> No
         if len(judged):
             assert row["pass_share"] == judged["braking_pass"].to_numpy(dtype=bool).mean()
         if row["interval_over"] == "runs":
-            assert (row["detected_share_low"], row["detected_share_high"]) == wilson(
+            assert (row["detected_share_low"], row["detected_share_high"]) == wilson_limits(
                 int(rows["detected"].sum()), len(rows)
             )
 
 
 @given(tables(), st.randoms(use_true_random=False))
 def test_counts_are_those_of_the_rows_in_whatever_order(table: pd.DataFrame, random: object) -> None:
-    found = tally(table)
+    found = tally_rows(table)
     keys = ["log", "configuration", "object_id", "time_to_detection_s"]
     for event, to in (("detected", "to"), ("conflict", "to_conflict")):
         mine = found[found["event"] == event].set_index(keys)["runs"]
@@ -76,7 +75,7 @@ def test_counts_are_those_of_the_rows_in_whatever_order(table: pd.DataFrame, ran
             mine.sort_index(), named.groupby(keys, dropna=False).size().sort_index(), check_names=False
         )
     assert found["passed"].sum() == 2 * table["braking_pass"].fillna(False).sum()
-    mixed = tally(table.sample(frac=1, random_state=random.randrange(1000)))  # type: ignore[attr-defined]
+    mixed = tally_rows(table.sample(frac=1, random_state=random.randrange(1000)))  # type: ignore[attr-defined]
     order = ["log", "configuration", "event", "object_id", "time_to_detection_s"]
     pd.testing.assert_frame_equal(*(one.sort_values(order, ignore_index=True) for one in (found, mixed)))
 
@@ -91,7 +90,7 @@ def test_rows_are_by_log_configuration_event_object_and_instant() -> None:
         for run, seen in enumerate([(2.0, None), (1.5, None), (2.0, 4.0)])
         for thing, s in zip(("9", "10"), seen, strict=True)
     ]  # fmt: skip
-    found = tally(pd.DataFrame(rows).astype({"detection_s": float, "time_to_detection_s": float}))
+    found = tally_rows(pd.DataFrame(rows).astype({"detection_s": float, "time_to_detection_s": float}))
     assert found["log"].tolist() == ["b"] * 8 + ["a"] * 8
     assert found["configuration"].tolist() == (["z"] * 4 + ["y"] * 4) * 2
     first = found.iloc[:4]
@@ -107,6 +106,6 @@ def test_without_rows_there_is_no_figure_and_no_column_more(conflicts: bool) -> 
                "time_to_detection_s", "distance_at_detection_m"]  # fmt: skip
     more = ["conflict_detected", "conflict_detection_s", "time_to_conflict_detection_s",
             "distance_at_conflict_detection_m"] if conflicts else []  # fmt: skip
-    found, _ = summary(pd.DataFrame(columns=columns + more), ["a"], {"a": None}, seed=0, horizon_s=None)
+    found, _ = summarise_rows(pd.DataFrame(columns=columns + more), ["a"], {"a": None}, seed=0, horizon_s=None)
     assert (found["n"].tolist(), found["detected_share"].tolist()) == ([0], [None])
     assert ("conflict_detected_share" in found) == conflicts

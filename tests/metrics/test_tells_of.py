@@ -13,19 +13,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from copem_replay.core.agree import AGREE
 from copem_replay.core.errors import InputError
-from copem_replay.core.object_list import Entries, TellsOf
+from copem_replay.core.object_list import AGREE, Entries, TellsOf
 from copem_replay.core.tracks import CLASSES
-from copem_replay.fusion.base import Inbox, StepFusion, fused_by
 from copem_replay.fusion.gnn import Gnn
+from copem_replay.fusion.interface import Inbox, StepFusion, ask_fusion
 from copem_replay.fusion.nms import Nms
-from copem_replay.fusion.testing.check import NonconformingError, check_fusion
+from copem_replay.fusion.testing import NonconformingError, check_fusion
 from copem_replay.fusion.tracker import Tracker
 from copem_replay.fusion.union import Union
-from copem_replay.io.recording import read
-from copem_replay.metrics.matching import DUPLICATE, GHOST, MATCH, match, match_both
-from copem_replay.pipeline.run import run
+from copem_replay.io.recording import read_log
+from copem_replay.metrics.matching import DUPLICATE, GHOST, MATCH, match_at_both_times, match_entries
+from copem_replay.pipeline.run import run_experiment
 from tests.helpers.reports import entry, inputs_of, joined, lists_of
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
 from tests.metrics.test_matching import preference
@@ -87,7 +86,7 @@ def told() -> Any:
 
 @pytest.mark.parametrize("claims", ["its own", "nearly"])
 def test_a_capture_is_that_of_a_list_that_has_arrived(claims: str) -> None:
-    found = fused_by(Own(claims=claims), told(), "configurations.mine.fusion")
+    found = ask_fusion(Own(claims=claims), told(), "configurations.mine.fusion")
     assert len(found.entries) == 1 + 1 + 2 + 2
 
 
@@ -95,7 +94,7 @@ def test_another_one_is_an_error_of_the_class_at_the_line_of_its_step() -> None:
     said = r"^configurations.mine.fusion: tests.metrics.test_tells_of:Own: captured_s: "
     said += "expected the capture of a list that has arrived, "
     with pytest.raises(InputError, match=said + r"found 0\.4 s \(.*test_tells_of\.py:\d+\)$") as caught:
-        fused_by(Own(claims="now"), told(), "configurations.mine.fusion")
+        ask_fusion(Own(claims="now"), told(), "configurations.mine.fusion")
     line = int(re.findall(r":(\d+)\)$", str(caught.value))[0])
     assert Path(__file__).read_text().splitlines()[line - 1].startswith("    def step(")
 
@@ -112,7 +111,7 @@ def test_a_capture_that_has_not_arrived_yet_is_none() -> None:
             return entries, memory
 
     with pytest.raises(InputError, match=r"found 0\.1 s"):
-        fused_by(Early(), told(), "fusion")
+        ask_fusion(Early(), told(), "fusion")
 
 
 def test_the_kit_asks_for_it_too() -> None:
@@ -177,7 +176,7 @@ def test_entries_of_one_list_may_tell_of_different_instants(things: Any, runs: A
     )  # fmt: skip
     then, now = truth_of(places([0, 1, 2]), [0.0, 1.0, 2.0]), truth_of(places([1, 2]), [1.0, 2.0])
     scene = scene_of(*classes)
-    about, at_once = match_both(lists, then, now, scene, gate_m=2.0)
+    about, at_once = match_at_both_times(lists, then, now, scene, gate_m=2.0)
     for s in range(len(runs)):
         for k in (0, 1):
             of_list, one = slice(lists.start[s, k], lists.start[s, k + 1]), lists.of(s, k)
@@ -187,11 +186,11 @@ def test_entries_of_one_list_may_tell_of_different_instants(things: Any, runs: A
                 for (o, role), t, x, y in zip(got, asked, found.x_m[of_list], found.y_m[of_list], strict=True):
                     assert role == GHOST or (x, y) == there(t)[o]
     for one, world, tells_of in ((about, then, "capture"), (at_once, now, "now")):
-        alone = match(lists, world, scene, gate_m=2.0, tells_of=tells_of)  # type: ignore[arg-type]
+        alone = match_entries(lists, world, scene, gate_m=2.0, tells_of=tells_of)  # type: ignore[arg-type]
         np.testing.assert_array_equal(alone.object_ix, one.object_ix)
         np.testing.assert_array_equal(alone.role, one.role)
     shuffled, _, to = permuted(lists, None, np.random.default_rng(seed))
-    again, _ = match_both(shuffled, then, now, scene, gate_m=2.0)
+    again, _ = match_at_both_times(shuffled, then, now, scene, gate_m=2.0)
     assert sorted(again.role[np.argsort(to)].tolist()) == sorted(about.role.tolist())
 
 
@@ -200,7 +199,7 @@ def test_at_the_instant_an_object_has_one_match_whichever_instants_its_entries_t
     world = truth_of({0: [(0, 0), (10, 0)]}, [0.0, 1.0])
     now = truth_of({0: [(10, 0)]}, [1.0])
     lists = lists_of([[joined(entry(0.5, captured_s=0.0, existence=0.9), entry(10, captured_s=1.0, existence=0.5))]])
-    about, at_once = match_both(lists, world, now, scene_of("car"), gate_m=3.0)
+    about, at_once = match_at_both_times(lists, world, now, scene_of("car"), gate_m=3.0)
     assert about.role.tolist() == [MATCH, DUPLICATE]
     assert at_once.role.tolist() == [GHOST, MATCH]
 
@@ -228,7 +227,7 @@ def late(latency_s: Any, *names: str, **more: Any) -> Any:
         pems={"p": [couple]}, units={"ego": EGO_UNIT | {"pem": "p"}}, runs=4, configurations=configurations,
         measure={"onset": {"kind": "appears"}} | more,
     )  # fmt: skip
-    return run(plan, [log])
+    return run_experiment(plan, [log])
 
 
 def test_latency_costs_its_length_by_match_as_by_truth_id() -> None:
@@ -294,7 +293,7 @@ def test_of_real_traffic_late_lists_are_known_as_late_as_they_are(
         configurations={"ideal": late, "now": {"units": "all"}, "gnn": late | {"fusion": {"kind": "gnn"}}},
         measure={"objects": {"classes": [classes]}, "accuracy": False},
     )  # fmt: skip
-    summary = run(plan, [read(path, name=name)]).summary.set_index("configuration")
+    summary = run_experiment(plan, [read_log(path, name=name)]).summary.set_index("configuration")
     gnn_s, ideal_s, now_s = (summary.loc[one, "ttd_rmst_s"] for one in ("gnn", "ideal", "now"))
     assert gnn_s == pytest.approx(ideal_s, abs=0.02)
     assert now_s < ideal_s

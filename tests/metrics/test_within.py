@@ -10,15 +10,15 @@ import pytest
 import shapely
 
 from copem_replay.core.errors import ExperimentError
-from copem_replay.experiment.against_log import against_log
 from copem_replay.experiment.schema import Experiment
+from copem_replay.experiment.validate import check_against_log
 from copem_replay.io.recording import Recording
-from copem_replay.metrics.episodes import episodes
-from copem_replay.metrics.within import only_within
+from copem_replay.metrics.detection.conflict import keep_episodes_within
+from copem_replay.metrics.episodes import find_episodes
 from copem_replay.perception.visibility import NO_STATICS
-from copem_replay.pipeline.notes import oddities
-from copem_replay.pipeline.prepare import prepare
-from copem_replay.pipeline.run import run
+from copem_replay.pipeline.notes import list_oddities
+from copem_replay.pipeline.prepare import prepare_log
+from copem_replay.pipeline.run import run_experiment
 from tests.helpers import scenes
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
 from tests.metrics.test_conflict import corridor_of, swept
@@ -43,8 +43,8 @@ def passing() -> Recording:
 
 def kept(log: Recording, within: Any, **measure: Any) -> set[str]:
     wanted = experiment(measure=APPEARS | {"objects": {"within": within}} | measure)
-    every = episodes(log.scene, log.truth, NO_STATICS, wanted)
-    found, outside_ix = only_within(log.scene, log.truth, every, wanted)
+    every = find_episodes(log.scene, log.truth, NO_STATICS, wanted)
+    found, outside_ix = keep_episodes_within(log.scene, log.truth, every, wanted)
     assert sorted([*found.object_ix, *outside_ix]) == sorted(every.object_ix)
     return {log.scene.object_ids[k] for k in found.object_ix}
 
@@ -163,7 +163,7 @@ class TestInARun:
         }  # fmt: skip
         every = experiment(measure=APPEARS, **more)
         some = experiment(measure=APPEARS | {"objects": {"within": {"corridor_m": 5}}}, **more)
-        whole, part = (run(plan, [passing()]) for plan in (every, some))
+        whole, part = (run_experiment(plan, [passing()]) for plan in (every, some))
         mine = whole.table[whole.table["object_id"] == "parked"].reset_index(drop=True)
         pd.testing.assert_frame_equal(mine, part.table, check_exact=True)
         ghosts = [of.summary["false_positives_per_min"].tolist() for of in (whole, part)]
@@ -173,8 +173,10 @@ class TestInARun:
         assert not any("within" in note for note in whole.notes)
 
     def test_nobody_is_left(self) -> None:
-        replay = prepare(passing(), wanted := experiment(measure=APPEARS | {"objects": {"within": {"corridor_m": 1}}}))
-        said = list(oddities(replay, wanted))
+        replay = prepare_log(
+            passing(), wanted := experiment(measure=APPEARS | {"objects": {"within": {"corridor_m": 1}}})
+        )
+        said = list(list_oddities(replay, wanted))
         assert "no rows: no object with an onset matters by `objects.within`" in said
         assert "objects.within: 4 of 4 objects with an onset left out, more than 1 m beside the ego's way ahead" in said
 
@@ -184,10 +186,10 @@ class TestInARun:
         units = {"mast": {"at": [0, 0], "height_m": 5, "pem": "sure"}}
         plan = {"ego": "none", "units": units, "configurations": {"PEM": {"units": ["mast"]}}}
         wanted = experiment(**plan, measure=APPEARS | {"objects": {"within": within}, "distance_to": "mast"})
-        problems = dict(against_log(wanted, log))
+        problems = dict(check_against_log(wanted, log))
         assert problems[("measure", "objects", "within")].startswith("no ego in this study, and so no path of it")
         with pytest.raises(ExperimentError, match=r"scene: measure\.objects\.within: no ego in this study"):
-            prepare(log, wanted)
+            prepare_log(log, wanted)
 
     def test_ghosts_where_nothing_is_annotated(self) -> None:
         """Two parked cars that only a recorded list would name are absent here, so the PEM's errors make the ghosts."""
@@ -196,7 +198,7 @@ class TestInARun:
         union = {"union": {"units": ["ego"], "fusion": {"kind": "union"}}}
         plans = [experiment(measure=APPEARS | area, pems={"sure": wide}, runs=20, configurations=union)
                  for area in ({}, {"annotated": {"range_m": 1000.0}}, {"annotated": {"range_m": 12.0}})]  # fmt: skip
-        whole, same, near = (run(plan, [passing()]) for plan in plans)
+        whole, same, near = (run_experiment(plan, [passing()]) for plan in plans)
         pd.testing.assert_frame_equal(whole.summary, same.summary, check_exact=True)
         fewer = [of.summary["false_positives_per_min"][0] for of in (whole, near)]
         assert 0 < fewer[1] < fewer[0] / 2

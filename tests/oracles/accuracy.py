@@ -14,10 +14,9 @@ from scipy.special import gammainc
 
 from copem_replay.core.object_list import ObjectLists
 from copem_replay.core.tracks import CLASSES, TRUTH, VALUES, Scene, Tracks
-from copem_replay.metrics.accuracy.statistics import BAND, EXISTENCE, OBJECT, RUN, Accuracy, Settings
-from copem_replay.metrics.episodes import Episodes
+from copem_replay.metrics.accuracy.statistics import BAND, EXISTENCE, OBJECT, RUN, Accuracy, AccuracySettings
+from copem_replay.metrics.episodes import Episodes, Reference
 from copem_replay.metrics.matching import DUPLICATE, GHOST, MATCH, Matches
-from copem_replay.metrics.reference import Reference
 
 Array = npt.NDArray[Any]
 SAME_S = 1e-6
@@ -92,7 +91,7 @@ def band_of(edges: Sequence[float], value: float) -> int | None:
     return None
 
 
-def is_annotated(settings: Settings, place: Array, away_m: float) -> bool:
+def is_annotated(settings: AccuracySettings, place: Array, away_m: float) -> bool:
     """Whether the truth is annotated at a place that is so far from the reference."""
     corners = settings.annotated_m
     inside = not corners or shapely.Polygon(corners).buffer(1e-6).covers(shapely.Point(place))
@@ -134,7 +133,7 @@ def expected_of(entry: Any, gate_m: float) -> tuple[float, float, float]:
 def plainly(
     lists: ObjectLists, about: Matches, now: Matches, issue_s: Array, places: Places,
     velocity: Mapping[int, tuple[float, float]], captures_s: Sequence[float] | None, places_captured: Places,
-    episodes: Episodes, stay_from_s: Array, reference: Reference, measured: Array, settings: Settings,
+    episodes: Episodes, stay_from_s: Array, reference: Reference, measured: Array, settings: AccuracySettings,
 ) -> Accuracy:  # fmt: skip
     """The same as `assess`, by the sentences of its module. `captures_s`: None, entries tell of now."""
     S, K, M = len(lists.start), len(issue_s), len(episodes.object_ix)

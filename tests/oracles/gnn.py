@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import connected_components
 
 from copem_replay.core.object_list import Entries, Inputs, ObjectLists, entries_of
 from copem_replay.core.tracks import CLASS_GROUPS, CLASSES
-from copem_replay.fusion.covariance_union import covariance_union
+from copem_replay.fusion.combine import covariance_union
 from tests.helpers.reports import inputs_of
 from tests.oracles import correlated
 

@@ -14,7 +14,7 @@ from osi3.osi_sensordata_pb2 import SensorData
 
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import CLASSES, NO_CAPTURE_NS, UNCERTAINTIES, Scene
-from copem_replay.io.write.osi_sensor_data import osi_id
+from copem_replay.io.schemas.osi_ground_truth import osi_id
 
 OSI_TYPE: dict[str, tuple[int, int | None]] = {
     "pedestrian": (3, None), "animal": (4, None), "other": (1, None), "vehicle": (2, 0), "car": (2, 4), "van": (2, 6),

@@ -5,12 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from copem_replay.metrics.survival import (
-    cumulative_incidence,
-    quantile_time,
-    quantile_with_never,
-    restricted_mean,
-)
+from copem_replay.metrics.survival import cumulative_incidence, quantile_time, quantile_with_never, restricted_mean
 
 CODES = {"object_left": 2, "ego_left": 0, "log_end": 0}
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from copem_replay.io.encodings.columns import as_text, level_of, levels_to
+from copem_replay.io.encodings.columns import format_number, list_level, list_levels
 
 UNLIKE = (TypeError, ValueError, AttributeError, RecursionError, OverflowError)
 
@@ -60,7 +60,7 @@ def text(value: Any) -> str:
     if isinstance(value, bytes):
         return value.hex()
     if isinstance(value, float | int):
-        return as_text(value)
+        return format_number(value)
     if isinstance(value, str):
         return value.encode(errors="replace").decode()
     raise TypeError
@@ -86,7 +86,7 @@ def steps(path: str) -> list[str]:
 def holds(definition: Any, payloads: list[bytes], decode: Any, child: Any, paths: list[str]) -> None:
     """Assert that messages taken apart are what the plain walk finds: numbers, texts, rows and their parents."""
     found: dict[str, list[Any]] = {path: [] for path in paths}
-    rows: dict[str, list[tuple[int, ...]]] = {level: [] for level in levels_to(paths)}
+    rows: dict[str, list[tuple[int, ...]]] = {level: [] for level in list_levels(paths)}
     good = []
     for m, payload in enumerate(payloads):
         try:
@@ -107,11 +107,11 @@ def holds(definition: Any, payloads: list[bytes], decode: Any, child: Any, paths
     for level, expected in rows.items():
         parent = shredded.levels[level].parent.tolist()
         if level:
-            assert [rows[level_of(level.removesuffix("[]"))][k] for k in parent] == [at[:-1] for at in expected]
+            assert [rows[list_level(level.removesuffix("[]"))][k] for k in parent] == [at[:-1] for at in expected]
         else:
             assert [(k,) for k in parent] == expected
     for path in paths:
-        level = shredded.levels[level_of(path)]
+        level = shredded.levels[list_level(path)]
         plain = np.array([np.nan if v is None else v for v, _ in found[path]], dtype=float)
         np.testing.assert_array_equal(level.numbers[path], plain)
         sure = ~np.isnan(plain)

@@ -12,18 +12,23 @@ from scipy import stats
 
 from copem_replay.core.tracks import CLASSES
 from copem_replay.experiment.schema import Experiment
-from copem_replay.experiment.validate import problems
+from copem_replay.experiment.validate import find_problems
 from copem_replay.io.recording import Recording
-from copem_replay.perception.claims import DrawnClaims, claims_of
-from copem_replay.perception.pem.classes import Classes, drawn_class
-from copem_replay.perception.pem.ghosts import AtPlaces, Beside, Ghosts, InField
-from copem_replay.perception.pem.model import Pem
-from copem_replay.perception.pem.scores import Scores
-from copem_replay.perception.pem.track_ids import TrackIds
-from copem_replay.perception.perceive import draws_of
-from copem_replay.perception.unit_errors import Clock, Outages, PoseError
-from copem_replay.pipeline.prepare import Replay, prepare
-from copem_replay.pipeline.run import run
+from copem_replay.perception.config import ClockError, Outages, PoseError
+from copem_replay.perception.pem.condition import ExistenceScores
+from copem_replay.perception.pem.model import (
+    FieldPlace,
+    GhostModel,
+    GivenPlaces,
+    ListedClasses,
+    ObjectSidePlace,
+    Pem,
+    TrackIds,
+    draw_classes,
+)
+from copem_replay.perception.perceive import DrawnClaims, draw_claims, make_draws
+from copem_replay.pipeline.prepare import Replay, prepare_log
+from copem_replay.pipeline.run import run_experiment
 from tests.helpers import scenes
 from tests.helpers.experiments import changed, source_of
 from tests.helpers.scenes import SEES_ALL, Thing, experiment, standing
@@ -52,10 +57,10 @@ def standing_child(until_s: float = 20.0) -> Recording:
 
 def claims(plan: Experiment, recording: Recording, runs: int) -> tuple[list[DrawnClaims], Replay]:
     """By run what a unit says of a child in each of its lists."""
-    replay = prepare(recording, plan)
+    replay = prepare_log(recording, plan)
     found = replay.world(plan).found
     by_run = [
-        claims_of(found, replay.expanded, draws_of(replay.scene, found, replay.expanded, np.array([k])))
+        draw_claims(found, replay.expanded, make_draws(replay.scene, found, replay.expanded, np.array([k])))
         for k in range(runs)
     ]
     return by_run, replay
@@ -80,7 +85,7 @@ class TestClasses:
         assert (taken[:, 0] == BICYCLE).mean() == pytest.approx(0.1, abs=4 * math.sqrt(0.09 / 400))
 
     def test_classes_that_are_not_named_are_told(self) -> None:
-        rows = Classes.model_validate({"confusion": {"car": {"van": 1.0}}})
+        rows = ListedClasses.model_validate({"confusion": {"car": {"van": 1.0}}})
         every = np.arange(len(CLASSES))
         told = rows.listed(every, np.full(len(CLASSES), 0.999999))
         assert told.tolist() == [CLASSES.index("van") if k == CLASSES.index("car") else k for k in every]
@@ -89,17 +94,20 @@ class TestClasses:
         row = np.zeros((1, len(CLASSES)))
         row[0, :3] = [0.1, 0.2, 0.7]
         top = 1 - 2.0**-53
-        assert drawn_class(row, np.zeros(1, dtype=int), np.array([top])).tolist() == [2]
+        assert draw_classes(row, np.zeros(1, dtype=int), np.array([top])).tolist() == [2]
 
     def test_a_number_on_a_bound_draws_the_class_above_it(self) -> None:
         row = np.zeros((1, len(CLASSES)))
         row[0, 1:3] = [0.25, 0.75]
         uniform = np.array([0.0, 0.2499, 0.25])
-        assert drawn_class(row, np.zeros(3, dtype=int), uniform).tolist() == [1, 1, 2]
+        assert draw_classes(row, np.zeros(3, dtype=int), uniform).tolist() == [1, 1, 2]
 
     def test_ideal_fusion_keeps_the_true_class(self) -> None:
         sure, wrong = plan_of({}), plan_of({"classes": {"confusion": {"pedestrian": {"car": 1.0}}}})
-        told, mistaken = run(sure, [standing_child(2.0)]).table, run(wrong, [standing_child(2.0)]).table
+        told, mistaken = (
+            run_experiment(sure, [standing_child(2.0)]).table,
+            run_experiment(wrong, [standing_child(2.0)]).table,
+        )
         of = told["configuration"].isin(["GT", "ideal"])
         assert told[of].equals(mistaken[of])
         assert told[~of]["detected"].all()
@@ -110,7 +118,7 @@ class TestScores:
     SCORES = {"kind": "scores", "real": [8, 2], "ghost": [2, 4]}  # noqa: RUF012
 
     def test_distributions(self) -> None:
-        scores = Scores.model_validate(self.SCORES)
+        scores = ExistenceScores.model_validate(self.SCORES)
         uniform = (np.arange(10_000) + 0.5) / 10_000
         for of_ghosts, shape in ((False, (8, 2)), (True, (2, 4))):
             drawn = scores.claimed(uniform, of_ghosts=of_ghosts, ghosts_in_list=1.0)
@@ -119,7 +127,7 @@ class TestScores:
 
     def test_calibrated_is_the_posterior(self) -> None:
         """Two drawn values by hand: f1 = 8·9 e^7 (1 - e), f0 = 20 e (1 - e)^3, half a ghost to one real entry."""
-        scores = Scores.model_validate(self.SCORES | {"calibrated": True})
+        scores = ExistenceScores.model_validate(self.SCORES | {"calibrated": True})
         for e in (0.3, 0.7):
             f1, f0 = 72 * e**7 * (1 - e), 20 * e * (1 - e) ** 3
             u = stats.beta.cdf(e, 8, 2)
@@ -156,7 +164,7 @@ class TestScores:
         plan = plan_of({"couples": couples, "ghosts": [{"in_list": 0.5, "where": field}]}, runs=4)
         union = experiment(configurations={"union": {"units": "all", "fusion": {"kind": "union"}}}).configurations
         plan = plan.model_copy(update={"configurations": union})
-        summary = run(plan, [standing_child(300.0)]).summary
+        summary = run_experiment(plan, [standing_child(300.0)]).summary
         assert (summary["existence_ece"].item() <= 0.01) == calibrated
 
 
@@ -211,7 +219,7 @@ def test_problems(tmp_path: Path, text: str, said: str) -> None:
     lines = changed().splitlines()
     first = lines.index("pems:")
     lines[first + 1 : lines.index("units:")] = [PEM % text]
-    _, found = problems(source_of(tmp_path, "\n".join(lines)))
+    _, found = find_problems(source_of(tmp_path, "\n".join(lines)))
     assert [line.partition(": ")[2] for line in found] == [f"pems.onboard.{said}"]
 
 
@@ -222,7 +230,7 @@ def test_existence_is_a_number_or_scores(tmp_path: Path) -> None:
         ("2", "existence: expected at most 1, or 'visible_share', found 2"),
     ):
         wrong = text.replace("probability: 0.5}", f"probability: 0.5}}\n      existence: {existence}")
-        _, found = problems(source_of(tmp_path, wrong))
+        _, found = find_problems(source_of(tmp_path, wrong))
         assert [line.partition(": ")[2] for line in found] == [f"pems.onboard[0].{said}"]
 
 
@@ -238,9 +246,20 @@ def test_the_guide_holds(tmp_path: Path) -> None:
     example = text.partition("```yaml\n")[2].partition("```")[0]
     whole = "version: 1\nlogs: [a.mcap]\nconfigurations: {all: {units: all, fusion: {kind: gnn}}}\n" + example
     (tmp_path / "a.mcap").touch()
-    plan, found = problems(source_of(tmp_path, whole))
+    plan, found = find_problems(source_of(tmp_path, whole))
     assert found == []
     assert plan is not None
-    every = (PoseError, Clock, Outages, Ghosts, InField, AtPlaces, Beside, Classes, Scores, TrackIds)
+    every = (
+        PoseError,
+        ClockError,
+        Outages,
+        GhostModel,
+        FieldPlace,
+        GivenPlaces,
+        ObjectSidePlace,
+        ListedClasses,
+        ExistenceScores,
+        TrackIds,
+    )
     for key in {key for model in every for key in model.model_fields} - {"kind"}:
         assert key in text, key

@@ -13,14 +13,13 @@ from scipy import stats
 
 from copem_replay.core.tracks import CLASSES, Float
 from copem_replay.experiment.schema import Experiment
-from copem_replay.experiment.validate import problems
+from copem_replay.experiment.validate import find_problems
 from copem_replay.io.recording import Recording
-from copem_replay.perception.claims import DrawnClaims, claims_of
-from copem_replay.perception.ghosts import GhostRows, ghost_draws, ghosts_in
-from copem_replay.perception.perceive import with_states
-from copem_replay.pipeline.prepare import prepare
-from copem_replay.pipeline.run import run
-from copem_replay.pipeline.sweep import points
+from copem_replay.perception.ghosts import GhostRows, draw_ghosts, make_ghost_draws
+from copem_replay.perception.perceive import DrawnClaims, add_states, draw_claims
+from copem_replay.pipeline.prepare import prepare_log
+from copem_replay.pipeline.run import run_experiment
+from copem_replay.pipeline.sweep import list_points
 from tests.helpers import scenes
 from tests.helpers.experiments import changed, source_of
 from tests.helpers.scenes import SEES_60_M, Thing, driving, experiment, standing
@@ -47,10 +46,11 @@ def scene_of(*things: Thing, until_s: float = 60.0) -> Recording:
 
 def found(plan: Experiment, recording: Recording, runs: int) -> list[GhostRows]:
     """By run the ghosts in all lists."""
-    replay = prepare(recording, plan)
+    replay = prepare_log(recording, plan)
     world = replay.world(plan)
     made = [
-        ghosts_in(replay.scene, world.found, replay.expanded, replay.placed, k, (-np.inf, np.inf)) for k in range(runs)
+        draw_ghosts(replay.scene, world.found, replay.expanded, replay.placed, k, (-np.inf, np.inf))
+        for k in range(runs)
     ]
     return [one for one in made if one is not None]
 
@@ -205,7 +205,7 @@ class TestWhatTheyLeave:
         without = with_ghosts.model_copy(
             update={"pems": {"eyes": with_ghosts.pems["eyes"].model_copy(update={"ghosts": ()})}}
         )
-        return run(with_ghosts, [self.RECORDING]), run(without, [self.RECORDING])
+        return run_experiment(with_ghosts, [self.RECORDING]), run_experiment(without, [self.RECORDING])
 
     def test_ideal_fusion_and_the_truth_do_not_know_of_them(self) -> None:
         ghosts, none = self.both()
@@ -225,9 +225,9 @@ class TestWhatTheyLeave:
 
     def test_a_run_alone_is_the_same_run(self) -> None:
         plan = plan_of({"in_list": 1.0, "lasts_s": 0.7, "where": FIELD}, runs=4, pem={"couples": self.NOISE})
-        one, two = run(plan, [self.RECORDING], jobs=1), run(plan, [self.RECORDING], jobs=2)
+        one, two = run_experiment(plan, [self.RECORDING], jobs=1), run_experiment(plan, [self.RECORDING], jobs=2)
         pd.testing.assert_frame_equal(one.table, two.table, check_exact=True)
-        fewer = run(plan.model_copy(update={"runs": 2}), [self.RECORDING])
+        fewer = run_experiment(plan.model_copy(update={"runs": 2}), [self.RECORDING])
         first = one.table[one.table["run"] < 2].reset_index(drop=True)
         pd.testing.assert_frame_equal(first, fewer.table.reset_index(drop=True), check_exact=True)
 
@@ -249,9 +249,9 @@ class TestEachBirthIsAnother:
 
     @staticmethod
     def claimed(rows: GhostRows, run_number: int) -> DrawnClaims:
-        replay = prepare(TestEachBirthIsAnother.RECORDING, TestEachBirthIsAnother.PLAN)
-        drawn = ghost_draws(replay.scene, rows, replay.expanded, run_number)
-        return claims_of(rows.found, replay.expanded, drawn, rows.sort)
+        replay = prepare_log(TestEachBirthIsAnother.RECORDING, TestEachBirthIsAnother.PLAN)
+        drawn = make_ghost_draws(replay.scene, rows, replay.expanded, run_number)
+        return draw_claims(rows.found, replay.expanded, drawn, rows.sort)
 
     def test_ids_and_scores(self) -> None:
         made = found(self.PLAN, self.RECORDING, 3)
@@ -269,9 +269,9 @@ class TestEachBirthIsAnother:
             assert one.existence.mean() == pytest.approx(2 / 6, abs=0.02)
 
     def test_they_are_the_same_in_a_part_of_the_log(self) -> None:
-        [whole, *_], replay = found(self.PLAN, self.RECORDING, 1), prepare(self.RECORDING, self.PLAN)
+        [whole, *_], replay = found(self.PLAN, self.RECORDING, 1), prepare_log(self.RECORDING, self.PLAN)
         world = replay.world(self.PLAN)
-        part = ghosts_in(replay.scene, world.found, replay.expanded, replay.placed, 0, (3.05, 5.05))
+        part = draw_ghosts(replay.scene, world.found, replay.expanded, replay.placed, 0, (3.05, 5.05))
         assert part is not None
         captured_s = whole.found.tracks.row_captured_s
         there = np.flatnonzero((captured_s > 3.05) & (captured_s < 5.05))
@@ -293,10 +293,10 @@ def test_errors_of_the_couple_that_applies() -> None:
         },
     ]  # fmt: skip
     plan = plan_of({"in_list": 5.0, "where": FIELD}, pem={"couples": couples})
-    replay = prepare(scene_of(until_s=30), plan)
+    replay = prepare_log(scene_of(until_s=30), plan)
     [rows] = found(plan, scene_of(until_s=30), 1)
-    drawn = ghost_draws(replay.scene, rows, replay.expanded, 0)
-    listed = with_states(replay.scene, rows.found.tracks, rows.found, replay.expanded, drawn)
+    drawn = make_ghost_draws(replay.scene, rows, replay.expanded, 0)
+    listed = add_states(replay.scene, rows.found.tracks, rows.found, replay.expanded, drawn)
     off_m: Float = listed.x_m[0] - rows.found.tracks.x_m[0]
     near = rows.found.view.range_m < 30
     assert off_m[near].std() == pytest.approx(1.0, rel=0.15)
@@ -311,7 +311,7 @@ class TestSweep:
     def test_of_the_first_sort_only_and_of_fusions_that_hear_of_them(self) -> None:
         others = {"in_list": 0.1, "where": FIELD}
         plan = plan_of(self.PLAN, others, sweep={"ghosts_in_list": [0, 0.5]})
-        swept = list(points(plan))
+        swept = list(list_points(plan))
         assert [(point.sweep, point.value, list(point.experiment.configurations)) for point in swept] == [
             ("ghosts_in_list", 0.0, ["gnn"]), ("ghosts_in_list", 0.5, ["gnn"]),
         ]  # fmt: skip
@@ -322,13 +322,15 @@ class TestSweep:
     def test_rows_are_those_of_an_experiment_with_so_many(self) -> None:
         recording = scene_of(Thing("car", "car", driving(55, 0, -8)), until_s=5)
         changes: dict[str, Any] = {"runs": 3, "pem": {"couples": TestWhatTheyLeave.NOISE}}
-        swept = run(plan_of(self.PLAN, sweep={"ghosts_in_list": [0, 3]}, **changes), [recording]).sweep
+        swept = run_experiment(plan_of(self.PLAN, sweep={"ghosts_in_list": [0, 3]}, **changes), [recording]).sweep
         assert swept is not None
         assert swept[["sweep", "value"]].values.tolist() == [["ghosts_in_list", 0.0], ["ghosts_in_list", 3.0]]
-        alone = run(plan_of(self.PLAN | {"in_list": 3.0}, **changes), [recording]).summary.set_index("configuration")
+        alone = run_experiment(plan_of(self.PLAN | {"in_list": 3.0}, **changes), [recording]).summary.set_index(
+            "configuration"
+        )
         for column in ("detected_share", "ttd_rmst_s", "list_rate_hz"):
             assert swept[column].iloc[1] == alone[column]["gnn"], column
 
     def test_without_any(self, tmp_path: Path) -> None:
-        _, said = problems(source_of(tmp_path, changed("sweep: {ghosts_in_list: [0, 1]}")))
+        _, said = find_problems(source_of(tmp_path, changed("sweep: {ghosts_in_list: [0, 1]}")))
         assert [line.partition(": ")[2] for line in said] == ["sweep.ghosts_in_list: no PEM has `ghosts: […]`"]

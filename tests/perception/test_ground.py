@@ -9,8 +9,8 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from copem_replay.perception.observation import observations
-from copem_replay.perception.sensor_poses import ground_at, place
+from copem_replay.perception.observation import observe_objects
+from copem_replay.perception.sensor_poses import find_ground, place_units
 from tests.helpers.scenes import EGO_UNIT, Thing, experiment, recording
 
 SQUARE = [[-4.0, -3.0], [6.0, -3.0], [6.0, 5.0], [-4.0, 5.0]]
@@ -37,11 +37,11 @@ def test_it_is_that_of_the_nearest_of_all_the_first_of_equals(
     at, given_ = np.array(places, dtype=float) + shift_m, np.array(corners) + shift_m
     place = shapely.Point(given_[0]) if len(given_) == 1 else shapely.Polygon(given_)
     distance = [place.distance(shapely.Point(one)) for one in at]
-    assert ground_at(states(at), given_) == (float(np.argmin(distance)), min(distance))
+    assert find_ground(states(at), given_) == (float(np.argmin(distance)), min(distance))
 
 
 def test_no_states_ground_at_zero() -> None:
-    assert ground_at(states(np.empty((0, 2))), np.array([[0.0, 0.0]])) == (0.0, np.inf)
+    assert find_ground(states(np.empty((0, 2))), np.array([[0.0, 0.0]])) == (0.0, np.inf)
 
 
 HOUSE = ((57.0, 0.0), (67.0, 0.0), (67.0, 10.0))
@@ -63,7 +63,7 @@ def test_what_is_far_from_all_objects_stands_on_the_ground_of_the_nearest() -> N
         units={"ego": EGO_UNIT, "mast": mast, "near": mast | {"at": [0.0, -50.0]}},
         obstacles=[{"polygon_m": HOUSE, "height_m": 8.0}, {"polygon_m": HOUSE, "height_m": 8.0, "ground_z_m": 3.0}],
     )
-    placed = place(scene, truth, asked)
+    placed = place_units(scene, truth, asked)
     assert [(solid.bottom_m, solid.top_m) for solid in placed.solids] == [(62.0, 70.0), (3.0, 11.0)]
     assert placed.static.bottom_m.tolist() == [42.0, 3.0], "who gives the ground gives the bottom"
     assert placed.static.top_m.tolist() == [70.0, 11.0]
@@ -82,6 +82,6 @@ def test_nobody_sees_under_a_house_where_the_ground_falls_away() -> None:
     house = {"polygon_m": ((57.0, 0.0), (67.0, 0.0), (67.0, 10.0), (57.0, 10.0)), "height_m": 8.0}
     for said, expected in (({}, 0.0), ({"ground_z_m": 62.0}, 1.0)):
         asked = experiment(units={"ego": EGO_UNIT, "eye": eye}, obstacles=[house | said])
-        found = observations(scene, truth, asked)
+        found = observe_objects(scene, truth, asked)
         behind = (found.tracks.row_object_ix == 2) & (found.tracks.row_unit_ix == 1)
         assert set(found.view.visible_share[behind].tolist()) == {expected}

@@ -13,16 +13,16 @@ from scipy import stats
 from copem_replay.core.random import stable_hash
 from copem_replay.core.tracks import Float, Int, Tracks
 from copem_replay.core.view_geometry import Errors, Noise, ViewGeometry
-from copem_replay.experiment.file import parse, plain
+from copem_replay.experiment.file import make_plain_source, parse_experiment
 from copem_replay.experiment.schema import Experiment
-from copem_replay.experiment.validate import problems
+from copem_replay.experiment.validate import find_problems
 from copem_replay.io.recording import Recording
-from copem_replay.perception.observation import Observations, observations
+from copem_replay.perception.observation import Observations, observe_objects
+from copem_replay.perception.pem.condition import noise_quantity
 from copem_replay.perception.pem.error import ErrorModel
-from copem_replay.perception.pem.memory import quantity_of
 from copem_replay.perception.perceive import perceive
-from copem_replay.pipeline.notes import notes_of
-from copem_replay.pipeline.prepare import prepare
+from copem_replay.pipeline.notes import list_notes
+from copem_replay.pipeline.prepare import prepare_log
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
 from tests.oracles.lasting import Series
 
@@ -54,7 +54,7 @@ def plan(
 
 
 def seen_by(log: Recording, setup: Experiment, runs: Int = RUNS, **more: Any) -> tuple[Tracks, Observations]:
-    found = observations(log.scene, log.truth, setup)
+    found = observe_objects(log.scene, log.truth, setup)
     return perceive(log.scene, found, setup, runs, **more), found
 
 
@@ -348,7 +348,7 @@ def test_no_rows_no_numbers(of: str, path: str, correlation_s: Any) -> None:
 
 def test_names_of_noise() -> None:
     names = ("position 1", "yaw", "length", "width", "height", "speed", "flip")
-    assert [quantity_of(name) for name in names] == ["position", "yaw", "size", "size", "size", "speed", "flip"]
+    assert [noise_quantity(name) for name in names] == ["position", "yaw", "size", "size", "size", "speed", "flip"]
 
 
 # ---- what is said -------------------------------------------------------------------------------------------------
@@ -361,7 +361,7 @@ COUPLE = {
 
 def said(pem: Any, **more: Any) -> list[str]:
     base = {"version": 1, "pems": {"lidar": pem}, "configurations": {"GT": {"units": "truth"}}}
-    return [line.removeprefix("experiment: ") for line in problems(plain(base | more))[1]]
+    return [line.removeprefix("experiment: ") for line in find_problems(make_plain_source(base | more))[1]]
 
 
 @pytest.mark.parametrize(
@@ -411,14 +411,14 @@ def test_what_is_remembered_in_vain_is_noted() -> None:
     setup = plan(
         {"yaw": [{"share": 1, "correlation_s": 1}]}, error={"kind": "gaussian", "covariance_m2": [[1, 0], [0, 1]]}
     )
-    notes = notes_of([log], [prepare(log, setup)], setup, replayed=False)
+    notes = list_notes([log], [prepare_log(log, setup)], setup, replayed=False)
     assert "pems.p.memory.yaw: no couple has a yaw error, nothing to remember" in notes
 
 
 def test_a_list_of_couples_is_the_short_form_and_stays_one() -> None:
     """What an experiment does not say is not in what is written of it: memory, sweeps of it."""
-    short, _ = parse(
-        plain(
+    short, _ = parse_experiment(
+        make_plain_source(
             {
                 "version": 1,
                 "logs": ["a"],
@@ -428,8 +428,8 @@ def test_a_list_of_couples_is_the_short_form_and_stays_one() -> None:
             }
         )
     )
-    whole, _ = parse(
-        plain(
+    whole, _ = parse_experiment(
+        make_plain_source(
             {
                 "version": 1,
                 "logs": ["a"],

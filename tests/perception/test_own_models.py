@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from copem_replay.core.errors import InputError
-from copem_replay.core.time_chunk import WHOLE
+from copem_replay.core.tracks import WHOLE
 from copem_replay.core.view_geometry import Errors, Noise, ViewGeometry
-from copem_replay.fusion.base import Inbox, StepFusion
+from copem_replay.fusion.interface import Inbox, StepFusion
 from copem_replay.perception.pem.detection import DetectionModel
 from copem_replay.perception.pem.error import ErrorModel
 from copem_replay.pipeline.one_run import tracks_of_run
-from copem_replay.pipeline.prepare import prepare
+from copem_replay.pipeline.prepare import prepare_log
 from tests.helpers import scenes
 from tests.helpers.scenes import experiment
 
@@ -100,7 +100,7 @@ def test_own_models_are_used() -> None:
         {"kind": "tests.perception.test_own_models:NearOnly", "reach_m": 30},
         {"kind": "tests.perception.test_own_models:Shifted"},
     )
-    ready = prepare(log, near)
+    ready = prepare_log(log, near)
     fused = tracks_of_run(ready, near, 0)["PEM"].fused
     first = np.flatnonzero(fused.valid[0])[0]
     assert fused.arrives_s[0, fused.frame_ix[first]] == pytest.approx(7.0), "30 m away at 7 s"
@@ -121,12 +121,12 @@ def test_a_detection_model_that_fails_is_named(kind: str, said: str) -> None:
     with pytest.raises(
         InputError, match=rf"^pems\.sure\[0\]\.detection: tests.perception.test_own_models:{kind}: .*{said}"
     ):
-        prepare(scenes.oncoming_car(), plan({"kind": f"tests.perception.test_own_models:{kind}"})).found(WHOLE)
+        prepare_log(scenes.oncoming_car(), plan({"kind": f"tests.perception.test_own_models:{kind}"})).found(WHOLE)
 
 
 def test_an_error_model_that_fails_is_named() -> None:
     wrong = plan({"kind": "constant", "probability": 1.0}, {"kind": "tests.perception.test_own_models:Flat"})
-    ready = prepare(scenes.oncoming_car(), wrong)
+    ready = prepare_log(scenes.oncoming_car(), wrong)
     with pytest.raises(InputError, match=r"^pems\.sure\[0\]\.error: .*east_m: expected shape \(1, 81\), found \(81,\)"):
         tracks_of_run(ready, wrong, 0)
 
@@ -190,4 +190,4 @@ def test_a_step_that_gives_something_else_is_named() -> None:
     said += ".*step: expected a list and a memory, found int"
     said += rf" \(.*test_own_models\.py:{line_of('# the step')}\)$"
     with pytest.raises(InputError, match=said):
-        tracks_of_run(prepare(scenes.oncoming_car(), wrong), wrong, 0)
+        tracks_of_run(prepare_log(scenes.oncoming_car(), wrong), wrong, 0)

@@ -13,10 +13,10 @@ from pydantic import ValidationError
 from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import Float, Int, Tracks
 from copem_replay.experiment.schema import Experiment
-from copem_replay.perception.sensor_poses import observers, poses
-from copem_replay.perception.visibility import Flat, Observers, Statics, VisibilityModel, hidden_by
-from copem_replay.pipeline.prepare import prepare
-from copem_replay.pipeline.run import run
+from copem_replay.perception.sensor_poses import compute_unit_poses, make_observers
+from copem_replay.perception.visibility import Flat, Observers, Statics, VisibilityModel, find_blockers
+from copem_replay.pipeline.prepare import prepare_log
+from copem_replay.pipeline.run import run_experiment
 from tests.helpers import scenes
 from tests.helpers.report_pages import TEXT, replayed
 from tests.helpers.scenes import experiment
@@ -53,22 +53,22 @@ def foggy(**changes: Any) -> Experiment:
 
 def test_it_decides_what_is_detected_and_in_sight() -> None:
     """The other car is 80 m away at 2 s and comes at 10 m/s: at 5.5 s it is 45 m away."""
-    table = run(foggy(), [scenes.oncoming_car()]).table.set_index("configuration")
+    table = run_experiment(foggy(), [scenes.oncoming_car()]).table.set_index("configuration")
     assert table.loc["PEM", ["onset_s", "detection_s", "in_sight_s"]].tolist() == pytest.approx([2.0, 5.5, 5.5])
 
 
 def test_it_decides_when_the_clock_starts() -> None:
     plan = foggy(measure={"onset": {"kind": "line_of_sight", "visible_share": 0.5}})
-    assert run(plan, [scenes.oncoming_car()]).table["onset_s"].tolist() == pytest.approx([5.5, 5.5])
+    assert run_experiment(plan, [scenes.oncoming_car()]).table["onset_s"].tolist() == pytest.approx([5.5, 5.5])
 
 
 def test_what_hides_is_nothing_unless_it_says_so() -> None:
     log, plan = scenes.behind_a_wall(), experiment(pems=SEES_HALF)
-    ready = prepare(log, plan)
-    at = poses(log.scene, plan.units["ego"], log.truth, None)
-    watching = observers([at], np.array([log.scene.ego_ix]))
-    [none] = hidden_by(log.truth, ready.placed.static, watching, Fog(kind="fog"))
-    [some] = hidden_by(log.truth, ready.placed.static, watching, Flat())
+    ready = prepare_log(log, plan)
+    at = compute_unit_poses(log.scene, plan.units["ego"], log.truth, None)
+    watching = make_observers([at], np.array([log.scene.ego_ix]))
+    [none] = find_blockers(log.truth, ready.placed.static, watching, Fog(kind="fog"))
+    [some] = find_blockers(log.truth, ready.placed.static, watching, Flat())
     assert set(none.tolist()) == {-1}
     assert (some != -1).any()
 
@@ -105,16 +105,16 @@ def test_written_and_read_back_it_is_the_same(written: Any) -> None:
 def test_what_it_gives_is_checked(how: str, said: str) -> None:
     plan = experiment(visibility={"kind": f"{HERE}:Wrong", "how": how})
     with pytest.raises(InputError, match=rf"^visibility: {HERE}:Wrong: {said} \(.*test_own_visibility\.py:\d+\)$"):
-        run(plan, [scenes.oncoming_car()])
+        run_experiment(plan, [scenes.oncoming_car()])
 
 
 def test_a_body_that_is_not_there_cannot_hide() -> None:
     log = scenes.oncoming_car()
-    at = poses(log.scene, experiment().units["ego"], log.truth, None)
-    watching = observers([at], np.array([log.scene.ego_ix]))
-    static = prepare(log, experiment()).placed.static
+    at = compute_unit_poses(log.scene, experiment().units["ego"], log.truth, None)
+    watching = make_observers([at], np.array([log.scene.ego_ix]))
+    static = prepare_log(log, experiment()).placed.static
     with pytest.raises(InputError, match=r"hidden_by: expected whole numbers -1 … 161 of shape \(1, 162\), found"):
-        hidden_by(log.truth, static, watching, Wrong(kind=f"{HERE}:Wrong", how="no such obstacle"))
+        find_blockers(log.truth, static, watching, Wrong(kind=f"{HERE}:Wrong", how="no such obstacle"))
 
 
 @pytest.mark.parametrize(

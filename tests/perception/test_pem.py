@@ -17,7 +17,7 @@ from scipy import stats
 from copem_replay.core.random import CounterRng, RandomKey, object_words
 from copem_replay.core.tracks import CLASSES
 from copem_replay.core.view_geometry import Errors, Noise, ViewGeometry
-from copem_replay.perception.pem.condition import Condition, Couple, applies
+from copem_replay.perception.pem.condition import Condition, Couple, find_couples
 from copem_replay.perception.pem.detection import DetectionModel
 from copem_replay.perception.pem.error import ErrorModel, Gaussian
 
@@ -130,12 +130,12 @@ class TestTheFirstThatHolds:
             {"when": {"range_m": [10, 40]}},
         )
         seen = view([5, 20, 20.5, 30, 45, 45, 60], kinds=["car", "car", "bicycle", "car", "bicycle", "car", "bicycle"])
-        assert applies(pem, seen).tolist() == [0, 0, 1, 2, 1, -1, -1]
+        assert find_couples(pem, seen).tolist() == [0, 0, 1, 2, 1, -1, -1]
 
     def test_order_decides(self) -> None:
         near, any_ = {"when": {"range_m": [0, 20]}}, {}
-        assert applies(couples(near, any_), view([10, 30])).tolist() == [0, 1]
-        assert applies(couples(any_, near), view([10, 30])).tolist() == [0, 0]
+        assert find_couples(couples(near, any_), view([10, 30])).tolist() == [0, 1]
+        assert find_couples(couples(any_, near), view([10, 30])).tolist() == [0, 0]
 
 
 def probability(data: dict[str, Any], seen: ViewGeometry) -> list[float]:

@@ -15,7 +15,7 @@ from scipy import stats
 from copem_replay.core.tracks import VALUES, Tracks
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
-from copem_replay.perception.observation import Observations, observations
+from copem_replay.perception.observation import Observations, observe_objects
 from copem_replay.perception.perceive import perceive
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
 
@@ -59,7 +59,7 @@ def seen(
     runs: npt.NDArray[np.int64] = RUNS,
     states: Literal["true", "expected", "sampled"] = "sampled",
 ) -> tuple[Observations, Tracks]:
-    found = observations(log.scene, log.truth, plan)
+    found = observe_objects(log.scene, log.truth, plan)
     return found, perceive(log.scene, found, plan, runs, states=states)
 
 
@@ -294,7 +294,7 @@ class TestHowItLooks:
             units={"mast": {"at": [3, 3], "yaw_deg": 90, "height_m": 6.0, "pem": "all"}},
             configurations={"all": {"units": "all"}},
         )
-        found = observations(log.scene, log.truth, plan)
+        found = observe_objects(log.scene, log.truth, plan)
         for p, (_, name, _) in enumerate(who(log, found.tracks)):
             dx, dy = {"car": (7, -3), "walker": (-3, 5), "ego": (-3, -3)}[name]
             assert found.view.range_m[p] == pytest.approx(math.hypot(dx, dy))
@@ -307,7 +307,7 @@ class TestHowItLooks:
         """On the car, which heads north from (10, 0): 2 m forward and 1 m left is (9, 2); it looks backwards."""
         log = square()
         unit = {"on": "car", "offset_m": [2.0, 1.0], "yaw_deg": 180, "height_m": 1.0, "pem": "all"}
-        found = observations(
+        found = observe_objects(
             log.scene, log.truth, experiment(units={"obu": unit}, configurations={"a": {"units": "all"}})
         )
         names = [name for _, name, _ in who(log, found.tracks)]
@@ -328,7 +328,7 @@ class TestAddressing:
 
     def test_fewer_objects_draw_the_same(self) -> None:
         log, plan = square(frames=2), two_units(ego=sees(0.5, ERRORS["all"]), mast=sees(0.5))
-        found = observations(log.scene, log.truth, plan)
+        found = observe_objects(log.scene, log.truth, plan)
         every = perceive(log.scene, found, plan, np.arange(40))
         walker = perceive(log.scene, found.of_objects(np.array([2])), plan, np.arange(40))
         rows = every.row_object_ix == 2
@@ -346,7 +346,7 @@ class TestAddressing:
 class TestEquipped:
     def test_a_unit_that_a_run_does_not_have_lists_nothing_in_it(self) -> None:
         log, plan = square(frames=2), two_units(ego=sees(1.0), mast=sees(1.0))
-        found = observations(log.scene, log.truth, plan)
+        found = observe_objects(log.scene, log.truth, plan)
         there = np.array([[True, True], [True, False], [False, True], [False, False]])
         of = perceive(log.scene, found, plan, np.arange(4), equipped=there)
         for run, (ego, mast) in enumerate(there.tolist()):

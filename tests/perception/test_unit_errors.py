@@ -13,14 +13,12 @@ from scipy import stats
 from copem_replay.core.object_list import ObjectLists, entries_of
 from copem_replay.core.tracks import Bool
 from copem_replay.experiment.schema import Experiment
-from copem_replay.experiment.validate import problems
+from copem_replay.experiment.validate import find_problems
 from copem_replay.io.recording import Recording
-from copem_replay.perception.clock import clock_errors_s
-from copem_replay.perception.outages import lists_not_made
-from copem_replay.pipeline.prepare import Replay, prepare
-from copem_replay.pipeline.receiver import seen_by_all
-from copem_replay.pipeline.run import run
-from copem_replay.pipeline.stated_captures import StatedCaptures
+from copem_replay.perception.perceive import clock_errors_s, lists_not_made
+from copem_replay.pipeline.prepare import Replay, prepare_log
+from copem_replay.pipeline.receiver import StatedCaptures, perceive_all_units
+from copem_replay.pipeline.run import run_experiment
 from tests.helpers import scenes
 from tests.helpers.experiments import changed, drive, source_of
 from tests.helpers.scenes import Thing, driving, experiment, standing
@@ -39,7 +37,7 @@ def alone(until_s: float = 30.0) -> Recording:
 
 
 def ready(recording: Recording, plan: Experiment) -> Replay:
-    return prepare(recording, plan)
+    return prepare_log(recording, plan)
 
 
 def down(plan: Experiment, recording: Recording, runs: int) -> Bool:
@@ -75,14 +73,14 @@ class TestOutages:
         replay = ready(alone(10.0), plan)
         [missing] = down(plan, alone(10.0), 1)
         assert 0 < missing.sum() < len(missing)
-        seen = seen_by_all(replay.world(plan), np.array([0]), states="sampled")
+        seen = perceive_all_units(replay.world(plan), np.array([0]), states="sampled")
         assert (np.isinf(seen.arrives_s[0]) == missing).all()
         assert (seen.valid[0] == ~missing[seen.frame_ix]).all()
 
     def test_the_receiver_issues_nothing_meanwhile(self) -> None:
         outages = {"down_share": 0.5, "lasts_s": 2.0}
         plan = self.PLAN.model_copy(update={"units": experiment(units={"mast": unit(outages=outages)}).units})
-        result = run(plan, [alone(10.0)])
+        result = run_experiment(plan, [alone(10.0)])
         rates = result.summary["list_rate_hz"]
         assert (rates < 9.9).all()
         assert result.accuracy is not None
@@ -103,8 +101,8 @@ class TestOutages:
         plan = self.PLAN
         without = plan.model_copy(update={"units": experiment(units={"mast": unit(rate_hz=50.0)}).units})
         never = experiment(units={"mast": unit(rate_hz=50.0, outages={"down_share": 0.0, "lasts_s": 0.5})}).units
-        result = run(without, [alone(4.0)])
-        other = run(plan.model_copy(update={"units": never}), [alone(4.0)])
+        result = run_experiment(without, [alone(4.0)])
+        other = run_experiment(plan.model_copy(update={"units": never}), [alone(4.0)])
         assert result.table.equals(other.table)
         assert result.summary.equals(other.summary)
 
@@ -155,7 +153,10 @@ class TestClock:
             "measure": {"onset": {"kind": "appears"}, "match": {"gate_m": 20.0}},
         }
         off = experiment(units={"mast": unit(clock={"offset_sigma_s": 0.05})}, **changes)
-        clocks, exact = run(off, [recording]), run(experiment(units={"mast": unit()}, **changes), [recording])
+        clocks, exact = (
+            run_experiment(off, [recording]),
+            run_experiment(experiment(units={"mast": unit()}, **changes), [recording]),
+        )
         [error_s] = np.unique(
             clock_errors_s(clocks.replays[0].scene, ("mast",), off, np.zeros(1), np.zeros(1, dtype=int), 0)  # type: ignore[arg-type]
         )
@@ -187,8 +188,8 @@ class TestClock:
             "runs": 60, "measure": {"onset": {"kind": "appears"}},
             "configurations": {"late": {"units": ["mast"], "latency_s": 0.2, "fusion": {"kind": fusion}}},
         } | changes  # fmt: skip
-        exact = run(experiment(units={"mast": unit()}, **of), [self.early_and_late()])
-        off = run(
+        exact = run_experiment(experiment(units={"mast": unit()}, **of), [self.early_and_late()])
+        off = run_experiment(
             experiment(units={"mast": unit(clock={"offset_sigma_s": self.SIGMA_S})}, **of), [self.early_and_late()]
         )
         return exact, off
@@ -223,7 +224,7 @@ class TestClock:
             "configurations": {"late": {"units": ["mast"], "latency_s": 0.2, "fusion": {"kind": "gnn"}}},
         }  # fmt: skip
         without, nothing = (
-            run(experiment(units={"mast": unit(**clock)}, **of), [self.early_and_late()])
+            run_experiment(experiment(units={"mast": unit(**clock)}, **of), [self.early_and_late()])
             for clock in ({}, {"clock": {"offset_sigma_s": 0.0}})
         )
         assert without.table.equals(nothing.table)
@@ -233,8 +234,10 @@ class TestClock:
         plan = experiment(
             units={"mast": unit(clock={"offset_sigma_s": 0.05})}, configurations={"PEM": {"units": "all"}}
         )
-        result = run(plan, [alone(2.0)])
-        without = run(experiment(units={"mast": unit()}, configurations={"PEM": {"units": "all"}}), [alone(2.0)])
+        result = run_experiment(plan, [alone(2.0)])
+        without = run_experiment(
+            experiment(units={"mast": unit()}, configurations={"PEM": {"units": "all"}}), [alone(2.0)]
+        )
         assert result.table.equals(without.table)
         assert (
             "scene: configuration PEM: ideal fusion uses true captures, ignoring clock errors of mast" in result.notes
@@ -249,7 +252,7 @@ class TestPlaced:
         recording = scenes.recording([EGO, *(things or [Thing("car", "car", standing(50, 0))])], until_s=until_s)
         replay = ready(recording, plan)
         world = replay.world(plan)
-        seen = seen_by_all(world, np.arange(runs), states="sampled")
+        seen = perceive_all_units(world, np.arange(runs), states="sampled")
         return seen, world.found.tracks, replay.scene
 
     def test_one_degree_at_fifty_metres(self) -> None:
@@ -291,7 +294,7 @@ class TestPlaced:
         """At 59 m of 60 m that the unit sees: it lists the car in every run, wherever it takes itself to be."""
         plan = experiment(units={"mast": unit(pem="sure", placed={"position_sigma_m": 5.0})})
         replay = ready(scenes.recording([EGO, Thing("car", "car", standing(59, 0))], until_s=0), plan)
-        assert seen_by_all(replay.world(plan), np.arange(50), states="sampled").valid.all()
+        assert perceive_all_units(replay.world(plan), np.arange(50), states="sampled").valid.all()
 
 
 RECORDED = "  lists: {recorded: {topic: objects}, %s}"
@@ -310,7 +313,7 @@ def test_not_of_recorded_units(tmp_path: Path, text: str, said: str) -> None:
         "configurations:", RECORDED % text + "\nconfigurations:"
     )
     lines = [line for line in whole.splitlines() if not line.startswith(("  PEM:", "  coPEM:", "  GT:"))]
-    _, found = problems(source_of(tmp_path, "\n".join(lines)))
+    _, found = find_problems(source_of(tmp_path, "\n".join(lines)))
     assert [line.partition(": ")[2] for line in found] == [f"units.lists.{said}; only for units with a pem"]
 
 
@@ -339,14 +342,14 @@ def test_not_of_recorded_units(tmp_path: Path, text: str, said: str) -> None:
 )
 def test_problems(tmp_path: Path, key: str, text: str, said: str) -> None:
     whole = changed().replace("height_m: 5.0,", f"height_m: 5.0, {key}: {text},")
-    _, found = problems(source_of(tmp_path, whole))
+    _, found = find_problems(source_of(tmp_path, whole))
     assert [line.partition(": ")[2] for line in found] == [said]
 
 
 def test_a_posterior_has_no_memory(tmp_path: Path) -> None:
     whole = changed().replace("height_m: 5.0,", "height_m: 5.0, placed: {yaw_sigma_deg: 1},")
     whole = whole.replace("latency_s: 0.5}", "latency_s: 0.5, fusion: {kind: ideal, combine: posterior}}")
-    _, found = problems(source_of(tmp_path, whole))
+    _, found = find_problems(source_of(tmp_path, whole))
     said = "configurations.coPEM.fusion.combine: posterior draws anew at each instant and has no memory; use samples"
     assert [line.partition(": ")[2] for line in found] == [said]
 
@@ -355,7 +358,7 @@ def test_outages_have_no_closed_form(tmp_path: Path) -> None:
     whole = changed("measure: {exact: true}").replace(
         "height_m: 5.0,", "height_m: 5.0, outages: {down_share: 0.1, lasts_s: 1},"
     )
-    _, found = problems(source_of(tmp_path, whole))
+    _, found = find_problems(source_of(tmp_path, whole))
     said = (
         "measure.exact: unit 'mast' has outages, in which all objects miss all lists together: that has no closed form"
     )

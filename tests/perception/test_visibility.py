@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from copem_replay.core.tracks import Tracks
-from copem_replay.io.recording import read
+from copem_replay.io.recording import read_log
 from copem_replay.perception.visibility import (
     NO_STATICS,
     Flat,
@@ -21,8 +21,8 @@ from copem_replay.perception.visibility import (
     Statics,
     Surface,
     box_corners,
-    hidden_by,
-    statics,
+    find_blockers,
+    make_statics,
     visible_shares,
 )
 from tests.oracles.visibility import flat_share, prism, random_observer, random_scene, rectangle, surface_share
@@ -91,7 +91,7 @@ def test_random_scenes_agree_with_the_oracle(seed: int, height_m: float) -> None
         )
         for b, c in zip(boxes, corners, strict=True)
     ]
-    static = statics([b["polygon"] for b in walls], [b["z0"] for b in walls], [b["z1"] - b["z0"] for b in walls])
+    static = make_statics([b["polygon"] for b in walls], [b["z0"] for b in walls], [b["z1"] - b["z0"] for b in walls])
     world = one_list(poses)
     flat, surface = (shares(world, observer, static, flat=f) for f in (True, False))
     for k in range(len(boxes)):
@@ -105,7 +105,7 @@ def test_random_scenes_agree_with_the_oracle(seed: int, height_m: float) -> None
 @pytest.mark.skipif(not DATA.is_dir(), reason="shared/data with recordings is not beside the project")
 @pytest.mark.parametrize("name", ["nuscenes_scene0061", "av2_3b3570b4"])
 def test_a_recording_agrees_with_the_oracle(name: str) -> None:
-    recording = read(DATA / f"{name}.mcap", name=name)
+    recording = read_log(DATA / f"{name}.mcap", name=name)
     truth, ego = recording.truth, recording.scene.ego_ix
     corners, checked = box_corners(truth), 0
     order, bounds = truth.by_frame
@@ -143,9 +143,9 @@ def test_a_recording_agrees_with_the_oracle(name: str) -> None:
 @pytest.mark.skipif(not DATA.is_dir(), reason="shared/data with recordings is not beside the project")
 def test_highway_merge_gives_the_published_table() -> None:
     """The worked example of omega-prime-visibility's README, on its own recording."""
-    recording = read(DATA / "highway_merge.mcap", name="highway_merge")
+    recording = read_log(DATA / "highway_merge.mcap", name="highway_merge")
     truth, scene = recording.truth, recording.scene
-    wall = statics([np.array([(-220, 10), (-120, 10), (-120, 0), (-220, 0)])], [0.0], [1.0])
+    wall = make_statics([np.array([(-220, 10), (-120, 10), (-120, 0), (-220, 0)])], [0.0], [1.0])
     ego = np.flatnonzero(truth.row_object_ix == scene.ego_ix)
     place = np.stack([truth.x_m[0, ego], truth.y_m[0, ego], np.full(len(ego), 1.8)], axis=-1)[None]
     there = np.ones((1, len(ego)), dtype=bool)
@@ -202,11 +202,11 @@ def test_an_obstacle_that_reaches_into_the_target_hides_where_it_begins_first() 
     """
     ell = np.array([(4, -6), (5, -6), (5, 4), (9.5, 4), (9.5, 5), (4, 5)], dtype=float)
     world = one_list([(10, 4.5, 0, 2, 2, 0, 2), (10, 0, 0, 1, 1, 0, 2)])
-    assert shares(world, (0, 0, 1), statics([ell], [0.0], [5.0]), flat=False).tolist() == [0, 0]
+    assert shares(world, (0, 0, 1), make_statics([ell], [0.0], [5.0]), flat=False).tolist() == [0, 0]
 
     def seen(begins_m: float) -> list[float]:
         wing = np.array([(begins_m, 4), (9.5, 4), (9.5, 5), (begins_m, 5)])
-        return [shares(world, (0, 4.5, 1), statics([wing], [0.0], [5.0]), flat=flat)[0] for flat in (True, False)]
+        return [shares(world, (0, 4.5, 1), make_statics([wing], [0.0], [5.0]), flat=flat)[0] for flat in (True, False)]
 
     assert seen(9.0) == [1, 1]
     half = math.atan(1 / 9)
@@ -226,7 +226,7 @@ def against_rays(
     """By how much the shares of a target 1.7 m high differ from those by 8,000 rays, with heights and without."""
     (c0, c1, c2, _), middle = target, target.mean(axis=0)
     pose = (*middle, np.arctan2(*(c0 - c1)[::-1]), np.hypot(*(c0 - c1)), np.hypot(*(c1 - c2)), 0.0, 1.7)
-    static = statics(solids, [z0 for z0, _ in heights], [z1 - z0 for z0, z1 in heights])
+    static = make_statics(solids, [z0 for z0, _ in heights], [z1 - z0 for z0, z1 in heights])
     surface, flat = (shares(one_list([pose]), eye, static, flat=flat)[0] for flat in (False, True))
     prisms = [(solid, z0, z1) for solid, (z0, z1) in zip(solids, heights, strict=True)]
     by_rays = surface_share(eye, (target, 0.0, 1.7), [], azimuths=8000, solids=prisms)
@@ -265,7 +265,7 @@ def test_a_gantry_does_not_look_through_the_truck_below_it(x_m: float) -> None:
     world = one_list([(0, 0, 0, 12, 2.5, 0, 4), (x_m, 0, 0, 0.001, 0.5, 0, 1.75)])
     above_m = np.clip(6 - 2 * x_m / 6, 0, 1.75)
     assert shares(world, (0, 0, 6), flat=False)[1] == pytest.approx(1 - above_m / 1.75, abs=1e-3)
-    assert hidden_by(world, NO_STATICS, at((0, 0, 6)), Surface())[0].tolist() == [-1, 0 if above_m > 0 else -1]
+    assert find_blockers(world, NO_STATICS, at((0, 0, 6)), Surface())[0].tolist() == [-1, 0 if above_m > 0 else -1]
     for inside in ((0, 0, 3.9), (0, 0, 4.0), (0, 0, 4.005)):
         assert shares(world, inside, flat=False)[1] == 1, "on its top, as on that of a mast of the log, is in it"
     assert shares(world, (0, 0, 6), flat=True)[1] == 1, "bodies without end have nothing above them"
@@ -279,7 +279,7 @@ def test_under_a_deck_what_is_above_its_far_edge_is_hidden() -> None:
 
 def test_a_unit_on_a_wall_or_a_roof_has_it_before_it() -> None:
     """On the face of a house, at its corner, and on its roof: what is behind it is hidden, what is before it is not."""
-    house = statics([np.array([(0, -10), (20, -10), (20, 10), (0, 10)])], [0.0], [12.0])
+    house = make_statics([np.array([(0, -10), (20, -10), (20, 10), (0, 10)])], [0.0], [12.0])
     world = one_list([(30, 0, 0, 1, 1, 0, 2), (-30, 0, 0, 1, 1, 0, 2), (-30, -30, 0, 1, 1, 0, 2)])
     for place in ((0, 0, 6), (-1e-9, 0, 6), (1e-9, 0, 6), (0, -10, 6)):
         assert shares(world, place, house, flat=False).tolist() == [0, 1, 1]
@@ -296,7 +296,7 @@ def test_a_person_who_steps_from_behind_a_corner() -> None:
 
     def unknown_s(east_m: float) -> float:
         west, east = east_m - 30, east_m + 3
-        house = statics([np.array([(west, 5), (east, 5), (east, 30), (west, 30)])], [0.0], [8.0])
+        house = make_statics([np.array([(west, 5), (east, 5), (east, 30), (west, 30)])], [0.0], [8.0])
         left, total = 1.0, 0.0
         for k in range(80):
             t = k / 10
@@ -349,8 +349,8 @@ def test_who_hides_whom() -> None:
             (-30, 0, 0, 1, 1, 0, 2),  # free
         ]
     )
-    house = statics([np.array([(-5, 10), (5, 10), (5, 12), (-5, 12)])], [0.0], [9.0])
-    assert hidden_by(world, house, at((0, 0, 1)), Surface())[0].tolist() == [2, -1, 1, -2, -1]
+    house = make_statics([np.array([(-5, 10), (5, 10), (5, 12), (-5, 12)])], [0.0], [9.0])
+    assert find_blockers(world, house, at((0, 0, 1)), Surface())[0].tolist() == [2, -1, 1, -2, -1]
 
 
 @pytest.mark.parametrize("side", [1, -1])
@@ -365,4 +365,4 @@ def test_a_wall_from_far_behind_to_the_front_hides_what_is_ahead(side: int) -> N
     free, hidden = math.atan(7 / 20) + math.atan(0.05), math.atan(3 / 20) - math.atan(0.05)
     assert seen == pytest.approx(free / (free + hidden), abs=1e-3)
     assert wall == 1
-    assert hidden_by(world, NO_STATICS, at((0, 0, 1)), Flat())[0].tolist() == [1, -1]
+    assert find_blockers(world, NO_STATICS, at((0, 0, 1)), Flat())[0].tolist() == [1, -1]

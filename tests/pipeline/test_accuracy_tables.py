@@ -9,12 +9,12 @@ import pandas as pd
 import pytest
 
 from copem_replay.io.recording import Recording
-from copem_replay.pipeline import blocks as blocks_module
-from copem_replay.pipeline.accuracy_tables import AccuracyTables
+from copem_replay.pipeline import replay as blocks_module
 from copem_replay.pipeline.one_run import tracks_of_run
-from copem_replay.pipeline.prepare import prepare
-from copem_replay.pipeline.run import Result, run
+from copem_replay.pipeline.prepare import prepare_log
+from copem_replay.pipeline.run import ExperimentResult, run_experiment
 from copem_replay.pipeline.scoring import DISTANCE_EDGES_M, EXISTENCE_THRESHOLDS
+from copem_replay.pipeline.tables import AccuracyTables
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
 
 KEYS = ["log", "configuration", "run", "object_id"]
@@ -49,7 +49,7 @@ def street(name: str, speed_mps: float) -> Recording:
 
 
 @pytest.fixture(scope="module")
-def result() -> Result:
+def result() -> ExperimentResult:
     """Everything that can happen to a list: misses, errors, stale entries, who is looked at from some instant on."""
     plan = experiment(
         runs=5,
@@ -58,20 +58,20 @@ def result() -> Result:
         configurations=configurations(*NAMES[2:], latency_s={"mast": 0.35}),
         measure={"onset": {"kind": "in_range", "range_m": 50}},
     )
-    return run(plan, [street("one", 10), street("two", 25)], jobs=2)
+    return run_experiment(plan, [street("one", 10), street("two", 25)], jobs=2)
 
 
-def tables(of: Result) -> AccuracyTables:
+def tables(of: ExperimentResult) -> AccuracyTables:
     assert of.accuracy is not None
     return of.accuracy
 
 
-def rows(of: Result, configuration: str, name: str = "accuracy") -> pd.DataFrame:
+def rows(of: ExperimentResult, configuration: str, name: str = "accuracy") -> pd.DataFrame:
     table = of.bands if name == "bands" else getattr(tables(of), name).to_pandas()
     return table[table["configuration"] == configuration]
 
 
-def figures(of: Result, configuration: str) -> pd.Series:
+def figures(of: ExperimentResult, configuration: str) -> pd.Series:
     return of.summary.set_index("configuration").loc[configuration]
 
 
@@ -81,7 +81,7 @@ def values(column: pd.Series) -> Any:
 
 
 class TestTheSame:
-    def test_rows_are_those_of_detections(self, result: Result) -> None:
+    def test_rows_are_those_of_detections(self, result: ExperimentResult) -> None:
         for name in ("accuracy", "detections"):
             table = result.table if name == "detections" else tables(result).accuracy.to_pandas()  # type: ignore[union-attr]
             expected = [
@@ -93,7 +93,7 @@ class TestTheSame:
             ]
             assert list(table[KEYS].itertuples(index=False, name=None)) == expected
 
-    def test_lists_of_a_stay(self, result: Result) -> None:
+    def test_lists_of_a_stay(self, result: ExperimentResult) -> None:
         """From the first instant the object is in the log, whatever its onset, to the end of the look."""
         instants = tables(result).instants
         assert instants is not None
@@ -113,7 +113,7 @@ class TestTheSame:
                 looked = ~np.isnan(np.asarray(one.gospa_m2, dtype=float))
                 assert (looked == (times_s[first:last] > onset_s - 1e-6)).all()
 
-    def test_errors_and_gospa_are_those_of_the_summary(self, result: Result) -> None:
+    def test_errors_and_gospa_are_those_of_the_summary(self, result: ExperimentResult) -> None:
         for name in NAMES:
             found, table = figures(result, name), rows(result, name)
             error_m = values(table["error_m"])
@@ -129,7 +129,7 @@ class TestTheSame:
             assert np.hypot(np.hypot(*parts[:2]), parts[2]) == pytest.approx(found["gospa_m"])
             assert len(looked) > 100
 
-    def test_columns_of_detections(self, result: Result) -> None:
+    def test_columns_of_detections(self, result: ExperimentResult) -> None:
         for name in NAMES:
             table = result.table[result.table["configuration"] == name]
             errors = [np.asarray(one, dtype=float) for one in rows(result, name)["error_m"]]
@@ -142,7 +142,7 @@ class TestTheSame:
             bias_m = (table["bias_east_m"].fillna(0) * count).sum() / count.sum()
             assert bias_m == pytest.approx(figures(result, name)["bias_east_m"])
 
-    def test_ghosts(self, result: Result) -> None:
+    def test_ghosts(self, result: ExperimentResult) -> None:
         some = 0
         for name in NAMES:
             table, found = rows(result, name, "lists"), figures(result, name)
@@ -163,7 +163,7 @@ class TestTheSame:
             some += table["ghosts"].sum()
         assert some > 100
 
-    def test_thresholds(self, result: Result) -> None:
+    def test_thresholds(self, result: ExperimentResult) -> None:
         """By match, for ideal fusion and the truth too, which are detected by truth id and so at least as soon."""
         for name in NAMES:
             steps = rows(result, name, "thresholds")
@@ -179,7 +179,7 @@ class TestTheSame:
                 assert (np.diff(part["detection_s"]) > 0).all()
         assert len(rows(result, "union", "thresholds")) > rows(result, "union", "thresholds").groupby(KEYS).ngroups
 
-    def test_bands_add_up(self, result: Result) -> None:
+    def test_bands_add_up(self, result: ExperimentResult) -> None:
         for name in NAMES:
             table, of_lists, bands = rows(result, name), rows(result, name, "lists"), rows(result, name, "bands")
             pairs = np.count_nonzero(~np.isnan(values(table["error_m"])))
@@ -208,7 +208,7 @@ class TestWhatIsThere:
     def test_not_asked_for(self) -> None:
         plan = experiment(units={"ego": UNITS["ego"]}, pems=pems(), configurations=configurations("gnn"),
                           measure=APPEARS | {"accuracy": False})  # fmt: skip
-        result = run(plan, [street("one", 10)])
+        result = run_experiment(plan, [street("one", 10)])
         assert result.accuracy is None
         assert "position_rmse_m" not in result.summary
         assert "matched_lists" not in result.table
@@ -219,7 +219,7 @@ class TestWhatIsThere:
         fleet = {"ego": UNITS["ego"], "obu": {"on": {"classes": ["car"], "penetration_rate": 0.5}, "pem": "p"}}
         late = configurations("union", "gnn", latency_s={"ego": 0.0, "default": 0.13})
         plan = experiment(units=fleet, pems=pems(0.8, 0.5), runs=8, measure=APPEARS, configurations=late)
-        result = run(plan, [street("one", 10)])
+        result = run_experiment(plan, [street("one", 10)])
         assert len(set(rows(result, "union", "lists")["lists"])) > 1
         for name in ("GT", "ideal", "union", "gnn"):
             table, found = result.table[result.table["configuration"] == name], figures(result, name)
@@ -247,7 +247,7 @@ class TestWhatIsThere:
                 pd.testing.assert_series_equal(first, table.set_index(KEYS)["detection_s"].dropna(), check_exact=True)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(blocks_module, "BLOCK_BYTES", 1)
-            other = run(plan, [street("one", 10)], jobs=2)
+            other = run_experiment(plan, [street("one", 10)], jobs=2)
         pd.testing.assert_frame_equal(result.summary, other.summary, check_exact=True)
         for name in ("accuracy", "instants", "lists", "thresholds"):
             assert getattr(tables(result), name).equals(getattr(tables(other), name)), name
@@ -270,7 +270,7 @@ class TestInTheHead:
         plan = experiment(
             units={"ego": UNITS["ego"]}, pems=pems(), configurations=configurations(kind), measure=APPEARS
         )
-        result = run(plan, [still(*others)])
+        result = run_experiment(plan, [still(*others)])
         late_s = 0.1 if kind == "tracker" else 0.0
         assert result.table["detection_s"].tolist() == [0.0] * 6 + [pytest.approx(late_s)] * 3
         for figure in (
@@ -286,7 +286,7 @@ class TestInTheHead:
     def test_what_the_gate_cuts_off_is_said(self, sigma_m: float, said: bool) -> None:
         plan = experiment(units={"ego": UNITS["ego"]}, pems=pems(sigma_m=sigma_m), measure=APPEARS,
                           configurations=configurations("union"))  # fmt: skip
-        result = run(plan, [still()])
+        result = run_experiment(plan, [still()])
         found = [note for note in result.notes if "expected beyond the gate of 3 m" in note]
         assert len(found) == said
         if said:
@@ -296,7 +296,7 @@ class TestInTheHead:
     def test_two_units_list_it_twice(self) -> None:
         plan = experiment(units=UNITS, pems=pems() | {"q": pems()["p"]}, measure=APPEARS,
                           configurations=configurations("union", "nms", "gnn"))  # fmt: skip
-        result = run(plan, [still()])
+        result = run_experiment(plan, [still()])
         assert rows(result, "union", "lists")[["lists", "duplicates", "ghosts"]].to_numpy().tolist() == [[21, 21, 0]]
         for kind in ("nms", "gnn"):
             assert rows(result, kind, "lists")[["lists", "duplicates", "ghosts"]].to_numpy().tolist() == [[21, 0, 0]]
@@ -308,14 +308,14 @@ class TestInTheHead:
         common: Any = {"pems": pems(1.0, 2.5), "runs": 30, "configurations": configurations("union")}
         common["units"] = {"ego": UNITS["ego"]}
         plan = experiment(measure=measure, **common)
-        by_id = run(plan, [still()]).table.set_index("configuration")
-        always = run(experiment(measure=measure | {"match": {"always": True}}, **common), [still()])
+        by_id = run_experiment(plan, [still()]).table.set_index("configuration")
+        always = run_experiment(experiment(measure=measure | {"match": {"always": True}}, **common), [still()])
         always_by = always.table.set_index("configuration")
         pd.testing.assert_frame_equal(always_by.loc["GT"], by_id.loc["GT"])
         assert set(by_id.loc["ideal", "detection_s"]) == {0.5}
         expected_s = []
         for k in range(30):
-            fused = tracks_of_run(prepare(still(), plan), plan, k)["ideal"].fused
+            fused = tracks_of_run(prepare_log(still(), plan), plan, k)["ideal"].fused
             times_s = fused.captured_s[fused.frame_ix]
             near = np.hypot(fused.x_m[0] - 20, fused.y_m[0] - 5) <= 3.0
             expected_s.append(times_s[near & (times_s > 0.49)].min())

@@ -16,23 +16,21 @@ from hypothesis import strategies as st
 
 from copem_replay.cli import main as cli
 from copem_replay.core.object_list import Inputs, ObjectLists
-from copem_replay.core.time_chunk import WHOLE, TimeChunk
-from copem_replay.core.tracks import TRUTH, VALUES, Tracks
-from copem_replay.experiment.file import load, log_paths
+from copem_replay.core.tracks import TRUTH, VALUES, WHOLE, TimeChunk, Tracks
+from copem_replay.experiment.file import log_paths, read_experiment_file
 from copem_replay.experiment.schema import Experiment
-from copem_replay.experiment.validate import problems, read_logs
-from copem_replay.fusion.base import ListFusion
+from copem_replay.experiment.validate import find_problems, read_logs
+from copem_replay.fusion.interface import ListFusion
 from copem_replay.fusion.union import Union
 from copem_replay.io.recording import Recording
 from copem_replay.perception.visibility import visible_shares
-from copem_replay.pipeline import chunking
-from copem_replay.pipeline.accuracy_tables import AccuracyTables
-from copem_replay.pipeline.chunking import Reach
+from copem_replay.pipeline import prepare as chunking
+from copem_replay.pipeline.expansion import Presence
 from copem_replay.pipeline.one_run import RunTracks
-from copem_replay.pipeline.prepare import prepare
-from copem_replay.pipeline.presence import Presence
-from copem_replay.pipeline.receiver import listen, seen_by_all
-from copem_replay.pipeline.run import Result, run
+from copem_replay.pipeline.prepare import Reach, prepare_log
+from copem_replay.pipeline.receiver import hear_units, perceive_all_units
+from copem_replay.pipeline.run import ExperimentResult, run_experiment
+from copem_replay.pipeline.tables import AccuracyTables
 from tests.helpers import scenes
 from tests.helpers.recordings import Obj, pedestrian, write_recording
 from tests.helpers.scenes import Thing, driving, experiment, standing
@@ -61,16 +59,18 @@ def shown_in(path: Path) -> dict[str, list[str]]:
     return {entity: sorted(str(sorted(row.items())) for row in rows(path, entity)) for entity in entities}
 
 
-def both_ways(plan: Experiment, recordings: Sequence[Recording], rows_at_once: int) -> tuple[Result, Result]:
+def both_ways(
+    plan: Experiment, recordings: Sequence[Recording], rows_at_once: int
+) -> tuple[ExperimentResult, ExperimentResult]:
     """In one piece, and in time chunks of so many observation rows."""
-    whole = run(plan, recordings)
+    whole = run_experiment(plan, recordings)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(chunking, "ROWS_AT_ONCE", 1)
         patch.setattr(chunking, "ROWS_A_CHUNK", rows_at_once)
-        return whole, run(plan, recordings)
+        return whole, run_experiment(plan, recordings)
 
 
-def assert_same(whole: Result, pieces: Result) -> None:
+def assert_same(whole: ExperimentResult, pieces: ExperimentResult) -> None:
     assert [replay.chunks for replay in whole.replays] == [(WHOLE,)] * len(whole.replays)
     pd.testing.assert_frame_equal(whole.table, pieces.table, check_exact=True)
     pd.testing.assert_frame_equal(whole.summary, pieces.summary, check_exact=True)
@@ -93,8 +93,8 @@ def assert_same_tables(whole: AccuracyTables, pieces: AccuracyTables) -> None:
 
 @pytest.mark.parametrize(("name", "rows", "configurations"), [("tc016d", 1500, None), ("crossing", 25_000, 9)])
 def test_the_sample_logs(name: str, rows: int, configurations: int | None) -> None:
-    source = load(LOGS / f"{name}.yaml")
-    plan, found = problems(source)
+    source = read_experiment_file(LOGS / f"{name}.yaml")
+    plan, found = find_problems(source)
     assert plan is not None, found
     chosen = dict(list(plan.configurations.items())[:configurations])
     plan = plan.model_copy(update={"runs": 2, "configurations": chosen})
@@ -220,7 +220,7 @@ def test_all_that_units_get_wrong(rows: int) -> None:
     whole, pieces = both_ways(plan, [traffic()], rows)
     assert len(pieces.replays[0].chunks) > 1
     assert_same(whole, pieces)
-    parallel = run(plan, [traffic()], jobs=2)
+    parallel = run_experiment(plan, [traffic()], jobs=2)
     assert_same(whole, parallel)
 
 
@@ -278,7 +278,7 @@ def test_chunks_cover_the_log_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(chunking, "ROWS_AT_ONCE", 1)
     monkeypatch.setattr(chunking, "ROWS_A_CHUNK", 40)
     log = traffic()
-    replay = prepare(log, experiment())
+    replay = prepare_log(log, experiment())
     cuts = replay.chunks
     assert (cuts[0].from_s, cuts[-1].until_s) == (-np.inf, np.inf)
     assert all(one.until_s == after.from_s for one, after in pairwise(cuts))
@@ -322,7 +322,7 @@ def test_what_no_run_lists_is_not_held(rows_at_once: int, monkeypatch: pytest.Mo
     monkeypatch.setattr(chunking, "ROWS_A_CHUNK", rows_at_once)
     near = [{"when": {"range_m": [0, 20]}, "detection": {"kind": "constant", "probability": 0.5}}]
     plan = experiment(pems={"sure": near})
-    replay = prepare(traffic(), plan)
+    replay = prepare_log(traffic(), plan)
     found = replay.found(WHOLE)
     listed = np.flatnonzero((found.view.range_m >= 0) & (found.view.range_m < 20))
     assert 0 < len(listed) < len(found.view.range_m) / 2
@@ -341,9 +341,9 @@ def test_visible_shares_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr("copem_replay.perception.observation.visible_shares", counted)
     monkeypatch.setattr(chunking, "ROWS_AT_ONCE", 1)
     monkeypatch.setattr(chunking, "ROWS_A_CHUNK", 60)
-    monkeypatch.setattr("copem_replay.pipeline.blocks.BLOCK_BYTES", 1)
+    monkeypatch.setattr("copem_replay.pipeline.replay.BLOCK_BYTES", 1)
     plan = experiment(runs=3, configurations={"late": {"units": "all", "latency_s": 0.4}}, pems={"sure": NOISY})
-    result = run(plan, [traffic()])
+    result = run_experiment(plan, [traffic()])
     [replay] = result.replays
     list(RunTracks(replay, plan, 0))
     rows = len(replay.truth.frame_ix)
@@ -376,10 +376,10 @@ def test_a_chunk_reaches_back_to_a_list_that_another_unit_still_goes_by() -> Non
         units={"ego": scenes.EGO_UNIT, "slow": {"at": [0, 9], "height_m": 5.0, "pem": "sure", "rate_hz": 1.0}},
         configurations={"ideal": {"units": "all", "latency_s": {"default": 0.2}}},
     )
-    replay = prepare(traffic(), plan)
+    replay = prepare_log(traffic(), plan)
     lists = replay.lists_only(plan)
-    seen = seen_by_all(lists, np.arange(1), states="true")
-    heard = {"ideal": listen(seen, lists, "ideal")}
+    seen = perceive_all_units(lists, np.arange(1), states="true")
+    heard = {"ideal": hear_units(seen, lists, "ideal")}
     assert Reach(plan, heard).earliest_s(TimeChunk(2.85, 3.0)) == pytest.approx(2.0, abs=0.01)
 
 

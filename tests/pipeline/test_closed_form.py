@@ -29,19 +29,19 @@ from pyarrow import parquet
 from copem_replay.cli import main as cli
 from copem_replay.core.errors import ExperimentError
 from copem_replay.core.tracks import Float
-from copem_replay.experiment.file import load, log_paths
+from copem_replay.experiment.file import log_paths, read_experiment_file
 from copem_replay.experiment.schema import Experiment
-from copem_replay.experiment.validate import problems, read_logs
+from copem_replay.experiment.validate import find_problems, read_logs
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.braking.driver import Reaction
-from copem_replay.metrics.braking.verdict import judge
-from copem_replay.metrics.detection.by_truth_id import detect
-from copem_replay.metrics.summary import summary
+from copem_replay.metrics.braking.verdict import judge_braking
+from copem_replay.metrics.detection.by_truth_id import detect_by_truth_id
+from copem_replay.metrics.summary import summarise_rows
 from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_incidence, quantile_with_never
-from copem_replay.pipeline.closed_form import distributions, exact_table
-from copem_replay.pipeline.prepare import Replay, prepare
-from copem_replay.pipeline.receiver import listen
-from copem_replay.pipeline.run import Result, run
+from copem_replay.pipeline.closed_form import compute_distributions, exact_table
+from copem_replay.pipeline.prepare import Replay, prepare_log
+from copem_replay.pipeline.receiver import hear_units
+from copem_replay.pipeline.run import ExperimentResult, run_experiment
 from tests.helpers.experiments import changed, drive, source_of
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
 
@@ -170,7 +170,7 @@ def replayed(world: World) -> tuple[Replay, Experiment]:
             "count_earlier": world.count_earlier,
         },
     )
-    return prepare(log, plan), plan
+    return prepare_log(log, plan), plan
 
 
 def ms(time_s: float) -> int:
@@ -182,7 +182,7 @@ def ms(time_s: float) -> int:
 def in_closed_form(ready: Replay, plan: Experiment, name: str = "all") -> dict[str, Times]:
     """What the package says, object by object."""
     result = {}
-    for object_ix, of in zip(ready.episodes.object_ix, distributions(ready, plan, name), strict=True):
+    for object_ix, of in zip(ready.episodes.object_ix, compute_distributions(ready, plan, name), strict=True):
         assert (np.diff(of.time_s) > 0).all()
         assert (of.probability >= 0).all()
         times: Times = {ms(t): float(p) for t, p in zip(of.time_s, of.probability, strict=True)}
@@ -203,8 +203,8 @@ def by_detect(ready: Replay, plan: Experiment, name: str = "all") -> dict[str, T
         valid = np.repeat((mine & (probability == 1))[None], len(outcomes), axis=0)
         valid[:, chance] = outcomes
         weight = np.where(outcomes, probability[chance], 1 - probability[chance]).prod(axis=1)
-        found = detect(
-            listen(replace(tracks, valid=valid), ready.world(plan), name),
+        found = detect_by_truth_id(
+            hear_units(replace(tracks, valid=valid), ready.world(plan), name),
             ready.episodes,
             confirm=plan.measure.confirm,
             count_earlier=plan.measure.count_earlier,
@@ -339,7 +339,7 @@ def test_lists_captured_at_different_times_that_arrive_together() -> None:
         configurations={"all": {"units": "all", "latency_s": {"ego": 0.04, "mast": 0.0}}},
         measure={"onset": {"kind": "at", "time_s": 0.22}, "confirm": {"hits": 2, "of": 3}},
     )
-    ready = prepare(log, plan)
+    ready = prepare_log(log, plan)
     found, real = in_closed_form(ready, plan)["a"], by_detect(ready, plan)["a"]
     same(found, real)
     # At 0.24 s by the mast alone, whose capture is after the onset; two hits need the next instant.
@@ -355,7 +355,7 @@ def test_the_truth_is_certain() -> None:
             units={},
             measure={"onset": {"kind": "appears"}, "confirm": {"hits": hits, "of": of}},
         ).model_copy(update={"units": replayed_plan.units})
-        of, *others = distributions(ready, plan, "GT")
+        of, *others = compute_distributions(ready, plan, "GT")
         assert not others
         assert ms(of.time_s[0]) == 500
         assert [ms(t) for t, p in zip(of.time_s, of.probability, strict=True) if p > 0] == [known]
@@ -384,7 +384,7 @@ def masts(count: int, probability: float = 0.5, **changes: Any) -> Experiment:
 
 
 def exact(plan: Experiment, log: Recording) -> pd.DataFrame:
-    return exact_table(prepare(log, plan), plan)
+    return exact_table(prepare_log(log, plan), plan)
 
 
 def near(values: list[float]) -> Any:
@@ -413,7 +413,7 @@ class TestByHand:
 
     def test_the_mean(self) -> None:
         """E min(T, 1 s) = Σ 0.1 s · P(T > 0.1 k s), k = 0 … 9: 0.1 · (1 − 2⁻¹⁰)."""
-        row = run(masts(1), [one_walker()]).summary.iloc[0]
+        row = run_experiment(masts(1), [one_walker()]).summary.iloc[0]
         assert row["ttd_rmst_s_exact"] == pytest.approx(0.1 * (1 - 2**-10), abs=1e-15)
         assert row["ttd_rmst_horizon_s"] == 1
 
@@ -477,18 +477,18 @@ class TestByHand:
             rows = exact(plan, one_walker())
             assert rows["probability"].tolist() == [1]
             assert rows["detection_s"].isna().all()
-            row = run(plan, [one_walker()]).summary.iloc[0]
+            row = run_experiment(plan, [one_walker()]).summary.iloc[0]
             assert (row["detected_share_exact"], row["ttd_rmst_s_exact"]) == (0, 1)
 
     def test_nothing_to_look_at(self) -> None:
         plan = masts(1, measure={"onset": {"kind": "in_range", "range_m": 5}, "exact": True})
-        result = run(plan, [one_walker()])
+        result = run_experiment(plan, [one_walker()])
         assert result.exact is not None
         assert len(result.exact) == 0
         assert result.summary["detected_share_exact"].isna().all()
         # Beside a log that has something it adds nothing.
         nearer = recording([Thing("ego", "car", standing(0, 0)), Thing("a", "car", standing(4, 3))], until_s=1, log="b")
-        both = run(plan, [one_walker(), nearer]).exact
+        both = run_experiment(plan, [one_walker(), nearer]).exact
         assert both is not None
         assert both["log"].unique().tolist() == ["b"]
         assert both["probability"].sum() == pytest.approx(1)
@@ -504,10 +504,10 @@ class TestByHand:
 
     def test_asked_for_or_not(self) -> None:
         quiet = masts(1, measure={"onset": {"kind": "appears"}})
-        result = run(quiet, [one_walker()])
+        result = run_experiment(quiet, [one_walker()])
         assert result.exact is None
         assert not [name for name in result.summary if name.endswith("_exact")]
-        asked = run(masts(1), [one_walker()])
+        asked = run_experiment(masts(1), [one_walker()])
         pd.testing.assert_frame_equal(asked.table, result.table)
         pd.testing.assert_frame_equal(asked.summary[list(result.summary)], result.summary)
 
@@ -515,7 +515,7 @@ class TestByHand:
 class TestTails:
     def test_never_where_one_minus_the_rest_is_nothing(self) -> None:
         """Two masts, eleven lists each, odds of 9 : 1: never with 10⁻²², at half the odds with (2/11)²²."""
-        result = run(masts(2, 0.9), [one_walker()])
+        result = run_experiment(masts(2, 0.9), [one_walker()])
         assert result.exact is not None
         never, row = result.exact.iloc[-1], result.summary.iloc[0]
         assert never["probability"] == pytest.approx(1e-22, rel=1e-12, abs=0)
@@ -525,14 +525,14 @@ class TestTails:
             assert found["miss_log10_half_odds"] == pytest.approx(22 * math.log10(2 / 11), rel=1e-13)
 
     def test_a_logarithm_where_there_is_no_double_any_more(self) -> None:
-        row = run(masts(110, 0.999), [one_walker()]).summary.iloc[0]
+        row = run_experiment(masts(110, 0.999), [one_walker()]).summary.iloc[0]
         assert row["miss_log10"] == pytest.approx(-3 * 110 * 11, rel=1e-12)
 
     def test_when_two_of_two_are_asked_for(self) -> None:
         """Three lists: all miss but the middle one, or but one at an end, or all, or but both ends."""
         there = one_walker(lambda t: t < 0.25)
         plan = masts(1, 0.999, measure={"onset": {"kind": "appears"}, "confirm": {"hits": 2, "of": 2}, "exact": True})
-        row = run(plan, [there]).summary.iloc[0]
+        row = run_experiment(plan, [there]).summary.iloc[0]
         p, q = 0.999, 1 - 0.999
         assert row["miss_log10"] == pytest.approx(math.log10(q**3 + 3 * p * q**2 + p * p * q), rel=1e-13)
 
@@ -543,7 +543,7 @@ class TestTails:
             Thing("a", "pedestrian", standing(20, 0), lambda t: t < 0.35),
             Thing("b", "pedestrian", standing(30, 0), lambda t: t < 0.15),
         ]
-        row = run(masts(1, 0.9), [recording(things, until_s=1.0)]).summary.iloc[0]
+        row = run_experiment(masts(1, 0.9), [recording(things, until_s=1.0)]).summary.iloc[0]
         assert row["miss_log10"] == pytest.approx(math.log10((1e-4 + 1e-2) / 2), rel=1e-13)
         assert row["miss_per_logit"] == pytest.approx(-(1e-4 * 3.6 + 1e-2 * 1.8) / (1e-4 + 1e-2), rel=1e-12)
         half = math.log10(((2 / 11) ** 4 + (2 / 11) ** 2) / 2)
@@ -551,7 +551,9 @@ class TestTails:
 
     def test_in_a_sweep(self) -> None:
         """What is later than 0.25 s leaves eight lists of eleven."""
-        sweep = run(masts(1, 0.9, sweep={"configurations": ["all"], "latency_s": [0.25]}), [one_walker()]).sweep
+        sweep = run_experiment(
+            masts(1, 0.9, sweep={"configurations": ["all"], "latency_s": [0.25]}), [one_walker()]
+        ).sweep
         assert sweep is not None
         assert sweep["miss_log10"].tolist() == pytest.approx([-8], rel=1e-13)
         assert sweep["miss_per_logit"].tolist() == pytest.approx([-7.2], rel=1e-13)
@@ -566,7 +568,9 @@ class TestTails:
             {"detection": {"kind": "constant", "probability": 0.9}},
         ]
         both = {"all": {"units": "all"}, "GT": {"units": "truth"}}
-        rows = run(masts(1, pems={"p": couples}, configurations=both), [log]).summary.set_index("configuration")
+        rows = run_experiment(masts(1, pems={"p": couples}, configurations=both), [log]).summary.set_index(
+            "configuration"
+        )
         assert rows.loc["all", "miss_log10"] == pytest.approx(math.log10(1e-11 / 2), rel=1e-13)
         assert rows.loc["all", "miss_per_logit"] == pytest.approx(-9.9, rel=1e-13)
         assert rows.loc["GT", ["miss_log10", "miss_per_logit", "miss_log10_half_odds"]].isna().all()
@@ -583,7 +587,9 @@ class TestTails:
             "fleet": {"on": {"classes": ["car"], "penetration_rate": 0.5}, "pem": "p"},
         }
         measure = {"onset": {"kind": "appears"}, "objects": {"classes": ["pedestrian"]}, "exact": True}
-        row = run(masts(1, 0.9, units=units, measure=measure), [recording(things, until_s=1.0)]).summary.iloc[0]
+        row = run_experiment(
+            masts(1, 0.9, units=units, measure=measure), [recording(things, until_s=1.0)]
+        ).summary.iloc[0]
         assert row["miss_log10"] == pytest.approx(-11 + math.log10(0.5 + 0.5e-11), rel=1e-13)
         assert row["miss_per_logit"] == pytest.approx(-9.9 * (1 + 1e-11 / (1 + 1e-11)), rel=1e-13)
 
@@ -610,7 +616,7 @@ def refused(plan: Experiment, log: Recording) -> str:
     """The line with which it is refused, before anything is run."""
     steps: list[tuple[int, int]] = []
     with pytest.raises(ExperimentError) as caught:
-        run(plan, [log], progress=lambda done, total: steps.append((done, total)))
+        run_experiment(plan, [log], progress=lambda done, total: steps.append((done, total)))
     assert steps == []
     (line,) = caught.value.problems
     assert "\n" not in line
@@ -630,9 +636,9 @@ class TestRefused:
         line = refused(masts(1, units=units, configurations=both, measure=TWO_OF_TWO), one_walker())
         assert line.startswith("scene: exact: configuration both: unit ego does not list at every instant")
         alone = masts(1, units=units, configurations={"PEM": both["PEM"]}, measure=TWO_OF_TWO)
-        assert run(alone, [one_walker()]).exact is not None
+        assert run_experiment(alone, [one_walker()]).exact is not None
         once = masts(1, units=units, configurations=both)
-        assert run(once, [one_walker()]).exact is not None
+        assert run_experiment(once, [one_walker()]).exact is not None
 
     def test_a_carrier_that_is_not_there_all_the_time(self) -> None:
         things = [
@@ -649,9 +655,9 @@ class TestRefused:
         late = {"late": {"units": "all", "latency_s": latency}}
         line = refused(masts(2, configurations=late, measure=TWO_OF_TWO), one_walker())
         assert line.startswith("scene: exact: configuration late: lists captured together arrive up to ")
-        assert run(masts(2, configurations=late), [one_walker()]).exact is not None
+        assert run_experiment(masts(2, configurations=late), [one_walker()]).exact is not None
         alike = {"late": {"units": "all", "latency_s": {"m0": 0.1, "default": 0.1}}}
-        assert run(masts(2, configurations=alike, measure=TWO_OF_TWO), [one_walker()]).exact is not None
+        assert run_experiment(masts(2, configurations=alike, measure=TWO_OF_TWO), [one_walker()]).exact is not None
 
     @pytest.mark.parametrize(
         ("confirm", "expected"),
@@ -719,7 +725,7 @@ class TestRefused:
         (tmp_path / "e.yaml").write_text(text)
         monkeypatch.chdir(tmp_path)
         monkeypatch.setattr("sys.argv", ["copem-replay", "run", "e.yaml"])
-        assert cli._ended() == 2
+        assert cli._run_to_exit_code() == 2
         assert capsys.readouterr().err.count("\n") == 1
         assert sorted(path.name for path in tmp_path.iterdir()) == ["drive.mcap", "e.yaml"]
 
@@ -728,26 +734,26 @@ def checked(folder: Path, *changes: str) -> list[str]:
     """`line: key: message` of what is wrong with the small experiment when lines of it are changed."""
     (folder / "drive.mcap").touch()
     source = source_of(folder, changed(*changes))
-    return [line.removeprefix(f"{source.path}:") for line in problems(source)[1]]
+    return [line.removeprefix(f"{source.path}:") for line in find_problems(source)[1]]
 
 
 # ------------------------------------------------------------------------------- the runs, and what they tend to
 
 
 @cache
-def replayed_file(name: str, **changes: Any) -> Result:
+def replayed_file(name: str, **changes: Any) -> ExperimentResult:
     """An experiment of ours with its exact times and without accuracy; `confirm`: hits and of."""
-    source = load(ROOT / "logs" / f"{name}.yaml")
+    source = read_experiment_file(ROOT / "logs" / f"{name}.yaml")
     confirm = changes.get("confirm")
     source.data["measure"] |= {"exact": True, "accuracy": False}
     if confirm is not None:
         source.data["measure"]["confirm"] = {"hits": confirm[0], "of": confirm[1]}
-    planned, found = problems(source)
+    planned, found = find_problems(source)
     assert not found
     assert planned is not None
     recordings, refusals = read_logs(planned, log_paths(source)[0], source)
     assert not refusals
-    return run(planned, recordings)
+    return run_experiment(planned, recordings)
 
 
 CASES = {"tc016d": (None, 6), "tc016d 3 of 5": ((3, 5), 6), "crossing_units": (None, 9 * 21)}
@@ -778,7 +784,7 @@ def farthest(times_s: np.ndarray, part: pd.DataFrame) -> float:
     return float(np.abs(steps - np.cumsum(probability)).max(initial=0.0))
 
 
-def pairs(result: Result) -> list[tuple[tuple[str, ...], pd.DataFrame, pd.DataFrame]]:
+def pairs(result: ExperimentResult) -> list[tuple[tuple[str, ...], pd.DataFrame, pd.DataFrame]]:
     """The runs and the exact rows of each log, configuration and object."""
     assert result.exact is not None
     keys = ["log", "configuration", "object_id"]
@@ -863,12 +869,12 @@ class TestPassing:
         delay_s = scipy.stats.gamma.ppf((np.arange(500) + 0.5) / 500, shape, scale=mean_s / shape)
         part = result.exact[result.exact["configuration"] == "PEM"]
         for row in part[part["detection_s"] < part["onset_s"] + 1.6].itertuples():
-            verdicts = judge(encounter, braking.driver, row.detection_s + delay_s)
+            verdicts = judge_braking(encounter, braking.driver, row.detection_s + delay_s)
             share = np.mean(verdicts.min_distance_m > braking.margin_m)
             assert row.pass_probability == pytest.approx(share, abs=1 / 500), row.detection_s
 
     @staticmethod
-    def meeting(reaction: dict[str, Any] | None, probability: float = 0.25, **changes: Any) -> Result:
+    def meeting(reaction: dict[str, Any] | None, probability: float = 0.25, **changes: Any) -> ExperimentResult:
         """The ego, 4 m long, drives at 10 m/s towards a pedestrian who stands on its way, his near side at 39.75 m.
 
         It stops in 6.25 m, 0.5 m are to be left: who begins to brake before 3.1 s stays clear.
@@ -884,7 +890,7 @@ class TestPassing:
             braking={"driver": driver if reaction is None else driver | {"reaction": reaction}},
             **changes,
         )
-        return run(plan, [recording([*things, aside], until_s=5.0)])
+        return run_experiment(plan, [recording([*things, aside], until_s=5.0)])
 
     def test_by_hand(self) -> None:
         """After a reaction of 0.25 s he has to be known by 2.85 s: the first 29 lists are soon enough."""
@@ -1008,7 +1014,7 @@ def test_the_file(
     (tmp_path / "e.yaml").write_text(changed(measure, *([driver] if braking else [])))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.argv", ["copem-replay", "run", "e.yaml"])
-    assert cli._ended() == 0, capsys.readouterr().err
+    assert cli._run_to_exit_code() == 0, capsys.readouterr().err
     table = parquet.read_table(tmp_path / "out" / "e" / "exact.parquet")
     number, text = pa.float64(), pa.string()
     columns = {
@@ -1058,7 +1064,7 @@ class TestSummary:
             Thing("a", "pedestrian", standing(20, 0), lambda t: t < 0.25),
             Thing("b", "pedestrian", standing(30, 0)),
         ]
-        row = run(masts(1, 0.25, runs=50), [recording(things, until_s=1.0)]).summary.iloc[0]
+        row = run_experiment(masts(1, 0.25, runs=50), [recording(things, until_s=1.0)]).summary.iloc[0]
         quarters = [Fraction(3, 4) ** (k + 1) for k in range(11)]
         assert row["detected_share_exact"] == pytest.approx(float(1 - (quarters[2] + quarters[10]) / 2))
         assert row["ttd_p5_s_exact"] == 0
@@ -1084,7 +1090,7 @@ class TestSummary:
             Thing("c", "pedestrian", standing(20, 0), lambda t: t > 7.5 * step),
         ]
         log = recording(things, until_s=10 * step, rate_hz=rate_hz)
-        row = run(masts(1, 0.25, runs=50), [log]).summary.iloc[0]
+        row = run_experiment(masts(1, 0.25, runs=50), [log]).summary.iloc[0]
         assert row["detected_share_exact"] == pytest.approx(1 - (0.75**3 + 0.75**11) / 2), "of what was seen, no guess"
         assert row["ttd_p5_s_exact"] == 0
         assert row["ttd_median_s_exact"] == pytest.approx(2 * step)  # ¾³ = 0.42
@@ -1095,10 +1101,10 @@ class TestSummary:
     def test_distances(self) -> None:
         """It comes from 100 m at 10 m/s: known at 0.1 k s it is 100 − k metres away, and farther with ¾ᵏ."""
         things = [Thing("ego", "car", standing(0, 0)), Thing("a", "car", driving(100, 0, -10))]
-        row = run(masts(1, 0.25), [recording(things, until_s=2.0)]).summary.iloc[0]
+        row = run_experiment(masts(1, 0.25), [recording(things, until_s=2.0)]).summary.iloc[0]
         assert row["dad_median_m_exact"] == pytest.approx(100 - 2)  # ¾² = 0.56 of the rows rank at or below, ¾³ = 0.42
         assert row["dad_p5_m_exact"] == pytest.approx(100 - 10)  # ¾¹⁰ = 0.056, ¾¹¹ = 0.042
-        shorter = run(masts(1, 0.25), [recording(things, until_s=0.9)]).summary.iloc[0]
+        shorter = run_experiment(masts(1, 0.25), [recording(things, until_s=0.9)]).summary.iloc[0]
         assert shorter["dad_p5_m_exact"] is None  # never with ¾¹⁰
         assert shorter["dad_median_m_exact"] == pytest.approx(100 - 2)
 
@@ -1110,7 +1116,7 @@ class TestSummary:
             until_s=2.0,
             log="other",
         )
-        row = run(masts(1), [one, three]).summary.iloc[0]
+        row = run_experiment(masts(1), [one, three]).summary.iloc[0]
         assert row["detected_share_exact"] == pytest.approx((3 / 4 + 3 * (1 - 0.5**21)) / 4)
 
     @settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow])
@@ -1141,7 +1147,9 @@ class TestSummary:
                 table += [row | {"detected": t is not None, "run": 0}] * count
         rates = {"c": None}
         frame = pd.DataFrame(table)
-        (row,) = summary(frame, ["c"], rates, seed=0, horizon_s=2.0, exact=pd.DataFrame(rows))[0].to_dict("records")
+        (row,) = summarise_rows(frame, ["c"], rates, seed=0, horizon_s=2.0, exact=pd.DataFrame(rows))[0].to_dict(
+            "records"
+        )
         for name in ("detected_share", "ttd_rmst_s"):
             assert row[f"{name}_exact"] == pytest.approx(row[name], abs=1e-12)
         missed = frame.loc[~frame["detected"], "object_id"].astype(float)
@@ -1163,7 +1171,7 @@ class TestSummary:
             Thing("b", "car", standing(20, 5), lambda t: t > 2.55),
         ]
         late = {"GT": {"units": "truth", "latency_s": 1.0}}
-        row = run(masts(1, runs=runs, configurations=late), [recording(things, until_s=3.0)]).summary.iloc[0]
+        row = run_experiment(masts(1, runs=runs, configurations=late), [recording(things, until_s=3.0)]).summary.iloc[0]
         for name in ("detected_share", "ttd_p5_s", "ttd_median_s", "ttd_p95_s", "ttd_rmst_s", "dad_median_m"):
             assert row[f"{name}_exact"] == row[name], name
 

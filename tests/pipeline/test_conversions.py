@@ -11,17 +11,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from copem_replay.communication.arrivals import FusionSchedule, fusion_schedule, out_of_sequence
+from copem_replay.communication.arrivals import FusionSchedule, find_out_of_sequence, fusion_schedule
 from copem_replay.core.object_list import ENTRY, Entries, ObjectLists, entries_of
 from copem_replay.core.tracks import CLASSES, VALUES, Tracks
 from copem_replay.experiment.schema import Experiment
-from copem_replay.fusion.base import inbox_at
-from copem_replay.fusion.inputs import inputs
+from copem_replay.fusion.inputs import make_inputs
+from copem_replay.fusion.interface import make_inbox
 from copem_replay.io.recording import Recording
-from copem_replay.metrics.matching import DUPLICATE, GHOST, MATCH, match
-from copem_replay.pipeline.conversions import as_fused_tracks
-from copem_replay.pipeline.prepare import prepare
-from copem_replay.pipeline.receiver import WorldChunk, _without_truth, receive, seen_by_all
+from copem_replay.metrics.matching import DUPLICATE, GHOST, MATCH, match_entries
+from copem_replay.pipeline.prepare import prepare_log
+from copem_replay.pipeline.receiver import _remove_truth_ids, convert_to_tracks, perceive_all_units, run_receivers
+from copem_replay.pipeline.world import WorldChunk
 from tests.helpers.reports import inputs_of, lists_of
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
 
@@ -58,7 +58,7 @@ class TestInstants:
         np.testing.assert_allclose(at.issue_s, [0.3, 0.4, 0.5, 0.6])
         assert at.newest.tolist() == [[0, -1], [2, -1], [2, -1], [3, -1]]
         assert arrived(at) == [[0], [2], [1], [3]]
-        assert out_of_sequence(lists_alone(sent, ("a", "b"))).tolist() == [False, True, False, False]
+        assert find_out_of_sequence(lists_alone(sent, ("a", "b"))).tolist() == [False, True, False, False]
 
     def test_of_lists_that_arrive_together_the_newest_counts(self) -> None:
         at = received([("a", 0.0, 0.5), ("a", 0.2, 0.5), ("a", 0.1, 0.5), ("b", 0.1, 0.5)])
@@ -113,15 +113,15 @@ class TestInstants:
 
     def test_the_inbox_is_in_order_of_capture_and_ones_own(self) -> None:
         sent = [("a", 0.2, 0.5), ("b", 0.1, 0.5), ("a", 0.0, 0.5), ("b", 0.3, 0.6), ("b", 0.2, 0.7)]
-        told = inputs(lists_alone(sent, ("a", "b")), lists_of([[entries_of(1)] * 5]), max_age_s=1.0)
-        inbox = inbox_at(told, 0, 0)
+        told = make_inputs(lists_alone(sent, ("a", "b")), lists_of([[entries_of(1)] * 5]), max_age_s=1.0)
+        inbox = make_inbox(told, 0, 0)
         assert [(one.unit, one.captured_s) for one in inbox.newest] == [("a", 0.2), ("b", 0.1)]
         assert [(one.unit, one.captured_s) for one in inbox.arrived] == [("a", 0.0), ("b", 0.1), ("a", 0.2)]
-        late = inbox_at(told, 0, 2)
+        late = make_inbox(told, 0, 2)
         assert [(one.unit, one.captured_s, one.arrives_s) for one in late.arrived] == [("b", 0.2, 0.7)]
         assert [one.captured_s for one in late.newest] == [0.2, 0.3]
         inbox.newest[0].entries["x_m"] = 9.0
-        assert inbox_at(told, 0, 0).newest[0].entries["x_m"].tolist() == [0.0]
+        assert make_inbox(told, 0, 0).newest[0].entries["x_m"].tolist() == [0.0]
 
 
 NAMES = ("ego", "other", "walker", "lorry", "second")
@@ -147,14 +147,14 @@ def pem(covariance_m2: Any = None, **more: Any) -> dict[str, Any]:
 
 
 def world_of(plan: Experiment, log: Recording) -> WorldChunk:
-    return prepare(log, plan).world(plan)
+    return prepare_log(log, plan).world(plan)
 
 
 def told_in(plan: Experiment, log: Recording, runs: Sequence[int] = (0,)) -> tuple[Tracks, ObjectLists]:
     """What the units list with truth ids, and without."""
     world = world_of(plan, log)
-    seen = seen_by_all(world, np.array(runs), states="sampled")
-    return seen, _without_truth(world, seen, np.array(runs))[0]
+    seen = perceive_all_units(world, np.array(runs), states="sampled")
+    return seen, _remove_truth_ids(world, seen, np.array(runs))[0]
 
 
 def as_sets(lists: ObjectLists, run: int = 0) -> list[Counter[bytes]]:
@@ -234,13 +234,13 @@ class TestBackToTracks:
     def test_nothing_is_lost_and_everyone_is_where_he_belongs(self) -> None:
         pems = pem([[0.1, 0], [0, 0.1]], probability=0.8)
         plan = experiment(pems=pems, units=TWO_UNITS, configurations=self.configurations())
-        replay = prepare(crowd(), plan)
+        replay = prepare_log(crowd(), plan)
         roles: Counter[int] = Counter()
-        for name, told in receive(replay.world(plan), np.arange(3), None):
+        for name, told in run_receivers(replay.world(plan), np.arange(3), None):
             issue_s, newest = told.at.issue_s, told.at.newest
-            matches = match(told.lists, replay.truth_cache.at(issue_s), replay.scene, gate_m=3.0)
+            matches = match_entries(told.lists, replay.truth_cache.at(issue_s), replay.scene, gate_m=3.0)
             for s in range(3):
-                fused_tracks = as_fused_tracks(told.lists, s, matches, told.heard, issue_s, newest)
+                fused_tracks = convert_to_tracks(told.lists, s, matches, told.heard, issue_s, newest)
                 fused, said = fused_tracks.fused, fused_tracks.said
                 assert said is not None
                 assert Counter(map(bytes, said)) == Counter(map(bytes, entries_in(told.lists, s))), name
@@ -260,10 +260,10 @@ class TestBackToTracks:
     def test_who_is_nobodys_match_keeps_the_fusions_own_identity(self) -> None:
         """With a gate of nothing all are ghosts: a track of each of the tracker's tracks, of each entry of union."""
         plan = experiment(pems=pem([[1, 0], [0, 1]]), units=TWO_UNITS, configurations=self.configurations())
-        replay = prepare(crowd(), plan)
-        for name, told in receive(replay.world(plan), np.arange(1), None):
-            matches = match(told.lists, replay.truth_cache.at(told.at.issue_s), replay.scene, gate_m=1e-6)
-            fused_tracks = as_fused_tracks(told.lists, 0, matches, told.heard, told.at.issue_s, told.at.newest)
+        replay = prepare_log(crowd(), plan)
+        for name, told in run_receivers(replay.world(plan), np.arange(1), None):
+            matches = match_entries(told.lists, replay.truth_cache.at(told.at.issue_s), replay.scene, gate_m=1e-6)
+            fused_tracks = convert_to_tracks(told.lists, 0, matches, told.heard, told.at.issue_s, told.at.newest)
             assert set(fused_tracks.fused.object_ix) == {-1}
             ids = entries_in(told.lists, 0)["track_id"]
             assert len(fused_tracks.fused.object_ix) == (len(set(ids)) if name == "tracker" else len(ids))
@@ -272,7 +272,7 @@ class TestBackToTracks:
     def test_ideal_fusion_is_as_sure_of_its_list_as_it_is(self) -> None:
         log = crowd()
         plan = experiment(pems=pem(probability=0.5), units=TWO_UNITS, configurations=self.configurations())
-        told = dict(receive(world_of(plan, log), np.arange(2), None))["ideal"]
+        told = dict(run_receivers(world_of(plan, log), np.arange(2), None))["ideal"]
         fused_tracks, lists = told.fused_tracks, told.lists
         assert fused_tracks is not None
         assert lists.entries.dtype == ENTRY
@@ -291,9 +291,9 @@ class TestBackToTracks:
 def test_a_belief_of_a_run_without_entries_is_empty() -> None:
     union = {"u": {"units": "all", "fusion": {"kind": "union"}}}
     plan = experiment(pems=pem(probability=0.0), configurations=union, units=TWO_UNITS)
-    replay = prepare(crowd(), plan)
-    ((_, told),) = receive(replay.world(plan), np.arange(1), None)
-    matches = match(told.lists, replay.truth_cache.at(told.at.issue_s), replay.scene, gate_m=3.0)
-    fused_tracks = as_fused_tracks(told.lists, 0, matches, told.heard, told.at.issue_s, told.at.newest)
+    replay = prepare_log(crowd(), plan)
+    ((_, told),) = run_receivers(replay.world(plan), np.arange(1), None)
+    matches = match_entries(told.lists, replay.truth_cache.at(told.at.issue_s), replay.scene, gate_m=3.0)
+    fused_tracks = convert_to_tracks(told.lists, 0, matches, told.heard, told.at.issue_s, told.at.newest)
     assert (len(fused_tracks.fused.frame_ix), len(fused_tracks.fused.object_ix)) == (0, 0)
     assert len(fused_tracks.fused.stamp_ns) == 11, "its lists are there, and empty"

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from copem_replay.cli import main as cli
-from copem_replay.pipeline.blocks import outcomes
-from copem_replay.pipeline.cost import Cost
-from copem_replay.pipeline.prepare import prepare
+from copem_replay.pipeline.cost import RunCost
+from copem_replay.pipeline.prepare import prepare_log
+from copem_replay.pipeline.replay import replay_outcomes
 from tests.helpers.experiments import changed, drive
 from tests.helpers.scenes import experiment, oncoming_car
 
@@ -19,7 +19,7 @@ NOTE = "% of the "
 
 def test_share_of_the_run() -> None:
     """16 of 20 s in blocks, in which two workers spent 24 of 30 s on accuracy: 0.8 of 0.8."""
-    cost = Cost(total_s=20.0, in_blocks_s=16.0, worked_s=30.0, accuracy_s=24.0)
+    cost = RunCost(total_s=20.0, in_blocks_s=16.0, worked_s=30.0, accuracy_s=24.0)
     assert cost.notes() == (
         "accuracy took 64 % of the 20 s of this replay; `measure: {accuracy: false}` leaves it out",
     )
@@ -28,13 +28,13 @@ def test_share_of_the_run() -> None:
 @pytest.mark.parametrize(
     "cost",
     [
-        Cost(total_s=20.0, in_blocks_s=16.0, worked_s=30.0, accuracy_s=18.75),  # half of it
-        Cost(total_s=10.0, in_blocks_s=10.0, worked_s=10.0, accuracy_s=10.0),  # not long
-        Cost(total_s=20.0, in_blocks_s=16.0, worked_s=30.0, accuracy_s=24.0, compiled=True),
-        Cost(total_s=20.0),  # no run at all
+        RunCost(total_s=20.0, in_blocks_s=16.0, worked_s=30.0, accuracy_s=18.75),  # half of it
+        RunCost(total_s=10.0, in_blocks_s=10.0, worked_s=10.0, accuracy_s=10.0),  # not long
+        RunCost(total_s=20.0, in_blocks_s=16.0, worked_s=30.0, accuracy_s=24.0, compiled=True),
+        RunCost(total_s=20.0),  # no run at all
     ],
 )
-def test_nothing_to_say(cost: Cost) -> None:
+def test_nothing_to_say(cost: RunCost) -> None:
     assert cost.notes() == ()
 
 
@@ -44,7 +44,7 @@ def test_what_accuracy_costs_is_in_its_blocks(fusion: str) -> None:
     configurations = {"it": {"units": ["ego"], "fusion": {"kind": fusion}}}
     for accuracy in (True, False):
         wanted = experiment(measure={"accuracy": accuracy}, configurations=configurations)
-        [found] = outcomes(prepare(oncoming_car(), wanted), wanted, np.arange(3))
+        [found] = replay_outcomes(prepare_log(oncoming_car(), wanted), wanted, np.arange(3))
         assert found.worked_s > 0
         assert (0 < found.accuracy_s < found.worked_s) if accuracy else found.accuracy_s == 0
 
@@ -58,7 +58,7 @@ def test_the_terminal_alone_says_it(
 
     def said(out: str) -> str:
         monkeypatch.setattr("sys.argv", ["copem-replay", "run", "e.yaml", "--out", out])
-        assert cli._ended() == 0
+        assert cli._run_to_exit_code() == 0
         return capsys.readouterr().err
 
     assert NOTE not in said("quick")

@@ -18,11 +18,11 @@ import pytest
 
 from copem_replay.cli import main as cli
 from copem_replay.core.errors import CopemError, InputError
-from copem_replay.pipeline.crew import dask_workers, worker
-from copem_replay.pipeline.crew.crew import TaskFailedError
-from copem_replay.pipeline.crew.dask_workers import DaskWorkers
-from copem_replay.pipeline.crew.task import LogTask, Task
-from copem_replay.pipeline.pieces import Pieces
+from copem_replay.pipeline import dask_workers, worker
+from copem_replay.pipeline.crew import TaskFailedError
+from copem_replay.pipeline.dask_workers import DaskWorkers
+from copem_replay.pipeline.pieces import PieceCache
+from copem_replay.pipeline.worker import LogTask, Task
 from tests.cli.test_api import cr
 from tests.helpers.experiments import changed, drive, files
 from tests.helpers.object_storage import Bucket
@@ -49,7 +49,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
     """Three workers on this machine, for all tests of this file."""
-    made = dask_workers._local(3)
+    made = dask_workers._start_local(3)
     yield made
     made.close()
 
@@ -60,7 +60,7 @@ def connected(cluster: Any, here: Path) -> Iterator[Callable[..., DaskWorkers]]:
     opened: list[DaskWorkers] = []
 
     def connect(kept: str = "kept", **keys: float) -> DaskWorkers:
-        opened.append(DaskWorkers(cluster.scheduler_address, Pieces(kept), 0, **keys))
+        opened.append(DaskWorkers(cluster.scheduler_address, PieceCache(kept), 0, **keys))
         return opened[-1]
 
     yield connect
@@ -220,7 +220,7 @@ def test_a_log_that_workers_die_of_is_skipped_where_that_is_asked_for(
     Path("e.yaml").write_text(text)
     command = f"copem-replay run e.yaml --skip-unreadable --out out --cluster {cluster.scheduler_address}"
     monkeypatch.setattr("sys.argv", command.split())
-    assert cli._ended() == 1
+    assert cli._run_to_exit_code() == 1
     why = "the worker that replayed it died 3 times (out of memory?)"
     assert f"note: at45.mcap: skipped: {why}" in capsys.readouterr().err.splitlines()
     rows = pd.read_csv("out/logs.csv", keep_default_na=False)[["path", "state", "reason"]].to_numpy().tolist()
@@ -241,7 +241,7 @@ def test_a_dead_pool_is_said_and_what_is_done_stays(here: Path) -> None:
 
 
 def test_pieces_that_are_kept_elsewhere_are_missed(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(worker, "_pieces_at", lambda address, folder: Pieces("elsewhere"))
+    monkeypatch.setattr(worker, "_open_pieces", lambda address, folder: PieceCache("elsewhere"))
     Path("e.yaml").write_text(study())
     cr.run("e.yaml", pieces="kept", recordings=["a.mcap"])  # so that this log is known
     with (
@@ -258,7 +258,7 @@ def test_a_defect_is_told_once_with_its_log_and_pieces(here: Path, monkeypatch: 
         begun.append(given)
         raise ZeroDivisionError("a defect")
 
-    monkeypatch.setattr(worker, "outcomes", fail)
+    monkeypatch.setattr(worker, "replay_outcomes", fail)
     with ThreadPoolExecutor(1) as pool, pytest.raises(TaskFailedError) as caught:
         replayed(study(), "out", pieces="kept", crew=pool)
     said = str(caught.value)
@@ -270,15 +270,15 @@ def test_a_defect_is_told_once_with_its_log_and_pieces(here: Path, monkeypatch: 
 def test_workers_that_differ_are_refused(
     connected: Callable[..., DaskWorkers], monkeypatch: pytest.MonkeyPatch, here: Path
 ) -> None:
-    expected = dask_workers.fingerprint() | {"numba": "0.1.2"}
-    monkeypatch.setattr(dask_workers, "fingerprint", lambda: expected)
+    expected = dask_workers.take_fingerprint() | {"numba": "0.1.2"}
+    monkeypatch.setattr(dask_workers, "take_fingerprint", lambda: expected)
     words = (
         r"^tcp://127.0.0.1:\d+: worker \S+ has numba \d[\d.]+, expected 0.1.2 \(\d of \d workers differ\): results wou"
     )
     with pytest.raises(CopemError, match=words):
         connected()
     with ThreadPoolExecutor(1) as pool:  # which is asked with its first task
-        monkeypatch.setattr(worker, "fingerprint", lambda: expected)
+        monkeypatch.setattr(worker, "take_fingerprint", lambda: expected)
         with pytest.raises(
             CopemError, match=r"^worker \S+ has numba 0.1.2, expected \d\S+: results would not be the same"
         ):
@@ -289,14 +289,14 @@ def test_pieces_that_a_worker_does_not_see(
     connected: Callable[..., DaskWorkers], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As if the folder were on this machine alone: what is written is not where workers look."""
-    monkeypatch.setattr(dask_workers, "greeting", _blind)
+    monkeypatch.setattr(dask_workers, "greet_worker", _blind)
     words = r"^kept: not visible from worker \S+; --pieces with a shared folder or s3://…$"
     with pytest.raises(CopemError, match=words):
         connected()
 
 
 def _blind(expected: dict[str, str], pieces: str, folder: str, token: str) -> tuple[str, str | None, bool]:
-    return dask_workers.greeting(expected, f"{pieces} of another machine", folder, token)
+    return dask_workers.greet_worker(expected, f"{pieces} of another machine", folder, token)
 
 
 @pytest.mark.parametrize(
@@ -318,7 +318,7 @@ def test_addresses(address: str, words: str) -> None:
 
 def test_a_scheduler_that_is_not_there(here: Path) -> None:
     with pytest.raises(CopemError, match=r"^--cluster: tcp://127.0.0.1:1: no scheduler answers there \("):
-        DaskWorkers("tcp://127.0.0.1:1", Pieces("kept"), 0, wait_s=0.1)
+        DaskWorkers("tcp://127.0.0.1:1", PieceCache("kept"), 0, wait_s=0.1)
 
 
 def test_a_scheduler_file_that_is_not_there_and_one_that_comes(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -326,10 +326,10 @@ def test_a_scheduler_file_that_is_not_there_and_one_that_comes(here: Path, monke
         r"^--cluster: s.json: no scheduler answers there \(expected the file of `dask scheduler --scheduler-file`, fo"
     )
     with pytest.raises(CopemError, match=words):
-        DaskWorkers("s.json", Pieces("kept"), 0, wait_s=0)
+        DaskWorkers("s.json", PieceCache("kept"), 0, wait_s=0)
     contents = ["", "{", '{"address": "tcp://127.0.0.1:1"}']
     monkeypatch.setattr(time, "sleep", lambda _: Path("s.json").write_text(contents.pop(0)))
-    assert dask_workers._address_in(Path("s.json"), time.monotonic() + 60) == "tcp://127.0.0.1:1"
+    assert dask_workers._read_address(Path("s.json"), time.monotonic() + 60) == "tcp://127.0.0.1:1"
 
 
 @pytest.mark.parametrize(
@@ -352,7 +352,7 @@ def test_certificates_that_are_not_there(
     for address in ("tls://127.0.0.1:1", "s.json"):
         monkeypatch.setattr("sys.argv", f"copem-replay run e.yaml --cluster {address}".split())
         with dask.config.set(settings):
-            assert cli._ended() == 2
+            assert cli._run_to_exit_code() == 2
         said = f"--cluster: {address}: expected certificates in Dask's settings, found {found}; {out}\n"
         assert capsys.readouterr().err == said
 

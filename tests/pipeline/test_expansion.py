@@ -24,19 +24,18 @@ from mcap.reader import make_reader
 from copem_replay.cli import main as cli
 from copem_replay.core.errors import ExperimentError
 from copem_replay.core.tracks import Bool, Int
-from copem_replay.experiment.against_log import against_log
 from copem_replay.experiment.schema import Experiment
-from copem_replay.experiment.validate import problems
+from copem_replay.experiment.validate import check_against_log, find_problems
 from copem_replay.io.recording import Recording
-from copem_replay.metrics.columns import frame
+from copem_replay.metrics.detections_table import build_frame
 from copem_replay.perception.config import Carriers
-from copem_replay.pipeline.accuracy_tables import with_accuracy
-from copem_replay.pipeline.blocks import outcomes
-from copem_replay.pipeline.closed_form import distributions, exact_table
-from copem_replay.pipeline.expansion import ExpandedExperiment, expand, of_run
-from copem_replay.pipeline.list_rates import list_times
-from copem_replay.pipeline.prepare import Replay, prepare
-from copem_replay.pipeline.run import run
+from copem_replay.pipeline.closed_form import compute_distributions, exact_table
+from copem_replay.pipeline.expansion import ExpandedExperiment, expand_experiment, resolve_for_run
+from copem_replay.pipeline.notes import measure_list_rates
+from copem_replay.pipeline.prepare import Replay, prepare_log
+from copem_replay.pipeline.replay import replay_outcomes
+from copem_replay.pipeline.run import run_experiment
+from copem_replay.pipeline.tables import add_row_accuracy
 from tests.helpers.experiments import changed, source_of
 from tests.helpers.recordings import Obj, pedestrian, write_recording
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
@@ -98,7 +97,7 @@ class TestExpansion:
     def test_one_unit_for_each_carrier(self) -> None:
         """In the order of the experiment, then of the log; the ego carries none of them."""
         wanted = plan({"fleet": some(0.3), "ego": EGO, "big": some(1.0, "truck", height_m=2.0)})
-        fleet = expand(wanted, street().scene)
+        fleet = expand_experiment(wanted, street().scene)
         units = fleet.units
         assert list(units) == ["fleet:12", "fleet:3", "fleet:b", "ego", "big:7"]
         assert [unit.on for unit in units.values()] == ["12", "3", "b", "ego", "7"]
@@ -118,17 +117,17 @@ class TestExpansion:
         ],
     )
     def test_classes_and_groups(self, classes: list[str], expected: list[str]) -> None:
-        fleet = expand(plan({"f": some(0.5, *classes), "ego": EGO}), street().scene)
+        fleet = expand_experiment(plan({"f": some(0.5, *classes), "ego": EGO}), street().scene)
         assert list(fleet.units) == [*(f"f:{name}" for name in expected), "ego"]
 
     def test_the_ego_by_any_choice_carries_none(self) -> None:
         scene = street(ego="12").scene
-        assert expand(plan({"f": some(0.5)}), scene).carrier == ("ego", "3", "b")
-        assert expand(plan({"f": some(0.5)}), street(ego=None).scene).carrier == ("ego", "12", "3", "b")
+        assert expand_experiment(plan({"f": some(0.5)}), scene).carrier == ("ego", "3", "b")
+        assert expand_experiment(plan({"f": some(0.5)}), street(ego=None).scene).carrier == ("ego", "12", "3", "b")
 
     def test_parked_ones_may_carry_one_too(self) -> None:
         parked = Thing("p", "car", standing(9, 9), moving=False)
-        assert expand(plan({"f": some(0.5)}), street([*things(), parked]).scene).carrier[-1] == "p"
+        assert expand_experiment(plan({"f": some(0.5)}), street([*things(), parked]).scene).carrier[-1] == "p"
 
     def test_configurations_name_them_by_the_unit(self) -> None:
         wanted = plan(
@@ -139,7 +138,7 @@ class TestExpansion:
                 "some": {"units": ["fleet", "ego"], "latency_s": {"fleet": 0.2, "big": 0.4, "default": 0.1}},
             },
         )
-        expanded = expand(wanted, street().scene)
+        expanded = expand_experiment(wanted, street().scene)
         truth, everyone, part = expanded.configurations.values()
         assert truth == wanted.configurations["GT"]
         assert everyone == wanted.configurations["all"]
@@ -151,17 +150,17 @@ class TestExpansion:
     def test_latency_by_the_units_name(self) -> None:
         """The pedestrian is known 0.2 s after a capture, by whomever."""
         late = {"late": {"units": ["fleet"], "latency_s": {"fleet": 0.2, "default": 0.05}}}
-        found = run(plan({"fleet": some(0.7)}, configurations=late), [street()]).table
+        found = run_experiment(plan({"fleet": some(0.7)}, configurations=late), [street()]).table
         seen = found[found["detected"]]
         assert len(seen) > 20
         np.testing.assert_allclose(seen["detection_s"] - seen["captured_s"], 0.2)
 
     def test_nothing_to_expand(self) -> None:
         wanted = plan({"ego": EGO, "v2v": {"on": "7", "pem": "p"}})
-        fleet = expand(wanted, street().scene)
+        fleet = expand_experiment(wanted, street().scene)
         assert fleet.units is wanted.units
         assert fleet.equipped("scene", np.arange(3)) is None
-        assert of_run(wanted, street().scene, 0) is wanted
+        assert resolve_for_run(wanted, street().scene, 0) is wanted
 
     def test_other_configurations_of_the_same_units(self) -> None:
         late = {"late": {"units": ["fleet"], "latency_s": {"fleet": 0.2, "default": 0.05}}}
@@ -169,7 +168,10 @@ class TestExpansion:
             plan({"fleet": some(0.5), "ego": EGO}),
             plan({"fleet": some(0.5), "ego": EGO}, configurations=late),
         )
-        found, expected = expand(first, street().scene).with_(other), expand(other, street().scene)
+        found, expected = (
+            expand_experiment(first, street().scene).with_(other),
+            expand_experiment(other, street().scene),
+        )
         assert found.configurations == expected.configurations
         assert found.units == expected.units
         assert found.written is other
@@ -180,15 +182,15 @@ class TestExpansion:
         """As if there were no such unit."""
         both = {"all": {"units": "all"}, "none": {"units": ["f"]}}
         wanted = plan({"ego": EGO, "f": some(0.9, "bus")}, configurations=both)
-        found = run(wanted, [street()]).table
-        alone = run(plan({"ego": EGO}), [street()]).table
+        found = run_experiment(wanted, [street()]).table
+        alone = run_experiment(plan({"ego": EGO}), [street()]).table
         pd.testing.assert_frame_equal(times(found, "all"), times(alone, "all"))
         assert not found[found["configuration"] == "none"]["detected"].any()
 
     def test_each_log_has_carriers_of_its_own(self) -> None:
         other = street([Thing("ego", "car", standing(0, 0)), Thing("w", "pedestrian", standing(5, 5)),
                         Thing("x", "car", standing(9, 9))], log="other")  # fmt: skip
-        found = run(plan({"f": some(0.9)}), [street(), other]).table
+        found = run_experiment(plan({"f": some(0.9)}), [street(), other]).table
         seen = found.dropna(subset="first_unit").groupby("log")["first_unit"].unique()
         assert set(seen["scene"]) == {"f:12", "f:3", "f:b"}
         assert set(seen["other"]) == {"f:x"}
@@ -197,14 +199,14 @@ class TestExpansion:
         """Where there is such an object; elsewhere it is a name like any other."""
         mast = {"at": [0, 0], "height_m": 3.0, "pem": "p"}
         wanted = plan({"ego": EGO, "fleet": some(0.5), "fleet:12": mast})
-        (found,) = against_log(wanted, street())
+        (found,) = check_against_log(wanted, street())
         assert found == (("units", "fleet:12"), "this is the name of fleet on object 12")
         with pytest.raises(ExperimentError, match="fleet:12 is what fleet is called on object 12") as caught:
-            prepare(street(), wanted)
+            prepare_log(street(), wanted)
         assert len(caught.value.problems) == 1
         wanted = plan({"ego": EGO, "fleet": some(0.5), "fleet:99": mast})
-        assert list(against_log(wanted, street())) == []
-        assert list(expand(wanted, street().scene).units)[-1] == "fleet:99"
+        assert list(check_against_log(wanted, street())) == []
+        assert list(expand_experiment(wanted, street().scene).units)[-1] == "fleet:99"
 
 
 # ------------------------------------------------------------------------------------- who carries one, and when
@@ -215,20 +217,20 @@ class TestShare:
     @given(st.floats(0, 1), st.floats(0, 1), st.integers(-3, 3))
     def test_who_does_at_a_share_does_at_a_larger_one(self, a: float, b: float, seed: int) -> None:
         scene = street().scene
-        fewer, more = (carried(expand(plan({"e": EGO, "f": some(x)}, seed=seed), scene), 100)
+        fewer, more = (carried(expand_experiment(plan({"e": EGO, "f": some(x)}, seed=seed), scene), 100)
                        if x < 1 else np.ones((100, 4), dtype=bool) for x in sorted((a, b)))  # fmt: skip
         assert not (fewer & ~more).any()
 
     def test_thirty_of_a_hundred_are_among_fifty(self) -> None:
         scene = street().scene
-        thirty, fifty = (carried(expand(plan({"f": some(x)}), scene)) for x in (0.3, 0.5))
+        thirty, fifty = (carried(expand_experiment(plan({"f": some(x)}), scene)) for x in (0.3, 0.5))
         assert not (thirty & ~fifty).any()
         assert (fifty & ~thirty).any(axis=0).all()
 
     def test_the_share_is_that_of_all_runs_and_of_each_carrier(self) -> None:
         """Counts by the binomial distribution; so are pairs, of carriers and of units: each draws by itself."""
         units = {"e": EGO, "f": some(0.3, "vehicles"), "g": some(0.6, "vehicles")}
-        fleet = expand(plan(units), street().scene)
+        fleet = expand_experiment(plan(units), street().scene)
         runs = 4000
         there = carried(fleet, runs)
         assert there[:, 0].all()
@@ -240,11 +242,11 @@ class TestShare:
 
     def test_runs_logs_and_seeds_draw_anew(self) -> None:
         wanted = plan({"f": some(0.5, "vehicles")})
-        fleet = expand(wanted, street().scene)
+        fleet = expand_experiment(wanted, street().scene)
         here = carried(fleet)
         others = [
             carried(fleet, log="other"),
-            carried(expand(wanted.model_copy(update={"seed": 8}), street().scene)),
+            carried(expand_experiment(wanted.model_copy(update={"seed": 8}), street().scene)),
             np.roll(here, 1, axis=0),
             np.roll(here, 1, axis=1),
         ]
@@ -254,7 +256,7 @@ class TestShare:
             assert min(law.cdf(agree), law.sf(agree - 1)) > RISK / 2
 
     def test_a_run_by_itself(self) -> None:
-        fleet = expand(plan({"f": some(0.4), "e": EGO}), street().scene)
+        fleet = expand_experiment(plan({"f": some(0.4), "e": EGO}), street().scene)
         whole = carried(fleet, 60)
         for k in (0, 1, 17, 59):
             one = fleet.equipped("scene", np.array([k]))
@@ -263,7 +265,7 @@ class TestShare:
 
     def test_the_order_of_objects_and_other_units_do_not_matter(self) -> None:
         def by_name(wanted: dict[str, Any], log: Recording) -> dict[str, list[bool]]:
-            fleet = expand(plan(wanted), log.scene)
+            fleet = expand_experiment(plan(wanted), log.scene)
             return dict(zip(fleet.units, carried(fleet, 80).T.tolist(), strict=True))
 
         usual = by_name({"ego": EGO, "f": some(0.4)}, street())
@@ -275,7 +277,7 @@ class TestShare:
 
     def test_the_name_of_the_unit_does(self) -> None:
         """Two units on the same objects are not carried together."""
-        fleet = expand(plan({"f": some(0.5), "g": some(0.5)}), street().scene)
+        fleet = expand_experiment(plan({"f": some(0.5), "g": some(0.5)}), street().scene)
         there = carried(fleet)
         assert (there[:, :3] != there[:, 3:]).any(axis=0).all()
 
@@ -308,7 +310,7 @@ class TestRuns:
         """A share of 0 is the configuration without it."""
         units = {"ego": EGO, "fleet": some(0.0)}
         wanted = plan(units, configurations=CONFIGURATIONS, measure=MEASURE | {"confirm": confirm})
-        found = run(wanted, [on_the_move()]).table
+        found = run_experiment(wanted, [on_the_move()]).table
         pd.testing.assert_frame_equal(times(found, "all"), times(found, "ego"))
         assert not found[found["configuration"] == "fleet"]["detected"].any()
         assert set(found["first_unit"].dropna()) == {"ego"}
@@ -325,8 +327,10 @@ class TestRuns:
             measure=measure,
         )
         log = on_the_move()
-        pd.testing.assert_frame_equal(run(whole, [log]).table, run(each, [log]).table, check_exact=True)
-        assert list_times(prepare(log, whole), whole) == list_times(prepare(log, each), each)
+        pd.testing.assert_frame_equal(
+            run_experiment(whole, [log]).table, run_experiment(each, [log]).table, check_exact=True
+        )
+        assert measure_list_rates(prepare_log(log, whole), whole) == measure_list_rates(prepare_log(log, each), each)
 
     @pytest.mark.parametrize(
         ("confirm", "accuracy"), [(CONFIRMS[0], True), *((confirm, False) for confirm in CONFIRMS)]
@@ -340,12 +344,12 @@ class TestRuns:
         wanted = plan(units, configurations=CONFIGURATIONS, measure=measure)
         one_by_one(wanted, on_the_move())
         # One hit without lists to be judged is settled for all runs at once, else for those of the same units.
-        parts = outcomes(prepare(on_the_move(), wanted), wanted, np.arange(40))
+        parts = replay_outcomes(prepare_log(on_the_move(), wanted), wanted, np.arange(40))
         assert (len(parts) == 1) == (confirm == CONFIRMS[0] and not accuracy)
 
     def test_one_block_or_many(self) -> None:
         wanted = plan({"ego": EGO, "fleet": some(0.5)}, configurations=CONFIGURATIONS)
-        ready = prepare(on_the_move(), wanted)
+        ready = prepare_log(on_the_move(), wanted)
         whole = block(ready, wanted, np.arange(40))
         parts = pd.concat([block(ready, wanted, np.arange(k, k + 5)) for k in range(0, 40, 5)])
         order = ["configuration", "run", "object_id"]
@@ -353,28 +357,29 @@ class TestRuns:
             whole.sort_values(order, ignore_index=True), parts.sort_values(order, ignore_index=True)
         )
         log = on_the_move()
-        assert run(wanted, [log], jobs=2).table.equals(run(wanted, [log]).table)
+        assert run_experiment(wanted, [log], jobs=2).table.equals(run_experiment(wanted, [log]).table)
 
     def test_more_carriers_are_never_later(self) -> None:
         """By the same draws, run by run and object by object."""
         shares = (0.0, 0.2, 0.5, 0.9, 1.0)
         found = [
-            times(run(plan({"ego": EGO, "fleet": some(s)}, runs=200), [on_the_move()]).table, "all") for s in shares
+            times(run_experiment(plan({"ego": EGO, "fleet": some(s)}, runs=200), [on_the_move()]).table, "all")
+            for s in shares
         ]
         for fewer, more in itertools.pairwise(found):
             assert (more["detection_s"].fillna(np.inf) <= fewer["detection_s"].fillna(np.inf)).all()
         assert (found[-1]["detection_s"].fillna(np.inf) < found[0]["detection_s"].fillna(np.inf)).any()
 
     def test_a_fleet_leaves_the_draws_of_others_as_they_are(self) -> None:
-        without = run(plan({"ego": EGO}, configurations={"ego": {"units": ["ego"]}}), [on_the_move()]).table
+        without = run_experiment(plan({"ego": EGO}, configurations={"ego": {"units": ["ego"]}}), [on_the_move()]).table
         wanted = plan({"fleet": some(0.5), "ego": EGO}, configurations=CONFIGURATIONS)
-        found = run(wanted, [on_the_move()]).table
+        found = run_experiment(wanted, [on_the_move()]).table
         pd.testing.assert_frame_equal(times(found, "ego"), times(without, "ego"))
 
     def test_the_order_of_objects_does_not_matter(self) -> None:
         log = on_the_move()
         wanted = plan({"ego": EGO, "fleet": some(0.5)}, configurations=CONFIGURATIONS)
-        usual = run(wanted, [log]).table
+        usual = run_experiment(wanted, [log]).table
         members = [
             Thing("v", "pedestrian", driving(30, -8, 0, 1), lambda t: t > 0.75),
             Thing("3", "car", driving(60, -4, -8), lambda t: not 0.45 < t < 1.35),
@@ -382,7 +387,7 @@ class TestRuns:
             Thing("12", "car", driving(40, 4, -6), lambda t: t < 1.15),
             Thing("ego", "car", driving(0, 0, 5)),
         ]
-        turned = run(wanted, [street(members, until_s=2.0)]).table
+        turned = run_experiment(wanted, [street(members, until_s=2.0)]).table
         order = ["configuration", "run", "object_id"]
         columns = [name for name in usual if name != "first_unit"]  # of two at one instant the experiment's first
         pd.testing.assert_frame_equal(
@@ -451,7 +456,7 @@ class TestRuns:
     def test_conflicts_foreseen_by_nobody_else(self) -> None:
         """With a share of 0 a conflict is foreseen when the ego alone foresees it: at its own lists."""
         wanted, log = self.meeting(0.0, {})
-        found = run(wanted, [log]).table.set_index(["run", "object_id"])
+        found = run_experiment(wanted, [log]).table.set_index(["run", "object_id"])
         alone, everyone = (found.loc[found["configuration"] == name, "conflict_detection_s"] for name in ("ego", "all"))
         assert alone.notna().any()
         pd.testing.assert_series_equal(everyone, alone)
@@ -465,18 +470,20 @@ class TestRuns:
 
 def block(ready: Replay, wanted: Experiment, runs: Int) -> pd.DataFrame:
     """The rows of some runs, how far off the lists were among them."""
-    return pd.concat([frame(with_accuracy(part)) for part in outcomes(ready, wanted, runs)], ignore_index=True)
+    return pd.concat(
+        [build_frame(add_row_accuracy(part)) for part in replay_outcomes(ready, wanted, runs)], ignore_index=True
+    )
 
 
 def one_by_one(wanted: Experiment, log: Recording) -> None:
     """Each run, replayed with its own units alone, gives the rows that it has among the others."""
-    whole = run(wanted, [log]).table
+    whole = run_experiment(wanted, [log]).table
     for _, part in whole.groupby("configuration"):
         assert part["run"].is_monotonic_increasing
     for k in range(wanted.runs):
-        alone = of_run(wanted, log.scene, k)
+        alone = resolve_for_run(wanted, log.scene, k)
         assert not any(isinstance(unit.on, Carriers) for unit in alone.units.values())
-        found = block(prepare(log, alone), alone, np.array([k]))
+        found = block(prepare_log(log, alone), alone, np.array([k]))
         expected = whole[whole["run"] == k].reset_index(drop=True)
         pd.testing.assert_frame_equal(found, expected, check_dtype=False, check_exact=True)
 
@@ -516,7 +523,7 @@ class TestClosedForm:
     def test_over_all_who_may_carry_one(self, given_: tuple[Recording, Experiment]) -> None:
         """The mixture, by the probability of each set of carriers, of the times with these carriers for certain."""
         log, wanted = given_
-        ready = prepare(log, wanted)
+        ready = prepare_log(log, wanted)
         fleet = ready.expanded
         found = in_closed_form(ready, wanted)["w"]
         unsure = [name for name, share in zip(fleet.units, fleet.share, strict=True) if share < 1]
@@ -527,7 +534,7 @@ class TestClosedForm:
             weight = math.prod(share_of[n] if on else 1 - share_of[n] for n, on in zip(unsure, outcome, strict=True))
             kept = {name: unit for name, unit in fleet.units.items() if name not in out}
             certain = wanted.model_copy(update={"units": kept, "configurations": fleet.configurations})
-            for t, p in in_closed_form(prepare(log, certain), certain)["w"].items():
+            for t, p in in_closed_form(prepare_log(log, certain), certain)["w"].items():
                 expected[t] = expected.get(t, 0.0) + weight * p
         same(found, expected)
 
@@ -552,7 +559,7 @@ class TestClosedForm:
                 known = [t for (name, t), x in zip(lists, held, strict=True) if x and carries[name]]
                 key = min(known, default=None)
                 expected[key] = expected.get(key, 0.0) + weight
-        found = in_closed_form(prepare(log, wanted), wanted)["w"]
+        found = in_closed_form(prepare_log(log, wanted), wanted)["w"]
         same(found, expected)
         # By hand: at 0 s by a alone, 0.3 · 0.4; never if both are without or miss it.
         assert found[0] == pytest.approx(0.12)
@@ -563,7 +570,7 @@ class TestClosedForm:
         members = [Thing("ego", "car", standing(0, 0)), Thing("w", "pedestrian", standing(15, 9)),
                    Thing("a", "car", standing(9, 4))]  # fmt: skip
         wanted = plan({"f": some(0.5)}, pems={"p": sure_to(1.0)}, measure=MEASURE | {"exact": True}, runs=300)
-        result = run(wanted, [street(members)])
+        result = run_experiment(wanted, [street(members)])
         assert result.exact is not None
         assert [p for p in result.exact["probability"] if p > 0] == [0.5, 0.5]
         assert set(result.table["time_to_detection_s"].dropna()) == {0.0}
@@ -579,7 +586,7 @@ class TestClosedForm:
             configurations=CONFIGURATIONS | {"mast": {"units": ["fleet", "mast"]}},
             measure=MEASURE | {"exact": True},
         )
-        result = run(wanted, [on_the_move()])
+        result = run_experiment(wanted, [on_the_move()])
         assert result.exact is not None
         keys = ["configuration", "object_id"]
         runs = dict(iter(result.table.groupby(keys)))
@@ -596,7 +603,7 @@ class TestClosedForm:
 
         def rows(units: dict[str, Any], name: str) -> list[tuple[float, float]]:
             wanted = plan(units, configurations=CONFIGURATIONS)
-            found = distributions(prepare(log, wanted), wanted, name)[0]
+            found = compute_distributions(prepare_log(log, wanted), wanted, name)[0]
             return [(t, p) for t, p in zip(found.time_s.tolist(), found.probability.tolist(), strict=True) if p > 0]
 
         assert rows({"ego": EGO, "fleet": some(0.0)}, "all") == rows({"ego": EGO, "fleet": some(0.0)}, "ego")
@@ -609,7 +616,7 @@ class TestClosedForm:
         wanted = plan({"ego": EGO, "fleet": some(0.1)}, measure=MEASURE | {"confirm": {"hits": 2, "of": 3}})
         log = street(things())
         with pytest.raises(ExperimentError, match="closed form") as caught:
-            exact_table(prepare(log, wanted), wanted)
+            exact_table(prepare_log(log, wanted), wanted)
         assert len(caught.value.problems) == 1
 
 
@@ -650,7 +657,7 @@ VISIBLE = (1.8 - (3 - 19.75 / 10.05)) / 1.8
     ],
 )
 def test_a_carried_unit_is_on_the_roof_by_default(unit: dict[str, Any], expected: float) -> None:
-    ready = prepare(over_a_wall(), plan({"f": unit}))
+    ready = prepare_log(over_a_wall(), plan({"f": unit}))
     assert len(ready.measured.view.visible_share) == 3
     assert ready.measured.view.visible_share == pytest.approx(expected, abs=1e-6)
 
@@ -669,11 +676,11 @@ class TestOfRun:
             },
         )
         scene = street().scene
-        fleet = expand(wanted, scene)
+        fleet = expand_experiment(wanted, scene)
         there = carried(fleet, 40)
         assert len({tuple(row) for row in there}) == 8, "all sets of three carriers"
         for k in range(40):
-            one = of_run(wanted, scene, k)
+            one = resolve_for_run(wanted, scene, k)
             kept = [name for name, on in zip(fleet.units, there[k], strict=True) if on]
             assert list(one.units) == kept
             assert one.units_of(one.configurations["fleet"]) == tuple(kept[:-1])
@@ -681,7 +688,7 @@ class TestOfRun:
             late = [one.configurations["part"].latency_of(name) for name in kept]
             assert late == [0.3] * (len(kept) - 1) + [0.1]
             assert one.configurations["GT"] == wanted.configurations["GT"]
-            assert expand(one, scene).equipped("scene", np.arange(3)) is None
+            assert expand_experiment(one, scene).equipped("scene", np.arange(3)) is None
 
     def test_onsets_are_those_of_all_runs(self) -> None:
         """`line_of_sight_any` does not ask who is only in some runs; no more in a run that is looked at alone."""
@@ -696,11 +703,11 @@ class TestOfRun:
         )
         onset = {"onset": {"kind": "line_of_sight_any", "visible_share": 0.5}}
         wanted = plan({"ego": EGO, "f": some(0.5)}, measure={"objects": {"classes": ["pedestrian"]}} | onset)
-        expected = prepare(log, wanted).episodes.onset_s.tolist()
+        expected = prepare_log(log, wanted).episodes.onset_s.tolist()
         assert expected == pytest.approx([2.0], abs=0.15)
         for k in range(6):
-            alone = of_run(wanted, log.scene, k)
-            assert prepare(log, alone, onsets_of=wanted).episodes.onset_s.tolist() == expected
+            alone = resolve_for_run(wanted, log.scene, k)
+            assert prepare_log(log, alone, onsets_of=wanted).episodes.onset_s.tolist() == expected
 
 
 TEXT = """\
@@ -733,7 +740,7 @@ def test_the_run_that_is_shown_has_its_own_units(
     (tmp_path / "e.yaml").write_text(TEXT.replace("SHOWN", str(shown)))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.argv", ["copem-replay", "run", "e.yaml"])
-    assert cli._ended() == 0, capsys.readouterr().err
+    assert cli._run_to_exit_code() == 0, capsys.readouterr().err
     folder = tmp_path / "out" / "e"
     names = {path.name for path in folder.iterdir()}
     assert names == {
@@ -744,14 +751,14 @@ def test_the_run_that_is_shown_has_its_own_units(
     # Lists of a run come when its own units send them: there are no instants that all runs have.
     assert "run" in pd.read_parquet(folder / "instants.parquet")
     source = source_of(folder, (folder / "experiment.yaml").read_text())
-    wanted, found = problems(source)
+    wanted, found = find_problems(source)
     assert wanted is not None, found
     assert found == []
     assert wanted.units["fleet"].on == Carriers(classes=("car",), penetration_rate=0.5)
 
     scene = street([Thing("1", "car", standing(0, 0)), *(Thing(str(k), "car", standing(9, 9)) for k in range(2, 8))],
                    ego="1", log="square").scene  # fmt: skip
-    expected = list(of_run(wanted, scene, shown).units)
+    expected = list(resolve_for_run(wanted, scene, shown).units)
     assert 1 < len(expected) < 7
     entries: set[str] = set()
     with (folder / "replay.mcap").open("rb") as file:
@@ -833,4 +840,4 @@ FLEET = "  mast: {on: {classes: [car], penetration_rate: 0.5}, pem: onboard}"
 def test_what_is_wrong_with_a_fleet(tmp_path: Path, changes: list[str], expected: list[str]) -> None:
     (tmp_path / "drive.mcap").touch()
     source = source_of(tmp_path, changed(*changes))
-    assert [line.removeprefix(f"{source.path}:") for line in problems(source)[1]] == expected
+    assert [line.removeprefix(f"{source.path}:") for line in find_problems(source)[1]] == expected

@@ -14,18 +14,18 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from copem_replay.communication.arrivals import overtaken
-from copem_replay.communication.link import taken_in
+from copem_replay.communication.arrivals import find_overtaken_lists
+from copem_replay.communication.link import sample_arrivals
 from copem_replay.core.errors import ExperimentError
 from copem_replay.core.tracks import UNCERTAINTIES, VALUES, Float, Tracks
 from copem_replay.experiment.schema import Experiment
 from copem_replay.fusion import FUSIONS
-from copem_replay.fusion.ideal import fuse
+from copem_replay.fusion.ideal import fuse_ideal
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.config import Confirm
-from copem_replay.metrics.detection.by_truth_id import detect
+from copem_replay.metrics.detection.by_truth_id import detect_by_truth_id
 from copem_replay.metrics.episodes import Episodes
-from copem_replay.pipeline.run import run
+from copem_replay.pipeline.run import run_experiment
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
 from tests.oracles import ideal
 from tests.oracles.ideal import SentList
@@ -63,7 +63,7 @@ def tracks(runs: list[list[SentList]], units: int, tick: int | None) -> Tracks:
         valid=np.array([[k in held[f].holds for _, k, f in rows] for held in runs]).reshape(len(runs), len(rows)),
         **columns,
     )
-    return taken_in(arriving, None if tick is None else 1000 / tick)
+    return sample_arrivals(arriving, None if tick is None else 1000 / tick)
 
 
 @st.composite
@@ -92,12 +92,12 @@ def test_states_and_detections_are_those_of_the_oracle(
 ) -> None:
     runs, units = drawn
     heard = tracks(runs, units, tick)
-    fused_tracks = fuse(heard, max_age_s=max_age / 1000)
+    fused_tracks = fuse_ideal(heard, max_age_s=max_age / 1000)
     fused = fused_tracks.fused
     began = np.full(OBJECTS, onset * STEP / 1000)
     nothing = np.zeros(OBJECTS, dtype=int)
     looked_at = Episodes(np.arange(OBJECTS), began, nothing > 0, np.full(OBJECTS, 0.9), nothing)
-    found = detect(heard, looked_at, confirm=Confirm(), count_earlier=False, max_age_s=max_age / 1000)
+    found = detect_by_truth_id(heard, looked_at, confirm=Confirm(), count_earlier=False, max_age_s=max_age / 1000)
     for s, lists in enumerate(runs):
         expected = ideal.known(lists, tick, max_age)
         np.testing.assert_allclose(fused.arrives_s[0], np.array(list(expected)) / 1000, atol=1e-9)
@@ -126,7 +126,7 @@ def test_in_one_run_a_fused_entry_is_made_of_one_entry_of_each_unit(
     drawn: tuple[list[list[SentList]], int], tick: int | None
 ) -> None:
     (lists, _), units = drawn
-    made = fuse(tracks([lists], units, tick), max_age_s=0.2)
+    made = fuse_ideal(tracks([lists], units, tick), max_age_s=0.2)
     expected = list(ideal.known(lists, tick, 200).values())
     for p in np.flatnonzero(made.fused.valid[0]):
         of = made.used[made.used_start[p] : made.used_start[p + 1]]
@@ -150,7 +150,7 @@ def test_overtaken_is_what_arrives_later_than_a_newer_list(
         return newer and mine is not None and its is not None and mine > its
 
     expected = [any(later(one, other) for other in lists) for one in lists]
-    assert overtaken(tracks([lists], units, tick)).tolist() == expected
+    assert find_overtaken_lists(tracks([lists], units, tick)).tolist() == expected
 
 
 # ------------------------------------------------------------------------------------------ exact against sampled
@@ -185,7 +185,7 @@ def z_scores(plan: Experiment, log: Recording, name: str) -> Float:
 
     One is beyond 4 once in 15,000 times; with the seed that all tests here have none is.
     """
-    result = run(plan, [log])
+    result = run_experiment(plan, [log])
     assert result.exact is not None
     exact = result.exact[(result.exact["configuration"] == name) & (result.exact["probability"] > 0)]
     exact = exact[exact["detection_s"].notna()]
@@ -275,7 +275,7 @@ def test_overtaken_lists_count_in_exact_times_and_in_runs(tmp_path: Path, monkey
         update={"measure": plan.measure.model_copy(update={"confirm": Confirm(hits=2, of=3), "exact": True})}
     )
     with pytest.raises(ExperimentError, match=r"lists arrive up to 0\.35 s after lists captured later, and confirm"):
-        run(twice, [parked(3)])
+        run_experiment(twice, [parked(3)])
 
 
 # ------------------------------------------------------------------------------- no fusion knows sooner than the ideal
@@ -340,7 +340,7 @@ def test_no_fusion_knows_an_object_sooner_than_the_ideal_of_the_same_lists(
     )  # fmt: skip
     moving = [Thing("m", "car", driving(-20, 30, 4))]
     log = recording([Thing("ego", "car", standing(0, 0)), *moving, *_standing(4)], until_s=4.0)
-    table = run(plan, [log]).table
+    table = run_experiment(plan, [log]).table
     known = table.pivot_table(
         index=["object_id", "run"], columns="configuration", values="detection_s", dropna=False
     ).fillna(np.inf)
@@ -364,6 +364,6 @@ def test_lists_that_are_released_together_are_not_overtaken() -> None:
         },
         measure={"onset": {"kind": "appears"}, "accuracy": False},
     )  # fmt: skip
-    shares = run(plan, [parked(2)]).summary.set_index("configuration")["overtaken_share"].to_dict()
+    shares = run_experiment(plan, [parked(2)]).summary.set_index("configuration")["overtaken_share"].to_dict()
     assert shares["kept"] == shares["kept3"] == 0.0
     assert shares["free"] == shares["free3"] > 0.35

@@ -13,17 +13,18 @@ from copem_replay.communication.link import KeptDraws, SentLists
 from copem_replay.communication.radio import Radio
 from copem_replay.core.errors import ExperimentError
 from copem_replay.core.tracks import Tracks
-from copem_replay.experiment.file import plain as filed
+from copem_replay.experiment.file import make_plain_source as filed
 from copem_replay.experiment.schema import Experiment
-from copem_replay.experiment.validate import problems
+from copem_replay.experiment.validate import find_problems
 from copem_replay.io.recording import Recording
 from copem_replay.perception.perceive import perceive
-from copem_replay.pipeline import chunking, perceived
-from copem_replay.pipeline.blocks import outcomes
-from copem_replay.pipeline.prepare import prepare
-from copem_replay.pipeline.receiver import ghosts_of, listen, seen_by_all
-from copem_replay.pipeline.run import Result, run
-from copem_replay.pipeline.sweep import points
+from copem_replay.pipeline import prepare as chunking
+from copem_replay.pipeline import world as perceived
+from copem_replay.pipeline.prepare import prepare_log
+from copem_replay.pipeline.receiver import draw_shown_ghosts, hear_units, perceive_all_units
+from copem_replay.pipeline.replay import replay_outcomes
+from copem_replay.pipeline.run import ExperimentResult, run_experiment
+from copem_replay.pipeline.sweep import list_points
 from tests.helpers import scenes
 from tests.helpers.scenes import Thing, driving, experiment, standing
 
@@ -60,12 +61,12 @@ def plan(link: object, **changes: Any) -> Experiment:
 
 def heard_by(experiment: Experiment, name: str = "coop", one: int = 0, recording: Recording | None = None) -> Tracks:
     """What reaches a receiver in one run."""
-    replay, runs = prepare(recording or traffic(), experiment), np.array([one])
+    replay, runs = prepare_log(recording or traffic(), experiment), np.array([one])
     world = replay.lists_only(experiment, runs)
-    return listen(seen_by_all(world, runs, states="true"), world, name)
+    return hear_units(perceive_all_units(world, runs, states="true"), world, name)
 
 
-def assert_same(one: Result, other: Result) -> None:
+def assert_same(one: ExperimentResult, other: ExperimentResult) -> None:
     columns = [name for name in one.table if name in other.table]  # one may have no link
     assert one.table[columns].equals(other.table[columns])
     columns = [name for name in one.summary if name in other.summary]
@@ -85,8 +86,10 @@ def test_a_link_that_is_sure_is_a_latency_to_the_last_bit() -> None:
         n: c | {"link": {"east": "near", "default": "far"}} for n, c in configurations.items()
     }
     sure = {"near": {"latency": 0.07}, "far": {"latency": 0.31, "reception": {"kind": "constant", "probability": 1}}}
-    one = run(plan(None, configurations=linked, links=sure), [traffic()])
-    other = run(plan(None, configurations={n: c | {"latency_s": late} for n, c in configurations.items()}), [traffic()])
+    one = run_experiment(plan(None, configurations=linked, links=sure), [traffic()])
+    other = run_experiment(
+        plan(None, configurations={n: c | {"latency_s": late} for n, c in configurations.items()}), [traffic()]
+    )
     assert_same(one, other)
 
 
@@ -126,29 +129,29 @@ def test_configurations_have_the_same_numbers() -> None:
 @pytest.mark.parametrize("link", ["v2x", "bursts"])
 def test_a_run_alone_is_the_same_run(link: str) -> None:
     some = plan(link)
-    replay = prepare(traffic(), some)
-    together = outcomes(replay, some, np.arange(4))
-    [alone] = outcomes(replay, some, np.array([2]))
+    replay = prepare_log(traffic(), some)
+    together = replay_outcomes(replay, some, np.arange(4))
+    [alone] = replay_outcomes(replay, some, np.array([2]))
     [same] = [part for part in together if part.runs.tolist() == [2]]
     assert alone.table.equals(same.table)
     for name in alone.all_scores:
         assert (alone.all_scores[name].issue_s == same.all_scores[name].issue_s).all()
-    assert_same(run(some, [traffic()]), run(some, [traffic()], jobs=2))
+    assert_same(run_experiment(some, [traffic()]), run_experiment(some, [traffic()], jobs=2))
 
 
 @pytest.mark.parametrize("link", ["v2x", None])
 def test_a_block_perceives_once(monkeypatch: pytest.MonkeyPatch, link: str | None) -> None:
     """Which objects are listed, and with which errors: of all runs at once, whether arrivals are drawn or not."""
     some, asked = plan(link), []
-    replay = prepare(traffic(), some)
-    outcomes(replay, some, np.arange(1))  # what is found out once a log
+    replay = prepare_log(traffic(), some)
+    replay_outcomes(replay, some, np.arange(1))  # what is found out once a log
 
     def counted(*given: Any, states: str, **more: Any) -> Tracks:
         asked.append((len(given[3]), states))
         return perceive(*given, states=states, **more)
 
     monkeypatch.setattr(perceived, "perceive", counted)
-    outcomes(replay, some, np.arange(4))
+    replay_outcomes(replay, some, np.arange(4))
     # With a queue how many objects lists have goes by the rows of all objects, detection by those of measured ones.
     assert sorted(asked) == sorted([(4, "sampled"), (4, "true"), *([(4, "true")] if link else [])])
 
@@ -163,10 +166,10 @@ def test_what_a_link_drew_is_drawn_once(monkeypatch: pytest.MonkeyPatch) -> None
 
     once = Radio._drawn
     monkeypatch.setattr(Radio, "_drawn", counted)
-    kept = run(some, [traffic()])
+    kept = run_experiment(some, [traffic()])
     assert len(drawn) == 4
     monkeypatch.setattr(KeptDraws.__init__, "__defaults__", (0,))
-    assert_same(kept, run(some, [traffic()]))
+    assert_same(kept, run_experiment(some, [traffic()]))
     assert len(drawn) > 8
 
 
@@ -177,10 +180,10 @@ def test_a_log_in_time_chunks_gives_the_same(monkeypatch: pytest.MonkeyPatch, fl
     if fleet:
         cars = {"on": {"classes": ["car"], "penetration_rate": 0.5}, "height_m": 1.6, "pem": "half", "ready": GAMMA}
         some = plan({"cars": "v2x"}, units={"ego": {"on": "ego", "height_m": 1.8, "pem": "half"}, "cars": cars})
-    whole = run(some, [traffic()])
+    whole = run_experiment(some, [traffic()])
     monkeypatch.setattr(chunking, "ROWS_AT_ONCE", 1)
     monkeypatch.setattr(chunking, "ROWS_A_CHUNK", 200)
-    cut = run(some, [traffic()])
+    cut = run_experiment(some, [traffic()])
     assert len(cut.replays[0].chunks) > 2
     assert_same(whole, cut)
 
@@ -191,8 +194,8 @@ def test_false_positives_are_in_the_air_too() -> None:
     couples = [{"detection": {"kind": "constant", "probability": 0.0}, "error": ERROR}]
     channel = {"channel": {"kbps": 100}}
     slow = plan("slow", pems={"half": {"couples": couples, "ghosts": [ghosts]}}, links={"slow": channel})
-    replay, runs = prepare(traffic(), slow), np.array([3])
-    found = ghosts_of(replay.world(slow), runs)
+    replay, runs = prepare_log(traffic(), slow), np.array([3])
+    found = draw_shown_ghosts(replay.world(slow), runs)
     assert found is not None
     heard = heard_by(slow, "gnn", one=3)
     g = np.bincount(found.found.tracks.frame_ix, minlength=len(heard.stamp_ns))
@@ -203,8 +206,8 @@ def test_false_positives_are_in_the_air_too() -> None:
 def test_lists_queue_for_as_long_as_they_are_in_their_run() -> None:
     """At 100 kbit/s a list of n objects takes 8 (121 + 35 n) / 100 000 s, and its unit sends ten a second."""
     slow = plan("slow", links={"slow": {"channel": {"kbps": 100}}})
-    replay, runs = prepare(traffic(), slow), np.array([3])
-    seen = seen_by_all(replay.world(slow), runs, states="true")
+    replay, runs = prepare_log(traffic(), slow), np.array([3])
+    seen = perceive_all_units(replay.world(slow), runs, states="true")
     objects = np.bincount(seen.frame_ix[seen.valid[0]], minlength=len(seen.stamp_ns))
     assert len(np.unique(objects)) > 2
     heard = heard_by(slow, one=3)
@@ -214,7 +217,7 @@ def test_lists_queue_for_as_long_as_they_are_in_their_run() -> None:
 
 def test_nothing_is_known_sooner_than_without_the_link() -> None:
     configurations = {"plain": {"units": "all"}, "coop": {"units": "all", "link": "v2x"}}
-    table = run(plan(None, configurations=configurations, runs=20), [traffic()]).table
+    table = run_experiment(plan(None, configurations=configurations, runs=20), [traffic()]).table
     plain, coop = (table[table["configuration"] == name]["detection_s"].to_numpy() for name in configurations)
     assert (np.nan_to_num(coop, nan=np.inf) >= np.nan_to_num(plain, nan=np.inf)).all()
     assert (coop > plain).any()
@@ -232,7 +235,7 @@ def one_car(loss: float, **configuration: Any) -> Experiment:
 @pytest.mark.parametrize("loss", [0.1, 0.5])
 def test_mean_delay_by_loss_and_its_closed_form(loss: float) -> None:
     """T p / (1 − p), and exact: each list is the first that arrives with (1 − p) p^k."""
-    result = run(one_car(loss), [scenes.oncoming_car()])
+    result = run_experiment(one_car(loss), [scenes.oncoming_car()])
     late_s = result.table["detection_s"] - 4.0
     expected_s = 0.1 * loss / (1 - loss)
     assert late_s.mean() == pytest.approx(expected_s, abs=4 * late_s.std() / math.sqrt(600))
@@ -246,7 +249,7 @@ def test_mean_delay_by_loss_and_its_closed_form(loss: float) -> None:
 
 def test_fused_lists_are_issued_at_ticks() -> None:
     """At 4 Hz the list of 4.0 s, which arrives at 4.03 s, is in the fused list of 4.25 s, and exact times say so."""
-    result = run(one_car(0.0, issue_hz=4, latency_s=0.03), [scenes.oncoming_car()])
+    result = run_experiment(one_car(0.0, issue_hz=4, latency_s=0.03), [scenes.oncoming_car()])
     assert set(result.table["detection_s"]) == {4.25}
     assert result.exact is not None
     assert result.exact[result.exact["probability"] > 0]["detection_s"].tolist() == [4.25]
@@ -273,7 +276,7 @@ def test_exact_is_refused_with_the_reason(link: dict[str, Any], unit: dict[str, 
     units = {"ego": scenes.EGO_UNIT | unit}
     refused = Experiment.model_validate(some.as_written() | {"links": {"v2x": link}, "units": units})
     with pytest.raises(ExperimentError) as caught:
-        run(refused, [scenes.oncoming_car()])
+        run_experiment(refused, [scenes.oncoming_car()])
     assert str(caught.value) == f"exact: configuration PEM: {said}, or leave exact out"
 
 
@@ -282,7 +285,7 @@ def test_without_a_receiver_there_is_no_distance() -> None:
     some = plan("v2x", units={"east": {"at": [30.0, 8], "height_m": 5, "pem": "half"}}, ego="none",
                 measure={"onset": {"kind": "appears"}, "distance_to": "east"})  # fmt: skip
     with pytest.raises(ExperimentError) as caught:
-        run(some, [alone])
+        run_experiment(some, [alone])
     expected = (
         "links.v2x.reception: shadowing: the distance to a receiver is unknown, for the log has no ego; use constant"
     )
@@ -294,13 +297,13 @@ def test_what_links_make_of_lists_is_in_the_summary() -> None:
     link = {"latency": 0.1}
     some = one_car(0.0, latency_s=0.0).model_copy(update={"runs": 1})
     plain = Experiment.model_validate(some.as_written() | {"links": {"v2x": link}})
-    [row] = run(plain, [scenes.oncoming_car()]).summary.to_dict("records")
+    [row] = run_experiment(plain, [scenes.oncoming_car()]).summary.to_dict("records")
     assert (row["lost_share"], row["overtaken_share"]) == (0.0, 0.0)
     assert row["age_of_information_p50_s"] == pytest.approx(0.15, abs=1e-6)
     assert row["age_of_information_p95_s"] == pytest.approx(0.195, abs=1e-6)
-    [none] = run(experiment(configurations={"PEM": {"units": ["ego"]}}), [scenes.oncoming_car()]).summary.to_dict(
-        "records"
-    )
+    [none] = run_experiment(
+        experiment(configurations={"PEM": {"units": ["ego"]}}), [scenes.oncoming_car()]
+    ).summary.to_dict("records")
     assert "lost_share" not in none
 
 
@@ -315,7 +318,7 @@ def test_lists_of_wired_units_are_none_of_the_links() -> None:
     some = plan(None, links={"slow": slow}, configurations=wired, runs=30, units=units)
     heard = [heard_by(some, one=k) for k in range(30)]
     sent = [one.common_arrives_s[np.isin(one.frame_unit_ix, (1, 2))] for one in heard]
-    [row] = run(some, [traffic()]).summary.to_dict("records")
+    [row] = run_experiment(some, [traffic()]).summary.to_dict("records")
     assert row["lost_share"] == np.mean([np.isinf(one).mean() for one in sent])
     assert row["lost_share"] == pytest.approx(0.5, abs=0.04)
     overtaken, came = 0, 0
@@ -342,7 +345,7 @@ def test_lists_that_are_taken_in_at_once_are_not_overtaken(sends: object) -> Non
         for name in ("sure", "slow") for hz in (0, 4)
     }  # fmt: skip
     some = experiment(units=units, links={"sure": {"latency": 0.05}, "slow": slow}, configurations=configurations)
-    rows = run(some, [scenes.oncoming_car()]).summary.set_index("configuration")
+    rows = run_experiment(some, [scenes.oncoming_car()]).summary.set_index("configuration")
     shares = rows["overtaken_share"].to_dict()
     heard = heard_by(some, "slow0", recording=scenes.oncoming_car()).common_arrives_s
     overtaken = np.mean([(heard[k + 1 :] <= heard[k]).any() for k in range(len(heard))])
@@ -362,13 +365,13 @@ def test_sweeps_of_links(kind: str) -> None:
     """More loss only removes lists, run by run; bursts leave the mean loss as it is."""
     values, link = SWEPT[kind]
     some = plan("v2x", links={"v2x": link}, runs=3, sweep={kind: values, "configurations": ["coop"]})
-    swept = list(points(some))
+    swept = list(list_points(some))
     assert [point.value for point in swept] == values
     came = [[np.isfinite(heard_by(at.experiment, one=k).common_arrives_s) for k in range(3)] for at in swept]
     if kind == "loss":
         assert all((more <= less).all() for k in range(3) for less, more in pairwise(one[k] for one in came))
         assert np.all(came[0])
-    rows = run(some, [traffic()]).sweep
+    rows = run_experiment(some, [traffic()]).sweep
     assert rows is not None
     lost = rows["lost_share"].to_numpy()
     np.testing.assert_allclose(lost, values if kind == "loss" else [0.4] * 3, atol=0.15)
@@ -388,7 +391,7 @@ def test_sweeps_of_links(kind: str) -> None:
 )  # fmt: skip
 def test_what_cannot_be_swept_is_said(link: dict[str, Any], sweep: dict[str, Any], said: str) -> None:
     data = plan("v2x", links={"v2x": link}).as_written() | {"sweep": sweep}
-    assert [f"experiment: {said}"] == [line for line in problems(filed(data))[1] if "sweep" in line]
+    assert [f"experiment: {said}"] == [line for line in find_problems(filed(data))[1] if "sweep" in line]
 
 
 def test_a_link_that_there_is_not() -> None:
@@ -398,7 +401,7 @@ def test_a_link_that_there_is_not() -> None:
         "two": {"units": "all", "link": {"nobody": "v2x"}},
     }
     del data["links"]["bursts"]
-    found = [line for line in problems(filed(data))[1] if "link" in line]
+    found = [line for line in find_problems(filed(data))[1] if "link" in line]
     assert found == [
         "experiment: configurations.coop.link: no link 'v2y' (there is v2x)",
         "experiment: configurations.two.link.nobody: no unit is named 'nobody'; there are ego, east, west, default",

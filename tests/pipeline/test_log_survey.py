@@ -11,7 +11,8 @@ import pytest
 from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import Tracks
 from copem_replay.experiment import validate
-from copem_replay.pipeline import log_survey, memory
+from copem_replay.pipeline import cost as memory
+from copem_replay.pipeline import study_log as log_survey
 from tests.cli.test_api import cr
 from tests.helpers.experiments import changed, drive
 from tests.pipeline.test_pieces import EXACT, FLEET, replayed, study
@@ -51,7 +52,7 @@ def test_few_logs_are_in_memory_at_a_time(kept: str | None, here: Path, monkeypa
         (here / f"name{k}.mcap").hardlink_to(here / "a.mcap")
     monkeypatch.setattr(log_survey, "STATES_HELD", 0)
     there: list[weakref.ref[Tracks]] = []
-    most, read = 0, validate.read
+    most, read = 0, validate.read_log
 
     def watched(*given: Any, **keys: Any) -> Any:
         nonlocal most
@@ -60,7 +61,7 @@ def test_few_logs_are_in_memory_at_a_time(kept: str | None, here: Path, monkeypa
         there.append(weakref.ref(recording.truth))
         return recording
 
-    monkeypatch.setattr(validate, "read", watched)
+    monkeypatch.setattr(validate, "read_log", watched)
     Path("e.yaml").write_text(study("logs: [name*.mcap]", "sweep: {latency_s: [0, 0.3]}", runs=3))
     cr.run("e.yaml", jobs=1, pieces=kept).save("out")
     assert len(there) > 19, "each but the first is read twice"

@@ -9,13 +9,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from copem_replay.experiment.file import plain
+from copem_replay.experiment.file import make_plain_source
 from copem_replay.experiment.schema import Experiment
-from copem_replay.experiment.validate import problems
-from copem_replay.pipeline.blocks import blocks
-from copem_replay.pipeline.prepare import prepare
-from copem_replay.pipeline.run import run
-from copem_replay.pipeline.sweep import points
+from copem_replay.experiment.validate import find_problems
+from copem_replay.pipeline.prepare import prepare_log
+from copem_replay.pipeline.replay import cut_blocks
+from copem_replay.pipeline.run import run_experiment
+from copem_replay.pipeline.sweep import list_points
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
 from tests.pipeline.test_chunking import assert_same, both_ways, traffic
 from tests.pipeline.test_closed_form import band, farthest, pairs, refused
@@ -72,8 +72,8 @@ LASTING: dict[str, tuple[Parts, Parts | None]] = {
 def test_the_runs_are_within_the_band_of_the_exact_distribution(case: str) -> None:
     """20 000 runs of each; without memory in the closed form they are outside."""
     measured = EXACT | {"accuracy": False}
-    result = run(plan(*LASTING[case], measure=measured), [coming()])
-    memoryless = run(plan([], runs=1, measure=measured), [coming()])
+    result = run_experiment(plan(*LASTING[case], measure=measured), [coming()])
+    memoryless = run_experiment(plan([], runs=1, measure=measured), [coming()])
     assert result.exact is not None
     assert len(pairs(result)) == 4
     outside = 0
@@ -91,7 +91,7 @@ def test_a_fleet_whose_units_last() -> None:
     setup = plan(
         [{"share": 0.9, "correlation_s": 1.0}], units=fleet, configurations={"all": {"units": "all"}}, measure=measured
     )
-    result = run(setup, [recording(things, until_s=2.0)])
+    result = run_experiment(setup, [recording(things, until_s=2.0)])
     [(_, runs, rows)] = pairs(result)
     assert 0.05 < rows["probability"].iloc[-1] < 0.95
     assert farthest(runs["detection_s"].to_numpy(), rows) <= band(20_000, 1e-7)
@@ -112,7 +112,7 @@ def test_time_to_detection_hardly_depends_on_the_list_rate(rate_hz: float) -> No
         configurations={"m": {"units": "all"}},
         measure=EXACT | {"accuracy": False},
     )
-    result = run(setup, [log])
+    result = run_experiment(setup, [log])
     assert result.exact is not None
     for t in (0.5, 1.0, 2.0):
         expected = (1 - p) * math.exp(-p * t / tau_s)
@@ -182,7 +182,7 @@ def test_memory_of_errors_leaves_exact_times_as_they_are() -> None:
     couples = [{"detection": FADING, "error": {"kind": "gaussian", "covariance_m2": [[1, 0], [0, 1]]}}]
     memory = {"position": TWO, "yaw": TWO}
     setups = [plan([], runs=1, pems={"p": pem, "q": pem}) for pem in (couples, {"couples": couples, "memory": memory})]
-    without, with_memory = (run(setup, [coming()]).exact for setup in setups)
+    without, with_memory = (run_experiment(setup, [coming()]).exact for setup in setups)
     pd.testing.assert_frame_equal(without, with_memory, check_exact=True)
 
 
@@ -197,18 +197,20 @@ def test_a_sweep_of_the_correlation_time() -> None:
     setup = plan(
         parts, [], runs=300, measure=measured, configurations=configurations, sweep={"correlation_s": [0, 0.5]}
     )
-    assert [(p.sweep, p.value, list(p.experiment.configurations)) for p in points(setup)] == [
+    assert [(p.sweep, p.value, list(p.experiment.configurations)) for p in list_points(setup)] == [
         ("correlation_s", 0, ["m"]), ("correlation_s", 0.5, ["m"]),
     ]  # fmt: skip
-    swept = run(setup, [coming()]).sweep
+    swept = run_experiment(setup, [coming()]).sweep
     assert swept is not None
     half = [{"share": 1.0, "correlation_s": 0.5}]
-    other = run(plan(half, [], runs=300, measure=measured, configurations=configurations), [coming()]).summary
+    other = run_experiment(
+        plan(half, [], runs=300, measure=measured, configurations=configurations), [coming()]
+    ).summary
     mine = swept[(swept["value"] == 0.5) & (swept["configuration"] == "m")].iloc[0]
     theirs = other[other["configuration"] == "m"].iloc[0]
     for column in ("detected_share", "detected_share_exact", "ttd_median_s", "ttd_rmst_s_exact"):
         assert mine[column] == theirs[column], column
-    fresh = run(plan([], [], runs=300, measure=measured, configurations=configurations), [coming()]).summary
+    fresh = run_experiment(plan([], [], runs=300, measure=measured, configurations=configurations), [coming()]).summary
     none = swept[swept["value"] == 0].iloc[0]
     theirs = fresh[fresh["configuration"] == "m"].iloc[0]
     assert none["detected_share_exact"] == pytest.approx(theirs["detected_share_exact"], rel=1e-12)
@@ -220,8 +222,10 @@ def test_a_sweep_that_nothing_remembers_is_refused() -> None:
         "version": 1, "pems": {"p": [{"detection": FADING}]}, "units": {"m": {"at": [0, 2], "height_m": 5, "pem": "p"}},
         "configurations": {"all": {"units": "all"}}, "sweep": {"correlation_s": [1]},
     }  # fmt: skip
-    assert problems(plain(data))[1] == ["experiment: sweep.correlation_s: no PEM has `memory: {detection: […]}`"]
-    assert problems(plain(data | {"sweep": {"correlation_s": [0.0001]}}))[1] == [
+    assert find_problems(make_plain_source(data))[1] == [
+        "experiment: sweep.correlation_s: no PEM has `memory: {detection: […]}`"
+    ]
+    assert find_problems(make_plain_source(data | {"sweep": {"correlation_s": [0.0001]}}))[1] == [
         "experiment: sweep.correlation_s[0]: expected 0 or at least 0.001 (s), found 0.0001",
         "experiment: sweep.correlation_s: no PEM has `memory: {detection: […]}`",
     ]
@@ -267,20 +271,20 @@ def test_chunks_have_the_same_bits(of: str, path: str, rows: int) -> None:
 
 def test_blocks_are_smaller_where_detection_lasts(monkeypatch: pytest.MonkeyPatch) -> None:
     """The numbers themselves are held then, not one byte each."""
-    monkeypatch.setattr("copem_replay.pipeline.blocks.BLOCK_BYTES", 1_000_000)
+    monkeypatch.setattr("copem_replay.pipeline.replay.BLOCK_BYTES", 1_000_000)
     measured = {"onset": {"kind": "appears"}, "accuracy": False}
     sizes = []
     for parts in ([], LASTING["numbers that two units share"][0]):
         setup = plan(parts, runs=100_000, measure=measured)
-        replay = prepare(coming(), setup)
-        sizes.append(max(map(len, blocks(replay, setup, 1))))
+        replay = prepare_log(coming(), setup)
+        sizes.append(max(map(len, cut_blocks(replay, setup, 1))))
         rows = len(replay.measured.tracks.frame_ix)
     assert sizes == [1_000_000 // rows, 1_000_000 // (40 * rows)]
 
 
 def test_more_workers_and_blocks_have_the_same_bits() -> None:
     setup = plan(LASTING["numbers that two units share"][0], runs=9, measure={"onset": {"kind": "appears"}})
-    one, many = (run(setup, [coming()], jobs=jobs).table for jobs in (1, 4))
+    one, many = (run_experiment(setup, [coming()], jobs=jobs).table for jobs in (1, 4))
     pd.testing.assert_frame_equal(one, many, check_exact=True)
     assert one["detection_s"].nunique() > 2
     assert np.isfinite(one["detection_s"]).any()

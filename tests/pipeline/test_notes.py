@@ -10,12 +10,13 @@ import pytest
 from copem_replay.core.errors import ExperimentError
 from copem_replay.experiment.file import log_paths
 from copem_replay.experiment.schema import Experiment
-from copem_replay.experiment.validate import problems, read_logs
+from copem_replay.experiment.validate import find_problems, read_logs
 from copem_replay.io.recording import Recording
-from copem_replay.pipeline import memory, notes
-from copem_replay.pipeline.notes import notes_of
-from copem_replay.pipeline.prepare import Replay, prepare
-from copem_replay.pipeline.run import run
+from copem_replay.pipeline import cost as memory
+from copem_replay.pipeline import notes
+from copem_replay.pipeline.notes import list_notes
+from copem_replay.pipeline.prepare import Replay, prepare_log
+from copem_replay.pipeline.run import run_experiment
 from tests.helpers.experiments import TEXT, changed, drive, source_of
 from tests.helpers.recordings import Obj, write_recording
 
@@ -24,21 +25,21 @@ MAST = "  mast: {{at: {at}, yaw_deg: {yaw}, height_m: 5.0, pem: onboard}}"
 
 def made(folder: Path, text: str) -> tuple[Experiment, list[Recording], list[Replay]]:
     source = source_of(folder, text)
-    experiment, found = problems(source)
+    experiment, found = find_problems(source)
     assert experiment is not None, found
     recordings, refused = read_logs(experiment, log_paths(source)[0], source)
     assert (found, refused) == ([], [])
-    return experiment, recordings, [prepare(recording, experiment) for recording in recordings]
+    return experiment, recordings, [prepare_log(recording, experiment) for recording in recordings]
 
 
 def before(folder: Path, text: str) -> list[str]:
     experiment, recordings, ready = made(folder, text)
-    return notes_of(recordings, ready, experiment, replayed=False)
+    return list_notes(recordings, ready, experiment, replayed=False)
 
 
 def after(folder: Path, text: str) -> list[str]:
     experiment, recordings, _ = made(folder, text)
-    return [note for note in run(experiment, recordings).notes if not note.startswith("no interval")]
+    return [note for note in run_experiment(experiment, recordings).notes if not note.startswith("no interval")]
 
 
 @pytest.fixture
@@ -245,11 +246,11 @@ class TestMemory:
     def test_run_refuses_before_it_begins(self, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         experiment, recordings, _ = made(here, changed("runs: 1000000000"))
         with pytest.raises(ExperimentError, match=r"1000000000 runs of 3 rows each take at least 2\.64e\+03 GB"):
-            run(experiment, recordings)
+            run_experiment(experiment, recordings)
 
     def test_what_is_free(self, monkeypatch: pytest.MonkeyPatch) -> None:
         files: dict[str, Any] = {"/proc/meminfo": "MemTotal: 9 kB\nMemAvailable:   6 kB\nSwapFree:  1 kB\n"}
-        monkeypatch.setattr(memory, "_text", lambda path: files.get(path, ""))
+        monkeypatch.setattr(memory, "_read_text", lambda path: files.get(path, ""))
         assert memory.free_bytes() == 7 * 1024
         group = "/sys/fs/cgroup/memory."
         files |= {f"{group}max": "5000\n", f"{group}current": "4000\n", f"{group}stat": "anon 3500\nfile 400\n"}

@@ -11,11 +11,11 @@ import pytest
 
 from copem_replay.core.errors import InputError, OutputError
 from copem_replay.experiment import validate
-from copem_replay.pipeline import study_tables
-from copem_replay.pipeline.log_tables import LogTables
-from copem_replay.pipeline.pieces import ranges
-from copem_replay.pipeline.study_tables import StudyTables
-from copem_replay.results import contents, tables
+from copem_replay.pipeline import tables as study_tables
+from copem_replay.pipeline.pieces import split_runs
+from copem_replay.pipeline.tables import LogTables, StudyTables
+from copem_replay.results import schema as contents
+from copem_replay.results import write as results_write
 from tests.cli.test_api import cr
 from tests.helpers.experiments import changed, drive
 
@@ -117,7 +117,7 @@ def test_a_finished_study_is_resumed_without_reading_a_log(here: Path, monkeypat
     def unread(*given: Any, **keys: Any) -> None:
         raise AssertionError("a log was read")
 
-    monkeypatch.setattr(validate, "read", unread)
+    monkeypatch.setattr(validate, "read_log", unread)
     again, computed, found = replayed(text, "again")
     assert (computed, found, again) == (0, 90, first)
 
@@ -125,8 +125,8 @@ def test_a_finished_study_is_resumed_without_reading_a_log(here: Path, monkeypat
 def test_a_log_that_is_shown_is_read_again_and_no_other(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     text = study("show: {run: worst, logs: [b]}", runs=3)
     first, _, _ = replayed(text, "first")
-    names, read = [], validate.read
-    monkeypatch.setattr(validate, "read", lambda *a, **k: names.append(k["name"]) or read(*a, **k))
+    names, read = [], validate.read_log
+    monkeypatch.setattr(validate, "read_log", lambda *a, **k: names.append(k["name"]) or read(*a, **k))
     again, _, _ = replayed(text, "again")
     assert names == ["b"]
     assert again == first
@@ -170,16 +170,16 @@ def test_what_is_damaged_is_computed_again(here: Path) -> None:
     ],
 )
 def test_ranges_of_runs(runs: int, episodes: int, expected: list[int]) -> None:
-    found = list(ranges(runs, episodes))
+    found = list(split_runs(runs, episodes))
     assert [begin for begin, _ in found] + [runs] == expected
     assert [end for _, end in found] == expected[1:]
 
 
 @pytest.mark.parametrize("episodes", [0, 1, 700, 3000, 130_000])
 def test_more_runs_have_the_same_ranges_but_the_last(episodes: int) -> None:
-    long = list(ranges(5000, episodes))
+    long = list(split_runs(5000, episodes))
     for runs in (1, 63, 64, 65, 300, 4999):
-        assert list(ranges(runs, episodes))[:-1] == long[: len(list(ranges(runs, episodes))) - 1]
+        assert list(split_runs(runs, episodes))[:-1] == long[: len(list(split_runs(runs, episodes))) - 1]
     for begin, end in long[:-1]:
         assert (end - begin) & (end - begin - 1) == 0
         assert begin % (end - begin) == 0
@@ -197,7 +197,7 @@ def test_a_long_log_in_stretches_has_the_pieces_of_each_configuration_alone(
     here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Stretches reach back as far as any configuration needs: pieces of one alone are those among others."""
-    from copem_replay.pipeline import chunking
+    from copem_replay.pipeline import prepare as chunking
 
     monkeypatch.setattr(chunking, "ROWS_A_CHUNK", 20)
     text = study(runs=6, gnn=True)
@@ -220,7 +220,7 @@ def test_rows_of_one_log_are_in_memory_at_a_time(
     """Where rows are too many they are read again to be written: the same bytes, of row groups, too."""
     monkeypatch.setattr(contents, "ROWS_A_GROUP", 100)
     if many:
-        monkeypatch.setattr(tables, "MANY_ROWS", 10)
+        monkeypatch.setattr(results_write, "MANY_ROWS", 10)
     for name in "cd":
         (here / f"{name}.mcap").hardlink_to("a.mcap")
     text = text.replace("logs: [a.mcap, b.mcap]", "logs: ['?.mcap']")

@@ -15,13 +15,13 @@ from copem_replay.cli import main as cli
 from copem_replay.communication.link import ConstantLink, UnitLinks, transmit
 from copem_replay.core.object_list import ENTRY, ObjectLists
 from copem_replay.experiment.schema import Experiment
-from copem_replay.fusion.base import ListFusion, fused_by
-from copem_replay.fusion.inputs import inputs
+from copem_replay.fusion.inputs import make_inputs
+from copem_replay.fusion.interface import ListFusion, ask_fusion
 from copem_replay.io.recording import Recording
-from copem_replay.pipeline import blocks as blocks_module
-from copem_replay.pipeline.prepare import prepare
-from copem_replay.pipeline.receiver import ReceiverOutput, _without_truth, receive, seen_by_all
-from copem_replay.pipeline.run import Result, run
+from copem_replay.pipeline import replay as blocks_module
+from copem_replay.pipeline.prepare import prepare_log
+from copem_replay.pipeline.receiver import ReceiverOutput, _remove_truth_ids, perceive_all_units, run_receivers
+from copem_replay.pipeline.run import ExperimentResult, run_experiment
 from tests.helpers.experiments import changed, drive
 from tests.helpers.reports import inputs_of
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
@@ -73,11 +73,11 @@ def noisy(**changes: Any) -> Experiment:
     return experiment(**(plan | changes))
 
 
-def of(result: Result, configuration: str) -> pd.DataFrame:
+def of(result: ExperimentResult, configuration: str) -> pd.DataFrame:
     return result.table[result.table["configuration"] == configuration]
 
 
-def figures(result: Result, configuration: str) -> pd.Series:
+def figures(result: ExperimentResult, configuration: str) -> pd.Series:
     return result.summary.set_index("configuration").loc[configuration]
 
 
@@ -102,11 +102,11 @@ class TestWhatDoesNotMatter:
     def test_the_order_of_entries_lists_and_units(self, latency_s: Any) -> None:
         """Told in another order: the same sets. Which unit was first is open where all lists arrive together."""
         plan, runs = noisy(), np.arange(3)
-        world = prepare(crowd(), plan).world(plan)
-        seen = seen_by_all(world, runs, states="sampled")
-        lists = _without_truth(world, seen, runs)[0]
+        world = prepare_log(crowd(), plan).world(plan)
+        seen = perceive_all_units(world, runs, states="sampled")
+        lists = _remove_truth_ids(world, seen, runs)[0]
         heard = transmit(seen, [UnitLinks("link", ConstantLink(latency_s=latency_s))])
-        told = inputs(heard, lists, max_age_s=1.0)
+        told = make_inputs(heard, lists, max_age_s=1.0)
         rng = np.random.default_rng(0)
         names = tuple(told.units[k] for k in (2, 0, 1))
         order = rng.permutation(len(told.unit_ix))
@@ -118,26 +118,26 @@ class TestWhatDoesNotMatter:
         for name in FUSIONS:
             fusion = plan.configurations[name].fusion
             assert isinstance(fusion, ListFusion)
-            one, again = fused_by(fusion, told, name), fused_by(fusion, other, name)
+            one, again = ask_fusion(fusion, told, name), ask_fusion(fusion, other, name)
             assert len(one.entries) > 100
             same_sets(one, again, told.units, names, whose=isinstance(latency_s, dict))
 
     def test_the_other_runs(self) -> None:
         plan = noisy()
-        world = prepare(crowd(), plan).world(plan)
-        batch = dict(receive(world, np.arange(5), None))
+        world = prepare_log(crowd(), plan).world(plan)
+        batch = dict(run_receivers(world, np.arange(5), None))
         for s in (0, 3):
-            for name, alone in receive(world, np.array([s]), None):
+            for name, alone in run_receivers(world, np.array([s]), None):
                 assert entries_of_run(alone, 0) == entries_of_run(batch[name], s if name != "GT" else 0), name
 
     def test_jobs_and_blocks(self, monkeypatch: pytest.MonkeyPatch) -> None:
         plan = noisy(runs=7)
         logs = [crowd(), crowd("again")]
-        one = run(plan, logs)
+        one = run_experiment(plan, logs)
         for jobs, size in ((3, 200_000_000), (1, 400 * 3 * 200), (2, 1)):
             monkeypatch.setattr(blocks_module, "BLOCK_BYTES", size)
-            assert len(blocks_module.blocks(one.replays[0], plan, jobs)) > 1
-            other = run(plan, logs, jobs=jobs)
+            assert len(blocks_module.cut_blocks(one.replays[0], plan, jobs)) > 1
+            other = run_experiment(plan, logs, jobs=jobs)
             pd.testing.assert_frame_equal(one.table, other.table, check_exact=True)
             pd.testing.assert_frame_equal(one.summary, other.summary, check_exact=True)
             for name, table in vars(one.accuracy).items():
@@ -160,9 +160,9 @@ FROM_500_MS: dict[str, Any] = {"onset": {"kind": "at", "time_s": 0.5}, "objects"
 ONE_UNIT = {"ego": EGO_UNIT | {"pem": "p"}}
 
 
-def replayed(log: Recording, units: Any = ONE_UNIT, measure: Any = FROM_500_MS, **more: Any) -> Result:
+def replayed(log: Recording, units: Any = ONE_UNIT, measure: Any = FROM_500_MS, **more: Any) -> ExperimentResult:
     plan = {"pems": pems(), "units": units, "configurations": configurations()} | more
-    return run(experiment(measure=measure, **plan), [log])
+    return run_experiment(experiment(measure=measure, **plan), [log])
 
 
 class TestInTheHead:
@@ -253,7 +253,7 @@ class TestInTheHead:
 
 OWN = """
 import numpy as np
-from copem_replay.fusion.base import StepFusion
+from copem_replay.fusion.interface import StepFusion
 
 class Mine(StepFusion):
     wrong: str = ""
@@ -279,7 +279,7 @@ class TestCommand:
     def run(self, here: Path, monkeypatch: pytest.MonkeyPatch, *options: str, fusion: str, show: str = "null") -> int:
         (here / "e.yaml").write_text(changed(f"  coPEM: {{units: all, fusion: {fusion}}}", f"show: {show}"))
         monkeypatch.setattr(sys, "argv", ["copem-replay", "run", "e.yaml", *options])
-        return cli._ended()
+        return cli._run_to_exit_code()
 
     @pytest.mark.parametrize(
         ("wrong", "said"),

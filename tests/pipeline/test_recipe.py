@@ -12,10 +12,10 @@ import pytest
 from pydantic import BaseModel
 
 from copem_replay.core.components import Component
-from copem_replay.experiment.drive import of_log
+from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.experiment.schema import Configuration, Experiment
-from copem_replay.pipeline import recipe as module
-from copem_replay.pipeline.recipe import NOT_OF_A_PIECE, canonical, key_of, recipe
+from copem_replay.pipeline import pieces as module
+from copem_replay.pipeline.pieces import NOT_OF_A_PIECE, canonical_json, recipe_key, write_recipe
 
 LOG = {"name": "a", "sha256": "0" * 64, "topic": "truth", "ahead_ns": []}
 PEM = {
@@ -49,7 +49,7 @@ def experiment(**changes: Any) -> Experiment:
 def key(of: Experiment, configuration: str = "mine", runs: tuple[int, int] = (0, 9), **log: Any) -> str:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # changed values need not be of the right kind
-        return key_of(recipe(of, configuration, LOG | log, runs))
+        return recipe_key(write_recipe(of, configuration, LOG | log, runs))
 
 
 class Marked(Component):
@@ -194,8 +194,8 @@ def test_an_onset_that_units_decide_is_of_all_units() -> None:
 def test_settings_of_a_log_are_in_its_recipe_alone() -> None:
     logs = [{"file": "a.mcap", "name": "a", "units": {"mast": {"height_m": 7}}}, {"file": "b.mcap", "name": "b"}]
     whole = experiment(logs=logs)
-    assert key(of_log(whole, "a")) != key(experiment())
-    assert key(of_log(whole, "b")) == key(experiment())
+    assert key(resolve_for_log(whole, "a")) != key(experiment())
+    assert key(resolve_for_log(whole, "b")) == key(experiment())
 
 
 def test_libraries_and_own_files_are_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -209,11 +209,11 @@ def test_libraries_and_own_files_are_in_it(tmp_path: Path, monkeypatch: pytest.M
     before = key(mine)
     (tmp_path / "own_model.py").write_text(text + "# another one\n")
     assert key(mine) != before
-    other_version = module.fingerprint() | {"numba": "0.0.1"}
-    monkeypatch.setattr(module, "fingerprint", lambda: other_version)
+    other_version = module.take_fingerprint() | {"numba": "0.0.1"}
+    monkeypatch.setattr(module, "take_fingerprint", lambda: other_version)
     assert key(experiment()) != before
 
 
 def test_canonical_json() -> None:
-    assert canonical({"b": (1.0, 0.1, None), "a": "é"}) == '{"a":"é","b":[1.0,0.1,null]}'
-    assert len(key_of("x")) == 40
+    assert canonical_json({"b": (1.0, 0.1, None), "a": "é"}) == '{"a":"é","b":[1.0,0.1,null]}'
+    assert len(recipe_key("x")) == 40

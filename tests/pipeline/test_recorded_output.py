@@ -14,18 +14,19 @@ import copem_replay as cr
 from copem_replay.cli import main as cli
 from copem_replay.core.errors import ExperimentError, InputError
 from copem_replay.core.object_list import Inputs, ObjectLists, entries_of
-from copem_replay.core.yaml import dump
-from copem_replay.experiment.file import plain
+from copem_replay.core.yaml import dump_yaml
+from copem_replay.experiment.file import make_plain_source
 from copem_replay.experiment.schema import Experiment
-from copem_replay.experiment.validate import problems, read_logs
-from copem_replay.fusion.as_recorded import AsPredicted, AsRecorded
+from copem_replay.experiment.validate import find_problems, read_logs
+from copem_replay.fusion.interface import PredictedFusion, RecordedFusion
 from copem_replay.io.recording import Recording
-from copem_replay.pipeline import chunking
-from copem_replay.pipeline.prepare import prepare
-from copem_replay.pipeline.run import Result, check_closed_form, run
-from copem_replay.pipeline.sweep import points
-from copem_replay.results.compare.compare import compare
-from copem_replay.results.read import load_results
+from copem_replay.pipeline import prepare as chunking
+from copem_replay.pipeline.closed_form import check_closed_form
+from copem_replay.pipeline.prepare import prepare_log
+from copem_replay.pipeline.run import ExperimentResult, run_experiment
+from copem_replay.pipeline.sweep import list_points
+from copem_replay.results.compare.compare import compare_folders
+from copem_replay.results.read import read_results
 from copem_replay.results.write import write_results
 from tests.helpers.recordings import SHARED, Obj, Topic, ns, write_recording
 from tests.io.test_recorded_units import car, list_of
@@ -60,17 +61,17 @@ def plan(path: Path, *, inputs: Any = ("rsu",), output: Any = None, **changes: A
     return Experiment.model_validate(data | changes)
 
 
-def replayed(experiment: Experiment) -> tuple[Recording, Result]:
+def replayed(experiment: Experiment) -> tuple[Recording, ExperimentResult]:
     recordings, refused = read_logs(experiment, [Path(experiment.logs[0])], None)
     assert not refused, refused
-    return recordings[0], run(experiment, recordings)
+    return recordings[0], run_experiment(experiment, recordings)
 
 
-def row(result: Result, configuration: str = "stack") -> pd.Series:
+def row(result: ExperimentResult, configuration: str = "stack") -> pd.Series:
     return result.table.set_index(["configuration", "object_id"]).loc[(configuration, "2")]
 
 
-def figures(result: Result, configuration: str = "stack") -> pd.Series:
+def figures(result: ExperimentResult, configuration: str = "stack") -> pd.Series:
     return result.summary.set_index("configuration").loc[configuration]
 
 
@@ -96,7 +97,7 @@ class TestTimes:
         rsu = [list_of(t, car(30)) for t in (0.3, 0.4, 0.7001)]
         paths = [drive(tmp_path / f"{k}.mcap", [logged(0.7, list_of(0.5, car(30)))], rsu) for k in "ab"]
         second = {"file": str(paths[1])} | ({"units": {lacks: None}} if lacks else {})
-        (tmp_path / "e.yaml").write_text(dump(plan(paths[0], logs=[str(paths[0]), second]).as_written()))
+        (tmp_path / "e.yaml").write_text(dump_yaml(plan(paths[0], logs=[str(paths[0]), second]).as_written()))
         result = cr.run(tmp_path / "e.yaml", jobs=1)
         of = result.summary.set_index("configuration")
         assert of["input_age_s"]["stack"] == pytest.approx(0.35)
@@ -212,9 +213,13 @@ class TestMeasured:
             ("s",), np.zeros(2, dtype=int), np.array([0.0, 0.1]), np.array([0.2, 0.3]), two, np.array([0.2, 0.3]),
             np.array([[0], [1]]), np.array([0, 1]), np.array([0, 1, 2]),
         )  # fmt: skip
-        assert AsRecorded().fuse(inputs).entries["track_id"].tolist() == [-1, -1, 7, 4, -1]
-        assert AsPredicted().fuse(inputs).of(int(one[0]), 1)["track_id"].tolist() == [4, -1]
-        assert (AsRecorded.tells_of, AsPredicted.tells_of, AsPredicted.resumable) == ("capture", "now", True)
+        assert RecordedFusion().fuse(inputs).entries["track_id"].tolist() == [-1, -1, 7, 4, -1]
+        assert PredictedFusion().fuse(inputs).of(int(one[0]), 1)["track_id"].tolist() == [4, -1]
+        assert (RecordedFusion.tells_of, PredictedFusion.tells_of, PredictedFusion.resumable) == (
+            "capture",
+            "now",
+            True,
+        )
 
     def test_several_runs_with_lists_of_several_lengths(self) -> None:
         """Run 0 has 2 and 1 entries, run 1 none and 3; two lists at one instant: the one captured last."""
@@ -225,7 +230,7 @@ class TestMeasured:
             ("s",), np.zeros(2, dtype=int), np.array([0.0, 0.1]), np.array([0.2, 0.2]), lists, np.array([0.2]),
             np.array([[1]]), np.array([1, 0]), np.array([0, 2]),
         )  # fmt: skip
-        found = AsRecorded().fuse(inputs)
+        found = RecordedFusion().fuse(inputs)
         assert found.start.tolist() == [[0, 1], [1, 4]]
         assert found.entries["x_m"].tolist() == [2, 3, 4, 5]
 
@@ -237,12 +242,12 @@ class TestMeasured:
         monkeypatch.setattr(chunking, "ROWS_AT_ONCE", 1)
         monkeypatch.setattr(chunking, "ROWS_A_CHUNK", 10)
         recording, pieces = replayed(experiment)
-        assert len(prepare(recording, experiment).chunks) > 3
+        assert len(prepare_log(recording, experiment).chunks) > 3
         pd.testing.assert_frame_equal(whole.table, pieces.table)
         pd.testing.assert_frame_equal(whole.summary, pieces.summary)
 
 
-def same_as_union(result: Result, name: str) -> None:
+def same_as_union(result: ExperimentResult, name: str) -> None:
     """Rows and figures of a recorded output and of the union of the unit with the same lists."""
     rows = [
         result.table[result.table["configuration"] == one].drop(
@@ -287,11 +292,11 @@ class TestRegret:
         recording, result = replayed(experiment)
         assert any("its regret is the difference to stack:ideal" in note for note in result.notes)
         write_results(tmp_path / "out", experiment, [recording], result, exporters=())
-        comparison = compare([tmp_path / "out"])
+        comparison = compare_folders([tmp_path / "out"])
         assert (comparison.baseline, comparison.configurations) == ("stack:ideal", ("stack",))
         found = comparison.overall.set_index("metric")["difference"]
         assert found["ttd_rmst_s"] == pytest.approx(0.3)
-        again = load_results(tmp_path / "out").experiment
+        again = read_results(tmp_path / "out").experiment
         assert (again.configurations, again.as_written()["configurations"]) == (
             experiment.configurations, experiment.as_written()["configurations"],
         )  # fmt: skip
@@ -319,8 +324,8 @@ class TestRegret:
         assert said in result.notes
         write_results(tmp_path / "out", experiment, [recording], result, exporters=())
         with pytest.raises(InputError, match="--baseline: expected a configuration to compare with"):
-            compare([tmp_path / "out"])
-        notes = compare([tmp_path / "out"], baseline="GT").notes
+            compare_folders([tmp_path / "out"])
+        notes = compare_folders([tmp_path / "out"], baseline="GT").notes
         assert "stack: no regret, for it has no `inputs`: only a difference to GT" in notes
 
 
@@ -343,7 +348,7 @@ class TestRefused:
         stack = {"recorded": {"topic": "stack"}, "inputs": ["rsu"]} | changes
         data = {"version": 1, "logs": [], "units": units, "pems": {"p": [{"detection": {"kind": "visible_share"}}]},
                 "configurations": {"stack": {k: v for k, v in stack.items() if v is not None}}}  # fmt: skip
-        _, found = problems(plain({**data, "logs": ["x"]}))
+        _, found = find_problems(make_plain_source({**data, "logs": ["x"]}))
         assert any(said in line.replace("configurations.stack", "configurations: stack").replace("stack.", "stack: ")
                    for line in found), found  # fmt: skip
 
@@ -364,8 +369,8 @@ class TestRefused:
         experiment = plan(path, inputs=None, measure={"onset": {"kind": "appears"}, "exact": True})
         recordings, _ = read_logs(experiment, [path], None)
         with pytest.raises(ExperimentError, match="it is recorded, and nothing says how probable its lists were"):
-            check_closed_form([prepare(recordings[0], experiment)], experiment)
-        _, found = problems(plain(experiment.as_written()))
+            check_closed_form([prepare_log(recordings[0], experiment)], experiment)
+        _, found = find_problems(make_plain_source(experiment.as_written()))
         assert any("a recorded output has no exact times" in line for line in found)
 
 
@@ -374,7 +379,7 @@ def test_sweeps_leave_it_as_it_is(tmp_path: Path) -> None:
     late = {"late": {"units": ["rsu"], "latency_s": 0.1}}
     stack = plan(path).as_written()["configurations"]
     experiment = plan(path, configurations=stack | late, sweep={"latency_s": [0.0, 0.2]})
-    assert [list(point.experiment.configurations) for point in points(experiment)] == [["late"], ["late"]]
+    assert [list(point.experiment.configurations) for point in list_points(experiment)] == [["late"], ["late"]]
     _, result = replayed(experiment)
     assert result.sweep is not None
     assert set(result.sweep["configuration"]) == {"late"}
@@ -387,12 +392,12 @@ def test_from_the_command_line(
 
     def said(*arguments: object) -> str:
         monkeypatch.setattr(sys, "argv", ["copem-replay", *map(str, arguments)])
-        assert cli._ended() == 0
+        assert cli._run_to_exit_code() == 0
         return capsys.readouterr().out
 
     stack = [logged(t + 0.1, list_of(t, car(30))) for t in np.arange(0.4, 1.8, 0.1)]
     path = drive(tmp_path / "a.mcap", stack, [list_of(t, car(30)) for t in np.arange(0.3, 1.8, 0.1)])
-    (tmp_path / "e.yaml").write_text(dump(plan(path).as_written()))
+    (tmp_path / "e.yaml").write_text(dump_yaml(plan(path).as_written()))
     out = tmp_path / "out"
     said("check", tmp_path / "e.yaml")
     assert "output_latency_s  output_delay_s  input_age_s" in said("run", tmp_path / "e.yaml", "--out", out)

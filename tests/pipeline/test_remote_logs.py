@@ -15,9 +15,9 @@ from typing import Any
 import pytest
 
 from copem_replay.cli import main as cli
-from copem_replay.core.remote import Remote
+from copem_replay.core.errors import RemoteFile
 from copem_replay.experiment import validate
-from copem_replay.results.reread import reread
+from copem_replay.results.read import reread_log
 from tests.cli.test_api import cr
 from tests.helpers.experiments import changed, drive
 from tests.helpers.object_storage import Bucket
@@ -50,7 +50,7 @@ def ran(command: str, capsys: pytest.CaptureFixture[str]) -> tuple[object, list[
     """Exit code of a command, and what it says on stderr."""
     argv, sys.argv = sys.argv, shlex.split(command)
     try:
-        code = cli._ended()
+        code = cli._run_to_exit_code()
     finally:
         sys.argv = argv
     return code, capsys.readouterr().err.splitlines()
@@ -69,11 +69,11 @@ def test_the_same_bytes_from_object_storage_and_nothing_is_fetched_again(
     remote = text.replace("drives/**", f"{drives.url}/drives/**")
     kept, there = f"{drives.url}/study.pieces", []
 
-    def fetch(log: Remote, to: str, whole: Any = Remote.fetch) -> None:
+    def fetch(log: RemoteFile, to: str, whole: Any = RemoteFile.fetch) -> None:
         there.append(sorted(path.name for path in here.glob("scratch/*/*")))
         whole(log, to)
 
-    monkeypatch.setattr(Remote, "fetch", fetch)
+    monkeypatch.setattr(RemoteFile, "fetch", fetch)
     first, mine, found = replayed(remote, "first", kept)
     assert (mine, found) == (computed, 0)
     assert but_places(first) == but_places(plain)
@@ -196,11 +196,11 @@ def test_a_run_is_drawn_from_the_log_where_it_lies(here: Path, drives: Bucket) -
     Path("e.yaml").write_text(changed(f"logs: ['{drives.url}/drives/b.mcap']"))
     cr.run("e.yaml").save("out")
     results = cr.load_results("out")
-    assert reread(results, "b", "2").scene.log == "b"
+    assert reread_log(results, "b", "2").scene.log == "b"
     drive(here / "other.mcap", first=7, host=7)
     drives.put(here / "other.mcap", "drives/b.mcap")
     with pytest.raises(cr.RecordingError, match=rf"^{drives.url}/drives/b.mcap: expected the log that was replayed"):
-        reread(results, "b", "2")
+        reread_log(results, "b", "2")
 
 
 def test_two_hundred_names_are_replayed_with_few_words_and_found_again_unread(
@@ -216,7 +216,7 @@ def test_two_hundred_names_are_replayed_with_few_words_and_found_again_unread(
     code, said = ran(command, capsys)
     assert (code, said[-1]) == (0, "pieces: 200 computed, 0 found in kept")
     assert len(said) <= 2
-    monkeypatch.setattr(validate, "read", lambda *_, **__: pytest.fail("a log was read"))
+    monkeypatch.setattr(validate, "read_log", lambda *_, **__: pytest.fail("a log was read"))
     files = {path.name: path.read_bytes() for path in Path("out").iterdir()}
     assert ran(command, capsys)[1][-1] == "pieces: 0 computed, 200 found in kept"
     assert {path.name: path.read_bytes() for path in Path("out").iterdir()} == files

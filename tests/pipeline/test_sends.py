@@ -11,16 +11,16 @@ import pytest
 from copem_replay.core.errors import ExperimentError
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import Float, Tracks
-from copem_replay.experiment.file import plain as filed
+from copem_replay.experiment.file import make_plain_source as filed
 from copem_replay.experiment.schema import Experiment
-from copem_replay.experiment.validate import problems
+from copem_replay.experiment.validate import find_problems
 from copem_replay.io.recording import Recording
-from copem_replay.pipeline import chunking
+from copem_replay.pipeline import prepare as chunking
 from copem_replay.pipeline.closed_form import check_exact
 from copem_replay.pipeline.one_run import tracks_of_run
-from copem_replay.pipeline.prepare import prepare
-from copem_replay.pipeline.receiver import seen_by_all
-from copem_replay.pipeline.run import Result, run
+from copem_replay.pipeline.prepare import prepare_log
+from copem_replay.pipeline.receiver import perceive_all_units
+from copem_replay.pipeline.run import ExperimentResult, run_experiment
 from tests.helpers import scenes
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, standing
 
@@ -51,9 +51,9 @@ def plan(sends: object, fusions: tuple[str, ...] = ("ideal",), mast: Any = None,
 
 def sent(recording: Recording, some: Experiment, one: int = 0) -> Tracks:
     """What units send in one run."""
-    replay, runs = prepare(recording, some), np.array([one])
+    replay, runs = prepare_log(recording, some), np.array([one])
     world = replace(replay.world(some), on_air=replay.on_air(some, runs))
-    return seen_by_all(world, runs, states="true")
+    return perceive_all_units(world, runs, states="true")
 
 
 def when(recording: Recording, some: Experiment, name: str) -> list[float]:
@@ -136,7 +136,7 @@ def held(tracks: FusedTracks, name: str) -> Float:
 def test_an_object_that_is_left_out_is_not_gone(kind: str) -> None:
     """A car that stands for 6 s is sent every second, and in every list from the first (the tracker: second) on."""
     car = recorded(Thing("car", "car", standing(30, 4)))
-    [tracks] = tracks_of_run(prepare(car, plan(CPM, (kind,))), plan(CPM, (kind,)), 0).values()
+    [tracks] = tracks_of_run(prepare_log(car, plan(CPM, (kind,))), plan(CPM, (kind,)), 0).values()
     there = held(tracks, "1")
     assert len(there) == 61
     assert there[11 if kind == "tracker" else 0 :].all()
@@ -147,7 +147,7 @@ def test_what_is_kept_is_as_it_was_captured_and_only_for_so_long(kind: str) -> N
     """A pedestrian walks at 1 m/s and is hidden from 2.65 s on: what was sent at 2.5 s is kept until 3.5 s."""
     walker = recorded(Thing("p", "pedestrian", driving(10, 4, 1.0), there=lambda t: t < 2.65))
     some = plan(CPM, (kind,), {"pem": "all"})
-    [tracks] = tracks_of_run(prepare(walker, some), some, 0).values()
+    [tracks] = tracks_of_run(prepare_log(walker, some), some, 0).values()
     at_s = tracks.fused.common_arrives_s
     assert at_s[held(tracks, "1")].max() == pytest.approx(3.5)
     rows = np.flatnonzero(tracks.fused.valid[0] & (tracks.fused.row_object_ix == 1))
@@ -162,8 +162,8 @@ def test_the_first_message_that_arrives_detects() -> None:
     lossy = {"reception": {"kind": "constant", "probability": 0.5}, "latency": 0.05}
     configurations = {"coop": {"units": ["mast"], "link": "lossy", "max_age_s": 2.0}}
     some = plan(CPM, links={"lossy": lossy}, configurations=configurations, runs=20)
-    table = run(some, [car]).table
-    replay = prepare(car, some)
+    table = run_experiment(some, [car]).table
+    replay = prepare_log(car, some)
     late = 0
     for one in range(20):
         tracks = tracks_of_run(replay, some, one)["coop"]
@@ -191,7 +191,7 @@ def noisy(sends: object = CPM, **changes: Any) -> tuple[Recording, Experiment]:
     return recorded(*cars), some
 
 
-def assert_same(one: Result, other: Result) -> None:
+def assert_same(one: ExperimentResult, other: ExperimentResult) -> None:
     assert one.table.equals(other.table)
     assert one.summary.equals(other.summary)
     assert one.accuracy is not None
@@ -202,11 +202,11 @@ def assert_same(one: Result, other: Result) -> None:
 @pytest.mark.parametrize("sends", [CPM, {"kind": "cpm", "interval_s": 0.2, "max_objects": 2}])
 def test_a_log_in_time_chunks_and_several_workers_give_the_same(monkeypatch: pytest.MonkeyPatch, sends: object) -> None:
     car, some = noisy(sends)
-    whole = run(some, [car])
-    assert_same(whole, run(some, [car], jobs=2))
+    whole = run_experiment(some, [car])
+    assert_same(whole, run_experiment(some, [car], jobs=2))
     monkeypatch.setattr(chunking, "ROWS_AT_ONCE", 1)
     monkeypatch.setattr(chunking, "ROWS_A_CHUNK", 200)
-    cut = run(some, [car])
+    cut = run_experiment(some, [car])
     assert len(cut.replays[0].chunks) > 2
     assert_same(whole, cut)
 
@@ -228,7 +228,7 @@ def when_in(recording: Recording, some: Experiment, one: int) -> list[float]:
 
 def test_refusals() -> None:
     def said(some: dict[str, Any]) -> str:
-        return "\n".join(map(str, problems(filed(some))[1]))
+        return "\n".join(map(str, find_problems(filed(some))[1]))
 
     data = plan(CPM).as_written() | {"measure": {"confirm": {"hits": 2, "of": 3}}}
     assert "measure.confirm: the messages of unit 'mast' leave out objects" in said(data)
@@ -241,6 +241,6 @@ def test_refusals() -> None:
     )
     exact = plan({"interval_s": 0.5}, measure={"exact": True, "accuracy": False})
     with pytest.raises(ExperimentError, match="`sends` rules that depend on earlier messages"):
-        check_exact([prepare(recorded(), exact)], exact)
+        check_exact([prepare_log(recorded(), exact)], exact)
     assert "unit 'mast' has `sends` rules that depend on earlier messages" in said(exact.as_written())
     assert "sends" not in str(plan(None).as_written())

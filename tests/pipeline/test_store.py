@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from copem_replay.core.errors import InputError, OutputError
-from copem_replay.pipeline.store import MARK, store_at
+from copem_replay.pipeline.pieces import MARK, open_store
 from tests.helpers.object_storage import Bucket
 
 
@@ -24,7 +24,7 @@ def test_what_is_written_is_there_for_every_process_that_has_the_address(
         "memory": f"memory://{tmp_path.name}/kept",
         "s3": f"{bucket.url}/kept/",
     }[kind]
-    store = store_at(address)
+    store = open_store(address)
     assert store.read("pieces/ab/1.parquet") is None
     store.write("pieces/ab/1.parquet", b"one")
     store.write("pieces/ab/1.parquet", b"other")
@@ -39,7 +39,7 @@ def test_what_is_written_is_there_for_every_process_that_has_the_address(
 
 
 def test_a_process_of_its_own_writes_what_this_one_reads(bucket: Bucket) -> None:
-    store = store_at(f"{bucket.url}/kept")
+    store = open_store(f"{bucket.url}/kept")
     code = "import pickle, sys; pickle.load(sys.stdin.buffer).write('logs/1.json', b'from elsewhere')"
     subprocess.run([sys.executable, "-c", code], input=pickle.dumps(store), check=True)
     assert store.read("logs/1.json") is None, "not there when it was listed"
@@ -48,11 +48,11 @@ def test_a_process_of_its_own_writes_what_this_one_reads(bucket: Bucket) -> None
 
 
 def test_one_request_writes_a_piece_and_one_listing_says_what_is_there(bucket: Bucket) -> None:
-    store = store_at(f"{bucket.url}/kept")
+    store = open_store(f"{bucket.url}/kept")
     for k in range(5):
         store.write(f"pieces/ab/{k}.parquet", bytes(1000))
     before = len(bucket.requests())
-    again = store_at(f"{bucket.url}/kept")
+    again = open_store(f"{bucket.url}/kept")
     assert [again.exists(f"pieces/ab/{k}.parquet") for k in range(7)] == [True] * 5 + [False] * 2
     assert [again.read(f"pieces/cd/{k}.parquet") for k in range(7)] == [None] * 7
     again.write("pieces/cd/1.parquet", bytes(6_000_000))
@@ -64,7 +64,7 @@ def test_one_request_writes_a_piece_and_one_listing_says_what_is_there(bucket: B
 def test_what_cannot_be_kept_is_said_in_one_line(bucket: Bucket, monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(address: str) -> str:
         with pytest.raises((InputError, OutputError)) as error:
-            store_at(address)
+            open_store(address)
         (line,) = error.value.problems
         return line
 
@@ -99,9 +99,9 @@ def test_what_is_not_installed_is_said_with_what_to_type(absent: str, url: str, 
     code = f"""
 import sys
 sys.modules[{absent!r}] = None
-from copem_replay.pipeline.store import store_at
+from copem_replay.pipeline.pieces import open_store
 try:
-    store_at({url!r})
+    open_store({url!r})
 except Exception as error:
     print(type(error).__name__, error)
 """
@@ -112,8 +112,8 @@ except Exception as error:
 def test_fsspec_is_not_loaded_for_what_lies_on_this_machine(tmp_path: Path) -> None:
     code = f"""
 import sys
-from copem_replay.pipeline.store import store_at
-store_at({str(tmp_path)!r}).write("logs/1.json", b"")
+from copem_replay.pipeline.pieces import open_store
+open_store({str(tmp_path)!r}).write("logs/1.json", b"")
 assert "fsspec" not in sys.modules
 """
     subprocess.run([sys.executable, "-c", code], check=True)

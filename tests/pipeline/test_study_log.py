@@ -15,12 +15,13 @@ import pandas as pd
 import pytest
 from mcap.writer import CompressionType
 
-from copem_replay.core.errors import RecordingError
-from copem_replay.core.remote import Remote
+from copem_replay.core.errors import RecordingError, RemoteFile
 from copem_replay.experiment import validate
-from copem_replay.io import checksum, recording
-from copem_replay.pipeline import gather, log_survey, study_log
-from copem_replay.pipeline.crew import worker
+from copem_replay.io import open as checksum
+from copem_replay.io import recording
+from copem_replay.pipeline import run as gather
+from copem_replay.pipeline import study_log, worker
+from copem_replay.pipeline import study_log as log_survey
 from tests.cli.test_api import cr
 from tests.helpers.experiments import changed
 from tests.helpers.object_storage import Bucket
@@ -145,13 +146,13 @@ class TestReplaced:
         """And what would copy the other content is not written; the tables are there."""
         assert call("run", "e.yaml", "--out", "plain").code == 0
         (here / "e.yaml").write_text(SHOWN)
-        old, outcomes = sha256("drive.mcap"), gather.outcomes
+        old, outcomes = sha256("drive.mcap"), gather.replay_outcomes
 
         def meanwhile(*a: Any) -> Any:
             replaced(here / "drive.mcap", here / "other.mcap")
             return outcomes(*a)
 
-        monkeypatch.setattr(gather, "outcomes", meanwhile)
+        monkeypatch.setattr(gather, "replay_outcomes", meanwhile)
         ended = call("run", "e.yaml", "--out", "out")
         assert ended.code == 1
         assert ended.lines == [
@@ -169,14 +170,14 @@ class TestReplaced:
         shutil.copy2(here / "drive.mcap", here / "first.mcap")
         (here / "e.yaml").write_text(changed("logs: [first.mcap, drive.mcap]"))
         monkeypatch.setattr(log_survey, "STATES_HELD", 0)
-        dropped = study_log.dropped
+        dropped = study_log.drop_content
 
         def meanwhile(*a: Any) -> Any:
             left = dropped(*a)
             replaced(here / "drive.mcap", here / "other.mcap")
             return left
 
-        monkeypatch.setattr(study_log, "dropped", meanwhile)
+        monkeypatch.setattr(study_log, "drop_content", meanwhile)
         ended = call("run", "e.yaml", "--out", "out")
         assert (ended.code, len(ended.lines)) == (2, 1)
         assert ended.lines[0].startswith("drive.mcap: expected the content that it had when it was read before, ")
@@ -219,14 +220,14 @@ class TestWhileItIsRead:
     def test_between_the_truth_and_the_lists_of_units(
         self, here: Path, call: Call, happens: Change, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        read = validate.read
+        read = validate.read_log
 
         def meanwhile(*a: Any, **k: Any) -> Any:
             found = read(*a, **k)
             happens(here / "drive.mcap", here / "other.mcap")
             return found
 
-        monkeypatch.setattr(validate, "read", meanwhile)
+        monkeypatch.setattr(validate, "read_log", meanwhile)
         self.refused(here, call, happens, "run", "e.yaml")
 
     @CHANGED
@@ -276,8 +277,10 @@ class TestWhileItIsRead:
 
 
 def test_a_log_that_is_gone_after_it_was_read_is_not_needed(here: Path, call: Call, monkeypatch: Any) -> None:
-    old, outcomes = sha256("drive.mcap"), gather.outcomes
-    monkeypatch.setattr(gather, "outcomes", lambda *a: [(here / "drive.mcap").unlink(missing_ok=True), outcomes(*a)][1])
+    old, outcomes = sha256("drive.mcap"), gather.replay_outcomes
+    monkeypatch.setattr(
+        gather, "replay_outcomes", lambda *a: [(here / "drive.mcap").unlink(missing_ok=True), outcomes(*a)][1]
+    )
     assert call("run", "e.yaml", "--out", "out").code == 0
     assert said("out") == ([old],) * 2
 
@@ -285,13 +288,13 @@ def test_a_log_that_is_gone_after_it_was_read_is_not_needed(here: Path, call: Ca
 class TestUnderAUrl:
     def test_that_changes_while_it_is_copied(self, here: Path, bucket: Bucket, monkeypatch: pytest.MonkeyPatch) -> None:
         url = bucket.put(here / "drive.mcap", "drive.mcap")
-        fetch = Remote.fetch
+        fetch = RemoteFile.fetch
 
-        def meanwhile(log: Remote, to: str) -> None:
+        def meanwhile(log: RemoteFile, to: str) -> None:
             fetch(log, to)
             bucket.put(here / "other.mcap", "drive.mcap")
 
-        monkeypatch.setattr(Remote, "fetch", meanwhile)
+        monkeypatch.setattr(RemoteFile, "fetch", meanwhile)
         with pytest.raises(Exception, match=r"drive\.mcap: it changed while it was copied; run the command again"):
             cr.run("e.yaml", url, pieces="kept")
         assert not list(Path("kept/logs").iterdir())
@@ -308,5 +311,5 @@ class TestUnderAUrl:
         assert said("out") == ([old],) * 2
 
     def test_a_time_that_its_writer_says_tells_nothing(self) -> None:
-        assert Remote("sftp://host/a.mcap", {"size": 7, "mtime": WHEN_S}).stamp is None
-        assert Remote("s3://bucket/a.mcap", {"size": 7, "ETag": "x"}).stamp == (7, "x")
+        assert RemoteFile("sftp://host/a.mcap", {"size": 7, "mtime": WHEN_S}).stamp is None
+        assert RemoteFile("s3://bucket/a.mcap", {"size": 7, "ETag": "x"}).stamp == (7, "x")

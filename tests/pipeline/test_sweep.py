@@ -18,16 +18,16 @@ import pytest
 
 from copem_replay.cli import main as cli
 from copem_replay.core.errors import ExperimentError
-from copem_replay.experiment.file import load, log_paths
+from copem_replay.experiment.file import log_paths, read_experiment_file
 from copem_replay.experiment.schema import Experiment
-from copem_replay.experiment.validate import problems, read_logs
+from copem_replay.experiment.validate import find_problems, read_logs
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.accuracy.metrics import ACCURACY
 from copem_replay.perception.config import Carriers
 from copem_replay.pipeline.closed_form import exact_table
-from copem_replay.pipeline.prepare import Replay, prepare
-from copem_replay.pipeline.run import run
-from copem_replay.pipeline.sweep import KINDS, Point, points, resolved
+from copem_replay.pipeline.prepare import Replay, prepare_log
+from copem_replay.pipeline.run import run_experiment
+from copem_replay.pipeline.sweep import KINDS, SweepPoint, list_points, resolve_sweep
 from tests.helpers.experiments import changed, drive, source_of
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
 
@@ -82,11 +82,11 @@ def crossing() -> Recording:
 
 
 def told(wanted: Experiment) -> list[tuple[str, float, list[str]]]:
-    return [(point.sweep, point.value, list(point.experiment.configurations)) for point in points(wanted)]
+    return [(point.sweep, point.value, list(point.experiment.configurations)) for point in list_points(wanted)]
 
 
-def only(wanted: Experiment) -> list[Point]:
-    return list(points(wanted))
+def only(wanted: Experiment) -> list[SweepPoint]:
+    return list(list_points(wanted))
 
 
 # ---------------------------------------------------------------------------------------------------- the points
@@ -155,7 +155,9 @@ class TestPoints:
 
     def test_units_are_the_first_ones_beside_the_egos(self) -> None:
         """In the order of the experiment, whatever that of the configuration; the ego's is always there."""
-        by_value = {point.value: point.experiment.configurations for point in points(plan({"units": [0, 1, 2, 3]}))}
+        by_value = {
+            point.value: point.experiment.configurations for point in list_points(plan({"units": [0, 1, 2, 3]}))
+        }
         chosen = {value: {name: c.units for name, c in at.items()} for value, at in by_value.items()}
         assert chosen == {
             0: {"all": ("ego",), "late": ("ego",), "mixed": ("ego",), "one": ("ego",)},
@@ -187,7 +189,7 @@ class TestPoints:
         fleet = {"on": {"classes": ["car"], "penetration_rate": 0.3}, "pem": "p"}
         wanted = plan({"units": [0, 1]}, units={"ego": UNITS["ego"], "fleet": fleet},
                       configurations={"all": {"units": "all"}})  # fmt: skip
-        assert [point.experiment.configurations["all"].units for point in points(wanted)] == [
+        assert [point.experiment.configurations["all"].units for point in list_points(wanted)] == [
             ("ego",),
             ("ego", "fleet"),
         ]
@@ -214,7 +216,7 @@ class TestPoints:
 
     def test_quantity_by_quantity_in_the_order_given(self) -> None:
         wanted = plan({"units": [3, 0], "rate_hz": [20, 10], "latency_s": [1, 0]})
-        assert [(point.sweep, point.value) for point in points(wanted)] == [
+        assert [(point.sweep, point.value) for point in list_points(wanted)] == [
             ("latency_s", 1), ("latency_s", 0), ("rate_hz", 20), ("rate_hz", 10), ("units", 3), ("units", 0),
         ]  # fmt: skip
         assert KINDS == (
@@ -239,16 +241,16 @@ class TestPoints:
     )
     def test_nothing_to_sweep(self, sweep: dict[str, Any]) -> None:
         assert only(plan(sweep)) == []
-        assert run(plan(sweep, runs=1), [crossing()]).sweep is None
+        assert run_experiment(plan(sweep, runs=1), [crossing()]).sweep is None
 
     def test_conflicts_are_sought_only_when_somebody_brakes_for_them(self) -> None:
         """They take time, and no column of a sweep tells of them."""
         measure = {"onset": {"kind": "appears"}, "conflict": {"horizon_s": 2.0}}
         for brakes_for, sought in (("object", False), ("conflict", True)):
             wanted = plan({"units": [1]}, measure=measure, braking={"driver": DRIVER, "brakes_for": brakes_for})
-            (point,) = points(wanted)
+            (point,) = list_points(wanted)
             assert (point.experiment.measure.conflict is not None) == sought
-        (point,) = points(plan({"units": [1]}, measure=measure, braking=None))
+        (point,) = list_points(plan({"units": [1]}, measure=measure, braking=None))
         assert point.experiment.measure.conflict is None
 
     def test_accuracy_never_is(self) -> None:
@@ -281,7 +283,7 @@ class TestResolved:
     @staticmethod
     def said(sweep: dict[str, Any], **changes: Any) -> Any:
         wanted = plan(sweep, **changes)
-        again = resolved(wanted)
+        again = resolve_sweep(wanted)
         assert told(again) == told(wanted)
         assert again.model_copy(update={"sweep": None}) == wanted.model_copy(update={"sweep": None})
         assert again.sweep is not None
@@ -313,14 +315,14 @@ class TestResolved:
 
     def test_nothing_to_say(self) -> None:
         assert self.said({"latency_s": [1]}, configurations={"PEM": CONFIGURATIONS["PEM"]}) is None
-        assert resolved(plan()) == plan()
+        assert resolve_sweep(plan()) == plan()
 
 
 # -------------------------------------------------------------------------------------------------- the results
 
 
 def swept(sweep: dict[str, Any], **changes: Any) -> pd.DataFrame:
-    result = run(plan(sweep, **changes), [crossing()])
+    result = run_experiment(plan(sweep, **changes), [crossing()])
     assert result.sweep is not None
     return result.sweep
 
@@ -333,7 +335,7 @@ def rows_at(table: pd.DataFrame, sweep: str, value: float) -> pd.DataFrame:
 
 def plainly(names: list[str], **changes: Any) -> pd.DataFrame:
     """The summary of the experiment as it would be written with that value, but for accuracy."""
-    found = without_accuracy(run(plan(**changes), [crossing()]).summary)
+    found = without_accuracy(run_experiment(plan(**changes), [crossing()]).summary)
     return found.set_index("configuration").loc[names].reset_index()
 
 
@@ -417,7 +419,7 @@ class TestResults:
         assert set(swept({"latency_s": [0, 3]})["ttd_rmst_horizon_s"]) == {4.0}
 
     def test_nothing_else_changes(self) -> None:
-        whole, plain = (run(plan(sweep), [crossing()]) for sweep in (EVERYTHING, None))
+        whole, plain = (run_experiment(plan(sweep), [crossing()]) for sweep in (EVERYTHING, None))
         pd.testing.assert_frame_equal(whole.table, plain.table, check_exact=True)
         pd.testing.assert_frame_equal(whole.summary, plain.summary, check_exact=True)
         assert whole.exact is not None
@@ -434,7 +436,9 @@ class TestResults:
     def test_progress(self) -> None:
         """One after the other, to the end, of everything from the beginning."""
         steps: list[tuple[int, int]] = []
-        run(plan({"latency_s": [0, 1], "rate_hz": [5]}), [crossing()], progress=lambda a, b: steps.append((a, b)))
+        run_experiment(
+            plan({"latency_s": [0, 1], "rate_hz": [5]}), [crossing()], progress=lambda a, b: steps.append((a, b))
+        )
         shares = [done / total for done, total in steps]
         assert shares == sorted(set(shares))
         assert shares[-1] == 1
@@ -450,7 +454,7 @@ class TestResults:
         )
         steps: list[int] = []
         with pytest.raises(ExperimentError, match="no closed form"):
-            run(wanted, [crossing()], progress=lambda done, total: steps.append(done))
+            run_experiment(wanted, [crossing()], progress=lambda done, total: steps.append(done))
         assert steps == []
 
 
@@ -461,10 +465,10 @@ def test_a_sweep_of_several_logs() -> None:
     """Over all of them together, as in the summary."""
     logs = [crossing(), recording([Thing("ego", "car", standing(0, 0)), Thing("7", "car", standing(9, 9)),
                                    Thing("w", "pedestrian", standing(15, 0))], until_s=1.0, log="other")]  # fmt: skip
-    found = run(plan({"latency_s": [0.4], "configurations": ["PEM", "all"]}), logs).sweep
+    found = run_experiment(plan({"latency_s": [0.4], "configurations": ["PEM", "all"]}), logs).sweep
     assert found is not None
     late = {name: c | {"latency_s": 0.4} for name, c in CONFIGURATIONS.items() if name in ("all", "PEM")}
-    expected = without_accuracy(run(plan(configurations=late), logs).summary)
+    expected = without_accuracy(run_experiment(plan(configurations=late), logs).summary)
     part = rows_at(found, "latency_s", 0.4)
     alike(part, expected)
 
@@ -482,7 +486,7 @@ def call(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
 
     def called(*arguments: str) -> list[str]:
         monkeypatch.setattr("sys.argv", ["copem-replay", *arguments])
-        code = cli._ended()
+        code = cli._run_to_exit_code()
         said = capsys.readouterr().err
         assert code == 0, said
         return said.splitlines()
@@ -553,7 +557,7 @@ class TestFiles:
         call("run", "d.yaml", "--out", "c")
         call("run", "c/experiment.yaml", "--out", "d")
         assert written(tmp_path / "c") == written(tmp_path / "d")
-        by_default = problems(load(tmp_path / "c" / "experiment.yaml"))[0]
+        by_default = find_problems(read_experiment_file(tmp_path / "c" / "experiment.yaml"))[0]
         assert by_default is not None
         assert by_default.sweep is not None
         assert by_default.sweep.chosen("latency_s") == ("coPEM",)
@@ -564,7 +568,7 @@ class TestFiles:
         said = call("run", "a/experiment.yaml", "--out", "b")
         assert not [line for line in said if not line.startswith("note: ")]
         assert written(tmp_path / "a") == written(tmp_path / "b")
-        wanted = problems(load(tmp_path / "a" / "experiment.yaml"))[0]
+        wanted = find_problems(read_experiment_file(tmp_path / "a" / "experiment.yaml"))[0]
         assert wanted is not None
         assert wanted.sweep is not None
         assert wanted.sweep.configurations == ("coPEM",)
@@ -667,7 +671,7 @@ class TestCheck:
 
     def test_our_own_experiments(self) -> None:
         for name in ("tc016d_beyond", "crossing_share"):
-            wanted, found = problems(load(ROOT / "logs" / f"{name}.yaml"))
+            wanted, found = find_problems(read_experiment_file(ROOT / "logs" / f"{name}.yaml"))
             assert found == []
             assert wanted is not None
             assert wanted.sweep is not None
@@ -676,7 +680,7 @@ class TestCheck:
 def checked(folder: Path, text: str) -> list[str]:
     (folder / "drive.mcap").touch()
     source = source_of(folder, text)
-    return [line.removeprefix(f"{source.path}:") for line in problems(source)[1]]
+    return [line.removeprefix(f"{source.path}:") for line in find_problems(source)[1]]
 
 
 # -------------------------------------------------------------------------------------------- our own experiments
@@ -684,8 +688,8 @@ def checked(folder: Path, text: str) -> list[str]:
 
 @cache
 def ours(name: str) -> tuple[Experiment, Recording]:
-    source = load(ROOT / "logs" / f"{name}.yaml")
-    wanted, found = problems(source)
+    source = read_experiment_file(ROOT / "logs" / f"{name}.yaml")
+    wanted, found = find_problems(source)
     assert wanted is not None, found
     (log,), refused = read_logs(wanted, log_paths(source)[0], source)
     assert not refused
@@ -705,10 +709,10 @@ class TestBeyondThePaper:
 
     def at(self, sweep: str) -> dict[float, dict[str, float]]:
         wanted, log = ours("tc016d_beyond")
-        ready = prepare(log, wanted)
+        ready = prepare_log(log, wanted)
         return {
-            point.value: passing(prepare(log, point.experiment) if sweep == "rate_hz" else ready, point.experiment)
-            for point in points(wanted)
+            point.value: passing(prepare_log(log, point.experiment) if sweep == "rate_hz" else ready, point.experiment)
+            for point in list_points(wanted)
             if point.sweep == sweep
         }
 
@@ -717,14 +721,14 @@ class TestBeyondThePaper:
         wanted, log = ours("tc016d_beyond")
         alone = [shares["PEM"] for shares in self.at("rate_hz").values()]
         assert list(self.at("rate_hz")) == [10, 20, 50]
-        assert alone[0] == pytest.approx(passing(prepare(log, wanted), wanted)["PEM"], abs=1e-9)
+        assert alone[0] == pytest.approx(passing(prepare_log(log, wanted), wanted)["PEM"], abs=1e-9)
         assert alone == pytest.approx([0.85, 0.90, 0.93], abs=0.02)
         assert all(b > a + 0.01 for a, b in itertools.pairwise(alone))
 
     def test_latency_of_the_roadside_units_alone_never_harms(self) -> None:
         """What the vehicle sees itself it knows at once; with the whole list late it is worse off than by itself."""
         wanted, log = ours("tc016d_beyond")
-        by_itself = passing(prepare(log, wanted), wanted)["PEM"]
+        by_itself = passing(prepare_log(log, wanted), wanted)["PEM"]
         by_latency = self.at("latency_s")
         assert len(by_latency) == 21
         remote = [shares["remote:0s"] for shares in by_latency.values()]
@@ -740,7 +744,7 @@ class TestBeyondThePaper:
         by_count = self.at("units")
         assert list(by_count) == list(range(21))
         wanted, log = ours("tc016d_beyond")
-        alone = passing(prepare(log, wanted), wanted)["PEM"]
+        alone = passing(prepare_log(log, wanted), wanted)["PEM"]
         for name in ("coPEM:0s", "remote:0s", "remote:0.5s"):
             shares = [at[name] for at in by_count.values()]
             assert shares[0] == pytest.approx(alone, abs=1e-12), "none beside the ego's"
@@ -753,9 +757,9 @@ def test_more_connected_vehicles_never_harm() -> None:
     wanted, log = ours("crossing_share")
     known: dict[float, pd.Series] = {}
     alone: pd.Series | None = None
-    for point in points(wanted):
+    for point in list_points(wanted):
         both = point.experiment.model_copy(update={"configurations": wanted.configurations})
-        rows = exact_table(prepare(log, both), both)
+        rows = exact_table(prepare_log(log, both), both)
         rows = rows.assign(tick=(rows["detection_s"] * 10).round())
         by = rows.pivot_table(index=["object_id", "tick"], columns="configuration", values="probability", aggfunc="sum")
         known[point.value] = by["V2V"].dropna().groupby("object_id").cumsum()
@@ -773,16 +777,18 @@ def test_more_connected_vehicles_never_harm() -> None:
 def test_a_sweep_that_changes_nothing_is_said() -> None:
     """The truth has no latency to vary, and nobody is there to carry a unit."""
     truth = {"GT": {"units": "truth"}}
-    found = run(plan({"latency_s": [0, 1]}, configurations=truth), [crossing()])
+    found = run_experiment(plan({"latency_s": [0, 1]}, configurations=truth), [crossing()])
     assert found.sweep is None
     assert "sweep of latency_s: it changes no configuration" in found.notes
     fresh = truth | {"PEM": {"units": ["ego"]}}
-    found = run(plan({"latency_s": [0, 1]}, configurations=fresh), [crossing()])
+    found = run_experiment(plan({"latency_s": [0, 1]}, configurations=fresh), [crossing()])
     assert found.sweep is None
     assert (
         "sweep of latency_s: it changes no configuration; none states a latency above 0 or by unit, and `sweep: "
         "{configurations: […]}` does not name any"
     ) in found.notes
     units = {"ego": UNITS["ego"], "buses": {"on": {"classes": ["bus"], "penetration_rate": 0.5}, "pem": "p"}}
-    found = run(plan({"penetration_rate": [0, 1]}, units=units, configurations={"all": {"units": "all"}}), [crossing()])
+    found = run_experiment(
+        plan({"penetration_rate": [0, 1]}, units=units, configurations={"all": {"units": "all"}}), [crossing()]
+    )
     assert any(note.endswith("unit buses: the log has no object to carry it (bus)") for note in found.notes)

@@ -12,13 +12,13 @@ import pytest
 
 from copem_replay.core.tracks import Tracks
 from copem_replay.experiment.schema import Experiment
-from copem_replay.metrics.detection.by_truth_id import Detections
-from copem_replay.metrics.way import WAY, list_that_told
-from copem_replay.pipeline import chunking
-from copem_replay.pipeline.prepare import prepare
-from copem_replay.pipeline.receiver import listen, seen_by_all
-from copem_replay.pipeline.run import run
-from copem_replay.report.figures.latency_breakdown import stages
+from copem_replay.metrics.detection.by_truth_id import FirstDetections
+from copem_replay.metrics.detections_table import WAY, find_informing_list
+from copem_replay.pipeline import prepare as chunking
+from copem_replay.pipeline.prepare import prepare_log
+from copem_replay.pipeline.receiver import hear_units, perceive_all_units
+from copem_replay.pipeline.run import run_experiment
+from copem_replay.report.figures.latency_breakdown import mean_stages
 from tests.helpers import scenes
 from tests.helpers.scenes import EGO_UNIT, experiment
 from tests.pipeline import test_recorded_output as recorded_outputs
@@ -36,8 +36,8 @@ def of_oncoming(
         "configurations": {"it": {"units": ["ego"], **configuration}},
     }  # fmt: skip
     some = experiment(**(data | changes))
-    table = run(some, [scenes.oncoming_car()]).table
-    return table[list(TIMES)].iloc[0].round(9).tolist(), stages(table, some, "it")
+    table = run_experiment(some, [scenes.oncoming_car()]).table
+    return table[list(TIMES)].iloc[0].round(9).tolist(), mean_stages(table, some, "it")
 
 
 @pytest.mark.parametrize(
@@ -75,10 +75,10 @@ def test_of_lists_that_confirm_it_is_the_last() -> None:
 
 
 def test_without_link_ready_or_sends_there_are_no_such_columns() -> None:
-    table = run(experiment(), [scenes.oncoming_car()]).table
+    table = run_experiment(experiment(), [scenes.oncoming_car()]).table
     assert not set(WAY) & set(table)
     linked = {"GT": {"units": "truth"}, "PEM": {"units": ["ego"], "link": "v2x"}}
-    beside = run(experiment(configurations=linked, links={"v2x": {}}), [scenes.oncoming_car()]).table
+    beside = run_experiment(experiment(configurations=linked, links={"v2x": {}}), [scenes.oncoming_car()]).table
     assert tuple(beside)[-3:] == WAY
     assert beside[list(WAY)].isna().all(axis=1).tolist() == [True, False]
     pd.testing.assert_frame_equal(beside.drop(columns=list(WAY)), table)
@@ -97,10 +97,10 @@ def drawn(**changes: Any) -> Experiment:
 
 def plainly(some: Experiment, name: str, one: int) -> dict[str, list[float]]:
     """By object the times of `WAY`, list by list; NaN: none."""
-    replay, runs = prepare(traffic(), some), np.array([one])
+    replay, runs = prepare_log(traffic(), some), np.array([one])
     world = replace(replay.world(some), on_air=replay.on_air(some, runs))
-    seen = seen_by_all(world, runs, states="true")
-    heard = listen(seen, world, name)
+    seen = perceive_all_units(world, runs, states="true")
+    heard = hear_units(seen, world, name)
     sent_s, arrives_s, captured_s = seen.common_arrives_s, heard.common_arrives_s, seen.captured_s
     holds = {
         (int(f), int(o)) for f, o, there in zip(seen.frame_ix, seen.row_object_ix, seen.valid[0], strict=True) if there
@@ -126,7 +126,7 @@ def plainly(some: Experiment, name: str, one: int) -> dict[str, list[float]]:
 
 def test_drawn_times_are_those_of_the_list_that_told() -> None:
     some = drawn(runs=6, measure={"onset": {"kind": "in_range", "range_m": 60}, "accuracy": False})
-    table = run(some, [traffic()]).table
+    table = run_experiment(some, [traffic()]).table
     of_ideal = table[table["configuration"] == "coop"]
     for one in range(6):
         rows = of_ideal[of_ideal["run"] == one].set_index("object_id")
@@ -148,10 +148,10 @@ def test_stages_add_up_to_the_time_to_detection() -> None:
         "GT": {"units": "truth", "link": "v2x"}, "wired": {"units": ["ego"]}, "ready": {"units": ["east"]},
     }  # fmt: skip
     some = drawn(units=units, configurations=configurations)
-    table = run(some, [traffic()]).table
+    table = run_experiment(some, [traffic()]).table
     for name, rows in table[table["detected"]].groupby("configuration"):
         assert len(rows) > 5, name
-        means = stages(rows, some, str(name))
+        means = mean_stages(rows, some, str(name))
         assert sum(means.values()) == pytest.approx(rows["time_to_detection_s"].mean(), abs=1e-8), name
         assert min(means.values()) >= 0, name
         if name != "wired":
@@ -163,12 +163,12 @@ def test_stages_add_up_to_the_time_to_detection() -> None:
 
 def test_the_same_in_time_chunks_and_by_any_number_of_workers(monkeypatch: pytest.MonkeyPatch) -> None:
     some = drawn(units=plan(None).as_written()["units"] | {"east": READY | {"sends": {"kind": "cpm"}}})
-    whole = run(some, [traffic()]).table
+    whole = run_experiment(some, [traffic()]).table
     assert whole[list(WAY)].notna().any().all()
-    assert run(some, [traffic()], jobs=2).table.equals(whole)
+    assert run_experiment(some, [traffic()], jobs=2).table.equals(whole)
     monkeypatch.setattr(chunking, "ROWS_AT_ONCE", 1)
     monkeypatch.setattr(chunking, "ROWS_A_CHUNK", 200)
-    assert run(some, [traffic()]).table.equals(whole)
+    assert run_experiment(some, [traffic()]).table.equals(whole)
 
 
 def test_what_is_listed_and_never_arrives() -> None:
@@ -194,7 +194,7 @@ def test_recorded_lists_are_sent_when_they_are_stamped(tmp_path: Path) -> None:
     assert times == [0.25, 0.3, 0.4, 0.4]
     assert rows.loc["stack", list(WAY)].isna().all()
     expected = {"until captured": 0.25, "processing": 0.05, "transport": 0.1, "fusion": 0.0}
-    assert stages(rows.loc[["rsu"]], some, "rsu") == expected
+    assert mean_stages(rows.loc[["rsu"]], some, "rsu") == expected
 
 
 def test_of_units_that_listed_it_together() -> None:
@@ -206,7 +206,7 @@ def test_of_units_that_listed_it_together() -> None:
             ("a", "b"), np.zeros(1, dtype=int), *(np.zeros(0, dtype=int),) * 3, np.array([0, 0]), np.array([1.0, 1.0]),
             np.array([0, 1]), np.array([at_s]), np.zeros((1, 0), dtype=bool), *(np.zeros((1, 0)),) * 9,
         )  # fmt: skip
-        return int(list_that_told(heard, Detections(*one))[0, 0])
+        return int(find_informing_list(heard, FirstDetections(*one))[0, 0])
 
     assert told((1.1, 1.2), 1.2, 0) == 1
     assert told((1.1, 1.2), 1.1, 1) == 0

@@ -8,19 +8,19 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from copem_replay.core.interpolation import at_instants
+from copem_replay.core.interpolation import interpolate_at_instants
 from copem_replay.io.recording import Recording
-from copem_replay.perception.observation import observations
-from copem_replay.pipeline.run import Result, run
+from copem_replay.perception.observation import observe_objects
+from copem_replay.pipeline.run import ExperimentResult, run_experiment
 from tests.helpers import scenes
 from tests.helpers.scenes import EGO_UNIT, Thing, experiment, recording, standing
 
 
-def replayed(log: Recording, **changes: Any) -> Result:
-    return run(experiment(**changes), [log])
+def replayed(log: Recording, **changes: Any) -> ExperimentResult:
+    return run_experiment(experiment(**changes), [log])
 
 
-def row(result: Result, configuration: str, object_id: str = "other", run_number: int = 0) -> pd.Series:
+def row(result: ExperimentResult, configuration: str, object_id: str = "other", run_number: int = 0) -> pd.Series:
     table = result.table
     chosen = table[
         (table["configuration"] == configuration) & (table["object_id"] == object_id) & (table["run"] == run_number)
@@ -29,7 +29,7 @@ def row(result: Result, configuration: str, object_id: str = "other", run_number
     return chosen.iloc[0]
 
 
-def of(result: Result, configuration: str) -> pd.Series:
+def of(result: ExperimentResult, configuration: str) -> pd.Series:
     return result.summary.set_index("configuration").loc[configuration]
 
 
@@ -204,7 +204,7 @@ def test_line_of_sight() -> None:
 @pytest.mark.parametrize(("gap_s", "lists_in_gap"), [(0.5, 4), (0.6, 0)])
 def test_short_gaps_are_bridged_and_long_ones_not(gap_s: float, lists_in_gap: int) -> None:
     log = scenes.come_and_go(gap_s)
-    truth = at_instants(log.truth, log.truth.stamp_ns, t0_ns=log.scene.t0_ns, max_gap_s=0.5)
+    truth = interpolate_at_instants(log.truth, log.truth.stamp_ns, t0_ns=log.scene.t0_ns, max_gap_s=0.5)
     walker = truth.captured_s[truth.frame_ix[truth.row_object_ix == 1]]
     assert np.count_nonzero((walker > 1.01) & (walker < 0.99 + gap_s)) == lists_in_gap
     assert len(replayed(log, measure={"onset": {"kind": "appears"}}).table) == 2, "still one object with one onset"
@@ -218,7 +218,7 @@ def test_a_unit_on_another_car_sees_past_it() -> None:
         pems={"sure": [{"detection": {"kind": "visible_share"}}]},
         configurations={"PEM": {"units": ["ego"]}, "V2V": {"units": ["v2v"]}},
     )
-    found = observations(log.scene, log.truth, plan)
+    found = observe_objects(log.scene, log.truth, plan)
     ids = np.array(log.scene.object_ids)[found.tracks.row_object_ix]
     unit = np.array(found.tracks.units)[found.tracks.row_unit_ix]
     assert set(ids[unit == "ego"]) == {"middle", "first"}
@@ -226,7 +226,7 @@ def test_a_unit_on_another_car_sees_past_it() -> None:
     assert found.view.visible_share[(unit == "ego") & (ids == "first")].max() == 0
     assert found.view.visible_share[(unit == "v2v")].min() == 1
     assert set(found.view.range_m[(unit == "v2v")].round(9)) == {10.0}
-    result = run(plan, [log])
+    result = run_experiment(plan, [log])
     assert not row(result, "PEM", "first")["detected"]
     assert row(result, "V2V", "first")["detected"]
 
@@ -249,7 +249,7 @@ def test_units_heights_count_from_the_ground_under_them() -> None:
         configurations={"PEM": {"units": "all"}},
     )
     for each in (log, raised):
-        found = observations(each.scene, each.truth, plan)
+        found = observe_objects(each.scene, each.truth, plan)
         walker = found.tracks.row_object_ix == 1
         low, mast = (found.view.visible_share[walker & (found.tracks.row_unit_ix == k)] for k in (0, 1))
         assert low == pytest.approx(0.5, abs=1e-3)
@@ -279,9 +279,9 @@ def test_an_offset_moves_a_fixed_unit_along_its_own_heading() -> None:
     mast = {"at": [5, 0], "yaw_deg": 90, "offset_m": [3, 4], "height_m": 5.0, "pem": "all"}
     plan = experiment(units={"mast": mast}, configurations={"all": {"units": "all"}}, measure={"distance_to": "mast"})
     log = scenes.oncoming_car()
-    found = observations(log.scene, log.truth, plan)
+    found = observe_objects(log.scene, log.truth, plan)
     other = found.tracks.row_object_ix == log.scene.object_number["other"]
     assert found.view.range_m[other][0] == pytest.approx(np.hypot(99, 3))
-    result = run(plan, [log])
+    result = run_experiment(plan, [log])
     distance = row(result, "all")["distance_at_detection_m"]
     assert distance == pytest.approx(np.hypot(100 - 10 * row(result, "all")["detection_s"] - 1, 3))

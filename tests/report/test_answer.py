@@ -20,50 +20,57 @@ from matplotlib.axes import Axes
 
 from copem_replay.core.colours import configuration_colours
 from copem_replay.core.errors import InputError
-from copem_replay.metrics.intervals import every_resample
+from copem_replay.metrics.intervals import list_resamples
 from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_incidence, restricted_mean
 from copem_replay.report.figures import FIGURES, Selection
 from copem_replay.report.figures.answer import answer_figure
-from copem_replay.report.figures.bands import mean_limits
-from copem_replay.report.figures.captions import per_cent, plain
-from copem_replay.report.figures.detection_curves import curves_figure
+from copem_replay.report.figures.detection_curves import curves_figure, mean_limits
 from copem_replay.report.figures.differences import differences_figure
-from copem_replay.report.figures.render import lay_out, rendered
-from copem_replay.report.figures.selection import choose, most_telling, that_differ
-from copem_replay.report.figures.style import DARK, WHITE, appearances, contrast, style
-from copem_replay.report.figures.trade_off import trade_off_figure
-from copem_replay.report.html.greys import INK, PAPER, as_variables, dark_greys
-from copem_replay.report.html.headers import (
-    difference_header,
-    header,
-    in_order,
-    number,
-    signed_difference,
-    without_unit,
+from copem_replay.report.figures.selection import choose_object_and_run, find_differing, find_most_telling
+from copem_replay.report.figures.style import (
+    DARK,
+    WHITE,
+    choose_appearances,
+    contrast_ratio,
+    figure_style,
+    format_per_cent,
+    format_three_digits,
+    lay_out,
+    render_figure,
 )
-from copem_replay.report.html.page import page as report_page
+from copem_replay.report.figures.trade_off import trade_off_figure
+from copem_replay.report.html.markup import INK, PAPER, dark_greys, replace_greys
+from copem_replay.report.html.page import build_page as report_page
 from copem_replay.report.html.study import load_study
-from copem_replay.results.compare import compare
-from copem_replay.results.read import Results, load_results
-from copem_replay.viewer.selection import telling
+from copem_replay.report.html.tables import (
+    column_header,
+    difference_column_header,
+    format_signed_difference,
+    format_value,
+    sort_columns,
+    strip_unit,
+)
+from copem_replay.results.compare import compare_folders
+from copem_replay.results.read import Results, read_results
+from copem_replay.viewer.sink import choose_telling_objects
 from tests.helpers.report_pages import ALONE, ONE, changed, eighteen, replayed, with_rows
 
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
     """One pedestrian, six runs."""
-    return load_results(replayed(tmp_path_factory.mktemp("one"), changed(ONE)))
+    return read_results(replayed(tmp_path_factory.mktemp("one"), changed(ONE)))
 
 
 @pytest.fixture(scope="module")
 def two(tmp_path_factory: pytest.TempPathFactory) -> Results:
     """Two pedestrians: nothing is resampled."""
-    return load_results(replayed(tmp_path_factory.mktemp("two"), changed()))
+    return read_results(replayed(tmp_path_factory.mktemp("two"), changed()))
 
 
 @pytest.fixture(scope="module")
 def many(tmp_path_factory: pytest.TempPathFactory) -> Results:
-    return load_results(replayed(tmp_path_factory.mktemp("many"), eighteen()))
+    return read_results(replayed(tmp_path_factory.mktemp("many"), eighteen()))
 
 
 def dots(axes: Axes) -> dict[str, tuple[float, bool]]:
@@ -139,7 +146,7 @@ class TestMeanLimits:
         ending = np.array(data.draw(st.lists(codes, min_size=count, max_size=count)))
         of = np.array([*range(4), *data.draw(st.lists(st.integers(0, 3), min_size=count - 4, max_size=count - 4))])
         found = mean_limits(time_s, ending, [f"c{k}" for k in of], 2.5, 1)
-        resampled = every_resample(4)
+        resampled = list_resamples(4)
         means: list[float] = []
         for chosen, times in zip(resampled.count, resampled.times, strict=True):
             kept = np.repeat(np.arange(count), chosen[of])
@@ -157,7 +164,7 @@ class TestMeanLimits:
 class TestDifferences:
     def test_they_are_those_of_compare(self, results: Results) -> None:
         figure = differences_figure(results)
-        table = compare([results.folder], baseline="late").overall.set_index(["configuration", "metric"])
+        table = compare_folders([results.folder], baseline="late").overall.set_index(["configuration", "metric"])
         assert rows(figure.axes[0]) == ["half", "hit", "never"], "the truth is no row"
         for axes, metric, times in zip(figure.axes, ("ttd_rmst_s", "pass_share"), (1, 100), strict=True):
             assert dots(axes), metric
@@ -175,12 +182,12 @@ class TestDifferences:
         assert "The ground truth, an upper bound, is not drawn: GT −0.5 " in note(figure)
 
     def test_a_report_has_its_own_baseline(self, results: Results) -> None:
-        found = compare([results], baseline="hit")
+        found = compare_folders([results], baseline="hit")
         figure = FIGURES["differences"].draw(results, Selection(differences=found))
         assert rows(figure.axes[0]) == ["half", "late", "never"]
 
     def test_with_nothing_to_compare_there_is_none(self, tmp_path: Path) -> None:
-        alone = load_results(replayed(tmp_path, changed(ONE, *ALONE)))
+        alone = read_results(replayed(tmp_path, changed(ONE, *ALONE)))
         assert FIGURES["differences"].missing(alone, Selection()) == ""
         with pytest.raises(InputError, match="there is nothing to compare with"):
             differences_figure(alone)
@@ -234,9 +241,9 @@ class TestEighteen:
         ).to_numpy()
         changed_one = with_rows(many, table, tmp_path / "alike")
         names = tuple(many.experiment.configurations)
-        found = that_differ(changed_one, names)
+        found = find_differing(changed_one, names)
         assert set(found) & {f"c{k:02}" for k in range(10)} == {"c00"}
-        assert that_differ(many, names[:12]) == names[:12]
+        assert find_differing(many, names[:12]) == names[:12]
 
     def test_the_page_is_small(self, many: Results) -> None:
         assert len(report_page(load_study(many.folder)).encode()) < 1_500_000
@@ -257,17 +264,17 @@ class TestWhichObject:
         table["time_to_detection_s"] = table["time_to_detection_s"].astype(float)
         table["onset_s"], table["ended_s"] = 0.0, 4.0
         table["conflict"] = [data.draw(st.booleans())] * len(table)
-        assert most_telling(table, ("GT",)) == ("x", telling(table, ("GT",), 1)[0])
+        assert find_most_telling(table, ("GT",)) == ("x", choose_telling_objects(table, ("GT",), 1)[0])
 
     def test_by_default_the_one_of_the_run_that_is_drawn(self, two: Results, tmp_path: Path) -> None:
         """The pedestrian in the way is in conflict; without that, the one that `half` knows later."""
-        assert choose(two, Selection()).object_id == "2"
+        assert choose_object_and_run(two, Selection()).object_id == "2"
         table = two.table.assign(conflict=False)
         run = int(table.loc[table["configuration"] == "half"].sort_values("time_to_detection_s")["run"].iloc[-1])
         of_run = table[(table["run"] == run) & (table["configuration"] != "GT")]
         late_s = of_run["time_to_detection_s"].fillna(of_run["ended_s"] - of_run["onset_s"])
         spread = late_s.groupby(of_run["object_id"]).agg(lambda s: s.max() - s.min())
-        chosen = choose(with_rows(two, table, tmp_path / "without"), Selection(run=run))
+        chosen = choose_object_and_run(with_rows(two, table, tmp_path / "without"), Selection(run=run))
         assert spread[chosen.object_id] == spread.max()
         assert len(chosen.configurations) == 4
         assert (chosen.configurations[0], chosen.configurations[-1]) == ("never", "GT")
@@ -277,20 +284,20 @@ class TestLooks:
     def test_colours_are_those_of_the_recording(self) -> None:
         names = [f"c{k}" for k in range(21)]
         colours = configuration_colours(names)
-        for name, look in appearances(names).items():
+        for name, look in choose_appearances(names).items():
             assert tuple(round(255 * channel) for channel in look.colour) == colours[name]
 
     def test_lines_are_seen_on_white_and_on_a_dark_page(self) -> None:
         """WCAG 2.1, 1.4.11: 3 to 1, by the colour itself or by its outline."""
-        for look in appearances([f"c{k}" for k in range(21)]).values():
+        for look in choose_appearances([f"c{k}" for k in range(21)]).values():
             for paper in (WHITE, DARK):
-                assert max(contrast(look.colour, paper), contrast(look.edge, paper)) >= 3, look
+                assert max(contrast_ratio(look.colour, paper), contrast_ratio(look.edge, paper)) >= 3, look
 
     def test_contrast(self) -> None:
-        assert contrast((0.0, 0.0, 0.0), WHITE) == pytest.approx(21)
-        assert contrast(WHITE, WHITE) == pytest.approx(1)
+        assert contrast_ratio((0.0, 0.0, 0.0), WHITE) == pytest.approx(21)
+        assert contrast_ratio(WHITE, WHITE) == pytest.approx(1)
         grey = 0x76 / 255  # the greys around it are known to end at 4.5
-        assert contrast((grey,) * 3, WHITE) == pytest.approx(4.54, abs=0.01)
+        assert contrast_ratio((grey,) * 3, WHITE) == pytest.approx(4.54, abs=0.01)
 
 
 def test_numbers_have_three_digits() -> None:
@@ -304,10 +311,10 @@ def test_numbers_have_three_digits() -> None:
         15371.2: "15371",
         -0.5: "−0.5",
     }
-    assert {value: plain(value) for value in shown} == shown
+    assert {value: format_three_digits(value) for value in shown} == shown
     shares = {0.0: "0", 1.0: "100", 0.844: "84.4", 0.99963: "> 99.9", 0.0001: "< 0.1", 0.9924: "99.2"}
-    assert {value: per_cent(value) for value in shares} == shares
-    assert per_cent(math.nan) == "–"
+    assert {value: format_per_cent(value) for value in shares} == shares
+    assert format_per_cent(math.nan) == "–"
 
 
 def test_headers_have_units_also_of_own_metrics() -> None:
@@ -317,17 +324,17 @@ def test_headers_have_units_also_of_own_metrics() -> None:
         "calls_per_min": "calls per minute",
         "cost": "cost",
     }
-    assert {name: header(name) for name in own} == own
-    assert without_unit("ttd_rmst_s") == "mean time to detection"
-    assert difference_header("pass_share") == "passes, percentage points"
-    assert (number("late_share", 0.5), number("cost", math.nan)) == ("50", "–")
-    assert [signed_difference("late_share", value) for value in (0.125, -0.5, 1e-12)] == ["+12.5", "−50", "±0"]
-    assert in_order(["n", "detected_share", "ttd_rmst_s"]) == ["ttd_rmst_s", "detected_share", "n"]
+    assert {name: column_header(name) for name in own} == own
+    assert strip_unit("ttd_rmst_s") == "mean time to detection"
+    assert difference_column_header("pass_share") == "passes, percentage points"
+    assert (format_value("late_share", 0.5), format_value("cost", math.nan)) == ("50", "–")
+    assert [format_signed_difference("late_share", value) for value in (0.125, -0.5, 1e-12)] == ["+12.5", "−50", "±0"]
+    assert sort_columns(["n", "detected_share", "ttd_rmst_s"]) == ["ttd_rmst_s", "detected_share", "n"]
 
 
 def test_greys_turn_over_and_colours_stay() -> None:
     """Black becomes the ink of the dark page, white its paper, a grey lies as far between them."""
-    page = as_variables('<path style="fill: #ffffff; stroke: #000000"/><path style="fill: #808080; stroke: #0072b2"/>')
+    page = replace_greys('<path style="fill: #ffffff; stroke: #000000"/><path style="fill: #808080; stroke: #0072b2"/>')
     assert "#0072b2" in page
     assert re.findall(r"#[0-9a-f]{6}", page) == ["#0072b2"]
     light, dark = dark_greys(page).splitlines()
@@ -349,12 +356,12 @@ def test_the_page_has_the_dark_paper_that_greys_go_by() -> None:
 
 def test_coordinates_are_rounded_to_a_hundredth_of_a_point(results: Results) -> None:
     """As matplotlib writes them, but for what nobody sees."""
-    with style():
+    with figure_style():
         figure = answer_figure(results)
         lay_out(figure)
         file = BytesIO()
         figure.savefig(file, format="svg")
-    ours = rendered(answer_figure(results), (".svg",))[".svg"].decode()
+    ours = render_figure(answer_figure(results), (".svg",))[".svg"].decode()
     paths = [re.findall(r' d="([^"]*)"', svg) for svg in (file.getvalue().decode(), ours)]
     assert len(paths[0]) == len(paths[1]) > 20
     for exact, rounded in zip(*paths, strict=True):

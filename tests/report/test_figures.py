@@ -28,27 +28,22 @@ from matplotlib.text import Annotation
 
 from copem_replay.cli import main as cli
 from copem_replay.core.errors import InputError
-from copem_replay.experiment.file import load, log_paths
-from copem_replay.experiment.validate import problems, read_logs
-from copem_replay.metrics.intervals import clusters, resamples, share_limits
+from copem_replay.experiment.file import log_paths, read_experiment_file
+from copem_replay.experiment.validate import find_problems, read_logs
+from copem_replay.metrics.intervals import choose_clusters, draw_resamples, share_limits
 from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_incidence
-from copem_replay.pipeline.run import run
-from copem_replay.report.figures.bands import band, resampled_incidence
-from copem_replay.report.figures.captions import percent, short_names
-from copem_replay.report.figures.detection_curves import curves_figure
-from copem_replay.report.figures.distances import distances_figure
-from copem_replay.report.figures.label_layout import last_instant
+from copem_replay.pipeline.run import run_experiment
+from copem_replay.report.figures.detection_curves import curves_figure, incidence_limits, resample_incidence
+from copem_replay.report.figures.distances import FAIL, KINDS, NEUTRAL, PASS, Strip, distances_figure
 from copem_replay.report.figures.latency_breakdown import latency_breakdown_figure
-from copem_replay.report.figures.selection import Selection, choose
-from copem_replay.report.figures.single_runs import runs_figure
-from copem_replay.report.figures.strips import FAIL, KINDS, NEUTRAL, PASS, Strip
-from copem_replay.report.figures.style import appearances
+from copem_replay.report.figures.registry import write_figure_files
+from copem_replay.report.figures.selection import Selection, choose_object_and_run
+from copem_replay.report.figures.single_runs import StoryEvent, last_instant, runs_figure
+from copem_replay.report.figures.style import choose_appearances, format_share, shorten_names
 from copem_replay.report.figures.sweeps import sweeps_figure
-from copem_replay.report.figures.timeline import Event
-from copem_replay.report.figures.write import write_figures
-from copem_replay.results.read import Results, load_results
+from copem_replay.results.read import Results, read_results
 from copem_replay.results.write import write_results
-from copem_replay.viewer.export import EXPORTERS
+from copem_replay.viewer.rrd import EXPORTERS
 from tests.helpers.recordings import Obj, pedestrian, write_recording
 from tests.helpers.report_pages import with_rows
 
@@ -98,13 +93,18 @@ def replayed(place: Path, text: str = TEXT, name: str = "results") -> Path:
     """A results folder beside the recording it is of."""
     drive(place / "drive.mcap")
     (place / "e.yaml").write_text(text, encoding="utf-8")
-    source = load(place / "e.yaml")
-    experiment, found = problems(source)
+    source = read_experiment_file(place / "e.yaml")
+    experiment, found = find_problems(source)
     assert experiment is not None, found
     recordings, refused = read_logs(experiment, log_paths(source)[0], source)
     assert not refused + found
     write_results(
-        place / name, experiment, recordings, run(experiment, recordings), exporters=EXPORTERS, overwrite=True
+        place / name,
+        experiment,
+        recordings,
+        run_experiment(experiment, recordings),
+        exporters=EXPORTERS,
+        overwrite=True,
     )
     return place / name
 
@@ -117,7 +117,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def results(made: Path) -> Results:
-    return load_results(made)
+    return read_results(made)
 
 
 @pytest.fixture
@@ -139,7 +139,7 @@ def call(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) ->
     def called(*arguments: object) -> Ended:
         monkeypatch.setattr(sys, "argv", ["copem-replay", "plot", *map(str, arguments)])
         capsys.readouterr()
-        code = cli._ended()
+        code = cli._run_to_exit_code()
         out, err = capsys.readouterr()
         return Ended(code, out.splitlines(), err.splitlines())
 
@@ -183,10 +183,10 @@ class TestCommand:
         assert not list(mine.glob(".*"))
 
     def test_the_same_bytes_twice(self, results: Results, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        first, _ = write_figures(results, tmp_path / "a" / "deep", Selection())
+        first, _ = write_figure_files(results, tmp_path / "a" / "deep", Selection())
         monkeypatch.setitem(matplotlib.rcParams, "font.size", 20.0)  # whatever the user likes
         monkeypatch.setenv("SOURCE_DATE_EPOCH", "1")
-        second, _ = write_figures(load_results(results.folder), tmp_path / "b", Selection())
+        second, _ = write_figure_files(read_results(results.folder), tmp_path / "b", Selection())
         assert len(first) == 2 * len(NAMES)
         assert {p.name: p.read_bytes() for p in first} == {p.name: p.read_bytes() for p in second}
         for path in first:
@@ -343,11 +343,11 @@ class TestCommand:
 class TestRuns:
     def test_from_worst_to_best(self, results: Results) -> None:
         # hit, near and never do not pass; of them who never knows is worst, then who knows last.
-        choice = choose(results, Selection())
+        choice = choose_object_and_run(results, Selection())
         assert (choice.log, choice.object_id, choice.run) == ("drive", "2", 0)
         assert choice.configurations == ("never", "hit", "late", "GT")
-        assert choose(results, Selection(["hit", "GT", "hit"])).configurations == ("hit", "GT")
-        assert choose(results, Selection(object_id="3", run=2)).object_id == "3"
+        assert choose_object_and_run(results, Selection(["hit", "GT", "hit"])).configurations == ("hit", "GT")
+        assert choose_object_and_run(results, Selection(object_id="3", run=2)).object_id == "3"
 
     def test_courses_and_events(self, results: Results) -> None:
         figure = runs_figure(results, Selection(["GT", "near", "hit", "never"], run=1))
@@ -407,20 +407,20 @@ class TestRuns:
         text = "\n".join(
             row for row in text.splitlines() if not row.startswith("  ") or "probab" in row or "on: ego" in row
         )
-        figure = runs_figure(load_results(replayed(tmp_path, text)), Selection())
+        figure = runs_figure(read_results(replayed(tmp_path, text)), Selection())
         titles = [axes.get_title(loc="left") for axes in figure.axes[:2]]
         assert titles == ["PEM\nknown after 0 s", "GT\nknown after 0 s"]
         assert "declared driver" not in note(figure)
 
     def test_labels_have_room(self) -> None:
         # The later label takes 12.5 letters of 0.56 · 7.5 pt: 0.729 of 2 inches, so that 1 s are what is left of it.
-        listed = [Event(0.0, "onset", "x"), Event(1.0, "outcome", "a long one.")]
+        listed = [StoryEvent(0.0, "onset", "x"), StoryEvent(1.0, "outcome", "a long one.")]
         assert last_instant(listed, 0.0, 1.2, 2.0) == pytest.approx(1 / (1 - 12.5 * 0.56 * 7.5 / 72 / 2))
         assert last_instant(listed[:1], 0.0, 1.2, 2.0) == 1.2
 
     def test_no_ego_unit(self, results: Results, mine: Path) -> None:
         text = (mine.parent / "e.yaml").read_text().replace("on: ego", "at: [0, 0]")
-        figure = runs_figure(load_results(replayed(mine.parent, text, "fixed")), Selection())
+        figure = runs_figure(read_results(replayed(mine.parent, text, "fixed")), Selection())
         assert figure.axes[-1].texts[0].get_text() == "the ego carries no unit"
 
 
@@ -478,7 +478,7 @@ class TestDistances:
         for name in ("conflict_detection_s", "time_to_conflict_detection_s", "distance_at_conflict_detection_m"):
             table[name] = np.where(table["conflict_detected"], 12.0, np.nan)
         table.loc[table["object_id"] == "2", "distance_at_conflict_detection_m"] = np.nan  # while the truth has a gap
-        figure = distances_figure(with_rows(load_results(mine), table, tmp_path / "foreseen"))
+        figure = distances_figure(with_rows(read_results(mine), table, tmp_path / "foreseen"))
         assert len(figure.axes) == 2
         # He brakes for the object, so that passing says nothing of this event.
         assert points(figure.axes[1]) == {"GT: not in conflict": pytest.approx([12.0] * 3)}
@@ -521,15 +521,15 @@ class TestDistances:
     def test_of_very_many_in_a_bin_some_are_drawn(self, mine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """Every other of six, from one edge to the other, and it is said."""
         distance_m, kind = np.full(6, 5.0), np.zeros(6, dtype=int)
-        monkeypatch.setattr("copem_replay.report.figures.strips.MOST", 3)
+        monkeypatch.setattr("copem_replay.report.figures.distances.MOST", 3)
         monkeypatch.setattr("copem_replay.report.figures.distances.MOST", 3)
         strip = self.strip(distance_m, kind)
         across, drawn = strip.place(distance_m, kind, np.zeros_like(strip.count))
         assert across[drawn] == pytest.approx([-5 / 6, -1 / 6, 3 / 6])
-        assert "Of more than" not in note(distances_figure(load_results(mine)))
-        monkeypatch.setattr("copem_replay.report.figures.strips.MOST", 2)
+        assert "Of more than" not in note(distances_figure(read_results(mine)))
         monkeypatch.setattr("copem_replay.report.figures.distances.MOST", 2)
-        figure = distances_figure(load_results(mine))
+        monkeypatch.setattr("copem_replay.report.figures.distances.MOST", 2)
+        figure = distances_figure(read_results(mine))
         assert "Of more than 2 points at nearly one distance 2 are drawn" in note(figure)
         assert len(points(figure.axes[0])["GT: passes"]) == 2
 
@@ -551,7 +551,7 @@ class TestCurves:
         # One in two lists holds him, so that the runs differ.
         text = changed(TWO, "runs: 40", text=TEXT.replace("sure: [{detection: {kind: constant, probability: 1.0}}]",
                        "sure: [{detection: {kind: constant, probability: 0.5}}]"))  # fmt: skip
-        results = load_results(replayed(tmp_path, text))
+        results = read_results(replayed(tmp_path, text))
         figure = curves_figure(results, configurations=["late"])
         (axes,) = figure.axes
         rows = results.table[results.table["configuration"] == "late"]
@@ -572,7 +572,7 @@ class TestCurves:
         rows = [("2", 0.0, 0.5), ("2", 1.0, 0.5), ("3", 1.0, 0.5), ("3", None, 0.5), ("3", 2.0, 0.0)]
         exact = pd.DataFrame(rows, columns=columns).assign(log="drive", configuration="GT")
         exact.to_parquet(mine / "exact.parquet")
-        figure = curves_figure(load_results(mine), configurations=["GT"])
+        figure = curves_figure(read_results(mine), configurations=["GT"])
         x, y = line(figure.axes[0], "exact")
         assert x[1:-1] == pytest.approx([0, 1])
         assert y == pytest.approx([0, 0.25, 0.75, 0.75])
@@ -588,7 +588,7 @@ class TestBands:
         ending = generator.choice([CENSORED, DETECTED, LEFT], n)
         count = generator.integers(0, 3, (resamples, n))
         at_s = np.arange(-1, 4, 0.125)
-        found = resampled_incidence(time_s, ending, count, at_s)
+        found = resample_incidence(time_s, ending, count, at_s)
         for r in range(resamples):
             rows = np.repeat(np.arange(n), count[r])
             times_s, share = cumulative_incidence(time_s[rows], ending[rows])
@@ -600,7 +600,7 @@ class TestBands:
         time_s = np.repeat([1.0, 1.0, 1.0, 5.0, 5.0], 20)
         ending = np.repeat([DETECTED, DETECTED, DETECTED, LEFT, LEFT], 20)
         names = np.repeat(list("abcde"), 20)
-        low, high = band(time_s, ending, list(names), np.array([0.5, 1.0]), 1)
+        low, high = incidence_limits(time_s, ending, list(names), np.array([0.5, 1.0]), 1)
         # None known by then: none of five, 1 − 0.025^(1/5). Then three of five: all or none is drawn often enough.
         assert (low[0], high[0]) == (0, pytest.approx(0.521824, abs=1e-6))
         assert (low[1], high[1]) == (0.0, 1.0)
@@ -612,8 +612,8 @@ class TestBands:
         names = [f"object {k}" for k in range(12)]
         rows = [(name, DETECTED if k < n else LEFT) for name, n in zip(names, known, strict=True) for k in range(20)]
         cluster, ending = [name for name, _ in rows], np.array([how for _, how in rows])
-        low, high = band(np.ones(240), ending, cluster, np.array([1.0]), 1)
-        kind, least, most = share_limits(known, totals, resamples(sorted(names), 1))
+        low, high = incidence_limits(np.ones(240), ending, cluster, np.array([1.0]), 1)
+        kind, least, most = share_limits(known, totals, draw_resamples(sorted(names), 1))
         assert kind == "bootstrap+exact"
         assert (low[0], high[0]) == pytest.approx((least, most), abs=0.02)
 
@@ -624,12 +624,12 @@ class TestBands:
             )
             return index.to_frame(index=False)
 
-        assert clusters(rows(1, 1))[0] == "runs"
-        assert clusters(rows(1, 1))[1].nunique() == 2
-        assert clusters(rows(1, 4))[0] is None
-        assert clusters(rows(1, 5))[0] == "objects"
-        assert clusters(rows(4, 2))[0] == "objects"
-        assert clusters(rows(5, 1))[0] == "logs"
+        assert choose_clusters(rows(1, 1))[0] == "runs"
+        assert choose_clusters(rows(1, 1))[1].nunique() == 2
+        assert choose_clusters(rows(1, 4))[0] is None
+        assert choose_clusters(rows(1, 5))[0] == "objects"
+        assert choose_clusters(rows(4, 2))[0] == "objects"
+        assert choose_clusters(rows(5, 1))[0] == "logs"
 
 
 class TestSweeps:
@@ -647,7 +647,7 @@ class TestSweeps:
         table = pd.DataFrame(rows, columns=columns).assign(n=6, interval="wilson", interval_over="runs")
         table["pass_share_exact"] = [0.79, 0.91, 1.0, None]
         table.to_csv(mine / "sweep.csv", index=False)
-        return load_results(mine)
+        return read_results(mine)
 
     def test_panels(self, swept: Results) -> None:
         figure = sweeps_figure(swept)
@@ -714,27 +714,27 @@ class TestLatencyBreakdown:
 
 class TestWords:
     def test_names_that_are_too_long_lose_their_middle(self) -> None:
-        names = short_names(["GT", "roadside units of the crossing, 0.5 s"])
+        names = shorten_names(["GT", "roadside units of the crossing, 0.5 s"])
         assert names == {"GT": "GT", "roadside units of the crossing, 0.5 s": "roadside unit…ssing, 0.5 s"}
         alike = ["a" * 20 + "1" + "b" * 20, "a" * 20 + "2" + "b" * 20]
-        assert list(short_names(alike).values()) == alike
+        assert list(shorten_names(alike).values()) == alike
 
     def test_percent(self) -> None:
         shares = [0, 1, 0.5, 0.996, 0.9999, 0.001, 0.0001, float("nan")]
-        assert [percent(share) for share in shares] == [
+        assert [format_share(share) for share in shares] == [
             "0 %", "100 %", "50 %", "99.6 %", "> 99.9 %", "0.1 %", "< 0.1 %", "–",
         ]  # fmt: skip
 
     def test_odd_names_are_drawn_as_they_are(self, tmp_path: Path) -> None:
         text = changed("runs: 1").replace("  late:", '  "$a$_{<&>}":').replace("  hit:", '  "_試":')
-        results = load_results(replayed(tmp_path, text))
-        files, notes = write_figures(results, None, Selection())
+        results = read_results(replayed(tmp_path, text))
+        files, notes = write_figure_files(results, None, Selection())
         assert (len(files), notes) == (2 * len(NAMES), [])
         labels = [text.get_text() for text in curves_figure(results).legends[0].get_texts()]
         assert labels == ["GT", "$a$_{<&>}", "near", "_試", "never"]
 
     def test_looks_differ(self) -> None:
-        looks = appearances([f"c{k}" for k in range(9)])
+        looks = choose_appearances([f"c{k}" for k in range(9)])
         assert len({(look.dashes, look.colour) for look in looks.values()}) == 9
         assert len({look.dashes for look in list(looks.values())[:7]}) == 7
         # The first line is the widest.
@@ -745,4 +745,4 @@ class TestWords:
         found = json.loads((mine / "provenance.json").read_text())
         (mine / "provenance.json").write_text(json.dumps(found | {"logs": []}))
         with pytest.raises(InputError, match=r"expected 1 logs as in experiment\.yaml, found 0"):
-            load_results(mine)
+            read_results(mine)

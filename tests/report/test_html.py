@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 import copem_replay as cr
 from copem_replay.cli import main as cli
 from copem_replay.core.errors import InputError, OutputError
-from copem_replay.report import write_report
+from copem_replay.report import write_html_report
 from copem_replay.report.figures import FIGURES, FigureKind, Selection
 from copem_replay.report.figures.latency_breakdown import (
     FUSION,
@@ -33,17 +33,17 @@ from copem_replay.report.figures.latency_breakdown import (
     STAGES,
     TRANSPORT,
     UNTIL_CAPTURED,
-    stages,
+    mean_stages,
 )
-from copem_replay.report.figures.selection import choose
-from copem_replay.report.figures.style import new_figure, style
-from copem_replay.report.figures.write import write_figures
-from copem_replay.report.html.markup import Html, tag
-from copem_replay.report.html.missed_objects import misses, powers
-from copem_replay.report.html.page import page
+from copem_replay.report.figures.registry import write_figure_files
+from copem_replay.report.figures.selection import choose_object_and_run
+from copem_replay.report.figures.style import figure_style, new_figure
+from copem_replay.report.html.markup import Html, make_tag
+from copem_replay.report.html.page import build_page
 from copem_replay.report.html.study import load_study
-from copem_replay.results.compare import compare
-from copem_replay.results.read import Results, load_results
+from copem_replay.report.html.tables import count_misses, format_power
+from copem_replay.results.compare import compare_folders
+from copem_replay.results.read import Results, read_results
 from tests.helpers.report_pages import ALONE, EVERY, ONE, Page, changed, drive, replayed
 
 NAMES = ("GT", "late", "half", "hit", "never")
@@ -57,7 +57,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def html(made: Path) -> str:
-    return page(load_study(made))
+    return build_page(load_study(made))
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +84,7 @@ def call(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) ->
     def called(*arguments: object) -> Ended:
         monkeypatch.setattr(sys, "argv", ["copem-replay", *map(str, arguments)])
         capsys.readouterr()
-        code = cli._ended()
+        code = cli._run_to_exit_code()
         out, err = capsys.readouterr()
         return Ended(code, out.splitlines(), err.splitlines())
 
@@ -98,7 +98,7 @@ def summary_rows(folder: Path) -> dict[str, dict[str, str]]:
 
 def lines_of(folder: Path) -> list[str]:
     """What the top of a folder's report says."""
-    return Page(page(load_study(folder))).lines()
+    return Page(build_page(load_study(folder))).lines()
 
 
 class TestNumbers:
@@ -161,7 +161,7 @@ class TestNumbers:
         ]
 
     def test_the_regret_is_that_of_compare(self, read: Page, made: Path) -> None:
-        rows = compare([made], baseline="late").overall.set_index(["configuration", "metric"])
+        rows = compare_folders([made], baseline="late").overall.set_index(["configuration", "metric"])
         seen = 0
         for id_ in ("regret", "regret-lists"):
             assert list(read.tables[id_]) == ["GT", "half", "hit", "never"]
@@ -249,7 +249,7 @@ class TestWords:
             drive(tmp_path / f"{name}.mcap")
         (tmp_path / "e.yaml").write_text(changed(logs))
         folder = cr.run(tmp_path / "e.yaml", jobs=1).save(tmp_path / "results")
-        rows, whole = summary_rows(folder), Page(page(load_study(folder)))
+        rows, whole = summary_rows(folder), Page(build_page(load_study(folder)))
         lines = whole.lines()
         assert int(rows["half"]["n"]) == int(rows["late"]["n"]) / 2
         assert float(rows["half"]["ttd_rmst_s"]) < float(rows["late"]["ttd_rmst_s"])
@@ -257,10 +257,15 @@ class TestWords:
         assert lines[3].startswith("half is ranked last: some logs lack the units, and means and shares are over")
         assert any(line.startswith("Sooner by pairs, without an interval: half (−") for line in lines)
         assert not any(line.startswith("Later") and "half" in line for line in lines)
-        results = load_results(folder)
-        assert set(choose(results, Selection(log="two")).configurations) == {"GT", "late", "hit", "never"}
+        results = read_results(folder)
+        assert set(choose_object_and_run(results, Selection(log="two")).configurations) == {
+            "GT",
+            "late",
+            "hit",
+            "never",
+        }
         with pytest.raises(InputError, match="log two has none of the units of half; choose another log"):
-            choose(results, Selection(("half",), log="two"))
+            choose_object_and_run(results, Selection(("half",), log="two"))
         note = "configuration half: none of its units in 1 of 2 logs (two), and left out there"
         assert any(note in line for line in whole.words.splitlines())
 
@@ -327,7 +332,7 @@ class TestWords:
         """Two configurations of the same unit tie; a third differs by draws of its own, and by an interval with 0."""
         other = ("  eye: {", "  other: {on: ego, height_m: 1.8, pem: half}\n  eye: {")
         tie = ("  hit: {units: [ego], latency_s: 1.8}", "  hit: {units: [other]}\n  again: {units: [other]}")
-        html = page(load_study(replayed(tmp_path, changed(ONE, other, tie, *ALONE[:2], ALONE[3]))))
+        html = build_page(load_study(replayed(tmp_path, changed(ONE, other, tie, *ALONE[:2], ALONE[3]))))
         lines = Page(html).lines()
         assert re.fullmatch(
             r"hit and again detect at the same times: after \S+ s on average\. The interval of their difference to the "
@@ -338,7 +343,7 @@ class TestWords:
 
     def test_one_configuration_is_compared_with_nothing(self, tmp_path: Path) -> None:
         folder = replayed(tmp_path, changed(ONE, *ALONE))
-        found = Page(page(load_study(folder)))
+        found = Page(build_page(load_study(folder)))
         lines = found.lines()
         assert "with the one configuration of perception units" in lines[1]
         assert lines[2].endswith("There is nothing to compare it with: it is the only configuration.")
@@ -357,7 +362,7 @@ class TestWords:
     def test_nothing_detected_has_no_winner(self, tmp_path: Path) -> None:
         text = changed(ONE, ("  late: {units: [ego], latency_s: 0.5}", "  late: {units: [eye]}"), *ALONE[:1], ALONE[2])
         text = text.replace("  half: {units: [weak]}", "  half: {units: [eye]}")
-        found = Page(page(load_study(replayed(tmp_path, text))))
+        found = Page(build_page(load_study(replayed(tmp_path, text))))
         assert found.lines()[2] == ("No configuration detects any measured object in any run.")
         assert not any("soonest" in line or "shortest" in line for line in found.lines())
         assert "No figure: nothing was detected." in found.words
@@ -365,7 +370,7 @@ class TestWords:
 
     def test_nobody_measured_is_no_answer(self, tmp_path: Path) -> None:
         folder = replayed(tmp_path, changed((EVERY, "measure: {objects: {classes: [animal]}, onset")))
-        found = Page(page(load_study(folder)))
+        found = Page(build_page(load_study(folder)))
         assert found.lines()[2] == "There is no answer: no measured object has an onset."
         assert any(line.startswith("drive: no rows: nothing to measure") for line in found.lines())
         assert "No differences: no object is measured." in found.words
@@ -375,17 +380,17 @@ class TestWords:
     def test_the_baseline_is_ideal_else_the_first_else_as_asked(self, made: Path, tmp_path: Path) -> None:
         assert load_study(made).baseline == "late"
         assert load_study(made, "hit").baseline == "hit"
-        assert "No configuration is named ideal, so this is the first" in page(load_study(made))
+        assert "No configuration is named ideal, so this is the first" in build_page(load_study(made))
         with pytest.raises(InputError, match="no configuration is named 'hti'"):
             load_study(made, "hti")
         named = replayed(tmp_path, changed(ONE, ("  hit:", "  ideal:")))
         assert load_study(named).baseline == "ideal"
-        assert "Each configuration minus the ideal fusion: the regret." in page(load_study(named))
+        assert "Each configuration minus the ideal fusion: the regret." in build_page(load_study(named))
 
 
 class TestNeverDetected:
     def test_by_name_and_in_how_many_runs(self, tmp_path: Path) -> None:
-        found = Page(page(load_study(replayed(tmp_path, changed()))))
+        found = Page(build_page(load_study(replayed(tmp_path, changed()))))
         assert found.rows["never"] == [
             ["log", "object", "class", "never in", "by", "looked at for (s)", "until"],
             ["drive", "2", "pedestrian", "6 runs (all)", "never", "4.5", "the log ended"],
@@ -401,7 +406,7 @@ class TestNeverDetected:
         assert float(rows["half"]["miss_per_logit"]) == pytest.approx(-23)
         assert float(rows["half"]["miss_log10_half_odds"]) == pytest.approx(46 * math.log10(2 / 3))
         assert float(rows["half"]["fail_share_exact"]) == pytest.approx(2.0**-14)
-        words = Page(page(load_study(folder))).words
+        words = Page(build_page(load_study(folder))).words
         certain = "the detection of every measured object is certain. The ego fails with probability"
         assert f"GT: {certain} 0." in words
         assert f"hit: {certain} 1." in words
@@ -427,7 +432,7 @@ class TestNeverDetected:
         ],
     )
     def test_numbers_of_any_size(self, log10: float, shown: str) -> None:
-        assert powers(log10) == shown
+        assert format_power(log10) == shown
 
     def test_counts_runs_by_log_object_and_configuration(self) -> None:
         rows = pd.DataFrame(
@@ -437,7 +442,7 @@ class TestNeverDetected:
             ],
             columns=["log", "object_id", "configuration", "time_to_detection_s", "runs"],
         ).assign(object_class="car", onset_s=0.0, ended_s=1.0, ended_by="log_end")  # fmt: skip
-        found = misses(rows)[["log", "object_id", "configuration", "missed", "runs"]].to_numpy().tolist()
+        found = count_misses(rows)[["log", "object_id", "configuration", "missed", "runs"]].to_numpy().tolist()
         assert found == [["a", "1", "A", 2, 3], ["b", "1", "A", 1, 3]]
 
 
@@ -466,12 +471,12 @@ class TestWaterfall:
         return pd.DataFrame(given | columns)
 
     def stages(self, made: Path, rows: pd.DataFrame, **configuration: Any) -> dict[str, float]:
-        experiment = load_results(made).experiment
+        experiment = read_results(made).experiment
         measure = configuration.pop("measure", {})
         data = experiment.as_written()
         data["measure"] |= measure
         data["configurations"] = {"it": {"units": ["ego", "weak"], **configuration}}
-        return stages(rows, type(experiment).model_validate(data), "it")
+        return mean_stages(rows, type(experiment).model_validate(data), "it")
 
     def test_what_arrives_is_known_where_fusion_is_ideal(self, made: Path) -> None:
         expected = {HIDDEN: 1.0, IN_SIGHT: 1.5, TRANSPORT: 2.5, FUSION: 0.0}
@@ -520,7 +525,7 @@ class TestWaterfall:
 
     def test_with_count_earlier_there_is_none(self, tmp_path: Path) -> None:
         folder = replayed(tmp_path, changed(("time_s: 0.5}}", "time_s: 0.5}, count_earlier: true}")))
-        found = Page(page(load_study(folder)))
+        found = Page(build_page(load_study(folder)))
         assert "No figure: with count_earlier" in found.words
         assert found.plots == ["answer", "differences", "curves", "distances"]
 
@@ -529,11 +534,11 @@ class TestFigures:
     def test_each_that_needs_no_recording(self, read: Page, tmp_path: Path) -> None:
         assert read.plots == ["answer", "differences", "curves", "distances", "latency_breakdown"]
         text = changed(ONE, *ALONE[2:]) + "sweep: {latency_s: [0, 0.5], rate_hz: [2, 10]}\n"
-        assert Page(page(load_study(replayed(tmp_path, text)))).plots == [*read.plots, "sweeps"]
+        assert Page(build_page(load_study(replayed(tmp_path, text)))).plots == [*read.plots, "sweeps"]
 
     def test_they_are_those_of_plot(self, made: Path, html: str, tmp_path: Path) -> None:
         """Shape by shape: the paths of each SVG file, in their order, are in the page."""
-        files, _ = write_figures(load_results(made), tmp_path, Selection())
+        files, _ = write_figure_files(read_results(made), tmp_path, Selection())
         shapes = re.findall(r' d="([^"]*)"', html)
         for name in ("curves", "distances", "latency_breakdown"):
             (file,) = (file for file in files if file.name == f"{name}.svg")
@@ -546,7 +551,7 @@ class TestFigures:
         self, mine: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     ) -> None:
         def rows(results: Results, of: Selection) -> Figure:
-            with style():
+            with figure_style():
                 figure = new_figure(3.0, 2.0)
                 figure.subplots().bar(results.chosen(of.configurations), 1.0)
             return figure
@@ -554,15 +559,15 @@ class TestFigures:
         about = ("Of each configuration a bar.",)
         own = FigureKind("How many", "a bar per configuration", rows, about=lambda results: about)
         monkeypatch.setitem(FIGURES, "how_many", own)
-        files, notes = write_figures(load_results(mine), tmp_path / "figures", Selection())
+        files, notes = write_figure_files(read_results(mine), tmp_path / "figures", Selection())
         assert [file.name for file in files[-2:]] == ["how_many.png", "how_many.svg"]
         assert notes == []
-        found = Page(page(load_study(mine)))
+        found = Page(build_page(load_study(mine)))
         assert found.plots[-1] == "how_many"
         assert "How many\nOf each configuration a bar.\n" in found.words
         monkeypatch.setitem(FIGURES, "how_many", replace(own, missing=lambda results, of: "there are none"))
-        assert "No figure: there are none." in Page(page(load_study(mine))).words
-        _, notes = write_figures(load_results(mine), tmp_path / "figures", Selection())
+        assert "No figure: there are none." in Page(build_page(load_study(mine))).words
+        _, notes = write_figure_files(read_results(mine), tmp_path / "figures", Selection())
         assert notes == ["no figure of how_many: there are none"]
         assert not list((tmp_path / "figures").glob("how_many*"))
 
@@ -585,7 +590,7 @@ class TestFigures:
     def test_a_foreseen_collision_is_said(self, tmp_path: Path) -> None:
         text = changed(ONE, *ALONE[2:], ("time_s: 0.5}}", "time_s: 0.5}, conflict: {horizon_s: 2.0}}"))
         text = text.replace("braking: {", "braking: {brakes_for: conflict, ")
-        found = Page(page(load_study(replayed(tmp_path, text))))
+        found = Page(build_page(load_study(replayed(tmp_path, text))))
         assert "Distance when the collision is foreseen" in found.words
         assert list(found.tables["conflict"]) == ["GT", "late", "half"]
 
@@ -595,12 +600,12 @@ class TestFigures:
 
 class TestFile:
     def test_the_same_bytes_wherever_the_folder_lies(self, made: Path, mine: Path, tmp_path: Path, html: str) -> None:
-        assert write_report(mine) == mine / "report.html"
+        assert write_html_report(mine) == mine / "report.html"
         assert (mine / "report.html").read_text(encoding="utf-8") == html
         other = tmp_path / "elsewhere" / "other"
         shutil.copytree(mine, other)
         (other / "report.html").unlink()
-        deep = write_report(other, tmp_path / "new" / "deep.htm")
+        deep = write_html_report(other, tmp_path / "new" / "deep.htm")
         assert deep.read_bytes() == (mine / "report.html").read_bytes()
         assert not (other / "report.html").exists()
         assert str(tmp_path).encode() not in deep.read_bytes()
@@ -630,9 +635,9 @@ class TestFile:
         name, log = "<img src=x onerror=alert(1)>\"'&amp;", "<script>alert(2)&'.mcap"
         text = changed(("logs: [drive.mcap]", f'logs: ["{log}"]'), ("  late:", f"  {json.dumps(name)}:"))
         text = text.replace("  ego: {on", '  "<b>ego": {on').replace("[ego]", '["<b>ego"]')
-        html = page(load_study(replayed(tmp_path, text, log)))
+        html = build_page(load_study(replayed(tmp_path, text, log)))
         found = Page(html)
-        plain = Page(page(load_study(replayed(tmp_path / "plain", changed()))))
+        plain = Page(build_page(load_study(replayed(tmp_path / "plain", changed()))))
         assert [tag for tag, _ in found.elements] == [tag for tag, _ in plain.elements]
         assert [sorted(given) for _, given in found.elements] == [sorted(given) for _, given in plain.elements]
         assert name in found.tables["summary"]
@@ -641,9 +646,9 @@ class TestFile:
         assert html.count("onerror") == html.count("&lt;img src=x onerror=alert(1)&gt;")
 
     def test_elements_escape_all_but_html(self) -> None:
-        made = tag("td", "a<b>&\"'", Html("<i></i>"), class_='x"y', data_value=None, hidden=True)
+        made = make_tag("td", "a<b>&\"'", Html("<i></i>"), class_='x"y', data_value=None, hidden=True)
         assert made == '<td class="x&quot;y" hidden>a&lt;b&gt;&amp;&quot;&#x27;<i></i></td>'
-        assert tag("p", "a\nb\x1b\u202e") == "<p>a\\nb\\x1b\\u202e</p>"
+        assert make_tag("p", "a\nb\x1b\u202e") == "<p>a\\nb\\x1b\\u202e</p>"
 
     def test_another_summary_is_refused(self, mine: Path) -> None:
         text = (mine / "summary.csv").read_text(encoding="utf-8")
@@ -657,16 +662,16 @@ class TestFile:
         ):
             (mine / "summary.csv").write_text(damaged, encoding="utf-8")
             with pytest.raises(InputError, match=said):
-                write_report(mine)
+                write_html_report(mine)
 
     def test_nothing_half_written(self, mine: Path, tmp_path: Path) -> None:
         (tmp_path / "file").write_text("a file")
         for out in (tmp_path / "report.pdf", tmp_path / "file" / "report.html", mine):
             with pytest.raises(OutputError):
-                write_report(mine, out)
+                write_html_report(mine, out)
         (mine / "detections.parquet").write_bytes(b"PAR1 damaged")
         with pytest.raises(InputError, match=r"detections.parquet: expected a table that can be read"):
-            write_report(mine)
+            write_html_report(mine)
         assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "mine"]
         assert not (mine / "report.html").exists()
 

@@ -12,25 +12,24 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from copem_replay.metrics.intervals import clusters
-from copem_replay.metrics.tally import DETECTED, tally
-from copem_replay.report import write_report
+from copem_replay.metrics.intervals import choose_clusters
+from copem_replay.metrics.summary import DETECTED, tally_rows
+from copem_replay.report import write_html_report
 from copem_replay.report.figures import Selection
-from copem_replay.report.figures.bands import mean_limits
-from copem_replay.report.figures.detection_curves import curve_of, endings
+from copem_replay.report.figures.detection_curves import build_curve, detection_endings, mean_limits
 from copem_replay.report.figures.latency_breakdown import (
     FUSION,
     HIDDEN,
     IN_SIGHT,
     TRANSPORT,
-    how_many,
-    stages,
-    stages_of,
+    count_detected,
+    mean_stages,
+    mean_stages_by_configuration,
 )
-from copem_replay.report.figures.selection import by_run, that_differ
-from copem_replay.report.figures.write import write_figures
-from copem_replay.report.html.missed_objects import misses
-from copem_replay.results.read import Results, load_results
+from copem_replay.report.figures.registry import write_figure_files
+from copem_replay.report.figures.selection import find_differing, pivot_by_run
+from copem_replay.report.html.tables import count_misses
+from copem_replay.results.read import Results, read_results
 from tests.helpers.report_pages import changed, eighteen, replayed
 
 LOGS = "logs: [drive.mcap]"
@@ -59,8 +58,8 @@ def test_neither_holds_all_rows(several: Path, tmp_path: Path, monkeypatch: pyte
 
     monkeypatch.setattr(Results, "table", property(whole))
     monkeypatch.setattr(Results, "each", watched)
-    assert write_report(several, tmp_path / "r.html").exists()
-    files, notes = write_figures(load_results(several), tmp_path / "figures", Selection())
+    assert write_html_report(several, tmp_path / "r.html").exists()
+    files, notes = write_figure_files(read_results(several), tmp_path / "figures", Selection())
     assert ({path.stem for path in files}, notes) == (
         {"answer", "differences", "runs", "curves", "distances", "latency_breakdown"}, []
     )  # fmt: skip
@@ -70,41 +69,41 @@ def test_neither_holds_all_rows(several: Path, tmp_path: Path, monkeypatch: pyte
 
 def test_log_by_log_they_are_as_of_all_rows(several: Path) -> None:
     """What goes log by log, against the whole table."""
-    results = load_results(several)
+    results = read_results(several)
     table = results.table
     names = tuple(results.experiment.configurations)
-    of_all = {name: stages(table[table["configuration"] == name], results.experiment, name) for name in names}
-    found = stages_of(results, names)
+    of_all = {name: mean_stages(table[table["configuration"] == name], results.experiment, name) for name in names}
+    found = mean_stages_by_configuration(results, names)
     assert found == {name: pytest.approx(of, abs=2e-9) for name, of in of_all.items()}
     assert any(len(of) > 4 for of in found.values()), "the way of lists that come by a link"
     detected = table.groupby("configuration")["detected"].agg(["sum", "size"])
-    assert how_many(results) == {name: tuple(detected.loc[name]) for name in names}
+    assert count_detected(results) == {name: tuple(detected.loc[name]) for name in names}
     keys = ["log", "object_id", "run"]
     times = table.set_index([*keys, "configuration"])["detection_s"].unstack("configuration")[list(names)]
-    np.testing.assert_array_equal(np.concatenate(list(by_run(results, "detection_s"))), times.to_numpy())
+    np.testing.assert_array_equal(np.concatenate(list(pivot_by_run(results, "detection_s"))), times.to_numpy())
 
 
 def test_in_sight_in_one_log_alone(several: Path) -> None:
     """Where it was never in sight until it was listed it was hidden until then, as if all rows were of one log."""
-    experiment = load_results(several).experiment
+    experiment = read_results(several).experiment
     one = pd.DataFrame({"detected": True, "onset_s": 1.0, "captured_s": [3.0, 4.0], "detection_s": [5.0, 7.0]})
     logs = [one.assign(configuration="half", in_sight_s=sight_s) for sight_s in (2.0, np.nan)]
     results: Any = SimpleNamespace(experiment=experiment, each=lambda *columns: iter(logs))
     expected = {HIDDEN: 1.75, IN_SIGHT: 0.75, TRANSPORT: 2.5, FUSION: 0.0}
-    assert stages_of(results, ["half"]) == {"half": expected}
-    assert stages(pd.concat(logs), experiment, "half") == expected
+    assert mean_stages_by_configuration(results, ["half"]) == {"half": expected}
+    assert mean_stages(pd.concat(logs), experiment, "half") == expected
 
 
 def test_those_that_differ_in_one_log_alone(tmp_path: Path) -> None:
     """Of eighteen configurations the same are drawn of two logs as of the whole table's times."""
     text = eighteen().replace(LOGS, "logs: [drive0.mcap, drive1.mcap]")
-    results = load_results(replayed(tmp_path, text, "drive0.mcap", "drive1.mcap"))
+    results = read_results(replayed(tmp_path, text, "drive0.mcap", "drive1.mcap"))
     names = tuple(results.experiment.configurations)
     table = results.table.set_index(["log", "object_id", "run", "configuration"])["time_to_detection_s"]
     times = table.unstack("configuration").round(6)
     alike = {name: next(one for one in names if times[one].equals(times[name])) for name in names}
-    assert set(that_differ(results, names)) <= set(alike.values())
-    assert set(that_differ(results, names, most=len(set(alike.values())))) == set(alike.values())
+    assert set(find_differing(results, names)) <= set(alike.values())
+    assert set(find_differing(results, names, most=len(set(alike.values())))) == set(alike.values())
 
 
 @st.composite
@@ -131,23 +130,25 @@ def tables(draw: st.DrawFn) -> pd.DataFrame:
 @settings(max_examples=60, deadline=None)
 def test_counts_say_what_rows_say(rows: pd.DataFrame) -> None:
     """The same curve to the last bit, the same bands, limits of the mean, and objects that are missed."""
-    found = tally(rows)
+    found = tally_rows(rows)
     counted = found[found["event"] == DETECTED]
     each = rows.assign(runs=1)
     assert counted["runs"].sum() == len(rows)
-    over = clusters(counted)[0]
+    over = choose_clusters(counted)[0]
     banded = over in ("logs", "objects")
     # Of one object runs are resampled, for which the tally is not taken.
-    one, all_ = (curve_of(of, clusters(of)[1] if banded else None, 1) for of in (counted, each))
+    one, all_ = (build_curve(of, choose_clusters(of)[1] if banded else None, 1) for of in (counted, each))
     for name in ("times_s", "share", *(("low", "high") if banded and len(one.times_s) else ())):
         np.testing.assert_array_equal(getattr(one, name), getattr(all_, name))
     if banded:
         limits = []
         for of in (counted, each):
-            time_s, ending, runs = endings(of)
-            limits.append(mean_limits(time_s, ending, list(clusters(of)[1]), 4.0, 1, runs))
+            time_s, ending, runs = detection_endings(of)
+            limits.append(mean_limits(time_s, ending, list(choose_clusters(of)[1]), 4.0, 1, runs))
         assert (limits[0] is None) == (limits[1] is None)
         assert limits[0] is None or limits[0] == pytest.approx(limits[1], abs=1e-9)
     columns = ["log", "object_id", "missed", "runs", "ended_s", "ended_by"]
-    by_name = [misses(of)[columns].sort_values(["log", "object_id"]).to_numpy().tolist() for of in (counted, each)]
+    by_name = [
+        count_misses(of)[columns].sort_values(["log", "object_id"]).to_numpy().tolist() for of in (counted, each)
+    ]
     assert by_name[0] == by_name[1]

@@ -11,7 +11,7 @@ import pytest
 from pyarrow import parquet
 
 from copem_replay.core.errors import InputError
-from copem_replay.results.compare import compare
+from copem_replay.results.compare import compare_folders
 from tests.helpers.compare_folders import BRAKING, MEASURE, Row, ghosts, row, seen, write_folder
 
 ROWS = [row("ideal", 1.0, 30.0), row("late", 2.0, 20.0)]
@@ -20,7 +20,7 @@ VERDICTS = [r | {"conflict": True, "braking_pass": True} for r in ROWS]
 
 def problems(*folders: Path, **options: Any) -> list[str]:
     with pytest.raises(InputError) as caught:
-        compare(folders, **({"baseline": "first:ideal"} | options))
+        compare_folders(folders, **({"baseline": "first:ideal"} | options))
     assert all("\n" not in problem for problem in caught.value.problems)
     return list(caught.value.problems)
 
@@ -93,7 +93,7 @@ def test_another_conflict_is_refused_where_it_is_braked_for(tmp_path):
     (problem,) = problems(*two(tmp_path, *given))
     assert "measure.conflict: expected null" in problem
     alike = two(tmp_path / "alike", {"braking": BRAKING}, {"braking": BRAKING, "measure": wide})
-    assert len(compare(alike, baseline="first:ideal").table)
+    assert len(compare_folders(alike, baseline="first:ideal").table)
 
 
 def test_every_reason_is_said(tmp_path):
@@ -127,7 +127,7 @@ def test_another_look_at_the_same_object_is_refused(tmp_path, column):
 
 def test_what_does_not_matter_may_differ(tmp_path):
     others = {"visibility": "flat", "measure": {"exact": True, "conflict": {"horizon_s": 3.0, "margin_m": 0.5}}}
-    assert len(compare(two(tmp_path, {}, others), baseline="first:ideal").table) == 9
+    assert len(compare_folders(two(tmp_path, {}, others), baseline="first:ideal").table) == 9
 
 
 def test_keys_that_an_older_version_did_not_have_stand_for_their_defaults(tmp_path):
@@ -136,7 +136,7 @@ def test_keys_that_an_older_version_did_not_have_stand_for_their_defaults(tmp_pa
     for key in ("match", "gospa", "accuracy"):
         del said["measure"][key]
     (folders[1] / "provenance.json").write_text(json.dumps(said))
-    assert len(compare(folders, baseline="first:ideal").table)
+    assert len(compare_folders(folders, baseline="first:ideal").table)
 
 
 # ------------------------------------------------------------------------------------------- damaged folders
@@ -199,7 +199,7 @@ def changed(path: Path, name: str, values: Any) -> None:
 @pytest.mark.parametrize("name", FILES)
 def test_a_column_that_is_missing_or_of_another_kind(tmp_path, name):
     folder = complete(tmp_path)
-    assert len(compare([folder]).table) == 7
+    assert len(compare_folders([folder]).table) == 7
     table = parquet.read_table(folder / name)
     last = {"detections.parquet": "ended_s", "lists.parquet": "ghosts_at"}.get(name, table.column_names[-1])
     changed(folder / name, last, pa.array(["text"] * len(table), pa.string()))
@@ -296,7 +296,7 @@ def test_the_runs_that_both_have_are_compared(tmp_path):
         return [row(name, time, 30.0, run=run) for run, time in enumerate(times) for name in ("ideal", "late")]
 
     first, second = (write_folder(tmp_path / n, rows(*t)) for n, t in (("first", (1, 1, 1)), ("second", (2, 5))))
-    comparison = compare([first, second], baseline="first:ideal", configurations=["second:late"])
+    comparison = compare_folders([first, second], baseline="first:ideal", configurations=["second:late"])
     table = comparison.table.set_index("metric")
     assert table["n"].tolist() == [2, 2, 2]
     assert table.loc["ttd_rmst_s", "difference"] == (1 + 4) / 2
@@ -308,14 +308,14 @@ def test_the_runs_that_both_have_are_compared(tmp_path):
 def test_rows_without_a_partner_are_left_out_and_counted(tmp_path):
     more = [row(name, 5.0, 30.0, object_id="8") for name in ("ideal", "late")]
     first, second = write_folder(tmp_path / "first", ROWS), write_folder(tmp_path / "second", [*ROWS, *more])
-    comparison = compare([first, second], baseline="first:ideal", configurations=["second:late"])
+    comparison = compare_folders([first, second], baseline="first:ideal", configurations=["second:late"])
     assert comparison.table["n"].tolist() == [1, 1, 1]
     assert note_of("left out", comparison.notes) == "1 row of second:late left out: first:ideal has no such object"
 
 
 def test_braking_of_one_folder_only_is_left_out(tmp_path):
     first, second = two(tmp_path, {"braking": BRAKING}, {})
-    comparison = compare([first, second], baseline="first:ideal")
+    comparison = compare_folders([first, second], baseline="first:ideal")
     by = comparison.table.groupby("configuration")["metric"].agg(set)
     assert {name for name, metrics in by.items() if "pass_share" in metrics} == {"first:late"}
     assert note_of("no braking", comparison.notes).startswith(f"{second}: no braking: pass_share is compared only")
@@ -324,7 +324,7 @@ def test_braking_of_one_folder_only_is_left_out(tmp_path):
 def test_without_accuracy_the_rest_is_compared(tmp_path):
     first = complete(tmp_path)
     second = write_folder(tmp_path / "second", ROWS)
-    comparison = compare([first, second], baseline="first:ideal")
+    comparison = compare_folders([first, second], baseline="first:ideal")
     by = comparison.table.groupby("configuration")["metric"].agg(set)
     accuracy = ("position_rmse_m", "gospa_m", "false_positives_per_min", "ttd_rmst_s_equal_ghosts")
     assert by["first:late"] - by["second:late"] == set(accuracy)

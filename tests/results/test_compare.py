@@ -13,13 +13,13 @@ from scipy.stats import binomtest
 
 from copem_replay.core.errors import InputError
 from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_incidence, restricted_mean
-from copem_replay.results.compare import Comparison, compare
+from copem_replay.results.compare import Comparison, compare_folders
 from copem_replay.results.read import open_results
 from tests.helpers.compare_folders import BRAKING, Row, limits_of, row, write_folder
 
 
 def compared(path: Path, rows: Sequence[Row], **given: Any) -> Comparison:
-    return compare([write_folder(path / "study", rows, **given)])
+    return compare_folders([write_folder(path / "study", rows, **given)])
 
 
 def of(comparison: Comparison, metric: str, log: str = "all") -> Any:
@@ -269,7 +269,7 @@ def test_means_of_all_logs_are_those_of_the_logs_by_their_rows(tmp_path):
 def test_the_same_rows_in_another_folder_differ_in_nothing(tmp_path):
     rows = [r | {"configuration": "x"} for r in random_rows(["x"])]
     folders = [write_folder(tmp_path / name, rows, braking=BRAKING) for name in ("first", "second")]
-    table = compare(folders, baseline="first:x").table
+    table = compare_folders(folders, baseline="first:x").table
     assert set(table["metric"]) == {"detected_share", "ttd_rmst_s", "dad_median_m", "pass_share"}
     assert (table["difference"] == 0.0).all()
     table = table[table["log"] == "all"].set_index("metric")
@@ -356,10 +356,10 @@ def test_of_a_detection_and_a_censoring_at_one_time_the_detection_comes_first(tm
 
 def test_some_metrics_are_those_of_all_and_an_open_folder_is_as_its_path(tmp_path):
     folder = write_folder(tmp_path / "study", random_rows(["ideal", "late", "later"]))
-    every = compare([folder]).table
-    some = compare([open_results(folder)], metrics=("dad_median_m", "ttd_rmst_s")).table
+    every = compare_folders([folder]).table
+    some = compare_folders([open_results(folder)], metrics=("dad_median_m", "ttd_rmst_s")).table
     expected = every[every["metric"].isin(["dad_median_m", "ttd_rmst_s"])].reset_index(drop=True)
     assert set(every["metric"]) > set(some["metric"])
     pd.testing.assert_frame_equal(some, expected)
     with pytest.raises(InputError, match="expected each folder once, found it twice"):
-        compare([open_results(folder), folder])
+        compare_folders([open_results(folder), folder])

@@ -14,8 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyarrow import compute, parquet
 
-from copem_replay.results.compare import compare
-from copem_replay.results.tables import file_of
+from copem_replay.results.compare import compare_folders
+from copem_replay.results.schema import table_file
 from tests.helpers.compare_folders import BRAKING, Row, ghosts, limits_of, row, step, write_folder
 from tests.oracles import compare as oracle
 
@@ -75,7 +75,7 @@ def test_figures_are_those_of_pairs_one_by_one(seed, count):
     given_study = study(seed, count)
     rows, lists = given_study["rows"], given_study["lists"]
     with TemporaryDirectory() as scratch:
-        table = compare([write_folder(Path(scratch) / "study", **given_study)]).table
+        table = compare_folders([write_folder(Path(scratch) / "study", **given_study)]).table
     logs = list(given_study["logs"])
     for log in ["all", *(logs if len(logs) > 1 else [])]:
         there = [log] if log != "all" else logs
@@ -113,7 +113,7 @@ def test_figures_are_those_of_pairs_one_by_one(seed, count):
 def test_intervals_resample_whole_logs(seed):
     given_study = study(seed, 5, fewest=2)
     with TemporaryDirectory() as scratch:
-        table = compare([write_folder(Path(scratch) / "study", **given_study)]).overall.set_index("metric")
+        table = compare_folders([write_folder(Path(scratch) / "study", **given_study)]).overall.set_index("metric")
     found = oracle.pairs(given_study["rows"], "late", "ideal")
     logs = sorted({pair[0]["log"] for pair in found})
     of_metric = {
@@ -145,20 +145,20 @@ def test_files_folders_and_orders_are_alike(seed, count):
     given_study, rnd = study(seed, count), Random(seed)
     with TemporaryDirectory() as scratch:
         folder = write_folder(Path(scratch) / "study", **given_study)
-        whole = compare([folder], false_positives_per_min=5.0)
+        whole = compare_folders([folder], false_positives_per_min=5.0)
         order = list(range(len(given_study["rows"])))
         rnd.shuffle(order)
         for name in ("detections.parquet", "accuracy.parquet"):
             table = parquet.read_table(folder / name).take(order)
             parquet.write_table(table, folder / name, row_group_size=rnd.randint(1, 4))
-        shuffled = compare([folder], false_positives_per_min=5.0)
+        shuffled = compare_folders([folder], false_positives_per_min=5.0)
         table = parquet.read_table(folder / "detections.parquet")
         (folder / "detections.parquet").unlink()
         (folder / "detections.parquet").mkdir()
         for log in table["log"].unique().to_pylist():
             mine = table.filter(compute.equal(table["log"], log))
-            parquet.write_table(mine, file_of(folder / "detections.parquet", log))
-        apart = compare([folder], false_positives_per_min=5.0)
+            parquet.write_table(mine, table_file(folder / "detections.parquet", log))
+        apart = compare_folders([folder], false_positives_per_min=5.0)
     for other in (shuffled, apart):
         pd.testing.assert_frame_equal(other.table, whole.table, check_exact=True)
         assert other.notes == whole.notes
@@ -182,7 +182,7 @@ def test_runs_told_as_logs_give_the_same_over_all(seed):
     )
     with TemporaryDirectory() as scratch:
         one, several = (
-            compare([write_folder(Path(scratch) / name, **of)], false_positives_per_min=5.0).overall
+            compare_folders([write_folder(Path(scratch) / name, **of)], false_positives_per_min=5.0).overall
             for name, of in (("one", given_study), ("several", apart))
         )
     columns = [name for name in one.columns if not name.startswith(("interval", "low", "high"))]

@@ -12,8 +12,8 @@ import pandas as pd
 import pytest
 from pyarrow import parquet
 
-from copem_replay.pipeline.run import run
-from copem_replay.results.compare.compare import compare
+from copem_replay.pipeline.run import run_experiment
+from copem_replay.results.compare.compare import compare_folders
 from copem_replay.results.write import write_results
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
 
@@ -47,7 +47,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     }  # fmt: skip
     recordings = [replace(log, path=path / "scene.mcap")]
     plan = experiment(**more)
-    write_results(path / "out", plan, recordings, run(plan, recordings), exporters=())
+    write_results(path / "out", plan, recordings, run_experiment(plan, recordings), exporters=())
     return path / "out"
 
 
@@ -79,7 +79,7 @@ def plainly(folder: Path, name: str, metric: str) -> tuple[float, float]:
 @pytest.mark.parametrize("metric", ["position_rmse_m", "gospa_m"])
 @pytest.mark.parametrize("name", ["gnn", "alone"])
 def test_regret_over_shared_instants_of_each_run(folder: Path, name: str, metric: str) -> None:
-    table = compare([folder], configurations=[name]).overall.set_index("metric")
+    table = compare_folders([folder], configurations=[name]).overall.set_index("metric")
     expected = plainly(folder, name, metric)
     assert table.loc[metric, ["value", "baseline_value"]].tolist() == pytest.approx(expected, rel=1e-6)
     assert table.loc[metric, "difference"] == pytest.approx(expected[0] - expected[1], rel=1e-6)
@@ -87,7 +87,7 @@ def test_regret_over_shared_instants_of_each_run(folder: Path, name: str, metric
 
 def test_what_is_compared_is_that_of_other_configurations(folder: Path) -> None:
     """All metrics, with intervals; what is left out are instants that one side does not have, counted over the runs."""
-    comparison = compare([folder])
+    comparison = compare_folders([folder])
     metrics = comparison.overall.groupby("configuration")["metric"].agg(set)
     assert {"position_rmse_m", "gospa_m", "false_positives_per_min"} <= metrics["gnn"] & metrics["alone"]
     assert not any("no accuracy.parquet" in note for note in comparison.notes)
@@ -103,18 +103,17 @@ def test_what_is_compared_is_that_of_other_configurations(folder: Path) -> None:
 
 def test_fewer_runs_are_the_first_ones(folder: Path) -> None:
     """Instants of runs that are not compared are not read for others."""
-    from copem_replay.results.compare.configuration_data import side_of
-    from copem_replay.results.compare.labels import named
-    from copem_replay.results.compare.pairing import grid_of
+    from copem_replay.results.compare.labels import label_configurations
+    from copem_replay.results.compare.pairing import build_grid, lay_out_configuration
     from copem_replay.results.read import open_results
 
     results = open_results(folder)
     (log,) = results.provenance.logs
     tables = results.rows_of(log.name)
-    whole = grid_of(0, [tables["detections.parquet"]], results.provenance.runs, 0)
+    whole = build_grid(0, [tables["detections.parquet"]], results.provenance.runs, 0)
     fewer = replace(whole, runs=2)
-    gnn = next(one for one in named([results]) if one.label == "gnn")
-    six, two = (side_of(gnn, tables, grid).accuracy for grid in (whole, fewer))
+    gnn = next(one for one in label_configurations([results]) if one.label == "gnn")
+    six, two = (lay_out_configuration(gnn, tables, grid).accuracy for grid in (whole, fewer))
     assert six is not None
     assert two is not None
     assert (six.by_run, len(six.of_run), len(two.of_run)) == (True, 6, 2)

@@ -11,8 +11,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from copem_replay.results.compare import Comparison, compare
-from copem_replay.results.compare import per_list as lists_module
+from copem_replay.results.compare import Comparison, compare_folders
+from copem_replay.results.compare import pairing as lists_module
 from tests.helpers.compare_folders import Row, ghosts, limits_of, row, seen, step, write_folder
 
 FOUR = [None] * 4
@@ -21,7 +21,9 @@ FOUR = [None] * 4
 def compared(
     path: Path, rows: Sequence[Row], *, false_positives_per_min: float | None = None, **given: Any
 ) -> Comparison:
-    return compare([write_folder(path / "study", rows, **given)], false_positives_per_min=false_positives_per_min)
+    return compare_folders(
+        [write_folder(path / "study", rows, **given)], false_positives_per_min=false_positives_per_min
+    )
 
 
 def of(comparison: Comparison, metric: str) -> Any:
@@ -58,7 +60,7 @@ def test_lists_begin_where_the_objects_stay_does(tmp_path):
     error = of(compared(tmp_path, rows), "position_rmse_m")  # the instants 1 s and 2 s
     assert error["value"] == pytest.approx(math.sqrt((25 + 49) / 2))
     assert error["baseline_value"] == pytest.approx(math.sqrt((1 + 4) / 2))
-    back = compare([tmp_path / "study"], baseline="late")
+    back = compare_folders([tmp_path / "study"], baseline="late")
     assert of(back, "position_rmse_m")["difference"] == pytest.approx(-error["difference"])
 
 
@@ -169,7 +171,7 @@ def test_lists_are_paired_part_by_part_as_well_as_at_once(tmp_path, monkeypatch)
     ]
     whole = compared(tmp_path, rows).table
     monkeypatch.setattr(lists_module, "_VALUES", 5)
-    assert compare([tmp_path / "study"]).table.equals(whole)
+    assert compare_folders([tmp_path / "study"]).table.equals(whole)
 
 
 # ------------------------------------------------------------------------------------------------- ghosts
@@ -271,7 +273,7 @@ def test_the_rate_is_the_baselines_own_unless_given(tmp_path):
     comparison = at_equal_ghosts(tmp_path, None, lists=lists)
     assert comparison.false_positives_per_min == 20.0
     assert of(comparison, "ttd_rmst_s_equal_ghosts")["existence"] == 0.5
-    back = compare([tmp_path / "study"], baseline="late")
+    back = compare_folders([tmp_path / "study"], baseline="late")
     assert back.false_positives_per_min == 60.0
     assert of(back, "ttd_rmst_s_equal_ghosts")["difference"] == -0.5
 
@@ -333,7 +335,7 @@ def test_of_the_truth_nothing_is_at_equal_ghosts(tmp_path):
     (folder / "experiment.yaml").write_text(
         "version: 1\nconfigurations:\n  ideal: {units: truth}\n  late: {units: all}\n"
     )
-    comparison = compare([folder], false_positives_per_min=20)
+    comparison = compare_folders([folder], false_positives_per_min=20)
     assert f"late: {NONE}the baseline is the truth, which has no ghosts" in comparison.notes
     assert "ttd_rmst_s_equal_ghosts" not in set(comparison.table["metric"])
 
@@ -363,7 +365,7 @@ def test_the_same_folder_again_differs_in_nothing(tmp_path):
     lists = [ghosts("x", 20 + run, run=run, existence=[0.0, 0.5], ghosts_at=[20 + run, 3]) for run in range(2)]
     steps = [step("x", 0.9, 0.0, **w) for w in where]
     folders = [write_folder(tmp_path / name, rows, lists=lists, steps=steps) for name in ("first", "second")]
-    comparison = compare(folders, baseline="first:x")
+    comparison = compare_folders(folders, baseline="first:x")
     assert comparison.table["metric"].tolist() == [
         "detected_share", "ttd_rmst_s", "ttd_rmst_s_equal_ghosts", "dad_median_m", "position_rmse_m", "gospa_m",
         "false_positives_per_min",
@@ -383,17 +385,17 @@ def test_how_few_lists_both_have_is_said(tmp_path):
     """Of four instants two are the other's; of the second log none."""
     rows = [seen(name, FOUR, FOUR, log=log) for name in ("ideal", "late") for log in ("a", "b")]
     folder = write_folder(tmp_path / "one", rows[::2], available_s={"late": [0.0, 0.5, 2.0, 2.5]})
-    assert compare([folder]).notes[-2:][0] == (
+    assert compare_folders([folder]).notes[-2:][0] == (
         "late: position_rmse_m and gospa_m are over the 2 instants that both have, of 4 and the 4 of ideal"
     )
     folder = write_folder(tmp_path / "two", rows, available_s={"late": [0.25, 0.5, 0.75, 2.5]})
     assert any(
         note == "late: position_rmse_m and gospa_m are over the 0 instants that both have, of 8 and the 8 of ideal; "
         "none in a, b"
-        for note in compare([folder]).notes
+        for note in compare_folders([folder]).notes
     )
     folder = write_folder(tmp_path / "same", rows)
-    assert not any("instants that both have" in note for note in compare([folder]).notes)
+    assert not any("instants that both have" in note for note in compare_folders([folder]).notes)
 
 
 @pytest.mark.parametrize(("always", "said"), [(False, 1), (True, 0)])
@@ -402,7 +404,7 @@ def test_who_detects_by_truth_id_is_said(tmp_path, always, said):
     path = write_folder(tmp_path / "study", rows, measure={"match": {"gate_m": 3.0, "always": always}})
     fusions = "configurations: {GT: {units: truth}, ideal: {units: all}, gnn: {units: all, fusion: {kind: gnn}}}"
     (path / "experiment.yaml").write_text(f"version: 1\n{fusions}\n")
-    notes = [note for note in compare([path]).notes if "by truth id" in note]
+    notes = [note for note in compare_folders([path]).notes if "by truth id" in note]
     assert (
         notes
         == [
@@ -411,4 +413,4 @@ def test_who_detects_by_truth_id_is_said(tmp_path, always, said):
         ]
         * said
     )
-    assert not [note for note in compare([path], configurations=["GT"]).notes if "by truth id" in note]
+    assert not [note for note in compare_folders([path], configurations=["GT"]).notes if "by truth id" in note]

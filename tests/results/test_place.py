@@ -16,12 +16,14 @@ from typing import Any
 
 import pytest
 
-from copem_replay.core import scratch
+from copem_replay.core import files as scratch
 from copem_replay.core.errors import OutputError
 from copem_replay.core.files import atomic_file
-from copem_replay.pipeline import gather
+from copem_replay.pipeline import run as gather
 from copem_replay.pipeline import run as runs
-from copem_replay.results import belongings, lock, place
+from copem_replay.results import folder as belongings
+from copem_replay.results import folder as lock
+from copem_replay.results import folder as place
 from tests.helpers.experiments import TEXT, changed, drive
 from tests.system.test_cli import ROOT, Call, Ended, call, here, installed, written
 
@@ -40,7 +42,9 @@ def old(here: Path, call: Call) -> Path:
     (folder / "figures/more/mine.svg").write_text("<svg/>")
     (folder / "figures/runs.png").write_text("of the old results")
     (folder / "report.html").write_text("of the old results")
-    belongings.list_made(folder, [folder / "figures/runs.png", folder / "report.html"])  # as `plot` and `report` do
+    belongings.add_to_made_list(
+        folder, [folder / "figures/runs.png", folder / "report.html"]
+    )  # as `plot` and `report` do
     (folder / "empty").mkdir()
     (folder / "link").symlink_to("../../drive.mcap")
     return folder
@@ -79,11 +83,11 @@ class TestOthers:
         if not links:
             monkeypatch.setattr(os, "link", raises(errno.EPERM))
         if not in_one_step:
-            monkeypatch.setattr(place, "exchange", lambda *_: False)
+            monkeypatch.setattr(place, "exchange_folders", lambda *_: False)
         before = written(old)
         inode = (old / "notes.txt").stat().st_ino
         assert again(call).lines == []
-        assert set(belongings.names_in(old)) == MINE | set(json.loads(before["provenance.json"])["files"])
+        assert set(belongings.list_names(old)) == MINE | set(json.loads(before["provenance.json"])["files"])
         assert (old / "notes.txt").read_text() == "mine\n"
         assert ((old / "notes.txt").stat().st_ino == inode) is links
         assert os.readlink(old / "link") == "../../drive.mcap"
@@ -123,13 +127,13 @@ class TestOthers:
     def test_that_came_while_the_folder_was_exchanged(
         self, old: Path, call: Call, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        exchange = place.exchange
+        exchange = place.exchange_folders
 
         def late(one: Path, other: Path) -> bool:
             (other / "late.txt").write_text("late\n")
             return exchange(one, other)
 
-        monkeypatch.setattr(place, "exchange", late)
+        monkeypatch.setattr(place, "exchange_folders", late)
         assert again(call).code == 0
         assert (old / "late.txt").read_text() == "late\n"
         assert os.listdir(old.parent) == ["e"]
@@ -140,7 +144,7 @@ class TestOthers:
         files = said.pop("files")
         (old / "provenance.json").write_text(json.dumps(said))
         assert again(call).lines == []
-        assert set(belongings.names_in(old)) == MINE | set(files)
+        assert set(belongings.list_names(old)) == MINE | set(files)
 
     @pytest.mark.parametrize("text", ["", "{", "[]", '{"tool": "another"}'])
     def test_a_folder_with_the_provenance_of_something_else_is_not_replaced(
@@ -194,7 +198,7 @@ class TestMade:
             assert call(*command).code == 0, command
         results = set(json.loads((folder / "provenance.json").read_text())["files"])
         assert {"sweep.csv", "exact.parquet", "bands.csv", "replay_1.rrd", "replay.configurations_7.rrd"} <= results
-        made = set(belongings.names_in(folder)) - results
+        made = set(belongings.list_names(folder)) - results
         assert {
             f"figures/{name}.{kind}" for name in ("answer", "differences", "sweeps") for kind in ("png", "svg")
         } <= made
@@ -205,7 +209,7 @@ class TestMade:
         (here / "e.yaml").write_text(TEXT.replace("probability: 0.5", "probability: 0.9"))
         assert call("run", "e.yaml", "--overwrite").lines == []
         results = set(json.loads((folder / "provenance.json").read_text())["files"])
-        assert set(belongings.names_in(folder)) == results | {"figures/mine.svg", "notes.txt"}
+        assert set(belongings.list_names(folder)) == results | {"figures/mine.svg", "notes.txt"}
         assert os.listdir(here / "out") == ["e"]
 
     def test_of_other_results_stays(self, here: Path, call: Call) -> None:
@@ -239,7 +243,7 @@ class TestMade:
         assert (old.parent / "keep.txt").read_text() == "keep\n"
         assert (old / "notes.txt").read_text() == "mine\n"
         assert (old / "elsewhere").is_symlink()
-        assert set(belongings.names_in(old)) - set(json.loads((old / "provenance.json").read_text())["files"]) == {
+        assert set(belongings.list_names(old)) - set(json.loads((old / "provenance.json").read_text())["files"]) == {
             *MINE, "elsewhere",
         }  # fmt: skip
         assert sorted(os.listdir(old.parent)) == ["e", "keep.txt"]
@@ -253,7 +257,7 @@ class TestMade:
         assert call("layout", "out/e").code == 2  # shows nothing: writes nothing
         assert call("report", "out/e", "--out", "out/e/late.html").code == 0
         assert again(call).lines == []
-        assert set(belongings.names_in(old)) == MINE | set(json.loads((old / "provenance.json").read_text())["files"])
+        assert set(belongings.list_names(old)) == MINE | set(json.loads((old / "provenance.json").read_text())["files"])
 
     @pytest.mark.parametrize("kind", ["link", "folder", "pipe"])
     def test_something_else_in_the_place_of_the_list(self, here: Path, call: Call, kind: str) -> None:
@@ -277,16 +281,16 @@ class TestMade:
     def test_what_is_made_while_the_folder_is_exchanged_goes_with_the_old_results(
         self, old: Path, call: Call, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        exchange = place.exchange
+        exchange = place.exchange_folders
 
         def late(one: Path, other: Path) -> bool:
-            belongings.list_made(other, [other / "late.html"])
+            belongings.add_to_made_list(other, [other / "late.html"])
             (other / "late.html").write_text("of the old results")
             return exchange(one, other)
 
-        monkeypatch.setattr(place, "exchange", late)
+        monkeypatch.setattr(place, "exchange_folders", late)
         assert again(call).lines == []
-        assert set(belongings.names_in(old)) == MINE | set(json.loads((old / "provenance.json").read_text())["files"])
+        assert set(belongings.list_names(old)) == MINE | set(json.loads((old / "provenance.json").read_text())["files"])
         assert os.listdir(old.parent) == ["e"]
 
     @pytest.mark.parametrize(
@@ -297,24 +301,24 @@ class TestMade:
     ) -> None:
         """So that a process that is killed at any instant leaves none that outlives its results."""
         assert call("run", "e.yaml").code == 0
-        folder, before = here / "out/e", set(belongings.names_in(here / "out/e"))
+        folder, before = here / "out/e", set(belongings.list_names(here / "out/e"))
         replace_ = os.replace
 
         def watched(source: Any, target: Any) -> None:
-            assert Path(target).relative_to("out/e").as_posix() in belongings.made_in(folder)
+            assert Path(target).relative_to("out/e").as_posix() in belongings.read_made_names(folder)
             replace_(source, target)
 
         monkeypatch.setattr(os, "replace", watched)
         assert call(command[0], "out/e", *command[1:]).code == 0
-        assert set(belongings.names_in(folder)) - before <= belongings.made_in(folder)
+        assert set(belongings.list_names(folder)) - before <= belongings.read_made_names(folder)
 
 
 class TestOneWriter:
     def test_a_second_run_is_refused_before_it_replays(
         self, here: Path, call: Call, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        with place.taken(here / "out/e", overwrite=False):
-            monkeypatch.setattr(gather, "outcomes", raises(errno.EIO))
+        with place.take_place(here / "out/e", overwrite=False):
+            monkeypatch.setattr(gather, "replay_outcomes", raises(errno.EIO))
             ended = call("run", "e.yaml")
         assert ended.code == 2
         assert ended.lines == [
@@ -327,9 +331,9 @@ class TestOneWriter:
         """The first stands still until the second has ended; and then is done."""
         code = (
             "import sys\nfrom copem_replay.cli import main as cli\nfrom copem_replay.pipeline import run\n"
-            "replay = run.run\n"
+            "replay = run.run_experiment\n"
             "def waits(*a, **k):\n    print('now', flush=True)\n    sys.stdin.readline()\n    return replay(*a, **k)\n"
-            "run.run = waits\nsys.argv = ['copem-replay', 'run', 'e.yaml']\ncli.main()\n"
+            "run.run_experiment = waits\nsys.argv = ['copem-replay', 'run', 'e.yaml']\ncli.main()\n"
         )
         first = subprocess.Popen(
             [sys.executable, "-c", code], cwd=here, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
@@ -348,7 +352,7 @@ class TestOneWriter:
         self, here: Path, call: Call, monkeypatch: pytest.MonkeyPatch, code: int
     ) -> None:
         monkeypatch.setattr(fcntl, "flock", raises(code))
-        replay = runs.run
+        replay = runs.run_experiment
         seeds = iter("23")
 
         def meanwhile(*a: Any, **k: Any) -> Any:
@@ -357,7 +361,7 @@ class TestOneWriter:
                 assert call("run", "e.yaml", "--seed", seed).code == 0
             return replay(*a, **k)
 
-        monkeypatch.setattr(runs, "run", meanwhile)
+        monkeypatch.setattr(runs, "run_experiment", meanwhile)
         ended = call("run", "e.yaml")
         assert ended.code == 0
         found = {
@@ -374,7 +378,7 @@ class TestOneWriter:
         self, old: Path, call: Call, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(fcntl, "flock", raises(errno.ENOLCK))
-        exchange = place.exchange
+        exchange = place.exchange_folders
         count = iter(range(9))
 
         def meanwhile(one: Path, other: Path) -> bool:
@@ -382,7 +386,7 @@ class TestOneWriter:
                 assert again(call).code == 0
             return exchange(one, other)
 
-        monkeypatch.setattr(place, "exchange", meanwhile)
+        monkeypatch.setattr(place, "exchange_folders", meanwhile)
         assert call("run", "e.yaml", "--seed", "6", "--overwrite").code == 0
         seeds = {path.name: json.loads((path / "provenance.json").read_text())["seed"] for path in old.parent.iterdir()}
         assert seeds == {"e": 5, "e-2": 6}
@@ -396,7 +400,7 @@ class TestOneWriter:
     def test_a_lock_file_that_goes_before_it_is_locked(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """What was opened has no name any more: the lock of another file is taken."""
         path = tmp_path / ".e.lock"
-        opened = lock._open
+        opened = lock._open_lock
         left = [1, 1]
 
         def vanishing(path: Path) -> int:
@@ -406,10 +410,10 @@ class TestOneWriter:
                 path.unlink()
             return fd
 
-        monkeypatch.setattr(lock, "_open", vanishing)
-        with lock.only_writer(tmp_path / "e"):
+        monkeypatch.setattr(lock, "_open_lock", vanishing)
+        with lock.lock_folder(tmp_path / "e"):
             assert not left
-            with pytest.raises(OutputError, match="another run"), lock.only_writer(tmp_path / "e"):
+            with pytest.raises(OutputError, match="another run"), lock.lock_folder(tmp_path / "e"):
                 pass
             assert path.exists()
         assert not path.exists()
@@ -438,7 +442,7 @@ class TestFlushed:
     ) -> None:
         (old.parents[1] / "e.yaml").write_text(SHOWN)
         flushed: set[tuple[int, int]] = set()
-        fsync, exchange = os.fsync, place.exchange
+        fsync, exchange = os.fsync, place.exchange_folders
 
         def noted(fd: int) -> None:
             found = os.fstat(fd)
@@ -453,7 +457,7 @@ class TestFlushed:
             return exchange(new, other)
 
         monkeypatch.setattr(os, "fsync", noted)
-        monkeypatch.setattr(place, "exchange", ready)
+        monkeypatch.setattr(place, "exchange_folders", ready)
         assert again(call).code == 0
         assert (old.parent.stat().st_dev, old.parent.stat().st_ino) in flushed
 
@@ -609,11 +613,11 @@ def test_what_is_made_of_old_results_does_not_get_among_new_ones(
         return replaced
 
     monkeypatch.setitem(FIGURES, "curves", replace(FIGURES["curves"], draw=meanwhile(FIGURES["curves"].draw)))
-    monkeypatch.setattr(page, "page", meanwhile(page.page))
+    monkeypatch.setattr(page, "build_page", meanwhile(page.build_page))
     ended = call(command, "out/e")
     assert ended.code == 2
     assert ended.lines[-1] == "out/e: other results took its place while it was read; do it once more"
-    assert set(belongings.names_in(old)) == MINE | set(json.loads((old / "provenance.json").read_text())["files"])
+    assert set(belongings.list_names(old)) == MINE | set(json.loads((old / "provenance.json").read_text())["files"])
 
 
 def test_tables_of_old_and_new_results_are_not_read_as_one(
@@ -621,7 +625,7 @@ def test_tables_of_old_and_new_results_are_not_read_as_one(
 ) -> None:
     from copem_replay.results import read
 
-    load = read.load
+    load = read.read_experiment_file
     replaced = iter([True])
 
     def meanwhile(path: Path) -> Any:
@@ -629,7 +633,7 @@ def test_tables_of_old_and_new_results_are_not_read_as_one(
             assert again(call).code == 0
         return load(path)
 
-    monkeypatch.setattr(read, "load", meanwhile)
+    monkeypatch.setattr(read, "read_experiment_file", meanwhile)
     ended = call("compare", "out/e", "--baseline", "GT")
     assert (ended.code, ended.lines[-1]) == (
         2,

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from copem_replay.core.errors import InputError
-from copem_replay.results.read import load_results, open_results
+from copem_replay.results.read import open_results, read_results
 from tests.helpers.compare_folders import row, write_folder
 
 
@@ -37,7 +37,7 @@ def test_files_are_read_when_they_are_asked_for(folder: Path) -> None:
     with pytest.raises(InputError, match=r"experiment\.yaml:1: logs: missing"):
         _ = found.table
     with pytest.raises(InputError, match=r"found no summary\.csv in it"):
-        load_results(folder)
+        read_results(folder)
 
 
 def test_tables_of_other_results_are_refused(folder: Path, tmp_path: Path) -> None:

@@ -14,11 +14,11 @@ from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import Solid
 from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import read_logs
-from copem_replay.io.truth_digest import truth_digest
-from copem_replay.pipeline.run import run
-from copem_replay.results.compare.compare import Comparison, compare
+from copem_replay.io.ground_truth import truth_digest
+from copem_replay.pipeline.run import run_experiment
+from copem_replay.results.compare.compare import Comparison, compare_folders
 from copem_replay.results.write import write_results
-from copem_replay.viewer.side_by_side import write_beside
+from copem_replay.viewer.side_by_side import write_side_by_side
 from tests.helpers.recordings import Obj, Topic, truth_topic, write_mcap
 from tests.helpers.scenes import Thing, driving, recording, standing
 from tests.io.test_recorded_units import car, list_of
@@ -71,7 +71,7 @@ def results(folder: Path, path: Path, topic: str = "stack", **changes: Any) -> P
     } | changes)  # fmt: skip
     recordings, refused = read_logs(experiment, [path], None)
     assert not refused
-    write_results(folder, experiment, recordings, run(experiment, recordings), exporters=())
+    write_results(folder, experiment, recordings, run_experiment(experiment, recordings), exporters=())
     return folder
 
 
@@ -85,20 +85,20 @@ def test_two_bags_of_one_drive(tmp_path: Path) -> None:
     one = results(tmp_path / "one", bag(tmp_path / "1" / "drive.mcap", [0.7, 1.2, 1.7]))
     lists_s = [0.4 + 0.1 * k for k in range(10)]
     two = results(tmp_path / "two", bag(tmp_path / "2" / "drive.mcap", lists_s, "fused"), "fused")
-    comparison = compare([one, two], baseline="one:stack", configurations=["two:stack"])
+    comparison = compare_folders([one, two], baseline="one:stack", configurations=["two:stack"])
     assert times(comparison) == {"two:stack": pytest.approx(-0.3)}
     assert comparison.notes[0] == (
         f"{two} differs from {one} in the recording of log drive (same truth); configurations.stack.recorded.topic "
         "(stack, fused); list_rate_hz of stack (2, 10)"
     )
     with pytest.raises(InputError, match=r"log drive: expected the recording of .*, found another of the same drive"):
-        write_beside(tmp_path / "x.rrd", [one, two], configurations=["two:stack"], baseline="one:stack")
+        write_side_by_side(tmp_path / "x.rrd", [one, two], configurations=["two:stack"], baseline="one:stack")
 
 
 def test_the_same_folder_again_differs_in_nothing(tmp_path: Path) -> None:
     path = bag(tmp_path / "drive.mcap", [0.7])
     folders = [results(tmp_path / name, path) for name in ("one", "two")]
-    assert not any("differs" in note for note in compare(folders, baseline="one:stack").notes)
+    assert not any("differs" in note for note in compare_folders(folders, baseline="one:stack").notes)
 
 
 class TestOtherNames:
@@ -107,7 +107,7 @@ class TestOtherNames:
         return [results(tmp_path / name, path, **changes) for name, path in zip(("one", "two"), paths, strict=True)]
 
     def test_pair_where_nothing_is_drawn(self, tmp_path: Path) -> None:
-        comparison = compare(self.two(tmp_path), baseline="one:stack")
+        comparison = compare_folders(self.two(tmp_path), baseline="one:stack")
         assert times(comparison)["two:stack"] == pytest.approx(-0.3)
         assert "the name of log v1 (v2); the recording of log v1 (same truth)" in comparison.notes[0]
         assert set(comparison.table["log"]) == {"all"}
@@ -117,28 +117,28 @@ class TestOtherNames:
         configurations = {"stack": stack, "PEM": {"units": ["ego"]}}
         folders = self.two(tmp_path, units=PEM, pems=HALF, configurations=configurations)
         with pytest.raises(InputError) as caught:
-            compare(folders, baseline="one:stack")
+            compare_folders(folders, baseline="one:stack")
         assert caught.value.problems == (
             f"{folders[1]}: log v2: expected the name v1 as in {folders[0]}, for what is drawn depends on it; run it "
             "again with `logs: [{file: …, name: v1}]`",
         )
         # Of what is not drawn, and within one folder, nothing depends on the name.
-        assert times(compare(folders, baseline="one:stack", configurations=["two:stack"]))
-        assert times(compare(folders, baseline="one:stack", configurations=["one:PEM"]))
+        assert times(compare_folders(folders, baseline="one:stack", configurations=["two:stack"]))
+        assert times(compare_folders(folders, baseline="one:stack", configurations=["one:PEM"]))
 
     def test_a_driver_who_is_drawn_is_refused(self, tmp_path: Path) -> None:
         gamma = {"kind": "gamma", "shape": 2.0, "mean_s": 0.5}
         braking = {"driver": {"kind": "constant_deceleration", "a_max_mps2": 8.0, "reaction": gamma}}
         folders = self.two(tmp_path, braking=braking)
         with pytest.raises(InputError, match="expected the name v1"):
-            compare(folders, baseline="one:stack", configurations=["two:stack"])
+            compare_folders(folders, baseline="one:stack", configurations=["two:stack"])
 
 
 def test_another_drive_is_refused(tmp_path: Path) -> None:
     one = results(tmp_path / "one", bag(tmp_path / "1" / "drive.mcap", [0.7]))
     two = results(tmp_path / "two", bag(tmp_path / "2" / "drive.mcap", [0.7], x_m=30.1))
     with pytest.raises(InputError) as caught:
-        compare([one, two], baseline="one:stack")
+        compare_folders([one, two], baseline="one:stack")
     assert caught.value.problems == (
         f"{two}: expected the logs of {one}, found drive missing and drive of another truth",
     )
@@ -147,7 +147,7 @@ def test_another_drive_is_refused(tmp_path: Path) -> None:
 def test_a_truth_of_another_topic_is_the_same(tmp_path: Path) -> None:
     one = results(tmp_path / "one", bag(tmp_path / "1" / "drive.mcap", [0.7]))
     two = results(tmp_path / "two", bag(tmp_path / "2" / "drive.mcap", [0.7], truth="objects"), ego="1")
-    comparison = compare([one, two], baseline="one:stack")
+    comparison = compare_folders([one, two], baseline="one:stack")
     assert "the topic of its truth (truth, objects)" in comparison.notes[0]
     assert times(comparison)["two:stack"] == 0
 
@@ -160,4 +160,4 @@ def test_results_of_before_are_told_by_their_files(tmp_path: Path) -> None:
     del said["logs"][0]["truth"]
     (two / "provenance.json").write_text(json.dumps(said))
     with pytest.raises(InputError, match=r"drive of other content \(SHA-256\)"):
-        compare([one, two], baseline="one:stack")
+        compare_folders([one, two], baseline="one:stack")

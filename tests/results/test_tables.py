@@ -16,12 +16,12 @@ from copem_replay.core.errors import InputError, OutputError
 from copem_replay.results.compare import (
     Comparison,
     check_out,
-    compare,
+    compare_folders,
     comparison_markdown,
     comparison_text,
     write_comparison,
 )
-from copem_replay.results.compare.tables import in_markdown
+from copem_replay.results.compare.tables import escape_markdown
 from tests.helpers.compare_folders import Row, row, write_folder
 
 
@@ -35,7 +35,7 @@ def study(tmp_path: Path, name: str, *configurations: str, **given: Any) -> Path
 
 def problem(*folders: Path, **options: Any) -> str:
     with pytest.raises(InputError) as caught:
-        compare(folders, **options)
+        compare_folders(folders, **options)
     (found,) = caught.value.problems
     return found
 
@@ -44,47 +44,47 @@ def problem(*folders: Path, **options: Any) -> str:
 
 
 def test_all_configurations_are_compared_with_the_ideal(tmp_path):
-    comparison = compare([study(tmp_path, "a", "GT", "ideal", "PEM")])
+    comparison = compare_folders([study(tmp_path, "a", "GT", "ideal", "PEM")])
     assert comparison.baseline == "ideal"
     assert comparison.configurations == ("GT", "PEM")
 
 
 def test_names_that_several_folders_have_get_the_folders(tmp_path):
     folders = [study(tmp_path, "old", "ideal", "GT", "nms"), study(tmp_path, "new", "GT", "gnn")]
-    comparison = compare(folders)
+    comparison = compare_folders(folders)
     assert comparison.baseline == "ideal"
     assert comparison.configurations == ("old:GT", "nms", "new:GT", "gnn")
 
 
 def test_folders_of_one_name_are_told_apart_by_their_paths(tmp_path):
     folders = [study(tmp_path, "a/out", "ideal", "GT"), study(tmp_path, "b/out", "GT")]
-    assert compare(folders).configurations == (f"{folders[0]}:GT", f"{folders[1]}:GT")
+    assert compare_folders(folders).configurations == (f"{folders[0]}:GT", f"{folders[1]}:GT")
 
 
 def test_a_name_that_looks_like_a_folders_is_no_other_ones(tmp_path):
     folders = [study(tmp_path, "a", "ideal", "x", "b:x"), study(tmp_path, "b", "x")]
-    comparison = compare(folders)
+    comparison = compare_folders(folders)
     assert len(set(comparison.configurations)) == 3
     assert set(comparison.table["configuration"]) == set(comparison.configurations)
 
 
 def test_a_name_stands_for_all_that_bear_it(tmp_path):
     folders = [study(tmp_path, "a", "ideal", "GT", "nms"), study(tmp_path, "b", "GT", "gnn")]
-    assert compare(folders, configurations=["GT"]).configurations == ("a:GT", "b:GT")
-    assert compare(folders, configurations=["b:GT", "a:nms", "nms"]).configurations == ("b:GT", "nms")
-    assert compare(folders, configurations=["nms", "gnn"], baseline="b:GT").baseline == "b:GT"
+    assert compare_folders(folders, configurations=["GT"]).configurations == ("a:GT", "b:GT")
+    assert compare_folders(folders, configurations=["b:GT", "a:nms", "nms"]).configurations == ("b:GT", "nms")
+    assert compare_folders(folders, configurations=["nms", "gnn"], baseline="b:GT").baseline == "b:GT"
 
 
 def test_a_configurations_own_name_goes_before_that_with_a_folders(tmp_path):
     folders = [study(tmp_path, "a", "ideal", "b:x"), study(tmp_path, "b", "x")]
-    assert compare(folders, configurations=["b:x"]).configurations == ("b:x",)
+    assert compare_folders(folders, configurations=["b:x"]).configurations == ("b:x",)
 
 
 def test_a_baseline_is_one_configuration(tmp_path):
     folders = [study(tmp_path, "a", "ideal", "GT"), study(tmp_path, "b", "ideal", "GT")]
     assert problem(*folders) == "--baseline: expected one of a:ideal, b:ideal, found ideal, which may be any"
     assert problem(*folders, baseline="GT") == "--baseline: expected one of a:GT, b:GT, found GT, which may be any"
-    assert compare(folders, baseline="b:ideal").configurations == ("a:ideal", "a:GT", "b:GT")
+    assert compare_folders(folders, baseline="b:ideal").configurations == ("a:ideal", "a:GT", "b:GT")
 
 
 def test_without_an_ideal_the_baseline_has_to_be_named(tmp_path):
@@ -98,7 +98,7 @@ def test_without_an_ideal_the_baseline_has_to_be_named(tmp_path):
 
 def test_every_unknown_configuration_is_said(tmp_path):
     with pytest.raises(InputError) as caught:
-        compare([study(tmp_path, "a", "ideal", "track", "nms")], configurations=["trakc", "nms", "nsm"])
+        compare_folders([study(tmp_path, "a", "ideal", "track", "nms")], configurations=["trakc", "nms", "nsm"])
     assert caught.value.problems == (
         "--configurations: no configuration is named 'trakc'; did you mean track?",
         "--configurations: no configuration is named 'nsm'; did you mean nms?",
@@ -122,7 +122,7 @@ def six_objects(tmp_path: Path) -> Comparison:
         found += [row("ideal", 1.0, 30.0, object_id=str(k)), row("same", 1.0, 30.0, object_id=str(k))]
         found += [row("fast", 0.75, 32.5, object_id=str(k))]
         found += [row("a|worse", 1.0 if k % 2 else None, 30.0 if k % 2 else None, object_id=str(k))]
-    return compare([write_folder(tmp_path / "study", found)])
+    return compare_folders([write_folder(tmp_path / "study", found)])
 
 
 def test_the_table_has_signs_and_intervals(tmp_path):
@@ -157,7 +157,7 @@ def test_what_the_table_shows_is_said_below(tmp_path):
 def test_who_is_better_beyond_the_interval_is_said(tmp_path):
     rows = [row("ideal", 1.0, 30.0, object_id=str(k)) for k in range(6)]
     rows += [row("fast", 0.75 - k / 100, 32.5 + k, object_id=str(k)) for k in range(6)]
-    lines = comparison_text(compare([write_folder(tmp_path / "study", rows)])).splitlines()
+    lines = comparison_text(compare_folders([write_folder(tmp_path / "study", rows)])).splitlines()
     assert lines[-2:] == [
         "better than ideal in ttd_rmst_s, the interval excluding 0: fast",
         "better than ideal in dad_median_m, the interval excluding 0: fast",
@@ -165,7 +165,9 @@ def test_who_is_better_beyond_the_interval_is_said(tmp_path):
 
 
 def test_without_an_interval_nothing_is_claimed(tmp_path):
-    text = comparison_text(compare([write_folder(tmp_path / "a", [row("ideal", 1.0, 30.0), row("fast", 0.5, 35.0)])]))
+    text = comparison_text(
+        compare_folders([write_folder(tmp_path / "a", [row("ideal", 1.0, 30.0), row("fast", 0.5, 35.0)])])
+    )
     assert "-0.5" in text
     assert "[" not in text
     assert "better" not in text
@@ -219,9 +221,8 @@ PIECES = st.sampled_from(
 @example("&copy; __a__ *b* `c` ~~d~~ http://e.f \\| g")
 def test_whatever_a_name_is_markdown_shows_it(name):
     shown = " ".join(name.split())
-    table = (
-        f"| {in_markdown(shown)} | b |\n| --- | --- |\n| {in_markdown(shown)} | d |\n\n- name: {in_markdown(shown)}\n"
-    )
+    cell = escape_markdown(shown)
+    table = f"| {cell} | b |\n| --- | --- |\n| {cell} | d |\n\n- name: {cell}\n"
     heading, _, cell, _, item = read_markdown(table)
     assert (heading, cell, item) == (shown, shown, f"name: {shown}".strip())
 
@@ -271,7 +272,7 @@ def test_results_are_not_overwritten_with_their_comparison(tmp_path):
 
 def test_rows_of_single_logs_are_in_the_csv_only(tmp_path):
     found = [row(name, 1.0, 30.0, log=log) for name in ("ideal", "late") for log in ("all", "b")]
-    comparison = compare([write_folder(tmp_path / "study", found)])
+    comparison = compare_folders([write_folder(tmp_path / "study", found)])
     assert comparison.table["log"].tolist() == ["all"] * 6 + ["b"] * 3  # a log may have that name, too
     assert comparison.overall["n"].tolist() == [2, 2, 2]
     assert len([line for line in comparison_text(comparison).splitlines() if line.startswith("late")]) == 1

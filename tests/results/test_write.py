@@ -16,20 +16,18 @@ from mcap.reader import make_reader
 from pyarrow import parquet
 
 import copem_replay as cr
-from copem_replay.core.time_chunk import WHOLE
+from copem_replay.core.tracks import WHOLE
 from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import read_logs
 from copem_replay.io.write.mcap import RUN_RECORD
-from copem_replay.pipeline import blocks as blocks_module
-from copem_replay.pipeline.log_tables import LogTables
-from copem_replay.pipeline.prepare import prepare
-from copem_replay.pipeline.run import Result, run
-from copem_replay.pipeline.selected_runs import shown_logs, shown_runs
-from copem_replay.pipeline.study_tables import StudyTables
-from copem_replay.results import tables as result_tables
-from copem_replay.results.export import Exporter, RunToExport
-from copem_replay.results.write import write_results
-from copem_replay.viewer.export import EXPORTERS
+from copem_replay.pipeline import replay as blocks_module
+from copem_replay.pipeline.one_run import select_shown_logs, select_shown_runs
+from copem_replay.pipeline.prepare import prepare_log
+from copem_replay.pipeline.run import ExperimentResult, run_experiment
+from copem_replay.pipeline.tables import LogTables, StudyTables
+from copem_replay.results import write as result_tables
+from copem_replay.results.write import Exporter, RunToExport, write_results
+from copem_replay.viewer.rrd import EXPORTERS
 from tests.helpers import scenes
 from tests.helpers.experiments import changed, drive
 from tests.helpers.recordings import Obj, write_recording
@@ -105,7 +103,7 @@ def test_the_folder_of_several_logs(two_logs: list[Path], tmp_path: Path) -> Non
     chosen = plan(show={"logs": ["all"], "run": 1}, configurations={"GT": {"units": "truth"}, "PEM": {"units": "all"}})
     recordings, refused = read_logs(chosen, two_logs, None)
     assert not refused
-    result = run(chosen, recordings)
+    result = run_experiment(chosen, recordings)
     folder = tmp_path / "out"
     write_results(folder, chosen, recordings, result, exporters=EXPORTERS)
     names = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
@@ -147,7 +145,7 @@ def test_without_accuracy_nothing_tells_of_it(two_logs: list[Path], tmp_path: Pa
     chosen = plan(show=None, measure={"accuracy": False})
     recordings, _ = read_logs(chosen, two_logs, None)
     folder = tmp_path / "out"
-    write_results(folder, chosen, recordings, run(chosen, recordings), exporters=EXPORTERS)
+    write_results(folder, chosen, recordings, run_experiment(chosen, recordings), exporters=EXPORTERS)
     assert {path.name for path in folder.iterdir()} == {
         "experiment.yaml", "provenance.json", "detections.parquet", "tally.parquet", "logs.csv", "summary.csv",
     }  # fmt: skip
@@ -177,7 +175,7 @@ def test_the_files_of_accuracy_say_the_same_as_rows_and_summary(two_logs: list[P
     )  # fmt: skip
     recordings, _ = read_logs(chosen, two_logs, None)
     folder = tmp_path / "out"
-    write_results(folder, chosen, recordings, run(chosen, recordings, jobs=2), exporters=EXPORTERS)
+    write_results(folder, chosen, recordings, run_experiment(chosen, recordings, jobs=2), exporters=EXPORTERS)
 
     def read(name: str) -> list[dict[str, Any]]:
         return parquet.read_table(folder / f"{name}.parquet").to_pylist()
@@ -241,11 +239,13 @@ def test_the_files_of_accuracy_say_the_same_as_rows_and_summary(two_logs: list[P
         assert part["ghosts"].sum() == sum(r["ghosts"] for r in mine)
 
 
-def made_up(times: list[float | None]) -> Result:
+def made_up(times: list[float | None]) -> ExperimentResult:
     """A result of one log with these times to detection, run by run; the horizon is 9 s."""
     of = {"log": "scene", "configuration": "PEM", "object_id": "a"}
     table = pd.DataFrame({**of, "run": range(len(times)), "time_to_detection_s": times})
-    return Result(of_one_log(table), pd.DataFrame(), (), (prepare(scenes.oncoming_car(), experiment()),), 9.0)
+    return ExperimentResult(
+        of_one_log(table), pd.DataFrame(), (), (prepare_log(scenes.oncoming_car(), experiment()),), 9.0
+    )
 
 
 def of_one_log(rows: pd.DataFrame) -> StudyTables:
@@ -267,12 +267,12 @@ def of_one_log(rows: pd.DataFrame) -> StudyTables:
 def test_which_run_is_shown(times: list[float | None], best: int, median: int, worst: int) -> None:
     result = made_up(times)
     for which, expected in (("best", best), ("median", median), ("worst", worst), (0, 0)):
-        (shown,) = shown_runs(experiment(show={"run": which}), result, "scene")
+        (shown,) = select_shown_runs(experiment(show={"run": which}), result, "scene")
         assert (shown.run, shown.stem) == (expected, "replay")
     for nothing in ({"run": None}, None):
-        assert shown_runs(experiment(show=nothing), result, "scene") == ()
-        assert shown_logs(experiment(show=nothing), result) == []
-    assert shown_logs(experiment(), result) == ["scene"]
+        assert select_shown_runs(experiment(show=nothing), result, "scene") == ()
+        assert select_shown_logs(experiment(show=nothing), result) == []
+    assert select_shown_logs(experiment(), result) == ["scene"]
 
 
 def test_several_runs_are_shown_each_as_it_was_asked_for() -> None:
@@ -285,7 +285,7 @@ def test_several_runs_are_shown_each_as_it_was_asked_for() -> None:
         for n, (name, one) in enumerate(keys)
     ]
     result = dataclasses.replace(made_up([]), tables=of_one_log(pd.DataFrame(rows)))
-    shown = shown_runs(experiment(show={"run": ["median", "worst", 0, "best"]}, runs=4), result, "scene")
+    shown = select_shown_runs(experiment(show={"run": ["median", "worst", 0, "best"]}, runs=4), result, "scene")
     over = "of 4 by time to detection summed over 2 configurations and 2 objects, the first of 2 equal"
     assert [(one.run, one.why, one.stem) for one in shown] == [
         (0, f"median {over}", "replay"),
@@ -294,7 +294,7 @@ def test_several_runs_are_shown_each_as_it_was_asked_for() -> None:
         (0, f"best {over}", "replay_best"),
     ]
     # Of a log in which nothing is measured.
-    other = shown_runs(experiment(show={"run": ["worst", 3]}, runs=4), result, "other")
+    other = select_shown_runs(experiment(show={"run": ["worst", 3]}, runs=4), result, "other")
     assert [(one.run, one.why) for one in other] == [
         (0, "first, not worst, as no measured object has an onset"),
         (3, ""),
@@ -309,7 +309,7 @@ def test_several_runs_of_several_logs(two_logs: list[Path], tmp_path: Path) -> N
     units = {"units": {"ego": {"on": "ego", "pem": "p"}}, "configurations": {"PEM": {"units": "all"}}}
     chosen = plan(show={"logs": ["all"], "run": ["worst", "best", 1]}, pems=seldom, **units)
     recordings, _ = read_logs(chosen, two_logs, None)
-    result = run(chosen, recordings)
+    result = run_experiment(chosen, recordings)
     folder = tmp_path / "out"
     for _ in range(2):  # what is there already goes
         write_results(folder, chosen, recordings, result, exporters=EXPORTERS, overwrite=True)
@@ -347,20 +347,20 @@ def test_blocks_bound_what_is_held_at_once(monkeypatch: pytest.MonkeyPatch) -> N
     for accuracy in (False, True):
         measure = {"onset": {"kind": "appears"}, "objects": {"ids": ["a"]}, "accuracy": accuracy}
         many = experiment(runs=100, measure=measure, pems={"sure": NOISY})
-        ready = prepare(log, many)
+        ready = prepare_log(log, many)
         candidates = ready.found(WHOLE) if accuracy else ready.measured
         rows = len(candidates.tracks.frame_ix)
         assert rows == (62 if accuracy else 31)
-        whole = run(many, [log])
+        whole = run_experiment(many, [log])
         with monkeypatch.context() as patch:
             patch.setattr(blocks_module, "BLOCK_BYTES", 7 * rows * (blocks_module.STATE_BYTES if accuracy else 1))
-            cut = blocks_module.blocks(ready, many, jobs=1)
+            cut = blocks_module.cut_blocks(ready, many, jobs=1)
             assert max(map(len, cut)) == 7
             assert np.concatenate(cut).tolist() == list(range(100))
-            in_sevens = run(many, [log])
+            in_sevens = run_experiment(many, [log])
             patch.setattr(blocks_module, "BLOCK_BYTES", 1)
-            assert set(map(len, blocks_module.blocks(ready, many, jobs=1))) == {1}
-            for cut_up in (in_sevens, run(many, [log])):
+            assert set(map(len, blocks_module.cut_blocks(ready, many, jobs=1))) == {1}
+            for cut_up in (in_sevens, run_experiment(many, [log])):
                 assert cut_up.table.equals(whole.table)
                 assert cut_up.summary.equals(whole.summary)
 
@@ -373,7 +373,7 @@ def test_what_is_shown_is_written_by_the_exporters_that_are_passed(two_logs: lis
 
     chosen = plan(show={"logs": ["all"], "run": 1}, configurations={"GT": {"units": "truth"}})
     recordings, _ = read_logs(chosen, two_logs, None)
-    result = run(chosen, recordings)
+    result = run_experiment(chosen, recordings)
     notes = write_results(tmp_path / "own", chosen, recordings, result, exporters=[Exporter(".txt", write)])
     shown = {path.relative_to(tmp_path / "own").as_posix() for path in (tmp_path / "own").rglob("replay/**/*.*")}
     assert shown == {"replay/near/drive.txt", "replay/far/drive.txt"}

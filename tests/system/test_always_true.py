@@ -10,11 +10,11 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from copem_replay.core.interpolation import states_at
+from copem_replay.core.interpolation import interpolate_states
 from copem_replay.io.recording import Recording
 from copem_replay.pipeline.one_run import tracks_of_run
-from copem_replay.pipeline.prepare import prepare
-from copem_replay.pipeline.run import run
+from copem_replay.pipeline.prepare import prepare_log
+from copem_replay.pipeline.run import run_experiment
 from tests.helpers.scenes import Thing, driving, experiment, recording
 
 MANY = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -81,7 +81,7 @@ def test_what_one_unit_detects_its_company_detects_too_and_not_later(
         },
         measure={"onset": onset, "confirm": confirm},
     )
-    table = run(plan, [log]).table
+    table = run_experiment(plan, [log]).table
     alone = by_row(table, "PEM")
     for name in ("two", "all"):
         together = by_row(table, name)
@@ -110,7 +110,7 @@ def test_where_nothing_can_be_confused_union_detects_as_ideal_does(
         },
         measure={"onset": onset, "confirm": confirm},
     )
-    table = run(plan, [recording(things, until_s=3.0)]).table
+    table = run_experiment(plan, [recording(things, until_s=3.0)]).table
     ideal, union = by_row(table, "ideal"), by_row(table, "union")
     pd.testing.assert_series_equal(ideal["detection_s"], union["detection_s"])
 
@@ -132,7 +132,7 @@ def test_latency_moves_every_detection_by_exactly_itself_or_past_the_end(
         },
         measure={"onset": onset},
     )
-    table = run(plan, [log]).table
+    table = run_experiment(plan, [log]).table
     for name in ("now", "GT"):
         now, late = by_row(table, name), by_row(table, "late" + name.removeprefix("now"))
         expected = (now["detection_s"] + latency).where(now["detection_s"] + latency <= now["ended_s"] + 1e-6)
@@ -151,7 +151,7 @@ def test_the_truth_detects_at_the_first_list_from_the_onset_on(log: Recording, o
         configurations={"GT": {"units": "truth"}},
         measure={"onset": onset, "confirm": confirm},
     )
-    table = run(plan, [log]).table
+    table = run_experiment(plan, [log]).table
     truth = log.truth
     for found in table.itertuples():
         track = log.scene.object_number[found.object_id]
@@ -177,9 +177,9 @@ def test_the_truth_detects_at_the_first_list_from_the_onset_on(log: Recording, o
 @settings(max_examples=10, deadline=None)
 def test_the_truth_is_believed_without_error(log: Recording) -> None:
     plan = experiment(configurations={"GT": {"units": "truth"}})
-    ready = prepare(log, plan)
+    ready = prepare_log(log, plan)
     fused = tracks_of_run(ready, plan, 0)["GT"].fused
-    at, there = states_at(
+    at, there = interpolate_states(
         log.truth, fused.row_object_ix, fused.captured_s[fused.frame_ix], t0_ns=log.scene.t0_ns, max_gap_s=0.5
     )
     assert there.all()
@@ -203,7 +203,7 @@ def test_identical_units_divide_the_variance(count: int) -> None:
     masts = {f"rsu{k}": {"at": [5.0 * k, -10], "height_m": 5.0, "pem": "p"} for k in range(count)}
     plan = experiment(pems=pems, units=masts, configurations={"all": {"units": "all"}})
     log = recording([Thing("ego", "car", driving(0, 0, 5)), Thing("o", "pedestrian", driving(20, 5, 0, 1))], until_s=2)
-    fused = tracks_of_run(prepare(log, plan), plan, 0)["all"].fused
+    fused = tracks_of_run(prepare_log(log, plan), plan, 0)["all"].fused
     np.testing.assert_allclose(fused.cov_ee_m2, variance / count)
     np.testing.assert_allclose(fused.cov_nn_m2, variance / count)
     np.testing.assert_allclose(fused.cov_en_m2, 0, atol=1e-12)
@@ -215,6 +215,6 @@ def test_no_list_before_the_first_capture_plus_latency(log: Recording, latency: 
     plan = experiment(
         pems=PEMS, units=units(None, None), configurations={"all": {"units": "all", "latency_s": latency}}
     )
-    fused = tracks_of_run(prepare(log, plan), plan, 0)["all"].fused
+    fused = tracks_of_run(prepare_log(log, plan), plan, 0)["all"].fused
     assert fused.arrives_s[0, 0] == pytest.approx(latency)
     np.testing.assert_allclose(fused.arrives_s[0] - fused.captured_s, latency, atol=1e-9)

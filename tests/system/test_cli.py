@@ -19,12 +19,13 @@ import pytest
 
 from copem_replay.cli import main as cli
 from copem_replay.core import yaml as plain_yaml
-from copem_replay.experiment.file import load, parse
-from copem_replay.pipeline import gather, study_log
-from copem_replay.results import place
+from copem_replay.experiment.file import parse_experiment, read_experiment_file
+from copem_replay.pipeline import run as gather
+from copem_replay.pipeline import study_log
+from copem_replay.results import folder as place
 from copem_replay.results import write as results
-from copem_replay.results.compare import compare, comparison_markdown, comparison_text
-from copem_replay.results.read import load_results
+from copem_replay.results.compare import compare_folders, comparison_markdown, comparison_text
+from copem_replay.results.read import read_results
 from tests.helpers.experiments import TEXT, changed, drive
 from tests.helpers.recordings import Obj, truth_topic, write_mcap, write_recording
 from tests.helpers.viewer import free_port
@@ -58,7 +59,7 @@ def call(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tm
     def called(*arguments: str | Path) -> Ended:
         monkeypatch.setattr(sys, "argv", ["copem-replay", *map(str, arguments)])
         capsys.readouterr()
-        code = cli._ended()
+        code = cli._run_to_exit_code()
         out, err = capsys.readouterr()
         if code != 70:
             assert "Traceback" not in err
@@ -156,7 +157,7 @@ class TestInstalled:
     )
     def test_heavy_imports_happen_where_they_are_used(self, here: Path, arguments: list[str]) -> None:
         code = (
-            "import sys; from copem_replay.cli import main as cli; code = cli._ended(); "
+            "import sys; from copem_replay.cli import main as cli; code = cli._run_to_exit_code(); "
             "heavy = {'pandas', 'numba', 'rerun', 'scipy', 'shapely', 'pyarrow'} & sys.modules.keys(); "
             "sys.exit(f'imported {heavy}' if heavy else code)"
         )
@@ -385,8 +386,8 @@ class TestCheck:
     def test_runs_that_may_be_too_many_are_said_before(
         self, here: Path, call: Call, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("copem_replay.pipeline.memory.free_bytes", lambda: 50_000)
-        monkeypatch.setattr(gather, "outcomes", raising(OSError(5, "Input/output error")))
+        monkeypatch.setattr("copem_replay.pipeline.cost.free_bytes", lambda: 50_000)
+        monkeypatch.setattr(gather, "replay_outcomes", raising(OSError(5, "Input/output error")))
         said = "note: 4 runs of 3 rows each may take 5.22e-05 GB, and 5e-05 GB are free"
         assert call("check", "e.yaml").lines == [said]
         assert call("run", "e.yaml").lines == [said, "copem-replay: Input/output error"]
@@ -511,7 +512,9 @@ class TestRun:
         names = ["[1] ü–中 #x.mcap", "a'b\"c: d.mcap", "tab\tnew\nline.mcap", "*.mcap", "- x.mcap"]
         for k, name in enumerate(names):
             drive(here / f"night {k}" / name)
-            (here / "e.yaml").write_text(plain_yaml.dump(plain_yaml.read(TEXT)[0] | {"logs": [f"night {k}/{name}"]}))
+            (here / "e.yaml").write_text(
+                plain_yaml.dump_yaml(plain_yaml.parse_yaml(TEXT)[0] | {"logs": [f"night {k}/{name}"]})
+            )
             assert call("run", "e.yaml", "--out", f"out/{k}").code == 0
             assert set(table(here / f"out/{k}")["log"]) == {name.removesuffix(".mcap")}
             again = call("run", f"out/{k}/experiment.yaml", "--out", f"again/{k}")
@@ -541,7 +544,7 @@ class TestOptions:
     def test_runs(self, here: Path, call: Call) -> None:
         assert call("run", "e.yaml", "--runs", "7").code == 0
         assert set(table(here / "out/e")["run"]) == set(range(7))
-        assert plain_yaml.read((here / "out/e/experiment.yaml").read_text())[0]["runs"] == 7
+        assert plain_yaml.parse_yaml((here / "out/e/experiment.yaml").read_text())[0]["runs"] == 7
 
     def test_fewer_runs_are_the_first_of_more(self, here: Path, call: Call) -> None:
         assert call("run", "e.yaml", "--runs", "2", "--out", "two").code == 0
@@ -571,7 +574,7 @@ class TestOptions:
     def test_ego(self, here: Path, call: Call) -> None:
         assert call("run", "e.yaml", "--ego", "2").code == 0
         assert set(table(here / "out/e")["object_id"]) == {"1"}
-        assert plain_yaml.read((here / "out/e/experiment.yaml").read_text())[0]["ego"] == "2"
+        assert plain_yaml.parse_yaml((here / "out/e/experiment.yaml").read_text())[0]["ego"] == "2"
 
     @pytest.mark.parametrize("ego", ["9", "3", ""])
     def test_ego_that_is_not_there(self, here: Path, call: Call, ego: str) -> None:
@@ -718,7 +721,7 @@ class TestWrittenExperiment:
     def test_holds_every_default_and_nothing_of_the_host(self, here: Path, call: Call) -> None:
         assert call("run", "e.yaml", "--jobs", "2").code == 0
         text = (here / "out/e/experiment.yaml").read_text()
-        data, _, _ = plain_yaml.read(text)
+        data, _, _ = plain_yaml.parse_yaml(text)
         assert data["logs"] == ["../../drive.mcap"]
         assert data["units"]["ego"] == {
             "on": "ego", "at": None, "offset_m": [0.0, 0.0], "yaw_deg": 0.0, "height_m": 1.8, "ground_z_m": None,
@@ -753,7 +756,7 @@ class TestCompare:
         return here
 
     def test_prints_what_the_library_finds(self, fused: Path, call: Call) -> None:
-        found = compare([fused / "out/e"], baseline="coPEM")
+        found = compare_folders([fused / "out/e"], baseline="coPEM")
         assert found.configurations == ("GT", "PEM")
         ended = call("compare", "out/e", "--baseline", "coPEM")
         assert ended.code == 0
@@ -762,7 +765,9 @@ class TestCompare:
 
     def test_of_some_configurations_into_a_file(self, fused: Path, call: Call) -> None:
         options = ["--baseline", "coPEM", "--configurations", "PEM", "--false-positives-per-min", "3"]
-        found = compare([fused / "out/e"], baseline="coPEM", configurations=["PEM"], false_positives_per_min=3.0)
+        found = compare_folders(
+            [fused / "out/e"], baseline="coPEM", configurations=["PEM"], false_positives_per_min=3.0
+        )
         for name in ("c.csv", "c.md"):
             ended = call("compare", "out/e", *options, "--out", name)
             assert ended.code == 0
@@ -814,10 +819,10 @@ class TestNamesOfConfigurations:
 
     @pytest.fixture
     def odd(self, here: Path, call: Call) -> Path:
-        data = plain_yaml.read(TEXT)[0]
+        data = plain_yaml.parse_yaml(TEXT)[0]
         data["configurations"] = {name: {"units": ["ego"], "latency_s": 0.1 * k} for k, name in enumerate(self.NAMES)}
         data["sweep"] = {"latency_s": [0.0, 0.5], "configurations": list(self.NAMES[:4])}
-        (here / "e.yaml").write_text(plain_yaml.dump(data))
+        (here / "e.yaml").write_text(plain_yaml.dump_yaml(data))
         assert call("run", "e.yaml").code == 0
         return here
 
@@ -831,7 +836,7 @@ class TestNamesOfConfigurations:
             assert "'=1+1" in cells, path
 
     def test_they_are_read_as_they_were(self, odd: Path, call: Call) -> None:
-        found = load_results(odd / "out/e")
+        found = read_results(odd / "out/e")
         assert tuple(found.summary["configuration"]) == self.NAMES
         assert found.sweep is not None
         assert set(found.sweep["configuration"]) == {"=1+1"}, "at one latency the others are as this one"
@@ -905,7 +910,7 @@ class TestTarget:
         self, here: Path, call: Call, out: str, said: str, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         """Said before anything is replayed."""
-        monkeypatch.setattr(gather, "outcomes", raising(AssertionError("replayed")))
+        monkeypatch.setattr(gather, "replay_outcomes", raising(AssertionError("replayed")))
         (here / "loop").symlink_to("pool")
         (here / "pool").symlink_to("loop")
         before = sorted(os.listdir(here))
@@ -1018,7 +1023,7 @@ class TestFailure:
         assert left == (["e"] if "--overwrite" in arguments else [])
 
     @pytest.mark.parametrize("failure", FAILURES, ids=[type(f.error).__name__ for f in FAILURES])
-    @pytest.mark.parametrize("step", ["write_csv", "provenance_of"])
+    @pytest.mark.parametrize("step", ["write_csv", "build_provenance"])
     def test_while_writing(
         self, here: Path, call: Call, arguments: list[str], failure: Failure, step: str, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -1029,7 +1034,7 @@ class TestFailure:
     def test_while_replaying(
         self, here: Path, call: Call, arguments: list[str], failure: Failure, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(gather, "outcomes", raising(failure.error))
+        monkeypatch.setattr(gather, "replay_outcomes", raising(failure.error))
         self.fails(here, call, arguments, failure)
 
     @pytest.mark.parametrize("failure", FAILURES, ids=[type(f.error).__name__ for f in FAILURES])
@@ -1040,7 +1045,7 @@ class TestFailure:
     ) -> None:  # fmt: skip
         """Where folders can be exchanged, and where they are moved in two steps: each of the steps fails."""
         rename = os.rename
-        monkeypatch.setattr(place, "exchange", raising(failure.error) if in_one_step else lambda *_: False)
+        monkeypatch.setattr(place, "exchange_folders", raising(failure.error) if in_one_step else lambda *_: False)
         for step in range(2 if "--overwrite" in arguments and not in_one_step else 1):
             count = iter(range(9))
 
@@ -1093,7 +1098,7 @@ class TestFailure:
 
     def test_a_defect_shows_where_it_is(self, here: Path, call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(
-            "copem_replay.experiment.draft.survey.survey", raising(ZeroDivisionError("division by zero"))
+            "copem_replay.experiment.draft.survey.survey_recording", raising(ZeroDivisionError("division by zero"))
         )
         ended = call("info", "drive.mcap")
         assert ended.code == 70
@@ -1211,17 +1216,17 @@ class TestSchema:
 
     @pytest.mark.parametrize("file", sorted(path.name for path in (ROOT / "logs").glob("*.yaml")))
     def test_accepts_the_samples(self, schema: dict[str, Any], file: str) -> None:
-        source = load(ROOT / "logs" / file)
+        source = read_experiment_file(ROOT / "logs" / file)
         assert list(wrong(source.data, schema, schema)) == []
 
     def test_accepts_what_is_written(self, schema: dict[str, Any], here: Path) -> None:
         text = changed("ego: 1", "measure: {objects: {ids: [2, '3']}}", "show: {logs: [first], run: median}")
         (here / "e.yaml").write_text(text)
-        experiment, problems = parse(load(here / "e.yaml"))
+        experiment, problems = parse_experiment(read_experiment_file(here / "e.yaml"))
         assert problems == []
         assert experiment is not None
         assert list(wrong(experiment.as_written(), schema, schema)) == []
-        assert list(wrong(load(here / "e.yaml").data, schema, schema)) == []
+        assert list(wrong(read_experiment_file(here / "e.yaml").data, schema, schema)) == []
 
     @pytest.mark.parametrize(
         "change",
@@ -1248,7 +1253,7 @@ class TestSchema:
     )
     def test_refuses(self, schema: dict[str, Any], here: Path, change: str) -> None:
         (here / "e.yaml").write_text(changed(change))
-        assert list(wrong(load(here / "e.yaml").data, schema, schema)) != []
+        assert list(wrong(read_experiment_file(here / "e.yaml").data, schema, schema)) != []
 
 
 TYPES: dict[str, Callable[[Any], bool]] = {

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from copem_replay.core.errors import CopemError
-from copem_replay.pipeline.crew.dask_workers import DaskWorkers
-from copem_replay.pipeline.pieces import Pieces
+from copem_replay.pipeline.dask_workers import DaskWorkers
+from copem_replay.pipeline.pieces import PieceCache
 from tests.cli.test_api import cr
 from tests.helpers.experiments import changed, drive, files
 from tests.pipeline.test_crew import at_45_m_and_a_half
@@ -72,7 +72,7 @@ def test_a_scheduler_that_is_killed_and_comes_back(here: Path, start: Start) -> 
     first, address = scheduler(start)
     worker = f"dask worker {address} --nworkers 1 --nthreads 1 --host 127.0.0.1 --no-dashboard"
     before = start(worker)
-    workers = DaskWorkers(address, Pieces("kept"), 0)
+    workers = DaskWorkers(address, PieceCache("kept"), 0)
     killed: list[int] = []
 
     def kill(done: int, total: int) -> None:
@@ -93,7 +93,7 @@ def test_a_scheduler_that_is_killed_and_comes_back(here: Path, start: Start) -> 
 def test_a_scheduler_that_does_not_come_back(here: Path, start: Start) -> None:
     first, address = scheduler(start)
     start(f"dask worker {address} --nworkers 1 --nthreads 1 --host 127.0.0.1 --no-dashboard")
-    workers = DaskWorkers(address, Pieces("kept"), 0)
+    workers = DaskWorkers(address, PieceCache("kept"), 0)
     workers._wait_s = workers._client._timeout = 0.5  # the client first looks for it, then we
 
     def kill(done: int, total: int) -> None:

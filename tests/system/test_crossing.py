@@ -23,10 +23,10 @@ from ruamel.yaml import YAML
 from shapely import LineString, Polygon, affinity
 
 import copem_replay as cr
-from copem_replay.experiment.file import load, log_paths
-from copem_replay.experiment.validate import across_logs, problems, read_logs
-from copem_replay.io.write.osi_trace import write_osi_trace
-from copem_replay.pipeline.run import run
+from copem_replay.experiment.file import log_paths, read_experiment_file
+from copem_replay.experiment.validate import check_across_logs, find_problems, read_logs
+from copem_replay.io.write.osi import write_osi_trace
+from copem_replay.pipeline.run import run_experiment
 
 ROOT = Path(__file__).resolve().parents[2]
 LOG = ROOT / "logs" / "crossing.mcap"
@@ -336,18 +336,18 @@ def test_the_van_is_parked_and_the_bus_stops(scenes: list[Scene], stays: dict[in
 
 @pytest.fixture(scope="module")
 def table() -> pd.DataFrame:
-    source = load(EXPERIMENT)
+    source = read_experiment_file(EXPERIMENT)
     source.data["runs"] = 10
     source.data["measure"]["accuracy"] = False
-    checked, found = problems(source)
+    checked, found = find_problems(source)
     assert found == []
     assert checked is not None
     paths, _ = log_paths(source)
     recordings, refused = read_logs(checked, paths, source)
     assert refused == []
-    assert list(across_logs(checked, recordings, source)) == []
+    assert list(check_across_logs(checked, recordings, source)) == []
     assert [note for recording in recordings for note in recording.notes] == []
-    result = run(checked, recordings, jobs=2)
+    result = run_experiment(checked, recordings, jobs=2)
     assert list(result.notes) == []
     assert list(result.summary["configuration"]) == list(checked.configurations)
     return result.table
@@ -449,15 +449,15 @@ def test_behind_the_van_hardly_anybody_sees_the_child(table: pd.DataFrame) -> No
 @pytest.fixture(scope="module")
 def fused() -> pd.DataFrame:
     """The summary of crossing.yaml, of two runs, by configuration."""
-    source = load(ROOT / "logs" / "crossing.yaml")
+    source = read_experiment_file(ROOT / "logs" / "crossing.yaml")
     source.data["runs"] = 2
-    checked, found = problems(source)
+    checked, found = find_problems(source)
     assert found == []
     assert checked is not None
     assert len(checked.shown()) == 4
     recordings, refused = read_logs(checked, log_paths(source)[0], source)
     assert refused == []
-    result = run(checked, recordings, jobs=2)
+    result = run_experiment(checked, recordings, jobs=2)
     assert list(result.notes) == []
     assert list(result.summary["configuration"]) == list(checked.configurations)
     return result.summary.set_index("configuration")

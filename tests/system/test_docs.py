@@ -20,13 +20,13 @@ import copem_replay as cr
 from copem_replay.cli import main as cli
 from copem_replay.communication.link import UnitLinks, transmit
 from copem_replay.core.view_geometry import ViewGeometry
-from copem_replay.experiment.file import load, parse
+from copem_replay.experiment.file import parse_experiment, read_experiment_file
 from copem_replay.experiment.schema import Experiment
-from copem_replay.fusion.base import StepFusion
-from copem_replay.fusion.testing.check import check_fusion
+from copem_replay.fusion.interface import StepFusion
+from copem_replay.fusion.testing import check_fusion
 from copem_replay.perception.pem.detection import DetectionModel
 from copem_replay.pipeline.one_run import tracks_of_run
-from copem_replay.pipeline.prepare import prepare
+from copem_replay.pipeline.prepare import prepare_log
 from tests.helpers import scenes
 from tests.helpers.scenes import experiment
 
@@ -148,7 +148,7 @@ def test_experiments_on_the_page_load(tmp_path: Path) -> None:
     for k, block in enumerate(blocks):
         path = tmp_path / f"{k}.yaml"
         path.write_text(block, encoding="utf-8")
-        experiment, problems = parse(load(path))
+        experiment, problems = parse_experiment(read_experiment_file(path))
         assert problems == []
         assert isinstance(experiment, Experiment)
 
@@ -205,7 +205,7 @@ def test_own_error_model_of_the_architecture_page_works(architecture: ModuleType
     couple = {"detection": {"kind": "page:Fading", "half_range_m": 1e9}}
     plan = experiment(pems={"sure": [couple | {"error": {"kind": "page:Widening", "sigma_m_per_m": 0.1}}]})
     log = scenes.oncoming_car()
-    fused = tracks_of_run(prepare(log, plan), plan, 0)["PEM"].fused
+    fused = tracks_of_run(prepare_log(log, plan), plan, 0)["PEM"].fused
     rows = np.flatnonzero(fused.valid[0])
     away_m = 100.0 - 10.0 * fused.captured_s[fused.frame_ix[rows]]  # the car comes at 10 m/s along the x axis
     assert fused.cov_ee_m2 is not None
@@ -254,7 +254,7 @@ def test_components_of_the_adding_page_work(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_the_adding_page_names_what_is_there() -> None:
     text = (ROOT / "docs/develop/adding.md").read_text(encoding="utf-8")
-    assert re.findall(r"^## (\d+) ", text, re.MULTILINE) == [str(k) for k in range(1, 11)]
+    assert re.findall(r"^## (\d+) ", text, re.MULTILINE) == [str(k) for k in range(1, 12)]
     for name in re.findall(r"`((?:[a-z]\w*/)+(?:\w+\.py)?)`", text):
         assert (ROOT / name).exists() or (ROOT / "copem_replay" / name).exists(), name
 

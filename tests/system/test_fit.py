@@ -13,7 +13,7 @@ import pytest
 
 import copem_replay as cr
 from copem_replay.cli import main as cli
-from copem_replay.core.yaml import dump, read
+from copem_replay.core.yaml import dump_yaml, parse_yaml
 from copem_replay.experiment.schema import Experiment
 from tests.helpers.recordings import SHARED
 from tools import check_fit
@@ -31,7 +31,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     check_fit.write_lists(CROSSING, *check_fit.KNOWN["radar"], 3, place / "radar.mcap")
     unit = {"rsu": check_fit.PLACE | {"recorded": {"topic": check_fit.TOPIC}}}
     data = check_fit.experiment_of(unit, {"recorded": {"units": ["rsu"]}}, logs=["radar.mcap"])
-    (place / "radar.yaml").write_text(dump(data))
+    (place / "radar.yaml").write_text(dump_yaml(data))
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(place)
         assert called(patch, "fit", "radar.yaml", "--unit", "rsu", "--out", "one") in (0, 1)
@@ -40,7 +40,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def called(patch: pytest.MonkeyPatch, *arguments: str) -> int:
     patch.setattr(sys, "argv", ["copem-replay", *arguments])
-    return cli._ended()
+    return cli._run_to_exit_code()
 
 
 def told(capsys: pytest.CaptureFixture[str]) -> str:
@@ -55,7 +55,7 @@ def test_all_files_are_there(folder: Path) -> None:
 def test_the_model_is_ready_to_paste(folder: Path) -> None:
     """It loads, and behind every number of it stands what is known of it."""
     text = (folder / "one/pem.yaml").read_text()
-    data, _, problems = read(text)
+    data, _, problems = parse_yaml(text)
     assert not problems
     experiment = Experiment.model_validate(
         {"version": 1, "configurations": {"fitted": {"units": ["rsu"]}}} | data

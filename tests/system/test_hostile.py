@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 from copem_replay.core.errors import CopemError, RecordingError
-from copem_replay.experiment.draft.survey import survey
+from copem_replay.experiment.draft.survey import survey_recording
 from copem_replay.io.containers.mcap_records import CHUNK_LIMIT_BYTES
-from copem_replay.io.recording import read
+from copem_replay.io.recording import read_log
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "tools"))
@@ -45,10 +45,10 @@ def whole(sample: Sample) -> Piece:
 def line(path: Path) -> str:
     """The one line that says why a file is refused; looking at it says the same."""
     with pytest.raises(RecordingError) as caught:
-        read(path, name="log")
+        read_log(path, name="log")
     (problem,) = caught.value.problems
     assert problem.isprintable()
-    assert survey(path).reason == problem
+    assert survey_recording(path).reason == problem
     return problem.removeprefix(f"{path}: ")
 
 
@@ -85,7 +85,7 @@ def test_decompression_bomb(path, compression, claimed, indexed):
     content, checksum = bomb(compression, 1 << 31, b"\0")
     sample = json_updates()
     written(path, whole(sample), Piece([], compression, claimed, checksum, content), indexed=indexed)
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert len(recording.truth.stamp_ns) == 20
     assert recording.damage == f"damaged after 1.900 s: 20 messages read ({TOO_LARGE})" if not indexed else True
     assert recording.notes[0] == recording.damage
@@ -103,7 +103,7 @@ def test_many_small_bombs(path):
     """Each within the limit of a chunk, together far more than a file of this size can hold."""
     content, checksum = bomb("zstd", 1 << 26, record(0x80, bytes(10_000)))
     written(path, whole(json_updates()), *[Piece([], "zstd", None, checksum, content)] * 40, indexed=False)
-    assert read(path, name="log").damage == (
+    assert read_log(path, name="log").damage == (
         "damaged after 1.900 s: 20 messages read (its chunks hold more than 1000 times the size of the file)"
     )
 
@@ -117,7 +117,7 @@ def test_many_bombs(path):
 def test_chunk_of_the_shortest_records(path):
     content, checksum = bomb("zstd", 1 << 25, record(0x80, b""))
     written(path, whole(json_updates()), Piece([], "zstd", None, checksum, content), indexed=False)
-    assert read(path, name="log").damage == (
+    assert read_log(path, name="log").damage == (
         "damaged after 1.900 s: 20 messages read (a chunk holds more than 262144 records)"
     )
 
@@ -127,7 +127,7 @@ def test_a_bomb_takes_no_more_memory_than_a_chunk(path):
     written(path, whole(json_updates()), Piece([], "lz4", 1000, checksum, content))
     tracemalloc.start()
     try:
-        read(path, name="log")
+        read_log(path, name="log")
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
@@ -140,14 +140,14 @@ def test_absurd_length_of_a_message(path, length):
     sample = json_updates()
     hit = Raw(5, sample.messages[7].body(), length)
     written(path, Piece([*sample.schemas, *sample.channels, *sample.messages[:7], hit, *sample.messages[8:]]))
-    assert read(path, name="log").damage == "damaged after 0.600 s: 7 of 19 messages read (the file ends too early)"
+    assert read_log(path, name="log").damage == "damaged after 0.600 s: 7 of 19 messages read (the file ends too early)"
 
 
 def test_message_shorter_than_its_head(path):
     sample = json_updates()
     hit = Raw(5, b"\1\0", 2)
     written(path, Piece([*sample.schemas, *sample.channels, *sample.messages[:7], hit]))
-    assert read(path, name="log").damage == "damaged after 0.600 s: 7 of 7 messages read (the file ends too early)"
+    assert read_log(path, name="log").damage == "damaged after 0.600 s: 7 of 7 messages read (the file ends too early)"
 
 
 @pytest.mark.parametrize("claimed", [2**40, 2**64 - 1])
@@ -169,7 +169,7 @@ def test_absurd_length_of_a_name(path):
 def test_index_that_promises_more_than_there_is(path):
     sample = json_updates()
     written(path, whole(sample), counts={1: 2**62})
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert len(recording.truth.stamp_ns) == 20
     assert recording.damage == (
         "damaged: its index cannot be used (the index promises 4611686018427387904 messages, and there are 20): "
@@ -179,7 +179,7 @@ def test_index_that_promises_more_than_there_is(path):
 
 def test_index_that_points_anywhere(path):
     written(path, whole(json_updates()), offsets={0: 2**63})
-    assert len(read(path, name="log").truth.stamp_ns) == 20
+    assert len(read_log(path, name="log").truth.stamp_ns) == 20
 
 
 @pytest.mark.parametrize("depth", [100, 100_000])
@@ -192,7 +192,7 @@ def test_deep_nesting(path, depth):
     ):
         sample.messages[0].data = payload
         written(path, whole(sample))
-        recording = read(path, name="log")
+        recording = read_log(path, name="log")
         assert len(recording.truth.stamp_ns) >= 19
         assert depth == 100 or any("cannot be decoded: skipped" in note for note in recording.notes)
 
@@ -204,7 +204,7 @@ def test_messages_of_messages(path):
     sample = protobuf_updates()
     sample.messages[0].data = data
     written(path, whole(sample))
-    assert "1 message cannot be decoded: skipped" in read(path, name="log").notes
+    assert "1 message cannot be decoded: skipped" in read_log(path, name="log").notes
 
 
 def test_definition_without_end(path):
@@ -234,7 +234,7 @@ def test_log_time_beyond_all_clocks(path, time_ns):
     for sample in (json_updates(), poses_and_lists()):
         sample.messages[-1].log_time = time_ns
         written(path, whole(sample))
-        assert "1 message logged at an impossible time: skipped" in read(path, name="log").notes
+        assert "1 message logged at an impossible time: skipped" in read_log(path, name="log").notes
 
 
 @pytest.mark.parametrize("value", ["NaN", "1e308", "-1e308", "1e999", "null", '"\\ud800"', "1" + "0" * 5000])
@@ -245,7 +245,7 @@ def test_absurd_numbers_in_json(path, value):
         said["entities"][number]["cubes"][0]["pose"]["position"]["x"] = "HERE"
         message.data = json.dumps(said).replace('"HERE"', value).encode()
     written(path, whole(sample))
-    recording = read(path, name="log")
+    recording = read_log(path, name="log")
     assert len(recording.truth.frame_ix) == 57 or len(recording.truth.frame_ix) == 51
     assert any("skipped" in note for note in recording.notes)
 
@@ -265,11 +265,11 @@ def test_topic_of_several_schemas(path):
     for message in sample.messages:
         message.channel = {1: 2, 2: 1}.get(message.channel, message.channel)
     written(path, whole(sample))
-    assert len(read(path, name="log").truth.stamp_ns) == 20
+    assert len(read_log(path, name="log").truth.stamp_ns) == 20
 
 
 def test_message_of_no_channel(path):
     sample = json_updates()
     sample.messages[3] = Message(77, 0, 0, 0, b"")
     written(path, whole(sample))
-    assert len(read(path, name="log").truth.stamp_ns) == 19
+    assert len(read_log(path, name="log").truth.stamp_ns) == 19

@@ -27,7 +27,7 @@ from osi3.osi_sensordata_pb2 import SensorData
 from ruamel.yaml import YAML
 from shapely import LineString, Point, Polygon, affinity
 
-from copem_replay.io.write.osi_trace import write_osi_trace
+from copem_replay.io.write.osi import write_osi_trace
 
 ROOT = Path(__file__).resolve().parents[2]
 LOG = ROOT / "logs" / "tc016d.mcap"

@@ -30,7 +30,7 @@ def test_the_commands_of_the_page(
     said = []
     for command in commands.splitlines():
         monkeypatch.setattr("sys.argv", shlex.split(command))
-        assert cli._ended() == 0, command
+        assert cli._run_to_exit_code() == 0, command
         said += capsys.readouterr().err.splitlines()
     assert [line for line in said if line.startswith("pieces: ")] == [
         f"pieces: 6 computed, 0 found in {url}/study.pieces",

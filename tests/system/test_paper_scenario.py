@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from copem_replay.experiment.file import load, log_paths
+from copem_replay.experiment.file import log_paths, read_experiment_file
 from copem_replay.experiment.schema import Experiment
-from copem_replay.experiment.validate import problems, read_logs
+from copem_replay.experiment.validate import find_problems, read_logs
 from copem_replay.io.recording import Recording
-from copem_replay.pipeline.prepare import prepare
-from copem_replay.pipeline.run import run
+from copem_replay.pipeline.prepare import prepare_log
+from copem_replay.pipeline.run import run_experiment
 
 FILE = Path(__file__).parents[2] / "logs/tc016d.yaml"
 ONSET_S = 3.0
@@ -21,9 +21,9 @@ SHARES = {0.5: 0.0, 0.6: 0.18, 0.7: 0.37, 0.8: 0.56, 0.9: 0.75, 1.0: 0.93, 1.1: 
 
 
 def loaded(visibility: str) -> tuple[Experiment, Recording]:
-    source = load(FILE)
+    source = read_experiment_file(FILE)
     source.data["visibility"] = visibility
-    experiment, found = problems(source)
+    experiment, found = find_problems(source)
     assert experiment is not None, found
     (recording,), refused = read_logs(experiment, log_paths(source)[0], source)
     assert not refused
@@ -33,7 +33,7 @@ def loaded(visibility: str) -> tuple[Experiment, Recording]:
 @pytest.mark.parametrize("visibility", ["flat", "surface"])
 def test_the_pedestrian_comes_out_from_behind_the_truck(visibility: str) -> None:
     experiment, recording = loaded(visibility)
-    ready = prepare(recording, experiment)
+    ready = prepare_log(recording, experiment)
     assert ready.episodes.onset_s == pytest.approx([ONSET_S])
     tracks, episode = ready.measured.tracks, ready.measured.view
     ego = tracks.row_unit_ix == tracks.units.index("ego")
@@ -50,7 +50,7 @@ def test_the_pedestrian_comes_out_from_behind_the_truck(visibility: str) -> None
 def test_times_follow_the_closed_form() -> None:
     """Independent detection per list: P(T > t) = Π (1 − share). The 500 runs stay within the DKW band at 10⁻⁶."""
     experiment, recording = loaded("flat")
-    result = run(experiment, [recording])
+    result = run_experiment(experiment, [recording])
     table = result.table.set_index("configuration")
     missed, exact = 1.0, {}
     for t, share in SHARES.items():
@@ -68,7 +68,7 @@ def test_times_follow_the_closed_form() -> None:
 def test_latency_costs_the_way_driven_meanwhile() -> None:
     """The ego drives 10 m/s towards his line: 22.3 m ahead of its centre at the onset, 3 m beside, he steps nearer."""
     experiment, recording = loaded("surface")
-    table = run(experiment, [recording]).table.set_index("configuration")
+    table = run_experiment(experiment, [recording]).table.set_index("configuration")
     for name, late in (("coPEM:0s", 0.0), ("coPEM:0.5s", 0.5), ("coPEM:1s", 1.0), ("coPEM:1.5s", 1.5)):
         expected = np.hypot(22.3 - 10 * late, 3.0 - late)
         assert table.loc[name, "distance_at_detection_m"].to_numpy() == pytest.approx(expected, abs=1e-6), name

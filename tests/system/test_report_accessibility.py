@@ -11,12 +11,12 @@ from typing import Any
 
 import pytest
 
-from copem_replay.experiment.file import load, log_paths
-from copem_replay.experiment.validate import problems, read_logs
-from copem_replay.pipeline.run import run
-from copem_replay.report import write_report
+from copem_replay.experiment.file import log_paths, read_experiment_file
+from copem_replay.experiment.validate import find_problems, read_logs
+from copem_replay.pipeline.run import run_experiment
+from copem_replay.report import write_html_report
 from copem_replay.results.write import write_results
-from copem_replay.viewer.export import EXPORTERS
+from copem_replay.viewer.rrd import EXPORTERS
 from tests.helpers.browser import Browser, opened_browser
 from tests.helpers.report_pages import eighteen, replayed
 
@@ -34,13 +34,13 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 def demo(place: Path) -> Path:
     """The sample experiment in fewer runs."""
-    source = load(DEMO)
-    experiment, found = problems(source)
+    source = read_experiment_file(DEMO)
+    experiment, found = find_problems(source)
     assert experiment is not None, found
     experiment = experiment.model_copy(update={"runs": 20, "show": experiment.show.model_copy(update={"run": None})})
     recordings, refused = read_logs(experiment, log_paths(source)[0], source)
     assert not refused
-    write_results(place / "demo", experiment, recordings, run(experiment, recordings), exporters=EXPORTERS)
+    write_results(place / "demo", experiment, recordings, run_experiment(experiment, recordings), exporters=EXPORTERS)
     return place / "demo"
 
 
@@ -48,7 +48,7 @@ def demo(place: Path) -> Path:
 def reports(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     place = tmp_path_factory.mktemp("reports")
     (place / "many").mkdir()
-    return {"demo": write_report(demo(place)), "eighteen": write_report(replayed(place / "many", eighteen()))}
+    return {"demo": write_html_report(demo(place)), "eighteen": write_html_report(replayed(place / "many", eighteen()))}
 
 
 def violations(browser: Browser) -> list[dict[str, Any]]:

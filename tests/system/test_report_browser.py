@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from copem_replay.report import write_report
+from copem_replay.report import write_html_report
 from tests.helpers.browser import Browser, opened_browser
 from tests.helpers.report_pages import ONE, changed, replayed
 
@@ -39,7 +39,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def report(folder: Path) -> Path:
-    return write_report(folder)
+    return write_html_report(folder)
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,7 @@ import pytest
 from distributed.cli import dask_worker
 
 from copem_replay.cli import main as cli
-from copem_replay.pipeline.crew import dask_workers
+from copem_replay.pipeline import dask_workers
 from tests.cli.test_api import cr
 from tests.helpers.experiments import changed, drive, files
 from tests.helpers.page import blocks, spans
@@ -100,7 +100,7 @@ def test_pieces_are_found_again_and_removed(here: Path) -> None:
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         eval(crewed, {"cr": cr, "executor": pool}).save("out/pool")
     assert files("out/pool") == files("out/plain")
-    cluster = dask_workers._local(1)
+    cluster = dask_workers._start_local(1)
     client = distributed.Client(cluster)
     typed(remove.replace("out/", ""), here)
     eval(crewed, {"cr": cr, "executor": client.get_executor()}).save("out/dask")
@@ -118,9 +118,9 @@ def test_as_many_processes_as_are_said(
     cr.run("study.yaml").save("out/shown")
     _, command = block("--cluster local").splitlines()
     monkeypatch.setattr("sys.argv", shlex.split(command + more))
-    begun, local = [], dask_workers._local
-    monkeypatch.setattr(dask_workers, "_local", lambda workers: begun.append(workers) or local(workers))
-    assert cli._ended() == 0
+    begun, local = [], dask_workers._start_local
+    monkeypatch.setattr(dask_workers, "_start_local", lambda workers: begun.append(workers) or local(workers))
+    assert cli._run_to_exit_code() == 0
     assert begun == [processes]
     assert COMPUTED.format("out") in capsys.readouterr().err.splitlines()
     found, expected = files("out/study"), files("out/shown")

@@ -11,7 +11,7 @@ import pytest
 from mcap.reader import make_reader
 
 import copem_replay as cr
-from copem_replay.pipeline import chunking
+from copem_replay.pipeline import prepare as chunking
 from tests.helpers.experiments import changed, drive
 from tests.viewer.test_rrd import rows
 

@@ -11,7 +11,7 @@ import pytest
 from copem_replay.core.colours import configuration_colours
 from copem_replay.core.errors import InputError
 from copem_replay.viewer import check_viewer, write_rrd
-from copem_replay.viewer.opening import identities, seek
+from copem_replay.viewer.open import read_identities, seek_recordings
 from tests.helpers.viewer import Viewer, free_port, headless_viewer
 from tests.viewer.test_rrd import CHANGES, SUMMARY, Made, approaching, make, rerun, rows
 
@@ -98,10 +98,10 @@ def test_where_no_viewer_is_or_can_be() -> None:
 def test_a_recording_is_moved_to_its_instant(made: Made, viewer: Viewer) -> None:
     viewer.open(made.path)
     viewer.seek(0.0)
-    (identity,) = identities([made.path]).values()
-    seek(viewer.url, {identity.recording: 1.5}, lambda: True)
+    (identity,) = read_identities([made.path]).values()
+    seek_recordings(viewer.url, {identity.recording: 1.5}, lambda: True)
     assert viewer.cursors()[identity.recording] == ("elapsed", 1_500_000_000)
 
 
 def test_a_viewer_that_has_ended_is_not_waited_for() -> None:
-    seek(f"rerun+http://127.0.0.1:{free_port()}/proxy", {"x": 1.0}, lambda: False)
+    seek_recordings(f"rerun+http://127.0.0.1:{free_port()}/proxy", {"x": 1.0}, lambda: False)

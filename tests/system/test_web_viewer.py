@@ -14,8 +14,7 @@ from urllib.parse import urlsplit
 import pytest
 
 import copem_replay as cr
-from copem_replay.viewer.opening import recordings_of
-from copem_replay.viewer.web import serve
+from copem_replay.viewer.open import list_rrd_files, serve_recordings
 from tests.helpers.experiments import changed, drive
 
 pytest.importorskip("selenium", reason="needs selenium, which `pip install .[dev]` brings")
@@ -44,7 +43,7 @@ def test_the_page_opens_at_the_onset_and_asks_nobody_else(tmp_path: Path) -> Non
     for option in (*OPTIONS, f"--user-data-dir={tmp_path / 'profile'}"):
         options.add_argument(option)
     options.set_capability("goog:loggingPrefs", {"performance": "ALL"})
-    with serve(folder, recordings_of(folder)) as server:
+    with serve_recordings(folder, list_rrd_files(folder)) as server:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
         browser = webdriver.Chrome(options=options, service=Service(driver))

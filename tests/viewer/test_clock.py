@@ -15,15 +15,14 @@ import pandas as pd
 import pytest
 
 from copem_replay.experiment.schema import Experiment
-from copem_replay.io.recording import Recording, read
-from copem_replay.pipeline.blocks import replay_block
+from copem_replay.io.recording import Recording, read_log
 from copem_replay.pipeline.one_run import tracks_of_run
-from copem_replay.pipeline.prepare import Replay, prepare
+from copem_replay.pipeline.prepare import Replay, prepare_log
+from copem_replay.pipeline.replay import replay_block
 from copem_replay.viewer import write_rrd
-from copem_replay.viewer.line_of_sight import sight
-from copem_replay.viewer.selection import SHOWN_OBJECTS, telling
-from copem_replay.viewer.status import clock_of, status_of
-from copem_replay.viewer.statuses import ABSENT, EARLY, KNOWN, TOO_LATE, UNCONFIRMED
+from copem_replay.viewer.line_of_sight import compute_sight
+from copem_replay.viewer.sink import ABSENT, EARLY, KNOWN, SHOWN_OBJECTS, TOO_LATE, UNCONFIRMED, choose_telling_objects
+from copem_replay.viewer.status import compute_status, read_episode_clocks
 from tests.helpers.recordings import SHARED
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
 from tests.viewer.test_rrd import SUMMARY, rows
@@ -84,15 +83,17 @@ MEASURES: dict[str, dict[str, Any]] = {
 
 def shown_in(replay: Replay, wanted: Experiment, run: int) -> tuple[pd.DataFrame, list[int]]:
     table = replay_block(replay, wanted, np.array([run]))
-    names = telling(table, ["GT", "GT late"], SHOWN_OBJECTS)
+    names = choose_telling_objects(table, ["GT", "GT late"], SHOWN_OBJECTS)
     return table, [replay.scene.object_number[name] for name in names]
 
 
 def agrees(replay: Replay, wanted: Experiment, run: int, table: pd.DataFrame, shown: list[int]) -> set[int]:
     """Hold every status of one run against the table; which statuses there are."""
-    seen, run_tracks, found = sight(replay, wanted, shown), tracks_of_run(replay, wanted, run), set()
+    seen, run_tracks, found = compute_sight(replay, wanted, shown), tracks_of_run(replay, wanted, run), set()
     for name in wanted.configurations:
-        of = status_of(replay, wanted, name, run_tracks[name], seen, clock_of(replay.scene, table, name))
+        of = compute_status(
+            replay, wanted, name, run_tracks[name], seen, read_episode_clocks(replay.scene, table, name)
+        )
         fused, episodes = run_tracks[name].fused, table[table["configuration"] == name].set_index("object_id")
         newest = np.searchsorted(fused.arrives_s[0], of.elapsed_ns / 1e9 + 1e-6, side="right") - 1
         for m, k in enumerate(shown):
@@ -119,7 +120,7 @@ def agrees(replay: Replay, wanted: Experiment, run: int, table: pd.DataFrame, sh
 def test_known_is_what_the_table_says(measure: str) -> None:
     """Never before `detection_s`, from there on whenever the newest list holds it; otherwise it is listed at most."""
     wanted = plan(**MEASURES[measure])
-    replay = prepare(waiting(), wanted)
+    replay = prepare_log(waiting(), wanted)
     found = set()
     for run in range(RUNS):
         table, shown = shown_in(replay, wanted, run)
@@ -144,7 +145,7 @@ def test_so_it_is_on_a_drive(measure: str) -> None:
         },
         measure={"onset": {"kind": "in_range", "range_m": 30}} | MEASURES[measure],
     )
-    replay = prepare(read(path, name="drive"), wanted)
+    replay = prepare_log(read_log(path, name="drive"), wanted)
     table = replay_block(replay, wanted, np.array([0]))
     shown = [replay.scene.object_number[name] for name in dict.fromkeys(table["object_id"])]
     assert len(shown) > 20
@@ -155,7 +156,7 @@ def test_so_it_is_on_a_drive(measure: str) -> None:
 def test_so_do_all_views(measure: str, tmp_path: Path) -> None:
     """Lanes, labels, sentences, marks and the curve of how many are known, as they are in the file."""
     wanted = plan(**MEASURES[measure])
-    replay = prepare(waiting(), wanted)
+    replay = prepare_log(waiting(), wanted)
     table, shown = shown_in(replay, wanted, 2)
     path = tmp_path / "replay.rrd"
     six = {name: CONFIGURATIONS[name] for name in ("GT", "PEM", "late", "mixed", "gnn", "tracker")}
@@ -203,7 +204,7 @@ def test_what_was_captured_before_the_onset_is_not_known(tmp_path: Path) -> None
         units={"ego": EGO_UNIT}, measure=PERSON | {"onset": STARTS},
         configurations={"GT": {"units": "truth"}, "late": {"units": ["ego"], "latency_s": 0.5}},
     )  # fmt: skip
-    replay = prepare(waiting(), wanted)
+    replay = prepare_log(waiting(), wanted)
     table = replay_block(replay, wanted, np.array([0]))
     path = tmp_path / "x.rrd"
     write_rrd(path, replay, wanted, [tracks_of_run(replay, wanted, 0)], table, SUMMARY, 0)
@@ -237,13 +238,13 @@ def test_not_confirmed_and_too_late(tmp_path: Path) -> None:
     """Two of two lists, ten a second, are needed of 2; 3 leaves at 2.2 s, and what tells of him arrives later."""
     units = {"ego": EGO_UNIT}
     twice = experiment(units=units, measure=PERSON | {"confirm": {"hits": 2, "of": 2}})
-    replay = prepare(waiting(), twice)
+    replay = prepare_log(waiting(), twice)
     table = replay_block(replay, twice, np.array([0]))
     write_rrd(tmp_path / "x.rrd", replay, twice, [tracks_of_run(replay, twice, 0)], table, SUMMARY, 0)
     assert lane(tmp_path / "x.rrd", "2 pedestrian", 1) == [(0, "listed, not confirmed"), (0.1, "known")]
     assert told(tmp_path / "x.rrd", "PEM", 0.0)[0] == "2 listed, not confirmed yet"
     late = experiment(units=units, measure=PERSON, configurations={"late": {"units": ["ego"], "latency_s": 1.0}})
-    replay = prepare(waiting(), late)
+    replay = prepare_log(waiting(), late)
     table = replay_block(replay, late, np.array([0]))
     assert table.set_index("object_id").loc["3", "ended_by"] == "object_left"
     write_rrd(tmp_path / "y.rrd", replay, late, [tracks_of_run(replay, late, 0)], table, SUMMARY, 0)

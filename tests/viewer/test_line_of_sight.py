@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from copem_replay.perception.field_of_view import outlines
 from copem_replay.perception.pem.condition import Couple
-from copem_replay.pipeline.prepare import prepare
-from copem_replay.viewer.line_of_sight import sight
-from copem_replay.viewer.sensors import named_units
+from copem_replay.perception.sensor_poses import couple_outlines
+from copem_replay.pipeline.prepare import prepare_log
+from copem_replay.viewer.line_of_sight import compute_sight
+from copem_replay.viewer.sensors import choose_named_units
 from tests.helpers.scenes import EGO_UNIT, SEES_60_M, SEES_ALL, Thing, driving, experiment, recording, standing
 from tests.viewer.test_rrd import Made, at, chunks, make, rows, static
 
@@ -37,30 +37,30 @@ def lines(row: dict[str, Any]) -> list[Any]:
 
 
 def test_a_sector_is_an_arc_and_two_edges() -> None:
-    [border] = outlines(pem({"range_m": [0, 80], "azimuth_deg": [-60, 60]}))
+    [border] = couple_outlines(pem({"range_m": [0, 80], "azimuth_deg": [-60, 60]}))
     half, high = 40.0, 80 * np.sqrt(3) / 2
     assert border[[0, 1, -2, -1]] == pytest.approx(np.array([[0, 0], [half, -high], [half, high], [0, 0]]))
     assert np.hypot(*border[1:-1].T) == pytest.approx(80)
     assert len(border) == 120 / 3 + 1 + 2
-    [band] = outlines(pem({"range_m": [10, 20], "azimuth_deg": [0, 90]}))
+    [band] = couple_outlines(pem({"range_m": [10, 20], "azimuth_deg": [0, 90]}))
     assert band[[0, 1]] == pytest.approx(np.array([[10, 0], [20, 0]]))
     assert band[-1] == pytest.approx(band[0])
     assert sorted({round(r, 6) for r in np.hypot(*band.T)}) == [10, 20]
 
 
 def test_all_around_is_circles_and_without_a_range_nothing() -> None:
-    inner, outer = outlines(pem({"range_m": [5, 30]}))
+    inner, outer = couple_outlines(pem({"range_m": [5, 30]}))
     assert (inner[0], outer[0]) == (pytest.approx([-5, 0]), pytest.approx([-30, 0]))
     assert inner[-1] == pytest.approx(inner[0])
-    assert len(outlines(pem({"range_m": [0, 30], "azimuth_deg": [-180, 180]}))) == 1
-    assert outlines(pem({}, {"azimuth_deg": [-60, 60]}, {"visible_share": [0.5, 1]})) == []
+    assert len(couple_outlines(pem({"range_m": [0, 30], "azimuth_deg": [-180, 180]}))) == 1
+    assert couple_outlines(pem({}, {"azimuth_deg": [-60, 60]}, {"visible_share": [0.5, 1]})) == []
     # Through 180°: an arc behind, of 60°.
-    [behind] = outlines(pem({"range_m": [0, 10], "azimuth_deg": [150, -150]}))
+    [behind] = couple_outlines(pem({"range_m": [0, 10], "azimuth_deg": [150, -150]}))
     assert behind[:, 0].max() == pytest.approx(0)
     assert len(behind) == 60 / 3 + 1 + 2
     # Couples that differ in something else have the same border once.
     one, other = {"range_m": [0, 10], "classes": ["car"]}, {"range_m": [0, 10], "visible_share": [0.5, 1.0]}
-    assert len(outlines(pem(one, other))) == 1
+    assert len(couple_outlines(pem(one, other))) == 1
 
 
 @pytest.fixture(scope="module")
@@ -225,7 +225,7 @@ def test_six_units_are_named_in_their_view_and_apart(tmp_path: Path) -> None:
         for chunk in reader.stream(store=blueprint)
         if "Points3D:show_labels" in chunk.to_record_batch().schema.names
     ]
-    named = list(named_units(made.replay, made.given, np.array([30.0, 0.0, 0.0]), 0.0))
+    named = list(choose_named_units(made.replay, made.given, np.array([30.0, 0.0, 0.0]), 0.0))
     assert len(named) == len(overrides) == 6
     assert named[0] == "ego"
     numbers = sorted(int(name[1:]) for name in named if name != "ego")
@@ -284,16 +284,16 @@ def test_the_eye_looks_ahead_of_the_ego_and_sees_the_object(tmp_path: Path) -> N
 
 def test_at_the_start_ego_and_object_are_framed(tmp_path: Path) -> None:
     """A car 30 m away at 0 s, whose onset is when it is 20 m away: a viewer that opens at 0 s shows both."""
-    from copem_replay.viewer.camera import eye_on, seen_from
+    from copem_replay.viewer.camera import camera_on_object, is_in_picture
 
     scene = recording(
         [Thing("ego", "car", standing(0, 0)), Thing("7", "car", driving(30, 0, -5), yaw_rad=np.pi)], until_s=3.0
     )
     made = make(tmp_path / "x.rrd", scene, measure={"onset": {"kind": "in_range", "range_m": 20}})
-    eye = eye_on(made.replay, made.given, made.table, made.replay.scene.object_number["7"], 1.55)
+    eye = camera_on_object(made.replay, made.given, made.table, made.replay.scene.object_number["7"], 1.55)
     for x in (0.0, 20.0, 30.0):
-        assert seen_from(eye, np.array([x - eye.ahead_m, 0, 0]), 1.55)
-    assert not seen_from(eye, np.array([200.0, 0, 0]), 1.55)
+        assert is_in_picture(eye, np.array([x - eye.ahead_m, 0, 0]), 1.55)
+    assert not is_in_picture(eye, np.array([200.0, 0, 0]), 1.55)
 
 
 def test_without_an_ego_the_eye_sees_the_unit_and_who_passes_it(tmp_path: Path) -> None:
@@ -339,11 +339,11 @@ def test_what_is_known_and_what_is_near_a_line_is_enough(monkeypatch: pytest.Mon
         x, y, vx, vy = turn.normal(0, [14, 14, 3, 3])
         things.append(Thing(str(k), "car" if k % 3 else "pedestrian", driving(x, y, vx, vy), yaw_rad=float(k)))
     given = experiment(units={"ego": EGO_UNIT, "pole": POLE_5_HZ}, obstacles=[WALL], measure=PERSON)
-    replay = prepare(recording(things, until_s=1.0), given)
+    replay = prepare_log(recording(things, until_s=1.0), given)
     shown = list(range(1, 13))
-    quick = sight(replay, given, shown, replay.rows_of(np.array(shown)))
+    quick = compute_sight(replay, given, shown, replay.rows_of(np.array(shown)))
     monkeypatch.setattr(line_of_sight, "is_own", lambda _: True)  # as a model that has to see the whole world
-    whole = sight(replay, given, shown)
+    whole = compute_sight(replay, given, shown)
     np.testing.assert_allclose(quick.share, whole.share, rtol=0, atol=1e-12)  # summed in another order
     for name in ("in_range", "body_ix", "body_m", "place_m"):
         assert np.array_equal(getattr(quick, name), getattr(whole, name), equal_nan=True), name

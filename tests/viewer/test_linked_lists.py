@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from copem_replay.pipeline import chunking
-from copem_replay.pipeline.list_rates import list_times
+from copem_replay.pipeline import prepare as chunking
+from copem_replay.pipeline.notes import measure_list_rates
 from copem_replay.pipeline.one_run import RunTracks, tracks_of_run
-from copem_replay.pipeline.prepare import prepare
-from copem_replay.viewer.linked_lists import FATES, LANES, UnitLists, _together, linked_lists, shown_under
+from copem_replay.pipeline.prepare import prepare_log
+from copem_replay.viewer.lanes import FATES, LANES, UnitLists, _group_fates, find_linked_lists, select_list_lanes
 from tests.helpers.scenes import EGO_UNIT, SEES_ALL, Thing, experiment, recording, standing
 from tests.viewer.test_line_of_sight import PERSON
 from tests.viewer.test_rrd import Made, make, rerun, rows, static
@@ -134,7 +134,7 @@ def test_lists_that_follow_soon_are_told_together_and_the_last_one_has_no_next(m
         "air: pole: 51 lists lost, captured 0.00 to 5.00 s, none arrives after"
     ]
     long = UnitLists("pole", (), np.arange(120) / 10, np.full(120, np.inf), np.arange(120) % 2, 0.1)
-    assert [len(some) for some in _together(long, 1)] == [26, 26, 8]
+    assert [len(some) for some in _group_fates(long, 1)] == [26, 26, 8]
 
 
 def test_older_than_what_counts_is_late_however_usual(made: Made, tmp_path: Path) -> None:
@@ -183,7 +183,7 @@ def test_shown_are_those_of_the_run_shown(tmp_path: Path) -> None:
         lost = np.isinf(arrives_s)
         overtaken = [not lost[k] and bool((arrives_s[k + 1 :] <= arrives_s[k]).any()) for k in range(len(pole))]
         tracks = tracks_of_run(made.replay, made.given, run)
-        [of] = linked_lists(tracks["air"], 1, "air", 1.0)
+        [of] = find_linked_lists(tracks["air"], 1, "air", 1.0)
         assert (of.fate == 1).tolist() == lost.tolist()
         assert (of.fate == 3).tolist() == overtaken
         made.write(tmp_path / f"{run}.rrd", run_tracks=tracks)
@@ -192,7 +192,7 @@ def test_shown_are_those_of_the_run_shown(tmp_path: Path) -> None:
         assert set(said[run]) <= {round(float(s), 9) for s in heard.captured_s[pole[lost]]}
         counts += np.bincount(of.fate, minlength=len(FATES))
     assert len(set(said.values())) == 4
-    links = list_times(made.replay, made.given)["air"].links
+    links = measure_list_rates(made.replay, made.given)["air"].links
     assert links is not None
     assert (counts.sum(), counts[1], counts[3]) == (links.sent, links.lost, links.overtaken)
     assert counts.min() > 0
@@ -202,14 +202,14 @@ def test_what_is_not_made_or_not_sent_is_not_lost(tmp_path: Path) -> None:
     """The pole is down a third of the time, and sends a message every 0.3 s at most; a link that loses nothing."""
     pole = MAST | {"outages": {"down_share": 0.3, "lasts_s": 0.5}, "sends": {"interval_s": 0.3}}
     made = make(tmp_path / "x.rrd", standing_by(), **AIR | {"units": {"ego": EGO_UNIT, "pole": pole}})
-    [of] = linked_lists(made.run_tracks["air"], 1, "air", 1.0)
+    [of] = find_linked_lists(made.run_tracks["air"], 1, "air", 1.0)
     assert 5 < len(of.fate) < 17
     assert not of.fate.any()
     lossy = AIR | {
         "units": {"ego": EGO_UNIT, "pole": pole},
         "links": {"v2x": {"reception": {"kind": "constant", "probability": 0.0}}},
     }
-    [none] = linked_lists(make(tmp_path / "y.rrd", standing_by(), **lossy).run_tracks["air"], 1, "air", 1.0)
+    [none] = find_linked_lists(make(tmp_path / "y.rrd", standing_by(), **lossy).run_tracks["air"], 1, "air", 1.0)
     assert none.captured_s.tolist() == of.captured_s.tolist()
     assert none.fate.tolist() == [1] * len(of.fate)
 
@@ -223,8 +223,8 @@ def test_a_carrier_that_is_not_equipped_loses_nothing(tmp_path: Path) -> None:
     plan = experiment(**AIR | {
         "units": {"fleet": fleet}, "configurations": {"air": {"units": "all", "link": "v2x"}},
     })  # fmt: skip
-    tracks = tracks_of_run(prepare(log, plan), plan, 0)["air"]
-    lists = linked_lists(tracks, 0, "air", 1.0)
+    tracks = tracks_of_run(prepare_log(log, plan), plan, 0)["air"]
+    lists = find_linked_lists(tracks, 0, "air", 1.0)
     assert 0 < len(lists) < 8
     assert not any(of.fate.any() for of in lists)
     # “fleet:c1” and its like need no escapes, and none has the lane of another.
@@ -235,20 +235,20 @@ def test_a_carrier_that_is_not_equipped_loses_nothing(tmp_path: Path) -> None:
 def test_the_truth_by_a_link(tmp_path: Path) -> None:
     plan = AIR | {"configurations": {"GT": {"units": "truth", "link": "v2x"}}}
     made = make(tmp_path / "x.rrd", standing_by(), **plan)
-    [of] = linked_lists(made.run_tracks["GT"], 0, "GT", 1.0)
+    [of] = find_linked_lists(made.run_tracks["GT"], 0, "GT", 1.0)
     assert (of.unit, len(of.fate), of.fate.any()) == ("truth", 51, False)
 
 
 def test_of_a_log_in_chunks_all_lists_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
     plan = experiment(**DRAWN)
-    whole = tracks_of_run(prepare(standing_by(), plan), plan, 2)["air"]
+    whole = tracks_of_run(prepare_log(standing_by(), plan), plan, 2)["air"]
     monkeypatch.setattr(chunking, "ROWS_AT_ONCE", 1)
     monkeypatch.setattr(chunking, "ROWS_A_CHUNK", 40)
-    replay = prepare(standing_by(), plan)
+    replay = prepare_log(standing_by(), plan)
     assert len(replay.chunks) > 2
-    [expected] = linked_lists(whole, 1, "air", 1.0)
+    [expected] = find_linked_lists(whole, 1, "air", 1.0)
     for chunk in RunTracks(replay, plan, 2):
-        [of] = linked_lists(chunk["air"], 1, "air", 1.0)
+        [of] = find_linked_lists(chunk["air"], 1, "air", 1.0)
         assert of.fate.tolist() == expected.fate.tolist()
         assert of.arrives_s.tolist() == expected.arrives_s.tolist()
 
@@ -259,6 +259,6 @@ def test_under_an_object_are_the_units_with_the_most_marks_while_it_is_looked_at
     fates = {k: (np.arange(40) < 20 + k).astype(int) for k in (3, 8, 0, 5, 1, 7, 2, 6)}
     units = [UnitLists(str(k), (str(k),), at_s, at_s, fate, 0.1) for k, fate in fates.items()]
     lists = {"a": units[:4], "b": units[4:], **{f"wired {k}": [] for k in range(LANES - 8)}}  # room for six
-    assert shown_under(lists, (2.0, 4.0)) == [("3",), ("8",), ("5",), ("7",), ("2",), ("6",)]
-    assert len(shown_under(lists, (0.0, 1.0))) == 6
-    assert shown_under(lists, (3.5, 4.0)) == []
+    assert select_list_lanes(lists, (2.0, 4.0)) == [("3",), ("8",), ("5",), ("7",), ("2",), ("6",)]
+    assert len(select_list_lanes(lists, (0.0, 1.0))) == 6
+    assert select_list_lanes(lists, (3.5, 4.0)) == []

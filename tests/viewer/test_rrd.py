@@ -23,15 +23,13 @@ import pytest
 from copem_replay.core.colours import configuration_colours
 from copem_replay.core.errors import OutputError
 from copem_replay.core.fused_tracks import FusedTracks
-from copem_replay.core.time_chunk import TimeChunk
-from copem_replay.core.tracks import CLASSES
+from copem_replay.core.tracks import CLASSES, TimeChunk
 from copem_replay.experiment.schema import Experiment
-from copem_replay.pipeline.blocks import replay_block
 from copem_replay.pipeline.one_run import RunTracks, tracks_of_run
-from copem_replay.pipeline.prepare import Replay, prepare
+from copem_replay.pipeline.prepare import Replay, prepare_log
+from copem_replay.pipeline.replay import replay_block
 from copem_replay.viewer import write_rrd
-from copem_replay.viewer.selection import telling
-from copem_replay.viewer.sink import ELAPSED, TIME
+from copem_replay.viewer.sink import ELAPSED, TIME, choose_telling_objects
 from tests.helpers.scenes import EGO_UNIT, SEES_60_M, SEES_ALL, T0_NS, Thing, driving, experiment, recording, standing
 
 os.environ["RERUN_ANALYTICS"] = "0"  # before it is imported, which is when something is written
@@ -91,7 +89,7 @@ class Made:
 
 def make(path: Path, scene: Any, **changes: Any) -> Made:
     given = experiment(**changes)
-    replay = prepare(scene, given)
+    replay = prepare_log(scene, given)
     run_tracks = tracks_of_run(replay, given, 3)
     made = Made(path, replay, given, run_tracks, replay_block(replay, given, np.array([3])))
     made.write(path)
@@ -610,13 +608,15 @@ def test_of_many_objects_those_that_tell_configurations_apart_are_shown() -> Non
         }
     )
     # Apart: a 0.2 s, b 8 s (never: 9 s); as soon as each other c after 5 s, d after 0.5 s, e never.
-    assert telling(episodes, ["GT"], 1) == ["b"]
-    assert telling(episodes, ["GT"], 2) == ["a", "b"]
-    assert telling(episodes, ["GT"], 3) == ["a", "b", "e"]
-    assert telling(episodes, ["GT"], 9) == ["a", "b", "c", "d", "e"]
+    assert choose_telling_objects(episodes, ["GT"], 1) == ["b"]
+    assert choose_telling_objects(episodes, ["GT"], 2) == ["a", "b"]
+    assert choose_telling_objects(episodes, ["GT"], 3) == ["a", "b", "e"]
+    assert choose_telling_objects(episodes, ["GT"], 9) == ["a", "b", "c", "d", "e"]
     meeting = episodes.assign(conflict=episodes["object_id"] == "d")
-    assert telling(meeting, ["GT"], 2) == ["b", "d"]
-    assert telling(episodes[episodes["configuration"] == "GT"], ["GT"], 2) == ["a", "b"], "nothing but the truth"
+    assert choose_telling_objects(meeting, ["GT"], 2) == ["b", "d"]
+    assert choose_telling_objects(episodes[episodes["configuration"] == "GT"], ["GT"], 2) == ["a", "b"], (
+        "nothing but the truth"
+    )
 
 
 def test_colours_do_not_repeat() -> None:

@@ -18,15 +18,16 @@ from hypothesis import strategies as st
 
 from copem_replay.core.colours import TRUTH, configuration_colours
 from copem_replay.experiment.schema import Experiment
-from copem_replay.io.recording import read
-from copem_replay.pipeline.blocks import replay_block
-from copem_replay.pipeline.expansion import of_run
+from copem_replay.io.recording import read_log
+from copem_replay.pipeline.expansion import resolve_for_run
 from copem_replay.pipeline.one_run import tracks_of_run
-from copem_replay.pipeline.prepare import prepare
-from copem_replay.viewer import palette, write_rrd
-from copem_replay.viewer.lanes import STEADY_S, steady
-from copem_replay.viewer.running import break_lines, running
-from copem_replay.viewer.statuses import KNOWN, STATUSES
+from copem_replay.pipeline.prepare import prepare_log
+from copem_replay.pipeline.replay import replay_block
+from copem_replay.viewer import sink as palette
+from copem_replay.viewer import write_rrd
+from copem_replay.viewer.curves import break_lines, running_median
+from copem_replay.viewer.lanes import STEADY_S, smooth_status
+from copem_replay.viewer.sink import KNOWN, STATUSES
 from tests.oracles.colour import apart_for_a_deuteranope, contrast
 from tests.viewer.test_rrd import SUMMARY, Made
 from tests.viewer.test_status import lane
@@ -43,9 +44,9 @@ MOST_LABELS = 6
 def city(tmp_path_factory: pytest.TempPathFactory) -> Made:
     folder = tmp_path_factory.mktemp("city")
     asked = Experiment.model_validate(city_traffic.experiment(city_traffic.write(folder)))
-    recording = read(folder / "city.mcap", name="city")
-    given = of_run(asked, recording.scene, 1)
-    replay = prepare(recording, given, onsets_of=asked)
+    recording = read_log(folder / "city.mcap", name="city")
+    given = resolve_for_run(asked, recording.scene, 1)
+    replay = prepare_log(recording, given, onsets_of=asked)
     made = Made(
         folder / "replay.rrd",
         replay,
@@ -97,10 +98,10 @@ def test_marks_of_differences_use_no_colour_of_a_configuration() -> None:
 
 def test_a_configuration_has_one_colour_everywhere(city: Made) -> None:
     """In boxes, lanes, lines, curves, the legend and the figures of the report."""
-    from copem_replay.report.figures.style import appearances
+    from copem_replay.report.figures.style import choose_appearances
 
     every = configuration_colours(city.given.configurations)
-    figures = {name: tuple(round(255 * c) for c in one.colour) for name, one in appearances(list(every)).items()}
+    figures = {name: tuple(round(255 * c) for c in one.colour) for name, one in choose_appearances(list(every)).items()}
     assert figures == every
     number = {name: r << 16 | g << 8 | b for name, (r, g, b) in every.items()}
     found = defaultdict(set)
@@ -214,7 +215,7 @@ def test_steady_lanes_begin_known_where_it_begins(runs: list[tuple[int, int]]) -
     """Tenths of a second each status lasts: spans are long, or the first of all, or the first known."""
     lasts, what = np.array([r for r, _ in runs]), np.array([s for _, s in runs])
     elapsed = np.append(0, np.cumsum(lasts)[:-1]) * 100_000_000
-    spans = steady(elapsed, what)
+    spans = smooth_status(elapsed, what)
     assert spans[0].first == 0
     assert spans[-1].end == len(what)
     assert all(a.end == b.first and a.status != b.status for a, b in pairwise(spans))
@@ -236,7 +237,7 @@ def test_running_quartiles_against_plain_ones() -> None:
     chance = np.random.default_rng(3)
     elapsed = np.sort(chance.choice(100, 60, replace=False)) * 50_000_000
     values = chance.normal(size=60)
-    of = running(elapsed, values)
+    of = running_median(elapsed, values)
     assert len(of.elapsed_ns)
     for now, quartiles in zip(of.elapsed_ns.tolist(), of.quartiles, strict=True):
         assert now % 250_000_000 == 0

@@ -18,7 +18,7 @@ import pytest
 
 from copem_replay.cli import main as cli
 from copem_replay.experiment.schema import Experiment
-from copem_replay.viewer.merge_experiments import Part, merged
+from copem_replay.viewer.side_by_side import ComparedExperiment, join_experiments
 from copem_replay.viewer.sink import ELAPSED
 from tests.helpers.experiments import changed, drive
 from tests.helpers.recordings import Obj, pedestrian, write_recording
@@ -45,7 +45,7 @@ def call(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
     def called(*words: str) -> tuple[int, list[str]]:
         monkeypatch.setattr("sys.argv", ["copem-replay", *words])
         capsys.readouterr()
-        return cli._ended(), capsys.readouterr().err.splitlines()
+        return cli._run_to_exit_code(), capsys.readouterr().err.splitlines()
 
     drive(tmp_path / "drive.mcap")
     for name, content in (("a", text(55, [0.3, 0.4])), ("b", text(80, [0.0, 0.0]))):
@@ -238,10 +238,16 @@ def test_units_of_one_name_are_one_only_where_they_are_the_same() -> None:
     east, west = ({"at": [x, 0], "height_m": 5.0} for x in (5, -5))
     same, moved, blind = experiment(east, 50), experiment(west, 50), experiment(east, 20)
     labels = {"PEM": "a:PEM", "GT": "GT"}
-    both = merged([Part("a", same, labels), Part("b", same, {"PEM": "b:PEM"})])
+    both = join_experiments([ComparedExperiment("a", same, labels), ComparedExperiment("b", same, {"PEM": "b:PEM"})])
     assert list(both.units) == ["ego", "mast"]
     assert list(both.configurations) == ["a:PEM", "GT", "b:PEM"]
-    both = merged([Part("a", same, labels), Part("b", moved, {"PEM": "b:PEM"}), Part("c", blind, {"PEM": "c:PEM"})])
+    both = join_experiments(
+        [
+            ComparedExperiment("a", same, labels),
+            ComparedExperiment("b", moved, {"PEM": "b:PEM"}),
+            ComparedExperiment("c", blind, {"PEM": "c:PEM"}),
+        ]
+    )
     assert list(both.units) == ["ego", "mast", "b:mast", "c:ego", "c:mast"]
     assert both.units["b:mast"].at == (-5, 0)
     pems = [both.pems[str(both.units[name].pem)] for name in ("mast", "b:mast", "c:mast")]

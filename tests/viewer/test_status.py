@@ -14,9 +14,7 @@ import pytest
 
 from copem_replay.core.colours import configuration_colours
 from copem_replay.core.tracks import Solid
-from copem_replay.viewer.selection import in_parts
-from copem_replay.viewer.sink import slices
-from copem_replay.viewer.statuses import STATUSES
+from copem_replay.viewer.sink import STATUSES, slice_by_frame, split_into_files
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, recording, standing
 from tests.viewer.test_line_of_sight import PERSON, SECTOR, WALL, lines
 from tests.viewer.test_rrd import SUMMARY, Made, at, chunks, make, rows, static
@@ -242,23 +240,23 @@ def test_gospa_is_of_the_measured_objects(tmp_path: Path) -> None:
 
 def test_six_configurations_a_file_and_nothing_dropped() -> None:
     names = [f"c{k}" for k in range(1, 19)]
-    parts = in_parts(names)
+    parts = split_into_files(names)
     assert [part.path(Path("out/replay_4.rrd")).name for part in parts] == [
         "replay_4.rrd",
         "replay_4.configurations_7-12.rrd",
         "replay_4.configurations_13-18.rrd",
     ]
     assert [name for part in parts for name in part.configurations] == names
-    assert [part.infix for part in in_parts(names[:6])] == [""]
-    assert [part.infix for part in in_parts(names[:7])] == ["", ".configurations_7"]
-    beside = in_parts(["base", *names[:7]], "base")
+    assert [part.infix for part in split_into_files(names[:6])] == [""]
+    assert [part.infix for part in split_into_files(names[:7])] == ["", ".configurations_7"]
+    beside = split_into_files(["base", *names[:7]], "base")
     assert [part.configurations for part in beside] == [("base", *names[:5]), ("base", *names[5:7])]
     assert [part.infix for part in beside] == ["", ".configurations_7-8"]
 
 
 def test_further_configurations_are_in_further_files(tmp_path: Path) -> None:
     from copem_replay.viewer import write_rrd
-    from copem_replay.viewer.export import EXPORTERS
+    from copem_replay.viewer.rrd import EXPORTERS
 
     scene = recording([Thing("ego", "car", standing(0, 0)), Thing("9", "pedestrian", standing(30, 0))], until_s=1.0)
     many = {f"GT{k}": {"units": "truth", "latency_s": k / 10} for k in range(8)}
@@ -297,7 +295,7 @@ def test_pieces_are_whole_lists_and_together_all(monkeypatch: pytest.MonkeyPatch
     )
     truth = scene.truth
     monkeypatch.setattr("copem_replay.viewer.sink.SLICE_ROWS", 7)
-    pieces = list(slices(truth, truth.valid[0]))
+    pieces = list(slice_by_frame(truth, truth.valid[0]))
     assert np.concatenate([counts for _, counts, _ in pieces]).tolist() == [1, 2, 3, 4, *[5] * 7]
     assert [rows.size for rows, _, _ in pieces] == [6, 4, *[5] * 7], "as many lists as there is room for, one at least"
     together = np.concatenate([rows for rows, _, _ in pieces])
@@ -330,9 +328,9 @@ def test_an_entry_that_no_object_is_matched_with(tmp_path: Path) -> None:
 def test_a_list_that_never_arrives_is_lost(hiding: Made) -> None:
     from dataclasses import replace
 
-    from copem_replay.viewer.line_of_sight import sight
-    from copem_replay.viewer.status import clock_of, status_of
-    from copem_replay.viewer.statuses import CAPTURED, KNOWN, LOST
+    from copem_replay.viewer.line_of_sight import compute_sight
+    from copem_replay.viewer.sink import CAPTURED, KNOWN, LOST
+    from copem_replay.viewer.status import compute_status, read_episode_clocks
 
     fused_tracks = hiding.run_tracks["both"]
     # Pedestrian 4 is in the pole's lists only: those of the first half of a second never arrive.
@@ -343,9 +341,9 @@ def test_a_list_that_never_arrives_is_lost(hiding: Made) -> None:
         heard=replace(fused_tracks.heard, arrives_s=arrives),
         fused=replace(fused_tracks.fused, valid=silent),
     )
-    seen = sight(hiding.replay, hiding.given, [hiding.replay.scene.object_number["4"]])
-    clock = clock_of(hiding.replay.scene, hiding.table, "both")
-    made = status_of(hiding.replay, hiding.given, "both", lossy, seen, clock)
+    seen = compute_sight(hiding.replay, hiding.given, [hiding.replay.scene.object_number["4"]])
+    clock = read_episode_clocks(hiding.replay.scene, hiding.table, "both")
+    made = compute_status(hiding.replay, hiding.given, "both", lossy, seen, clock)
     early = made.elapsed_ns < 450_000_000
     assert set(made.status[early, 0].tolist()) == {LOST}
     assert set(made.status[~early, 0].tolist()) == {KNOWN}
@@ -357,9 +355,9 @@ def test_what_a_units_next_list_no_longer_holds_is_neither_lost_nor_unmatched(hi
     """Two lists of the pole hold pedestrian 4, at 0 and 0.1 s, the next ones do not; no fused list ever does."""
     from dataclasses import replace
 
-    from copem_replay.viewer.line_of_sight import sight
-    from copem_replay.viewer.status import clock_of, status_of
-    from copem_replay.viewer.statuses import LOST, UNMATCHED, VISIBLE
+    from copem_replay.viewer.line_of_sight import compute_sight
+    from copem_replay.viewer.sink import LOST, UNMATCHED, VISIBLE
+    from copem_replay.viewer.status import compute_status, read_episode_clocks
 
     fused_tracks, number = hiding.run_tracks["both"], hiding.replay.scene.object_number["4"]
     heard = fused_tracks.heard
@@ -368,9 +366,9 @@ def test_what_a_units_next_list_no_longer_holds_is_neither_lost_nor_unmatched(hi
     if not arrives:
         heard = replace(heard, arrives_s=np.full_like(heard.arrives_s, np.inf))
     nothing = replace(fused_tracks.fused, valid=np.zeros_like(fused_tracks.fused.valid))
-    seen = sight(hiding.replay, hiding.given, [number])
-    clock = clock_of(hiding.replay.scene, hiding.table.assign(detected=False, detection_s=np.nan), "both")
-    made = status_of(
+    seen = compute_sight(hiding.replay, hiding.given, [number])
+    clock = read_episode_clocks(hiding.replay.scene, hiding.table.assign(detected=False, detection_s=np.nan), "both")
+    made = compute_status(
         hiding.replay, hiding.given, "both", replace(fused_tracks, heard=heard, fused=nothing), seen, clock
     )
     early = made.elapsed_ns < 199_000_000

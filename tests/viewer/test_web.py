@@ -19,8 +19,19 @@ import psutil
 import pytest
 
 import copem_replay as cr
-from copem_replay.viewer.opening import Identity, identities, opening_s, recordings_of
-from copem_replay.viewer.web import PAGE, POLICY, TYPES, Server, Site, opening_page, set_time
+from copem_replay.viewer.open import (
+    PAGE,
+    POLICY,
+    TYPES,
+    RecordingIdentity,
+    Server,
+    ViewerSite,
+    list_rrd_files,
+    opening_page,
+    opening_s,
+    read_identities,
+    set_time,
+)
 from tests.helpers.experiments import changed, drive
 
 COMMAND = Path(sys.executable).with_name("copem-replay")
@@ -41,7 +52,7 @@ def got(url: str) -> tuple[bytes, HTTPMessage]:
 
 class TestOpening:
     def test_half_a_second_before_the_first_onset(self, results: Path) -> None:
-        files = recordings_of(results)
+        files = list_rrd_files(results)
         assert [path.name for path in files] == ["replay.rrd", "replay_worst.rrd"]
         assert opening_s(results, files) == {path: pytest.approx(0.5) for path in files}
 
@@ -54,7 +65,7 @@ class TestOpening:
         drive(tmp_path / "again.mcap")
         (tmp_path / "e.yaml").write_text(changed("logs: [drive.mcap, again.mcap]", "show: {run: 0, logs: [all]}"))
         folder = cr.run(tmp_path / "e.yaml").save(tmp_path / "r")
-        files = recordings_of(folder)
+        files = list_rrd_files(folder)
         assert [path.relative_to(folder.absolute()).as_posix() for path in files] == [
             "replay/again.rrd",
             "replay/drive.rrd",
@@ -63,13 +74,13 @@ class TestOpening:
 
     def test_a_recording_without_results_beside_it_opens_at_its_beginning(self, results: Path, tmp_path: Path) -> None:
         (tmp_path / "replay.rrd").write_bytes((results / "replay.rrd").read_bytes())
-        assert opening_s(tmp_path, recordings_of(tmp_path)) == {}
+        assert opening_s(tmp_path, list_rrd_files(tmp_path)) == {}
 
     def test_each_recording_has_an_identity(self, results: Path, tmp_path: Path) -> None:
-        found = identities(recordings_of(results))
+        found = read_identities(list_rrd_files(results))
         assert len({identity.recording for identity in found.values()}) == 2
         (tmp_path / "x.rrd").write_bytes(b"no recording")
-        assert identities([tmp_path / "x.rrd"]) == {}
+        assert read_identities([tmp_path / "x.rrd"]) == {}
 
 
 class TestRequest:
@@ -79,10 +90,10 @@ class TestRequest:
         time = b"\x12\x09\x0a\x07elapsed" + b"\x1a\x06\x08\x80\xf2\x8b\xa8\x09"
         inner = store + time + b"\x28\x01"
         assert len(inner) == 39
-        assert set_time(Identity("a:b", "r"), 2.5) == b"\x32\x27" + inner
+        assert set_time(RecordingIdentity("a:b", "r"), 2.5) == b"\x32\x27" + inner
 
     def test_long_names_have_their_length_in_two_bytes(self) -> None:
-        inner = set_time(Identity("a", "r" * 200), 0.0)
+        inner = set_time(RecordingIdentity("a", "r" * 200), 0.0)
         assert inner[3:7] == b"\x0a" + bytes([212 & 127 | 128, 212 >> 7]) + b"R"
 
 
@@ -92,7 +103,7 @@ class TestServer:
         (tmp_path / "a b.rrd").write_bytes(b"\x00recording" * 100_000)
         (tmp_path / "secret").write_text("secret")
         assets = dict.fromkeys(TYPES, b"viewer") | {PAGE: opening_page(b"<html><head></head></html>", ["a b.rrd"], [])}
-        with Server(Site(assets, {"a b.rrd": tmp_path / "a b.rrd", "gone.rrd": tmp_path / "gone.rrd"})) as server:
+        with Server(ViewerSite(assets, {"a b.rrd": tmp_path / "a b.rrd", "gone.rrd": tmp_path / "gone.rrd"})) as server:
             thread = threading.Thread(target=server.serve_forever)
             thread.start()
             yield server

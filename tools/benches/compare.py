@@ -12,13 +12,12 @@ import numpy as np
 import pandas as pd
 
 from benches import common
-from copem_replay.results.contents import write_parquet
-from copem_replay.results.tables import file_of
+from copem_replay.results.schema import table_file, write_parquet
 
 RUNS, OBJECTS, CONFIGURATIONS = 500, 20, ("ideal", "late", "later")
 _COMPARE = """
 import resource, sys, time
-from copem_replay.results.compare import compare
+from copem_replay.results.compare import compare_folders as compare
 began = time.perf_counter()
 compare([__import__("pathlib").Path(sys.argv[1])])
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, time.perf_counter() - began)
@@ -60,4 +59,4 @@ def write(folder: Path, logs: list[str]) -> None:
             "ended_s": 10.0,
             "ended_by": "object_left",
         })  # fmt: skip
-        write_parquet(table, file_of(folder / "detections.parquet", log))
+        write_parquet(table, table_file(folder / "detections.parquet", log))

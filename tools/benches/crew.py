@@ -70,12 +70,12 @@ _ONE_WAY = "import sys; sys.path.insert(0, sys.argv[1]); from benches.crew impor
 def go(way: str, folder: str) -> None:
     """Print seconds of one way, of its start, megabytes of a worker at most, rows: in a process of its own."""
     import copem_replay as cr
-    from copem_replay.cli.api.run import replayed, with_crew
-    from copem_replay.cli.api.study import prepared, study_of
-    from copem_replay.pipeline.crew.crew import Crew
-    from copem_replay.pipeline.crew.dask_workers import DaskWorkers
-    from copem_replay.pipeline.log_survey import LogSurvey
-    from copem_replay.pipeline.pieces import Pieces
+    from copem_replay.api.run import read_with_crew, replay_study
+    from copem_replay.api.study import make_study, prepare_study
+    from copem_replay.pipeline.crew import Crew
+    from copem_replay.pipeline.dask_workers import DaskWorkers
+    from copem_replay.pipeline.pieces import PieceCache
+    from copem_replay.pipeline.study_log import LogSurvey
 
     os.chdir(folder)
     cr.run("e.yaml", "drive00.mcap", jobs=1)  # compiled, and warm
@@ -85,14 +85,14 @@ def go(way: str, folder: str) -> None:
         print(time.perf_counter() - began_s, 0, 0, len(result.detections), 0)
         return
     began_s = time.perf_counter()
-    workers = DaskWorkers(way, Pieces("warm"), 2)
-    warm = Crew(workers, pieces := Pieces("warm"))  # kernels are loaded in the workers, too
-    with_crew(lambda: study_of("e.yaml", ["drive00.mcap", "drive01.mcap"], LogSurvey(pieces), warm), warm)
+    workers = DaskWorkers(way, PieceCache("warm"), 2)
+    warm = Crew(workers, pieces := PieceCache("warm"))  # kernels are loaded in the workers, too
+    read_with_crew(lambda: make_study("e.yaml", ["drive00.mcap", "drive01.mcap"], LogSurvey(pieces), warm), warm)
     start_s, began_s = time.perf_counter() - began_s, time.perf_counter()
-    hands = Crew(workers, pieces := Pieces("kept"))
-    study = with_crew(lambda: study_of("e.yaml", None, LogSurvey(pieces), hands), hands)
+    hands = Crew(workers, pieces := PieceCache("kept"))
+    study = read_with_crew(lambda: make_study("e.yaml", None, LogSurvey(pieces), hands), hands)
     computed_s = time.perf_counter() - began_s
-    result = replayed(study, prepared(study)[0], 1, None, pieces)
+    result = replay_study(study, prepare_study(study)[0], 1, None, pieces)
     took_s = time.perf_counter() - began_s
     workers.close()
     print(took_s, start_s, hands.peak_bytes / 1e6, len(result.detections), computed_s)

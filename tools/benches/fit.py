@@ -11,10 +11,10 @@ import numpy as np
 
 from benches import common
 from copem_replay.core.view_geometry import ViewGeometry
+from copem_replay.fitting.detection import fit_detection
+from copem_replay.fitting.replay_check import replay_statistics, simulate_lists
+from copem_replay.fitting.rows import FitLists, FitRows
 from copem_replay.perception.pem.model import Pem
-from copem_replay.pipeline.fit.detection import fit_detection
-from copem_replay.pipeline.fit.replay_check import replayed, simulated
-from copem_replay.pipeline.fit.rows import FitLists, FitRows
 
 PASSES, LISTS, PERIOD_S = 1000, 100, 0.1
 PEM = {
@@ -43,7 +43,7 @@ def fit() -> Iterator[common.Line]:
     share = found.memory["share"].value if found.memory else None
     yield {**took, "rows": len(rows.listed), "rungs": len(found.ladder), "share": share}
     some = rows.take(rows.pass_ix < 100)
-    checked = common.timed(lambda: replayed(Pem.model_validate(PEM), some, lists, runs=500))
+    checked = common.timed(lambda: replay_statistics(Pem.model_validate(PEM), some, lists, runs=500))
     yield {"fit_replay_check_s": round(checked.seconds, 2), "rows": len(some.listed), "runs": 500}
 
 
@@ -68,7 +68,7 @@ def drives() -> tuple[FitRows, FitLists]:
         class_ix=none, existence=nothing, track_id=none, fold=pass_ix % 5,
     )  # fmt: skip
     listed, along_m, across_m = (
-        values[0] for values in simulated(Pem.model_validate(PEM), rows, lists, np.zeros(1, dtype=int), 0)
+        values[0] for values in simulate_lists(Pem.model_validate(PEM), rows, lists, np.zeros(1, dtype=int), 0)
     )
     along_m, across_m = (np.where(listed, error, np.nan) for error in (along_m, across_m))
     cos, sin = np.cos(bearing), np.sin(bearing)

@@ -21,16 +21,17 @@ from copem_replay.communication.arrivals import fusion_schedule
 from copem_replay.core.object_list import COVARIANCES, Inputs, ObjectLists, entries_of
 from copem_replay.core.tracks import CLASSES, Float, Tracks
 from copem_replay.experiment.schema import Experiment
-from copem_replay.fusion.base import ListFusion
 from copem_replay.fusion.gnn import Gnn
-from copem_replay.fusion.ideal import fuse
-from copem_replay.fusion.inputs import inputs
+from copem_replay.fusion.ideal import fuse_ideal
+from copem_replay.fusion.inputs import make_inputs
+from copem_replay.fusion.interface import ListFusion
 from copem_replay.fusion.tracker import Tracker
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.gospa import gospa, gospa_pairs
-from copem_replay.pipeline.blocks import blocks
-from copem_replay.pipeline.prepare import prepare
-from copem_replay.pipeline.receiver import WorldChunk, _without_truth, listen, seen_by_all
+from copem_replay.pipeline.prepare import prepare_log
+from copem_replay.pipeline.receiver import _remove_truth_ids, hear_units, perceive_all_units
+from copem_replay.pipeline.replay import cut_blocks
+from copem_replay.pipeline.world import WorldChunk
 from tests.oracles import gnn as gnn_oracle
 
 PERIOD_S = 0.1
@@ -77,11 +78,11 @@ def crossing(experiment: Experiment, recording: Recording) -> Iterator[common.Li
 
     Only the fusion: what units list, and when it arrives, is there before.
     """
-    ready = prepare(recording, experiment)
+    ready = prepare_log(recording, experiment)
     world = ready.world(experiment)
-    cut = blocks(ready, experiment, 2)[:2]
-    seen = [seen_by_all(world, runs, states="sampled") for runs in cut]
-    told = [_without_truth(world, each, runs)[0] for each, runs in zip(seen, cut, strict=True)]
+    cut = cut_blocks(ready, experiment, 2)[:2]
+    seen = [perceive_all_units(world, runs, states="sampled") for runs in cut]
+    told = [_remove_truth_ids(world, each, runs)[0] for each, runs in zip(seen, cut, strict=True)]
     with ThreadPoolExecutor(2) as pool:
         for name in world.experiment.configurations:
             parts = [_fusing(world, name, *each) for each in zip(seen, told, strict=True)]
@@ -99,14 +100,14 @@ def crossing(experiment: Experiment, recording: Recording) -> Iterator[common.Li
 
 def _fusing(world: WorldChunk, name: str, seen: Tracks, told: ObjectLists) -> tuple[Callable[[], object], int]:
     """Fuses one block of runs as one configuration does; how many lists each run gets."""
-    heard = listen(seen, world, name)
+    heard = hear_units(seen, world, name)
     configuration = world.experiment.configurations[name]
     age_of_information_s, fusion = configuration.max_age_s, configuration.fusion
     count = len(fusion_schedule(heard, max_age_s=age_of_information_s).issue_s)
     if isinstance(fusion, ListFusion):
-        ready = inputs(heard, told, max_age_s=age_of_information_s)
+        ready = make_inputs(heard, told, max_age_s=age_of_information_s)
         return lambda: fusion.fuse(ready), count
-    return lambda: fuse(heard, max_age_s=age_of_information_s, without_object_ix=world.scene.ego_ix), count
+    return lambda: fuse_ideal(heard, max_age_s=age_of_information_s, without_object_ix=world.scene.ego_ix), count
 
 
 # -------------------------------------------------------------------------------------------------- nearest neighbours

@@ -11,9 +11,9 @@ from typing import Any
 
 from benches import common
 from copem_replay.experiment.schema import Experiment
-from copem_replay.io.recording import Recording, read
-from copem_replay.pipeline.prepare import Replay, prepare
-from copem_replay.pipeline.run import run
+from copem_replay.io.recording import Recording, read_log
+from copem_replay.pipeline.prepare import Replay, prepare_log
+from copem_replay.pipeline.run import run_experiment
 
 RUNS = 20
 LINKS: dict[str, dict[str, Any]] = {
@@ -34,11 +34,11 @@ def by_fusion(recording: Recording) -> Iterator[common.Line]:
     """A line for each fusion, with accuracy and without."""
     for fusion, accuracy in KINDS:
         plans = [plan(link, fusion, accuracy) for link in LINKS.values()]
-        ready = [prepare(recording, one) for one in plans]
+        ready = [prepare_log(recording, one) for one in plans]
 
         def replayed(experiment: Experiment, replay: Replay) -> None:
             vars(replay).pop("_drawn", None)  # what links drew is of the call before
-            run(experiment, [recording], ready=[replay])
+            run_experiment(experiment, [recording], ready=[replay])
 
         constant_s, drawn_s = common.interleaved(
             [partial(replayed, one, its) for one, its in zip(plans, ready, strict=True)]
@@ -68,4 +68,4 @@ def links() -> Iterator[common.Line]:
     """A minute of 20 objects, five of which send what they see by radio: what it costs that arrivals are drawn."""
     with common.scratch() as folder:
         common.write_truth(folder / "minute.mcap", common.boxes(600, 20))
-        yield from by_fusion(read(folder / "minute.mcap", name="minute", ego="0"))
+        yield from by_fusion(read_log(folder / "minute.mcap", name="minute", ego="0"))

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from benches import common
-from copem_replay.io.write.osi_trace import write_osi_trace
+from copem_replay.io.write.osi import write_osi_trace
 from make_logs import long_drive
 
 _RUN = ("run", "--out", "out", "--overwrite", "--jobs", "2")

@@ -11,10 +11,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from benches import common
-from copem_replay.core.lasting import ListTimes, drifting, held
+from copem_replay.core.lasting import ListStamps, draw_correlated_normals, draw_held_uniforms
 from copem_replay.core.random import CounterRng, RandomKey, object_words
 from copem_replay.experiment.schema import Experiment
-from copem_replay.pipeline.run import run
+from copem_replay.pipeline.run import run_experiment
 
 LISTS, OBJECTS, RUNS, STEP_NS = 600, 20, 50, 100_000_000
 """One unit at 10 Hz, a minute."""
@@ -26,7 +26,7 @@ def memory() -> Iterator[common.Line]:
     experiment, recordings = common.loaded("crossing")
     plain = experiment.model_copy(update={"runs": 2, "show": None})
     lasting = remembering(plain)
-    took = common.interleaved([lambda: run(plain, recordings), lambda: run(lasting, recordings)])
+    took = common.interleaved([lambda: run_experiment(plain, recordings), lambda: run_experiment(lasting, recordings)])
     yield {"memory_crossing_ratio": round(took[1] / took[0], 3), "seconds": round(took[1], 3)}
 
 
@@ -35,14 +35,14 @@ def numbers() -> common.Line:
     none = np.zeros(LISTS, dtype=np.int64)
     words = np.repeat(object_words([str(k) for k in range(OBJECTS)]), LISTS)
     random_key = RandomKey(("u",), np.tile(none, OBJECTS), words, np.tile(stamps, OBJECTS))
-    lists = ListTimes(stamps, none, np.tile(np.arange(LISTS), OBJECTS))
+    lists = ListStamps(stamps, none, np.tile(np.arange(LISTS), OBJECTS))
     rng, runs = CounterRng(1, "bench"), np.arange(RUNS)
     uniform, slow, quick, normal, drifts = common.interleaved([
         lambda: rng.uniform("p", random_key, runs),
-        lambda: held(rng, "p", random_key, runs, 1.0),
-        lambda: held(rng, "p", random_key, runs, 0.5),
+        lambda: draw_held_uniforms(rng, "p", random_key, runs, 1.0),
+        lambda: draw_held_uniforms(rng, "p", random_key, runs, 0.5),
         lambda: rng.normal("p", random_key, runs),
-        lambda: drifting(rng, "p", random_key, runs, 1.0, lists=lists),
+        lambda: draw_correlated_normals(rng, "p", random_key, runs, 1.0, lists=lists),
     ])  # fmt: skip
     return {
         "memory_held_ratio_at_0.1": round(slow / uniform, 2),

@@ -12,7 +12,7 @@ import pandas as pd
 from mcap.writer import Writer
 
 from benches import common
-from copem_replay.io.recording import read
+from copem_replay.io.recording import read_log
 
 FRAMES, COUNT, STEP_S = 1200, 60, 0.05
 STATES = FRAMES * COUNT
@@ -56,15 +56,15 @@ def by_format(folder: Path, osi: Path) -> Iterator[common.Line]:
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
 
-    yield _line("osi", common.best(lambda: read(osi, name="osi"), 3))
+    yield _line("osi", common.best(lambda: read_log(osi, name="osi"), 3))
     for name, (encoding, schema, payloads) in {
         "scene_update_protobuf": ("protobuf", *_scene_updates(as_json=False)),
         "scene_update_json": ("json", *_scene_updates(as_json=True)),
     }.items():
         path = _written(folder / f"{name}.mcap", "foxglove.SceneUpdate", encoding, schema, payloads)
-        yield _line(name, common.best(lambda path=path: read(path, name="scene"), 3))
+        yield _line(name, common.best(lambda path=path: read_log(path, name="scene"), 3))
     path = _written(folder / "tracked.mcap", _TRACKED, "cdr", ("ros2msg", DEFINITION.encode()), _tracked())
-    ours = common.best(lambda: read(path, name="tracked"), 3)
+    ours = common.best(lambda: read_log(path, name="tracked"), 3)
 
     def theirs() -> float:
         """Every message decoded, and the places of its objects touched."""
@@ -201,7 +201,7 @@ def reading() -> Iterator[common.Line]:
     with common.scratch() as folder:
         path = folder / "read.mcap"
         common.write_truth(path, common.boxes(1200, 60))
-        ours = common.best(lambda: read(path, name="read"), 3)
+        ours = common.best(lambda: read_log(path, name="read"), 3)
         plain = common.best(lambda: plain_loop(path), 3)
         yield {"read_ratio": round(ours / plain, 3), "read_objects_per_s": round(72_000 / ours)}
         yield from by_format(folder, path)

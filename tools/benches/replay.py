@@ -9,9 +9,9 @@ import numpy as np
 
 from benches import common
 from copem_replay.perception.visibility import NO_STATICS, Flat, Observers, Surface, visible_shares
-from copem_replay.pipeline.blocks import replay_block
-from copem_replay.pipeline.prepare import prepare
-from copem_replay.pipeline.run import run
+from copem_replay.pipeline.prepare import prepare_log
+from copem_replay.pipeline.replay import replay_block
+from copem_replay.pipeline.run import run_experiment
 
 
 def visibility() -> Iterator[common.Line]:
@@ -36,7 +36,7 @@ def paper() -> Iterator[common.Line]:
     """
     experiment, recordings = common.loaded("tc016d")
     listed = experiment.model_copy(update={"braking": None})
-    ready, runs = prepare(recordings[0], listed), np.arange(experiment.runs)
+    ready, runs = prepare_log(recordings[0], listed), np.arange(experiment.runs)
     rng = np.random.default_rng(1)
     cells = len(ready.measured.tracks.frame_ix) * experiment.runs
     ours = common.best(lambda: replay_block(ready, listed, runs))
@@ -51,7 +51,7 @@ def paper() -> Iterator[common.Line]:
     took_s: dict[str, float] = {}
     for name, keys in variants.items():
         whole = experiment.model_copy(update={"measure": experiment.measure.model_copy(update=keys)})
-        seconds = common.best(lambda whole=whole: run(whole, recordings, jobs=os.cpu_count() or 1))
+        seconds = common.best(lambda whole=whole: run_experiment(whole, recordings, jobs=os.cpu_count() or 1))
         took_s[name] = seconds
         factor = round(count * recordings[0].scene.end_s / seconds)
         yield {f"paper{name}_realtime_factor": factor, "seconds": round(seconds, 3)}

@@ -10,14 +10,14 @@ import numpy as np
 from benches import common
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import Scene
-from copem_replay.io.write.detail_json_writer import DetailWriter
-from copem_replay.io.write.foxglove_scene import SceneWriter
+from copem_replay.io.write.detail import DetailWriter
 from copem_replay.io.write.mcap import write_mcap
-from copem_replay.io.write.osi_sensor_data_writer import SensorDataWriter
-from copem_replay.metrics.summary import horizon_s, summary
-from copem_replay.pipeline.blocks import replay_block
+from copem_replay.io.write.osi import SensorDataWriter
+from copem_replay.io.write.scene import FoxgloveSceneWriter
+from copem_replay.metrics.summary import horizon_s, summarise_rows
 from copem_replay.pipeline.one_run import tracks_of_run
-from copem_replay.pipeline.prepare import prepare
+from copem_replay.pipeline.prepare import prepare_log
+from copem_replay.pipeline.replay import replay_block
 from copem_replay.viewer import write_rrd
 from tests.oracles import messages as plain
 
@@ -34,7 +34,7 @@ def encoding(scene: Scene, all_tracks: dict[str, FusedTracks], compared: str) ->
             numbers = {unit: k + 1 for k, unit in enumerate(of.heard.units)}
             writers = (
                 SensorDataWriter(scene, of, numbers),
-                SceneWriter(scene, of, name, _GREY),
+                FoxgloveSceneWriter(scene, of, name, _GREY),
                 DetailWriter(scene, of, {}),
             )
             made += [message for writer in writers for message in writer.messages(available_ns)]
@@ -65,11 +65,11 @@ def writing() -> Iterator[common.Line]:
     """
     experiment, recordings = common.loaded("crossing")
     experiment = experiment.model_copy(update={"configurations": experiment.shown()})
-    ready = prepare(recordings[0], experiment)
+    ready = prepare_log(recordings[0], experiment)
     run_tracks = tracks_of_run(ready, experiment, 0)
     table = replay_block(ready, experiment, np.arange(1))
     rates: dict[str, float | None] = dict.fromkeys(experiment.configurations)
-    rows, _ = summary(table, list(experiment.configurations), rates, seed=1, horizon_s=horizon_s(table, None))
+    rows, _ = summarise_rows(table, list(experiment.configurations), rates, seed=1, horizon_s=horizon_s(table, None))
     listed = sum(int(lists.fused.valid.sum()) for lists in run_tracks.values())
     shown = listed + len(ready.truth.frame_ix)
     with common.scratch() as folder:

@@ -171,11 +171,11 @@ def compressed(plain: bytes, compression: str) -> bytes:
 
 def taken_apart(path: Path, most: int) -> Sample:
     """The first `most` messages of each channel."""
-    from copem_replay.io.containers.mcap_recovery import FromStart
+    from copem_replay.io.containers.mcap_records import RecordsFromStart
 
     counts, messages = Counter[int](), []
     with path.open("rb") as file:
-        stream = FromStart(file)
+        stream = RecordsFromStart(file)
         for item in stream:
             if type(item).__name__ == "Message" and counts[item.channel_id] < most:
                 counts[item.channel_id] += 1

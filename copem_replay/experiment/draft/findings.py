@@ -1,16 +1,32 @@
-"""What a look at a recording finds: plain values, in the order in which JSON has them."""
+"""The findings of a survey of a recording, as plain values in the order of the JSON; and the experiment they suggest.
+
+Suggestions (the ego, the measured objects, the place of a mast) are guesses from the content of the log, with reasons.
+"""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from copem_replay.core.errors import RecordingError
+from copem_replay.core.tracks import CLASSES, Bool, Float, Int, Scene, Tracks, class_indices
+from copem_replay.io.channel import schema_name
+from copem_replay.io.log import BrokenIndexError, Log
+from copem_replay.io.recording import Recording, foreign_channels, read_log
+from copem_replay.io.schemas.poses import ODOMETRY, is_pose
+
+if TYPE_CHECKING:
+    from copem_replay.io.schemas.description import Fields
+
 
 Role = Literal["truth", "unit", "poses", "unread"]
 
 
 @dataclass(frozen=True)
 class TopicFound:
-    """A channel, and what it is to a replay."""
+    """A channel, and its role in a replay."""
 
     topic: str
     schema: str
@@ -27,18 +43,18 @@ class UnitFound:
     lists: int = 0
     entries: int = 0
     rate_hz: float | None = None  # median
-    covariances_said: bool = False  # by every entry
-    captures_said: bool = False  # by every list
+    covariances_said: bool = False  # whether by every entry
+    captures_said: bool = False  # whether by every list
     problem: str | None = None
-    delay_s: float | None = None  # as entries fit the truth best, of lists that do not say when they were captured
+    delay_s: float | None = None  # by the best fit to the truth, of lists that do not state their capture
     delay_interval_s: list[float] | None = None  # 95 %
-    delay: str | None = None  # the same in words, or that it cannot be told; None: lists say it
+    delay: str | None = None  # the delay in words, or that it cannot be told; None: lists state their capture
     oddities: list[str] = field(default_factory=list)  # one line each
 
 
 @dataclass(frozen=True)
 class EgoFound:
-    """The ego vehicle that the log names: its size in its first frame, and from when to when it is there."""
+    """The ego vehicle that the log names: its size in its first frame, and when it is in the log."""
 
     id: str
     class_: str  # in JSON `class`
@@ -49,7 +65,7 @@ class EgoFound:
 
 @dataclass(frozen=True)
 class Mast:
-    """A place to look on from, and the direction to look in."""
+    """A place for a roadside unit, and the direction it looks in."""
 
     at: list[float]  # x, y in metres, as in the log
     yaw_deg: int
@@ -59,8 +75,8 @@ class Mast:
 class Suggestion:
     """An experiment to begin with.
 
-    `ego`: as the experiment has it, None: the host vehicle of the log. `classes`: those that are measured, None: all
-    that moves. `masts`: two, the one with more room around it first.
+    `ego`: value of the key, None: the host vehicle of the log. `classes`: measured classes, None: all that moves.
+    `masts`: two, the one with more room around it first.
     """
 
     ego: str | dict[str, str] | None
@@ -83,13 +99,13 @@ class TruthFound:
     longest_gap_s: float | None
     longest_gap_at_s: float | None
     gaps_inside_tracks: int
-    x_m: list[float]  # from where to where the centres of the boxes lie
+    x_m: list[float]  # extent of the centres of the boxes, from and to
     y_m: list[float]
     moving: dict[str, int]  # objects by class
     stationary: dict[str, int]
     host_id: str | None
     ego: EgoFound | None
-    missing: list[str]  # what a user may have to give
+    missing: list[str]  # keys that a user may have to give
     damage: str | None
     notes: list[str]
     vehicles: str  # ids of objects that move, as messages list them
@@ -101,8 +117,8 @@ class TruthFound:
 class ProposalFound:
     """A channel that looks like a list of objects, by the names of its fields.
 
-    `read`: as an experiment has it, of what was found. `missing`: needed keys that were not found. `offers`: fields of
-    the messages. `problem`: why it was not read. `truth`: what is read so, None where not all was found.
+    `read`: value of the key, with the fields that were found. `missing`: needed keys without a field. `offers`: fields
+    of the messages. `problem`: why the channel was not read. `truth`: the list read so, None where it was not.
     """
 
     topic: str
@@ -115,13 +131,13 @@ class ProposalFound:
 
 
 @dataclass(frozen=True)
-class Survey:
-    """A recording that was looked at.
+class RecordingSurvey:
+    """The survey of a recording.
 
-    `readable`: whether a list of true objects could be read; if not, `reason` says why in a line, and `topics` what
-    the file holds all the same. `truth` has an entry per topic that could be the truth: one, unless there is a choice
-    to make (then `choice` says so). `damage`: what is wrong with the file. `proposals`: where no list is known by
-    name, what could be read by naming fields. `units`: lists of units, where there is no truth to hold them against.
+    `readable`: whether a list of true objects could be read; if not, `reason` says why in a line. `topics`: the
+    channels of the file. `truth`: an entry per topic that could be the truth; one, unless there is a choice to make,
+    which `choice` describes. `damage`: of the file. `proposals`: where no schema is known, channels that could be read
+    by naming fields. `units`: lists of units, where there is no truth to compare them with.
     """
 
     recording: str
@@ -136,6 +152,181 @@ class Survey:
     units: list[UnitFound] = field(default_factory=list)
 
 
-def as_json(survey: Survey) -> dict[str, Any]:
-    """Plain data that JSON can hold, the same for the same recording."""
+def survey_as_json(survey: RecordingSurvey) -> dict[str, Any]:
+    """The survey as plain data for JSON."""
     return asdict(survey, dict_factory=lambda items: {name.removesuffix("_"): value for name, value in items})
+
+
+# Suggestions for an experiment.
+
+RANGE_M = 50.0
+"""Distance to the ego within which objects are measured: the default of the onset `in_range`."""
+MAST_M = 10.0
+"""Distance of the mast from the busiest place: beside the lane, not on it."""
+_CELL_M = 10.0
+"""Cells of the grid on which the busiest place is sought: two or three lanes wide."""
+_MOVED_M = 10.0
+"""An object that moved less is parked, or nearly."""
+_MOSTLY = 0.75
+"""The least share of a log for which an ego is there: the vehicle that records a log is there nearly throughout."""
+_ROWS = 100_000
+"""Object states that are looked at for the place of a mast, at most; more: slower, the place hardly moves."""
+_DRIVEN = ("car", "van", "truck", "bus", "vehicle", "motorcycle")
+_FRAMES = ("base_link", "base_footprint", "ego_vehicle", "ego", "vehicle")  # usual names of the vehicle's own frame
+
+
+def suggest_experiment(log: Log, recording: Recording, fields: Fields | None = None) -> Suggestion:
+    """Suggest an experiment on a recording."""
+    ego, why, recording = _suggest_ego(log, recording, fields)
+    scene, truth = recording.scene, recording.truth
+    objects = truth.row_object_ix
+    number = scene.ego_ix if ego is None or isinstance(ego, dict) else scene.object_number.get(ego, -1)
+    classes, onset, rows = _suggest_measured(scene, truth, number)
+    if not len(rows):
+        rows = np.arange(len(objects))
+    return Suggestion(ego, why, classes, onset, _suggest_masts(truth, rows, objects))
+
+
+def _suggest_ego(
+    log: Log, recording: Recording, fields: Fields | None
+) -> tuple[str | dict[str, str] | None, str, Recording]:
+    """The value of `ego`, why, and the recording read with it."""
+    scene = recording.scene
+    if recording.around is not None and recording.around.ego is not None:
+        poses = _find_poses(log)
+        if poses:
+            return {"topic": poses[0]["topic"]}, "the only odometry of the log", recording
+    if scene.ego_ix >= 0:
+        ident = scene.object_ids[scene.ego_ix]
+        return None, f"the log names its host vehicle: {ident} ({CLASSES[scene.object_class[scene.ego_ix]]})", recording
+    host = recording.host_id
+    none = "the log names no host vehicle" if host is None else f"the log's host vehicle {host} is no moving object"
+    for place in _find_poses(log):
+        from copem_replay.io.config import EgoTopic
+
+        try:
+            ego_topic = EgoTopic.model_validate(place)
+            with_ego = read_log(log, name=scene.log, topic=recording.topic, fields=fields, ego=ego_topic)
+        except (RecordingError, BrokenIndexError):
+            continue
+        if with_ego.scene.ego_ix >= 0:
+            return place, f"{none}; these poses may be the ego's", with_ego
+    ident, why = _find_longest_vehicle(scene, recording.truth)
+    return ident, f"{none}; {why}", recording
+
+
+def _find_poses(log: Log) -> list[dict[str, str]]:
+    """Values of `ego` for the topics that may have its poses: odometry first, transforms last."""
+    if not foreign_channels(log):
+        return []
+    from copem_replay.io.encodings.columns import DefinitionError
+    from copem_replay.io.log import gather_messages
+    from copem_replay.io.schemas.poses import decode_poses
+
+    ranked: list[tuple[int, dict[str, str]]] = []
+    for channel in foreign_channels(log):
+        if not is_pose(channel) or channel.topic.endswith("tf_static"):
+            continue
+        if schema_name(channel) == ODOMETRY:
+            ranked.append((0, {"topic": channel.topic}))
+            continue
+        try:
+            messages = gather_messages(log, frozenset([channel.number]))
+            times = np.array(messages.log_time_ns[channel.number], dtype=np.int64)
+            poses = decode_poses(channel, messages.payloads[channel.number], times)
+        except (DefinitionError, KeyError, BrokenIndexError):
+            continue
+        if len(set(poses.stamp_ns.tolist())) < 2:  # a place, not a way
+            continue
+        frames = {name.lstrip("/") for name in poses.child}
+        base = next((name for name in _FRAMES if name in frames), None)
+        if frames == {""}:
+            ranked.append((1, {"topic": channel.topic}))
+        elif base is not None:
+            ranked.append((2, {"topic": channel.topic, "frame": base}))
+    return [place for _, place in sorted(ranked, key=lambda pair: pair[0])]
+
+
+def _find_longest_vehicle(scene: Scene, truth: Tracks) -> tuple[str, str]:
+    """The driving vehicle that is in the log for longest, and why; "none" where no other object would be measured.
+
+    "none" also where it is there for a part of the log only: that log was recorded from beside the road.
+    """
+    objects, count = truth.row_object_ix, len(scene.object_ids)
+    first, last = np.full(count, np.inf), np.full(count, -np.inf)
+    np.minimum.at(first, objects, truth.row_captured_s)
+    np.maximum.at(last, objects, truth.row_captured_s)
+    extent = np.zeros((2, count))
+    for k, values in enumerate((truth.x_m[0], truth.y_m[0])):
+        low, high = np.full(count, np.inf), np.full(count, -np.inf)
+        np.minimum.at(low, objects, values)
+        np.maximum.at(high, objects, values)
+        extent[k] = high - low
+    moved = np.hypot(*extent)
+    drives = scene.moving & np.isin(scene.object_class, class_indices(_DRIVEN))
+    if not drives.any():
+        return "none", "there is no vehicle to be the ego"
+    if scene.moving.sum() < 2:
+        return "none", f"{scene.object_ids[int(drives.argmax())]}, the only one that moves, is measured"
+    best = max(np.flatnonzero(drives), key=lambda k: (moved[k] >= _MOVED_M, last[k] - first[k], moved[k]))
+    longest = (
+        f"of the vehicles that drive, {scene.object_ids[best]} ({CLASSES[scene.object_class[best]]}) "
+        f"is there longest, {first[best]:.1f} – {last[best]:.1f} s"
+    )
+    if last[best] - first[best] < _MOSTLY * scene.end_s:
+        return "none", f"{longest} of {scene.end_s:.1f} s, and an ego is there nearly all the time"
+    return scene.object_ids[best], longest
+
+
+def _suggest_measured(scene: Scene, truth: Tracks, ego_ix: int) -> tuple[list[str] | None, str, Int]:
+    """Classes, onset and rows of the measured objects: vulnerable road users near the ego, else vehicles, else all."""
+    objects = truth.row_object_ix
+    near = _is_near_ego(truth, objects, ego_ix)
+    others = scene.moving[objects] & (objects != ego_ix)
+    kinds = scene.object_class[objects]
+    groups: list[tuple[list[str] | None, Bool]] = [
+        ([name], others & np.isin(kinds, class_indices((name,)))) for name in ("vru", "vehicles")
+    ]
+    groups.append((None, others))
+    for onset, in_reach in (("in_range", near), ("appears", np.ones_like(near))):
+        for classes, which in groups:
+            if (rows := np.flatnonzero(which & in_reach)).size:
+                return classes, onset, rows
+    return None, "in_range", np.flatnonzero(others)
+
+
+def _is_near_ego(truth: Tracks, objects: Int, ego_ix: int) -> Bool:
+    """(P,) whether a row is in range of the ego; all are without an ego."""
+    if ego_ix < 0:
+        return np.ones(len(objects), dtype=bool)
+    x, y = np.full(len(truth.stamp_ns), np.nan), np.full(len(truth.stamp_ns), np.nan)
+    ego_rows = np.flatnonzero(objects == ego_ix)
+    x[truth.frame_ix[ego_rows]], y[truth.frame_ix[ego_rows]] = truth.x_m[0, ego_rows], truth.y_m[0, ego_rows]
+    away = np.hypot(truth.x_m[0] - x[truth.frame_ix], truth.y_m[0] - y[truth.frame_ix])
+    return np.asarray(away <= RANGE_M)  # NaN, the ego is not there: no
+
+
+def _suggest_masts(truth: Tracks, rows: Int, objects: Int) -> list[Mast]:
+    """Two masts that face each other across the busiest place of measured objects, the one with more room first."""
+    rows = rows[:: max(1, len(rows) // _ROWS)]
+    x, y = truth.x_m[0, rows], truth.y_m[0, rows]
+    cells = np.stack([np.floor(x / _CELL_M), np.floor(y / _CELL_M)], axis=1)
+    visits = np.unique(np.column_stack([cells, objects[rows]]), axis=0)
+    places, counts = np.unique(visits[:, :2], axis=0, return_counts=True)
+    busiest = places[counts == counts.max()]
+    middle = np.array([np.median(x), np.median(y)])
+    inside = (cells == busiest[np.hypot(*((busiest + 0.5) * _CELL_M - middle).T).argmin()]).all(axis=1)
+    centre = np.array([x[inside].mean(), y[inside].mean()])
+    step = max(1, len(truth.x_m[0]) // _ROWS)
+    everyone = np.stack([truth.x_m[0, ::step], truth.y_m[0, ::step]], axis=1)
+    turns = np.deg2rad(np.arange(0, 360, 45))
+    around = [centre + MAST_M * np.array([np.cos(t), np.sin(t)]) for t in turns]
+    free = [float(np.hypot(*(everyone - place).T).min()) for place in around]
+    best = int(np.argmax(np.round(free, 3)))
+    return [_make_mast(centre, float(turns[(best + more) % 8])) for more in (0, 4)]
+
+
+def _make_mast(centre: Float, turn: float) -> Mast:
+    place = centre + MAST_M * np.array([np.cos(turn), np.sin(turn)])
+    facing = round(np.rad2deg(turn)) - 180
+    return Mast([round(float(v), 1) for v in place], facing + 360 if facing <= -180 else facing)

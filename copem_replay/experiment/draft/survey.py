@@ -1,9 +1,10 @@
-"""A look at a recording: its topics, the truth in it, the lists of its units, and the experiment to begin with."""
+"""The survey of a recording: its topics, the truth in it, the lists of its units; and of several, their clocks."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,75 +12,85 @@ import numpy as np
 
 from copem_replay.core.errors import RecordingError
 from copem_replay.core.tracks import CLASSES, Bool, Float, Scene
-from copem_replay.experiment.draft.defaults import suggestion
 from copem_replay.experiment.draft.findings import (
     EgoFound,
     ProposalFound,
+    RecordingSurvey,
     Role,
-    Survey,
     TopicFound,
     TruthFound,
     UnitFound,
+    suggest_experiment,
 )
 from copem_replay.io.channel import Channel
+from copem_replay.io.ground_truth import MAX_GAP_S
 from copem_replay.io.log import Log
-from copem_replay.io.open import name_of, open_log
-from copem_replay.io.plausibility import MAX_GAP_S
-from copem_replay.io.recording import Recording, choose_topic, foreign, is_truth, moving_ids, read, truth_topics
+from copem_replay.io.open import Local, first_recording, label_files, name_log, open_log
+from copem_replay.io.recording import (
+    Recording,
+    choose_topic,
+    foreign_channels,
+    is_truth,
+    moving_ids,
+    read_log,
+    truth_topics,
+)
 from copem_replay.io.schemas import osi_ground_truth as osi
-from copem_replay.io.schemas.pose_schemas import is_pose
-from copem_replay.io.schemas.registry import is_list
-from copem_replay.io.together import Local, first_of
+from copem_replay.io.schemas.poses import is_pose
+from copem_replay.io.schemas.registry import is_list, known_lists
 
-if TYPE_CHECKING:  # it imports much that a recording of the truth alone does not need
-    from copem_replay.io.recorded_osi import RecordedLists
+if TYPE_CHECKING:  # they import much that a recording of the truth alone does not need
+    from copem_replay.io.clock_offset import TimeOffset
+    from copem_replay.io.recorded_lists import RecordedLists
     from copem_replay.io.schemas.description import Fields
+    from copem_replay.io.short_tracks import ListPoints
+
 
 GATE_M = 3.0
-"""Farther from a true object an entry is about no object: the default of `measure.match`."""
-_OURS = "copem/"  # what this project wrote beside a recording
+"""Distance within which an entry is about a true object: the default of `measure.match`."""
+_OURS = "copem/"  # prefix of the topics that this project writes
 _EGO_HINT = "give `ego: <id>` in the experiment, or `--ego <id>`"
 
 
-def survey(place: Local | str) -> Survey:
-    """Look at a recording: the same findings for the same bytes. A bad recording raises nothing."""
+def survey_recording(place: Local | str) -> RecordingSurvey:
+    """The survey of a recording, equal for equal bytes. A bad recording raises nothing: `reason` says why."""
     place = Path(place) if isinstance(place, str) else place
-    path = first_of(place)
+    path = first_recording(place)
     names = [path] if isinstance(place, Path) else list(place.paths)
-    found = Survey(recording=" + ".join(one.name or str(one) for one in names), log=str(place))
+    survey = RecordingSurvey(recording=" + ".join(one.name or str(one) for one in names), log=str(place))
     try:
         log = open_log(place)
     except RecordingError as error:
-        return replace(found, reason=str(error))
-    found = replace(found, damage=log.damage, topics=_topics(log))
+        return replace(survey, reason=str(error))
+    survey = replace(survey, damage=log.damage, topics=_survey_topics(log))
     try:
         topics = [choose_topic(log)[0]]
     except RecordingError as error:
         topics = list(truth_topics(log))
         if not topics:
-            units = list(_units_alone(log, place, found.topics))
-            return replace(found, reason=str(error), proposals=_proposals(log, found.topics), units=units)
-        found = replace(found, choice=str(error))
+            units = list(_survey_units_alone(log, place, survey.topics))
+            return replace(survey, reason=str(error), proposals=_list_proposals(log, survey.topics), units=units)
+        survey = replace(survey, choice=str(error))
     truth, failures = [], []
-    beside = [t.topic for t in found.topics if t.role == "unit"]
+    beside = [t.topic for t in survey.topics if t.role == "unit"]
     for topic in topics:
         try:
-            recording = read(log, name=name_of(path), topic=topic, beside=beside)
+            recording = read_log(log, name=name_log(path), topic=topic, beside=beside)
         except RecordingError as error:
             failures.append(str(error))
             continue
-        truth.append(_truth(log, recording, found.topics))
+        truth.append(_survey_truth(log, recording, survey.topics))
     if not truth:
-        return replace(found, reason="; ".join(failures))
-    damage = next((t.damage for t in truth if t.damage), found.damage)
-    return replace(found, readable=True, truth=truth, damage=damage)
+        return replace(survey, reason="; ".join(failures))
+    damage = next((t.damage for t in truth if t.damage), survey.damage)
+    return replace(survey, readable=True, truth=truth, damage=damage)
 
 
-def _topics(log: Log) -> list[TopicFound]:
-    """The channels, and what each is to us."""
+def _survey_topics(log: Log) -> list[TopicFound]:
+    """The channels, each with its role."""
     truths = truth_topics(log)
     lists, poses = set[int](), set[int]()
-    if foreign(log):
+    if foreign_channels(log):
         lists = {c.number for c in log.channels if is_list(c)}
         poses = {c.number for c in log.channels if is_pose(c)}
 
@@ -93,79 +104,87 @@ def _topics(log: Log) -> list[TopicFound]:
     return [TopicFound(c.topic, c.schema, c.encoding, c.messages, role(c)) for c in log.channels]
 
 
-def _units(recording: Recording, topics: Sequence[str]) -> Iterator[UnitFound]:
-    """The lists of each unit, or what is wrong with them: `problem`."""
+def _survey_units(recording: Recording, topics: Sequence[str]) -> Iterator[UnitFound]:
+    """The lists of each unit; `problem` where they cannot be read."""
     for topic in dict.fromkeys(topics):
-        from copem_replay.io.recorded_lists import lists_on  # it takes time, and most recordings have no lists
+        from copem_replay.io.recorded_lists import read_unit_lists  # it takes time, and most recordings have no lists
 
         try:
-            found = lists_on(recording.local, topic, recording.scene, recording.around)
+            lists = read_unit_lists(recording.local, topic, recording.scene, recording.around)
         except RecordingError as error:
             yield UnitFound(topic, problem="; ".join(error.within(recording.path, topic)))
             continue
-        yield _unit(topic, found, _against_truth(recording, found) if len(found.tracks.stamp_ns) else {})
+        yield _survey_unit(topic, lists, _compare_with_truth(recording, lists) if len(lists.tracks.stamp_ns) else {})
 
 
-def _units_alone(log: Log, place: Local, topics: Sequence[TopicFound]) -> Iterator[UnitFound]:
-    """The lists of each unit of a recording without truth, as far as they can be read without one."""
-    from copem_replay.experiment.draft.clocks import without_objects
-    from copem_replay.io.recorded_lists import lists_on
+def _survey_units_alone(log: Log, place: Local, topics: Sequence[TopicFound]) -> Iterator[UnitFound]:
+    """The lists of each unit of a recording without truth, as far as they can be read."""
+    from copem_replay.io.recorded_lists import read_unit_lists
 
-    scene = without_objects(log.path.stem, log.start_ns, log.end_ns)
+    scene = make_empty_scene(log.path.stem, log.start_ns, log.end_ns)
     for topic in dict.fromkeys(t.topic for t in topics if t.role == "unit" and t.messages):
         try:
-            yield _unit(topic, lists_on(place, topic, scene, None), {})
+            yield _survey_unit(topic, read_unit_lists(place, topic, scene, None), {})
         except RecordingError as error:
             yield UnitFound(topic, problem="; ".join(error.within(log.path, topic)))
 
 
-def _unit(topic: str, found: RecordedLists, known: dict[str, Any]) -> UnitFound:
-    """What the lists say of themselves, and what is known of them by the truth."""
-    between_s = np.diff(np.unique(found.tracks.stamp_ns)) * 1e-9
-    lists = len(found.tracks.stamp_ns)
+def _survey_unit(topic: str, recorded: RecordedLists, known: dict[str, Any]) -> UnitFound:
+    """The lists of a unit: their own properties, and those by comparison with the truth, `known`."""
+    between_s = np.diff(np.unique(recorded.tracks.stamp_ns)) * 1e-9
+    lists = len(recorded.tracks.stamp_ns)
     return UnitFound(
         topic,
         lists=lists,
-        entries=len(found.tracks.frame_ix),
+        entries=len(recorded.tracks.frame_ix),
         rate_hz=round(1.0 / float(np.median(between_s)), 3) if len(between_s) else None,
-        covariances_said=bool(found.spread_said.all()),
-        captures_said=bool(found.capture_said.all()),
+        covariances_said=bool(recorded.spread_said.all()),
+        captures_said=bool(recorded.capture_said.all()),
         problem=None if lists else "holds no list",
         **known,
     )
 
 
-def _against_truth(recording: Recording, found: RecordedLists) -> dict[str, Any]:
-    """How late the lists of a unit are, and what is odd about them."""
-    from copem_replay.io.list_checks import captured_before, delay_of, delay_words, odd_about
-    from copem_replay.io.recorded_units import with_truth_ids
+def _compare_with_truth(recording: Recording, lists: RecordedLists) -> dict[str, Any]:
+    """Delay and oddities of the lists of a unit, as fields of `UnitFound`."""
+    from copem_replay.io.recorded_units import (
+        assign_truth_ids,
+        delay_words,
+        describe_oddities,
+        estimate_delay,
+        shift_captures,
+    )
 
     scene, truth, known, delay_s = recording.scene, recording.truth, dict[str, Any](), 0.0
-    if not found.capture_said.all():
-        delay = delay_of(found, scene, truth)
+    if not lists.capture_said.all():
+        delay = estimate_delay(lists, scene, truth)
         known["delay"] = delay_words(delay)
         if delay.untold is None:
             known["delay_s"] = delay_s = round(max(delay.offset_s, 0.0), 3)
             known["delay_interval_s"] = [round(delay.low_s, 3), round(delay.high_s, 3)]
-    shifted = captured_before(found, scene, delay_s)
-    told = with_truth_ids(shifted, scene, truth, gate_m=GATE_M, max_gap_s=MAX_GAP_S)
-    return known | {"oddities": list(odd_about(found, told.row_object_ix, scene))}
+    shifted = shift_captures(lists, scene, delay_s)
+    matched = assign_truth_ids(shifted, scene, truth, gate_m=GATE_M, max_gap_s=MAX_GAP_S)
+    return known | {"oddities": list(describe_oddities(lists, matched.row_object_ix, scene))}
 
 
-def _proposals(log: Log, topics: Sequence[TopicFound]) -> list[ProposalFound]:
-    """Lists by the names of their fields."""
-    if not foreign(log):
+def _list_proposals(log: Log, topics: Sequence[TopicFound]) -> list[ProposalFound]:
+    """Proposals for channels of unknown schemas, with the truth where they can be read."""
+    if not foreign_channels(log):
         return []
-    from copem_replay.experiment.draft.field_trial import fields_of, proposals
+    from copem_replay.experiment.draft.fields import parse_fields, try_proposals
 
     return [
-        found if recording is None else replace(found, truth=_truth(log, recording, topics, fields_of(found)))
-        for found, recording in proposals(log, log.path.stem)
+        proposal
+        if recording is None
+        else replace(proposal, truth=_survey_truth(log, recording, topics, parse_fields(proposal)))
+        for proposal, recording in try_proposals(log, log.path.stem)
     ]
 
 
-def _truth(log: Log, recording: Recording, topics: Sequence[TopicFound], fields: Fields | None = None) -> TruthFound:
-    """One list of true objects, and what the other topics are to it."""
+def _survey_truth(
+    log: Log, recording: Recording, topics: Sequence[TopicFound], fields: Fields | None = None
+) -> TruthFound:
+    """One list of true objects, the units beside it, and the experiment they suggest."""
     scene, truth = recording.scene, recording.truth
     poses = [t.topic for t in topics if t.role == "poses" and t.messages]
     units = [t.topic for t in topics if t.role == "unit" and t.messages]
@@ -183,33 +202,33 @@ def _truth(log: Log, recording: Recording, topics: Sequence[TopicFound], fields:
         longest_gap_s=round(float(between_s[longest]), 9) if len(between_s) else None,
         longest_gap_at_s=round(float(truth.captured_s[longest]), 9) if len(between_s) else None,
         gaps_inside_tracks=int((inside_s > MAX_GAP_S).sum()),
-        x_m=_extent(truth.x_m[0]),
-        y_m=_extent(truth.y_m[0]),
-        moving=_by_class(scene, scene.moving),
-        stationary=_by_class(scene, ~scene.moving),
+        x_m=_round_extent(truth.x_m[0]),
+        y_m=_round_extent(truth.y_m[0]),
+        moving=_count_by_class(scene, scene.moving),
+        stationary=_count_by_class(scene, ~scene.moving),
         host_id=recording.host_id,
-        ego=_ego(recording),
-        missing=_missing(recording, poses),
+        ego=_describe_ego(recording),
+        missing=_list_missing(recording, poses),
         damage=recording.damage,
         notes=list(recording.notes),
         vehicles=moving_ids(scene, shown=6),
-        units=list(_units(recording, units)),
-        suggested=suggestion(log, recording, fields),
+        units=list(_survey_units(recording, units)),
+        suggested=suggest_experiment(log, recording, fields),
     )
 
 
-def _extent(values: Float) -> list[float]:
-    """From where to where the centres of the boxes lie."""
+def _round_extent(values: Float) -> list[float]:
+    """The extent of values, from and to, rounded to 0.1."""
     return [round(float(values.min()), 1), round(float(values.max()), 1)]
 
 
-def _by_class(scene: Scene, which: Bool) -> dict[str, int]:
+def _count_by_class(scene: Scene, which: Bool) -> dict[str, int]:
     counts = np.bincount(scene.object_class[which], minlength=len(CLASSES)).tolist()
     return {name: number for name, number in zip(CLASSES, counts, strict=True) if number}
 
 
-def _ego(recording: Recording) -> EgoFound | None:
-    """Describe the ego vehicle the log names: its size at its first frame, and when it is there."""
+def _describe_ego(recording: Recording) -> EgoFound | None:
+    """The ego vehicle that the log names; None: it names none."""
     scene, truth = recording.scene, recording.truth
     if scene.ego_ix < 0:
         return None
@@ -224,8 +243,8 @@ def _ego(recording: Recording) -> EgoFound | None:
     )
 
 
-def _missing(recording: Recording, poses: Sequence[str]) -> list[str]:
-    """Say what a user may have to give; `poses`: topics that may have the ego's."""
+def _list_missing(recording: Recording, poses: Sequence[str]) -> list[str]:
+    """A line for each key that a user may have to give. `poses`: topics that may have the ego's poses."""
     scene = recording.scene
     if scene.ego_ix >= 0:
         return []
@@ -235,3 +254,122 @@ def _missing(recording: Recording, poses: Sequence[str]) -> list[str]:
     if poses:
         line += f"; or `ego: {{topic: {poses[0]}}}` (poses are on {', '.join(poses)})"
     return [line]
+
+
+# Clock offsets of several recordings of one drive, from the traffic that they have in common.
+
+
+@dataclass(frozen=True)
+class ClockFound:
+    """The clock of a recording against the first one's: `offset`, and the two `lists` it is estimated from.
+
+    `late`: those of the two that do not state their capture, so that the offset includes their delay.
+    """
+
+    path: Path
+    lists: tuple[str, str]
+    offset: TimeOffset
+    late: tuple[str, ...] = ()
+
+    def words(self) -> str:
+        """`0.130 s (95 %: 0.120 … 0.140 s)` and the drift, or that it cannot be told."""
+        offset = self.offset
+        if offset.untold is not None:
+            return f"cannot be told: {offset.untold}"
+        words = f"{offset.offset_s:.3f} s (95 %: {offset.low_s:.3f} … {offset.high_s:.3f} s)"
+        if offset.unbiased:
+            words += ", assuming no shift along the path"
+        if offset.drift is not None:
+            drift, low, high = (1e6 * value for value in offset.drift)
+            words += f", drift {drift:.0f} µs/s (95 %: {low:.0f} … {high:.0f})"
+        if self.late:
+            do = "does" if len(self.late) == 1 else "do"
+            words += f", the delay of {' and '.join(self.late)} included, which {do} not say when captured"
+        return words
+
+    def plain(self) -> dict[str, object]:
+        """The findings for JSON: seconds, and seconds per second; null where they cannot be told, for which see
+        `untold`.
+        """
+        offset = self.offset
+        told = offset.untold is None
+        return {
+            "lists": list(self.lists),
+            "clock_offset_s": offset.offset_s if told else None,
+            "interval_s": [offset.low_s, offset.high_s] if told else None,
+            "drift": offset.drift[0] if told and offset.drift else None,
+            "drift_interval": list(offset.drift[1:]) if told and offset.drift else None,
+            "entries": offset.entries,
+            "if_not_shifted": offset.unbiased,
+            "untold": offset.untold,
+        }
+
+
+@dataclass(frozen=True)
+class _TimedLists:
+    name: str
+    entries: ListPoints
+    captures_said: bool = True  # also for the truth
+
+
+def compare_clocks(paths: Sequence[Path]) -> list[ClockFound]:
+    """The clock of each recording but the first. Raises RecordingError for one that cannot be read or has no object
+    list.
+    """
+    t0_ns: int | None = None
+    lists_of: list[list[_TimedLists]] = []
+    for path, label in zip(paths, label_files(paths), strict=True):
+        log = open_log(path)
+        t0_ns = log.start_ns if t0_ns is None else t0_ns
+        lists = list(_read_timed_lists(log, label, t0_ns))
+        if not lists:
+            raise RecordingError("no object list to tell its clock by", path=path)
+        lists_of.append(lists)
+    return [_find_best(path, lists_of[0], lists) for path, lists in zip(paths[1:], lists_of[1:], strict=True)]
+
+
+def _find_best(path: Path, first: Sequence[_TimedLists], others: Sequence[_TimedLists]) -> ClockFound:
+    """The offset with the narrowest interval, among the pairs of lists with the fewest unknown delays."""
+    from copem_replay.io.clock_offset import estimate_time_offset
+
+    clocks = [
+        ClockFound(
+            path,
+            (a.name, b.name),
+            estimate_time_offset(a.entries, b.entries),
+            tuple(one.name for one in (a, b) if not one.captures_said),
+        )
+        for a, b in product(first, others)
+    ]
+    return min(
+        clocks, key=lambda one: (one.offset.untold is not None, len(one.late), one.offset.high_s - one.offset.low_s)
+    )
+
+
+def _read_timed_lists(log: Log, label: str, t0_ns: int) -> Iterator[_TimedLists]:
+    """The object lists of a recording, truths first, in seconds since `t0_ns`, without those that cannot be read."""
+    from copem_replay.io.recorded_lists import read_unit_lists
+    from copem_replay.io.short_tracks import make_list_points
+
+    for topic in truth_topics(log):
+        try:
+            truth = read_log(log, name=label, topic=topic).truth
+        except RecordingError:
+            continue
+        yield _TimedLists(f"{label}:{topic}", make_list_points(truth, t0_ns))
+    scene = make_empty_scene(label, t0_ns, log.end_ns)
+    osi_topics = [c.topic for c in log.channels if c.schema == "osi3.SensorData" and c.messages]
+    others = [c.topic for c in known_lists(log.channels) if c.messages and c.topic not in truth_topics(log)]
+    for topic in dict.fromkeys([*osi_topics, *others]):
+        try:
+            lists = read_unit_lists(log.path, topic, scene, None)
+        except RecordingError:
+            continue
+        if not topic.startswith(_OURS) and len(lists.tracks.frame_ix):
+            entries = make_list_points(lists.tracks, t0_ns, lists.track_id)
+            yield _TimedLists(f"{label}:{topic}", entries, bool(lists.capture_said.all()))
+
+
+def make_empty_scene(name: str, t0_ns: int, end_ns: int) -> Scene:
+    """A scene without objects, for a log without truth."""
+    return Scene(name, t0_ns, end_ns, (), np.empty(0, dtype=np.int8), np.empty(0, dtype=bool))

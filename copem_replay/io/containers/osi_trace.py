@@ -1,7 +1,8 @@
 """OSI's binary trace of a single channel: each message after its length (four bytes, little-endian), and nothing else.
 
-(OSI 3.8, trace file formats and naming conventions.) What kind of message it holds is found out from the messages; the
-name decides where they leave it open, if it is `<time>_<type>_<osi>_<protobuf>_<frames>_<name>.osi` by convention.
+Source: OSI 3.8, trace file formats and naming conventions. The kind of message follows from the messages themselves;
+where they leave it open it follows from the name of the file, by convention
+`<time>_<type>_<osi>_<protobuf>_<frames>_<name>.osi`.
 """
 
 from __future__ import annotations
@@ -22,20 +23,17 @@ import numpy as np
 from google.protobuf.message import DecodeError
 from mcap.records import Message
 
-from copem_replay.core.errors import RecordingError
-from copem_replay.core.text import counted
-from copem_replay.io.channel import Channel
+from copem_replay.core.errors import RecordingError, count_noun
+from copem_replay.io.channel import LAST_NS, Channel
 from copem_replay.io.containers.mcap_records import CHUNK_LIMIT_BYTES, MAGIC
-from copem_replay.io.containers.unsupported import other_than
-from copem_replay.io.log import Log, open_file
-from copem_replay.io.schemas.decoded import LAST_NS
+from copem_replay.io.log import Log, open_file, unsupported_file_error
 from copem_replay.io.schemas.osi_ground_truth import GROUND_TRUTH, SENSOR_DATA, SENSOR_VIEW
 
 _LENGTH_BYTES = 4
-_TRIED = 10  # messages by which the kind is found out (chosen)
+_TRIED = 10  # messages by which the kind is told; more make opening slower
 _EXPLAINED = 0.5
-"""Of the bytes of messages: the least share with a meaning by which a kind is believed (chosen). Of the right kind
-it is 1, less where OSI is newer than ours; of a wrong one 0.2 at most, but 0.9 of a sensor view as ground truth."""
+"""Least share of the bytes of messages with a meaning in a schema. In the right one the share is 1, less where the OSI
+of the file is newer; in a wrong one at most 0.2, except 0.9 for a sensor view read as ground truth."""
 _NAME = re.compile(
     r"(\d{8}T\d{4}\w*?_)?(?P<type>[a-z]+)_(?P<osi>[\d.]+)_(?P<protobuf>[\d.]+)_(?P<frames>\d{1,12})(_|\.)"
 )
@@ -47,13 +45,13 @@ _NOT_READ = {
 
 
 @dataclass(frozen=True)
-class Trace(Log):
-    """A trace that was looked at: one channel, whose topic is the name of its messages (`GroundTruth`).
+class TraceLog(Log):
+    """The log of a trace: one channel, whose topic is the name of its messages (`GroundTruth`).
 
-    Messages are logged at their time stamps. By these: where they are in the file, how long, and when.
+    Log times are the messages' time stamps. In their order: offsets and lengths of the messages in the file, and times.
     """
 
-    osi_version: str = ""  # as the first message says it
+    osi_version: str = ""  # as the first message states it
     offsets: Sequence[int] = field(default=(), repr=False)
     lengths: Sequence[int] = field(default=(), repr=False)
     times_ns: Sequence[int] = field(default=(), repr=False)
@@ -69,25 +67,25 @@ class Trace(Log):
 
 
 def is_trace(path: Path) -> bool:
-    """Whether a file is to be read as OSI's trace of a single channel: by its name, unless it is MCAP all the same."""
+    """Whether a file is read as OSI's trace of a single channel: its name ends in `.osi`, and it is not MCAP."""
     if path.suffix.lower() != ".osi" or not path.is_file():
         return False
     with open_file(path) as file:
         return file.read(len(MAGIC)) != MAGIC
 
 
-def open_trace(path: Path) -> Trace:
-    """Look at a trace. Raises RecordingError: a kind that is not read, no message, or messages of no kind."""
-    said = _NAME.match(path.name)
-    schema, notes = _schema(path, said["type"] if said else "")
-    kind, skipped = message_class(schema), Counter[str]()
+def open_trace(path: Path) -> TraceLog:
+    """The log of a trace. Raises RecordingError: a kind that is not read, no message, or messages of no kind."""
+    name = _NAME.match(path.name)
+    schema, notes = _find_schema(path, name["type"] if name else "")
+    message_class, skipped = load_message_class(schema), Counter[str]()
     offsets, lengths, times_ns = array("q"), array("q"), array("q")
     cut: list[str] = []
     release = ""
     with open_file(path) as file:
-        for offset, payload in _payloads(file, cut):
+        for offset, payload in _read_payloads(file, cut):
             try:
-                message = kind.FromString(payload)
+                message = message_class.FromString(payload)
             except DecodeError:
                 skipped["cannot be decoded"] += 1
                 continue
@@ -101,14 +99,16 @@ def open_trace(path: Path) -> Trace:
             offsets.append(offset)
             lengths.append(len(payload))
             times_ns.append(time_ns)
-    notes += [f"{counted(number, 'message')} {what}: skipped" for what, number in skipped.items()]
+    notes += [f"{count_noun(number, 'message')} {what}: skipped" for what, number in skipped.items()]
     if not offsets:
-        why = "; ".join([*cut, *notes])
-        raise RecordingError(f"{'damaged, and ' if cut else ''}no message of {schema} can be read ({why})", path=path)
+        reason = "; ".join([*cut, *notes])
+        raise RecordingError(
+            f"{'damaged, and ' if cut else ''}no message of {schema} can be read ({reason})", path=path
+        )
     order = np.argsort(np.array(times_ns), kind="stable")
-    expected = int(said["frames"]) if said and cut else None
+    expected = int(name["frames"]) if name and cut else None
     topic = schema.removeprefix("osi3.")
-    return Trace(
+    return TraceLog(
         path=path,
         channels=(Channel(1, topic, schema, "protobuf", len(offsets), expected, "protobuf"),),
         indexed=False,
@@ -124,14 +124,14 @@ def open_trace(path: Path) -> Trace:
     )
 
 
-def message_class(schema: str) -> Any:
-    """The class of messages, imported when first needed."""
+def load_message_class(schema: str) -> Any:
+    """The class of a schema's messages, imported when first needed."""
     name = schema.removeprefix("osi3.")
     return getattr(import_module(f"osi3.osi_{name.lower()}_pb2"), name)
 
 
-def _payloads(file: IO[bytes], cut: list[str]) -> Iterator[tuple[int, bytes]]:
-    """Where each message is, and the message, as far as they go; why not further is put into `cut`."""
+def _read_payloads(file: IO[bytes], cut: list[str]) -> Iterator[tuple[int, bytes]]:
+    """Offset and bytes of each message, as far as they go; `cut` gets the reason why no further."""
     size = os.fstat(file.fileno()).st_size
     offset = 0
     while offset < size:
@@ -149,26 +149,26 @@ def _payloads(file: IO[bytes], cut: list[str]) -> Iterator[tuple[int, bytes]]:
 
 
 def _time_ns(message: Any) -> int | None:
-    """The time stamp of a message, or of the ground truth in it."""
-    said = [message, *([message.global_ground_truth] if hasattr(message, "global_ground_truth") else [])]
-    for one in said:
-        if one.HasField("timestamp"):
-            return int(one.timestamp.seconds) * 10**9 + int(one.timestamp.nanos)
+    """The time stamp of a message, or of the ground truth in it, in ns; None: there is none."""
+    candidates = [message, *([message.global_ground_truth] if hasattr(message, "global_ground_truth") else [])]
+    for candidate in candidates:
+        if candidate.HasField("timestamp"):
+            return int(candidate.timestamp.seconds) * 10**9 + int(candidate.timestamp.nanos)
     return None
 
 
-def _schema(path: Path, named: str) -> tuple[str, list[str]]:
-    """What the messages are, and a note where the file's name does not say. Raises RecordingError."""
+def _find_schema(path: Path, named: str) -> tuple[str, list[str]]:
+    """The schema of the messages, and a note where it is not that of the file's name. Raises RecordingError."""
     if named in _NOT_READ:
         raise RecordingError(
             f"osi3.{_NOT_READ[named]} by its name, which is not read; {', '.join(_READ)} are", path=path
         )
     with open_file(path) as file:
-        first = [payload for _, payload in islice(_payloads(file, []), _TRIED)]
+        first = [payload for _, payload in islice(_read_payloads(file, []), _TRIED)]
         if not first:
             file.seek(0)
-            raise other_than("an OSI trace", path, file.read(64))
-    share = {schema: _explained(first, schema) for schema in _READ.values()}
+            raise unsupported_file_error("an OSI trace", path, file.read(64))
+    share = {schema: _explained_share(first, schema) for schema in _READ.values()}
     best, second = sorted(share, key=lambda schema: -share[schema])[:2]
     if named in _READ and (share[_READ[named]] == share[best] or share[best] < _EXPLAINED):
         return _READ[named], []
@@ -182,12 +182,12 @@ def _schema(path: Path, named: str) -> tuple[str, list[str]]:
     )
 
 
-def _explained(payloads: Sequence[bytes], schema: str) -> float:
-    """The share of the bytes of messages that have a meaning in a schema."""
+def _explained_share(payloads: Sequence[bytes], schema: str) -> float:
+    """Share of the bytes of messages that have a meaning in a schema, from 0 to 1."""
     kept = 0
     for payload in payloads:
         try:
-            message = message_class(schema).FromString(payload)
+            message = load_message_class(schema).FromString(payload)
         except DecodeError:
             continue
         message.DiscardUnknownFields()

@@ -1,41 +1,159 @@
 """A rosbag2 folder as one recording: the MCAP files that its `metadata.yaml` names, in order of log time.
 
-Channels of several files that agree in topic, schema and encoding are one. A file is opened when the time has come of
-its first message, and closed when it is through. One that is damaged is read as far as it goes; of several, one that
-cannot be read at all is left out, and it is said.
+Channels of several files that agree in topic, schema and encoding are one. A file is opened when its first message is
+due, and closed after its last one. A damaged file is read as far as it goes; of several files, one that cannot be read
+at all is left out with a note.
 """
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from mcap.records import Message
+from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
-from copem_replay.core.errors import RecordingError
-from copem_replay.core.text import counted
+from copem_replay.core.errors import RecordingError, count_noun
+from copem_replay.core.yaml import NotYamlError, compose_nodes
 from copem_replay.io.channel import Channel
-from copem_replay.io.containers.in_order import merged
-from copem_replay.io.containers.mcap_indexed import renumbered
-from copem_replay.io.containers.rosbag2_metadata import files_of, unnamed_in
-from copem_replay.io.log import BrokenIndexError, Log, from_start, open_mcap
-from copem_replay.io.window import Window, overlap
+from copem_replay.io.containers.mcap_records import renumber_message
+from copem_replay.io.log import CONVERT, BrokenIndexError, Log, open_from_start, open_mcap, unpacking_advice
+from copem_replay.io.window import Window, has_overlap
+
+# `metadata.yaml`: the files of the folder, and reasons why they are not read.
+
+METADATA = "metadata.yaml"
+_INFORMATION = "rosbag2_bagfile_information"
+_LONGEST_BYTES = 1 << 19
+"""A longer file is no description: three hundred topics and a thousand files take half of it."""
+
+
+def list_bag_files(folder: Path) -> list[Path]:
+    """The MCAP files of a folder in the order of its description; all of them exist. Raises RecordingError."""
+    place = folder / METADATA
+    information = _find_information(folder)
+    storage = _node_text(information, "storage_identifier")
+    names = _list_file_names(information)
+    if not names:
+        raise RecordingError("names no file (`relative_file_paths`)", path=place)
+    if storage == "sqlite3" or any(name.endswith(".db3") for name in names):
+        raise RecordingError(f"its files are of SQLite (.db3), which is not read; {CONVERT}", path=folder)
+    if _node_text(information, "compression_mode").lower() == "message":
+        raise RecordingError(f"its messages are compressed one by one, which is not read; {CONVERT}", path=folder)
+    return [_bag_file_path(folder, name) for name in names]
+
+
+def note_unnamed_files(folder: Path, named: Sequence[Path]) -> Iterator[str]:
+    """A note if a folder has MCAP files that its description does not name."""
+    names = {path.name for path in named}
+    others = sorted(path.name for path in folder.glob("*.mcap") if path.name not in names)
+    if others:
+        more = " …" if len(others) > 1 else ""
+        yield f"{count_noun(len(others), 'file')} that {METADATA} does not name not read: {others[0]}{more}"
+
+
+def _find_information(folder: Path) -> Node:
+    """The mapping in the folder's description. Raises RecordingError: there is none."""
+    place = folder / METADATA
+    try:
+        with place.open("rb") as file:
+            content = file.read(_LONGEST_BYTES + 1)
+    except FileNotFoundError:
+        advice = "; name its files as logs of their own, or let `ros2 bag reindex` write it: then they are one"
+        ending = advice if any(folder.glob("*.mcap")) else ""
+        raise RecordingError(f"expected a recording, found a folder without {METADATA}{ending}", path=folder) from None
+    except OSError as error:
+        raise RecordingError(f"cannot be opened: {error.strerror}", path=place) from None
+    if len(content) > _LONGEST_BYTES:
+        raise RecordingError("expected the description of a rosbag2 folder, found more than 512 KiB", path=place)
+    try:
+        root = compose_nodes(content.decode())
+    except UnicodeDecodeError:
+        raise RecordingError("expected YAML, found text that is not UTF-8", path=place) from None
+    except NotYamlError as error:
+        raise RecordingError(f"not YAML: line {error.line}: {error.why}", path=place) from None
+    information = _inner_node(root, _INFORMATION)
+    if not isinstance(information, MappingNode):
+        raise RecordingError(f"expected the description of a rosbag2 folder, found no `{_INFORMATION}`", path=place)
+    return information
+
+
+def _list_file_names(information: Node) -> list[str]:
+    """The named files, each once: `relative_file_paths`, then those that only `files` has."""
+    listed = _inner_node(information, "relative_file_paths")
+    names = [item.value for item in _item_nodes(listed) if isinstance(item, ScalarNode)]
+    names += [_node_text(item, "path") for item in _item_nodes(_inner_node(information, "files"))]
+    return list(dict.fromkeys(name for name in names if name))
+
+
+def _bag_file_path(folder: Path, name: str) -> Path:
+    """A named file, or what it was unpacked to. Raises RecordingError: outside of the folder, missing, compressed."""
+    path = folder / name
+    if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts or "\0" in name:
+        raise RecordingError(f"expected files of the folder, found {name!r}", path=folder / METADATA)
+    advice = unpacking_advice(path)
+    try:
+        if advice is not None and path.with_suffix("").is_file():  # it was unpacked, and its description left as it was
+            return path.with_suffix("")
+        exists = path.exists()
+    except OSError:  # a name that no file can have
+        exists = False
+    if not exists:
+        raise RecordingError(f"no such file, but {METADATA} names it", path=path)
+    if advice is not None:
+        raise RecordingError(advice, path=path)
+    return path
+
+
+def _inner_node(node: Node | None, name: str) -> Node | None:
+    """The value of a key of a mapping; aliases are not expanded, so that nothing can grow."""
+    if not isinstance(node, MappingNode):
+        return None
+    return next((v for k, v in node.value if isinstance(k, ScalarNode) and k.value == name), None)
+
+
+def _item_nodes(node: Node | None) -> list[Node]:
+    return list(node.value) if isinstance(node, SequenceNode) else []
+
+
+def _node_text(node: Node | None, name: str) -> str:
+    inner = _inner_node(node, name)
+    return str(inner.value) if isinstance(inner, ScalarNode) else ""
+
+
+def merge_streams(streams: Sequence[tuple[int, Callable[[], Iterator[Message]]]]) -> Iterator[Message]:
+    """Messages of several streams in order of log time. A stream, in order itself: (first log time, how to open it)."""
+    waiting: list[tuple[int, int, Message | None]] = [(start, k, None) for k, (start, _) in enumerate(streams)]
+    heapq.heapify(waiting)
+    running: dict[int, Iterator[Message]] = {}
+    while waiting:
+        _, k, message = waiting[0]
+        if message is None:
+            running[k] = streams[k][1]()
+        else:
+            yield message
+        if (following := next(running[k], None)) is None:
+            heapq.heappop(waiting)
+            del running[k]
+        else:
+            heapq.heapreplace(waiting, (following.log_time, k, following))
 
 
 @dataclass(frozen=True)
-class Part:
-    """A file of a folder."""
+class BagFile:
+    """One file of a folder."""
 
     log: Log
-    numbers: Mapping[int, int]  # the folder's number of each channel, by the file's
+    numbers: Mapping[int, int]  # channel numbers of the folder, by those of the file
 
 
 @dataclass(frozen=True)
-class Bag(Log):
-    """A folder that was looked at."""
+class BagLog(Log):
+    """The log of a folder."""
 
-    parts: tuple[Part, ...] = ()
+    parts: tuple[BagFile, ...] = ()
     lost: tuple[str, ...] = ()  # files that cannot be read at all, and why
 
     def messages(self, numbers: Set[int]) -> Iterator[Message]:
@@ -45,70 +163,70 @@ class Bag(Log):
         """
         streams: list[tuple[int, Callable[[], Iterator[Message]]]] = []
         for part in self.parts:
-            mine = {theirs: ours for theirs, ours in part.numbers.items() if ours in numbers}
-            there = {c.number for c in part.log.channels if c.number in mine and c.messages}
-            if overlap(part.log.spans(there).values(), part.log.start_ns, part.log.end_ns):
-                streams.append((part.log.start_ns, _Renumbered(part.log, mine).__iter__))
-        yield from merged(streams)
+            numbers_in_log = {theirs: ours for theirs, ours in part.numbers.items() if ours in numbers}
+            filled = {c.number for c in part.log.channels if c.number in numbers_in_log and c.messages}
+            if has_overlap(part.log.spans(filled).values(), part.log.start_ns, part.log.end_ns):
+                streams.append((part.log.start_ns, _RenumberedFile(part.log, numbers_in_log).__iter__))
+        yield from merge_streams(streams)
 
     def within(self, window: Window | None) -> Log:
-        """The same folder, of which only a window is read, file by file."""
+        """The log with every file restricted to a window."""
         parts = tuple(replace(part, log=part.log.within(window)) for part in self.parts)
         return replace(self, window=window, parts=parts)
 
     def from_start(self, error: BrokenIndexError) -> Log:
-        """The same, every file read from its start. Raises RecordingError."""
+        """The log with every file opened without its index. Raises RecordingError."""
         logs, lost = [], list(self.lost)
         for part in self.parts:
             log = part.log
             try:
-                why = error.__cause__ if log.path == error.path else None
-                logs.append(from_start(log.path, why, log.channels) if log.indexed else log)
-            except RecordingError as found:
-                lost.append(_of_file(log.path, found))
-        return _joined(self.path, logs, lost, self.notes).within(self.window)
+                cause = error.__cause__ if log.path == error.path else None
+                logs.append(open_from_start(log.path, cause, log.channels) if log.indexed else log)
+            except RecordingError as failure:
+                lost.append(_error_in_file(log.path, failure))
+        return _join_bag_files(self.path, logs, lost, self.notes).within(self.window)
 
 
 @dataclass(frozen=True)
-class _Renumbered:
+class _RenumberedFile:
     log: Log
     numbers: Mapping[int, int]
 
     def __iter__(self) -> Iterator[Message]:
         for message in self.log.messages(self.numbers.keys()):
-            yield renumbered(message, self.numbers)
+            yield renumber_message(message, self.numbers)
 
 
-def open_bag(folder: Path) -> Bag:
-    """Look at a folder. Raises RecordingError: none of rosbag2, or of files that are missing or not read."""
+def open_bag(folder: Path) -> BagLog:
+    """The log of a rosbag2 folder. Raises RecordingError: none of rosbag2, a file is missing or not read."""
     logs, lost = [], []
-    paths = files_of(folder)
+    paths = list_bag_files(folder)
     for path in paths:
         try:
             logs.append(open_mcap(path))
         except RecordingError as error:
-            lost.append(_of_file(path, error))
-    return _joined(folder, logs, lost, tuple(unnamed_in(folder, paths)))
+            lost.append(_error_in_file(path, error))
+    return _join_bag_files(folder, logs, lost, tuple(note_unnamed_files(folder, paths)))
 
 
-def _joined(folder: Path, logs: Sequence[Log], lost: Sequence[str], notes: tuple[str, ...]) -> Bag:
+def _join_bag_files(folder: Path, logs: Sequence[Log], lost: Sequence[str], notes: tuple[str, ...]) -> BagLog:
     if not logs:
         first, *others = lost
-        more = f"; and so on, {counted(len(lost), 'file')} in all" if others else ""
+        more = f"; and so on, {count_noun(len(lost), 'file')} in all" if others else ""
         raise RecordingError(f"{first}{more}", path=folder)
     damages = [f"{log.path.name}: {log.damage}" for log in logs if log.damage]
     numbers: dict[tuple[object, ...], int] = {}
     channels: dict[int, Channel] = {}
     parts = []
     for log in logs:
-        mine = {}
+        numbers_of_log = {}
         for c in log.channels:
             key = (c.topic, c.schema, c.encoding, c.schema_encoding, c.schema_data)
-            number = mine[c.number] = numbers.setdefault(key, len(numbers) + 1)
-            channels[number] = _and(channels[number], c) if number in channels else replace(c, number=number)
-        parts.append(Part(log, mine))
+            number = numbers_of_log[c.number] = numbers.setdefault(key, len(numbers) + 1)
+            channels[number] = _merge_channels(channels[number], c) if number in channels else replace(c, number=number)
+        parts.append(BagFile(log, numbers_of_log))
     last = max(log.start_ns for log in logs)
-    return Bag(
+    return BagLog(
         path=folder,
         channels=tuple(channels[number] for number in sorted(channels)),
         indexed=all(log.indexed for log in logs),
@@ -123,13 +241,13 @@ def _joined(folder: Path, logs: Sequence[Log], lost: Sequence[str], notes: tuple
     )
 
 
-def _and(one: Channel, other: Channel) -> Channel:
-    """A channel of several files: all its messages."""
+def _merge_channels(one: Channel, other: Channel) -> Channel:
+    """One channel for two files: the messages of both, counted."""
     expected = [c.messages if c.expected is None else c.expected for c in (one, other)]
-    known = one.expected is not None or other.expected is not None
-    return replace(one, messages=one.messages + other.messages, expected=sum(expected) if known else None)
+    has_expected = one.expected is not None or other.expected is not None
+    return replace(one, messages=one.messages + other.messages, expected=sum(expected) if has_expected else None)
 
 
-def _of_file(path: Path, error: RecordingError) -> str:
-    """What is wrong with a file of the folder, under its own name."""
+def _error_in_file(path: Path, error: RecordingError) -> str:
+    """`file.mcap: …`: what is wrong with a file of the folder."""
     return f"{path.name}: {'; '.join(error.within(path))}"

@@ -18,9 +18,7 @@ import pyarrow.feather
 
 from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import Float
-from copem_replay.io.convert import rotate
-from copem_replay.io.convert.ground_truth import Box, Frame, Report
-from copem_replay.io.convert.kinds import KINDS
+from copem_replay.io.convert.conversion import KINDS, Box, ConversionReport, Frame, rotation_from_quaternion
 
 EGO_SIZE_M: Final = (4.877, 2.0, 1.473)
 """Length, width, height of the cars, Ford Fusion Hybrid; the recording `av2_3b3570b4` gives the ego this size."""
@@ -66,7 +64,7 @@ _KIND: Final = {
 
 def frames(
     log: Path,
-    report: Report,
+    report: ConversionReport,
     *,
     ego_size_m: tuple[float, float, float] = EGO_SIZE_M,
     centre_from_rear_axle_m: tuple[float, float, float] = CENTRE_FROM_REAR_AXLE_M,
@@ -74,9 +72,9 @@ def frames(
     """All annotated instants, with the ego vehicle as host. Raises InputError."""
     if not log.is_dir():
         raise InputError(f"{log}: expected the folder of an Argoverse 2 sensor log, found no folder")
-    poses = _table(log / "city_SE3_egovehicle.feather", _POSE)
-    boxes = _table(log / "annotations.feather", (*_POSE, *_SIZE), ("category", "track_uuid"))
-    city_R_ego, city_t_ego = _se3(poses)
+    poses = _read_table(log / "city_SE3_egovehicle.feather", _POSE)
+    boxes = _read_table(log / "annotations.feather", (*_POSE, *_SIZE), ("category", "track_uuid"))
+    city_R_ego, city_t_ego = _read_se3(poses)
     pose_of = {int(stamp): k for k, stamp in enumerate(poses["timestamp_ns"])}
 
     uuids = dict.fromkeys(boxes["track_uuid"][boxes["category"] != _EGO].tolist())
@@ -86,13 +84,13 @@ def frames(
     report.assume(
         f"ego vehicle: id 1, {size} m, its centre {centre} m (ahead, left, up) of the rear axle, where the log has it"
     )
-    ego_R_object, ego_t_object = _se3(boxes)
-    for stamp_ns, rows in _by_stamp(boxes["timestamp_ns"]):
+    ego_R_object, ego_t_object = _read_se3(boxes)
+    for stamp_ns, rows in _group_by_stamp(boxes["timestamp_ns"]):
         if (pose := pose_of.get(stamp_ns)) is None:
             report.count("annotated instant", "without an ego pose of the same time stamp: skipped")
             continue
         R, t = city_R_ego[pose], city_t_ego[pose]
-        found = [_ego(R, t, ego_size_m, centre_from_rear_axle_m)]
+        frame_boxes = [_make_ego_box(R, t, ego_size_m, centre_from_rear_axle_m)]
         for k in rows:
             if boxes["category"][k] == _EGO:
                 report.count("row", f"of category {_EGO}: replaced by the ego pose")
@@ -101,36 +99,36 @@ def frames(
             if category not in _KIND:
                 report.count("object state", f"of the unknown category {category}: taken as other")
             length, width, height = (float(boxes[name][k]) for name in _SIZE)
-            found.append(
+            frame_boxes.append(
                 Box(
                     id=ids[boxes["track_uuid"][k]],
                     kind=KINDS[_KIND.get(category, "other")],
                     at_m=tuple((R @ ego_t_object[k] + t).tolist()),
-                    yaw_rad=_yaw(R @ ego_R_object[k]),
+                    yaw_rad=_yaw_of_matrix(R @ ego_R_object[k]),
                     size_m=(length, width, height),
                 )
             )
-        yield Frame(stamp_ns, found, host=1)
+        yield Frame(stamp_ns, frame_boxes, host=1)
 
 
-def _ego(R: Float, t: Float, size_m: tuple[float, float, float], centre_m: tuple[float, float, float]) -> Box:
+def _make_ego_box(R: Float, t: Float, size_m: tuple[float, float, float], centre_m: tuple[float, float, float]) -> Box:
     """Return the ego vehicle at a pose of its rear axle."""
     at_m = tuple((R @ np.array(centre_m) + t).tolist())
     x, y, z = (-v + 0.0 for v in centre_m)
-    return Box(1, KINDS["car"], at_m, _yaw(R), size_m, rear_axle_m=(x, y, z))
+    return Box(1, KINDS["car"], at_m, _yaw_of_matrix(R), size_m, rear_axle_m=(x, y, z))
 
 
-def _yaw(R: Float) -> float:
+def _yaw_of_matrix(R: Float) -> float:
     return float(np.arctan2(R[1, 0], R[0, 0]))
 
 
-def _se3(table: dict[str, Any]) -> tuple[Float, Float]:
+def _read_se3(table: dict[str, Any]) -> tuple[Float, Float]:
     """(N, 3, 3) rotations and (N, 3) translations."""
-    R = rotate.of_quaternion(*(table[name] for name in ("qw", "qx", "qy", "qz")))
+    R = rotation_from_quaternion(*(table[name] for name in ("qw", "qx", "qy", "qz")))
     return R, np.stack([table[name] for name in ("tx_m", "ty_m", "tz_m")], axis=-1)
 
 
-def _by_stamp(stamps_ns: Any) -> Iterator[tuple[int, Any]]:
+def _group_by_stamp(stamps_ns: Any) -> Iterator[tuple[int, Any]]:
     """Yield each stamp once, in order, with its rows as in the file."""
     unique, group = np.unique(stamps_ns, return_inverse=True)
     order = np.argsort(group, kind="stable")
@@ -139,7 +137,7 @@ def _by_stamp(stamps_ns: Any) -> Iterator[tuple[int, Any]]:
         yield stamp_ns, order[edges[k] : edges[k + 1]].tolist()
 
 
-def _table(path: Path, numbers: tuple[str, ...], texts: tuple[str, ...] = ()) -> dict[str, Any]:
+def _read_table(path: Path, numbers: tuple[str, ...], texts: tuple[str, ...] = ()) -> dict[str, Any]:
     """Return the columns that are used, (N,) each. Raises InputError."""
     try:
         table = pyarrow.feather.read_table(path, memory_map=False)

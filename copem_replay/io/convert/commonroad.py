@@ -8,18 +8,121 @@ gives no host vehicle. Velocities are speeds along the orientation.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Final
+from xml.parsers import expat
 
 from copem_replay.core.errors import InputError
-from copem_replay.io.convert.ground_truth import Box, Frame, Report
-from copem_replay.io.convert.kinds import KINDS, Kind
-from copem_replay.io.convert.parse import number, positive, seconds_as_ns, shown
-from copem_replay.io.convert.rotate import wrapped
-from copem_replay.io.convert.xml_nodes import Node, parts
+from copem_replay.io.convert.conversion import (
+    KINDS,
+    Box,
+    ConversionReport,
+    Frame,
+    OsiKind,
+    parse_number,
+    parse_positive,
+    parse_seconds_as_ns,
+    quote_value,
+    wrap_yaw,
+)
+
+# XML read part by part: each child of the root as a small tree that is dropped after use. Expat is used directly, since
+# it gives line numbers. A DOCTYPE is refused: no entity is ever expanded, no file fetched.
+
+_BLOCK_BYTES: Final = 1 << 16
+
+
+@dataclass
+class XmlNode:
+    """One element."""
+
+    tag: str
+    attributes: dict[str, str]
+    line: int
+    text: str = ""
+    children: list[XmlNode] = field(default_factory=list)
+
+    def all(self, tag: str) -> list[XmlNode]:
+        """Children of that tag."""
+        return [child for child in self.children if child.tag == tag]
+
+    def attribute(self, name: str, path: Path) -> str:
+        """The value of an attribute. Raises InputError: there is none."""
+        if (value := self.attributes.get(name)) is None:
+            found = ", ".join(self.attributes) or "none"
+            raise InputError(f"{path}:{self.line}: expected <{self.tag}> with the attribute {name}, found {found}")
+        return value
+
+    def find(self, *tags: str) -> XmlNode | None:
+        """Return the first child of the first tag, its first child of the next, and so on."""
+        node: XmlNode | None = self
+        for tag in tags:
+            node = next((child for child in node.children if child.tag == tag), None) if node is not None else None
+        return node
+
+
+def read_parts(path: Path, root_tags: tuple[str, ...]) -> Iterator[XmlNode]:
+    """Yield the root without its children, then each child once it is complete. Raises InputError."""
+    reading = _ParserHandlers(path, root_tags)
+    try:
+        with path.open("rb") as stream:
+            while block := stream.read(_BLOCK_BYTES):
+                reading.parser.Parse(block, False)
+                while reading.done:
+                    yield reading.done.popleft()
+            reading.parser.Parse(b"", True)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be opened: {error.strerror}") from None
+    except expat.ExpatError as error:
+        found = expat.errors.messages[error.code]
+        raise InputError(f"{path}:{error.lineno}: expected XML, found something else or its end: {found}") from None
+    except (LookupError, ValueError) as error:  # an encoding that Python lacks
+        raise InputError(f"{path}: expected XML, found something else: {error}") from None
+    yield from reading.done
+
+
+class _ParserHandlers:
+    """Handlers of the parser, with the parts they have completed."""
+
+    def __init__(self, path: Path, root_tags: tuple[str, ...]) -> None:
+        self.path, self.root_tags = path, root_tags
+        self.open: list[XmlNode] = []
+        self.done: deque[XmlNode] = deque()
+        self.parser = parser = expat.ParserCreate()
+        parser.buffer_text = True
+        parser.StartElementHandler = self._start
+        parser.EndElementHandler = self._end
+        parser.CharacterDataHandler = self._text
+        parser.StartDoctypeDeclHandler = self._doctype
+
+    def _start(self, tag: str, attributes: dict[str, str]) -> None:
+        node = XmlNode(tag, attributes, self.parser.CurrentLineNumber)
+        if not self.open:
+            if tag not in self.root_tags:
+                expected = " or ".join(f"<{name}>" for name in self.root_tags)
+                raise InputError(f"{self.path}:{node.line}: expected {expected}, found <{tag}>")
+            self.done.append(node)
+        elif len(self.open) > 1:  # children of the root are handed out, not kept
+            self.open[-1].children.append(node)
+        self.open.append(node)
+
+    def _end(self, _tag: str) -> None:
+        node = self.open.pop()
+        if len(self.open) == 1:
+            self.done.append(node)
+
+    def _text(self, text: str) -> None:
+        if len(self.open) > 1:
+            self.open[-1].text += text
+
+    def _doctype(self, *_: object) -> None:
+        line = self.parser.CurrentLineNumber
+        raise InputError(f"{self.path}:{line}: expected no DOCTYPE, found one: refused, it could expand without end")
+
 
 _KIND: Final = {
     "bicycle": "bicycle",
@@ -40,7 +143,7 @@ _KIND: Final = {
     "truck": "truck",
     "unknown": "other",
 }
-_LAST_STEP: Final = 10_000_000  # chosen: eleven days at 10 Hz
+_LAST_STEP: Final = 10_000_000  # eleven days at 10 Hz; a larger step is an error
 _IGNORED: Final = {
     "environmentObstacle": "has no pose: skipped",
     "phantomObstacle": "is nowhere in particular: skipped",
@@ -60,10 +163,10 @@ class _Shape:
     yaw_rad: float = 0.0
 
 
-def frames(path: Path, report: Report) -> Iterator[Frame]:
-    """All steps at which a dynamic obstacle is somewhere; static ones are in all of them. Raises InputError."""
-    source = parts(path, ("commonRoad",))
-    step_s = _step(next(source), path)
+def frames(path: Path, report: ConversionReport) -> Iterator[Frame]:
+    """All steps at which a dynamic obstacle has a state; static ones are in all of them. Raises InputError."""
+    source = read_parts(path, ("commonRoad",))
+    step_s = _read_time_step(next(source), path)
     steps: dict[int, list[Box]] = {}
     static: list[Box] = []
     for node in source:
@@ -71,59 +174,63 @@ def frames(path: Path, report: Report) -> Iterator[Frame]:
             report.count(node.tag, _IGNORED[node.tag])
         elif node.tag in ("dynamicObstacle", "staticObstacle"):
             moving = node.tag == "dynamicObstacle"
-            ident = _id(node, path)
-            kind = _kind(node, path, report, moving=moving)
-            shape = _shape(node, path, report)
+            ident = _read_id(node, path)
+            kind = _map_kind(node, path, report, moving=moving)
+            shape = _read_shape(node, path, report)
             if shape is None:
                 continue
             report.names[ident] = str(ident)
             report.assume("flat world: boxes stand on z = 0, with the typical height of their class")
-            for state in _states(node, path, report) if moving else [_initial(node, path)]:
-                box = _box(ident, kind, shape, state, path, report, moving=moving)
+            for state in _list_states(node, path, report) if moving else [_initial_state(node, path)]:
+                box = _make_box(ident, kind, shape, state, path, report, moving=moving)
                 if box is None:
                     continue
                 if moving:
-                    steps.setdefault(_time(state, path), []).append(box)
+                    steps.setdefault(_read_time(state, path), []).append(box)
                 else:
                     static.append(box)
     for step in sorted(steps or {0: []}):
-        stamp_ns = seconds_as_ns(step, f"{path}: time step {step}", times=step_s)
+        stamp_ns = parse_seconds_as_ns(step, f"{path}: time step {step}", times=step_s)
         yield Frame(stamp_ns, [*steps.get(step, []), *static])
 
 
-def _step(root: Node, path: Path) -> Decimal:
-    said = root.attributes.get("timeStepSize")
+def _read_time_step(root: XmlNode, path: Path) -> Decimal:
+    text = root.attributes.get("timeStepSize")
     try:
-        step_s = Decimal(said or "")
+        step_s = Decimal(text or "")
     except InvalidOperation:
         step_s = Decimal(0)
     if not step_s.is_finite() or not Decimal("1e-6") <= step_s <= 1000:
-        raise InputError(f"{path}:{root.line}: expected timeStepSize in seconds (1e-6 to 1000), found {shown(said)}")
+        raise InputError(
+            f"{path}:{root.line}: expected timeStepSize in seconds (1e-6 to 1000), found {quote_value(text)}"
+        )
     return step_s
 
 
-def _id(node: Node, path: Path) -> int:
-    said = node.attributes.get("id", "")
-    if not (said.isascii() and said.isdecimal() and len(said) < 19):
-        raise InputError(f"{path}:{node.line}: expected <{node.tag}> with a whole number as id, found {shown(said)}")
-    return int(said)
+def _read_id(node: XmlNode, path: Path) -> int:
+    text = node.attributes.get("id", "")
+    if not (text.isascii() and text.isdecimal() and len(text) < 19):
+        raise InputError(
+            f"{path}:{node.line}: expected <{node.tag}> with a whole number as id, found {quote_value(text)}"
+        )
+    return int(text)
 
 
-def _kind(node: Node, path: Path, report: Report, *, moving: bool) -> Kind:
-    said = node.find("type")
-    name = said.text.strip() if said is not None else ""
+def _map_kind(node: XmlNode, path: Path, report: ConversionReport, *, moving: bool) -> OsiKind:
+    type_node = node.find("type")
+    name = type_node.text.strip() if type_node is not None else ""
     if name not in _KIND:
-        report.count("obstacle", f"of the unknown type {shown(name)}: taken as other")
+        report.count("obstacle", f"of the unknown type {quote_value(name)}: taken as other")
     kind = KINDS[_KIND.get(name, "other")]
     if moving == kind.moving:
         return kind
     if moving:
         return KINDS["other"]
-    # What stands for good keeps the typical height of what it is.
-    return Kind("static", False, KINDS["static"].type, like=kind.like)
+    # A static obstacle keeps the typical height of its kind.
+    return OsiKind("static", False, KINDS["static"].type, like=kind.like)
 
 
-def _shape(node: Node, path: Path, report: Report) -> _Shape | None:
+def _read_shape(node: XmlNode, path: Path, report: ConversionReport) -> _Shape | None:
     shape = node.find("shape")
     children = shape.children if shape is not None else []
     if len(children) != 1 or children[0].tag not in ("rectangle", "circle", "polygon"):
@@ -132,19 +239,21 @@ def _shape(node: Node, path: Path, report: Report) -> _Shape | None:
         return None
     (drawn,) = children
     if drawn.tag == "polygon":
-        return _around([_point(point, path) for point in drawn.all("point")], drawn, path, report)
+        return _box_around([_read_point(point, path) for point in drawn.all("point")], drawn, path, report)
     centre = drawn.find("center")
-    x, y = _point(centre, path) if centre is not None else (0.0, 0.0)
+    x, y = _read_point(centre, path) if centre is not None else (0.0, 0.0)
     if drawn.tag == "circle":
-        size_m = 2 * positive(_text(drawn, path, "radius"), f"{path}:{drawn.line}: radius")
+        size_m = 2 * parse_positive(_read_text(drawn, path, "radius"), f"{path}:{drawn.line}: radius")
         return _Shape(size_m, size_m, x, y)
-    length, width = (positive(_text(drawn, path, tag), f"{path}:{drawn.line}: {tag}") for tag in ("length", "width"))
+    length, width = (
+        parse_positive(_read_text(drawn, path, tag), f"{path}:{drawn.line}: {tag}") for tag in ("length", "width")
+    )
     turned = drawn.find("orientation")
-    yaw_rad = _value(turned, path, report) if turned is not None else 0.0
+    yaw_rad = _read_value(turned, path, report) if turned is not None else 0.0
     return _Shape(length, width, x, y, yaw_rad)
 
 
-def _around(points: list[tuple[float, float]], node: Node, path: Path, report: Report) -> _Shape:
+def _box_around(points: list[tuple[float, float]], node: XmlNode, path: Path, report: ConversionReport) -> _Shape:
     """Return the box along the obstacle's own axes around a polygon."""
     if len(points) < 3:
         raise InputError(f"{path}:{node.line}: expected a polygon of at least 3 points, found {len(points)}")
@@ -153,31 +262,33 @@ def _around(points: list[tuple[float, float]], node: Node, path: Path, report: R
     return _Shape(east - west, north - south, (east + west) / 2, (north + south) / 2)
 
 
-def _initial(node: Node, path: Path) -> Node:
+def _initial_state(node: XmlNode, path: Path) -> XmlNode:
     if (state := node.find("initialState")) is None:
         raise InputError(f"{path}:{node.line}: expected <{node.tag}> with an <initialState>, found none")
     return state
 
 
-def _states(node: Node, path: Path, report: Report) -> list[Node]:
+def _list_states(node: XmlNode, path: Path, report: ConversionReport) -> list[XmlNode]:
     trajectory = node.find("trajectory")
     if trajectory is None and node.find("occupancySet") is not None:
         report.count("obstacle", "with an occupancySet: only its initial state taken")
-    return [_initial(node, path), *(trajectory.all("state") if trajectory is not None else [])]
+    return [_initial_state(node, path), *(trajectory.all("state") if trajectory is not None else [])]
 
 
-def _time(state: Node, path: Path) -> int:
+def _read_time(state: XmlNode, path: Path) -> int:
     """Return the step of a state; of an interval the first."""
     time = state.find("time")
-    said = None if time is None else time.find("exact") or time.find("intervalStart")
-    text = said.text.strip() if said is not None else ""
+    value = None if time is None else time.find("exact") or time.find("intervalStart")
+    text = value.text.strip() if value is not None else ""
     if not (text.isascii() and text.isdecimal() and len(text) < 19 and int(text) <= _LAST_STEP):
-        raise InputError(f"{path}:{state.line}: time: expected a step of 0 to {_LAST_STEP}, found {shown(text)}")
+        raise InputError(f"{path}:{state.line}: time: expected a step of 0 to {_LAST_STEP}, found {quote_value(text)}")
     return int(text)
 
 
-def _box(ident: int, kind: Kind, shape: _Shape, state: Node, path: Path, report: Report, *, moving: bool) -> Box | None:
-    """Return the obstacle in a state, None where that gives no point."""
+def _make_box(
+    ident: int, kind: OsiKind, shape: _Shape, state: XmlNode, path: Path, report: ConversionReport, *, moving: bool
+) -> Box | None:
+    """Return the obstacle in a state; None: the state has no position."""
     place = state.find("position")
     point = next((child for child in place.children), None) if place is not None else None
     if point is not None and point.tag in ("rectangle", "circle"):
@@ -188,37 +299,37 @@ def _box(ident: int, kind: Kind, shape: _Shape, state: Node, path: Path, report:
     if point is None:
         report.count("state", "without a point as position: skipped")
         return None
-    x, y = _point(point, path)
+    x, y = _read_point(point, path)
     turned, speed = state.find("orientation"), state.find("velocity")
     if turned is None:
         report.count("state", "without orientation: 0 taken")
-    yaw_rad = _value(turned, path, report) if turned is not None else 0.0
+    yaw_rad = _read_value(turned, path, report) if turned is not None else 0.0
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     at_m = (x + cos * shape.x_m - sin * shape.y_m, y + sin * shape.x_m + cos * shape.y_m, kind.height_m / 2)
     velocity = None
     if moving and speed is not None:
-        speed_mps = _value(speed, path, report)
+        speed_mps = _read_value(speed, path, report)
         velocity = (speed_mps * cos, speed_mps * sin)
     size_m = (shape.length_m, shape.width_m, kind.height_m)
-    return Box(ident, kind, at_m, wrapped(yaw_rad + shape.yaw_rad), size_m, velocity)
+    return Box(ident, kind, at_m, wrap_yaw(yaw_rad + shape.yaw_rad), size_m, velocity)
 
 
-def _value(node: Node, path: Path, report: Report) -> float:
-    """Return a value: as such, exact, or the middle of an interval."""
+def _read_value(node: XmlNode, path: Path, report: ConversionReport) -> float:
+    """Return a value, stated as such, as `exact`, or as an interval, of which it is the middle."""
     where = f"{path}:{node.line}: {node.tag}"
     low, high, exact = node.find("intervalStart"), node.find("intervalEnd"), node.find("exact")
     if low is not None and high is not None:
         report.count("value", f"of {node.tag} given as an interval: the middle taken")
-        return (number(low.text, where) + number(high.text, where)) / 2
-    return number((node if exact is None else exact).text.strip(), where)
+        return (parse_number(low.text, where) + parse_number(high.text, where)) / 2
+    return parse_number((node if exact is None else exact).text.strip(), where)
 
 
-def _point(node: Node, path: Path) -> tuple[float, float]:
-    x, y = (number(_text(node, path, axis), f"{path}:{node.line}: {axis}") for axis in "xy")
+def _read_point(node: XmlNode, path: Path) -> tuple[float, float]:
+    x, y = (parse_number(_read_text(node, path, axis), f"{path}:{node.line}: {axis}") for axis in "xy")
     return x, y
 
 
-def _text(node: Node, path: Path, tag: str) -> str:
+def _read_text(node: XmlNode, path: Path, tag: str) -> str:
     if (child := node.find(tag)) is None:
         found = ", ".join(c.tag for c in node.children) or "nothing"
         raise InputError(f"{path}:{node.line}: expected <{node.tag}> with <{tag}>, found {found}")

@@ -1,22 +1,333 @@
-"""From a data set or a simulation to recordings of OSI truth: which files, one after the other, and what is noted.
+"""Converting data sets and simulations to recordings of OSI truth: sources, outputs, kinds of objects, and notes.
 
-A format is one module with `frames(source, report, **options)` and a row of `FORMATS`. A recording is complete or not
-there, and the same input gives the same bytes.
+A format is one module with `frames(source, report, **options)` and a row of `FORMATS`. An output is complete or does
+not exist; a given input gives the same bytes each time.
 """
 
 from __future__ import annotations
 
+import json
+import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from decimal import Decimal
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
-from copem_replay.core.errors import InputError, OutputError
-from copem_replay.core.text import counted, unknown
-from copem_replay.io.convert.ground_truth import RECORD, Frame, Report, write
-from copem_replay.io.convert.scenario_folder import scenarios
+import numpy as np
+from osi3.osi_groundtruth_pb2 import GroundTruth
+from osi3.osi_object_pb2 import MovingObject, StationaryObject
+
+from copem_replay.core.errors import InputError, OutputError, count_noun, unknown_name_message
+from copem_replay.core.tracks import Float
+from copem_replay.io.convert import restricted_pickle
+from copem_replay.io.ground_truth import HEIGHTS_M
+from copem_replay.io.write.osi import NANOS_PER_SECOND, OsiTrace, empty_ground_truth, write_osi_trace
+
+# Kinds of objects in OSI. Each format maps its own names onto these.
+
+Vehicle = MovingObject.VehicleClassification
+Static = StationaryObject.Classification
+
+
+@dataclass(frozen=True)
+class OsiKind:
+    """A kind of object: its type in OSI and, for vehicles and stationary objects, its classification."""
+
+    name: str
+    moving: bool
+    type: int  # MovingObject.Type, or StationaryObject.Classification.Type
+    vehicle: int | None = None
+    like: str = "vehicle"  # the class whose typical height it has
+
+    @property
+    def height_m(self) -> float:
+        """Typical height, for sources without heights."""
+        return HEIGHTS_M[self.like][1]
+
+
+_VEHICLES = {  # name: (vehicle classification, class whose height is typical)
+    "car": (Vehicle.TYPE_MEDIUM_CAR, "car"),
+    "van": (Vehicle.TYPE_DELIVERY_VAN, "van"),
+    "truck": (Vehicle.TYPE_HEAVY_TRUCK, "truck"),
+    "tractor": (Vehicle.TYPE_SEMITRACTOR, "truck"),
+    "bus": (Vehicle.TYPE_BUS, "bus"),
+    "trailer": (Vehicle.TYPE_TRAILER, "trailer"),
+    "motorcycle": (Vehicle.TYPE_MOTORBIKE, "motorcycle"),
+    "bicycle": (Vehicle.TYPE_BICYCLE, "bicycle"),
+    "scooter": (Vehicle.TYPE_STANDUP_SCOOTER, "bicycle"),
+    "wheelchair": (Vehicle.TYPE_WHEELCHAIR, "pedestrian"),
+    "tram": (Vehicle.TYPE_TRAM, "bus"),
+    "train": (Vehicle.TYPE_TRAIN, "bus"),
+    "work machine": (Vehicle.TYPE_WORK_MACHINE, "truck"),
+    "vehicle": (None, "vehicle"),  # a vehicle of unknown kind
+}
+_STATIC = {
+    "cone": Static.TYPE_CONSTRUCTION_SITE_ELEMENT,
+    "pole": Static.TYPE_POLE,
+    "barrier": Static.TYPE_BARRIER,
+    "building": Static.TYPE_BUILDING,
+    "static": Static.TYPE_OTHER,
+}
+KINDS: Final[dict[str, OsiKind]] = {
+    **{name: OsiKind(name, True, MovingObject.TYPE_VEHICLE, *what) for name, what in _VEHICLES.items()},
+    "pedestrian": OsiKind("pedestrian", True, MovingObject.TYPE_PEDESTRIAN, like="pedestrian"),
+    "animal": OsiKind("animal", True, MovingObject.TYPE_ANIMAL, like="animal"),
+    "other": OsiKind("other", True, MovingObject.TYPE_OTHER, like="other"),
+    **{name: OsiKind(name, False, number, like="other") for name, number in _STATIC.items()},
+}
+"""By name; the last five never move."""
+
+
+# Rotations as matrices, (…, 3, 3), and the yaw of one.
+
+
+def rotation_from_quaternion(w: Float, x: Float, y: Float, z: Float) -> Float:
+    """Rotation matrices (N, 3, 3) of quaternions, (N,) each, of any length but 0 (then NaN)."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        w, x, y, z = np.array([w, x, y, z], dtype=np.float64) / np.sqrt(w * w + x * x + y * y + z * z)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    matrices: Float = np.moveaxis(np.array(rows), -1, 0)
+    return matrices
+
+
+def rotation_from_euler(roll: float, pitch: float, yaw: float) -> Float:
+    """Rotation matrix (3, 3): first roll about x, then pitch about y, then yaw about z, all axes fixed."""
+    half = np.array([roll, pitch, yaw]) / 2
+    (cr, cp, cy), (sr, sp, sy) = np.cos(half), np.sin(half)
+    w, x = cr * cp * cy + sr * sp * sy, sr * cp * cy - cr * sp * sy
+    y, z = cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy
+    matrix: Float = rotation_from_quaternion(*(np.array([v]) for v in (w, x, y, z)))[0]
+    return matrix
+
+
+def wrap_yaw(yaw_rad: float) -> float:
+    """The angle of this direction in [−π, π]."""
+    return math.remainder(yaw_rad, math.tau)
+
+
+# Numbers, times and ids from texts. Errors name the place.
+
+LAST_SECOND: Final = 4_000_000_000  # Unix time of 2096; reading takes no later stamp (`LAST_NS`)
+_LARGEST_ID: Final = 2**63 - 1  # OSI ids have 64 bits, which many readers keep in a signed integer
+
+
+def parse_number(text: object, where: str) -> float:
+    """Return a finite number. Raises InputError, `where: expected a number, found …`."""
+    try:
+        value = float(text) if isinstance(text, str | int | float) and not isinstance(text, bool) else math.nan
+    except (ValueError, OverflowError):
+        value = math.nan
+    if not math.isfinite(value):
+        raise InputError(f"{where}: expected a number, found {quote_value(text)}")
+    return value
+
+
+def parse_positive(text: object, where: str) -> float:
+    """Return a finite number above 0. Raises InputError."""
+    if (value := parse_number(text, where)) <= 0.0:
+        raise InputError(f"{where}: expected a number above 0, found {quote_value(text)}")
+    return value
+
+
+def parse_seconds_as_ns(text: object, where: str, *, times: Decimal = Decimal(1)) -> int:
+    """Return nanoseconds of seconds, exactly as they are written; `times` is what they count. Raises InputError."""
+    try:
+        seconds = Decimal(str(text)) * times if not isinstance(text, bool) else Decimal("nan")
+    except ArithmeticError:  # no number, or one whose exponent no decimal has
+        seconds = Decimal("nan")
+    if not seconds.is_finite() or not 0 <= seconds <= LAST_SECOND:
+        raise InputError(f"{where}: expected a time of 0 to {LAST_SECOND} s, found {quote_value(text)}")
+    return round(seconds * 1_000_000_000)
+
+
+def quote_value(value: object) -> str:
+    """Return the value as an error quotes it: on one line, shortened."""
+    text = "nothing" if value is None else repr(value)
+    text = " ".join(text.split())
+    return text if len(text) <= 60 else text[:57] + "…"
+
+
+def number_names(names: Iterable[str]) -> dict[str, int]:
+    """Return the OSI id of each name: the name itself where all are whole numbers, else 1, 2, … as they come."""
+    unique = list(dict.fromkeys(names))
+    if all(name.isascii() and name.isdecimal() and len(name) < 20 and str(int(name)) == name for name in unique):
+        kept = {name: int(name) for name in unique}
+        if all(ident <= _LARGEST_ID for ident in kept.values()):
+            return kept
+    return {name: k for k, name in enumerate(unique, start=1)}
+
+
+# A recording of osi3.GroundTruth from boxes: the last step of every converter.
+
+TOPIC: Final = "ground_truth"
+RECORD: Final = "copem_replay.conversion"
+"""Metadata record of the file: format, the source's ids by OSI id, and the notes."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """One object at one instant, in the world frame of the source."""
+
+    id: int
+    kind: OsiKind
+    at_m: tuple[float, float, float]  # centre of the box
+    yaw_rad: float  # counter-clockwise from +x
+    size_m: tuple[float, float, float]  # length, width, height
+    velocity_mps: tuple[float, float] | None = None  # None: the source states none
+    rear_axle_m: tuple[float, float, float] | None = None  # from the centre, in the frame of the box
+
+
+@dataclass(frozen=True)
+class Frame:
+    """All boxes of one instant."""
+
+    stamp_ns: int
+    boxes: list[Box]
+    host: int | None = None
+
+
+@dataclass
+class ConversionReport:
+    """What was skipped, assumed or corrected in a conversion, and the names of the objects in the source."""
+
+    counts: Counter[tuple[str, str]] = field(default_factory=Counter)
+    assumed: dict[str, None] = field(default_factory=dict)  # a line each, in order
+    names: dict[int, str] = field(default_factory=dict)  # by OSI id
+    frames: int = 0
+    objects: Counter[str] = field(default_factory=Counter)  # per kind
+    seen: set[tuple[bool, int]] = field(default_factory=set)
+
+    def count(self, noun: str, what: str, number: int = 1) -> None:
+        """Count states to be noted as `number noun what`."""
+        if number:
+            self.counts[noun, what] += number
+
+    def assume(self, line: str) -> None:
+        """Add a note on an assumption, once."""
+        self.assumed[line] = None
+
+    def lines(self) -> list[str]:
+        """All notes."""
+        return [*self.assumed, *(f"{count_noun(number, noun)} {what}" for (noun, what), number in self.counts.items())]
+
+
+def write_recording(
+    path: Path, frames: Iterable[Frame], report: ConversionReport, *, source: Path, format_name: str
+) -> None:
+    """Write the recording, complete or not at all. Raises InputError: no object, or times not in order."""
+    record: dict[str, str] = {}
+    trace = OsiTrace(
+        description=f"{source.name}, converted from {format_name}",
+        topics={TOPIC: "osi3.GroundTruth: all objects of the source"},
+        messages=_encode_messages(frames, report, source, format_name, record),
+        source=f"{format_name}: {source.name} (copem-replay convert)",
+        records={RECORD: record},
+    )
+    write_osi_trace(trace, path)
+
+
+def _encode_messages(
+    frames: Iterable[Frame], report: ConversionReport, source: Path, format_name: str, record: dict[str, str]
+) -> Iterator[tuple[str, GroundTruth]]:
+    """Encode frame by frame; `record` is filled after the last, since only then all names are known."""
+    last_ns = -1
+    for frame in frames:
+        if not last_ns < frame.stamp_ns <= LAST_SECOND * NANOS_PER_SECOND:
+            expected = f"after {last_ns / 1e9:.6f} s" if last_ns >= 0 else "of 0 s or later"
+            raise InputError(
+                f"{source}: frame {report.frames + 1}: expected a time {expected}, up to {LAST_SECOND} s, "
+                f"found {frame.stamp_ns / 1e9:.6f} s"
+            )
+        last_ns = frame.stamp_ns
+        report.frames += 1
+        yield TOPIC, _encode_message(frame, report)
+    if not report.seen:
+        skipped = "".join(f"; {line}" for line in report.lines())
+        raise InputError(f"{source}: no object to convert in {count_noun(report.frames, 'frame')}{skipped}")
+    ids = {str(ident): name for ident, name in sorted(report.names.items())}
+    notes = json.dumps(report.lines(), ensure_ascii=False)
+    record |= {"format": format_name, "ids": json.dumps(ids, ensure_ascii=False), "notes": notes}
+
+
+def _encode_message(frame: Frame, report: ConversionReport) -> GroundTruth:
+    osi = empty_ground_truth(frame.stamp_ns, frame.host)
+    for box in frame.boxes:
+        if not all(map(math.isfinite, (*box.at_m, box.yaw_rad, *box.size_m))):
+            report.count("object state", "with a number that is none: skipped")
+            continue
+        if min(box.size_m) <= 0.0:
+            report.count("object state", "without a size above 0: skipped")
+            continue
+        if (key := (box.kind.moving, box.id)) not in report.seen:
+            report.seen.add(key)
+            report.objects[box.kind.name] += 1
+        _add_box(osi, box)
+    return osi
+
+
+def _add_box(osi: Any, box: Box) -> None:
+    new = (osi.moving_object if box.kind.moving else osi.stationary_object).add()
+    new.id.value = box.id
+    base = new.base
+    base.dimension.length, base.dimension.width, base.dimension.height = box.size_m
+    base.position.x, base.position.y, base.position.z = box.at_m
+    base.orientation.roll, base.orientation.pitch, base.orientation.yaw = 0.0, 0.0, box.yaw_rad
+    if not box.kind.moving:
+        new.classification.type = box.kind.type
+        return
+    new.type = box.kind.type
+    if box.kind.vehicle is not None:
+        new.vehicle_classification.type = box.kind.vehicle
+    if box.velocity_mps is not None and all(map(math.isfinite, box.velocity_mps)):
+        base.velocity.x, base.velocity.y, base.velocity.z = *box.velocity_mps, 0.0
+    if box.rear_axle_m is not None:
+        rear = new.vehicle_attributes.bbcenter_to_rear
+        rear.x, rear.y, rear.z = box.rear_axle_m
+
+
+# Folders of ScenarioNet: a pickle for each scenario, in a folder for each worker, and two with indexes. The mapping
+# names the files and their folders relative to itself: a data set may be nothing but a mapping to others. Without it
+# all pickles in the folder and below are scenarios.
+
+_MAPPING: Final = "dataset_mapping.pkl"
+_SUMMARY: Final = "dataset_summary.pkl"  # of metadata that the scenarios have, too
+
+
+def find_scenarios(folder: Path) -> dict[str, Path]:
+    """Files of the scenarios by their names without the ending, in order of the names. Raises InputError."""
+    mapping = folder / _MAPPING
+    files = _read_mapping(mapping) if mapping.is_file() else sorted(folder.rglob("*.pkl"))
+    found: dict[str, Path] = {}
+    for path in sorted(files, key=lambda path: path.name):
+        if path.name in (_MAPPING, _SUMMARY):
+            continue
+        if (other := found.setdefault(path.stem, path)) != path:
+            raise InputError(f"{folder}: expected one scenario {path.stem}, found {other} and {path}")
+    if not found:
+        raise InputError(f"{folder}: expected scenarios of ScenarioNet, found no *.pkl in the folder")
+    return found
+
+
+def _read_mapping(mapping: Path) -> list[Path]:
+    places = restricted_pickle.load_pickle(mapping)
+    if not isinstance(places, dict):
+        raise InputError(f"{mapping}: expected the folder of each scenario by its file, found {type(places).__name__}")
+    for name, place in places.items():
+        if not (isinstance(name, str) and isinstance(place, str)) or not name or Path(name).name != name:
+            raise InputError(
+                f"{mapping}: expected files and their folders, found {quote_value(name)} in {quote_value(place)}"
+            )
+    return [mapping.parent / place / name for name, place in places.items()]
+
+
+# Conversion of one source, or of many.
 
 FORMATS: Final[Mapping[str, str]] = {
     "argoverse2": "argoverse2",
@@ -28,24 +339,26 @@ FORMATS: Final[Mapping[str, str]] = {
 }
 """Module of this folder by the name of the format."""
 _MOST_LINES: Final = 10
-"""Lines of one kind in a summary (chosen): a data set has thousands of scenarios."""
+"""Lines of one kind in a summary, at most: a data set has thousands of scenarios."""
 
 
-def convert(source: Path, out: Path, *, format: str, options: Mapping[str, Any] | None = None) -> Report:
+def convert_source(
+    source: Path, out: Path, *, format: str, options: Mapping[str, Any] | None = None
+) -> ConversionReport:
     """Convert one recording to the file `out`.
 
     `options`: keyword arguments of the format's `frames`. Raises InputError: unknown format, or a source that cannot be
     converted; OutputError.
     """
     if format not in FORMATS:
-        raise InputError(unknown("format", format, FORMATS))
+        raise InputError(unknown_name_message("format", format, FORMATS))
     frames: Callable[..., Iterator[Frame]] = import_module(f"copem_replay.io.convert.{FORMATS[format]}").frames
-    report = Report()
-    write(out, frames(source, report, **(options or {})), report, source=source, format_name=format)
+    report = ConversionReport()
+    write_recording(out, frames(source, report, **(options or {})), report, source=source, format_name=format)
     return report
 
 
-def outputs(source: Path, out: Path, *, format: str, overwrite: bool = False) -> dict[Path, Path]:
+def plan_outputs(source: Path, out: Path, *, format: str, overwrite: bool = False) -> dict[Path, Path]:
     """Return the source of each recording to write: one, or one per scenario of a folder of ScenarioNet.
 
     Raises InputError: the source does not exist, or an output exists already.
@@ -55,55 +368,55 @@ def outputs(source: Path, out: Path, *, format: str, overwrite: bool = False) ->
     if format == "scenarionet" and source.is_dir():
         if out.suffix == ".mcap" or out.is_file():
             raise InputError(f"{out}: expected a folder for the recordings of one, found a file's name")
-        asked = {out / f"{name}.mcap": path for name, path in scenarios(source).items()}
+        asked = {out / f"{name}.mcap": path for name, path in find_scenarios(source).items()}
     else:
         if out.suffix != ".mcap":
             raise InputError(f"{out}: expected an output that ends in .mcap, found {out.name!r}")
         asked = {out: source}
-    there = [path for path in asked if path.is_file()]
-    if there and not overwrite:
-        more = f", and {counted(len(there) - 1, 'other')}" if len(there) > 1 else ""
-        raise InputError(f"{there[0]}: is there already{more}; give another name, or --overwrite")
+    existing = [path for path in asked if path.is_file()]
+    if existing and not overwrite:
+        more = f", and {count_noun(len(existing) - 1, 'other')}" if len(existing) > 1 else ""
+        raise InputError(f"{existing[0]}: is there already{more}; give another name, or --overwrite")
     return asked
 
 
 @dataclass
 class Conversion:
-    """What the notes and errors of all recordings of one command add up to."""
+    """The sums of notes and errors over all recordings of one command."""
 
     asked: int = 0  # recordings
     done: int = 0
     wrong: list[str] = field(default_factory=list)  # a line per problem
     notes: Counter[tuple[str, str]] = field(default_factory=Counter)  # (noun, what): how many
     assumed: Counter[str] = field(default_factory=Counter)  # line: recordings
-    numbered: bool = False  # ids are not the names of the source
+    numbered: bool = False  # whether ids differ from the names in the source
 
-    def add(self, report: Report) -> None:
-        """Take in the report of a recording that was written."""
+    def add(self, report: ConversionReport) -> None:
+        """Add the report of a recording that was written."""
         self.done += 1
         self.notes += report.counts
         self.assumed.update(list(report.assumed))
         self.numbered |= any(name != str(ident) for ident, name in report.names.items())
 
     def note_lines(self) -> list[str]:
-        """What was skipped, assumed or put right, a line each."""
+        """A line for everything that was skipped, assumed or corrected."""
         many = self.asked > 1
-        lines = [f"{line} ({counted(n, 'recording')})" if many else line for line, n in self.assumed.items()]
+        lines = [f"{line} ({count_noun(n, 'recording')})" if many else line for line, n in self.assumed.items()]
         if len(lines) > _MOST_LINES:
             more = len(lines) - _MOST_LINES
             lines[_MOST_LINES:] = [f"… and {more} more; the metadata record {RECORD} of each has all"]
-        lines += [f"{counted(number, noun)} {what}" for (noun, what), number in self.notes.items()]
+        lines += [f"{count_noun(number, noun)} {what}" for (noun, what), number in self.notes.items()]
         if self.numbered:
             lines.append(f"objects are numbered; the file's metadata record {RECORD} has their names")
         return lines
 
     def problem_lines(self) -> list[str]:
-        """What is wrong, a line each, and of many recordings how many are missing."""
+        """A line for each error, and with many recordings one that counts those not written."""
         lines = self.wrong[:_MOST_LINES]
         if len(self.wrong) > _MOST_LINES:
             lines.append(f"… and {len(self.wrong) - _MOST_LINES} more")
         if self.wrong and self.asked > 1:
-            lines.append(f"{self.asked - self.done} of {counted(self.asked, 'scenario')} not converted")
+            lines.append(f"{self.asked - self.done} of {count_noun(self.asked, 'scenario')} not converted")
         return lines
 
 
@@ -118,7 +431,7 @@ def convert_all(
     conversion.asked = len(asked)
     for output, source in asked.items():
         try:
-            report = convert(source, output, format=format, options=options)
+            report = convert_source(source, output, format=format, options=options)
         except InputError as error:
             conversion.wrong += error.problems
             continue
@@ -127,4 +440,4 @@ def convert_all(
             break
         conversion.add(report)
         objects = ", ".join(f"{many} {name}" for name, many in sorted(report.objects.items()))
-        yield f"{output}: {counted(report.frames, 'frame')}, {objects}"
+        yield f"{output}: {count_noun(report.frames, 'frame')}, {objects}"

@@ -1,9 +1,9 @@
 """Unpickling that builds nothing but containers, numbers, strings and plain numpy arrays.
 
-A pickle is a program: it may call whatever it names. Here it can name a dozen harmless things; the first other
-name stops it, before anything of it is imported. Nor does numpy believe what a pickle says of an array: a type that
-calls bytes references, or a list that is shorter than the shape, reads what is not its own. And a few bytes of a
-pickle cannot ask for gigabytes, neither at once nor by holding one list many times.
+A pickle is a program that may call whatever it names. Here it can name a dozen harmless functions and types; any other
+name is refused before it is imported. What a pickle says of an array is checked before numpy gets it: bytes declared as
+references, or a list shorter than the shape, would make numpy read foreign memory. A few bytes of a pickle cannot ask
+for gigabytes, neither at once nor by holding one list many times.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ import numpy as np
 from copem_replay.core.errors import InputError
 
 _TIMES: Final = 16
-"""How many times as many numbers and characters as the file has bytes may be made of it (chosen; about 1 is usual)."""
+"""Most numbers and characters made of a file, in bytes of the file; about 1 is usual."""
 _DEEPEST: Final = 100
-"""How deep containers may lie in each other (chosen; 6 are usual)."""
+"""Most levels of containers in each other; 6 are usual."""
 _ORDERS: Final = ("<", ">", "=", "|")
 
 _NDARRAY: Final = object()
 """Stands for the class of arrays: pickles name it, and may not call it."""
 _KIND: Final = object()
-"""Stands for any type that only says what a defaultdict is made of."""
+"""Stands for any type that is only named as the factory of a defaultdict."""
 _KINDS: Final = ("bool", "dict", "float", "int", "list", "long", "str", "tuple", "unicode")
 
 
 class _Dtype:
-    """Type of an array: plain numbers, strings and references, no records. Of its state only the byte order counts."""
+    """Type of an array: plain numbers, strings and references, no records. Of its state only the byte order is used."""
 
     __slots__ = ("dtype",)
 
@@ -53,13 +53,13 @@ class _Dtype:
 
 
 class _Array(np.ndarray[Any, Any]):
-    """An array whose content is as much as its shape says."""
+    """An array whose content is checked to be as large as its shape."""
 
     take_from: Callable[[int], None]
 
     def __setstate__(self, state: Any) -> None:
-        _version, shape, given, fortran, content = state
-        dtype = _plain(given)
+        _version, shape, declared, fortran, content = state
+        dtype = _plain_dtype(declared)
         if self.shape != (0,) or not all(type(n) is int and n >= 0 for n in shape):
             raise pickle.UnpicklingError(f"an array of shape {shape}")
         expected = math.prod(shape) * (1 if dtype.hasobject else dtype.itemsize)
@@ -74,18 +74,18 @@ class _Array(np.ndarray[Any, Any]):
 
 
 class _RefusedError(Exception):
-    """The pickle names something else."""
+    """The pickle names something that is not allowed."""
 
 
-class _Restricted(pickle.Unpickler):
-    """What a pickle may name, by module and name, old and new; nothing is imported."""
+class _RestrictedUnpickler(pickle.Unpickler):
+    """Everything that a pickle may name, by module and name, old and new; nothing is imported."""
 
     def __init__(self, data: bytes) -> None:
         super().__init__(io.BytesIO(data))
         self._left = _TIMES * len(data)
         self._safe: dict[tuple[str, str], Any] = {
             ("collections", "OrderedDict"): lambda items=(): collections.OrderedDict(self._counted(items)),
-            ("collections", "defaultdict"): lambda factory=None: {},  # what it would make of a key is not called
+            ("collections", "defaultdict"): lambda factory=None: {},  # its factory is never called
             ("_codecs", "encode"): self._encode,
             ("numpy", "ndarray"): _NDARRAY,
             ("numpy", "dtype"): lambda name, align=False, copy=False: _Dtype(name),
@@ -94,7 +94,7 @@ class _Restricted(pickle.Unpickler):
             self._safe |= {(module, kind): _KIND for kind in _KINDS}
             self._safe |= {
                 (module, "complex"): lambda real, imag: complex(real, imag),
-                (module, "bytes"): lambda: b"",  # how old pickles spell none
+                (module, "bytes"): lambda: b"",  # empty bytes in old pickles
                 (module, "set"): lambda items=(): set(self._counted(items)),
                 (module, "frozenset"): lambda items=(): frozenset(self._counted(items)),
             }
@@ -119,14 +119,14 @@ class _Restricted(pickle.Unpickler):
         return items
 
     def _encode(self, text: str, encoding: str = "latin1") -> bytes:
-        """How old pickles spell bytes; no other codec, some of them unpack."""
+        """Bytes as old pickles spell them; other codecs are refused, since some of them decompress."""
         if encoding != "latin1":
             raise pickle.UnpicklingError(f"bytes as {encoding}")
         encoded: bytes = self._counted(text).encode("latin1")
         return encoded
 
     def _reconstruct(self, kind: object, shape: tuple[int, ...], dtype: object) -> _Array:
-        """Return an empty array, which its state fills: no pickle asks for a larger one."""
+        """Return an empty array, which its state fills; a request for a larger one is refused."""
         if kind is not _NDARRAY or shape != (0,):
             raise pickle.UnpicklingError(f"an array of shape {shape} without content")
         array = _Array((0,))
@@ -134,7 +134,7 @@ class _Restricted(pickle.Unpickler):
         return array
 
     def _scalar(self, dtype: _Dtype, content: bytes) -> Any:
-        kind = _plain(dtype)
+        kind = _plain_dtype(dtype)
         if kind.hasobject or type(content) is not bytes or len(content) != kind.itemsize:
             raise pickle.UnpicklingError(f"a number of {kind} with other content")
         self._take(len(content))
@@ -146,27 +146,27 @@ class _Restricted(pickle.Unpickler):
         """Return an array over bytes, which it does not copy."""
         if type(content) not in (bytes, bytearray):
             raise pickle.UnpicklingError("an array over something else than bytes")
-        flat = np.frombuffer(content, _plain(dtype))
+        flat = np.frombuffer(content, _plain_dtype(dtype))
         if order == "K" and axes is not None:
             return flat.reshape(shape, order="C").transpose(axes)
         return flat.reshape(shape, order=order)
 
 
-def _plain(dtype: _Dtype) -> np.dtype[Any]:
+def _plain_dtype(dtype: _Dtype) -> np.dtype[Any]:
     if type(dtype) is not _Dtype:
         raise pickle.UnpicklingError("an array without a type")
     return dtype.dtype
 
 
 def _check_memo(data: bytes) -> None:
-    """Refuse an index far beyond what there is to remember: as many places would be made for it."""
+    """Refuse an index of the memo far beyond the file's size: as many places would be allocated for it."""
     for number, (code, argument, _) in enumerate(pickletools.genops(data)):
         if code.name in ("PUT", "BINPUT", "LONG_BINPUT") and not 0 <= int(argument or 0) <= number:
             raise pickle.UnpicklingError(f"a memo of {argument} places")
 
 
-def _unfolded(thing: Any, known: dict[int, int], depth: int = 0) -> int:
-    """How much it is to whom looks at all of it: what is held twice counts twice. Raises UnpicklingError: a circle."""
+def _unfolded_size(thing: Any, known: dict[int, int], depth: int = 0) -> int:
+    """The size of a value when all of it is visited: parts held twice count twice. Raises UnpicklingError: a circle."""
     if isinstance(thing, str | bytes | bytearray):
         return 1 + len(thing)
     if isinstance(thing, np.ndarray) and not thing.dtype.hasobject:
@@ -178,17 +178,17 @@ def _unfolded(thing: Any, known: dict[int, int], depth: int = 0) -> int:
             raise pickle.UnpicklingError(f"containers in each other, more than {_DEEPEST} deep")
         items = (*thing.keys(), *thing.values()) if isinstance(thing, dict) else thing
         flat = items.flat if isinstance(items, np.ndarray) else items
-        known[id(thing)] = 1 + sum(_unfolded(item, known, depth + 1) for item in flat)
+        known[id(thing)] = 1 + sum(_unfolded_size(item, known, depth + 1) for item in flat)
     return known[id(thing)]
 
 
-def load(path: Path) -> Any:
-    """Return what the file holds. Raises InputError: it names anything else, or is no pickle."""
+def load_pickle(path: Path) -> Any:
+    """Return the value in the file. Raises InputError: it names what is not allowed, or is no pickle."""
     try:
         data = path.read_bytes()
         _check_memo(data)
-        found = _Restricted(data).load()
-        if _unfolded(found, {}) > _TIMES * len(data):
+        found = _RestrictedUnpickler(data).load()
+        if _unfolded_size(found, {}) > _TIMES * len(data):
             raise pickle.UnpicklingError("far more content than it has bytes")
         return found
     except OSError as error:

@@ -15,22 +15,28 @@ from typing import Any, Final
 
 import numpy as np
 
-from copem_replay.core.errors import InputError
-from copem_replay.core.text import counted
+from copem_replay.core.errors import InputError, count_noun
 from copem_replay.core.tracks import Bool, Float
 from copem_replay.io.convert import restricted_pickle
-from copem_replay.io.convert.ground_truth import Box, Frame, Report
-from copem_replay.io.convert.kinds import KINDS, Kind
-from copem_replay.io.convert.parse import LAST_SECOND, numbered, shown
-from copem_replay.io.convert.rotate import wrapped
+from copem_replay.io.convert.conversion import (
+    KINDS,
+    LAST_SECOND,
+    Box,
+    ConversionReport,
+    Frame,
+    OsiKind,
+    number_names,
+    quote_value,
+    wrap_yaw,
+)
 
-_MOST_COLUMNS: Final = 16  # chosen; there are at most 3
-_MOST_STEPS: Final = 10_000_000  # chosen: eleven days at 10 Hz
+_MOST_COLUMNS: Final = 16  # of an array; formats have at most 3
+_MOST_STEPS: Final = 10_000_000  # eleven days at 10 Hz; a longer array is an error
 
 EGO_CENTRE_M: Final = 1.385
 """Centre of nuScenes' Renault Zoe ahead of its rear axle: as in py123d, from the model's data."""
 
-_KIND_OF_NUSCENES: Final = {  # category, or what it begins with; the longest that fits
+_KIND_OF_NUSCENES: Final = {  # by category or its beginning; the longest that fits counts
     "animal": "animal",
     "human.pedestrian": "pedestrian",
     "human.pedestrian.personal_mobility": "scooter",
@@ -66,29 +72,29 @@ _KIND_OF_METADRIVE: Final = {
 class _Track:
     """One object, (T,) and (T, n) each."""
 
-    kind: Kind
+    kind: OsiKind
     valid: Bool
     at_m: Float  # (T, 3)
     yaw_rad: Float
     size_m: Float  # (T, 3)
-    velocity_mps: Float  # (T, 2), NaN where it is not given
+    velocity_mps: Float  # (T, 2), NaN: not given
 
 
-def frames(path: Path, report: Report, *, ego_centre_m: float | None = None) -> Iterator[Frame]:
+def frames(path: Path, report: ConversionReport, *, ego_centre_m: float | None = None) -> Iterator[Frame]:
     """All steps, with the track of `sdc_id` as host. Raises InputError.
 
     `ego_centre_m`: of the ego's box ahead of the position given for it; None: `EGO_CENTRE_M` for nuScenes, else 0.
     """
-    scenario = restricted_pickle.load(path)
-    metadata = _part(scenario, "metadata", dict, str(path))
-    stamps_ns = _stamps(metadata, f"{path}: metadata")
-    named = {str(name): track for name, track in _part(scenario, "tracks", dict, str(path)).items()}
-    ids = numbered(named)
+    scenario = restricted_pickle.load_pickle(path)
+    metadata = _get_part(scenario, "metadata", dict, str(path))
+    stamps_ns = _read_stamps(metadata, f"{path}: metadata")
+    named = {str(name): track for name, track in _get_part(scenario, "tracks", dict, str(path)).items()}
+    ids = number_names(named)
     host = None if metadata.get("sdc_id") is None else str(metadata["sdc_id"])
     if host not in ids:
         report.assume("no ego vehicle: " + ("no sdc_id" if host is None else f"no track {host} (sdc_id)"))
     tracks = {
-        name: _track(track, len(stamps_ns), f"{path}: track {name}", report, ego=name == host)
+        name: _read_track(track, len(stamps_ns), f"{path}: track {name}", report, ego=name == host)
         for name, track in named.items()
     }
     if host in tracks:
@@ -99,28 +105,30 @@ def frames(path: Path, report: Report, *, ego_centre_m: float | None = None) -> 
             _move_ahead(tracks[host], ego_centre_m)
     report.names |= {ids[name]: name for name in tracks}
     for step, stamp_ns in enumerate(stamps_ns):
-        boxes = [_box(ids[name], t, step) for name, t in tracks.items() if t.valid[step]]
+        boxes = [_make_box(ids[name], t, step) for name, t in tracks.items() if t.valid[step]]
         yield Frame(stamp_ns, boxes, ids.get(host) if host is not None else None)
 
 
-def _box(ident: int, track: _Track, step: int) -> Box:
+def _make_box(ident: int, track: _Track, step: int) -> Box:
     x, y, z = track.at_m[step].tolist()
     length, width, height = track.size_m[step].tolist()
     vx, vy = track.velocity_mps[step].tolist()
     yaw_rad = float(track.yaw_rad[step])
-    yaw_rad = wrapped(yaw_rad) if np.isfinite(yaw_rad) else yaw_rad
+    yaw_rad = wrap_yaw(yaw_rad) if np.isfinite(yaw_rad) else yaw_rad
     return Box(ident, track.kind, (x, y, z), yaw_rad, (length, width, height), (vx, vy))
 
 
-def _track(track: Any, steps: int, where: str, report: Report, *, ego: bool) -> _Track:
-    state = _part(track, "state", dict, where)
-    valid = _array(state, "valid", steps, 1, where)[:, 0] > 0.5
-    position = _array(state, "position", steps, 0, where)
+def _read_track(track: Any, steps: int, where: str, report: ConversionReport, *, ego: bool) -> _Track:
+    state = _get_part(track, "state", dict, where)
+    valid = _read_array(state, "valid", steps, 1, where)[:, 0] > 0.5
+    position = _read_array(state, "position", steps, 0, where)
     if position.shape[1] not in (2, 3):
         raise InputError(f"{where}: position: expected 2 or 3 columns, found {position.shape[1]}")
     at_m = np.zeros((steps, 3))
     at_m[:, : position.shape[1]] = position
-    size_m = np.concatenate([_array(state, name, steps, 1, where) for name in ("length", "width", "height")], axis=1)
+    size_m = np.concatenate(
+        [_read_array(state, name, steps, 1, where) for name in ("length", "width", "height")], axis=1
+    )
     if ego and (swapped := valid & (size_m[:, 0] < size_m[:, 1])).any():
         found = "×".join(f"{v:g}" for v in size_m[swapped][0, :2])
         report.count(
@@ -132,13 +140,13 @@ def _track(track: Any, steps: int, where: str, report: Report, *, ego: bool) -> 
         at_m[:, 2] = size_m[:, 2] / 2
     velocity = np.full((steps, 2), np.nan)
     if "velocity" in state:
-        velocity = _array(state, "velocity", steps, 0, where)[:, :2].copy()
+        velocity = _read_array(state, "velocity", steps, 0, where)[:, :2].copy()
         beside = np.concatenate([[True], ~valid[:-1]]) | np.concatenate([~valid[1:], [True]])
         unknown = valid & beside & ~velocity.any(axis=1)
         report.count("state", "at the ends of tracks with velocity 0: taken as not given", int(unknown.sum()))
         velocity[unknown] = np.nan
-    yaw_rad = _array(state, "heading", steps, 1, where)[:, 0]
-    return _Track(_kind(track, report), valid, at_m, yaw_rad, size_m, velocity)
+    yaw_rad = _read_array(state, "heading", steps, 1, where)[:, 0]
+    return _Track(_map_kind(track, report), valid, at_m, yaw_rad, size_m, velocity)
 
 
 def _move_ahead(track: _Track, ahead_m: float) -> None:
@@ -147,8 +155,8 @@ def _move_ahead(track: _Track, ahead_m: float) -> None:
     track.at_m[:, 1] += ahead_m * np.sin(track.yaw_rad)
 
 
-def _kind(track: Mapping[str, Any], report: Report) -> Kind:
-    """Go by the category of the data set where it is one of nuScenes, else by the type of MetaDrive."""
+def _map_kind(track: Mapping[str, Any], report: ConversionReport) -> OsiKind:
+    """The kind of an object, by its category in nuScenes if it has one, else by its type in MetaDrive."""
     metadata = track.get("metadata")
     category = str(metadata.get("type", "")) if isinstance(metadata, dict) else ""
     parts = category.split(".")
@@ -156,27 +164,27 @@ def _kind(track: Mapping[str, Any], report: Report) -> Kind:
         if name := _KIND_OF_NUSCENES.get(".".join(parts[:length])):
             return KINDS[name]
     if (kind := str(track.get("type"))) not in _KIND_OF_METADRIVE:
-        report.count("track", f"of the unknown type {shown(kind)}: taken as other")
+        report.count("track", f"of the unknown type {quote_value(kind)}: taken as other")
     return KINDS[_KIND_OF_METADRIVE.get(kind, "other")]
 
 
-def _stamps(metadata: Mapping[str, Any], where: str) -> list[int]:
+def _read_stamps(metadata: Mapping[str, Any], where: str) -> list[int]:
     """Nanoseconds of each step, from seconds; whole microseconds: they come as 0.30000000000000004 and as float32."""
     name = next((name for name in ("ts", "timestep") if name in metadata), None)
     if name is None:
         raise InputError(f"{where}: expected the times of the steps in `ts`, found {', '.join(map(str, metadata))}")
     try:
-        given = np.asarray(metadata[name])
-        times_s = given.astype(np.float64).ravel() if given.size <= _MOST_STEPS else np.empty(0)
+        times = np.asarray(metadata[name])
+        times_s = times.astype(np.float64).ravel() if times.size <= _MOST_STEPS else np.empty(0)
     except (TypeError, ValueError):
-        raise InputError(f"{where}: {name}: expected numbers, found {shown(metadata[name])}") from None
+        raise InputError(f"{where}: {name}: expected numbers, found {quote_value(metadata[name])}") from None
     if not len(times_s) or not (np.isfinite(times_s).all() and (np.abs(times_s) <= LAST_SECOND).all()):
-        raise InputError(f"{where}: {name}: expected times in seconds, found {shown(metadata[name])}")
+        raise InputError(f"{where}: {name}: expected times in seconds, found {quote_value(metadata[name])}")
     stamps: list[int] = (np.round(times_s * 1e6).astype(np.int64) * 1000).tolist()
     return stamps
 
 
-def _part(whole: Any, key: str, kind: type, where: str) -> Any:
+def _get_part(whole: Any, key: str, kind: type, where: str) -> Any:
     """Return a part of a dict. Raises InputError."""
     if not isinstance(whole, dict) or not isinstance(whole.get(key), kind):
         found = ", ".join(map(str, list(whole)[:8])) if isinstance(whole, dict) else type(whole).__name__
@@ -184,19 +192,19 @@ def _part(whole: Any, key: str, kind: type, where: str) -> Any:
     return whole[key]
 
 
-def _array(state: Mapping[str, Any], name: str, steps: int, columns: int, where: str) -> Float:
+def _read_array(state: Mapping[str, Any], name: str, steps: int, columns: int, where: str) -> Float:
     """(T, n) array of a state; `columns` of 0: any number of them. Raises InputError."""
     if name not in state:
         raise InputError(f"{where}: expected {name!r} in its state, found {', '.join(map(str, state))}")
     try:
-        given = np.asarray(state[name])
+        values = np.asarray(state[name])
         most = columns or _MOST_COLUMNS
-        # Before any number is converted: an array of nothing can have any shape.
-        if given.ndim not in (1, 2) or len(given) != steps or not steps <= given.size <= steps * most:
+        # Checked before any number is converted: an empty array can have any shape.
+        if values.ndim not in (1, 2) or len(values) != steps or not steps <= values.size <= steps * most:
             raise InputError(
-                f"{where}: {name}: expected {counted(steps, 'step')} of up to {most}, as `ts` has, "
-                f"found shape {given.shape}"
+                f"{where}: {name}: expected {count_noun(steps, 'step')} of up to {most}, as `ts` has, "
+                f"found shape {values.shape}"
             )
-        return given.astype(np.float64).reshape(steps, -1)
+        return values.astype(np.float64).reshape(steps, -1)
     except (TypeError, ValueError):
-        raise InputError(f"{where}: {name}: expected an array of numbers, found {shown(state[name])}") from None
+        raise InputError(f"{where}: {name}: expected an array of numbers, found {quote_value(state[name])}") from None

@@ -1,7 +1,10 @@
-"""ROS 2 messages: the definition inside the recording, made into a program for `cdr_kernel`.
+"""ROS 2 messages (CDR) decoded into columns, by the definition inside the recording.
 
-Definitions (`ros2msg`, `ros2idl`) are parsed by rosbags; what a package changed between releases is therefore read as
-the file says it. Of a message only the fields that are asked for are taken.
+Definitions (`ros2msg`, `ros2idl`) are parsed by rosbags, so messages are read as the recording's release of a package
+defines them. A definition becomes a program that says which fields to skip and which to take; one compiled walk, the
+kernel, runs it over all messages. CDR has no lengths to jump by (OMG, Common Object Request Broker Architecture part
+2, 9.3; DDS-XTypes 1.3, 7.4.3), so everything before a field is walked through. The kernel knows no types: it takes the
+bits of numbers and the places of texts, which become columns afterwards.
 """
 
 from __future__ import annotations
@@ -13,43 +16,330 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from numba import njit
 
 from copem_replay.core.tracks import Bool, Int
-from copem_replay.io.encodings import cdr_kernel as kernel
-from copem_replay.io.encodings.cdr_program import (
-    ARRAY,
-    BASE,
-    BASES,
-    NAME,
-    TEXT,
-    Program,
-    base,
-    fields_of,
-    named,
-    picked,
+from copem_replay.io.encodings.columns import (
+    Definition,
+    DefinitionError,
+    RawColumn,
+    ShreddedMessages,
+    ValueKind,
+    join_arrays,
+    list_level,
+    list_levels,
+    parent_level,
+    shred_columns,
+    split_batches,
 )
-from copem_replay.io.encodings.columns import Definition, Shredded, above, batches, level_of, levels_to
-from copem_replay.io.encodings.raw_values import DefinitionError, RawColumn, joined, shredded
 
-_DEEPEST = kernel.DEEPEST - 1
+# The kernel.
+
+END, SKIP, TAKE, TEXT, BYTES, NUMBERS, LIST, ARRAY, NEXT, MARK, BACK, SIZE = range(12)
+"""Instructions, one in each row of a program, with up to three numbers:
+
+SKIP alignment, bytes · TAKE size, column · TEXT column or −1, unit of its length · BYTES length, column · NUMBERS size
+(a list of numbers, passed over) · LIST where it ends, level or −1 · ARRAY length, where it ends, level or −1 · NEXT
+(the end of an item) · MARK, BACK: go back to where the mark is · SIZE (of what follows, which XCDR2 alone has) · END.
+"""
+
+DEEPEST = 32
+"""Lists within lists that a program has, at most."""
+_HEADER = 4  # bytes of the encapsulation; alignment counts from their end
+_SPARE = 8  # bytes that may be left over at the end: padding
+
+
+@njit(cache=True)
+def _read_number(data, at, size, swapped):  # type: ignore[no-untyped-def]
+    """The bits of a number."""
+    bits = np.uint64(0)
+    for k in range(size):
+        byte = data[at + k] if swapped else data[at + size - 1 - k]
+        bits = (bits << np.uint64(8)) | np.uint64(byte)
+    return bits
+
+
+@njit(cache=True)
+def walk_cdr(data, bounds, program, first, room, bits, lengths, parent, decoded):  # type: ignore[no-untyped-def]
+    """(L,) number of rows of each level. `room (L,)`: rows there is room for; those beyond are counted and not kept.
+
+    Message m is `data[bounds[m]:bounds[m + 1]]`. The value of column c in row r of its level goes to
+    `bits[first[c] + r]`; of a text that is its begin, and `lengths` has its length. `parent[l, r]` is the parent of row
+    r of level l; level 0 is the message. A message that does not fit its schema is not `decoded` and leaves no rows.
+    """
+    rows = np.zeros(len(room), dtype=np.int64)
+    before = np.zeros(len(room), dtype=np.int64)
+    back = np.zeros(DEEPEST, dtype=np.int64)  # instruction after the head of each list that is open
+    left = np.zeros(DEEPEST, dtype=np.int64)  # its items still to come
+    owner = np.zeros(DEEPEST, dtype=np.int64)  # its level
+    for m in range(len(bounds) - 1):
+        begin, end = bounds[m] + _HEADER, bounds[m + 1]
+        before[:] = rows
+        if rows[0] < room[0]:
+            parent[0, rows[0]] = m
+        rows[0] += 1
+        good = end >= begin and data[bounds[m]] == 0 and data[bounds[m] + 1] in (0, 1, 6, 7)
+        swapped = good and data[bounds[m] + 1] in (0, 6)
+        most = 4 if good and data[bounds[m] + 1] >= 6 else 8  # XCDR2 aligns to four bytes at most
+        at, pc, depth, mark = begin, 0, 0, begin
+        while good:
+            op, a, b, c = program[pc, 0], program[pc, 1], program[pc, 2], program[pc, 3]
+            pc += 1
+            if op in (SKIP, TAKE, BYTES):
+                step = a if op != BYTES else 1
+                step = min(step, most)
+                at += -(at - begin) % step
+                size = b if op == SKIP else a
+                if size > end - at:
+                    good = False
+                    break
+                if op != SKIP:
+                    slot = b
+                    level = program[pc - 1, 3]
+                    row = rows[level] - 1
+                    if row < room[level]:
+                        if op == TAKE:
+                            bits[first[slot] + row] = _read_number(data, at, a, swapped)
+                        else:
+                            bits[first[slot] + row] = np.uint64(at)
+                            lengths[first[slot] + row] = a
+                at += size
+            elif op == NEXT:
+                left[depth - 1] -= 1
+                if left[depth - 1] > 0:
+                    level = owner[depth - 1]
+                    pc = back[depth - 1]
+                    if level >= 0:
+                        rows[level] += 1
+                        if rows[level] <= room[level]:
+                            parent[level, rows[level] - 1] = parent[level, rows[level] - 2]
+                else:
+                    depth -= 1
+            elif op == MARK:
+                mark = at
+            elif op == BACK:
+                at = mark
+            elif op == SIZE:
+                if most == 4:
+                    at += -(at - begin) % 4 + 4
+                    if at > end:
+                        good = False
+                        break
+            elif op == END:
+                good = end - at <= _SPARE
+                break
+            else:
+                if op == ARRAY:
+                    number, stop, level = a, b, c
+                else:
+                    at += -(at - begin) % 4
+                    if end - at < 4:
+                        good = False
+                        break
+                    number, stop, level = np.int64(_read_number(data, at, 4, swapped)), a, b
+                    at += 4
+                if op == TEXT:
+                    size = number * b
+                    if size > end - at:
+                        good = False
+                        break
+                    if a >= 0:
+                        row = rows[c] - 1
+                        if row < room[c]:
+                            bits[first[a] + row] = np.uint64(at)
+                            lengths[first[a] + row] = size
+                    at += size
+                elif op == NUMBERS:
+                    if number > 0:
+                        at += -(at - begin) % min(a, most)
+                    if number > (end - at) // a:
+                        good = False
+                        break
+                    at += number * a
+                elif number == 0:
+                    pc = stop
+                else:
+                    if number > end - at:  # an item is a byte at least
+                        good = False
+                        break
+                    back[depth], left[depth], owner[depth] = pc, number, level
+                    if level >= 0:
+                        rows[level] += 1
+                        if rows[level] <= room[level]:
+                            inner = 0  # the nearest level around it
+                            for d in range(depth - 1, -1, -1):
+                                if owner[d] >= 0:
+                                    inner = owner[d]
+                                    break
+                            parent[level, rows[level] - 1] = rows[inner] - 1
+                    depth += 1
+        decoded[m] = good
+        if not good:
+            rows[:] = before
+    return rows
+
+
+# The program of a definition.
+
+BASES = {
+    "bool": (1, "u1"),
+    "byte": (1, "u1"),
+    "char": (1, "u1"),
+    "int8": (1, "i1"),
+    "uint8": (1, "u1"),
+    "int16": (2, "i2"),
+    "uint16": (2, "u2"),
+    "int32": (4, "i4"),
+    "uint32": (4, "u4"),
+    "int64": (8, "i8"),
+    "uint64": (8, "u8"),
+    "float32": (4, "f4"),
+    "float64": (8, "f8"),
+}
+"""Types of numbers: the size in bytes and NumPy's name."""
+STRING_TYPE = "string"
+BASE, NAME, FIXED_ARRAY, SEQUENCE = 1, 2, 3, 4
+"""rosbags' kinds of node."""
+
+
+def find_message_fields(types: Any, name: str, of: str) -> list[tuple[str, Any]]:
+    """The fields of a type, which the definition `of` a message may lack. Raises DefinitionError."""
+    return list(types[resolve_type_name(name, types, of)][1])
+
+
+def resolve_type_name(name: str, types: Any, of: str) -> str:
+    """The name of a type. Raises DefinitionError where the definition `of` a message lacks it."""
+    if name not in types:
+        raise DefinitionError(f"the definition of {of} lacks {name}")
+    return name
+
+
+def base_type(name: str) -> str:
+    """The name of a type of values. Raises DefinitionError for one that is not read."""
+    if name not in BASES and name != STRING_TYPE:
+        raise DefinitionError(f"values of type {name} are not read by this version")
+    return name
+
+
+class CdrProgram:
+    """The program for the messages of a type, which takes the columns of the paths `wanted`."""
+
+    def __init__(self, types: Any, wanted: Sequence[str], levels: Sequence[str]) -> None:
+        self._types = types
+        self._column = {path: k for k, path in enumerate(wanted)}
+        self._level = {name: k for k, name in enumerate(levels)}
+        self._picked: dict[str, list[int]] = {}
+        for array, item in map(split_chosen_item, wanted):
+            if item >= 0:
+                self._picked.setdefault(array, []).append(item)
+        self._rows: list[list[int]] = []
+        self.kinds: dict[str, ValueKind] = {}  # by wanted path
+
+    def finished(self) -> Int:
+        """The program of I instructions, (I, 4)."""
+        return np.array([*self._rows, [END, 0, 0, 0]], dtype=np.int64)
+
+    def add_type(self, name: str, path: str) -> None:
+        """Add instructions for all fields of a type, in their order."""
+        fields = self._types[name][1]
+        if not fields:
+            self._skip(1, 1)  # an empty structure is sent as one byte
+        for field, node in fields:
+            self._add_node(node, f"{path}.{field}" if path else field)
+
+    def _skip(self, size: int, number: int) -> None:
+        """Skip numbers, in one instruction with those before them where no padding can lie between."""
+        if self._rows and (last := self._rows[-1])[0] == SKIP and size <= last[1] and last[2] % size == 0:
+            last[2] += size * number
+        else:
+            self._add(SKIP, size, size * number)
+
+    def _add(self, *instruction: int) -> int:
+        self._rows.append([*instruction, *[0] * (4 - len(instruction))])
+        return len(self._rows) - 1
+
+    def _add_node(self, node: Any, path: str) -> None:
+        kind, detail = node
+        if kind == BASE:
+            self._add_base(detail[0], path)
+        elif kind == NAME:
+            self.add_type(detail, path)
+        else:
+            item, number = detail
+            self._add_list(kind == FIXED_ARRAY, item, number, path)
+
+    def _add_list(self, fixed: bool, item: Any, number: int, path: str) -> None:
+        """Add a list: as one text if that is wanted, then its chosen items, then the whole list."""
+        base = item[1][0] if item[0] == BASE else ""
+        size = BASES[base][0] if base in BASES else 0
+        level = self._level.get(f"{path}[]", -1)
+        if path in self._column or path in self._picked:
+            self._add(MARK)
+        if path in self._column:
+            column, of = self._column[path], self._level[list_level(path)]
+            self.kinds[path] = ValueKind("bytes")
+            self._add(BYTES, number, column, of) if fixed else self._add(TEXT, column, 1, of)
+            self._add(BACK)
+        if picked := self._picked.get(path):
+            before = 0
+            for k in sorted(picked):
+                if k > before:
+                    self._skip(size, k - before)
+                self._add_base(base, f"{path}[{k}]")
+                before = k + 1
+            self._add(BACK)
+        if size and level < 0:
+            self._skip(size, number) if fixed else self._add(NUMBERS, size)
+            return
+        if not size:
+            self._add(SIZE)
+        head = self._add(ARRAY, number, 0, level) if fixed else self._add(LIST, 0, level)
+        self._add_node(item, f"{path}[]")
+        self._add(NEXT)
+        self._rows[head][2 if fixed else 1] = len(self._rows)
+
+    def _add_base(self, name: str, path: str) -> None:
+        column = self._column.get(path, -1)
+        level = self._level.get(list_level(path), 0)
+        if name == STRING_TYPE:
+            self._add(TEXT, column, 1, level)
+            self.kinds[path] = ValueKind("ended")
+            return
+        size, how = BASES[name]
+        self.kinds[path] = ValueKind("bool" if name == "bool" else how)
+        if column < 0:
+            self._skip(size, 1)
+        else:
+            self._add(TAKE, size, column, level)
+
+
+def split_chosen_item(path: str) -> tuple[str, int]:
+    """The list and the number of the item that a path chooses at its end; −1: it chooses none."""
+    array, _, item = path.removesuffix("]").rpartition("[")
+    return (array, int(item)) if path.endswith("]") and item.isdecimal() and len(item) < 10 else (path, -1)
+
+
+# Definitions and decoding.
+
+_DEEPEST = DEEPEST - 1
 _MOST_FIELDS = 20_000
-"""A definition that has more is taken for damage (chosen: the largest of autoware have some 100)."""
+"""A definition with more fields is taken for damaged: the largest of Autoware have some 100."""
 _LONGEST_ARRAY = 1 << 31
 _EVERYWHERE: dict[str, Any] = {
     f"builtin_interfaces/msg/{name}": ([], [("sec", (1, ("int32", 0))), ("nanosec", (1, ("uint32", 0)))])
     for name in ("Time", "Duration")
 }
-"""Types that some writers leave out of their definitions, as rosbags has them."""
+"""Types that some writers leave out of their definitions, in the form of rosbags."""
 
 
 class CdrDefinition(Definition):
-    """What the messages of a ROS 2 channel look like. Raises DefinitionError."""
+    """The definition of a ROS 2 channel's messages. Raises DefinitionError."""
 
     def __init__(self, name: str, encoding: str, text: bytes) -> None:
         super().__init__()
         self._name = name if name.count("/") == 2 else name.replace("/", "/msg/")
         try:
-            self._types = {**_EVERYWHERE, **_parsed(text.decode().replace("\r", ""), self._name, encoding)}
+            self._types = {**_EVERYWHERE, **_parse_definition(text.decode().replace("\r", ""), self._name, encoding)}
         except Exception as error:  # whatever a parser raises at what is no definition
             why = " ".join(str(error).split())[:200] or type(error).__name__
             raise DefinitionError(f"the definition of {name} cannot be parsed: {why}") from None
@@ -61,40 +351,42 @@ class CdrDefinition(Definition):
 
     def picks(self, path: str) -> bool:
         """Whether a path is of one item of an array of numbers: taken without the others."""
-        array, item = picked(path)
+        array, item = split_chosen_item(path)
         return 0 <= item < self._arrays.get(array, 0)
 
-    def shred(self, payloads: Sequence[bytes], numbers: Iterable[str], texts: Iterable[str]) -> Shredded:
-        """Take messages apart. Raises KeyError for a path that is neither offered nor picked."""
+    def shred(self, payloads: Sequence[bytes], numbers: Iterable[str], texts: Iterable[str]) -> ShreddedMessages:
+        """The columns of messages. Raises KeyError for a path that is neither offered nor picked."""
         wanted = self._known((*(numbers := tuple(numbers)), *(texts := tuple(texts))))
-        levels = levels_to(wanted)
-        builder = Program(self._types, wanted, levels)
+        levels = list_levels(wanted)
+        builder = CdrProgram(self._types, wanted, levels)
         builder.add_type(self._name, "")
         program = builder.finished()
-        level_ix = np.array([levels.index(level_of(path)) for path in wanted], dtype=np.int64)
+        level_ix = np.array([levels.index(list_level(path)) for path in wanted], dtype=np.int64)
         columns = [RawColumn(builder.kinds[path]) for path in wanted]
         rows = np.zeros(len(levels), dtype=np.int64)
         parents: list[list[Int]] = [[] for _ in levels]
         decoded = np.zeros(len(payloads), dtype=bool)
-        for batch in batches(payloads):
+        for batch in split_batches(payloads):
             data = b"".join(payloads[batch])
             bounds = np.cumsum([0, *map(len, payloads[batch])], dtype=np.int64)
-            found, bits, lengths, parent = _walked(data, bounds, program, level_ix, decoded[batch], len(levels))
+            batch_rows, bits, lengths, parent = _walk_batch(
+                data, bounds, program, level_ix, decoded[batch], len(levels)
+            )
             for k, name in enumerate(levels):
-                up = batch.start if not name else rows[levels.index(above(name))]
-                parents[k].append(parent[k, : found[k]] + up)
+                up = batch.start if not name else rows[levels.index(parent_level(name))]
+                parents[k].append(parent[k, : batch_rows[k]] + up)
             for column, b, n in zip(columns, bits, lengths, strict=True):
                 column.add(data, b, n)
-            rows += found
+            rows += batch_rows
 
-        by_level = {name: joined(parents[k], np.int64) for k, name in enumerate(levels)}
-        return shredded(by_level, dict(zip(wanted, columns, strict=True)), numbers, texts, decoded)
+        by_level = {name: join_arrays(parents[k], np.int64) for k, name in enumerate(levels)}
+        return shred_columns(by_level, dict(zip(wanted, columns, strict=True)), numbers, texts, decoded)
 
     def _explore(self, name: str, path: str, inside: tuple[str, ...]) -> None:
-        """Note all leaves below a type. Raises DefinitionError for what has no end, or is too much."""
+        """Add all leaves below a type to the offered ones. Raises DefinitionError: nested without end, or too many."""
         if name in inside or len(inside) > _DEEPEST:
             raise DefinitionError(f"the definition of {self._name} is nested without end ({name})")
-        for field, node in fields_of(self._types, name, self._name):
+        for field, node in find_message_fields(self._types, name, self._name):
             self._explore_node(node, f"{path}.{field}" if path else field, (*inside, name))
 
     def _explore_node(self, node: Any, path: str, inside: tuple[str, ...]) -> None:
@@ -103,32 +395,32 @@ class CdrDefinition(Definition):
             raise DefinitionError(f"the definition of {self._name} has more than {_MOST_FIELDS} fields")
         kind, detail = node
         if kind == BASE:
-            self._offers[path] = "text" if base(detail[0]) == TEXT else "number"
+            self._offers[path] = "text" if base_type(detail[0]) == STRING_TYPE else "number"
         elif kind == NAME:
-            self._explore(named(detail, self._types, self._name), path, inside)
+            self._explore(resolve_type_name(detail, self._types, self._name), path, inside)
         else:
             item, number = detail
-            if kind == ARRAY and not 0 < number <= _LONGEST_ARRAY:
+            if kind == FIXED_ARRAY and not 0 < number <= _LONGEST_ARRAY:
                 raise DefinitionError(f"{path} of {self._name} is an array of {number} items")
             if item[0] == BASE and item[1][0] in ("uint8", "byte"):
                 self._offers[path] = "text"  # as one: an id, say
-            if item[0] == BASE and item[1][0] in BASES and kind == ARRAY:
+            if item[0] == BASE and item[1][0] in BASES and kind == FIXED_ARRAY:
                 self._arrays[path] = number
             self._explore_node(item, f"{path}[]", inside)
 
 
-def _walked(
+def _walk_batch(
     data: bytes, bounds: Int, program: Int, level_ix: Int, decoded: Bool, levels: int
 ) -> tuple[Int, list[Any], list[Int], Int]:
-    """Rows of each level; the bits and lengths of each column; the parents, (levels, most rows)."""
-    at = np.frombuffer(data, dtype=np.uint8)
+    """Number of rows of each level; bits and lengths of each column; parents (levels, most rows)."""
+    octets = np.frombuffer(data, dtype=np.uint8)
     first = np.zeros(len(level_ix) + 1, dtype=np.int64)
     none = np.zeros(0, dtype=np.uint64), np.zeros(0, dtype=np.int64), np.zeros((levels, 0), dtype=np.int64)
-    rows = kernel.walk(at, bounds, program, first, np.zeros(levels, dtype=np.int64), *none, decoded)
+    rows = walk_cdr(octets, bounds, program, first, np.zeros(levels, dtype=np.int64), *none, decoded)
     np.cumsum(rows[level_ix], out=first[1:])
     bits, lengths = np.empty(first[-1], dtype=np.uint64), np.empty(first[-1], dtype=np.int64)
     parent = np.empty((levels, int(rows.max(initial=0))), dtype=np.int64)
-    kernel.walk(at, bounds, program, first, rows, bits, lengths, parent, decoded)
+    walk_cdr(octets, bounds, program, first, rows, bits, lengths, parent, decoded)
     parts = [slice(*ends) for ends in pairwise(first.tolist())]
     return rows, [bits[p] for p in parts], [lengths[p] for p in parts], parent
 
@@ -136,8 +428,8 @@ def _walked(
 _SEPARATOR = re.compile(r"^={10,}[ \t]*$", re.MULTILINE)
 
 
-@lru_cache(maxsize=32)  # one is asked for several times: to look, for the truth, for the lists of units
-def _parsed(text: str, name: str, encoding: str) -> dict[str, Any]:
+@lru_cache(maxsize=32)  # a definition is needed several times: for the survey, the truth, the lists of units
+def _parse_definition(text: str, name: str, encoding: str) -> dict[str, Any]:
     """The types a schema defines, by name. Raises whatever rosbags does."""
     # Imported here: recordings of other kinds have no use for it.
     from rosbags.typesys import get_types_from_idl, get_types_from_msg

@@ -1,146 +1,305 @@
-"""Records made of columns, many at once: first how many bytes each takes, then all of them to their places.
+"""Records encoded from columns, many at once: protobuf messages and JSON texts.
 
-A part of a record knows its size in every row, `sizes` (N,), and puts its bytes where it is told, `at` (N,). Records
-are the parts one after the other. Letters: N rows, M rows of a repeated part.
+First the sizes of all records are computed, then their bytes are put into one buffer. A part of a record knows its size
+in every row, `sizes` (N,), and puts its bytes at the places `at` (N,). A record is its parts one after the other.
+Letters: N rows, M rows of a repeated part.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
+import orjson
+from google.protobuf.descriptor import Descriptor, FieldDescriptor
+from numba import njit
 from numpy.typing import NDArray
 
 from copem_replay.core.tracks import Bool, Int
-from copem_replay.io.encodings import column_bytes_kernel as kernel
+
+# Blocks of lists.
+
+MOST_ROWS = 20_000
+"""Rows of a block, unless one list has more: some MB of records."""
+
+
+def split_into_blocks(bounds: Int) -> Iterator[tuple[int, int]]:
+    """The first list of each block and the one after its last; list k has rows `bounds[k]:bounds[k + 1]`."""
+    first = 0
+    while first < len(bounds) - 1:
+        last = max(first + 1, int(np.searchsorted(bounds, bounds[first] + MOST_ROWS, side="right")) - 1)
+        yield first, last
+        first = last
+
+
+def expand_ranges(start: Int, rows: Int) -> tuple[Int, Int]:
+    """(R + 1,) begin of each row's range in the result, and the ranges `start[row]:start[row + 1]` concatenated."""
+    counts = start[rows + 1] - start[rows]
+    begin = np.concatenate([[0], np.cumsum(counts)])
+    return begin, np.arange(begin[-1]) + np.repeat(start[rows] - begin[:-1], counts)
+
+
+# Kernels that put a column's bytes to their places.
+
+
+@njit(cache=True, nogil=True)
+def _put_varint(out, at, value):  # type: ignore[no-untyped-def]
+    """Put a number in groups of seven bits; returns the place after it."""
+    while value >= np.uint64(128):
+        out[at] = np.uint8(value & np.uint64(127)) | np.uint8(128)
+        value >>= np.uint64(7)
+        at += 1
+    out[at] = np.uint8(value)
+    return at + 1
+
+
+@njit(cache=True, nogil=True)
+def varint_sizes(values):  # type: ignore[no-untyped-def]
+    """(N,) sizes of numbers (N,) as varints, in bytes."""
+    sizes = np.empty(len(values), dtype=np.int64)
+    for k in range(len(values)):
+        rest, size = values[k] >> np.uint64(7), 1
+        while rest:
+            rest >>= np.uint64(7)
+            size += 1
+        sizes[k] = size
+    return sizes
+
+
+@njit(cache=True, nogil=True)
+def put_varints(out, at, sizes, tag, values):  # type: ignore[no-untyped-def]
+    """Put tags and varints at places `at` (N,), except where the size is 0."""
+    for k in range(len(at)):
+        if sizes[k]:
+            _put_varint(out, _put_varint(out, at[k], tag), values[k])
+
+
+@njit(cache=True, nogil=True)
+def put_fixed(out, at, sizes, tag, bits):  # type: ignore[no-untyped-def]
+    """Put tags and eight bytes each, the lowest first, except where the size is 0."""
+    for k in range(len(at)):
+        if sizes[k]:
+            place = _put_varint(out, at[k], tag)
+            for i in range(8):
+                out[place + i] = np.uint8((bits[k] >> np.uint64(8 * i)) & np.uint64(255))
+
+
+@njit(cache=True, nogil=True)
+def put_pieces(out, at, pool, first, sizes):  # type: ignore[no-untyped-def]
+    """Put `pool[first[k]:first[k] + sizes[k]]` at `at[k]`."""
+    for k in range(len(at)):
+        for i in range(sizes[k]):
+            out[at[k] + i] = pool[first[k] + i]
+
+
+# Parts of records.
 
 Bytes = NDArray[np.uint8]
 
 
-class Part(Protocol):
-    """A part of the records."""
+class RecordPart(Protocol):
+    """A part of every record, in N rows."""
 
     @property
     def sizes(self) -> Int:
-        """(N,) bytes in each row."""
+        """(N,) size in each row, in bytes."""
 
     def put(self, out: Bytes, at: Int) -> None:
-        """Write the bytes of every row to its place."""
+        """Put the bytes of every row at its place in `out`, `at` (N,)."""
 
 
-class Texts:
+class TextPool:
     """Texts to choose from: number k is `pool[first[k]:first[k] + lengths[k]]`."""
 
     def __init__(self, pool: bytes, first: Int, lengths: Int) -> None:
         self._pool, self._first, self._lengths = np.frombuffer(pool, dtype=np.uint8), first, lengths
 
     @classmethod
-    def of(cls, texts: Sequence[bytes]) -> Texts:
-        """These texts."""
+    def of(cls, texts: Sequence[bytes]) -> TextPool:
+        """A pool of these texts."""
         lengths = np.fromiter(map(len, texts), dtype=np.int64, count=len(texts))
         return cls(b"".join(texts), np.cumsum(lengths) - lengths, lengths)
 
-    def at(self, which: Int | Bool) -> Pieces:
-        """In row n the text `which[n]`."""
+    def at(self, which: Int | Bool) -> RowTexts:
+        """The part that has the text `which[n]` in row n."""
         places = np.asarray(which, dtype=np.int64)
-        return Pieces(self._pool, self._first[places], self._lengths[places])
+        return RowTexts(self._pool, self._first[places], self._lengths[places])
 
 
-class Pieces:
-    """In each row a text as it is."""
+class RowTexts:
+    """A part that has a text of a pool in each row."""
 
     def __init__(self, pool: Bytes, first: Int, lengths: Int) -> None:
         self._pool, self._first, self.sizes = pool, first, lengths
 
     def put(self, out: Bytes, at: Int) -> None:
-        """As `Part` has it."""
-        kernel.put_pieces(out, at, self._pool, self._first, self.sizes)
+        """Put the bytes of every row at its place in `out`, `at` (N,)."""
+        put_pieces(out, at, self._pool, self._first, self.sizes)
 
 
-def constant(text: bytes, rows: int) -> Pieces:
-    """The same in every row."""
-    return Texts.of([text]).at(np.zeros(rows, dtype=np.int64))
+def repeat_text(text: bytes, rows: int) -> RowTexts:
+    """The part that has the same text in every row."""
+    return TextPool.of([text]).at(np.zeros(rows, dtype=np.int64))
 
 
-class Number:
-    """A tag and a number: a varint, or of a double its eight bytes; left out where it is 0 unless `always`."""
+class NumberField:
+    """A tag and a number, a varint or the eight bytes of a double; left out where it is 0 unless `always`."""
 
     def __init__(self, tag: int, values: NDArray[Any], always: bool) -> None:
         self._fixed = values.dtype.kind == "f"
         dtype = np.float64 if self._fixed else np.uint64 if values.dtype.kind == "u" else np.int64
         self._bits = np.ascontiguousarray(values, dtype=dtype).view(np.uint64)
         self._tag = np.uint64(tag)
-        head = int(kernel.varint_sizes(np.array([tag], dtype=np.uint64))[0])
-        sizes = np.full(len(values), head + 8) if self._fixed else kernel.varint_sizes(self._bits) + head
+        head = int(varint_sizes(np.array([tag], dtype=np.uint64))[0])
+        sizes = np.full(len(values), head + 8) if self._fixed else varint_sizes(self._bits) + head
         self.sizes: Int = sizes if always else np.where(self._bits != 0, sizes, 0)
 
     def put(self, out: Bytes, at: Int) -> None:
-        """As `Part` has it."""
-        fill = kernel.put_fixed if self._fixed else kernel.put_varints
+        """Put the bytes of every row at its place in `out`, `at` (N,)."""
+        fill = put_fixed if self._fixed else put_varints
         fill(out, at, self.sizes, self._tag, self._bits)
 
 
-class Sized:
-    """A tag, how many bytes follow, and parts; left out where these are empty unless `always`."""
+class SizedField:
+    """A tag, the size of the parts, and the parts; left out where these are empty unless `always`."""
 
-    def __init__(self, tag: int, parts: Sequence[Part], rows: int, always: bool) -> None:
+    def __init__(self, tag: int, parts: Sequence[RecordPart], rows: int, always: bool) -> None:
         self._parts = parts
-        inner = total(parts, rows)
-        self._head = Number(tag, inner, always)
+        inner = count_bytes(parts, rows)
+        self._head = NumberField(tag, inner, always)
         self.sizes = self._head.sizes + inner
 
     def put(self, out: Bytes, at: Int) -> None:
-        """As `Part` has it."""
+        """Put the bytes of every row at its place in `out`, `at` (N,)."""
         self._head.put(out, at)
-        put(self._parts, out, at + self._head.sizes)
+        put_parts(self._parts, out, at + self._head.sizes)
 
 
-class Each:
-    """In row n the rows `start[n]:start[n + 1]` of other parts, (M,), one after the other."""
+class RowGroups:
+    """A part that has in row n the rows `start[n]:start[n + 1]` of other parts, (M,), one after the other."""
 
-    def __init__(self, start: Int, parts: Sequence[Part]) -> None:
+    def __init__(self, start: Int, parts: Sequence[RecordPart]) -> None:
         self._start, self._parts = start, parts
-        self._before: Int = np.concatenate([[0], np.cumsum(total(parts, int(start[-1])))])
+        self._before: Int = np.concatenate([[0], np.cumsum(count_bytes(parts, int(start[-1])))])
 
     @cached_property
     def sizes(self) -> Int:
-        """As `Part` has it."""
+        """(N,) size in each row, in bytes."""
         return np.diff(self._before[self._start])
 
     def put(self, out: Bytes, at: Int) -> None:
-        """As `Part` has it."""
+        """Put the bytes of every row at its place in `out`, `at` (N,)."""
         shift = at - self._before[self._start[:-1]]
-        put(self._parts, out, np.repeat(shift, np.diff(self._start)) + self._before[:-1])
+        put_parts(self._parts, out, np.repeat(shift, np.diff(self._start)) + self._before[:-1])
 
 
-def starts(counts: Int | Bool) -> Int:
-    """(N + 1,) where the rows of each begin that has so many, and where the last ends."""
+def start_offsets(counts: Int | Bool) -> Int:
+    """(N + 1,) the first row of each of N groups of so many rows, and the end of the last."""
     result: Int = np.concatenate([[0], np.cumsum(counts)])
     return result
 
 
-def total(parts: Sequence[Part], rows: int) -> Int:
-    """(N,) bytes of all parts."""
+def count_bytes(parts: Sequence[RecordPart], rows: int) -> Int:
+    """(N,) sizes of all parts together, in bytes."""
     result = np.zeros(rows, dtype=np.int64)
     for part in parts:
         result += part.sizes
     return result
 
 
-def put(parts: Sequence[Part], out: Bytes, at: Int) -> None:
-    """The parts one after the other, from `at` (N,) on."""
+def put_parts(parts: Sequence[RecordPart], out: Bytes, at: Int) -> None:
+    """Put the parts one after the other, from `at` (N,) on."""
     for part in parts:
         part.put(out, at)
         at = at + part.sizes
 
 
-def records(parts: Sequence[Part], rows: int) -> list[bytes]:
+def encode_records(parts: Sequence[RecordPart], rows: int) -> list[bytes]:
     """The bytes of every row."""
-    bounds = starts(total(parts, rows))
+    bounds = start_offsets(count_bytes(parts, rows))
     out = np.empty(bounds[-1], dtype=np.uint8)
-    put(parts, out, bounds[:-1])
+    put_parts(parts, out, bounds[:-1])
     whole, cuts = out.tobytes(), bounds.tolist()
     return [whole[first:last] for first, last in pairwise(cuts)]
+
+
+# JSON, as orjson writes it.
+
+_COMMA = TextPool.of([b",", b""])
+
+
+def encode_texts(values: Sequence[str]) -> TextPool:
+    """A pool of texts as JSON strings."""
+    return TextPool.of([orjson.dumps(value) for value in values])
+
+
+def encode_numbers(values: NDArray[Any] | None, rows: int) -> RowTexts:
+    """The part of numbers (N,); null where one is not finite, and in all rows if `values` is None."""
+    if values is None:
+        return repeat_text(b"null", rows)
+    text = orjson.dumps(np.ascontiguousarray(values), option=orjson.OPT_SERIALIZE_NUMPY)
+    commas = np.flatnonzero(np.frombuffer(text, dtype=np.uint8) == ord(","))
+    first = np.concatenate([[1], commas + 1])[:rows]
+    return TextPool(text, first, np.append(commas, len(text) - 1)[:rows] - first).at(np.arange(rows))
+
+
+def encode_arrays(start: Int, parts: Sequence[RecordPart]) -> list[RecordPart]:
+    """The parts of JSON arrays: array n has as items the rows `start[n]:start[n + 1]` of `parts`."""
+    rows, first = len(start) - 1, np.zeros(start[-1] + 1, dtype=bool)
+    first[start[:-1]] = True
+    return [repeat_text(b"[", rows), RowGroups(start, [_COMMA.at(first[:-1]), *parts]), repeat_text(b"]", rows)]
+
+
+# Protobuf messages, with the bytes of `SerializeToString(deterministic=True)`.
+
+_VARINT, _FIXED64, _SIZED = 0, 1, 2  # wire types
+
+Content: TypeAlias = Mapping[str, "float | NDArray[Any] | RowTexts | Content | RepeatedMessages"]
+"""Values by field: numbers (N,) or one for all, texts, the content of a message; of a repeated field its rows, or all
+of it, encoded already.
+"""
+
+
+@dataclass(frozen=True)
+class RepeatedMessages:
+    """The messages of a repeated field: in row n those of rows `start[n]:start[n + 1]`."""
+
+    start: Int
+    content: Content
+
+
+def optional_message(said: Bool, content: Content) -> RepeatedMessages:
+    """A message in the rows `said` (N,) only; `content` has these rows alone."""
+    return RepeatedMessages(start_offsets(said), content)
+
+
+def encode_messages(descriptor: Descriptor, content: Content, rows: int) -> list[bytes]:
+    """One encoded message for each row."""
+    return encode_records(_encode_fields(descriptor, content, rows), rows)
+
+
+def _encode_fields(descriptor: Descriptor, content: Content, rows: int) -> list[RecordPart]:
+    """The parts of a message: its fields in the order of their numbers."""
+    fields = {name: descriptor.fields_by_name[name] for name in content}
+    return [
+        _encode_field(fields[name], content[name], rows) for name in sorted(content, key=lambda n: fields[n].number)
+    ]
+
+
+def _encode_field(field: FieldDescriptor, value: Any, rows: int) -> RecordPart:
+    number = field.number << 3
+    if isinstance(value, RepeatedMessages):
+        inside = int(value.start[-1])
+        parts = _encode_fields(field.message_type, value.content, inside)
+        return RowGroups(value.start, [SizedField(number | _SIZED, parts, inside, always=True)])
+    if isinstance(value, Mapping):
+        return SizedField(number | _SIZED, _encode_fields(field.message_type, value, rows), rows, always=True)
+    if isinstance(value, RowTexts):
+        return value if field.message_type else SizedField(number | _SIZED, [value], rows, always=field.has_presence)
+    wire, dtype = (_FIXED64, np.float64) if field.type == field.TYPE_DOUBLE else (_VARINT, np.int64)
+    column = value if isinstance(value, np.ndarray) else np.full(rows, value, dtype=dtype)
+    return NumberField(number | wire, column, always=field.has_presence)

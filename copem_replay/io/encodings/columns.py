@@ -1,17 +1,21 @@
-"""Messages of any schema taken apart into columns: one table per list that was asked into.
+"""Columns of messages of any schema: one table for each list on the way to the fields that are asked for.
 
 A *path* names a field from the message down, `objects[].kinematics.pose.position.x`; `[]` stands for each item of a
 list. Its *level* is the path up to its last `[]`: `""` for the message itself, `objects[]`,
-`objects[].classification[]`. Every level is a table; a row knows the row of the level above that it belongs to. So
-whoever reads a format works on columns, whatever the messages were encoded in.
+`objects[].classification[]`. Every level is a table; a row knows the row of the level above that it belongs to. Code
+that reads a format works on these columns, whatever the encoding of the messages.
+
+A `Definition` makes the columns of one encoding. The walks through CDR and protobuf know no types: they give the bits
+of numbers and the places of texts, and `RawColumn` makes columns of them.
 """
 
 from __future__ import annotations
 
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +24,7 @@ from copem_replay.core.tracks import Bool, Float, Int
 
 
 @dataclass(frozen=True)
-class Texts:
+class DistinctTexts:
     """R texts, each distinct one kept once."""
 
     code: Int  # (R,) index into words; −1: not said
@@ -28,46 +32,46 @@ class Texts:
 
 
 @dataclass(frozen=True)
-class Level:
+class LevelRows:
     """R rows of one list: `parent (R,)` is the row of the level above (of the message: its number)."""
 
     parent: Int
     numbers: dict[str, Float]  # (R,) by path; NaN: not said
-    texts: dict[str, Texts]  # by path; whole numbers as digits, bytes as hexadecimal digits
+    texts: dict[str, DistinctTexts]  # by path; whole numbers as digits, bytes as hexadecimal digits
 
 
 @dataclass(frozen=True)
-class Shredded:
+class ShreddedMessages:
     """F messages: `levels` by name, and which of the messages could be decoded; the others have no rows."""
 
-    levels: dict[str, Level]
+    levels: dict[str, LevelRows]
     decoded: Bool  # (F,)
 
 
 class Definition(ABC):
-    """What messages of one channel look like. Made from the schema inside the recording."""
+    """The fields of the messages of one channel, and how messages are decoded into columns."""
 
     def __init__(self) -> None:
         self._offers: dict[str, str] = {}
 
     def offers(self) -> dict[str, str]:
-        """The paths of all leaves, and what each is: `number`, `text`."""
+        """The kind of each leaf by its path: `number` or `text`."""
         return self._offers
 
     def names(self, path: str) -> Mapping[int, str]:
-        """The names of the numbers of an enumeration, empty for what is none."""
+        """The names of an enumeration by their numbers; empty for any other field."""
         return {}
 
     def picks(self, path: str) -> bool:
-        """Whether `shred` takes this path, with an item chosen in it, as it is."""
+        """Whether `shred` itself takes this path, in which an item of a list is chosen."""
         return False
 
     @abstractmethod
-    def shred(self, payloads: Sequence[bytes], numbers: Iterable[str], texts: Iterable[str]) -> Shredded:
-        """Take messages apart. Raises KeyError for a path that is neither offered nor picked."""
+    def shred(self, payloads: Sequence[bytes], numbers: Iterable[str], texts: Iterable[str]) -> ShreddedMessages:
+        """The columns of messages. Raises KeyError for a path that is neither offered nor picked."""
 
     def _known(self, paths: Iterable[str]) -> list[str]:
-        """Each path once. Raises KeyError."""
+        """The paths, each once. Raises KeyError for one that is neither offered nor picked."""
         wanted = list(dict.fromkeys(paths))
         for path in wanted:
             if path not in self._offers and not self.picks(path):
@@ -75,46 +79,46 @@ class Definition(ABC):
         return wanted
 
 
-def take_apart(
+def shred_messages(
     definition: Definition, payloads: Sequence[bytes], numbers: Iterable[str] = (), texts: Iterable[str] = ()
-) -> Shredded:
-    """Take messages apart; a path may name one item of a list, `position[0]`, counted from 0.
+) -> ShreddedMessages:
+    """The columns of messages; a path may name one item of a list, `position[0]`, counted from 0.
 
     Such a column is of the level that is left when the item is chosen: `objects[].position[0]` of `objects[]`,
     `sensors[0].objects[].x` of `sensors[0].objects[]`. Raises KeyError for a path that is not offered.
     """
     numbers, texts = tuple(numbers), tuple(texts)
     picked = [p for p in dict.fromkeys((*numbers, *texts)) if _ITEM.search(p) and not definition.picks(p)]
-    whole = [[any_item(p) if p in picked else p for p in paths] for paths in (numbers, texts)]
-    found = definition.shred(payloads, *whole)
-    levels = dict(found.levels)
+    whole = [[any_item_path(p) if p in picked else p for p in paths] for paths in (numbers, texts)]
+    shredded = definition.shred(payloads, *whole)
+    levels = dict(shredded.levels)
     chosen: dict[str, Int] = {}
     for path in picked:
-        level = level_of(path)
+        level = list_level(path)
         _choose_level(levels, chosen, level)
-        source = level_of(any_item(path))
+        source = list_level(any_item_path(path))
         rows = np.arange(len(levels[source].parent))
-        at, inner = rows, source
-        for step in reversed(_items_chosen(path)):
-            good = _place_in_parent(levels[inner].parent)[at] == step
-            rows, at = rows[good], levels[inner].parent[at[good]]
-            inner = above(inner)
-        to = at
+        ancestors, inner = rows, source
+        for step in reversed(_chosen_items(path)):
+            good = _place_in_parent(levels[inner].parent)[ancestors] == step
+            rows, ancestors = rows[good], levels[inner].parent[ancestors[good]]
+            inner = parent_level(inner)
+        target_rows = ancestors
         if level in chosen:  # its rows are some of those of the whole level
             number = np.full(len(levels[inner].parent), -1)
             number[chosen[level]] = np.arange(len(chosen[level]))
-            to = number[at]
-            rows, to = rows[to >= 0], to[to >= 0]
-        levels[level] = _with_items(levels[level], levels[source], path, to, rows)
-    return Shredded(levels, found.decoded)
+            target_rows = number[ancestors]
+            rows, target_rows = rows[target_rows >= 0], target_rows[target_rows >= 0]
+        levels[level] = _add_items(levels[level], levels[source], path, target_rows, rows)
+    return ShreddedMessages(levels, shredded.decoded)
 
 
 BATCH_BYTES = 4_000_000
-"""Of messages taken apart at once: what a cache holds (chosen)."""
+"""Bytes of messages that are decoded at once: as much as a cache holds."""
 
 
-def batches(payloads: Sequence[bytes], most_bytes: int | None = None) -> Iterator[slice]:
-    """Messages in runs of some megabytes, or of about `most_bytes`."""
+def split_batches(payloads: Sequence[bytes], most_bytes: int | None = None) -> Iterator[slice]:
+    """Slices of messages of about `most_bytes` each, None: `BATCH_BYTES`."""
     most_bytes = BATCH_BYTES if most_bytes is None else most_bytes
     first, size = 0, 0
     for k, payload in enumerate(payloads):
@@ -129,35 +133,35 @@ def batches(payloads: Sequence[bytes], most_bytes: int | None = None) -> Iterato
 _ITEM = re.compile(r"\[(\d{1,9})\]")
 
 
-def any_item(path: str) -> str:
+def any_item_path(path: str) -> str:
     """The path with every item of its lists: `position[]` of `position[0]`."""
     return _ITEM.sub("[]", path)
 
 
-def _items_chosen(path: str) -> list[int]:
+def _chosen_items(path: str) -> list[int]:
     """The items chosen after the last `[]`: 1 and 0 of `objects[].b[1].c[0]`."""
-    return [int(k) for k in _ITEM.findall(path[len(level_of(path)) :])]
+    return [int(k) for k in _ITEM.findall(path[len(list_level(path)) :])]
 
 
-def _choose_level(levels: dict[str, Level], chosen: dict[str, Int], name: str) -> None:
-    """Make the level `name`, and those above it, of the rows that lie in the items it names; note which those are."""
+def _choose_level(levels: dict[str, LevelRows], chosen: dict[str, Int], name: str) -> None:
+    """Add the level `name`, and those above it, with the rows in the items that it names; `chosen` gets these rows."""
     if name in levels:
         return
-    outer = above(name)
+    outer = parent_level(name)
     _choose_level(levels, chosen, outer)
-    whole = any_item(name)
+    whole = any_item_path(name)
     rows = np.arange(len(levels[whole].parent))
-    at, inner = levels[whole].parent, above(whole)
-    for step in reversed(_items_chosen(name.removesuffix("[]"))):
-        good = _place_in_parent(levels[inner].parent)[at] == step
-        rows, at = rows[good], levels[inner].parent[at[good]]
-        inner = above(inner)
+    ancestors, inner = levels[whole].parent, parent_level(whole)
+    for step in reversed(_chosen_items(name.removesuffix("[]"))):
+        good = _place_in_parent(levels[inner].parent)[ancestors] == step
+        rows, ancestors = rows[good], levels[inner].parent[ancestors[good]]
+        inner = parent_level(inner)
     if outer in chosen:
         number = np.full(len(levels[inner].parent), -1)
         number[chosen[outer]] = np.arange(len(chosen[outer]))
-        good = number[at] >= 0
-        rows, at = rows[good], number[at[good]]
-    levels[name], chosen[name] = Level(at, {}, {}), rows
+        good = number[ancestors] >= 0
+        rows, ancestors = rows[good], number[ancestors[good]]
+    levels[name], chosen[name] = LevelRows(ancestors, {}, {}), rows
 
 
 def _place_in_parent(parent: Int) -> Int:
@@ -166,66 +170,193 @@ def _place_in_parent(parent: Int) -> Int:
     return np.arange(len(parent)) - np.repeat(first, np.diff(np.append(first, len(parent))))
 
 
-def _with_items(target: Level, source: Level, path: str, to: Int, of: Int) -> Level:
+def _add_items(target: LevelRows, source: LevelRows, path: str, to: Int, of: Int) -> LevelRows:
     """`target` with the column `path` added: rows `of` the source at rows `to`."""
-    numbers, texts, whole = dict(target.numbers), dict(target.texts), any_item(path)
+    numbers, texts, whole = dict(target.numbers), dict(target.texts), any_item_path(path)
     if whole in source.numbers:
         numbers[path] = np.full(len(target.parent), np.nan)
         numbers[path][to] = source.numbers[whole][of]
     if whole in source.texts:
         code = np.full(len(target.parent), -1)
         code[to] = source.texts[whole].code[of]
-        texts[path] = Texts(code, source.texts[whole].words)
-    return Level(target.parent, numbers, texts)
+        texts[path] = DistinctTexts(code, source.texts[whole].words)
+    return LevelRows(target.parent, numbers, texts)
 
 
-def as_text(value: float) -> str:
-    """A number as text: whole ones as digits, others so that nothing is lost."""
+def format_number(value: float) -> str:
+    """A number as text: a whole one as digits, another so that reading it gives the same number."""
     if isinstance(value, int) or (value.is_integer() and abs(value) < _WHOLE):
         return str(int(value))
     return repr(float(value))
 
 
-_WHOLE = 1e18  # floats beyond are not written as digits (chosen)
+_WHOLE = 1e18  # larger floats are not written as digits: a 64-bit integer would not hold them all
 
 
-def level_of(path: str) -> str:
-    """The list a path leads into: `objects[].pose.x` is of `objects[]`."""
+def list_level(path: str) -> str:
+    """The level of a path: `objects[]` of `objects[].pose.x`."""
     head, bracket, _ = path.rpartition("[]")
     return head + bracket
 
 
-def above(level: str) -> str:
+def parent_level(level: str) -> str:
     """The level that holds a list: `objects[]` of `objects[].classification[]`, the message (`""`) of `objects[]`."""
-    return level_of(level.removesuffix("[]"))
+    return list_level(level.removesuffix("[]"))
 
 
-def levels_to(paths: Iterable[str]) -> list[str]:
+def list_levels(paths: Iterable[str]) -> list[str]:
     """All levels that lead to these paths, the outer ones first; the message (`""`) is always among them."""
-    found = {""}
+    levels = {""}
     for path in paths:
-        level = level_of(path)
-        while level not in found:
-            found.add(level)
-            level = above(level)
-    return sorted(found, key=lambda name: (name.count("[]"), name))
+        level = list_level(path)
+        while level not in levels:
+            levels.add(level)
+            level = parent_level(level)
+    return sorted(levels, key=lambda name: (name.count("[]"), name))
 
 
-def rows_above(shredded: Shredded, level: str, ancestor: str) -> NDArray[np.int64]:
+def ancestor_rows(shredded: ShreddedMessages, level: str, ancestor: str) -> NDArray[np.int64]:
     """(R,) for each row of `level` its row in `ancestor`, a level above it or itself."""
     row = np.arange(len(shredded.levels[level].parent))
     while level != ancestor:
         row = shredded.levels[level].parent[row]
-        level = above(level)
+        level = parent_level(level)
     return row
 
 
 def common_level(one: str, other: str) -> str:
-    """The innermost level that both are in."""
+    """The innermost level that both levels are in."""
     around = {one, ""}
     while one:
-        one = above(one)
+        one = parent_level(one)
         around.add(one)
     while other not in around:
-        other = above(other)
+        other = parent_level(other)
     return other
+
+
+# Raw values of messages, the bits of numbers and the bytes of texts, made into columns.
+
+
+class DefinitionError(ValueError):
+    """A definition that cannot be used, and why."""
+
+
+@dataclass(frozen=True)
+class ValueKind:
+    """The kind of a column's values.
+
+    `how`: NumPy's type of the bits of a number (`f8`), or `bool`, `zigzag` (a signed number as in protobuf's sint),
+    `text`, `ended` (a text up to the zeros at its end), `bytes`. `names`: those of an enumeration by their numbers.
+    """
+
+    how: str
+    names: Mapping[int, str] = field(default_factory=dict)
+
+    @property
+    def is_number(self) -> bool:
+        """Whether the values are numbers."""
+        return self.how not in ("text", "ended", "bytes")
+
+
+class RawColumn:
+    """The values of one path, gathered batch by batch."""
+
+    def __init__(self, kind: ValueKind) -> None:
+        self._kind = kind
+        self._values: list[Any] = []
+        self._codes: list[Int] = []
+        self._said: list[Bool] = []
+        self._code_of: dict[bytes, int] = {}
+
+    def add(self, data: bytes, bits: Any, lengths: Int, said: Bool | None = None) -> None:
+        """Add a batch: bits of numbers, or places of texts in `data` and their `lengths`.
+
+        `said (R,)`: False where a message has no value; None: every message has one.
+        """
+        if said is not None:
+            self._said.append(said)
+        if self._kind.is_number:
+            self._values.append(_decode_numbers(bits, self._kind.how))
+            return
+        code_of = self._code_of
+        parts = [data[b : b + n] for b, n in zip(bits.tolist(), lengths.tolist(), strict=True)]
+        self._codes.append(np.array([code_of.setdefault(p, len(code_of)) for p in parts], dtype=np.int64))
+
+    def numbers(self) -> Float:
+        """All values as numbers; NaN: no value, or no number."""
+        if self._kind.is_number:
+            with np.errstate(invalid="ignore"):  # some NaN of float32
+                values: Float = join_arrays(self._values, np.float64).astype(np.float64)
+        else:
+            of_code = np.array([_parse_number(p, self._kind.how) for p in self._code_of], dtype=np.float64)
+            values = of_code[join_arrays(self._codes, np.int64)]
+        if self._said:
+            values[~join_arrays(self._said, bool)] = np.nan
+        return values
+
+    def texts(self) -> DistinctTexts:
+        """All values as texts; code −1: no value."""
+        code: Int
+        if self._kind.is_number:
+            values, code = np.unique(join_arrays(self._values, np.float64), return_inverse=True)
+            words = [self._word_of_number(v) for v in values.tolist()]
+        else:
+            code = join_arrays(self._codes, np.int64)
+            words = [_format_text(p, self._kind.how) for p in self._code_of]
+        distinct = dict.fromkeys(words)  # different bytes may be the same text
+        number = {word: k for k, word in enumerate(distinct)}
+        code = np.array([number[w] for w in words], dtype=np.int64)[code]
+        if self._said:
+            code[~join_arrays(self._said, bool)] = -1
+        return DistinctTexts(code, tuple(distinct))
+
+    def _word_of_number(self, value: Any) -> str:
+        if self._kind.how == "bool":
+            return "true" if value else "false"
+        return self._kind.names.get(value) or format_number(value)
+
+
+def shred_columns(
+    parents: Mapping[str, Int],
+    columns: Mapping[str, RawColumn],
+    numbers: Collection[str],
+    texts: Collection[str],
+    decoded: Bool,
+) -> ShreddedMessages:
+    """The levels with their `parents`, by name, and the columns by path in them."""
+    levels = {name: LevelRows(parent, {}, {}) for name, parent in parents.items()}
+    for path, column in columns.items():
+        if path in numbers:
+            levels[list_level(path)].numbers[path] = column.numbers()
+        if path in texts:
+            levels[list_level(path)].texts[path] = column.texts()
+    return ShreddedMessages(levels, decoded)
+
+
+def join_arrays(parts: Sequence[Any], kind: Any) -> Any:
+    """The arrays concatenated; an empty one of type `kind` if there are none."""
+    return np.concatenate(parts) if parts else np.zeros(0, dtype=kind)
+
+
+def _decode_numbers(bits: Any, how: str) -> Any:
+    if how == "bool":
+        return bits.astype(np.uint8)
+    if how == "zigzag":
+        return (bits >> np.uint64(1)).view(np.int64) ^ -(bits & np.uint64(1)).view(np.int64)
+    return bits.astype(f"u{how[1]}", copy=False).view(how)
+
+
+def _parse_number(text: bytes, how: str) -> float:
+    try:
+        return float(_decode_text(text, how))
+    except ValueError:
+        return np.nan
+
+
+def _format_text(text: bytes, how: str) -> str:
+    return text.hex() if how == "bytes" else _decode_text(text, how)
+
+
+def _decode_text(text: bytes, how: str) -> str:
+    return (text if how == "text" else text.rstrip(b"\0")).decode(errors="replace")

@@ -1,4 +1,7 @@
-"""JSON messages of any schema, taken apart into columns, many messages at once."""
+"""JSON messages of any schema, decoded into columns, many messages at once.
+
+A channel's fields are those of some of its messages: a JSON channel need not have a schema, nor keep to it.
+"""
 
 from __future__ import annotations
 
@@ -13,29 +16,38 @@ import numpy as np
 import orjson
 
 from copem_replay.core.tracks import Float, Int
-from copem_replay.io.encodings.columns import Definition, Level, Shredded, Texts, as_text, batches, level_of, levels_to
-from copem_replay.io.encodings.raw_values import joined
+from copem_replay.io.encodings.columns import (
+    Definition,
+    DistinctTexts,
+    LevelRows,
+    ShreddedMessages,
+    format_number,
+    join_arrays,
+    list_level,
+    list_levels,
+    split_batches,
+)
 
 _DEEPEST = 12
-"""Levels of values within values that are offered (chosen)."""
+"""Levels of values within values that are offered; object lists have about five."""
 _MOST_FIELDS = 20_000
-"""So many are offered of a message (chosen)."""
+"""Most fields that are offered of a channel: bounds the search where names of fields are data."""
 _LOOKED_AT = 20
-"""Messages with something in a list that a channel is judged by, and items of each list (chosen)."""
+"""Messages with an item in a list by which a channel is judged, and items of each list; more make opening slower."""
 _LOOKED_AT_MOST = 2000
-"""Messages, whatever they hold (chosen: minutes of empty lists)."""
+"""Most messages at the start, with or without items: minutes of empty lists."""
 _LATER = 50
-"""Of those after, evenly spaced, where a list was empty so far (chosen)."""
+"""Messages after those, evenly spaced, that are looked at while a list was empty in all before."""
 _BATCH_BYTES = 30_000
-"""Of messages that are trees at the same time: larger heaps of them leave the cache (chosen: the fastest of some)."""
+"""Bytes of messages that are trees at the same time: larger heaps of trees leave the cache and are slower."""
 _INEXACT = 2.0**63
-"""A number as large may have been a whole one, with digits that orjson drops and `json` does not."""
+"""A number as large may have been a whole one, with digits that orjson drops and `json` keeps."""
 _UNLIKE = (TypeError, ValueError, AttributeError, RecursionError, OverflowError)
-"""What is raised at messages that are not what the others are."""
+"""Errors at messages of another structure than the others."""
 
 
 class JsonDefinition(Definition):
-    """JSON messages, judged by some of them: a schema need not be there, nor be kept to."""
+    """The definition of JSON messages, from some of them."""
 
     def __init__(self, samples: Sequence[bytes]) -> None:
         super().__init__()
@@ -52,32 +64,32 @@ class JsonDefinition(Definition):
                 break
             self._look_at(payload)
 
-    def shred(self, payloads: Sequence[bytes], numbers: Iterable[str], texts: Iterable[str]) -> Shredded:
-        """Take messages apart. Raises KeyError for a path that is not offered."""
+    def shred(self, payloads: Sequence[bytes], numbers: Iterable[str], texts: Iterable[str]) -> ShreddedMessages:
+        """The columns of messages. Raises KeyError for a path that is not offered."""
         numbers, texts = tuple(dict.fromkeys(numbers)), tuple(dict.fromkeys(texts))
         self._known((*numbers, *texts))
-        table = _Table(numbers, texts)
+        table = _RowTable(numbers, texts)
         decoded = np.zeros(len(payloads), dtype=bool)
-        for batch in batches(payloads, _BATCH_BYTES):
-            trees = [_quickly(payload) for payload in payloads[batch]]
-            there = batch.start + np.flatnonzero([tree is not None for tree in trees])
+        for batch in split_batches(payloads, _BATCH_BYTES):
+            trees = [_parse_quickly(payload) for payload in payloads[batch]]
+            numbers_in_batch = batch.start + np.flatnonzero([tree is not None for tree in trees])
             try:
-                table.add([tree for tree in trees if tree is not None], there, exact=False)
-                decoded[there] = True
-            except _UNLIKE:  # of one of them; which, is seen one by one
-                for number in there.tolist():
+                table.add([tree for tree in trees if tree is not None], numbers_in_batch, exact=False)
+                decoded[numbers_in_batch] = True
+            except _UNLIKE:  # one of them is unlike the others: one by one tells which
+                for number in numbers_in_batch.tolist():
                     decoded[number] = table.add_one(payloads[number], number)
-        return Shredded(table.levels(), decoded)
+        return ShreddedMessages(table.levels(), decoded)
 
     def _look_at(self, payload: bytes) -> bool:
-        """Note what a message holds; whether it is more than empty lists."""
-        message = _quickly(payload)
+        """Add the fields of a message to the offered ones; whether it holds more than empty lists."""
+        message = _parse_quickly(payload)
         lists: list[bool] = []
         self._explore(message, "", lists)
         return message is not None and (any(lists) or not lists)
 
     def _explore(self, value: Any, path: str, lists: list[bool], depth: int = 0) -> None:
-        """Note all leaves below a value, and of each list whether there is something in it."""
+        """Add all leaves below a value to the offered ones, and to each list whether it has items."""
         if depth > _DEEPEST or len(self._offers) >= _MOST_FIELDS:
             return
         if isinstance(value, dict):
@@ -94,11 +106,11 @@ class JsonDefinition(Definition):
 
 
 _NO_NAME = re.compile(r"[][.]")
-"""What paths are made of: a field with such a name cannot be named."""
+"""Characters that paths are made of: no path can name a field with them in its name."""
 
 
-def _exactly(payload: bytes) -> Any:
-    """A message, None for what is none."""
+def _parse_exactly(payload: bytes) -> Any:
+    """The message in a payload, with exact whole numbers; None: it is no JSON object or list."""
     try:
         message = json.loads(payload)
     except (ValueError, RecursionError):
@@ -106,81 +118,84 @@ def _exactly(payload: bytes) -> Any:
     return message if isinstance(message, dict | list) else None
 
 
-def _quickly(payload: bytes) -> Any:
-    """The same; whole numbers beyond 64 bits may be rounded. NaN, say, orjson leaves to `json`."""
+def _parse_quickly(payload: bytes) -> Any:
+    """The message in a payload; None: it is no JSON object or list. Whole numbers beyond 64 bits may be rounded.
+
+    What orjson refuses, such as NaN, is parsed by `json`.
+    """
     try:
         message = orjson.loads(payload)
     except ValueError:
-        return _exactly(payload)
+        return _parse_exactly(payload)
     return message if isinstance(message, dict | list) else None
 
 
-class _Place:
-    """Where in a message something is wanted: the fields to step into, and what is to be taken at them."""
+class _WantedPlace:
+    """A place in a message on the way to wanted paths: the fields to step into, and the columns to take here."""
 
     def __init__(self) -> None:
-        self.fields: dict[str, _Place] = {}
-        self.item: _Place | None = None  # of a list
+        self.fields: dict[str, _WantedPlace] = {}
+        self.item: _WantedPlace | None = None  # of a list
         self.level = ""
         self.number: str | None = None  # the path whose column this is
         self.text: str | None = None
 
 
-class _Table:
-    """The rows of all levels while they are gathered."""
+class _RowTable:
+    """The rows of all levels, gathered batch by batch."""
 
     def __init__(self, numbers: Sequence[str], texts: Sequence[str]) -> None:
-        self._root = _planned(numbers, texts)
-        self._parents: dict[str, list[Int]] = {name: [] for name in levels_to((*numbers, *texts))}
+        self._root = _plan_places(numbers, texts)
+        self._parents: dict[str, list[Int]] = {name: [] for name in list_levels((*numbers, *texts))}
         self._rows = dict.fromkeys(self._parents, 0)
         self._numbers: dict[str, list[Float]] = {path: [] for path in numbers}
         self._codes: dict[str, list[Int]] = {path: [] for path in texts}
         self._words: dict[str, dict[str, int]] = {path: {} for path in texts}
 
     def add(self, trees: Sequence[Any], number: Int, *, exact: bool) -> None:
-        """Messages of these numbers. Raises one of `_UNLIKE`, and then adds nothing."""
-        found = _Batch({"": number}, self._rows, exact)
-        found.visit(self._root, trees)
-        for name, parent in found.parents.items():
+        """Add the messages of these numbers. Raises one of `_UNLIKE`, and then adds nothing."""
+        batch = _Batch({"": number}, self._rows, exact)
+        batch.visit(self._root, trees)
+        for name, parent in batch.parents.items():
             self._parents[name].append(parent)
             self._rows[name] += len(parent)
-        for path, column in found.numbers.items():
+        for path, column in batch.numbers.items():
             self._numbers[path].append(column)
-        for path, said in found.texts.items():
+        for path, values in batch.texts.items():
             words = self._words[path]
-            code = [-1 if word is None else words.setdefault(word, len(words)) for word in said]
+            code = [-1 if word is None else words.setdefault(word, len(words)) for word in values]
             self._codes[path].append(np.array(code, dtype=np.int64))
 
     def add_one(self, payload: bytes, number: int) -> bool:
-        """A message; whether it is like the others."""
+        """Add one message; False: it is unlike the others, and nothing is added."""
         try:
-            self.add([_exactly(payload)], np.array([number]), exact=True)
+            self.add([_parse_exactly(payload)], np.array([number]), exact=True)
         except _UNLIKE:
             return False
         return True
 
-    def levels(self) -> dict[str, Level]:
-        """All that was gathered."""
-        made = {name: Level(joined(parts, np.int64), {}, {}) for name, parts in self._parents.items()}
+    def levels(self) -> dict[str, LevelRows]:
+        """The levels with all rows that were added."""
+        levels = {name: LevelRows(join_arrays(parts, np.int64), {}, {}) for name, parts in self._parents.items()}
         for path, columns in self._numbers.items():
-            made[level_of(path)].numbers[path] = joined(columns, np.float64)
+            levels[list_level(path)].numbers[path] = join_arrays(columns, np.float64)
         for path, codes in self._codes.items():
-            made[level_of(path)].texts[path] = Texts(joined(codes, np.int64), tuple(self._words[path]))
-        return made
+            levels[list_level(path)].texts[path] = DistinctTexts(join_arrays(codes, np.int64), tuple(self._words[path]))
+        return levels
 
 
 class _Batch:
-    """What some messages hold: the parents of its rows by level, and columns by path; all values of a path at once."""
+    """The rows of some messages: parents by level, and columns by path; all values of a path are taken at once."""
 
     def __init__(self, parents: dict[str, Int], before: Mapping[str, int], exact: bool) -> None:
         self.parents, self._before, self._exact = parents, before, exact
         self.numbers: dict[str, Float] = {}
         self.texts: dict[str, list[str | None]] = {}
 
-    def visit(self, place: _Place, values: Sequence[Any]) -> None:
-        """Take what is wanted at a place, from its value in every row; None: it has none there."""
+    def visit(self, place: _WantedPlace, values: Sequence[Any]) -> None:
+        """Take the wanted columns at and below a place, from its value in every row; None: the row has none."""
         if place.number is not None:
-            self.numbers[place.number] = _numbers(values)
+            self.numbers[place.number] = _convert_numbers(values)
         if place.text is not None:
             self.texts[place.text] = [
                 v if v is None or (type(v) is str and v.isascii()) else self._text(v) for v in values
@@ -201,19 +216,19 @@ class _Batch:
         if isinstance(value, float) and not self._exact and abs(value) >= _INEXACT:
             raise ValueError("a number that may have had more digits")
         if isinstance(value, float | int):
-            return as_text(value)
+            return format_number(value)
         if isinstance(value, str):
             return value.encode(errors="replace").decode()  # half a surrogate is no text
         raise TypeError("expected a text, found a structure")
 
 
-def _numbers(values: Sequence[Any]) -> Float:
+def _convert_numbers(values: Sequence[Any]) -> Float:
     if {*map(type, values)} <= {float, int, bool, NoneType}:
         return np.array(values, dtype=np.float64)
-    return np.array([np.nan if v is None else _number(v) for v in values], dtype=np.float64)
+    return np.array([np.nan if v is None else _convert_number(v) for v in values], dtype=np.float64)
 
 
-def _number(value: Any) -> float:
+def _convert_number(value: Any) -> float:
     """A number, or a text that is one (MSight writes such); NaN for a text that is none."""
     if isinstance(value, str):
         try:
@@ -223,17 +238,17 @@ def _number(value: Any) -> float:
     return float(value)
 
 
-def _planned(numbers: Sequence[str], texts: Sequence[str]) -> _Place:
-    root = _Place()
+def _plan_places(numbers: Sequence[str], texts: Sequence[str]) -> _WantedPlace:
+    root = _WantedPlace()
     for path, is_text in (*((p, False) for p in numbers), *((p, True) for p in texts)):
         place = root
-        for step in _steps(path):
+        for step in _path_steps(path):
             if step == "[]":
                 if place.item is None:
-                    place.item = _Place()
+                    place.item = _WantedPlace()
                 place = place.item
             else:
-                place = place.fields.setdefault(step, _Place())
+                place = place.fields.setdefault(step, _WantedPlace())
         if is_text:
             place.text = path
         else:
@@ -242,7 +257,7 @@ def _planned(numbers: Sequence[str], texts: Sequence[str]) -> _Place:
     return root
 
 
-def _steps(path: str) -> Iterator[str]:
+def _path_steps(path: str) -> Iterator[str]:
     """`a.b[].c` → a, b, [], c."""
     for part in path.split("."):
         name = part.rstrip("[]")
@@ -251,7 +266,7 @@ def _steps(path: str) -> Iterator[str]:
         yield from ["[]"] * part.count("[]")
 
 
-def _name_levels(place: _Place, path: str, level: str) -> None:
+def _name_levels(place: _WantedPlace, path: str, level: str) -> None:
     place.level = level
     for name, inner in place.fields.items():
         _name_levels(inner, f"{path}.{name}" if path else name, level)

@@ -1,7 +1,9 @@
-"""Protobuf messages of any schema, taken apart into columns by the descriptors inside the recording.
+"""Protobuf messages of any schema decoded into columns, by the descriptors inside the recording.
 
-Google's parser says what is a message, and brings it into canonical form; then one compiled walk (`protobuf_kernel`)
-takes the fields that are asked for.
+Google's parser decides what is a message and brings it into canonical form: every field as its schema has it, fields
+that are not repeated once. Then one compiled walk, the kernel, takes the fields that are asked for by a table made from
+the schema. It takes the bits of numbers and the places of texts, stays within the message whatever its bytes are, and
+stops at bytes that are no message. Wire format: protobuf.dev/programming-guides/encoding.
 """
 
 from __future__ import annotations
@@ -13,39 +15,217 @@ from typing import Any
 import numpy as np
 from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.message import DecodeError, EncodeError
+from numba import njit
 
 from copem_replay.core.tracks import Int
-from copem_replay.io.encodings import protobuf_kernel as kernel
-from copem_replay.io.encodings.columns import Definition, Shredded, above, batches, level_of, levels_to
-from copem_replay.io.encodings.raw_values import DefinitionError, Kind, RawColumn, joined, shredded
+from copem_replay.io.encodings.columns import (
+    Definition,
+    DefinitionError,
+    RawColumn,
+    ShreddedMessages,
+    ValueKind,
+    join_arrays,
+    list_level,
+    list_levels,
+    parent_level,
+    shred_columns,
+    split_batches,
+)
+
+# The kernel.
+
+VARINT, FIXED64, BYTES, GROUP, END_GROUP, FIXED32 = range(6)
+"""Wire types."""
+MESSAGE = 6
+"""Besides the wire types, in the table of fields: bytes (or a group) that are a message to step into."""
+NUMBER, WHAT, COLUMN, LEVEL, INTO = range(5)
+"""Columns of the table of fields: the field's number, its wire type or MESSAGE, its column or −1, the level of a
+repeated field or −1, the kind of message inside or −1."""
+DEEPEST = 32
+"""Messages within messages, at most; no path leads deeper."""
+
+
+@njit(cache=True)
+def _read_varint(data, at, end):  # type: ignore[no-untyped-def]
+    """A number and the place after it, which is beyond `end` if the number does not end before."""
+    value, shift = np.uint64(0), 0
+    while at < end and shift < 70:
+        byte = data[at]
+        value |= np.uint64(byte & 127) << np.uint64(shift)
+        at += 1
+        shift += 7
+        if byte < 128:
+            return value, at
+    return value, end + 1
+
+
+@njit(cache=True)
+def _read_fixed(data, at, size):  # type: ignore[no-untyped-def]
+    value = np.uint64(0)
+    for k in range(size):
+        value |= np.uint64(data[at + k]) << np.uint64(8 * k)
+    return value
+
+
+@njit(cache=True)
+def _skip_value(data, at, end, wire):  # type: ignore[no-untyped-def]
+    """The end of a value that begins at `at`, of a group the place of its end tag; beyond `end`: it has no end."""
+    if wire == VARINT:
+        return _read_varint(data, at, end)[1]
+    if wire == FIXED64:
+        return at + 8
+    if wire == FIXED32:
+        return at + 4
+    if wire == BYTES:
+        size, at = _read_varint(data, at, end)
+        return end + 1 if at > end or size > np.uint64(end - at) else at + np.int64(size)
+    depth = 1
+    while at < end:
+        mark = at
+        tag, at = _read_varint(data, at, end)
+        inner = np.int64(tag & np.uint64(7))
+        if inner == GROUP:
+            depth += 1
+        elif inner == END_GROUP:
+            depth -= 1
+            if depth == 0:
+                return mark
+        elif inner > FIXED32:
+            return end + 1
+        else:
+            at = _skip_plain_value(data, at, end, inner)
+    return end + 1
+
+
+@njit(cache=True)
+def _skip_plain_value(data, at, end, wire):  # type: ignore[no-untyped-def]
+    """The end of a value other than a group that begins at `at`; beyond `end`: it has no end."""
+    value, after = _read_varint(data, at, end)
+    if wire == VARINT:
+        return after
+    if wire == BYTES:
+        return end + 1 if after > end or value > np.uint64(end - after) else after + np.int64(value)
+    return at + (8 if wire == FIXED64 else 4)
+
+
+@njit(cache=True)
+def walk_protobuf(  # type: ignore[no-untyped-def]
+    data, bounds, fields, node_first, node_level, blank, blank_first, first, room, bits, lengths, said, parent
+):
+    """(L,) number of rows of each level. `room (L,)`: rows there is room for; those beyond are counted and not kept.
+
+    Message m is `data[bounds[m]:bounds[m + 1]]`. A message of kind n has `fields[node_first[n]:node_first[n + 1]]` and
+    is of level `node_level[n]`; where it is present, its columns `blank[blank_first[n]:blank_first[n + 1]]` are 0 or
+    empty unless it states another value. The value of column c in row r of its level goes to `bits[first[c] + r]`, with
+    `said` and, of a text, `lengths`. `parent[l, r]` is the parent of row r of level l; level 0 is the message.
+    """
+    rows = np.zeros(len(room), dtype=np.int64)
+    ends = np.zeros(DEEPEST, dtype=np.int64)
+    nodes = np.zeros(DEEPEST, dtype=np.int64)
+    for m in range(len(bounds) - 1):
+        if rows[0] < room[0]:
+            parent[0, rows[0]] = m
+        rows[0] += 1
+        at, depth, entered = bounds[m], 0, True
+        ends[0], nodes[0] = bounds[m + 1], 0
+        while depth >= 0:
+            node, end = nodes[depth], ends[depth]
+            if entered:
+                entered = False
+                row = rows[node_level[node]] - 1
+                if row < room[node_level[node]]:
+                    for k in range(blank_first[node], blank_first[node + 1]):
+                        place = first[blank[k]] + row
+                        bits[place], lengths[place], said[place] = 0, 0, True
+            if at >= end:
+                at, depth = end, depth - 1
+                continue
+            tag, at = _read_varint(data, at, end)
+            wire, number = np.int64(tag & np.uint64(7)), np.int64(tag >> np.uint64(3))
+            if at > end or wire > FIXED32:
+                break
+            if wire == END_GROUP:  # of the one that was stepped into
+                continue
+            after = _skip_value(data, at, end, wire)
+            if after > end:
+                break
+            found = -1
+            for k in range(node_first[node], node_first[node + 1]):
+                if fields[k, NUMBER] == number:
+                    found = k
+                    break
+            if found < 0:
+                at = after
+                continue
+            what, column, level, into = fields[found, 1], fields[found, 2], fields[found, 3], fields[found, 4]
+            begin = _read_varint(data, at, end)[1] if wire == BYTES else at
+            if what == MESSAGE:
+                if (wire != BYTES and wire != GROUP) or depth + 1 == DEEPEST:
+                    at = after
+                    continue
+                if level >= 0:
+                    if rows[level] < room[level]:
+                        parent[level, rows[level]] = rows[node_level[node]] - 1
+                    rows[level] += 1
+                depth += 1
+                ends[depth], nodes[depth], at, entered = after, into, begin, True
+                continue
+            if what == wire or (wire == BYTES and level >= 0):  # one value, or many in one
+                while True:
+                    value, next_at = np.uint64(begin), after
+                    if what == VARINT:
+                        value, next_at = _read_varint(data, begin, after)
+                    elif what != BYTES:
+                        next_at = begin + (8 if what == FIXED64 else 4)
+                    if next_at > after or (wire != what and begin == after):
+                        break
+                    if what in (FIXED64, FIXED32):
+                        value = _read_fixed(data, begin, next_at - begin)
+                    of = node_level[node]
+                    if level >= 0:
+                        of = level
+                        if rows[level] < room[level]:
+                            parent[level, rows[level]] = rows[node_level[node]] - 1
+                        rows[level] += 1
+                    if rows[of] - 1 < room[of]:
+                        place = first[column] + rows[of] - 1
+                        bits[place], lengths[place], said[place] = value, after - begin, True
+                    begin = next_at
+                    if begin >= after:
+                        break
+            at = after
+    return rows
+
+
+# Definitions and decoding.
 
 _DEEPEST = 12
-"""Levels of messages within messages that are offered (chosen: definitions may refer to themselves)."""
+"""Levels of messages within messages that are offered: definitions may refer to themselves."""
 _MOST_FIELDS = 20_000
-"""So many are offered of a message (chosen)."""
+"""Most fields that are offered of a message: a definition that refers to itself has no end of them."""
 _TYPES = {
-    FieldDescriptor.TYPE_DOUBLE: (kernel.FIXED64, "f8"),
-    FieldDescriptor.TYPE_FIXED64: (kernel.FIXED64, "u8"),
-    FieldDescriptor.TYPE_SFIXED64: (kernel.FIXED64, "i8"),
-    FieldDescriptor.TYPE_FLOAT: (kernel.FIXED32, "f4"),
-    FieldDescriptor.TYPE_FIXED32: (kernel.FIXED32, "u4"),
-    FieldDescriptor.TYPE_SFIXED32: (kernel.FIXED32, "i4"),
-    FieldDescriptor.TYPE_INT64: (kernel.VARINT, "i8"),
-    FieldDescriptor.TYPE_UINT64: (kernel.VARINT, "u8"),
-    FieldDescriptor.TYPE_SINT64: (kernel.VARINT, "zigzag"),
-    FieldDescriptor.TYPE_INT32: (kernel.VARINT, "i4"),
-    FieldDescriptor.TYPE_UINT32: (kernel.VARINT, "u4"),
-    FieldDescriptor.TYPE_SINT32: (kernel.VARINT, "zigzag"),
-    FieldDescriptor.TYPE_ENUM: (kernel.VARINT, "i4"),
-    FieldDescriptor.TYPE_BOOL: (kernel.VARINT, "bool"),
-    FieldDescriptor.TYPE_STRING: (kernel.BYTES, "text"),
-    FieldDescriptor.TYPE_BYTES: (kernel.BYTES, "bytes"),
+    FieldDescriptor.TYPE_DOUBLE: (FIXED64, "f8"),
+    FieldDescriptor.TYPE_FIXED64: (FIXED64, "u8"),
+    FieldDescriptor.TYPE_SFIXED64: (FIXED64, "i8"),
+    FieldDescriptor.TYPE_FLOAT: (FIXED32, "f4"),
+    FieldDescriptor.TYPE_FIXED32: (FIXED32, "u4"),
+    FieldDescriptor.TYPE_SFIXED32: (FIXED32, "i4"),
+    FieldDescriptor.TYPE_INT64: (VARINT, "i8"),
+    FieldDescriptor.TYPE_UINT64: (VARINT, "u8"),
+    FieldDescriptor.TYPE_SINT64: (VARINT, "zigzag"),
+    FieldDescriptor.TYPE_INT32: (VARINT, "i4"),
+    FieldDescriptor.TYPE_UINT32: (VARINT, "u4"),
+    FieldDescriptor.TYPE_SINT32: (VARINT, "zigzag"),
+    FieldDescriptor.TYPE_ENUM: (VARINT, "i4"),
+    FieldDescriptor.TYPE_BOOL: (VARINT, "bool"),
+    FieldDescriptor.TYPE_STRING: (BYTES, "text"),
+    FieldDescriptor.TYPE_BYTES: (BYTES, "bytes"),
 }
-"""How each type lies in a message, and how it is read."""
+"""The wire type of each type of field, and its `ValueKind.how`."""
 
 
 class ProtobufDefinition(Definition):
-    """What the messages of a protobuf channel look like. Raises DefinitionError."""
+    """The definition of a protobuf channel's messages. Raises DefinitionError."""
 
     def __init__(self, name: str, schema: Any) -> None:
         from mcap_protobuf.decoder import DecoderFactory
@@ -67,39 +247,39 @@ class ProtobufDefinition(Definition):
         self._explore(empty.DESCRIPTOR)
 
     def names(self, path: str) -> Mapping[int, str]:
-        """The names of the numbers of an enumeration, empty for what is none."""
+        """The names of an enumeration by their numbers; empty for any other field."""
         return self._names.get(path, {})
 
-    def shred(self, payloads: Sequence[bytes], numbers: Iterable[str], texts: Iterable[str]) -> Shredded:
-        """Take messages apart. Raises KeyError for a path that is not offered."""
+    def shred(self, payloads: Sequence[bytes], numbers: Iterable[str], texts: Iterable[str]) -> ShreddedMessages:
+        """The columns of messages. Raises KeyError for a path that is not offered."""
         numbers, texts = tuple(numbers), tuple(texts)
         wanted = self._known((*numbers, *texts))
-        levels = levels_to(wanted)
-        table = _Table(self._root, wanted, levels)
+        levels = list_levels(wanted)
+        table = _FieldTable(self._root, wanted, levels)
         columns = [RawColumn(table.kinds[path]) for path in wanted]
-        level_ix = np.array([levels.index(level_of(path)) for path in wanted], dtype=np.int64)
+        level_ix = np.array([levels.index(list_level(path)) for path in wanted], dtype=np.int64)
         rows = np.zeros(len(levels), dtype=np.int64)
         parents: list[list[Int]] = [[] for _ in levels]
         decoded = np.zeros(len(payloads), dtype=bool)
-        for batch in batches(payloads):
+        for batch in split_batches(payloads):
             whole = [self._canonical(payload) for payload in payloads[batch]]
             good = batch.start + np.flatnonzero([p is not None for p in whole])
             decoded[good] = True
             data = b"".join(p for p in whole if p is not None)
             bounds = np.cumsum([0, *(len(p) for p in whole if p is not None)], dtype=np.int64)
-            found, taken, parent = _walked(data, bounds, table, level_ix, len(levels))
+            batch_rows, taken, parent = _walk_messages(data, bounds, table, level_ix, len(levels))
             for k, name in enumerate(levels):
-                of = parent[k, : found[k]]
-                parents[k].append(of + rows[levels.index(above(name))] if name else good[of])
+                of = parent[k, : batch_rows[k]]
+                parents[k].append(of + rows[levels.index(parent_level(name))] if name else good[of])
             for column, (bits, lengths, said) in zip(columns, taken, strict=True):
                 column.add(data, bits, lengths, said)
-            rows += found
+            rows += batch_rows
 
-        by_level = {name: joined(parents[k], np.int64) for k, name in enumerate(levels)}
-        return shredded(by_level, dict(zip(wanted, columns, strict=True)), numbers, texts, decoded)
+        by_level = {name: join_arrays(parents[k], np.int64) for k, name in enumerate(levels)}
+        return shred_columns(by_level, dict(zip(wanted, columns, strict=True)), numbers, texts, decoded)
 
     def _canonical(self, payload: bytes) -> bytes | None:
-        """A message with every field once and as its schema has it, None for what is none."""
+        """The message with every field once and as its schema has it; None: no message."""
         try:
             message = self._parse(payload)
             message.DiscardUnknownFields()
@@ -109,7 +289,7 @@ class ProtobufDefinition(Definition):
         return written
 
     def _explore(self, root: Any) -> None:
-        """Note all leaves, those of outer messages first: definitions may refer to themselves, and many times."""
+        """Add all leaves to the offered ones, those of outer messages first: definitions may refer to themselves."""
         level = [(root, "")]
         for _ in range(_DEEPEST):
             below = []
@@ -117,9 +297,9 @@ class ProtobufDefinition(Definition):
                 for field in descriptor.fields:
                     here = (f"{path}.{field.name}" if path else field.name) + ("[]" if field.is_repeated else "")
                     if field.message_type is None:
-                        self._offers[here] = "number" if _TYPES[field.type][0] != kernel.BYTES else "text"
+                        self._offers[here] = "number" if _TYPES[field.type][0] != BYTES else "text"
                         if field.enum_type is not None:
-                            self._names[here] = _names_of(field)
+                            self._names[here] = _enum_names(field)
                     elif not field.message_type.GetOptions().map_entry:
                         below.append((field.message_type, here))
                 if len(self._offers) + len(below) > _MOST_FIELDS:
@@ -127,11 +307,11 @@ class ProtobufDefinition(Definition):
             level = below
 
 
-class _Table:
+class _FieldTable:
     """The fields that lead to `wanted` paths, for the walk, by the kind of message they are in."""
 
     def __init__(self, root: Any, wanted: Sequence[str], levels: Sequence[str]) -> None:
-        self.kinds: dict[str, Kind] = {}
+        self.kinds: dict[str, ValueKind] = {}
         self._level = {name: k for k, name in enumerate(levels)}
         nodes: list[tuple[Any, str]] = [(root, "")]
         node_of = {"": 0}
@@ -149,7 +329,7 @@ class _Table:
                     fields.append([])
                     blank.append([])
                     level = self._level[here] if field.is_repeated else -1
-                    fields[node].append([field.number, kernel.MESSAGE, -1, level, node_of[here]])
+                    fields[node].append([field.number, MESSAGE, -1, level, node_of[here]])
                 node = node_of[here]
             field = nodes[node][0].fields_by_name[parts[-1].removesuffix("[]")]
             wire, how = _TYPES[field.type]
@@ -157,30 +337,36 @@ class _Table:
             fields[node].append([field.number, wire, column, level, -1])
             if not field.is_repeated and not field.has_presence:
                 blank[node].append(column)
-            self.kinds[path] = Kind(how, _names_of(field) if field.enum_type is not None else {})
+            self.kinds[path] = ValueKind(how, _enum_names(field) if field.enum_type is not None else {})
         self.fields = np.array([row for rows in fields for row in rows], dtype=np.int64).reshape(-1, 5)
         self.node_first = np.cumsum([0, *map(len, fields)], dtype=np.int64)
-        self.node_level = np.array([self._level[level_of(path)] for _, path in nodes], dtype=np.int64)
+        self.node_level = np.array([self._level[list_level(path)] for _, path in nodes], dtype=np.int64)
         self.blank = np.array([column for columns in blank for column in columns], dtype=np.int64)
         self.blank_first = np.cumsum([0, *map(len, blank)], dtype=np.int64)
 
 
-def _names_of(field: Any) -> dict[int, str]:
+def _enum_names(field: Any) -> dict[int, str]:
     return {v.number: v.name for v in field.enum_type.values}
 
 
-def _walked(
-    data: bytes, bounds: Int, table: _Table, level_ix: Int, levels: int
+def _walk_messages(
+    data: bytes, bounds: Int, table: _FieldTable, level_ix: Int, levels: int
 ) -> tuple[Int, list[tuple[Any, Int, Any]], Int]:
-    """Rows of each level; bits, lengths and whether it is said, of each column; the parents, (levels, most rows)."""
-    at = np.frombuffer(data, dtype=np.uint8)
+    """Number of rows of each level; bits, lengths and presence of each column's values; parents (levels, most rows)."""
+    octets = np.frombuffer(data, dtype=np.uint8)
     plan = (table.fields, table.node_first, table.node_level, table.blank, table.blank_first)
     first = np.zeros(len(level_ix) + 1, dtype=np.int64)
 
     def walk(room: Int, size: int, most: int) -> tuple[Int, Any, Int, Any, Int]:
         bits, lengths = np.empty(size, dtype=np.uint64), np.empty(size, dtype=np.int64)
         said, parent = np.zeros(size, dtype=bool), np.empty((levels, most), dtype=np.int64)
-        return kernel.walk(at, bounds, *plan, first, room, bits, lengths, said, parent), bits, lengths, said, parent
+        return (
+            walk_protobuf(octets, bounds, *plan, first, room, bits, lengths, said, parent),
+            bits,
+            lengths,
+            said,
+            parent,
+        )
 
     rows = walk(np.zeros(levels, dtype=np.int64), 0, 0)[0]
     np.cumsum(rows[level_ix], out=first[1:])

@@ -1,46 +1,220 @@
-"""Object lists of any schema, read by the names of their fields.
+"""Object lists of any schema, decoded by a description of their fields.
 
-`Fields` says where a message has what; the formats this version knows by name are such descriptions, too, and so is
-`read:` of an experiment.
+The formats that are known by name have such descriptions (`io/schemas/formats.py`); for any other schema an experiment
+gives one with `read:`.
 """
 
 from __future__ import annotations
 
+import difflib
+import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from copem_replay.core.classes import class_named
-from copem_replay.core.text import counted
-from copem_replay.core.tracks import CLASSES, Bool, Float, Int
+from copem_replay.core.errors import count_noun
+from copem_replay.core.tracks import CLASSES, VALUES, Bool, Float, Int
 from copem_replay.io.encodings.columns import (
     Definition,
-    Shredded,
-    Texts,
-    any_item,
+    DistinctTexts,
+    ShreddedMessages,
+    ancestor_rows,
+    any_item_path,
     common_level,
-    level_of,
-    rows_above,
-    take_apart,
+    list_level,
+    list_levels,
+    shred_messages,
 )
-from copem_replay.io.schemas.decoded import DecodedObjects
-from copem_replay.io.schemas.description import Amount, Class, Description, Fields, Stamp, Yaw
-from copem_replay.io.schemas.field_paths import FieldsError, Wanted
-from copem_replay.io.schemas.shapes import largest, outlined, rounded
-from copem_replay.io.schemas.timestamps import nanoseconds
+from copem_replay.io.ground_truth import DecodedObjects
+from copem_replay.io.schemas.description import (
+    Amount,
+    ClassField,
+    Description,
+    Fields,
+    Stamp,
+    Yaw,
+    find_stamp_paths,
+    parse_nanoseconds,
+)
 
-__all__ = ["Class", "DecodedLists", "Description", "Fields", "FieldsError", "Stamp", "Yaw", "listed"]
+# The columns of messages that a description needs.
+
+_COMPARED = 2000  # fields that are compared with a missing one for an error: more make it slow
+_SHOWN = 12  # fields named in an error, at most
+
+
+class FieldsError(ValueError):
+    """A path that messages do not have: the key that named it, and the paths they have instead."""
+
+
+class WantedPaths:
+    """The paths of a description, from the message down. Raises FieldsError where messages do not offer them.
+
+    `stamp`: one path, or those of seconds and nanoseconds. `numbers` and `texts`: the columns to decode.
+    """
+
+    def __init__(self, description: Description, offers: Collection[str]) -> None:
+        self._fields, self._described, self._offers = description.fields, description, offers
+        objects = any_item_path(self._fields.objects)
+        lists = {level for path in offers for level in list_levels([path]) if level}
+        if objects not in lists or not self._fields.objects.endswith("[]"):
+            raise self._lacks("objects", self._fields.objects, "list", sorted(lists))
+        class_field = self._fields.class_
+        self.class_ = ClassField(path=class_field) if isinstance(class_field, str) else class_field
+        self.stamp = self._stamp_paths()
+        self.numbers, self.texts = self._columns()
+
+    def path(self, path: str) -> str:
+        """The path from the message down, of one that is relative to an object unless it begins with `/`."""
+        return path[1:] if path.startswith("/") else f"{self._fields.objects}.{path}"
+
+    def _lacks(self, key: str, path: str, what: str = "", candidates: Collection[str] = ()) -> FieldsError:
+        """The error for a missing path, with similar ones of `candidates`, else of all that are offered."""
+        offered = list(candidates or self._offers)
+        near = difflib.get_close_matches(path, offered[:_COMPARED], n=3, cutoff=0.5)
+        near += [p for p in offered if p.rpartition(".")[2] == path.rpartition(".")[2] and p not in near][:3]
+        shown = near or offered[:_SHOWN]
+        more = f", … ({len(offered)} in all)" if len(offered) > len(shown) else ""
+        what = f"{what} " if what else ""
+        return FieldsError(
+            f"read.{key}: the messages have no {what}{path!r}; they have {', '.join(shown) or 'nothing'}{more}"
+        )
+
+    def _need(self, key: str, path: str, within: str | None = None) -> str:
+        """The path. Raises FieldsError: messages do not have it, or have several values of it for one of `within`."""
+        if any_item_path(path) not in self._offers:
+            raise self._lacks(key, path)
+        if within is not None and list_level(path) not in list_levels([within]):
+            level = list_level(path)
+            raise FieldsError(
+                f"read.{key}: {path!r} is several values for each of {list_level(within) or 'the message'}: "
+                f"choose one, {level.removesuffix('[]') + '[0]' + path[len(level) :]!r} say"
+            )
+        return path
+
+    def _of_object(self, key: str, path: str) -> str:
+        """The path from the message down; an object has one value of it. Raises FieldsError."""
+        return self._need(key, self.path(path), f"{self._fields.objects}.")
+
+    def _columns(self) -> tuple[list[str], list[str]]:
+        fields, described = self._fields, self._described
+        numbers: list[str] = []
+        texts: list[str] = []
+        for key in ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "vx_mps", "vy_mps", "existence"):
+            path = getattr(fields, key)
+            if isinstance(path, str):
+                numbers.append(self._of_object(key, path))
+        numbers += [self._of_object(key, path) for key, path in described.said.items()]
+        if described.footprint is not None:
+            numbers += [self._need("footprint", self.path(f"{described.footprint}.{axis}")) for axis in "xy"]
+        if isinstance(fields.yaw_rad, str):
+            numbers.append(self._of_object("yaw_rad", fields.yaw_rad))
+        elif isinstance(fields.yaw_rad, Yaw):
+            if fields.yaw_rad.degrees is not None:
+                numbers.append(self._of_object("yaw_rad.degrees", fields.yaw_rad.degrees))
+            elif fields.yaw_rad.quaternion is not None:
+                whole = fields.yaw_rad.quaternion
+                numbers += [self._of_object("yaw_rad.quaternion", f"{whole}.{axis}") for axis in "xyzw"]
+        if fields.covariance is not None:
+            numbers += [self._of_object("covariance", f"{fields.covariance}[{k}]") for k in (0, 1, 7)]
+        if fields.id is not None:
+            texts.append(self._of_object("id", fields.id))
+        if (class_field := self.class_) is not None:
+            whole = self._need("class", self.path(class_field.path))
+            texts.append(whole)
+            if class_field.probability is not None:
+                numbers.append(self._need("class.probability", self.path(class_field.probability), whole))
+            if class_field.key is not None:
+                texts.append(self._need("class.key", self.path(class_field.key), whole))
+        if fields.frame is not None:
+            texts.append(self._of_object("frame", f"/{fields.frame}"))
+        texts += [self._of_object("only", path) for path in described.only]
+        if described.within is not None:
+            texts.append(self._of_object("id", described.within))
+        if described.solid is not None:
+            numbers += [self._of_object("length_m", described.solid.kind)]
+            numbers += [self._of_object("length_m", f"{described.solid.dimensions}[{k}]") for k in range(2)]
+        if described.stays is not None:
+            texts.append(described.stays)
+        texts += self.stamp
+        return numbers, texts
+
+    def _stamp_paths(self) -> list[str]:
+        stamp = self._fields.stamp
+        if stamp is None:
+            return []
+        path = stamp.path if isinstance(stamp, Stamp) else stamp
+        paths = find_stamp_paths(self._offers, path)
+        if not paths:
+            raise self._lacks("stamp", path)
+        return paths
+
+
+# Boxes of objects whose shape is an outline, a solid other than a box, or several bodies.
+
+_SPHERE, _CYLINDER, _CONE = 2, 3, 4
+"""Types of shape_msgs/SolidPrimitive; a cylinder and a cone have a height and a radius."""
+_YAW = VALUES.index("yaw_rad")
+_SIZE = slice(VALUES.index("length_m"), VALUES.index("width_m") + 1)
+_SIZES = slice(VALUES.index("length_m"), VALUES.index("height_m") + 1)
+
+
+def fit_outlines(values: Float, found: ShreddedMessages, objects: str, footprint: str) -> None:
+    """Set the box of objects in `values (P, V)` without length and width to that around their points at `footprint`."""
+    level = list_level(f"{footprint}.x")
+    points = found.levels[level]
+    owner = ancestor_rows(found, level, objects)
+    least, most = (np.full((len(values), 2), end) for end in (np.inf, -np.inf))
+    for k, axis in enumerate("xy"):
+        along = points.numbers[f"{footprint}.{axis}"]
+        np.minimum.at(least[:, k], owner, along)
+        np.maximum.at(most[:, k], owner, along)
+    size = values[:, _SIZE]
+    flat = np.flatnonzero(~(size > 0).all(axis=1) & (most > least).all(axis=1))  # of no point: never
+    middle, yaw = (least[flat] + most[flat]) / 2, values[flat, _YAW]
+    values[flat, _SIZE] = most[flat] - least[flat]
+    values[flat, 0] += middle[:, 0] * np.cos(yaw) - middle[:, 1] * np.sin(yaw)
+    values[flat, 1] += middle[:, 0] * np.sin(yaw) + middle[:, 1] * np.cos(yaw)
+
+
+def fit_solids(values: Float, kind: Float, first: Float, second: Float) -> None:
+    """Set the sizes in `values (P, V)` of solids other than boxes to those of the box around them.
+
+    `kind (P,)`: the type of shape_msgs/SolidPrimitive; `first (P,)` and `second (P,)`: its first two dimensions.
+    """
+    ball, upright = kind == _SPHERE, (kind == _CYLINDER) | (kind == _CONE)
+    across = 2.0 * np.where(ball, first, second)
+    height = np.where(ball, across, first)
+    round_ = ball | upright
+    values[round_, _SIZES] = np.stack([across, across, height], axis=1)[round_]
+
+
+def find_largest(values: Float, meant: Bool, found: ShreddedMessages, objects: str, of: str) -> Bool:
+    """(P,) which objects `meant (P,)` are the largest of their thing in the list `of`; of equal ones the first."""
+    owner = ancestor_rows(found, objects, of)
+    volume = np.where(meant, np.nan_to_num(values[:, _SIZES]).prod(axis=1), -np.inf)
+    order = np.lexsort((-volume, owner))
+    first = np.ones(len(order), dtype=bool)
+    first[1:] = np.diff(owner[order]) != 0
+    chosen = meant.copy()
+    chosen[order[~first]] = False
+    return chosen
+
+
+# Decoding.
+
+__all__ = ["ClassField", "DecodedLists", "Description", "Fields", "FieldsError", "Stamp", "Yaw", "decode_lists"]
 
 
 @dataclass(frozen=True)
 class DecodedLists:
-    """The lists of one topic, and what of them only recorded units need: (P,) each.
+    """The lists of one topic, with properties of entries that only recorded units need, (P,) each.
 
-    `frame_code` indexes `frames`, −1: no frame is said. `covariance_m2 (P, 3)` is xx, xy, yy of the position in the
-    list's frame, NaN: not said. `probability (P, C)` of each class sums to 1.
+    `frame_code` indexes `frames`, −1: no frame is named. `covariance_m2 (P, 3)` is xx, xy, yy of the position in the
+    list's frame, NaN: not stated. `probability (P, C)` of each class sums to 1.
     """
 
     columns: DecodedObjects
@@ -51,60 +225,62 @@ class DecodedLists:
     probability: Float
     log_time_ns: Int  # (F,)
     named: bool  # whether its objects have ids
-    part: str = ""  # which of several recordings of one drive they are of
+    part: str = ""  # the recording they are from, of several of one drive
 
 
-def listed(
+def decode_lists(
     definition: Definition, description: Description, payloads: Sequence[bytes], log_time_ns: Int
 ) -> DecodedLists:
-    """The lists that messages hold, logged at `log_time_ns (F,)`. Raises FieldsError."""
-    with np.errstate(over="ignore", invalid="ignore"):  # what is no number, or too large a one, is found out later
-        return _Reader(definition, description, payloads).listed(log_time_ns)
+    """The lists in messages that were logged at `log_time_ns (F,)`. Raises FieldsError."""
+    with np.errstate(over="ignore", invalid="ignore"):  # states that are not finite are left out later
+        return _BatchReader(definition, description, payloads).listed(log_time_ns)
 
 
-class _Reader:
+class _BatchReader:
     """Columns of one batch of messages."""
 
     def __init__(self, definition: Definition, description: Description, payloads: Sequence[bytes]) -> None:
         self._fields = description.fields
         self._description = description
         self._notes: Counter[tuple[str, str]] = Counter()
-        self._wanted = Wanted(description, definition.offers())
-        self._found: Shredded = take_apart(definition, payloads, self._wanted.numbers, self._wanted.texts)
+        self._wanted = WantedPaths(description, definition.offers())
+        self._found: ShreddedMessages = shred_messages(definition, payloads, self._wanted.numbers, self._wanted.texts)
         self._names = definition.names
         self._messages = len(payloads)
 
     def rows(self, level: str) -> int:
+        """Number of rows of a level."""
         return len(self._found.levels[level].parent)
 
     def number(self, path: str) -> Float:
-        """(P,) of the objects: from their own level, or one above."""
+        """(P,) numbers of the objects at a path, of their own level or one above."""
         whole = self._wanted.path(path)
-        level = level_of(whole)
+        level = list_level(whole)
         column: Float = self._found.levels[level].numbers[whole]
-        return column[rows_above(self._found, self._fields.objects, level)]
+        return column[ancestor_rows(self._found, self._fields.objects, level)]
 
-    def text(self, path: str) -> Texts:
+    def text(self, path: str) -> DistinctTexts:
+        """(P,) texts of the objects at a path, of their own level or one above."""
         whole = self._wanted.path(path)
-        level = level_of(whole)
-        found = self._found.levels[level].texts[whole]
-        return Texts(found.code[rows_above(self._found, self._fields.objects, level)], found.words)
+        level = list_level(whole)
+        texts = self._found.levels[level].texts[whole]
+        return DistinctTexts(texts.code[ancestor_rows(self._found, self._fields.objects, level)], texts.words)
 
     def _stamps(self, log_time_ns: Int) -> tuple[Int, Bool]:
-        """(F,) time stamps of all messages, and whether they say one."""
+        """(F,) time stamps of all messages, else their log times, and (F,) whether they have one."""
         stamp_ns, stamped = log_time_ns.copy(), np.zeros(len(log_time_ns), dtype=bool)
         paths, stamp = self._wanted.stamp, self._fields.stamp
         if not paths:
             return stamp_ns, stamped
-        level = level_of(paths[0])
-        found = self._found.levels[level]
-        message = self._found.levels[""].parent[rows_above(self._found, level, "")]
+        level = list_level(paths[0])
+        rows = self._found.levels[level]
+        message = self._found.levels[""].parent[ancestor_rows(self._found, level, "")]
         unit = stamp.unit if isinstance(stamp, Stamp) else "s"
-        said_ns, said, impossible = nanoseconds([found.texts[p] for p in paths], unit)
+        stated_ns, has_stamp, impossible = parse_nanoseconds([rows.texts[p] for p in paths], unit)
         if impossible:
             self._notes["message", "with an impossible time stamp: the time of logging taken"] += impossible
-        first = np.flatnonzero(said)[::-1]  # of several in one message the first
-        stamp_ns[message[first]], stamped[message[first]] = said_ns[first], True
+        first = np.flatnonzero(has_stamp)[::-1]  # of several in one message the first
+        stamp_ns[message[first]], stamped[message[first]] = stated_ns[first], True
         return stamp_ns, stamped
 
     def _amount(self, amount: Amount | None, otherwise: float) -> Float:
@@ -113,12 +289,12 @@ class _Reader:
         return np.full(self.rows(self._fields.objects), otherwise if amount is None else float(amount))
 
     def _yaw(self) -> Float:
-        said = self._fields.yaw_rad
-        if not isinstance(said, Yaw):
-            return self._amount(said, 0.0)
-        if said.degrees is not None:
-            return np.deg2rad(self.number(said.degrees))
-        x, y, z, w = (self.number(f"{said.quaternion}.{axis}") for axis in "xyzw")
+        yaw_field = self._fields.yaw_rad
+        if not isinstance(yaw_field, Yaw):
+            return self._amount(yaw_field, 0.0)
+        if yaw_field.degrees is not None:
+            return np.deg2rad(self.number(yaw_field.degrees))
+        x, y, z, w = (self.number(f"{yaw_field.quaternion}.{axis}") for axis in "xyzw")
         empty = (x == 0.0) & (y == 0.0) & (z == 0.0) & (w == 0.0)
         if empty.any():
             self._notes["object state", "without orientation: yaw 0 taken"] += int(empty.sum())
@@ -128,59 +304,62 @@ class _Reader:
     def _classes(self) -> Float:
         """(P, C) probability of each class, sums to 1."""
         rows = self.rows(self._fields.objects)
-        said = self._wanted.class_
+        class_field = self._wanted.class_
         probability = np.zeros((rows, len(CLASSES)))
-        if said is not None:
-            whole = self._wanted.path(said.path)
-            level = level_of(whole)
+        if class_field is not None:
+            whole = self._wanted.path(class_field.path)
+            level = list_level(whole)
             shared = common_level(level, self._fields.objects)
             texts = self._found.levels[level].texts[whole]
-            known_as = self._by_name(any_item(whole), said.map)
+            known_as = self._by_name(any_item_path(whole), class_field.map)
             of_word = np.array([_class_ix(word, known_as) for word in texts.words] + [-1])
             code = of_word[texts.code]
             share = np.ones(len(code))
-            if said.probability is not None:
-                share = self._found.levels[level_of(self._wanted.path(said.probability))].numbers[
-                    self._wanted.path(said.probability)
+            if class_field.probability is not None:
+                share = self._found.levels[list_level(self._wanted.path(class_field.probability))].numbers[
+                    self._wanted.path(class_field.probability)
                 ]
-                share = share[rows_above(self._found, level, level_of(self._wanted.path(said.probability)))]
-                # said with no probability it is still said; more than certain is nothing
+                share = share[ancestor_rows(self._found, level, list_level(self._wanted.path(class_field.probability)))]
+                # A class with probability 0 or NaN is still stated; more than 1 counts as 1.
                 share = np.clip(np.nan_to_num(share), 1e-9, 1.0)
-            known = code >= 0
-            if said.key is not None:
-                keys = self._found.levels[level_of(self._wanted.path(said.key))].texts[self._wanted.path(said.key)]
-                key = keys.code[rows_above(self._found, level, level_of(self._wanted.path(said.key)))]
-                known &= np.array([word.lower() in said.keys for word in keys.words] + [False])[key]
-            owner = rows_above(self._found, level, shared)
+            counted = code >= 0
+            if class_field.key is not None:
+                keys = self._found.levels[list_level(self._wanted.path(class_field.key))].texts[
+                    self._wanted.path(class_field.key)
+                ]
+                key = keys.code[ancestor_rows(self._found, level, list_level(self._wanted.path(class_field.key)))]
+                counted &= np.array([word.lower() in class_field.keys for word in keys.words] + [False])[key]
+            owner = ancestor_rows(self._found, level, shared)
             claimed = np.zeros((self.rows(shared), len(CLASSES)))
-            np.add.at(claimed, (owner[known], code[known]), share[known])
-            probability = claimed[rows_above(self._found, self._fields.objects, shared)]
+            np.add.at(claimed, (owner[counted], code[counted]), share[counted])
+            probability = claimed[ancestor_rows(self._found, self._fields.objects, shared)]
         none = probability.sum(axis=1) <= 0
         probability[none, CLASSES.index("other")] = 1.0
         normed: Float = probability / probability.sum(axis=1, keepdims=True)
         return normed
 
     def _by_name(self, path: str, meant: Mapping[str, str]) -> Mapping[str, str]:
-        """What values mean, those of an enumeration by their names, too."""
+        """The class of each value, for values of an enumeration also by their names."""
         names = {name: meant[str(number)] for number, name in self._names(path).items() if str(number) in meant}
         return {**names, **meant}
 
     def _frame_of(self) -> tuple[Int, tuple[str, ...]]:
+        """(P,) index of the frame of each object, −1: none, and the names of frames."""
         path = self._fields.frame
         if path is None:
             return np.full(self.rows(self._fields.objects), -1), ()
-        found = self.text(f"/{path}")
-        return found.code, found.words
+        names = self.text(f"/{path}")
+        return names.code, names.words
 
     def _meant(self) -> Bool:
-        """(P,) the objects that the format means."""
+        """(P,) whether an object has the values of `only`."""
         meant = np.ones(self.rows(self._fields.objects), dtype=bool)
         for path, values in self._description.only.items():
-            found = self.text(path)
-            meant &= np.array([word in values for word in found.words] + [False], dtype=bool)[found.code]
+            texts = self.text(path)
+            meant &= np.array([word in values for word in texts.words] + [False], dtype=bool)[texts.code]
         return meant
 
-    def _ids(self) -> Texts | None:
+    def _ids(self) -> DistinctTexts | None:
         """(P,) ids; None: objects have none."""
         if self._fields.id is None:
             return None
@@ -188,45 +367,45 @@ class _Reader:
         nothing = np.array([not word for word in ids.words] + [True])[ids.code]  # an empty text is no id
         if nothing.all():
             return None
-        ids = Texts(np.where(nothing, -1, ids.code), ids.words)
+        ids = DistinctTexts(np.where(nothing, -1, ids.code), ids.words)
         if self._description.within is None:
             return ids
         spaces = self.text(self._description.within)
         width = len(ids.words) + 1
         pairs, code = np.unique((spaces.code + 1) * width + ids.code + 1, return_inverse=True)
-        names = tuple(_joined(spaces, pair // width - 1, ids, pair % width - 1) for pair in pairs.tolist())
-        return Texts(np.where(ids.code < 0, -1, code), names)
+        names = tuple(_join_id(spaces, pair // width - 1, ids, pair % width - 1) for pair in pairs.tolist())
+        return DistinctTexts(np.where(ids.code < 0, -1, code), names)
 
     def _said(self, what: Literal["yaw", "velocity", "covariance"]) -> Bool:
-        """(P,) which objects say this."""
+        """(P,) whether an object states this property."""
         path = self._description.said.get(what)
         if path is None:
             return np.ones(self.rows(self._fields.objects), dtype=bool)
-        said: Bool = self.number(path) != 0
-        return said
+        stated: Bool = self.number(path) != 0
+        return stated
 
     def _shaped(self, values: Float, meant: Bool) -> Bool:
-        """Give all the boxes that their shapes say; (P,) which are meant all the same."""
+        """(P,) which objects remain meant, after boxes in `values (P, V)` were set by their shapes."""
         described, objects = self._description, self._fields.objects
         if described.footprint is not None:
-            outlined(values, self._found, objects, self._wanted.path(described.footprint))
+            fit_outlines(values, self._found, objects, self._wanted.path(described.footprint))
         if (solid := described.solid) is not None:
-            rounded(values, *(self.number(p) for p in (solid.kind, *(f"{solid.dimensions}[{k}]" for k in range(2)))))
+            fit_solids(values, *(self.number(p) for p in (solid.kind, *(f"{solid.dimensions}[{k}]" for k in range(2)))))
         if described.largest_of is None:
             return meant
-        chosen = largest(values, meant, self._found, objects, described.largest_of)
+        chosen = find_largest(values, meant, self._found, objects, described.largest_of)
         if beside := int((meant & ~chosen).sum()):
             self._notes["cube", "beside a larger one of the same entity: left out"] += beside
         return chosen
 
     def _velocity(self, yaw: Float) -> tuple[Float, Float]:
-        """(P,) each along the axes of the list's frame, NaN: not said."""
+        """(P,) velocities along each axis of the list's frame, NaN: not stated."""
         vx, vy = (self._amount(path, np.nan) for path in (self._fields.vx_mps, self._fields.vy_mps))
         if self._fields.velocity == "object":
             cos, sin = np.cos(yaw), np.sin(yaw)
             vx, vy = vx * cos - vy * sin, vx * sin + vy * cos
-        said = self._said("velocity")
-        return np.where(said, vx, np.nan), np.where(said, vy, np.nan)
+        stated = self._said("velocity")
+        return np.where(stated, vx, np.nan), np.where(stated, vy, np.nan)
 
     def _values(self) -> Float:
         """(P, V) values of the objects, in the order of VALUES."""
@@ -245,8 +424,8 @@ class _Reader:
             axis=1,
         )
 
-    def _kept(self, meant: Bool, ids: Texts | None) -> Int:
-        """(K,) rows of the objects that are meant and have an id, if objects have ids; notes what of them is unsaid."""
+    def _kept(self, meant: Bool, ids: DistinctTexts | None) -> Int:
+        """(K,) rows of the objects that are meant and, if objects have ids, have one; notes tell of the others."""
         if ids is not None:
             nameless = (ids.code < 0) & meant
             meant = meant & ~nameless
@@ -258,7 +437,7 @@ class _Reader:
         return keep
 
     def _covariance(self, keep: Int) -> Float:
-        """(K, 3) xx, xy, yy of the positions, NaN: not said."""
+        """(K, 3) xx, xy, yy of the positions, NaN: not stated."""
         path = self._fields.covariance
         if path is None:
             return np.full((len(keep), 3), np.nan)
@@ -267,16 +446,16 @@ class _Reader:
         return covariance
 
     def _unsaid(self) -> int:
-        """How many messages between the first and the last with a thing that stays do not repeat it."""
+        """Number of states that messages leave out between the first and the last one with a thing that stays."""
         if (path := self._description.stays) is None:
             return 0
-        level = level_of(path)
-        code, message = self._found.levels[level].texts[path].code, rows_above(self._found, level, "")
+        level = list_level(path)
+        code, message = self._found.levels[level].texts[path].code, ancestor_rows(self._found, level, "")
         code, message = np.unique(np.stack([code, message])[:, code >= 0], axis=1)
         return int((np.diff(message) - 1)[np.diff(code) == 0].sum())
 
     def listed(self, log_time_ns: Int) -> DecodedLists:
-        """All columns of the objects that are kept. Notes stand in the order in which things are found out."""
+        """The columns of the objects that are kept. The order of the steps is that of the notes."""
         found, meant = self._found, self._meant()
         if lost := int((~found.decoded).sum()):
             self._notes["message", "cannot be decoded: skipped"] += lost
@@ -287,7 +466,7 @@ class _Reader:
         keep = self._kept(meant, ids)
         number = np.arange(len(keep)) if ids is None else ids.code[keep]
         names = tuple(str(k) for k in range(len(keep))) if ids is None else ids.words
-        message = found.levels[""].parent[rows_above(found, self._fields.objects, "")]
+        message = found.levels[""].parent[ancestor_rows(found, self._fields.objects, "")]
         kept_message = np.flatnonzero(found.decoded)
         probability = self._classes()[keep]
         if unsaid := self._unsaid():
@@ -303,7 +482,7 @@ class _Reader:
             object_ix=number.astype(np.int64),
             class_ix=probability.argmax(axis=1).astype(np.int8),
             values=values[keep],
-            notes=tuple(f"{counted(n, noun)} {what}" for (noun, what), n in self._notes.items()),
+            notes=tuple(f"{count_noun(n, noun)} {what}" for (noun, what), n in self._notes.items()),
         )
         frame, frames = self._frame_of()
         return DecodedLists(
@@ -318,11 +497,45 @@ class _Reader:
         )
 
 
-def _joined(spaces: Texts, space: int, ids: Texts, ident: int) -> str:
-    named = spaces.words[space] if space >= 0 else ""
-    return f"{named}/{ids.words[ident]}" if named and ident >= 0 else ids.words[ident] if ident >= 0 else ""
+def _join_id(spaces: DistinctTexts, space: int, ids: DistinctTexts, ident: int) -> str:
+    """`namespace/id`, `id` without a namespace, `""` without an id."""
+    if ident < 0:
+        return ""
+    namespace = spaces.words[space] if space >= 0 else ""
+    return f"{namespace}/{ids.words[ident]}" if namespace else ids.words[ident]
 
 
 def _class_ix(word: str, known: Mapping[str, str]) -> int:
-    name = known.get(word) or class_named(word)
+    name = known.get(word) or class_from_name(word)
     return CLASSES.index(name) if name is not None else CLASSES.index("other")
+
+
+# What names of classes mean, as data sets and drivers write them.
+
+_WORDS = {
+    "pedestrian": ("pedestrian", "person", "people", "human", "walker", "adult", "child", "wheelchair", "stroller"),
+    "bicycle": ("bicycle", "bicyclist", "bike", "cyclist", "cycle", "scooter", "rider"),
+    "motorcycle": ("motorcycle", "motorbike", "motorcyclist", "moped"),
+    "van": ("van", "minivan", "pickup"),
+    "truck": ("truck", "lorry", "semi"),
+    "bus": ("bus", "coach", "minibus"),
+    "trailer": ("trailer", "caravan"),
+    "animal": ("animal", "dog", "cat", "deer"),
+    "car": ("car", "sedan", "taxi", "passenger"),
+    "vehicle": ("vehicle", "ego"),
+    "other": ("other", "unknown", "misc", "object", "barrier", "cone", "sign", "tram", "train"),
+}
+"""Words by class. Of several classes that a name fits the first in `_ORDER` counts."""
+assert set(_WORDS) == set(CLASSES)
+_ORDER = ("motorcycle", *(name for name in _WORDS if name != "motorcycle"))
+"""In order of preference: `vehicle.bus` is a bus, `motorcycle rider` no bicycle."""
+
+
+def class_from_name(text: str) -> str | None:
+    """The class that a name means, None where it says nothing: `Car`, `vehicle.bus.rigid`, `TYPE_PEDESTRIAN`."""
+    words = set(re.split(r"[^a-z]+", re.sub(r"([a-z])([A-Z])", r"\1 \2", text).lower()))
+    words |= {word.removesuffix("s") for word in words}
+    for name in _ORDER:
+        if words & set(_WORDS[name]):
+            return name
+    return None

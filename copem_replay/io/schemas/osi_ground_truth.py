@@ -1,4 +1,4 @@
-"""ASAM OSI: osi3.GroundTruth, and osi3.SensorView for the ground truth inside it.
+"""ASAM OSI: the decoder of osi3.GroundTruth, and of osi3.SensorView for the ground truth inside it.
 
 Decoded with the classes of osi-python, whose wire format is common to OSI 3.0 – 3.8: the schema inside a
 recording is not needed. The tables below hold value numbers, not names, because names were added and renamed
@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 from google.protobuf.message import DecodeError
 
-from copem_replay.core.text import counted
+from copem_replay.core.errors import count_noun
 from copem_replay.core.tracks import CLASSES, VALUES, Float, Solid
-from copem_replay.io.schemas.decoded import FARTHEST_M, DecodedObjects
+from copem_replay.io.channel import LAST_NS
+from copem_replay.io.ground_truth import FARTHEST_M, DecodedObjects
 
 GROUND_TRUTH = "osi3.GroundTruth"
 SENSOR_VIEW = "osi3.SensorView"
@@ -52,25 +53,25 @@ _NAME_OF_VEHICLE = {
     16: "truck",  # semitractor
     17: "bicycle",  # stand-up scooter
     18: "bicycle",  # micromobility device
-    19: "truck",  # work machine (chosen: big, slow, hides others)
+    19: "truck",  # work machine: big, slow, hides others
     20: "other",  # watercraft
     21: "other",  # aircraft
 }
 _CLASS_OF_VEHICLE = {number: CLASSES.index(name) for number, name in _NAME_OF_VEHICLE.items()}
 
-_MOST_CORNERS = 1000  # of a base polygon (chosen: visibility looks at each of them)
-_LAST_SECOND = 4_000_000_000  # chosen: Unix time of 2096; differences of stamps still fit 64 bits
+_MOST_CORNERS = 1000  # of a base polygon: visibility computes with each of them
+_LAST_SECOND = LAST_NS // 10**9
 _NAN = float("nan")
 
 
-def class_of(kind: int, vehicle: int | None) -> int:
-    """Index into CLASSES of a MovingObject's type and, where it says one, vehicle classification type."""
+def osi_class_index(kind: int, vehicle: int | None) -> int:
+    """Index into CLASSES, from a MovingObject's type and its type of vehicle classification (None: it has none)."""
     if kind != _IS_VEHICLE:
         return _CLASS_OF_TYPE.get(kind, OTHER)
     return VEHICLE if vehicle is None else _CLASS_OF_VEHICLE.get(vehicle, VEHICLE)
 
 
-class Decoder:
+class GroundTruthDecoder:
     """Collects messages of one topic: `add` each payload, then take `columns`."""
 
     def __init__(self) -> None:
@@ -93,9 +94,9 @@ class Decoder:
         self._notes: Counter[tuple[str, str]] = Counter()  # what is counted, and what is the matter with it
 
     def add(self, payload: bytes, *, schema: str, log_time_ns: int, ahead_ns: int = 0) -> None:
-        """Take in a message of `schema`, one of `TRUTH_SCHEMAS`; what is none is skipped and noted.
+        """Add a message of `schema`, one of `TRUTH_SCHEMAS`; one that cannot be decoded is skipped with a note.
 
-        `ahead_ns`: of the clock of its stamp, against that of the log times.
+        `ahead_ns`: how far the clock of its stamp is ahead of that of the log times.
         """
         try:
             message = self._message_of[schema].FromString(payload)
@@ -119,7 +120,7 @@ class Decoder:
         self._stamp_ns.append(seconds * 1_000_000_000 + nanos - (0 if stamped is None else ahead_ns))
         self._stamped.append(stamped is not None)
         self._add_host(message, truth)
-        if not self._lane_boundaries and len(truth.lane_boundary):  # said once, or again in every message
+        if not self._lane_boundaries and len(truth.lane_boundary):  # the lanes of one message are those of all
             self._add_lanes(truth.lane_boundary)
         before = len(self._object_ix)
         self._add_moving(truth.moving_object)
@@ -127,7 +128,7 @@ class Decoder:
         self._rows.append(len(self._object_ix) - before)
 
     def columns(self) -> DecodedObjects:
-        """All that was added."""
+        """The columns of all messages that were added."""
         ids, moving = self._names()
         solids = tuple(solid for solid in self._solids.values() if solid is not None)
         if solids:
@@ -144,18 +145,18 @@ class Decoder:
             lane_boundaries=tuple(self._lane_boundaries),
             solids=solids,
             hosts=tuple(self._hosts),
-            notes=tuple(f"{counted(number, noun)} {what}" for (noun, what), number in self._notes.items()),
+            notes=tuple(f"{count_noun(number, noun)} {what}" for (noun, what), number in self._notes.items()),
         )
 
     def _add_host(self, message: Any, truth: Any) -> None:
-        """Note the host: by the ground truth, else by the sensor view around it. An id of 0 is an id."""
-        for said in (truth, message):
-            if said.HasField("host_vehicle_id"):
-                self._hosts.append(str(said.host_vehicle_id.value))
+        """Add the host's id: that of the ground truth, else of the sensor view around it. An id of 0 is an id."""
+        for source in (truth, message):
+            if source.HasField("host_vehicle_id"):
+                self._hosts.append(str(source.host_vehicle_id.value))
                 return
 
     def _add_moving(self, objects: Any) -> None:
-        """One row each. Reading fields costs more than all else: each once, presence only where 0 is read."""
+        """Add a row for each. Reading fields costs most: each is read once, its presence only where it is 0."""
         number_of, next_number = self._moving_number, self._next_number
         add_object, add_class = self._object_ix.append, self._class_ix.append
         add_values, notes = self._values.extend, self._notes
@@ -185,7 +186,7 @@ class Decoder:
             add_values((x, y, z, yaw, vx, vy, size.length, size.width, size.height))
 
     def _add_stationary(self, objects: Any) -> None:
-        """One row each, of class `other`, at rest; none for those that have an outline of their own."""
+        """Add a row of class `other`, at rest, for each; none for those with a base polygon, which become solids."""
         number_of, notes = self._stationary_number, self._notes
         for stationary in objects:
             ident = stationary.id.value
@@ -209,7 +210,7 @@ class Decoder:
             self._values.extend((x, y, position.z, yaw, 0.0, 0.0, size.length, size.width, size.height))
 
     def _solid(self, ident: int, base: Any) -> Solid | None:
-        """The prism of an object over its base polygon, as high as its box; None where that is none: the box."""
+        """The prism over an object's base polygon, as high as its box; None: no base polygon, or no simple one."""
         if not base.base_polygon:
             return None
         import shapely
@@ -225,12 +226,12 @@ class Decoder:
         if outline is None or not outline.is_valid or not outline.area > 0.0:
             self._notes["stationary object", "whose base_polygon is no simple polygon: its box taken"] += 1
             return None
-        if not 0.0 < height_m <= FARTHEST_M:  # said of the box
+        if not 0.0 < height_m <= FARTHEST_M:  # a note tells of it when its box is assembled
             return None
         return Solid(f"object {ident}", corners, position.z - height_m / 2, height_m)
 
     def _add_lanes(self, boundaries: Any) -> None:
-        """Lines of two points and more, of points that are somewhere."""
+        """Add the boundaries that have two points or more; points beyond `FARTHEST_M` or NaN are left out."""
         for boundary in boundaries:
             points = [(p.position.x, p.position.y, p.position.z) for p in boundary.boundary_line]
             line = np.array(points, dtype=np.float64).reshape(-1, 3)
@@ -244,7 +245,7 @@ class Decoder:
         return number
 
     def _names(self) -> tuple[tuple[str, ...], list[bool]]:
-        """(N,) ids as text, and whether they move. A stationary object may have the id of a moving one."""
+        """(N,) ids as texts, and (N,) whether objects move. A stationary object may have the id of a moving one."""
         ids = [""] * (len(self._moving_number) + len(self._stationary_number))
         moving = [False] * len(ids)
         for ident, number in self._moving_number.items():
@@ -252,3 +253,20 @@ class Decoder:
         for ident, number in self._stationary_number.items():
             ids[number] = f"stationary:{ident}" if ident in self._moving_number else str(ident)
         return tuple(ids), moving
+
+
+def osi_id(object_id: str) -> int:
+    """The number OSI has for an object: its id where that is a number, else a stable hash of it."""
+    number = object_id.removeprefix("stationary:")
+    if number.isdigit() and int(number) < 2**64:
+        return int(number)
+    from copem_replay.core.random import object_words
+
+    return int(object_words([object_id])[0])
+
+
+def load_sensor_data_class() -> Any:
+    """The SensorData class, imported when first needed."""
+    from osi3.osi_sensordata_pb2 import SensorData
+
+    return SensorData

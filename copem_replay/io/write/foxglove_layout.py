@@ -1,7 +1,7 @@
 """Layouts for Foxglove and Lichtblick: the scenes of a replay.mcap side by side, or two configurations compared.
 
-Panels of scenes have their cameras in step and follow the ego; under them is when each object is known, and how old its
-entries are.
+Panels of scenes share their camera and follow the ego; under them, lanes show when each object is known, and curves the
+age of its entries.
 """
 
 from __future__ import annotations
@@ -15,25 +15,24 @@ from typing import Any
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
-from copem_replay.core.errors import InputError
-from copem_replay.core.text import unknown
+from copem_replay.core.errors import InputError, unknown_name_message
 from copem_replay.io.write.message_family import EGO_FRAME, MIDDLE_FRAME, TRUTH_TOPICS
 
 PREFIX, SUFFIX = "copem/", "/scene"
 EYE = {"perspective": True, "phi": 55, "thetaOffset": 45, "fovy": 45, "near": 0.5, "far": 5000}
-"""How the camera looks (chosen): degrees from above and around."""
+"""The camera: its angles from above and around, in degrees; other values change the picture only."""
 DISTANCE_M = 60.0
-"""From how far (chosen: whom the ego meets within two seconds is in the picture)."""
+"""Distance of the camera: objects that the ego meets within two seconds are in the picture."""
 TOLD_OBJECTS = 3
-"""Of how many objects the lanes and curves tell: those known at the most different times (chosen)."""
+"""Objects with lanes and curves, those known at the most different times; more make the strip too narrow to read."""
 _CDR_TEXT = 8
-"""What is before the text of a ROS 2 string: the head, and how long it is."""
+"""Bytes before the text of a ROS 2 string: the head, and the length."""
 _NEVER_NS = 2**62
 
 
 @dataclass(frozen=True)
-class Contents:
-    """What a replay.mcap has to show: configurations, objects, whether the truth is drawn, and the frame to follow."""
+class ReplayContents:
+    """The content of a replay.mcap: configurations, objects, whether the truth is drawn, and the frame to follow."""
 
     configurations: tuple[str, ...]
     objects: tuple[str, ...]
@@ -41,8 +40,8 @@ class Contents:
     follow: str | None
 
 
-def contents(replay: Path) -> Contents:
-    """What is in a replay.mcap. Raises InputError where it has no scene to show, or cannot be read."""
+def read_contents(replay: Path) -> ReplayContents:
+    """The content of a replay.mcap. Raises InputError: it has no scene to show, or cannot be read."""
     try:
         with replay.open("rb") as file:
             reader = make_reader(file)
@@ -65,46 +64,46 @@ def contents(replay: Path) -> Contents:
         raise InputError(f"{replay}: cannot be read: {' '.join(str(error).split())}") from None
     if not names:
         raise InputError(f"{replay}: expected topics {PREFIX}<configuration>{SUFFIX}, as in a replay.mcap, found none")
-    apart = {name: _apart(times, len(names)) for name, times in known.items()}
+    apart = {name: _detection_gap(times, len(names)) for name, times in known.items()}
     objects = sorted(apart, key=lambda name: -apart[name])[:TOLD_OBJECTS]
     follow = next((frame for frame in (EGO_FRAME, MIDDLE_FRAME) if frame.encode() in moves), None)
-    return Contents(names, tuple(objects), TRUTH_TOPICS[1] in topics, follow)
+    return ReplayContents(names, tuple(objects), TRUTH_TOPICS[1] in topics, follow)
 
 
-def _apart(times_ns: dict[str, int], configurations: int) -> int:
-    """How far apart the first and the last configuration know an object; one that never does is the last."""
+def _detection_gap(times_ns: dict[str, int], configurations: int) -> int:
+    """Time in ns between the first and the last configuration that knows an object; never knowing it is the latest."""
     last = _NEVER_NS if len(times_ns) < configurations else max(times_ns.values())
     return last - min(times_ns.values())
 
 
-def layout_of(replay: Path, compare: Sequence[str] = ()) -> dict[str, Any]:
+def build_layout(replay: Path, compare: Sequence[str] = ()) -> dict[str, Any]:
     """The layout: a panel per configuration, or of `compare` one with all of them and one of each.
 
-    Raises InputError where there is no scene to show, or none of a configuration.
+    Raises InputError: there is no scene to show, or none of a configuration.
     """
-    found = contents(replay)
+    contents = read_contents(replay)
     for name in compare:
-        if name not in found.configurations:
-            raise InputError(f"{replay}: {unknown('configuration', name, found.configurations)}")
-    shown = tuple(dict.fromkeys(compare)) or found.configurations
+        if name not in contents.configurations:
+            raise InputError(f"{replay}: {unknown_name_message('configuration', name, contents.configurations)}")
+    shown = tuple(dict.fromkeys(compare)) or contents.configurations
     groups = [(name,) for name in shown] if not compare else [shown, *((name,) for name in shown)]
-    scenes = {f"3D!{k}": _scene_panel(group, found) for k, group in enumerate(groups)}
-    told = _told(shown, found.objects) if found.objects else {}
-    rows = _grid(list(scenes))
+    scenes = {f"3D!{k}": _scene_panel(group, contents) for k, group in enumerate(groups)}
+    strip = _knowledge_panels(shown, contents.objects) if contents.objects else {}
+    rows = _arrange_grid(list(scenes))
     return {
-        "configById": {**scenes, **told},
+        "configById": {**scenes, **strip},
         "globalVariables": {},
         "userNodes": {},
         "playbackConfig": {"speed": 1},
-        "layout": _under(rows, _split("row", list(told))) if told else rows,
+        "layout": _stack_below(rows, _split_panels("row", list(strip))) if strip else rows,
     }
 
 
-def _told(configurations: Sequence[str], objects: Sequence[str]) -> dict[str, Any]:
-    """When each object is known, and how old its entries are."""
+def _knowledge_panels(configurations: Sequence[str], objects: Sequence[str]) -> dict[str, Any]:
+    """The panels of lanes (when each object is known) and of curves (the age of its entries)."""
     paths = [
-        (f"{name}: {one}", f"{PREFIX}{name}/status.objects[:]{{id=={json.dumps(one)}}}")
-        for one in objects
+        (f"{name}: {ident}", f"{PREFIX}{name}/status.objects[:]{{id=={json.dumps(ident)}}}")
+        for ident in objects
         for name in configurations
     ]
     lanes = [{"value": f"{path}.status", "label": label, "timestampMethod": "receiveTime"} for label, path in paths]
@@ -119,15 +118,15 @@ def _told(configurations: Sequence[str], objects: Sequence[str]) -> dict[str, An
                    "legendDisplay": "floating", "showXAxisLabels": True, "showYAxisLabels": True,
                    "showPlotValuesInLegend": False, "sidebarDimension": 240},
     }  # fmt: skip
-    return {key: {**_titled(titles[key]), **panel} for key, panel in panels.items()}
+    return {key: {**_title_settings(titles[key]), **panel} for key, panel in panels.items()}
 
 
-def _titled(title: str) -> dict[str, str]:
+def _title_settings(title: str) -> dict[str, str]:
     return {"foxglovePanelTitle": title, "lichtblickPanelTitle": title}
 
 
-def _scene_panel(configurations: Sequence[str], found: Contents) -> dict[str, Any]:
-    """A 3D panel of some configurations over the truth, which follows the ego."""
+def _scene_panel(configurations: Sequence[str], found: ReplayContents) -> dict[str, Any]:
+    """A 3D panel of some configurations over the truth, whose camera follows the ego."""
     camera = {**EYE, "distance": DISTANCE_M, "target": [0, 0, 0], "targetOffset": [0, 0, 0],
               "targetOrientation": [0, 0, 0, 1]}  # fmt: skip
     shown = {f"{PREFIX}{name}/{kind}" for name in configurations for kind in ("scene", "uncertainty")}
@@ -137,7 +136,7 @@ def _scene_panel(configurations: Sequence[str], found: Contents) -> dict[str, An
     grid = {"visible": True, "frameLocked": True, "label": "Grid", "instanceId": "grid", "layerId": "foxglove.Grid",
             "size": 200, "divisions": 20, "lineWidth": 1, "color": "#55555588"}  # fmt: skip
     return {
-        **_titled(" and ".join(configurations)),
+        **_title_settings(" and ".join(configurations)),
         "cameraState": camera,
         **({"followTf": found.follow, "followMode": "follow-position"} if found.follow else {}),
         "scene": {"syncCamera": True, "transforms": {"visible": False}},
@@ -147,20 +146,20 @@ def _scene_panel(configurations: Sequence[str], found: Contents) -> dict[str, An
     }
 
 
-def _under(scenes: Any, told: Any) -> dict[str, Any]:
+def _stack_below(scenes: Any, told: Any) -> dict[str, Any]:
     """Lanes and curves in a strip under the scenes."""
     return {"first": scenes, "second": told, "direction": "column", "splitPercentage": 72}
 
 
-def _grid(panels: Sequence[str]) -> Any:
-    """Rows of up to three, all panels of a row as wide, all rows as high."""
+def _arrange_grid(panels: Sequence[str]) -> Any:
+    """A grid of rows of up to three panels; panels of a row have one width, rows one height."""
     wide = 3 if len(panels) in (3, 5, 6) or len(panels) > 8 else 2
-    return _split("column", [_split("row", panels[k : k + wide]) for k in range(0, len(panels), wide)])
+    return _split_panels("column", [_split_panels("row", panels[k : k + wide]) for k in range(0, len(panels), wide)])
 
 
-def _split(direction: str, parts: Sequence[Any]) -> Any:
-    """The parts one after the other: a split has two sides, so the second holds the rest."""
+def _split_panels(direction: str, parts: Sequence[Any]) -> Any:
+    """The panels side by side; a split has two sides, so the second holds the rest."""
     if len(parts) == 1:
         return parts[0]
-    rest = _split(direction, parts[1:])
+    rest = _split_panels(direction, parts[1:])
     return {"first": parts[0], "second": rest, "direction": direction, "splitPercentage": round(100 / len(parts), 3)}

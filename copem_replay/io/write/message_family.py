@@ -1,52 +1,219 @@
-"""In what messages a replay is written: those of the family its recording is of.
+"""The families of messages in which a replay is written: OSI's and ROS 2's, by the messages of its recording.
 
-OSI: osi3.SensorData, foxglove.SceneUpdate (protobuf), and JSON; for all recordings but those of ROS 2. ROS 2: CDR
-only, for a file of the profile `ros2` holds nothing else.
+OSI: osi3.SensorData, foxglove.SceneUpdate (protobuf), and JSON, for all recordings but those of ROS 2. ROS 2: CDR only,
+since a file of the profile `ros2` holds nothing else.
+
+An MCAP file is copied here, too: every channel, message, metadata record and attachment as it was. A window restricts
+messages only. A sound file is read in order of log time through its index; a damaged one from its start as far as it
+goes, and sorted.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
 from typing import Any, Protocol
 
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Header, Message, Metadata, Schema
+from mcap.writer import Writer
+
 from copem_replay.core.colours import Rgb
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import TRUTH, Int, Scene
+from copem_replay.io.containers.mcap_records import (
+    DAMAGE,
+    MAGIC,
+    RecordsFromStart,
+    parse_record,
+    read_by_log_time,
+    read_record_at,
+    read_summary,
+    renumber_message,
+)
+from copem_replay.io.log import Log, open_file
 from copem_replay.io.recording import Recording
-from copem_replay.io.write import (
-    autoware_objects as detected_objects,
+from copem_replay.io.schemas.osi_ground_truth import SENSOR_DATA, load_sensor_data_class
+from copem_replay.io.schemas.registry import DETAIL_SCHEMA
+from copem_replay.io.window import is_kept
+from copem_replay.io.write.detail import (
+    DETAIL_JSON,
+    STATUS_JSON,
+    STATUS_SCHEMA,
+    STATUSES,
+    DetailWriter,
+    Event,
+    Statuses,
+    StatusWriter,
 )
-from copem_replay.io.write import (
-    cdr_writer as cdr_write,
+from copem_replay.io.write.osi import OSI_VERSION, SensorDataWriter
+from copem_replay.io.write.ros2 import (
+    DETECTED_OBJECTS,
+    HEAD,
+    SCENE_UPDATE,
+    STATUS,
+    STRING,
+    TRANSFORM,
+    CdrMessage,
+    DetectedObjectsWriter,
+    encode_string,
+    message_definition,
 )
-from copem_replay.io.write import (
-    detail_json as detail,
+from copem_replay.io.write.scene import (
+    FOXGLOVE_SCENE_SCHEMA,
+    FRAME_ID,
+    Ellipses,
+    Entity,
+    FoxgloveSceneWriter,
+    Pose,
+    Ros2SceneWriter,
+    UncertaintyWriter,
+    encode_ellipses,
+    encode_ros2_scene,
+    encode_ros2_transform,
+    encode_scene,
+    encode_transform,
+    load_scene_class,
+    load_transform_class,
 )
-from copem_replay.io.write import (
-    foxglove_scene as foxglove,
-)
-from copem_replay.io.write import (
-    foxglove_scene_ros2 as foxglove_ros2,
-)
-from copem_replay.io.write import (
-    osi_sensor_data as sensor_data,
-)
-from copem_replay.io.write.detail_json_writer import DetailWriter
-from copem_replay.io.write.drawing import Entity, Pose
-from copem_replay.io.write.osi_sensor_data_writer import SensorDataWriter
-from copem_replay.io.write.pass_through import Catalogue
-from copem_replay.io.write.ros2_definitions import STATUS, STRING, TRANSFORM, definition
-from copem_replay.io.write.status import JSON_SCHEMA as STATUS_JSON
-from copem_replay.io.write.status import SCHEMA as STATUS_SCHEMA
-from copem_replay.io.write.status import STATUSES, Statuses, StatusWriter
-from copem_replay.io.write.uncertainty import Ellipses, UncertaintyWriter
+
+
+class Catalogue:
+    """Schemas, channels and attachments of a file that is being written: equal ones are written once."""
+
+    def __init__(self, writer: Writer) -> None:
+        self.writer = writer
+        self._schemas: dict[tuple[str, str, bytes], int] = {}
+        self._channels: dict[tuple[object, ...], int] = {}
+        self._attached: set[tuple[object, ...]] = set()
+
+    def schema(self, name: str, encoding: str, data: bytes) -> int:
+        """The number of a schema, which is written if it is new."""
+        if (name, encoding, data) not in self._schemas:
+            self._schemas[name, encoding, data] = self.writer.register_schema(name, encoding, data)
+        return self._schemas[name, encoding, data]
+
+    def channel(self, topic: str, encoding: str, schema: int, metadata: dict[str, str]) -> int:
+        """The number of a channel, which is written if it is new."""
+        ordered = dict(sorted(metadata.items()))
+        key = (topic, encoding, schema, tuple(ordered.items()))
+        if key not in self._channels:
+            self._channels[key] = self.writer.register_channel(topic, encoding, schema, ordered)
+        return self._channels[key]
+
+    def attach(self, a: Attachment) -> None:
+        """Write an attachment if it is new."""
+        key = (a.create_time, a.log_time, a.name, a.media_type, a.data)
+        if key not in self._attached:
+            self._attached.add(key)
+            self.writer.add_attachment(*key)
+
+
+class OriginalMcap:
+    """An MCAP file to be copied: its channels and metadata, and its messages on demand.
+
+    `damage` says that not all of it can be copied, None where all can.
+    """
+
+    def __init__(self, log: Log) -> None:
+        self._log = log
+        self.damage: str | None = None
+        self.profile = ""
+        self.metadata: dict[str, dict[str, str]] = {}
+        self.channels: dict[int, Channel] = {}
+        self.attachments: list[Attachment] = []
+        self.start_ns = log.start_ns
+        self._schemas: dict[int, Schema] = {}
+        self._by_index = log.indexed and self._look_up()
+        if not self._by_index:
+            self._salvage()
+            if not log.complete or log.indexed:
+                self.damage = "damaged: its messages are copied as far as they can be read"
+
+    def _look_up(self) -> bool:
+        """Whether the file can be copied through its index; all that is copied is read once, since only that tells."""
+        try:
+            with open_file(self._log.path) as file:
+                summary = read_summary(file)
+                if summary is None:
+                    return False
+                header = parse_record(Opcode.HEADER, read_record_at(file, len(MAGIC), Opcode.HEADER))
+                metadata = [
+                    parse_record(Opcode.METADATA, read_record_at(file, index.offset, Opcode.METADATA))
+                    for index in summary.metadata_indexes
+                ]
+                attachments = [
+                    parse_record(Opcode.ATTACHMENT, read_record_at(file, index.offset, Opcode.ATTACHMENT))
+                    for index in summary.attachment_indexes
+                ]
+                for _message in read_by_log_time(file, summary, self._log.spans(summary.channels.keys())):
+                    pass
+        except DAMAGE:
+            return False
+        self.profile = header.profile if isinstance(header, Header) else ""
+        for record in metadata:
+            if isinstance(record, Metadata):
+                self._keep(record)
+        self.attachments = [record for record in attachments if isinstance(record, Attachment)]
+        self._schemas, self.channels = dict(summary.schemas), dict(summary.channels)
+        return True
+
+    def _salvage(self) -> None:
+        with open_file(self._log.path) as file:
+            stream = RecordsFromStart(file)
+            for record in stream:
+                if isinstance(record, Header):
+                    self.profile = record.profile
+                elif isinstance(record, Metadata):
+                    self._keep(record)
+                elif isinstance(record, Attachment):
+                    self.attachments.append(record)
+        self._schemas, self.channels = stream.schemas, stream.channels
+
+    def _keep(self, record: Metadata) -> None:
+        """Keep a metadata record, merged with others of its name: rosbag2 writes one name several times."""
+        self.metadata.setdefault(record.name, {}).update(record.metadata)
+
+    def register(self, catalogue: Catalogue, without: Collection[str] = ()) -> dict[int, int]:
+        """Put schemas, channels and attachments into the output. Returns the new number of each channel.
+
+        Channels of the topics `without` are left out, with their messages.
+        """
+        numbers: dict[int, int] = {}
+        for number, channel in sorted(self.channels.items()):
+            if channel.topic in without:
+                continue
+            schema = self._schemas.get(channel.schema_id)
+            schema_id = catalogue.schema(schema.name, schema.encoding, schema.data) if schema else 0
+            numbers[number] = catalogue.channel(
+                channel.topic, channel.message_encoding, schema_id, dict(channel.metadata)
+            )
+        for attachment in self.attachments:
+            catalogue.attach(attachment)
+        return numbers
+
+    def messages(self, numbers: Mapping[int, int]) -> Iterator[Message]:
+        """The messages in order of log time, with the channel numbers of the output."""
+        spans = self._log.spans(numbers.keys())
+        with open_file(self._log.path) as file:
+            if self._by_index and (summary := read_summary(file)) is not None:
+                messages = read_by_log_time(file, summary, spans)
+            else:
+                kept = (
+                    r
+                    for r in RecordsFromStart(file)
+                    if isinstance(r, Message) and is_kept(spans, r.channel_id, r.log_time)
+                )
+                messages = iter(sorted(kept, key=lambda message: message.log_time))
+            for message in messages:
+                yield renumber_message(message, numbers)
+
 
 OSI_CHANNEL = "net.asam.osi.trace.channel."
-_NAMELESS = "map"  # chosen: the name of the world frame where none is given, as REP 105 has it
+_NAMELESS = "map"  # name of the world frame where none is given, after REP 105
 
 _FOREVER = "\n    sec: 9223372036\n    nsec: 854775807"
 QOS = (
@@ -63,24 +230,24 @@ class ListWriter(Protocol):
         """The lists as they became available at these instants of the log's clock, (F,)."""
 
 
-class Opened(Protocol):
+class OpenedFamily(Protocol):
     """A family whose schemas are in the file that is being written."""
 
     osi: bool
     """Whether osi3 messages are written."""
 
     def channels(
-        self, name: str, fused_tracks: FusedTracks, events: Mapping[int, Sequence[detail.Event]], colour: Rgb
+        self, name: str, fused_tracks: FusedTracks, events: Mapping[int, Sequence[Event]], colour: Rgb
     ) -> dict[int, ListWriter]:
         """The channels of a configuration: `objects`, `scene`, `detail`, in this order."""
 
     def seen_besides(
         self, name: str, fused_tracks: FusedTracks, statuses: Statuses, colour: Rgb
     ) -> dict[int, ListWriter]:
-        """The channels of a configuration that are only for looking at: `status`, `uncertainty`."""
+        """The channels of a configuration for viewers: `status`, `uncertainty`."""
 
     def truth(self) -> TruthWriter:
-        """What puts the truth into the file as a scene of its own."""
+        """The writer of the truth as a scene of its own."""
 
 
 @dataclass(frozen=True)
@@ -94,66 +261,64 @@ class TruthWriter:
     followed: Callable[[Pose, int, str], bytes]
 
 
-Family = Callable[[Catalogue, Scene, Mapping[str, int]], Opened]
-"""Puts the schemas into a file; the last: the numbers by which units go."""
+Family = Callable[[Catalogue, Scene, Mapping[str, int]], OpenedFamily]
+"""Puts a family's schemas into a file. The last argument: the number of each unit."""
 
 
-def family_of(recording: Recording) -> Family:
-    """The family a recording is of, by how the truth is encoded."""
+def find_family(recording: Recording) -> Family:
+    """The family of a recording, by the encoding of its truth."""
     if recording.encoding == "cdr":
-        return partial(_Ros2, frame_id=recording.world or _NAMELESS)
-    return partial(_Osi, frame_id=recording.world or foxglove.FRAME_ID)
+        return partial(_Ros2Family, frame_id=recording.world or _NAMELESS)
+    return partial(_OsiFamily, frame_id=recording.world or FRAME_ID)
 
 
-def topics_of(configuration: str) -> list[str]:
-    """The topics of a configuration, whatever the family."""
+def list_topics(configuration: str) -> list[str]:
+    """The topics of a configuration's lists, in any family: objects, scene, detail."""
     return [f"copem/{configuration}/{kind}" for kind in ("objects", "scene", "detail")]
 
 
-def more_topics_of(configuration: str) -> list[str]:
-    """Its topics that are only for looking at."""
+def list_extra_topics(configuration: str) -> list[str]:
+    """The topics of a configuration for viewers: status, uncertainty."""
     return [f"copem/{configuration}/{kind}" for kind in ("status", "uncertainty")]
 
 
 TRUTH_TOPICS = [f"copem/{TRUTH}/{kind}" for kind in ("scene", "static", "transform")]
-"""The truth as a scene of its own: what moves, what does not, where the ego is."""
+"""Topics of the truth's scene: moving objects, static ones, the ego's pose."""
 EGO_FRAME, MIDDLE_FRAME = "copem_ego", "copem_middle"
-"""Frames of reference to follow: one moves with the ego, the other, without an ego, stands amid all objects."""
+"""Frames of reference to follow: one moves with the ego, the other, without an ego, stands in the middle of objects."""
 
 
 def osi_version() -> str:
-    """Of OSI, what is written."""
-    return ".".join(map(str, sensor_data.OSI_VERSION))
+    """The version of OSI that is written."""
+    return ".".join(map(str, OSI_VERSION))
 
 
-class _Osi:
+class _OsiFamily:
     """osi3.SensorData; foxglove.SceneUpdate in the frame of reference `frame_id`; details as JSON."""
 
     osi = True
 
-    def __init__(
-        self, catalogue: Catalogue, scene: Scene, units: Mapping[str, int], frame_id: str = foxglove.FRAME_ID
-    ) -> None:
+    def __init__(self, catalogue: Catalogue, scene: Scene, units: Mapping[str, int], frame_id: str = FRAME_ID) -> None:
         self._catalogue, self._scene, self._units, self._frame_id = catalogue, scene, units, frame_id
-        self._objects = _protobuf(catalogue, sensor_data.message_class(), sensor_data.SCHEMA)
-        self._scenes = _protobuf(catalogue, foxglove.message_class(), foxglove.SCHEMA)
-        self._details = catalogue.schema(detail.SCHEMA, "jsonschema", json.dumps(detail.JSON_SCHEMA).encode())
+        self._objects = _add_protobuf_channel(catalogue, load_sensor_data_class(), SENSOR_DATA)
+        self._scenes = _add_protobuf_channel(catalogue, load_scene_class(), FOXGLOVE_SCENE_SCHEMA)
+        self._details = catalogue.schema(DETAIL_SCHEMA, "jsonschema", json.dumps(DETAIL_JSON).encode())
 
     def channels(
-        self, name: str, fused_tracks: FusedTracks, events: Mapping[int, Sequence[detail.Event]], colour: Rgb
+        self, name: str, fused_tracks: FusedTracks, events: Mapping[int, Sequence[Event]], colour: Rgb
     ) -> dict[int, ListWriter]:
         description = {
             f"{OSI_CHANNEL}description": f"fused object list of configuration {name}",
             f"{OSI_CHANNEL}osi_version": osi_version(),
             f"{OSI_CHANNEL}protobuf_version": version("protobuf"),
         }
-        objects, scenes, details = topics_of(name)
+        objects, scenes, details = list_topics(name)
         channel, scene = self._catalogue.channel, self._scene
         return {
             channel(objects, "protobuf", self._objects, description): SensorDataWriter(
                 scene, fused_tracks, self._units
             ),
-            channel(scenes, "protobuf", self._scenes, {}): foxglove.SceneWriter(
+            channel(scenes, "protobuf", self._scenes, {}): FoxgloveSceneWriter(
                 scene, fused_tracks, name, colour, self._frame_id
             ),
             channel(details, "json", self._details, {}): DetailWriter(scene, fused_tracks, events),
@@ -162,27 +327,27 @@ class _Osi:
     def seen_besides(
         self, name: str, fused_tracks: FusedTracks, statuses: Statuses, colour: Rgb
     ) -> dict[int, ListWriter]:
-        catalogue, (status, uncertainty) = self._catalogue, more_topics_of(name)
-        said = catalogue.schema(STATUS_SCHEMA, "jsonschema", json.dumps(STATUS_JSON).encode())
+        catalogue, (status, uncertainty) = self._catalogue, list_extra_topics(name)
+        schema = catalogue.schema(STATUS_SCHEMA, "jsonschema", json.dumps(STATUS_JSON).encode())
         return {
-            catalogue.channel(status, "json", said, {}): StatusWriter(statuses),
+            catalogue.channel(status, "json", schema, {}): StatusWriter(statuses),
             catalogue.channel(uncertainty, "protobuf", self._scenes, {}): UncertaintyWriter(
-                self._scene, fused_tracks, colour, partial(foxglove.ellipses, frame_id=self._frame_id)
+                self._scene, fused_tracks, colour, partial(encode_ellipses, frame_id=self._frame_id)
             ),
         }
 
     def truth(self) -> TruthWriter:
-        moves = _protobuf(self._catalogue, foxglove.transform_class(), "foxglove.FrameTransform")
+        moves = _add_protobuf_channel(self._catalogue, load_transform_class(), "foxglove.FrameTransform")
         schemas = zip(TRUTH_TOPICS, (self._scenes, self._scenes, moves), strict=True)
         scene, static, ego = (self._catalogue.channel(topic, "protobuf", schema, {}) for topic, schema in schemas)
-        placed = partial(foxglove.transform, self._frame_id)
+        placed = partial(encode_transform, self._frame_id)
         return TruthWriter(scene, static, ego, self.drawn, placed)
 
     def drawn(self, entities: Sequence[Entity], time_ns: int) -> bytes:
-        return foxglove.drawn(entities, time_ns, self._frame_id)
+        return encode_scene(entities, time_ns, self._frame_id)
 
 
-class _Ros2:
+class _Ros2Family:
     """autoware_perception_msgs/DetectedObjects and foxglove_msgs/SceneUpdate in the frame of reference `frame_id`; the
     JSON of the details as std_msgs/String.
     """
@@ -192,45 +357,45 @@ class _Ros2:
     def __init__(self, catalogue: Catalogue, scene: Scene, units: Mapping[str, int], frame_id: str) -> None:
         self._catalogue, self._scene, self._frame_id = catalogue, scene, frame_id
         self._schemas = [
-            catalogue.schema(name, "ros2msg", definition(name))
-            for name in (detected_objects.SCHEMA, foxglove_ros2.SCHEMA, STRING)
+            catalogue.schema(name, "ros2msg", message_definition(name))
+            for name in (DETECTED_OBJECTS, SCENE_UPDATE, STRING)
         ]
 
     def channels(
-        self, name: str, fused_tracks: FusedTracks, events: Mapping[int, Sequence[detail.Event]], colour: Rgb
+        self, name: str, fused_tracks: FusedTracks, events: Mapping[int, Sequence[Event]], colour: Rgb
     ) -> dict[int, ListWriter]:
         scene, frame_id = self._scene, self._frame_id
-        objects = detected_objects.DetectedObjectsWriter(scene, fused_tracks, frame_id)
+        objects = DetectedObjectsWriter(scene, fused_tracks, frame_id)
         details = DetailWriter(scene, fused_tracks, events, sizes_of=objects.round)
         writers: list[ListWriter] = [
-            _ListByList(objects.message),
-            _ListByList(foxglove_ros2.SceneWriter(scene, fused_tracks, name, colour, frame_id).message),
-            _AsString(details),
+            _SingleListEncoder(objects.message),
+            _SingleListEncoder(Ros2SceneWriter(scene, fused_tracks, name, colour, frame_id).message),
+            _StringEncoder(details),
         ]
         numbers = [
             self._catalogue.channel(topic, "cdr", schema, {"offered_qos_profiles": QOS})
-            for topic, schema in zip(topics_of(name), self._schemas, strict=True)
+            for topic, schema in zip(list_topics(name), self._schemas, strict=True)
         ]
         return dict(zip(numbers, writers, strict=True))
 
     def seen_besides(
         self, name: str, fused_tracks: FusedTracks, statuses: Statuses, colour: Rgb
     ) -> dict[int, ListWriter]:
-        schemas = self._catalogue.schema(STATUS, "ros2msg", definition(STATUS)), self._schemas[1]
-        numbers = [self._channel(topic, schema) for topic, schema in zip(more_topics_of(name), schemas, strict=True)]
+        schemas = self._catalogue.schema(STATUS, "ros2msg", message_definition(STATUS)), self._schemas[1]
+        numbers = [self._channel(topic, schema) for topic, schema in zip(list_extra_topics(name), schemas, strict=True)]
         uncertainty = UncertaintyWriter(self._scene, fused_tracks, colour, self._ellipses)
-        writers: list[ListWriter] = [_AsStatus(statuses), uncertainty]
+        writers: list[ListWriter] = [_StatusEncoder(statuses), uncertainty]
         return dict(zip(numbers, writers, strict=True))
 
     def truth(self) -> TruthWriter:
-        moves = self._catalogue.schema(TRANSFORM, "ros2msg", definition(TRANSFORM))
+        moves = self._catalogue.schema(TRANSFORM, "ros2msg", message_definition(TRANSFORM))
         schemas = zip(TRUTH_TOPICS, (self._schemas[1], self._schemas[1], moves), strict=True)
         scene, static, ego = (self._channel(topic, schema) for topic, schema in schemas)
-        placed = partial(foxglove_ros2.transform, self._frame_id)
+        placed = partial(encode_ros2_transform, self._frame_id)
         return TruthWriter(scene, static, ego, self.drawn, placed)
 
     def drawn(self, entities: Sequence[Entity], time_ns: int) -> bytes:
-        return foxglove_ros2.drawn(entities, time_ns, self._frame_id)
+        return encode_ros2_scene(entities, time_ns, self._frame_id)
 
     def _ellipses(self, ellipses: Ellipses, time_ns: Int, start: Int) -> Iterator[bytes]:
         every = ellipses.entities()
@@ -241,11 +406,11 @@ class _Ros2:
         return self._catalogue.channel(topic, "cdr", schema, {"offered_qos_profiles": QOS})
 
 
-OSI: Family = _Osi
+OSI: Family = _OsiFamily
 """The family of all recordings but those of ROS 2."""
 
 
-class _AsStatus:
+class _StatusEncoder:
     """Statuses as copem_replay_msgs/Status."""
 
     def __init__(self, statuses: Statuses) -> None:
@@ -254,7 +419,7 @@ class _AsStatus:
     def messages(self, available_ns: Int) -> Iterator[bytes]:
         status, age_s = self._statuses.at(available_ns)
         for time_ns, each, ages in zip(available_ns.tolist(), status.tolist(), age_s.tolist(), strict=True):
-            out = cdr_write.Cdr()
+            out = CdrMessage()
             out.stamp(time_ns)
             out.add("I", len(each))
             for name, which, age in zip(self._statuses.names, each, ages, strict=True):
@@ -264,18 +429,18 @@ class _AsStatus:
             yield out.message()
 
 
-class _AsString:
-    """A writer of JSON whose messages go as std_msgs/String."""
+class _StringEncoder:
+    """Messages of JSON as std_msgs/String."""
 
     def __init__(self, writer: ListWriter) -> None:
         self._writer = writer
 
     def messages(self, available_ns: Int) -> Iterator[bytes]:
-        return (cdr_write.HEAD + cdr_write.text(data.decode()) for data in self._writer.messages(available_ns))
+        return (HEAD + encode_string(data.decode()) for data in self._writer.messages(available_ns))
 
 
-class _ListByList:
-    """What makes one message at a time, of the number of its list and the instant."""
+class _SingleListEncoder:
+    """Messages made one at a time, from the number of a list and its instant."""
 
     def __init__(self, message: Callable[[int, int], bytes]) -> None:
         self._message = message
@@ -284,7 +449,7 @@ class _ListByList:
         return (self._message(frame, time_ns) for frame, time_ns in enumerate(available_ns.tolist()))
 
 
-def _protobuf(catalogue: Catalogue, message_class: Any, name: str) -> int:
+def _add_protobuf_channel(catalogue: Catalogue, message_class: Any, name: str) -> int:
     from mcap_protobuf.schema import build_file_descriptor_set
 
     data = build_file_descriptor_set(message_class).SerializeToString(deterministic=True)

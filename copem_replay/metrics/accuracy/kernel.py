@@ -1,4 +1,12 @@
-"""The sums of `metrics/accuracy/statistics.py`, in one pass over lists of all runs. What they mean is said there."""
+"""The compiled sums of accuracy, in one pass over the lists of all runs; `metrics/accuracy/statistics.py` defines them.
+
+The NEES of pairs is cut off by the gate. Of an error whose covariance is as stated, of eigenvalues λ₁ ≥ λ₂, eᵀP⁻¹e is
+χ² of two degrees of freedom, and in direction φ of the whitened error its length squared is that times s(φ) = λ₁cos²φ +
+λ₂sin²φ: within the gate g while eᵀP⁻¹e ≤ t = g²/s. The share e^(−t/2) of errors is beyond it; of those within, the
+first and the second moment, not yet divided by the share within, are 2 − (t + 2)e^(−t/2) and 8 − (t² + 4t + 8)e^(−t/2).
+All are means over φ, periodic and smooth: 64 equal steps give six digits where one axis is twenty times the other.
+Source: χ² of two degrees of freedom is the exponential distribution of mean 2; the moments are its truncated ones.
+"""
 
 from __future__ import annotations
 
@@ -8,20 +16,81 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from copem_replay.core.kernels import borrowing
+from copem_replay.core.compiled import borrowing
+from copem_replay.core.geometry import is_in_area
 from copem_replay.core.object_list import Entries
-from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int
-from copem_replay.metrics.accuracy.nees import expected, nees
-from copem_replay.metrics.area import in_area
+from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int
 from copem_replay.metrics.gospa import gospa_pairs
 from copem_replay.metrics.matching import DUPLICATE, GHOST, MATCH
 
-_TOLERANCE_S = SAME_INSTANT_NS * 1e-9
+# NEES, and its moments within a gate.
+
+SMALLEST_VARIANCE_M2 = 1e-9
+"""Eigenvalues of a covariance count as at least this, (0.03 mm)²: a claimed variance of 0 then has a finite NEES."""
+
+_ROUND = np.cos((np.arange(16) + 0.5) * np.pi / 16)
+"""cos 2φ at 64 equal steps of φ round the circle, each value once: each occurs four times."""
+_NEARLY_ROUND = np.cos((np.arange(8) + 0.5) * np.pi / 8)
+"""cos 2φ at 32 equal steps, which are enough where the axes are alike (`_ALIKE`)."""
+_ALIKE = 5.0
+"""Up to this ratio of eigenvalues 32 steps and 64 agree to five digits."""
+_NONE = 80.0
+"""From this t on no error is beyond the gate: e⁻⁴⁰ is below the rounding of 1."""
+_SMALL = 1e-3
+"""Below this g²/λ₂ the moments are the first terms of their series, which are good to 1e-7 there."""
+_LEAST = 1e-30
+"""t is at least this, so that the share within is not 0."""
+
+
+@borrowing
+def compute_nees(a: float, b: float, d: float, east_m: float, north_m: float) -> tuple[float, float, float]:
+    """eᵀP⁻¹e of an error and P = ((a, b), (b, d)), and the eigenvalues of P, the larger first: (1, m², m²)."""
+    half, turn = (a + d) / 2, np.hypot((a - d) / 2, b)
+    along = 0.5 * np.arctan2(2 * b, a - d)  # the direction of the larger eigenvalue
+    u, v = east_m * np.cos(along) + north_m * np.sin(along), north_m * np.cos(along) - east_m * np.sin(along)
+    large, small = max(half + turn, SMALLEST_VARIANCE_M2), max(half - turn, SMALLEST_VARIANCE_M2)
+    return float(u * u / large + v * v / small), large, small
+
+
+@borrowing
+def expect_gated_nees(large_m2: float, small_m2: float, gate_m: float) -> tuple[float, float, float]:
+    """The share of errors beyond a gate, and mean NEES and mean squared NEES of those within, for two eigenvalues."""
+    square = gate_m * gate_m
+    if square >= _NONE * large_m2:
+        return 0.0, 2.0, 8.0
+    if square < _SMALL * small_m2:
+        return _expand_small_gate(large_m2, small_m2, square)
+    mean, half = (large_m2 + small_m2) / 2, (large_m2 - small_m2) / 2
+    steps = _NEARLY_ROUND if large_m2 <= _ALIKE * small_m2 else _ROUND
+    beyond = first = second = 0.0
+    for step in steps:
+        t = square / (mean + half * step)
+        e = np.exp(-t / 2)
+        beyond += e
+        first += (t + 2) * e
+        second += ((t + 4) * t + 8) * e
+    n = len(steps)
+    within = n - beyond
+    return beyond / n, (2 * n - first) / within, (8 * n - second) / within
+
+
+@borrowing
+def _expand_small_gate(large_m2: float, small_m2: float, square: float) -> tuple[float, float, float]:
+    # As `expect_gated_nees` for small t, where its differences are rounding only: the first terms of their series.
+    within = first = second = 0.0
+    for step in _ROUND:
+        t = max(square / ((large_m2 + small_m2) / 2 + (large_m2 - small_m2) / 2 * step), _LEAST)
+        within += t / 2 - t * t / 8
+        first += t * t / 4 - t**3 / 12
+        second += t**3 / 6 - t**4 / 16
+    return 1.0 - within / len(_ROUND), first / within, second / within
+
+
 Records = NDArray[Any]
 
 
-class World(NamedTuple):
-    """The truth list by list, in each by object: that of list k is rows `start[k] : start[k + 1]`."""
+class TruthByList(NamedTuple):
+    """The truth list by list, in each by object: list k has rows `start[k] : start[k + 1]`."""
 
     start: Int  # (K + 1,)
     object_ix: Int  # (P,), as all that follow
@@ -31,29 +100,29 @@ class World(NamedTuple):
     vy_mps: Float
 
 
-class Found(NamedTuple):
-    """What entries are matched with. All (N,)."""
+class EntryMatches(NamedTuple):
+    """The matches of entries. All (N,)."""
 
     object_ix: Int
     role: NDArray[np.int8]
-    x_m: Float  # where it is then
+    x_m: Float  # of the matched object
     y_m: Float
-    class_ix: NDArray[np.int8]  # what entries say themselves
+    class_ix: NDArray[np.int8]  # the entry's own most probable class
 
 
-class Stays(NamedTuple):
+class EpisodeLists(NamedTuple):
     """Which lists count for each episode. All (M,) but the first."""
 
     episode_of: Int  # (N,) by object, −1: not measured
     first_list: Int  # lists first_list … first_list + lists − 1
     lists: Int
-    column: Int  # of the first one in the arrays list by list
+    column: Int  # of the first list, in the arrays list by list
     onset_s: Float
     ended_s: Float
 
 
-class Asked(NamedTuple):
-    """Parameters."""
+class AccuracyParameters(NamedTuple):
+    """The settings of accuracy as arrays and numbers; `AccuracySettings` has their meaning."""
 
     cutoff_m: float
     power: float
@@ -62,11 +131,11 @@ class Asked(NamedTuple):
     distance_edges_m: Float
     time_edges_s: Float
     existence_thresholds: Float
-    annotated_m: Float  # (V, 2) corners, none: anywhere
+    annotated_m: Float  # (V, 2) corners; none: everywhere
     annotated_range_m: float
 
 
-class Sums(NamedTuple):
+class AccuracySums(NamedTuple):
     """Where the sums go: fields and shapes are those of `Accuracy`."""
 
     error_m: NDArray[np.float32]
@@ -79,32 +148,32 @@ class Sums(NamedTuple):
     by_existence: Records
 
 
-class SoFar(NamedTuple):
-    """What goes on from list to list. All (S, M)."""
+class EpisodeStates(NamedTuple):
+    """What is carried from list to list. All (S, M)."""
 
-    last_track: Int  # as which it was matched last, −1: as none
+    last_track: Int  # the track of the object's last pair, −1: none
     unknown_since_s: Float  # NaN: known
 
 
-class _Here(NamedTuple):
-    # The objects whose stay has the list at hand, and their matches in the run at hand.
+class _ListScratch(NamedTuple):
+    # The objects whose stay includes the list at hand, and their matches in the run at hand.
     episode: Int
     row: Int  # of the truth, −1: it has a gap there
     distance_band: Int
-    pair: Int  # the entry that is about it, −1: none
-    match: Int  # the one that is matched with it now, −1: none
+    pair: Int  # the entry that is about the object, −1: none
+    match: Int  # the entry that is matched with it now, −1: none
     target: Int  # its place among the targets, −1: not looked at now
-    place_of: Int  # by episode: its place here, −1: not here
+    place_of: Int  # by episode: its place in these arrays, −1: none
 
 
 class _Targets(NamedTuple):
-    # Those of them that are looked at now: the truth of GOSPA.
+    # The objects that are looked at now: the truth of GOSPA.
     episode: Int
     column: Int  # of this list in the arrays list by list
     x_m: Float
     y_m: Float
     partner: Int
-    false: Int  # estimates without a partner that are nearest to it
+    false: Int  # number of estimates without a partner that are nearest to it
 
 
 class _Estimates(NamedTuple):
@@ -116,10 +185,11 @@ class _Estimates(NamedTuple):
 
 @nb.njit(cache=True, nogil=True)
 def add_up(
-    start: Int, entries: Entries, about: Found, now: Found, issue_s: Float, world: World, stays: Stays,
-    reference_x_m: Float, reference_y_m: Float, present: Bool, asked: Asked, so_far: SoFar, out: Sums,
+    start: Int, entries: Entries, about: EntryMatches, now: EntryMatches, issue_s: Float, world: TruthByList,
+    stays: EpisodeLists, reference_x_m: Float, reference_y_m: Float, present: Bool, asked: AccuracyParameters,
+    so_far: EpisodeStates, out: AccuracySums,
 ) -> None:  # fmt: skip
-    """Add the next K lists of S runs. Numbers of lists in `stays` count from the first of them.
+    """Add the next K lists of S runs to `out`. Numbers of lists in `stays` count from the first of them.
 
     `about`: matches at the instants the entries tell of; `now`: at those the lists are available.
     """
@@ -128,7 +198,7 @@ def add_up(
     for s in range(S):
         for k in range(len(issue_s)):
             longest = max(longest, start[s, k + 1] - start[s, k])
-    here = _Here(
+    here = _ListScratch(
         np.empty(M, np.int64), np.empty(M, np.int64), np.empty(M, np.int64), np.empty(M, np.int64),
         np.empty(M, np.int64), np.empty(M, np.int64), np.full(M, -1),
     )  # fmt: skip
@@ -137,73 +207,77 @@ def add_up(
         np.empty(M, np.int64),
     )  # fmt: skip
     estimates = _Estimates(np.empty(longest), np.empty(longest), np.empty(longest, np.bool_))
-    _each_list(
+    _add_each_list(
         start, entries, about, now, issue_s, world, stays, (reference_x_m, reference_y_m, present), asked, so_far, out,
         (here, targets, estimates),
     )  # fmt: skip
 
 
 @borrowing
-def _each_list(
-    start: Int, entries: Entries, about: Found, now: Found, issue_s: Float, world: World, stays: Stays,
-    reference: tuple[Float, Float, Bool], asked: Asked, so_far: SoFar, out: Sums,
-    scratch: tuple[_Here, _Targets, _Estimates],
+def _add_each_list(
+    start: Int, entries: Entries, about: EntryMatches, now: EntryMatches, issue_s: Float, world: TruthByList,
+    stays: EpisodeLists, reference: tuple[Float, Float, Bool], asked: AccuracyParameters, so_far: EpisodeStates,
+    out: AccuracySums, scratch: tuple[_ListScratch, _Targets, _Estimates],
 ) -> None:  # fmt: skip
     reference_x_m, reference_y_m, present = reference
     here, targets, estimates = scratch
     S = len(out.by_object)
-    # What is expected of a covariance: of one list after the other it is mostly the same one.
+    # The expected moments are kept while the covariance stays the same, which it mostly does from list to list.
     large_m2 = small_m2 = np.nan
-    beyond = mean = second = np.nan
+    beyond = nees_expected = nees_square_expected = np.nan
     for k in range(len(issue_s)):
         if not present[k]:
             continue
         from_m = (reference_x_m[k], reference_y_m[k])
-        n, wanted = _gather(k, issue_s[k], world, stays, from_m, asked, here, targets)
-        time_band = _band(asked.time_edges_s, issue_s[k])
+        n, wanted = _gather_targets(k, issue_s[k], world, stays, from_m, asked, here, targets)
+        time_band = _find_band(asked.time_edges_s, issue_s[k])
         for s in range(S):
             here.pair[:n] = -1
             here.match[:n] = -1
-            count = _entries(
+            count = _add_entries(
                 s, start[s, k], start[s, k + 1], entries, about, now, stays, from_m, time_band, asked,
                 here, targets, wanted, estimates, out,
             )  # fmt: skip
             for h in range(n):
                 m, match = here.episode[h], here.match[h]
                 if here.target[h] >= 0:
-                    _look(out.by_object[s], m, match)
-                    _look(out.by_distance[s], here.distance_band[h], match)
-                    _look(out.by_time[s], time_band, match)
+                    _count_look(out.by_object[s], m, match)
+                    _count_look(out.by_distance[s], here.distance_band[h], match)
+                    _count_look(out.by_time[s], time_band, match)
                 if here.row[h] >= 0:
-                    _follow(out.by_object[s, m], m, match, issue_s[k], stays, so_far.unknown_since_s[s])
+                    _update_gap(out.by_object[s, m], m, match, issue_s[k], stays, so_far.unknown_since_s[s])
                 i, p = here.pair[h], here.row[h]
                 if i < 0:
                     continue
                 entry, sums = entries[i], out.by_object[s, m]
                 then_east_m, then_north_m = entry.x_m - about.x_m[i], entry.y_m - about.y_m[i]
-                of, large, small = nees(entry.cov_ee_m2, entry.cov_en_m2, entry.cov_nn_m2, then_east_m, then_north_m)
+                nees, large, small = compute_nees(
+                    entry.cov_ee_m2, entry.cov_en_m2, entry.cov_nn_m2, then_east_m, then_north_m
+                )
                 if large != large_m2 or small != small_m2:
                     large_m2, small_m2 = large, small
-                    beyond, mean, second = expected(large, small, asked.gate_m)
+                    beyond, nees_expected, nees_square_expected = expect_gated_nees(large, small, asked.gate_m)
                 square_m2, age_of_information_s = then_east_m**2 + then_north_m**2, issue_s[k] - entry.captured_s
-                _further(sums, entry, square_m2, beyond, second, age_of_information_s, m, so_far.last_track[s])
+                _add_object_sums(
+                    sums, entry, square_m2, beyond, nees_square_expected, age_of_information_s, m, so_far.last_track[s]
+                )
                 east_m = north_m = np.nan
                 if p >= 0:
                     east_m, north_m = entry.x_m - world.x_m[p], entry.y_m - world.y_m[p]
                     out.error_m[s, stays.column[m] + k - stays.first_list[m]] = np.hypot(east_m, north_m)
                     vx_mps, vy_mps = entry.vx_mps - world.vx_mps[p], entry.vy_mps - world.vy_mps[p]
                     sums.velocity_square_m2ps2 += vx_mps**2 + vy_mps**2
-                _add_pair(out.by_object[s], m, east_m, north_m, of, mean)
-                _add_pair(out.by_distance[s], here.distance_band[h], east_m, north_m, of, mean)
-                _add_pair(out.by_time[s], time_band, east_m, north_m, of, mean)
-            _gospa(out.gospa[s], out.by_object[s], out.by_run[s], targets, wanted, estimates, count, asked)
+                _add_pair(out.by_object[s], m, east_m, north_m, nees, nees_expected)
+                _add_pair(out.by_distance[s], here.distance_band[h], east_m, north_m, nees, nees_expected)
+                _add_pair(out.by_time[s], time_band, east_m, north_m, nees, nees_expected)
+            _add_gospa(out.gospa[s], out.by_object[s], out.by_run[s], targets, wanted, estimates, count, asked)
         for h in range(n):
             here.place_of[here.episode[h]] = -1
 
 
 @borrowing
-def close(stays: Stays, so_far: SoFar, out: Sums) -> None:
-    """Add what ends with the episodes, after all lists."""
+def close_episodes(stays: EpisodeLists, so_far: EpisodeStates, out: AccuracySums) -> None:
+    """Add the gaps that last until the episodes end, after all lists."""
     S, M = out.by_object.shape
     for s in range(S):
         for m in range(M):
@@ -213,11 +287,12 @@ def close(stays: Stays, so_far: SoFar, out: Sums) -> None:
 
 
 @borrowing
-def _gather(
-    k: int, issue_s: float, world: World, stays: Stays, from_m: tuple[float, float], asked: Asked, here: _Here,
-    targets: _Targets,
+def _gather_targets(
+    k: int, issue_s: float, world: TruthByList, stays: EpisodeLists, from_m: tuple[float, float],
+    asked: AccuracyParameters, here: _ListScratch, targets: _Targets,
 ) -> tuple[int, int]:  # fmt: skip
-    # How many objects are in their stay at list k, last those in a gap of the truth; and how many are looked at.
+    # Out: the objects whose stay includes list k, those in a gap of the truth last. Returns their number, and the
+    # number of those that are looked at.
     n = wanted = 0
     for p in range(world.start[k], world.start[k + 1]):
         m = stays.episode_of[world.object_ix[p]]
@@ -225,8 +300,8 @@ def _gather(
             continue
         away_m = np.hypot(world.x_m[p] - from_m[0], world.y_m[p] - from_m[1])
         here.episode[n], here.row[n], here.place_of[m] = m, p, n
-        here.distance_band[n], here.target[n] = _band(asked.distance_edges_m, away_m), -1
-        if issue_s >= stays.onset_s[m] - _TOLERANCE_S:
+        here.distance_band[n], here.target[n] = _find_band(asked.distance_edges_m, away_m), -1
+        if issue_s >= stays.onset_s[m] - SAME_INSTANT_S:
             here.target[n] = wanted
             targets.episode[wanted], targets.column[wanted] = m, stays.column[m] + k - stays.first_list[m]
             targets.x_m[wanted], targets.y_m[wanted] = world.x_m[p], world.y_m[p]
@@ -241,12 +316,12 @@ def _gather(
 
 
 @borrowing
-def _entries(
-    s: int, first: int, after: int, entries: Entries, about: Found, now: Found, stays: Stays,
-    from_m: tuple[float, float], time_band: int, asked: Asked, here: _Here, targets: _Targets, wanted: int,
-    estimates: _Estimates, out: Sums,
+def _add_entries(
+    s: int, first: int, after: int, entries: Entries, about: EntryMatches, now: EntryMatches, stays: EpisodeLists,
+    from_m: tuple[float, float], time_band: int, asked: AccuracyParameters, here: _ListScratch, targets: _Targets,
+    wanted: int, estimates: _Estimates, out: AccuracySums,
 ) -> int:  # fmt: skip
-    # Find the matches in a list of run s, count its other entries, and say how many GOSPA counts.
+    # Find the matches in a list of run s and count its other entries. Returns the number of entries in GOSPA.
     count = 0
     for i in range(first, after):
         if about.role[i] == MATCH:
@@ -265,7 +340,7 @@ def _entries(
         measured = asked.measured_class[about.class_ix[i]]
         nowhere = now.role[i] == GHOST
         if (nowhere or about.role[i] == GHOST) and measured:
-            annotated = in_area(
+            annotated = is_in_area(
                 entries[i].x_m, entries[i].y_m, from_m[0], from_m[1], asked.annotated_m, asked.annotated_range_m
             )
             if not annotated and nowhere:
@@ -285,7 +360,7 @@ def _entries(
             claim.with_object += about.role[i] != GHOST
             if nowhere:
                 stale = about.role[i] != GHOST
-                _ghost(
+                _add_false_positive(
                     s, entries[i].x_m, entries[i].y_m, existence, stale, from_m, time_band, asked, targets, wanted,
                     out,
                 )  # fmt: skip
@@ -293,9 +368,9 @@ def _entries(
 
 
 @borrowing
-def _ghost(
+def _add_false_positive(
     s: int, x_m: float, y_m: float, existence: float, stale: bool, from_m: tuple[float, float], time_band: int,
-    asked: Asked, targets: _Targets, wanted: int, out: Sums,
+    asked: AccuracyParameters, targets: _Targets, wanted: int, out: AccuracySums,
 ) -> None:  # fmt: skip
     out.by_run[s].ghosts += 1
     if stale:
@@ -303,27 +378,27 @@ def _ghost(
     else:
         for q in range(len(asked.existence_thresholds)):
             out.ghosts_at[s, q] += existence >= asked.existence_thresholds[q]
-    distance_band = _band(asked.distance_edges_m, np.hypot(x_m - from_m[0], y_m - from_m[1]))
+    distance_band = _find_band(asked.distance_edges_m, np.hypot(x_m - from_m[0], y_m - from_m[1]))
     if distance_band >= 0:
         out.by_distance[s, distance_band].ghosts += 1
     if time_band >= 0:
         out.by_time[s, time_band].ghosts += 1
-    nearest = _nearest(x_m, y_m, targets, wanted)
+    nearest = _find_nearest_target(x_m, y_m, targets, wanted)
     if nearest >= 0:
         out.by_object[s, targets.episode[nearest]].ghosts += 1
 
 
 @borrowing
-def _look(records: Records, at: int, match: int) -> None:
-    if at >= 0:
-        records[at].looked += 1
+def _count_look(records: Records, band: int, match: int) -> None:
+    if band >= 0:
+        records[band].looked += 1
         if match < 0:
-            records[at].missed += 1
+            records[band].missed += 1
 
 
 @borrowing
-def _follow(sums: Any, m: int, match: int, issue_s: float, stays: Stays, unknown_since_s: Float) -> None:
-    # How long it is unknown, which goes on from list to list. −1: no match.
+def _update_gap(sums: Any, m: int, match: int, issue_s: float, stays: EpisodeLists, unknown_since_s: Float) -> None:
+    # The time for which the object is unknown, carried from list to list. `match` −1: none.
     now_s = min(max(issue_s, stays.onset_s[m]), stays.ended_s[m])
     if match < 0:
         if np.isnan(unknown_since_s[m]):
@@ -334,20 +409,20 @@ def _follow(sums: Any, m: int, match: int, issue_s: float, stays: Stays, unknown
 
 
 @borrowing
-def _further(
+def _add_object_sums(
     sums: Any,
     entry: Any,
     square_then_m2: float,
     beyond: float,
-    second: float,
+    nees_square_expected: float,
     age_of_information_s: float,
     m: int,
     last_track: Int,
 ) -> None:
-    # What only objects add up.
+    # The sums that only objects have.
     sums.square_then_m2 += square_then_m2
     sums.beyond_gate += beyond
-    sums.nees_square_expected += second
+    sums.nees_square_expected += nees_square_expected
     sums.age_of_information_s += age_of_information_s
     track = entry.track_id
     if track >= 0:
@@ -357,14 +432,14 @@ def _further(
 
 
 @borrowing
-def _add_pair(records: Records, at: int, east_m: float, north_m: float, of: float, mean: float) -> None:
-    # NaN: the object is not there now.
-    if at < 0:
+def _add_pair(records: Records, band: int, east_m: float, north_m: float, nees: float, nees_expected: float) -> None:
+    # `east_m`, `north_m` NaN: the object is not there now.
+    if band < 0:
         return
-    sums = records[at]
+    sums = records[band]
     sums.pairs += 1
-    sums.nees += of
-    sums.nees_expected += mean
+    sums.nees += nees
+    sums.nees_expected += nees_expected
     if not np.isnan(east_m):
         sums.placed += 1
         sums.square_m2 += east_m**2 + north_m**2
@@ -373,11 +448,11 @@ def _add_pair(records: Records, at: int, east_m: float, north_m: float, of: floa
 
 
 @borrowing
-def _gospa(
+def _add_gospa(
     gospa: NDArray[np.float32], by_object: Records, sums: Any, targets: _Targets, wanted: int,
-    estimates: _Estimates, count: int, asked: Asked,
+    estimates: _Estimates, count: int, asked: AccuracyParameters,
 ) -> None:  # fmt: skip
-    # One list's GOSPA, handed out to the objects, and its OSPA: the same pairs are the best ones for both.
+    # The GOSPA of one list, divided among the objects, and its OSPA: the same pairs are the best ones for both.
     if wanted == 0:
         return
     sums.lists_looked += 1
@@ -395,7 +470,7 @@ def _gospa(
             estimates.paired[targets.partner[t]] = True
     for b in range(count):
         if not estimates.paired[b]:
-            targets.false[_nearest(estimates.x_m[b], estimates.y_m[b], targets, wanted)] += 1
+            targets.false[_find_nearest_target(estimates.x_m[b], estimates.y_m[b], targets, wanted)] += 1
     for t in range(wanted):
         m, b = targets.episode[t], targets.partner[t]
         located = missed = 0.0
@@ -412,7 +487,7 @@ def _gospa(
 
 
 @borrowing
-def _nearest(x_m: float, y_m: float, targets: _Targets, wanted: int) -> int:
+def _find_nearest_target(x_m: float, y_m: float, targets: _Targets, wanted: int) -> int:
     # The target nearest to a place, of equally near ones the first; −1: there are none.
     best, least = -1, np.inf
     for t in range(wanted):
@@ -423,7 +498,7 @@ def _nearest(x_m: float, y_m: float, targets: _Targets, wanted: int) -> int:
 
 
 @borrowing
-def _band(edges: Float, value: float) -> int:
+def _find_band(edges: Float, value: float) -> int:
     # The band that holds the value, its lower edge included, its upper one not; −1: none.
     band = int(np.searchsorted(edges, value, side="right")) - 1
     return band if band < len(edges) - 1 else -1

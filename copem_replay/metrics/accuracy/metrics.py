@@ -1,7 +1,4 @@
-"""The metrics made of the statistics of `metrics/accuracy/statistics.py`, where each is defined.
-
-None: there is nothing to make it of.
-"""
+"""The metrics of accuracy, from the sums of `metrics/accuracy/statistics.py`, which defines them. None: no sample."""
 
 from __future__ import annotations
 
@@ -13,147 +10,147 @@ import numpy as np
 from copem_replay.metrics.metric import Metric
 
 if TYPE_CHECKING:
-    from copem_replay.metrics.accuracy.statistics import Total
+    from copem_replay.metrics.accuracy.statistics import AccuracyTotal
 
 
-def _ratio(sums: float, count: float) -> float | None:
-    """The mean; None: there is nothing to average."""
+def _divide_sum(sums: float, count: float) -> float | None:
+    """Sum by count; None for a count of 0."""
     return float(sums) / float(count) if count > 0 else None
 
 
-def _root(mean: float | None, power: float = 2.0) -> float | None:
+def _power_mean(mean: float | None, power: float = 2.0) -> float | None:
     return None if mean is None else float(mean ** (1.0 / power))
 
 
-def position_rmse_m(of: Total) -> float | None:
-    """Against the truth when the list is available."""
-    return _root(_ratio(of.episodes["square_m2"], of.episodes["placed"]))
+def position_rmse_m(total: AccuracyTotal) -> float | None:
+    """Root mean square position error in metres, against the truth when the list is available."""
+    return _power_mean(_divide_sum(total.episodes["square_m2"], total.episodes["placed"]))
 
 
-def position_rmse_captured_m(of: Total) -> float | None:
-    """Against the truth at the instant the entry tells of."""
-    return _root(_ratio(of.episodes["square_then_m2"], of.episodes["pairs"]))
+def position_rmse_captured_m(total: AccuracyTotal) -> float | None:
+    """Root mean square position error in metres, against the truth at the instant the entry tells of."""
+    return _power_mean(_divide_sum(total.episodes["square_then_m2"], total.episodes["pairs"]))
 
 
-def velocity_rmse_mps(of: Total) -> float | None:
-    """Against the truth when the list is available."""
-    return _root(_ratio(of.episodes["velocity_square_m2ps2"], of.episodes["placed"]))
+def velocity_rmse_mps(total: AccuracyTotal) -> float | None:
+    """Root mean square velocity error in m/s, against the truth when the list is available."""
+    return _power_mean(_divide_sum(total.episodes["velocity_square_m2ps2"], total.episodes["placed"]))
 
 
-def bias_east_m(of: Total) -> float | None:
-    """Mean error, entry minus truth when the list is available."""
-    return _ratio(of.episodes["east_m"], of.episodes["placed"])
+def bias_east_m(total: AccuracyTotal) -> float | None:
+    """Mean easting error in metres, entry minus truth when the list is available."""
+    return _divide_sum(total.episodes["east_m"], total.episodes["placed"])
 
 
-def bias_north_m(of: Total) -> float | None:
-    """Mean error, entry minus truth when the list is available."""
-    return _ratio(of.episodes["north_m"], of.episodes["placed"])
+def bias_north_m(total: AccuracyTotal) -> float | None:
+    """Mean northing error in metres, entry minus truth when the list is available."""
+    return _divide_sum(total.episodes["north_m"], total.episodes["placed"])
 
 
-def age_of_information_s(of: Total) -> float | None:
-    """Mean over pairs."""
-    return _ratio(of.episodes["age_of_information_s"], of.episodes["pairs"])
+def age_of_information_s(total: AccuracyTotal) -> float | None:
+    """Mean age of entries in seconds, over pairs."""
+    return _divide_sum(total.episodes["age_of_information_s"], total.episodes["pairs"])
 
 
-def nees(of: Total) -> float | None:
-    """Mean over pairs; `nees_expected` is right."""
-    return _ratio(of.episodes["nees"], of.episodes["pairs"])
+def mean_nees(total: AccuracyTotal) -> float | None:
+    """Mean NEES over pairs; where covariances are true it is `nees_expected`."""
+    return _divide_sum(total.episodes["nees"], total.episodes["pairs"])
 
 
-def nees_expected(of: Total) -> float | None:
-    """What it is on average where covariances are true: 2, less what the gate cuts off."""
-    return _ratio(of.episodes["nees_expected"], of.episodes["pairs"])
+def nees_expected(total: AccuracyTotal) -> float | None:
+    """Mean NEES where covariances are true: 2, minus the part that the gate cuts off."""
+    return _divide_sum(total.episodes["nees_expected"], total.episodes["pairs"])
 
 
-def nees_low(of: Total) -> float | None:
-    """Lower limit of the mean of as many independent samples as rows have pairs, 95 %; uncut χ²₂ₙ(0.025) / n."""
-    return _limit(of, 0.025)
+def nees_low(total: AccuracyTotal) -> float | None:
+    """Lower 95 % limit of the mean of n independent samples, n rows with a pair; without a gate χ²₂ₙ(0.025) / n."""
+    return _nees_limit(total, 0.025)
 
 
-def nees_high(of: Total) -> float | None:
-    """Upper limit."""
-    return _limit(of, 0.975)
+def nees_high(total: AccuracyTotal) -> float | None:
+    """Upper 95 % limit of the mean of n independent samples, n rows with a pair."""
+    return _nees_limit(total, 0.975)
 
 
-def _limit(of: Total, level: float) -> float | None:
-    """Of the gamma distribution that has the mean and the variance of that mean of samples, as far as the gate lets."""
+def _nees_limit(total: AccuracyTotal, level: float) -> float | None:
+    """The quantile at `level` of the gamma distribution with the mean and variance of the mean NEES within the gate."""
     from scipy.special import gammaincinv
 
-    mean, square = nees_expected(of), _ratio(of.episodes["nees_square_expected"], of.episodes["pairs"])
+    mean, square = nees_expected(total), _divide_sum(total.episodes["nees_square_expected"], total.episodes["pairs"])
     if mean is None or square is None:
         return None
-    shape = of.matched_rows * mean**2 / (square - mean**2)
+    shape = total.matched_rows * mean**2 / (square - mean**2)
     return mean * float(gammaincinv(shape, level)) / shape
 
 
-def beyond_gate_share(of: Total) -> float | None:
-    """Of errors as the covariances of pairs have them, how many the gate lets not through; mean over pairs."""
-    return _ratio(of.episodes["beyond_gate"], of.episodes["pairs"])
+def beyond_gate_share(total: AccuracyTotal) -> float | None:
+    """Share of errors beyond the gate, were they distributed as the covariances claim; mean over pairs."""
+    return _divide_sum(total.episodes["beyond_gate"], total.episodes["pairs"])
 
 
-def identity_switches(of: Total) -> float | None:
-    """Mean over episodes and runs that have a match with a track."""
-    return _ratio(of.episodes["switches"], of.tracked_rows)
+def identity_switches(total: AccuracyTotal) -> float | None:
+    """Mean number of identity switches, over the episodes and runs with a pair that names a track."""
+    return _divide_sum(total.episodes["switches"], total.tracked_rows)
 
 
-def longest_gap_s(of: Total) -> float | None:
-    """Mean over episodes and runs."""
-    return _ratio(of.episodes["longest_gap_s"], of.rows)
+def longest_gap_s(total: AccuracyTotal) -> float | None:
+    """Mean of the longest time unknown in seconds, over episodes and runs."""
+    return _divide_sum(total.episodes["longest_gap_s"], total.rows)
 
 
-def _gospa(of: Total, sums: float) -> float | None:
-    return _root(_ratio(sums, of.runs["lists_looked"]), of.settings.power)
+def _gospa_root(total: AccuracyTotal, sums: float) -> float | None:
+    return _power_mean(_divide_sum(sums, total.runs["lists_looked"]), total.settings.power)
 
 
-def gospa_m(of: Total) -> float | None:
+def gospa_m(total: AccuracyTotal) -> float | None:
     """Mean over lists of GOSPAᵖ, to the power 1/p: the p-th powers of its three parts add up to its own."""
-    parts = sum(of.episodes[f"gospa_{part}"] for part in ("localisation", "missed", "false"))
-    return _gospa(of, parts)
+    parts = sum(total.episodes[f"gospa_{part}"] for part in ("localisation", "missed", "false"))
+    return _gospa_root(total, parts)
 
 
-def gospa_localisation_m(of: Total) -> float | None:
-    """The part of the pairs."""
-    return _gospa(of, of.episodes["gospa_localisation"])
+def gospa_localisation_m(total: AccuracyTotal) -> float | None:
+    """The part of GOSPA from position errors of pairs, to the power 1/p, in metres."""
+    return _gospa_root(total, total.episodes["gospa_localisation"])
 
 
-def gospa_missed_m(of: Total) -> float | None:
-    """The part of the misses."""
-    return _gospa(of, of.episodes["gospa_missed"])
+def gospa_missed_m(total: AccuracyTotal) -> float | None:
+    """The part of GOSPA from missed objects, to the power 1/p, in metres."""
+    return _gospa_root(total, total.episodes["gospa_missed"])
 
 
-def gospa_false_m(of: Total) -> float | None:
-    """The part of the false entries."""
-    return _gospa(of, of.episodes["gospa_false"])
+def gospa_false_m(total: AccuracyTotal) -> float | None:
+    """The part of GOSPA from false entries, to the power 1/p, in metres."""
+    return _gospa_root(total, total.episodes["gospa_false"])
 
 
-def ospa_m(of: Total) -> float | None:
-    """Mean over lists."""
-    return _ratio(of.runs["ospa_m"], of.runs["lists_looked"])
+def ospa_m(total: AccuracyTotal) -> float | None:
+    """Mean OSPA over lists, in metres."""
+    return _divide_sum(total.runs["ospa_m"], total.runs["lists_looked"])
 
 
-def false_positives_per_min(of: Total) -> float | None:
-    """Entries, so that a ghost counts in each list it is in."""
-    return _ratio(60 * of.runs["ghosts"], of.runs["time_s"])
+def false_positives_per_min(total: AccuracyTotal) -> float | None:
+    """Ghost entries per minute; a ghost counts in each list it is in."""
+    return _divide_sum(60 * total.runs["ghosts"], total.runs["time_s"])
 
 
-def stale_false_positives_per_min(of: Total) -> float | None:
-    """Of these the ones that were about some object at the instant they tell of."""
-    return _ratio(60 * of.runs["stale_ghosts"], of.runs["time_s"])
+def stale_false_positives_per_min(total: AccuracyTotal) -> float | None:
+    """Ghost entries per minute that were about some object at the instant they tell of."""
+    return _divide_sum(60 * total.runs["stale_ghosts"], total.runs["time_s"])
 
 
-def duplicates_per_min(of: Total) -> float | None:
-    """Entries, as ghosts; of measured objects, looked at or not."""
-    return _ratio(60 * of.runs["duplicates"], of.runs["time_s"])
+def duplicates_per_min(total: AccuracyTotal) -> float | None:
+    """Duplicate entries of measured objects per minute, in lists looked at or not."""
+    return _divide_sum(60 * total.runs["duplicates"], total.runs["time_s"])
 
 
-def existence_ece(of: Total) -> float | None:
+def existence_ece(total: AccuracyTotal) -> float | None:
     """Expected calibration error, 0 … 1."""
-    bins = of.by_existence
-    return _ratio(np.abs(bins["with_object"] - bins["existence"]).sum(), bins["entries"].sum())
+    bins = total.by_existence
+    return _divide_sum(np.abs(bins["with_object"] - bins["existence"]).sum(), bins["entries"].sum())
 
 
 _TOTAL = attrgetter("accuracy")
-"""The sums that all of them are made of; None where the experiment asks for no accuracy."""
+"""The statistics of all metrics here; None where the experiment does not ask for accuracy."""
 
 ACCURACY = (
     Metric("position_rmse_m", _TOTAL, position_rmse_m, -1,
@@ -179,7 +176,7 @@ ACCURACY = (
            "false positives that were at an object at the instant they tell of, per minute", "lists"),
     Metric("duplicates_per_min", _TOTAL, duplicates_per_min, -1,
            "second entries at an object, per minute of log", "lists"),
-    Metric("nees", _TOTAL, nees, 0,
+    Metric("nees", _TOTAL, mean_nees, 0,
            "squared error by claimed covariance: more than expected where covariances are too small", "accuracy"),
     Metric("nees_expected", _TOTAL, nees_expected, 0,
            "nees if covariances are true: 2, minus what the gate cuts off", "accuracy"),
@@ -193,4 +190,4 @@ ACCURACY = (
     Metric("longest_gap_s", _TOTAL, longest_gap_s, -1,
            "longest time for which an object is unknown after its onset, mean", "lists"),
 )  # fmt: skip
-"""The metrics of accuracy, in the order of the columns."""
+"""The columns, in their order."""

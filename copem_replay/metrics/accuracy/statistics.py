@@ -1,15 +1,15 @@
-"""Accuracy of fused lists: definitions, and statistics that add up.
+"""Accuracy of fused lists: definitions, and statistics that add up over runs, episodes and logs.
 
-All is counted once per fused list, at the instant it is available, in the lists at which there is a place to measure
-distances from (the ego). Nothing is held from one list to the next, nothing weighed by time. What a *match* is, a
-*duplicate*, a *ghost*: `metrics/matching.py`. An episode's *stay*: the lists from the first instant that object and ego
-share to the end of the episode, but where the truth has a gap. *Looked at*: those of its stay from the onset on.
+Statistics count once per fused list, at the instant it is available, in the lists at which there is a place to measure
+distances from (the ego); they are not weighted by time. *Match*, *duplicate* and *ghost* are defined in
+`metrics/matching.py`. An episode's *stay*: the lists from the first instant that object and ego share to the end of the
+episode, except in gaps of the truth. An object is *looked at* in the lists of its stay from the onset on.
 
-What is said of an object is asked at the instant the entry *tells of*; what the list is worth *now* at the instant it
-is available. So there are matches of two kinds, by the same rules: *pairs* are entries that are about an object then.
+There are matches of two kinds, by the same rules: at the instant the entry *tells of*, for what it states of an object,
+and *now*, at the instant the list is available, for what the list is worth. *Pairs* are matches of the first kind.
 
-Over the pairs of the stay, a gap of the truth at the list's instant included; no pairs: nothing to average, and no say
-in the mean of others:
+Over the pairs of the stay, a gap of the truth at the list's instant included; an episode without pairs has no value and
+no part in means:
 
 - position error (m): to the truth at the list's instant, so latency counts in full, whatever the gate; *at its
   instant*: to the truth at the instant the entry tells of. Bias (m): entry minus truth, east and north. Velocity error
@@ -18,11 +18,11 @@ in the mean of others:
 - age (s): available minus captured.
 - NEES (1): eᵀ P⁻¹ e of the position at the entry's instant, P as claimed, its eigenvalues at least 1e-9 m². The gate
   lets no larger errors through, so where P is true the mean is `nees_expected`, 2 or less
-  (`metrics/accuracy/nees.py`), and of what is so claimed the share `beyond_gate` is no pair. Its 95 % band is for as
-  many independent samples as run × object pairs with a match, for lists are not independent.
+  (`metrics/accuracy/kernel.py`), and the share `beyond_gate` of such errors makes no pair. Its 95 % band is for as many
+  independent samples as there are rows, run × object, with a pair, for lists are not independent.
 - identity switches (1): pairs of another track than the object's last pair that named a track.
 
-Over an episode, by what is matched now; never matched: the worst there is:
+Over an episode, by matches now; an object that is never matched has the worst value:
 
 - longest time unknown (MTL, s): from onset to end it is known from a list with a match to the next list without one.
   The last list of the stay before the onset says whether it was known at the onset; before the first list it is
@@ -39,9 +39,9 @@ Over all lists:
   the nearest one looked at. Mean of GOSPAᵖ over the lists in which something is looked at, to the power 1/p. Never
   matched: cᵖ/2 in each list.
 - where the truth is not annotated an entry that is at no object now is no ghost, and in no GOSPA, OSPA or ghost count;
-  one at no object at the instant it tells of has no say in the existence.
+  one at no object at the instant it tells of does not count for the existence.
 - OSPA (m): of the same two sets; mean over the same lists.
-- existence: calibrated when of the entries with existence p the share p is of an object, at the instant they tell of.
+- existence: calibrated when a share p of the entries with existence p is about an object, at the instant they tell of.
   In ten bins of equal width, over the entries of measured classes, duplicates being of an object too. Expected
   calibration error: mean over the entries of their bin's |share − mean existence|.
 
@@ -63,7 +63,7 @@ from copem_replay.core.tracks import Int
 from copem_replay.metrics.accuracy.kernel import Records
 
 EXISTENCE_BINS = 10
-"""Of equal width (chosen)."""
+"""Bins of equal width, as many as in Naeini et al. 2015."""
 
 _LISTS = [("looked", "i8"), ("missed", "i8"), ("ghosts", "i8")]
 _PAIRS = [
@@ -96,7 +96,7 @@ OBJECT = np.dtype(
         ("gospa_false", "f8"),
     ]
 )
-"""The same of one episode, and further sums (`longest_gap_s`: the longest)."""
+"""Sums of one episode: those of `BAND`, and further ones (`longest_gap_s`: the longest)."""
 
 RUN = np.dtype(
     [
@@ -117,8 +117,8 @@ EXISTENCE = np.dtype([("entries", "i8"), ("existence", "f8"), ("with_object", "i
 
 
 @dataclass(frozen=True)
-class Settings:
-    """What is asked for. Bands hold their lower edge, not their upper one; what is in no band is in none of their sums.
+class AccuracySettings:
+    """Parameters of accuracy. A band includes its lower edge, not its upper one; a value may be in no band.
 
     `distance_edges_m`: from the reference to the true object, or to the ghost; `time_edges_s`: of the log.
     """
@@ -129,15 +129,15 @@ class Settings:
     distance_edges_m: tuple[float, ...] = ()
     time_edges_s: tuple[float, ...] = ()
     existence_thresholds: tuple[float, ...] = ()
-    annotated_m: tuple[tuple[float, float], ...] = ()  # corners of where the truth is annotated; none: anywhere
-    annotated_range_m: float = np.inf  # and how far around the reference
+    annotated_m: tuple[tuple[float, float], ...] = ()  # corners of the annotated area; none: everywhere
+    annotated_range_m: float = np.inf  # radius of the annotated area around the reference
 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Statistics of S runs. Nothing is summed over runs, so that it does not matter how they are cut into blocks."""
+    """Statistics of S runs, not summed over runs: blocks of any size give the same total."""
 
-    settings: Settings
+    settings: AccuracySettings
     first_list: Int  # (M,) of the stay: its lists are first_list … first_list + count − 1
     count: Int  # (M,)
     error_m: NDArray[np.float32]  # (S, L) episode after episode, L = Σ count: position error; NaN: no placed pair
@@ -150,7 +150,7 @@ class Accuracy:
     by_existence: Records  # (S, EXISTENCE_BINS) of EXISTENCE
 
     def of_run(self, s: int) -> Accuracy:
-        """Of one run."""
+        """The statistics of run s, with S = 1."""
         columns: dict[str, Any] = {name: getattr(self, name)[s : s + 1] for name in _PER_RUN}
         return replace(self, **columns)
 
@@ -158,21 +158,21 @@ class Accuracy:
 _PER_RUN = tuple(f.name for f in fields(Accuracy) if f.name not in ("settings", "first_list", "count"))
 
 
-def for_runs(of: Accuracy, runs: int) -> Accuracy:
-    """The same for each of `runs` runs, where one stands for all."""
-    if len(of.by_run) == runs:
-        return of
+def repeat_for_runs(accuracy: Accuracy, runs: int) -> Accuracy:
+    """Statistics of `runs` runs, each as the one run that stands for all."""
+    if len(accuracy.by_run) == runs:
+        return accuracy
     columns: dict[str, Any] = {
-        name: np.broadcast_to(getattr(of, name), (runs, *getattr(of, name).shape[1:])) for name in _PER_RUN
+        name: np.broadcast_to(getattr(accuracy, name), (runs, *getattr(accuracy, name).shape[1:])) for name in _PER_RUN
     }
-    return replace(of, **columns)
+    return replace(accuracy, **columns)
 
 
 @dataclass(frozen=True)
-class Total:
-    """What figures are made of: sums over runs, episodes and, added, logs."""
+class AccuracyTotal:
+    """Sums over runs and episodes; totals of several logs add up."""
 
-    settings: Settings
+    settings: AccuracySettings
     rows: int  # episodes × runs
     matched_rows: int  # with a pair at least
     tracked_rows: int  # with a pair at least whose entry names a track
@@ -183,58 +183,60 @@ class Total:
     by_time: Records  # (bands,) of BAND
     by_existence: Records  # (EXISTENCE_BINS,) of EXISTENCE
 
-    def __add__(self, other: Total) -> Total:
+    def __add__(self, other: AccuracyTotal) -> AccuracyTotal:
         if self.settings != other.settings:
             raise ValueError("Total: expected the same settings")
         sums: dict[str, Any] = {}
-        for name in (f.name for f in fields(Total) if f.name != "settings"):
+        for name in (f.name for f in fields(AccuracyTotal) if f.name != "settings"):
             mine, others = getattr(self, name), getattr(other, name)
             records = getattr(getattr(mine, "dtype", None), "names", None)
-            sums[name] = _summed(np.stack([mine, others])) if records else mine + others
+            sums[name] = _sum_pairwise(np.stack([mine, others])) if records else mine + others
         return replace(self, **sums)
 
 
-def total(parts: Sequence[Accuracy]) -> Total:
-    """Sums over episodes and all runs, which are in the order of `parts`: to the last bit, however they are cut.
+def sum_accuracy(parts: Sequence[Accuracy]) -> AccuracyTotal:
+    """Sums over episodes and all runs, in the order of `parts`: equal to the last bit for parts of any size.
 
-    Runs add up pairwise, as the leaves of a tree: two neighbours, then two neighbouring pairs, … So what runs from a
-    power of two on sum up to, as many as that power or fewer, is a part of the sum of all: see `joined`.
+    Runs add up pairwise, as the leaves of a tree: two neighbours, then two neighbouring pairs, … So the sum of runs
+    that begin at a multiple of a power of two, at most as many as that power, is a part of the sum of all
+    (`join_totals`).
     """
 
     def all_runs(name: str) -> Any:
         return np.concatenate([getattr(part, name) for part in parts])
 
     episodes = all_runs("by_object")
-    return Total(
+    return AccuracyTotal(
         parts[0].settings,
         episodes.size,
         int((episodes["pairs"] > 0).sum()),
         int((episodes["tracked"] > 0).sum()),
-        _summed(_summed(episodes.T)),
-        _summed(all_runs("by_run")),
+        _sum_pairwise(_sum_pairwise(episodes.T)),
+        _sum_pairwise(all_runs("by_run")),
         all_runs("ghosts_at").sum(axis=0),
-        *(_summed(all_runs(name)) for name in ("by_distance", "by_time", "by_existence")),
+        *(_sum_pairwise(all_runs(name)) for name in ("by_distance", "by_time", "by_existence")),
     )
 
 
-def joined(parts: Sequence[tuple[int, Total]]) -> Total:
-    """The sum over all runs, of sums over neighbouring runs (how many, their sum), as `total` has it.
+def join_totals(parts: Sequence[tuple[int, AccuracyTotal]]) -> AccuracyTotal:
+    """The total over all runs, equal to that of `sum_accuracy`, from parts (number of runs, total) of neighbouring
+    runs.
 
-    Each begins at a multiple of the power of two that its number of runs, the last one's aside, is.
+    The number of runs of each part but the last is a power of two, and the part begins at a multiple of it.
     """
-    nodes: list[tuple[int, Total]] = []
+    nodes: list[tuple[int, AccuracyTotal]] = []
     for node in parts:
         nodes.append(node)
         while len(nodes) > 1 and nodes[-1][0] == nodes[-2][0]:
             (size, last), (_, before) = nodes.pop(), nodes.pop()
             nodes.append((2 * size, before + last))
     _, result = nodes.pop()
-    while nodes:  # what has no neighbour of its size goes up as it is
+    while nodes:  # a node without a neighbour of its size is passed up
         result = nodes.pop()[1] + result
     return result
 
 
-def _summed(records: Records) -> Records:
+def _sum_pairwise(records: Records) -> Records:
     """Pairwise sums over the first axis, field by field."""
     sums: Records = np.zeros(records.shape[1:], dtype=records.dtype)
     for name in records.dtype.names or () if len(records) else ():

@@ -1,7 +1,7 @@
-"""Driver models: what the ego does once an object is known. They say how late and how hard, and never draw.
+"""Driver models: how late and how hard the ego brakes once an object is known.
 
 A driver reacts after a delay and then brakes along its path; it does not steer. It is declared, not observed: a verdict
-is that of the declared driver.
+is that of the declared driver. Models draw no random numbers; they map those they are given.
 """
 
 from __future__ import annotations
@@ -12,13 +12,22 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import AfterValidator, Field
 
-from copem_replay.core.components import Component, NotNegative, Positive, Slot, asked, numbers_of, wrong
+from copem_replay.core.components import (
+    Component,
+    NotNegative,
+    Positive,
+    Slot,
+    ask_component,
+    ask_numbers,
+    wrong_answer_error,
+)
 from copem_replay.core.tracks import Float
 
 _SHORTEST_S = 0.05
-"""A deceleration that builds up faster than this is taken to be there at once (chosen: 5 steps)."""
+"""The shortest build-up of a deceleration: five steps of `NODE_S`, in which braking is computed."""
 UNRESOLVED = 1e-15
-"""Shares below this are not told where only the inverse of a distribution is known: its numbers end 10⁻¹⁶ below 1."""
+"""Shares below this are unknown where only the inverse of a distribution is known: uniform numbers end 10⁻¹⁶ below 1.
+"""
 
 
 class Reaction(Component, ABC):
@@ -36,10 +45,10 @@ class Reaction(Component, ABC):
         """(K,) seconds for uniform numbers (K,) in (0, 1): the inverse of their distribution, never decreasing."""
 
     def survival(self, delay_s: Float) -> Float | None:
-        """(K,) probability that it takes longer than `delay_s (K,)` ≥ 0, to the far tail. None: not known.
+        """(K,) probability that a reaction takes longer than `delay_s (K,)` ≥ 0, to the far tail. None: not known.
 
-        It need not be given. With it failures rarer than 10⁻¹⁵ have a probability; `delays` has to hold for numbers
-        down to 10⁻³⁰⁰, then.
+        Optional. With it failures rarer than 10⁻¹⁵ have a probability; `delays` then has to hold for numbers down to
+        10⁻³⁰⁰.
         """
         return None
 
@@ -51,7 +60,7 @@ class ConstantReaction(Reaction):
     delay_s: NotNegative = 0.0
 
     def delays(self, uniform: Float) -> Float:
-        """(K,) all the same."""
+        """(K,) the delay."""
         return np.full(len(uniform), self.delay_s)
 
     def survival(self, delay_s: Float) -> Float:
@@ -127,10 +136,10 @@ class Driver(Component, ABC):
 
     @abstractmethod
     def deceleration_mps2(self, elapsed_s: Float, speed_mps: Float) -> Float:
-        """(R, T) how hard it brakes `elapsed_s (R, T)` ≥ 0 after it began to at `speed_mps (R, 1)`, ≥ 0."""
+        """(R, T) deceleration ≥ 0, `elapsed_s (R, T)` ≥ 0 after braking began at `speed_mps (R, 1)`."""
 
 
-def _resolved(build_up_s: float) -> float:
+def _check_build_up(build_up_s: float) -> float:
     if 0 < build_up_s < _SHORTEST_S:
         raise ValueError(
             f"expected 0, or at least {_SHORTEST_S:g} s (braking is worked out every 10 ms), found {build_up_s:g}"
@@ -147,10 +156,10 @@ class ConstantDeceleration(Driver):
 
     kind: Literal["constant_deceleration"] = "constant_deceleration"
     a_max_mps2: Annotated[float, Field(strict=True, ge=0.01, le=100)]
-    build_up_s: Annotated[float, Field(strict=True, ge=0, le=100), AfterValidator(_resolved)] = 0.0
+    build_up_s: Annotated[float, Field(strict=True, ge=0, le=100), AfterValidator(_check_build_up)] = 0.0
 
     def deceleration_mps2(self, elapsed_s: Float, speed_mps: Float) -> Float:
-        """(R, T) a_max, or as much of it as is built up."""
+        """(R, T) `a_max_mps2`, or the part of it that is built up."""
         if self.build_up_s == 0:
             return np.full(elapsed_s.shape, self.a_max_mps2)
         result: Float = self.a_max_mps2 * np.minimum(elapsed_s / self.build_up_s, 1.0)
@@ -160,55 +169,55 @@ class ConstantDeceleration(Driver):
 DRIVERS = {"constant_deceleration": "copem_replay.metrics.braking.driver:ConstantDeceleration"}
 
 
-def delays_of(reaction: Reaction, uniform: Float) -> Float:
-    """(K,) what a reaction model says of uniform numbers (K,), checked. Raises InputError when it is no delay."""
+def reaction_delays(reaction: Reaction, uniform: Float) -> Float:
+    """(K,) delays in seconds of a reaction model for uniform numbers (K,). Raises InputError for an invalid one."""
     where = "braking.driver.reaction"
-    return numbers_of(
+    return ask_numbers(
         reaction, where, "delays(uniform)", lambda: reaction.delays(uniform), uniform.shape, "seconds ≥ 0"
     )
 
 
 _TRIED = np.array([0.01, 0.1, 0.5, 0.9, 0.99])
-"""Numbers at which the survival of a reaction is held against its delays (chosen)."""
+"""Uniform numbers, from both tails and the middle, at which the survival of a reaction is compared with its delays."""
 
 
-def survival_of(reaction: Reaction, delay_s: Float) -> Float | None:
-    """(K,) how probably a reaction takes longer than `delay_s (K,)`, checked. None: it does not say.
+def reaction_survival(reaction: Reaction, delay_s: Float) -> Float | None:
+    """(K,) probability that a reaction takes longer than `delay_s (K,)`; None: the model has no survival function.
 
-    Raises InputError when it is no probability, or not of the delays that the same reaction gives.
+    Raises InputError for an invalid probability, or one that contradicts the delays of the model.
     """
     where = "braking.driver.reaction"
     what = "survival(delay_s)"
 
     def survival(of_s: Float) -> Float | None:
-        given = asked(reaction, where, lambda: reaction.survival(of_s))
-        if given is None:
+        answer = ask_component(reaction, where, lambda: reaction.survival(of_s))
+        if answer is None:
             return None
-        return numbers_of(reaction, where, what, lambda: given, of_s.shape, "probabilities 0 … 1", 1.0)
+        return ask_numbers(reaction, where, what, lambda: answer, of_s.shape, "probabilities 0 … 1", 1.0)
 
-    found = survival(delay_s)
-    if found is None:
+    survivals = survival(delay_s)
+    if survivals is None:
         return None
-    # Whatever the distribution, P(D > d) ≤ 1 − u ≤ P(D ≥ d): with d a hair aside for rounding.
-    at_s = delays_of(reaction, _TRIED)
+    # Whatever the distribution, P(D > d) ≤ 1 − u ≤ P(D ≥ d): compared a hair beside d, for rounding.
+    at_s = reaction_delays(reaction, _TRIED)
     for hair, sign in ((1e-9, 1), (-1e-9, -1)):
-        there = survival(at_s * (1 + hair))
-        assert there is not None
-        off = np.flatnonzero((sign * (there - (1 - _TRIED)) > 1e-6) & (at_s > 0))
+        beside = survival(at_s * (1 + hair))
+        assert beside is not None
+        off = np.flatnonzero((sign * (beside - (1 - _TRIED)) > 1e-6) & (at_s > 0))
         if len(off):
             k = off[0]
-            raise wrong(
+            raise wrong_answer_error(
                 reaction, where,
                 f"{what}: expected at {at_s[k]:g} s, which is delays({_TRIED[k]:g}), "
-                f"at {'most' if sign > 0 else 'least'} {1 - _TRIED[k]:g}; found {there[k]:g}", "survival",
+                f"at {'most' if sign > 0 else 'least'} {1 - _TRIED[k]:g}; found {beside[k]:g}", "survival",
             )  # fmt: skip
-    return found
+    return survivals
 
 
-def deceleration_of(driver: Driver, elapsed_s: Float, speed_mps: Float) -> Float:
-    """(R, T) what a driver model says of `elapsed_s (R, T)` and `speed_mps (R, 1)`, checked. Raises InputError."""
+def driver_deceleration(driver: Driver, elapsed_s: Float, speed_mps: Float) -> Float:
+    """(R, T) decelerations of a driver model, as `deceleration_mps2`. Raises InputError for an invalid one."""
     where = "braking.driver"
-    return numbers_of(
+    return ask_numbers(
         driver, where, "deceleration_mps2(elapsed_s, speed_mps)",
         lambda: driver.deceleration_mps2(elapsed_s, speed_mps), elapsed_s.shape, "m/s² ≥ 0",
     )  # fmt: skip

@@ -1,125 +1,133 @@
-"""The first fused lists that imply a collision (the paper's detection of the potential collision).
+"""Implied collisions: the first fused list that implies one, and the episodes that `measure.objects.within` keeps.
 
-A fused list implies one when the object, keeping its perceived velocity from its perceived place, will within the
-horizon be in the ego's corridor: what the ego, at its present speed, will sweep of its own path, and a margin around
-it. Paths are compared, arrival times are not.
+A fused list implies a collision when the object, keeping its perceived velocity from its perceived place, will within
+the horizon be in the ego's corridor: the part of its own path that the ego, at its present speed, will sweep, and a
+margin around it. Paths are compared, arrival times are not. Source: Piazzoni et al. 2022 (detection of the potential
+collision).
+
+`within` is decided on the truth. Polygon and path: by the object's centre at the onset; conflict: at any of its frames
+from the onset to the end of its episode. The path is the part ahead of the ego at the onset, up to the end of the
+episode.
 """
 
 from __future__ import annotations
 
+from dataclasses import fields, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numba as nb
 import numpy as np
 
-from copem_replay.core.box_distance import pose_on
+from copem_replay.core.errors import ExperimentError
 from copem_replay.core.fused_tracks import FusedTracks
-from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int, Tracks
-from copem_replay.metrics.braking.ego_path import EgoPath
-from copem_replay.metrics.config import Confirm, Conflict
+from copem_replay.core.geometry import are_in_area, polygon_corners, pose_on_path
+from copem_replay.core.interpolation import interpolate_states
+from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int, Scene, Tracks
+from copem_replay.metrics.braking.encounter import EgoPath
+from copem_replay.metrics.config import Confirm, Conflict, MetricsSetup, Within
 
 if TYPE_CHECKING:
     from copem_replay.metrics.episodes import Episodes
 
-_TOLERANCE_S = SAME_INSTANT_NS * 1e-9
+
 _PIECE_M = 2.0
-"""Length of the straight pieces a corridor is made of (chosen)."""
+"""Length of the straight pieces of a corridor; shorter: narrower corridors in bends, slower."""
 _PIECES = 500
-"""More pieces than this are not made: they are longer then (chosen: a kilometre)."""
+"""Corridors above a kilometre have this many longer pieces, so that no speed makes the computation slow."""
 
 
 class ConflictDetector:
     """When the receiver first has a list (`hits` of its last `of` lists) that implies a collision, episode by episode.
 
-    As with detections, a list counts when something at or after the onset contributed to what it says of the object.
+    As with detections, a list counts when a capture at or after the onset contributed to its entry.
     Time chunks of a log are added one after the other.
     """
 
-    def __init__(self, ego: EgoPath, found: Episodes, wanted: Conflict, *, confirm: Confirm, count_earlier: bool):
-        self._ego, self._found, self._wanted, self._confirm = ego, found, wanted, confirm
-        never = np.full(len(found.object_ix), -np.inf)
-        self._not_before_s = never if count_earlier else found.onset_s - _TOLERANCE_S
+    def __init__(self, ego: EgoPath, episodes: Episodes, conflict: Conflict, *, confirm: Confirm, count_earlier: bool):
+        self._ego, self._episodes, self._conflict, self._confirm = ego, episodes, conflict, confirm
+        never = np.full(len(episodes.object_ix), -np.inf)
+        self._not_before_s = never if count_earlier else episodes.onset_s - SAME_INSTANT_S
         self._lists, self._runs, self._issue_s = 0, 1, [np.empty(0)]
-        self._held: dict[tuple[int, int], list[Int]] = {}  # by run and episode: lists that imply one
+        self._held: dict[tuple[int, int], list[Int]] = {}  # by run and episode: numbers of the lists that imply one
 
     def add(self, fused_tracks: FusedTracks, first_run: int = 0) -> None:
-        """Take in the fused tracks of runs (S,), `first_run` and on; several of one time chunk may be."""
+        """Add the fused tracks of runs (S,) from `first_run` on; a time chunk may come in blocks of runs."""
         fused = fused_tracks.fused
         self._runs = max(self._runs, first_run + len(fused.valid))
         issue_s = fused.common_arrives_s
-        implied = implied_by(fused, self._ego, self._wanted)
+        implied = find_conflicts(fused, self._ego, self._conflict)
         newest_s = fused_tracks.captured_s
         track_of = {int(o): k for k, o in enumerate(fused.object_ix)}
-        for m, object_ix in enumerate(self._found.object_ix.tolist()):
+        for m, object_ix in enumerate(self._episodes.object_ix.tolist()):
             if object_ix not in track_of:
                 continue
             track = track_of[object_ix]
             rows = slice(int(fused.start[track]), int(fused.start[track + 1]))
             counts = implied[:, rows] & (newest_s[:, rows] >= self._not_before_s[m])
-            counts &= issue_s[fused.frame_ix[rows]] <= self._found.ended_s[m] + _TOLERANCE_S
+            counts &= issue_s[fused.frame_ix[rows]] <= self._episodes.ended_s[m] + SAME_INSTANT_S
             for s in np.flatnonzero(counts.any(axis=1)).tolist():
                 held = self._lists + fused.frame_ix[rows][counts[s]]
                 self._held.setdefault((first_run + s, m), []).append(held)
 
     def next(self, issue_s: Float) -> None:
-        """Done with a time chunk, whose lists were available at `issue_s (K,)`."""
+        """End a time chunk, whose lists are available at `issue_s (K,)`."""
         self._issue_s.append(issue_s)
         self._lists += len(issue_s)
 
     def result(self) -> Float:
-        """(S, M) when that was, in one run where one stands for all; NaN: never."""
+        """(S, M) seconds at which such a list is available, S = 1 where one run stands for all; NaN: never."""
         issue_s = np.concatenate(self._issue_s)
-        first_s = np.full((self._runs, len(self._found.object_ix)), np.nan)
+        first_s = np.full((self._runs, len(self._episodes.object_ix)), np.nan)
         hits, of = self._confirm.hits, self._confirm.of
         for (s, m), parts in self._held.items():
             held = np.concatenate(parts)
-            # So many lists before it hold it too, that list among them, within the last `of`.
+            # Places in `held` from which on `hits` lists are within `of` consecutive ones.
             enough = np.flatnonzero(held[hits - 1 :] - held[: max(len(held) - hits + 1, 0)] < of)
             if len(enough):
                 first_s[s, m] = issue_s[held[enough[0] + hits - 1]]
         return first_s
 
 
-def implied_by(tracks: Tracks, ego: EgoPath, wanted: Conflict) -> Bool:
-    """(S, P) which states of tracks imply a collision, at the instants their lists are available."""
-    pieces, bounds = corridors(ego, tracks.common_arrives_s, wanted)
+def find_conflicts(tracks: Tracks, ego: EgoPath, conflict: Conflict) -> Bool:
+    """(S, P) whether each state of the tracks implies a collision, at the instants their lists are available."""
+    pieces, bounds = build_corridors(ego, tracks.common_arrives_s, conflict)
     implied = np.zeros(tracks.valid.shape, dtype=np.bool_)
     columns = (tracks.x_m, tracks.y_m, tracks.yaw_rad, tracks.vx_mps, tracks.vy_mps, tracks.length_m, tracks.width_m)
-    _implied(tracks.valid, _Boxes(*columns), tracks.frame_ix, pieces, bounds, wanted.horizon_s, implied)
+    _mark_conflicts(tracks.valid, _Boxes(*columns), tracks.frame_ix, pieces, bounds, conflict.horizon_s, implied)
     return implied
 
 
-def corridors(ego: EgoPath, now_s: Float, wanted: Conflict) -> tuple[Float, Int]:
-    """Rectangles (C, 5) — x, y, yaw, length, width — that cover the ego's corridor at instants (K,), grouped (K + 1,).
+def build_corridors(ego: EgoPath, now_s: Float, conflict: Conflict) -> tuple[Float, Int]:
+    """Rectangles (C, 5), x, y, yaw, length, width, that cover the ego's corridor at instants (K,); bounds (K + 1,).
 
-    None where the ego is not in the log.
+    Those of instant k are rows `bounds[k] : bounds[k + 1]`; none where the ego is not in the log.
     """
     course = ego.course(now_s)
-    ahead_m = np.where(np.isnan(course.along_m), np.nan, course.speed_mps * wanted.horizon_s)
+    ahead_m = np.where(np.isnan(course.along_m), np.nan, course.speed_mps * conflict.horizon_s)
     pieces_of = np.clip(np.ceil(np.nan_to_num(ahead_m) / _PIECE_M), 1, _PIECES)
     count = np.where(np.isnan(ahead_m), 0, pieces_of).astype(np.int64)
     bounds = np.concatenate([[0], np.cumsum(count)])
     pieces = np.empty((bounds[-1], 5))
-    size = ego.size_m + 2 * wanted.margin_m
-    _cover(ego.path, course.along_m, np.nan_to_num(ahead_m), bounds, size, pieces)
+    size = ego.size_m + 2 * conflict.margin_m
+    _cover_corridor(ego.path, course.along_m, np.nan_to_num(ahead_m), bounds, size, pieces)
     return pieces, bounds
 
 
 @nb.njit(cache=True, nogil=True)
-def _cover(path: Float, along: Float, ahead: Float, bounds: Int, size: Float, pieces: Float) -> None:
-    """Each piece lies as the ego does halfway along it, and reaches as far as the path does in between."""
+def _cover_corridor(path: Float, along: Float, ahead: Float, bounds: Int, size: Float, pieces: Float) -> None:
+    """Each piece has the ego's pose halfway along it, and reaches as far as the path does along the piece."""
     for k in range(len(along)):
         n = bounds[k + 1] - bounds[k]
         for j in range(n):
             from_m, to_m = along[k] + ahead[k] * j / n, along[k] + ahead[k] * (j + 1) / n
-            x, y, yaw = pose_on(path, (from_m + to_m) / 2)
+            x, y, yaw = pose_on_path(path, (from_m + to_m) / 2)
             c, s = np.cos(yaw), np.sin(yaw)
             low, high, right, left = 0.0, 0.0, 0.0, 0.0
             first = np.searchsorted(path[:, 0], from_m)
             last = np.searchsorted(path[:, 0], to_m)
             for v in range(first - 1, last + 1):
                 at_m = from_m if v < first else to_m if v == last else path[v, 0]
-                px, py, _ = pose_on(path, at_m)
+                px, py, _ = pose_on_path(path, at_m)
                 u, w = c * (px - x) + s * (py - y), -s * (px - x) + c * (py - y)
                 low, high, right, left = min(low, u), max(high, u), min(right, w), max(left, w)
             u, w = (low + high) / 2, (right + left) / 2
@@ -140,7 +148,7 @@ class _Boxes(NamedTuple):
 
 
 @nb.njit(cache=True, nogil=True)
-def _implied(
+def _mark_conflicts(
     valid: Bool, boxes: _Boxes, frame_ix: Int, pieces: Float, bounds: Int, horizon_s: float, out: Bool
 ) -> None:
     x, y, yaw, vx, vy, length, width = boxes
@@ -149,7 +157,7 @@ def _implied(
             if not valid[s, p]:
                 continue
             for c in range(bounds[frame_ix[p]], bounds[frame_ix[p] + 1]):
-                if _will_be_in(
+                if _will_enter(
                     x[s, p], y[s, p], yaw[s, p], vx[s, p], vy[s, p], length[s, p], width[s, p], pieces[c], horizon_s
                 ):
                     out[s, p] = True
@@ -157,13 +165,13 @@ def _implied(
 
 
 @nb.njit(cache=True)
-def _will_be_in(
+def _will_enter(
     x: float, y: float, yaw: float, vx: float, vy: float, length: float, width: float, piece: Float, horizon_s: float
 ) -> bool:
-    """Whether a box that moves on straight without turning meets a standing one within the horizon.
+    """Whether a box that moves straight on without turning meets a standing one within the horizon.
 
-    At any instant two rectangles overlap unless an axis of either separates them, and each axis stops and starts to do
-    so at one instant each.
+    At any instant two rectangles overlap unless an axis of either separates them (separating axis theorem); each axis
+    stops to separate them at one instant, and starts again at one.
     """
     dx, dy = x - piece[0], y - piece[1]
     first, last = 0.0, horizon_s
@@ -191,3 +199,87 @@ def _will_be_in(
         if first > last:
             return False
     return True
+
+
+# Episodes that matter, by `measure.objects.within`: in a polygon, near the ego's path, or soon on it.
+
+_TOLERANCE_M = 1e-6
+"""Far below any distance that matters, far above the rounding of coordinates."""
+
+
+def keep_episodes_within(
+    scene: Scene, truth: Tracks, episodes: Episodes, experiment: MetricsSetup
+) -> tuple[Episodes, Int]:
+    """The episodes that `measure.objects.within` keeps, and the object indices (K,) of the others.
+
+    Raises ExperimentError where the condition needs the path of an ego and there is none.
+    """
+    within = experiment.measure.objects.within
+    if within is None:
+        return episodes, np.empty(0, dtype=np.int64)
+    if within.of_ego and scene.ego_ix < 0:
+        raise ExperimentError(f"{scene.log}: measure.objects.within: no ego in this study, and so no path of it")
+    decide = _is_within_at_onset if within.conflict_s is None else _will_conflict
+    kept = decide(scene, truth, episodes, experiment)
+    return replace(episodes, **{f.name: getattr(episodes, f.name)[kept] for f in fields(episodes)}), episodes.object_ix[
+        ~kept
+    ]
+
+
+def describe_excluded(within: Within) -> str:
+    """Where the excluded objects are, for a note."""
+    if within.polygon_m is not None:
+        return "outside the polygon at their onset"
+    if within.corridor_m is not None:
+        return f"more than {within.corridor_m:g} m beside the ego's way ahead"
+    return f"never within {within.conflict_s:g} s of the ego's way"
+
+
+def _is_within_at_onset(scene: Scene, truth: Tracks, episodes: Episodes, experiment: MetricsSetup) -> Bool:
+    """(M,) whether the centre is in the polygon or corridor at the onset; False in a gap of the truth."""
+    within = experiment.measure.objects.within
+    assert within is not None
+    state, present = interpolate_states(
+        truth, episodes.object_ix, episodes.onset_s, t0_ns=scene.t0_ns, max_gap_s=experiment.max_gap_s
+    )  # fmt: skip
+    x_m, y_m = state["x_m"], state["y_m"]
+    if within.polygon_m is not None:
+        return present & are_in_area(x_m, y_m, x_m, y_m, polygon_corners(within.polygon_m), np.inf)
+    assert within.corridor_m is not None
+    beside_m = _distance_to_path_m(EgoPath(scene, truth, experiment.max_gap_s), x_m, y_m, episodes)
+    near: Bool = present & (beside_m <= within.corridor_m + _TOLERANCE_M)
+    return near
+
+
+def _distance_to_path_m(ego: EgoPath, x_m: Float, y_m: Float, episodes: Episodes) -> Float:
+    """(M,) metres from places to the path of the ego's centre from the onset to the end of each episode."""
+    import shapely
+
+    ends_m = [np.interp(time_s, ego.frame_s, ego.frame_m) for time_s in (episodes.onset_s, episodes.ended_s)]
+    paths = []
+    for from_m, to_m in zip(*ends_m, strict=True):
+        first, after = np.searchsorted(ego.path[:, 0], (from_m, to_m))
+        along_m = np.concatenate([[from_m], ego.path[first:after, 0], [to_m]])
+        paths.append(np.stack([np.interp(along_m, ego.path[:, 0], ego.path[:, k]) for k in (1, 2)], axis=1))
+    distance_m: Float = shapely.distance([shapely.LineString(path) for path in paths], shapely.points(x_m, y_m))
+    return distance_m
+
+
+def _will_conflict(scene: Scene, truth: Tracks, episodes: Episodes, experiment: MetricsSetup) -> Bool:
+    """(M,) whether at any frame the object, at constant velocity, would within `conflict_s` enter the corridor."""
+    within, measure = experiment.measure.objects.within, experiment.measure
+    assert within is not None
+    assert within.conflict_s is not None
+    margin_m = (measure.conflict or Conflict()).margin_m
+    ego = EgoPath(scene, truth, experiment.max_gap_s)
+    tracks = truth.take_tracks(np.isin(truth.object_ix, episodes.object_ix))
+    implied = find_conflicts(tracks, ego, Conflict(horizon_s=within.conflict_s, margin_m=margin_m))[0]
+    episode_of = np.full(len(scene.object_ids), -1)
+    episode_of[episodes.object_ix] = np.arange(len(episodes.object_ix))
+    episode, time_s = episode_of[tracks.row_object_ix], tracks.row_captured_s
+    implied &= (time_s >= episodes.onset_s[episode] - SAME_INSTANT_S) & (
+        time_s <= episodes.ended_s[episode] + SAME_INSTANT_S
+    )
+    kept = np.zeros(len(episodes.object_ix), dtype=bool)
+    kept[episode[implied]] = True
+    return kept

@@ -8,8 +8,8 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from copem_replay.core.components import Component, NotNegative, Share, numbers_of
-from copem_replay.core.grid import bilinear, check_grid
+from copem_replay.core.components import Component, NotNegative, Share, ask_numbers
+from copem_replay.core.interpolation import check_grid, interpolate_bilinear
 from copem_replay.core.tracks import Float
 from copem_replay.core.view_geometry import ViewGeometry
 
@@ -30,10 +30,10 @@ class DetectionModel(Component, ABC):
         """(P,) probability that each row is listed, 0 … 1."""
 
 
-def probability_of(model: DetectionModel, view: ViewGeometry, where: str) -> Float:
-    """(P,) what a model says, checked. Raises InputError, naming `where` it stands, when it is no probability."""
+def ask_detection_probability(model: DetectionModel, view: ViewGeometry, where: str) -> Float:
+    """(P,) the probabilities that a model gives, checked. Raises InputError, naming `where` it stands, for others."""
     shape = (len(view.range_m),)
-    return numbers_of(model, where, "probability(view)", lambda: model.probability(view), shape, "0 … 1", 1 + 1e-12)
+    return ask_numbers(model, where, "probability(view)", lambda: model.probability(view), shape, "0 … 1", 1 + 1e-12)
 
 
 class VisibleShare(DetectionModel):
@@ -46,18 +46,18 @@ class VisibleShare(DetectionModel):
         return view.visible_share
 
 
-class Constant(DetectionModel):
+class ConstantDetection(DetectionModel):
     """Detected with the same probability wherever the condition holds."""
 
     kind: Literal["constant"] = "constant"
     probability_: Annotated[Share, Field(alias="probability")]
 
     def probability(self, view: ViewGeometry) -> Float:
-        """(P,) all the same."""
+        """(P,) `probability` everywhere."""
         return np.full(len(view.range_m), self.probability_)
 
 
-class Table(DetectionModel):
+class TableDetection(DetectionModel):
     """Detection probability by range and visible share, bilinear between the given values, constant beyond them.
 
     `probability[i][j]` belongs to `range_m[i]` and `visible_share[j]`. Either axis may be left out.
@@ -74,12 +74,15 @@ class Table(DetectionModel):
         return self
 
     def probability(self, view: ViewGeometry) -> Float:
-        """(P,) interpolated."""
-        return bilinear(self.range_m, self.visible_share, self.probability_, view.range_m, view.visible_share)
+        """(P,) the table, interpolated."""
+        return interpolate_bilinear(
+            self.range_m, self.visible_share, self.probability_, view.range_m, view.visible_share
+        )
 
 
 DETECTION_MODELS = {
     "visible_share": "copem_replay.perception.pem.detection:VisibleShare",
-    "constant": "copem_replay.perception.pem.detection:Constant",
-    "table": "copem_replay.perception.pem.detection:Table",
+    "constant": "copem_replay.perception.pem.detection:ConstantDetection",
+    "table": "copem_replay.perception.pem.detection:TableDetection",
 }
+"""Built-in names of `detection: {kind: …}`."""

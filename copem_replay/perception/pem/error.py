@@ -8,8 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from copem_replay.core.components import Component, Covariance, NotNegative, Pair, asked, wrong
-from copem_replay.core.own_code import FAILURES
+from copem_replay.core.components import Component, Covariance, NotNegative, Pair, ask_component, wrong_answer_error
+from copem_replay.core.errors import FAILURES
 from copem_replay.core.tracks import Float
 from copem_replay.core.view_geometry import Errors, Noise, ViewGeometry
 
@@ -37,8 +37,8 @@ class ErrorModel(Component, ABC):
         Returns `Errors`, all finite:
 
         - `east_m`, `north_m` (S, P): added to the true position, metres easting and northing.
-        - `cov_ee_m2`, `cov_en_m2`, `cov_nn_m2` (P,): the covariance that the unit claims of these, m². The same in all
-          runs. It is not checked against the errors: a model may claim more, or less, than is true.
+        - `cov_ee_m2`, `cov_en_m2`, `cov_nn_m2` (P,): the covariance that the unit claims of these, m², in all runs.
+          It is not checked against the errors: a model may claim more, or less, than is true.
         - `yaw_rad` (S, P) and `yaw_var_rad2` (P,): added to the true heading, counter-clockwise.
         - `size_m` (3, S, P) and `size_var_m2` (P,): added to length, width and height.
         - `speed_mps` (S, P) and `speed_var_m2ps2` (P,): added to the speed along the track.
@@ -48,28 +48,34 @@ class ErrorModel(Component, ABC):
         """
 
 
-def errors_of(model: ErrorModel, view: ViewGeometry, noise: Noise, runs: int, where: str) -> Errors:
-    """What a model says, checked. Raises InputError, naming `where` it stands, when shapes or numbers are wrong."""
-    found = asked(model, where, lambda: model.perturb(view, noise))
-    if not isinstance(found, Errors):
-        raise wrong(model, where, f"perturb(view, noise): expected Errors, found {type(found).__name__}", "perturb")
+def ask_errors(model: ErrorModel, view: ViewGeometry, noise: Noise, runs: int, where: str) -> Errors:
+    """The errors that a model gives, checked. Raises InputError that names `where` it stands."""
+    errors = ask_component(model, where, lambda: model.perturb(view, noise))
+    if not isinstance(errors, Errors):
+        raise wrong_answer_error(
+            model, where, f"perturb(view, noise): expected Errors, found {type(errors).__name__}", "perturb"
+        )
     n = len(view.range_m)
-    for field in fields(found):
-        values = getattr(found, field.name)
+    for field in fields(errors):
+        values = getattr(errors, field.name)
         if values is None:
             continue
         variance = field.name.startswith("cov_") or "_var_" in field.name
         expected = (n,) if variance else (3, runs, n) if field.name == "size_m" else (runs, n)
         shape = np.shape(values)
         if shape != expected:
-            raise wrong(model, where, f"perturb: {field.name}: expected shape {expected}, found {shape}", "perturb")
+            raise wrong_answer_error(
+                model, where, f"perturb: {field.name}: expected shape {expected}, found {shape}", "perturb"
+            )
         if not np.isfinite(values).all():
-            raise wrong(model, where, f"perturb: {field.name}: expected numbers, found NaN or infinity", "perturb")
-    return found
+            raise wrong_answer_error(
+                model, where, f"perturb: {field.name}: expected numbers, found NaN or infinity", "perturb"
+            )
+    return errors
 
 
-def names_asked(model: ErrorModel) -> frozenset[str] | None:
-    """The names by which a model asks for noise, found by asking it about no row; None where it fails at that."""
+def find_noise_names(model: ErrorModel) -> frozenset[str] | None:
+    """The names by which a model asks for noise, when it is asked about no rows; None where it fails at that."""
     asked: set[str] = set()
 
     def noise(name: str) -> Float:
@@ -78,7 +84,7 @@ def names_asked(model: ErrorModel) -> frozenset[str] | None:
 
     try:
         model.perturb(ViewGeometry(*np.zeros((len(fields(ViewGeometry)), 0))), noise)
-    except FAILURES:  # a user's own may not expect that there is none
+    except FAILURES:  # a user's own may not expect to be asked about none
         return None
     return frozenset(asked)
 
@@ -103,7 +109,7 @@ class Gaussian(ErrorModel):
         """Offsets = mean + L·z with L·Lᵀ the covariance, turned into easting and northing."""
         (a, b), (_, d) = self.covariance_m2
         l11 = np.sqrt(a)
-        # What rounding leaves of a singular matrix may not be blown up: no row is longer than its variance says.
+        # Rounding of a singular matrix must not be amplified: no row is longer than its variance says.
         l21 = float(np.clip(b / l11, -np.sqrt(d), np.sqrt(d))) if l11 > 0 else 0.0
         l22 = np.sqrt(max(d - l21 * l21, 0.0))
         z1, z2 = noise("position 1"), noise("position 2")
@@ -137,3 +143,4 @@ class Gaussian(ErrorModel):
 
 
 ERROR_MODELS = {"gaussian": "copem_replay.perception.pem.error:Gaussian"}
+"""Built-in names of `error: {kind: …}`."""

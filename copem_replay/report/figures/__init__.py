@@ -1,8 +1,10 @@
-"""Plot: figures from a results folder, each by a function that takes the results and gives a matplotlib Figure.
+"""Figures of a results folder, each by a function from results to a matplotlib Figure.
 
-They are the rows of `FIGURES` (`registry.py`); `write.py` makes the files. Nothing of matplotlib is imported before a
-figure is asked for, and pyplot never is.
+`FIGURES` (`registry.py`) has them all, and `write_figure_files` writes them. matplotlib is imported with the first
+figure, pyplot never.
 """
+
+from __future__ import annotations
 
 from copem_replay.report.figures.registry import FIGURES, FigureKind
 from copem_replay.report.figures.selection import Selection

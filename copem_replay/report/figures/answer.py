@@ -1,4 +1,4 @@
-"""The figure of the answer: how soon each configuration detects on average, and how many pass; the soonest first."""
+"""Figure of the answer: mean time to detection and share that passes of each configuration, the soonest first."""
 
 from __future__ import annotations
 
@@ -8,14 +8,26 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from copem_replay.metrics.fixed import fixed_in
-from copem_replay.metrics.intervals import clusters
-from copem_replay.report.figures.bands import mean_limits
-from copem_replay.report.figures.captions import few_in_words, per_cent, plain, short_names, study
-from copem_replay.report.figures.contenders import RANKED_BY, contenders, soonest_first, truths
-from copem_replay.report.figures.detection_curves import endings
-from copem_replay.report.figures.dots import ROW_IN, Dot, draw_rows
-from copem_replay.report.figures.style import add_note, appearances, new_figure, style
+from copem_replay.metrics.intervals import choose_clusters, find_fixed_outcomes
+from copem_replay.report.figures.detection_curves import detection_endings, mean_limits
+from copem_replay.report.figures.style import (
+    RANKED_BY,
+    ROW_IN,
+    Dot,
+    add_note,
+    choose_appearances,
+    describe_results,
+    describe_too_few,
+    draw_rows,
+    figure_style,
+    find_contenders,
+    find_truths,
+    format_per_cent,
+    format_three_digits,
+    new_figure,
+    shorten_names,
+    sort_soonest_first,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -23,41 +35,42 @@ if TYPE_CHECKING:
 
     from copem_replay.results.read import Results
 
+
 _SHARES = {"pass_share": "Passes, of rows in conflict", "detected_share": "Detected"}
-"""Of these the first that tells something is drawn, too."""
+"""Shares of which the first informative one is drawn, too, with their labels."""
 
 
 def answer_figure(results: Results, *, configurations: Sequence[str] | None = None) -> Figure:
-    """Mean time to detection and share that passes, a dot with its 95 % interval each; the ground truth as a line."""
-    names = soonest_first(results, contenders(results, configurations))
+    """Mean time to detection and share that passes, dots with 95 % intervals; the ground truth as a line."""
+    names = sort_soonest_first(results, find_contenders(results, configurations))
     rows = results.summary.set_index("configuration")
-    upper = [name for name in truths(results) if name in results.chosen(configurations) and name not in names]
-    times, why = _times(results, names)
-    share = _share(rows, names)
-    with style():
+    upper = [name for name in find_truths(results) if name in results.chosen(configurations) and name not in names]
+    times, reasons = _time_dots(results, names)
+    share = _choose_share(rows, names)
+    with figure_style():
         figure = new_figure(8.0, 1.0 + ROW_IN * len(names) + 0.15 * bool(upper))
         panels = figure.subplots(1, 1 + bool(share), squeeze=False, width_ratios=[1.5, 1.0] if share else None)[0]
-        looks = appearances(tuple(results.experiment.configurations))
+        looks = choose_appearances(tuple(results.experiment.configurations))
         draw_rows(panels[0], list(zip(names, times, strict=True)), looks, named=True)
         panels[0].set_xlabel("Mean time to detection (s)")
-        _line(panels[0], {name: float(rows.loc[name, RANKED_BY]) for name in upper}, " s")
-        _from_zero(panels[0], times)
+        _draw_truth_line(panels[0], {name: float(rows.loc[name, RANKED_BY]) for name in upper}, " s")
+        _start_at_zero(panels[0], times)
         if share:
             shares = [_share_dot(rows.loc[name], share) for name in names]
             draw_rows(panels[1], list(zip(names, shares, strict=True)), looks, named=False)
             panels[1].set_xlabel(f"{_SHARES[share]} (%)")
             panels[1].set_xlim(-4, 104)
-            _line(panels[1], {name: 100 * float(rows.loc[name, share]) for name in upper}, " %")
+            _draw_truth_line(panels[1], {name: 100 * float(rows.loc[name, share]) for name in upper}, " %")
         drawn = any(dot.low is not None for dot in times)
-        add_note(figure, [*why, *_note(results, names, rows, intervals=drawn)])
+        add_note(figure, [*reasons, *_note_sentences(results, names, rows, intervals=drawn)])
     return figure
 
 
-def _times(results: Results, names: Sequence[str]) -> tuple[list[Dot], list[str]]:
-    """A dot of each, and first of all what has no interval, and why."""
+def _time_dots(results: Results, names: Sequence[str]) -> tuple[list[Dot], list[str]]:
+    """A dot per configuration, and sentences on those without an interval."""
     rows = results.summary.set_index("configuration")
-    over, cluster = clusters(results.known)
-    fixed = fixed_in(results.experiment.as_written())
+    over, cluster = choose_clusters(results.known)
+    fixed = find_fixed_outcomes(results.experiment.as_written())
     dots: list[Dot] = []
     without: dict[str, list[str]] = {}
     for name in names:
@@ -66,32 +79,33 @@ def _times(results: Results, names: Sequence[str]) -> tuple[list[Dot], list[str]
             dots.append(Dot(None, None, None, "not measured"))
             continue
         if rows.loc[name, "detected_share"] == 0:
-            dots.append(Dot(None, None, None, f"never (counts as {plain(horizon_s)} s)"))
+            dots.append(Dot(None, None, None, f"never (counts as {format_three_digits(horizon_s)} s)"))
             continue
         limits = None
-        reason = few_in_words(results) if over is None else "every run is the same"
+        reason = describe_too_few(results) if over is None else "every run is the same"
         if over is not None and not (over == "runs" and fixed.known(name)):
-            mine = results.known["configuration"] == name
-            time_s, ending, runs = endings(results.known[mine])
+            rows_of_name = results.known["configuration"] == name
+            time_s, ending, runs = detection_endings(results.known[rows_of_name])
             seed = results.experiment.seed
-            limits = mean_limits(np.round(time_s, 9), ending, list(cluster[mine]), horizon_s, seed, runs)
+            limits = mean_limits(np.round(time_s, 9), ending, list(cluster[rows_of_name]), horizon_s, seed, runs)
             reason = f"all {over} alike"
         if limits is None:
             without.setdefault(reason, []).append(name)
-            dots.append(Dot(mean_s, None, None, plain(mean_s)))
+            dots.append(Dot(mean_s, None, None, format_three_digits(mean_s)))
         else:
-            dots.append(Dot(mean_s, *limits, f"{plain(mean_s)} [{plain(limits[0])}, {plain(limits[1])}]"))
-    return dots, [_without(reason, of, names) for reason, of in without.items()]
+            low, high = map(format_three_digits, limits)
+            dots.append(Dot(mean_s, *limits, f"{format_three_digits(mean_s)} [{low}, {high}]"))
+    return dots, [_explain_without(reason, lacking, names) for reason, lacking in without.items()]
 
 
-def _without(reason: str, of: Sequence[str], names: Sequence[str]) -> str:
-    short = short_names(names)
-    of_names = "" if len(of) == len(names) else f" of {', '.join(short[name] for name in of)}"
+def _explain_without(reason: str, lacking: Sequence[str], names: Sequence[str]) -> str:
+    short = shorten_names(names)
+    of_names = "" if len(lacking) == len(names) else f" of {', '.join(short[name] for name in lacking)}"
     return f"No interval of the mean time{of_names} (hollow): {reason}"
 
 
-def _share(rows: pd.DataFrame, names: Sequence[str]) -> str | None:
-    """Which share is drawn beside the times; None: it tells nothing."""
+def _choose_share(rows: pd.DataFrame, names: Sequence[str]) -> str | None:
+    """The share that is drawn beside the times; None if there is no informative one."""
     if "pass_share" in rows and rows.loc[list(names), "pass_share"].notna().any():
         return "pass_share"
     return "detected_share" if (rows.loc[list(names), "detected_share"] < 1).any() else None
@@ -104,46 +118,56 @@ def _share_dot(row: Any, share: str) -> Dot:
     if value is None:
         return Dot(None, None, None, "no conflict")
     if low is None or high is None:
-        return Dot(100 * value, None, None, per_cent(value))
-    return Dot(100 * value, 100 * low, 100 * high, f"{per_cent(value)} [{per_cent(low)}, {per_cent(high)}]")
+        return Dot(100 * value, None, None, format_per_cent(value))
+    return Dot(
+        100 * value,
+        100 * low,
+        100 * high,
+        f"{format_per_cent(value)} [{format_per_cent(low)}, {format_per_cent(high)}]",
+    )
 
 
-def _line(axes: Axes, values: dict[str, float], unit: str) -> None:
-    """The ground truth: not ranked, what could be had at best."""
+def _draw_truth_line(axes: Axes, values: dict[str, float], unit: str) -> None:
+    """Draw the ground truth as dashed lines with their values: an upper bound, not ranked."""
     for name, value in values.items():
         if not np.isnan(value):
             axes.axvline(value, color="0.45", linewidth=1.2, linestyle=(0, (4, 2)), zorder=1, label=name)
-    shown = ", ".join(f"{short} {plain(values[name])}{unit}" for name, short in short_names(list(values)).items())
+    shown = ", ".join(
+        f"{short} {format_three_digits(values[name])}{unit}" for name, short in shorten_names(list(values)).items()
+    )
     first = next(iter(values.values()), None)
     if first is not None and not np.isnan(first):
+        place = _axes_fraction(axes, first)
         axes.annotate(
             shown, (first, 1), xycoords=axes.get_xaxis_transform(), xytext=(0, 2), textcoords="offset points",
-            ha="center" if 0.15 < _place(axes, first) < 0.85 else "left" if _place(axes, first) <= 0.15 else "right",
+            ha="center" if 0.15 < place < 0.85 else "left" if place <= 0.15 else "right",
             va="bottom", fontsize=7.5, color="0.3", annotation_clip=False,
         )  # fmt: skip
 
 
-def _place(axes: Axes, value: float) -> float:
+def _axes_fraction(axes: Axes, value: float) -> float:
     low, high = axes.get_xlim()
     return (value - low) / (high - low)
 
 
-def _from_zero(axes: Axes, dots: Sequence[Dot]) -> None:
-    """Times begin at 0 where they are not negative, and there is a way to go where all are 0."""
+def _start_at_zero(axes: Axes, dots: Sequence[Dot]) -> None:
+    """Set limits of the axis: from 0 unless a time is negative, and 1 s long if all times are 0."""
     ends = [end for dot in dots for end in (dot.value, dot.low, dot.high) if end is not None]
     low, high = min([0.0, *ends]), max([0.0, *ends])
     span = (high - low) or 1.0
     axes.set_xlim(low - 0.04 * span, high + 0.06 * span)
 
 
-def _note(results: Results, names: Sequence[str], rows: pd.DataFrame, *, intervals: bool) -> list[str]:
-    over = clusters(results.known)[0]
-    said = [study(results, names)]
+def _note_sentences(results: Results, names: Sequence[str], rows: pd.DataFrame, *, intervals: bool) -> list[str]:
+    over = choose_clusters(results.known)[0]
+    sentences = [describe_results(results, names)]
     if intervals:
-        said.append(f"Lines: 95 % intervals over {over}. Two that overlap may differ for sure: see the differences")
+        sentences.append(
+            f"Lines: 95 % intervals over {over}. Two that overlap may differ for sure: see the differences"
+        )
     horizon = rows["ttd_rmst_horizon_s"].dropna()
     if (rows.loc[list(names), "detected_share"] < 1).any() and len(horizon):
-        said.append(f"An object that is never detected counts as {plain(float(horizon.iloc[0]))} s")
-    if truths(results):
-        said.append("Dashed: the ground truth, an upper bound, not ranked")
-    return said
+        sentences.append(f"An object that is never detected counts as {format_three_digits(float(horizon.iloc[0]))} s")
+    if find_truths(results):
+        sentences.append("Dashed: the ground truth, an upper bound, not ranked")
+    return sentences

@@ -1,7 +1,12 @@
-"""The figure of curves: which share of the objects is detected by when, configuration by configuration.
+"""Figure of curves: share of objects detected over the time since the onset, with 95 % bands, by configuration.
 
-The curves are cumulative incidences of detection (Aalen–Johansen, departure competing:
-metrics/survival.py), so that what is never detected keeps them below 100 %.
+The curves are cumulative incidences of detection (Aalen–Johansen, departure competing: `metrics/survival.py`): objects
+that are never detected keep them below 100 %.
+
+Bands resample whole clusters of rows with replacement: the runs of a single measured object; else logs, or objects, of
+which there are at least `FEWEST_CLUSTERS`; with fewer there is no band. At each instant the limits are those of a share
+in `summary.csv` (`metrics/intervals.py`); all configurations resample the same clusters. Letters of the shapes: n rows,
+K clusters, R resamples, G instants, M steps of a curve.
 """
 
 from __future__ import annotations
@@ -15,20 +20,29 @@ import numpy as np
 import pandas as pd
 
 from copem_replay.core.tracks import Float, Int
-from copem_replay.metrics.end_reason import competes
-from copem_replay.metrics.fixed import NOTHING_DRAWN, fixed_in
-from copem_replay.metrics.intervals import FEWEST_CLUSTERS, clusters
-from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_incidence
-from copem_replay.report.figures.bands import band
-from copem_replay.report.figures.captions import list_rates, short_names, study
-from copem_replay.report.figures.selection import left_out, that_differ
+from copem_replay.metrics.intervals import (
+    FEWEST_CLUSTERS,
+    NOTHING_DRAWN,
+    Counts,
+    choose_clusters,
+    draw_resamples,
+    effective_number,
+    find_fixed_outcomes,
+    percentile_limits,
+    widen_limits,
+)
+from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_incidence, is_competing
+from copem_replay.report.figures.selection import describe_left_out, find_differing
 from copem_replay.report.figures.style import (
     Appearance,
     add_note,
-    appearances,
+    choose_appearances,
+    describe_list_rates,
+    describe_results,
+    figure_style,
+    mark_configuration,
     new_figure,
-    of_configuration,
-    style,
+    shorten_names,
 )
 
 if TYPE_CHECKING:
@@ -37,18 +51,120 @@ if TYPE_CHECKING:
 
     from copem_replay.results.read import Results
 
+
+# Bands.
+
+RESAMPLES = 400
+"""Resamples of a band: its limits are then off by about 1 % of its width."""
+_SAME_S = 1e-9
+"""Means this close are equal: times are whole nanoseconds."""
+_CELLS = 4_000_000
+"""Resamples × rows held at a time: 32 MB per array."""
+
+
+def incidence_limits(
+    time_s: Float, ending: Int, cluster: Sequence[str], at_s: Float, seed: int, runs: Int | None = None
+) -> tuple[Float, Float]:
+    """Lower and upper limits (G,) of the cumulative incidence at instants (G,).
+
+    `time_s` (n,), `ending` (n,) as in `cumulative_incidence`; `cluster` (n,): name of each row's cluster; `runs` (n,):
+    how often each row counts, None: once.
+    """
+    runs = np.ones(len(time_s), dtype=np.int64) if runs is None else runs
+    names, cluster_ix = np.unique(np.asarray(cluster, dtype=str), return_inverse=True)
+    resampled = draw_resamples([str(name) for name in names], seed, RESAMPLES)
+    # Rows of one cluster with equal time and ending become one row that counts as often.
+    order = np.lexsort((cluster_ix, ending, time_s))
+    keys = np.stack([time_s, ending, cluster_ix])[:, order]
+    first = np.flatnonzero(np.append(True, (np.diff(keys) != 0).any(axis=0)))
+    alike = np.diff(np.append(0, np.cumsum(runs[order]))[np.append(first, len(order))])
+    rows = order[first]
+
+    def curves(count: Counts) -> Float:
+        return resample_incidence(time_s[rows], ending[rows], count[:, cluster_ix[rows]].astype(np.int64) * alike, at_s)
+
+    size = max(1, _CELLS // max(len(rows), len(at_s)))
+    blocks = [curves(resampled.count[k : k + size]) for k in range(0, len(resampled.count), size)]
+    share, n = curves(np.ones((1, len(names)), dtype=np.uint32))[0], effective_number(np.bincount(cluster_ix, runs))
+    limits = [percentile_limits(resampled_shares, resampled) for resampled_shares in np.concatenate(blocks).T]
+    widened = [widen_limits(*limit, n)[1:] for limit in zip(limits, share.tolist(), strict=True)]
+    low, high = np.array(widened).reshape(-1, 2).T
+    return low, high
+
+
+def resample_incidence(time_s: Float, ending: Int, count: Int, at_s: Float) -> Float:
+    """(R, G) cumulative incidence at instants (G,) of rows (n,), sorted by time, that count `count` (R, n) times.
+
+    The estimator of `cumulative_incidence` for all resamples at once; NaN for a resample without rows.
+    """
+    until = np.concatenate([np.zeros((len(count), 1)), np.cumsum(count, axis=1)], axis=1)
+    total = until[:, -1:]
+    weight = np.where(ending == DETECTED, count, 0).astype(float)
+    lost_s = np.unique(time_s[ending == CENSORED])
+    if len(lost_s):
+        lost = np.concatenate(
+            [np.zeros((len(count), 1)), np.cumsum(np.where(ending == CENSORED, count, 0), axis=1)], axis=1
+        )
+        before, after = (np.searchsorted(time_s, lost_s, side=side) for side in ("left", "right"))
+        gone, remaining = lost[:, after] - lost[:, before], total - until[:, after]
+        # A censored row hands its weight on to all remaining rows, if there are any.
+        factors = np.divide(gone, remaining, out=np.zeros_like(gone), where=remaining > 0) + 1.0
+        handed = np.concatenate([np.ones((len(count), 1)), np.cumprod(factors, axis=1)], axis=1)
+        weight *= handed[:, np.searchsorted(lost_s, time_s, side="left")]
+    summed = np.concatenate([np.zeros((len(count), 1)), np.cumsum(weight, axis=1)], axis=1)
+    with np.errstate(invalid="ignore"):  # 0 / 0 in a resample without rows
+        shares = summed[:, np.searchsorted(time_s, at_s, side="right")] / total
+    result: Float = np.minimum(shares, 1.0)
+    return result
+
+
+def mean_limits(
+    time_s: Float, ending: Int, cluster: Sequence[str], horizon_s: float, seed: int, runs: Int | None = None
+) -> tuple[float, float] | None:
+    """Limits of the restricted mean of times (n,) at a horizon; None if all resamples have one mean.
+
+    Arguments as in `incidence_limits`; the resamples are those of a share in `summary.csv`.
+    """
+    runs = np.ones(len(time_s), dtype=np.int64) if runs is None else runs
+    names, cluster_ix = np.unique(np.asarray(cluster, dtype=str), return_inverse=True)
+    resampled = draw_resamples([str(name) for name in names], seed)
+    if not (ending == CENSORED).any():  # no weight is handed on, so sums per cluster suffice
+        counted_s = np.where(ending == DETECTED, np.minimum(time_s, horizon_s), horizon_s)
+        sums = np.stack([np.bincount(cluster_ix, counted_s * runs), np.bincount(cluster_ix, runs)], axis=1)
+        resampled_sums = resampled.count.astype(float) @ sums
+        return _drop_equal_limits(*percentile_limits(resampled_sums[:, 0] / resampled_sums[:, 1], resampled))
+    order = np.lexsort((cluster_ix, ending, time_s))
+    time_s, ending, cluster_ix, runs = time_s[order], ending[order], cluster_ix[order], runs[order]
+    at_s = np.unique(time_s[(ending == DETECTED) & (time_s < horizon_s)])
+    lengths_s = np.diff(np.append(at_s, horizon_s))
+    size = max(1, _CELLS // max(len(time_s), len(at_s), 1))
+    means = [
+        horizon_s
+        - resample_incidence(time_s, ending, resampled.count[k : k + size][:, cluster_ix].astype(np.int64) * runs, at_s)
+        @ lengths_s
+        for k in range(0, len(resampled.count), size)
+    ]  # fmt: skip
+    return _drop_equal_limits(*percentile_limits(np.concatenate(means), resampled))
+
+
+def _drop_equal_limits(low: float, high: float) -> tuple[float, float] | None:
+    return (low, high) if high - low > _SAME_S else None
+
+
+# Curves.
+
 _NEARLY = 0.005
-"""The axis ends when each curve has come this near to its last value (chosen)."""
+"""The axis ends where each curve is within this of its last value: what follows could not be seen."""
 MOST_BANDS = 6
-"""More bands than this hide each other (chosen)."""
+"""Most curves with bands: more bands hide each other."""
 _EXACT: dict[str, Any] = {"color": "black", "linewidth": 0.7, "linestyle": (0, (5, 3))}
 _INSTANTS = 600
-"""At which a band is drawn, at most (chosen: a few per pixel's width)."""
+"""Most instants of a band, about one per pixel: it keeps the SVG small."""
 
 
 @dataclass(frozen=True)
 class DetectionCurve:
-    """A step function: 0 before the first of `times_s (M,)`, `share (M,)` from each on; limits (M,) or None."""
+    """A step function: 0 before the first of `times_s` (M,), `share` (M,) from each on; with limits (M,) or None."""
 
     times_s: Float
     share: Float
@@ -57,101 +173,102 @@ class DetectionCurve:
 
     @property
     def last(self) -> float:
-        """The value it ends with."""
+        """The last value; 0 without steps."""
         return float(self.share[-1]) if len(self.share) else 0.0
 
     def nearly_s(self) -> float:
-        """When it has come near to its last value."""
+        """The first step within `_NEARLY` of the last value (s)."""
         return float(self.times_s[np.argmax(self.share >= self.last - _NEARLY)]) if len(self.share) else 0.0
 
 
 def curves_figure(results: Results, *, configurations: Sequence[str] | None = None) -> Figure:
     """Share detected over the time since the onset, of up to twelve configurations that differ.
 
-    With 95 % bands, unless there are too many of them, and the exact curves, where there are some.
+    With 95 % bands for up to `MOST_BANDS` configurations, and with exact curves if the results have them.
     """
-    every = results.chosen(configurations)
-    names = that_differ(results, every)
-    over, curves = curves_of(results, names, bands=len(names) <= MOST_BANDS)
+    chosen = results.chosen(configurations)
+    names = find_differing(results, chosen)
+    over, curves = build_curves(results, names, bands=len(names) <= MOST_BANDS)
     exact = {name: exact_curve(results.exact, name) for name in names} if results.exact is not None else {}
-    with style():
-        figure = _drawn(results, curves, exact)
-        _note(figure, results, names, over, curves, bool(exact), left_out(every, names))
+    with figure_style():
+        figure = _draw_curves(results, curves, exact)
+        _add_caption(figure, results, names, over, curves, bool(exact), describe_left_out(chosen, names))
         return figure
 
 
-def endings(rows: pd.DataFrame) -> tuple[Float, Int, Int]:
-    """Time (n,) from the onset to the detection or to the end of the episode, how the episode ended, in how many runs.
+def detection_endings(rows: pd.DataFrame) -> tuple[Float, Int, Int]:
+    """Time (n,) from onset to detection or end of the episode, kind of ending (n,) and number of runs (n,).
 
-    Of rows of `Results.known`.
+    `rows`: of `Results.known`.
     """
     detected = rows["time_to_detection_s"].notna().to_numpy()
     looked_s = (rows["ended_s"] - rows["onset_s"]).to_numpy(dtype=float)
     time_s = np.where(detected, rows["time_to_detection_s"].to_numpy(dtype=float), looked_s)
-    ending = np.where(detected, DETECTED, np.where(competes(rows["ended_by"]), LEFT, CENSORED))
+    ending = np.where(detected, DETECTED, np.where(is_competing(rows["ended_by"]), LEFT, CENSORED))
     return time_s, ending, rows["runs"].to_numpy()
 
 
-def curves_of(
+def build_curves(
     results: Results, names: Sequence[str], *, bands: bool = True
 ) -> tuple[str | None, dict[str, DetectionCurve]]:
-    """What is resampled whole, or `NOTHING_DRAWN`; and the curves, with bands where there is something to resample."""
-    over, cluster = clusters(results.known)
-    same = [name for name in names if over == "runs" and fixed_in(results.experiment.as_written()).known(name)]
-    over = NOTHING_DRAWN if same and len(same) == len(names) else over
+    """The kind of clusters (None, or `NOTHING_DRAWN`), and the curves, with bands if there is something to resample."""
+    over, cluster = choose_clusters(results.known)
+    fixed = [
+        name for name in names if over == "runs" and find_fixed_outcomes(results.experiment.as_written()).known(name)
+    ]
+    over = NOTHING_DRAWN if fixed and len(fixed) == len(names) else over
     curves = {}
     for name in names:
         rows = results.known["configuration"] == name
-        banded = bands and over is not None and name not in same
-        curves[name] = curve_of(results.known[rows], cluster[rows] if banded else None, results.experiment.seed)
+        banded = bands and over is not None and name not in fixed
+        curves[name] = build_curve(results.known[rows], cluster[rows] if banded else None, results.experiment.seed)
     return over, curves
 
 
-def curve_of(rows: pd.DataFrame, cluster: pd.Series | None, seed: int) -> DetectionCurve:
-    """The curve of one configuration's rows (n,), with a band where it is said which cluster each row is of."""
+def build_curve(rows: pd.DataFrame, cluster: pd.Series | None, seed: int) -> DetectionCurve:
+    """The curve of one configuration's rows (n,), with a band if `cluster` names the cluster of each row."""
     if not len(rows):
         return DetectionCurve(np.empty(0), np.empty(0))
-    time_s, ending, runs = endings(rows)
+    time_s, ending, runs = detection_endings(rows)
     times_s, share = cumulative_incidence(time_s, ending, runs.astype(float))
     if cluster is None or not len(times_s):
         return DetectionCurve(times_s, share)
-    # Few enough steps for a file of a bearable size.
-    kept = np.unique(np.linspace(0, len(times_s) - 1, min(len(times_s), _INSTANTS)).astype(int))
-    low, high = band(time_s, ending, list(cluster), times_s[kept], seed, runs)
-    held = np.searchsorted(kept, np.arange(len(times_s)), side="right") - 1
-    return DetectionCurve(times_s, share, low[held], high[held])
+    steps = np.unique(np.linspace(0, len(times_s) - 1, min(len(times_s), _INSTANTS)).astype(int))
+    low, high = incidence_limits(time_s, ending, list(cluster), times_s[steps], seed, runs)
+    step_ix = np.searchsorted(steps, np.arange(len(times_s)), side="right") - 1
+    return DetectionCurve(times_s, share, low[step_ix], high[step_ix])
 
 
 def exact_curve(exact: pd.DataFrame, name: str) -> DetectionCurve:
-    """The probability of being detected by then, every log and object counting the same.
+    """The exact probability of being detected by then, averaged over logs and objects.
 
-    Not the estimator of the runs' curves, which hands the weight of censored rows on to all that remain: be it a
-    millionth of one, as none of the runs has it.
+    It differs from the estimator of the runs' curves, which hands the weight of censored rows on to all remaining ones,
+    even to an ending with a probability of a millionth, which no run has.
     """
     rows = exact[exact["configuration"] == name]
-    known = rows[rows["time_to_detection_s"].notna() & (rows["probability"] > 0)]
-    times_s, place = np.unique(known["time_to_detection_s"].to_numpy(dtype=float), return_inverse=True)
-    mass = np.bincount(place, weights=known["probability"].to_numpy(dtype=float), minlength=len(times_s))
+    detections = rows[rows["time_to_detection_s"].notna() & (rows["probability"] > 0)]
+    times_s, place = np.unique(detections["time_to_detection_s"].to_numpy(dtype=float), return_inverse=True)
+    mass = np.bincount(place, weights=detections["probability"].to_numpy(dtype=float), minlength=len(times_s))
     return DetectionCurve(times_s, np.cumsum(mass) / max(rows.groupby(["log", "object_id"]).ngroups, 1))
 
 
-def _drawn(results: Results, curves: dict[str, DetectionCurve], exact: dict[str, DetectionCurve]) -> Figure:
-    looks = appearances(tuple(results.experiment.configurations))
-    short = short_names(list(curves))
-    begin_s, end_s = time_axis([*curves.values(), *exact.values()])
+def _draw_curves(results: Results, curves: dict[str, DetectionCurve], exact: dict[str, DetectionCurve]) -> Figure:
+    looks = choose_appearances(tuple(results.experiment.configurations))
+    short = shorten_names(list(curves))
+    begin_s, end_s = choose_time_limits([*curves.values(), *exact.values()])
     figure = new_figure(8.0, 4.5)
     axes = figure.subplots()
     handles: list[Any] = []
     numbers = {name: k for k, name in enumerate(looks)}
     for name, curve in curves.items():
-        with of_configuration(numbers[name], axes):
-            _band(axes, curve, name, looks[name], begin_s, end_s)
-            handles += _step(axes, curve, begin_s, end_s, label=name, zorder=2.2, **looks[name].line())
+        with mark_configuration(numbers[name], axes):
+            _draw_band(axes, curve, name, looks[name], begin_s, end_s)
+            handles += _draw_step(axes, curve, begin_s, end_s, label=name, zorder=2.2, **looks[name].line())
     for k, (name, curve) in enumerate(exact.items()):
-        with of_configuration(numbers[name], axes):
-            drawn = _step(axes, curve, begin_s, end_s, label="exact", zorder=3, **_EXACT)
-        handles += drawn if k == 0 else []
-    _axes(axes, begin_s, end_s)
+        with mark_configuration(numbers[name], axes):
+            lines = _draw_step(axes, curve, begin_s, end_s, label="exact", zorder=3, **_EXACT)
+        handles += lines if k == 0 else []
+    _set_up_axes(axes, begin_s, end_s)
     axes.set_xlabel("Time since the onset (s)")
     axes.set_ylabel("Share detected by then")
     figure.legend(
@@ -163,16 +280,16 @@ def _drawn(results: Results, curves: dict[str, DetectionCurve], exact: dict[str,
     return figure
 
 
-def _axes(axes: Axes, begin_s: float, end_s: float) -> None:
+def _set_up_axes(axes: Axes, begin_s: float, end_s: float) -> None:
     axes.set_xlim(begin_s, end_s)
     axes.set_ylim(-0.02, 1.03)
     axes.yaxis.set_major_formatter(lambda value, _: f"{100 * value:.0f} %")
 
 
-def _band(axes: Axes, curve: DetectionCurve, name: str, look: Appearance, begin_s: float, end_s: float) -> None:
+def _draw_band(axes: Axes, curve: DetectionCurve, name: str, look: Appearance, begin_s: float, end_s: float) -> None:
     if curve.low is None or curve.high is None:
         return
-    x, low, high = (_steps(curve.times_s, values, begin_s, end_s) for values in (None, curve.low, curve.high))
+    x, low, high = (_step_vertices(curve.times_s, values, begin_s, end_s) for values in (None, curve.low, curve.high))
     axes.fill_between(
         x, low, high, step="post", color=look.colour, alpha=0.2, linewidth=0, zorder=1, label=f"band of {name}"
     )
@@ -180,21 +297,21 @@ def _band(axes: Axes, curve: DetectionCurve, name: str, look: Appearance, begin_
         axes.step(x, limit, where="post", color=look.edge, linewidth=0.5, alpha=0.7, zorder=1.1)
 
 
-def time_axis(curves: Sequence[DetectionCurve]) -> tuple[float, float]:
-    """From before the first detection until each curve has come near to its last value."""
+def choose_time_limits(curves: Sequence[DetectionCurve]) -> tuple[float, float]:
+    """Limits of the time axis: before the first detection, and where each curve is near its last value."""
     begin_s = min([0.0, *(float(curve.times_s[0]) for curve in curves if len(curve.times_s))])
     end_s = max(curve.nearly_s() for curve in curves)
     end_s += 0.12 * (end_s - begin_s) or 1.0
     return begin_s - 0.03 * (end_s - begin_s), end_s
 
 
-def _step(axes: Axes, curve: DetectionCurve, begin_s: float, end_s: float, **line: Any) -> list[Any]:
-    x, y = (_steps(curve.times_s, values, begin_s, end_s) for values in (None, curve.share))
+def _draw_step(axes: Axes, curve: DetectionCurve, begin_s: float, end_s: float, **line: Any) -> list[Any]:
+    x, y = (_step_vertices(curve.times_s, values, begin_s, end_s) for values in (None, curve.share))
     return axes.step(x, y, where="post", **line)
 
 
-def _steps(times_s: Float, values: Float | None, begin_s: float, end_s: float) -> Float:
-    """Vertices (M + 2,) of a step function over the whole axis: its times, or its values."""
+def _step_vertices(times_s: Float, values: Float | None, begin_s: float, end_s: float) -> Float:
+    """Times (`values` None) or values of the vertices (M + 2,) of a step function over the whole axis."""
     shown = times_s <= end_s
     if values is None:
         return np.concatenate([[begin_s], times_s[shown], [end_s]])
@@ -202,7 +319,7 @@ def _steps(times_s: Float, values: Float | None, begin_s: float, end_s: float) -
     return np.concatenate([[0.0], kept, kept[-1:] if len(kept) else [0.0]])
 
 
-def _note(
+def _add_caption(
     figure: Figure,
     results: Results,
     names: Sequence[str],
@@ -220,13 +337,13 @@ def _note(
     elif len(names) > MOST_BANDS:
         bands = f"No bands with more than {MOST_BANDS} curves; choose some with --configurations"
     end_s = figure.axes[0].get_xlim()[1]
-    later = max((curve.last - _share_at(curve, end_s) for curve in curves.values()), default=0.0)
+    later = max((curve.last - _evaluate_share(curve, end_s) for curve in curves.values()), default=0.0)
     add_note(
         figure,
         [
             left,
-            study(results, names),
-            list_rates(results.summary, names),
+            describe_results(results, names),
+            describe_list_rates(results.summary, names),
             "Cumulative incidence of detection: what departs undetected is never detected",
             bands,
             "Dashed: the exact share detected by then" if exact else "",
@@ -235,6 +352,6 @@ def _note(
     )
 
 
-def _share_at(curve: DetectionCurve, time_s: float) -> float:
+def _evaluate_share(curve: DetectionCurve, time_s: float) -> float:
     k = int(np.searchsorted(curve.times_s, time_s, side="right"))
     return float(curve.share[k - 1]) if k else 0.0

@@ -1,21 +1,24 @@
-"""The figure of stages: where the time from the clock's start to the detection goes.
+"""Figure of stages: how the time from the onset to the detection is spent, on average.
 
 | stage | from | to |
 |---|---|---|
 | hidden | the onset | the first list of any of the configuration's units in which it is in sight (`in_sight_s`) |
-| in sight | there | the first list that has the object (`listed_s`) |
-| listed | there | the newest capture that contributed to knowing (`captured_s`) |
-| processing | there | when that list was ready to be sent (`sent_s`) |
-| transport | there | its arrival (`arrived_s`): captured plus latency where there is neither link nor `ready` |
-| fusion | there | the fused list with which it was known (`detection_s`) |
+| in sight | in sight | the first list that has the object (`listed_s`) |
+| listed | first list | the newest capture that contributed to knowing (`captured_s`) |
+| processing | capture | the instant at which that list is ready to be sent (`sent_s`) |
+| transport | ready | its arrival (`arrived_s`): captured plus latency without a link and `ready` |
+| fusion | arrival | the fused list with which it is known (`detection_s`) |
 
-Means over the rows that were detected, so that stages add up. An object listed while no unit had it in sight was hidden
-until it was listed. Of a confirmation only the newest capture is known: what it takes is spent *in sight*, as is the
-time in which another unit's list of the object is still on its way; `listed` where lists have a way that is told
-(`metrics/way.py`). Where they have not, ideal fusion and the truth know from the list that brings it (one hit): all
-from its capture on is transport, nothing fusion. Otherwise transport is the latency, where all units have the same;
-else the two stages are one. So are the first two where it is not known when it was in sight: the truth needs no sight,
-and recorded units don't tell. With `count_earlier` times may be negative, and nothing is drawn.
+Means are over the detected rows, so that stages add up. An object listed while no unit had it in sight counts as hidden
+until it is listed. Only the newest capture of a confirmation is known, so the time of a confirmation, and that in which
+another unit's list of the object is on its way, belong to *listed* where the instants of lists on their way are known
+(`WAY` in `metrics/detections_table.py`), and to *in sight* elsewhere.
+
+Without these instants, ideal fusion and the truth know an object from the list that brings it (one hit): all time from
+the capture on is transport. Otherwise transport is the latency if all units have one latency; if not, transport and
+fusion are one stage, *since captured*. The first two stages are one, *until captured*, if the instant of coming into
+sight is unknown: for the truth, and for recorded units. With `count_earlier` times may be negative, and the figure is
+not drawn.
 """
 
 from __future__ import annotations
@@ -28,16 +31,25 @@ import pandas as pd
 
 from copem_replay.core.tracks import TRUTH, Float
 from copem_replay.experiment.schema import Experiment
-from copem_replay.metrics.way import WAY
-from copem_replay.pipeline.receiver import by_truth
-from copem_replay.report.figures.captions import percent, short_names, study
-from copem_replay.report.figures.style import add_note, appearances, new_figure, of_configuration, style
+from copem_replay.metrics.detections_table import WAY
+from copem_replay.pipeline.receiver import has_truth_ids
+from copem_replay.report.figures.style import (
+    add_note,
+    choose_appearances,
+    describe_results,
+    figure_style,
+    format_share,
+    mark_configuration,
+    new_figure,
+    shorten_names,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from copem_replay.results.read import Results
+
 
 _INSTANTS = ("onset_s", "in_sight_s", *WAY, "captured_s", "detection_s")
 HIDDEN, IN_SIGHT, UNTIL_CAPTURED, LISTED = "hidden", "in sight", "until captured", "listed"
@@ -69,64 +81,64 @@ HATCHES = {
     FUSION: ("#ffffff", "...", "#000000"),
     SINCE_CAPTURED: ("#6e6e6e", "xxx", "#ffffff"),
 }
-"""Of each stage its fill, and the hatch on it with its colour."""
+"""Fill, hatch and colour of the hatch by stage."""
 
 
-def stages_of(results: Results, names: Sequence[str]) -> dict[str, dict[str, float]]:
-    """By configuration the mean seconds of each stage."""
+def mean_stages_by_configuration(results: Results, names: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Mean duration (s) of each stage, by configuration."""
     sums: dict[str, dict[str, float]] = {name: {} for name in names}
     for rows in results.each("configuration", "detected", *_INSTANTS):
         for name, so_far in sums.items():
-            for stage, of in _sums(rows[rows["configuration"] == name], results.experiment, name).items():
-                so_far[stage] = so_far.get(stage, 0.0) + of
-    return {name: _means(of) for name, of in sums.items()}
+            for stage, sum_s in _sum_stages(rows[rows["configuration"] == name], results.experiment, name).items():
+                so_far[stage] = so_far.get(stage, 0.0) + sum_s
+    return {name: _divide_sums(sum_s) for name, sum_s in sums.items()}
 
 
-def how_many(results: Results) -> dict[str, tuple[int, int]]:
-    """Of each configuration in how many rows the object is detected, and how many rows there are."""
-    known = results.known
-    detected = known["runs"].where(known["time_to_detection_s"].notna(), 0).groupby(known["configuration"]).sum()
-    every = known["runs"].groupby(known["configuration"]).sum()
-    return {name: (int(detected[name]), int(every[name])) for name in results.experiment.configurations}
+def count_detected(results: Results) -> dict[str, tuple[int, int]]:
+    """Numbers of rows with detection and of all rows, by configuration."""
+    rows = results.known
+    detected = rows["runs"].where(rows["time_to_detection_s"].notna(), 0).groupby(rows["configuration"]).sum()
+    counted = rows["runs"].groupby(rows["configuration"]).sum()
+    return {name: (int(detected[name]), int(counted[name])) for name in results.experiment.configurations}
 
 
 def no_stages(results: Results, names: Sequence[str]) -> str | None:
-    """The reason why nothing can be drawn; None: it can."""
+    """The reason why the figure cannot be drawn; None if it can."""
     if results.experiment.measure.count_earlier:
         return "with count_earlier an object may be known before the clock starts"
-    detected = how_many(results)
+    detected = count_detected(results)
     return None if any(detected[name][0] for name in names) else "nothing was detected"
 
 
 def latency_breakdown_figure(results: Results, *, configurations: Sequence[str] | None = None) -> Figure:
     """Mean duration of the stages from the onset to the detection, a bar per configuration."""
     names = results.chosen(configurations)
-    means, known = stages_of(results, names), how_many(results)
-    looks, short = appearances(tuple(results.experiment.configurations)), short_names(names)
-    with style():
+    means, detected = mean_stages_by_configuration(results, names), count_detected(results)
+    looks, short = choose_appearances(tuple(results.experiment.configurations)), shorten_names(names)
+    with figure_style():
         figure = new_figure(8.0, 1.3 + 0.3 * len(names))
         axes = figure.subplots()
-        longest_s = max(sum(of.values()) for of in means.values())
+        longest_s = max(sum(means_of_name.values()) for means_of_name in means.values())
         for k, name in enumerate(names):
-            with of_configuration(list(looks).index(name), axes):
-                _bar(axes, k, means[name], looks[name].colour)
-                said = _beside(sum(means[name].values()), *known[name])
-                axes.text(sum(means[name].values()) + 0.008 * longest_s, k, said, va="center_baseline")
+            with mark_configuration(list(looks).index(name), axes):
+                _draw_bar(axes, k, means[name], looks[name].colour)
+                label = _label_bar(sum(means[name].values()), *detected[name])
+                axes.text(sum(means[name].values()) + 0.008 * longest_s, k, label, va="center_baseline")
         axes.set_yticks(range(len(names)), [short[name] for name in names])
         axes.tick_params(axis="y", length=0, pad=10)
         axes.set_ylim(len(names) - 0.4, -0.6)
         axes.set_xlim(0, 1.3 * longest_s or 1.0)
         axes.grid(visible=False, axis="y")
         axes.set_xlabel("Mean time (s)")
-        there = [stage for stage in STAGES if any(stage in of for of in means.values())]
-        _legend(figure, there)
-        note = [study(results, names), "Means over the rows that are detected"]
-        add_note(figure, [*note, *(["Listed: not sent, lost or late"] if LISTED in there else [])])
+        stages = [stage for stage in STAGES if any(stage in means_of_name for means_of_name in means.values())]
+        _add_legend(figure, stages)
+        note = [describe_results(results, names), "Means over the rows that are detected"]
+        add_note(figure, [*note, *(["Listed: not sent, lost or late"] if LISTED in stages else [])])
     return figure
 
 
-def _bar(axes: Axes, place: int, means: dict[str, float], colour: tuple[float, float, float]) -> None:
-    """The stages of one configuration one after the other, after a tick of its colour."""
+def _draw_bar(axes: Axes, place: int, means: dict[str, float], colour: tuple[float, float, float]) -> None:
+    """Draw the stages of one configuration in a row, after a tick of its colour."""
     beside: dict[str, Any] = {"transform": axes.get_yaxis_transform(), "clip_on": False, "label": "_colour"}
     axes.plot(
         [-0.008, -0.008], [place - 0.35, place + 0.35], color=colour, linewidth=5, solid_capstyle="butt", **beside
@@ -139,35 +151,35 @@ def _bar(axes: Axes, place: int, means: dict[str, float], colour: tuple[float, f
         begin_s += mean_s
 
 
-def _legend(figure: Figure, there: Sequence[str]) -> None:
+def _add_legend(figure: Figure, stages: Sequence[str]) -> None:
     from matplotlib.patches import Patch
 
     handles = []
-    for stage in there:
+    for stage in stages:
         fill, hatch, ink = HATCHES[stage]
         patch = Patch(facecolor=fill, edgecolor=ink if hatch else "#404040", hatch=hatch, linewidth=0.4)
         handles.append(patch)
-    figure.legend(handles, list(there), loc="outside upper center", ncols=len(there), columnspacing=1.5)
+    figure.legend(handles, list(stages), loc="outside upper center", ncols=len(stages), columnspacing=1.5)
 
 
-def stages(rows: pd.DataFrame, experiment: Experiment, name: str) -> dict[str, float]:
-    """Mean seconds of each stage that is known of a configuration's rows; empty where none was detected."""
-    return _means(_sums(rows, experiment, name))
+def mean_stages(rows: pd.DataFrame, experiment: Experiment, name: str) -> dict[str, float]:
+    """Mean duration (s) of each known stage over rows of a configuration; empty without a detection."""
+    return _divide_sums(_sum_stages(rows, experiment, name))
 
 
-def _means(sums: Mapping[str, float]) -> dict[str, float]:
-    """Of sums over the rows, and their number under "" (none: nothing was detected)."""
+def _divide_sums(sums: Mapping[str, float]) -> dict[str, float]:
+    """Means from sums over rows, whose number is under ""; empty without a detection."""
     sums = dict(sums)
     count = sums.pop("", 0.0)
-    if HIDDEN in sums and UNTIL_CAPTURED in sums:  # in some logs in sight, in others never until it was listed
+    if HIDDEN in sums and UNTIL_CAPTURED in sums:  # logs with and without instants in sight
         sums[HIDDEN] += sums.pop(UNTIL_CAPTURED)
-    # To a nanosecond: 3.9 − 3 is not 0.9.
-    means = {stage: float(np.round(of / count, 9)) + 0.0 for stage, of in sums.items()}
+    # Rounded to a nanosecond: in floats 3.9 − 3 is not 0.9.
+    means = {stage: float(np.round(sum_s / count, 9)) + 0.0 for stage, sum_s in sums.items()}
     return {stage: mean_s for stage, mean_s in means.items() if mean_s or stage not in (LISTED, PROCESSING)}
 
 
-def _sums(rows: pd.DataFrame, experiment: Experiment, name: str) -> dict[str, float]:
-    """Of some rows; of one log and another they add up."""
+def _sum_stages(rows: pd.DataFrame, experiment: Experiment, name: str) -> dict[str, float]:
+    """Sums of the stages (s) over rows, with the number of rows under ""; sums of several logs can be added."""
     rows = rows[rows["detected"].astype(bool) & rows["captured_s"].notna()]
     if not len(rows):
         return {}
@@ -188,14 +200,14 @@ def _sums(rows: pd.DataFrame, experiment: Experiment, name: str) -> dict[str, fl
         result |= {LISTED: captured_s - listed_s, PROCESSING: sent_s - captured_s}
         result |= {TRANSPORT: arrived_s - sent_s, FUSION: known_s - arrived_s}
     else:
-        result |= _since_captured(known_s - captured_s, experiment, name)
+        result |= _stages_since_capture(known_s - captured_s, experiment, name)
     return {"": float(len(rows))} | {stage: float(values.sum()) for stage, values in result.items()}
 
 
-def _since_captured(delay_s: Float, experiment: Experiment, name: str) -> dict[str, Float]:
+def _stages_since_capture(delay_s: Float, experiment: Experiment, name: str) -> dict[str, Float]:
     configuration = experiment.configurations[name]
     units = experiment.units_of(configuration)
-    by_id = by_truth(configuration) and not experiment.measure.match.always
+    by_id = has_truth_ids(configuration) and not experiment.measure.match.always
     if by_id and experiment.measure.confirm.hits == 1:
         return {TRANSPORT: delay_s, FUSION: np.zeros_like(delay_s)}
     latency_s = {experiment.delay_of(name, unit) for unit in units or (TRUTH,)}
@@ -207,7 +219,7 @@ def _since_captured(delay_s: Float, experiment: Experiment, name: str) -> dict[s
     return {TRANSPORT: transport_s, FUSION: delay_s - transport_s}
 
 
-def _beside(total_s: float, detected: int, rows: int) -> str:
+def _label_bar(total_s: float, detected: int, rows: int) -> str:
     if not detected:
         return " never known"
-    return f" {total_s:.3g} s" + ("" if detected == rows else f", {percent(detected / rows)} known")
+    return f" {total_s:.3g} s" + ("" if detected == rows else f", {format_share(detected / rows)} known")

@@ -1,22 +1,27 @@
-"""All figures, a row each: `plot` writes every one that can be drawn, the report embeds those that need no recording.
+"""Registry of all figures: `plot` writes those that can be drawn, the report embeds those that need no recording.
 
-A figure of one's own is one more row, `FIGURES["name"] = FigureKind(…)`.
+Another figure is added with `FIGURES["name"] = FigureKind(…)`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from copem_replay.core.errors import RecordingError
+from copem_replay.core.files import atomic_files
 from copem_replay.report.figures.answer import answer_figure
 from copem_replay.report.figures.detection_curves import curves_figure
 from copem_replay.report.figures.differences import differences_figure, no_differences
 from copem_replay.report.figures.distances import distances_about, distances_figure
 from copem_replay.report.figures.latency_breakdown import latency_breakdown_figure, no_stages
-from copem_replay.report.figures.selection import Selection
+from copem_replay.report.figures.selection import Selection, choose_object_and_run
+from copem_replay.report.figures.style import METADATA, render_figure
 from copem_replay.report.figures.sweeps import sweeps_figure
 from copem_replay.report.figures.trade_off import no_trade_off, trade_off_figure
+from copem_replay.results.folder import add_to_made_list, check_unchanged
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -32,9 +37,9 @@ def _nothing_missing(results: Results, selection: Selection) -> str | None:
 class FigureKind:
     """A figure. `title`: its heading in the report. `shows`: what it shows, for readers who cannot see it.
 
-    `draw` makes it (`new_figure` within `style()`), and raises RecordingError where `needs_recording` and the recording
-    is missing. `missing`: the reason why these results have no such figure, "" if it need not be given, None: they have
-    one. `about`: paragraphs above it in the report.
+    `draw` makes it (`new_figure` within `figure_style()`); with `needs_recording` it raises RecordingError if the
+    recording is missing. `missing`: the reason why the results have no such figure, "" for a reason that need not be
+    given, None if they have one. `about`: paragraphs above it in the report.
     """
 
     title: str
@@ -45,15 +50,15 @@ class FigureKind:
     needs_recording: bool = False
 
 
-def _runs(results: Results, of: Selection) -> Figure:
-    from copem_replay.report.figures.single_runs import runs_figure  # with all that replays a run
+def _draw_runs(results: Results, of: Selection) -> Figure:
+    from copem_replay.report.figures.single_runs import runs_figure
 
     return runs_figure(results, of)
 
 
 def _no_differences(results: Results, selection: Selection) -> str | None:
-    why = no_differences(results, results.chosen(selection.configurations), selection.differences)
-    return None if why is None else ""
+    reason = no_differences(results, results.chosen(selection.configurations), selection.differences)
+    return None if reason is None else ""
 
 
 def _no_sweep(results: Results, selection: Selection) -> str | None:
@@ -90,7 +95,7 @@ FIGURES: dict[str, FigureKind] = {
     "runs": FigureKind(
         "Single runs",
         "speed of the ego, distance and visible share of one object in one run, a column per configuration",
-        _runs,
+        _draw_runs,
         needs_recording=True,
     ),
     "curves": FigureKind(
@@ -127,4 +132,40 @@ FIGURES: dict[str, FigureKind] = {
         ),
     ),
 }
-"""By the name of its files, in the order in which they are written."""
+"""Figures by the name of their files, in the order in which they are written."""
+
+
+# Files: PNG and SVG of each figure, complete under their names or not there.
+
+
+def write_figure_files(results: Results, folder: Path | None, selection: Selection) -> tuple[list[Path], list[str]]:
+    """Write all figures of a results folder into `folder`, by default its `figures`.
+
+    Returns the files, and a note per figure that cannot be made. Existing figures of these names are replaced, and
+    removed if they can no longer be made. Raises InputError for a selection that is not among the results, OutputError
+    if nothing can be written.
+    """
+    choice = choose_object_and_run(results, selection)  # raises before anything is drawn
+    selection = replace(selection, log=choice.log, object_id=choice.object_id, run=choice.run)
+    folder = results.folder / "figures" if folder is None else folder
+    notes: list[str] = []
+    files: list[str] = []
+    names = [f"{name}{suffix}" for name in FIGURES for suffix in METADATA]
+    with atomic_files(folder, names, way_out="; choose another with --out") as scratch:
+        for name, kind in FIGURES.items():
+            reason = kind.missing(results, selection)
+            if reason is not None:
+                notes += [f"no figure of {name}: {reason}"] * bool(reason)
+                continue
+            try:
+                content = render_figure(kind.draw(results, selection))
+            except RecordingError as error:
+                notes += [f"no figure of {name}: {problem}" for problem in error.problems]
+                continue
+            check_unchanged(results.folder, results.seen)
+            for suffix, data in content.items():
+                (scratch / f"{name}{suffix}").write_bytes(data)
+                files.append(f"{name}{suffix}")
+        check_unchanged(results.folder, results.seen)
+        add_to_made_list(results.folder, [folder / file for file in files])
+    return [folder / file for file in files], notes

@@ -1,30 +1,44 @@
-"""How figures look: one colour, dash, width and marker per configuration, the same in every figure.
+"""Style of figures: one colour, dash, width and marker per configuration in every figure; notes, numbers, files, rows.
 
-Colours come from `core/colours.py`; what would be hard to see on white, or on a dark page, has an outline. Dashes
-and markers tell configurations apart in grey, too, and lines get thinner from one to the next, so that curves that
-coincide lie on each other like stripes.
+Colours come from `core/colours.py`; a colour with little contrast to white or to a dark page has an outline. Dashes and
+markers distinguish configurations in grey, too. Lines get thinner from one configuration to the next, so that
+coinciding curves look like stripes.
 """
 
 from __future__ import annotations
 
+import math
+import re
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from io import BytesIO
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
+import numpy as np
+import pandas as pd
+
 from copem_replay.core.colours import configuration_colours
+from copem_replay.core.errors import count_noun
+from copem_replay.metrics.intervals import FEWEST_CLUSTERS
+from copem_replay.results.compare.labels import DEFAULT_BASELINE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from copem_replay.results.compare import Comparison
+    from copem_replay.results.read import Results
+
 
 Colour = tuple[float, float, float]
 
 INK: Colour = (0.15, 0.15, 0.15)
 FAINT: Colour = (0.45, 0.45, 0.45)
 NOTE_PT = 7.5
-"""Size of the line that says what a figure shows (points)."""
+"""Size of the note below a figure (points)."""
 
 _DASHES: tuple[Any, ...] = (
     (),
@@ -38,15 +52,15 @@ _DASHES: tuple[Any, ...] = (
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 _WIDEST_PT, _THINNEST_PT = 4.4, 1.5
 _PALE = 0.4
-"""How much of a colour is left in its pale version (chosen)."""
+"""Share of a colour in its pale version: clearly paler, but still that colour."""
 _NEEDS_OUTLINE = 3.0
 """Contrast with the paper, white or dark, below which a colour gets an outline. Source: WCAG 2.1, 1.4.11."""
 WHITE: Colour = (1.0, 1.0, 1.0)
 DARK: Colour = (27 / 255, 27 / 255, 27 / 255)
-"""Paper: of a file, and of the report on a dark screen."""
+"""Paper of a file, and of the report on a dark screen."""
 
 _STYLE: dict[str, Any] = {
-    "font.family": ["DejaVu Sans"],  # comes with matplotlib: the same on every machine
+    "font.family": ["DejaVu Sans"],  # comes with matplotlib, so it is on every machine
     "font.size": 8.5,
     "axes.titlesize": 9,
     "axes.labelsize": 8.5,
@@ -62,14 +76,14 @@ _STYLE: dict[str, Any] = {
     "grid.linewidth": 0.6,
     "legend.frameon": False,
     "text.parse_math": False,  # a name may hold a dollar sign
-    "svg.hashsalt": "copem-replay",  # else ids, and so bytes, are random
+    "svg.hashsalt": "copem-replay",  # otherwise ids, and so bytes, are random
     "savefig.dpi": 150,
 }
 
 
 @dataclass(frozen=True)
 class Appearance:
-    """How one configuration is drawn. `edge`: colour of outlines, the colour itself where it is dark enough."""
+    """Line and marker of one configuration. `edge`: colour of outlines, `colour` itself if it needs none."""
 
     colour: Colour
     edge: Colour
@@ -79,15 +93,17 @@ class Appearance:
 
     @property
     def pale(self) -> Appearance:
-        """The same, mixed with white: see-through lines would show what lies below them, their outlines too."""
-        return replace(self, colour=_mixed(self.colour, WHITE, 1 - _PALE), edge=_mixed(self.edge, WHITE, 1 - _PALE))
+        """The appearance mixed with white. Transparency would show the lines and outlines below."""
+        return replace(
+            self, colour=_mix_colours(self.colour, WHITE, 1 - _PALE), edge=_mix_colours(self.edge, WHITE, 1 - _PALE)
+        )
 
     def line(self, width_pt: float | None = None) -> dict[str, Any]:
         """Arguments of a matplotlib line."""
         from matplotlib import patheffects
 
         width = width_pt or self.width_pt
-        # Dashes scale with widths: those of thick lines would be too long to repeat within a step.
+        # matplotlib scales dashes with the width: those of thick lines would not repeat within a step.
         dashes = tuple(length * 1.6 / width for length in self.dashes)
         drawn: dict[str, Any] = {"color": self.colour, "linewidth": width, "solid_capstyle": "butt"}
         drawn["linestyle"] = (0, dashes) if dashes else "-"
@@ -97,13 +113,13 @@ class Appearance:
         return drawn
 
 
-def appearances(configurations: Sequence[str]) -> dict[str, Appearance]:
-    """How each configuration of an experiment is drawn, whichever of them a figure shows."""
+def choose_appearances(configurations: Sequence[str]) -> dict[str, Appearance]:
+    """The appearance of each configuration of an experiment; figures of some of them pass all, too."""
     count = len(configurations)
     result = {}
     for k, (name, rgb) in enumerate(configuration_colours(configurations).items()):
         red, green, blue = (channel / 255 for channel in rgb)
-        edge = _outline((red, green, blue))
+        edge = _outline_colour((red, green, blue))
         width = _WIDEST_PT + (_THINNEST_PT - _WIDEST_PT) * k / max(count - 1, 1)
         result[name] = Appearance(
             (red, green, blue),
@@ -115,31 +131,31 @@ def appearances(configurations: Sequence[str]) -> dict[str, Appearance]:
     return result
 
 
-def _outline(colour: Colour) -> Colour:
-    """Darker where white paper needs it, lighter where dark paper does, else the colour itself."""
-    if contrast(colour, WHITE) < _NEEDS_OUTLINE:
-        return _mixed(colour, (0.0, 0.0, 0.0), 0.45)
-    return _mixed(colour, WHITE, 0.45) if contrast(colour, DARK) < _NEEDS_OUTLINE else colour
+def _outline_colour(colour: Colour) -> Colour:
+    """A darker colour if the contrast to white is low, a lighter one if that to dark paper is, else the colour."""
+    if contrast_ratio(colour, WHITE) < _NEEDS_OUTLINE:
+        return _mix_colours(colour, (0.0, 0.0, 0.0), 0.45)
+    return _mix_colours(colour, WHITE, 0.45) if contrast_ratio(colour, DARK) < _NEEDS_OUTLINE else colour
 
 
-def _mixed(colour: Colour, other: Colour, share: float) -> Colour:
+def _mix_colours(colour: Colour, other: Colour, share: float) -> Colour:
     red, green, blue = (one + share * (two - one) for one, two in zip(colour, other, strict=True))
     return red, green, blue
 
 
-def contrast(colour: Colour, other: Colour) -> float:
+def contrast_ratio(colour: Colour, other: Colour) -> float:
     """Contrast of two colours, 1 (none) to 21. Source: WCAG 2.1, relative luminance."""
-    low, high = sorted(map(_luminance, (colour, other)))
+    low, high = sorted(map(_relative_luminance, (colour, other)))
     return (high + 0.05) / (low + 0.05)
 
 
-def _luminance(colour: Colour) -> float:
+def _relative_luminance(colour: Colour) -> float:
     red, green, blue = (c / 12.92 if c <= 0.03928 else ((c + 0.055) / 1.055) ** 2.4 for c in colour)
     return 0.2126 * red + 0.7152 * green + 0.0722 * blue
 
 
 @contextmanager
-def style() -> Iterator[None]:
+def figure_style() -> Iterator[None]:
     """The package's settings of matplotlib while a figure is made or written, whatever the user's are."""
     import matplotlib
 
@@ -151,12 +167,12 @@ def style() -> Iterator[None]:
 
 
 _MARKED: WeakKeyDictionary[Any, int] = WeakKeyDictionary()
-"""How many artists of a figure are marked as those of some configuration."""
+"""Number of artists marked so far, by figure."""
 
 
 @contextmanager
-def of_configuration(number: int, *panels: Axes) -> Iterator[None]:
-    """Mark what is drawn into panels meanwhile as that of a configuration: a page of HTML can then hide it."""
+def mark_configuration(number: int, *panels: Axes) -> Iterator[None]:
+    """Mark everything drawn into panels in this context as a configuration's, so that an HTML page can hide it."""
     before = {id(artist) for axes in panels for artist in axes.get_children()}
     yield
     drawn = [artist for axes in panels for artist in axes.get_children() if id(artist) not in before]
@@ -168,7 +184,7 @@ def of_configuration(number: int, *panels: Axes) -> Iterator[None]:
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
-    """An empty figure that lays itself out, on no window."""
+    """An empty figure with constrained layout, without a window."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -178,12 +194,12 @@ def new_figure(width_in: float, height_in: float) -> Figure:
 
 
 def add_note(figure: Figure, sentences: Sequence[str]) -> float:
-    """Write what the figure shows below it, in small print, and keep that place free. Returns its height in inches."""
+    """Write sentences below a figure in small print, in a space kept free. Returns its height in inches."""
     import re
     import textwrap
 
     width_in, height_in = (float(v) for v in figure.get_size_inches())
-    per_line = int((width_in - 0.2) * 72 / (NOTE_PT * 0.56))  # a letter is 0.56 of the size wide, on the average
+    per_line = int((width_in - 0.2) * 72 / (NOTE_PT * 0.56))  # a letter is on average 0.56 of the font size wide
     text = ". ".join(sentence.rstrip(".") for sentence in sentences if sentence) + "."
     lines = textwrap.wrap(re.sub(r"(?<=\d) (?=%|[ms]\b)", "\u00a0", text), per_line)
     below_in = len(lines) * NOTE_PT * 1.3 / 72 + 0.12
@@ -193,3 +209,253 @@ def add_note(figure: Figure, sentences: Sequence[str]) -> float:
         engine.set(rect=(0, below, 1, 1 - below))  # type: ignore[call-arg]
     figure.text(0.1 / width_in, 0.06 / height_in, "\n".join(lines), fontsize=NOTE_PT, color="0.3", va="bottom")
     return below_in
+
+
+# Words of figures: names that fit, numbers of rows, list rates, formats of numbers.
+
+_LONGEST_NAME = 26
+"""Most letters of a configuration's name: longer ones would take too much of a figure's width."""
+
+
+def shorten_names(names: Sequence[str]) -> dict[str, str]:
+    """Short names by name: the middle of long ones left out, if all still differ."""
+    half = _LONGEST_NAME // 2
+    short = {name: name if len(name) <= _LONGEST_NAME else f"{name[:half]}…{name[-half + 1 :]}" for name in names}
+    return short if len(set(short.values())) == len(short) else {name: name for name in names}
+
+
+def describe_results(results: Results, names: Sequence[str]) -> str:
+    """Runs, objects, logs, rows per configuration and seed of the results, in words."""
+    counted = results.known[results.known["configuration"].isin(list(names))]
+    things = counted.groupby(["log", "object_id"]).ngroups
+    logs = counted["log"].nunique()
+    in_logs = f" in {count_noun(logs, 'log')}" if logs > 1 else ""
+    rows = counted["runs"].sum() / max(counted["configuration"].nunique(), 1)
+    return (
+        f"{count_noun(results.experiment.runs, 'run')} of {count_noun(things, 'object')}{in_logs}, "
+        f"n = {rows:.0f} per configuration, seed {results.experiment.seed}"
+    )
+
+
+def describe_list_rates(rows: pd.DataFrame, names: Sequence[str]) -> str:
+    """Fused lists per second, configurations of one rate together; `rows` as in `summary.csv`."""
+    by_rate: dict[str, list[str]] = {}
+    for name, short in shorten_names(names).items():
+        rates = rows.loc[rows["configuration"] == name, "list_rate_hz"].dropna()
+        if len(rates):
+            low, high = f"{rates.min():.3g}", f"{rates.max():.3g}"
+            by_rate.setdefault(low if low == high else f"{low} to {high}", []).append(short)
+    if not by_rate:
+        return ""
+    if len(by_rate) == 1:
+        return f"{next(iter(by_rate))} fused lists per second"
+    return "Fused lists per second: " + "; ".join(
+        f"{rate} ({', '.join(names_alike)})" for rate, names_alike in by_rate.items()
+    )
+
+
+def format_share(share: float) -> str:
+    """A share in per cent, `85 %` or `99.8 %`; 100 and 0 only for all and nothing."""
+    if np.isnan(share):
+        return "–"
+    if 0 < share < 0.0005 or 0.9995 < share < 1:
+        return "< 0.1 %" if share < 0.5 else "> 99.9 %"
+    return f"{100 * share:.1f} %" if 0 < share < 0.01 or 0.99 < share < 1 else f"{100 * share:.0f} %"
+
+
+def format_per_cent(share: float) -> str:
+    """A share in per cent to three significant digits, `84.4` or `> 99.9`; 100 and 0 only for all and nothing."""
+    if np.isnan(share):
+        return "–"
+    if 0 < share < 0.0005 or 0.9995 <= share < 1:
+        return "< 0.1" if share < 0.5 else "> 99.9"
+    return format_three_digits(100 * share)
+
+
+def format_three_digits(value: float) -> str:
+    """A number to three significant digits; whole from 1000 on, 0 below 10⁻⁹."""
+    return "0" if abs(value) < 1e-9 else f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}".replace("-", "−")
+
+
+def describe_too_few(results: Results) -> str:
+    """The number of clusters if they are too few to be resampled, such as `2 objects`; else empty."""
+    known = results.known
+    logs, things = known["log"].nunique(), known.groupby(["log", "object_id"]).ngroups
+    if max(logs, things) >= FEWEST_CLUSTERS:
+        return ""
+    if things == 1:
+        return f"{count_noun(results.experiment.runs, 'run')} of one object"
+    return count_noun(things, "object") + (f" in {count_noun(logs, 'log')}" if logs > 1 else "")
+
+
+# Files of figures, of equal bytes every time.
+
+METADATA = {
+    ".png": {"Software": None},  # the version of matplotlib
+    ".svg": {"Date": None, "Creator": None},
+}
+"""Suffixes of files, and metadata of matplotlib that are left out."""
+
+
+def render_figure(figure: Figure, suffixes: Sequence[str] = tuple(METADATA)) -> dict[str, bytes]:
+    """The content of a file of each kind."""
+    content = {}
+    with figure_style(), warnings.catch_warnings():
+        warnings.filterwarnings(
+            "ignore", message="Glyph .* missing from"
+        )  # a letter of a name that the font lacks is drawn as a box
+        lay_out(figure)
+        for axes in figure.axes:
+            # The last bits of a layout differ between calls, and ids within an SVG depend on them.
+            left, bottom, width, height = (round(float(v), 6) for v in axes.get_position().bounds)
+            axes.set_position((left, bottom, width, height))
+        for suffix in suffixes:
+            content[suffix] = _save_svg(figure) if suffix == ".svg" else _save_figure(figure, suffix)
+    return content
+
+
+def _save_figure(figure: Figure, suffix: str) -> bytes:
+    file = BytesIO()
+    figure.savefig(file, format=suffix[1:], metadata=METADATA[suffix])
+    return file.getvalue()
+
+
+def _save_svg(figure: Figure) -> bytes:
+    """The SVG that `savefig` writes, without drawing everything twice as it does."""
+    import matplotlib
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+
+    canvas, dpi, file = figure.canvas, figure.dpi, BytesIO()
+    figure.dpi = matplotlib.rcParams["savefig.dpi"]  # of pictures in the SVG
+    FigureCanvasSVG(figure).print_svg(file, metadata=METADATA[".svg"])  # type: ignore[no-untyped-call]
+    figure.dpi = dpi
+    figure.set_canvas(canvas)
+    return _round_coordinates(file.getvalue())
+
+
+def lay_out(figure: Figure) -> None:
+    """Compute the layout and fix it, so that all files have one layout."""
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        engine.execute(figure)
+        figure.set_layout_engine("none")
+
+
+_PATH = re.compile(rb'(?<= d=")[^"]+|(?<= [xy]=")[-\d.]+(?=")')
+_LONG = re.compile(rb"-?\d+\.\d{3,}")
+
+
+def _round_coordinates(svg: bytes) -> bytes:
+    """An SVG with coordinates rounded to 0.01 points: finer than any screen or printer, and half as long."""
+    return _PATH.sub(lambda path: _LONG.sub(lambda number: b"%.2f" % float(number[0]), path[0]), svg)
+
+
+# Contenders, their order, and the default baseline.
+
+RANKED_BY = "ttd_rmst_s"
+"""Metric of the ranking: the mean time to detection that includes objects never detected."""
+
+
+def find_truths(results: Results) -> tuple[str, ...]:
+    """Configurations of the ground truth, in their order."""
+    return tuple(
+        name for name, configuration in results.experiment.configurations.items() if configuration.units == "truth"
+    )
+
+
+def find_contenders(results: Results, names: Sequence[str] | None = None) -> tuple[str, ...]:
+    """Those of `names` (None: all) that are not the ground truth; all of `names` if there are no others."""
+    chosen, upper = results.chosen(names), find_truths(results)
+    return tuple(name for name in chosen if name not in upper) or chosen
+
+
+def sort_soonest_first(results: Results, names: Sequence[str]) -> tuple[str, ...]:
+    """Configurations by mean time to detection; equal ones by the share that passes, then in their order.
+
+    Configurations with fewer rows come last: their means are over fewer objects.
+    """
+    rows = results.summary.set_index("configuration")
+    fewer = find_with_fewer_rows(results, names)
+
+    def rank(name: str) -> tuple[bool, float, float]:
+        row = rows.loc[name]
+        mean_s, passes = float(row[RANKED_BY]), float(row.get("pass_share", math.nan))
+        return name in fewer, math.inf if math.isnan(mean_s) else mean_s, 0.0 if math.isnan(passes) else -passes
+
+    return tuple(sorted(names, key=rank))
+
+
+def find_with_fewer_rows(results: Results, names: Sequence[str]) -> tuple[str, ...]:
+    """Configurations with fewer rows than the others, because some logs lack their units."""
+    rows = results.summary.set_index("configuration")["n"].loc[list(names)]
+    return tuple(name for name in names if rows[name] < rows.max())
+
+
+def default_baseline(results: Results) -> str:
+    """The configuration `ideal`; without one the first that is not the ground truth."""
+    names = tuple(results.experiment.configurations)
+    return DEFAULT_BASELINE if DEFAULT_BASELINE in names else find_contenders(results)[0]
+
+
+def compare_with_default(results: Results, names: Sequence[str], metrics: Sequence[str]) -> Comparison:
+    """Differences of configurations to the default baseline, in some metrics. Raises InputError."""
+    from copem_replay.results.compare import compare_folders
+
+    return compare_folders([results], configurations=names, baseline=default_baseline(results), metrics=metrics)
+
+
+# Dots with intervals, a row per configuration, for the figures of the answer and of differences.
+
+ROW_IN = 0.27
+"""Height of a row (inches)."""
+_DOT = 34.0
+"""Area of a dot (square points)."""
+
+
+@dataclass(frozen=True)
+class Dot:
+    """A value with or without limits. `words`: text beside it; `sure`: in bold. Without a value only words."""
+
+    value: float | None
+    low: float | None
+    high: float | None
+    words: str
+    sure: bool = False
+
+
+def draw_rows(axes: Axes, dots: Sequence[tuple[str, Dot]], looks: dict[str, Appearance], *, named: bool) -> None:
+    """Draw a row per dot, the first at the top; a dot is filled if it has an interval, else hollow.
+
+    `named`: with names at the left.
+    """
+    numbers = {name: k for k, name in enumerate(looks)}
+    for row, (name, dot) in enumerate(dots):
+        with mark_configuration(numbers[name], axes):
+            _draw_row(axes, row, dot, looks[name], name)
+    short = shorten_names([name for name, _ in dots])
+    axes.set_yticks(range(len(dots)), [short[name] for name, _ in dots] if named else [])
+    axes.set_ylim(len(dots) - 0.45, -0.55)
+    axes.tick_params(axis="y", length=0)
+    axes.grid(visible=False, axis="y")
+    axes.spines["left"].set_visible(False)
+    for k in range(1, len(dots)):
+        axes.axhline(k - 0.5, color="0.93", linewidth=0.6, zorder=0.5)
+
+
+def _draw_row(axes: Axes, row: int, dot: Dot, look: Appearance, name: str) -> None:
+    words: dict[str, Any] = {"va": "center_baseline", "fontsize": 8, "clip_on": False}
+    axes.text(
+        1.03, row, dot.words, transform=axes.get_yaxis_transform(), ha="left",
+        color=INK if dot.value is not None else FAINT, fontweight="bold" if dot.sure else "normal", **words,
+    )  # fmt: skip
+    if dot.value is None:
+        return
+    limits = dot.low is not None and dot.high is not None
+    if dot.low is not None and dot.high is not None:
+        if look.edge != look.colour:
+            axes.plot([dot.low, dot.high], [row, row], color=look.edge, linewidth=3.6, zorder=2, label="_outline")
+        axes.plot([dot.low, dot.high], [row, row], color=look.colour, linewidth=2.4, zorder=2.1, label=f"of {name}")
+    axes.scatter(
+        [dot.value], [row], s=_DOT, marker=look.marker, zorder=3, label=name, linewidths=1.0 if limits else 1.6,
+        facecolor=look.colour if limits else "white", edgecolor=look.edge, clip_on=False,
+    )  # fmt: skip

@@ -1,6 +1,6 @@
-"""The figure of sweeps: what becomes of shares and times when latency, rate, units or their share change.
+"""Figure of sweeps: shares and times to detection over the values of each swept quantity, such as latency or rate.
 
-Made of `sweep.csv`: the columns of `summary.csv`, and which `sweep` and `value` each row is of.
+It is drawn from `sweep.csv`, which has the columns of `summary.csv`, and `sweep` and `value` of each row.
 """
 
 from __future__ import annotations
@@ -11,12 +11,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from copem_replay.core.errors import InputError
-from copem_replay.core.text import interval_words
+from copem_replay.core.errors import InputError, interval_words
 from copem_replay.core.tracks import Float
-from copem_replay.report.figures.captions import list_rates, short_names
-from copem_replay.report.figures.selection import MOST_LINES, evenly, left_out
-from copem_replay.report.figures.style import Appearance, add_note, appearances, new_figure, of_configuration, style
+from copem_replay.report.figures.selection import MOST_LINES, describe_left_out, pick_evenly
+from copem_replay.report.figures.style import (
+    Appearance,
+    add_note,
+    choose_appearances,
+    describe_list_rates,
+    figure_style,
+    mark_configuration,
+    new_figure,
+    shorten_names,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,8 +32,9 @@ if TYPE_CHECKING:
 
     from copem_replay.results.read import Results
 
+
 _BEYOND_S = 1e9
-"""Stands for never where a band is drawn: above every axis (chosen)."""
+"""Stands for never in bands: above every axis, and finite, as drawing needs it."""
 AXES = {
     "latency_s": "Latency (s)",
     "rate_hz": "Rate of the units (lists per second)",
@@ -49,26 +57,26 @@ def sweeps_figure(results: Results, *, configurations: Sequence[str] | None = No
     sweep = results.sweep
     if sweep is None:
         raise InputError(f"{results.folder}: expected sweep.csv in it, found none; give the experiment a `sweep:`")
-    wanted = results.chosen(configurations) if configurations else tuple(dict.fromkeys(sweep["configuration"]))
-    sweep = sweep[sweep["configuration"].isin(wanted)]
+    names = results.chosen(configurations) if configurations else tuple(dict.fromkeys(sweep["configuration"]))
+    sweep = sweep[sweep["configuration"].isin(names)]
     kinds = list(dict.fromkeys(sweep["sweep"]))
     if not kinds:
-        raise InputError(f"{results.folder}/sweep.csv: expected rows of {', '.join(wanted)}, found none")
-    every, wanted = wanted, _that_differ(sweep, wanted)
-    sweep = sweep[sweep["configuration"].isin(wanted)]
+        raise InputError(f"{results.folder}/sweep.csv: expected rows of {', '.join(names)}, found none")
+    asked, names = names, _find_differing(sweep, names)
+    sweep = sweep[sweep["configuration"].isin(names)]
     rows = [name for name in _ROWS if name == "ttd" or (name in sweep and sweep[name].notna().any())]
-    looks = appearances(tuple(dict.fromkeys([*results.experiment.configurations, *wanted])))
-    with style():
+    looks = choose_appearances(tuple(dict.fromkeys([*results.experiment.configurations, *names])))
+    with figure_style():
         figure = new_figure(2.2 + 2.35 * len(kinds), 1.0 + 1.75 * len(rows))
         panels = figure.subplots(len(rows), len(kinds), sharex="col", sharey="row", squeeze=False)
         for column, kind in zip(panels.T, kinds, strict=True):
             part = sweep[sweep["sweep"] == kind]
             for axes, row in zip(column, rows, strict=True):
-                for name in wanted:
-                    mine = part[part["configuration"] == name].sort_values("value", kind="stable")
-                    if len(mine):
-                        with of_configuration(list(looks).index(name), axes):
-                            _series(axes, mine, row, name, looks[name])
+                for name in names:
+                    series = part[part["configuration"] == name].sort_values("value", kind="stable")
+                    if len(series):
+                        with mark_configuration(list(looks).index(name), axes):
+                            _draw_series(axes, series, row, name, looks[name])
             _value_axis(column[-1], kind, part)
         for axes, row in zip(panels[:, 0], rows, strict=True):
             axes.set_ylabel(_ROWS[row])
@@ -76,61 +84,61 @@ def sweeps_figure(results: Results, *, configurations: Sequence[str] | None = No
                 axes.set_ylim(-0.03, 1.05)
                 axes.yaxis.set_major_formatter(lambda value, _: f"{100 * value:.0f} %")
         _close_open_bands(panels[-1])
-        _legend(figure, panels, kinds, wanted)
-        add_note(figure, [*_note(results, sweep, kinds, wanted), left_out(every, wanted)])
+        _add_legend(figure, panels, kinds, names)
+        add_note(figure, [*_note_sentences(results, sweep, kinds, names), describe_left_out(asked, names)])
     return figure
 
 
-def _that_differ(sweep: pd.DataFrame, names: Sequence[str]) -> tuple[str, ...]:
-    """At most twelve, evenly from the soonest to the latest, by the mean over all values."""
+def _find_differing(sweep: pd.DataFrame, names: Sequence[str]) -> tuple[str, ...]:
+    """Up to `MOST_LINES` configurations, evenly from the soonest to the latest by the mean over all values."""
     mean_s = sweep["ttd_rmst_s"].groupby(sweep["configuration"]).mean() if "ttd_rmst_s" in sweep else pd.Series()
-    kept = evenly(sorted(names, key=lambda name: float(mean_s.get(name, 0.0))), MOST_LINES)
-    return tuple(name for name in names if name in kept)
+    picked = pick_evenly(sorted(names, key=lambda name: float(mean_s.get(name, 0.0))), MOST_LINES)
+    return tuple(name for name in names if name in picked)
 
 
-def swept_name(name: str, kind: str) -> str:
-    """What a configuration is called where a quantity is swept: its own name may tell the latency it no longer has."""
+def name_in_sweep(name: str, kind: str) -> str:
+    """Label of a configuration in a sweep; its name may contain a latency that is swept."""
     return f"{name} (latency swept)" if kind == "latency_s" else name
 
 
-def _legend(figure: Figure, panels: Any, kinds: Sequence[str], names: Sequence[str]) -> None:
-    """A configuration that is drawn with its latency swept and as it is, too, is there twice."""
-    short = short_names(names)
+def _add_legend(figure: Figure, panels: Any, kinds: Sequence[str], names: Sequence[str]) -> None:
+    """Add the legend; a configuration drawn in a sweep of latency and in another one has two entries."""
+    short = shorten_names(names)
     handles: dict[str, Line2D] = {}
     for name in (*names, "exact"):
         for column, kind in zip(panels.T, kinds, strict=True):
             drawn = [line for axes in column for line in axes.get_lines() if line.get_label() == name]
             if drawn:
-                handles.setdefault(name if name == "exact" else swept_name(short[name], kind), drawn[0])
+                handles.setdefault(name if name == "exact" else name_in_sweep(short[name], kind), drawn[0])
     figure.legend(list(handles.values()), list(handles), loc="outside right upper", handlelength=3.2)
 
 
-def _series(axes: Axes, rows: pd.DataFrame, what: str, name: str, look: Appearance) -> None:
-    """One configuration in one panel: a line with markers, and its band."""
+def _draw_series(axes: Axes, rows: pd.DataFrame, quantity: str, name: str, look: Appearance) -> None:
+    """Draw one configuration in one panel: a line with markers, and its band."""
     value = rows["value"].to_numpy(dtype=float)
-    if what == "ttd":
-        middle, low, high = (_column(rows, f"ttd_{q}_s") for q in ("median", "p5", "p95"))
-        # A quantile among the never detected lies beyond every axis, where the fifth percentile is known.
+    if quantity == "ttd":
+        middle, low, high = (_read_column(rows, f"ttd_{q}_s") for q in ("median", "p5", "p95"))
+        # With a known fifth percentile, a missing 95th is among the never detected: beyond every axis.
         high = np.where(np.isnan(high) & ~np.isnan(low), np.inf, high)
     else:
-        middle, low, high = (_column(rows, what + end) for end in ("", "_low", "_high"))
-    known = ~np.isnan(low) & ~np.isnan(high)
-    if known.any():
+        middle, low, high = (_read_column(rows, quantity + end) for end in ("", "_low", "_high"))
+    limited = ~np.isnan(low) & ~np.isnan(high)
+    if limited.any():
         high = np.minimum(high, _BEYOND_S)
         axes.fill_between(
-            value, low, high, where=known, color=look.colour, alpha=0.12, linewidth=0, label=f"band of {name}"
+            value, low, high, where=limited, color=look.colour, alpha=0.12, linewidth=0, label=f"band of {name}"
         )
-        for limit in (low, high):  # as lines, too: bands lie on each other
-            shown = np.where(known & (limit < _BEYOND_S), limit, np.nan)
+        for limit in (low, high):  # with lines, since bands overlap
+            shown = np.where(limited & (limit < _BEYOND_S), limit, np.nan)
             axes.plot(value, shown, color=look.edge, linewidth=0.5, label="_limit")
-        beside = np.concatenate([[False], known[:-1]]) | np.concatenate([known[1:], [False]])
-        alone = known & ~beside  # a point between two without limits has no band
+        beside = np.concatenate([[False], limited[:-1]]) | np.concatenate([limited[1:], [False]])
+        alone = limited & ~beside  # a point between two without limits has no band
         axes.vlines(value[alone], low[alone], high[alone], color=look.edge, linewidth=1)
     line = look.line(max(look.width_pt * 0.6, 1.2))
     axes.plot(
         value, middle, marker=look.marker, markersize=4.5, markeredgecolor=look.edge, label=name, zorder=2.5, **line
     )
-    exact = _column(rows, "ttd_median_s_exact" if what == "ttd" else f"{what}_exact")
+    exact = _read_column(rows, "ttd_median_s_exact" if quantity == "ttd" else f"{quantity}_exact")
     if not np.isnan(exact).all():
         axes.plot(value, exact, color="black", linewidth=0.7, linestyle=(0, (5, 3)), label="exact", zorder=3)
 
@@ -140,13 +148,13 @@ def _any_exact(sweep: pd.DataFrame) -> bool:
     return any(bool(sweep[name].notna().any()) for name in names if name in sweep)
 
 
-def _column(rows: pd.DataFrame, name: str) -> Float:
-    """A column (n,) as numbers, NaN where there is none."""
+def _read_column(rows: pd.DataFrame, name: str) -> Float:
+    """A column (n,) as floats, NaN if it is missing."""
     return rows[name].to_numpy(dtype=float) if name in rows else np.full(len(rows), np.nan)
 
 
 def _close_open_bands(panels: Sequence[Axes]) -> None:
-    """End the time axis above all that is finite: bands that go on reach its top."""
+    """End the time axis above all finite values, so that open bands reach its top."""
     drawn = [np.asarray(line.get_ydata(), dtype=float) for axes in panels for line in axes.get_lines()]
     heights = np.concatenate([np.zeros(1), *drawn])
     heights = heights[np.isfinite(heights) & (heights < _BEYOND_S)]
@@ -169,26 +177,28 @@ def _value_axis(axes: Axes, kind: str, part: pd.DataFrame) -> None:
 
 
 def _interval_kinds(sweep: pd.DataFrame) -> list[str]:
-    """Of which kinds the limits of shares are, and over what; those that there are none of are not among them."""
+    """Kinds of the limits of shares with their clusters, in words; empty without limits."""
     if "interval_over" not in sweep or "interval" not in sweep:
         return []
-    there = sweep[["interval", "interval_over"]].dropna().drop_duplicates()
-    return sorted(interval_words(*of) for of in there.itertuples(index=False))
+    distinct = sweep[["interval", "interval_over"]].dropna().drop_duplicates()
+    return sorted(interval_words(*interval) for interval in distinct.itertuples(index=False))
 
 
-def _note(results: Results, sweep: pd.DataFrame, kinds: Sequence[str], names: Sequence[str]) -> list[str]:
+def _note_sentences(results: Results, sweep: pd.DataFrame, kinds: Sequence[str], names: Sequence[str]) -> list[str]:
     n = sorted({int(value) for value in sweep["n"].dropna()}) if "n" in sweep else []
     rows = f", n = {n[0] if n[0] == n[-1] else f'{n[0]} to {n[-1]}'} per point" if n else ""
-    said = [f"Sweeps, {results.experiment.runs} runs{rows}, seed {results.experiment.seed}"]
+    sentences = [f"Sweeps, {results.experiment.runs} runs{rows}, seed {results.experiment.seed}"]
     for kind in kinds:
         if kind != "rate_hz":
-            rates = list_rates(sweep[sweep["sweep"] == kind], names)
-            said.append(f"{AXES.get(kind, kind).partition(' (')[0]}: {rates[:1].lower()}{rates[1:]}" if rates else "")
+            rates = describe_list_rates(sweep[sweep["sweep"] == kind], names)
+            sentences.append(
+                f"{AXES.get(kind, kind).partition(' (')[0]}: {rates[:1].lower()}{rates[1:]}" if rates else ""
+            )
     limits = _interval_kinds(sweep)
-    said.append(f"Bands of shares: 95 %, {'; '.join(limits)}" if limits else "No intervals of the shares")
-    said.append("Dashed black: exact, what the runs tend to" if _any_exact(sweep) else "")
+    sentences.append(f"Bands of shares: 95 %, {'; '.join(limits)}" if limits else "No intervals of the shares")
+    sentences.append("Dashed black: exact, what the runs tend to" if _any_exact(sweep) else "")
     if "ttd_p95_s" in sweep and sweep["ttd_p95_s"].isna().any():
-        said.append(
+        sentences.append(
             "Where a band reaches the top of the axis, or a line is missing, the quantile is among the never detected"
         )
-    return said
+    return sentences

@@ -1,1 +1,1 @@
-"""The report of a results folder, as one HTML page."""
+"""The report of a results folder as one HTML page."""

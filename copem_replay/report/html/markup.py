@@ -1,4 +1,4 @@
-"""HTML as text, of which only the package's own is taken literally."""
+"""Markup: elements of HTML in which all text but the package's own HTML is escaped; swatches and greys of figures."""
 
 from __future__ import annotations
 
@@ -6,55 +6,121 @@ import html
 import re
 from collections.abc import Iterable, Sequence
 
-from copem_replay.core.errors import printable
+from copem_replay.core.errors import escape_unprintable
+from copem_replay.report.figures.style import Appearance, Colour
 
 
 class Html(str):
-    """Text that is HTML already."""
+    """Text that is already HTML, and is not escaped."""
 
     __slots__ = ()
 
 
-def text(value: str) -> Html:
-    """Any text as HTML that shows it, and does nothing else."""
-    return value if isinstance(value, Html) else Html(html.escape(printable(value)))
+def escape_text(value: str) -> Html:
+    """HTML that shows a text literally; Html stays as it is."""
+    return value if isinstance(value, Html) else Html(html.escape(escape_unprintable(value)))
 
 
-def tag(name: str, *children: str, **attributes: str | bool | None) -> Html:
+def make_tag(name: str, *children: str, **attributes: str | bool | None) -> Html:
     """An element; `class_`, `data_value`: `class`, `data-value`. None or False: without the attribute."""
-    said = "".join(
-        f" {key.rstrip('_').replace('_', '-')}" + ("" if value is True else f'="{text(value)}"')
+    written = "".join(
+        f" {key.rstrip('_').replace('_', '-')}" + ("" if value is True else f'="{escape_text(value)}"')
         for key, value in attributes.items()
         if value is not None and value is not False
     )
-    return Html(f"<{name}{said}>{joined(children)}</{name}>")
+    return Html(f"<{name}{written}>{join_html(children)}</{name}>")
 
 
-def joined(parts: Iterable[str], between: str = "") -> Html:
-    """Parts one after the other."""
-    return Html(text(between).join(map(text, parts)))
+def join_html(parts: Iterable[str], between: str = "") -> Html:
+    """Parts in a row, escaped, with `between` between them."""
+    return Html(escape_text(between).join(map(escape_text, parts)))
 
 
-def breakable(name: str) -> Html:
-    """A name that may be broken after an underscore, a colon or a dot that is no decimal point."""
-    return Html(re.sub(r"([_:](?=\w)|\.(?=[a-z]))", r"\1<wbr>", text(name)))
+def allow_breaks(name: str) -> Html:
+    """A name with possible line breaks after underscores, colons and dots that are no decimal points."""
+    return Html(re.sub(r"([_:](?=\w)|\.(?=[a-z]))", r"\1<wbr>", escape_text(name)))
 
 
-def table(head: Sequence[str], rows: Iterable[str], *, caption: str = "", id_: str | None = None) -> Html:
-    """A table that scrolls where it is too wide; `rows` are elements, the first column of `head` names them."""
-    first = tag("tr", *(tag("th", breakable(name), scope="col") for name in head))
-    above = [tag("caption", caption)] if caption else []
-    whole = tag("table", *above, tag("thead", first), tag("tbody", *rows), id_=id_)
-    # To be scrolled with the keyboard it has to be reached by it.
-    return tag("div", whole, class_="scroll", tabindex="0", role="region", aria_label=caption or "table")
+def make_table(head: Sequence[str], rows: Iterable[str], *, caption: str = "", id_: str | None = None) -> Html:
+    """A table that scrolls where it is too wide; `head`: names of columns, `rows`: elements."""
+    first = make_tag("tr", *(make_tag("th", allow_breaks(name), scope="col") for name in head))
+    above = [make_tag("caption", caption)] if caption else []
+    table = make_tag("table", *above, make_tag("thead", first), make_tag("tbody", *rows), id_=id_)
+    # Without a tab index the keyboard cannot scroll it.
+    return make_tag("div", table, class_="scroll", tabindex="0", role="region", aria_label=caption or "table")
 
 
-def folded(title: str, *parts: str) -> Html:
-    """Parts that are shown when asked for, and on paper."""
-    return tag("details", tag("summary", title), *parts)
+def fold_parts(title: str, *parts: str) -> Html:
+    """Parts that are unfolded by their title, and on paper."""
+    return make_tag("details", make_tag("summary", title), *parts)
 
 
-def listed(items: Iterable[str]) -> Html:
-    """A list, nothing where it is empty."""
-    found = [tag("li", item) for item in items]
-    return tag("ul", *found) if found else Html()
+def make_list(items: Iterable[str]) -> Html:
+    """A list of items; no element without items."""
+    elements = [make_tag("li", item) for item in items]
+    return make_tag("ul", *elements) if elements else Html()
+
+
+# Swatches: pieces of lines as in figures (`report/figures/style.py`), for keys and rows of tables.
+
+_PX = 1.25
+"""Pixels per point of a line's width: the enlargement of figures on a page."""
+
+
+def css_colour(colour: Colour) -> str:
+    """A colour in CSS, `rgb(…)`."""
+    red, green, blue = (round(255 * channel) for channel in colour)
+    return f"rgb({red},{green},{blue})"
+
+
+def _dash_array(look: Appearance, width_px: float) -> str:
+    # Dashes are longer on thicker lines, as in the figures, but by less.
+    scale = 1.6 * _PX * max(width_px / (1.6 * _PX * 2), 1.0) ** 0.5
+    return ",".join(f"{round(length * scale, 1):g}" for length in look.dashes)
+
+
+def line_swatch(look: Appearance) -> Html:
+    """A piece of a configuration's line as SVG."""
+    width = look.width_pt * _PX
+    dash = _dash_array(look, width) or None
+
+    def line(colour: Colour, wide: float) -> Html:
+        return make_tag(
+            "line",
+            x1="1", y1="7", x2="43", y2="7", stroke=css_colour(colour), stroke_width=f"{wide:.2f}",
+            stroke_dasharray=dash,
+        )  # fmt: skip
+
+    edge = [line(look.edge, width + 1.8)] if look.edge != look.colour else []
+    return make_tag("svg", *edge, line(look.colour, width), class_="swatch", viewBox="0 0 44 14", aria_hidden="true")
+
+
+# Greys of figures become variables of the page, from ink for black to paper for white, so that a dark page inverts
+# them. Colours stay: a configuration has one colour.
+
+_GREY = re.compile(r"(?<=[: \"])#([0-9a-f]{2})\1\1\b")
+_USED = re.compile(r"var\(--g-([0-9a-f]{2})\)")
+INK, PAPER = (232, 232, 232), (27, 27, 27)
+"""Ink and paper of the dark page, equal to those in `page.css`."""
+
+
+def replace_greys(svg: str) -> str:
+    """Greys such as `#262626` as `var(--g-26)`, in styles and attributes; `page.css` sets the rest."""
+    return _GREY.sub(r"var(--g-\1)", svg)
+
+
+def dark_greys(html: str) -> str:
+    """CSS that sets the variables of a page, for light paper and dark screens."""
+    levels = sorted({int(level, 16) for level in _USED.findall(html)})
+    light = "".join(f"--g-{k:02x}:#{k:02x}{k:02x}{k:02x};" for k in levels)
+    dark = "".join(f"--g-{k:02x}:{_invert_grey(k)};" for k in levels)
+    if not levels:
+        return ""
+    return f":root{{{light}}}\n@media screen and (prefers-color-scheme: dark){{:root{{{dark}}}}}\n"
+
+
+def _invert_grey(level: int) -> str:
+    """The colour of a grey on the dark page: linear from ink (0) to paper (255)."""
+    share = level / 255
+    red, green, blue = (round(ink + (paper - ink) * share) for ink, paper in zip(INK, PAPER, strict=True))
+    return f"#{red:02x}{green:02x}{blue:02x}"

@@ -1,27 +1,134 @@
-"""The page: all sections one after the other, in one file."""
+"""Page: the report of a results folder as one HTML file, which loads nothing else."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING
 
+from copem_replay.core.errors import OutputError
+from copem_replay.core.files import atomic_file
 from copem_replay.report.figures.registry import FIGURES
 from copem_replay.report.figures.selection import Selection
-from copem_replay.report.html.conclusions import lead, more
-from copem_replay.report.html.embedded import drawn
-from copem_replay.report.html.latency_breakdown import stage_table
-from copem_replay.report.html.markup import Html, joined, tag
-from copem_replay.report.html.missed_objects import never_detected, without_a_draw
-from copem_replay.report.html.provenance import provenance
-from copem_replay.report.html.setup import configurations, question, setting
-from copem_replay.report.html.study import Study
-from copem_replay.report.html.swatches import swatch
-from copem_replay.report.html.tables import baseline_words, regret_table, summary_tables
-from copem_replay.report.html.whole import contents, whole_page
+from copem_replay.report.figures.style import render_figure
+from copem_replay.report.html.conclusions import write_details, write_lead
+from copem_replay.report.html.markup import (
+    Html,
+    dark_greys,
+    escape_text,
+    join_html,
+    line_swatch,
+    make_list,
+    make_tag,
+    replace_greys,
+)
+from copem_replay.report.html.setup import (
+    describe_configurations,
+    describe_question,
+    describe_setting,
+    provenance_tables,
+)
+from copem_replay.report.html.study import ReportData, load_study
+from copem_replay.report.html.tables import (
+    baseline_words,
+    exact_misses,
+    never_detected,
+    regret_table,
+    stage_table,
+    summary_tables,
+)
+from copem_replay.results.folder import add_to_made_list, check_unchanged
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+_POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:"
+"""Content-Security-Policy: the page loads nothing from outside."""
+
+
+def section_links(sections: Iterable[tuple[str, str]]) -> Html:
+    """Links to sections, (id, title) each."""
+    links = [make_tag("a", title, href=f"#{id_}") for id_, title in sections]
+    return make_tag("nav", make_list(links), aria_label="Contents", class_="screen")
+
+
+def whole_page(title: str, body: Html) -> str:
+    """A page around a body, with style, script, and the greys of a dark screen."""
+    own = files("copem_replay.report.html")
+    style, script = ((own / name).read_text(encoding="utf-8") for name in ("page.css", "page.js"))
+    return "\n".join(
+        [
+            '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
+            '<meta name="viewport" content="width=device-width, initial-scale=1">',
+            f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">',
+            '<meta name="color-scheme" content="light dark">',
+            '<link rel="icon" href="data:,">',
+            f"<title>{escape_text(title)}</title>\n<style>\n{style}{dark_greys(body)}</style>\n</head>\n<body>\n<main>",
+            body,
+            f"</main>\n<script>\n{script}</script>\n</body>\n</html>\n",
+        ]
+    )
+
+
+# The file: complete under its name or not there, and of equal bytes for equal results.
+
+REPORT = "report.html"
+_SUFFIXES = (".html", ".htm")
+
+
+def check_report(path: Path) -> None:
+    """Raise OutputError for a folder, or a name without the suffix of a page."""
+    if path.suffix.lower() not in _SUFFIXES or path.is_dir():
+        found = "a folder" if path.is_dir() else path.name
+        raise OutputError(f"{path}: expected a name that ends with {' or '.join(_SUFFIXES)}, found {found}")
+
+
+def write_html_report(folder: Path, out: Path | None = None, *, baseline: str | None = None) -> Path:
+    """Write the report of a results folder, by default as `report.html` in it. Returns its path.
+
+    An existing report is replaced. Raises InputError if the results cannot be read, OutputError if the file cannot be
+    written.
+    """
+    path = folder / REPORT if out is None else out
+    check_report(path)
+    study = load_study(folder, baseline)
+    html = build_page(study)
+    with atomic_file(path) as scratch:
+        scratch.write_text(html, encoding="utf-8", newline="\n")
+        check_unchanged(folder, study.results.seen)
+        add_to_made_list(folder, [path])
+    return path
+
+
+# Figures in a page: the SVG that `plot` writes, with ids that are unique on the page.
+
+_NOT_DRAWN = re.compile(r"<!--.*?-->\s*|<metadata>.*?</metadata>\s*|<style .*?</style>\s*", re.DOTALL)
+_IDS = re.compile(r'(?<= id=")|(?<=xlink:href="#)|(?<=url\(#)')
+_LARGER = 1.25
+"""Enlargement of a figure, where there is room: its texts are then about as large as those of tables."""
+_SIZE = re.compile(r'(<svg [^>]*?)width="([\d.]+)pt" height="[\d.]+pt"')
+
+
+def _enlarge(size: re.Match[str]) -> str:
+    return f'{size[1]}style="width: {_LARGER * float(size[2]):.0f}pt"'
+
+
+def figure_element(name: str, figure: Figure, title: str, shows: str) -> Html:
+    """A figure as an element of a page, scrolled where there is no room; `shows`: text for screen readers."""
+    svg = render_figure(figure, (".svg",))[".svg"].decode("utf-8")
+    svg = _NOT_DRAWN.sub("", svg[svg.index("<svg ") :])  # comments repeat texts of users without escapes
+    svg = replace_greys(_SIZE.sub(_enlarge, _IDS.sub(f"{name}-", svg), count=1))
+    plot = make_tag("div", Html(svg), id_=name, class_="plot", role="img", aria_label=shows)
+    return make_tag("div", plot, class_="scroll figure", tabindex="0", role="region", aria_label=title)
+
 
 _ANSWER, _DIFFERENCES = "answer", "differences"
 _BELOW = {"latency_breakdown": stage_table}
-"""What stands below a figure."""
+"""Elements below figures."""
 
 
 @dataclass(frozen=True)
@@ -31,68 +138,74 @@ class _Section:
     parts: Sequence[Html]
 
 
-def page(study: Study) -> str:
-    """The whole report as HTML, nothing of which has to be fetched."""
+def build_page(study: ReportData) -> str:
+    """The whole report as HTML."""
     measured = len(study.results.known) > 0
     sections = [
-        _Section("differences-of-it", "Differences", _differences(study)),
-        *_figures(study, ("trade_off",)),
-        _Section("configurations-of-it", "What is compared", [tag("p", setting(study)), configurations(study)]),
+        _Section("differences-of-it", "Differences", _difference_parts(study)),
+        *_figure_sections(study, ("trade_off",)),
+        _Section(
+            "configurations-of-it",
+            "What is compared",
+            [make_tag("p", describe_setting(study)), describe_configurations(study)],
+        ),
         _Section("table", "Summary", [summary_tables(study)]),
     ]
     if measured:
-        sections += _figures(study, [name for name in FIGURES if name not in (_ANSWER, _DIFFERENCES, "trade_off")])
-        sections.append(_Section("missed", "Never detected", [never_detected(study), without_a_draw(study)]))
-    sections.append(_Section("provenance", "Where this comes from", [provenance(study)]))
+        sections += _figure_sections(
+            study, [name for name in FIGURES if name not in (_ANSWER, _DIFFERENCES, "trade_off")]
+        )
+        sections.append(_Section("missed", "Never detected", [never_detected(study), exact_misses(study)]))
+    sections.append(_Section("provenance", "Where this comes from", [provenance_tables(study)]))
     title = f"When was it known? {', '.join(file.name for file in study.results.provenance.logs)}"
-    head = tag(
+    head = make_tag(
         "header",
-        tag("h1", "When was it known?"),
-        tag("p", question(study), class_="question"),
-        lead(study),
-        *([_embedded(study, _ANSWER)] if measured else []),
-        more(study),
-        contents((one.id, one.title) for one in sections),
-        *([_key(study)] if measured and len(study.names) > 1 else []),
+        make_tag("h1", "When was it known?"),
+        make_tag("p", describe_question(study), class_="question"),
+        write_lead(study),
+        *([_embed_figure(study, _ANSWER)] if measured else []),
+        write_details(study),
+        section_links((section.id, section.title) for section in sections),
+        *([_configuration_key(study)] if measured and len(study.names) > 1 else []),
     )
     return whole_page(
-        title, joined([head, *(tag("section", tag("h2", s.title), *s.parts, id_=s.id) for s in sections)])
+        title, join_html([head, *(make_tag("section", make_tag("h2", s.title), *s.parts, id_=s.id) for s in sections)])
     )
 
 
-def _embedded(study: Study, name: str) -> Html:
+def _embed_figure(study: ReportData, name: str) -> Html:
     kind = FIGURES[name]
-    return drawn(name, kind.draw(study.results, Selection(differences=study.regret)), kind.title, kind.shows)
+    return figure_element(name, kind.draw(study.results, Selection(differences=study.regret)), kind.title, kind.shows)
 
 
-def _differences(study: Study) -> list[Html]:
-    """The figure above the table that it is drawn from."""
+def _difference_parts(study: ReportData) -> list[Html]:
+    """The figure of differences, if there is one, and its table."""
     if study.regret is None or FIGURES[_DIFFERENCES].missing(study.results, Selection(differences=study.regret)):
         return [regret_table(study)]
-    return [baseline_words(study), _embedded(study, _DIFFERENCES), regret_table(study)]
+    return [baseline_words(study), _embed_figure(study, _DIFFERENCES), regret_table(study)]
 
 
-def _figures(study: Study, names: Sequence[str]) -> Iterator[_Section]:
-    """A section for each figure that needs no recording; with the reason where it cannot be drawn."""
+def _figure_sections(study: ReportData, names: Sequence[str]) -> Iterator[_Section]:
+    """A section per figure that needs no recording, with the reason in place of a figure that cannot be drawn."""
     for name in names:
         kind = FIGURES[name]
-        why = "" if kind.needs_recording else kind.missing(study.results, Selection())
-        if why == "" or not len(study.results.known):
+        reason = "" if kind.needs_recording else kind.missing(study.results, Selection())
+        if reason == "" or not len(study.results.known):
             continue
-        if why is not None:
-            yield _Section(f"section-{name}", kind.title, [tag("p", f"No figure: {why}.")])
+        if reason is not None:
+            yield _Section(f"section-{name}", kind.title, [make_tag("p", f"No figure: {reason}.")])
             continue
-        about = [tag("p", line) for line in kind.about(study.results)]
+        about = [make_tag("p", line) for line in kind.about(study.results)]
         below = [_BELOW[name](study)] if name in _BELOW else []
-        yield _Section(f"section-{name}", kind.title, [*about, _embedded(study, name), *below])
+        yield _Section(f"section-{name}", kind.title, [*about, _embed_figure(study, name), *below])
 
 
-def _key(study: Study) -> Html:
-    """The line of each configuration; pressed to leave a configuration out of all figures."""
+def _configuration_key(study: ReportData) -> Html:
+    """A button with the line of each configuration, which hides it in all figures or shows it again."""
     buttons = [
-        tag("button", swatch(look), name, type="button", aria_pressed="true", data_configuration=str(k))
+        make_tag("button", line_swatch(look), name, type="button", aria_pressed="true", data_configuration=str(k))
         for k, (name, look) in enumerate(study.looks.items())
     ]
-    every = [tag("button", word, type="button", data_every=word) for word in ("all", "none")]
-    said = tag("span", "Shown in the figures:", class_="screen")
-    return tag("div", said, *buttons, tag("span", *every, class_="screen"), class_="key", id_="key")
+    switches = [make_tag("button", word, type="button", data_every=word) for word in ("all", "none")]
+    label = make_tag("span", "Shown in the figures:", class_="screen")
+    return make_tag("div", label, *buttons, make_tag("span", *switches, class_="screen"), class_="key", id_="key")

@@ -1,156 +1,274 @@
-"""What was compared, in words: the question, and each configuration."""
+"""Setup in words: the question, how it was measured, each configuration, errors of units, provenance."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
 
 from copem_replay.core.components import Component
-from copem_replay.core.text import counted
+from copem_replay.core.errors import count_noun
 from copem_replay.core.tracks import TRUTH
-from copem_replay.experiment.schema import Configuration, Experiment
-from copem_replay.io.window import in_words
-from copem_replay.report.html.markup import Html, table, tag
-from copem_replay.report.html.tables import named
-from copem_replay.report.html.unit_errors import unit_errors
+from copem_replay.experiment.schema import Configuration, Experiment, Unit
+from copem_replay.io.window import describe_window
+from copem_replay.perception.pem.model import Pem
+from copem_replay.report.html.markup import Html, allow_breaks, fold_parts, join_html, make_list, make_table, make_tag
+from copem_replay.report.html.tables import row_head
 
 if TYPE_CHECKING:
-    from copem_replay.report.html.study import Study
+    from copem_replay.report.html.study import ReportData
+
+
+# Provenance: recordings, notes, parameters, versions.
+
+
+def provenance_tables(study: ReportData) -> Html:
+    """The content of `provenance.json` as tables."""
+    data = study.provenance
+    logs = [
+        make_tag(
+            "tr",
+            make_tag("th", str(log["log"]), scope="row"),
+            make_tag("td", str(log.get("topic") or "–"), class_="text"),
+            make_tag("td", make_tag("code", str(log["sha256"])), class_="text"),
+        )
+        for log in data["logs"]
+    ]
+    skipped = [f"{log['log']}: {log['reason']}" for log in data.get("logs_skipped", [])]
+    notes = [str(note) for note in data.get("notes", [])]
+    if study.regret is not None:
+        notes += [note.removeprefix(f"{study.results.folder}: ") for note in study.regret.notes]
+    keys = ("copem_replay", "python", "seed", "runs", "window_s", "visibility", "max_gap_s")
+    parameters = {key: data.get(key) for key in keys}
+    measured = {key: data.get(key) for key in ("measure", "braking", "run_shown")}
+    return join_html(
+        [
+            make_tag("h3", "Recordings"),
+            make_table(
+                ["log", "topic of the truth", "SHA-256"], logs, caption="Recordings that were replayed", id_="logs"
+            ),
+            make_tag("p", "Skipped, and not in any figure:" if skipped else "No recording was skipped."),
+            make_list(skipped),
+            make_tag("h3", "Notes"),
+            make_list(notes) or make_tag("p", "There are none."),
+            fold_parts("How it was made and measured", _pairs_table(parameters | measured, "Parameters", "parameters")),
+            fold_parts("Libraries", _pairs_table(data.get("libraries", {}), "Versions of libraries", "libraries")),
+        ]
+    )
+
+
+def _pairs_table(data: dict[str, Any], caption: str, id_: str) -> Html:
+    rows = [
+        make_tag(
+            "tr", make_tag("th", allow_breaks(key), scope="row"), make_tag("td", value, class_="text"), data_row=key
+        )
+        for key, value in _flatten_keys(data, "")
+    ]
+    return make_table(["key", "value"], rows, caption=caption, id_=id_)
+
+
+def _flatten_keys(data: Any, key: str) -> Iterator[tuple[str, str]]:
+    """Pairs of whole key, such as `measure.onset.kind`, and value in words."""
+    if isinstance(data, dict) and data:
+        for name, value in data.items():
+            yield from _flatten_keys(value, f"{key}.{name}" if key else str(name))
+    elif isinstance(data, list):
+        yield key, ", ".join(map(str, data)) or "–"
+    else:
+        yield key, _format_value(data)
+
+
+def _format_value(value: Any) -> str:
+    if value is None or value == {}:
+        return "–"
+    if isinstance(value, float):
+        return f"{value:.9g}"
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+# Errors of units beside those of single entries by their PEMs: outages, place, clock, ghosts, classes, track ids.
+
+
+def describe_unit_errors(experiment: Experiment) -> str:
+    """A sentence per unit with such errors, each after a blank; empty without any."""
+    sentences = ""
+    for name, unit in experiment.modelled.items():
+        errors = [*_describe_unit(unit), *_describe_pem(experiment.pems[str(unit.pem)])]
+        if errors:
+            sentences += f" Unit {name}: {', '.join(errors)}."
+    return sentences
+
+
+def _describe_unit(unit: Unit) -> list[str]:
+    errors = []
+    if unit.outages is not None:
+        errors.append(
+            f"no lists {100 * unit.outages.down_share:g} % of the time, {unit.outages.lasts_s:g} s at a time on average"
+        )
+    if unit.placed is not None:
+        errors.append(
+            f"wrong about its own place (σ {unit.placed.position_sigma_m:g} m) "
+            f"and heading (σ {unit.placed.yaw_sigma_deg:g}°)"
+        )
+    if unit.clock is not None:
+        errors.append(
+            f"a clock that is off (σ {unit.clock.offset_sigma_s:g} s and {unit.clock.drift_sigma_ppm:g} ppm), "
+            "which ideal fusion ignores"
+        )
+    return errors
+
+
+def _describe_pem(pem: Pem) -> list[str]:
+    errors = []
+    if pem.ghosts:
+        errors.append(
+            f"{pem.ghosts_in_list:g} false entries in a list on average, of which neither the truth nor ideal "
+            "fusion knows"
+        )
+    if pem.classes is not None and pem.classes.confusion:
+        errors.append(f"mistakes {' and '.join(pem.classes.confusion)} for others")
+    if pem.tracks is not None:
+        errors.append(f"a track id that switches every {pem.tracks.lasts_s:g} s")
+    return errors
+
+
+# Question and configurations.
 
 _CLASSES = {"vru": "vulnerable road user", "vehicles": "vehicle"}
 _NAMED = 6
-"""Units, logs or objects that are named one by one, at most (chosen)."""
+"""Most units, logs or objects that are named one by one: more make a sentence hard to read."""
 
 
-def some(names: Sequence[str]) -> str:
-    """Names, the first of them where they are many."""
+def shorten_list(names: Sequence[str]) -> str:
+    """Names with commas; of too many the first, and how many more there are."""
     shown = ", ".join(names[:_NAMED])
     return shown if len(names) <= _NAMED else f"{shown} and {len(names) - _NAMED} more"
 
 
-def together(names: Sequence[str]) -> str:
-    """`A, B and C`; the first of them where they are many."""
-    return f"{some(names[:-1])} and {names[-1]}" if 1 < len(names) <= _NAMED else some(names)
+def join_names(names: Sequence[str]) -> str:
+    """`A, B and C`; of too many the first, and how many more there are."""
+    return f"{shorten_list(names[:-1])} and {names[-1]}" if 1 < len(names) <= _NAMED else shorten_list(names)
 
 
-def logs(study: Study) -> str:
-    """Which recordings."""
+def describe_recordings(study: ReportData) -> str:
+    """The names of the logs, and the window that was read."""
     names = [file.name for file in study.results.provenance.logs]
     window = study.results.experiment.window_s
     part = ""
     if window is not None and window != (None, None):
-        part = f" ({in_words(*window)} of {'it' if len(names) == 1 else 'each'})"
-    return (f"the log {names[0]}" if len(names) == 1 else f"{len(names)} logs ({some(names)})") + part
+        part = f" ({describe_window(*window)} of {'it' if len(names) == 1 else 'each'})"
+    return (f"the log {names[0]}" if len(names) == 1 else f"{len(names)} logs ({shorten_list(names)})") + part
 
 
-def question(study: Study) -> str:
-    """What was asked."""
+def describe_question(study: ReportData) -> str:
+    """The question that the report answers."""
     experiment = study.results.experiment
     measure = experiment.measure
     if measure.objects.ids is not None:
-        them = f"object {together(measure.objects.ids)}"
+        objects = f"object {join_names(measure.objects.ids)}"
     elif measure.objects.classes is not None:
-        them = f"each measured {' or '.join(_CLASSES.get(name, name) for name in measure.objects.classes)}"
+        objects = f"each measured {' or '.join(_CLASSES.get(name, name) for name in measure.objects.classes)}"
     else:
-        them = "each object that moves"
+        objects = "each object that moves"
     which = f"each of {len(study.names)} configurations" if len(study.names) > 1 else "the one configuration"
     far = "" if experiment.measure.distance_to != "ego" or experiment.ego == "none" else ", and how far away,"
     return (
-        f"On {logs(study)}: how soon{far} is {them} known to the receiver, with {which} of perception units, latencies "
-        "and fusion?"
+        f"On {describe_recordings(study)}: how soon{far} is {objects} known to the receiver, with {which} of "
+        "perception units, latencies and fusion?"
     )
 
 
-def setting(study: Study) -> str:
-    """How it was measured: rows, and when the clock starts."""
-    results = study.results
+def describe_setting(study: ReportData) -> str:
+    """How it was measured: number of rows, seed, start of the clock, confirmation, errors of units."""
+    results, experiment = study.results, study.results.experiment
     things = results.known.groupby(["log", "object_id"]).ngroups
     rows = int(results.known["runs"].sum()) // len(study.names)
-    confirm = results.experiment.measure.confirm
+    confirm = experiment.measure.confirm
     hits = f" An object is known when {confirm.hits} of {confirm.of} captures hold it." if confirm.hits > 1 else ""
     return (
-        f"{counted(things, 'measured object')}, {counted(results.experiment.runs, 'run')}, so {counted(rows, 'row')} "
-        f"for each configuration; common random numbers per run (seed {results.experiment.seed}). "
-        f"The clock of an object starts {_onset(results.experiment)}.{hits}{unit_errors(results.experiment)}"
+        f"{count_noun(things, 'measured object')}, {count_noun(experiment.runs, 'run')}, so {count_noun(rows, 'row')} "
+        f"for each configuration; common random numbers per run (seed {experiment.seed}). "
+        f"The clock of an object starts {_describe_onset(experiment)}.{hits}{describe_unit_errors(experiment)}"
     )
 
 
-def _onset(experiment: Experiment) -> str:
+def _describe_onset(experiment: Experiment) -> str:
     near = experiment.measure.distance_to
     return experiment.measure.onset.described("the ego" if near == "ego" else f"unit {near}")
 
 
-def configurations(study: Study) -> Html:
-    """What each configuration is made of."""
+def describe_configurations(study: ReportData) -> Html:
+    """A table of units, fusion and latency of each configuration."""
     experiment = study.results.experiment
     rows = []
     for name, configuration in experiment.configurations.items():
         truth = configuration.units == "truth"
         units = experiment.units_of(configuration)
         cells = (
-            _heard(configuration, units),
-            "–" if truth else "its own" if configuration.recorded else _fusion(configuration),
-            "as recorded" if configuration.recorded else _way(experiment, configuration, units),
+            _describe_units(configuration, units),
+            "–" if truth else "its own" if configuration.recorded else _describe_fusion(configuration),
+            "as recorded" if configuration.recorded else _describe_links(experiment, configuration, units),
         )
         rows.append(
-            tag(
+            make_tag(
                 "tr",
-                named(study, name),
+                row_head(study, name),
                 *(
-                    tag("td", cell, class_=kind)
+                    make_tag("td", cell, class_=kind)
                     for cell, kind in zip(cells, ("text long", "text", "text long"), strict=True)
                 ),
             )
         )
     head = ["configuration", "units", "fusion", "latency"]
-    return table(head, rows, caption="The configurations, and how each is drawn", id_="configurations")
+    return make_table(head, rows, caption="The configurations, and how each is drawn", id_="configurations")
 
 
-def _heard(configuration: Configuration, units: Sequence[str]) -> str:
+def _describe_units(configuration: Configuration, units: Sequence[str]) -> str:
     if configuration.units == "truth":
         return "ground truth"
     if configuration.recorded is not None:
-        of = f", of {some(configuration.inputs)}" if configuration.inputs else ""
-        return f"recorded on {configuration.recorded.topic}{of}"
-    return f"{len(units)}: {some(units)}" if len(units) > 1 else "".join(units)
+        inputs = f", of {shorten_list(configuration.inputs)}" if configuration.inputs else ""
+        return f"recorded on {configuration.recorded.topic}{inputs}"
+    return f"{len(units)}: {shorten_list(units)}" if len(units) > 1 else "".join(units)
 
 
-def _fusion(configuration: Configuration) -> str:
-    """Its kind, and what is not by default."""
-    return _component(configuration.fusion)
+def _describe_fusion(configuration: Configuration) -> str:
+    """Kind of the fusion, and parameters that differ from their defaults."""
+    return _describe_component(configuration.fusion)
 
 
-def _component(component: Component) -> str:
-    said = component.model_dump(mode="json", by_alias=True)
-    kind = str(said.pop("kind"))
+def _describe_component(component: Component) -> str:
+    values = component.model_dump(mode="json", by_alias=True)
+    kind = str(values.pop("kind"))
     plain = {key: field.get_default() for key, field in type(component).model_fields.items()}
-    of = {key: value for key in type(component).model_fields if isinstance(value := getattr(component, key), Component)}
-    said |= {key: _component(value) for key, value in of.items() if value != plain.get(key)}
-    plain |= {key: said[key] for key, value in of.items() if value == plain.get(key)}
-    other = [f"{key}: {value}" for key, value in said.items() if value != plain.get(key)]
+    components = {
+        key: value for key in type(component).model_fields if isinstance(value := getattr(component, key), Component)
+    }
+    values |= {key: _describe_component(value) for key, value in components.items() if value != plain.get(key)}
+    plain |= {key: values[key] for key, value in components.items() if value == plain.get(key)}
+    other = [f"{key}: {value}" for key, value in values.items() if value != plain.get(key)]
     return f"{kind} ({', '.join(other)})" if other else kind
 
 
-def _way(experiment: Experiment, configuration: Configuration, units: Sequence[str]) -> str:
-    """By which links lists come, and the latency; how often lists are issued."""
+def _describe_links(experiment: Experiment, configuration: Configuration, units: Sequence[str]) -> str:
+    """Links by which lists come, latency, and rate at which the receiver issues lists."""
     by: dict[str, list[str]] = {}
     senders = units or (TRUTH,)
     for unit in senders:
         link = configuration.link_of(unit)
         if isinstance(link, str):
-            by.setdefault(f"link {link} = {_component(experiment.links[link])}", []).append(unit)
+            by.setdefault(f"link {link} = {_describe_component(experiment.links[link])}", []).append(unit)
         elif link is not None:
-            by.setdefault(_component(link), []).append(unit)
-    links = [said if len(of) == len(senders) else f"{some(of)} by {said}" for said, of in by.items()]
-    late = [_latency(configuration, units)] if configuration.latency_s or not links else []
+            by.setdefault(_describe_component(link), []).append(unit)
+    links = [link if len(names) == len(senders) else f"{shorten_list(names)} by {link}" for link, names in by.items()]
+    late = [_describe_latency(configuration, units)] if configuration.latency_s or not links else []
     issued = [f"issued at {configuration.issue_hz:g} Hz"] if configuration.issue_hz is not None else []
     return "; ".join([*links, *late, *issued])
 
 
-def _latency(configuration: Configuration, units: Sequence[str]) -> str:
+def _describe_latency(configuration: Configuration, units: Sequence[str]) -> str:
     if not isinstance(configuration.latency_s, dict):
         return f"{configuration.latency_s:g} s"
     by: dict[float, list[str]] = {}
     for unit in units:
         by.setdefault(configuration.latency_of(unit), []).append(unit)
-    return "; ".join(f"{some(of)} {latency_s:g} s" for latency_s, of in by.items())
+    return "; ".join(f"{shorten_list(names)} {latency_s:g} s" for latency_s, names in by.items())

@@ -1,8 +1,8 @@
-"""Data of a report: the results, where they come from, and their comparison with the baseline."""
+"""Data of a report: results, provenance, their comparison with the baseline, and ties with the best."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -10,13 +10,54 @@ from typing import Any
 
 import pandas as pd
 
-from copem_replay.core.errors import InputError
-from copem_replay.core.text import unknown
-from copem_replay.report.figures.contenders import RANKED_BY, contenders, default_baseline, soonest_first
-from copem_replay.report.figures.style import Appearance, appearances
-from copem_replay.report.html.ties import as_soon_as
-from copem_replay.results.compare import Comparison, compare
-from copem_replay.results.read import Results, load_results
+from copem_replay.core.errors import InputError, unknown_name_message
+from copem_replay.core.tracks import SAME_INSTANT_S
+from copem_replay.metrics.intervals import NOTHING_DRAWN, choose_clusters
+from copem_replay.report.figures.selection import pivot_by_run
+from copem_replay.report.figures.style import (
+    RANKED_BY,
+    Appearance,
+    choose_appearances,
+    default_baseline,
+    describe_too_few,
+    find_contenders,
+    sort_soonest_first,
+)
+from copem_replay.results.compare import Comparison, compare_folders
+from copem_replay.results.compare.limits import ALL_ALIKE
+from copem_replay.results.read import Results, read_results
+
+
+def find_ties(best: str, names: Sequence[str], results: Results) -> tuple[str, ...]:
+    """The best, and all of `names` that detect the same objects at the same times in the same runs."""
+    tied = dict.fromkeys(names, True)
+    for times_s in pivot_by_run(results, "detection_s"):
+        best_s = times_s[best]
+        for name in tied:
+            equal = ((times_s[name] - best_s).abs() <= SAME_INSTANT_S) | (times_s[name].isna() & best_s.isna())
+            tied[name] &= name == best or bool(equal.all())
+    return tuple(name for name in names if tied[name])
+
+
+def detects_at_onset(study: ReportData) -> bool:
+    """Whether the best detects every object at its onset in every run."""
+    known = study.results.known
+    return bool((known.loc[known["configuration"] == study.best, "time_to_detection_s"].abs() <= SAME_INSTANT_S).all())
+
+
+def explain_missing_interval(study: ReportData, rows: pd.DataFrame) -> str:
+    """Why differences to the best have no interval: `2 objects`, `each is the same in every run`."""
+    over = choose_clusters(study.results.known)[0]
+    kinds = list(rows["interval"].dropna().unique()) if "interval" in rows else []
+    reasons = []
+    if ALL_ALIKE in kinds:
+        reasons.append(f"each is the same in every {over[:-1] if over else 'object'}")
+    if NOTHING_DRAWN in kinds:
+        reasons.append("nothing is drawn, every run is the same")
+    if not reasons:
+        reasons.append(describe_too_few(study.results) or "too few of what is resampled")
+    return " or ".join(reasons)
+
 
 _COLUMNS = (
     "detected_share", "interval", "interval_over", "ttd_median_s", "ttd_rmst_s", "ttd_rmst_horizon_s", "dad_median_m",
@@ -25,11 +66,11 @@ _BRAKING = ("n_conflict", "pass_share", "pass_share_low", "pass_share_high", "pa
 
 
 @dataclass(frozen=True)
-class Study:
-    """Results, and what of them is compared.
+class ReportData:
+    """Results with their comparisons.
 
-    `baseline`: None where there is nothing to compare; `regret` are the differences to it. `best`: the configuration
-    that detects soonest of those that are not the truth; None: no object is measured. `lead`: their differences to it.
+    `baseline`: None if there is nothing to compare; `regret`: the differences to it. `best`: the contender that detects
+    soonest, None if no object is measured; `lead`: the differences of the other contenders to it.
     """
 
     results: Results
@@ -50,58 +91,59 @@ class Study:
 
     @property
     def contenders(self) -> tuple[str, ...]:
-        """Those that are not the truth itself; all, if there is nothing else."""
-        return contenders(self.results)
+        """Configurations that are not the truth; all, if there are no others."""
+        return find_contenders(self.results)
 
     @property
     def looks(self) -> dict[str, Appearance]:
         """How each configuration is drawn."""
-        return appearances(self.names)
+        return choose_appearances(self.names)
 
     @cached_property
     def as_soon(self) -> tuple[str, ...]:
-        """The best and all other contenders that detect the same objects in the same runs, each at the same time."""
-        return as_soon_as(str(self.best), self.contenders, self.results)
+        """The best, and all contenders that detect the same objects at the same times in the same runs."""
+        return find_ties(str(self.best), self.contenders, self.results)
 
     def of(self, name: str) -> pd.Series:
         """The row of `summary.csv` of a configuration."""
         return self.results.summary.set_index("configuration").loc[name]
 
 
-def load_study(folder: Path, baseline: str | None = None) -> Study:
-    """Read a results folder and compare what is in it with a baseline.
+def load_study(folder: Path, baseline: str | None = None) -> ReportData:
+    """Read a results folder and compare its configurations with a baseline.
 
-    That is by default `ideal`, else the first configuration that is not the truth. Raises InputError.
+    None: `ideal`, else the first configuration that is not the truth. Raises InputError: no or damaged results, no such
+    baseline.
     """
-    results = load_results(folder, rowless=True)
+    results = read_results(folder, rowless=True)
     _check_summary(results)
     names = tuple(results.experiment.configurations)
     if baseline is not None and baseline not in names:
-        raise InputError(f"--baseline: {unknown('configuration', baseline, names)}")
+        raise InputError(f"--baseline: {unknown_name_message('configuration', baseline, names)}")
     if not len(results.known):
-        return Study(results, None, None, None, None)
-    ranked = contenders(results)
-    best = soonest_first(results, ranked)[0]
+        return ReportData(results, None, None, None, None)
+    ranked = find_contenders(results)
+    best = sort_soonest_first(results, ranked)[0]
     if len(names) < 2:
-        return Study(results, None, None, best, None)
+        return ReportData(results, None, None, best, None)
     against = baseline or default_baseline(results)
-    regret = compare([results], baseline=against)
+    regret = compare_folders([results], baseline=against)
     lead = None
     if len(ranked) > 1:
         lead = (
             regret
             if best == against and ranked == names
-            else compare([results], configurations=ranked, baseline=best, metrics=(RANKED_BY,))
+            else compare_folders([results], configurations=ranked, baseline=best, metrics=(RANKED_BY,))
         )
-    return Study(results, against, regret, best, lead)
+    return ReportData(results, against, regret, best, lead)
 
 
 def _check_summary(results: Results) -> None:
-    """Raise InputError where `summary.csv` is not that of the experiment."""
+    """Raise InputError if `summary.csv` lacks columns, or has rows of other configurations than the experiment."""
     place, again = results.folder / "summary.csv", "run the experiment again with --overwrite"
     needed = _COLUMNS + (_BRAKING if results.experiment.braking is not None else ())
     if missing := [name for name in needed if name not in results.summary]:
         raise InputError(f"{place}: expected the column {missing[0]}, found none; {again}")
-    expected, found = list(results.experiment.configurations), list(results.summary["configuration"])
-    if found != expected:
-        raise InputError(f"{place}: expected rows of {', '.join(expected)}, found {', '.join(found)}; {again}")
+    expected, listed = list(results.experiment.configurations), list(results.summary["configuration"])
+    if listed != expected:
+        raise InputError(f"{place}: expected rows of {', '.join(expected)}, found {', '.join(listed)}; {again}")

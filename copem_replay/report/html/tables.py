@@ -1,10 +1,11 @@
-"""The summary and the regret as tables, with what their columns mean.
+"""Tables: summary, differences, missed objects and stages of the latency, with the meaning of their columns.
 
 Cells have three significant digits; `data-value` holds the number of `summary.csv`.
 """
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -12,124 +13,241 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from copem_replay.core.text import counted
+from copem_replay.core.errors import count_noun
 from copem_replay.metrics.metric import RowMetric, own_metrics
+from copem_replay.metrics.summary import describe_intervals, format_cell
 from copem_replay.metrics.summary_metrics import METRIC, METRICS, PARTS
-from copem_replay.metrics.summary_text import intervals_said
-from copem_replay.report.figures.captions import plain
+from copem_replay.metrics.survival import EndReason
 from copem_replay.report.figures.differences import excludes_0
-from copem_replay.report.html.headers import (
-    difference,
-    difference_header,
-    header,
-    in_order,
-    number,
-    signed_difference,
-    without_unit,
+from copem_replay.report.figures.latency_breakdown import STAGES, count_detected, mean_stages_by_configuration
+from copem_replay.report.figures.style import format_per_cent, format_three_digits
+from copem_replay.report.html.markup import (
+    Html,
+    allow_breaks,
+    fold_parts,
+    join_html,
+    line_swatch,
+    make_list,
+    make_table,
+    make_tag,
 )
-from copem_replay.report.html.markup import Html, breakable, folded, joined, listed, table, tag
-from copem_replay.report.html.swatches import swatch
 from copem_replay.results.compare.metrics import METRICS as COMPARED
-from copem_replay.results.compare.tables import comparison_lines, without_interval
+from copem_replay.results.compare.tables import NOTHING, comparison_lines, explain_no_interval
 
 if TYPE_CHECKING:
-    from copem_replay.report.html.study import Study
+    from copem_replay.report.html.study import ReportData
+
+
+# Headers of columns and formats of their values: three significant digits, shares in per cent.
+
+_HEADERS = {
+    "n": "rows",
+    "list_rate_hz": "fused lists per second",
+    "detected_share": "detected, %",
+    "ttd_median_s": "median time to detection, s",
+    "ttd_p95_s": "95 % detected by, s",
+    "ttd_rmst_s": "mean time to detection, s",
+    "ttd_rmst_s_equal_ghosts": "mean time at equal false positives, s",
+    "dad_median_m": "median distance at detection, m",
+    "dad_p5_m": "95 % detected beyond, m",
+    "conflict_detected_share": "collision foreseen, %",
+    "conflict_ttd_median_s": "median time until foreseen, s",
+    "conflict_ttd_p95_s": "95 % foreseen by, s",
+    "conflict_ttd_rmst_s": "mean time until foreseen, s",
+    "conflict_dad_median_m": "median distance when foreseen, m",
+    "n_conflict": "rows in conflict",
+    "pass_share": "passes, %",
+    "pass_share_exact": "passes without a draw, %",
+    "position_rmse_m": "position error (RMSE), m",
+    "position_rmse_captured_m": "position error at capture (RMSE), m",
+    "velocity_rmse_mps": "velocity error (RMSE), m/s",
+    "age_of_information_s": "age of information, s",
+    "nees": "NEES",
+    "nees_expected": "NEES expected",
+    "gospa_m": "GOSPA, m",
+    "false_positives_per_min": "false positives per minute",
+    "stale_false_positives_per_min": "stale ones of these per minute",
+    "duplicates_per_min": "duplicates per minute",
+    "longest_gap_s": "longest gap, s",
+}
+_UNITS = {
+    "_per_min": " per minute", "_share": ", %", "_mps2": ", m/s²", "_mps": ", m/s", "_deg": ", °", "_hz": ", Hz",
+    "_m": ", m", "_s": ", s",
+}  # fmt: skip
+"""Units by ends of names, for columns without an entry in `_HEADERS`."""
+FIRST = ("ttd_rmst_s", "ttd_median_s", "ttd_p95_s", "detected_share")
+"""First columns of a table, which a narrow screen shows without scrolling."""
+
+
+def column_header(name: str) -> str:
+    """The header of a column with its unit: `mean time to detection, s`."""
+    if name in _HEADERS:
+        return _HEADERS[name]
+    for end, unit in _UNITS.items():
+        if name.endswith(end) and len(name) > len(end):
+            return name.removesuffix(end).replace("_", " ") + unit
+    return name.replace("_", " ")
+
+
+def strip_unit(name: str) -> str:
+    """The header of a column without its unit, for sentences."""
+    return column_header(name).partition(", ")[0]
+
+
+def is_share(name: str) -> bool:
+    """Whether a column is shown in per cent."""
+    return column_header(name).endswith(", %")
+
+
+def sort_columns(names: Sequence[str]) -> list[str]:
+    """Columns in the order in which they are shown: those in `FIRST`, then the others."""
+    return sorted(names, key=lambda name: FIRST.index(name) if name in FIRST else len(FIRST))
+
+
+def format_value(name: str, value: float) -> str:
+    """A value of a column; NaN as a dash."""
+    if value != value:
+        return "–"
+    return format_per_cent(value) if is_share(name) else format_three_digits(value)
+
+
+def difference_column_header(name: str) -> str:
+    """The header of a column of differences, in percentage points for shares."""
+    return column_header(name).removesuffix(", %") + ", percentage points" if is_share(name) else column_header(name)
+
+
+def format_difference(name: str, value: float) -> str:
+    """A limit of a difference, in the unit of its column."""
+    return format_three_digits(value * (100 if is_share(name) else 1))
+
+
+def format_signed_difference(name: str, value: float) -> str:
+    """A difference with its sign."""
+    if abs(value) < NOTHING:
+        return "±0"
+    return ("+" if value > 0 else "") + format_difference(name, value)
+
 
 _INTERVALS = {"detected_share": "interval", "pass_share": "pass_interval"}
-"""Columns that have limits, and where it is said of which kind."""
+"""Columns with limits, and the columns that name their kind of interval."""
 _COUNTS = {"n": ("row", "rows"), "n_conflict": ("row in conflict", "rows in conflict")}
 _ONCE = (*_COUNTS, "list_rate_hz")
-"""Columns that are said once below a table where they are the same for all."""
+"""Columns that become a sentence below the table if all rows have one value."""
 
 
 @dataclass(frozen=True)
-class Part:
-    """Columns of `summary.csv` that are shown together, and what they mean."""
+class SummaryPart:
+    """Columns of `summary.csv` in one table, with their meanings."""
 
     id: str
     caption: str
     columns: dict[str, str]
 
 
-def _parts(own: Sequence[RowMetric]) -> list[Part]:
+def _list_parts(own: Sequence[RowMetric]) -> list[SummaryPart]:
     metrics = (*METRICS, *own_metrics(own))
-    return [Part(id_, caption, {m.name: m.help for m in metrics if m.part == id_}) for id_, caption in PARTS.items()]
+    return [
+        SummaryPart(id_, caption, {m.name: m.help for m in metrics if m.part == id_}) for id_, caption in PARTS.items()
+    ]
 
 
-def summary_tables(study: Study) -> Html:
-    """What `summary.csv` says, in parts of which each fits on a page."""
+def summary_tables(study: ReportData) -> Html:
+    """`summary.csv` as several tables, each of which fits on a page."""
     rows = study.results.summary
     parts = []
-    for part in _parts(study.results.experiment.measure.metrics):
-        there = {name: says for name, says in part.columns.items() if name in rows and rows[name].notna().any()}
-        once = [name for name in there if name in _ONCE and rows[name].nunique(dropna=False) == 1]
-        columns = {name: there[name] for name in in_order(list(there)) if name not in once}
-        wanted = part.id != "braking" or "pass_share" in columns
-        if columns and wanted:
-            below = [*_once(rows, once), *_interval(study, part, columns)]
-            parts += [_table(study, part, columns), *(tag("p", line, class_="below") for line in below)]
-            parts.append(folded("What the columns mean", _meanings(columns.items())))
-    return joined(parts)
+    for part in _list_parts(study.results.experiment.measure.metrics):
+        present = {name: says for name, says in part.columns.items() if name in rows and rows[name].notna().any()}
+        once = [name for name in present if name in _ONCE and rows[name].nunique(dropna=False) == 1]
+        columns = {name: present[name] for name in sort_columns(list(present)) if name not in once}
+        shown = part.id != "braking" or "pass_share" in columns
+        if columns and shown:
+            below = [*_common_values(rows, once), *_interval_sentences(study, part, columns)]
+            parts += [_summary_table(study, part, columns), *(make_tag("p", line, class_="below") for line in below)]
+            parts.append(fold_parts("What the columns mean", _column_meanings(columns.items())))
+    return join_html(parts)
 
 
-def _once(rows: pd.DataFrame, names: Sequence[str]) -> list[str]:
-    """Columns that are the same for all: `500 rows, 10 fused lists per second for each configuration.`"""
-    said = [counted(int(rows[name].iloc[0]), noun, many) for name, (noun, many) in _COUNTS.items() if name in names]
-    said += [f"{plain(float(rows[name].iloc[0]))} {header(name)}" for name in names if name not in _COUNTS]
-    return [f"{', '.join(said)} for each configuration."] if said else []
+def _common_values(rows: pd.DataFrame, names: Sequence[str]) -> list[str]:
+    """A sentence of columns with one value: `500 rows, 10 fused lists per second for each configuration.`"""
+    values = [
+        count_noun(int(rows[name].iloc[0]), noun, many) for name, (noun, many) in _COUNTS.items() if name in names
+    ]
+    values += [
+        f"{format_three_digits(float(rows[name].iloc[0]))} {column_header(name)}"
+        for name in names
+        if name not in _COUNTS
+    ]
+    return [f"{', '.join(values)} for each configuration."] if values else []
 
 
-def _table(study: Study, part: Part, columns: dict[str, str]) -> Html:
+def _summary_table(study: ReportData, part: SummaryPart, columns: dict[str, str]) -> Html:
     rows = []
     for row in study.results.summary.to_dict("records"):
-        cells = [_cell(row, name) for name in columns]
-        rows.append(tag("tr", named(study, str(row["configuration"])), *cells, data_row=str(row["configuration"])))
-    return table(["configuration", *map(header, columns)], rows, caption=part.caption, id_=part.id)
+        cells = [_summary_cell(row, name) for name in columns]
+        rows.append(
+            make_tag("tr", row_head(study, str(row["configuration"])), *cells, data_row=str(row["configuration"]))
+        )
+    return make_table(["configuration", *map(column_header, columns)], rows, caption=part.caption, id_=part.id)
 
 
-def named(study: Study, name: str) -> Html:
+def row_head(study: ReportData, name: str) -> Html:
     """The head of a configuration's row."""
-    return tag("th", tag("span", swatch(study.looks[name]), tag("span", breakable(name)), class_="named"), scope="row")
+    return make_tag(
+        "th",
+        make_tag("span", line_swatch(study.looks[name]), make_tag("span", allow_breaks(name)), class_="named"),
+        scope="row",
+    )
 
 
-def _cell(row: dict[str, Any], name: str) -> Html:
+def _summary_cell(row: dict[str, Any], name: str) -> Html:
     value = float("nan") if pd.isna(row[name]) else float(row[name])
-    parts = [Html(number(name, value))]
+    parts = [Html(format_value(name, value))]
     low, high = (row.get(f"{name}_{end}") if name in _INTERVALS else None for end in ("low", "high"))
     if low is not None and high is not None and pd.notna(low) and pd.notna(high):
-        parts.append(interval(number(name, float(low)), number(name, float(high))))
-    return tag("td", *parts, data_column=name, data_value=full(row[name]), data_low=full(low), data_high=full(high))
+        parts.append(interval_markup(format_value(name, float(low)), format_value(name, float(high))))
+    return make_tag(
+        "td",
+        *parts,
+        data_column=name,
+        data_value=full_number(row[name]),
+        data_low=full_number(low),
+        data_high=full_number(high),
+    )
 
 
-def interval(low: str, high: str) -> Html:
-    """Limits, below their figure where that is narrower."""
-    return joined([" ", tag("span", f"[{low}, {high}]", class_="interval")])
+def interval_markup(low: str, high: str) -> Html:
+    """Limits of an interval, which may wrap below their value."""
+    return join_html([" ", make_tag("span", f"[{low}, {high}]", class_="interval")])
 
 
-def full(value: Any) -> str | None:
-    """A number as `summary.csv` has it; None: there is none."""
+def full_number(value: Any) -> str | None:
+    """A number with the digits of `summary.csv`; None for a missing one."""
     return f"{value:.9g}" if value is not None and pd.notna(value) else None
 
 
-def _interval(study: Study, part: Part, columns: Iterable[str]) -> list[str]:
+def _interval_sentences(study: ReportData, part: SummaryPart, columns: Iterable[str]) -> list[str]:
     rows = study.results.summary
-    said = []
-    for of in (name for name in columns if name in _INTERVALS):
-        lines = intervals_said(rows, _INTERVALS[of])
+    sentences = []
+    for column in (name for name in columns if name in _INTERVALS):
+        lines = describe_intervals(rows, _INTERVALS[column])
         none = ["no interval: too few logs and objects; additional runs say nothing about other traffic"]
         words = [line.replace("95 %: ", "95 % ").replace("no 95 % of", "no 95 % interval of") for line in lines or none]
-        said += [_sentence(f"{without_unit(of)}: {line}") for line in words]
+        sentences += [_replace_metric_names(f"{strip_unit(column)}: {line}") for line in words]
     horizon = rows["ttd_rmst_horizon_s"].dropna() if "ttd_rmst_s" in columns else pd.Series(dtype=float)
     if len(horizon):
-        said.append(f"In means an object that is never detected counts as {plain(float(horizon.iloc[0]))} s.")
-    return said
+        sentences.append(
+            f"In means an object that is never detected counts as {format_three_digits(float(horizon.iloc[0]))} s."
+        )
+    return sentences
 
 
-def _meanings(columns: Iterable[tuple[str, str]], names: Any = header) -> Html:
+def _column_meanings(columns: Iterable[tuple[str, str]], names: Any = column_header) -> Html:
     terms = [
-        part for name, says in columns for part in (tag("dt", names(name)), tag("dd", says, " ", tag("code", name)))
+        part
+        for name, says in columns
+        for part in (make_tag("dt", names(name)), make_tag("dd", says, " ", make_tag("code", name)))
     ]
-    return tag("dl", *terms)
+    return make_tag("dl", *terms)
 
 
 _WORDS = {name: METRIC[name].compared for name in COMPARED if name in METRIC} | {
@@ -138,48 +256,52 @@ _WORDS = {name: METRIC[name].compared for name in COMPARED if name in METRIC} | 
 
 
 _LISTS = ("position_rmse_m", "gospa_m", "false_positives_per_min")
-"""Differences in a table of their own, so that both fit on a page."""
+"""Metrics of lists, whose differences have a table of their own so that both fit on a page."""
 
 
-def regret_table(study: Study) -> Html:
-    """Each configuration minus the baseline, as `copem-replay compare` has it; or why there is none."""
+def regret_table(study: ReportData) -> Html:
+    """Each configuration minus the baseline, as in `copem-replay compare`; or why there are no differences."""
     regret = study.regret
     if regret is None:
-        why = "no object is measured" if study.best is None else "there is one configuration only"
-        return tag("p", f"No differences: {why}.")
+        reason = "no object is measured" if study.best is None else "there is one configuration only"
+        return make_tag("p", f"No differences: {reason}.")
     rows = {(row.configuration, row.metric): row for row in regret.overall.itertuples(index=False)}
-    metrics = in_order([m for m in COMPARED if any((name, m) in rows for name in regret.configurations)])
+    metrics = sort_columns([m for m in COMPARED if any((name, m) in rows for name in regret.configurations)])
     words = [(m, f"{_WORDS[m]}; {'more' if COMPARED[m] > 0 else 'less'} is better") for m in metrics]
     tables = []
-    for id_, what, there in (
+    for id_, suffix, columns in (
         ("regret", "", [m for m in metrics if m not in _LISTS]),
         ("regret-lists", ", of the lists", [m for m in metrics if m in _LISTS]),
     ):
         lines = [
-            tag("tr", named(study, name), *(_difference(rows.get((name, m)), m) for m in there), data_row=name)
+            make_tag(
+                "tr", row_head(study, name), *(_difference_cell(rows.get((name, m)), m) for m in columns), data_row=name
+            )
             for name in regret.configurations
         ]
-        head = ["configuration", *map(difference_header, there)]
-        tables += [table(head, lines, caption=f"Differences to {regret.baseline}{what}", id_=id_)] if there else []
-    return joined(
+        head = ["configuration", *map(difference_column_header, columns)]
+        tables += (
+            [make_table(head, lines, caption=f"Differences to {regret.baseline}{suffix}", id_=id_)] if columns else []
+        )
+    return join_html(
         [
             *tables,
-            tag("p", "Bold: the interval excludes 0.", class_="below"),
-            folded(
+            make_tag("p", "Bold: the interval excludes 0.", class_="below"),
+            fold_parts(
                 "What the columns mean, and how they are made",
-                _meanings(words, difference_header),
-                listed(_sentence(line) for line in comparison_lines(regret) if not line.startswith("*")),
+                _column_meanings(words, difference_column_header),
+                make_list(_replace_metric_names(line) for line in comparison_lines(regret) if not line.startswith("*")),
             ),
         ]
     )
 
 
-def baseline_words(study: Study) -> Html:
-    """What the baseline is, and why it is this one."""
+def baseline_words(study: ReportData) -> Html:
+    """Words on which configuration is the baseline, and why."""
     if study.baseline is None:
         return Html()
     if study.baseline == "ideal":
-        return tag("p", "Each configuration minus the ideal fusion: the regret. It is a baseline, not a bound.")
+        return make_tag("p", "Each configuration minus the ideal fusion: the regret. It is a baseline, not a bound.")
     by_default = study.baseline == study.contenders[0] and "ideal" not in study.names
     why = (
         "No configuration is named ideal, so this is the first that is not the ground truth; --baseline of "
@@ -187,27 +309,176 @@ def baseline_words(study: Study) -> Html:
         if by_default
         else "It is chosen with --baseline, or the only one to compare with."
     )
-    return tag("p", "Each configuration minus ", tag("b", study.baseline), f". {why}")
+    return make_tag("p", "Each configuration minus ", make_tag("b", study.baseline), f". {why}")
 
 
-def _difference(row: Any, metric: str) -> Html:
+def _difference_cell(row: Any, metric: str) -> Html:
     if row is None or pd.isna(row.difference):
-        return tag("td", "–", data_column=metric)
+        return make_tag("td", "–", data_column=metric)
     limits = row.low, row.high
-    shown: list[str] = [signed_difference(metric, row.difference)]
+    shown: list[str] = [format_signed_difference(metric, row.difference)]
     if excludes_0(row):
-        shown = [tag("b", *shown)]
+        shown = [make_tag("b", *shown)]
     if pd.notna(row.interval_over):
-        shown.append(interval(*("–" if pd.isna(limit) else difference(metric, limit) for limit in limits)))
-    shown += [f" ({why})" for why in without_interval(row)]
-    low, high = map(full, limits)
-    return tag("td", *shown, data_column=metric, data_value=full(row.difference), data_low=low, data_high=high)
+        shown.append(
+            interval_markup(*("–" if pd.isna(limit) else format_difference(metric, limit) for limit in limits))
+        )
+    shown += [f" ({why})" for why in explain_no_interval(row)]
+    low, high = map(full_number, limits)
+    return make_tag(
+        "td", *shown, data_column=metric, data_value=full_number(row.difference), data_low=low, data_high=high
+    )
 
 
 _METRIC_NAMES = re.compile("|".join(rf"\b{name}\b" for name in sorted(COMPARED, key=len, reverse=True)))
 
 
-def _sentence(line: str) -> str:
-    """A line of the comparison with its columns as they are called on the page."""
-    line = _METRIC_NAMES.sub(lambda found: without_unit(found[0]), line)
+def _replace_metric_names(line: str) -> str:
+    """A line of the comparison with headers of columns in place of their names."""
+    line = _METRIC_NAMES.sub(lambda found: strip_unit(found[0]), line)
     return f"{line[:1].upper()}{line[1:]}."
+
+
+# Objects that were never detected, and the exact probability of that, where it is known.
+
+_OPEN = 40
+"""Most rows of an unfolded table: about a screen."""
+
+
+def never_detected(study: ReportData) -> Html:
+    """A table with a row per object and set of configurations that miss it in equally many runs, most missed first."""
+    rows_of_tally = study.results.known
+    missed = count_misses(rows_of_tally)
+    if not len(missed):
+        return make_tag("p", "None: every measured object was detected in every run, by every configuration.")
+    rows = [_missed_row(study, found, list(names)) for found, names in _group_misses(missed, study.names)]
+    things = missed.groupby(["log", "object_id"]).ngroups
+    measured = rows_of_tally.groupby(["log", "object_id"]).ngroups
+    text = (
+        f"{count_noun(things, 'object')} of the {measured} measured, missed in some run by some configuration; the "
+        "most missed first. A row names all configurations that miss the object in as many runs."
+    )
+    head = ["log", "object", "class", "never in", "by", "looked at for (s)", "until"]
+    table = make_table(head, rows, caption="Objects never detected", id_="never")
+    if len(rows) > _OPEN:
+        table = make_tag("details", make_tag("summary", f"All {len(rows)} rows"), table)
+    return join_html([make_tag("p", text), table])
+
+
+def exact_misses(study: ReportData) -> Html:
+    """Exact probabilities that an object is never detected and that the ego fails, a line per configuration."""
+    rows = study.results.summary
+    if "miss_log10" not in rows:
+        return Html()
+    above = "What the PEM implies if its lists err independently of each other, which small numbers hang on most."
+    lines = make_list(_exact_sentence(row) for row in rows.to_dict("records"))
+    return join_html([make_tag("h3", "Without a draw"), make_tag("p", above), lines])
+
+
+def _exact_sentence(row: dict[str, Any]) -> Html:
+    missed, half, fails = (
+        float(row.get(name, math.nan)) for name in ("miss_log10", "miss_log10_half_odds", "fail_share_exact")
+    )
+    sentence: list[str] = [make_tag("b", str(row["configuration"])), ": "]
+    if math.isnan(missed):
+        sentence.append("the detection of every measured object is certain")
+    elif missed == 0:
+        sentence.append("no list ever holds a measured object")
+    else:
+        sentence += [
+            "a measured object is never detected with probability ", format_power(missed),
+            "; were the odds of every detection half of what the PEM says, that would be ", format_power(half),
+        ]  # fmt: skip
+    if not math.isnan(fails):
+        sentence += [". The ego fails with probability ", format_power(math.log10(fails)) if fails > 0 else "0"]
+    return join_html([*sentence, "."])
+
+
+def format_power(log10: float) -> Html:
+    """A number of any size from its decadic logarithm: `0.0123`, `4.2·10⁻²²`."""
+    if -3 <= log10 < 4:
+        return Html(format_cell(math.pow(10, log10)))
+    mantissa, _, exponent = f"{math.pow(10, log10 - math.floor(log10)):.1e}".partition("e")
+    power = make_tag("sup", f"{math.floor(log10) + int(exponent)}".replace("-", "−"))
+    return join_html(["10" if mantissa == "1.0" else f"{mantissa}·10", power])
+
+
+def count_misses(known: pd.DataFrame) -> pd.DataFrame:
+    """Rows by log, object and configuration with `missed` > 0: runs without detection, of `runs`."""
+    keys = ["log", "object_id", "configuration"]
+    missed = known["runs"].where(known["time_to_detection_s"].isna(), 0)
+    grouped = known.assign(missed=missed).groupby(keys, sort=False)
+    counts = grouped.agg(
+        missed=("missed", "sum"),
+        runs=("runs", "sum"),
+        object_class=("object_class", "first"),
+        onset_s=("onset_s", "first"),
+        ended_s=("ended_s", "first"),
+        ended_by=("ended_by", "first"),
+    ).reset_index()
+    return counts[counts["missed"] > 0]
+
+
+def _group_misses(missed: pd.DataFrame, order: Sequence[str]) -> list[tuple[pd.Series, tuple[str, ...]]]:
+    by_key: dict[tuple[str, str, int, int], tuple[pd.Series, list[str]]] = {}
+    for _, row in missed.iterrows():
+        key = (str(row["log"]), str(row["object_id"]), int(row["missed"]), int(row["runs"]))
+        by_key.setdefault(key, (row, []))[1].append(str(row["configuration"]))
+    ranked = sorted(by_key, key=lambda key: (-key[2] / key[3], -len(by_key[key][1]), key))
+    return [(by_key[key][0], tuple(name for name in order if name in by_key[key][1])) for key in ranked]
+
+
+def _missed_row(study: ReportData, row: pd.Series, names: list[str]) -> Html:
+    by_all = len(names) == len(study.names) > 1
+    by = f"all {len(names)} configurations" if by_all else ", ".join(names)
+    return make_tag(
+        "tr",
+        make_tag("th", str(row["log"]), scope="row"),
+        make_tag("td", str(row["object_id"]), class_="text"),
+        make_tag("td", str(row["object_class"]), class_="text"),
+        make_tag("td", f"{count_noun(int(row['runs']), 'run') if row['missed'] == row['runs'] else row['missed']}"
+            + (" (all)" if row["missed"] == row["runs"] else f" of {count_noun(int(row['runs']), 'run')}"),
+            data_value=str(row["missed"])),
+        make_tag("td", by, class_="text long"),
+        make_tag("td", format_cell(float(row["ended_s"] - row["onset_s"]))),
+        make_tag("td", EndReason(row["ended_by"]).past, class_="text"),
+    )  # fmt: skip
+
+
+# Stages of the latency (`report/figures/latency_breakdown.py`).
+
+
+def stage_table(study: ReportData) -> Html:
+    """Means of the stages and their meaning, below their figure."""
+    means = mean_stages_by_configuration(study.results, study.names)
+    stages = [stage for stage in STAGES if any(stage in means_of_name for means_of_name in means.values())]
+    detected = count_detected(study.results)
+    about = (
+        "Means over the rows in which the object is detected; how many these are, where not all, is beside the bar. "
+        "Rows without detection have no stages, so bars of configurations that miss many objects are over other rows, "
+        "and their sum is not the mean time to detection."
+    )
+    terms = [part for stage in stages for part in (make_tag("dt", stage), make_tag("dd", STAGES[stage]))]
+    below = fold_parts("What the stages are", make_tag("dl", *terms))
+    return join_html([make_tag("p", about), _stages_table(study, means, stages, detected), below])
+
+
+def _stages_table(
+    study: ReportData, means: dict[str, dict[str, float]], stages: list[str], detected: dict[str, tuple[int, int]]
+) -> Html:
+    rows = []
+    for name in study.names:
+        figures = [*(means[name].get(stage) for stage in stages), sum(means[name].values()) if means[name] else None]
+        cells = [
+            make_tag(
+                "td",
+                "–" if value is None else format_three_digits(value),
+                data_column=stage,
+                data_value=full_number(value) or "",
+            )
+            for stage, value in zip([*stages, "sum"], figures, strict=True)
+        ]
+        counted = make_tag("td", f"{detected[name][0]} of {detected[name][1]}", data_column="detected")
+        rows.append(make_tag("tr", row_head(study, name), counted, *cells, data_row=name))
+    head = ["configuration", "known", *stages, "sum"]
+    return make_table(head, rows, caption="Mean duration of the stages, in seconds", id_="stages")

@@ -1,44 +1,309 @@
-"""Compare: configurations with a baseline, on the same logs, objects and runs, within or across results folders."""
+"""The comparison of configurations with a baseline, on the same logs, objects and runs, within or across folders.
+
+Folders are checked for what they must have in common: the recordings, the random numbers, and what is measured how.
+Logs are read one by one, so that no rows are kept but their sums.
+"""
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from copem_replay.core.errors import InputError
-from copem_replay.core.tracks import SAME_INSTANT_NS
-from copem_replay.results.compare.all_logs import AllLogs
-from copem_replay.results.compare.bootstrap import Draws, Names, resampled_over
-from copem_replay.results.compare.comparable import check_comparable
-from copem_replay.results.compare.configuration_data import ConfigurationData, rows_of, side_of
-from copem_replay.results.compare.equal_ghosts import ghost_totals, kept_by, notes_on_equal_ghosts, why_not
-from copem_replay.results.compare.ideals import notes_on_outputs
-from copem_replay.results.compare.inputs import read_folders
-from copem_replay.results.compare.labels import Named, chosen, named
-from copem_replay.results.compare.limits import limits
-from copem_replay.results.compare.metrics import Regret, Setting, regrets
-from copem_replay.results.compare.notes import (
-    note_on_measuring,
-    notes_on_folders,
-    notes_on_instants,
-    notes_on_pairs,
-    notes_on_rows,
+from copem_replay.core.errors import InputError, count_noun
+from copem_replay.core.tracks import SAME_INSTANT_S, Int
+from copem_replay.metrics.intervals import FEWEST_CLUSTERS
+from copem_replay.results.compare.labels import (
+    LabelledConfiguration,
+    check_log_names,
+    choose_configurations,
+    label_configurations,
+    log_keys,
+    logs_match_by_truth,
+    notes_on_differences,
+    notes_on_output_baseline,
+    rename_logs,
 )
-from copem_replay.results.compare.paired_statistics import mcnemar
-from copem_replay.results.compare.pairing import Grid, grid_of, number
-from copem_replay.results.compare.same_drive import check_names, notes_on_differences, renamed
+from copem_replay.results.compare.limits import (
+    ClusterDraws,
+    ClusterNames,
+    choose_resampled,
+    difference_limits,
+    mcnemar_p_value,
+)
+from copem_replay.results.compare.metrics import (
+    GhostTotals,
+    PairSettings,
+    Regret,
+    compute_regrets,
+    explain_incomparable,
+    find_operating_points,
+    ghost_totals,
+    notes_on_equal_ghosts,
+)
+from copem_replay.results.compare.pairing import (
+    ConfigurationData,
+    PairingGrid,
+    build_grid,
+    configuration_rows,
+    count_shared_instants,
+    float_column,
+    lay_out_configuration,
+)
+from copem_replay.results.read import Results, open_results
+from copem_replay.results.schema import OPTIONAL
 
-if TYPE_CHECKING:
-    from copem_replay.results.read import Results
+# The sums of a pair over its logs.
+
+
+@dataclass
+class AllLogs:
+    """The sums of a pair, log by log: `objects`: with rows of both sides; `alone`: rows that only one side has, (first,
+    second); `instants`: as `count_shared_instants` gives them.
+    """
+
+    objects: list[int] = field(default_factory=list)
+    alone: list[tuple[int, int]] = field(default_factory=list)
+    instants: list[Int] = field(default_factory=list)
+    _regrets: dict[str, list[Regret]] = field(default_factory=dict)
+
+    def add(
+        self,
+        first: ConfigurationData,
+        second: ConfigurationData,
+        regrets: Sequence[Regret],
+        grid: PairingGrid,
+        *,
+        more: bool,
+    ) -> None:
+        """Add a log with its regrets. `more`: there are other logs."""
+        both = np.flatnonzero(first.there & second.there)
+        objects = len(np.unique(both // grid.runs))
+        self.objects.append(objects)
+        self.alone.append((int((first.there & ~second.there).sum()), int((second.there & ~first.there).sum())))
+        if first.accuracy is not None and second.accuracy is not None:
+            self.instants.append(count_shared_instants(first.accuracy, second.accuracy))
+        for regret in regrets:
+            # Runs stay apart for a single object: they are resampled if no log has another.
+            figure = regret.figure.condensed(runs=objects <= 1) if more else regret.figure
+            self._regrets.setdefault(regret.metric, []).append(replace(regret, figure=figure))
+
+    def regrets(self) -> Iterator[Regret]:
+        """The regret of every metric over all logs."""
+        for of_logs in self._regrets.values():
+            figures = [regret.figure for regret in of_logs]
+            yield replace(of_logs[0], figure=type(figures[0]).joined(figures))
+
+
+# The results folders of a comparison.
+
+
+def read_folders(given: Sequence[Path | Results]) -> list[Results]:
+    """Results folders; open ones are not read again. Raises InputError, a line for each folder that cannot be read or
+    is given twice.
+    """
+    folders: list[Results] = []
+    problems: list[str] = []
+    seen: dict[Path, Path] = {}
+    for folder in given:
+        path = folder.folder if isinstance(folder, Results) else folder
+        if path.resolve() in seen:
+            problems.append(f"{path}: expected each folder once, found it twice ({seen[path.resolve()]})")
+            continue
+        seen[path.resolve()] = path
+        try:
+            folders.append(_read_folder(folder))
+        except InputError as error:
+            problems += error.problems
+    if problems:
+        raise InputError(problems)
+    if not folders:
+        raise InputError("compare: expected a results folder, found none")
+    return folders
+
+
+def _read_folder(folder: Path | Results) -> Results:
+    results = folder if isinstance(folder, Results) else open_results(folder)
+    for name in ("by_log", "source"):
+        getattr(results, name)
+    return results
+
+
+# Notes on a comparison: what is left out, and why.
+
+_NEEDED = {
+    "position_rmse_m": {"accuracy.parquet", "instants.parquet"},
+    "gospa_m": {"accuracy.parquet", "instants.parquet"},
+    "false_positives_per_min": {"lists.parquet"},
+    "ttd_rmst_s_equal_ghosts": {"lists.parquet", "thresholds.parquet"},
+}
+
+
+def notes_on_folders(folders: Sequence[Results]) -> Iterator[str]:
+    """Notes on folders that have other numbers of runs, or lack tables or braking."""
+    runs = {str(folder.folder): folder.provenance.runs for folder in folders}
+    if len(set(runs.values())) > 1:
+        has = ", ".join(f"{path} {count}" for path, count in runs.items())
+        yield f"other numbers of runs ({has}): the first {min(runs.values())} are compared"
+    for folder in folders:
+        missing = [name for name in OPTIONAL if name not in folder.by_log]
+        metrics = [metric for metric, files in _NEEDED.items() if files & set(missing)]
+        if metrics:
+            yield (
+                f"{folder.folder}: no {', '.join(missing)} (without accuracy, or of "
+                f"an older version): not compared: {', '.join(metrics)}"
+            )
+    with_braking = [folder for folder in folders if folder.provenance.braking is not None]
+    if with_braking and len(with_braking) < len(folders):
+        without = ", ".join(str(folder.folder) for folder in folders if folder.provenance.braking is None)
+        yield f"{without}: no braking: pass_share is compared only among those that have it"
+
+
+def notes_on_pairs(baseline: LabelledConfiguration, pairs: Mapping[LabelledConfiguration, AllLogs]) -> Iterator[str]:
+    """Notes on rows without a partner."""
+    for one, pair in pairs.items():
+        counts = np.sum(pair.alone, axis=0).tolist()
+        for (one_side, other), count in zip(((one, baseline), (baseline, one)), counts, strict=True):
+            if count:
+                yield f"{count_noun(count, 'row')} of {one_side.label} left out: {other.label} has no such object"
+
+
+def notes_on_instants(
+    baseline: LabelledConfiguration, pairs: Mapping[LabelledConfiguration, AllLogs], logs: Sequence[str]
+) -> Iterator[str]:
+    """Notes on lists without a list of the other configuration at the same instant."""
+    labels_of: dict[tuple[int, int, int, str], list[str]] = {}
+    for one, pair in pairs.items():
+        shared, count, baseline_count = np.sum(pair.instants, axis=0).tolist() if pair.instants else (0, 0, 0)
+        if shared < max(count, baseline_count):
+            none = ", ".join(log for log, counts in zip(logs, pair.instants, strict=True) if counts[0] == 0)
+            labels_of.setdefault((shared, count, baseline_count, none if len(logs) > 1 else ""), []).append(one.label)
+    for (number, count, baseline_count, none), labels in labels_of.items():
+        lacking = f"; none in {none}" if none else ""
+        yield (
+            f"{', '.join(labels)}: position_rmse_m and gospa_m are over the {count_noun(number, 'instant')} that both "
+            f"have, of {count} and the {baseline_count} of {baseline.label}{lacking}"
+        )
+
+
+def note_on_measuring(baseline: LabelledConfiguration, others: Sequence[LabelledConfiguration]) -> Iterator[str]:
+    """A note on configurations that detect by truth id while others detect by match."""
+    by_id = [one for one in (baseline, *others) if one.configuration in one.results.by_truth_id]
+    if by_id and len(by_id) <= len(others):
+        yield (
+            f"{', '.join(one.label for one in by_id)}: detected by truth id, the others by match within the gate "
+            "(`match: {always: true}` matches all alike)"
+        )
+
+
+def notes_on_rows(table: pd.DataFrame, asked: float | None) -> Iterator[str]:
+    """Notes on missing intervals, and on configurations with fewer ghosts than `asked` per minute."""
+    overall = table.drop_duplicates(["configuration", "metric"])
+    without = overall[overall["difference"].notna() & overall["interval"].isna()]
+    with_interval = set(overall.loc[overall["interval_over"].notna(), "configuration"])
+    nameless = (without["metric"] == "false_positives_per_min") & without["configuration"].isin(with_interval)
+    if nameless.any():
+        yield (
+            "no interval of false_positives_per_min: without accuracy.parquet it is not known which object a ghost is "
+            "nearest to"
+        )
+    without = without[~nameless]
+    if len(without):
+        metrics = ", ".join(dict.fromkeys(without["metric"]))
+        yield (
+            f"no interval of {metrics}: neither {FEWEST_CLUSTERS} logs, nor {FEWEST_CLUSTERS} measured objects, nor "
+            f"{FEWEST_CLUSTERS} runs of a single one; more runs of several say nothing about other traffic"
+        )
+    ghosts = overall[overall["metric"] == "ttd_rmst_s_equal_ghosts"]
+    fewer = ghosts[ghosts["ghosts_kept_per_min"] < asked * (1 - 1e-9)] if asked is not None else ghosts[:0]
+    for row in fewer.itertuples():
+        yield (
+            f"{row.configuration}: all its entries make only {row.ghosts_kept_per_min:.4g} ghosts per minute: its "
+            "ttd_rmst_s_equal_ghosts is at that rate"
+        )
+
+
+# What folders must have in common to be compared.
+
+_MEASURE = ("objects", "onset", "count_earlier", "confirm", "match", "distance_to", "horizon_s", "gospa", "annotated")
+"""Keys of `measure` that the compared metrics depend on."""
+
+
+def check_comparable(folders: Sequence[Results]) -> None:
+    """Raise InputError, a line for every reason why a folder cannot be compared with the first."""
+    problems = [problem for other in folders[1:] for problem in _find_problems(folders[0], other)]
+    if problems:
+        raise InputError(problems)
+
+
+def _find_problems(first: Results, other: Results) -> Iterator[str]:
+    before, after = first.provenance, other.provenance
+    other_logs = list(_compare_logs(first, other))
+    if before.window_s == after.window_s:  # else their truths may differ for that reason alone
+        yield from other_logs
+    for key in ("seed", "window_s", "max_gap_s"):
+        yield from _describe_mismatch(first, other, key, getattr(before, key), getattr(after, key))
+    # As written, for the ego that `null` stands for is in the logs.
+    if other_logs or not logs_match_by_truth(first, other):  # equal truths have the same ego
+        yield from _describe_mismatch(first, other, "ego", first.source.data.get("ego"), other.source.data.get("ego"))
+    for key in _MEASURE:
+        yield from _describe_mismatch(first, other, f"measure.{key}", before.measure.get(key), after.measure.get(key))
+    onset = before.measure.get("onset")
+    if isinstance(onset, dict) and str(onset.get("kind")).startswith("line_of_sight"):
+        yield from _describe_mismatch(first, other, "visibility", before.visibility, after.visibility)
+    if before.braking is not None and after.braking is not None:
+        yield from _describe_mismatch(first, other, "braking", before.braking, after.braking)
+        if before.braking.get("brakes_for") == after.braking.get("brakes_for") == "conflict":
+            conflicts = before.measure.get("conflict"), after.measure.get("conflict")
+            yield from _describe_mismatch(first, other, "measure.conflict", *conflicts)
+
+
+def _describe_mismatch(first: Results, other: Results, key: str, expected: object, found: object) -> Iterator[str]:
+    if expected != found:
+        yield (
+            f"{other.folder}: {key}: expected {_shorten_value(expected)} as in {first.folder}, found "
+            f"{_shorten_value(found)}"
+        )
+
+
+def _shorten_value(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _compare_logs(first: Results, other: Results) -> Iterator[str]:
+    """Problems of the logs: other drives; where logs match by file only, other names or topics too."""
+    by_truth = logs_match_by_truth(first, other)
+    expected, found = ({key: log.name for key, log in keys.items()} for keys in log_keys(first, other))
+    missing, more = ([a[sha] for sha in a if sha not in b] for a, b in ((expected, found), (found, expected)))
+    if missing or more:
+        lacks = [f"{', '.join(missing)} missing"] if missing else []
+        other_ones = (
+            [f"{', '.join(more)} of {'another truth' if by_truth else 'other content (SHA-256)'}"] if more else []
+        )
+        yield f"{other.folder}: expected the logs of {first.folder}, found {' and '.join(lacks + other_ones)}"
+        return
+    if by_truth:
+        return
+    names, other_names = (sorted(log.name for log in folder.provenance.logs) for folder in (first, other))
+    if names != other_names or expected != found:
+        yield (
+            f"{other.folder}: expected the logs to be named as in {first.folder}, {', '.join(names)}, found "
+            f"{', '.join(other_names)}: draws are by the log's name"
+        )
+        return
+    topics, other_topics = ({log.name: log.topic for log in folder.provenance.logs} for folder in (first, other))
+    for name, topic in topics.items():
+        yield from _describe_mismatch(first, other, f"log {name}: topic", topic, other_topics[name])
+
 
 ALL = "all"
-"""What stands for the log in figures of all logs."""
+"""The value of the column `log` for all logs together."""
 COLUMNS = {
     "log": "object",
     "configuration": "object",
@@ -60,7 +325,7 @@ COLUMNS = {
     "ghosts_kept_per_min": "float64",
     "baseline_ghosts_kept_per_min": "float64",
 }
-"""Columns of a comparison, and as what pandas has them."""
+"""Columns of a comparison, and their types in pandas."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +353,7 @@ class Comparison:
         return self.table.drop_duplicates(["configuration", "metric"])  # they come first, and a log may be named `all`
 
 
-def compare(
+def compare_folders(
     folders: Sequence[Path | Results],
     *,
     configurations: Sequence[str] | None = None,
@@ -101,51 +366,23 @@ def compare(
     `false_positives_per_min`: at which times to detection are compared once more; None: as many as the baseline has.
     Raises InputError, a line for every reason why something cannot be read or compared.
     """
-    if false_positives_per_min is not None and not 0 <= false_positives_per_min < math.inf:
-        raise InputError(
-            f"--false-positives-per-min: expected a number of at least 0, found {false_positives_per_min:g}"
-        )
+    _check_rate(false_positives_per_min)
     read = read_folders(folders)
     check_comparable(read)
-    read, renames = renamed(read)
-    against, *others = chosen(named(read), configurations, baseline)
-    check_names(against, others, renames)
+    read, renames = rename_logs(read)
+    against, *others = choose_configurations(label_configurations(read), configurations, baseline)
+    check_log_names(against, others, renames)
     used = list(dict.fromkeys(one.results for one in (against, *others)))
     logs, runs = [log.name for log in read[0].provenance.logs], min(folder.provenance.runs for folder in read)
     totals = ghost_totals((against, *others), logs, runs)
-    asked = false_positives_per_min
-    if asked is None and against in totals:
+    own_rate = false_positives_per_min is None
+    if own_rate and against in totals:
         false_positives_per_min = totals[against].per_min
-    reasons, settings = {}, {}
-    setting = Setting(_horizon_s(read, against, logs), float(read[0].provenance.measure["gospa"]["power"]))
-    for one in others:
-        both = totals.get(one), totals.get(against)
-        truth = against.configuration in against.results.truth
-        why = why_not(*both, false_positives_per_min, asked=asked is not None, truth=truth)
-        kept = None if why is not None else kept_by(*both, false_positives_per_min)
-        reasons[one.label], settings[one] = why, replace(setting, kept=kept)
-    names, draws = Names(logs, [], runs), Draws(read[0].provenance.seed)
-    pairs = {one: AllLogs() for one in others}
-    rows: list[dict[str, object]] = []
-    for k, log in enumerate(logs):
-        tables = {results: results.rows_of(log) for results in used}
-        grid = grid_of(k, (of["detections.parquet"] for of in tables.values()), runs, len(names.objects))
-        names.objects.extend(f"{log}\n{name}" for name in grid.objects)
-        second = side_of(against, tables[against.results], grid)
-        for one, pair in pairs.items():
-            first = side_of(one, tables[one.results], grid)
-            _check_same_episodes(one, first, against, second, log, grid)
-            found = list(regrets(first, second, grid, settings[one], metrics))
-            pair.add(first, second, found, grid, more=len(logs) > 1)
-            if len(logs) > 1:
-                over = resampled_over(pair.objects[-1:])
-                rows += [{"log": log, **_row(of, one, against, over, names, draws)} for of in found]
-    overall = [
-        {"log": ALL, **_row(of, one, against, resampled_over(pair.objects), names, draws)}
-        for one, pair in pairs.items()
-        for of in pair.regrets()
-    ]
-    table = pd.DataFrame([*overall, *rows], columns=list(COLUMNS)).astype(COLUMNS)
+    setting = PairSettings(_horizon_s(read, against, logs), float(read[0].provenance.measure["gospa"]["power"]))
+    settings, reasons = _settle_ghosts(setting, against, others, totals, false_positives_per_min, asked=not own_rate)
+    names, draws = ClusterNames(logs, [], runs), ClusterDraws(read[0].provenance.seed)
+    pairs, rows = _compare_each_log(against, settings, names, draws, metrics)
+    table = pd.DataFrame(rows, columns=list(COLUMNS)).astype(COLUMNS)
     return Comparison(
         table=table,
         baseline=against.label,
@@ -157,7 +394,7 @@ def compare(
             *notes_on_differences(used, renames),
             *notes_on_pairs(against, pairs),
             *note_on_measuring(against, others),
-            *notes_on_outputs(against, others),
+            *notes_on_output_baseline(against, others),
             *notes_on_instants(against, pairs, logs),
             *notes_on_equal_ghosts(reasons),
             *notes_on_rows(table, false_positives_per_min),
@@ -165,27 +402,98 @@ def compare(
     )
 
 
-def _horizon_s(folders: Sequence[Results], against: Named, logs: Sequence[str]) -> float:
-    """The longest episode is that of any folder."""
+def _check_rate(false_positives_per_min: float | None) -> None:
+    """Raise InputError where the rate that the user asked for is no rate."""
+    if false_positives_per_min is not None and not 0 <= false_positives_per_min < math.inf:
+        raise InputError(
+            f"--false-positives-per-min: expected a number of at least 0, found {false_positives_per_min:g}"
+        )
+
+
+def _settle_ghosts(
+    setting: PairSettings,
+    against: LabelledConfiguration,
+    others: Sequence[LabelledConfiguration],
+    totals: Mapping[LabelledConfiguration, GhostTotals],
+    per_min: float | None,
+    *,
+    asked: bool,
+) -> tuple[dict[LabelledConfiguration, PairSettings], dict[str, str | None]]:
+    """The settings of each pair, with operating points at equal ghosts; by label why there are none, None: there are.
+
+    `asked`: whether the user asked for the rate `per_min`; else it is that of the baseline.
+    """
+    settings, reasons = {}, {}
+    truth = against.configuration in against.results.truth
+    for one in others:
+        both = totals.get(one), totals.get(against)
+        why = explain_incomparable(*both, per_min, asked=asked, truth=truth)
+        kept = None if why is not None else find_operating_points(*both, per_min)
+        reasons[one.label], settings[one] = why, replace(setting, kept=kept)
+    return settings, reasons
+
+
+def _compare_each_log(
+    against: LabelledConfiguration,
+    settings: Mapping[LabelledConfiguration, PairSettings],
+    names: ClusterNames,
+    draws: ClusterDraws,
+    metrics: Sequence[str] | None,
+) -> tuple[dict[LabelledConfiguration, AllLogs], list[dict[str, object]]]:
+    """The sums of each pair over the logs of `names`; rows of all logs, then of each log where there are several.
+
+    The objects of the logs are appended to `names`.
+    """
+    logs, pairs = names.logs, {one: AllLogs() for one in settings}
+    rows: list[dict[str, object]] = []
+    for k, log in enumerate(logs):
+        tables = {results: results.rows_of(log) for results in dict.fromkeys(one.results for one in (against, *pairs))}
+        detections = (of_folder["detections.parquet"] for of_folder in tables.values())
+        grid = build_grid(k, detections, names.runs, len(names.objects))
+        names.objects.extend(f"{log}\n{name}" for name in grid.objects)
+        second = lay_out_configuration(against, tables[against.results], grid)
+        for one, pair in pairs.items():
+            first = lay_out_configuration(one, tables[one.results], grid)
+            _check_same_episodes(one, first, against, second, log, grid)
+            regrets = list(compute_regrets(first, second, grid, settings[one], metrics))
+            pair.add(first, second, regrets, grid, more=len(logs) > 1)
+            if len(logs) > 1:
+                over = choose_resampled(pair.objects[-1:])
+                rows += [{"log": log, **_make_row(regret, one, against, over, names, draws)} for regret in regrets]
+    overall = [
+        {"log": ALL, **_make_row(regret, one, against, choose_resampled(pair.objects), names, draws)}
+        for one, pair in pairs.items()
+        for regret in pair.regrets()
+    ]
+    return pairs, [*overall, *rows]
+
+
+def _horizon_s(folders: Sequence[Results], against: LabelledConfiguration, logs: Sequence[str]) -> float:
+    """The horizon in seconds: that of `measure`, else the longest episode of any folder."""
     horizon_s = folders[0].provenance.measure["horizon_s"]
     used_s = [one.provenance.horizon_used_s for one in folders if one.provenance.horizon_used_s is not None]
     if horizon_s is None and not used_s:
         for log in logs:
-            rows = rows_of(against, against.results.rows_of(log, "detections.parquet"))["detections.parquet"]
-            used_s += (number(rows["ended_s"]) - number(rows["onset_s"])).tolist()
+            rows = configuration_rows(against, against.results.rows_of(log, "detections.parquet"))["detections.parquet"]
+            used_s += (float_column(rows["ended_s"]) - float_column(rows["onset_s"])).tolist()
     return float(np.nanmax(used_s) if horizon_s is None else horizon_s)
 
 
 def _check_same_episodes(
-    one: Named, first: ConfigurationData, against: Named, second: ConfigurationData, log: str, grid: Grid
+    one: LabelledConfiguration,
+    first: ConfigurationData,
+    against: LabelledConfiguration,
+    second: ConfigurationData,
+    log: str,
+    grid: PairingGrid,
 ) -> None:
-    """Raise InputError where an object is not looked at from and until the same time: no pair then is one."""
+    """Raise InputError where an episode begins or ends at another instant, so that its rows are no pair."""
     if one.results is against.results:
         return
     both = first.there & second.there
     for what in ("onset_s", "ended_s"):
         found, expected = getattr(first, what), getattr(second, what)
-        other = np.flatnonzero(both & (np.abs(found - expected) > 1e-9 * SAME_INSTANT_NS))
+        other = np.flatnonzero(both & (np.abs(found - expected) > SAME_INSTANT_S))
         if len(other):
             name = grid.objects[other[0] // grid.runs]
             raise InputError(
@@ -194,30 +502,41 @@ def _check_same_episodes(
             )
 
 
-def _fixed(metric: str, *sides: Named) -> bool:
-    """Whether a metric is the same in every run, with all of them."""
+def _is_fixed(metric: str, *sides: LabelledConfiguration) -> bool:
+    """Whether a metric is equal in every run, on all sides."""
     if metric == "pass_share":
         return all(side.results.fixed.passes(side.configuration) for side in sides)
     return all(side.results.fixed.known(side.configuration) for side in sides)
 
 
-def _row(regret: Regret, one: Named, against: Named, over: str, names: Names, draws: Draws) -> dict[str, object]:
-    """Of a log, or of all. `over`: what is resampled."""
+def _make_row(
+    regret: Regret,
+    one: LabelledConfiguration,
+    against: LabelledConfiguration,
+    over: str,
+    names: ClusterNames,
+    draws: ClusterDraws,
+) -> dict[str, object]:
+    """The row of a regret, of one log or all. `over`: the clusters that are resampled."""
     figure = regret.figure
-    value, other, difference = figure.values()
+    value, baseline_value, difference = figure.values()
     row: dict[str, object] = {"configuration": one.label, "baseline": against.label, "metric": regret.metric}
-    row |= {"value": _number(value), "baseline_value": _number(other), "n": int(figure.items["n"].sum())}
-    row["difference"] = _number(difference)
-    row |= limits(figure, difference, over, names, draws, fixed=_fixed(regret.metric, one, against))
+    row |= {
+        "value": _number_or_none(value),
+        "baseline_value": _number_or_none(baseline_value),
+        "n": int(figure.items["n"].sum()),
+    }
+    row["difference"] = _number_or_none(difference)
+    row |= difference_limits(figure, difference, over, names, draws, fixed=_is_fixed(regret.metric, one, against))
     if "only" in figure.items.columns:
         only = figure.items["only"].sum(axis=0)
         row |= {"only_configuration": int(only[0]), "only_baseline": int(only[1])}
-        row["p_value"] = mcnemar(int(only[0]), int(only[1])) if len(figure.items["n"]) else None
+        row["p_value"] = mcnemar_p_value(int(only[0]), int(only[1])) if len(figure.items["n"]) else None
     if regret.kept is not None:
         for name, kept in zip(("", "baseline_"), regret.kept, strict=True):
             row[f"{name}existence"], row[f"{name}ghosts_kept_per_min"] = kept.existence, kept.false_positives_per_min
     return row
 
 
-def _number(value: float) -> float | None:
+def _number_or_none(value: float) -> float | None:
     return value if math.isfinite(value) else None

@@ -1,7 +1,7 @@
-"""Differences of two configurations, metric by metric, over the rows and lists that both have.
+"""Metrics of a comparison: differences of two configurations, over the rows and lists that both have.
 
 Rows are paired by log, object and run, lists by instant; differences are first − second. Definitions are those of
-`summary.csv`, but for what pairs allow:
+`summary.csv`, except:
 
 *ttd_rmst_s*: the difference of the two restricted means over the rows that both have; never detected counts as the
 horizon, an object still there when observation ends is censored.
@@ -9,30 +9,193 @@ horizon, an object still there when observation ends is censored.
 distance, so it differs infinitely from a distance, and not at all from never.
 *gospa_m*: a list counts where an object is measured in it, on or after its onset.
 *ttd_rmst_s_equal_ghosts*: ttd_rmst_s, with entries below a threshold of existence left out, so that each side has as
-many ghosts per minute over all logs and runs as is asked for, stale ones not counted; where that says something
-(`results/compare/equal_ghosts.py`). Between two thresholds (the second may leave nothing)
-it is their mixture that has exactly as many: a share of the drives goes by the one, the rest by the other, as between
-two points of a ROC curve. Resamples keep the thresholds and the share.
+many ghosts per minute over all logs and runs as is asked for (`explain_incomparable`: where that means nothing). Stale
+ghosts are not counted: a late list that was right at its capture is not cleaner without them. Between two thresholds
+(the second may leave nothing) their mixture has exactly as many: a share of the drives uses the one, the rest the
+other, as between two points of a ROC curve. Resamples keep the thresholds and the share.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import Bool, Float, Int
 from copem_replay.metrics.summary_metrics import METRIC
 from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT
-from copem_replay.results.compare.bootstrap import Items
-from copem_replay.results.compare.configuration_data import ConfigurationData, StepData
-from copem_replay.results.compare.differences import Figure, OfMedians, OfSums, OfTimes
-from copem_replay.results.compare.equal_ghosts import Kept
-from copem_replay.results.compare.pairing import Grid
-from copem_replay.results.compare.per_list import together
+from copem_replay.results.compare.labels import LabelledConfiguration
+from copem_replay.results.compare.limits import (
+    MedianStatistic,
+    PairStatistic,
+    StatisticItems,
+    SumStatistic,
+    TimeStatistic,
+)
+from copem_replay.results.compare.pairing import (
+    ConfigurationData,
+    PairingGrid,
+    StepData,
+    configuration_rows,
+    float_column,
+    integer_column,
+    list_column,
+    pair_lists,
+)
+from copem_replay.results.schema import AGAIN
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+# Operating points: the ghosts per minute at which times are compared.
+
+FEWEST_GHOSTS = 10
+"""Fewer ghosts than this decide nothing: of ten the Poisson error is already a third."""
+TRUTH = "the baseline is the truth, which has no ghosts"
+ONE_VALUE = "all entries claim the same existence, so that none is left out before the others"
+FEW = f"fewer than {FEWEST_GHOSTS} ghosts would decide"
+_FILES = ("lists.parquet", "thresholds.parquet")
+
+
+@dataclass(frozen=True)
+class GhostTotals:
+    """Ghosts of a configuration in all logs and runs, without stale ones; the existence at which it detects."""
+
+    minutes: float
+    existence: Float  # (T,) ascending
+    at: Int  # (T,) ghosts of at least each existence
+    least: float  # lowest existence of a detection; inf: none
+    most: float  # highest; −inf: none
+
+    @property
+    def per_min(self) -> float | None:
+        """Ghosts per minute at the lowest existence; None: not known."""
+        return float(self.at[0]) / self.minutes if len(self.existence) and self.minutes > 0 else None
+
+    @property
+    def tells_apart(self) -> bool:
+        """Whether any threshold leaves out some of the entries but not all."""
+        all_left = (self.at == self.at[:1]) & (self.least >= self.existence)
+        none_left = (self.at == 0) & (self.most < self.existence)
+        return not (all_left | none_left).all()
+
+
+@dataclass(frozen=True)
+class OperatingPoint:
+    """Entries of at least `existence` are listed in a share of the drives, in the rest those of at least `above`."""
+
+    existence: float
+    above: float  # inf: nothing
+    share: float
+    false_positives_per_min: float
+
+
+def ghost_totals(
+    sides: Sequence[LabelledConfiguration], logs: Sequence[str], runs: int
+) -> dict[LabelledConfiguration, GhostTotals]:
+    """Totals of the sides whose folders have the tables for it. Raises InputError where these are damaged."""
+    totals: dict[LabelledConfiguration, GhostTotals] = {}
+    for log in logs:
+        for results in dict.fromkeys(one.results for one in sides if {*_FILES} <= set(one.results.by_log)):
+            tables = results.rows_of(log, *_FILES)
+            for one in (one for one in sides if one.results is results):
+                rows, steps = configuration_rows(one, tables).values()
+                totals[one] = _add_log(one, totals.get(one), rows, steps, runs)
+    return totals
+
+
+def _add_log(
+    one: LabelledConfiguration, before: GhostTotals | None, rows: pa.Table, steps: pa.Table, runs: int
+) -> GhostTotals:
+    """The totals of the earlier logs and of one more, in the first `runs` runs."""
+    lengths, existence = list_column(rows["existence"])
+    counts, at = list_column(rows["ghosts_at"])
+    thresholds = existence[: lengths[0]] if len(lengths) else existence
+    if before is not None and len(before.existence):
+        thresholds = before.existence if len(lengths) else thresholds
+    consistent = (lengths == len(thresholds)).all() and (counts == len(thresholds)).all()
+    size = len(lengths), len(thresholds)
+    if not consistent or (existence.reshape(size) != thresholds).any() or (np.diff(thresholds) <= 0).any():
+        raise InputError(
+            f"{one.results.folder / _FILES[0]}: expected the same ascending existence and as many ghosts_at in all "
+            f"rows, found others; {AGAIN}"
+        )
+    compared = integer_column(rows["run"], missing=runs) < runs
+    minutes = float(float_column(rows["minutes"])[compared].sum())
+    ghosts = at.reshape(size)[compared].sum(axis=0).astype(np.int64)
+    steps_at = float_column(steps["existence"])[integer_column(steps["run"], missing=runs) < runs]
+    least, most = float(steps_at.min(initial=np.inf)), float(steps_at.max(initial=-np.inf))
+    if before is None or not len(before.existence):
+        return GhostTotals(minutes, thresholds, ghosts, least, most)
+    ghosts = ghosts if len(lengths) else np.zeros_like(before.at)
+    return GhostTotals(
+        before.minutes + minutes,
+        before.existence,
+        before.at + ghosts,
+        min(before.least, least),
+        max(before.most, most),
+    )
+
+
+def find_operating_point(ghosts: GhostTotals, per_min: float) -> OperatingPoint | None:
+    """The operating point with `per_min` ghosts, fewer where all entries make fewer; None: the rate is not known."""
+    if ghosts.per_min is None:
+        return None
+    rates = np.append(ghosts.at / ghosts.minutes, 0.0)
+    limits = np.append(ghosts.existence, np.inf)
+    k = int(np.argmax(rates <= per_min * (1 + 1e-9)))
+    if k == 0 or rates[k] >= per_min * (1 - 1e-9):
+        return OperatingPoint(float(limits[k]), float(limits[k]), 1.0, float(rates[k]))
+    share = float((per_min - rates[k]) / (rates[k - 1] - rates[k]))
+    return OperatingPoint(float(limits[k - 1]), float(limits[k]), share, per_min)
+
+
+def find_operating_points(
+    first: GhostTotals | None, second: GhostTotals | None, per_min: float | None
+) -> tuple[OperatingPoint, OperatingPoint] | None:
+    """The operating points of both sides; None: one is not known."""
+    if first is None or second is None or per_min is None:
+        return None
+    kept = find_operating_point(first, per_min), find_operating_point(second, per_min)
+    return None if kept[0] is None or kept[1] is None else (kept[0], kept[1])
+
+
+def explain_incomparable(
+    first: GhostTotals | None, second: GhostTotals | None, per_min: float | None, *, asked: bool, truth: bool
+) -> str | None:
+    """Why the times of two sides at `per_min` ghosts cannot be compared; None: they can, or there are none.
+
+    `asked`: whether the user asked for the rate; else it is the second side's own. `truth`: whether the second side is
+    the truth.
+    """
+    if per_min is None or first is None or second is None:
+        return None
+    if truth:
+        return TRUTH
+    if not asked and second.at[:1].sum() < FEWEST_GHOSTS:
+        return FEW
+    for side in (first, second):
+        kept = find_operating_point(side, per_min)
+        if side.per_min is None or kept is None or side.per_min <= per_min * (1 + 1e-9):
+            continue
+        if not side.tells_apart:
+            return ONE_VALUE if side is first else f"of the baseline, {ONE_VALUE}"
+        if kept.false_positives_per_min * side.minutes < FEWEST_GHOSTS * (1 - 1e-9):
+            return FEW
+    return None
+
+
+def notes_on_equal_ghosts(reasons: Mapping[str, str | None]) -> Iterator[str]:
+    """Notes on pairs without times at equal ghosts. `reasons`: by label."""
+    for reason in dict.fromkeys(reason for reason in reasons.values() if reason is not None):
+        labels = ", ".join(label for label, why in reasons.items() if why == reason)
+        yield f"{labels}: no ttd_rmst_s_equal_ghosts: {reason}"
+
 
 METRICS = {name: METRIC[name.removesuffix("_equal_ghosts")].better for name in (
     "detected_share", "ttd_rmst_s", "ttd_rmst_s_equal_ghosts", "dad_median_m", "position_rmse_m", "gospa_m",
@@ -42,21 +205,21 @@ METRICS = {name: METRIC[name.removesuffix("_equal_ghosts")].better for name in (
 
 
 @dataclass(frozen=True)
-class Setting:
-    """How a pair is measured: the horizon, GOSPA's power, and what is kept of each side's entries for equal ghosts."""
+class PairSettings:
+    """Parameters of a pair: the horizon, the power of GOSPA, and the operating points of both sides."""
 
     horizon_s: float
     power: float
-    kept: tuple[Kept, Kept] | None = None
+    kept: tuple[OperatingPoint, OperatingPoint] | None = None
 
 
 @dataclass(frozen=True)
 class Regret:
-    """A metric of a pair; `kept`: at which ghosts the first and the second are, where that is chosen."""
+    """A metric of a pair; `kept`: operating points of the first and the second, for times at equal ghosts."""
 
     metric: str
-    figure: Figure
-    kept: tuple[Kept, Kept] | None = None
+    figure: PairStatistic
+    kept: tuple[OperatingPoint, OperatingPoint] | None = None
 
 
 @dataclass(frozen=True)
@@ -65,9 +228,9 @@ class _Pair:
 
     first: ConfigurationData
     second: ConfigurationData
-    grid: Grid
+    grid: PairingGrid
     cells: Int
-    setting: Setting
+    setting: PairSettings
 
     @property
     def sides(self) -> tuple[ConfigurationData, ConfigurationData]:
@@ -76,155 +239,165 @@ class _Pair:
     @property
     def runs(self) -> Int:
         """(C,) the run of each cell."""
-        found: Int = self.cells % self.grid.runs
-        return found
+        runs: Int = self.cells % self.grid.runs
+        return runs
 
-    def items(self, cells: Int, **columns: NDArray[Any]) -> Items:
-        """An item for each of some cells, −1 − r: of run r and no object."""
+    def items(self, cells: Int, **columns: NDArray[Any]) -> StatisticItems:
+        """An item for each of `cells`; −1 − r stands for run r and no object."""
         objects = np.where(cells < 0, -1, cells // self.grid.runs + self.grid.before)
         runs = np.where(cells < 0, -1 - cells, cells % self.grid.runs)
         numbers = {"logs": np.full(len(cells), self.grid.log_ix), "objects": objects, "runs": runs}
         n = {"n": np.ones(len(cells), dtype=np.int64)}
-        return Items({name: of.astype(np.int32) for name, of in numbers.items()} | n | columns)
+        return StatisticItems({name: of.astype(np.int32) for name, of in numbers.items()} | n | columns)
 
 
-def regrets(
-    first: ConfigurationData, second: ConfigurationData, grid: Grid, setting: Setting, only: Sequence[str] | None = None
+def compute_regrets(
+    first: ConfigurationData,
+    second: ConfigurationData,
+    grid: PairingGrid,
+    setting: PairSettings,
+    only: Sequence[str] | None = None,
 ) -> Iterator[Regret]:
-    """Every metric of a log, or only some, that both sides have what it takes for."""
+    """The metrics of a log, all or `only` some, for which both sides have the data."""
     pair = _Pair(first, second, grid, np.flatnonzero(first.there & second.there), setting)
-    for names, made in _METRICS.items():
+    for names, compute in _METRICS.items():
         if only is None or not set(names).isdisjoint(only):
-            yield from (one for one in made(pair) if only is None or one.metric in only)
+            yield from (regret for regret in compute(pair) if only is None or regret.metric in only)
 
 
-def _of_detections(pair: _Pair) -> Iterator[Regret]:
-    yield Regret("detected_share", _shares(pair, pair.cells, *(side.detected[pair.cells] for side in pair.sides)))
+def _detection_regrets(pair: _Pair) -> Iterator[Regret]:
+    yield Regret(
+        "detected_share", _share_statistic(pair, pair.cells, *(side.detected[pair.cells] for side in pair.sides))
+    )
     times = [((1.0, side.detection_s),) for side in pair.sides]
     yield Regret("ttd_rmst_s", _restricted_means(pair, times))
 
 
-def _at_equal_ghosts(pair: _Pair) -> Iterator[Regret]:
+def _equal_ghosts_regrets(pair: _Pair) -> Iterator[Regret]:
     if pair.setting.kept is None:
         return
     times = []
     for side, kept in zip(pair.sides, pair.setting.kept, strict=True):
         parts = ((kept.share, kept.existence), (1.0 - kept.share, kept.above))
         assert side.steps is not None
-        times.append([(share, _detected_s(side.steps, limit, len(side.there))) for share, limit in parts if share > 0])
+        times.append(
+            [(share, _detection_times_s(side.steps, limit, len(side.there))) for share, limit in parts if share > 0]
+        )
     yield Regret("ttd_rmst_s_equal_ghosts", _restricted_means(pair, times), pair.setting.kept)
 
 
-def _detected_s(steps: StepData, existence: float, cells: int) -> Float:
-    """(C,) when each cell is detected by entries of at least some existence; NaN: never."""
+def _detection_times_s(steps: StepData, existence: float, cells: int) -> Float:
+    """(C,) seconds at which each cell is detected by entries of at least `existence`; NaN: never."""
     detection_s = np.full(cells, np.inf)
     enough = steps.existence >= existence
     np.minimum.at(detection_s, steps.cell[enough], steps.detection_s[enough])
     return np.where(np.isinf(detection_s), np.nan, detection_s)
 
 
-def _restricted_means(pair: _Pair, times: Sequence[Sequence[tuple[float, Float]]]) -> OfTimes:
-    """Of times of detection (N·S,), NaN: not, with their shares of the drives, of both sides."""
+def _restricted_means(pair: _Pair, times: Sequence[Sequence[tuple[float, Float]]]) -> TimeStatistic:
+    """The restricted means of both sides, from (share of the drives, instants of detection (N·S,), NaN: never)."""
     shares, parts = [], []
     for side, sign, of_side in zip(pair.sides, (1.0, -1.0), times, strict=True):
         for share, detection_s in of_side:
             shares.append(sign * share)
-            parts.append(_times(pair, side, detection_s[pair.cells]))
-    return OfTimes(parts=tuple(parts), shares=tuple(shares), horizon_s=pair.setting.horizon_s)
+            parts.append(_time_items(pair, side, detection_s[pair.cells]))
+    return TimeStatistic(parts=tuple(parts), shares=tuple(shares), horizon_s=pair.setting.horizon_s)
 
 
-def _times(pair: _Pair, side: ConfigurationData, detection_s: Float) -> Items:
-    """To a nanosecond, as in summary."""
+def _time_items(pair: _Pair, side: ConfigurationData, detection_s: Float) -> StatisticItems:
+    """Items of times to detection, rounded to a nanosecond as in the summary."""
     cells, detected = pair.cells, ~np.isnan(detection_s)
     time_s = np.where(detected, detection_s, side.ended_s[cells]) - side.onset_s[cells]
     ending = np.where(detected, DETECTED, np.where(side.left[cells], LEFT, CENSORED)).astype(np.int8)
     return pair.items(cells, time_s=np.round(time_s, 9), ending=ending)
 
 
-def _of_distances(pair: _Pair) -> Iterator[Regret]:
+def _distance_regrets(pair: _Pair) -> Iterator[Regret]:
     first, second = (np.where(side.detected, side.distance_m, -np.inf)[pair.cells] for side in pair.sides)
     placed = ~np.isnan(first + second)  # NaN: detected during a gap of the truth, no distance to rank
     items = pair.items(pair.cells[placed], first=first[placed], second=second[placed])
-    yield Regret("dad_median_m", OfMedians(parts=(items,)))
+    yield Regret("dad_median_m", MedianStatistic(parts=(items,)))
 
 
-def _of_lists(pair: _Pair) -> Iterator[Regret]:
-    """Errors and GOSPA; lists are of no object in particular, so that their number stays when objects are resampled."""
+def _list_regrets(pair: _Pair) -> Iterator[Regret]:
+    """Errors and GOSPA; lists belong to no object, so that their number stays when objects are resampled."""
     if pair.first.accuracy is None or pair.second.accuracy is None:
         return
-    both = together(pair.first.accuracy, pair.second.accuracy, pair.grid, pair.cells)
-    k = both.matched > 0
-    squares = np.concatenate([both.squared_m2, both.matched[:, None]], axis=1)[k]
-    errors = pair.items(pair.cells[k], n=both.matched[k], sums=squares)
-    yield Regret("position_rmse_m", OfSums(parts=(errors,), of=_root(2.0)))
-    there = both.measured > 0
-    parts = np.concatenate([both.gospa, np.zeros((len(pair.cells), 1))], axis=1)[there]
-    items = _with_runs(pair, pair.cells[there], parts, np.outer(both.lists, [0.0, 0.0, 1.0]), both.lists)
-    yield Regret("gospa_m", OfSums(parts=(items,), of=_root(pair.setting.power)))
+    both = pair_lists(pair.first.accuracy, pair.second.accuracy, pair.grid, pair.cells)
+    matched = both.matched > 0
+    squares = np.concatenate([both.squared_m2, both.matched[:, None]], axis=1)[matched]
+    errors = pair.items(pair.cells[matched], n=both.matched[matched], sums=squares)
+    yield Regret("position_rmse_m", SumStatistic(parts=(errors,), of=_make_power_mean(2.0)))
+    measured = both.measured > 0
+    parts = np.concatenate([both.gospa, np.zeros((len(pair.cells), 1))], axis=1)[measured]
+    items = _append_run_items(pair, pair.cells[measured], parts, np.outer(both.lists, [0.0, 0.0, 1.0]), both.lists)
+    yield Regret("gospa_m", SumStatistic(parts=(items,), of=_make_power_mean(pair.setting.power)))
 
 
-def _of_ghosts(pair: _Pair) -> Iterator[Regret]:
-    """Ghosts over minutes; those that are nearest to no measured object are of their list only."""
-    ghosts, others = pair.first.ghosts, pair.second.ghosts
-    if ghosts is None or others is None:
+def _false_positive_regrets(pair: _Pair) -> Iterator[Regret]:
+    """Ghosts per minute; those nearest to no measured object belong to their run only."""
+    ghosts, other_ghosts = pair.first.ghosts, pair.second.ghosts
+    if ghosts is None or other_ghosts is None:
         return
-    there = ghosts.there & others.there
-    cells, runs = pair.cells[there[pair.runs]], pair.runs[there[pair.runs]]
+    present = ghosts.there & other_ghosts.there
+    cells, runs = pair.cells[present[pair.runs]], pair.runs[present[pair.runs]]
     nearest = np.zeros((len(cells), 4))
-    rest = np.stack([ghosts.count, others.count, ghosts.minutes, others.minutes], axis=1).astype(float)
-    rest[~there] = 0.0
+    rest = np.stack([ghosts.count, other_ghosts.count, ghosts.minutes, other_ghosts.minutes], axis=1).astype(float)
+    rest[~present] = 0.0
     accuracy = [side.accuracy for side in pair.sides if side.accuracy is not None]
-    for k, of in enumerate(accuracy if len(accuracy) == 2 else ()):
-        nearest[:, k] = of.ghosts[cells]
+    for k, accuracy_of_side in enumerate(accuracy if len(accuracy) == 2 else ()):
+        nearest[:, k] = accuracy_of_side.ghosts[cells]
         rest[:, k] -= np.bincount(runs, nearest[:, k], minlength=len(rest))
-    items = _with_runs(pair, cells, nearest, rest, there.astype(np.int64))
-    yield Regret("false_positives_per_min", OfSums(parts=(items,), by_object=len(accuracy) == 2, of=_rates))
+    items = _append_run_items(pair, cells, nearest, rest, present.astype(np.int64))
+    yield Regret(
+        "false_positives_per_min", SumStatistic(parts=(items,), by_object=len(accuracy) == 2, of=_divide_rates)
+    )
 
 
-def _of_braking(pair: _Pair) -> Iterator[Regret]:
+def _braking_regrets(pair: _Pair) -> Iterator[Regret]:
     first, second, cells = pair.first, pair.second, pair.cells
     if first.conflict is not None and second.conflict is not None:
         assert first.passes is not None
         assert second.passes is not None
         judged = cells[first.conflict[cells] & second.conflict[cells]]
-        yield Regret("pass_share", _shares(pair, judged, first.passes[judged], second.passes[judged]))
+        yield Regret("pass_share", _share_statistic(pair, judged, first.passes[judged], second.passes[judged]))
 
 
-def _shares(pair: _Pair, cells: Int, first: Bool, second: Bool) -> OfSums:
+def _share_statistic(pair: _Pair, cells: Int, first: Bool, second: Bool) -> SumStatistic:
     only = np.stack([first & ~second, second & ~first], axis=1).astype(np.int64)
     sums = np.stack([first, second, np.ones(len(cells))], axis=1)
-    return OfSums(parts=(pair.items(cells, only=only, sums=sums),), of=_mean)
+    return SumStatistic(parts=(pair.items(cells, only=only, sums=sums),), of=_divide_mean)
 
 
-def _with_runs(pair: _Pair, cells: Int, of_cells: Float, of_runs: Float, n: Int) -> Items:
-    """Items of cells, then of all runs that count for something (`n (S,)`)."""
-    at = np.flatnonzero(n)
-    counts = np.concatenate([np.zeros(len(cells), dtype=np.int64), n[at]])
-    return pair.items(np.concatenate([cells, -1 - at]), n=counts, sums=np.concatenate([of_cells, of_runs[at]]))
+def _append_run_items(pair: _Pair, cells: Int, of_cells: Float, of_runs: Float, n: Int) -> StatisticItems:
+    """Items of cells, then of the runs with `n (S,)` above 0."""
+    runs = np.flatnonzero(n)
+    counts = np.concatenate([np.zeros(len(cells), dtype=np.int64), n[runs]])
+    return pair.items(np.concatenate([cells, -1 - runs]), n=counts, sums=np.concatenate([of_cells, of_runs[runs]]))
 
 
-def _mean(sums: Float) -> tuple[Float, Float]:
+def _divide_mean(sums: Float) -> tuple[Float, Float]:
     return sums[..., 0] / sums[..., 2], sums[..., 1] / sums[..., 2]
 
 
-def _root(power: float) -> Callable[[Float], tuple[Float, Float]]:
+def _make_power_mean(power: float) -> Callable[[Float], tuple[Float, Float]]:
     def of(sums: Float) -> tuple[Float, Float]:
-        first, second = _mean(sums)
+        first, second = _divide_mean(sums)
         return first ** (1 / power), second ** (1 / power)
 
     return of
 
 
-def _rates(sums: Float) -> tuple[Float, Float]:
+def _divide_rates(sums: Float) -> tuple[Float, Float]:
     return sums[..., 0] / sums[..., 2], sums[..., 1] / sums[..., 3]
 
 
 _METRICS = {
-    ("detected_share", "ttd_rmst_s"): _of_detections,
-    ("ttd_rmst_s_equal_ghosts",): _at_equal_ghosts,
-    ("dad_median_m",): _of_distances,
-    ("position_rmse_m", "gospa_m"): _of_lists,
-    ("false_positives_per_min",): _of_ghosts,
-    ("pass_share",): _of_braking,
+    ("detected_share", "ttd_rmst_s"): _detection_regrets,
+    ("ttd_rmst_s_equal_ghosts",): _equal_ghosts_regrets,
+    ("dad_median_m",): _distance_regrets,
+    ("position_rmse_m", "gospa_m"): _list_regrets,
+    ("false_positives_per_min",): _false_positive_regrets,
+    ("pass_share",): _braking_regrets,
 }
-"""What makes which metrics, in the order of a comparison."""
+"""By metrics the function that computes them, in the order of a comparison."""

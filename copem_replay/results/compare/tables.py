@@ -1,4 +1,4 @@
-"""A comparison as text: for a terminal, as Markdown, as CSV. Nothing is cut off."""
+"""Tables of a comparison: for a terminal, as Markdown, as CSV. Nothing is cut off."""
 
 from __future__ import annotations
 
@@ -9,45 +9,49 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from copem_replay.core.errors import OutputError, printable
+from copem_replay.core.errors import OutputError, escape_unprintable, wrap_line
 from copem_replay.core.files import atomic_file
-from copem_replay.core.text import wrapped
-from copem_replay.metrics.fixed import NOTHING_DRAWN
-from copem_replay.metrics.summary_text import as_text
-from copem_replay.results.belongings import list_made
+from copem_replay.metrics.intervals import NOTHING_DRAWN
+from copem_replay.metrics.summary import format_table
 from copem_replay.results.compare.limits import ALL_ALIKE
 from copem_replay.results.compare.metrics import METRICS
+from copem_replay.results.folder import add_to_made_list
 
 if TYPE_CHECKING:
     from copem_replay.results.compare.compare import Comparison
 
+
 _SUFFIXES = (".csv", ".md")
 _RESULTS = ("summary.csv", "sweep.csv", "bands.csv")
 NOTHING = 1e-9
-"""Closer to 0 than this is 0 (chosen: below what any of the metrics is measured with)."""
+"""Differences closer to 0 are 0: far below what any of the metrics resolves."""
 APART = "*"
 """Marks a difference whose interval excludes 0."""
 _WITHOUT = {ALL_ALIKE: "all alike", NOTHING_DRAWN: NOTHING_DRAWN}
-"""How it is said in a cell that there is no interval, and why."""
+"""Words in a cell without an interval, by the reason."""
 
 
 def comparison_text(comparison: Comparison, width: int | None = None) -> str:
-    """A row per configuration, a column per metric, and what they are; for a terminal of a width, or a pipe."""
-    lines = (part for line in comparison_lines(comparison) for part in wrapped(line, width))
-    return "\n".join([as_text(_cells(comparison), width), *lines])
+    """The comparison as text: a row per configuration, a column per metric, and lines on them. `width`: None for a
+    pipe.
+    """
+    lines = (part for line in comparison_lines(comparison) for part in wrap_line(line, width))
+    return "\n".join([format_table(_format_cells(comparison), width), *lines])
 
 
 def comparison_markdown(comparison: Comparison) -> str:
-    """The same as a Markdown table, the lines after it and the notes as a list; ends with a newline."""
-    cells = _cells(comparison)
+    """The comparison as a Markdown table, with lines and notes as a list after it; ends with a newline."""
+    cells = _format_cells(comparison)
     notes = (f"note: {note}" for note in comparison.notes)
     rows = [list(cells.columns), ["---"] * len(cells.columns), *cells.itertuples(index=False)]
-    lines = ["| " + " | ".join(in_markdown(str(cell)) for cell in row) + " |" for row in rows]
-    return "\n".join([*lines, "", *(f"- {in_markdown(line)}" for line in (*comparison_lines(comparison), *notes)), ""])
+    lines = ["| " + " | ".join(escape_markdown(str(cell)) for cell in row) + " |" for row in rows]
+    return "\n".join(
+        [*lines, "", *(f"- {escape_markdown(line)}" for line in (*comparison_lines(comparison), *notes)), ""]
+    )
 
 
 def check_out(path: Path) -> None:
-    """Raise OutputError where a comparison cannot be written as what the file's name says."""
+    """Raise OutputError where the file's name has another suffix, or is that of a table of results."""
     if path.suffix.lower() not in _SUFFIXES:
         raise OutputError(f"{path}: expected a name that ends with {' or '.join(_SUFFIXES)}, found {path.name}")
     if path.name in _RESULTS and (path.parent / "provenance.json").exists():
@@ -55,9 +59,9 @@ def check_out(path: Path) -> None:
 
 
 def write_comparison(comparison: Comparison, path: Path, folders: Sequence[Path] = ()) -> None:
-    """Write CSV (a row per log, configuration and metric) or a Markdown table, as the name says. Raises OutputError.
+    """Write CSV (a row per log, configuration and metric) or a Markdown table, by the suffix. Raises OutputError.
 
-    `folders`: of the results that are compared.
+    `folders`: of the compared results, which list the file if it lies in them.
     """
     from copem_replay.results.write import write_csv
 
@@ -68,50 +72,50 @@ def write_comparison(comparison: Comparison, path: Path, folders: Sequence[Path]
         else:
             scratch.write_text(comparison_markdown(comparison), encoding="utf-8")
         for folder in folders:
-            list_made(folder, [path])
+            add_to_made_list(folder, [path])
 
 
-def _cells(comparison: Comparison) -> pd.DataFrame:
+def _format_cells(comparison: Comparison) -> pd.DataFrame:
     rows = {(row.configuration, row.metric): row for row in comparison.overall.itertuples(index=False)}
     metrics = [metric for metric in METRICS if any((name, metric) in rows for name in comparison.configurations)]
     columns: dict[str, list[str]] = {"configuration": list(comparison.configurations)}
     for metric in metrics:
-        columns[metric] = [_cell(rows.get((name, metric))) for name in comparison.configurations]
+        columns[metric] = [_format_cell(rows.get((name, metric))) for name in comparison.configurations]
     return pd.DataFrame(columns)
 
 
-def _cell(row: Any) -> str:
+def _format_cell(row: Any) -> str:
     """`+0.12 [0.05, 0.2] *`; `+0.12 (all alike)`; a dash where there is no difference."""
     if row is None or pd.isna(row.difference):
         return "–"
     if pd.isna(row.interval_over):
-        return " ".join([signed(row.difference), *(f"({why})" for why in without_interval(row))])
-    low, high = ("–" if pd.isna(limit) else plain(limit) for limit in (row.low, row.high))
-    return f"{signed(row.difference)} [{low}, {high}]{f' {APART}' if _excludes_0(row.low, row.high) else ''}"
+        return " ".join([format_signed(row.difference), *(f"({why})" for why in explain_no_interval(row))])
+    low, high = ("–" if pd.isna(limit) else format_limit(limit) for limit in (row.low, row.high))
+    return f"{format_signed(row.difference)} [{low}, {high}]{f' {APART}' if _excludes_0(row.low, row.high) else ''}"
 
 
 def _excludes_0(low: float, high: float) -> bool:
-    """Whether an interval tells a difference from none."""
+    """Whether an interval excludes 0."""
     return bool(low > NOTHING or high < -NOTHING)
 
 
-def without_interval(row: Any) -> list[str]:
-    """Why a difference has no interval, in a word or two; nothing where it has one, or where clusters are too few."""
+def explain_no_interval(row: Any) -> list[str]:
+    """Why a difference has no interval, in a word or two; empty where it has one, or where clusters are too few."""
     return [_WITHOUT[row.interval]] if row.interval in _WITHOUT else []
 
 
-def signed(value: float) -> str:
+def format_signed(value: float) -> str:
     """A difference to three significant digits, with its sign."""
-    return "±0" if abs(value) < NOTHING else ("+" if value > 0 else "") + plain(value)
+    return "±0" if abs(value) < NOTHING else ("+" if value > 0 else "") + format_limit(value)
 
 
-def plain(value: float) -> str:
+def format_limit(value: float) -> str:
     """A limit to three significant digits."""
     return "0" if abs(value) < NOTHING else f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 
 def comparison_lines(comparison: Comparison) -> Iterator[str]:
-    """What the table shows, and which are better than the baseline."""
+    """Lines on the table: its meaning, and the configurations that are better than the baseline."""
     overall = comparison.overall
     shown = set(overall["metric"])
     yield f"differences to {comparison.baseline}, paired by log, object and run; accuracy at instants that both have"
@@ -121,7 +125,7 @@ def comparison_lines(comparison: Comparison) -> Iterator[str]:
         yield f"[95 %]: bootstrap interval over {'; '.join(kinds)}"
     if any(_excludes_0(low, high) for low, high in zip(overall["low"], overall["high"], strict=True)):
         yield f"{APART}: the interval excludes 0"
-    yield from _on_intervals(overall)
+    yield from _describe_intervals(overall)
     yield (
         f"ttd_rmst_s: mean time to detection up to {comparison.horizon_s:.4g} s, never detected counting as that; "
         "objects still there at the end are censored"
@@ -133,26 +137,26 @@ def comparison_lines(comparison: Comparison) -> Iterator[str]:
             "remain, not counting stale ones"
         )
     for metric, better in METRICS.items():
-        of = overall[overall["metric"] == metric]
-        beyond = of["low"] > NOTHING if better > 0 else of["high"] < -NOTHING
+        of_metric = overall[overall["metric"] == metric]
+        beyond = of_metric["low"] > NOTHING if better > 0 else of_metric["high"] < -NOTHING
         if beyond.any():
-            names = ", ".join(of.loc[beyond, "configuration"])
+            names = ", ".join(of_metric.loc[beyond, "configuration"])
             yield f"better than {comparison.baseline} in {metric}, the interval excluding 0: {names}"
 
 
 _HTML = {"&": "&amp;", "<": "&lt;", ">": "&gt;"}
 _MARKDOWN = re.compile(r"[\\`*~|$]|(?<![^\W_])_|_(?![^\W_])|!(?=\[)|\](?=[(\[])|:(?=//)")
-"""What begins something in Markdown wherever it stands; `_` only at the edge of a word, `]` only before a target."""
+"""Characters with a meaning in Markdown anywhere; `_` only at the edge of a word, `]` only before a target."""
 
 
-def in_markdown(text: str) -> str:
-    """Text that reads as itself, on one line, in Markdown and in the HTML that it becomes."""
-    html = re.sub("[&<>]", lambda found: _HTML[found[0]], printable(text))
+def escape_markdown(text: str) -> str:
+    """Text on one line, escaped so that Markdown and its HTML show it unchanged."""
+    html = re.sub("[&<>]", lambda found: _HTML[found[0]], escape_unprintable(text))
     return _MARKDOWN.sub(r"\\\g<0>", html)
 
 
-def _on_intervals(overall: pd.DataFrame) -> Iterator[str]:
-    """Which differences have other intervals, or none, because there is nothing to resample."""
+def _describe_intervals(overall: pd.DataFrame) -> Iterator[str]:
+    """Lines on differences with other kinds of intervals, or without any, as nothing varies among resamples."""
     kinds = {kind: list(dict.fromkeys(of["metric"])) for kind, of in overall.groupby("interval", sort=False)}
     if "exact" in kinds:
         yield (

@@ -1,0 +1,153 @@
+"""Recordings in Python: read, surveyed, and the draft of an experiment that replays one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from copem_replay.core.errors import RecordingError
+from copem_replay.core.tracks import Scene, Tracks
+from copem_replay.io.recording import Recording
+from copem_replay.io.window import WindowSeconds
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from copem_replay.api.study import AnyExperiment, AnyPath
+    from copem_replay.experiment.draft.findings import RecordingSurvey
+    from copem_replay.io.config import EgoTopic
+
+
+def read_recordings(experiment: AnyExperiment) -> list[Recording]:
+    """Read the recordings an experiment names, with its ego, topic, window and recorded units.
+
+    Every recording gets a name of its own, `scene.log`: that of its file, with its folder where two are alike.
+
+    Raises InputError with all problems at once: of the experiment, of each recording, and of both together.
+
+    >>> [recording.scene.log for recording in cr.read_recordings("logs/tc016d.yaml")]
+    ['tc016d']
+    """
+    from copem_replay.api.study import make_study
+
+    return list(make_study(experiment).recordings)
+
+
+def read_recording(
+    path: AnyPath,
+    ego: str | EgoTopic | None = None,
+    topic: str | None = None,
+    window_s: WindowSeconds = None,
+) -> Recording:
+    """Read one recording: an MCAP file, a rosbag2 folder or an OSI trace.
+
+    `ego`: id of the ego vehicle; None: the one the recording names. `topic`: where the true objects are; None: the only
+    such topic. `window_s`: what is read, [from, to] in seconds since the first message of the truth; None: all.
+    The result holds `scene` and `truth`, whose arrays are (1, P): one run, P rows, metres and radians, east and north.
+
+    Raises RecordingError: no such file, an unknown format, no true objects, no such ego, several topics to choose from.
+
+    >>> recording = cr.read_recording("logs/tc016d.mcap", window_s=(0, 2))
+    >>> len(recording.scene.object_ids), recording.truth.x_m.shape
+    (9, (1, 189))
+    """
+    from copem_replay.io.open import name_log
+    from copem_replay.io.recording import read_log
+
+    return read_log(Path(path), name=name_log(Path(path)), ego=ego, topic=topic, window_s=window_s)
+
+
+def read_lists(path: AnyPath, topic: str, scene: Scene) -> Tracks:
+    """Read lists of objects back that a replay has written as `osi3.SensorData`, or that a unit has recorded.
+
+    `scene`: of the recording that was replayed; its ids tell which objects they are. The result has one run: values
+    (1, P) in metres, radians and m/s, lists (F,) with `captured_s`, and `arrives_s` (1, F) in seconds since the start.
+
+    Raises RecordingError: no such topic of osi3.SensorData, a message that cannot be decoded.
+
+    >>> scene = cr.read_recording("logs/tc016d.mcap").scene
+    >>> lists = cr.read_lists("out/tc016d/replay.mcap", "copem/PEM/objects", scene)
+    >>> len(lists.stamp_ns), lists.x_m.shape[0]
+    (81, 1)
+    """
+    from copem_replay.io.recorded_lists import read_sensor_data
+
+    return read_sensor_data(Path(path), topic, scene)
+
+
+def inspect_recording(path: AnyPath) -> dict[str, Any]:
+    """Survey a recording: topics, true objects, lists of units, span in seconds, rates in Hz, ego, what is missing.
+
+    The result is plain data, as of `copem-replay info --json`. A recording that cannot be read raises nothing:
+    `readable` is then False, and `reason` says why.
+
+    >>> found = cr.inspect_recording("logs/tc016d.mcap")
+    >>> found["readable"], [topic["role"] for topic in found["topics"]]
+    (True, ['truth'])
+    """
+    from copem_replay.experiment.draft.findings import survey_as_json
+    from copem_replay.experiment.draft.survey import survey_recording
+
+    return survey_as_json(survey_recording(Path(path)))
+
+
+def draft_experiment(path: AnyPath) -> str:
+    """Draft an experiment that replays a recording: YAML with comments, its paths relative to the working folder.
+
+    The text is what `copem-replay init` prints. Ego, a mast and recorded units are guesses, each with a comment.
+
+    Raises RecordingError where no list of true objects is readable, or the path of the recording is not UTF-8.
+
+    >>> print(cr.draft_experiment("logs/tc016d.mcap").splitlines()[0])
+    # Replays tc016d.mcap, 8.0 s: 2 pedestrian, 1 bicycle, 4 car, 1 truck.
+    """
+    text, survey = draft_recording(Path(path))
+    if text is None:
+        raise RecordingError(survey.reason or f"{path}: no list of true objects")
+    check_encodable(path)
+    return text
+
+
+def check_encodable(path: AnyPath) -> None:
+    """Raise RecordingError for a path that is not UTF-8, which no experiment file can hold."""
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        raise RecordingError(f"{path}: its path is not UTF-8: no experiment could name it") from None
+
+
+def draft_joint_recordings(paths: Sequence[Path]) -> tuple[str | None, RecordingSurvey]:
+    """The draft for several recordings of one drive, with their clock offsets, 0 where none can be estimated.
+
+    Returns the text, None where no list of true objects is readable, and the joint survey.
+    """
+    from copem_replay.experiment.draft.survey import compare_clocks, survey_recording
+    from copem_replay.experiment.draft.template import format_draft, format_proposed_draft, quote_yaml
+    from copem_replay.io.open import DriveRecordings
+
+    clocks = compare_clocks(paths)
+    ahead_s = [0.0, *(0.0 if clock.offset.untold else round(clock.offset.offset_s, 3) for clock in clocks)]
+    survey = survey_recording(DriveRecordings(tuple(paths), tuple(ahead_s)))
+    text = format_draft(survey) if survey.readable else format_proposed_draft(survey)
+    if text is None:
+        return None, survey
+    entry = [
+        "logs:   # relative to this file, or absolute",
+        f"  - together: [{', '.join(quote_yaml(str(p)) for p in paths)}]",
+    ]
+    entry += ["    clock_offset_s:   # how far a clock is ahead of the first one's; it is subtracted"]
+    for clock, offset_s in zip(clocks, ahead_s[1:], strict=True):
+        lists = " and ".join(clock.lists)
+        entry.append(f"      {quote_yaml(str(clock.path))}: {offset_s}   # {clock.words()}; by {lists}")
+    lines = text.splitlines()
+    logs_line = next(k for k, line in enumerate(lines) if line.startswith("logs: ["))
+    return "\n".join([*lines[:logs_line], *entry, *lines[logs_line + 1 :]]) + "\n", survey
+
+
+def draft_recording(path: Path) -> tuple[str | None, RecordingSurvey]:
+    """The draft, None where no list of true objects is readable, and the survey behind it."""
+    from copem_replay.experiment.draft.survey import survey_recording
+    from copem_replay.experiment.draft.template import format_draft, format_proposed_draft
+
+    survey = survey_recording(path)
+    return (format_draft(survey) if survey.readable else format_proposed_draft(survey)), survey

@@ -1,0 +1,140 @@
+"""Results folders in Python: read, compared, reported, and opened in the viewer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
+
+from copem_replay.core.errors import InputError, OutputError
+from copem_replay.results.compare import Comparison
+from copem_replay.results.read import Results
+
+if TYPE_CHECKING:
+    from copem_replay.api.run import StudyResult
+
+
+AnyResults: TypeAlias = "Results | StudyResult | str | PathLike[str]"
+"""Results that were read, a saved result of `run`, or the path of a results folder."""
+
+
+def load_results(folder: str | PathLike[str]) -> Results:
+    """Read a results folder: its experiment and its tables, under the names that `run` gives them.
+
+    `detections`, `tally`, `summary`, and where it has them `exact`, `sweep`, `accuracy`, `bands` (else None): pandas,
+    times in seconds (`_s`), distances in metres (`_m`). Of many rows `each` gives those of a log at a time.
+
+    Raises InputError: no such folder, no results in it, or damaged ones.
+
+    >>> results = cr.load_results("out/tc016d")
+    >>> results.detections["configuration"].nunique(), len(results.summary)
+    (6, 6)
+    """
+    from copem_replay.results.read import read_results
+
+    return read_results(Path(folder))
+
+
+def compare(
+    results: AnyResults | Sequence[AnyResults],
+    *,
+    configurations: Sequence[str] | None = None,
+    baseline: str | None = None,
+    false_positives_per_min: float | None = None,
+) -> Comparison:
+    """Compare configurations with a baseline, paired by log, object and run, within or across results folders.
+
+    `configurations`: only these; None: all. `baseline`: None: the one named `ideal`. `false_positives_per_min`: false
+    positives per minute at which times to detection are compared once more; None: those of the baseline. `table` of the
+    result has a row per log, configuration and metric: `difference` with the limits `low` and `high` of its 95 %
+    interval.
+
+    Raises InputError with every reason why the results are unreadable or not comparable.
+
+    >>> comparison = cr.compare("out/tc016d", baseline="PEM")
+    >>> table = comparison.overall.set_index(["metric", "configuration"])
+    >>> table.loc[("ttd_rmst_s", "coPEM:0.5s"), "baseline_value"].round(1)
+    np.float64(0.8)
+    """
+    from copem_replay.results.compare import compare_folders
+
+    all_results = list(results) if isinstance(results, Sequence) and not isinstance(results, str) else [results]
+    return compare_folders(
+        [find_results_folder(folder) for folder in all_results],
+        configurations=configurations,
+        baseline=baseline,
+        false_positives_per_min=false_positives_per_min,
+    )
+
+
+def write_report(results: AnyResults, file: str | PathLike[str] | None = None, *, baseline: str | None = None) -> Path:
+    """Write the report of a results folder as one HTML file that opens offline. Returns its path.
+
+    `file`: None: `report.html` in the folder. `baseline`: None: the configuration named `ideal`, if any.
+
+    Raises InputError where the results are unreadable, OutputError where the file is not writable.
+
+    >>> cr.write_report("out/tc016d", "report.html").name
+    'report.html'
+    """
+    from copem_replay.report import write_html_report
+
+    return write_html_report(find_results_folder(results), None if file is None else Path(file), baseline=baseline)
+
+
+def view(results: AnyResults, *, web: bool = False) -> None:
+    """Open the recordings of a results folder in the Rerun viewer, just before the first onset, and wait until it ends.
+
+    `web`: serve viewer and recordings on a free port of 127.0.0.1 instead, print the address, and go on until
+    interrupted (Ctrl-C).
+
+    Raises InputError: no such folder, or no `replay.rrd` in it; OutputError where the viewer does not open.
+
+    >>> cr.view("out/nowhere")
+    Traceback (most recent call last):
+    copem_replay.core.errors.InputError: out/nowhere: no such folder
+    """
+    from copem_replay.results.schema import check_format
+    from copem_replay.viewer.open import list_rrd_files, open_viewer
+
+    folder = find_results_folder(results)
+    files = list_rrd_files(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder")
+    check_format(folder)
+    if not files:
+        raise InputError(f"{folder}: no replay.rrd in this folder; `show: {{run: 0}}` in an experiment writes one")
+    if web:
+        _serve_recordings(folder, files)
+    elif code := open_viewer(folder, files):
+        raise OutputError(
+            f"{folder}: the Rerun viewer could not be opened (it ended with {code}); without a display, "
+            f"copem-replay view {folder} --web serves it for a browser"
+        )
+
+
+def _serve_recordings(folder: Path, files: Sequence[Path]) -> None:
+    """Serve recordings for a browser until interrupted."""
+    from copem_replay.viewer.open import serve_recordings
+
+    try:
+        with serve_recordings(folder, files) as server:
+            print(f"viewer at {server.url} (Ctrl-C ends it)", flush=True)
+            server.serve_forever()
+    except KeyboardInterrupt:  # the intended end
+        return
+
+
+def find_results_folder(results: AnyResults) -> Path:
+    """The folder of results. Raises InputError for results that are not saved."""
+    if isinstance(results, str | PathLike):
+        return Path(results)
+    if results.folder is None:
+        raise InputError("expected results in a folder, found some that are not saved; result.save(folder) does")
+    return results.folder
+
+
+def reread_results(results: AnyResults) -> Results:
+    """Results as read from their folder; results that were read before are returned as they are."""
+    return results if isinstance(results, Results) else load_results(find_results_folder(results))

@@ -1,0 +1,272 @@
+"""`cr.run` and its result; and, for one recording, the fused tracks of one run and the observations of its units."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from copem_replay.api.study import AnyExperiment, AnyPath, AnyRecordings, LoadedStudy, make_study, prepare_study
+from copem_replay.core.errors import InputError, OutputError, count_noun
+from copem_replay.core.fused_tracks import FusedTracks
+from copem_replay.core.tracks import CLASSES
+from copem_replay.experiment.drive import resolve_for_log
+from copem_replay.experiment.schema import Experiment
+from copem_replay.io.recording import Recording
+from copem_replay.pipeline.run import ExperimentResult, Progress
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from copem_replay.io.open import File
+    from copem_replay.pipeline.crew import Crew
+    from copem_replay.pipeline.pieces import PieceCache
+    from copem_replay.pipeline.prepare import Replay
+    from copem_replay.results.folder import ResultsPlace
+
+
+@dataclass(repr=False)
+class StudyResult:
+    """What an experiment gave: pandas tables, as a results folder has them.
+
+    `detections`: a row per log, configuration, run and measured object. `summary`: a row per configuration.
+    `exact`, `sweep`, `accuracy`, `bands`: None where the experiment does not ask for them. Times are in seconds (`_s`),
+    distances in metres (`_m`); missing values are null. Source of each column: docs/guide/metrics.md.
+
+    >>> result = cr.run({"version": 1, "configurations": {"GT": {"units": "truth"}}}, "logs/tc016d.mcap")
+    >>> result.detections.shape[0], result.exact is None
+    (7, True)
+    """
+
+    experiment: Experiment
+    recordings: tuple[Recording, ...]
+    replayed: ExperimentResult
+    folder: Path | None = None
+    """The results folder, once they are saved."""
+
+    def __repr__(self) -> str:
+        configurations = count_noun(len(self.experiment.configurations), "configuration")
+        runs, logs = count_noun(self.experiment.runs, "run"), count_noun(len(self.recordings), "recording")
+        return f"StudyResult({configurations}, {runs}, {logs}, {self.folder or 'not saved'})"
+
+    @property
+    def detections(self) -> pd.DataFrame:
+        """When, and how far away, each measured object was detected: log × configuration × run × object."""
+        return self.replayed.table
+
+    @property
+    def summary(self) -> pd.DataFrame:
+        """The metrics of each configuration."""
+        return self.replayed.summary
+
+    @property
+    def exact(self) -> pd.DataFrame | None:
+        """The probability of each time of detection, with `measure: {exact: true}`."""
+        return self.replayed.exact
+
+    @property
+    def sweep(self) -> pd.DataFrame | None:
+        """The summary at each value of the sweep, with `sweep:`."""
+        return self.replayed.sweep
+
+    @property
+    def accuracy(self) -> pd.DataFrame | None:
+        """Position errors and parts of GOSPA, list by list, in the order of `detections`."""
+        return None if self.replayed.accuracy is None else _make_frame(self.replayed.accuracy.accuracy)
+
+    @property
+    def bands(self) -> pd.DataFrame | None:
+        """Accuracy by configuration and by distance, time or existence."""
+        return self.replayed.bands
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What recordings lack, what was corrected, and what can hardly be meant: one line each."""
+        return self.replayed.notes
+
+    def save(self, folder: AnyPath, overwrite: bool = False) -> Path:
+        """Write the results folder, complete or not at all. Returns its path.
+
+        Raises OutputError: the folder holds something already (`overwrite` replaces results), or is not writable; also
+        where a replay could not be written, and all other results are there.
+
+        >>> result.save("out/example", overwrite=True).name
+        'example'
+        """
+        from copem_replay.results.folder import check_inputs, take_place
+
+        with take_place(Path(folder), overwrite=overwrite) as place:
+            check_inputs(place, [path for recording in self.recordings for path in recording.paths])
+            fill_results_folder(place, self)
+            self.folder = place.shown
+        if place.failed:
+            raise OutputError(place.failed)
+        return place.shown
+
+
+def fill_results_folder(
+    place: ResultsPlace, result: StudyResult, *, skipped: Sequence[tuple[File, str]] = (), viewer: str | None = None
+) -> list[str]:
+    """Write results into a results place. Returns notes, one line each.
+
+    `skipped`: logs that were left out, with reasons. `viewer`: address of a Rerun viewer that also gets the recordings.
+    """
+    from copem_replay.results.write import MCAP, fill_place
+    from copem_replay.viewer.rrd import make_rrd_exporter
+
+    exporters = [MCAP, make_rrd_exporter(viewer)]
+    return fill_place(
+        place, result.experiment, result.recordings, result.replayed, exporters=exporters, skipped=skipped
+    )
+
+
+def _make_frame(table: pa.Table | None) -> pd.DataFrame | None:
+    return None if table is None else table.to_pandas()
+
+
+def run(
+    experiment: AnyExperiment,
+    recordings: AnyRecordings | None = None,
+    jobs: int | None = None,
+    progress: Progress | None = None,
+    pieces: AnyPath | None = None,
+    crew: Executor | None = None,
+) -> StudyResult:
+    """Replay recordings through an experiment, and measure.
+
+    `experiment`: an Experiment, its keys and values in a dict, or the path of its file. `recordings`: Recordings or
+    paths, one or several; None: those the experiment names. `jobs`: workers; None: one per core. The result does not
+    depend on it. `progress(done, total)` is called after each block of runs. `pieces`: a folder or a URL where what
+    was computed is kept, and found by the next run (docs/guide/scale.md). `crew`: an executor of processes on this
+    machine or on others, such as ProcessPoolExecutor or `Client.get_executor()` of Dask, in place of `jobs`; it needs
+    `pieces` that all of them see, and recordings by their paths.
+
+    Raises InputError, before any run, with all problems at once: of the experiment (ExperimentError), of recordings, of
+    both together, times without a closed form, runs that no memory holds.
+
+    >>> result = cr.run("logs/tc016d.yaml")
+    >>> result.summary["ttd_median_s"].round(3).tolist()
+    [0.0, 0.8, 0.0, 0.5, 1.0, 1.5]
+    """
+    from copem_replay.pipeline.study_log import LogSurvey
+
+    cache = None if pieces is None else open_pieces(str(pieces))
+    if crew is None:
+        study = make_study(experiment, recordings, LogSurvey(cache))
+    elif cache is None:
+        raise InputError("crew: expected `pieces`, too: a folder or a URL that all its workers see")
+    else:
+        from copem_replay.pipeline.crew import Crew
+
+        show = None if progress is None else lambda p: progress(p.rows_done, p.rows)
+        workers = Crew(crew, cache, show)
+        study = read_with_crew(lambda: make_study(experiment, recordings, LogSurvey(cache), workers), workers)
+    return replay_study(study, prepare_study(study)[0], jobs, progress, cache)
+
+
+def read_with_crew(read: Callable[[], LoadedStudy], crew: Crew) -> LoadedStudy:
+    """The study that `read` returns, with all pieces computed; it is read again after a log that killed workers."""
+    while crew.fill((study := read()).experiment, study.recordings):
+        pass
+    return study
+
+
+def open_pieces(address: str) -> PieceCache:
+    """The pieces kept in a folder, or under a URL. Raises InputError, OutputError."""
+    from copem_replay.pipeline.pieces import PieceCache
+
+    return PieceCache(address)
+
+
+def replay_study(
+    study: LoadedStudy,
+    ready: Sequence[Replay],
+    jobs: int | None,
+    progress: Progress | None,
+    pieces: PieceCache | None = None,
+) -> StudyResult:
+    """Replay the prepared logs of a study (`ready`). `progress(done, total)` is called after each block of runs."""
+    from copem_replay.pipeline.run import run_experiment
+
+    result = run_experiment(
+        study.experiment, study.recordings, jobs=count_workers(jobs), progress=progress, ready=ready, pieces=pieces
+    )
+    return StudyResult(study.experiment, study.recordings, result)
+
+
+def count_workers(jobs: int | None) -> int:
+    """The number of workers: `jobs`, or one per core that this process may use. Raises InputError for less than 1."""
+    if jobs is not None:
+        if jobs < 1:
+            raise InputError(f"jobs: expected at least 1, found {jobs}")
+        return jobs
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def fused_tracks(experiment: AnyExperiment, recording: Recording | AnyPath, run: int = 0) -> dict[str, FusedTracks]:
+    """The fused lists of each configuration in one run of one recording: the same lists that `run` measures.
+
+    By the name of the configuration. `fused` holds the tracks, values (1, P) in metres, radians and m/s, and
+    `to_dataframe()` gives a row per entry.
+
+    Raises InputError as `run` does; ExperimentError where the recording is too long to be held at once.
+
+    >>> fused = cr.fused_tracks("logs/tc016d.yaml", "logs/tc016d.mcap", run=3)["coPEM:1s"]
+    >>> fused.to_dataframe()[["available_s", "object_id", "x_m"]].head(1)
+       available_s object_id       x_m
+    0          1.0         2  0.221615
+    """
+    from copem_replay.pipeline.one_run import replay_run
+
+    study = make_study(experiment, recording)
+    if not 0 <= run < study.experiment.runs:
+        raise InputError(f"run: expected 0 … {study.experiment.runs - 1}, found {run}")
+    log = study.recordings[0]
+    replayed = replay_run(log, resolve_for_log(study.experiment, log.scene.log), run)
+    return {name: replace(fused, scene=replayed.replay.scene) for name, fused in replayed.run_tracks.whole().items()}
+
+
+def observations(experiment: AnyExperiment, recording: Recording | AnyPath) -> pd.DataFrame:
+    """How each unit sees each measured object at each capture: what its detection model goes by. Nothing is drawn.
+
+    A row per unit, object and capture: `captured_s`, `since_onset_s`, `range_m` (horizontal, to the centre of the box),
+    `azimuth_rad` (from the heading of the unit), `bearing_rad` (from east), `visible_share` and `probability` (0 … 1).
+
+    Raises InputError as `run` does.
+
+    >>> seen = cr.observations("logs/tc016d.yaml", "logs/tc016d.mcap").query("unit == 'ego'")
+    >>> seen.loc[seen["since_onset_s"].between(0.55, 0.75), "visible_share"].round(2).tolist()
+    [0.18, 0.37]
+    """
+    from copem_replay.pipeline.prepare import prepare_log
+
+    study = make_study(experiment, recording)
+    replay = prepare_log(study.recordings[0], resolve_for_log(study.experiment, study.recordings[0].scene.log))
+    observed, episodes = replay.measured, replay.episodes
+    tracks, scene = observed.tracks, replay.scene
+    onset_s = pd.Series(episodes.onset_s, index=episodes.object_ix).reindex(tracks.row_object_ix).to_numpy()
+    return pd.DataFrame(
+        {
+            "unit": _label_numbers(tracks.units, tracks.row_unit_ix),
+            "object_id": _label_numbers(scene.object_ids, tracks.row_object_ix),
+            "object_class": _label_numbers(CLASSES, scene.object_class[tracks.row_object_ix]),
+            "captured_s": tracks.row_captured_s,
+            "since_onset_s": tracks.row_captured_s - onset_s,
+            "range_m": observed.view.range_m,
+            "azimuth_rad": observed.view.azimuth_rad,
+            "bearing_rad": observed.view.bearing_rad,
+            "visible_share": observed.view.visible_share,
+            "probability": observed.probability,
+        }
+    )
+
+
+def _label_numbers(names: Sequence[str], numbers: NDArray[np.integer[Any]]) -> list[str]:
+    return [names[k] for k in numbers]

@@ -1,0 +1,399 @@
+"""The memory of errors: z = √w · drift + √c · constant + √(1 − w − c) · white, from standardised residuals.
+
+The drift is the Ornstein–Uhlenbeck process that is replayed, with e^(−Δ/τ) at any list rate; the constant is one number
+per object and log, as `always` is. The likelihood is that of a Kalman filter over irregular lists; scale, and where
+asked the mean, are integrated out (REML), so that few series do not look surer than they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numba as nb
+import numpy as np
+from scipy.special import expit, logit
+
+from copem_replay.core.tracks import Bool, Float, Int
+from copem_replay.fitting.estimate import (
+    DROP,
+    Bounds,
+    Estimate,
+    Note,
+    drop_note,
+    maximise_likelihood,
+    profile_limits,
+    round_digits,
+)
+
+# Kernels: whitening by a Kalman filter, and correlations between rows.
+
+
+@nb.njit(cache=True)
+def whiten_columns(values: Float, decay: Float, new: Bool, drift: float, constant: float) -> tuple[Float, Float]:
+    """Columns (n, K) freed of their memory, (n, K), and the variance of each row given those before it, (n,).
+
+    The model of each column, of variance 1: √drift · Ornstein–Uhlenbeck + √constant · one number per series + white
+    noise. `decay (n,)`: e^(−Δ/τ) since the row before; `new (n,)`: a series begins. The filter is linear and its gains
+    do not depend on the values: columns of a design are whitened like what is explained by them.
+
+    Source: A. C. Harvey, "Forecasting, structural time series models and the Kalman filter", 1989, 3.4.
+    """
+    n, K = values.shape
+    out, variance = np.empty((n, K)), np.empty(n)
+    wander, bias = np.zeros(K), np.zeros(K)
+    rest = max(1.0 - drift - constant, 1e-9)
+    aa, ab, bb = drift, 0.0, constant
+    for t in range(n):
+        if new[t]:
+            wander[:] = 0.0
+            bias[:] = 0.0
+            aa, ab, bb = drift, 0.0, constant
+        else:
+            f = decay[t]
+            aa = f * f * aa + (1.0 - f * f) * drift
+            ab *= f
+            for k in range(K):
+                wander[k] *= f
+        of_a, of_b = aa + ab, ab + bb
+        s = of_a + of_b + rest
+        gain_a, gain_b, scale = of_a / s, of_b / s, 1.0 / np.sqrt(s)
+        for k in range(K):
+            innovation = values[t, k] - wander[k] - bias[k]
+            out[t, k] = innovation * scale
+            wander[k] += gain_a * innovation
+            bias[k] += gain_b * innovation
+        aa -= gain_a * of_a
+        ab -= gain_a * of_b
+        bb -= gain_b * of_b
+        variance[t] = s
+    return out, variance
+
+
+@nb.njit(cache=True)
+def sum_whitened_moments(
+    values: Float, decay: Float, new: Bool, drift: float, constant: float
+) -> tuple[Float, Float, float, float]:
+    """Sums of columns v whitened as by `whiten_columns`, for a likelihood: Σ v² (C,), Σ v·1 (C,), Σ 1·1, Σ ln variance.
+
+    `1`: a column of ones, whitened like the others, for the common mean.
+    """
+    n, C = values.shape
+    squares, cross = np.zeros(C), np.zeros(C)
+    state = np.zeros((C + 1, 2))
+    rest = max(1.0 - drift - constant, 1e-9)
+    ones, logs, product = 0.0, 0.0, 1.0
+    aa, ab, bb = drift, 0.0, constant
+    for t in range(n):
+        f = 0.0
+        if new[t]:
+            state[:] = 0.0
+            aa, ab, bb = drift, 0.0, constant
+        else:
+            f = decay[t]
+            aa = f * f * (aa - drift) + drift
+            ab *= f
+        of_a, of_b = aa + ab, ab + bb
+        s = of_a + of_b + rest
+        r = 1.0 / s
+        gain_a, gain_b = of_a * r, of_b * r
+        a, b = state[C, 0] * f, state[C, 1]
+        one = 1.0 - a - b
+        state[C, 0], state[C, 1] = a + gain_a * one, b + gain_b * one
+        ones += one * one * r
+        for k in range(C):
+            a, b = state[k, 0] * f, state[k, 1]
+            innovation = values[t, k] - a - b
+            state[k, 0], state[k, 1] = a + gain_a * innovation, b + gain_b * innovation
+            squares[k] += innovation * innovation * r
+            cross[k] += innovation * one * r
+        aa -= gain_a * of_a
+        ab -= gain_a * of_b
+        bb -= gain_b * of_b
+        product *= s
+        if product < 1e-200 or product > 1e200:  # few logarithms: they take most of the time
+            logs += np.log(product)
+            product = 1.0
+    return squares, cross, ones, logs + np.log(product)
+
+
+@nb.njit(cache=True)
+def sum_squared_correlations(decay: Float, new: Bool, bin_ix: Int, bins: int, drift: float, constant: float) -> Float:
+    """(B,) Σ ρ² over all pairs of rows of a bin, a row with itself as 1: a variance has n² over it effective rows."""
+    out = np.zeros(bins)
+    once, twice, count = np.zeros(bins), np.zeros(bins), np.zeros(bins)
+    for t in range(len(decay)):
+        if new[t]:
+            once[:] = 0.0
+            twice[:] = 0.0
+            count[:] = 0.0
+        else:
+            f = decay[t]
+            for b in range(bins):
+                once[b] *= f
+                twice[b] *= f * f
+        b = bin_ix[t]
+        pairs = drift * drift * twice[b] + 2 * drift * constant * once[b] + constant * constant * count[b]
+        out[b] += 1.0 + 2.0 * pairs
+        once[b] += 1.0
+        twice[b] += 1.0
+        count[b] += 1.0
+    return out
+
+
+# Fits of the memory.
+
+_ODDS = 8.0
+"""Log-odds beyond which a share counts as none, or all."""
+_FEWEST = 12
+"""Rows below which no memory is fitted: three parameters, and a scale and a mean of each column."""
+_ENOUGH = 10_000
+"""Rows by which a fit to many starts, and by which a model is refused. More take longer and refuse hardly more."""
+
+
+@dataclass(frozen=True)
+class MemoryShares:
+    """Shares of the variance that drift (`drift`, with `tau_s`) and that are `constant`; the rest is white."""
+
+    drift: float = 0.0
+    tau_s: float = 1.0
+    constant: float = 0.0
+
+
+@dataclass(frozen=True)
+class LastingPart:
+    """A part of a PEM's `memory`: its share of the variance, and its correlation time."""
+
+    share: Estimate
+    correlation_s: Estimate | Literal["always"]
+
+    def keys(self, note: Note = drop_note) -> dict[str, Any]:
+        """The keys as they are replayed."""
+        lasts = self.correlation_s
+        return {
+            "share": note(round(self.share.value, 3), self.share.words()),
+            "correlation_s": lasts if isinstance(lasts, str) else note(round_digits(lasts.value), lasts.words()),
+        }
+
+    @property
+    def yaml(self) -> dict[str, Any]:
+        """The keys as plain data, without words."""
+        return self.keys()
+
+
+@dataclass(frozen=True)
+class ErrorMemoryFit:
+    """The memory of one quantity. `log_likelihood` by model (`none`, `constant`, `drift`, `both`), REML.
+
+    `shares`: of the model that is written, the simplest that the data do not refuse. `parts`: these with intervals
+    (under `both`, whichever is written). `untold`: what the data do not determine.
+    """
+
+    shares: MemoryShares = MemoryShares()
+    parts: tuple[LastingPart, ...] = ()
+    log_likelihood: dict[str, float] = field(default_factory=dict)
+    untold: str | None = None
+
+
+class ResidualSeries:
+    """Rows (n,) that follow each other: seconds since the one before, and whether a series begins."""
+
+    def __init__(self, gap_s: Float, new: Bool) -> None:
+        self.gap_s, self.new = gap_s, new
+        self._last = (0.0, gap_s)
+
+    def decay(self, tau_s: float) -> Float:
+        """(n,) e^(−Δ/τ)."""
+        if self._last[0] != tau_s:  # derivatives by shares keep τ
+            self._last = tau_s, np.exp(-self.gap_s / tau_s)
+        return self._last[1]
+
+    def some(self, rows: int) -> Int:
+        """About so many rows: those of every n-th series."""
+        series_ix = np.cumsum(self.new) - 1
+        step = max(len(self.new) // rows, 1)
+        return np.flatnonzero(series_ix % step == 0)
+
+
+def whiten_series(values: Float, series: ResidualSeries, shares: MemoryShares) -> tuple[Float, Float]:
+    """Columns (n, K) freed of memory, and the variance of each row given those before it (n,)."""
+    if shares.drift == shares.constant == 0:
+        return values, np.ones(len(values))
+    decay = series.decay(shares.tau_s)
+    return whiten_columns(np.ascontiguousarray(values), decay, series.new, shares.drift, shares.constant)
+
+
+def log_likelihood(z: Float, series: ResidualSeries, shares: MemoryShares, *, centred: bool) -> float:
+    """REML of columns (n, C) that share a memory: each with a scale, and if `centred` a mean, of its own."""
+    n, C = z.shape
+    squares, cross, ones, logs = sum_whitened_moments(
+        z, series.decay(shares.tau_s), series.new, shares.drift, shares.constant
+    )
+    total = -0.5 * C * logs
+    if centred:
+        squares, n, total = squares - cross**2 / ones, n - 1, total - 0.5 * C * np.log(ones)
+    return float(total - 0.5 * n * np.log(np.maximum(squares, 1e-300) / n).sum())
+
+
+def refit_error_memory(z: Float, series: ResidualSeries, start: MemoryShares, *, centred: bool) -> MemoryShares:
+    """The shares of greatest likelihood from a start near them, without a choice among models."""
+    z, bounds = np.ascontiguousarray(z), _bound_parameters(series)
+    best, _ = maximise_likelihood(
+        lambda x: log_likelihood(z, series, _unpack_shares(x), centred=centred), [_pack_shares(start)], bounds
+    )
+    return _unpack_shares(best)
+
+
+def fit_error_memory(z: Float, series: ResidualSeries, *, centred: bool, intervals: bool = True) -> ErrorMemoryFit:
+    """The memory of residuals (n, C); without `intervals` it has no parts.
+
+    With many rows those of some series give the start, and decide which models are refused.
+    """
+    n, count = len(z), int(series.new.sum())
+    if n < _FEWEST or n <= count + 2:
+        return ErrorMemoryFit(untold=f"{n} entries in {count} series: no memory can be told")
+    if n > 2 * _ENOUGH:
+        rows = series.some(_ENOUGH)
+        rough = fit_error_memory(
+            z[rows], ResidualSeries(series.gap_s[rows], series.new[rows]), centred=centred, intervals=False
+        )
+        if rough.untold is None and rough.shares.drift > 0:
+            return _polish_fit(np.ascontiguousarray(z), series, rough, centred=centred, intervals=intervals)
+    z, bounds = np.ascontiguousarray(z), _bound_parameters(series)
+
+    def of(shares: MemoryShares) -> float:
+        return log_likelihood(z, series, shares, centred=centred)
+
+    first = [MemoryShares(w, tau_s, c) for w in (0.3, 0.7) for c in (0.05, 0.2) for tau_s in (0.3, 1.0, 3.0)]
+    both, highest = maximise_likelihood(
+        lambda x: of(_unpack_shares(x)), [_pack_shares(one) for one in sorted(first, key=of, reverse=True)[:2]], bounds
+    )
+    shares_of_both = _unpack_shares(both)
+    starts = [
+        (shares_of_both.drift + 0.5 * shares_of_both.constant, both[2]),
+        (shares_of_both.drift + shares_of_both.constant, bounds[2][1] - 3.0),
+    ]
+    drift, of_drift = maximise_likelihood(
+        lambda x: of(_unpack_drift(x)),
+        [(both[0], both[2]), *((logit(np.clip(w, 0.01, 0.99)), tau) for w, tau in starts)],
+        [bounds[0], bounds[2]],
+    )
+    constant, of_constant = maximise_likelihood(
+        lambda x: of(MemoryShares(constant=float(expit(x[0])))), [(0.0,), (-3.0,)], bounds[:1]
+    )
+    likelihoods = {
+        "none": of(MemoryShares()),
+        "constant": of_constant,
+        "drift": of_drift,
+        "both": max(highest, of_drift),
+    }
+    models = {
+        "none": MemoryShares(),
+        "constant": MemoryShares(constant=float(expit(constant[0]))),
+        "drift": _unpack_drift(drift),
+    }
+    models["both"] = shares_of_both
+    chosen = next(name for name, allowed in _ALLOWED.items() if likelihoods["both"] - likelihoods[name] <= allowed)
+    fit = ErrorMemoryFit(models[chosen], (), likelihoods)
+    return _add_intervals(fit, of, (both, highest), bounds, (n, count)) if intervals else fit
+
+
+def _polish_fit(
+    z: Float, series: ResidualSeries, rough: ErrorMemoryFit, *, centred: bool, intervals: bool
+) -> ErrorMemoryFit:
+    """The fit to all rows, from that to some of them; models that these refuse stay refused."""
+    bounds, constant = _bound_parameters(series), rough.shares.constant > 0
+
+    def of(shares: MemoryShares) -> float:
+        return log_likelihood(z, series, shares, centred=centred)
+
+    both, highest = maximise_likelihood(lambda x: of(_unpack_shares(x)), [_pack_shares(rough.shares)], bounds)
+    shares, likelihoods = _unpack_shares(both), {"none": of(MemoryShares()), "both": highest}
+    if not constant:
+        start = (logit(shares.drift + 0.5 * shares.constant), both[2])
+        drift, likelihoods["drift"] = maximise_likelihood(
+            lambda x: of(_unpack_drift(x)), [start], [bounds[0], bounds[2]]
+        )
+        shares = _unpack_drift(drift) if highest - likelihoods["drift"] <= _ALLOWED["drift"] else shares
+    fit = ErrorMemoryFit(shares, (), likelihoods)
+    return _add_intervals(fit, of, (both, highest), bounds, (len(z), int(series.new.sum()))) if intervals else fit
+
+
+def _bound_parameters(series: ResidualSeries) -> list[tuple[float, float]]:
+    """Bounds of the log-odds of two shares and of ln τ: from a tenth of a gap to twenty times the longest series."""
+    longest_s = float(np.bincount(np.cumsum(series.new) - 1, np.where(series.new, 0.0, series.gap_s)).max())
+    shortest = np.log(max(np.median(series.gap_s[~series.new]) / 10, 1e-3))
+    return [(-_ODDS, _ODDS), (-_ODDS, _ODDS), (shortest, max(np.log(20 * max(longest_s, 1e-3)), shortest + 1))]
+
+
+_ALLOWED = {"none": 3.907, "constant": 2.996, "drift": DROP, "both": 0.0}
+"""By how much the log-likelihood of a simpler model may be less: half of the 95 % quantile of χ²₃, χ²₂ and χ²₁."""
+
+
+def _unpack_shares(x: Float) -> MemoryShares:
+    """Shares from the log-odds of the drift, those of the constant in the rest, and ln τ."""
+    drift = float(expit(x[0]))
+    return MemoryShares(drift, float(np.exp(x[2])), (1 - drift) * float(expit(x[1])))
+
+
+def _unpack_drift(x: Float) -> MemoryShares:
+    """Shares from the log-odds of the drift and ln τ, without a constant."""
+    return MemoryShares(float(expit(x[0])), float(np.exp(x[1])))
+
+
+def _unpack_swapped(x: Float) -> MemoryShares:
+    """Shares from the log-odds of the constant, those of the drift in the rest, and ln τ."""
+    constant = float(expit(x[0]))
+    return MemoryShares((1 - constant) * float(expit(x[1])), float(np.exp(x[2])), constant)
+
+
+def _pack_shares(shares: MemoryShares, *, swapped: bool = False) -> tuple[float, float, float]:
+    """The parameters that `_unpack_shares`, or `_unpack_swapped`, turns into these shares."""
+    first, second = (shares.constant, shares.drift) if swapped else (shares.drift, shares.constant)
+    first = min(first, 1 - 1e-6)
+    return float(logit(first)), float(logit(min(second / (1 - first), 1.0))), float(np.log(shares.tau_s))
+
+
+def _add_intervals(
+    fit: ErrorMemoryFit,
+    of: Callable[[MemoryShares], float],
+    peak: tuple[Float, float],
+    bounds: Bounds,
+    counted: tuple[int, int],
+) -> ErrorMemoryFit:
+    """The fit with its parts and their profile intervals. `counted`: rows and series."""
+    both, value = peak
+    n, count = counted
+    shares = fit.shares
+
+    def share_of(at: Float, model: Callable[[Float], MemoryShares], written: float, effective: float) -> Estimate:
+        low, high = profile_limits(lambda x: of(model(x)), at, value, 0, bounds)
+        low, high = (0.0 if low <= -_ODDS else float(expit(low))), (1.0 if high >= _ODDS else float(expit(high)))
+        return Estimate(written, min(low, written), max(high, written), n, effective)
+
+    if shares.drift == shares.constant == 0:
+        return ErrorMemoryFit(
+            shares, (), fit.log_likelihood, f"no memory in {n} entries of {count} series beyond chance"
+        )
+    parts = []
+    if shares.drift > 0:
+        low, high = profile_limits(lambda x: of(_unpack_shares(x)), both, value, 2, bounds)
+        low_s, high_s = float(np.exp(low)), float("inf") if high >= bounds[2][1] else float(np.exp(high))
+        share = share_of(both, _unpack_shares, shares.drift, float(count))
+        tau = Estimate(shares.tau_s, min(low_s, shares.tau_s), max(high_s, shares.tau_s), n, float(count))
+        parts.append(LastingPart(share, tau))
+    untold = None
+    if shares.constant > 0:
+        at = np.clip(_pack_shares(_unpack_shares(both), swapped=True), *np.array(bounds).T)
+        share = share_of(at, _unpack_swapped, shares.constant, float(count))
+        parts.append(LastingPart(share, "always"))
+        if shares.drift == 0:
+            start = float(logit(np.clip(shares.constant, 1e-3, 1 - 1e-3)))
+            only = [bounds[0], bounds[2]]
+            best, top = maximise_likelihood(
+                lambda x: of(_unpack_drift(x)), [(start, bounds[2][1]), (start, bounds[2][1] - 3)], only
+            )
+            low, _ = profile_limits(lambda x: of(_unpack_drift(x)), best, top, 1, only)
+            untold = f"τ > {np.exp(low):.2g} s or constant"
+    return ErrorMemoryFit(shares, tuple(parts), fit.log_likelihood, untold)

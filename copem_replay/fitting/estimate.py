@@ -1,0 +1,243 @@
+"""Estimates: one number of a fitted model with its interval, maximum likelihood, and the choice among models."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from copem_replay.core.tracks import Float, Int
+from copem_replay.metrics.intervals import draw_resamples
+
+Note = Callable[[Any, str], Any]
+"""Called with a value and words about it: the value as it is written, with the words as a comment."""
+
+
+PER_ROW = "per row"
+"""Metadata of a field with a value for each row of the data, which is not reported as an estimate."""
+
+
+def drop_note(value: Any, words: str) -> Any:
+    """The value without words: a `Note` for plain data."""
+    return value
+
+
+def round_digits(value: float, count: int = 4) -> float:
+    """To `count` significant digits: no interval tells more."""
+    return float(f"{value:.{count}g}")
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """`value` with its 95 % interval, from `n` observations that are worth `n_effective` independent ones.
+
+    `n_effective` NaN: not known. `why`: why the data do not determine the number; then `value` is what is used instead,
+    and `low` and `high` bound what the data leave open (NaN: no bound). `chosen`: set, not estimated.
+
+    >>> Estimate(0.9, 0.85, 0.94, n=400, n_effective=120.0).words()
+    '0.9 (95 %: 0.85 … 0.94, n 400, effective 120)'
+    >>> Estimate(1.0, why="no miss in 161 lists").words()
+    'not identifiable: no miss in 161 lists'
+    """
+
+    value: float
+    low: float = float("nan")
+    high: float = float("nan")
+    n: int = 0
+    n_effective: float = 0.0
+    why: str | None = None
+    chosen: bool = False
+
+    def words(self) -> str:
+        """The estimate in words, as files and the report have it."""
+        if self.why is not None:
+            return f"not identifiable: {self.why}"
+        if self.chosen:
+            return "chosen"
+        effective = "" if math.isnan(self.n_effective) else f", effective {self.n_effective:.3g}"
+        return f"{self.value:.3g} (95 %: {self.low:.3g} … {self.high:.3g}, n {self.n}{effective})"
+
+
+# Maximum likelihood over a few numbers, and profile intervals.
+
+LogLikelihood = Callable[[Float], float]
+Bounds = Sequence[tuple[float, float]]
+DROP = 1.9207294
+"""By how much the log-likelihood falls at the ends of a 95 % interval: half of the 95 % quantile of χ²₁."""
+_H = 1e-3
+"""Step of derivatives: small beside 1, the scale of logarithms and log-odds, and large beside rounding."""
+_GAIN = 1e-3
+"""Log-likelihood that a step must promise, else the maximum is found: far below DROP."""
+_FAR = 3.0
+"""The longest step of a parameter, a logarithm or log-odds: a factor of twenty."""
+
+
+def maximise_likelihood(
+    of: LogLikelihood, starts: Sequence[Sequence[float] | Float], bounds: Bounds
+) -> tuple[Float, float]:
+    """Where a log-likelihood of a few numbers is largest, and its maximum: the best of Newton's method from each start.
+
+    With derivatives by differences, along the eigenvectors of the curvature, damped where a step gains nothing: for so
+    few numbers fewer calls than L-BFGS (docs/develop/decisions/0032-fitted-errors.md).
+    """
+    low, high = np.array(bounds, dtype=float).reshape(-1, 2).T
+    maxima = [_climb(of, np.clip(np.asarray(start, dtype=float), low, high), low, high) for start in starts]
+    return max(maxima, key=lambda one: one[1])
+
+
+def _climb(of: LogLikelihood, at: Float, low: Float, high: Float) -> tuple[Float, float]:
+    value, damping = of(at), 1e-3
+    for _ in range(60 if len(at) else 0):
+        slope, curvature = _differentiate(of, at, value, low, high)
+        free = ~(((at <= low) & (slope < 0)) | ((at >= high) & (slope > 0)))
+        slope = np.where(free, slope, 0.0)
+        curvature *= np.outer(free, free)
+        size, axes = np.linalg.eigh(curvature)
+        along = axes.T @ slope
+        while True:
+            step = axes @ (along / (np.abs(size) * (1 + damping) + damping + 1e-9))
+            step *= min(1.0, _FAR / max(np.abs(step).max(), 1e-12))
+            ahead = np.clip(at + step, low, high)
+            if slope @ (ahead - at) < _GAIN:
+                return at, value
+            if (better := of(ahead)) > value:
+                at, value, damping = ahead, better, damping / 8
+                break
+            damping *= 10
+    return at, value
+
+
+def _differentiate(of: LogLikelihood, at: Float, value: float, low: Float, high: Float) -> tuple[Float, Float]:
+    """Gradient (k,) and curvature (k, k), just inside the bounds."""
+    steps = _H * np.eye(len(at))
+    at = np.clip(at, low + _H, high - _H)
+    up, down = ([of(at + sign * step) for step in steps] for sign in (1, -1))
+    curvature = np.diag([(u + d - 2 * value) / _H**2 for u, d in zip(up, down, strict=True)])
+    for i in range(len(at)):
+        for j in range(i):
+            both = of(at + steps[i] + steps[j])
+            curvature[i, j] = curvature[j, i] = (both - up[i] - up[j] + value) / _H**2
+    return (np.array(up) - np.array(down)) / (2 * _H), curvature
+
+
+def profile_limits(of: LogLikelihood, best: Float, value: float, k: int, bounds: Bounds) -> tuple[float, float]:
+    """The 95 % profile interval of parameter k about the maximum; a bound where the likelihood never falls enough."""
+    others = [j for j in range(len(best)) if j != k]
+    rest = [bounds[j] for j in others]
+    # Near the bounds of log-odds a log-likelihood is flat, and a search that starts there stays there.
+    low, high = ([(1 - a) * one + a * two for one, two in rest] for a in (0.3, 0.7))
+
+    def limit(towards: float) -> float:
+        starts = [best[others], np.clip(best[others], low, high)]
+
+        def fall(at: float) -> float:
+            nonlocal starts
+            if np.array_equal(starts[0], starts[-1]):
+                starts = starts[:1]
+            warm, highest = maximise_likelihood(lambda x: of(np.insert(x, k, at)), starts, rest)
+            starts = [warm]
+            return value - highest - DROP
+
+        end, step, inner = bounds[k][0 if towards < 0 else 1], 0.25, float(best[k])
+        while True:  # outwards until the likelihood has fallen
+            outer = min(inner + step, end) if towards > 0 else max(inner - step, end)
+            if (below := fall(outer)) > 0:
+                break
+            if outer == end:
+                return end
+            inner, step = outer, 2 * step
+        before = fall(inner) if inner != best[k] else -DROP
+        for _ in range(6):  # the profile is about a parabola: secants of its root meet fast
+            near, far = np.sqrt(max(before + DROP, 0.0)), np.sqrt(below + DROP)
+            at = inner + (outer - inner) * np.clip((np.sqrt(DROP) - near) / (far - near), 0.02, 0.98)
+            here = fall(at)
+            if abs(here) < 0.02:
+                return float(at)
+            inner, before, outer, below = (at, here, outer, below) if here < 0 else (inner, before, at, here)
+        return float(inner)
+
+    return limit(-1.0), limit(1.0)
+
+
+# The choice among models: the simplest that predicts like the best. Held out, each model is fitted without a fold of
+# the passes and scored there by the log-probability of the recording; Breiman's rule takes the simplest within one
+# standard error of the best. With too few passes to hold any out, BIC decides.
+#
+# Sources: L. Breiman, J. Friedman, R. Olshen, C. Stone, "Classification and Regression Trees", 1984, section 3.4.3
+# (the rule); G. Schwarz, "Estimating the dimension of a model", Ann. Statist. 6 (1978) 461–464.
+
+FEWEST_PASSES = 4
+"""Passes below which none is held out: a standard error of fewer differences says little."""
+
+
+@dataclass(frozen=True)
+class Rung:
+    """One model of a ladder: its score per list, and how far that is below the best, ± one standard error.
+
+    `score`: held-out log-likelihood (nats per list), or −BIC / 2n.
+    """
+
+    name: str
+    score: float
+    below: float
+    below_se: float
+    chosen: bool
+    by: Literal["held out", "BIC"]
+
+    def words(self) -> str:
+        """The rung in words, as files and the report have it."""
+        far = "the best" if self.below == 0 else f"{self.below:.3g} ± {self.below_se:.2g} below the best"
+        return f"{self.name}: {self.score:.4g} nats per list ({self.by}), {far}{', chosen' if self.chosen else ''}"
+
+
+def held_out_possible(pass_ix: Int, fold: Int) -> bool:
+    """Whether there are enough passes, in more than one fold."""
+    return len(np.unique(pass_ix)) >= FEWEST_PASSES and len(np.unique(fold)) > 1
+
+
+def choose_rung(
+    names: Sequence[str], scores: Float, weights: Float | Int, *, simplest: bool = False, seed: int = 0
+) -> tuple[int, tuple[Rung, ...]]:
+    """The simplest rung within one standard error of the best, and the table of all; `simplest`: the first in any case.
+
+    `names` from the simplest to the richest; `scores (rungs, passes)`: held-out log-likelihood of each pass, summed;
+    `weights (passes,)`: how many lists each has. The standard error is that of the difference to the best, over
+    resamples of whole passes. A rung by which something recorded is impossible (−inf) is below any other.
+    """
+    total = weights.sum()
+    score = scores.sum(axis=1) / total
+    best = int(np.argmax(score))
+    count = draw_resamples([str(k) for k in range(len(weights))], seed)
+    times = count.times / count.times.sum()
+    below, error = np.zeros(len(names)), np.zeros(len(names))
+    for k in range(len(names)):
+        if k == best:
+            continue
+        below[k] = score[best] - score[k]
+        if np.isfinite(below[k]):
+            drawn = count.count @ (scores[best] - scores[k]) / (count.count @ weights)
+            error[k] = np.sqrt(times @ (drawn - times @ drawn) ** 2)
+    return _tabulate_rungs(names, score, below, error, "held out", simplest)
+
+
+def choose_by_bic(
+    names: Sequence[str], log_likelihood: Float, parameters: Int, n: int, n_effective: float, *, simplest: bool = False
+) -> tuple[int, tuple[Rung, ...]]:
+    """The rung of the least BIC, of equal ones the simplest, and the table of all; see `choose_rung`.
+
+    `log_likelihood (rungs,)` of `n` rows that are worth `n_effective`, each model fitted to all. `parameters`: how many
+    numbers each has.
+    """
+    score = log_likelihood / n - parameters * np.log(max(n_effective, 1.0)) / (2 * n_effective)
+    return _tabulate_rungs(names, score, score.max() - score, np.zeros(len(names)), "BIC", simplest)
+
+
+def _tabulate_rungs(
+    names: Sequence[str], score: Float, below: Float, error: Float, by: Literal["held out", "BIC"], simplest: bool
+) -> tuple[int, tuple[Rung, ...]]:
+    index = 0 if simplest else int(np.argmax(below <= error))
+    columns = zip(names, score.tolist(), below.tolist(), error.tolist(), strict=True)
+    return index, tuple(Rung(name, s, b, e, k == index, by) for k, (name, s, b, e) in enumerate(columns))

@@ -1,0 +1,487 @@
+"""Fit: a perception error model of a recorded unit, from its lists to the keys of an experiment.
+
+The lists are gathered and matched, the parts are fitted, and all is fitted again with narrower and wider gates, to note
+the estimates that depend on the gate. The result replays beside what was recorded, in an experiment of its own.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from copem_replay.core.errors import InputError, count_noun
+from copem_replay.core.yaml import CommentedValue, strip_comments
+from copem_replay.experiment.schema import Experiment
+from copem_replay.fitting.detection import DetectionCouple, DetectionFit, fit_detection
+from copem_replay.fitting.errors import ErrorBin, ErrorFit, fit_errors, remove_pose
+from copem_replay.fitting.estimate import PER_ROW, Estimate
+from copem_replay.fitting.gather import (
+    LONGEST_S,
+    Gathered,
+    LogView,
+    NothingMatchedError,
+    check_unit,
+    gather_rows,
+    raw_lists,
+    view_log,
+)
+from copem_replay.fitting.pose import DelayFit, unit_delay
+from copem_replay.fitting.replay_check import StatisticCheck, remove_memory, replay_check
+from copem_replay.fitting.rest import RestFit, fit_rest
+from copem_replay.fitting.rows import FitLists
+from copem_replay.io.recording import Recording
+from copem_replay.perception.config import PoseError
+from copem_replay.perception.pem.model import Pem
+
+# Estimates by name, wherever the parts of a fit hold them, and plain data.
+
+_ROUNDING = 1e-9
+"""Relative difference up to which two numbers count as equal: more than summing in another order makes."""
+
+
+def name_estimates(part: Any, name: str = "") -> Iterator[tuple[str, Estimate]]:
+    """Every estimate with its name, as `detection.memory.share`, in the order of the fields."""
+    if isinstance(part, Estimate):
+        yield name, part
+        return
+    for key, value in _list_members(part):
+        yield from name_estimates(value, f"{name}.{key}" if name else key)
+
+
+def _list_members(part: Any) -> Iterator[tuple[str, Any]]:
+    if is_dataclass(part):
+        yield from (
+            (field.name, getattr(part, field.name)) for field in fields(part) if not field.metadata.get(PER_ROW)
+        )
+    elif isinstance(part, Mapping):
+        yield from ((" ".join(key) if isinstance(key, tuple) else str(key), value) for key, value in part.items())
+    elif isinstance(part, list | tuple):
+        yield from ((str(k), value) for k, value in enumerate(part))
+
+
+def find_moved(main: Any, others: Mapping[float, Any]) -> list[str]:
+    """A line for each estimate that another gate moves out of its interval; `others`: fits by their gate, in metres."""
+    by_gate = {gate_m: dict(name_estimates(parts)) for gate_m, parts in others.items()}
+    lines = []
+    for name, estimate in name_estimates(main):
+        shown = name.removeprefix("rest.")
+        for gate_m, estimates in by_gate.items():
+            other = estimates.get(name)
+            if other is None or other.why is not None or estimate.why is not None or math.isnan(estimate.low):
+                continue
+            slack = _ROUNDING * abs(estimate.value)
+            if not (math.isnan(other.value) or estimate.low - slack <= other.value <= estimate.high + slack):
+                lines.append(f"{shown}: {estimate.words()}, but {other.value:.3g} with a gate of {gate_m:g} m")
+    return lines
+
+
+def to_plain_data(part: Any) -> Any:
+    """Anything a fit holds as plain data for JSON; NaN and infinity as null."""
+    if isinstance(part, float | np.floating):
+        return float(part) if math.isfinite(part) else None
+    if isinstance(part, np.ndarray):
+        return to_plain_data(part.tolist())
+    if isinstance(part, np.generic):
+        return part.item()
+    if isinstance(part, list | tuple):
+        return [to_plain_data(value) for value in part]
+    if is_dataclass(part) or isinstance(part, Mapping):
+        return {key: to_plain_data(value) for key, value in _list_members(part)}
+    return part
+
+
+# Fitting a unit.
+
+Truth = Literal["partial", "complete"]
+BY = ("range", "visible_share")
+SURE = 0.05
+"""p below which a replay check fails, over the number of statistics: the usual level of five per cent."""
+_GATES = (0.75, 1.25)
+"""Widths of the other gates that a unit is fitted with, as shares of the experiment's gate."""
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """How a unit is fitted. `truth` None: partial where a list has more entries about no true object than objects."""
+
+    hold_out: tuple[str, ...] = ()
+    folds: int | None = None
+    truth: Truth | None = None
+    by: tuple[str, ...] = BY
+    monotone: bool = True
+    simplest: bool = False
+    other_gates: bool = True
+
+
+@dataclass(frozen=True)
+class FittedParts:
+    """The parts of a fit: detection, errors of entries, and all else."""
+
+    detection: DetectionFit
+    errors: ErrorFit
+    rest: RestFit
+
+
+@dataclass(frozen=True)
+class ReplayChecks:
+    """The recording among runs of the fitted model, and among runs of it without memory (empty: it has no memory).
+
+    `held_out`: on logs that the model was not fitted to; else on those that it was.
+    """
+
+    held_out: bool
+    fitted: tuple[StatisticCheck, ...]
+    memoryless: tuple[StatisticCheck, ...]
+
+    @property
+    def fails(self) -> bool:
+        """Whether any statistic is too often outside of what the model gives; Bonferroni over their number."""
+        return any(one.verdict == "too sure" and one.p * len(self.fitted) < SURE for one in self.fitted)
+
+    def lines(self) -> Iterator[str]:
+        """A line per statistic."""
+        fresh = {one.statistic: one for one in self.memoryless}
+        where = "logs held out" if self.held_out else "the logs it was fitted to"
+        for one in self.fitted:
+            line = f"replay check on {where}, {one.statistic}: {_format_verdict(one)}"
+            memoryless = fresh.get(one.statistic)
+            yield line if memoryless is None else f"{line}; without memory: {_format_verdict(memoryless)}"
+
+
+def _format_verdict(one: StatisticCheck) -> str:
+    return f"{one.verdict} ({one.inside} of {count_noun(len(one.pit), 'pass', 'passes')} inside 95 %, p {one.p:.2g})"
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fitted unit. `logs`: names of the logs it is fitted to; `held_out`: of those that are held out."""
+
+    unit: str
+    logs: tuple[str, ...]
+    held_out: tuple[str, ...]
+    how: FitOptions
+    truth: Truth
+    delay: DelayFit
+    rate_hz: Estimate
+    parts: FittedParts
+    gathered: Gathered
+    held: Gathered | None  # rows of the logs that are held out, within the reach of the others
+    gates: tuple[str, ...]  # lines on estimates that another gate moves
+    notes: tuple[str, ...]
+    checks: ReplayChecks | None = None
+
+    @property
+    def said(self) -> tuple[str, ...]:
+        """All notes: on the data, on detection, and on estimates that another gate moves."""
+        more = [f"detection: {line}" for line in self.parts.detection.notes]
+        more += [f"no memory of detection: {why}" for why in (self.parts.detection.memory_why,) if why is not None]
+        more += [f"another gate: {line}" for line in self.gates]
+        return (*self.notes, *more)
+
+
+def fit_unit(experiment: Experiment, recordings: Sequence[Recording], unit: str, how: FitOptions | None = None) -> Fit:
+    """Fit the recorded `unit` of an experiment over its logs.
+
+    Raises InputError: no such unit or log, no place, or no entry near a true object.
+    """
+    how = how or FitOptions()
+    check_unit(experiment, unit)
+    fitted, held_out = _split_held_out(recordings, how)
+    lists = raw_lists(fitted, experiment, unit)
+    declared_s = _declared_delay_s(experiment, unit)
+    delay = unit_delay(list(zip(fitted, lists, strict=True)), declared_s)
+    views = _view_logs(fitted, experiment, unit, delay.seconds)
+    gate_m, max_gap_s = experiment.measure.match.gate_m, experiment.max_gap_s
+    try:
+        gathered = gather_rows(views, gate_m=gate_m, max_gap_s=max_gap_s, folds=how.folds, name=unit)
+    except NothingMatchedError:
+        _check_delay(fitted, experiment, unit)
+        raise
+    truth: Truth = how.truth or ("partial" if gathered.crowded else "complete")
+    parts = _fit_parts(gathered, truth, how)
+    other_gates = {
+        share * gate_m: _fit_parts(
+            gather_rows(views, gate_m=share * gate_m, max_gap_s=max_gap_s, reach=gathered.reach, folds=how.folds),
+            truth, how,
+        )
+        for share in (_GATES if how.other_gates else ())
+    }  # fmt: skip
+    held = None
+    if held_out:
+        held_views = _view_logs(held_out, experiment, unit, delay.seconds)
+        held = gather_rows(held_views, gate_m=gate_m, max_gap_s=max_gap_s, reach=gathered.reach)
+    return Fit(
+        unit, tuple(r.scene.log for r in fitted), tuple(r.scene.log for r in held_out), how, truth, delay,
+        estimate_rate(gathered.lists), parts, gathered, held, tuple(find_moved(parts, other_gates)),
+        (*delay.notes, *_note_data(gathered, truth, how)),
+    )  # fmt: skip
+
+
+def _view_logs(recordings: Sequence[Recording], experiment: Experiment, unit: str, delay_s: float) -> list[LogView]:
+    lists = raw_lists(recordings, experiment, unit)
+    return [
+        view_log(recording, unit_lists, experiment, unit, delay_s)
+        for recording, unit_lists in zip(recordings, lists, strict=True)
+    ]
+
+
+def _check_delay(recordings: Sequence[Recording], experiment: Experiment, unit: str) -> None:
+    """Raises InputError, with the delay, where entries are near true objects if lists are later than assumed."""
+    for delay_s in np.arange(0.0, LONGEST_S + 0.01, 0.05).round(2).tolist():
+        views = _view_logs(recordings, experiment, unit, delay_s)
+        with suppress(NothingMatchedError):
+            gather_rows(views, gate_m=experiment.measure.match.gate_m, max_gap_s=experiment.max_gap_s)
+            raise InputError(
+                f"unit {unit}: its entries are near true objects if its lists are {delay_s:g} s late, which cannot be "
+                f"told from them alone; if they are, say `delay_s: {delay_s:g}`"
+            )
+
+
+def _fit_parts(gathered: Gathered, truth: Truth, how: FitOptions) -> FittedParts:
+    rows, lists = gathered.rows, gathered.lists
+    rest = fit_rest(rows, lists, gathered.other, truth=truth)
+    return FittedParts(
+        fit_detection(rows, lists, monotone=how.monotone, by=how.by, simplest=how.simplest),
+        remove_pose(fit_errors(rows, lists, simplest=how.simplest), rest.placed),
+        rest,
+    )
+
+
+def _split_held_out(recordings: Sequence[Recording], how: FitOptions) -> tuple[list[Recording], list[Recording]]:
+    """The logs that are fitted, and those that are held out."""
+    names = [recording.scene.log for recording in recordings]
+    for name in how.hold_out:
+        if name not in names:
+            raise InputError(f"--hold-out {name}: expected a log of the experiment ({', '.join(names)})")
+    fitted = [one for one in recordings if one.scene.log not in how.hold_out]
+    if not fitted:
+        raise InputError("--hold-out: expected a log that is left to fit, found all held out")
+    return fitted, [one for one in recordings if one.scene.log in how.hold_out]
+
+
+def _declared_delay_s(experiment: Experiment, unit: str) -> float | None:
+    """The delay that the experiment states; None: it states none."""
+    recorded = experiment.units[unit].recorded
+    return recorded.delay_s if recorded is not None and "delay_s" in recorded.model_fields_set else None
+
+
+def estimate_rate(lists: FitLists) -> Estimate:
+    """Lists per second: one over the median time between two."""
+    step_s = np.diff(lists.captured_s)[np.diff(lists.log) == 0]
+    step_s = step_s[step_s > 0]
+    if not len(step_s):
+        return Estimate(1.0, why="one list alone has no rate")
+    low, middle, high = np.quantile(step_s, [0.025, 0.5, 0.975])
+    return Estimate(1 / float(middle), 1 / float(high), 1 / float(low), len(step_s), float("nan"))
+
+
+def _note_data(gathered: Gathered, truth: Truth, how: FitOptions) -> list[str]:
+    """Notes on matches, truth and folds."""
+    lists, other = gathered.lists, gathered.other
+    notes = [f"{gathered.beyond:.1%} of the matches are farther apart than 0.8 of the gate", *gathered.notes]
+    if truth == "partial":
+        entries = count_noun(int(lists.entries.sum()), "entry", "entries")
+        why = "" if how.truth else ", as a list has more of them than true objects within reach"
+        notes.append(
+            f"{len(other.list)} of {entries} are about no true object; they are taken for other traffic{why}: "
+            "no ghosts are fitted (--truth complete, if the truth has all)"
+        )
+    if len(np.unique(gathered.rows.fold)) < 2:
+        notes.append(f"{count_noun(gathered.number_of_passes, 'pass', 'passes')}: none is held out to choose a model")
+    return notes
+
+
+# A fit as keys of an experiment: the PEM, the unit, and an experiment that replays both beside what was recorded.
+
+RUNS = 500
+"""Runs of the experiment that is written: shares are then known to about two per cent."""
+Tree = dict[str, Any]
+
+
+def round_significant(value: float) -> float:
+    """To six significant digits: no interval tells more."""
+    return float(f"{value:.6g}")
+
+
+def annotate_estimate(estimate: Estimate) -> CommentedValue:
+    """An estimate as a value, with its interval as a comment."""
+    return CommentedValue(round_significant(estimate.value), estimate.words())
+
+
+def build_pem(fit: Fit) -> Tree:
+    """The PEM, with the interval of every number as a comment."""
+    couples = [
+        _build_couple(fit, detection, of_bin) for detection in fit.parts.detection.couples for of_bin in _list_bins(fit)
+    ]
+    more = fit.parts.rest.pem_keys(CommentedValue)
+    memory = dict(_build_memories(fit)) | more.pop("memory", {})
+    return {"couples": couples} | ({"memory": memory} if memory else {}) | more
+
+
+def _list_bins(fit: Fit) -> Iterator[tuple[Tree, ErrorBin]]:
+    """The bins of the errors, and where each holds: together in all of the reach."""
+    low_m, high_m = fit.gathered.reach.range_m
+    bins = fit.parts.errors.bins
+    nearest = min(error_bin.where.range_m[0] for error_bin in bins)
+    farthest = max(error_bin.where.range_m[1] for error_bin in bins)
+    for error_bin in bins:
+        from_m, to_m = error_bin.where.range_m
+        from_m = low_m if from_m == nearest else max(from_m, low_m)
+        to_m = high_m if to_m == farthest else min(to_m, high_m)
+        if to_m > from_m:
+            yield error_bin.where.when | {"range_m": [round_significant(from_m), round_significant(to_m)]}, error_bin
+
+
+def _build_couple(fit: Fit, detection: DetectionCouple, of_bin: tuple[Tree, ErrorBin]) -> Tree:
+    where, errors = of_bin
+    reach = fit.gathered.reach
+    comment = "within reach: nothing is claimed beyond the last 5 m, and the last 5°, with five matched entries"
+    when: Tree = where | {"range_m": CommentedValue(where["range_m"], comment)}
+    if reach.azimuth_deg is not None:
+        when["azimuth_deg"] = list(reach.azimuth_deg)
+    return {
+        "when": when | detection.when,
+        "detection": _build_table(detection),
+        "error": _build_error(fit.parts.errors, errors),
+        "existence": CommentedValue(0.9, "chosen: the lists say nothing of it"),
+    } | fit.parts.rest.couple_keys(CommentedValue)
+
+
+def _build_table(detection: DetectionCouple) -> Tree:
+    """The detection model, with the interval of every probability as a comment."""
+    tree = detection.detection()
+    estimates = detection.probability
+    if tree["kind"] == "constant":
+        return tree | {"probability": CommentedValue(tree["probability"], estimates[0][0].words())}
+    for axis in tree.keys() & {"range_m", "visible_share"}:
+        tree[axis] = CommentedValue(tree[axis], "nodes: chosen, at quantiles of the rows")
+    rows = zip(tree["probability"], estimates, strict=True)
+    tree["probability"] = [
+        [CommentedValue(value, one.words()) for value, one in zip(values, row, strict=True)] for values, row in rows
+    ]
+    return tree
+
+
+def _build_error(errors: ErrorFit, error_bin: ErrorBin) -> Tree:
+    tree: Tree = errors.yaml_error(error_bin)
+    (first, second), (xx, xy, yy) = tree["covariance_m2"], error_bin.covariance_m2
+    tree["covariance_m2"] = [
+        CommentedValue(first, f"variance {xx.words()}; covariance {xy.words()}"),
+        CommentedValue(second, f"variance {yy.words()}"),
+    ]
+    tree["mean_m"] = [
+        CommentedValue(value, mean.words()) for value, mean in zip(tree["mean_m"], error_bin.mean_m, strict=True)
+    ]
+    for key in tree.keys() & {"yaw_sigma_deg", "speed_sigma_mps", "size_sigma_m"}:
+        tree[key] = CommentedValue(tree[key], getattr(errors, key).words())
+    return tree
+
+
+def _build_memories(fit: Fit) -> Iterator[tuple[str, list[Tree]]]:
+    detection = fit.parts.detection.memory
+    if detection is not None:
+        [part] = fit.parts.detection.yaml_detection()["memory"]["detection"]
+        yield "detection", [{key: CommentedValue(value, detection[key].words()) for key, value in part.items()}]
+    for quantity, parts in fit.parts.errors.memory.items():
+        if parts:
+            yield quantity, [part.keys(CommentedValue) for part in parts]
+
+
+def build_unit(fit: Fit, experiment: Experiment, pem: str) -> Tree:
+    """The unit at its place, with the fitted PEM and rate."""
+    recorded = experiment.units[fit.unit]
+    tree: Tree = {
+        key: value
+        for key, value in recorded.model_dump(mode="json", by_alias=True, exclude_unset=True).items()
+        if key != "recorded"
+    }
+    tree |= {"pem": pem, "rate_hz": annotate_estimate(fit.rate_hz)}
+    return tree | fit.parts.rest.unit_keys(CommentedValue)
+
+
+def build_snippet(fit: Fit, experiment: Experiment) -> Tree:
+    """`pems` and `units`, to be pasted into an experiment."""
+    return {"pems": {fit.unit: build_pem(fit)}, "units": {fit.unit: build_unit(fit, experiment, fit.unit)}}
+
+
+def build_experiment(fit: Fit, experiment: Experiment, logs: Sequence[Any]) -> Tree:
+    """An experiment over some logs that replays the fitted unit beside the recorded one, as plain data.
+
+    `logs`: its entries of `logs`. Other units and PEMs of the experiment stay.
+    """
+    data = experiment.as_written()
+    name, other = fit.unit, _find_free_name(f"{fit.unit}_recorded", data["units"])
+    pem = _find_free_name(name, data["pems"])
+    late_s = max(round_significant(fit.delay.seconds), 0.0)
+    stated = {"delay_s": late_s, "covariance_m2": _pool_covariance(fit)}
+    recorded = _complete_unit(data["units"][name], stated)
+    units = {key: value for key, value in data["units"].items() if key != name}
+    entries = [_build_both_settings(entry, name, other, stated) for entry in logs]
+    latency = {"latency_s": {name: late_s}}
+    return {
+        **{key: value for key, value in data.items() if key not in ("sweep", "show")},
+        "logs": entries,
+        "runs": RUNS,
+        "pems": data["pems"] | {pem: strip_comments(build_pem(fit))},
+        "units": {name: strip_comments(build_unit(fit, experiment, pem)), other: recorded, **units},
+        "configurations": {"recorded": {"units": [other]}, "fitted": {"units": [name], **latency}},
+    }
+
+
+def _pool_covariance(fit: Fit) -> list[list[float]]:
+    """The covariance of all errors in easting and northing, for recorded entries that state none."""
+    rows = fit.gathered.rows
+    finite = np.isfinite(rows.east_m)
+    (ee, en), (_, nn) = np.cov(np.stack([rows.east_m[finite], rows.north_m[finite]])).tolist()
+    return [[round_significant(ee), round_significant(en)], [round_significant(en), round_significant(nn)]]
+
+
+def _find_free_name(name: str, taken: Any) -> str:
+    while name in taken:
+        name += "_"
+    return name
+
+
+def _complete_unit(unit: Tree, told: Tree) -> Tree:
+    """A recorded unit with the delay that was found, and a covariance where none is stated."""
+    if unit.get("recorded") is None:
+        return unit
+    stated = {key: value for key, value in unit["recorded"].items() if value is not None}
+    return unit | {"recorded": told | stated | {"delay_s": told["delay_s"]}}
+
+
+def _build_both_settings(entry: Any, name: str, other: str, told: Tree) -> Any:
+    """The settings of a log, those of the recorded unit for both the recorded and the fitted one."""
+    settings = entry.get("units") if isinstance(entry, dict) else None
+    if not settings or name not in settings:
+        return entry
+    unit_settings = settings[name]
+    fitted = (
+        None if unit_settings is None else {key: value for key, value in unit_settings.items() if key != "recorded"}
+    )
+    both = {other: None if unit_settings is None else _complete_unit(unit_settings, told)} | (
+        {name: fitted} if fitted or unit_settings is None else {}
+    )
+    return entry | {"units": {key: value for key, value in settings.items() if key != name} | both}
+
+
+# The replay check.
+
+
+def add_replay_check(fit: Fit, *, seed: int = 0) -> Fit:
+    """The fit with its replay check, on logs that are held out where there are any, with memory and without."""
+    gathered = fit.held or fit.gathered
+    pem = Pem.model_validate(strip_comments(build_pem(fit)))
+    keys = fit.parts.rest.placed.keys()
+    placed = PoseError.model_validate(keys) if keys else None
+    with_memory = replay_check(pem, gathered.rows, gathered.lists, placed=placed, seed=seed)
+    fresh: tuple[StatisticCheck, ...] = ()
+    if pem.remembers:
+        always_new = None if placed is None else placed.model_copy(update={"memory": None})
+        fresh = replay_check(remove_memory(pem), gathered.rows, gathered.lists, placed=always_new, seed=seed)
+    return replace(fit, checks=ReplayChecks(fit.held is not None, with_memory, fresh))

@@ -1,0 +1,373 @@
+"""What a fit writes: its page `fit.html`, the folder with PEM, experiment and rows, and places for the viewer."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from copem_replay.core.colours import Rgb
+from copem_replay.core.errors import OutputError, count_noun
+from copem_replay.core.tracks import CLASSES, Float, Int
+from copem_replay.core.yaml import dump_with_comments, dump_yaml
+from copem_replay.experiment.schema import Experiment
+from copem_replay.fitting.diagnostics import FIT_FIGURES, FitStudy
+from copem_replay.fitting.estimate import Estimate, Rung
+from copem_replay.fitting.fit import Fit, build_experiment, build_snippet, name_estimates, to_plain_data
+from copem_replay.fitting.gather import Gathered
+from copem_replay.fitting.rows import FitLists, FitRows
+from copem_replay.io.recording import Recording
+from copem_replay.report.figures.style import format_three_digits
+from copem_replay.report.html.markup import Html, allow_breaks, join_html, make_list, make_table, make_tag
+from copem_replay.report.html.page import figure_element, section_links, whole_page
+from copem_replay.results.folder import EXPERIMENT, MARK, ResultsPlace
+from copem_replay.results.schema import describe_logs, list_versions, log_entries, write_parquet
+from copem_replay.viewer.sink import (
+    ELAPSED,
+    GROUND,
+    RecordingSink,
+    digest_texts,
+    file_stream,
+    plain_part,
+    stack_float32,
+    to_nanoseconds,
+)
+
+if TYPE_CHECKING:
+    from rerun import blueprint as rrb
+
+# The page: the numbers, the choices, what is not determined, and the figures with plain words.
+
+
+def fit_page(study: FitStudy) -> str:
+    """The whole page as HTML, which loads nothing from elsewhere."""
+    sections = [
+        ("estimates", "What was estimated", _estimates_table(study)),
+        ("choices", "Which models were compared", _choice_tables(study)),
+        ("untold", "What cannot be told", make_list(_list_untold(study)) or make_tag("p", "Nothing is left open.")),
+        *_figure_sections(study),
+    ]
+    rows, first = study.rows, study.first_rows
+    lead = (
+        f"{count_noun(len(study.lists.log), 'list')} in {count_noun(len(study.logs), 'log')}, "
+        f"{count_noun(len(rows.log), 'row')} (a list and a true object within reach), of which "
+        f"{int(rows.listed.sum())} are listed, in {count_noun(len(first) - 1, 'pass', 'passes')}."
+    )
+    head = make_tag(
+        "header",
+        make_tag("h1", f"The perception of {study.unit}"),
+        make_tag("p", "A perception error model that was fitted to recorded lists.", class_="question"),
+        make_tag("p", lead, class_="lead"),
+        make_list(study.notes),
+        section_links((id_, title) for id_, title, _ in sections),
+    )
+    below = (make_tag("section", make_tag("h2", title), body, id_=id_) for id_, title, body in sections)
+    return whole_page(f"Fit of {study.unit}", join_html([head, *below]))
+
+
+def _figure_sections(study: FitStudy) -> Iterator[tuple[str, str, Html]]:
+    for name, kind in FIT_FIGURES.items():
+        why = kind.missing(study)
+        if why is None:
+            body = join_html(
+                [figure_element(name, kind.draw(study), kind.title, kind.shows), make_tag("p", kind.about)]
+            )
+        else:
+            body = make_tag("p", f"No figure: {why}.")
+        yield f"section-{name}", kind.title, body
+
+
+def _estimates_table(study: FitStudy) -> Html:
+    rows = [
+        make_tag(
+            "tr",
+            make_tag("th", allow_breaks(name), scope="row"),
+            make_tag("td", _format_value(one)),
+            make_tag("td", _format_interval(one)),
+            make_tag("td", str(one.n) if one.n else "–"),
+            make_tag("td", format_three_digits(one.n_effective) if one.n_effective > 0 else "–"),
+            make_tag("td", one.why or ("chosen" if one.chosen else ""), class_="text"),
+        )
+        for name, one in study.estimates.items()
+    ]
+    head = ("number", "estimate", "95 %", "n", "effective n", "not identifiable")
+    return make_table(head, rows, caption="Every number with its interval", id_="numbers")
+
+
+def _format_value(one: Estimate) -> str:
+    return "–" if np.isnan(one.value) else format_three_digits(one.value)
+
+
+def _format_interval(one: Estimate) -> str:
+    if np.isnan(one.low) and np.isnan(one.high):
+        return "–"
+    return f"{format_three_digits(one.low)} … {'∞' if np.isinf(one.high) else format_three_digits(one.high)}"
+
+
+def _choice_tables(study: FitStudy) -> Html:
+    ladders: Sequence[tuple[str, Sequence[Rung]]] = (
+        ("Detection", study.detection.ladder),
+        ("Position error", study.errors.ladder),
+        ("Frame of the position error", study.errors.frames),
+    )
+    intro = (
+        "Each model is scored on passes it was not fitted to; the simplest within one standard error of the best is "
+        "written. Where too few passes are there to hold any out, BIC decides."
+    )
+    parts: list[Html] = [make_tag("p", intro)]
+    for title, rungs in ladders:
+        rows = [
+            make_tag(
+                "tr",
+                make_tag("th", rung.name, scope="row"),
+                make_tag("td", format_three_digits(rung.score)),
+                make_tag("td", _format_below(rung)),
+                make_tag("td", rung.by, class_="text"),
+                make_tag("td", "chosen" if rung.chosen else "", class_="text"),
+            )
+            for rung in rungs
+        ]
+        parts.append(make_table(("model", "nats per list", "below the best", "scored by", ""), rows, caption=title))
+    return join_html(parts)
+
+
+def _format_below(rung: Rung) -> str:
+    if rung.below == 0:
+        return "–"
+    return f"{format_three_digits(rung.below)} ± {format_three_digits(rung.below_se)}"
+
+
+def _list_untold(study: FitStudy) -> list[str]:
+    reasons = {**study.errors.untold, **study.rest.untold}
+    if study.detection.memory_why is not None:
+        reasons = {"memory.detection": study.detection.memory_why, **reasons}
+    return [f"{name}: {why}" for name, why in reasons.items()]
+
+
+# The folder: the PEM to paste, the experiment that replays it beside the recording, rows and estimates. It is complete
+# under its name or missing, as a results folder (`results/folder.py`).
+
+PEM, ROWS, ESTIMATES = "pem.yaml", "rows.parquet", "fit.json"
+Page = Callable[[Path, Fit], None]
+"""Writes a file about a fit."""
+
+
+def fill_fit(
+    place: ResultsPlace, fit: Fit, experiment: Experiment, recordings: Sequence[Recording], pages: Mapping[str, Page]
+) -> None:
+    """Write a fit into a folder that is reserved. `pages`: further files by name. Raises OutputError.
+
+    Pages that cannot be written are left out (`place.left_out`).
+    """
+    files = sorted([PEM, EXPERIMENT, ROWS, ESTIMATES, MARK, *pages])
+    replayed = [one for one in recordings if one.scene.log in (fit.held_out or fit.logs)]
+    provenance = list_versions() | {
+        "format": "fit",
+        "unit": fit.unit,
+        "logs": describe_logs(recordings),
+        "notes": list(fit.said),
+    }
+    try:
+        place.will_hold(files)
+        new = place.new
+        (new / PEM).write_text(pem_text(fit, experiment), encoding="utf-8")
+        data = build_experiment(
+            fit, experiment, log_entries(_list_settings(experiment, replayed), replayed, place.folder)
+        )
+        (new / EXPERIMENT).write_text(dump_yaml(data), encoding="utf-8")
+        write_parquet(rows_table(fit, recordings), new / ROWS)
+        (new / ESTIMATES).write_text(
+            _format_json(describe_estimates(fit) | {"provenance": provenance}), encoding="utf-8"
+        )
+        for name, page in pages.items():
+            with place.may_fail([name]):
+                page(new / name, fit)
+        files = [name for name in files if name not in place.left_out]
+        (new / MARK).write_text(_format_json(provenance | {"files": files}), encoding="utf-8")
+        place.finish(files)
+    except OSError as error:
+        raise OutputError(f"{place.folder}: cannot be written: {error.strerror or error}") from error
+
+
+def _format_json(data: Mapping[str, Any]) -> str:
+    return json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def _list_settings(experiment: Experiment, recordings: Sequence[Recording]) -> list[Any]:
+    """The entries of `logs` of some recordings."""
+    names = {recording.scene.log for recording in recordings}
+    return [entry for entry in experiment.logs if isinstance(entry, str) or entry.name in names]
+
+
+def pem_text(fit: Fit, experiment: Experiment) -> str:
+    """`pem.yaml`: a head on the whole fit, and the interval of every number as a comment."""
+    rest = fit.parts.rest
+    head = [
+        f"Unit {fit.unit}, fitted to {count_noun(len(fit.logs), 'log')}: {', '.join(fit.logs)}",
+        *([f"Held out: {', '.join(fit.held_out)}"] if fit.held_out else []),
+        f"{fit.gathered.matched} entries of true objects in {len(fit.gathered.lists.log)} lists, "
+        f"{count_noun(fit.gathered.number_of_passes, 'pass', 'passes')}; truth {fit.truth}",
+        f"delay of its lists: `latency_s: {{{fit.unit}: {fit.delay.seconds:.3g}}}` in a configuration: "
+        f"{fit.delay.estimate.words()}",
+        *(f"{name}: not fitted: {why}" for name, why in rest.untold.items()),
+        *fit.gates,
+    ]
+    return "".join(f"# {' '.join(line.split())}\n" for line in head) + dump_with_comments(
+        build_snippet(fit, experiment)
+    )
+
+
+def describe_estimates(fit: Fit) -> dict[str, Any]:
+    """`fit.json`: every estimate, and the data behind it."""
+    return {
+        "unit": fit.unit,
+        "logs": list(fit.logs),
+        "held_out": list(fit.held_out),
+        "how": to_plain_data(fit.how),
+        "truth": fit.truth,
+        "reach": to_plain_data(fit.gathered.reach),
+        "lists": len(fit.gathered.lists.log),
+        "rows": len(fit.gathered.rows.list),
+        "matched": fit.gathered.matched,
+        "passes": fit.gathered.number_of_passes,
+        "beyond_gate_share": fit.gathered.beyond,
+        "other_gates": list(fit.gates),
+        "estimates": {name: to_plain_data(one) for name, one in list_estimates(fit)},
+        "parts": to_plain_data(fit.parts),
+        "replay_check": to_plain_data(fit.checks),
+        "notes": list(fit.said),
+    }
+
+
+def list_estimates(fit: Fit) -> list[tuple[str, Any]]:
+    """Every estimate by its name."""
+    first = [("delay_s", fit.delay.estimate), ("rate_hz", fit.rate_hz)]
+    return first + [(name.removeprefix("rest."), one) for name, one in name_estimates(fit.parts)]
+
+
+def rows_table(fit: Fit, recordings: Sequence[Recording]) -> pd.DataFrame:
+    """`rows.parquet`: a row per list and true object within reach."""
+    pieces = [_build_rows(fit.gathered, fit.logs, recordings).assign(held_out=False)]
+    if fit.held is not None:
+        pieces.append(_build_rows(fit.held, fit.held_out, recordings).assign(held_out=True))
+    return pd.concat(pieces, ignore_index=True)
+
+
+def _build_rows(gathered: Gathered, logs: Sequence[str], recordings: Sequence[Recording]) -> pd.DataFrame:
+    rows, view = gathered.rows, gathered.rows.view
+    scenes = {recording.scene.log: recording.scene for recording in recordings}
+    names = [scenes[logs[k]].object_ids[o] for k, o in zip(rows.log.tolist(), rows.object.tolist(), strict=True)]
+    columns: dict[str, Any] = {
+        "log": np.array(logs, dtype=object)[rows.log],
+        "list": rows.list,
+        "object_id": names,
+        "object_class": np.array(CLASSES, dtype=object)[view.class_ix],
+        "pass": rows.pass_ix,
+        "fold": rows.fold,
+        "captured_s": rows.captured_s,
+        **{name: getattr(view, name) for name in ("range_m", "azimuth_rad", "bearing_rad", "visible_share")},
+        "speed_mps": view.speed_mps,
+        "true_x_m": rows.state_m[:, 0],
+        "true_y_m": rows.state_m[:, 1],
+        "listed": rows.listed,
+        **{f"error_{name}": getattr(rows, name) for name in ("along_m", "across_m", "east_m", "north_m", "yaw_rad")},
+        "error_speed_mps": rows.speed_mps,
+        **{f"error_{name}_m": rows.size_m[k] for k, name in enumerate(("length", "width", "height"))},
+        "listed_class": [CLASSES[k] if k >= 0 else None for k in rows.class_ix.tolist()],
+        "existence": rows.existence,
+        "track_id": pd.array(rows.track_id, dtype="Int64"),
+    }
+    columns["track_id"][rows.track_id < 0] = pd.NA
+    return pd.DataFrame(columns)
+
+
+def table_lines(fit: Fit) -> list[str]:
+    """The estimates as lines of a table, what is not fitted, and which models were compared."""
+    parts = fit.parts
+    lines = [f"{name}: {one.words()}" for name, one in list_estimates(fit)]
+    untold = {**parts.errors.untold, **parts.rest.untold}
+    lines += [f"{name}: not fitted: {why}" for name, why in untold.items()]
+    ladders = {"detection": parts.detection.ladder, "errors": parts.errors.ladder, "frame": parts.errors.frames}
+    lines += [f"{what}, {rung.words()}" for what, rungs in ladders.items() for rung in rungs]
+    return lines + ([] if fit.checks is None else list(fit.checks.lines()))
+
+
+# Places for the viewer: errors and misses of a fitted unit, all at once and list by list.
+
+LISTED: Rgb = (86, 180, 233)
+MISSED: Rgb = (255, 90, 90)
+ERROR: Rgb = (230, 159, 0)
+UNIT: Rgb = (255, 255, 255)
+
+
+def write_fit_places(path: Path, unit: str, logs: tuple[str, ...], rows: FitRows, lists: FitLists) -> None:
+    """Write where true objects are listed, with an arrow to the entry, and where they are missed, in each log.
+
+    Times are since the start of each log; heights are left out. Raises OutputError.
+    """
+    import rerun as rr
+
+    ids = "copem_replay_fit", digest_texts(unit, *logs, str(len(rows.log)))
+    with file_stream(path, *ids) as rec:
+        rec.send_blueprint(_fit_blueprint(logs, rows))
+        out = RecordingSink(rec, 0)
+        for log, name in enumerate(logs):
+            own, lists_of_log = ["world", plain_part(name)], np.flatnonzero(lists.log == log)
+            rows_of_log = np.flatnonzero(rows.log == log)
+            rows_of_log = rows_of_log[np.argsort(rows.list[rows_of_log], kind="stable")]
+            elapsed_ns = to_nanoseconds(lists.captured_s[lists_of_log])
+            east_m, north_m = rows.state_m.T
+            erring = rows.listed & np.isfinite(rows.east_m)
+            for what, which, colour in (("listed", rows.listed, LISTED), ("missed", ~rows.listed, MISSED)):
+                shown = rows_of_log[which[rows_of_log]]
+                points = rr.Points3D.columns(positions=_flat_positions(east_m[shown], north_m[shown]))
+                out.columns([*own, what], elapsed_ns, points.partition(_count_rows(rows.list[shown], lists_of_log)))
+                look = rr.Points3D.from_fields(colors=[colour], radii=rr.Radius.ui_points(3 if what == "listed" else 4))
+                out.static([*own, what], look)
+            shown = rows_of_log[erring[rows_of_log]]
+            arrows = rr.Arrows3D.columns(
+                origins=_flat_positions(east_m[shown], north_m[shown]),
+                vectors=_flat_positions(rows.east_m[shown], rows.north_m[shown]),
+            )
+            out.columns([*own, "error"], elapsed_ns, arrows.partition(_count_rows(rows.list[shown], lists_of_log)))
+            out.static([*own, "error"], rr.Arrows3D.from_fields(colors=[ERROR], radii=rr.Radius.ui_points(1)))
+            places = rr.Points3D.columns(
+                positions=_flat_positions(lists.east_m[lists_of_log], lists.north_m[lists_of_log])
+            )
+            out.columns([*own, "unit"], elapsed_ns, places.partition(np.ones(len(lists_of_log), dtype=np.int64)))
+            mark = rr.Points3D.from_fields(colors=[UNIT], radii=rr.Radius.ui_points(7), labels=[unit], show_labels=True)
+            out.static([*own, "unit"], mark)
+
+
+def _flat_positions(east_m: Float, north_m: Float) -> np.ndarray:
+    return stack_float32(east_m, north_m, np.zeros(len(east_m)))
+
+
+def _count_rows(list_ix: Int, lists: Int) -> Int:
+    """(lists,) how many rows each list has."""
+    return np.bincount(list_ix - lists[0], minlength=len(lists)) if len(lists) else np.zeros(0, dtype=np.int64)
+
+
+def _fit_blueprint(logs: tuple[str, ...], rows: FitRows) -> rrb.Blueprint:
+    """Two views from above: whole logs, and the current list."""
+    import rerun.blueprint as rrb
+
+    low, high = rows.state_m.min(axis=0), rows.state_m.max(axis=0)
+    middle = np.append((low + high) / 2, 0.0)
+    away_m = 1.8 * max(float((high - low).max()), 20.0)
+    eye = rrb.EyeControls3D(
+        position=(middle + np.array([0.0, -0.01, 1.0]) * away_m).tolist(), look_target=middle.tolist(), eye_up=(0, 1, 0)
+    )
+    every = rrb.VisibleTimeRange(ELAPSED, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite())
+    views = [
+        rrb.Spatial3DView(origin="world", name=name, eye_controls=eye, time_ranges=ranges, background=GROUND)
+        for name, ranges in (("All errors and misses", [every]), ("At this time", []))
+    ]
+    panel = rrb.TimePanel(timeline=ELAPSED, state="collapsed")
+    return rrb.Blueprint(
+        rrb.Horizontal(*views), panel, rrb.SelectionPanel(state="collapsed"), auto_layout=False, auto_views=False
+    )

@@ -1,0 +1,299 @@
+"""Tables of detection probabilities fitted to rows, shrunk towards what they have in common."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numba as nb
+import numpy as np
+from scipy.special import betaincinv, betaln
+
+from copem_replay.core.tracks import Bool, Float, Int
+from copem_replay.fitting.estimate import Estimate
+from copem_replay.fitting.rows import NodeWeights, PooledRows
+from copem_replay.metrics.intervals import DRAWN_FROM, draw_resamples, percentile_limits
+
+# Kernels: EM on the nodes of tables, and monotone regression. Shapes: C pooled rows, K nodes of G tables of I ranges ×
+# J visible shares.
+
+_LEAST = 1e-12
+"""Probabilities keep this far from 0 and 1 within EM, where logarithms are taken."""
+
+
+@nb.njit(cache=True, nogil=True)
+def fit_em_many(
+    theta: Float,
+    node: Int,
+    weight: Float,
+    hit: Bool,
+    count: Float,
+    prior: Float,
+    shape: Int,
+    monotone: bool,
+    close: float,
+) -> Float:
+    """(R, K) probabilities of `fit_em`, from one start, for counts (R, C) and priors (R, 2, K)."""
+    out = np.empty((len(count), len(theta)))
+    for r in range(len(count)):
+        out[r] = fit_em(theta, node, weight, hit, count[r], prior[r], shape, monotone, close)[0]
+    return out
+
+
+@nb.njit(cache=True, nogil=True)
+def fit_em(
+    theta: Float,
+    node: Int,
+    weight: Float,
+    hit: Bool,
+    count: Float,
+    prior: Float,
+    shape: Int,
+    monotone: bool,
+    close: float = 1e-7,
+) -> tuple[Float, Float]:
+    """Maximum-likelihood probabilities (K,) at the nodes, p = Σ weight · θ, and the hits and misses there (2, K).
+
+    `node`, `weight` (C, 4): the nodes around a pooled row; `count (C,)`: how many rows it stands for; `hit`: whether
+    they are listed. `prior (2, K)`: hits and misses that are added to each node. `shape (3,)`: G, I, J. Each step
+    shares a row among its nodes by their parts in its probability, and takes hits over rows at each node. Two steps
+    are extrapolated where that is better (SQUAREM, scheme 3; Varadhan and Roland, Scand. J. Statist. 35, 2008).
+    """
+    counts = np.zeros((2, len(theta)))
+    here = theta.copy()
+    for _ in range(300):
+        _share_out(here, node, weight, hit, count, prior, counts)
+        one = _divide_counts(counts, shape, monotone)
+        level = _share_out(one, node, weight, hit, count, prior, counts)
+        two = _divide_counts(counts, shape, monotone)
+        first, second = one - here, two - 2 * one + here
+        done = np.abs(two - one).max() < close
+        ahead = np.sqrt((first**2).sum() / max((second**2).sum(), 1e-300))
+        here, far = two, here + 2 * ahead * first + ahead**2 * second
+        if done:
+            break
+        if ahead > 1:
+            far = np.minimum(np.maximum(far, _LEAST), 1 - _LEAST)
+            if monotone:
+                far = monotone_tables(far, np.ones(len(far)), shape)
+            if _share_out(far, node, weight, hit, count, prior, counts) > level:
+                here = far
+    _share_out(here, node, weight, hit, count, prior, counts)
+    return here, counts - prior
+
+
+@nb.njit(cache=True, nogil=True)
+def _share_out(theta: Float, node: Int, weight: Float, hit: Bool, count: Float, prior: Float, counts: Float) -> float:
+    """Fill `counts (2, K)` with hits and misses of each node and its prior; the penalised log-likelihood of `theta`."""
+    counts[:] = prior
+    total = 0.0
+    for k in range(len(theta)):
+        if prior[0, k] > 0:
+            total += prior[0, k] * np.log(theta[k])
+        if prior[1, k] > 0:
+            total += prior[1, k] * np.log(1 - theta[k])
+    for c in range(len(count)):
+        if count[c] == 0:
+            continue
+        p = 0.0
+        for m in range(4):
+            value = theta[node[c, m]]
+            p += weight[c, m] * (value if hit[c] else 1 - value)
+        p = max(p, _LEAST)
+        total += count[c] * np.log(p)
+        side = 0 if hit[c] else 1
+        for m in range(4):
+            value = theta[node[c, m]]
+            counts[side, node[c, m]] += count[c] * weight[c, m] * (value if hit[c] else 1 - value) / p
+    return total
+
+
+@nb.njit(cache=True, nogil=True)
+def _divide_counts(counts: Float, shape: Int, monotone: bool) -> Float:
+    total = np.maximum(counts[0] + counts[1], _LEAST)
+    share = np.minimum(np.maximum(counts[0] / total, _LEAST), 1 - _LEAST)
+    return monotone_tables(share, total, shape) if monotone else share
+
+
+@nb.njit(cache=True, nogil=True)
+def monotone_tables(value: Float, weight: Float, shape: Int) -> Float:
+    """The nearest tables (K,) in weighted squares that do not rise with range nor fall with visible share.
+
+    For shares of counts these are also the likeliest such tables. Projections on either order in turn, each after its
+    last correction is given back (Dykstra and Robertson, Ann. Statist. 10, 1982).
+    """
+    tables, ranges, shares = shape
+    out = value.copy()
+    taken = np.zeros((2, len(value)))
+    for _ in range(1000):
+        before = out.copy()
+        for order in range(2):
+            wanted = out + taken[order]
+            for g in range(tables):
+                first = g * ranges * shares
+                if order == 0:
+                    for j in range(shares):
+                        part = slice(first + j, first + ranges * shares, shares)
+                        out[part] = -_fit_ascending(-wanted[part], weight[part])
+                else:
+                    for i in range(ranges):
+                        part = slice(first + i * shares, first + (i + 1) * shares)
+                        out[part] = _fit_ascending(wanted[part], weight[part])
+            taken[order] = wanted - out
+        if ranges == 1 or shares == 1 or np.abs(out - before).max() < 1e-10:
+            break
+    return out
+
+
+@nb.njit(cache=True, nogil=True)
+def _fit_ascending(value: Float, weight: Float) -> Float:
+    """The nearest ascending values in weighted squares: neighbours that are out of order are pooled."""
+    n = len(value)
+    mean, mass, size = np.empty(n), np.empty(n), np.empty(n, dtype=np.int64)
+    top = 0
+    for i in range(n):
+        mean[top], mass[top], size[top] = value[i], weight[i], 1
+        top += 1
+        while top > 1 and mean[top - 2] > mean[top - 1]:
+            total = mass[top - 2] + mass[top - 1]
+            mean[top - 2] = (mean[top - 2] * mass[top - 2] + mean[top - 1] * mass[top - 1]) / total
+            mass[top - 2], size[top - 2] = total, size[top - 2] + size[top - 1]
+            top -= 1
+    out = np.empty(n)
+    at = 0
+    for k in range(top):
+        out[at : at + size[k]] = mean[k]
+        at += size[k]
+    return out
+
+
+# Fits of tables.
+
+_DRAWN = 200
+"""Resamples of passes: five beyond each limit of 95 %. More: smoother limits, longer fits."""
+STRENGTHS = (1.0, 2.0, 4.0, 8.0, 16.0)
+"""Effective rows that a prior may count as. The least keeps a node off 0 and 1; the most is less than a node has of its
+own, as tables that look alike are not known to be."""
+
+
+@dataclass(frozen=True)
+class TableFit:
+    """Probabilities `theta (K,)` at the nodes, and how they are shrunk.
+
+    The table of all rows is shrunk towards one `constant`, and where there are several tables these towards that of
+    all, each by a prior of `strength` effective rows, one number for each level. `worth`: rows per effective row.
+    """
+
+    theta: Float
+    constant: float
+    strength: tuple[float, ...]
+    worth: float
+
+
+def fit_table(entries: PooledRows, times: Float, worth: float, *, monotone: bool) -> TableFit:
+    """Fit to the passes; `times (passes,)`: how often each counts; `worth`: rows per effective row."""
+    count = entries.count.T @ times
+    constant = (count @ entries.hit / worth + 0.5) / (count.sum() / worth + 1)  # Jeffreys
+    levels = _list_levels(entries.placed)
+    theta, strength = np.array([constant]), []
+    for level in levels:
+        parent = np.resize(theta, int(np.prod(level.shape)))
+        theta, prior = _shrink_table(level, entries.hit, count, parent, worth, monotone)
+        strength.append(prior)
+    return TableFit(theta if levels else np.array([constant]), float(constant), tuple(strength), worth)
+
+
+def _list_levels(placed: NodeWeights) -> list[NodeWeights]:
+    """The levels from the table of all rows to the single tables; empty where a table has one node."""
+    levels = [placed.pooled()] if placed.shape[1] * placed.shape[2] > 1 else []
+    return [*levels, placed] if placed.shape[0] > 1 else levels
+
+
+def _shrink_table(
+    placed: NodeWeights, hit: Bool, count: Float, parent: Float, worth: float, monotone: bool
+) -> tuple[Float, float]:
+    """Probabilities shrunk towards `parent (K,)`, and the strength of greatest likelihood, in effective rows.
+
+    The likelihood of a strength is Laplace's approximation, all probabilities integrated out in their log-odds.
+    """
+    shape, theta, best = np.array(placed.shape), parent, (-np.inf, parent, 0.0)
+    for strength in STRENGTHS:
+        a, b = strength * parent, strength * (1 - parent)
+        prior = worth * np.stack([a, b])
+        theta = fit_em(theta, placed.node, placed.weight, hit, count, prior, shape, monotone)[0]
+        p, inside = placed.chances(theta), theta * (1 - theta)
+        curve = inside[:, None] * fisher_information(placed, theta, count / worth) * inside + np.diag(strength * inside)
+        likely = (
+            count @ np.log(np.where(hit, p, 1 - p)) / worth
+            + (a * np.log(theta) + b * np.log1p(-theta) - betaln(a, b) + np.log(2 * np.pi) / 2).sum()
+            - np.linalg.slogdet(curve)[1] / 2
+        )
+        if likely > best[0]:
+            best = float(likely), theta, strength
+    return best[1:]
+
+
+def fisher_information(placed: NodeWeights, theta: Float, count: Float) -> Float:
+    """(K, K) Fisher information on the probabilities at the nodes of `count (C,)` pooled rows."""
+    p = np.clip(placed.chances(theta), 1e-9, 1 - 1e-9)
+    dense = np.zeros((len(p), len(theta)))
+    for m in range(4):
+        np.add.at(dense, (np.arange(len(p)), placed.node[:, m]), placed.weight[:, m])
+    result: Float = (dense * (count / (p * (1 - p)))[:, None]).T @ dense
+    return result
+
+
+def estimate_nodes(
+    entries: PooledRows, rows: NodeWeights, fit: TableFit, *, monotone: bool, resampled: bool = True
+) -> tuple[list[Estimate], Float]:
+    """The probability at each node with its interval, and the covariance (K, K) of all.
+
+    The interval is Jeffreys' of the effective number of rows. With enough passes to resample it is on each side the
+    wider of both: resamples show neither what hardly ever happens nor the shrinking.
+    """
+    theta, placed = fit.theta, entries.placed
+    passes = entries.count.shape[0]
+    count = np.asarray(entries.count.sum(axis=0))
+    K, inside = len(theta), theta * (1 - theta)
+    strength = fit.strength[-1] if fit.strength else 1.0
+    curve = fisher_information(placed, theta, count / fit.worth) + np.diag(strength / inside)
+    covariance = np.asarray(np.linalg.inv(curve), dtype=np.float64)
+    touched = np.zeros(K, dtype=np.int64)
+    np.add.at(touched, rows.node[rows.weight > 0], 1)
+    effective = np.minimum(inside / np.diag(covariance), touched / fit.worth)
+    low, high = (betaincinv(theta * effective + 0.5, (1 - theta) * effective + 0.5, q) for q in (0.025, 0.975))
+    if passes >= DRAWN_FROM and resampled:
+        drawn = draw_resamples([str(k) for k in range(passes)], 0, _DRAWN)
+        theta_drawn = _fit_resamples(entries, fit, drawn.count.astype(float), monotone)
+        covariance[:] = np.cov(theta_drawn.T)
+        for k in range(K):
+            a, b = percentile_limits(theta_drawn[:, k], drawn)
+            low[k], high[k] = min(low[k], a), max(high[k], b)
+    columns = zip(theta, low, high, touched, effective, strict=True)
+    return [Estimate(float(t), float(a), float(b), int(n), float(e)) for t, a, b, n, e in columns], covariance
+
+
+def _fit_resamples(entries: PooledRows, fit: TableFit, times: Float, monotone: bool) -> Float:
+    """(R, K) probabilities of `fit_table` at the strengths of `fit`; `times (R, passes)`: counts of passes."""
+    count = np.ascontiguousarray(times @ entries.count)
+    total = count.sum(axis=1)
+    theta: Float = ((count @ entries.hit / fit.worth + 0.5) / (total / fit.worth + 1))[:, None]
+    for level, strength in zip(_list_levels(entries.placed), fit.strength, strict=True):
+        K = int(np.prod(level.shape))
+        parent = np.tile(theta, (1, K // theta.shape[1]))
+        prior = fit.worth * strength * np.stack([parent, 1 - parent], axis=1)
+        start = fit.theta if len(fit.theta) == K else fit.theta.reshape(-1, K).mean(axis=0)
+        theta = _fit_each(level, entries.hit, start, monotone, count, prior)
+    return theta
+
+
+def _fit_each(placed: NodeWeights, hit: Bool, start: Float, monotone: bool, count: Float, prior: Float) -> Float:
+    """(R, K) probabilities for counts (R, C) and priors (R, 2, K), from one start, computed in threads."""
+    shape = np.array(placed.shape)
+
+    def fitted(count: Float, prior: Float) -> Float:
+        result: Float = fit_em_many(start, placed.node, placed.weight, hit, count, prior, shape, monotone, 1e-5)
+        return result
+
+    with ThreadPoolExecutor() as threads:
+        return np.concatenate(list(threads.map(fitted, np.array_split(count, 8), np.array_split(prior, 8))))

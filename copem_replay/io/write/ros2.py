@@ -1,0 +1,358 @@
+"""Writing ROS 2 messages: CDR, definitions, and fused lists as autoware_perception_msgs/DetectedObjects.
+
+`header.stamp` is the instant the list is available, `header.frame_id` the world of the recording. The twist is along
+the object, as in Autoware; a pedestrian is a cylinder whose diameter is the mean of its length and width. An unknown
+covariance is 0 and flagged as absent; of height, roll and pitch it is always 0.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import numpy as np
+
+from copem_replay.core.fused_tracks import FusedTracks
+from copem_replay.core.tracks import CLASSES, Float, Int, Scene
+
+# CDR, little-endian, each value aligned to its own size.
+
+HEAD = b"\0\1\0\0"
+"""The begin of every message; alignment counts from its end."""
+_FIRST_S, _LAST_S = -(2**31), 2**31 - 1
+
+
+def encode_time(time_ns: int) -> bytes:
+    """builtin_interfaces/Time; seconds beyond its 32 bits become the nearest that they hold."""
+    seconds, nanoseconds = divmod(time_ns, 1_000_000_000)
+    return struct.pack("<iI", min(max(seconds, _FIRST_S), _LAST_S), nanoseconds)
+
+
+def encode_string(value: str) -> bytes:
+    """A string, to be put at a multiple of 4 bytes."""
+    encoded = value.encode()
+    return struct.pack("<I", len(encoded) + 1) + encoded + b"\0"
+
+
+def encode_count(value: int) -> bytes:
+    """The number of items of a list."""
+    return struct.pack("<I", value)
+
+
+def pad_to_size(data: bytes, size: int = 4) -> bytes:
+    """The data, padded with zeros to a multiple of `size` bytes."""
+    return data + bytes(-len(data) % size)
+
+
+class CdrMessage:
+    """A message that grows field by field, each aligned to its own size."""
+
+    def __init__(self) -> None:
+        self._body = bytearray()
+
+    def add(self, kind: str, *values: float) -> None:
+        """Add numbers of a format of `struct`: `B`, `I`, `i` or `d`."""
+        size = struct.calcsize(kind)
+        self._body += bytes(-len(self._body) % size) + struct.pack(f"<{len(values)}{kind}", *values)
+
+    def text(self, value: str) -> None:
+        """Add a string."""
+        self._body += bytes(-len(self._body) % 4) + encode_string(value)
+
+    def stamp(self, time_ns: int) -> None:
+        """Add a time."""
+        self._body += bytes(-len(self._body) % 4) + encode_time(time_ns)
+
+    def message(self) -> bytes:
+        """The whole message, with its head."""
+        return HEAD + bytes(self._body)
+
+
+# Definitions of the written messages as in MCAP (`ros2msg`): a type, then all types in it. Sources: the packages' own
+# message files (autoware_perception_msgs, foxglove_msgs, std_msgs, geometry_msgs), without their comments.
+
+DETECTED_OBJECTS = "autoware_perception_msgs/msg/DetectedObjects"
+SCENE_UPDATE = "foxglove_msgs/msg/SceneUpdate"
+STRING = "std_msgs/msg/String"
+TRANSFORM = "foxglove_msgs/msg/FrameTransform"
+STATUS = "copem_replay_msgs/msg/Status"
+
+_COLOURED = "foxglove_msgs/Color color"
+_MESHED = (f"{_COLOURED}", "foxglove_msgs/Color[] colors", "uint32[] indices")
+_POSED = "geometry_msgs/Pose pose"
+_XYZ = ("float64 x", "float64 y", "float64 z")
+
+_FIELDS: dict[str, tuple[str, ...]] = {
+    "builtin_interfaces/Time": ("int32 sec", "uint32 nanosec"),
+    "builtin_interfaces/Duration": ("int32 sec", "uint32 nanosec"),
+    "std_msgs/Header": ("builtin_interfaces/Time stamp", "string frame_id"),
+    "std_msgs/String": ("string data",),
+    "geometry_msgs/Point": _XYZ,
+    "geometry_msgs/Point32": ("float32 x", "float32 y", "float32 z"),
+    "geometry_msgs/Vector3": _XYZ,
+    "geometry_msgs/Quaternion": ("float64 x 0", "float64 y 0", "float64 z 0", "float64 w 1"),
+    "geometry_msgs/Polygon": ("geometry_msgs/Point32[] points",),
+    "geometry_msgs/Pose": ("geometry_msgs/Point position", "geometry_msgs/Quaternion orientation"),
+    "geometry_msgs/PoseWithCovariance": (_POSED, "float64[36] covariance"),
+    "geometry_msgs/Twist": ("geometry_msgs/Vector3 linear", "geometry_msgs/Vector3 angular"),
+    "geometry_msgs/TwistWithCovariance": ("geometry_msgs/Twist twist", "float64[36] covariance"),
+    "autoware_perception_msgs/DetectedObjects": (
+        "std_msgs/Header header",
+        "autoware_perception_msgs/DetectedObject[] objects",
+    ),
+    "autoware_perception_msgs/DetectedObject": (
+        "float32 existence_probability",
+        "autoware_perception_msgs/ObjectClassification[] classification",
+        "autoware_perception_msgs/DetectedObjectKinematics kinematics",
+        "autoware_perception_msgs/Shape shape",
+    ),
+    "autoware_perception_msgs/ObjectClassification": (
+        "uint8 UNKNOWN = 0",
+        "uint8 CAR = 1",
+        "uint8 TRUCK = 2",
+        "uint8 BUS = 3",
+        "uint8 TRAILER = 4",
+        "uint8 MOTORCYCLE = 5",
+        "uint8 BICYCLE = 6",
+        "uint8 PEDESTRIAN = 7",
+        "uint8 ANIMAL = 8",
+        "uint8 HAZARD = 9",
+        "uint8 OVER_DRIVABLE = 10",
+        "uint8 UNDER_DRIVABLE = 11",
+        "uint8 label",
+        "float32 probability",
+    ),
+    "autoware_perception_msgs/DetectedObjectKinematics": (
+        "uint8 UNAVAILABLE=0",
+        "uint8 SIGN_UNKNOWN=1",
+        "uint8 AVAILABLE=2",
+        "geometry_msgs/PoseWithCovariance pose_with_covariance",
+        "bool has_position_covariance",
+        "uint8 orientation_availability",
+        "geometry_msgs/TwistWithCovariance twist_with_covariance",
+        "bool has_twist",
+        "bool has_twist_covariance",
+    ),
+    "autoware_perception_msgs/Shape": (
+        "uint8 BOUNDING_BOX=0",
+        "uint8 CYLINDER=1",
+        "uint8 POLYGON=2",
+        "uint8 type",
+        "geometry_msgs/Polygon footprint",
+        "geometry_msgs/Vector3 dimensions",
+    ),
+    "foxglove_msgs/SceneUpdate": (
+        "foxglove_msgs/SceneEntityDeletion[] deletions",
+        "foxglove_msgs/SceneEntity[] entities",
+    ),
+    "foxglove_msgs/SceneEntityDeletion": (
+        "builtin_interfaces/Time timestamp",
+        "uint8 MATCHING_ID=0",
+        "uint8 ALL=1",
+        "uint8 type",
+        "string id",
+    ),
+    "foxglove_msgs/SceneEntity": (
+        "builtin_interfaces/Time timestamp",
+        "string frame_id",
+        "string id",
+        "builtin_interfaces/Duration lifetime",
+        "bool frame_locked",
+        "foxglove_msgs/KeyValuePair[] metadata",
+        "foxglove_msgs/ArrowPrimitive[] arrows",
+        "foxglove_msgs/CubePrimitive[] cubes",
+        "foxglove_msgs/SpherePrimitive[] spheres",
+        "foxglove_msgs/CylinderPrimitive[] cylinders",
+        "foxglove_msgs/LinePrimitive[] lines",
+        "foxglove_msgs/TriangleListPrimitive[] triangles",
+        "foxglove_msgs/TextPrimitive[] texts",
+        "foxglove_msgs/ModelPrimitive[] models",
+    ),
+    "foxglove_msgs/FrameTransform": (
+        "builtin_interfaces/Time timestamp",
+        "string parent_frame_id",
+        "string child_frame_id",
+        "geometry_msgs/Vector3 translation",
+        "geometry_msgs/Quaternion rotation",
+    ),
+    "copem_replay_msgs/Status": ("builtin_interfaces/Time stamp", "copem_replay_msgs/ObjectStatus[] objects"),
+    "copem_replay_msgs/ObjectStatus": ("string id", "string status", "float64 age_s"),
+    "foxglove_msgs/Color": ("float64 r", "float64 g", "float64 b", "float64 a"),
+    "foxglove_msgs/KeyValuePair": ("string key", "string value"),
+    "foxglove_msgs/ArrowPrimitive": (
+        _POSED,
+        "float64 shaft_length",
+        "float64 shaft_diameter",
+        "float64 head_length",
+        "float64 head_diameter",
+        _COLOURED,
+    ),
+    "foxglove_msgs/CubePrimitive": (_POSED, "geometry_msgs/Vector3 size", _COLOURED),
+    "foxglove_msgs/SpherePrimitive": (_POSED, "geometry_msgs/Vector3 size", _COLOURED),
+    "foxglove_msgs/CylinderPrimitive": (
+        _POSED,
+        "geometry_msgs/Vector3 size",
+        "float64 bottom_scale",
+        "float64 top_scale",
+        _COLOURED,
+    ),
+    "foxglove_msgs/LinePrimitive": (
+        "uint8 LINE_STRIP=0",
+        "uint8 LINE_LOOP=1",
+        "uint8 LINE_LIST=2",
+        "uint8 type",
+        _POSED,
+        "float64 thickness",
+        "bool scale_invariant",
+        "geometry_msgs/Point[] points",
+        *_MESHED,
+    ),
+    "foxglove_msgs/TriangleListPrimitive": (_POSED, "geometry_msgs/Point[] points", *_MESHED),
+    "foxglove_msgs/TextPrimitive": (
+        _POSED,
+        "bool billboard",
+        "float64 font_size",
+        "bool scale_invariant",
+        _COLOURED,
+        "string text",
+    ),
+    "foxglove_msgs/ModelPrimitive": (
+        _POSED,
+        "geometry_msgs/Vector3 scale",
+        _COLOURED,
+        "bool override_color",
+        "string url",
+        "string media_type",
+        "uint8[] data",
+    ),
+}
+_RULE = "=" * 80
+
+
+def message_definition(name: str) -> bytes:
+    """The definition of a message type (`package/msg/Type`) with those of all types in it."""
+    types = [name.replace("/msg/", "/")]
+    for each in types:  # grows as it goes
+        inside = (field.split()[0].split("[")[0] for field in _FIELDS[each])
+        types += [kind for kind in dict.fromkeys(inside) if "/" in kind and kind not in types]
+    first, *others = ("\n".join(_FIELDS[each]) + "\n" for each in types)
+    return "".join([first, *(f"{_RULE}\nMSG: {n}\n{t}" for n, t in zip(types[1:], others, strict=True))]).encode()
+
+
+LABELS = {
+    "pedestrian": 7,
+    "bicycle": 6,
+    "motorcycle": 5,
+    "car": 1,
+    "van": 1,  # car: Autoware has no label for vans
+    "truck": 2,
+    "bus": 3,
+    "trailer": 4,
+    "animal": 8,
+    "other": 0,
+    "vehicle": 0,  # unknown: nor one for a vehicle of any kind
+}
+"""ObjectClassification.label by class."""
+_LABEL = np.array([LABELS[name] for name in CLASSES])
+_BOUNDING_BOX, _CYLINDER = 0, 1  # Shape.type
+_AVAILABLE = 2  # DetectedObjectKinematics: the orientation is known in full
+
+# A DetectedObject from its pose on; it begins, and so ends, at a multiple of 8 bytes.
+_BODY = np.dtype(
+    [
+        ("pose", "<f8", 7),
+        ("pose_covariance", "<f8", 36),
+        ("has_position_covariance", "u1"),
+        ("orientation_availability", "u1"),
+        ("", "V6"),
+        ("twist", "<f8", 6),
+        ("twist_covariance", "<f8", 36),
+        ("has_twist", "u1"),
+        ("has_twist_covariance", "u1"),
+        ("shape", "u1"),
+        ("", "V1"),
+        ("footprint_points", "<u4"),
+        ("dimensions", "<f8", 3),
+    ]
+)
+_EAST, _EAST_NORTH, _NORTH_EAST, _NORTH, _YAW = 0, 1, 6, 7, 35  # places in a 6 × 6 matrix by rows
+
+
+class DetectedObjectsWriter:
+    """Turns the fused lists of one run (values (1, P)) into messages, list by list."""
+
+    def __init__(self, scene: Scene, fused_tracks: FusedTracks, frame_id: str) -> None:
+        self._fused, self._listed, self._said = fused_tracks.fused, fused_tracks.listed, fused_tracks.said
+        object_ix = fused_tracks.fused.row_object_ix
+        self._moving = np.where(object_ix >= 0, scene.moving[object_ix], True)
+        self._class_ix = fused_tracks.class_of(scene)
+        self.round = self._class_ix == CLASSES.index("pedestrian")
+        """(P,) which objects are cylinders."""
+        self._certain: list[bytes] = [_encode_head(1.0, {int(label): 1.0}) for label in _LABEL]
+        self._frame_id = pad_to_size(encode_string(frame_id))
+
+    def message(self, frame: int, available_ns: int) -> bytes:
+        """List number `frame` as it became available at `available_ns` of the log's clock."""
+        rows = self._listed(frame)
+        begin = encode_time(available_ns) + self._frame_id + encode_count(len(rows))
+        if not rows:
+            return HEAD + begin
+        bodies = self._bodies(np.array(rows)).tobytes()
+        parts = [HEAD, begin]
+        for k, row in enumerate(rows):
+            parts.append(self._head_of(row))
+            if k == 0:
+                parts.append(bytes(-len(begin) % 8))  # all others begin at a multiple of 8 bytes
+            parts.append(bodies[k * _BODY.itemsize : (k + 1) * _BODY.itemsize])
+        return b"".join(parts)
+
+    def _head_of(self, row: int) -> bytes:
+        if self._said is None:
+            return self._certain[int(self._class_ix[row])]
+        entry = self._said[row]
+        share: dict[int, float] = {}
+        for index in np.flatnonzero(entry["class_probability"]):
+            label = int(_LABEL[index])
+            share[label] = share.get(label, 0.0) + float(entry["class_probability"][index])
+        return _encode_head(float(entry["existence"]), share)
+
+    def _bodies(self, rows: Int) -> Any:
+        fused, moving, cylinder = self._fused, self._moving[rows], self.round[rows]
+        body = np.zeros(len(rows), dtype=_BODY)
+        yaw = fused.yaw_rad[0, rows]
+        pose, covariance = body["pose"], body["pose_covariance"]
+        for k, name in enumerate(("x_m", "y_m", "z_m")):
+            pose[:, k] = getattr(fused, name)[0, rows]
+        pose[:, 5], pose[:, 6] = np.sin(yaw / 2), np.cos(yaw / 2)
+        east, north = self._variance("cov_ee_m2", rows), self._variance("cov_nn_m2", rows)
+        covariance[:, _EAST], covariance[:, _NORTH] = east, north
+        covariance[:, _EAST_NORTH] = covariance[:, _NORTH_EAST] = self._variance("cov_en_m2", rows)
+        covariance[:, _YAW] = self._variance("yaw_var_rad2", rows)
+        body["has_position_covariance"] = (east > 0) & (north > 0)
+        body["orientation_availability"] = _AVAILABLE
+
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        vx, vy = np.where(moving, fused.vx_mps[0, rows], 0.0), np.where(moving, fused.vy_mps[0, rows], 0.0)
+        body["twist"][:, 0], body["twist"][:, 1] = cos * vx + sin * vy, cos * vy - sin * vx
+        fast = np.where(moving, self._variance("speed_var_m2ps2", rows), 0.0)
+        body["twist_covariance"][:, 0] = body["twist_covariance"][:, 7] = fast
+        body["has_twist"], body["has_twist_covariance"] = moving, fast > 0
+
+        length, width = fused.length_m[0, rows], fused.width_m[0, rows]
+        across = (length + width) / 2
+        body["shape"] = np.where(cylinder, _CYLINDER, _BOUNDING_BOX)
+        body["dimensions"][:, 0] = np.where(cylinder, across, length)
+        body["dimensions"][:, 1] = np.where(cylinder, across, width)
+        body["dimensions"][:, 2] = fused.height_m[0, rows]
+        return body
+
+    def _variance(self, name: str, rows: Int) -> Float:
+        """Variances of `rows`, 0 where the state is exact or the variance is not known."""
+        variance = getattr(self._fused, name)
+        return np.zeros(len(rows)) if variance is None else np.nan_to_num(variance[0, rows])
+
+
+def _encode_head(existence: float, share: dict[int, float]) -> bytes:
+    """A DetectedObject up to its pose, by its label."""
+    classes = (struct.pack("<B3xf", label, probability) for label, probability in share.items())
+    return struct.pack("<fI", existence, len(share)) + b"".join(classes)

@@ -1,0 +1,490 @@
+"""Scenes for Foxglove and Lichtblick, foxglove.SceneUpdate in protobuf and ROS 2: boxes of fused lists, ellipses of
+uncertainty, and the truth.
+
+Every message deletes all that was on its topic and draws anew, so playback shows the right boxes after a seek and
+nothing accumulates (entities replace by id and live until deleted).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from copem_replay.core.colours import Rgb
+from copem_replay.core.fused_tracks import FusedTracks
+from copem_replay.core.tracks import CLASSES, Float, Int, Scene
+from copem_replay.io.encodings.column_bytes import (
+    Content,
+    RepeatedMessages,
+    TextPool,
+    encode_messages,
+    optional_message,
+    repeat_text,
+    split_into_blocks,
+)
+from copem_replay.io.write.ros2 import HEAD, CdrMessage, encode_count, encode_string, encode_time, pad_to_size
+
+# Elements of scenes besides boxes, for any encoding.
+
+Rgba: TypeAlias = tuple[float, float, float, float]
+Place: TypeAlias = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A place in the frame of reference, m, and a turn about the vertical, rad."""
+
+    x_m: float = 0.0
+    y_m: float = 0.0
+    z_m: float = 0.0
+    yaw_rad: float = 0.0
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line through points (K, 3) of its own frame; `width` in pixels."""
+
+    points: Sequence[Place]
+    colour: Rgba
+    pose: Pose = field(default_factory=Pose)
+    width: float = 1.5
+
+
+@dataclass(frozen=True)
+class Text:
+    """A text that faces the camera; `size` in pixels."""
+
+    text: str
+    colour: Rgba
+    pose: Pose
+    size: float = 14.0
+
+
+@dataclass(frozen=True)
+class Ellipse:
+    """An upright elliptic cylinder with these diameters and this height, m."""
+
+    size: Place
+    colour: Rgba
+    pose: Pose
+
+
+@dataclass(frozen=True)
+class Entity:
+    """A named entity: its metadata, which a viewer shows for a selected entity, and its elements."""
+
+    name: str
+    says: Mapping[str, str] = field(default_factory=dict)
+    lines: Sequence[Line] = ()
+    texts: Sequence[Text] = ()
+    ellipses: Sequence[Ellipse] = ()
+
+
+@dataclass(frozen=True)
+class TruthFrame:
+    """The moving entities at an instant of the log's clock; `followed`: the pose of the frame to follow, None: none."""
+
+    time_ns: int
+    entities: Sequence[Entity]
+    followed: Pose | None
+
+
+@dataclass(frozen=True)
+class TruthScene:
+    """The truth as a scene: static entities, frames of moving ones, and the name of the frame to follow."""
+
+    static: Sequence[Entity]
+    frames: Iterable[TruthFrame]
+    follow: str
+
+
+# Uncertainty: 2σ ellipses of position, paler with the age of the entry.
+
+SIGMAS = 2.0
+FRESH_ALPHA, OLDEST_ALPHA, FADES_S = 0.6, 0.15, 1.0
+"""Opacity of an ellipse: that of a fresh entry, the least, and the age of the least in s; only the picture changes."""
+SMALLEST_M = 0.01
+"""Smaller standard deviations are not drawn: their ellipses would be points."""
+
+
+@dataclass(frozen=True)
+class Ellipses:
+    """Upright elliptic cylinders, (N,): names, ages of the entries (`""`: unknown), places, sizes, opacity."""
+
+    names: list[str]
+    ages: list[str]
+    x_m: Float
+    y_m: Float
+    z_m: Float
+    yaw_rad: Float
+    length_m: Float
+    width_m: Float
+    alpha: Float
+    colour: tuple[float, float, float]
+    height_m: float = 0.02
+
+    def entities(self) -> list[Entity]:
+        """An entity for each ellipse."""
+        numbers = (getattr(self, n).tolist() for n in ("x_m", "y_m", "z_m", "yaw_rad", "length_m", "width_m", "alpha"))
+        return [
+            Entity(
+                name,
+                {"age_s": age} if age else {},
+                ellipses=[Ellipse((length, width, self.height_m), (*self.colour, alpha), Pose(x, y, z, yaw))],
+            )
+            for name, age, x, y, z, yaw, length, width, alpha in zip(self.names, self.ages, *numbers, strict=True)
+        ]
+
+
+Encode = Callable[[Ellipses, Int, Int], Iterable[bytes]]
+"""Makes K messages from all ellipses, the instants (K,), and the first ellipse of each instant (K + 1,)."""
+
+
+class UncertaintyWriter:
+    """Turns the fused lists of one run (values (1, P)) into scenes of ellipses, many lists at once."""
+
+    def __init__(self, scene: Scene, fused_tracks: FusedTracks, colour: Rgb, encode: Encode) -> None:
+        self._t0_ns, self._fused_tracks, self._encode = scene.t0_ns, fused_tracks, encode
+        self._colour = colour[0] / 255, colour[1] / 255, colour[2] / 255
+        fused, rows = fused_tracks.fused, len(fused_tracks.fused.frame_ix)
+        ee, en, nn = (
+            np.zeros(rows) if c is None else np.asarray(c[0], dtype=float)
+            for c in (fused.cov_ee_m2, fused.cov_en_m2, fused.cov_nn_m2)
+        )
+        self._major, self._minor, self._yaw_rad = principal_axes(ee, en, nn)
+        self._names, self._name = fused_tracks.names_of(scene)
+
+    def messages(self, available_ns: Int) -> Iterator[bytes]:
+        """The lists as they became available at these instants of the log's clock, (F,)."""
+        rows, bounds = self._fused_tracks.listed_rows
+        drawn = self._major[rows] >= SMALLEST_M  # neither the truth, nor lists that state no covariance
+        rows, bounds = rows[drawn], np.concatenate([[0], np.cumsum(drawn)])[bounds]
+        for first, last in split_into_blocks(bounds):
+            time_ns, start = available_ns[first:last], bounds[first : last + 1] - bounds[first]
+            available_s = np.repeat((time_ns - self._t0_ns) * 1e-9, np.diff(start))
+            yield from self._encode(self._ellipses(rows[bounds[first] : bounds[last]], available_s), time_ns, start)
+
+    def _ellipses(self, rows: Int, available_s: Float) -> Ellipses:
+        fused = self._fused_tracks.fused
+        age_s = np.fmax(0.0, available_s - self._fused_tracks.captured_s[0, rows])
+        return Ellipses(
+            names=[self._names[k] for k in self._name[rows].tolist()],
+            ages=[f"{age:.3f}" if math.isfinite(age) else "" for age in age_s.tolist()],
+            x_m=fused.x_m[0, rows],
+            y_m=fused.y_m[0, rows],
+            z_m=fused.z_m[0, rows] - fused.height_m[0, rows] / 2,  # on the ground
+            yaw_rad=self._yaw_rad[rows],
+            length_m=2 * SIGMAS * self._major[rows],
+            width_m=2 * SIGMAS * self._minor[rows],
+            alpha=FRESH_ALPHA + (OLDEST_ALPHA - FRESH_ALPHA) * np.minimum(age_s / FADES_S, 1.0),
+            colour=self._colour,
+        )
+
+
+def principal_axes(ee: Float, en: Float, nn: Float) -> tuple[Float, Float, Float]:
+    """(P,) standard deviations along the major and the minor axis, and the angle of the major one from east, rad."""
+    middle, half = (ee + nn) / 2, np.hypot((ee - nn) / 2, en)
+    return np.sqrt(middle + half), np.sqrt(np.maximum(middle - half, 0.0)), np.arctan2(2 * en, ee - nn) / 2
+
+
+# Scenes in protobuf.
+
+FOXGLOVE_SCENE_SCHEMA = "foxglove.SceneUpdate"
+FRAME_ID = "global"
+"""Name of the world frame in the OSI converters of these viewers."""
+ALPHA = 0.5
+"""Opacity of boxes: what is inside stays visible."""
+
+
+def load_scene_class() -> Any:
+    """The SceneUpdate class, imported when first needed."""
+    from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+
+    return SceneUpdate
+
+
+class FoxgloveSceneWriter:
+    """Turns the fused lists of one run (values (1, P)) into messages, many lists at once."""
+
+    def __init__(
+        self, scene: Scene, fused_tracks: FusedTracks, configuration: str, colour: Rgb, frame_id: str = FRAME_ID
+    ) -> None:
+        self._fused, self._rows, self._frame_id = fused_tracks.fused, fused_tracks.listed_rows, frame_id
+        names, self._name = fused_tracks.names_of(scene)
+        self._names = TextPool.of([name.encode() for name in names])
+        # The metadata of boxes are encoded once for every pair of name and class.
+        keys, self._key = np.unique(self._name * len(CLASSES) + fused_tracks.class_of(scene), return_inverse=True)
+        pairs = (divmod(key, len(CLASSES)) for key in keys.tolist())
+        self._says = TextPool.of(
+            [_encode_metadata(box_metadata(names[name], kind, configuration)) for name, kind in pairs]
+        )
+        shades = zip("rgb", colour, strict=True)
+        self._colour: Content = {**{shade: c / 255 for shade, c in shades}, "a": ALPHA}
+
+    def messages(self, available_ns: Int) -> Iterator[bytes]:
+        """The lists as they became available at these instants of the log's clock, (F,)."""
+        for first, last in split_into_blocks(self._rows[1]):
+            bounds = self._rows[1][first : last + 1]
+            rows = self._rows[0][bounds[0] : bounds[-1]]
+            entities: Content = {
+                "id": self._names.at(self._name[rows]),
+                "metadata": self._says.at(self._key[rows]),
+                "cubes": RepeatedMessages(np.arange(len(rows) + 1), self._cubes(rows)),
+            }
+            yield from encode_updates(available_ns[first:last], bounds - bounds[0], entities, self._frame_id)
+
+    def _cubes(self, rows: Int) -> Content:
+        x, y, z, length, width, height, yaw = (
+            getattr(self._fused, name)[0, rows]
+            for name in ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "yaw_rad")
+        )
+        pose: Content = {"position": {"x": x, "y": y, "z": z}, "orientation": encode_orientation(yaw)}
+        return {"pose": pose, "size": {"x": length, "y": width, "z": height}, "color": self._colour}
+
+
+def encode_orientation(yaw_rad: Float) -> Content:
+    """The quaternion of a turn about the vertical."""
+    return {"z": np.sin(yaw_rad / 2), "w": np.cos(yaw_rad / 2)}
+
+
+def encode_updates(time_ns: Int, start: Int, entities: Content, frame_id: str) -> list[bytes]:
+    """Messages that delete all on their topic; message k draws the entities `start[k]:start[k + 1]`."""
+    rows = int(start[-1])
+    deletion: Content = {"timestamp": _encode_stamp(time_ns), "type": 1}  # ALL
+    drawn: Content = {
+        "timestamp": _encode_stamp(np.repeat(time_ns, np.diff(start))),
+        "frame_id": repeat_text(frame_id.encode(), rows),
+        **entities,
+    }
+    content: Content = {
+        "deletions": RepeatedMessages(np.arange(len(time_ns) + 1), deletion),
+        "entities": RepeatedMessages(start, drawn),
+    }
+    return encode_messages(load_scene_class().DESCRIPTOR, content, len(time_ns))
+
+
+def encode_ellipses(drawn: Ellipses, time_ns: Int, start: Int, frame_id: str) -> list[bytes]:
+    """Messages of ellipses; message k draws the ellipses `start[k]:start[k + 1]`."""
+    rows = np.arange(len(drawn.names) + 1)
+    ages = [age.encode() for age in drawn.ages if age]
+    age: Content = {"key": repeat_text(b"age_s", len(ages)), "value": TextPool.of(ages).at(np.arange(len(ages)))}
+    red, green, blue = drawn.colour
+    cylinder: Content = {
+        "pose": {
+            "position": {"x": drawn.x_m, "y": drawn.y_m, "z": drawn.z_m},
+            "orientation": encode_orientation(drawn.yaw_rad),
+        },
+        "size": {"x": drawn.length_m, "y": drawn.width_m, "z": drawn.height_m},
+        "bottom_scale": 1.0,
+        "top_scale": 1.0,
+        "color": {"r": red, "g": green, "b": blue, "a": drawn.alpha},
+    }
+    entities: Content = {
+        "id": TextPool.of([name.encode() for name in drawn.names]).at(rows[:-1]),
+        "metadata": optional_message(np.array([age != "" for age in drawn.ages], dtype=bool), age),
+        "cylinders": RepeatedMessages(rows, cylinder),
+    }
+    return encode_updates(time_ns, start, entities, frame_id)
+
+
+def _encode_stamp(time_ns: Int) -> Content:
+    seconds, nanos = np.divmod(time_ns, 1_000_000_000)
+    return {"seconds": seconds, "nanos": nanos}
+
+
+def box_metadata(name: str, class_ix: int, configuration: str) -> dict[str, str]:
+    """The metadata of a box, which a viewer shows for a selected box."""
+    return {"configuration": configuration, "class": CLASSES[class_ix], "object": name}
+
+
+def _encode_metadata(metadata: dict[str, str]) -> bytes:
+    """The metadata of a box as encoded fields of a SceneEntity."""
+    from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
+
+    entity = SceneEntity()
+    for key, text in metadata.items():
+        entity.metadata.add(key=key, value=text)
+    encoded: bytes = entity.SerializeToString(deterministic=True)
+    return encoded
+
+
+def encode_scene(entities: Sequence[Entity], time_ns: int, frame_id: str) -> bytes:
+    """A message that deletes all on its topic and draws entities."""
+    from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
+
+    update = load_scene_class()()
+    deletion = update.deletions.add()
+    deletion.type = SceneEntityDeletion.ALL
+    deletion.timestamp.FromNanoseconds(time_ns)
+    for each in entities:
+        entity = update.entities.add(frame_id=frame_id, id=each.name)
+        entity.timestamp.CopyFrom(deletion.timestamp)
+        for key, value in each.says.items():
+            entity.metadata.add(key=key, value=value)
+        for ellipse in each.ellipses:
+            element = entity.cylinders.add(bottom_scale=1.0, top_scale=1.0)
+            element.size.x, element.size.y, element.size.z = ellipse.size
+            _place_primitive(element, ellipse.pose, ellipse.colour)
+        for line in each.lines:
+            element = entity.lines.add(thickness=line.width, scale_invariant=True)
+            for x, y, z in line.points:
+                element.points.add(x=x, y=y, z=z)
+            _place_primitive(element, line.pose, line.colour)
+        for text in each.texts:
+            element = entity.texts.add(billboard=True, font_size=text.size, scale_invariant=True, text=text.text)
+            _place_primitive(element, text.pose, text.colour)
+    encoded: bytes = update.SerializeToString(deterministic=True)
+    return encoded
+
+
+def load_transform_class() -> Any:
+    """The FrameTransform class, imported when first needed."""
+    from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+
+    return FrameTransform
+
+
+def encode_transform(parent: str, pose: Pose, time_ns: int, child: str) -> bytes:
+    """The pose of the frame `child` in the frame `parent`: foxglove.FrameTransform."""
+    transform = load_transform_class()(parent_frame_id=parent, child_frame_id=child)
+    transform.timestamp.FromNanoseconds(time_ns)
+    transform.translation.x, transform.translation.y, transform.translation.z = pose.x_m, pose.y_m, pose.z_m
+    transform.rotation.z, transform.rotation.w = math.sin(pose.yaw_rad / 2), math.cos(pose.yaw_rad / 2)
+    encoded: bytes = transform.SerializeToString(deterministic=True)
+    return encoded
+
+
+def _place_primitive(primitive: Any, pose: Pose, colour: tuple[float, float, float, float]) -> None:
+    position, orientation, color = primitive.pose.position, primitive.pose.orientation, primitive.color
+    position.x, position.y, position.z = pose.x_m, pose.y_m, pose.z_m
+    orientation.z, orientation.w = math.sin(pose.yaw_rad / 2), math.cos(pose.yaw_rad / 2)
+    color.r, color.g, color.b, color.a = colour
+
+
+# Scenes in ROS 2: foxglove_msgs/SceneUpdate.
+
+_ALL = 1  # SceneEntityDeletion.type
+_FOREVER = bytes(8)  # lifetime
+_UNLOCKED = bytes(4)  # frame_locked, padded to a multiple of 4 bytes
+
+# From the cube's pose to the end of an entity: one cube, no sphere, cylinder, line, triangle, text, model.
+_CUBE = np.dtype([("pose", "<f8", 7), ("size", "<f8", 3), ("color", "<f8", 4), ("none", "<u4", 6)])
+
+
+class Ros2SceneWriter:
+    """Turns the fused lists of one run (values (1, P)) into messages, list by list."""
+
+    def __init__(self, scene: Scene, fused_tracks: FusedTracks, configuration: str, colour: Rgb, frame_id: str) -> None:
+        self._fused, self._listed = fused_tracks.fused, fused_tracks.listed
+        every, which = fused_tracks.names_of(scene)
+        names, kinds = [every[k] for k in which.tolist()], fused_tracks.class_of(scene).tolist()
+        entities = {
+            key: _encode_entity(key[0], box_metadata(*key, configuration), frame_id)
+            for key in dict.fromkeys(zip(names, kinds, strict=True))
+        }
+        self._entity = [entities[key] for key in zip(names, kinds, strict=True)]
+        self._color = (*(c / 255 for c in colour), ALPHA)
+
+    def message(self, frame: int, available_ns: int) -> bytes:
+        """List number `frame` as it became available at `available_ns` of the log's clock."""
+        rows = self._listed(frame)
+        now = encode_time(available_ns)
+        deletion = pad_to_size(now + bytes([_ALL, 0, 0, 0]) + encode_string(""))
+        begin = encode_count(1) + deletion + encode_count(len(rows))
+        cubes = self._cubes(rows)
+        parts = [HEAD, begin]
+        offset = len(begin)
+        for k, row in enumerate(rows):
+            entity = self._entity[row]
+            offset += len(now) + len(entity)
+            parts += (now, entity, bytes(-offset % 8), cubes[k * _CUBE.itemsize : (k + 1) * _CUBE.itemsize])
+            offset = 0  # a cube begins, and so ends, at a multiple of 8 bytes
+        return b"".join(parts)
+
+    def _cubes(self, rows: list[int]) -> bytes:
+        fused = self._fused
+        cubes = np.zeros(len(rows), dtype=_CUBE)
+        for k, name in enumerate(("x_m", "y_m", "z_m")):
+            cubes["pose"][:, k] = getattr(fused, name)[0, rows]
+        half = fused.yaw_rad[0, rows] / 2
+        cubes["pose"][:, 5], cubes["pose"][:, 6] = np.sin(half), np.cos(half)
+        for k, name in enumerate(("length_m", "width_m", "height_m")):
+            cubes["size"][:, k] = getattr(fused, name)[0, rows]
+        cubes["color"] = self._color
+        return cubes.tobytes()
+
+
+def _encode_entity(name: str, metadata: dict[str, str], frame_id: str) -> bytes:
+    """An entity from its frame of reference to the number of its cubes."""
+    texts = [pad_to_size(encode_string(each)) for pair in metadata.items() for each in pair]
+    head = pad_to_size(encode_string(frame_id)) + pad_to_size(encode_string(name)) + _FOREVER + _UNLOCKED
+    return head + encode_count(len(metadata)) + b"".join(texts) + encode_count(0) + encode_count(1)
+
+
+def encode_ros2_scene(entities: Sequence[Entity], time_ns: int, frame_id: str) -> bytes:
+    """A message that deletes all on its topic and draws entities."""
+    out = CdrMessage()
+    out.add("I", 1)
+    out.stamp(time_ns)
+    out.add("B", _ALL)
+    out.text("")
+    out.add("I", len(entities))
+    for each in entities:
+        out.stamp(time_ns)
+        out.text(frame_id)
+        out.text(each.name)
+        out.add("I", 0, 0)  # lifetime
+        out.add("B", 0)  # frame_locked
+        out.add("I", len(each.says))
+        for pair in each.says.items():
+            for text in pair:
+                out.text(text)
+        out.add("I", 0, 0, 0, len(each.ellipses))  # arrows, cubes, spheres, cylinders
+        for ellipse in each.ellipses:
+            _write_pose(out, ellipse.pose)
+            out.add("d", *ellipse.size, 1.0, 1.0, *ellipse.colour)
+        out.add("I", len(each.lines))
+        for line in each.lines:
+            _write_line(out, line.points, line.width, line.pose, line.colour)
+        out.add("I", 0, len(each.texts))  # triangles, texts
+        for words in each.texts:
+            _write_pose(out, words.pose)
+            out.add("B", 1)  # billboard
+            out.add("d", words.size)
+            out.add("B", 1)  # scale_invariant
+            out.add("d", *words.colour)
+            out.text(words.text)
+        out.add("I", 0)  # models
+    return out.message()
+
+
+def encode_ros2_transform(parent: str, pose: Pose, time_ns: int, child: str) -> bytes:
+    """The pose of the frame `child` in the frame `parent`: foxglove_msgs/FrameTransform."""
+    out = CdrMessage()
+    out.stamp(time_ns)
+    out.text(parent)
+    out.text(child)
+    _write_pose(out, pose)
+    return out.message()
+
+
+def _write_line(
+    out: CdrMessage, points: Sequence[tuple[float, float, float]], width: float, pose: Pose, colour: Rgba
+) -> None:
+    out.add("B", 0)  # LINE_STRIP
+    _write_pose(out, pose)
+    out.add("d", width)
+    out.add("B", 1)  # scale_invariant
+    out.add("I", len(points))
+    for point in points:
+        out.add("d", *point)
+    out.add("d", *colour)
+    out.add("I", 0, 0)  # colors, indices
+
+
+def _write_pose(out: CdrMessage, pose: Pose) -> None:
+    out.add("d", pose.x_m, pose.y_m, pose.z_m, 0.0, 0.0, math.sin(pose.yaw_rad / 2), math.cos(pose.yaw_rad / 2))

@@ -1,0 +1,549 @@
+"""The place of a results folder during a run: checked, locked, tidied up, and in the end exchanged with the new one.
+
+A folder lists the files of its results in `provenance.json`, and those that commands made of them in `made.jsonl`; both
+go when new results take its place, the user's own files stay. See docs/develop/decisions/0020-results-folder.md.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import platform
+import shutil
+import stat
+import traceback
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from copem_replay.core.errors import CopemError, InputError, OutputError
+from copem_replay.core.files import (
+    OLD,
+    ScratchFolder,
+    flush_all,
+    flush_file,
+    hidden_name,
+    is_scratch,
+    make_scratch_folder,
+    remove_leftovers,
+    try_lock,
+)
+
+# The files that belong to a results folder.
+
+MARK = "provenance.json"
+MADE = "made.jsonl"
+"""Lists the files that commands made of the results later, a JSON string a line.
+
+Lines are only appended, so that two commands at a time lose none, and a half-written line is no name.
+"""
+
+
+@dataclass(frozen=True)
+class FolderFiles:
+    """The files of a results folder, by names relative to it.
+
+    `results`: those of the results, None where the folder does not list them (an older version). `made`: those that
+    commands made of the results afterwards.
+    """
+
+    results: frozenset[str] | None
+    made: frozenset[str]
+    every: tuple[str, ...]  # files, links, empty folders
+
+    def others(self, written: Collection[str]) -> list[str]:
+        """The user's own files. `written`: new results, which stand for those of a folder without a list."""
+        ours = (self.results if self.results is not None else frozenset(written)) | self.made
+        return [name for name in self.every if name not in ours]
+
+
+def list_belongings(folder: Path) -> FolderFiles | None:
+    """The files of a results folder; None: it is not one. Raises OSError, OutputError for a mount point in it."""
+    try:
+        provenance: Any = json.loads((folder / MARK).read_bytes())
+    except (OSError, ValueError):
+        return None
+    if not isinstance(provenance, dict) or "copem_replay" not in provenance:
+        return None
+    listed = provenance.get("files")
+    results = frozenset(map(str, listed)) if isinstance(listed, list) else None
+    return FolderFiles(results, read_made_names(folder), tuple(list_names(folder)))
+
+
+def read_made_names(folder: Path) -> frozenset[str]:
+    """The names listed as made of the results of a folder, and that of the list itself.
+
+    They are only compared with names of existing files, never opened: a list may hold any text.
+    """
+    names = {MADE}
+    for line in _read_made_list(folder).splitlines():
+        try:
+            name = json.loads(line)
+        except (ValueError, RecursionError):
+            continue
+        if isinstance(name, str):
+            names.add(name)
+    return frozenset(names)
+
+
+def add_to_made_list(folder: Path, files: Iterable[Path]) -> None:
+    """List those of `files` that lie in a results folder as made of its results, with which they go.
+
+    To be called before a file gets its name, so that a killed process leaves no unlisted file. Raises OutputError.
+    """
+    root = os.path.realpath(folder)
+    if not os.path.isfile(os.path.join(root, MARK)):
+        return
+    places = [os.path.join(os.path.realpath(file.parent), file.name) for file in files]
+    names = {os.path.relpath(place, root) for place in places if place.startswith(f"{root}{os.sep}")}
+    if not (new := sorted(names - read_made_names(folder))):
+        return
+    cut_off = _read_made_list(folder)[-1:] not in (b"", b"\n")  # the last line, by a killed process
+    text = "\n" * cut_off + "".join(f"{json.dumps(name)}\n" for name in new)
+    try:
+        fd = os.open(folder / MADE, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
+        try:
+            os.write(fd, text.encode())
+            os.fsync(fd)
+        finally:
+            os.close(fd)
+    except OSError as error:
+        raise OutputError(f"{folder / MADE}: cannot be written: {error.strerror or error}") from None
+
+
+def _read_made_list(folder: Path) -> bytes:
+    """The content of the list; empty where there is none, or something else in its place."""
+    try:
+        fd = os.open(folder / MADE, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+        with open(fd, "rb") as file:
+            return file.read() if stat.S_ISREG(os.fstat(fd).st_mode) else b""
+    except OSError:
+        return b""
+
+
+def check_unchanged(folder: Path, seen: os.stat_result) -> None:
+    """Raise InputError where other results have taken the place of those that were read."""
+    try:
+        same = os.path.samestat(os.stat(folder), seen)
+    except OSError:
+        same = False
+    if not same:
+        raise InputError(f"{folder}: other results took its place while it was read; do it once more")
+
+
+def list_names(folder: Path, at: str = "") -> Iterator[str]:
+    """Files, links and empty folders in a folder, by names relative to it; `at` comes before them. Raises OSError."""
+    entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
+    if at and not entries:
+        yield at.removesuffix("/")
+    for entry in entries:
+        if not entry.is_dir(follow_symlinks=False):
+            yield at + entry.name
+        elif os.path.ismount(entry.path):
+            raise OutputError(f"{entry.path}: a mount point cannot be replaced; choose another folder with --out")
+        elif not is_scratch(Path(entry.path)):  # a figure that is being written, or was when its process was killed
+            yield from list_names(Path(entry.path), f"{at}{entry.name}/")
+
+
+def keep_file(name: str, old: Path, new: Path, spare: Path) -> str:
+    """Keep the file or folder `name` of `old` in `new`: linked, else copied by way of `spare`. Raises OSError.
+
+    Returns its name there: `name`, or one with `.kept` where `new` has another of that name.
+    """
+    source, target, number = old / name, new / name, 0
+    while os.path.lexists(target) or any(parent.is_file() for parent in _folders_between(target, new)):
+        number += 1
+        first, slash, rest = name.partition("/")
+        target = new / f"{first}.kept{number if number > 1 else ''}{slash}{rest}"
+    name = target.relative_to(new).as_posix()
+    if source.is_dir() and not source.is_symlink():
+        _make_folders(source, target, old)
+        return name
+    _make_folders(source.parent, target.parent, old)
+    try:
+        os.link(source, target, follow_symlinks=False)
+    except OSError:
+        spare.unlink(missing_ok=True)
+        shutil.copy2(source, spare, follow_symlinks=False)
+        os.rename(spare, target)
+    return name
+
+
+def _folders_between(path: Path, top: Path) -> Iterator[Path]:
+    yield from (parent for parent in path.parents if parent != top and top in parent.parents)
+
+
+def _make_folders(source: Path, target: Path, top: Path) -> None:
+    """Make `target` with the mode of `source`, and the folders above it up to `top`."""
+    if target.exists():
+        return
+    if source != top:
+        _make_folders(source.parent, target.parent, top)
+    target.mkdir()
+    target.chmod(source.stat().st_mode & 0o777 | 0o700)
+
+
+# The lock: one process at a time writes to a place.
+
+_TRIES = 100
+"""Tries to lock: each fails only where the lock file goes between being opened and locked, as its process ends."""
+
+
+@contextmanager
+def lock_folder(folder: Path) -> Iterator[None]:
+    """Be the only process that writes to `folder`: `.NAME.lock` beside it is locked meanwhile, and removed in the end.
+
+    On file systems without locks nothing is locked. Raises OutputError where another process has the lock, OSError.
+    """
+    path = folder.parent / f"{hidden_name(folder.name)}.lock"
+    fd, locked = _try_lock(path, folder)
+    if locked:
+        with suppress(OSError):
+            os.pwrite(fd, (name := f"process {os.getpid()} on {platform.node()}\n").encode(), 0)
+            os.ftruncate(fd, len(name.encode()))
+    try:
+        yield
+    finally:
+        if locked:  # while it is locked: a waiting process would lock a file without a name
+            with suppress(OSError):
+                path.unlink()
+        os.close(fd)
+        if not locked:
+            with suppress(OSError):
+                path.unlink()
+
+
+def _try_lock(path: Path, folder: Path) -> tuple[int, bool]:
+    """The lock file, open, and whether it is locked: False where there are no locks."""
+    for _ in range(_TRIES):
+        fd = _open_lock(path)
+        locked = try_lock(fd)
+        if locked is None or (locked and _is_still(path, fd)):
+            return fd, bool(locked)
+        try:
+            if locked is False:
+                name = os.pread(fd, 200, 0).decode(errors="replace").strip()
+                raise OutputError(
+                    f"{folder}: another run ({name or 'just started'}) is writing its results there; wait until it has "
+                    "ended, or choose another folder with --out"
+                )
+        finally:
+            os.close(fd)
+    raise OutputError(f"{folder}: cannot be written: {path} comes and goes; choose another folder with --out")
+
+
+def _open_lock(path: Path) -> int:
+    flags = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    try:
+        return os.open(path, os.O_RDWR | os.O_CREAT | flags, 0o666)
+    except PermissionError:  # left by another user
+        return os.open(path, os.O_RDONLY | flags)
+
+
+def _is_still(path: Path, fd: int) -> bool:
+    """Whether an open file is still the one of this name."""
+    with suppress(FileNotFoundError):
+        return os.path.samestat(os.fstat(fd), os.lstat(path))
+    return False
+
+
+# The exchange of two names in one step, where the system has it (Linux, most of its file systems).
+
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # fcntl.h, linux/fs.h
+_CANNOT = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EPERM)
+"""Errors of an old kernel, of a file system without the exchange, and of containers that refuse unknown calls."""
+
+
+def exchange_folders(first: Path, second: Path) -> bool:
+    """Exchange two names of one file system by renameat2(2); neither is missing at any instant. Raises OSError.
+
+    False: the system has no such exchange.
+    """
+    import ctypes
+
+    function = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    if function is None:
+        return False
+    if function(_AT_FDCWD, os.fsencode(first), _AT_FDCWD, os.fsencode(second), ctypes.c_uint(_RENAME_EXCHANGE)) == 0:
+        return True
+    code = ctypes.get_errno()
+    if code in _CANNOT:
+        return False
+    raise OSError(code, os.strerror(code), str(second))
+
+
+# The place of the results of one run.
+
+EXPERIMENT = "experiment.yaml"
+_NEW, _SPARE = "results", "copy"
+_OTHERS = "something else came there during the run, and stays"
+_ROOM = 600
+"""Bytes left for paths in a results folder and in scratch folders beside it: two names and a half of 255 bytes."""
+
+
+@dataclass
+class ResultsPlace:
+    """The place that results are written to. `folder` changes where they cannot have the name that was asked for."""
+
+    folder: Path  # absolute, no links
+    asked: Path  # as it was given
+    asked_folder: Path  # `asked`, absolute, no links
+    scratch: ScratchFolder
+    before: os.stat_result | None  # the folder to be replaced, at the start
+    notes: list[str] = field(default_factory=list)  # about this place, not about the results
+    failed: list[str] = field(
+        default_factory=list
+    )  # files that could not be written, without which the results are complete
+    left_out: set[str] = field(default_factory=set)  # the names of these files
+
+    @property
+    def shown(self) -> Path:
+        """The folder of the results, as it was given where they are there."""
+        return self.asked if self.folder == self.asked_folder else self.folder
+
+    @property
+    def new(self) -> Path:
+        """The folder to fill."""
+        return self.scratch.path / _NEW
+
+    def will_hold(self, files: Sequence[str]) -> None:
+        """Declare the files of the results, before any is written. Raises OSError."""
+        self.scratch.will_hold([_SPARE, *(f"{_NEW}/{name}" for name in files)])
+
+    @contextmanager
+    def may_fail(self, names: Sequence[str]) -> Iterator[None]:
+        """Write files without which the results are complete: an error goes to `failed`, and the files are left out."""
+        try:
+            yield
+        except Exception as error:  # also a defect: it must not cost the results of hours
+            for path in (self.new / name for name in names):
+                path.unlink(missing_ok=True)
+                _remove_empty([parent for parent in path.parents if self.new in parent.parents])
+            self.left_out.update(names)
+            shown = [str(self.asked / name) for name in names]
+            why = self._reason(error)
+            for name in shown:
+                why = why.removeprefix(f"{name}: ")
+            self.failed.append(f"{', '.join(shown)}: not written ({why}); all other results are there")
+
+    def _reason(self, error: Exception) -> str:
+        """The reason of an error in a line."""
+        if isinstance(error, CopemError):
+            return "; ".join(error.problems).replace(str(self.new), str(self.asked))
+        if isinstance(error, OSError):
+            return error.strerror or str(error)
+        if isinstance(error, MemoryError):
+            return "not enough memory"
+        frame = traceback.extract_tb(error.__traceback__)[-1]
+        words = " ".join(f"{type(error).__name__}: {error}".split())
+        return f"internal error, please report it: {words}, in {Path(frame.filename).name}, line {frame.lineno}"
+
+    def finish(self, files: Sequence[str]) -> None:
+        """Give the new folder its name; an old one goes when all of the new one is on the disk. Raises OSError."""
+        flush_all(self.new)
+        state = _stat_folder(self.folder)
+        why: str | None = _OTHERS
+        if state is None:
+            why = None if _try_rename(self.new, self.folder) else _OTHERS
+        elif self.before is not None and os.path.samestat(state, self.before):
+            why = self._replace(files)
+        if why is not None:
+            self._elsewhere(why)
+        flush_file(self.folder.parent)
+
+    def _replace(self, files: Sequence[str]) -> str | None:
+        """Put the new folder in the place of the old one, with the user's own files. Returns why not; None: done."""
+        held = list_belongings(self.folder)
+        if held is None:
+            return _OTHERS
+        try:
+            kept = self._keep(held, files)
+        except OSError as error:
+            for name in set(held.others(files)) - set(files):
+                with suppress(OSError):
+                    (self.new / name).unlink()
+            return f"not replaced, as {error.filename} can be neither linked nor copied ({error.strerror})"
+        assert self.before is not None
+        if exchange_folders(self.new, self.folder):
+            if not os.path.samestat(self.new.stat(), self.before):
+                exchange_folders(self.new, self.folder)
+                return _OTHERS
+            old = self.new
+        else:
+            old = self.scratch.path / OLD
+            _move_in(self.new, self.folder, old)
+        self._keep_late(old, held, kept)
+        return None
+
+    def _keep(self, held: FolderFiles, files: Sequence[str]) -> dict[str, str]:
+        """Keep the user's own files in the new folder. Returns their names there by those in the old one."""
+        others = held.others(files)
+        ours = set(held.every) - set(others)
+        removable = [_SPARE, *(f"{_NEW}/{name}" for name in {*files, *ours}), *(f"{OLD}/{name}" for name in ours)]
+        kept: dict[str, str] = {}
+        same: dict[str, str] = {}
+        self.scratch.will_hold(removable, {f"{_NEW}/{name}": f"{self.folder.name}/{name}" for name in others})
+        for name in sorted(others, key=lambda name: name in files):  # those that keep their names first
+            kept[name] = keep_file(name, self.folder, self.new, self.scratch.path / _SPARE)
+            if kept[name] != name:
+                self.notes.append(f"{self.asked}/{name}: kept as {kept[name]}, as the results have one of that name")
+            same |= {f"{at}/{name}": f"{self.folder.name}/{kept[name]}" for at in (_NEW, OLD)}
+            same[f"{_NEW}/{kept[name]}"] = f"{self.folder.name}/{name}"
+        if others:
+            self.scratch.will_hold(removable, same)
+            flush_all(self.new)
+        return kept
+
+    def _keep_late(self, old: Path, held: FolderFiles, kept: dict[str, str]) -> None:
+        """Keep files that came into the old folder during the exchange, except those made of the old results."""
+        made = read_made_names(old)
+        late = [name for name in list_names(old) if name not in held.every]
+        self.scratch.add([f"{old.name}/{name}" for name in made.intersection(late)])
+        for name in late:
+            if name not in made:
+                with suppress(OSError):
+                    kept[name] = keep_file(name, old, self.folder, self.scratch.path / _SPARE)
+                    self.scratch.add(same={f"{old.name}/{name}": f"{self.folder.name}/{kept[name]}"})
+
+    def _elsewhere(self, why: str) -> None:
+        """Give the new folder another name."""
+        number = 2
+        while True:
+            other = self.asked_folder.with_name(f"{self.asked_folder.name}-{number}")
+            if not os.path.lexists(other) and _try_rename(self.new, other):
+                break
+            number += 1
+        self.notes.append(f"{self.asked}: {why}; the results of this run are in {other}")
+        self.folder = other
+
+
+def _stat_folder(path: Path) -> os.stat_result | None:
+    """The state of the file or folder at a path; None: nothing, or an empty folder. Raises OSError."""
+    try:
+        state = os.lstat(path)
+    except FileNotFoundError:
+        return None
+    return state if not path.is_dir() or path.is_symlink() or any(path.iterdir()) else None
+
+
+def _try_rename(new: Path, name: Path) -> bool:
+    """Rename a folder; False where there is something at the new name but an empty folder. Raises OSError."""
+    try:
+        os.rename(new, name)
+    except OSError as error:
+        if error.errno in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
+            return False
+        raise
+    return True
+
+
+def _move_in(new: Path, name: Path, old: Path) -> None:
+    """Put a folder in the place of another in two steps. The next run repairs a process killed between them."""
+    os.rename(name, old)
+    try:
+        os.rename(new, name)
+    except BaseException:
+        with suppress(OSError):
+            os.rename(old, name)
+        raise
+
+
+@contextmanager
+def take_place(folder: Path, *, overwrite: bool) -> Iterator[ResultsPlace]:
+    """Lock the place of a results folder and remove leftovers of killed runs. Raises OutputError, nothing being
+    written.
+
+    In the end unfinished results are removed, and folders that were made for them.
+    """
+    check_target(folder, overwrite=overwrite)
+    with ExitStack() as stack:
+        try:
+            place = _take_place(folder, overwrite, stack)
+        except OSError as error:
+            raise OutputError(f"{folder}: cannot be written: {error.strerror or error}") from None
+        yield place
+
+
+def _take_place(folder: Path, overwrite: bool, stack: ExitStack) -> ResultsPlace:
+    path = folder.resolve()
+    room = os.pathconf("/", "PC_PATH_MAX") - _ROOM
+    if len(os.fsencode(path)) > room:
+        raise OutputError(f"{folder}: cannot be written: its whole path has more than {room} bytes")
+    for parent in (missing := [parent for parent in path.parents if not parent.exists()])[::-1]:
+        parent.mkdir(exist_ok=True)
+    stack.callback(_remove_empty, missing)
+    stack.enter_context(lock_folder(path))
+    notes = remove_leftovers(path)
+    check_target(folder, overwrite=overwrite)
+    scratch = stack.enter_context(make_scratch_folder(path))
+    scratch.will_hold([])
+    place = ResultsPlace(path, folder, path, scratch, _stat_folder(path), notes)
+    place.new.mkdir()
+    return place
+
+
+def _remove_empty(folders: Sequence[Path]) -> None:
+    """Remove folders as long as they are empty, the innermost first."""
+    with suppress(OSError):
+        for folder in folders:
+            folder.rmdir()
+
+
+def check_target(folder: Path, *, overwrite: bool) -> None:
+    """Raise OutputError where a results folder may not be written."""
+    try:
+        parent = next((place for place in Path(os.path.abspath(folder)).parents if place.exists()), Path("/"))
+        exists = _folder_exists(folder)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written: {error.strerror}") from None
+    if not parent.is_dir():
+        raise OutputError(f"{folder}: cannot be written: {parent} is a file")
+    if not os.access(parent, os.W_OK | os.X_OK):
+        raise OutputError(f"{folder}: cannot be written: no permission to write in {parent}")
+    if not exists:
+        return
+    if not folder.is_dir():
+        raise OutputError(f"{folder}: expected a folder for the results, found a file")
+    if not os.access(folder, os.R_OK | os.W_OK | os.X_OK):
+        raise OutputError(f"{folder}: cannot be written: no permission to replace what is in it")
+    empty = not any(folder.iterdir())
+    try:
+        held = None if empty else list_belongings(folder)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be replaced: {error.filename}: {error.strerror}") from None
+    if not empty and held is None:
+        raise OutputError(f"{folder}: not empty and no results folder; choose another with --out")
+    if not empty and not overwrite:
+        raise OutputError(
+            f"{folder}: results are there already; --overwrite replaces them, --out chooses another folder"
+        )
+    place = folder.resolve()
+    if place.is_mount() or place in (Path.cwd(), *Path.cwd().parents):
+        raise OutputError(f"{folder}: cannot be replaced, being in use or a mount point; choose a folder in it")
+
+
+def _folder_exists(folder: Path) -> bool:
+    """Whether a path exists. Raises OSError for an impossible one: a loop of links, a name that is too long."""
+    try:
+        os.stat(folder)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    return True
+
+
+def check_inputs(place: ResultsPlace, inputs: Sequence[Path]) -> None:
+    """Raise OutputError where an input of the run would go with the folder that is replaced."""
+    if place.before is None:
+        return
+    held = list_belongings(place.folder)
+    ours = None if held is None or held.results is None else held.results | held.made
+    for path in inputs:
+        if not path.resolve().is_relative_to(place.folder):
+            continue
+        name = path.resolve().relative_to(place.folder).as_posix()
+        goes = ours is None or any(one == name or one.startswith(f"{name}/") for one in ours)
+        if goes and name != EXPERIMENT:
+            raise OutputError(f"{place.asked}: {path} is in it and would go with it; choose another folder with --out")

@@ -1,0 +1,168 @@
+"""Errors of entries: what was drawn is found again, with intervals that hold it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from statsmodels.tsa.statespace.sarimax import SARIMAX
+
+from copem_replay.core.errors import InputError
+from copem_replay.fitting.error_memory import (
+    MemoryShares,
+    ResidualSeries,
+    fit_error_memory,
+    log_likelihood,
+    whiten_series,
+)
+from copem_replay.fitting.errors import fit_errors, remove_pose
+from copem_replay.fitting.estimate import Estimate
+from copem_replay.fitting.pose import PoseFit
+from copem_replay.perception.pem.error import Gaussian
+from tests.helpers.fit_rows import lasting_normals, rows_of
+
+
+def _series(rng: np.random.Generator, count: int, lists: int, **of: float) -> tuple[np.ndarray, ResidualSeries]:
+    gap_s = rng.uniform(0.05, 0.15, count * lists)
+    new = np.arange(count * lists) % lists == 0
+    gap_s[new] = 0.0
+    each = [lasting_normals(rng, np.cumsum(gap_s[k * lists : (k + 1) * lists]), **of, columns=2) for k in range(count)]
+    return np.concatenate(each), ResidualSeries(gap_s, new)
+
+
+def test_the_likelihood_of_a_drift_and_white_noise_is_that_of_statsmodels() -> None:
+    rng = np.random.default_rng(3)
+    z = rng.normal(size=60).cumsum() / 4
+    drift, tau_s, gap_s = 0.7, 0.8, 0.1
+    phi = np.exp(-gap_s / tau_s)
+    model = SARIMAX(z, order=(1, 0, 0), measurement_error=True)
+    expected = model.loglike([phi, 1 - drift, drift * (1 - phi**2)])
+    series = ResidualSeries(np.where(np.arange(60) == 0, 0.0, gap_s), np.arange(60) == 0)
+    out, variance = whiten_series(z[:, None], series, MemoryShares(drift, tau_s))
+    found = -0.5 * float((out**2).sum() + np.log(variance).sum() + 60 * np.log(2 * np.pi))
+    assert found == pytest.approx(expected, abs=1e-6)
+
+
+def test_the_likelihood_with_uneven_lists_and_a_constant_is_that_of_the_dense_covariance() -> None:
+    rng = np.random.default_rng(4)
+    z, series = _series(rng, 3, 7, drift=0.5, tau_s=0.4, constant=0.3)
+    shares = MemoryShares(0.5, 0.4, 0.3)
+    covariance = np.zeros((21, 21))
+    for k in range(3):
+        at = np.cumsum(series.gap_s[7 * k : 7 * k + 7])
+        apart = np.abs(at[:, None] - at)
+        covariance[7 * k : 7 * k + 7, 7 * k : 7 * k + 7] = 0.5 * np.exp(-apart / 0.4) + 0.3 + 0.2 * np.eye(7)
+    inverse, one, total = np.linalg.inv(covariance), np.ones(21), 0.0
+    for column in z.T:  # REML: the mean and the scale integrated out
+        rest = column - (one @ inverse @ column) / (one @ inverse @ one)
+        total -= 0.5 * (np.linalg.slogdet(covariance)[1] + np.log(one @ inverse @ one))
+        total -= 10 * np.log(rest @ inverse @ rest / 20)
+    assert log_likelihood(z, series, shares, centred=True) == pytest.approx(total, abs=1e-8)
+
+
+def test_drift_and_constant_are_found_again() -> None:
+    z, series = _series(np.random.default_rng(1), 60, 80, drift=0.6, tau_s=1.0, constant=0.2)
+    fit = fit_error_memory(z, series, centred=True)
+    drifting, always = fit.parts
+    assert always.correlation_s == "always"
+    assert not isinstance(drifting.correlation_s, str)
+    for estimate, true in ((drifting.share, 0.6), (drifting.correlation_s, 1.0), (always.share, 0.2)):
+        assert estimate.low <= true <= estimate.high
+        assert estimate.low <= estimate.value <= estimate.high
+        assert estimate.high - estimate.low < 0.9 * true
+    assert fit.untold is None
+
+
+@pytest.mark.parametrize(
+    ("drawn", "expected"),
+    [
+        ({"drift": 0.0, "tau_s": 1.0, "constant": 0.0}, "no memory"),
+        ({"drift": 0.8, "tau_s": 400.0, "constant": 0.0}, "s or constant"),
+    ],
+)
+def test_what_cannot_be_told_is_said(drawn: dict[str, float], expected: str) -> None:
+    z, series = _series(np.random.default_rng(2), 12, 60, **drawn)
+    fit = fit_error_memory(z, series, centred=True)
+    assert fit.untold is not None
+    assert expected in fit.untold
+    assert fit.shares.drift == 0
+
+
+def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
+    held = []
+    for seed in range(20):
+        rows, lists = rows_of(seed, passes=16, lists_each=60)
+        fit = fit_errors(rows, lists)
+        [part] = fit.memory["position"]
+        assert not isinstance(part.correlation_s, str)
+        assert fit.yaw_sigma_deg is not None
+        assert fit.size_sigma_m is not None
+        expected = [
+            (part.share, 0.6), (part.correlation_s, 1.0),
+            (fit.yaw_sigma_deg, np.rad2deg(0.05)), (fit.size_sigma_m, 0.3),
+        ]  # fmt: skip
+        for one in fit.bins:
+            expected += [(one.mean_m[0], 0.2), (one.mean_m[1], -0.1)]
+            expected += [(one.covariance_m2[0], 0.16), (one.covariance_m2[2], 0.04)]
+        held += [estimate.low <= true <= estimate.high for estimate, true in expected]
+    assert len(held) >= 160
+    assert np.mean(held) >= 0.88  # four standard errors below 0.95 of 160 numbers
+
+
+def test_bins_and_frame_are_chosen_where_they_explain_more() -> None:
+    rows, lists = rows_of(5, passes=40, spread=lambda r: (0.1 + 0.02 * r, 0.1 + 0.005 * r), memory=(0.3, 0.3, 0.0))
+    fit = fit_errors(rows, lists, edges_m=(20.0,))
+    assert fit.frame == "line_of_sight"
+    near, far = fit.bins
+    assert near.where.when == {"range_m": [0.0, 20.0]}
+    assert 2 * near.covariance_m2[0].high < far.covariance_m2[0].low
+    assert [rung.name for rung in fit.ladder if rung.chosen] == ["by range + memory"]
+    assert len(fit_errors(rows, lists, simplest=True).bins) == 1
+
+
+def test_what_is_written_is_what_is_replayed() -> None:
+    rows, lists = rows_of(6)
+    fit = fit_errors(rows, lists)
+    model = Gaussian.model_validate(fit.yaml_error(fit.bins[0]))
+    assert model.covariance_m2[0][0] == pytest.approx(fit.bins[0].covariance_m2[0].value, rel=1e-3)
+    assert model.speed_sigma_mps == 0
+    assert fit.untold["speed"] == "the lists have no such field"
+    flat_m = np.array([np.zeros(len(rows.listed)), np.zeros(len(rows.listed)), np.full(len(rows.listed), np.nan)])
+    assert fit_errors(replace(rows, size_m=flat_m), lists).untold["size"] == "the lists have only some of its fields"
+    assert fit.yaml_memory["position"][0]["share"] == pytest.approx(fit.shares.drift, abs=1e-3)
+
+
+def test_a_field_that_is_never_filled_is_no_measurement() -> None:
+    rows, lists = rows_of(9)
+    fit = fit_errors(replace(rows, speed_mps=np.where(rows.listed, 0.0 - rows.view.speed_mps, np.nan)), lists)
+    assert fit.speed_sigma_mps is None
+    assert fit.untold["speed"] == "the same in every entry"
+    reversed_yaw = np.where(np.arange(len(rows.log)) % 4 == 0, rows.yaw_rad - np.pi, rows.yaw_rad)
+    fit = fit_errors(replace(rows, yaw_rad=reversed_yaw), lists)
+    assert fit.yaw_sigma_deg is None
+    assert fit.untold["yaw"].endswith("% of the entries point backwards, which no Gaussian does")
+
+
+def test_what_the_pose_explains_is_not_in_the_errors_too() -> None:
+    rows, lists = rows_of(9)
+    fit = fit_errors(rows, lists)
+    assert remove_pose(fit, PoseFit(untold="no pair")) is fit
+    placed = PoseFit(Estimate(0.1), Estimate(float(np.rad2deg(0.005))))
+    [one], [less] = fit.bins, remove_pose(fit, placed).bins
+    far_m = one.where.range_m[1]
+    assert less.covariance_m2[0].value == pytest.approx(one.covariance_m2[0].value - 0.01)
+    expected = one.covariance_m2[2].value - 0.01 - 0.005**2 * far_m**2 / 3  # the mean of r² between 0 and there
+    assert less.covariance_m2[2].value == pytest.approx(expected)
+    assert less.covariance_m2[2].high < one.covariance_m2[2].high
+    huge = remove_pose(fit, PoseFit(Estimate(5.0), Estimate(0.0))).bins[0]
+    assert huge.covariance_m2[0].value == pytest.approx(one.covariance_m2[0].value / 20)
+
+
+def test_few_passes_are_scored_by_bic() -> None:
+    rows, lists = rows_of(7, passes=3)
+    assert {rung.by for rung in fit_errors(rows, lists).ladder} == {"BIC"}
+
+
+def test_too_few_entries_are_refused_with_a_reason() -> None:
+    rows, lists = rows_of(8, passes=1, lists_each=20, listed=0.1)
+    with pytest.raises(InputError, match="errors need at least 8"):
+        fit_errors(rows, lists)
