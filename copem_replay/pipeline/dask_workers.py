@@ -30,6 +30,9 @@ WAIT_S = 600.0
 """Seconds to wait for a scheduler that is gone or has no worker: a machine that restarts is up again by then."""
 _ANSWERS_S = 10.0
 """Seconds to wait for a scheduler at the beginning: Dask's own default is 30, a wrong address is found out sooner."""
+_FETCHES_S = 60.0
+"""Seconds to wait for a receipt, a few hundred bytes. Where its client closes meanwhile Dask waits without end, and
+with it all later receipts: one thread hands them over."""
 _LOOKS = 1000
 """Tasks that are searched for one whose log a worker has in memory. More take longer; no result depends on it."""
 _STARTS_S = 60.0
@@ -118,8 +121,9 @@ class DaskWorkers(Workers):
         key = f"copem-{secrets.token_hex(8)}"
         self._given[key] = future, len(task.keys)
         try:
-            given = self._client.submit(_do_at_worker, task, key=key, pure=False)
-            given.add_done_callback(lambda _: self._landed(task, given, future))
+            client = self._client
+            given = client.submit(_do_at_worker, task, key=key, pure=False)
+            given.add_done_callback(lambda _: self._landed(task, given, future, client))
         except Exception:
             if self._client.status not in _CLOSED:
                 raise
@@ -210,11 +214,13 @@ class DaskWorkers(Workers):
                 with suppress(InvalidStateError):
                     future.set_exception(WorkerDiedError(self._deaths[key], host, alone=alone))
 
-    def _landed(self, task: Task, given: Any, future: Future[Receipt]) -> None:
+    def _landed(self, task: Task, given: Any, future: Future[Receipt], client: Any) -> None:
         """Hand over the result of a task."""
         with suppress(InvalidStateError):  # the task is not wanted any more
             try:
-                worker, receipt = given.result()
+                if client.status in _CLOSED:
+                    raise CancelledError
+                worker, receipt = given.result(timeout=_FETCHES_S)
                 self._has[task.log] = worker
                 self._idle.append(worker)
                 future.set_result(receipt)
@@ -240,7 +246,7 @@ def _do_at_worker(task: Task) -> tuple[str, Receipt]:
 
 def _give_up(future: Future[Receipt]) -> None:
     """Cancel a task whose scheduler is gone."""
-    if future.cancel():
+    if not future.cancelled() and future.cancel():  # once: a future tells of its end one time
         future.set_running_or_notify_cancel()
 
 

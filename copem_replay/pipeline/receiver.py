@@ -429,8 +429,8 @@ class _SharedLists:
 
     @cached_property
     def without_truth_ids(self) -> tuple[ObjectLists, Int]:
-        """What `_remove_truth_ids` gives: the units' lists, and which entries a partial unit takes for one object."""
-        return _remove_truth_ids(self.world, self.seen("sampled"), self._runs, self.ghosts)
+        """What `remove_truth_ids` gives: the units' lists, and which entries a partial unit takes for one object."""
+        return remove_truth_ids(self.world, self.seen("sampled"), self._runs, self.ghosts)
 
     def fuse_ideal(
         self, heard: Tracks, at: FusionSchedule, kept: KeptEntries | None, states: States, *,
@@ -482,7 +482,7 @@ def _find_faults(world: WorldChunk, seen: Tracks, ghosts: GhostRows | None) -> U
     return UnitFaults(rows, not_made)
 
 
-def _remove_truth_ids(
+def remove_truth_ids(
     world: WorldChunk, seen: Tracks, runs: Int, ghosts: GhostRows | None = None
 ) -> tuple[ObjectLists, Int]:
     """The units' lists as a real fusion sees them: without truth ids, the entries of each in a random order.

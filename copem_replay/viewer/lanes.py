@@ -217,7 +217,7 @@ def write_list_fates(out: RecordingSink, name: str, lists: Sequence[UnitLists]) 
         )
         for unit_lists in lists
         for fate in (LOST, LATE, OVERTAKEN)
-        for group in _group_fates(unit_lists, fate)
+        for group in group_fates(unit_lists, fate)
     )
     columns = rr.TextLog.columns(text=[text for _, _, text in rows], level=[level for _, level, _ in rows])
     out.columns(
@@ -225,7 +225,7 @@ def write_list_fates(out: RecordingSink, name: str, lists: Sequence[UnitLists]) 
     )
 
 
-def _group_fates(unit_lists: UnitLists, fate: int) -> Iterator[list[int]]:
+def group_fates(unit_lists: UnitLists, fate: int) -> Iterator[list[int]]:
     """Indices of the lists of one fate that share a row."""
     group: list[int] = []
     for k in np.flatnonzero(unit_lists.fate == fate).tolist():

@@ -13,7 +13,7 @@ from copem_replay.cli import main as cli
 from copem_replay.core.errors import InputError
 from copem_replay.experiment.file import log_paths, read_experiment_file
 from copem_replay.experiment.validate import find_problems, read_logs
-from copem_replay.io.write.foxglove_layout import _split_panels, build_layout
+from copem_replay.io.write.foxglove_layout import build_layout, split_panels
 from copem_replay.pipeline.run import run_experiment
 from copem_replay.results.write import write_results
 from copem_replay.viewer.rrd import EXPORTERS
@@ -120,7 +120,7 @@ def test_the_sample_layout_is_what_the_command_makes(
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 5])
 def test_parts_of_a_split_are_alike(count: int) -> None:
-    found = leaves(_split_panels("row", [str(k) for k in range(count)]))
+    found = leaves(split_panels("row", [str(k) for k in range(count)]))
     assert [panel for panel, *_ in found] == [str(k) for k in range(count)]
     assert [wide for _, wide, _ in found] == pytest.approx([1 / count] * count, abs=1e-4)
 

@@ -31,7 +31,7 @@ from copem_replay.experiment.validate import find_problems
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.braking.encounter import EgoPath
 from copem_replay.metrics.config import Conflict
-from copem_replay.metrics.detection.conflict import _will_enter, build_corridors
+from copem_replay.metrics.detection.conflict import build_corridors, will_enter
 from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.replay import replay_block
@@ -322,7 +322,7 @@ class TestOracle:
         standing_there = boxes(0.0, 0.0, yaws[1], *piece)[0]
         near_m = float(shapely.distance(moved, standing_there).min())
         other = np.array([far_m, -far_m, yaws[1], *piece])
-        found = _will_enter(place[0] + far_m, place[1] - far_m, yaws[0], *velocity, *size, other, horizon_s)
+        found = will_enter(place[0] + far_m, place[1] - far_m, yaws[0], *velocity, *size, other, horizon_s)
         # Between two steps it moves less than this; and rounding.
         step_m = math.hypot(*velocity) * horizon_s / 200 + 1e-6
         smaller = boxes(0.0, 0.0, yaws[1], piece[0] - 2e-6, piece[1] - 2e-6)[0]
@@ -333,7 +333,7 @@ class TestOracle:
 
     @pytest.mark.parametrize(("y_m", "expected"), [(2.0, True), (2.001, False)])
     def test_boxes_that_stand_side_by_side_meet_where_they_touch(self, y_m: float, expected: bool) -> None:
-        assert _will_enter(0.0, y_m, 0.0, 0.0, 0.0, 4.0, 2.0, np.array([0.0, 0.0, 0.0, 4.0, 2.0]), 3.0) is expected
+        assert will_enter(0.0, y_m, 0.0, 0.0, 0.0, 4.0, 2.0, np.array([0.0, 0.0, 0.0, 4.0, 2.0]), 3.0) is expected
 
     @given(drawn=logs(), horizon_s=st.floats(0.1, 4), margin_m=st.floats(0, 1.5))
     @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])

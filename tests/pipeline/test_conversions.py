@@ -20,7 +20,7 @@ from copem_replay.fusion.interface import make_inbox
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.matching import DUPLICATE, GHOST, MATCH, match_entries
 from copem_replay.pipeline.prepare import prepare_log
-from copem_replay.pipeline.receiver import _remove_truth_ids, convert_to_tracks, perceive_all_units, run_receivers
+from copem_replay.pipeline.receiver import convert_to_tracks, perceive_all_units, remove_truth_ids, run_receivers
 from copem_replay.pipeline.world import WorldChunk
 from tests.helpers.reports import inputs_of, lists_of
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
@@ -154,7 +154,7 @@ def told_in(plan: Experiment, log: Recording, runs: Sequence[int] = (0,)) -> tup
     """What the units list with truth ids, and without."""
     world = world_of(plan, log)
     seen = perceive_all_units(world, np.array(runs), states="sampled")
-    return seen, _remove_truth_ids(world, seen, np.array(runs))[0]
+    return seen, remove_truth_ids(world, seen, np.array(runs))[0]
 
 
 def as_sets(lists: ObjectLists, run: int = 0) -> list[Counter[bytes]]:

@@ -371,6 +371,27 @@ def test_a_client_that_has_closed_itself_gives_up_its_tasks(connected: Callable[
     assert closed
 
 
+def test_a_receipt_that_does_not_come_is_given_up(
+    connected: Callable[..., DaskWorkers], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Dask's client waits without end for a result where it closes in that moment."""
+    import distributed
+
+    plain, computed, _ = replayed(study(), "plain", pieces="alone")
+    workers, late, fetch = connected(), list[bool](), distributed.Future.result
+
+    def fetch_late(future: Any, timeout: float | None = None) -> Any:
+        assert timeout is not None
+        if not late:
+            late.append(True)
+            raise TimeoutError(f"timed out after {timeout} s.")
+        return fetch(future, timeout)
+
+    monkeypatch.setattr(distributed.Future, "result", fetch_late)
+    assert replayed(study(), "dask", pieces="kept", crew=workers) == (plain, computed, 0)
+    assert late
+
+
 def test_what_a_crew_needs(here: Path) -> None:
     Path("e.yaml").write_text(study())
     with ThreadPoolExecutor(1) as pool:

@@ -20,7 +20,7 @@ from copem_replay.fusion.interface import ListFusion, ask_fusion
 from copem_replay.io.recording import Recording
 from copem_replay.pipeline import replay as blocks_module
 from copem_replay.pipeline.prepare import prepare_log
-from copem_replay.pipeline.receiver import ReceiverOutput, _remove_truth_ids, perceive_all_units, run_receivers
+from copem_replay.pipeline.receiver import ReceiverOutput, perceive_all_units, remove_truth_ids, run_receivers
 from copem_replay.pipeline.run import ExperimentResult, run_experiment
 from tests.helpers.experiments import changed, drive
 from tests.helpers.reports import inputs_of
@@ -104,7 +104,7 @@ class TestWhatDoesNotMatter:
         plan, runs = noisy(), np.arange(3)
         world = prepare_log(crowd(), plan).world(plan)
         seen = perceive_all_units(world, runs, states="sampled")
-        lists = _remove_truth_ids(world, seen, runs)[0]
+        lists = remove_truth_ids(world, seen, runs)[0]
         heard = transmit(seen, [UnitLinks("link", ConstantLink(latency_s=latency_s))])
         told = make_inputs(heard, lists, max_age_s=1.0)
         rng = np.random.default_rng(0)

@@ -17,7 +17,7 @@ from copem_replay.pipeline import prepare as chunking
 from copem_replay.pipeline.notes import measure_list_rates
 from copem_replay.pipeline.one_run import RunTracks, tracks_of_run
 from copem_replay.pipeline.prepare import prepare_log
-from copem_replay.viewer.lanes import FATES, LANES, UnitLists, _group_fates, find_linked_lists, select_list_lanes
+from copem_replay.viewer.lanes import FATES, LANES, UnitLists, find_linked_lists, group_fates, select_list_lanes
 from tests.helpers.scenes import EGO_UNIT, SEES_ALL, Thing, experiment, recording, standing
 from tests.viewer.test_line_of_sight import PERSON
 from tests.viewer.test_rrd import Made, make, rerun, rows, static
@@ -134,7 +134,7 @@ def test_lists_that_follow_soon_are_told_together_and_the_last_one_has_no_next(m
         "air: pole: 51 lists lost, captured 0.00 to 5.00 s, none arrives after"
     ]
     long = UnitLists("pole", (), np.arange(120) / 10, np.full(120, np.inf), np.arange(120) % 2, 0.1)
-    assert [len(some) for some in _group_fates(long, 1)] == [26, 26, 8]
+    assert [len(some) for some in group_fates(long, 1)] == [26, 26, 8]
 
 
 def test_older_than_what_counts_is_late_however_usual(made: Made, tmp_path: Path) -> None:

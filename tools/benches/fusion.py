@@ -29,7 +29,7 @@ from copem_replay.fusion.tracker import Tracker
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.gospa import gospa, gospa_pairs
 from copem_replay.pipeline.prepare import prepare_log
-from copem_replay.pipeline.receiver import _remove_truth_ids, hear_units, perceive_all_units
+from copem_replay.pipeline.receiver import hear_units, perceive_all_units, remove_truth_ids
 from copem_replay.pipeline.replay import cut_blocks
 from copem_replay.pipeline.world import WorldChunk
 from tests.oracles import gnn as gnn_oracle
@@ -82,7 +82,7 @@ def crossing(experiment: Experiment, recording: Recording) -> Iterator[common.Li
     world = ready.world(experiment)
     cut = cut_blocks(ready, experiment, 2)[:2]
     seen = [perceive_all_units(world, runs, states="sampled") for runs in cut]
-    told = [_remove_truth_ids(world, each, runs)[0] for each, runs in zip(seen, cut, strict=True)]
+    told = [remove_truth_ids(world, each, runs)[0] for each, runs in zip(seen, cut, strict=True)]
     with ThreadPoolExecutor(2) as pool:
         for name in world.experiment.configurations:
             parts = [_fusing(world, name, *each) for each in zip(seen, told, strict=True)]

@@ -95,7 +95,7 @@ def build_layout(replay: Path, compare: Sequence[str] = ()) -> dict[str, Any]:
         "globalVariables": {},
         "userNodes": {},
         "playbackConfig": {"speed": 1},
-        "layout": _stack_below(rows, _split_panels("row", list(strip))) if strip else rows,
+        "layout": _stack_below(rows, split_panels("row", list(strip))) if strip else rows,
     }
 
 
@@ -154,12 +154,12 @@ def _stack_below(scenes: Any, told: Any) -> dict[str, Any]:
 def _arrange_grid(panels: Sequence[str]) -> Any:
     """A grid of rows of up to three panels; panels of a row have one width, rows one height."""
     wide = 3 if len(panels) in (3, 5, 6) or len(panels) > 8 else 2
-    return _split_panels("column", [_split_panels("row", panels[k : k + wide]) for k in range(0, len(panels), wide)])
+    return split_panels("column", [split_panels("row", panels[k : k + wide]) for k in range(0, len(panels), wide)])
 
 
-def _split_panels(direction: str, parts: Sequence[Any]) -> Any:
+def split_panels(direction: str, parts: Sequence[Any]) -> Any:
     """The panels side by side; a split has two sides, so the second holds the rest."""
     if len(parts) == 1:
         return parts[0]
-    rest = _split_panels(direction, parts[1:])
+    rest = split_panels(direction, parts[1:])
     return {"first": parts[0], "second": rest, "direction": direction, "splitPercentage": round(100 / len(parts), 3)}

@@ -157,7 +157,7 @@ def _mark_conflicts(
             if not valid[s, p]:
                 continue
             for c in range(bounds[frame_ix[p]], bounds[frame_ix[p] + 1]):
-                if _will_enter(
+                if will_enter(
                     x[s, p], y[s, p], yaw[s, p], vx[s, p], vy[s, p], length[s, p], width[s, p], pieces[c], horizon_s
                 ):
                     out[s, p] = True
@@ -165,7 +165,7 @@ def _mark_conflicts(
 
 
 @nb.njit(cache=True)
-def _will_enter(
+def will_enter(
     x: float, y: float, yaw: float, vx: float, vy: float, length: float, width: float, piece: Float, horizon_s: float
 ) -> bool:
     """Whether a box that moves straight on without turning meets a standing one within the horizon.
