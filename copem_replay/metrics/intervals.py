@@ -1,251 +1,264 @@
-"""Intervals: of shares over independent rows (Wilson), and over whole clusters of dependent rows: logs, objects or
-runs.
+"""Intervals: how far a figure may be from that of all such traffic, by the drives at hand. Nothing is drawn for them.
 
-*Resample*: as many clusters as there are, drawn with replacement. Below `DRAWN_FROM` clusters all resamples that differ
-are enumerated, each counting as often as it would be drawn; else `RESAMPLES` are drawn, by random numbers that are
-addressed by the clusters' names: all configurations and metrics resample the same clusters, at every call.
-*Percentile limits*: quantiles of a figure over all resamples, widened for few clusters.
-*Exact limits*: of k successes in n trials (Clopper–Pearson). Clusters count as n = (Σw)²/Σw² trials, w being their
-numbers of rows (Kish's effective size), and k = share · n. A cluster is no more extreme than all or nothing, so the
-limits are wide enough for any share in between; percentiles see no spread where all clusters are alike.
+*Cluster*: rows that hang together. Logs, from `FEWEST_LOGS` on; in a single log its objects, from `FEWEST_CLUSTERS` on;
+of a single object its runs. Of two logs there is no interval: how drives differ cannot be told from two, and objects of
+several logs are never taken as independent (`choose_over`).
+*Share*: exact limits (Clopper–Pearson) of p·n of n trials, n an effective number of objects: no more than there are
+once objects of one log hang together by `WITHIN_LOG`, nor than the spread between logs tells (`limit_share`).
+*Any other figure*: value ± t·√V, from the figure without each cluster (`limit_figure`), at most `MOST_GROUPS` times.
+*Quantile*: all values at which the limits of the share at or below them hold the quantile's level (`limit_quantile`).
 *Nothing drawn*: where no random number is behind a result it is equal in every run, and an interval over runs tells
 nothing (`find_fixed_outcomes`).
 
-Letters of the shapes: R resamples, K clusters.
+Limits are at 95 %. What they hold, and what not: tools/coverage.py, docs/guide/metrics.md. Functions of arrays take any
+leading axes (…). Letters of the shapes: K clusters, G values.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
-from itertools import combinations_with_replacement
-from statistics import NormalDist
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
-from copem_replay.core.random import CounterRng, RandomKey, object_words
+from copem_replay.core.errors import count_noun
 from copem_replay.core.tracks import TRUTH, Float, Int
 
-Counts = NDArray[np.uint32]
-
-RESAMPLES = 2000
-"""Bootstrap resamples: the share beyond a 95 % limit is then off by .0035 (one standard error)."""
-DRAWN_FROM = 8
-"""From so many clusters on resamples are drawn: of seven there are 1,716 different ones, of eight 6,435."""
-EXACT_BELOW = 100
-"""Over fewer clusters, by effective size, a share's limits are never narrower than the exact ones (decision 19)."""
-FEWEST_EACH = 10
-"""Nor where fewer clusters than this, by effective size, succeed or fail: coverage by `tools/coverage.py`."""
+FEWEST_LOGS = 3
+"""From so many logs on intervals are over logs."""
 FEWEST_CLUSTERS = 5
-"""Fewer logs or objects are not resampled: coverage is measured from five clusters on (`tools/coverage.py`)."""
-_CELLS = 4_000_000
-"""Numbers held at a time, 32 MB: the size of blocks, which changes no result."""
+"""Over fewer objects of one log, or runs of one object, there is no interval of a figure."""
+MOST_GROUPS = 200
+"""More clusters are joined to so many groups before a figure is computed without each."""
+WITHIN_LOG = 0.2
+"""Correlation of two objects of a log that few logs cannot refute; on recorded drives .02 to .10."""
+CONFIDENCE = 0.95
+_TAIL = (1.0 - CONFIDENCE) / 2
 _ROUNDING = 1e-9
-"""Effective numbers of clusters that differ by rounding only are equal."""
+"""Numbers of trials, and figures, that differ by less differ by rounding only."""
+
+# What an interval is over.
+
+_TELLS = {
+    "logs": "how far other drives of this kind may differ",
+    "objects": "how far other objects of this drive may differ; nothing about other drives",
+    "runs": "how far other draws of the same models may differ for this one object; nothing about other traffic",
+}
+_UNITS = {"logs": ("log", ""), "objects": ("object", " of this drive"), "runs": ("run", " of this one object")}
 
 
-@dataclass(frozen=True)
-class Resamples:
-    """`count (R, K)`: how often each resample has each cluster; `times (R,)`: how many resamples are like this one."""
-
-    count: Counts
-    times: Int
+def choose_over(logs: int, objects: int) -> str | None:
+    """What an interval is over: `logs`, `objects` or `runs`; None: nothing. `logs`, `objects`: how many have rows."""
+    if logs >= FEWEST_LOGS:
+        return "logs"
+    if logs != 1:
+        return None
+    return "runs" if objects == 1 else "objects" if objects >= FEWEST_CLUSTERS else None
 
 
 def choose_clusters(table: pd.DataFrame) -> tuple[str | None, pd.Series]:
-    """The kind of cluster that is resampled (`runs`, `logs`, `objects`; None: too few), and each row's cluster (n,).
+    """What an interval of a table's rows is over, as by `choose_over`, and each row's cluster (n,).
 
-    Rows of a tally stand for several runs: where runs are resampled they form one cluster.
+    Rows of a tally stand for several runs: where the interval is over runs they form one cluster.
     """
     log = table["log"].astype(str)
     episode = log + "\n" + table["object_id"].astype(str)
-    if episode.nunique() == 1:
-        return "runs", table["run"].astype(str) if "run" in table else episode
-    if log.nunique() >= FEWEST_CLUSTERS:
-        return "logs", log
-    return ("objects" if episode.nunique() >= FEWEST_CLUSTERS else None), episode
+    over = choose_over(log.nunique(), episode.nunique())
+    if over == "runs" and "run" in table:
+        return over, table["run"].astype(str)
+    return over, log if over == "logs" else episode
 
 
-def draw_resamples(names: Sequence[str], seed: int, number: int = RESAMPLES) -> Resamples:
-    """All resamples of the named clusters below `DRAWN_FROM` clusters, else `number` drawn ones."""
-    if len(names) < DRAWN_FROM:
-        return list_resamples(len(names))
-    zeros = np.zeros(len(names), dtype=np.int64)
-    random_key, rng = RandomKey(("",), zeros, object_words(names), zeros), CounterRng(seed, "summary")
-    size = max(1, _CELLS // len(names))
-    blocks = [np.arange(r, min(r + size, number)) for r in range(0, number, size)]
-    count = np.concatenate([count_multiplicities(rng.uniform("bootstrap", random_key, block)) for block in blocks])
-    return Resamples(count, np.ones(number, dtype=np.int64))
+def describe_clusters(over: str, number: int | None = None) -> str:
+    """What an interval is over, and what it tells: `8 logs: how far other drives of this kind may differ`."""
+    noun, whose = _UNITS[over]
+    counted = f"{noun}s" if number is None else count_noun(number, noun)
+    return f"{counted}{whose}: {_TELLS[over]}"
 
 
-@cache
-def list_resamples(clusters: int) -> Resamples:
-    """All resamples of K clusters that differ, the order of drawing aside; `times` add up to K^K."""
-    numbers = np.arange(clusters)
-    drawn = np.array(list(combinations_with_replacement(range(clusters), clusters)))
-    count = (drawn[:, :, None] == numbers).sum(axis=1).astype(np.uint32)
-    factorial = np.array([math.factorial(k) for k in range(clusters + 1)])
-    times = factorial[clusters] // factorial[count].prod(axis=1)
-    count.flags.writeable = times.flags.writeable = False  # kept for the next call
-    return Resamples(count, times)
-
-
-def count_multiplicities(uniform: Float) -> Counts:
-    """(R, K) how often each cluster is drawn: of `uniform (R, K)`, between 0 and 1, u draws cluster ⌊u·K⌋."""
-    R, K = uniform.shape
-    drawn = (uniform * K).astype(np.int64) + K * np.arange(R)[:, None]
-    return np.bincount(drawn.ravel(), minlength=uniform.size).reshape(R, K).astype(np.uint32)
-
-
-def percentile_limits(values: Float, resampled: Resamples, *, confidence: float = 0.95) -> tuple[float, float]:
-    """Quantiles of a figure (R,) of each resample, linear between neighbours: (low, high).
-
-    At the levels of a confidence, widened for few clusters (`expand_tail`). A resample that stands for several counts
-    as often.
-
-    Resamples without a figure, NaN, are left out; both limits are NaN where none is left. A limit that is infinite, or
-    NaN between −∞ and ∞, does not exist.
-
-    Source: B. Efron, "Nonparametric standard errors and confidence intervals", Canad. J. Statist. 9 (1981) 139–158
-    (percentile method).
-    """
-    tail = expand_tail(confidence, resampled.count.shape[1])
-    defined = ~np.isnan(values)
-    if not defined.any():
-        return math.nan, math.nan
-    order = np.argsort(values[defined], kind="stable")
-    ranked, until = values[defined][order], np.cumsum(resampled.times[defined][order])
-    low, high = (_weighted_quantile(ranked, until, level) for level in (tail, 1.0 - tail))
-    return low, high
-
-
-def _weighted_quantile(ranked: Float, until: Int, level: float) -> float:
-    """The quantile at `level` of values (R,), ascending; `until (R,)`: how many resamples they stand for up to each."""
-    place = level * (int(until[-1]) - 1)
-    first = math.floor(place)
-    below, above = (
-        float(ranked[np.searchsorted(until, min(k, until[-1] - 1), side="right")]) for k in (first, first + 1)
+def explain_no_clusters(logs: int, objects: int) -> str:
+    """Why there is no interval, where `choose_over` says so."""
+    if logs == 1:
+        return (
+            f"{count_noun(objects, 'object')} of one drive, fewer than {FEWEST_CLUSTERS}; more runs say nothing about "
+            "other traffic"
+        )
+    return (
+        f"{count_noun(logs, 'log')}, fewer than {FEWEST_LOGS}: how drives differ cannot be told, and objects of "
+        "several logs are not pooled"
     )
-    # Of two infinite neighbours the difference would be NaN.
-    return below if below == above or place == first else below + (above - below) * (place - first)
 
 
-def expand_tail(confidence: float, clusters: int) -> float:
-    """The probability beyond each limit of a percentile interval over `clusters` clusters, at most (1 − confidence)/2.
-
-    A resample of K clusters varies less than K fresh ones would, by √((K − 1)/K), and its quantiles are normal ones
-    where Student's are due: with 5 clusters plain percentiles hold the truth 86 times of 100, not 95. The level is
-    Φ(−t·√(K/(K − 1))), t the two-sided quantile of Student's distribution with K − 1 degrees of freedom. With one
-    cluster nothing varies: the plain level.
-
-    Source: T. C. Hesterberg, "What teachers should know about the bootstrap", Amer. Statist. 69 (2015) 371–386
-    (expanded percentile interval).
-    """
-    from scipy.special import ndtr, stdtrit
-
-    tail = (1.0 - confidence) / 2
-    if clusters == 1:
-        return tail
-    return float(ndtr(stdtrit(clusters - 1, tail) * math.sqrt(clusters / (clusters - 1))))
+def absent_share(logs: int) -> float:
+    """The largest share of traffic that may be of a kind which none of so many logs has, at 95 %: 1 − .05^(1/K)."""
+    return float(1.0 - (1.0 - CONFIDENCE) ** (1.0 / logs))
 
 
-def exact_limits(successes: float, n: float, *, confidence: float = 0.95) -> tuple[float, float]:
-    """Bound the probability of success given `successes` of `n` independent trials exactly: (low, high), shares.
+def describe_absent(logs: int) -> str:
+    """What so many logs cannot exclude, whatever the interval: a kind of drive that none of them is."""
+    return f"a kind of drive that makes up to {100 * absent_share(logs):.0f} % of such traffic can be absent"
 
-    The limits enclose all p with which so few successes, and so many, have a probability of at least
-    (1 − confidence)/2. Neither number need be whole: the limits are quantiles of beta distributions.
+
+# Shares.
+
+
+def exact_limits(successes: float | Float, n: float | Float) -> tuple[Float, Float]:
+    """Bound the probability of success given `successes` of `n` independent trials exactly: (low, high), shares (…).
+
+    The limits enclose all p with which so few successes, and so many, have a probability of at least .025. Neither
+    number need be whole: the limits are quantiles of beta distributions.
 
     Source: C. J. Clopper, E. S. Pearson, "The use of confidence or fiducial limits illustrated in the case of the
     binomial", Biometrika 26 (1934) 404–413.
     """
     from scipy.special import betaincinv
 
-    tail, failures = (1.0 - confidence) / 2, n - successes
-    low = 0.0 if successes <= _ROUNDING else float(betaincinv(successes, max(failures, 0.0) + 1.0, tail))
-    high = 1.0 if failures <= _ROUNDING else float(betaincinv(max(successes, 0.0) + 1.0, failures, 1.0 - tail))
-    return low, high
+    k, n = np.broadcast_arrays(np.asarray(successes, dtype=float), np.asarray(n, dtype=float))
+    none, all_of_them = k <= _ROUNDING, n - k <= _ROUNDING
+    failures = np.where(all_of_them, 0.0, n - k)
+    low = betaincinv(np.where(none, 1.0, k), failures + 1.0, _TAIL)
+    high = betaincinv(np.where(none, 0.0, k) + 1.0, np.where(all_of_them, 1.0, failures), 1.0 - _TAIL)
+    return np.where(none, 0.0, low), np.where(all_of_them, 1.0, high)
 
 
-def effective_number(weights: Float | Int) -> float:
-    """The number of equal clusters that weights (K,) ≥ 0, one of them above 0, amount to: (Σw)²/Σw², from 1 to K.
+def limit_share(
+    successes: Float | Int, rows: Float | Int, objects: float | Float | Int | None = None
+) -> tuple[Float, Float]:
+    """Bound Σ successes / Σ rows over K clusters: (low, high), shares (…).
 
-    Source: L. Kish, "Survey Sampling", Wiley 1965, section 11.2.
+    `successes (…, K)` of `rows (…, K)`; a cluster without rows is none. `objects (…)`: how many the rows are about,
+    None: one in each cluster; rows weigh so that together they are as many.
     """
-    weights = np.asarray(weights, dtype=float)
-    return float(weights.sum() ** 2 / (weights @ weights))
+    rows = np.asarray(rows, dtype=float)
+    objects = (rows > 0).sum(axis=-1) if objects is None else objects
+    total, scale = rows.sum(axis=-1), np.asarray(objects, dtype=float) / rows.sum(axis=-1)
+    share = np.sum(successes, axis=-1) / total
+    residual = (successes - share[..., None] * rows) * scale[..., None]
+    weights = rows * scale[..., None]
+    return spread_share(share, share_variance(residual, weights), weights)
 
 
-def bootstrap_share(
-    successes: Float | Int, totals: Float | Int, resampled: Resamples, *, confidence: float = 0.95
-) -> tuple[float, float]:
-    """Bound Σ successes / Σ totals by percentiles over resamples of whole clusters: (low, high), shares.
+def share_variance(residual: Float, weights: Float) -> Float:
+    """(…) variance of a share, from residuals (…, K), s_g − p·w_g, of clusters with weights (…, K): point estimate."""
+    clusters = (weights > 0).sum(axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):  # one cluster: no variance
+        variance: Float = clusters / (clusters - 1.0) * (residual**2).sum(axis=-1) / weights.sum(axis=-1) ** 2
+    return np.where(clusters > 1, variance, 0.0)
 
-    `successes (K,)` of `totals (K,)` in each cluster, 0 ≤ successes ≤ totals; a total may be 0, and a resample without
-    any is left out. The interval of the failures is the mirror image.
+
+def spread_share(share: Float, variance: Float, weights: Float) -> tuple[Float, Float]:
+    """Exact limits (…) of a share with a variance (…) over clusters that have so many objects each, `weights (…, K)`.
+
+    Of n objects, m = Σw²/Σw in an average object's cluster, at most n/(1 + .2·(m − 1)) count; nor more than
+    p(1 − p)/variance, times (t of n − 1 / t of K − 1)² as few clusters show little of how they vary. One at least.
     """
-    sums = np.empty((len(resampled.count), 2))
-    columns = np.stack([successes, totals], axis=1).astype(float)
-    size = max(1, _CELLS // len(columns))
-    for r in range(0, len(sums), size):
-        sums[r : r + size] = resampled.count[r : r + size].astype(float) @ columns
-    with np.errstate(invalid="ignore"):  # a resample without a total has no share
-        return percentile_limits(sums[:, 0] / sums[:, 1], resampled, confidence=confidence)
+    from scipy.special import stdtrit
+
+    n, clusters = weights.sum(axis=-1), (weights > 0).sum(axis=-1)
+    counted = n / (1.0 + WITHIN_LOG * ((weights**2).sum(axis=-1) / n - 1.0))
+    spread = share * (1.0 - share)
+    told = (variance > 0) & (spread > _ROUNDING**2) & (clusters > 1)
+    ratio = stdtrit(np.where(told, n - 1.0, 1.0), _TAIL) / stdtrit(np.where(told, clusters - 1.0, 1.0), _TAIL)
+    by_spread = np.where(told, spread / np.where(told, variance, 1.0) * ratio**2, np.inf)
+    effective = np.maximum(np.minimum(counted, by_spread), 1.0)
+    return exact_limits(np.clip(share, 0.0, 1.0) * effective, effective)
 
 
-def share_limits(successes: Float | Int, totals: Float | Int, resampled: Resamples) -> tuple[str, float, float]:
-    """Bound Σ successes / Σ totals: (kind, low, high).
+def alike_limits(difference: float, weights: Float) -> tuple[float, float]:
+    """Bound a difference of two shares, −1 … 1, that is the same in all clusters of `weights (K,)` objects: (low, high).
 
-    Kind `bootstrap`: the limits of `bootstrap_share`, over many clusters of which enough succeed and fail; else
-    `bootstrap+exact`: on each side the wider of these and the exact limits.
+    Exact on each side, with n as in `spread_share` without a variance: as if |difference| · n of n objects favoured the
+    one and the rest neither; of the rest, any share that is possible where none of n does may favour the other. Five
+    logs of one object at 0: [−.522, .522], at 1: [.478, 1].
     """
-    limits = bootstrap_share(successes, totals, resampled)
-    return widen_limits(limits, float(successes.sum()) / float(totals.sum()), effective_number(totals))
-
-
-def widen_limits(limits: tuple[float, float], share: float, n: float) -> tuple[str, float, float]:
-    """(kind, low, high) of a share over `n` clusters, as wide as the exact limits unless many succeed and many fail."""
-    k = min(n * share, n)
-    if min(n - EXACT_BELOW, k - FEWEST_EACH, n - k - FEWEST_EACH) >= -_ROUNDING:
-        return "bootstrap", *limits
-    least, most = exact_limits(k, n)
-    return "bootstrap+exact", min(limits[0], least), max(limits[1], most)
-
-
-def alike_limits(difference: float, n: float) -> tuple[float, float]:
-    """Bound a difference of two shares, −1 … 1, that is the same in all of `n` clusters: (low, high).
-
-    Exact on each side: as if |difference| · n of n clusters favoured the one and the rest neither; of the rest, any
-    share that is possible where none of n does may favour the other. Five clusters at 0: [−.522, .522], at 1: [.478,
-    1].
-    """
-    size = min(abs(difference), 1.0)
-    low, high = exact_limits(size * n, n)
-    low -= (1.0 - size) * exact_limits(0.0, n)[1]
+    size, objects = min(abs(difference), 1.0), np.asarray(weights, dtype=float)
+    nothing = np.asarray(0.0)
+    low, high = (float(limit) for limit in spread_share(np.asarray(size), nothing, objects))
+    low -= (1.0 - size) * float(spread_share(nothing, nothing, objects)[1])
     return (low, high) if difference >= 0 else (-high, -low)
 
 
-def wilson_limits(successes: int, n: int, *, confidence: float = 0.95) -> tuple[float, float]:
-    """Bound the probability of success given `successes` of `n` independent trials: (low, high), shares.
+# Any other figure.
 
-    All p for which |successes/n − p| ≤ z·√(p(1 − p)/n), z the two-sided normal quantile. Low is exactly 0
-    without a success, high exactly 1 without a failure.
 
-    Source: E. B. Wilson, "Probable inference, the law of succession, and statistical inference",
-    J. Amer. Statist. Assoc. 22 (1927) 209–212.
+def group_clusters(clusters: int) -> Int:
+    """(K,) the group of each cluster, neighbours together, at most `MOST_GROUPS`."""
+    return np.arange(clusters) * min(clusters, MOST_GROUPS) // max(clusters, 1)
+
+
+def figure_variance(value: Float, without: Float, weights: Float) -> tuple[Float, Float]:
+    """The variance (…) of a figure and its degrees of freedom (…), from the figure without each cluster (…, K).
+
+    e = (n − w)·(value − without), V = Σ e²/(1 − w/n)/n², n = Σw. Degrees of freedom (tr Q)²/tr Q², Q being the
+    covariance of e/√(1 − w/n) for clusters that vary alike: K − 1 where all weigh the same. Clusters of weight 0 do
+    not count.
+
+    Source: C. F. J. Wu, "Jackknife, bootstrap and other resampling methods in regression analysis", Ann. Statist. 14
+    (1986) 1261–1295 (weighted delete-one jackknife); F. E. Satterthwaite, Biometrics Bulletin 2 (1946) 110–114.
     """
-    z = -NormalDist().inv_cdf((1.0 - confidence) / 2)
-    share, z2 = successes / n, z * z
-    centre = (share + z2 / (2 * n)) / (1 + z2 / n)
-    half = z * math.sqrt(share * (1 - share) / n + z2 / (4 * n * n)) / (1 + z2 / n)
-    # At the ends the root of the equation is 0 or 1; the difference of two rounded terms need not be.
-    low = 0.0 if successes == 0 else centre - half
-    high = 1.0 if successes == n else centre + half
-    return low, high
+    u = weights / weights.sum(axis=-1, keepdims=True)
+    rest = np.where(u < 1.0, 1.0 - u, 1.0)
+    error = np.where(u > 0, (1.0 - u) * (value[..., None] - without), 0.0)
+    squares = (u**2).sum(axis=-1)[..., None, None]
+    crossed = u[..., :, None] * u[..., None, :]
+    Q = crossed * (squares - u[..., :, None] - u[..., None, :])
+    place = np.arange(u.shape[-1])
+    Q[..., place, place] += u**2
+    Q /= np.sqrt(rest[..., :, None] * rest[..., None, :])
+    trace = np.trace(Q, axis1=-2, axis2=-1)
+    return (error**2 / rest).sum(axis=-1), trace**2 / (Q**2).sum(axis=(-2, -1))
+
+
+def limit_figure(
+    value: float | Float,
+    without: Float,
+    weights: Float,
+    bounds: tuple[float, float] = (-np.inf, np.inf),
+) -> tuple[Float, Float]:
+    """Bound a figure by Student's t, from the figure without each cluster (…, K): (low, high), (…).
+
+    `weights (…, K)`: how many objects, or whatever the figure is an average over, a cluster has. `bounds`: the least and
+    the most that is possible. At least two clusters weigh something.
+    """
+    from scipy.special import stdtrit
+
+    value = np.asarray(value, dtype=float)
+    variance, df = figure_variance(value, without, np.asarray(weights, dtype=float))
+    half = -stdtrit(df, _TAIL) * np.sqrt(variance)
+    return np.maximum(value - half, bounds[0]), np.minimum(value + half, bounds[1])
+
+
+# Quantiles.
+
+
+def limit_quantile(values: Float, low: Float, high: Float, q: float = 0.5) -> tuple[float, float]:
+    """Bound the q-quantile by the limits `low`, `high (G,)` of the share at or below each of `values (G,)`.
+
+    Values ascend, the first is the lowest possible, −∞ where there is none: where even there the share may be q, few
+    clusters tell no lower limit. From the first value whose share may be q to the first whose share, and that of all
+    after it, is q for sure; ∞ where there is none. So it is conservative where limits do not ascend.
+    """
+    possible, unsure = np.flatnonzero(high >= q - _ROUNDING), np.flatnonzero(low < q - _ROUNDING)
+    ends = np.append(values, np.inf)
+    return float(ends[possible[0] if len(possible) else -1]), float(ends[unsure[-1] + 1 if len(unsure) else 0])
+
+
+EXACT = "exact"
+"""The kind of an interval by exact binomial limits, of a share or of a difference of shares that all clusters have."""
+JACKKNIFE = "jackknife"
+"""The kind of an interval by Student's t from the figure without each cluster."""
+INVERTED = "inverted"
+"""The kind of an interval of a median, from the limits of shares."""
+ALL_ALIKE = "all clusters alike"
+"""The kind of an interval that does not exist as the figure is the same in every cluster, a median in nearly all."""
+
+
+def interval_words(kind: str, over: str, number: int | None = None) -> str:
+    """What limits are, by the columns `interval` and `interval_over`: `over 8 logs: how far …`."""
+    method = {EXACT: "exact binomial limits", JACKKNIFE: "Student's t", INVERTED: "of medians"}.get(kind, kind)
+    return f"{method} over {describe_clusters(over, number)}"
 
 
 # Outcomes that are equal in every run.
