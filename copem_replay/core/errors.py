@@ -156,16 +156,6 @@ def count_noun(number: int, noun: str, plural: str = "") -> str:
     return f"{number} {noun if number == 1 else plural or noun + 's'}"
 
 
-def interval_words(kind: str, over: str) -> str:
-    """What limits are, by their kind and what they are over in `summary.csv`; an unknown kind is named as it is."""
-    words = {
-        "wilson": "Wilson interval over {}",
-        "bootstrap": "bootstrap interval over {}",
-        "bootstrap+exact": "bootstrap interval over {}, nowhere narrower than exact binomial limits",
-    }
-    return words.get(kind, f"{kind} interval over {{}}").format(over)
-
-
 def unknown_name_message(what: str, name: object, known: Iterable[str]) -> str:
     """A message that a name is unknown, with the likely name, or else all known ones."""
     names = list(dict.fromkeys(known))

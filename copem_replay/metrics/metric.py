@@ -44,7 +44,6 @@ class MetricInputs:
 
     rows: pd.DataFrame
     list_rate_hz: float | None
-    seed: int
     horizon_s: float | None
     lists_fixed: bool = False
     reaction_fixed: bool = False

@@ -13,11 +13,18 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from copem_replay.core.errors import interval_words, wrap_line
+from copem_replay.core.errors import wrap_line
 from copem_replay.core.tracks import Int
 from copem_replay.metrics.accuracy.metrics import beyond_gate_share
 from copem_replay.metrics.accuracy.statistics import AccuracyTotal
-from copem_replay.metrics.intervals import FEWEST_CLUSTERS, NOTHING_DRAWN, FixedOutcomes, choose_clusters
+from copem_replay.metrics.intervals import (
+    NOTHING_DRAWN,
+    FixedOutcomes,
+    choose_over,
+    describe_absent,
+    explain_no_clusters,
+    interval_words,
+)
 from copem_replay.metrics.metric import (
     LinkTimes,
     MetricInputs,
@@ -149,7 +156,6 @@ def summarise_tally(
     configurations: Sequence[str],
     list_rate_hz: Mapping[str, float | None],
     *,
-    seed: int,
     horizon_s: float | None,
     exact: pd.DataFrame | None = None,
     accuracy: Mapping[str, AccuracyTotal] | None = None,
@@ -178,7 +184,6 @@ def summarise_tally(
         inputs = MetricInputs(
             detections_of.get(name, detections.iloc[:0]),
             list_rate_hz[name],
-            seed,
             horizon_s,
             lists_fixed=fixed.known(name),
             reaction_fixed=fixed.passes(name),
@@ -196,13 +201,12 @@ def summarise_tally(
 def _note_no_interval(detections: pd.DataFrame) -> list[str]:
     """Which shares have no interval, from the rows of the tally for detections."""
     conflicts = detections[detections["in_conflict"]] if "in_conflict" in detections else detections.iloc[:0]
-    shares = (("detected", detections, "measured objects"), ("pass", conflicts, "objects in conflict"))
-    return [
-        f"no interval of the {share} share: fewer than {FEWEST_CLUSTERS} logs and fewer than {FEWEST_CLUSTERS} "
-        f"{objects}, and more runs say nothing about other traffic"
-        for share, rows, objects in shares
-        if len(rows) and choose_clusters(rows)[0] is None
-    ]
+    notes = []
+    for share, rows in (("detected", detections), ("pass", conflicts)):
+        logs, objects = rows["log"].nunique(), rows.groupby(["log", "object_id"], sort=False).ngroups
+        if len(rows) and choose_over(logs, objects) is None:
+            notes.append(f"no interval of the {share} share: {explain_no_clusters(logs, objects)}")
+    return notes
 
 
 def _note_beyond_gate(accuracy: Mapping[str, AccuracyTotal]) -> list[str]:
@@ -290,10 +294,18 @@ def _interval_lines(summary: pd.DataFrame, share: str) -> list[str]:
 
 
 def describe_intervals(summary: pd.DataFrame, name: str) -> list[str]:
-    """Lines on the kind of the limits, from the column `name`, and on the rows without limits as nothing is drawn."""
-    limited = summary.dropna(subset=f"{name}_over").drop_duplicates([name, f"{name}_over"])
-    kinds = [interval_words(*of) for of in limited[[name, f"{name}_over"]].itertuples(index=False)]
+    """Lines on the limits: their kind, from the column `name`, what they are over, and what that cannot exclude; on the
+    rows without limits as nothing is drawn.
+    """
+    columns = [name, f"{name}_over", f"{name}_clusters"]
+    limited = summary.reindex(columns=columns).dropna(subset=columns[1]).drop_duplicates()
+    kinds = [
+        interval_words(kind, over, None if pd.isna(number) else int(number))
+        for kind, over, number in limited.itertuples(index=False)
+    ]
     lines = [f"95 %: {'; '.join(kinds)}"] if kinds else []
+    logs = limited.loc[limited[columns[1]] == "logs", columns[2]].dropna()
+    lines += [f"whatever the interval, {describe_absent(int(logs.min()))}"] if len(logs) else []
     undrawn = summary.loc[summary[name] == NOTHING_DRAWN, "configuration"]
     if len(undrawn):
         lines.append(f"no 95 % of {', '.join(undrawn)}: nothing drawn, every run is the same")

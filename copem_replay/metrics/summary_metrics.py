@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from copem_replay.core.tracks import Bool, Float
 from copem_replay.metrics.accuracy.metrics import ACCURACY
 from copem_replay.metrics.braking.driver import UNRESOLVED
-from copem_replay.metrics.intervals import NOTHING_DRAWN, choose_clusters, draw_resamples, share_limits, wilson_limits
+from copem_replay.metrics.intervals import EXACT, NOTHING_DRAWN, choose_clusters, exact_limits, limit_share
 from copem_replay.metrics.metric import LINK, OUTPUT, Metric, MetricInputs
 from copem_replay.metrics.survival import (
     CENSORED,
@@ -106,42 +106,40 @@ def summarise_conflicts(inputs: MetricInputs) -> DetectionStatistics | None:
 
 @dataclass(frozen=True)
 class ShareEstimate:
-    """A share of rows and its 95 % limits, their kind, and the clusters they are over (None: there are none)."""
+    """A share of rows and its 95 % limits, their kind, what they are over and how many of these (None: nothing)."""
 
     n: int
     share: float | None
-    kind: str | None
-    over: str | None
-    low: float | None
-    high: float | None
+    kind: str | None = None
+    over: str | None = None
+    clusters: int | None = None
+    low: float | None = None
+    high: float | None = None
 
 
-def _estimate_share(part: pd.DataFrame, successes: NDArray[np.int64], seed: int, *, fixed: bool) -> ShareEstimate:
+def _estimate_share(part: pd.DataFrame, successes: NDArray[np.int64], *, fixed: bool) -> ShareEstimate:
     """The share of `successes (n,)` among the runs of the tally's rows (n,). `fixed`: equal in every run."""
     n, total = int(part["runs"].sum()), int(successes.sum())
     share = total / n if n else None
     over, cluster = choose_clusters(part)
     if over is None or not n:
-        return ShareEstimate(n, share, None, None, None, None)
+        return ShareEstimate(n, share)
     if over == "runs":
         if fixed:
-            return ShareEstimate(n, share, NOTHING_DRAWN, None, None, None)
-        return ShareEstimate(n, share, "wilson", over, *wilson_limits(total, n))
+            return ShareEstimate(n, share, NOTHING_DRAWN)
+        return ShareEstimate(n, share, EXACT, over, n, *map(float, exact_limits(total, n)))
     columns = pd.DataFrame({"sum": successes, "count": part["runs"].to_numpy()})
     counted = columns.groupby(cluster.to_numpy(), sort=True).sum()
-    # Addressed by the clusters' names: every configuration resamples the same logs or objects.
-    resampled = draw_resamples([str(name) for name in counted.index], seed)
-    kind, low, high = share_limits(
-        counted["sum"].to_numpy(dtype=float), counted["count"].to_numpy(dtype=float), resampled
-    )
-    return ShareEstimate(n, share, kind, over, low, high)
+    objects = part.groupby(["log", "object_id"], sort=False).ngroups
+    limits = limit_share(counted["sum"].to_numpy(dtype=float), counted["count"].to_numpy(dtype=float), objects)
+    return ShareEstimate(n, share, EXACT, over, len(counted), *map(float, limits))
 
 
 def estimate_detected_share(inputs: MetricInputs) -> ShareEstimate:
     """The share of the rows that are detected."""
     runs = inputs.rows["runs"].to_numpy()
     return _estimate_share(
-        inputs.rows, np.where(_is_known(inputs.rows), runs, 0), inputs.seed, fixed=inputs.lists_fixed
+        inputs.rows, np.where(_is_known(inputs.rows), runs, 0), fixed=inputs.lists_fixed
     )
 
 
@@ -158,7 +156,7 @@ def estimate_passed_share(inputs: MetricInputs) -> ShareEstimate | None:
     if "in_conflict" not in inputs.rows:
         return None
     part = inputs.rows[inputs.rows["in_conflict"]]
-    return _estimate_share(part, part["passed"].to_numpy(), inputs.seed, fixed=inputs.reaction_fixed)
+    return _estimate_share(part, part["passed"].to_numpy(), fixed=inputs.reaction_fixed)
 
 
 @dataclass(frozen=True)
@@ -242,8 +240,9 @@ def _limit_metrics(
         row(
             f"{prefix}interval_over",
             value=attrgetter("over"),
-            help=f"what the limits of {of} are over: runs, objects or logs",
+            help=f"what the limits of {of} are over: logs, objects of one log or runs of one object",
         ),
+        row(f"{prefix}interval_clusters", value=attrgetter("clusters"), help=f"how many of these the limits of {of} are over"),
     )
 
 

@@ -10,7 +10,7 @@ censor: F may stay below 1 for ever, and a quantile above its last value does no
 *Distance at detection*: far is good, so a row that was never detected ranks below every distance.
 Intervals: metrics/intervals.py. No function here draws a random number.
 
-Letters of the shapes: n rows, M distinct times of detection.
+Letters of the shapes: n rows, M distinct times of detection, K clusters of rows, G instants.
 """
 
 from __future__ import annotations
@@ -130,6 +130,55 @@ def restricted_mean(times_s: Float, incidence: Float, horizon_s: float) -> float
     before = times_s < horizon_s
     lengths_s = np.diff(np.append(times_s[before], horizon_s))
     return float(horizon_s - incidence[before] @ lengths_s)
+
+
+def restricted_means_without(
+    time_s: Float, ending: NDArray[np.integer[Any]], weight: Float, cluster: Int, clusters: int, horizon_s: float
+) -> Float:
+    """(K,) restricted means at a horizon without the rows of each cluster, seconds; NaN where no row is left.
+
+    Rows (n,) as for `cumulative_incidence`, with whole numbers as weights; `cluster (n,)`: 0 … K − 1.
+    """
+    # Steps are weighted by what the earlier censored rows hand on. Times of censoring are few, one or less per object:
+    # between two of them sums over clusters are enough.
+    censored = ending == CENSORED
+    lost_s = np.unique(time_s[censored])
+    spans = len(lost_s) + 1
+    span = np.searchsorted(lost_s, time_s, side="left")  # censored at the end of it, or all else within it
+
+    def without_each(kept: Bool, of: Float) -> Float:
+        """(K, spans) sums of all rows but those of each cluster."""
+        place = cluster[kept] * spans + span[kept]
+        sums = np.bincount(place, of[kept], minlength=clusters * spans).reshape(clusters, spans)
+        return sums.sum(axis=0) - sums
+
+    within = without_each(np.ones(len(weight), dtype=bool), weight)
+    total = within.sum(axis=1)
+    lost = without_each(censored, weight)[:, :-1]
+    remaining = total[:, None] - np.cumsum(within, axis=1)[:, :-1]
+    remains = remaining > 0  # whole numbers
+    factors = np.where(remains, 1.0 + lost / np.where(remains, remaining, 1.0), 1.0)
+    handed = np.concatenate([np.ones((clusters, 1)), np.cumprod(factors, axis=1)], axis=1)
+    gained = without_each(ending == DETECTED, weight * np.maximum(horizon_s - time_s, 0.0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        means: Float = horizon_s - (gained * handed).sum(axis=1) / total
+    return means
+
+
+def incidences_without(
+    time_s: Float, ending: NDArray[np.integer[Any]], weight: Float, cluster: Int, clusters: int, at_s: Float
+) -> Float:
+    """(K, G) cumulative incidence at instants (G,) without the rows of each cluster; NaN where no row is left.
+
+    Rows (n,) as for `cumulative_incidence`; `cluster (n,)`: 0 … K − 1.
+    """
+    shares = np.full((clusters, len(at_s)), np.nan)
+    for k in range(clusters):
+        rest = (cluster != k) & (weight > 0)
+        if rest.any():
+            times_s, incidence = cumulative_incidence(time_s[rest], ending[rest], weight[rest])
+            shares[k] = np.append(0.0, incidence)[np.searchsorted(times_s, at_s, side="right")]
+    return shares
 
 
 def quantile_with_never(values: Float, detected: Bool, q: float, weight: Float | None = None) -> float | None:

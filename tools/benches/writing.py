@@ -69,7 +69,7 @@ def writing() -> Iterator[common.Line]:
     run_tracks = tracks_of_run(ready, experiment, 0)
     table = replay_block(ready, experiment, np.arange(1))
     rates: dict[str, float | None] = dict.fromkeys(experiment.configurations)
-    rows, _ = summarise_rows(table, list(experiment.configurations), rates, seed=1, horizon_s=horizon_s(table, None))
+    rows, _ = summarise_rows(table, list(experiment.configurations), rates, horizon_s=horizon_s(table, None))
     listed = sum(int(lists.fused.valid.sum()) for lists in run_tracks.values())
     shown = listed + len(ready.truth.frame_ix)
     with common.scratch() as folder:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ import pandas as pd
 
 from copem_replay.core.errors import InputError, count_noun
 from copem_replay.core.tracks import SAME_INSTANT_S, Int
-from copem_replay.metrics.intervals import FEWEST_CLUSTERS
+from copem_replay.metrics.intervals import FEWEST_CLUSTERS, FEWEST_LOGS, choose_over, explain_no_clusters
 from copem_replay.results.compare.labels import (
     LabelledConfiguration,
     check_log_names,
@@ -31,13 +31,13 @@ from copem_replay.results.compare.labels import (
     rename_logs,
 )
 from copem_replay.results.compare.limits import (
-    ClusterDraws,
     ClusterNames,
-    choose_resampled,
     difference_limits,
+    find_decisive_log,
     mcnemar_p_value,
 )
 from copem_replay.results.compare.metrics import (
+    METRICS,
     GhostTotals,
     PairSettings,
     Regret,
@@ -65,12 +65,13 @@ from copem_replay.results.schema import OPTIONAL
 @dataclass
 class AllLogs:
     """The sums of a pair, log by log: `objects`: with rows of both sides; `alone`: rows that only one side has, (first,
-    second); `instants`: as `count_shared_instants` gives them.
+    second); `instants`: as `count_shared_instants` gives them; `differences`: of each metric, of the logs that have one.
     """
 
     objects: list[int] = field(default_factory=list)
     alone: list[tuple[int, int]] = field(default_factory=list)
     instants: list[Int] = field(default_factory=list)
+    differences: dict[str, list[float]] = field(default_factory=dict)
     _regrets: dict[str, list[Regret]] = field(default_factory=dict)
 
     def add(
@@ -90,9 +91,18 @@ class AllLogs:
         if first.accuracy is not None and second.accuracy is not None:
             self.instants.append(count_shared_instants(first.accuracy, second.accuracy))
         for regret in regrets:
-            # Runs stay apart for a single object: they are resampled if no log has another.
+            # Runs stay apart for a single object: they are the clusters if no log has another.
             figure = regret.figure.condensed(runs=objects <= 1) if more else regret.figure
             self._regrets.setdefault(regret.metric, []).append(replace(regret, figure=figure))
+
+    @property
+    def over(self) -> str | None:
+        """The clusters of intervals."""
+        return choose_over(sum(count > 0 for count in self.objects), sum(self.objects))
+
+    def count_better(self, metric: str) -> int:
+        """The number of logs whose own difference is for the better."""
+        return sum(METRICS[metric] * difference > 0 for difference in self.differences.get(metric, ()))
 
     def regrets(self) -> Iterator[Regret]:
         """The regret of every metric over all logs."""
@@ -202,8 +212,16 @@ def note_on_measuring(baseline: LabelledConfiguration, others: Sequence[Labelled
         )
 
 
-def notes_on_rows(table: pd.DataFrame, asked: float | None) -> Iterator[str]:
-    """Notes on missing intervals, and on configurations with fewer ghosts than `asked` per minute."""
+_FEW_HAVE_IT = (
+    f"fewer than {FEWEST_LOGS} logs, {FEWEST_CLUSTERS} objects of one log, or {FEWEST_CLUSTERS} runs of one object have "
+    "it, or too few for its limits"
+)
+
+
+def notes_on_rows(table: pd.DataFrame, pairs: Iterable[AllLogs], asked: float | None) -> Iterator[str]:
+    """Notes on missing intervals, on logs that decide, and on configurations with fewer ghosts than `asked` per minute."""
+    none = [of.objects for of in pairs if any(of.objects) and of.over is None]
+    why = explain_no_clusters(sum(count > 0 for count in none[0]), sum(none[0])) if none else None
     overall = table.drop_duplicates(["configuration", "metric"])
     without = overall[overall["difference"].notna() & overall["interval"].isna()]
     with_interval = set(overall.loc[overall["interval_over"].notna(), "configuration"])
@@ -216,10 +234,11 @@ def notes_on_rows(table: pd.DataFrame, asked: float | None) -> Iterator[str]:
     without = without[~nameless]
     if len(without):
         metrics = ", ".join(dict.fromkeys(without["metric"]))
-        yield (
-            f"no interval of {metrics}: neither {FEWEST_CLUSTERS} logs, nor {FEWEST_CLUSTERS} measured objects, nor "
-            f"{FEWEST_CLUSTERS} runs of a single one; more runs of several say nothing about other traffic"
-        )
+        yield f"no interval of {metrics}: {why or _FEW_HAVE_IT}"
+    decisive = overall[overall["hangs_on"].notna()]
+    for log, rows in decisive.groupby("hangs_on", sort=False):
+        listed = (f"{row.metric} of {row.configuration} {row.difference_without_it:+.3g}" for row in rows.itertuples())
+        yield f"hangs on log {log}; without it: {', '.join(listed)}"
     ghosts = overall[overall["metric"] == "ttd_rmst_s_equal_ghosts"]
     fewer = ghosts[ghosts["ghosts_kept_per_min"] < asked * (1 - 1e-9)] if asked is not None else ghosts[:0]
     for row in fewer.itertuples():
@@ -324,6 +343,10 @@ COLUMNS = {
     "baseline_existence": "float64",
     "ghosts_kept_per_min": "float64",
     "baseline_ghosts_kept_per_min": "float64",
+    "clusters": "Int64",
+    "logs_better": "Int64",
+    "hangs_on": "object",
+    "difference_without_it": "float64",
 }
 """Columns of a comparison, and their types in pandas."""
 
@@ -380,8 +403,7 @@ def compare_folders(
         false_positives_per_min = totals[against].per_min
     setting = PairSettings(_horizon_s(read, against, logs), float(read[0].provenance.measure["gospa"]["power"]))
     settings, reasons = _settle_ghosts(setting, against, others, totals, false_positives_per_min, asked=not own_rate)
-    names, draws = ClusterNames(logs, [], runs), ClusterDraws(read[0].provenance.seed)
-    pairs, rows = _compare_each_log(against, settings, names, draws, metrics)
+    pairs, rows = _compare_each_log(against, settings, ClusterNames(logs, [], runs), metrics)
     table = pd.DataFrame(rows, columns=list(COLUMNS)).astype(COLUMNS)
     return Comparison(
         table=table,
@@ -397,7 +419,7 @@ def compare_folders(
             *notes_on_output_baseline(against, others),
             *notes_on_instants(against, pairs, logs),
             *notes_on_equal_ghosts(reasons),
-            *notes_on_rows(table, false_positives_per_min),
+            *notes_on_rows(table, pairs.values(), false_positives_per_min),
         ),
     )
 
@@ -437,7 +459,6 @@ def _compare_each_log(
     against: LabelledConfiguration,
     settings: Mapping[LabelledConfiguration, PairSettings],
     names: ClusterNames,
-    draws: ClusterDraws,
     metrics: Sequence[str] | None,
 ) -> tuple[dict[LabelledConfiguration, AllLogs], list[dict[str, object]]]:
     """The sums of each pair over the logs of `names`; rows of all logs, then of each log where there are several.
@@ -457,15 +478,27 @@ def _compare_each_log(
             _check_same_episodes(one, first, against, second, log, grid)
             regrets = list(compute_regrets(first, second, grid, settings[one], metrics))
             pair.add(first, second, regrets, grid, more=len(logs) > 1)
-            if len(logs) > 1:
-                over = choose_resampled(pair.objects[-1:])
-                rows += [{"log": log, **_make_row(regret, one, against, over, names, draws)} for regret in regrets]
-    overall = [
-        {"log": ALL, **_make_row(regret, one, against, choose_resampled(pair.objects), names, draws)}
-        for one, pair in pairs.items()
-        for regret in pair.regrets()
-    ]
-    return pairs, [*overall, *rows]
+            over = choose_over(min(pair.objects[-1], 1), pair.objects[-1])
+            for regret in regrets if len(logs) > 1 else ():
+                values = regret.figure.values()
+                pair.differences.setdefault(regret.metric, []).append(values[2])
+                rows.append({"log": log, **_make_row(regret, values, one, against, over, names)})
+    return pairs, [*_overall_rows(against, pairs, names), *rows]
+
+
+def _overall_rows(
+    against: LabelledConfiguration, pairs: Mapping[LabelledConfiguration, AllLogs], names: ClusterNames
+) -> Iterator[dict[str, object]]:
+    """The rows of all logs. Of intervals over logs: how many logs are better, and on which the difference hangs."""
+    for one, pair in pairs.items():
+        for regret in pair.regrets():
+            values = regret.figure.values()
+            row = {"log": ALL, **_make_row(regret, values, one, against, pair.over, names)}
+            if row.get("interval_over") == "logs":
+                row["logs_better"] = pair.count_better(regret.metric)
+                if (decisive := find_decisive_log(regret.figure, values[2], names)) is not None:
+                    row["hangs_on"], row["difference_without_it"] = decisive[0], _number_or_none(decisive[1])
+            yield row
 
 
 def _horizon_s(folders: Sequence[Results], against: LabelledConfiguration, logs: Sequence[str]) -> float:
@@ -511,15 +544,14 @@ def _is_fixed(metric: str, *sides: LabelledConfiguration) -> bool:
 
 def _make_row(
     regret: Regret,
+    values: tuple[float, float, float],
     one: LabelledConfiguration,
     against: LabelledConfiguration,
-    over: str,
+    over: str | None,
     names: ClusterNames,
-    draws: ClusterDraws,
 ) -> dict[str, object]:
-    """The row of a regret, of one log or all. `over`: the clusters that are resampled."""
-    figure = regret.figure
-    value, baseline_value, difference = figure.values()
+    """The row of a regret with its `values`, of one log or all. `over`: the clusters of its interval."""
+    figure, (value, baseline_value, difference) = regret.figure, values
     row: dict[str, object] = {"configuration": one.label, "baseline": against.label, "metric": regret.metric}
     row |= {
         "value": _number_or_none(value),
@@ -527,7 +559,7 @@ def _make_row(
         "n": int(figure.items["n"].sum()),
     }
     row["difference"] = _number_or_none(difference)
-    row |= difference_limits(figure, difference, over, names, draws, fixed=_is_fixed(regret.metric, one, against))
+    row |= difference_limits(figure, difference, over, names, fixed=_is_fixed(regret.metric, one, against))
     if "only" in figure.items.columns:
         only = figure.items["only"].sum(axis=0)
         row |= {"only_configuration": int(only[0]), "only_baseline": int(only[1])}

@@ -1,17 +1,16 @@
-"""Figures of pairs and the limits of their differences: over resamples, exact, or none and why.
+"""Figures of pairs and the limits of their differences: by leaving out clusters, exact, or none and why.
 
 *Pair*: the same row (log, object, run) in two configurations, with common random numbers.
 *Difference*: the first minus the second, pair by pair, or of two figures of the same pairs.
 *Discordant*: a pair that succeeded in one only. McNemar's test asks whether as many do so in the one as in the other.
-*Cluster*: dependent pairs, such as all of one log. A *resample* draws as many clusters as there are, with replacement,
-both sides of a pair together, so that what both have in common cancels, as it does in the difference.
+*Cluster*: dependent pairs, such as all of one log. It is left out on both sides of a pair together, so that what both
+have in common cancels, as it does in the difference.
 *Median*: the smallest value that at least half of the weight is at or below: the value of some pair.
 
-Clusters are those of `summary.csv`: logs, if there are at least five; else measured objects, if there are at least
-five; runs, where there is one object in one log. With fewer there is no interval: more runs of the same traffic do not
-narrow it, and few clusters do not show how they vary.
+Clusters are those of `summary.csv` (`metrics/intervals.py`), and have the weight of what the figure averages: as many
+objects as have it; lists in GOSPA, minutes in ghosts per minute, runs where there is one object.
 
-Letters of the shapes: i items, K clusters, R resamples, m sums.
+Letters of the shapes: i items, K clusters, m sums, G values.
 """
 
 from __future__ import annotations
@@ -28,21 +27,30 @@ from numpy.typing import NDArray
 
 from copem_replay.core.tracks import Bool, Float, Int
 from copem_replay.metrics.intervals import (
+    ALL_ALIKE,
+    EXACT,
     FEWEST_CLUSTERS,
+    FEWEST_LOGS,
+    INVERTED,
+    JACKKNIFE,
+    MOST_GROUPS,
     NOTHING_DRAWN,
-    Counts,
-    Resamples,
     alike_limits,
-    draw_resamples,
-    effective_number,
-    percentile_limits,
+    exact_limits,
+    group_clusters,
+    limit_figure,
+    limit_quantile,
+    limit_share,
 )
-from copem_replay.metrics.survival import CENSORED, DETECTED, cumulative_incidence, quantile_with_never, restricted_mean
+from copem_replay.metrics.survival import (
+    cumulative_incidence,
+    quantile_with_never,
+    restricted_mean,
+    restricted_means_without,
+)
 
-# Items of figures, and the clusters that are resampled.
+# Items of figures, and the clusters that are left out.
 
-_KEPT = 4
-"""Sets of clusters whose resamples are kept: few sets differ, and each may be large; changes no result."""
 _SUMMED = ("n", "only", "sums")
 """Columns that are summed when items are joined; the others are equal among them."""
 
@@ -92,25 +100,12 @@ class ClusterNames:
     runs: int
 
 
-class ClusterDraws:
-    """Resamples of clusters, addressed by their names: the same clusters are drawn alike for every metric."""
-
-    def __init__(self, seed: int) -> None:
-        self._seed = seed
-        self._kept: dict[tuple[str, ...], Resamples] = {}
-
-    def of(self, names: tuple[str, ...]) -> Resamples:
-        """The resamples of the named clusters."""
-        if names not in self._kept:
-            while len(self._kept) >= _KEPT:
-                del self._kept[next(iter(self._kept))]
-            self._kept[names] = draw_resamples(names, self._seed)
-        return self._kept[names]
-
-
 @dataclass(frozen=True)
 class ClusterIndex:
-    """K clusters: sorted `names`, and the `number` of each log, object or run among them (−1: none, counts once)."""
+    """K clusters: sorted `names`, and the `number` of each log, object or run among them (−1: in none, always there).
+
+    Clusters are logs, objects or runs (`over`), or groups of neighbours where there are many.
+    """
 
     over: str
     names: tuple[str, ...]
@@ -121,19 +116,29 @@ class ClusterIndex:
         cluster: Int = self.number[items[self.over]]
         return cluster
 
+    @property
+    def grouped(self) -> ClusterIndex:
+        """At most `MOST_GROUPS` clusters: neighbours together."""
+        if len(self.names) <= MOST_GROUPS:
+            return self
+        group = group_clusters(len(self.names))
+        names = tuple(self.names[k] for k in np.flatnonzero(np.diff(group, prepend=-1)))
+        return replace(self, names=names, number=np.where(self.number >= 0, group[self.number], -1))
 
-def choose_resampled(objects: Sequence[int]) -> str:
-    """The kind of cluster that is resampled for all metrics of a pair. `objects`: number with rows in each log."""
-    if sum(objects) == 1:
-        return "runs"
-    return "logs" if sum(count > 0 for count in objects) >= FEWEST_CLUSTERS else "objects"
+    def count_objects(self, items: StatisticItems) -> Float:
+        """(K,) objects with items in each cluster; runs where clusters are runs."""
+        cluster = self.of(items)
+        counted = (cluster >= 0) & (items["n"] > 0)
+        by = "objects" if self.over != "runs" else "runs"
+        pairs = np.unique(np.stack([cluster[counted], items[by][counted]]), axis=1)
+        return np.bincount(pairs[0], minlength=len(self.names)).astype(float)
 
 
 def index_clusters(items: StatisticItems, over: str, names: ClusterNames) -> ClusterIndex | None:
-    """The logs, objects or runs that are resampled, in the order of their names; None: too few have the figure."""
+    """The logs, objects or runs with items, in the order of their names; None: too few have the figure."""
     all_names = {"logs": names.logs, "objects": names.objects, "runs": [str(run) for run in range(names.runs)]}[over]
     present = sorted(np.unique(items[over][items[over] >= 0]).tolist(), key=lambda k: all_names[k])
-    if len(present) < FEWEST_CLUSTERS:
+    if len(present) < (FEWEST_LOGS if over == "logs" else FEWEST_CLUSTERS):
         return None
     number = np.full(len(all_names) + 1, -1, dtype=np.int64)
     number[present] = np.arange(len(present))
@@ -141,9 +146,6 @@ def index_clusters(items: StatisticItems, over: str, names: ClusterNames) -> Clu
 
 
 # Statistics of pairs. A ValueError for shapes or values is a defect of the caller.
-
-_CELLS = 4_000_000
-"""Numbers held at a time, 32 MB: the size of blocks, which changes no result."""
 
 
 def mcnemar_p_value(only_first: int, only_second: int) -> float:
@@ -164,75 +166,14 @@ def mcnemar_p_value(only_first: int, only_second: int) -> float:
     return min(1.0, 2.0 * float(bdtr(min(only_first, only_second), only_first + only_second, 0.5)))
 
 
-def resample_sums(sums: Float, count: NDArray[np.unsignedinteger[Any]]) -> Float:
-    """(R, m) sums of each resample: `sums (K, m)` of the clusters, drawn `count (R, K)` times.
-
-    Equal columns give equal sums, to the last bit. Raises ValueError for other shapes.
-    """
-    _check_clusters(count, len(sums))
-    # Each distinct column once: a product of matrices may round equal columns differently.
-    first = [next(j for j in range(k + 1) if np.array_equal(sums[:, j], sums[:, k])) for k in range(sums.shape[1])]
-    distinct = sorted(set(first))
-    columns = np.ascontiguousarray(sums[:, distinct], dtype=float)
-    result = np.empty((len(count), len(distinct)))
-    size = max(1, _CELLS // max(len(sums), 1))
-    for r in range(0, len(count), size):
-        result[r : r + size] = count[r : r + size].astype(float) @ columns
-    sums_of_all: Float = result[:, [distinct.index(k) for k in first]]
-    return sums_of_all
-
-
-def resample_medians(values: Float, cluster: Int, count: NDArray[np.unsignedinteger[Any]], n: Int) -> Float:
-    """(R,) median of each resample: `values (i,)`, `n (i,)` times each, those of `cluster (i,)` drawn
-    `count (R, K)` times.
-
-    Values may be infinite; NaN where a resample has no value. Raises ValueError for NaN, or other shapes.
-    """
-    if values.shape != cluster.shape or np.isnan(values).any():
-        raise ValueError("resampled_medians: expected numbers, each of a cluster")
-    R, K = count.shape
-    _check_clusters(count, K if not len(cluster) else max(K, int(cluster.max()) + 1))
-    if not len(values):
-        return np.full(R, np.nan)
-    order = np.argsort(values, kind="stable")
-    ranked, ranked_cluster, times = values[order], cluster[order], n[order]
-    # In two steps: the block, of about √i blocks of neighbours, with the median, then the place in the block. All
-    # counts are whole numbers, which floats hold exactly.
-    items = len(values)
-    length = max(1, math.isqrt(items))
-    blocks = -(-items // length)
-    in_block = np.bincount(ranked_cluster * blocks + np.arange(items) // length, times, minlength=K * blocks).reshape(
-        K, blocks
-    )
-    until = np.empty((R, blocks))
-    size = max(1, _CELLS // K)
-    for r in range(0, R, size):
-        until[r : r + size] = np.cumsum(count[r : r + size].astype(float) @ in_block, axis=1)
-    total = until[:, -1]
-    block = np.argmax(2 * until >= total[:, None], axis=1)
-    before = np.where(block > 0, until[np.arange(R), np.maximum(block - 1, 0)], 0.0)
-    place = block[:, None] * length + np.arange(length)
-    exists = place < items
-    place = np.minimum(place, items - 1)
-    weight = np.where(exists, count[np.arange(R)[:, None], ranked_cluster[place]] * times[place], 0)
-    reached = 2 * (before[:, None] + np.cumsum(weight, axis=1)) >= total[:, None]
-    median = ranked[place[np.arange(R), np.argmax(reached, axis=1)]]
-    return np.where(total > 0, median, np.nan)
-
-
-def _check_clusters(count: NDArray[Any], clusters: int) -> None:
-    if count.ndim != 2 or count.shape[1] != clusters:
-        raise ValueError(f"expected counts of {clusters} clusters, found {count.shape}")
-
-
-# Figures of pairs, computed from items that can be summed over any clusters: of all logs, of one, of a resample.
+# Figures of pairs, computed from items that can be summed over any clusters: of all logs, of one, without one.
 
 
 @dataclass(frozen=True, kw_only=True)
 class PairStatistic(ABC):
     """A figure of two configurations. Items of shares have `only (i, 2)`: whether only the first, or second, succeeded.
 
-    `by_object`: whether the items are known by object, so that objects can be resampled.
+    `by_object`: whether the items are known by object, so that objects can be clusters.
     """
 
     parts: tuple[StatisticItems, ...]
@@ -257,15 +198,41 @@ class PairStatistic(ABC):
         """The figure of the first, of the second, and their difference; NaN or infinite: there is none."""
 
     @abstractmethod
-    def resampled(self, clusters: ClusterIndex, count: Counts) -> Float:
-        """(R,) differences when each cluster counts as in `count (R, K)`."""
+    def without_each(self, clusters: ClusterIndex) -> Float:
+        """(K,) differences without the items of each cluster."""
+
+    def weights(self, clusters: ClusterIndex) -> Float:
+        """(K,) how much of what the figure averages each cluster has: objects with items, or runs of one."""
+        return clusters.count_objects(self.items)
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """The least and the most that the difference can be."""
+        return -math.inf, math.inf
+
+    def limits(self, difference: float, clusters: ClusterIndex) -> tuple[str, float, float]:
+        """The kind of the limits, and both; NaN: without some cluster there is no difference, and so no limits."""
+        of = clusters.grouped
+        without, weights = self.without_each(of), self.weights(of)
+        if not np.isfinite(without).all():
+            return JACKKNIFE, math.nan, math.nan
+        if np.abs(without - difference).max() > _SAME:
+            low, high = limit_figure(difference, without, weights, self.bounds)
+            return JACKKNIFE, float(low), float(high)
+        if "only" not in self.items.columns:
+            return ALL_ALIKE, math.nan, math.nan
+        return EXACT, *alike_limits(difference, self.weights(clusters))
 
 
 @dataclass(frozen=True, kw_only=True)
 class SumStatistic(PairStatistic):
-    """A function `of` sums (…, m) that gives the figure of either side: shares, means, their roots. Items: `sums`."""
+    """A function `of` sums (…, m) that gives the figure of either side: shares, means, their roots. Items: `sums`.
+
+    `weighed_by`: the sum that the figure averages over, where it is no number of objects.
+    """
 
     of: Callable[[Float], tuple[Float, Float]]
+    weighed_by: int | None = None
 
     def values(self) -> tuple[float, float, float]:
         """Of the first, of the second, and their difference."""
@@ -273,16 +240,38 @@ class SumStatistic(PairStatistic):
             first, second = self.of(self.items["sums"].sum(axis=0))
             return float(first), float(second), float(first - second)
 
-    def resampled(self, clusters: ClusterIndex, count: Counts) -> Float:
-        """(R,) differences; items of no cluster count once in each resample."""
+    def _sums_by_cluster(self, clusters: ClusterIndex) -> tuple[Float, Float]:
+        """(K, m) sums of each cluster, and (m,) of the items that are in none."""
         cluster, sums = clusters.of(self.items), self.items["sums"]
-        drawn, size = cluster >= 0, len(clusters.names)
-        by_cluster = [np.bincount(cluster[drawn], column[drawn], minlength=size) for column in sums.T]
-        fixed = sums[~drawn].sum(axis=0)
+        within, size = cluster >= 0, len(clusters.names)
+        columns = [np.bincount(cluster[within], column[within], minlength=size) for column in sums.T]
+        return np.stack(columns, axis=1), sums[~within].sum(axis=0)
+
+    def without_each(self, clusters: ClusterIndex) -> Float:
+        """(K,) differences. Items of no cluster stay, and the other clusters count for the one that is left out."""
+        by_cluster, always = self._sums_by_cluster(clusters)
+        rest = by_cluster.sum(axis=0) - by_cluster
+        if always.any():
+            weights = clusters.count_objects(self.items)
+            total = weights.sum()
+            rest = rest * (total / np.where(weights < total, total - weights, total))[:, None] + always
         with np.errstate(divide="ignore", invalid="ignore"):
-            first, second = self.of(resample_sums(np.stack(by_cluster, axis=1), count) + fixed)
+            first, second = self.of(rest)
             difference: Float = first - second
         return difference
+
+    def weights(self, clusters: ClusterIndex) -> Float:
+        """(K,) the sum `weighed_by` of each cluster; objects where there is none, or where it is not by cluster."""
+        by_cluster, always = self._sums_by_cluster(clusters)
+        if self.weighed_by is None or always.any():
+            return clusters.count_objects(self.items)
+        weights: Float = by_cluster[:, self.weighed_by]
+        return weights
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """−1 and 1 for a difference of shares."""
+        return (-1.0, 1.0) if "only" in self.items.columns else super().bounds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -304,9 +293,31 @@ class MedianStatistic(PairStatistic):
         )
         return first, second, difference
 
-    def resampled(self, clusters: ClusterIndex, count: Counts) -> Float:
-        """(R,) medians of the differences."""
-        return resample_medians(self.differences, clusters.of(self.items), count, self.items["n"])
+    def without_each(self, clusters: ClusterIndex) -> Float:
+        """(K,) medians of the differences."""
+        cluster, n = clusters.of(self.items), self.items["n"].astype(float)
+        medians = [_weighted_median(self.differences[cluster != k], n[cluster != k]) for k in range(len(clusters.names))]
+        return np.array(medians)
+
+    def limits(self, difference: float, clusters: ClusterIndex) -> tuple[str, float, float]:
+        """Limits of the share of differences at or below a value, inverted; of very many values by `_VALUES` of them."""
+        cluster, n, K = clusters.of(self.items), self.items["n"].astype(float), len(clusters.names)
+        order = np.argsort(self.differences, kind="stable")
+        ranked = self.differences[order]
+        last_of = np.flatnonzero(np.append(np.diff(ranked, append=np.nan) != 0, True)[: len(ranked)])
+        last_of = last_of[np.unique(np.linspace(0, len(last_of) - 1, min(len(last_of), _VALUES)).astype(int))]
+        # Rows of each cluster up to each value; of −∞, where no row needs to be, none.
+        step = np.searchsorted(last_of, np.arange(len(ranked)), side="left")
+        place = step * K + cluster[order]
+        until = np.cumsum(np.bincount(place, n[order], minlength=len(last_of) * K).reshape(-1, K), axis=0)
+        until = np.concatenate([np.zeros((1, K)), until])
+        if clusters.over == "runs":
+            low, high = exact_limits(until.sum(axis=1), until[-1].sum())
+        else:
+            objects = clusters.count_objects(self.items).sum()
+            low, high = limit_share(until, np.broadcast_to(until[-1], until.shape), objects)
+        least, most = limit_quantile(np.append(-np.inf, ranked[last_of]), low, high)
+        return (ALL_ALIKE, math.nan, math.nan) if most - least <= _SAME else (INVERTED, least, most)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -330,42 +341,23 @@ class TimeStatistic(PairStatistic):
             sides[share < 0] += abs(share) * restricted_mean(*steps, self.horizon_s)
         return sides[0], sides[1], sides[0] - sides[1]
 
-    def resampled(self, clusters: ClusterIndex, count: Counts) -> Float:
-        """(R,) differences."""
-        sides = np.zeros((2, len(count)))
+    def without_each(self, clusters: ClusterIndex) -> Float:
+        """(K,) differences."""
+        K, sides = len(clusters.names), np.zeros((2, len(clusters.names)))
         for share, part in zip(self.shares, self.parts, strict=True):
-            sides[int(share < 0)] += abs(share) * self._means(part, clusters, count)
+            n = part["n"].astype(float)
+            means = restricted_means_without(
+                part["time_s"], part["ending"], n, clusters.of(part), K, self.horizon_s
+            )  # fmt: skip
+            sides[int(share < 0)] += abs(share) * means
         difference: Float = sides[0] - sides[1]
         return difference
 
-    def _means(self, part: StatisticItems, clusters: ClusterIndex, count: Counts) -> Float:
-        """(R,) restricted means: `cumulative_incidence` for all resamples at once.
-
-        A step is weighted by what the earlier censored rows hand on. Times of censoring are few, one or less per
-        object: between two of them sums over clusters are enough.
-        """
-        time_s, ending, n, cluster = part["time_s"], part["ending"], part["n"], clusters.of(part)
-        censored = ending == CENSORED
-        lost_s = np.unique(time_s[censored])
-        K, spans = len(clusters.names), len(lost_s) + 1
-        span = np.searchsorted(lost_s, time_s, side="left")  # censored at the end of it, or all else within it
-
-        def by_cluster(kept: Bool, weight: Float) -> Float:
-            """(R, spans) sums of the resamples."""
-            place = cluster[kept] * spans + span[kept]
-            return count.astype(float) @ np.bincount(place, weight[kept], minlength=K * spans).reshape(K, spans)
-
-        within = by_cluster(np.ones(len(n), dtype=bool), n)
-        total = within.sum(axis=1)
-        lost = by_cluster(censored, n)[:, :-1]
-        remaining = total[:, None] - np.cumsum(within, axis=1)[:, :-1]
-        remains = remaining > 0  # whole numbers
-        factors = np.where(remains, 1.0 + lost / np.where(remains, remaining, 1.0), 1.0)
-        handed = np.concatenate([np.ones((len(count), 1)), np.cumprod(factors, axis=1)], axis=1)
-        gained = by_cluster(ending == DETECTED, n * np.maximum(self.horizon_s - time_s, 0.0))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            means: Float = self.horizon_s - (gained * handed).sum(axis=1) / total
-        return means
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """As far apart as never is from the earliest time."""
+        earliest = min((float(part["time_s"].min(initial=0.0)) for part in self.parts), default=0.0)
+        return min(earliest, self.horizon_s) - self.horizon_s, self.horizon_s - min(earliest, self.horizon_s)
 
 
 def _weighted_median(values: Float, weight: Float) -> float:
@@ -375,41 +367,48 @@ def _weighted_median(values: Float, weight: Float) -> float:
     return -math.inf if median is None else median
 
 
-ALL_ALIKE = "all clusters alike"
-"""The kind of an interval that does not exist as the difference is the same in every cluster, so all resamples are
-equal.
-
-For a median it is enough that it is the same in nearly all.
-"""
 _SAME = 1e-9
 """Differences this close are the same: far below what any of the metrics resolves."""
+_VALUES = 2000
+"""Most values at which a median's limits are sought: they are then off by at most a two-thousandth of the rows."""
+
+
+def find_decisive_log(figure: PairStatistic, difference: float, names: ClusterNames) -> tuple[str, float] | None:
+    """The log without which the difference turns its sign or is at most half, and the difference then; None: no log.
+
+    Of several the one that changes it most.
+    """
+    clusters = index_clusters(figure.items, "logs", names)
+    if clusters is None or abs(difference) <= _SAME or clusters.grouped is not clusters:
+        return None
+    left = figure.without_each(clusters) * np.sign(difference)
+    left = np.where(np.isnan(left), np.inf, left)
+    k = int(np.argmin(left))
+    return (clusters.names[k], float(left[k] * np.sign(difference))) if left[k] <= abs(difference) / 2 else None
 
 
 def difference_limits(
-    figure: PairStatistic, difference: float, over: str, names: ClusterNames, draws: ClusterDraws, *, fixed: bool
+    figure: PairStatistic, difference: float, over: str | None, names: ClusterNames, *, fixed: bool
 ) -> dict[str, object]:
-    """The columns `low`, `high`, `interval` and `interval_over` of a difference, as far as they exist.
+    """The columns `low`, `high`, `interval`, `interval_over` and `clusters` of a difference, as far as they exist.
 
-    `over`: the kind of cluster that is resampled. `fixed`: the figure is equal in every run, on either side.
+    `over`: the kind of cluster, None: none. `fixed`: the figure is equal in every run, on either side.
     """
-    if not math.isfinite(difference):
+    if over is None or not math.isfinite(difference):
         return {}
     if over == "runs" and fixed:
         return {"interval": NOTHING_DRAWN}
-    drawn = index_clusters(figure.items, over, names)
-    if drawn is None or not (figure.by_object or over != "objects"):
+    clusters = index_clusters(figure.items, over, names)
+    if clusters is None or not (figure.by_object or over != "objects"):
         return {}
-    resampled = draws.of(drawn.names)
-    low, high = percentile_limits(figure.resampled(drawn, resampled.count), resampled)
-    kind = "bootstrap"
-    if abs(high - low) <= _SAME:
-        if "only" not in figure.items.columns:
-            return {"interval": ALL_ALIKE}
-        cluster = drawn.of(figure.items)
-        rows = np.bincount(cluster[cluster >= 0], figure.items["n"][cluster >= 0], minlength=len(drawn.names))
-        kind, (low, high) = "exact", alike_limits(difference, effective_number(rows))
+    kind, low, high = figure.limits(difference, clusters)
+    if kind == ALL_ALIKE:
+        return {"interval": kind}
+    if not (math.isfinite(low) or math.isfinite(high)):
+        return {}
     limits = {"low": low, "high": high}
     return {name: limit if math.isfinite(limit) else None for name, limit in limits.items()} | {
         "interval": kind,
         "interval_over": over,
+        "clusters": len(clusters.names),
     }

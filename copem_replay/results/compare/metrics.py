@@ -12,7 +12,7 @@ distance, so it differs infinitely from a distance, and not at all from never.
 many ghosts per minute over all logs and runs as is asked for (`explain_incomparable`: where that means nothing). Stale
 ghosts are not counted: a late list that was right at its capture is not cleaner without them. Between two thresholds
 (the second may leave nothing) their mixture has exactly as many: a share of the drives uses the one, the rest the
-other, as between two points of a ROC curve. Resamples keep the thresholds and the share.
+other, as between two points of a ROC curve. Intervals keep the thresholds and the share.
 """
 
 from __future__ import annotations
@@ -320,7 +320,7 @@ def _distance_regrets(pair: _Pair) -> Iterator[Regret]:
 
 
 def _list_regrets(pair: _Pair) -> Iterator[Regret]:
-    """Errors and GOSPA; lists belong to no object, so that their number stays when objects are resampled."""
+    """Errors and GOSPA; lists belong to no object, so that their number stays where objects are clusters."""
     if pair.first.accuracy is None or pair.second.accuracy is None:
         return
     both = pair_lists(pair.first.accuracy, pair.second.accuracy, pair.grid, pair.cells)
@@ -331,7 +331,7 @@ def _list_regrets(pair: _Pair) -> Iterator[Regret]:
     measured = both.measured > 0
     parts = np.concatenate([both.gospa, np.zeros((len(pair.cells), 1))], axis=1)[measured]
     items = _append_run_items(pair, pair.cells[measured], parts, np.outer(both.lists, [0.0, 0.0, 1.0]), both.lists)
-    yield Regret("gospa_m", SumStatistic(parts=(items,), of=_make_power_mean(pair.setting.power)))
+    yield Regret("gospa_m", SumStatistic(parts=(items,), of=_make_power_mean(pair.setting.power), weighed_by=2))
 
 
 def _false_positive_regrets(pair: _Pair) -> Iterator[Regret]:
@@ -349,9 +349,8 @@ def _false_positive_regrets(pair: _Pair) -> Iterator[Regret]:
         nearest[:, k] = accuracy_of_side.ghosts[cells]
         rest[:, k] -= np.bincount(runs, nearest[:, k], minlength=len(rest))
     items = _append_run_items(pair, cells, nearest, rest, present.astype(np.int64))
-    yield Regret(
-        "false_positives_per_min", SumStatistic(parts=(items,), by_object=len(accuracy) == 2, of=_divide_rates)
-    )
+    rate = SumStatistic(parts=(items,), by_object=len(accuracy) == 2, of=_divide_rates, weighed_by=2)
+    yield Regret("false_positives_per_min", rate)
 
 
 def _braking_regrets(pair: _Pair) -> Iterator[Regret]:

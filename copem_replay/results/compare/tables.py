@@ -11,9 +11,8 @@ import pandas as pd
 
 from copem_replay.core.errors import OutputError, escape_unprintable, wrap_line
 from copem_replay.core.files import atomic_file
-from copem_replay.metrics.intervals import NOTHING_DRAWN
+from copem_replay.metrics.intervals import ALL_ALIKE, EXACT, NOTHING_DRAWN, describe_absent, describe_clusters
 from copem_replay.metrics.summary import format_table
-from copem_replay.results.compare.limits import ALL_ALIKE
 from copem_replay.results.compare.metrics import METRICS
 from copem_replay.results.folder import add_to_made_list
 
@@ -119,10 +118,15 @@ def comparison_lines(comparison: Comparison) -> Iterator[str]:
     overall = comparison.overall
     shown = set(overall["metric"])
     yield f"differences to {comparison.baseline}, paired by log, object and run; accuracy at instants that both have"
-    over = overall.dropna(subset="interval_over").groupby("interval_over", sort=False)["metric"].unique()
-    kinds = [kind if len(over) == 1 else f"{kind} ({', '.join(metrics)})" for kind, metrics in over.items()]
+    limited = overall.dropna(subset="interval_over")
+    over = limited.groupby(["interval_over", "clusters"], sort=False)["metric"].unique()
+    kinds = [
+        describe_clusters(kind, number) + (f" ({', '.join(metrics)})" if len(over) > 1 else "")
+        for (kind, number), metrics in over.items()
+    ]
     if kinds:
-        yield f"[95 %]: bootstrap interval over {'; '.join(kinds)}"
+        yield f"[95 %]: over {'; '.join(kinds)}"
+    yield from _describe_logs(limited[limited["interval_over"] == "logs"])
     if any(_excludes_0(low, high) for low, high in zip(overall["low"], overall["high"], strict=True)):
         yield f"{APART}: the interval excludes 0"
     yield from _describe_intervals(overall)
@@ -140,8 +144,30 @@ def comparison_lines(comparison: Comparison) -> Iterator[str]:
         of_metric = overall[overall["metric"] == metric]
         beyond = of_metric["low"] > NOTHING if better > 0 else of_metric["high"] < -NOTHING
         if beyond.any():
-            names = ", ".join(of_metric.loc[beyond, "configuration"])
+            names = ", ".join(map(_name_with_logs, of_metric[beyond].itertuples(index=False)))
             yield f"better than {comparison.baseline} in {metric}, the interval excluding 0: {names}"
+
+
+def _describe_logs(limited: pd.DataFrame) -> Iterator[str]:
+    """Lines on intervals over logs: in how many logs each configuration is better, and what none of them may have."""
+    if not len(limited):
+        return
+    parts = []
+    for metric, rows in limited.groupby("metric", sort=False):
+        counts = (f"{row.configuration} {row.logs_better} of {row.clusters}" for row in rows.itertuples())
+        parts.append(f"{metric} {', '.join(counts)}")
+    yield f"logs that gain: {'; '.join(parts)}"
+    yield f"whatever the interval, {describe_absent(int(limited['clusters'].min()))}"
+
+
+def _name_with_logs(row: Any) -> str:
+    """A configuration, and in how many logs it gains, where the interval is over logs."""
+    return row.configuration if pd.isna(row.logs_better) else f"{row.configuration} ({describe_gain(row)})"
+
+
+def describe_gain(row: Any) -> str:
+    """In how many logs a configuration is better than the baseline: `7 of 8 logs gain`."""
+    return f"{row.logs_better} of {row.clusters} logs gain"
 
 
 _HTML = {"&": "&amp;", "<": "&lt;", ">": "&gt;"}
@@ -156,13 +182,10 @@ def escape_markdown(text: str) -> str:
 
 
 def _describe_intervals(overall: pd.DataFrame) -> Iterator[str]:
-    """Lines on differences with other kinds of intervals, or without any, as nothing varies among resamples."""
+    """Lines on differences with other kinds of intervals, or without any, as nothing varies."""
     kinds = {kind: list(dict.fromkeys(of["metric"])) for kind, of in overall.groupby("interval", sort=False)}
-    if "exact" in kinds:
-        yield (
-            f"{', '.join(kinds['exact'])}: exact binomial limits where the difference is the same in every cluster, "
-            "because all resamples are then the same"
-        )
+    if EXACT in kinds:
+        yield f"{', '.join(kinds[EXACT])}: exact binomial limits where the difference is the same in every cluster"
     if ALL_ALIKE in kinds:
         yield (
             f"({_WITHOUT[ALL_ALIKE]}): the difference is the same in every cluster, or a median in nearly all, so how "
