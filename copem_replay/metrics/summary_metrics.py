@@ -138,9 +138,7 @@ def _estimate_share(part: pd.DataFrame, successes: NDArray[np.int64], *, fixed: 
 def estimate_detected_share(inputs: MetricInputs) -> ShareEstimate:
     """The share of the rows that are detected."""
     runs = inputs.rows["runs"].to_numpy()
-    return _estimate_share(
-        inputs.rows, np.where(_is_known(inputs.rows), runs, 0), fixed=inputs.lists_fixed
-    )
+    return _estimate_share(inputs.rows, np.where(_is_known(inputs.rows), runs, 0), fixed=inputs.lists_fixed)
 
 
 def estimate_foreseen_share(inputs: MetricInputs) -> float | None:
@@ -242,7 +240,11 @@ def _limit_metrics(
             value=attrgetter("over"),
             help=f"what the limits of {of} are over: logs, objects of one log or runs of one object",
         ),
-        row(f"{prefix}interval_clusters", value=attrgetter("clusters"), help=f"how many of these the limits of {of} are over"),
+        row(
+            f"{prefix}interval_clusters",
+            value=attrgetter("clusters"),
+            help=f"how many of these the limits of {of} are over",
+        ),
     )
 
 

@@ -150,7 +150,8 @@ def restricted_means_without(
         """(K, spans) sums of all rows but those of each cluster."""
         place = cluster[kept] * spans + span[kept]
         sums = np.bincount(place, of[kept], minlength=clusters * spans).reshape(clusters, spans)
-        return sums.sum(axis=0) - sums
+        rest: Float = sums.sum(axis=0) - sums
+        return rest
 
     within = without_each(np.ones(len(weight), dtype=bool), weight)
     total = within.sum(axis=1)

@@ -234,7 +234,7 @@ class Results:
 
     @cached_property
     def known(self) -> pd.DataFrame:
-        """The tally of detections; for a single object a row per run, as runs are then resampled."""
+        """The tally of detections; for a single object a row per run, as runs are then the clusters."""
         tally = self.tally[self.tally["event"] == DETECTED]
         if not len(tally) or choose_clusters(tally)[0] != "runs":
             return tally

@@ -1,4 +1,4 @@
-"""What is resampled whole: logs where there are enough, else objects, and the runs of a lone object."""
+"""What intervals are over: logs from three on, the objects of one log, the runs of one object; never objects of two."""
 
 from __future__ import annotations
 
@@ -19,15 +19,14 @@ def rows(logs: int, objects: int, runs: int = 2) -> pd.DataFrame:
     [
         (1, 1, "runs", 2),
         (2, 1, None, 2),
-        (4, 1, None, 4),
-        (2, 2, None, 4),  # objects of one name in two logs are two
+        (2, 9, None, 18),  # objects of one name in two logs are two
+        (1, 4, None, 4),
         (1, 5, "objects", 5),
-        (4, 2, "objects", 8),
-        (5, 1, "logs", 5),
-        (5, 9, "logs", 5),
+        (3, 1, "logs", 3),
+        (3, 9, "logs", 3),
     ],
 )
-def test_what_is_resampled(logs: int, objects: int, over: str | None, many: int) -> None:
+def test_what_intervals_are_over(logs: int, objects: int, over: str | None, many: int) -> None:
     found, cluster = choose_clusters(rows(logs, objects))
     assert found == over
     assert cluster.nunique() == many

@@ -1,9 +1,8 @@
-"""Intervals over whole clusters against numbers computed by hand, fractions and SciPy."""
+"""Intervals over whole clusters against numbers computed by hand, SciPy and plain loops."""
 
 import itertools
 import math
 from collections import Counter
-from fractions import Fraction
 
 import numpy as np
 import numpy.typing as npt
@@ -15,31 +14,322 @@ from scipy.stats import binomtest
 
 from copem_replay.core.random import CounterRng, RandomKey, object_words
 from copem_replay.metrics.intervals import (
-    Resamples,
+    MOST_GROUPS,
+    absent_share,
     alike_limits,
-    bootstrap_share,
-    count_multiplicities,
+    describe_absent,
+    describe_clusters,
     draw_resamples,
-    effective_number,
     exact_limits,
     expand_tail,
+    figure_variance,
+    group_clusters,
+    limit_figure,
+    limit_quantile,
+    limit_share,
     list_resamples,
     percentile_limits,
-    share_limits,
 )
 from copem_replay.metrics.summary import format_summary, summarise_rows
-from tests.helpers.compare_folders import limits_of, widened
+from tests.helpers.compare_folders import widened
+from tests.oracles import intervals as oracle
 
 Array = npt.NDArray[np.float64]
 
 
-def of(uniform: Array) -> Resamples:
-    """The resamples that these numbers draw."""
-    return Resamples(count_multiplicities(uniform), np.ones(len(uniform), dtype=np.int64))
+def pair(limits: tuple[Array, Array]) -> tuple[float, float]:
+    return float(limits[0]), float(limits[1])
 
 
-def columns(clusters: list[tuple[int, int]]) -> list[npt.NDArray[np.int64]]:
-    return [np.array(column) for column in zip(*clusters, strict=True)]
+# ------------------------------------------------------------------------------------ exact limits
+
+
+def test_exact_limits_by_hand():
+    # All of five, with probability p⁵ = 0.025; none of five, (1 − p)⁵ = 0.025.
+    assert pair(exact_limits(5, 5)) == (pytest.approx(0.025**0.2), 1.0)
+    assert pair(exact_limits(0, 5)) == (0.0, pytest.approx(1 - 0.025**0.2))
+    assert pair(exact_limits(5, 5))[0] == pytest.approx(0.478176, abs=1e-6)
+    # In between: of Beta(1, 1.5) the distribution is 1 − (1 − x)^1.5.
+    assert pair(exact_limits(1, 1.5))[0] == pytest.approx(1 - 0.975 ** (1 / 1.5))
+
+
+@given(st.integers(1, 300).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
+def test_exact_limits_of_whole_numbers_are_those_of_clopper_and_pearson(trials: tuple[int, int]):
+    k, n = trials
+    expected = binomtest(k, n).proportion_ci(0.95, method="exact")
+    assert pair(exact_limits(k, n)) == pytest.approx((expected.low, expected.high), abs=1e-8)
+
+
+fractional = st.floats(1, 200).flatmap(lambda n: st.tuples(st.floats(0, 1).map(lambda share: share * n), st.just(n)))
+
+
+@given(fractional)
+def test_exact_limits_hold_their_share_and_are_mirrored_by_the_failures(trials: tuple[float, float]):
+    k, n = trials
+    low, high = pair(exact_limits(k, n))
+    assert 0 <= low <= k / n + 1e-9
+    assert k / n - 1e-9 <= high <= 1
+    assert pair(exact_limits(n - k, n)) == pytest.approx((1 - high, 1 - low), abs=1e-7)
+
+
+# ------------------------------------------------------------------------------------ shares
+
+
+def test_three_logs_that_detect_all_are_as_many_objects_as_hang_together_a_little():
+    # Three logs of five: m = 5, n/(1 + .2 · 4) = 15/1.8; low = .025^(1.8/15).
+    assert pair(limit_share([5, 5, 5], [5, 5, 5], 15)) == (pytest.approx(0.025 ** (1.8 / 15)), 1.0)
+    # Of one object each: n = 3. More runs of each change nothing.
+    assert pair(limit_share([1, 1, 1], [1, 1, 1], 3)) == (pytest.approx(0.025 ** (1 / 3)), 1.0)
+    assert pair(limit_share([900, 900, 900], [900, 900, 900], 3)) == (pytest.approx(0.025 ** (1 / 3)), 1.0)
+
+
+def test_logs_that_contradict_each_other_are_few_objects():
+    # All of ten, none of ten, five of ten: p = .5, v = 3/2 · (5² + 5²)/30² = 1/12, p(1 − p)/v = 3; t of 29 degrees is
+    # 2.045230, of 2 4.302653: 3 · .225949 = .677848, and less than one object there is not.
+    assert pair(limit_share([10, 0, 5], [10, 10, 10], 30)) == pytest.approx(oracle.exact(0.5, 1.0))
+    # 7, 5 and 6 of 10: p = .6, v = 3/2 · 2/900 = 1/300, p(1 − p)/v = 72 · .225949 = 16.27 > 30/2.8.
+    assert pair(limit_share([7, 5, 6], [10, 10, 10], 30)) == pytest.approx(oracle.exact(0.6, 30 / 2.8))
+    # 9, 3, 6: v = 3/2 · 18/900 = .03, .24/.03 · .225949 = 1.807593.
+    assert pair(limit_share([9, 3, 6], [10, 10, 10], 30)) == pytest.approx(oracle.exact(0.6, 1.807593), abs=1e-5)
+
+
+def test_unequal_logs_by_hand():
+    # 4 of 4, 1 of 1, 0 of 1: n = 6, p = 5/6, m = 18/6 = 3, 6/1.4 = 4.2857; residuals 2/3, 1/6, −5/6: v =
+    # 3/2 · (42/36)/36 = 7/144, p(1 − p)/v = 20/7; t of 5 degrees is 2.570582: · .356936 = 1.019817.
+    expected = oracle.exact(5 / 6, 1.019817)
+    assert pair(limit_share([4, 1, 0], [4, 1, 1], 6)) == pytest.approx(expected, abs=1e-5)
+
+
+logs = st.lists(
+    st.integers(1, 9).flatmap(lambda w: st.tuples(st.floats(0, 1).map(lambda p: p * w), st.just(w))),
+    min_size=3, max_size=12,
+)  # fmt: skip
+
+
+@given(logs)
+def test_limits_of_shares_are_those_of_the_plain_formula(clusters: list[tuple[float, float]]):
+    successes, objects = np.array(clusters).T
+    found = pair(limit_share(successes, objects, objects.sum()))
+    assert found == pytest.approx(oracle.share(clusters), abs=1e-7)
+    share = successes.sum() / objects.sum()
+    assert found[0] - 1e-9 <= share <= found[1] + 1e-9
+
+
+@given(logs, st.permutations(range(12)), st.integers(2, 50))
+def test_neither_the_order_of_logs_nor_more_runs_change_limits(
+    clusters: list[tuple[float, float]], order: list[int], runs: int
+):
+    successes, objects = np.array(clusters).T
+    once = pair(limit_share(successes, objects, objects.sum()))
+    shuffled = [k for k in order if k < len(clusters)]
+    assert pair(limit_share(successes[shuffled], objects[shuffled], objects.sum())) == pytest.approx(once, abs=1e-9)
+    assert pair(limit_share(successes * runs, objects * runs, objects.sum())) == pytest.approx(once, abs=1e-9)
+
+
+@given(logs)
+def test_failures_have_the_mirrored_interval(clusters: list[tuple[float, float]]):
+    successes, objects = np.array(clusters).T
+    low, high = pair(limit_share(successes, objects, objects.sum()))
+    assert pair(limit_share(objects - successes, objects, objects.sum())) == pytest.approx(
+        (1 - high, 1 - low), abs=1e-6
+    )
+
+
+def test_many_studies_at_once_are_each_by_itself():
+    rng = np.random.default_rng(3)
+    objects = rng.integers(0, 5, (2, 7, 4)) * 1.0 + [1, 0, 1, 1]
+    successes = objects * rng.random((2, 7, 4))
+    low, high = limit_share(successes, objects, objects.sum(axis=-1))
+    for a, b in itertools.product(range(2), range(7)):
+        there = objects[a, b] > 0  # a log without objects is none
+        of = list(zip(successes[a, b][there], objects[a, b][there], strict=True))
+        assert (low[a, b], high[a, b]) == pytest.approx(oracle.share(of), abs=1e-8)
+
+
+# ------------------------------------------------------------------------------------ other figures
+
+
+def test_three_equal_logs_have_the_ordinary_interval_of_their_mean():
+    # 1, 2 and 6: mean 3, variance 7, 3 ± 4.302653 · √(7/3); without each: 4, 3.5, 1.5.
+    low, high = pair(limit_figure(3.0, np.array([4.0, 3.5, 1.5]), np.ones(3)))
+    assert (low, high) == pytest.approx((3 - 4.302653 * math.sqrt(7 / 3), 3 + 4.302653 * math.sqrt(7 / 3)), abs=1e-5)
+    assert pair(limit_figure(3.0, np.array([4.0, 3.5, 1.5]), np.ones(3), (0.0, 5.0))) == (0.0, 5.0)
+
+
+@pytest.mark.parametrize("K", [2, 3, 5, 20])
+def test_equal_logs_leave_one_degree_of_freedom_less(K):
+    df = figure_variance(np.asarray(0.0), np.arange(float(K)), np.full(K, 7.0))[1]
+    assert float(df) == pytest.approx(K - 1)
+
+
+def test_a_log_that_has_nearly_all_leaves_little_more_than_one_degree_of_freedom():
+    # Weights 2, 1, 1: n = 4, Q = BBᵀ written out: diag 1/2 · (1/4), …
+    variance, df = figure_variance(np.asarray(1.0), np.array([0.0, 1.5, 1.5]), np.array([2.0, 1.0, 1.0]))
+    # e = 2 · 1, 3 · −.5, 3 · −.5: (4/.5 + 2.25/.75 · 2)/16.
+    assert float(variance) == pytest.approx((8 + 6) / 16)
+    w = np.array([2.0, 1.0, 1.0])
+    B = np.diag((1 - w / 4) ** -0.5) @ (np.diag(w) - np.outer(w, w) / 4)
+    assert float(df) == pytest.approx(np.trace(B @ B.T) ** 2 / np.trace(B @ B.T @ B @ B.T))
+    assert 1 < float(df) < 2
+
+
+figures = st.lists(st.tuples(st.floats(-50, 50), st.integers(1, 30)), min_size=2, max_size=9)
+
+
+@given(figures)
+def test_limits_of_means_are_those_of_the_plain_formula(clusters: list[tuple[float, int]]):
+    sums, weights = np.array([x * w for x, w in clusters]), np.array([w for _, w in clusters], dtype=float)
+    value = sums.sum() / weights.sum()
+    without = (sums.sum() - sums) / (weights.sum() - weights)
+    low, high = pair(limit_figure(value, without, weights))
+    assert (low, high) == pytest.approx(oracle.figure(value, without, weights), abs=1e-6, rel=1e-6)
+    assert low <= value <= high
+    order = np.argsort(sums, kind="stable")
+    again = pair(limit_figure(value, without[order], weights[order]))
+    assert again == pytest.approx((low, high), abs=1e-6)
+    scaled = pair(limit_figure(value, without, weights * 12))  # weights count by their ratio
+    assert scaled == pytest.approx((low, high), abs=1e-6)
+
+
+def test_many_clusters_make_groups_of_neighbours():
+    assert group_clusters(3).tolist() == [0, 1, 2]
+    assert group_clusters(MOST_GROUPS).tolist() == list(range(MOST_GROUPS))
+    many = group_clusters(1001)
+    assert np.unique(many).tolist() == list(range(MOST_GROUPS))
+    assert (np.diff(many) >= 0).all()
+    assert set(np.bincount(many).tolist()) == {5, 6}
+
+
+# ------------------------------------------------------------------------------------ quantiles
+
+
+def test_a_median_of_eight_is_between_the_first_and_the_last():
+    """Of eight objects in one log: a half is possible from one of eight (high .5265) to seven (low .4735)."""
+    values = np.array([-math.inf, *range(8)])
+    shares = np.tril(np.ones((9, 8)), -1)
+    low, high = limit_share(shares, np.ones((9, 8)))
+    for k in range(9):
+        assert (low[k], high[k]) == pytest.approx(oracle.share([(float(i < k), 1.0) for i in range(8)]))
+    assert limit_quantile(values, low, high) == (0.0, 7.0)
+    # Three tell no limit: with none at or below a value, up to .708 may be; with all, from .292 on.
+    few = limit_share(np.tril(np.ones((4, 3)), -1), np.ones((4, 3)))
+    assert limit_quantile(values[:4], *few) == (-math.inf, math.inf)
+
+
+def test_a_limit_that_does_not_ascend_is_taken_conservatively():
+    values, high = np.arange(4.0), np.array([0.4, 0.6, 0.4, 1.0])
+    assert limit_quantile(values, np.array([0.0, 0.5, 0.4, 0.7]), high) == (1.0, 3.0)
+    assert limit_quantile(values, np.array([0.0, 0.5, 0.5, 0.7]), high, 0.9) == (3.0, math.inf)
+
+
+# ------------------------------------------------------------------------------------ differences that are all alike
+
+
+def test_a_difference_that_is_the_same_in_five_objects_by_hand():
+    assert alike_limits(0.0, np.ones(5)) == pytest.approx((-0.521824, 0.521824), abs=1e-6)
+    assert alike_limits(1.0, np.ones(5)) == pytest.approx((0.478176, 1.0), abs=1e-6)
+    assert alike_limits(-1.0, np.ones(5)) == pytest.approx((-1.0, -0.478176), abs=1e-6)
+    # Three logs of five: 15/1.8 objects.
+    assert alike_limits(1.0, np.full(3, 5.0)) == pytest.approx((0.025 ** (1.8 / 15), 1.0))
+
+
+some_weights = st.lists(st.integers(1, 40), min_size=1, max_size=9).map(lambda w: np.array(w, dtype=float))
+
+
+@given(st.floats(-1, 1), some_weights)
+def test_limits_of_alike_differences_are_mirrored_hold_it_and_stay_possible(difference: float, weights: Array):
+    low, high = alike_limits(difference, weights)
+    assert -1 - 1e-9 <= low <= difference + 1e-9
+    assert difference - 1e-9 <= high <= 1 + 1e-9
+    assert alike_limits(-difference, weights) == pytest.approx((-high, -low), abs=1e-12)
+
+
+@given(st.floats(0, 0.99), some_weights)
+def test_a_little_more_of_a_difference_changes_its_limits_a_little(difference: float, weights: Array):
+    one, other = np.array(alike_limits(difference, weights)), np.array(alike_limits(difference + 1e-4, weights))
+    assert (other >= one - 1e-9).all()
+    assert other == pytest.approx(one, abs=0.02)
+
+
+# ------------------------------------------------------------------------------------ words
+
+
+def test_what_a_sample_cannot_exclude():
+    assert absent_share(8) == pytest.approx(0.312344, abs=1e-6)  # .95 that eight have one: 1 − (1 − x)⁸
+    assert absent_share(3) == pytest.approx(0.631597, abs=1e-6)
+    assert describe_absent(8) == "a kind of drive that makes up to 31 % of such traffic can be absent"
+
+
+def test_an_interval_says_what_it_is_over():
+    assert describe_clusters("logs", 8) == "8 logs: how far other drives of this kind may differ"
+    assert describe_clusters("objects", 12).startswith("12 objects of this drive: ")
+    assert "nothing about other drives" in describe_clusters("objects")
+    assert describe_clusters("runs", 1).startswith("1 run of this one object: ")
+
+
+# ------------------------------------------------------------------------------------ the summary
+
+
+def rows_of(detected: list[list[bool]]) -> pd.DataFrame:
+    """Rows of one configuration, an object each with its runs, that are looked at for 2 s and known at 1 s or never."""
+    found = pd.DataFrame(
+        [
+            {"object_id": str(k), "run": run, "detected": known, "time_to_detection_s": 1.0 if known else math.nan}
+            for k, of_object in enumerate(detected)
+            for run, known in enumerate(of_object)
+        ]
+    )
+    return found.assign(log="a", configuration="c", onset_s=0.0, ended_s=2.0, ended_by="object_left",
+                        distance_at_detection_m=5.0)  # fmt: skip
+
+
+def test_the_summary_of_five_objects_that_are_always_detected() -> None:
+    table, notes = summarise_rows(rows_of([[True] * 20] * 5), ["c"], {"c": 10.0}, horizon_s=2.0)
+    (row,) = table.to_dict("records")
+    assert (row["detected_share_low"], row["detected_share_high"]) == (pytest.approx(0.025**0.2), 1.0)
+    assert (row["interval"], row["interval_over"], row["interval_clusters"], notes) == ("exact", "objects", 5, [])
+    lines = format_summary(table).splitlines()
+    assert "[0.4782, 1]" in lines[1]
+    assert any(line.startswith("95 %: exact binomial limits over 5 objects of this drive: ") for line in lines)
+    assert not any("absent" in line for line in lines)
+
+
+def drives(shares: list[list[float]], runs: int = 4) -> pd.DataFrame:
+    """A log each, objects with the share of their runs in which they are detected."""
+    return pd.concat(
+        [rows_of([[r < share * runs for r in range(runs)] for share in of]).assign(log=f"log {k}")
+         for k, of in enumerate(shares)], ignore_index=True,
+    )  # fmt: skip
+
+
+def test_the_summary_of_three_logs_counts_objects() -> None:
+    shares = [[1.0, 0.5, 0.75], [1.0], [0.25, 0.5]]
+    table, notes = summarise_rows(drives(shares), ["c"], {"c": 10.0}, horizon_s=2.0)
+    (row,) = table.to_dict("records")
+    expected = oracle.share([(sum(of), len(of)) for of in shares])
+    assert (row["detected_share_low"], row["detected_share_high"]) == pytest.approx(expected)
+    assert (row["interval_over"], row["interval_clusters"], notes) == ("logs", 3, [])
+    lines = format_summary(table).splitlines()
+    assert any("over 3 logs: how far other drives of this kind may differ" in line for line in lines)
+    assert any("up to 63 % of such traffic can be absent" in line for line in lines)
+    more, _ = summarise_rows(drives(shares, runs=40), ["c"], {"c": 10.0}, horizon_s=2.0)
+    limits = ["detected_share_low", "detected_share_high"]
+    assert more[limits].to_numpy() == pytest.approx(table[limits].to_numpy())
+
+
+def test_two_logs_have_no_interval_whatever_is_in_them() -> None:
+    table, notes = summarise_rows(drives([[1.0] * 9, [0.5] * 9]), ["c"], {"c": 10.0}, horizon_s=2.0)
+    assert table[["detected_share_low", "interval", "interval_over", "interval_clusters"]].isna().all(axis=None)
+    (note,) = notes
+    assert note.startswith("no interval of the detected share: 2 logs, fewer than 3: ")
+
+
+def test_one_object_has_the_binomial_interval_of_its_runs() -> None:
+    table, _ = summarise_rows(drives([[0.75]], runs=20), ["c"], {"c": 10.0}, horizon_s=2.0)
+    (row,) = table.to_dict("records")
+    expected = binomtest(15, 20).proportion_ci(0.95, method="exact")
+    assert (row["detected_share_low"], row["detected_share_high"]) == pytest.approx((expected.low, expected.high))
+    assert (row["interval"], row["interval_over"], row["interval_clusters"]) == ("exact", "runs", 20)
 
 
 # ------------------------------------------------------------------------------------ resamples
@@ -92,255 +382,6 @@ def test_two_clusters_by_hand():
     assert (low, high) == pytest.approx((0.2359488 / 2, 1 - 0.2359488 / 2), abs=1e-7)
 
 
-# ------------------------------------------------------------------------------------ bootstrap
-
-
-def share(successes: list[int], totals: list[int], uniform: Array, confidence: float) -> tuple[float, float]:
-    return bootstrap_share(np.array(successes), np.array(totals), of(uniform), confidence=confidence)
-
-
-def test_four_resamples_by_hand():
-    # Clusters 0 of 2 and 4 of 4. Drawn: both first, first and second twice, both second.
-    uniform = np.array([[0.1, 0.2], [0.1, 0.9], [0.6, 0.4], [0.99, 0.5]])
-    # Shares 0, 2/3, 2/3, 1. Two clusters: Student's quantile of one degree of freedom is 1, by √2: Φ(−√2) = 0.0786496.
-    steps = 3 * 0.07864960352514258
-    expected = (2 / 3 * steps, 1 - 1 / 3 * steps)
-    assert share([0, 4], [2, 4], uniform, 0.5) == pytest.approx(expected, abs=1e-12)
-
-
 @pytest.mark.parametrize(("clusters", "tail"), [(1, 0.025), (2, 0.0), (5, 0.00095), (10, 0.00855), (10**6, 0.025)])
 def test_few_clusters_widen_the_tails(clusters, tail):
     assert expand_tail(0.95, clusters) == pytest.approx(tail, abs=5e-6)
-
-
-@pytest.mark.long
-def test_intervals_over_few_clusters_hold_the_mean_as_often_as_they_say():
-    """Means of 5 clusters of equal size: plain percentiles hold it 85 times of 100; these at least 91."""
-    rng = np.random.default_rng(11)
-    held = 0
-    for _ in range(400):
-        shares = rng.beta(4, 4, 5)
-        successes, totals = np.rint(shares * 10_000).astype(int), np.full(5, 10_000)
-        low, high = bootstrap_share(successes, totals, list_resamples(5))
-        held += low <= 0.5 <= high
-    assert held >= 0.91 * 400
-
-
-def test_resamples_without_any_total_are_left_out():
-    # Of the four, the one that draws the empty cluster twice says nothing; all others say 1/3.
-    uniform = np.array([[0.1, 0.2], [0.1, 0.9], [0.6, 0.4], [0.99, 0.5]])
-    assert share([0, 1], [0, 3], uniform, 0.95) == pytest.approx((1 / 3, 1 / 3), abs=1e-15)
-
-
-def test_numbers_next_to_the_ends_draw_the_first_and_the_last_cluster():
-    least, most = np.nextafter(0.0, 1.0), np.nextafter(1.0, 0.0)
-    for clusters in (1, 3, 7, 10, 1000):
-        successes = [0] * (clusters - 1) + [1]
-        assert share(successes, [1] * clusters, np.full((2, clusters), most), 0.9) == (1.0, 1.0)
-        if clusters > 1:
-            assert share(successes, [1] * clusters, np.full((2, clusters), least), 0.9) == (0.0, 0.0)
-
-
-tallies = st.lists(
-    st.integers(0, 5).flatmap(lambda total: st.tuples(st.integers(0, total), st.just(total))),
-    min_size=1,
-    max_size=4,
-).filter(lambda clusters: any(total for _, total in clusters))
-
-
-def sorted_shares(clusters: list[tuple[int, int]]) -> list[Fraction]:
-    """Shares of all equally likely resamples that have one, in fractions."""
-    shares = []
-    for drawn in itertools.product(clusters, repeat=len(clusters)):
-        if total := sum(t for _, t in drawn):
-            shares.append(Fraction(sum(s for s, _ in drawn), total))
-    return sorted(shares)
-
-
-@given(tallies, st.integers(1, 19))
-def test_over_every_resample_the_limits_are_its_ordered_shares(clusters: list[tuple[int, int]], tail: int):
-    shares = sorted_shares(clusters)
-    # `tail` fortieths on each side, widened; between two ordered shares, straight.
-    low, high = widened(len(clusters), 1 - tail / 20) if len(clusters) > 1 else (tail / 40, 1 - tail / 40)
-    expected = []
-    for level in (Fraction(low), Fraction(high)):
-        steps = level * (len(shares) - 1)
-        below = math.floor(steps)
-        above = min(below + 1, len(shares) - 1)
-        expected.append(float(shares[below] + (steps - below) * (shares[above] - shares[below])))
-    found = bootstrap_share(*columns(clusters), list_resamples(len(clusters)), confidence=1 - tail / 20)
-    assert found == pytest.approx(expected, abs=1e-12)
-
-
-@given(tallies, st.integers(2, 50))
-def test_more_rows_of_the_same_kind_in_each_cluster_teach_nothing(clusters: list[tuple[int, int]], copies: int):
-    successes, totals = columns(clusters)
-    every = list_resamples(len(clusters))
-    once = bootstrap_share(successes, totals, every, confidence=0.9)
-    often = bootstrap_share(successes * copies, totals * copies, every, confidence=0.9)
-    assert often == pytest.approx(once, abs=1e-14)
-
-
-@given(tallies, st.integers(0, 2**32 - 1))
-def test_failures_have_the_mirrored_bootstrap_interval(clusters: list[tuple[int, int]], seed: int):
-    successes, totals = (list(column) for column in zip(*clusters, strict=True))
-    # The first rows draw each cluster alone, so that there is always a resample with a total.
-    alone = np.repeat(np.arange(len(clusters))[:, None] + 0.5, len(clusters), axis=1) / len(clusters)
-    uniform = np.concatenate([alone, np.random.default_rng(seed).uniform(1e-9, 1.0, (30, len(clusters)))])
-    low, high = share(successes, totals, uniform, 0.8)
-    failures = [t - s for s, t in clusters]
-    assert share(failures, totals, uniform, 0.8) == pytest.approx((1 - high, 1 - low), abs=1e-12)
-
-
-def test_over_independent_rows_it_agrees_with_theory_at_the_default_size():
-    # 400 rows of one, half of them successes: 1.96 · √(0.25/400) = 0.049 to either side.
-    uniform = np.random.default_rng(7).uniform(1e-9, 1.0, (2000, 400))
-    successes = np.tile([0, 1], 200)
-    low, high = bootstrap_share(successes, np.ones(400, dtype=np.int64), of(uniform))
-    assert low == pytest.approx(0.451, abs=0.006)
-    assert high == pytest.approx(0.549, abs=0.006)
-    # The same rows in 20 clusters of one mind each: √20 times as wide.
-    low, high = bootstrap_share(np.tile([0, 20], 10), np.full(20, 20), of(uniform[:, :20]))
-    assert high - low == pytest.approx(2 * 0.049 * math.sqrt(20), abs=0.05)
-
-
-# ------------------------------------------------------------------------------------ exact limits
-
-
-def test_exact_limits_by_hand():
-    # All of five, with probability p⁵ = 0.025; none of five, (1 − p)⁵ = 0.025.
-    assert exact_limits(5, 5) == (pytest.approx(0.025**0.2), 1.0)
-    assert exact_limits(0, 5) == (0.0, pytest.approx(1 - 0.025**0.2))
-    assert exact_limits(5, 5)[0] == pytest.approx(0.478176, abs=1e-6)
-    # In between: of Beta(1, 1.5) the distribution is 1 − (1 − x)^1.5.
-    assert exact_limits(1, 1.5)[0] == pytest.approx(1 - 0.975 ** (1 / 1.5))
-
-
-@given(st.integers(1, 300).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))), st.floats(0.5, 0.999))
-def test_exact_limits_of_whole_numbers_are_those_of_clopper_and_pearson(trials: tuple[int, int], confidence: float):
-    k, n = trials
-    expected = binomtest(k, n).proportion_ci(confidence, method="exact")
-    assert exact_limits(k, n, confidence=confidence) == pytest.approx((expected.low, expected.high), abs=1e-8)
-
-
-fractional = st.floats(1, 200).flatmap(lambda n: st.tuples(st.floats(0, 1).map(lambda share: share * n), st.just(n)))
-
-
-@given(fractional)
-def test_exact_limits_hold_their_share_and_are_mirrored_by_the_failures(trials: tuple[float, float]):
-    k, n = trials
-    low, high = exact_limits(k, n)
-    assert 0 <= low <= k / n + 1e-9
-    assert k / n - 1e-9 <= high <= 1
-    assert exact_limits(n - k, n) == pytest.approx((1 - high, 1 - low), abs=1e-7)
-
-
-def test_effective_numbers_by_hand():
-    assert effective_number(np.array([7, 7, 7, 7])) == pytest.approx(4)
-    assert effective_number(np.array([3.0, 1.0])) == pytest.approx(1.6)
-    assert effective_number(np.array([5, 0, 0])) == 1
-
-
-# ------------------------------------------------------------------------------------ shares
-
-
-def limits(clusters: list[tuple[int, int]]) -> tuple[str, float, float]:
-    return share_limits(*columns(clusters), draw_resamples([str(k) for k in range(len(clusters))], 1))
-
-
-def test_five_that_are_alike_are_no_certainty():
-    assert limits([(20, 20)] * 5) == ("bootstrap+exact", pytest.approx(0.025**0.2), 1.0)
-    assert limits([(0, 20)] * 5) == ("bootstrap+exact", 0.0, pytest.approx(1 - 0.025**0.2))
-    # Of 150, too: 1 − 0.025^(1/150).
-    assert limits([(0, 20)] * 150) == ("bootstrap+exact", 0.0, pytest.approx(0.0242926, abs=1e-7))
-
-
-def test_a_cluster_that_outweighs_the_others_is_nearly_all_there_is():
-    # n = 24² / (20² + 4 · 1²) = 1.425743: low = 0.025^(1/n), of Beta(n, 1).
-    kind, low, high = limits([(20, 20), (1, 1), (1, 1), (1, 1), (1, 1)])
-    assert (kind, low, high) == ("bootstrap+exact", pytest.approx(0.025 ** (404 / 576)), 1.0)
-
-
-def test_limits_are_the_wider_of_both_on_each_side():
-    # One of five succeeds, and half of another: the exact limits of 1.5 of 5 are wider below, as they are above.
-    clusters = [(2, 2), (1, 2), (0, 2), (0, 2), (0, 2)]
-    drawn = bootstrap_share(*columns(clusters), list_resamples(5))
-    kind, low, high = limits(clusters)
-    exact = exact_limits(1.5, 5)
-    assert (kind, low, high) == ("bootstrap+exact", min(drawn[0], exact[0]), max(drawn[1], exact[1]))
-    assert drawn == pytest.approx(
-        limits_of(list("abcde"), lambda some: sum({"a": 2, "b": 1}.get(one, 0) for one in some) / 10), abs=1e-12
-    )
-
-
-def test_many_clusters_of_which_enough_succeed_and_fail_are_only_resampled():
-    rng = np.random.default_rng(2)
-    clusters = [(int(k), 10) for k in rng.integers(0, 11, 120)]
-    assert limits(clusters) == (
-        "bootstrap",
-        *bootstrap_share(*columns(clusters), draw_resamples(list(map(str, range(120))), 1)),
-    )
-    # Of 120 nine succeed: fewer than ten.
-    assert limits([(1, 1)] * 9 + [(0, 1)] * 111)[0] == "bootstrap+exact"
-    assert limits([(1, 1)] * 10 + [(0, 1)] * 110)[0] == "bootstrap"
-    assert limits([(1, 1)] * 49 + [(0, 1)] * 50)[0] == "bootstrap+exact"
-
-
-@given(st.lists(st.tuples(st.integers(0, 4), st.integers(4, 6)), min_size=1, max_size=6))
-def test_limits_of_a_share_are_never_narrower_than_either(clusters: list[tuple[int, int]]):
-    _, low, high = limits(clusters)
-    for narrower in (bootstrap_share(*columns(clusters), list_resamples(len(clusters))),):
-        assert low <= narrower[0]
-        assert narrower[1] <= high
-    successes, totals = columns(clusters)
-    n = effective_number(totals)
-    least, most = exact_limits(n * successes.sum() / totals.sum(), n)
-    assert low <= least + 1e-12
-    assert most - 1e-12 <= high
-
-
-def rows_of(detected: list[list[bool]]) -> pd.DataFrame:
-    """Rows of one configuration, an object each with its runs, that are looked at for 2 s and known at 1 s or never."""
-    found = pd.DataFrame(
-        [
-            {"object_id": str(k), "run": run, "detected": known, "time_to_detection_s": 1.0 if known else math.nan}
-            for k, of_object in enumerate(detected)
-            for run, known in enumerate(of_object)
-        ]
-    )
-    return found.assign(log="a", configuration="c", onset_s=0.0, ended_s=2.0, ended_by="object_left",
-                        distance_at_detection_m=5.0)  # fmt: skip
-
-
-def test_the_summary_of_five_objects_that_are_always_detected() -> None:
-    table, notes = summarise_rows(rows_of([[True] * 20] * 5), ["c"], {"c": 10.0}, seed=1, horizon_s=2.0)
-    (row,) = table.to_dict("records")
-    assert (row["detected_share_low"], row["detected_share_high"]) == (pytest.approx(0.025**0.2), 1.0)
-    assert (row["interval"], row["interval_over"], notes) == ("bootstrap+exact", "objects", [])
-    lines = format_summary(table).splitlines()
-    assert "[0.4782, 1]" in lines[1]
-    assert "95 %: bootstrap interval over objects, nowhere narrower than exact binomial limits" in lines
-
-
-# ------------------------------------------------------------------------------------ differences that are all alike
-
-
-def test_a_difference_that_is_the_same_in_five_clusters_by_hand():
-    assert alike_limits(0.0, 5) == pytest.approx((-0.521824, 0.521824), abs=1e-6)
-    assert alike_limits(1.0, 5) == pytest.approx((0.478176, 1.0), abs=1e-6)
-    assert alike_limits(-1.0, 5) == pytest.approx((-1.0, -0.478176), abs=1e-6)
-
-
-@given(st.floats(-1, 1), st.floats(1, 200))
-def test_limits_of_alike_differences_are_mirrored_hold_it_and_stay_possible(difference: float, n: float):
-    low, high = alike_limits(difference, n)
-    assert -1 - 1e-9 <= low <= difference + 1e-9
-    assert difference - 1e-9 <= high <= 1 + 1e-9
-    assert alike_limits(-difference, n) == pytest.approx((-high, -low), abs=1e-12)
-
-
-@given(st.floats(0, 0.99), st.floats(1, 60))
-def test_a_little_more_of_a_difference_changes_its_limits_a_little(difference: float, n: float):
-    one, other = np.array(alike_limits(difference, n)), np.array(alike_limits(difference + 1e-4, n))
-    assert (other >= one - 1e-9).all()
-    assert other == pytest.approx(one, abs=0.02)

@@ -111,7 +111,7 @@ def test_statistics_are_sums_over_logs() -> None:
     """Late: one of two rows in each of the logs; without rows there is no value."""
     late = LateShare(kind="x:LateShare", name="late_share", late_s=2.0)
     table, _ = summarise_rows(
-        rows_of("a", "b", "b2"), ["c", "none"], {"c": 1.0, "none": None}, seed=0, horizon_s=5.0, own=[late]
+        rows_of("a", "b", "b2"), ["c", "none"], {"c": 1.0, "none": None}, horizon_s=5.0, own=[late]
     )
     assert table["late_share"].iloc[0] == 0.5
     assert pd.isna(table["late_share"].iloc[1])
@@ -127,7 +127,7 @@ def test_statistics_are_sums_over_logs() -> None:
 )
 def test_an_own_metric_that_fails_is_named(kind: type[RowMetric], said: str) -> None:
     with pytest.raises(InputError, match=rf"^measure\.metrics\[0\]: own:X: {said}"):
-        summarise_rows(rows_of("a"), ["c"], {"c": 1.0}, seed=0, horizon_s=5.0, own=[kind(kind="own:X", name="x")])
+        summarise_rows(rows_of("a"), ["c"], {"c": 1.0}, horizon_s=5.0, own=[kind(kind="own:X", name="x")])
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,7 @@ def tables(draw: st.DrawFn) -> pd.DataFrame:
 
 @given(tables())
 def test_the_summary_of_the_tally_is_that_of_the_rows(table: pd.DataFrame) -> None:
-    found, _ = summarise_rows(table, ["a", "b"], {"a": 1.0, "b": 2.0}, seed=3, horizon_s=7.3)
+    found, _ = summarise_rows(table, ["a", "b"], {"a": 1.0, "b": 2.0}, horizon_s=7.3)
     for name, row in found.set_index("configuration").iterrows():
         rows = table[table["configuration"] == name]
         for metric, value in (figures(rows, 7.3) | figures(rows, 7.3, "conflict_")).items():
@@ -106,6 +106,6 @@ def test_without_rows_there_is_no_figure_and_no_column_more(conflicts: bool) -> 
                "time_to_detection_s", "distance_at_detection_m"]  # fmt: skip
     more = ["conflict_detected", "conflict_detection_s", "time_to_conflict_detection_s",
             "distance_at_conflict_detection_m"] if conflicts else []  # fmt: skip
-    found, _ = summarise_rows(pd.DataFrame(columns=columns + more), ["a"], {"a": None}, seed=0, horizon_s=None)
+    found, _ = summarise_rows(pd.DataFrame(columns=columns + more), ["a"], {"a": None}, horizon_s=None)
     assert (found["n"].tolist(), found["detected_share"].tolist()) == ([0], [None])
     assert ("conflict_detected_share" in found) == conflicts

@@ -1147,7 +1147,7 @@ class TestSummary:
                 table += [row | {"detected": t is not None, "run": 0}] * count
         rates = {"c": None}
         frame = pd.DataFrame(table)
-        (row,) = summarise_rows(frame, ["c"], rates, seed=0, horizon_s=2.0, exact=pd.DataFrame(rows))[0].to_dict(
+        (row,) = summarise_rows(frame, ["c"], rates, horizon_s=2.0, exact=pd.DataFrame(rows))[0].to_dict(
             "records"
         )
         for name in ("detected_share", "ttd_rmst_s"):

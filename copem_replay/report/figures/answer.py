@@ -9,16 +9,17 @@ import numpy as np
 import pandas as pd
 
 from copem_replay.metrics.intervals import choose_clusters, find_fixed_outcomes
-from copem_replay.report.figures.detection_curves import detection_endings, mean_limits
+from copem_replay.report.figures.detection_curves import cluster_rows, detection_endings, mean_limits
 from copem_replay.report.figures.style import (
     RANKED_BY,
     ROW_IN,
     Dot,
     add_note,
     choose_appearances,
+    describe_over,
     describe_results,
-    describe_too_few,
     draw_rows,
+    explain_no_intervals,
     figure_style,
     find_contenders,
     find_truths,
@@ -82,12 +83,13 @@ def _time_dots(results: Results, names: Sequence[str]) -> tuple[list[Dot], list[
             dots.append(Dot(None, None, None, f"never (counts as {format_three_digits(horizon_s)} s)"))
             continue
         limits = None
-        reason = describe_too_few(results) if over is None else "every run is the same"
+        reason = explain_no_intervals(results) if over is None else "every run is the same"
         if over is not None and not (over == "runs" and fixed.known(name)):
             rows_of_name = results.known["configuration"] == name
-            time_s, ending, runs = detection_endings(results.known[rows_of_name])
-            seed = results.experiment.seed
-            limits = mean_limits(np.round(time_s, 9), ending, list(cluster[rows_of_name]), horizon_s, seed, runs)
+            of_name = results.known[rows_of_name]
+            time_s, ending, runs = detection_endings(of_name)
+            clusters = cluster_rows(of_name, over, cluster[rows_of_name])
+            limits = mean_limits(np.round(time_s, 9), ending, clusters, horizon_s, runs)
             reason = f"all {over} alike"
         if limits is None:
             without.setdefault(reason, []).append(name)
@@ -159,12 +161,10 @@ def _start_at_zero(axes: Axes, dots: Sequence[Dot]) -> None:
 
 
 def _note_sentences(results: Results, names: Sequence[str], rows: pd.DataFrame, *, intervals: bool) -> list[str]:
-    over = choose_clusters(results.known)[0]
     sentences = [describe_results(results, names)]
     if intervals:
-        sentences.append(
-            f"Lines: 95 % intervals over {over}. Two that overlap may differ for sure: see the differences"
-        )
+        sentences.append(f"Lines: 95 % intervals over {describe_over(results)}")
+        sentences.append("Two that overlap may differ for sure: see the differences")
     horizon = rows["ttd_rmst_horizon_s"].dropna()
     if (rows.loc[list(names), "detected_share"] < 1).any() and len(horizon):
         sentences.append(f"An object that is never detected counts as {format_three_digits(float(horizon.iloc[0]))} s")

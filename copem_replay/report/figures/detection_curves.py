@@ -3,10 +3,9 @@
 The curves are cumulative incidences of detection (Aalen–Johansen, departure competing: `metrics/survival.py`): objects
 that are never detected keep them below 100 %.
 
-Bands resample whole clusters of rows with replacement: the runs of a single measured object; else logs, or objects, of
-which there are at least `FEWEST_CLUSTERS`; with fewer there is no band. At each instant the limits are those of a share
-in `summary.csv` (`metrics/intervals.py`); all configurations resample the same clusters. Letters of the shapes: n rows,
-K clusters, R resamples, G instants, M steps of a curve.
+Bands are over the clusters of `summary.csv` (`metrics/intervals.py`), and at each instant the limits are those of a
+share: its variance is from the curves without each cluster, as with censoring a curve is no ratio of sums. Letters of
+the shapes: n rows, K clusters, G instants, M steps of a curve.
 """
 
 from __future__ import annotations
@@ -21,24 +20,34 @@ import pandas as pd
 
 from copem_replay.core.tracks import Float, Int
 from copem_replay.metrics.intervals import (
-    FEWEST_CLUSTERS,
     NOTHING_DRAWN,
-    Counts,
     choose_clusters,
-    draw_resamples,
-    effective_number,
+    exact_limits,
     find_fixed_outcomes,
-    percentile_limits,
-    widen_limits,
+    group_clusters,
+    limit_figure,
+    share_variance,
+    spread_share,
 )
-from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_incidence, is_competing
+from copem_replay.metrics.survival import (
+    CENSORED,
+    DETECTED,
+    LEFT,
+    cumulative_incidence,
+    incidences_without,
+    is_competing,
+    restricted_mean,
+    restricted_means_without,
+)
 from copem_replay.report.figures.selection import describe_left_out, find_differing
 from copem_replay.report.figures.style import (
     Appearance,
     add_note,
     choose_appearances,
     describe_list_rates,
+    describe_over,
     describe_results,
+    explain_no_intervals,
     figure_style,
     mark_configuration,
     new_figure,
@@ -54,101 +63,77 @@ if TYPE_CHECKING:
 
 # Bands.
 
-RESAMPLES = 400
-"""Resamples of a band: its limits are then off by about 1 % of its width."""
 _SAME_S = 1e-9
 """Means this close are equal: times are whole nanoseconds."""
-_CELLS = 4_000_000
-"""Resamples × rows held at a time: 32 MB per array."""
+
+
+@dataclass(frozen=True)
+class RowClusters:
+    """What an interval of rows (n,) is over: each row's `name` (n,), and `object` (n,), the episode it is about."""
+
+    over: str
+    name: Sequence[str]
+    object: Sequence[str]
+
+    @property
+    def number(self) -> Int:
+        """(n,) the cluster of each row, 0 … K − 1 in the order of their names."""
+        number: Int = np.unique(np.asarray(self.name, dtype=str), return_inverse=True)[1]
+        return number
+
+    @property
+    def weights(self) -> Float:
+        """(K,) objects of each cluster; runs count one each."""
+        number = self.number
+        if self.over == "runs":
+            return np.ones(int(number.max()) + 1)
+        pairs = np.unique(np.stack([number, np.unique(np.asarray(self.object), return_inverse=True)[1]]), axis=1)
+        return np.bincount(pairs[0]).astype(float)
+
+
+def cluster_rows(rows: pd.DataFrame, over: str, cluster: pd.Series) -> RowClusters:
+    """The clusters of a configuration's rows (n,), from `choose_clusters`."""
+    return RowClusters(over, list(cluster), list(rows["log"].astype(str) + "\n" + rows["object_id"].astype(str)))
 
 
 def incidence_limits(
-    time_s: Float, ending: Int, cluster: Sequence[str], at_s: Float, seed: int, runs: Int | None = None
+    time_s: Float, ending: Int, clusters: RowClusters, at_s: Float, runs: Int | None = None
 ) -> tuple[Float, Float]:
-    """Lower and upper limits (G,) of the cumulative incidence at instants (G,).
+    """Lower and upper limits (G,) of the cumulative incidence at instants (G,), ascending.
 
-    `time_s` (n,), `ending` (n,) as in `cumulative_incidence`; `cluster` (n,): name of each row's cluster; `runs` (n,):
-    how often each row counts, None: once.
+    `time_s` (n,), `ending` (n,) as in `cumulative_incidence`; `runs` (n,): how often each row counts, None: once.
     """
     runs = np.ones(len(time_s), dtype=np.int64) if runs is None else runs
-    names, cluster_ix = np.unique(np.asarray(cluster, dtype=str), return_inverse=True)
-    resampled = draw_resamples([str(name) for name in names], seed, RESAMPLES)
-    # Rows of one cluster with equal time and ending become one row that counts as often.
-    order = np.lexsort((cluster_ix, ending, time_s))
-    keys = np.stack([time_s, ending, cluster_ix])[:, order]
-    first = np.flatnonzero(np.append(True, (np.diff(keys) != 0).any(axis=0)))
-    alike = np.diff(np.append(0, np.cumsum(runs[order]))[np.append(first, len(order))])
-    rows = order[first]
-
-    def curves(count: Counts) -> Float:
-        return resample_incidence(time_s[rows], ending[rows], count[:, cluster_ix[rows]].astype(np.int64) * alike, at_s)
-
-    size = max(1, _CELLS // max(len(rows), len(at_s)))
-    blocks = [curves(resampled.count[k : k + size]) for k in range(0, len(resampled.count), size)]
-    share, n = curves(np.ones((1, len(names)), dtype=np.uint32))[0], effective_number(np.bincount(cluster_ix, runs))
-    limits = [percentile_limits(resampled_shares, resampled) for resampled_shares in np.concatenate(blocks).T]
-    widened = [widen_limits(*limit, n)[1:] for limit in zip(limits, share.tolist(), strict=True)]
-    low, high = np.array(widened).reshape(-1, 2).T
-    return low, high
-
-
-def resample_incidence(time_s: Float, ending: Int, count: Int, at_s: Float) -> Float:
-    """(R, G) cumulative incidence at instants (G,) of rows (n,), sorted by time, that count `count` (R, n) times.
-
-    The estimator of `cumulative_incidence` for all resamples at once; NaN for a resample without rows.
-    """
-    until = np.concatenate([np.zeros((len(count), 1)), np.cumsum(count, axis=1)], axis=1)
-    total = until[:, -1:]
-    weight = np.where(ending == DETECTED, count, 0).astype(float)
-    lost_s = np.unique(time_s[ending == CENSORED])
-    if len(lost_s):
-        lost = np.concatenate(
-            [np.zeros((len(count), 1)), np.cumsum(np.where(ending == CENSORED, count, 0), axis=1)], axis=1
-        )
-        before, after = (np.searchsorted(time_s, lost_s, side=side) for side in ("left", "right"))
-        gone, remaining = lost[:, after] - lost[:, before], total - until[:, after]
-        # A censored row hands its weight on to all remaining rows, if there are any.
-        factors = np.divide(gone, remaining, out=np.zeros_like(gone), where=remaining > 0) + 1.0
-        handed = np.concatenate([np.ones((len(count), 1)), np.cumprod(factors, axis=1)], axis=1)
-        weight *= handed[:, np.searchsorted(lost_s, time_s, side="left")]
-    summed = np.concatenate([np.zeros((len(count), 1)), np.cumsum(weight, axis=1)], axis=1)
-    with np.errstate(invalid="ignore"):  # 0 / 0 in a resample without rows
-        shares = summed[:, np.searchsorted(time_s, at_s, side="right")] / total
-    result: Float = np.minimum(shares, 1.0)
-    return result
+    times_s, incidence = cumulative_incidence(time_s, ending, runs.astype(float))
+    share = np.append(0.0, incidence)[np.searchsorted(times_s, at_s, side="right")]
+    weights = clusters.weights
+    if clusters.over == "runs":
+        return exact_limits(share * len(weights), float(len(weights)))
+    group = group_clusters(len(weights))
+    of_group, row_group = np.bincount(group, weights).astype(float), group[clusters.number]
+    without = incidences_without(time_s, ending, runs.astype(float), row_group, len(of_group), at_s).T
+    residual = (of_group.sum() - of_group) * (share[:, None] - without)
+    variance = share_variance(residual, np.broadcast_to(of_group, residual.shape))
+    return spread_share(share, variance, np.broadcast_to(weights, (len(share), len(weights))))
 
 
 def mean_limits(
-    time_s: Float, ending: Int, cluster: Sequence[str], horizon_s: float, seed: int, runs: Int | None = None
+    time_s: Float, ending: Int, clusters: RowClusters, horizon_s: float, runs: Int | None = None
 ) -> tuple[float, float] | None:
-    """Limits of the restricted mean of times (n,) at a horizon; None if all resamples have one mean.
-
-    Arguments as in `incidence_limits`; the resamples are those of a share in `summary.csv`.
+    """Limits of the restricted mean of times (n,) at a horizon; None if it is the same without any cluster, or if there
+    are fewer than two. Arguments as in `incidence_limits`.
     """
-    runs = np.ones(len(time_s), dtype=np.int64) if runs is None else runs
-    names, cluster_ix = np.unique(np.asarray(cluster, dtype=str), return_inverse=True)
-    resampled = draw_resamples([str(name) for name in names], seed)
-    if not (ending == CENSORED).any():  # no weight is handed on, so sums per cluster suffice
-        counted_s = np.where(ending == DETECTED, np.minimum(time_s, horizon_s), horizon_s)
-        sums = np.stack([np.bincount(cluster_ix, counted_s * runs), np.bincount(cluster_ix, runs)], axis=1)
-        resampled_sums = resampled.count.astype(float) @ sums
-        return _drop_equal_limits(*percentile_limits(resampled_sums[:, 0] / resampled_sums[:, 1], resampled))
-    order = np.lexsort((cluster_ix, ending, time_s))
-    time_s, ending, cluster_ix, runs = time_s[order], ending[order], cluster_ix[order], runs[order]
-    at_s = np.unique(time_s[(ending == DETECTED) & (time_s < horizon_s)])
-    lengths_s = np.diff(np.append(at_s, horizon_s))
-    size = max(1, _CELLS // max(len(time_s), len(at_s), 1))
-    means = [
-        horizon_s
-        - resample_incidence(time_s, ending, resampled.count[k : k + size][:, cluster_ix].astype(np.int64) * runs, at_s)
-        @ lengths_s
-        for k in range(0, len(resampled.count), size)
-    ]  # fmt: skip
-    return _drop_equal_limits(*percentile_limits(np.concatenate(means), resampled))
-
-
-def _drop_equal_limits(low: float, high: float) -> tuple[float, float] | None:
-    return (low, high) if high - low > _SAME_S else None
+    weight = np.ones(len(time_s)) if runs is None else runs.astype(float)
+    group = group_clusters(len(clusters.weights))
+    weights = np.bincount(group, clusters.weights).astype(float)
+    if len(weights) < 2:
+        return None
+    mean_s = restricted_mean(*cumulative_incidence(time_s, ending, weight), horizon_s)
+    without = restricted_means_without(time_s, ending, weight, group[clusters.number], len(weights), horizon_s)
+    if np.abs(without - mean_s).max() <= _SAME_S:
+        return None
+    low, high = limit_figure(mean_s, without, weights, (min(0.0, float(time_s.min())), horizon_s))
+    return float(low), float(high)
 
 
 # Curves.
@@ -211,7 +196,7 @@ def detection_endings(rows: pd.DataFrame) -> tuple[Float, Int, Int]:
 def build_curves(
     results: Results, names: Sequence[str], *, bands: bool = True
 ) -> tuple[str | None, dict[str, DetectionCurve]]:
-    """The kind of clusters (None, or `NOTHING_DRAWN`), and the curves, with bands if there is something to resample."""
+    """The kind of clusters (None, or `NOTHING_DRAWN`), and the curves, with bands if there are clusters."""
     over, cluster = choose_clusters(results.known)
     fixed = [
         name for name in names if over == "runs" and find_fixed_outcomes(results.experiment.as_written()).known(name)
@@ -221,20 +206,22 @@ def build_curves(
     for name in names:
         rows = results.known["configuration"] == name
         banded = bands and over is not None and name not in fixed
-        curves[name] = build_curve(results.known[rows], cluster[rows] if banded else None, results.experiment.seed)
+        of_name = results.known[rows]
+        clusters = cluster_rows(of_name, over, cluster[rows]) if banded and over is not None else None
+        curves[name] = build_curve(of_name, clusters)
     return over, curves
 
 
-def build_curve(rows: pd.DataFrame, cluster: pd.Series | None, seed: int) -> DetectionCurve:
-    """The curve of one configuration's rows (n,), with a band if `cluster` names the cluster of each row."""
+def build_curve(rows: pd.DataFrame, clusters: RowClusters | None) -> DetectionCurve:
+    """The curve of one configuration's rows (n,), with a band over their clusters if there are any."""
     if not len(rows):
         return DetectionCurve(np.empty(0), np.empty(0))
     time_s, ending, runs = detection_endings(rows)
     times_s, share = cumulative_incidence(time_s, ending, runs.astype(float))
-    if cluster is None or not len(times_s):
+    if clusters is None or not len(times_s):
         return DetectionCurve(times_s, share)
     steps = np.unique(np.linspace(0, len(times_s) - 1, min(len(times_s), _INSTANTS)).astype(int))
-    low, high = incidence_limits(time_s, ending, list(cluster), times_s[steps], seed, runs)
+    low, high = incidence_limits(time_s, ending, clusters, times_s[steps], runs)
     step_ix = np.searchsorted(steps, np.arange(len(times_s)), side="right") - 1
     return DetectionCurve(times_s, share, low[step_ix], high[step_ix])
 
@@ -328,14 +315,15 @@ def _add_caption(
     exact: bool,
     left: str,
 ) -> None:
-    bands = f"Bands: 95 %, bootstrap over whole {over}, or exact binomial limits where few decide"
+    bands = ""
     if over is None:
-        few = f"fewer than {FEWEST_CLUSTERS}"
-        bands = f"No bands: {few} logs and {few} objects, and more runs say nothing about other traffic"
+        bands = f"No bands: {explain_no_intervals(results)}"
     elif over == NOTHING_DRAWN:
         bands = "No bands: nothing drawn, every run is the same"
     elif len(names) > MOST_BANDS:
         bands = f"No bands with more than {MOST_BANDS} curves; choose some with --configurations"
+    else:
+        bands = f"Bands: 95 %, over {describe_over(results)}"
     end_s = figure.axes[0].get_xlim()[1]
     later = max((curve.last - _evaluate_share(curve, end_s) for curve in curves.values()), default=0.0)
     add_note(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from copem_replay.core.errors import InputError
-from copem_replay.metrics.intervals import NOTHING_DRAWN, choose_clusters
+from copem_replay.metrics.intervals import ALL_ALIKE, NOTHING_DRAWN, choose_clusters
 from copem_replay.report.figures.style import (
     INK,
     RANKED_BY,
@@ -18,17 +18,17 @@ from copem_replay.report.figures.style import (
     choose_appearances,
     compare_with_default,
     default_baseline,
+    describe_over,
     describe_results,
-    describe_too_few,
     draw_rows,
+    explain_no_intervals,
     figure_style,
     find_truths,
     format_three_digits,
     new_figure,
     sort_soonest_first,
 )
-from copem_replay.results.compare.limits import ALL_ALIKE
-from copem_replay.results.compare.tables import NOTHING, explain_no_interval
+from copem_replay.results.compare.tables import NOTHING, describe_gain, explain_no_interval
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -151,20 +151,24 @@ def _explain_without(
     words = {ALL_ALIKE: f"each difference is the same in every {over[:-1] if over else 'object'}",
              NOTHING_DRAWN: "nothing is drawn, every run is the same"}  # fmt: skip
     reasons = [said for kind, said in words.items() if kind in kinds]
-    return [f"No intervals: {' or '.join(reasons) or describe_too_few(results) or 'too few differ'}"]
+    return [f"No intervals: {' or '.join(reasons) or explain_no_intervals(results) or 'too few differ'}"]
 
 
 def _note_sentences(results: Results, comparison: Comparison, names: Sequence[str]) -> list[str]:
-    over = comparison.overall.loc[comparison.overall["metric"] == RANKED_BY, "interval_over"].dropna().unique()
+    rows = comparison.overall
+    limited = rows[(rows["metric"] == RANKED_BY) & rows["interval_over"].notna() & rows["configuration"].isin(names)]
     sentences = [
         f"Each configuration minus {comparison.baseline}, paired by log, object and run",
         describe_results(results, names),
     ]
-    if len(over):
+    if len(limited):
         sentences.append(
-            f"Lines: 95 % intervals, bootstrap over {over[0]}; bold: the interval excludes 0; hollow: no interval"
+            f"Lines: 95 % intervals over {describe_over(results)}; bold: the interval excludes 0; hollow: no interval"
         )
-    return sentences
+    gains = [
+        f"{row.configuration} {describe_gain(row)}" for row in limited.itertuples() if not pd.isna(row.logs_better)
+    ]
+    return [*sentences, *([f"Mean time: {', '.join(gains)}"] if gains else [])]
 
 
 def _describe_upper_bound(

@@ -22,7 +22,7 @@ import pandas as pd
 
 from copem_replay.core.colours import configuration_colours
 from copem_replay.core.errors import count_noun
-from copem_replay.metrics.intervals import FEWEST_CLUSTERS
+from copem_replay.metrics.intervals import choose_clusters, describe_absent, describe_clusters, explain_no_clusters
 from copem_replay.results.compare.labels import DEFAULT_BASELINE
 
 if TYPE_CHECKING:
@@ -277,15 +277,22 @@ def format_three_digits(value: float) -> str:
     return "0" if abs(value) < 1e-9 else f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}".replace("-", "−")
 
 
-def describe_too_few(results: Results) -> str:
-    """The number of clusters if they are too few to be resampled, such as `2 objects`; else empty."""
-    known = results.known
-    logs, things = known["log"].nunique(), known.groupby(["log", "object_id"]).ngroups
-    if max(logs, things) >= FEWEST_CLUSTERS:
+def describe_over(results: Results) -> str:
+    """What intervals of the results are over, what that tells and cannot exclude; empty where there are none."""
+    over, cluster = choose_clusters(results.known)
+    if over is None:
         return ""
-    if things == 1:
-        return f"{count_noun(results.experiment.runs, 'run')} of one object"
-    return count_noun(things, "object") + (f" in {count_noun(logs, 'log')}" if logs > 1 else "")
+    number = results.experiment.runs if over == "runs" else cluster.nunique()
+    absent = f"; whatever the interval, {describe_absent(number)}" if over == "logs" else ""
+    return describe_clusters(over, number) + absent
+
+
+def explain_no_intervals(results: Results) -> str:
+    """Why there are no intervals, such as `2 logs, fewer than 3: …`; empty where there are."""
+    known = results.known
+    if choose_clusters(known)[0] is not None:
+        return ""
+    return explain_no_clusters(known["log"].nunique(), known.groupby(["log", "object_id"]).ngroups)
 
 
 # Files of figures, of equal bytes every time.

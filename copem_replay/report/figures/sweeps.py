@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from copem_replay.core.errors import InputError, interval_words
+from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import Float
+from copem_replay.metrics.summary import describe_intervals
 from copem_replay.report.figures.selection import MOST_LINES, describe_left_out, pick_evenly
 from copem_replay.report.figures.style import (
     Appearance,
@@ -176,12 +177,12 @@ def _value_axis(axes: Axes, kind: str, part: pd.DataFrame) -> None:
     axes.set_xlabel(AXES.get(kind, kind))
 
 
-def _interval_kinds(sweep: pd.DataFrame) -> list[str]:
-    """Kinds of the limits of shares with their clusters, in words; empty without limits."""
-    if "interval_over" not in sweep or "interval" not in sweep:
-        return []
-    distinct = sweep[["interval", "interval_over"]].dropna().drop_duplicates()
-    return sorted(interval_words(*interval) for interval in distinct.itertuples(index=False))
+def _describe_bands(sweep: pd.DataFrame) -> str:
+    """What the limits of shares are, and over what."""
+    if "interval_over" not in sweep or not sweep["interval_over"].notna().any():
+        return "No intervals of the shares"
+    limited = sweep.drop_duplicates(["interval", "interval_over"]) if "interval_clusters" not in sweep else sweep
+    return ". ".join(f"Bands of shares, {line}" for line in describe_intervals(limited, "interval")[:1])
 
 
 def _note_sentences(results: Results, sweep: pd.DataFrame, kinds: Sequence[str], names: Sequence[str]) -> list[str]:
@@ -194,8 +195,7 @@ def _note_sentences(results: Results, sweep: pd.DataFrame, kinds: Sequence[str],
             sentences.append(
                 f"{AXES.get(kind, kind).partition(' (')[0]}: {rates[:1].lower()}{rates[1:]}" if rates else ""
             )
-    limits = _interval_kinds(sweep)
-    sentences.append(f"Bands of shares: 95 %, {'; '.join(limits)}" if limits else "No intervals of the shares")
+    sentences.append(_describe_bands(sweep))
     sentences.append("Dashed black: exact, what the runs tend to" if _any_exact(sweep) else "")
     if "ttd_p95_s" in sweep and sweep["ttd_p95_s"].isna().any():
         sentences.append(

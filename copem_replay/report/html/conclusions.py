@@ -10,15 +10,21 @@ from typing import Any
 import pandas as pd
 
 from copem_replay.core.errors import count_noun
-from copem_replay.metrics.intervals import FEWEST_CLUSTERS, NOTHING_DRAWN
-from copem_replay.report.figures.style import RANKED_BY, find_with_fewer_rows, format_per_cent, format_three_digits
+from copem_replay.metrics.intervals import ALL_ALIKE, NOTHING_DRAWN
+from copem_replay.report.figures.style import (
+    RANKED_BY,
+    describe_over,
+    explain_no_intervals,
+    find_with_fewer_rows,
+    format_per_cent,
+    format_three_digits,
+)
 from copem_replay.report.html.markup import Html, escape_text, join_html, make_list, make_tag
 from copem_replay.report.html.setup import join_names, shorten_list
 from copem_replay.report.html.study import ReportData, detects_at_onset, explain_missing_interval
 from copem_replay.report.html.tables import format_signed_difference
 from copem_replay.results.compare import Comparison
-from copem_replay.results.compare.limits import ALL_ALIKE
-from copem_replay.results.compare.tables import NOTHING
+from copem_replay.results.compare.tables import NOTHING, describe_gain
 
 _INTERVAL = re.compile(r"(?:[^\s(]+ (?:s|%|percentage points) )?\[[^\[\]<]*\]")
 
@@ -186,7 +192,8 @@ def _format_difference(row: Any, unit: str = " s") -> str:
     shown = format_signed_difference("", row.difference) + unit
     if pd.isna(row.interval_over) or pd.isna(row.low) or pd.isna(row.high):
         return shown
-    return f"{shown} [{format_three_digits(row.low)}, {format_three_digits(row.high)}]"
+    logs = "" if pd.isna(row.logs_better) else f", {describe_gain(row)}"
+    return f"{shown} [{format_three_digits(row.low)}, {format_three_digits(row.high)}]{logs}"
 
 
 def _format_unsure(row: Any) -> str:
@@ -269,18 +276,11 @@ def _certainty_sentences(study: ReportData) -> Iterator[str]:
         return
     if not len(over):
         yield (
-            f"There are no intervals: there are fewer than {FEWEST_CLUSTERS} logs and fewer than {FEWEST_CLUSTERS} "
-            "measured objects. The result holds for these objects; additional runs of the same traffic say nothing "
-            "about other traffic."
+            f"There are no intervals: {explain_no_intervals(study.results)}. The result holds for these objects; "
+            "additional runs of the same traffic say nothing about other traffic."
         )
         return
-    tells = {
-        "runs": "how far other draws of the same models may differ, for this one object in this one log; they say "
-        "nothing about other traffic",
-        "objects": "how far other objects in traffic of this kind may differ",
-        "logs": "how far other recordings of this kind may differ",
-    }[str(over.iloc[0])]
-    yield f"Intervals are 95 %, in brackets, over {over.iloc[0]}: {tells}."
+    yield f"Intervals are 95 %, in brackets, over {describe_over(study.results)}."
 
 
 def _left_out_sentences(study: ReportData) -> Iterator[str]:

@@ -12,19 +12,18 @@ import pandas as pd
 
 from copem_replay.core.errors import InputError, unknown_name_message
 from copem_replay.core.tracks import SAME_INSTANT_S
-from copem_replay.metrics.intervals import NOTHING_DRAWN, choose_clusters
+from copem_replay.metrics.intervals import ALL_ALIKE, NOTHING_DRAWN, choose_clusters
 from copem_replay.report.figures.selection import pivot_by_run
 from copem_replay.report.figures.style import (
     RANKED_BY,
     Appearance,
     choose_appearances,
     default_baseline,
-    describe_too_few,
+    explain_no_intervals,
     find_contenders,
     sort_soonest_first,
 )
 from copem_replay.results.compare import Comparison, compare_folders
-from copem_replay.results.compare.limits import ALL_ALIKE
 from copem_replay.results.read import Results, read_results
 
 
@@ -55,7 +54,7 @@ def explain_missing_interval(study: ReportData, rows: pd.DataFrame) -> str:
     if NOTHING_DRAWN in kinds:
         reasons.append("nothing is drawn, every run is the same")
     if not reasons:
-        reasons.append(describe_too_few(study.results) or "too few of what is resampled")
+        reasons.append(explain_no_intervals(study.results) or "too few have it")
     return " or ".join(reasons)
 
 

@@ -65,7 +65,7 @@ from copem_replay.results.schema import OPTIONAL
 @dataclass
 class AllLogs:
     """The sums of a pair, log by log: `objects`: with rows of both sides; `alone`: rows that only one side has, (first,
-    second); `instants`: as `count_shared_instants` gives them; `differences`: of each metric, of the logs that have one.
+    second); `instants`: as `count_shared_instants` gives them; `differences`: by metric, of each log that has one.
     """
 
     objects: list[int] = field(default_factory=list)
@@ -213,13 +213,13 @@ def note_on_measuring(baseline: LabelledConfiguration, others: Sequence[Labelled
 
 
 _FEW_HAVE_IT = (
-    f"fewer than {FEWEST_LOGS} logs, {FEWEST_CLUSTERS} objects of one log, or {FEWEST_CLUSTERS} runs of one object have "
-    "it, or too few for its limits"
+    f"fewer than {FEWEST_LOGS} logs, {FEWEST_CLUSTERS} objects of one log, or {FEWEST_CLUSTERS} runs of one object "
+    "have it, or too few for its limits"
 )
 
 
 def notes_on_rows(table: pd.DataFrame, pairs: Iterable[AllLogs], asked: float | None) -> Iterator[str]:
-    """Notes on missing intervals, on logs that decide, and on configurations with fewer ghosts than `asked` per minute."""
+    """Notes on missing intervals, on logs that decide, and on configurations with fewer ghosts per minute than `asked`."""
     none = [of.objects for of in pairs if any(of.objects) and of.over is None]
     why = explain_no_clusters(sum(count > 0 for count in none[0]), sum(none[0])) if none else None
     overall = table.drop_duplicates(["configuration", "metric"])

@@ -25,7 +25,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from copem_replay.core.tracks import Bool, Float, Int
+from copem_replay.core.tracks import Float, Int
 from copem_replay.metrics.intervals import (
     ALL_ALIKE,
     EXACT,
@@ -296,11 +296,13 @@ class MedianStatistic(PairStatistic):
     def without_each(self, clusters: ClusterIndex) -> Float:
         """(K,) medians of the differences."""
         cluster, n = clusters.of(self.items), self.items["n"].astype(float)
-        medians = [_weighted_median(self.differences[cluster != k], n[cluster != k]) for k in range(len(clusters.names))]
+        medians = [
+            _weighted_median(self.differences[cluster != k], n[cluster != k]) for k in range(len(clusters.names))
+        ]
         return np.array(medians)
 
     def limits(self, difference: float, clusters: ClusterIndex) -> tuple[str, float, float]:
-        """Limits of the share of differences at or below a value, inverted; of very many values by `_VALUES` of them."""
+        """Limits of the share of differences at or below a value, inverted, at `_VALUES` of them at most."""
         cluster, n, K = clusters.of(self.items), self.items["n"].astype(float), len(clusters.names)
         order = np.argsort(self.differences, kind="stable")
         ranked = self.differences[order]
