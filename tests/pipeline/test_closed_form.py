@@ -1147,9 +1147,7 @@ class TestSummary:
                 table += [row | {"detected": t is not None, "run": 0}] * count
         rates = {"c": None}
         frame = pd.DataFrame(table)
-        (row,) = summarise_rows(frame, ["c"], rates, horizon_s=2.0, exact=pd.DataFrame(rows))[0].to_dict(
-            "records"
-        )
+        (row,) = summarise_rows(frame, ["c"], rates, horizon_s=2.0, exact=pd.DataFrame(rows))[0].to_dict("records")
         for name in ("detected_share", "ttd_rmst_s"):
             assert row[f"{name}_exact"] == pytest.approx(row[name], abs=1e-12)
         missed = frame.loc[~frame["detected"], "object_id"].astype(float)

@@ -130,17 +130,15 @@ def test_without_braking_there_is_no_pass_share(tmp_path):
 
 # ----------------------------------------------------------------------------------------------- intervals
 
-SEED = 5
 
-
-def limits_by_a_loop(clusters: dict[str, list[tuple[float, float]]], seed: int = SEED) -> tuple[float, float]:
-    """Of resamples with as many clusters as there are, the mean of all differences in them."""
+def limits_by_a_loop(clusters: dict[str, list[tuple[float, float]]]) -> tuple[float, float]:
+    """From the mean of all differences in all clusters, and in all but one."""
 
     def mean(drawn: list[str]) -> float:
         pairs = [pair for name in drawn for pair in clusters[name]]
         return float(np.mean([first for first, _ in pairs]) - np.mean([second for _, second in pairs]))
 
-    return limits_of(list(clusters), mean, seed)
+    return limits_of(list(clusters), mean)
 
 
 def pairs_of(times: Sequence[tuple[float, float]], **where: Any) -> list[Row]:
@@ -152,21 +150,21 @@ def pairs_of(times: Sequence[tuple[float, float]], **where: Any) -> list[Row]:
     ]
 
 
-def test_objects_are_resampled_whole(tmp_path):
+def test_objects_are_left_out_whole(tmp_path):
     rng = np.random.default_rng(7)
     of_objects = {str(k): [(float(a) + k, float(b)) for a, b in rng.uniform(0, 2, (3, 2))] for k in range(6)}
     rows = [r for name, times in of_objects.items() for r in pairs_of(times, object_id=name)]
-    time = of(compared(tmp_path, rows, seed=SEED), "ttd_rmst_s")
+    time = of(compared(tmp_path, rows), "ttd_rmst_s")
     expected = limits_by_a_loop({f"a\n{name}": times for name, times in of_objects.items()})
     assert time["interval_over"] == "objects"
     assert (time["low"], time["high"]) == pytest.approx(expected, abs=1e-8)
 
 
-def test_five_logs_are_resampled_whole_and_each_by_what_it_has(tmp_path):
+def test_five_logs_are_left_out_whole_and_each_has_limits_by_what_it_has(tmp_path):
     rng = np.random.default_rng(8)
     of_logs = {f"log{k}": [(float(a) + k, float(b)) for a, b in rng.uniform(0, 2, (6, 2))] for k in range(5)}
     rows = [r for name, times in of_logs.items() for r in pairs_of(times, log=name)]
-    comparison = compared(tmp_path, rows, seed=SEED)
+    comparison = compared(tmp_path, rows)
     time = of(comparison, "ttd_rmst_s")
     assert time["interval_over"] == "logs"
     assert (time["low"], time["high"]) == pytest.approx(limits_by_a_loop(of_logs), abs=1e-8)
@@ -178,8 +176,9 @@ def test_five_logs_are_resampled_whole_and_each_by_what_it_has(tmp_path):
     assert (one["low"], one["high"]) == pytest.approx(expected, abs=1e-8)
 
 
-def test_the_median_is_resampled_too(tmp_path):
-    # Of six objects three are 1 m and three 2 m nearer: the limits are these, and no mean of any.
+def test_the_median_has_limits_too(tmp_path):
+    # Of six objects three are 1 m and three 2 m nearer: the limits are these, and no mean of any. None of six: up to
+    # .459 may be; half of them: .147 to .853.
     rows = [r for k in range(6) for r in pairs_of([(1.0 + k % 2, 0.0)], object_id=str(k))]
     distance = of(compared(tmp_path, rows), "dad_median_m")
     assert (distance["difference"], distance["low"], distance["high"]) == (-2.0, -2.0, -1.0)
@@ -195,12 +194,12 @@ def test_shares_that_differ_alike_in_five_objects_have_exact_limits(tmp_path):
         assert (share["interval"], share["interval_over"]) == ("exact", "objects")
 
 
-def test_exact_limits_go_by_the_rows_of_each_object(tmp_path):
-    """One object in 20 runs, four in one each: n = 24² / (20² + 4) clusters."""
+def test_exact_limits_count_objects_and_no_runs(tmp_path):
+    """One object in 20 runs, four in one each: five objects."""
     rows = [row(name, 1.0, 30.0, object_id="0", run=run) for run in range(20) for name in ("ideal", "late")]
     rows += [row(name, 1.0, 30.0, object_id=str(k)) for k in range(1, 5) for name in ("ideal", "late")]
     share = of(compared(tmp_path, rows), "detected_share")
-    limit = 1 - 0.025 ** (404 / 576)
+    limit = 1 - 0.025 ** (1 / 5)
     assert (share["low"], share["high"]) == pytest.approx((-limit, limit))
 
 
@@ -211,11 +210,11 @@ def test_means_that_are_all_alike_have_no_interval_and_one_that_is_not_brings_it
     assert time["interval"] == "all clusters alike"
     assert time[["low", "high", "interval_over"]].isna().all()
     time = of(compared(tmp_path / "other", [*rows, *pairs_of([(1.75, 1.0)], object_id="9")]), "ttd_rmst_s")
-    assert (time["interval"], time["interval_over"]) == ("bootstrap", "objects")
-    assert 0.5 <= time["low"] < time["high"] < 0.75
+    assert (time["interval"], time["interval_over"]) == ("jackknife", "objects")
+    assert 0.48 < time["low"] < 0.5 < time["high"] < 0.75
 
 
-def test_a_median_that_no_resample_moves_has_no_interval_either(tmp_path):
+def test_a_median_of_which_nearly_all_are_alike_has_no_interval_either(tmp_path):
     rows = [r for k in range(20) for r in pairs_of([(1.0 + (k == 3), 1.0)], object_id=str(k))]
     distance = of(compared(tmp_path, rows), "dad_median_m")
     assert (distance["difference"], distance["interval"]) == (0.0, "all clusters alike")
@@ -267,14 +266,14 @@ def test_means_of_all_logs_are_those_of_the_logs_by_their_rows(tmp_path):
 
 
 def test_the_same_rows_in_another_folder_differ_in_nothing(tmp_path):
-    rows = [r | {"configuration": "x"} for r in random_rows(["x"])]
+    rows = [r | {"configuration": "x"} for r in random_rows(["x"], logs=3)]
     folders = [write_folder(tmp_path / name, rows, braking=BRAKING) for name in ("first", "second")]
     table = compare_folders(folders, baseline="first:x").table
     assert set(table["metric"]) == {"detected_share", "ttd_rmst_s", "dad_median_m", "pass_share"}
     assert (table["difference"] == 0.0).all()
     table = table[table["log"] == "all"].set_index("metric")
-    # None of eight clusters differs, and of the six in conflict none: 1 − 0.025^(1/8), 1 − 0.025^(1/6).
-    for metric, limit in (("detected_share", 0.369417), ("pass_share", 0.459258)):
+    # None of twelve objects in three logs differs, and of the nine in conflict none: 12/1.6 and 9/1.4 of them count.
+    for metric, limit in (("detected_share", 1 - 0.025 ** (1.6 / 12)), ("pass_share", 1 - 0.025 ** (1.4 / 9))):
         assert tuple(table.loc[metric, ["low", "high"]]) == pytest.approx((-limit, limit), abs=1e-6)
         assert table.loc[metric, "interval"] == "exact"
     others = table.loc[["ttd_rmst_s", "dad_median_m"]]
@@ -301,8 +300,8 @@ def test_rows_are_in_the_order_of_logs_configurations_and_metrics(tmp_path):
     assert (table["baseline"] == "ideal").all()
 
 
-def test_censored_times_are_estimated_as_in_the_summary_and_in_every_resample(tmp_path):
-    """Each resample by itself: its rows, as often as they are drawn, through the estimator of one sample."""
+def test_censored_times_are_estimated_as_in_the_summary_and_without_each_object(tmp_path):
+    """Without each object by itself: the rows of the others through the estimator of one sample."""
     rng = np.random.default_rng(12)
     rows, sides = [], {"late": {}, "ideal": {}}
     endings = {"log_end": CENSORED, "ego_left": CENSORED, "object_left": LEFT}
@@ -317,7 +316,7 @@ def test_censored_times_are_estimated_as_in_the_summary_and_in_every_resample(tm
                         ended_s=until, ended_by=ended_by)
                 )  # fmt: skip
                 sides[name].setdefault(f"a\n{k}", []).append((at, DETECTED) if known else (until, endings[ended_by]))
-    time = of(compared(tmp_path, rows, seed=SEED), "ttd_rmst_s")
+    time = of(compared(tmp_path, rows), "ttd_rmst_s")
 
     def mean(name: str, drawn: Sequence[str]) -> float:
         times = [pair for key in drawn for pair in sides[name][key]]
@@ -327,20 +326,21 @@ def test_censored_times_are_estimated_as_in_the_summary_and_in_every_resample(tm
     keys = sorted(sides["ideal"])
     assert time["value"] == pytest.approx(mean("late", keys))
     assert time["baseline_value"] == pytest.approx(mean("ideal", keys))
-    expected = limits_of(keys, lambda drawn: mean("late", drawn) - mean("ideal", drawn), SEED)
+    expected = limits_of(keys, lambda drawn: mean("late", drawn) - mean("ideal", drawn))
     assert (time["low"], time["high"]) == pytest.approx(expected, abs=1e-9)
 
 
-def test_all_metrics_of_a_pair_are_resampled_alike_or_not_at_all(tmp_path):
-    """Six logs, of which four have a distance: that is too few of them, not an occasion to resample objects."""
+def test_all_metrics_of_a_pair_have_the_same_clusters_or_none(tmp_path):
+    """Six logs, of which two have a distance: that is too few of them, not an occasion to take objects."""
     rows = [
-        row(name, time if k < 4 or name == "ideal" else None, 9.0 if k < 4 or name == "ideal" else None, log=f"log{k}")
+        row(name, time if k < 4 else 2.0, 9.0 if k < 2 else None, log=f"log{k}")
         for k in range(6)
         for name, time in (("ideal", 1.0), ("late", 2.0))
     ]
     rows += [row(name, 1.0, None, log="log5", object_id="8") for name in ("ideal", "late")]
     comparison = compared(tmp_path, rows)
     assert of(comparison, "ttd_rmst_s")["interval_over"] == "logs"
+    assert pd.isna(of(comparison, "dad_median_m")["interval_over"])
     assert set(comparison.table[comparison.table["log"] == "all"]["interval_over"].dropna()) == {"logs"}
 
 

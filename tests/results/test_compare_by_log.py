@@ -18,7 +18,18 @@ from copem_replay.results.compare import compare_folders
 from copem_replay.results.schema import table_file
 from tests.helpers.compare_folders import BRAKING, Row, ghosts, limits_of, row, step, write_folder
 from tests.oracles import compare as oracle
+from tests.oracles import intervals
 
+OF_INTERVALS = (
+    "low",
+    "high",
+    "interval",
+    "interval_over",
+    "clusters",
+    "logs_better",
+    "hangs_on",
+    "difference_without_it",
+)
 INSTANTS = {"ideal": [0.0, 1.0, 2.0, 3.0], "late": [1.0, 2.0, 2.5, 3.0]}
 
 
@@ -109,33 +120,67 @@ def test_figures_are_those_of_pairs_one_by_one(seed, count):
 
 
 @settings(max_examples=8)
-@given(seeds)
-def test_intervals_resample_whole_logs(seed):
-    given_study = study(seed, 5, fewest=2)
+@given(seeds, st.sampled_from([3, 5]))
+def test_intervals_leave_out_whole_logs(seed, count):
+    given_study = study(seed, count, fewest=2)
     with TemporaryDirectory() as scratch:
         table = compare_folders([write_folder(Path(scratch) / "study", **given_study)]).overall.set_index("metric")
     found = oracle.pairs(given_study["rows"], "late", "ideal")
     logs = sorted({pair[0]["log"] for pair in found})
-    of_metric = {
-        "detected_share": lambda drawn: oracle.share(drawn, "detected"),
-        "ttd_rmst_s": oracle.restricted_means,
-        "dad_median_m": oracle.medians,
-    }
+    if len(logs) < 3:
+        assert table["interval_over"].isna().all()
+        return
+    of_log = {log: [pair for pair in found if pair[0]["log"] == log] for log in logs}
+    objects = [len({pair[0]["object_id"] for pair in of}) for of in of_log.values()]
+    of_metric = {"detected_share": lambda drawn: oracle.share(drawn, "detected"), "ttd_rmst_s": oracle.restricted_means}
     for metric, figure in of_metric.items():
-        if table.loc[metric, "interval"] != "bootstrap" or table.loc[metric, "interval_over"] != "logs":
-            continue
 
         def difference(names: list[str], figure: Any = figure) -> float:
-            return figure([pair for name in names for pair in found if pair[0]["log"] == name])[2]
+            return figure([pair for name in names for pair in of_log[name]])[2]
 
-        if metric == "dad_median_m" and any(
-            oracle.medians([p for p in found if p[0]["log"] == n]) is None for n in logs
-        ):
-            continue
-        with np.errstate(invalid="ignore"):  # of medians that are infinite
-            limits = limits_of(logs, difference)
-        wanted = [limit if np.isfinite(limit) else np.nan for limit in limits]
-        assert table.loc[metric, ["low", "high"]].tolist() == pytest.approx(wanted, abs=1e-9, nan_ok=True)
+        row = table.loc[metric]
+        if row["interval"] == "jackknife":
+            bound = (
+                1.0 if metric == "detected_share" else 10.0
+            )  # never counts as 10 s, the earliest time is not below 0
+            wanted = np.clip(limits_of(logs, difference, objects), -bound, bound)
+            assert [row["low"], row["high"]] == pytest.approx(wanted, abs=1e-9)
+            assert (row["interval_over"], row["clusters"]) == ("logs", len(logs))
+            better = 1 if metric == "detected_share" else -1
+            assert row["logs_better"] == sum(better * difference([log]) > 1e-12 for log in logs)
+            left = {log: difference([other for other in logs if other != log]) for log in logs}
+            signed = {log: value * np.sign(row["difference"]) for log, value in left.items()}
+            if abs(row["difference"]) > 1e-9 and min(signed.values()) < abs(row["difference"]) / 2 - 1e-9:
+                assert signed[row["hangs_on"]] == pytest.approx(min(signed.values()))
+                assert row["difference_without_it"] == pytest.approx(left[row["hangs_on"]])
+            elif min(signed.values()) > abs(row["difference"]) / 2 + 1e-9:
+                assert pd.isna(row["hangs_on"])
+
+
+@settings(max_examples=10)
+@given(seeds)
+def test_limits_of_medians_are_those_of_shares_inverted(seed):
+    rnd = Random(seed)
+    of_log: dict[str, list[tuple[float, str]]] = {}
+    rows = []
+    for log in "abcd":
+        for thing in "12345"[: rnd.randint(2, 5)]:
+            for run in range(2):
+                far_m = rnd.choice([10.0, 12.0, 15.0, 15.5, 30.0])
+                of_log.setdefault(log, []).append((far_m - 11.0, thing))
+                of = {"log": log, "object_id": thing, "run": run}
+                rows += [row("late", 1.0, far_m, **of), row("ideal", 1.0, 11.0, **of)]
+    with TemporaryDirectory() as scratch:
+        found = compare_folders([write_folder(Path(scratch) / "study", rows)]).overall.set_index("metric")
+    of_median = found.loc["dad_median_m"]
+    low, high = intervals.median(of_log)
+    if low == high:
+        assert of_median["interval"] == "all clusters alike"
+        return
+    wanted = [limit if np.isfinite(limit) else np.nan for limit in (low, high)]
+    assert [of_median["low"], of_median["high"]] == pytest.approx(wanted, nan_ok=True)
+    if np.isfinite(low) or np.isfinite(high):
+        assert (of_median["interval"], of_median["interval_over"]) == ("inverted", "logs")
 
 
 @settings(max_examples=15)
@@ -185,7 +230,7 @@ def test_runs_told_as_logs_give_the_same_over_all(seed):
             compare_folders([write_folder(Path(scratch) / name, **of)], false_positives_per_min=5.0).overall
             for name, of in (("one", given_study), ("several", apart))
         )
-    columns = [name for name in one.columns if not name.startswith(("interval", "low", "high"))]
+    columns = [name for name in one.columns if name not in OF_INTERVALS]
     pd.testing.assert_frame_equal(
         one[columns].reset_index(drop=True), several[columns].reset_index(drop=True), rtol=1e-12
     )

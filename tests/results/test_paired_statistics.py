@@ -1,4 +1,4 @@
-"""Statistics of pairs against SciPy, NumPy and plain loops."""
+"""Statistics of pairs, and limits over resamples, against SciPy, NumPy and plain loops."""
 
 import math
 
@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from scipy.stats import binomtest
 
 from copem_replay.metrics.intervals import Resamples, count_multiplicities, percentile_limits
-from copem_replay.metrics.survival import quantile_with_never
-from copem_replay.results.compare.limits import mcnemar_p_value, resample_medians, resample_sums
+from copem_replay.results.compare.limits import mcnemar_p_value
 from tests.helpers.compare_folders import widened
 
 counts = st.integers(0, 400)
@@ -39,56 +38,6 @@ def test_mcnemar_of_less_than_nothing_is_refused():
 def test_each_number_draws_its_cluster():
     drawn = count_multiplicities(np.array([[0.1, 0.9, 0.5], [0.1, 0.2, 0.3], [0.99, 0.7, 0.34]]))
     assert drawn.tolist() == [[1, 1, 1], [3, 0, 0], [0, 1, 2]]
-
-
-def test_sums_of_resamples_are_those_of_a_plain_loop():
-    rng = np.random.default_rng(1)
-    sums, count = rng.normal(size=(7, 3)), rng.integers(0, 4, (50, 7)).astype(np.uint32)
-    expected = [[sum(int(c) * sums[k, j] for k, c in enumerate(row)) for j in range(3)] for row in count]
-    assert resample_sums(sums, count) == pytest.approx(np.array(expected))
-
-
-def test_equal_columns_have_equal_sums_to_the_last_bit():
-    rng = np.random.default_rng(2)
-    column = rng.normal(size=301)
-    sums = np.stack([column, rng.normal(size=301), column, np.ones(301), column], axis=1)
-    result = resample_sums(sums, rng.integers(0, 9, (97, 301)).astype(np.uint32))
-    assert (result[:, 0] == result[:, 2]).all()
-    assert (result[:, 0] == result[:, 4]).all()
-
-
-def test_counts_of_other_clusters_are_refused():
-    count = np.ones((4, 3), dtype=np.uint32)
-    with pytest.raises(ValueError, match="2 clusters"):
-        resample_sums(np.ones((2, 1)), count)
-    with pytest.raises(ValueError, match="4 clusters"):
-        resample_medians(np.ones(2), np.array([0, 3]), count, np.ones(2, dtype=np.int64))
-
-
-numbers = st.integers(-3, 3).map(float) | st.sampled_from([-math.inf, math.inf])
-rows = st.lists(st.tuples(numbers, st.integers(0, 3), st.integers(1, 3)), max_size=12)
-
-
-@given(rows, st.lists(st.lists(st.integers(0, 3), min_size=4, max_size=4), min_size=1, max_size=5))
-def test_medians_of_resamples_are_those_of_the_rows_written_out(items, count):
-    values, cluster, n = (np.array([item[k] for item in items], dtype=(float, int, int)[k]) for k in range(3))
-    found = resample_medians(values, cluster, np.array(count, dtype=np.uint32), n)
-    for median, multiplicity in zip(found, count, strict=True):
-        written_out = np.repeat(values, [multiplicity[c] * times for c, times in zip(cluster, n, strict=True)])
-        if not len(written_out):
-            assert math.isnan(median)
-        else:
-            assert median == sorted(written_out)[(len(written_out) - 1) // 2]
-
-
-def test_medians_are_those_of_statistics_with_weights():
-    rng = np.random.default_rng(5)
-    values, cluster = rng.normal(size=1000), rng.integers(0, 20, 1000)
-    count = rng.integers(0, 3, (30, 20)).astype(np.uint32)
-    expected = [
-        quantile_with_never(values, np.ones(1000, dtype=bool), 0.5, row[cluster].astype(float)) for row in count
-    ]
-    assert resample_medians(values, cluster, count, np.ones(1000, dtype=np.int64)).tolist() == expected
 
 
 def limits(values, clusters, confidence=0.95):

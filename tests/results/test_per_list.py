@@ -72,7 +72,7 @@ def test_without_a_common_instant_there_is_nothing_to_compare(tmp_path):
         assert pd.isna(of(comparison, metric)["difference"])
 
 
-def test_errors_of_objects_are_resampled_whole(tmp_path):
+def test_errors_of_objects_are_left_out_whole(tmp_path):
     rng = np.random.default_rng(3)
     errors = {str(k): rng.uniform(0, 2 + k, (2, 4)).astype(np.float32) for k in range(5)}
     rows = [
@@ -87,7 +87,7 @@ def test_errors_of_objects_are_resampled_whole(tmp_path):
         first, second = np.sqrt((both**2).mean(axis=1))
         return float(first - second)
 
-    assert (error["interval"], error["interval_over"]) == ("bootstrap", "objects")
+    assert (error["interval"], error["interval_over"]) == ("jackknife", "objects")
     expected = limits_of([f"a\n{key}" for key in errors], regret)
     assert (error["low"], error["high"]) == pytest.approx(expected, abs=1e-8)
 
@@ -123,7 +123,7 @@ def test_lists_in_which_nobody_is_measured_do_not_count(tmp_path):
     assert (gospa["value"], gospa["baseline_value"], gospa["n"]) == (3.0, 1.0, 2)
 
 
-def test_an_object_that_no_list_is_measured_by_is_none_to_resample(tmp_path):
+def test_an_object_that_no_list_is_measured_by_is_no_cluster(tmp_path):
     rows = [
         seen(name, FOUR, [1.0 if k < 4 else None] * 4, object_id=str(k)) for k in range(5) for name in ("ideal", "late")
     ]
@@ -141,7 +141,7 @@ def test_each_run_has_its_lists(tmp_path):
     assert gospa["difference"] == pytest.approx(math.sqrt(4.5) - math.sqrt(1.5))
 
 
-def test_resampled_objects_leave_the_number_of_lists_as_it_is(tmp_path):
+def test_without_an_object_the_number_of_lists_is_as_it_was(tmp_path):
     parts = {str(k): (float(k), 1.0) for k in range(5)}
     rows = [
         seen(name, FOUR, [parts[key][side]] * 4, object_id=key)
@@ -149,11 +149,11 @@ def test_resampled_objects_leave_the_number_of_lists_as_it_is(tmp_path):
         for side, name in enumerate(("late", "ideal"))
     ]
     gospa = of(compared(tmp_path, rows), "gospa_m")
-    # Every list has all objects: its sum is that of those drawn.
+    # Every list has five objects: without one the others stand for it.
 
     def regret(drawn: list[str]) -> float:
-        some = [parts[key[2:]] for key in drawn]
-        return math.sqrt(sum(a for a, _ in some)) - math.sqrt(sum(b for _, b in some))
+        some, times = [parts[key[2:]] for key in drawn], 5 / len(drawn)
+        return math.sqrt(times * sum(a for a, _ in some)) - math.sqrt(times * sum(b for _, b in some))
 
     expected = limits_of([f"a\n{key}" for key in parts], regret)
     assert gospa["difference"] == pytest.approx(math.sqrt(10) - math.sqrt(5))
@@ -197,24 +197,26 @@ def test_ghosts_go_with_the_object_that_is_nearest_and_the_others_stay(tmp_path)
         for name in ("ideal", "late")
     ]
     rate = of(compared(tmp_path, rows, lists=[ghosts("ideal", 0), ghosts("late", 13)]), "false_positives_per_min")
-    expected = limits_of([f"a\n{key}" for key in nearest], lambda drawn: 3 + sum(nearest[key[2:]] for key in drawn))
+    expected = limits_of(
+        [f"a\n{key}" for key in nearest], lambda drawn: 3 + sum(nearest[key[2:]] for key in drawn) * 5 / len(drawn)
+    )
     assert rate["difference"] == 13.0
     assert rate["interval_over"] == "objects"
     assert (rate["low"], rate["high"]) == pytest.approx(expected)
 
 
-def test_where_it_is_not_known_whose_ghosts_they_are_objects_are_not_resampled(tmp_path):
+def test_where_it_is_not_known_whose_ghosts_they_are_objects_are_no_clusters(tmp_path):
     rows = [row(name, 1.0, 30.0, object_id=str(k)) for name in ("ideal", "late") for k in range(5)]
     comparison = compared(tmp_path, rows, lists=[ghosts("ideal", 0), ghosts("late", 13)])
     assert of(comparison, "detected_share")["interval_over"] == "objects"
     assert pd.isna(of(comparison, "false_positives_per_min")["interval_over"])
-    assert [note for note in comparison.notes if note.startswith("no interval")] == [
+    assert [note for note in comparison.notes if note.startswith("no interval of false")] == [
         "no interval of false_positives_per_min: without accuracy.parquet it is not known which object a ghost is "
         "nearest to"
     ]
 
 
-def test_ghosts_of_one_object_are_resampled_by_run(tmp_path):
+def test_ghosts_of_one_object_are_left_out_by_run(tmp_path):
     counts = [0, 2, 4, 6, 8]
     rows = [row(name, 1.0, 30.0, run=run) for name in ("ideal", "late") for run in range(5)]
     lists = [ghosts("late", n, run=run) for run, n in enumerate(counts)]

@@ -134,7 +134,8 @@ def test_the_table_has_signs_and_intervals(tmp_path):
     assert by_name["same"].count("±0 (all alike)") == 2
     assert "-0.25 (all alike)" in by_name["fast"]
     assert "+2.5 (all alike)" in by_name["fast"]
-    assert "-0.5 [-1, 0]" in by_name["a|worse"]  # six are few: anything
+    # Of six objects half: ± t of 5 degrees · √(.3/6) = ± .5748, and no less than −1.
+    assert "-0.5 [-1, 0.0748]" in by_name["a|worse"]
     assert "+4.5 [" in by_name["a|worse"]
     assert by_name["a|worse"].endswith("–")  # half of them never: no median
     assert all("…" not in line and "..." not in line for line in lines)
@@ -144,9 +145,9 @@ def test_what_the_table_shows_is_said_below(tmp_path):
     lines = comparison_text(six_objects(tmp_path)).splitlines()[4:]
     assert lines == [
         "differences to ideal, paired by log, object and run; accuracy at instants that both have",
-        "[95 %]: bootstrap interval over objects",
-        "detected_share: exact binomial limits where the difference is the same in every cluster, because all "
-        "resamples are then the same",
+        "[95 %]: over 6 objects of this drive: how far other objects of this drive may differ; nothing about other "
+        "drives",
+        "detected_share: exact binomial limits where the difference is the same in every cluster",
         "(all alike): the difference is the same in every cluster, or a median in nearly all, so how it varies is "
         "not known",
         "ttd_rmst_s: mean time to detection up to 10 s, never detected counting as that; objects still there at the "
@@ -236,7 +237,8 @@ def test_csv_has_a_row_for_each_log_configuration_and_metric(tmp_path):
         "log", "configuration", "baseline", "metric", "value", "baseline_value", "difference", "low", "high",
         "interval", "interval_over", "n", "p_value", "only_configuration", "only_baseline", "existence",
         "baseline_existence",
-        "ghosts_kept_per_min", "baseline_ghosts_kept_per_min",
+        "ghosts_kept_per_min", "baseline_ghosts_kept_per_min", "clusters", "logs_better", "hangs_on",
+        "difference_without_it",
     ]  # fmt: skip
     assert [(r["log"], r["configuration"], r["metric"]) for r in read[3:6]] == [
         ("all", "fast", "detected_share"), ("all", "fast", "ttd_rmst_s"), ("all", "fast", "dad_median_m"),
@@ -246,7 +248,7 @@ def test_csv_has_a_row_for_each_log_configuration_and_metric(tmp_path):
     assert (fast["p_value"], fast["only_baseline"], fast["existence"]) == ("", "", "")
     assert (share["only_configuration"], share["only_baseline"], share["p_value"]) == ("0", "3", "0.25")
     assert (read[8]["difference"], read[8]["low"], read[8]["interval_over"]) == ("", "", "")
-    assert (fast["low"], fast["interval"], share["interval"]) == ("", "all clusters alike", "bootstrap")
+    assert (fast["low"], fast["interval"], share["interval"]) == ("", "all clusters alike", "jackknife")
 
 
 def test_the_files_name_says_what_is_written(tmp_path):

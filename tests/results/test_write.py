@@ -68,7 +68,8 @@ ACCURACY = {
 }
 SUMMARY = [
     "configuration", "n", "list_rate_hz", "detected_share", "detected_share_low", "detected_share_high", "interval",
-    "interval_over", "ttd_p5_s", "ttd_median_s", "ttd_p95_s", "ttd_rmst_s", "ttd_rmst_horizon_s", "dad_median_m",
+    "interval_over", "interval_clusters",
+    "ttd_p5_s", "ttd_median_s", "ttd_p95_s", "ttd_rmst_s", "ttd_rmst_horizon_s", "dad_median_m",
     "dad_p5_m",
 ]  # fmt: skip
 FIGURES = [
@@ -134,7 +135,7 @@ def test_the_folder_of_several_logs(two_logs: list[Path], tmp_path: Path) -> Non
         ("GT", "6", "1"),
         ("PEM", "6", "0.5"),
     ]
-    assert summary[0]["interval"] == "", "two logs, two objects: too few to resample"
+    assert summary[0]["interval"] == "", "two logs: too few"
     provenance = json.loads((folder / "provenance.json").read_text())
     assert [entry["log"] for entry in provenance["logs"]] == ["near/drive", "far/drive"]
     assert any("no interval" in note for note in provenance["notes"])

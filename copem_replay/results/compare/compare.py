@@ -219,7 +219,7 @@ _FEW_HAVE_IT = (
 
 
 def notes_on_rows(table: pd.DataFrame, pairs: Iterable[AllLogs], asked: float | None) -> Iterator[str]:
-    """Notes on missing intervals, on logs that decide, and on configurations with fewer ghosts per minute than `asked`."""
+    """Notes on missing intervals, on decisive logs, and on configurations with fewer ghosts than `asked` a minute."""
     none = [of.objects for of in pairs if any(of.objects) and of.over is None]
     why = explain_no_clusters(sum(count > 0 for count in none[0]), sum(none[0])) if none else None
     overall = table.drop_duplicates(["configuration", "metric"])

@@ -127,9 +127,8 @@ class ClusterIndex:
 
     def count_objects(self, items: StatisticItems) -> Float:
         """(K,) objects with items in each cluster; runs where clusters are runs."""
-        cluster = self.of(items)
-        counted = (cluster >= 0) & (items["n"] > 0)
-        by = "objects" if self.over != "runs" else "runs"
+        cluster, by = self.of(items), "objects" if self.over != "runs" else "runs"
+        counted = (cluster >= 0) & (items[by] >= 0)
         pairs = np.unique(np.stack([cluster[counted], items[by][counted]]), axis=1)
         return np.bincount(pairs[0], minlength=len(self.names)).astype(float)
 
@@ -306,7 +305,7 @@ class MedianStatistic(PairStatistic):
         cluster, n, K = clusters.of(self.items), self.items["n"].astype(float), len(clusters.names)
         order = np.argsort(self.differences, kind="stable")
         ranked = self.differences[order]
-        last_of = np.flatnonzero(np.append(np.diff(ranked, append=np.nan) != 0, True)[: len(ranked)])
+        last_of = np.flatnonzero(np.append(ranked[1:] != ranked[:-1], True))
         last_of = last_of[np.unique(np.linspace(0, len(last_of) - 1, min(len(last_of), _VALUES)).astype(int))]
         # Rows of each cluster up to each value; of −∞, where no row needs to be, none.
         step = np.searchsorted(last_of, np.arange(len(ranked)), side="left")
