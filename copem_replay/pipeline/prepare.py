@@ -25,6 +25,7 @@ from copem_replay.experiment.schema import Configuration, Experiment
 from copem_replay.fusion.interface import ListFusion
 from copem_replay.io.recorded_units import RecordedUnits, join_recorded_units
 from copem_replay.io.recording import Recording
+from copem_replay.metrics.accuracy.held import HeldFrames
 from copem_replay.metrics.braking.encounter import EgoPath, Encounter, find_encounters
 from copem_replay.metrics.braking.verdict import find_passing_intervals
 from copem_replay.metrics.detection.conflict import keep_episodes_within
@@ -39,7 +40,7 @@ from copem_replay.pipeline.receiver import (
     perceive_all_units,
     state_captures,
 )
-from copem_replay.pipeline.scoring import TruthCache
+from copem_replay.pipeline.scoring import TruthCache, make_log_frames
 from copem_replay.pipeline.world import (
     ClaimedRows,
     OnAir,
@@ -203,6 +204,11 @@ class Replay:
     def truth_cache(self) -> TruthCache:
         """The truth at the instants of fused lists, each computed once."""
         return TruthCache(self.scene, self.truth, self.expanded)
+
+    @cached_property
+    def held_frames(self) -> HeldFrames:
+        """The frames at which it is measured what receivers hold."""
+        return make_log_frames(self.truth_cache, self.episodes)
 
     def truth_cache_of(self, chunk: TimeChunk) -> TruthCache:
         """The truth that configurations share: of a whole log it is kept, of a time chunk it is made anew."""

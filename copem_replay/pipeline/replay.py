@@ -197,7 +197,7 @@ def _find_known(
             around = replay.truth_cache_of(world.chunk)
             for name, output in receivers.receive(world):
                 if name not in judges:
-                    judges[name] = _Judge(replay, experiment, output, receivers.issue_s(name), len(runs))
+                    judges[name] = _Judge(replay, experiment, name, output, receivers.issue_s(name), len(runs))
                 judges[name].add(around, output)
         for name, judge in judges.items():
             scores, conflict_known_s = judge.result()
@@ -219,13 +219,17 @@ class _Judge:
     """Scores and perceived conflicts of one configuration's lists, chunk by chunk."""
 
     def __init__(
-        self, replay: Replay, experiment: Experiment, first: ReceiverOutput, issue_s: Float, runs: int
+        self, replay: Replay, experiment: Experiment, name: str, first: ReceiverOutput, issue_s: Float, runs: int
     ) -> None:
         measure = experiment.measure
         self.units, self._runs = first.heard.units, runs
         self._scorer = self._conflicts = None
         if _needs_all(experiment):
-            self._scorer = Scorer(replay.truth_cache, replay.episodes, first, issue_s, measure)
+            frames = replay.held_frames if measure.accuracy else None
+            self._scorer = Scorer(
+                replay.truth_cache, replay.episodes, first, issue_s, measure, frames,
+                experiment.configurations[name].max_age_s,
+            )  # fmt: skip
         if measure.conflict is not None:
             self._conflicts = ConflictDetector(
                 replay.ego,

@@ -18,6 +18,7 @@ from copem_replay.core.interpolation import AROUND_S, interpolate_at_instants, i
 from copem_replay.core.object_list import AGREE
 from copem_replay.core.tracks import CLASSES, Bool, Float, Int, Scene, Tracks, class_indices
 from copem_replay.metrics.accuracy.aggregator import Aggregator
+from copem_replay.metrics.accuracy.held import HeldAccuracy, HeldErrors, HeldFrames, make_held_frames
 from copem_replay.metrics.accuracy.statistics import Accuracy, AccuracySettings, repeat_for_runs
 from copem_replay.metrics.config import AnnotatedArea, Measure, MetricsSetup
 from copem_replay.metrics.detection.by_match import DetectionSteps, FirstMatches, collect_captures
@@ -60,6 +61,10 @@ class TruthCache:
     def at(self, time_s: Float) -> Tracks:
         """The truth at instants (K,), ascending."""
         return _cache_instants(self._worlds, time_s, self._at)
+
+    def between(self, time_s: Float) -> Tracks:
+        """The truth at instants (K,), ascending, which is not kept."""
+        return self._at(time_s)
 
     def at_stated(self, time_s: Float, captured_s: tuple[Float, Float]) -> Tracks:
         """The truth at stated instants (K,), ascending; `captured_s`: the earliest and latest true capture of each."""
@@ -116,13 +121,15 @@ class TruthCache:
 class ConfigurationScores:
     """The scores of one configuration in the runs (S,), or in the one that stands for all.
 
-    `issue_s (K,)`: when each list is available. `detections`, `steps`: by match, whatever the fusion.
+    `issue_s (K,)`: when each list is available. `detections`, `steps`: by match, whatever the fusion. `held`: with
+    `accuracy`.
     """
 
     issue_s: Float
     detections: FirstDetections
     steps: DetectionSteps
     accuracy: Accuracy | None
+    held: HeldAccuracy | None = None
 
 
 def match_lists(around: TruthCache, output: ReceiverOutput, measure: Measure) -> Matches:
@@ -160,11 +167,15 @@ def _list_captures(output: ReceiverOutput) -> Float:
 
 
 class Scorer:
-    """Measures a configuration's lists, chunk by chunk; `issue_s (K,)`: when those of the whole log are available."""
+    """Measures a configuration's lists, chunk by chunk; `issue_s (K,)`: when those of the whole log are available.
+
+    `frames`: at which it is measured what is held; None: accuracy is not measured. `max_age_s`: of the configuration.
+    """
 
     def __init__(
-        self, around: TruthCache, episodes: Episodes, output: ReceiverOutput, issue_s: Float, measure: Measure
-    ) -> None:
+        self, around: TruthCache, episodes: Episodes, output: ReceiverOutput, issue_s: Float, measure: Measure,
+        frames: HeldFrames | None, max_age_s: float,
+    ) -> None:  # fmt: skip
         self._issue_s, self._measure = issue_s, measure
         self.accuracy_s = 0.0
         """Seconds that measuring accuracy took, without matching."""
@@ -173,22 +184,27 @@ class Scorer:
             episodes, runs=runs, confirm=measure.confirm, count_earlier=measure.count_earlier,
             captures=collect_captures(output.heard, instants=measure.confirm.hits > 1),
         )  # fmt: skip
-        self._aggregator = None
-        if measure.accuracy:
+        self._aggregator = self._held = None
+        if frames is not None:
+            settings, classes = accuracy_settings(measure, around.scene.end_s), around.classes(measure)
             self._aggregator = Aggregator(
-                issue_s, around.scene, episodes, around.since_s(episodes), around.reference(issue_s),
-                around.classes(measure), settings=accuracy_settings(measure, around.scene.end_s), runs=runs,
+                issue_s, around.scene, episodes, around.since_s(episodes), around.reference(issue_s), classes,
+                settings=settings, runs=runs,
             )  # fmt: skip
+            self._held = HeldErrors(
+                frames, issue_s, max_age_s, around.scene, episodes, classes, settings=settings, runs=runs
+            )
 
     def add(self, around: TruthCache, output: ReceiverOutput) -> Matches:
         """Take in the lists of a time chunk. Returns their matches."""
         lists, issue_s = output.lists, output.at.issue_s
-        if self._aggregator is None:
+        if self._aggregator is None or self._held is None:
             matches = match_lists(around, output, self._measure)
         else:
             began_s = time.perf_counter()
             matches, now = _match_at_both_times(around, output, self._measure)
             self._aggregator.add(lists, matches, now, around.at(issue_s))
+            self._held.add(lists, matches)
             self.accuracy_s += time.perf_counter() - began_s
         self._known.add(lists, matches, issue_s)
         return matches
@@ -196,9 +212,14 @@ class Scorer:
     def result(self, runs: int) -> ConfigurationScores:
         """The scores in this number of runs."""
         detections, steps = self._known.result()
-        aggregator = self._aggregator
-        accuracy = None if aggregator is None else repeat_for_runs(aggregator.result(), runs)
-        return ConfigurationScores(self._issue_s, detections, steps, accuracy)
+        accuracy = None if self._aggregator is None else repeat_for_runs(self._aggregator.result(), runs)
+        held = None if self._held is None else self._held.result().repeated(runs)
+        return ConfigurationScores(self._issue_s, detections, steps, accuracy, held)
+
+
+def make_log_frames(around: TruthCache, episodes: Episodes) -> HeldFrames:
+    """The frames of a log at which it is measured what is held."""
+    return make_held_frames(around.truth.captured_s, episodes, around.between, around.reference)
 
 
 # What accuracy is measured by: bands of distance, time and existence.

@@ -2,8 +2,8 @@
 
 | table | rows |
 |---|---|
-| `accuracy` | as `detections`: by list of the object's stay its position error and its part of GOSPAᵖ; its ghosts |
-| `instants` | log × configuration, and run where runs differ in them: when each fused list is available |
+| `accuracy` | as `detections`: by list of the object's stay, and as held at each frame of its episode, its position error and its part of GOSPAᵖ; its ghosts |
+| `instants` | log × configuration, and run where runs differ in them: when each fused list is available; which is held when |
 | `lists` | log × configuration × run: lists, ghosts, stale ones, and how many of the others from which existence on |
 | `thresholds` | log × configuration × run × object × step: when it is detected if more existence is asked for |
 | `bands` | configuration × distance, time (by log) or existence: from, to, and the figures in between |
@@ -101,24 +101,26 @@ def accuracy_tables(logs: Sequence[LogTables], rows: pd.DataFrame, *, same_insta
     beside = pa.concat_tables([log.beside for log in logs if log.beside is not None])
     runs = pa.concat_tables([log.runs for log in logs if log.runs is not None])
     per_list = keys
-    for name in ("first_list", "error_m", "gospa_m2", "ghosts"):
+    for name in _BY_LIST:
         per_list = per_list.append_column(name, beside[name])
     lengths = pc.list_value_length(beside["existence"]).to_numpy()
     thresholds = keys.take(pa.array(np.repeat(np.arange(len(lengths)), lengths)))
     thresholds = thresholds.append_column("existence", pc.list_flatten(beside["existence"]))
     thresholds = thresholds.append_column("detection_s", pc.list_flatten(beside["steps_s"]))
-    lists = runs.drop_columns("available_s")
+    lists = runs.drop_columns(list(_INSTANTS))
     return AccuracyTables(per_list, _build_instants(runs, same_instants), lists, thresholds)
 
 
 def _build_instants(runs: pa.Table, same: bool) -> pa.Table:
     """`instants`: a row per configuration, and per run where runs do not have the same instants."""
-    columns = runs.select(["log", "configuration", "run", "available_s"])
+    columns = runs.select(["log", "configuration", "run", *_INSTANTS])
     if same:
         return columns.filter(pc.equal(columns["run"], 0)).drop_columns("run")
     stated = np.flatnonzero(columns["available_s"].is_valid())
     rows = stated[np.searchsorted(stated, np.arange(len(columns)), side="right") - 1]  # as in the row before
-    return columns.set_column(3, "available_s", columns["available_s"].take(pa.array(rows)))
+    for k, name in enumerate(_INSTANTS, 3):
+        columns = columns.set_column(k, name, columns[name].take(pa.array(rows)))
+    return columns
 
 
 def tabulate_bands(of_logs: Mapping[tuple[str, str], AccuracyTotal]) -> pd.DataFrame:
@@ -170,27 +172,33 @@ RUNS = pa.schema(
     [
         ("log", pa.string()), ("configuration", pa.string()), ("run", pa.int64()), ("lists", pa.int64()),
         ("minutes", pa.float64()), ("ghosts", pa.int64()), ("stale_ghosts", pa.int64()), ("duplicates", pa.int64()),
-        ("existence", pa.list_(pa.float64())), ("ghosts_at", pa.list_(pa.int64())),
-        ("available_s", pa.list_(pa.float64())),
+        ("existence", pa.list_(pa.float64())), ("ghosts_at", pa.list_(pa.int64())), ("without_truth", pa.int64()),
+        ("available_s", pa.list_(pa.float64())), ("frame_s", pa.list_(pa.float64())), ("held_list", pa.list_(pa.int64())),
     ]
 )  # fmt: skip
+_INSTANTS = ("available_s", "frame_s", "held_list")
+"""Columns of `instants`; the others are those of `lists`."""
 
 BESIDE = pa.schema(
     [
         ("first_list", pa.int64()), ("error_m", pa.large_list(pa.float32())), ("gospa_m2", pa.large_list(pa.float32())),
-        ("ghosts", pa.int64()), ("existence", pa.large_list(pa.float64())), ("steps_s", pa.large_list(pa.float64())),
+        ("ghosts", pa.int64()), ("first_frame", pa.int64()), ("error_held_m", pa.large_list(pa.float32())),
+        ("age_held_s", pa.large_list(pa.float32())), ("gospa_held_m2", pa.large_list(pa.float32())),
+        ("existence", pa.large_list(pa.float64())), ("steps_s", pa.large_list(pa.float64())),
     ]
 )  # fmt: skip
+_BY_LIST = tuple(name for name in BESIDE.names if name not in ("existence", "steps_s"))
+"""Columns of `accuracy`; the others are those of `thresholds`."""
 
 
 @dataclass(frozen=True)
 class LogTables:
     """The tables of one log; `beside` and `runs` are None without accuracy.
 
-    `beside` has the rows of `rows`: `first_list`, `error_m`, `gospa_m2` and `ghosts` of `accuracy.parquet`, and the
-    steps `existence` and `steps_s` of `thresholds.parquet`. `runs` has a row per configuration and run: the columns of
-    `lists.parquet`, and `available_s` of `instants.parquet`; null: as in the row before. `totals`: by configuration
-    sums of accuracy, each with the number of neighbouring runs that it is over.
+    `beside` has the rows of `rows`: the columns of `accuracy.parquet`, and the steps `existence` and `steps_s` of
+    `thresholds.parquet`. `runs` has a row per configuration and run: the columns of `lists.parquet`, and those of
+    `instants.parquet`; null: as in the row before. `totals`: by configuration sums of accuracy, each with the number of
+    neighbouring runs that it is over.
     """
 
     log: str
@@ -258,42 +266,40 @@ def _split_by_runs(outcomes: Iterable[BlockOutcome], name: str) -> Iterator[tupl
 
 def _build_beside(outcomes: Sequence[BlockOutcome]) -> pa.Table:
     """`LogTables.beside`, in the order of the outcomes' rows."""
-    first: list[Int] = []
-    lengths: list[Int] = [np.zeros(1, dtype=np.int64)]
-    values: dict[str, list[Any]] = {name: [] for name in ("error_m", "gospa_m2", "existence", "steps_s")}
-    steps: list[Int] = [np.zeros(1, dtype=np.int64)]
-    ghosts: list[Int] = []
+    parts = []
     for outcome in outcomes:
         runs = len(outcome.runs)
         for _, scores, accuracy in list_accuracies(outcome):
-            first.append(np.tile(accuracy.first_list, runs))
-            lengths.append(np.tile(accuracy.count, runs))
-            values["error_m"].append(accuracy.error_m.ravel())
-            values["gospa_m2"].append(accuracy.gospa.ravel())
-            ghosts.append(accuracy.by_object["ghosts"].ravel())
+            held = scores.held
+            assert held is not None
             count, existence, steps_s = _count_steps(scores, runs)
-            steps.append(count)
-            values["existence"].append(existence)
-            values["steps_s"].append(steps_s)
+            lists, frames = np.tile(accuracy.count, runs), np.tile(held.count, runs)
+            columns = {
+                "first_list": np.tile(accuracy.first_list, runs),
+                "error_m": (lists, accuracy.error_m.ravel()),
+                "gospa_m2": (lists, accuracy.gospa.ravel()),
+                "ghosts": accuracy.by_object["ghosts"].ravel(),
+                "first_frame": np.tile(held.first, runs),
+                "error_held_m": (frames, held.error_m.ravel()),
+                "age_held_s": (frames, held.age_s.ravel()),
+                "gospa_held_m2": (frames, held.gospa.ravel()),
+                "existence": (count, existence),
+                "steps_s": (count, steps_s),
+            }
+            parts.append(columns)
+    return pa.table({one.name: _join_column(one.type, [part[one.name] for part in parts]) for one in BESIDE})
+
+
+def _join_column(kind: pa.DataType, parts: Sequence[Any]) -> pa.Array:
+    """A column of whole numbers (n,), or of lists given as (lengths (n,), their content)."""
     none = np.empty(0, dtype=np.int64)
-
-    def nested(counts: list[Int], name: str, kind: type) -> pa.Array:
-        flat = np.concatenate([np.empty(0, dtype=kind), *values[name]])
-        if kind is np.float32:  # to about a millimetre: finer is noise, and takes twice the space
-            flat = np.round(flat * np.float32(1024)) / np.float32(1024)
-        offsets = pa.array(np.cumsum(np.concatenate(counts)), pa.int64())
-        return pa.LargeListArray.from_arrays(offsets, pa.array(flat, mask=np.isnan(flat)))
-
-    return pa.table(
-        {
-            "first_list": pa.array(np.concatenate([none, *first])),
-            "error_m": nested(lengths, "error_m", np.float32),
-            "gospa_m2": nested(lengths, "gospa_m2", np.float32),
-            "ghosts": pa.array(np.concatenate([none, *ghosts])),
-            "existence": nested(steps, "existence", np.float64),
-            "steps_s": nested(steps, "steps_s", np.float64),
-        }
-    )
+    if not pa.types.is_large_list(kind):
+        return pa.array(np.concatenate([none, *parts]))
+    flat = np.concatenate([np.empty(0, dtype=kind.value_type.to_pandas_dtype()), *(part[1] for part in parts)])
+    if flat.dtype == np.float32:  # to about a millimetre or millisecond: finer is noise, and takes twice the space
+        flat = np.round(flat * np.float32(1024)) / np.float32(1024)
+    offsets = np.cumsum(np.concatenate([np.zeros(1, dtype=np.int64), *(part[0] for part in parts)]))
+    return pa.LargeListArray.from_arrays(pa.array(offsets, pa.int64()), pa.array(flat, mask=np.isnan(flat)))
 
 
 def _count_steps(scores: ConfigurationScores, runs: int) -> tuple[Int, Float, Float]:
@@ -310,6 +316,10 @@ def _build_runs(outcomes: Sequence[BlockOutcome], names: Sequence[str]) -> pa.Ta
     rows: list[dict[str, Any]] = []
     for outcome in outcomes:
         for name, scores, accuracy in list_accuracies(outcome):
+            held = scores.held
+            assert held is not None
+            instants: dict[str, Any] = {"available_s": scores.issue_s, "frame_s": held.frame_s}
+            instants["held_list"] = [k if k >= 0 else None for k in held.list_ix.tolist()]
             for s, run in enumerate(outcome.runs.tolist()):
                 sums = accuracy.by_run[s]
                 rows.append(
@@ -324,7 +334,8 @@ def _build_runs(outcomes: Sequence[BlockOutcome], names: Sequence[str]) -> pa.Ta
                         "duplicates": int(sums["duplicates"]),
                         "existence": list(accuracy.settings.existence_thresholds),
                         "ghosts_at": accuracy.ghosts_at[s].tolist(),
-                        "available_s": scores.issue_s,
+                        "without_truth": int(held.without_truth[s]),
+                        **instants,
                     }
                 )
     place = {name: k for k, name in enumerate(names)}
@@ -334,7 +345,7 @@ def _build_runs(outcomes: Sequence[BlockOutcome], names: Sequence[str]) -> pa.Ta
         instants = before.get(row["configuration"])
         before[row["configuration"]] = row["available_s"]
         if instants is not None and (instants is row["available_s"] or np.array_equal(instants, row["available_s"])):
-            row["available_s"] = None
+            row |= dict.fromkeys(_INSTANTS)
     return pa.Table.from_pylist(rows, RUNS)
 
 

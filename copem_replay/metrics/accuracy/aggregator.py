@@ -64,21 +64,16 @@ class Aggregator:
             episode_of, first, count, np.cumsum(count) - count, episodes.onset_s, episodes.ended_s
         )
         self._issue_s, self._reference, self._settings = issue_s, reference, settings
-        distance_edges_m, time_edges_s = _as_column(settings.distance_edges_m), _as_column(settings.time_edges_s)
-        thresholds = _as_column(settings.existence_thresholds)
-        self._parameters = AccuracyParameters(
-            settings.cutoff_m, settings.power, settings.gate_m, measured_class, distance_edges_m, time_edges_s,
-            thresholds, polygon_corners(settings.annotated_m), settings.annotated_range_m,
-        )  # fmt: skip
+        self._parameters = asked = make_parameters(settings, measured_class)
         S, M, L = runs, len(episodes.object_ix), int(count.sum())
         self._out = AccuracySums(
             np.full((S, L), np.nan, dtype=np.float32),
             np.full((S, L), np.nan, dtype=np.float32),
             np.zeros((S, M), dtype=OBJECT),
             np.zeros(S, dtype=RUN),
-            np.zeros((S, len(thresholds)), dtype=np.int64),
-            np.zeros((S, max(len(distance_edges_m) - 1, 0)), dtype=BAND),
-            np.zeros((S, max(len(time_edges_s) - 1, 0)), dtype=BAND),
+            np.zeros((S, len(asked.existence_thresholds)), dtype=np.int64),
+            np.zeros((S, max(len(asked.distance_edges_m) - 1, 0)), dtype=BAND),
+            np.zeros((S, max(len(asked.time_edges_s) - 1, 0)), dtype=BAND),
             np.zeros((S, EXISTENCE_BINS), dtype=EXISTENCE),
         )
         self._out.by_run["lists"] = reference.present.sum()
@@ -101,8 +96,8 @@ class Aggregator:
         chunk = slice(self._added, self._added + count)
         reference = self._reference
         add_up(
-            lists.start, lists.entries, _entry_matches(about), _entry_matches(now), self._issue_s[chunk],
-            _sort_truth_by_list(world),
+            lists.start, lists.entries, take_match_columns(about), take_match_columns(now), self._issue_s[chunk],
+            sort_truth_by_list(world),
             self._stays._replace(first_list=self._stays.first_list - self._added),
             reference.x_m[chunk], reference.y_m[chunk], reference.present[chunk],
             self._parameters, self._states, self._out,
@@ -117,15 +112,26 @@ class Aggregator:
         return Accuracy(self._settings, self._stays.first_list, self._stays.lists, *self._out)
 
 
+def make_parameters(settings: AccuracySettings, measured_class: Bool) -> AccuracyParameters:
+    """The settings as compiled code takes them. `measured_class (C,)`: as of `Aggregator`."""
+    return AccuracyParameters(
+        settings.cutoff_m, settings.power, settings.gate_m, measured_class, _as_column(settings.distance_edges_m),
+        _as_column(settings.time_edges_s), _as_column(settings.existence_thresholds),
+        polygon_corners(settings.annotated_m), settings.annotated_range_m,
+    )  # fmt: skip
+
+
 def _as_column(values: tuple[float, ...]) -> Float:
     return np.array(values, dtype=np.float64)
 
 
-def _entry_matches(matches: Matches) -> EntryMatches:
+def take_match_columns(matches: Matches) -> EntryMatches:
+    """The matches as compiled code takes them."""
     return EntryMatches(matches.object_ix, matches.role, matches.x_m, matches.y_m, matches.class_ix)
 
 
-def _sort_truth_by_list(truth: Tracks) -> TruthByList:
+def sort_truth_by_list(truth: Tracks) -> TruthByList:
+    """The truth frame by frame, in each by object."""
     order = np.lexsort((truth.row_object_ix, truth.frame_ix))
     columns = (getattr(truth, name)[0, order] for name in ("x_m", "y_m", "vx_mps", "vy_mps"))
     return TruthByList(truth.by_frame[1], truth.row_object_ix[order], *columns)

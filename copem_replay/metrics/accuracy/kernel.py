@@ -166,21 +166,32 @@ class _ListScratch(NamedTuple):
     place_of: Int  # by episode: its place in these arrays, −1: none
 
 
-class _Targets(NamedTuple):
-    # The objects that are looked at now: the truth of GOSPA.
+class Targets(NamedTuple):
+    """The objects that are looked at now: the truth of GOSPA; and its division among them."""
+
     episode: Int
     column: Int  # of this list in the arrays list by list
     x_m: Float
     y_m: Float
     partner: Int
-    false: Int  # number of estimates without a partner that are nearest to it
+    located: Float  # the object's parts of GOSPAᵖ
+    missed: Float
+    false: Float
 
 
-class _Estimates(NamedTuple):
-    # The entries of the list at hand that GOSPA counts.
+class Estimates(NamedTuple):
+    """The entries of the list at hand that GOSPA counts."""
+
     x_m: Float
     y_m: Float
     paired: Bool
+
+
+@nb.njit(cache=True)
+def make_targets(most: int) -> Targets:
+    """Room for so many objects."""
+    whole, real = np.empty((3, most), dtype=np.int64), np.empty((5, most))
+    return Targets(whole[0], whole[1], real[0], real[1], whole[2], real[2], real[3], real[4])
 
 
 @nb.njit(cache=True, nogil=True)
@@ -202,11 +213,8 @@ def add_up(
         np.empty(M, np.int64), np.empty(M, np.int64), np.empty(M, np.int64), np.empty(M, np.int64),
         np.empty(M, np.int64), np.empty(M, np.int64), np.full(M, -1),
     )  # fmt: skip
-    targets = _Targets(
-        np.empty(M, np.int64), np.empty(M, np.int64), np.empty(M), np.empty(M), np.empty(M, np.int64),
-        np.empty(M, np.int64),
-    )  # fmt: skip
-    estimates = _Estimates(np.empty(longest), np.empty(longest), np.empty(longest, np.bool_))
+    targets = make_targets(M)
+    estimates = Estimates(np.empty(longest), np.empty(longest), np.empty(longest, np.bool_))
     _add_each_list(
         start, entries, about, now, issue_s, world, stays, (reference_x_m, reference_y_m, present), asked, so_far, out,
         (here, targets, estimates),
@@ -217,7 +225,7 @@ def add_up(
 def _add_each_list(
     start: Int, entries: Entries, about: EntryMatches, now: EntryMatches, issue_s: Float, world: TruthByList,
     stays: EpisodeLists, reference: tuple[Float, Float, Bool], asked: AccuracyParameters, so_far: EpisodeStates,
-    out: AccuracySums, scratch: tuple[_ListScratch, _Targets, _Estimates],
+    out: AccuracySums, scratch: tuple[_ListScratch, Targets, Estimates],
 ) -> None:  # fmt: skip
     reference_x_m, reference_y_m, present = reference
     here, targets, estimates = scratch
@@ -289,7 +297,7 @@ def close_episodes(stays: EpisodeLists, so_far: EpisodeStates, out: AccuracySums
 @borrowing
 def _gather_targets(
     k: int, issue_s: float, world: TruthByList, stays: EpisodeLists, from_m: tuple[float, float],
-    asked: AccuracyParameters, here: _ListScratch, targets: _Targets,
+    asked: AccuracyParameters, here: _ListScratch, targets: Targets,
 ) -> tuple[int, int]:  # fmt: skip
     # Out: the objects whose stay includes list k, those in a gap of the truth last. Returns their number, and the
     # number of those that are looked at.
@@ -318,8 +326,8 @@ def _gather_targets(
 @borrowing
 def _add_entries(
     s: int, first: int, after: int, entries: Entries, about: EntryMatches, now: EntryMatches, stays: EpisodeLists,
-    from_m: tuple[float, float], time_band: int, asked: AccuracyParameters, here: _ListScratch, targets: _Targets,
-    wanted: int, estimates: _Estimates, out: AccuracySums,
+    from_m: tuple[float, float], time_band: int, asked: AccuracyParameters, here: _ListScratch, targets: Targets,
+    wanted: int, estimates: Estimates, out: AccuracySums,
 ) -> int:  # fmt: skip
     # Find the matches in a list of run s and count its other entries. Returns the number of entries in GOSPA.
     count = 0
@@ -370,7 +378,7 @@ def _add_entries(
 @borrowing
 def _add_false_positive(
     s: int, x_m: float, y_m: float, existence: float, stale: bool, from_m: tuple[float, float], time_band: int,
-    asked: AccuracyParameters, targets: _Targets, wanted: int, out: AccuracySums,
+    asked: AccuracyParameters, targets: Targets, wanted: int, out: AccuracySums,
 ) -> None:  # fmt: skip
     out.by_run[s].ghosts += 1
     if stale:
@@ -383,7 +391,7 @@ def _add_false_positive(
         out.by_distance[s, distance_band].ghosts += 1
     if time_band >= 0:
         out.by_time[s, time_band].ghosts += 1
-    nearest = _find_nearest_target(x_m, y_m, targets, wanted)
+    nearest = find_nearest_target(x_m, y_m, targets, wanted)
     if nearest >= 0:
         out.by_object[s, targets.episode[nearest]].ghosts += 1
 
@@ -449,46 +457,58 @@ def _add_pair(records: Records, band: int, east_m: float, north_m: float, nees: 
 
 @borrowing
 def _add_gospa(
-    gospa: NDArray[np.float32], by_object: Records, sums: Any, targets: _Targets, wanted: int,
-    estimates: _Estimates, count: int, asked: AccuracyParameters,
+    gospa: NDArray[np.float32], by_object: Records, sums: Any, targets: Targets, wanted: int,
+    estimates: Estimates, count: int, asked: AccuracyParameters,
 ) -> None:  # fmt: skip
     # The GOSPA of one list, divided among the objects, and its OSPA: the same pairs are the best ones for both.
     if wanted == 0:
         return
     sums.lists_looked += 1
-    unit = asked.cutoff_m**asked.power
-    localisation, pairs = gospa_pairs(
-        targets.x_m[:wanted], targets.y_m[:wanted], estimates.x_m[:count], estimates.y_m[:count],
-        asked.cutoff_m, asked.power, targets.partner[:wanted],
-    )  # fmt: skip
+    localisation, pairs = divide_gospa(targets, wanted, estimates, count, asked.cutoff_m, asked.power)
     most = max(wanted, count)
-    sums.ospa_m += ((localisation + unit * (most - pairs)) / most) ** (1.0 / asked.power)
-    estimates.paired[:count] = False
-    targets.false[:wanted] = 0
+    sums.ospa_m += ((localisation + asked.cutoff_m**asked.power * (most - pairs)) / most) ** (1.0 / asked.power)
     for t in range(wanted):
-        if targets.partner[t] >= 0:
-            estimates.paired[targets.partner[t]] = True
-    for b in range(count):
-        if not estimates.paired[b]:
-            targets.false[_find_nearest_target(estimates.x_m[b], estimates.y_m[b], targets, wanted)] += 1
-    for t in range(wanted):
-        m, b = targets.episode[t], targets.partner[t]
-        located = missed = 0.0
-        if b >= 0:
-            square = (targets.x_m[t] - estimates.x_m[b]) ** 2 + (targets.y_m[t] - estimates.y_m[b]) ** 2
-            located = square ** (asked.power / 2)
-        else:
-            missed = unit / 2
-        false = unit / 2 * targets.false[t]
-        by_object[m].gospa_localisation += located
-        by_object[m].gospa_missed += missed
-        by_object[m].gospa_false += false
-        gospa[targets.column[t]] = located + missed + false
+        m = targets.episode[t]
+        by_object[m].gospa_localisation += targets.located[t]
+        by_object[m].gospa_missed += targets.missed[t]
+        by_object[m].gospa_false += targets.false[t]
+        gospa[targets.column[t]] = targets.located[t] + targets.missed[t] + targets.false[t]
 
 
 @borrowing
-def _find_nearest_target(x_m: float, y_m: float, targets: _Targets, wanted: int) -> int:
-    # The target nearest to a place, of equally near ones the first; −1: there are none.
+def divide_gospa(
+    targets: Targets, wanted: int, estimates: Estimates, count: int, cutoff_m: float, power: float
+) -> tuple[float, int]:
+    """Divide GOSPAᵖ among `wanted` objects, one at least, given `count` entries.
+
+    Out: `targets.located`, `missed` and `false`. Gives Σ dᵖ over the pairs, and how many they are.
+    """
+    unit = cutoff_m**power
+    localisation, pairs = gospa_pairs(
+        targets.x_m[:wanted], targets.y_m[:wanted], estimates.x_m[:count], estimates.y_m[:count],
+        cutoff_m, power, targets.partner[:wanted],
+    )  # fmt: skip
+    estimates.paired[:count] = False
+    for t in range(wanted):
+        b = targets.partner[t]
+        targets.located[t] = targets.missed[t] = targets.false[t] = 0.0
+        if b >= 0:
+            estimates.paired[b] = True
+            square = (targets.x_m[t] - estimates.x_m[b]) ** 2 + (targets.y_m[t] - estimates.y_m[b]) ** 2
+            targets.located[t] = square ** (power / 2)
+        else:
+            targets.missed[t] = unit / 2
+    for b in range(count):
+        if not estimates.paired[b]:
+            targets.false[find_nearest_target(estimates.x_m[b], estimates.y_m[b], targets, wanted)] += 1
+    for t in range(wanted):
+        targets.false[t] *= unit / 2
+    return localisation, pairs
+
+
+@borrowing
+def find_nearest_target(x_m: float, y_m: float, targets: Targets, wanted: int) -> int:
+    """The target nearest to a place, of equally near ones the first; −1: there are none."""
     best, least = -1, np.inf
     for t in range(wanted):
         square = (targets.x_m[t] - x_m) ** 2 + (targets.y_m[t] - y_m) ** 2
