@@ -2,8 +2,8 @@
 
 | table | rows |
 |---|---|
-| `accuracy` | as `detections`: by list of the object's stay, and as held at each frame of its episode, its position error and its part of GOSPAᵖ; its ghosts |
-| `instants` | log × configuration, and run where runs differ in them: when each fused list is available; which is held when |
+| `accuracy` | as `detections`: position error and part of GOSPAᵖ by list of the stay, and as held by frame; ghosts |
+| `instants` | log × configuration, and run where runs differ in them: when lists are available, which are held |
 | `lists` | log × configuration × run: lists, ghosts, stale ones, and how many of the others from which existence on |
 | `thresholds` | log × configuration × run × object × step: when it is detected if more existence is asked for |
 | `bands` | configuration × distance, time (by log) or existence: from, to, and the figures in between |
@@ -173,7 +173,8 @@ RUNS = pa.schema(
         ("log", pa.string()), ("configuration", pa.string()), ("run", pa.int64()), ("lists", pa.int64()),
         ("minutes", pa.float64()), ("ghosts", pa.int64()), ("stale_ghosts", pa.int64()), ("duplicates", pa.int64()),
         ("existence", pa.list_(pa.float64())), ("ghosts_at", pa.list_(pa.int64())), ("without_truth", pa.int64()),
-        ("available_s", pa.list_(pa.float64())), ("frame_s", pa.list_(pa.float64())), ("held_list", pa.list_(pa.int64())),
+        ("available_s", pa.list_(pa.float64())), ("frame_s", pa.list_(pa.float64())),
+        ("held_list", pa.list_(pa.int64())),
     ]
 )  # fmt: skip
 _INSTANTS = ("available_s", "frame_s", "held_list")
@@ -342,9 +343,9 @@ def _build_runs(outcomes: Sequence[BlockOutcome], names: Sequence[str]) -> pa.Ta
     rows.sort(key=lambda row: (place[row["configuration"]], row["run"]))
     before: dict[str, Any] = {}
     for row in rows:  # instants equal to those of the run before are null
-        instants = before.get(row["configuration"])
-        before[row["configuration"]] = row["available_s"]
-        if instants is not None and (instants is row["available_s"] or np.array_equal(instants, row["available_s"])):
+        last, issue_s = before.get(row["configuration"]), row["available_s"]
+        before[row["configuration"]] = issue_s
+        if last is not None and (last is issue_s or np.array_equal(last, issue_s)):
             row |= dict.fromkeys(_INSTANTS)
     return pa.Table.from_pylist(rows, RUNS)
 

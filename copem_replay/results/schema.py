@@ -63,19 +63,24 @@ CONFLICT = {
 }
 _OBJECT_COLUMNS = ("object_id", "object_class", "onset_s", "ended_s", "ended_by")
 TALLY = ("log", "configuration", "event", *_OBJECT_COLUMNS, "time_to_detection_s", "distance_at_detection_m", "runs")
+HELD = ("error_held_m", "age_held_s", "gospa_held_m2")
+"""Columns of `accuracy.parquet` with a value for each frame."""
 OPTIONAL = {
     "accuracy.parquet": _OBJECT
-    | {
-        "first_list": "whole numbers",
-        "error_m": "lists of numbers",
-        "gospa_m2": "lists of numbers",
-        "ghosts": "whole numbers",
+    | {"ghosts": "whole numbers", "first_frame": "whole numbers"}
+    | dict.fromkeys(HELD, "lists of numbers"),
+    "instants.parquet": {
+        "log": "text",
+        "configuration": "text",
+        "available_s": "lists of numbers",
+        "frame_s": "lists of numbers",
+        "held_list": "lists of whole numbers",
     },
-    "instants.parquet": {"log": "text", "configuration": "text", "available_s": "lists of numbers"},
     "lists.parquet": _KEYS
     | {
         "minutes": "numbers",
         "ghosts": "whole numbers",
+        "without_truth": "whole numbers",
         "existence": "lists of numbers",
         "ghosts_at": "lists of whole numbers",
     },

@@ -6,8 +6,8 @@ compared at the *frames* of the truth, thinned to ten a second and the same for 
 - *held* is the newest list available by then. Where it has been available for longer than `max_age_s` there is none:
   what is held is empty. Before its first list a configuration has issued nothing, and no frame counts.
 - An entry keeps the object that its own list gave it, at the instant the entry tells of; it is never matched again.
-- *Error* (m): the entry's position as it stands in the list, minus the truth at the frame. No gate, no extrapolation: of
-  an object at constant velocity v and an entry of age a it is the list's own error plus v · a.
+- *Error* (m): the entry's position as it stands in the list, minus the truth at the frame. No gate, no extrapolation:
+  of an object at constant velocity v and an entry of age a it is the list's own error minus v · a.
 - *Age* (s): the frame minus the entry's newest capture.
 - Objects: those with an episode, from onset to end, where the truth has them at the frame and there is a place to
   measure distances from.
@@ -183,8 +183,8 @@ class HeldErrors:
 class _EpisodeFrames(NamedTuple):
     # Which frames count for each episode. All (M,) but the first.
     episode_of: Int  # (N,) by object, −1: not measured
-    first: Int  # frames first … first + count − 1
-    count: Int
+    first: Int  # frames first … first + frames − 1
+    frames: Int
     column: Int  # of the first frame, in the columns (S, L)
     onset_s: Float
 
@@ -251,15 +251,13 @@ def _measure_each_frame(
 
 
 @borrowing
-def _gather_present(
-    g: int, truth: TruthByList, episodes: _EpisodeFrames, targets: Targets, here: _FrameScratch
-) -> int:
+def _gather_present(g: int, truth: TruthByList, episodes: _EpisodeFrames, targets: Targets, here: _FrameScratch) -> int:
     # Out: the objects that count at frame g, and those that the truth has there. Returns the number of the first.
     wanted = 0
     for p in range(truth.start[g], truth.start[g + 1]):
         m = episodes.episode_of[truth.object_ix[p]]
         here.present[m] = True
-        if g < episodes.first[m] or g >= episodes.first[m] + episodes.count[m]:
+        if g < episodes.first[m] or g >= episodes.first[m] + episodes.frames[m]:
             continue
         here.target_of[m] = wanted
         targets.episode[wanted], targets.column[wanted] = m, episodes.column[m] + g - episodes.first[m]

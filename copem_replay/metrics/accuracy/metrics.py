@@ -155,7 +155,7 @@ _TOTAL = attrgetter("accuracy")
 ACCURACY = (
     Metric("position_rmse_m", _TOTAL, position_rmse_m, -1,
            "root mean square error of positions against the truth when the list is available", "accuracy",
-           "position error, over lists that both have"),
+           "position error of what is held at the frames of the truth, where both list the object"),
     Metric("position_rmse_captured_m", _TOTAL, position_rmse_captured_m, -1,
            "the same at the instant the entry tells of", "accuracy"),
     Metric("bias_east_m", _TOTAL, bias_east_m, 0, "mean easting error, entry minus truth"),
@@ -165,7 +165,7 @@ ACCURACY = (
            "how old entries are: available minus captured, mean", "accuracy"),
     Metric("gospa_m", _TOTAL, gospa_m, -1,
            "GOSPA of the lists: position errors, misses and false entries in one number", "lists",
-           "GOSPA, over lists that both have"),
+           "GOSPA of what is held at the frames of the truth"),
     Metric("gospa_localisation_m", _TOTAL, gospa_localisation_m, -1, "part of GOSPA from position errors of pairs"),
     Metric("gospa_missed_m", _TOTAL, gospa_missed_m, -1, "part of GOSPA from missed objects"),
     Metric("gospa_false_m", _TOTAL, gospa_false_m, -1, "part of GOSPA from false entries"),

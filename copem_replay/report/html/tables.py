@@ -31,11 +31,13 @@ from copem_replay.report.html.markup import (
     make_table,
     make_tag,
 )
+from copem_replay.results.compare.metrics import LIKE
 from copem_replay.results.compare.metrics import METRICS as COMPARED
-from copem_replay.results.compare.tables import NOTHING, comparison_lines, explain_no_interval
+from copem_replay.results.compare.tables import NOTHING, comparison_lines, explain_no_interval, held_cells
 
 if TYPE_CHECKING:
     from copem_replay.report.html.study import ReportData
+    from copem_replay.results.compare import Comparison
 
 
 # Headers of columns and formats of their values: three significant digits, shares in per cent.
@@ -65,6 +67,8 @@ _HEADERS = {
     "nees": "NEES",
     "nees_expected": "NEES expected",
     "gospa_m": "GOSPA, m",
+    "position_rmse_held_m": "error of what is held (RMSE), m",
+    "gospa_held_m": "GOSPA of what is held, m",
     "false_positives_per_min": "false positives per minute",
     "stale_false_positives_per_min": "stale ones of these per minute",
     "duplicates_per_min": "duplicates per minute",
@@ -250,12 +254,12 @@ def _column_meanings(columns: Iterable[tuple[str, str]], names: Any = column_hea
     return make_tag("dl", *terms)
 
 
-_WORDS = {name: METRIC[name].compared for name in COMPARED if name in METRIC} | {
+_WORDS = {name: METRIC[LIKE.get(name, name)].compared for name in COMPARED} | {
     "ttd_rmst_s_equal_ghosts": "the same at as many false positives per minute as the baseline has",
 }
 
 
-_LISTS = ("position_rmse_m", "gospa_m", "false_positives_per_min")
+_LISTS = ("position_rmse_held_m", "gospa_held_m", "false_positives_per_min")
 """Metrics of lists, whose differences have a table of their own so that both fit on a page."""
 
 
@@ -287,6 +291,7 @@ def regret_table(study: ReportData) -> Html:
         [
             *tables,
             make_tag("p", "Bold: the interval excludes 0.", class_="below"),
+            _held_table(study, regret),
             fold_parts(
                 "What the columns mean, and how they are made",
                 _column_meanings(words, difference_column_header),
@@ -294,6 +299,17 @@ def regret_table(study: ReportData) -> Html:
             ),
         ]
     )
+
+
+def _held_table(study: ReportData, regret: Comparison) -> Html:
+    """What the differences of what is held are over: a row per configuration; nothing where they are not compared."""
+    cells = held_cells(regret)
+    lines = [
+        make_tag("tr", row_head(study, name), *(make_tag("td", cell) for cell in rest), data_row=name)
+        for name, *rest in cells.itertuples(index=False)
+    ]
+    caption = f"What is held at the frames of the truth: of the configuration / of {regret.baseline}"
+    return make_table(list(cells.columns), lines, caption=caption, id_="regret-held") if lines else Html()
 
 
 def baseline_words(study: ReportData) -> Html:

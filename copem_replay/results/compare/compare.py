@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 
 from copem_replay.core.errors import InputError, count_noun
-from copem_replay.core.tracks import SAME_INSTANT_S, Int
+from copem_replay.core.tracks import SAME_INSTANT_S
 from copem_replay.metrics.intervals import FEWEST_CLUSTERS, FEWEST_LOGS, choose_over, explain_no_clusters
 from copem_replay.results.compare.labels import (
     LabelledConfiguration,
@@ -52,12 +52,11 @@ from copem_replay.results.compare.pairing import (
     PairingGrid,
     build_grid,
     configuration_rows,
-    count_shared_instants,
     float_column,
     lay_out_configuration,
 )
 from copem_replay.results.read import Results, open_results
-from copem_replay.results.schema import OPTIONAL
+from copem_replay.results.schema import AGAIN, OPTIONAL
 
 # The sums of a pair over its logs.
 
@@ -65,12 +64,11 @@ from copem_replay.results.schema import OPTIONAL
 @dataclass
 class AllLogs:
     """The sums of a pair, log by log: `objects`: with rows of both sides; `alone`: rows that only one side has, (first,
-    second); `instants`: as `count_shared_instants` gives them; `differences`: by metric, of each log that has one.
+    second); `differences`: by metric, of each log that has one.
     """
 
     objects: list[int] = field(default_factory=list)
     alone: list[tuple[int, int]] = field(default_factory=list)
-    instants: list[Int] = field(default_factory=list)
     differences: dict[str, list[float]] = field(default_factory=dict)
     _regrets: dict[str, list[Regret]] = field(default_factory=dict)
 
@@ -88,8 +86,6 @@ class AllLogs:
         objects = len(np.unique(both // grid.runs))
         self.objects.append(objects)
         self.alone.append((int((first.there & ~second.there).sum()), int((second.there & ~first.there).sum())))
-        if first.accuracy is not None and second.accuracy is not None:
-            self.instants.append(count_shared_instants(first.accuracy, second.accuracy))
         for regret in regrets:
             # Runs stay apart for a single object: they are the clusters if no log has another.
             figure = regret.figure.condensed(runs=objects <= 1) if more else regret.figure
@@ -106,9 +102,7 @@ class AllLogs:
 
     def regrets(self) -> Iterator[Regret]:
         """The regret of every metric over all logs."""
-        for of_logs in self._regrets.values():
-            figures = [regret.figure for regret in of_logs]
-            yield replace(of_logs[0], figure=type(figures[0]).joined(figures))
+        return map(Regret.joined, self._regrets.values())
 
 
 # The results folders of a comparison.
@@ -148,8 +142,8 @@ def _read_folder(folder: Path | Results) -> Results:
 # Notes on a comparison: what is left out, and why.
 
 _NEEDED = {
-    "position_rmse_m": {"accuracy.parquet", "instants.parquet"},
-    "gospa_m": {"accuracy.parquet", "instants.parquet"},
+    "position_rmse_held_m": {"accuracy.parquet", "instants.parquet"},
+    "gospa_held_m": {"accuracy.parquet", "instants.parquet"},
     "false_positives_per_min": {"lists.parquet"},
     "ttd_rmst_s_equal_ghosts": {"lists.parquet", "thresholds.parquet"},
 }
@@ -184,22 +178,12 @@ def notes_on_pairs(baseline: LabelledConfiguration, pairs: Mapping[LabelledConfi
                 yield f"{count_noun(count, 'row')} of {one_side.label} left out: {other.label} has no such object"
 
 
-def notes_on_instants(
-    baseline: LabelledConfiguration, pairs: Mapping[LabelledConfiguration, AllLogs], logs: Sequence[str]
-) -> Iterator[str]:
-    """Notes on lists without a list of the other configuration at the same instant."""
-    labels_of: dict[tuple[int, int, int, str], list[str]] = {}
-    for one, pair in pairs.items():
-        shared, count, baseline_count = np.sum(pair.instants, axis=0).tolist() if pair.instants else (0, 0, 0)
-        if shared < max(count, baseline_count):
-            none = ", ".join(log for log, counts in zip(logs, pair.instants, strict=True) if counts[0] == 0)
-            labels_of.setdefault((shared, count, baseline_count, none if len(logs) > 1 else ""), []).append(one.label)
-    for (number, count, baseline_count, none), labels in labels_of.items():
-        lacking = f"; none in {none}" if none else ""
-        yield (
-            f"{', '.join(labels)}: position_rmse_m and gospa_m are over the {count_noun(number, 'instant')} that both "
-            f"have, of {count} and the {baseline_count} of {baseline.label}{lacking}"
-        )
+def notes_on_frames(table: pd.DataFrame) -> Iterator[str]:
+    """A note on pairs without a frame from which on both sides have issued a list."""
+    rows = table.loc[table["frames"] == 0, ["log", "configuration"]].drop_duplicates()
+    for log, labels in rows.groupby("log", sort=False)["configuration"]:
+        where = "" if log == ALL else f"log {log}: "
+        yield f"{where}{', '.join(labels)}: no frame at which an object is measured and both sides have issued a list"
 
 
 def note_on_measuring(baseline: LabelledConfiguration, others: Sequence[LabelledConfiguration]) -> Iterator[str]:
@@ -347,6 +331,13 @@ COLUMNS = {
     "logs_better": "Int64",
     "hangs_on": "object",
     "difference_without_it": "float64",
+    "frames": "Int64",
+    "age_s": "float64",
+    "baseline_age_s": "float64",
+    "no_list_share": "float64",
+    "baseline_no_list_share": "float64",
+    "without_truth": "Int64",
+    "baseline_without_truth": "Int64",
 }
 """Columns of a comparison, and their types in pandas."""
 
@@ -417,7 +408,7 @@ def compare_folders(
             *notes_on_pairs(against, pairs),
             *note_on_measuring(against, others),
             *notes_on_output_baseline(against, others),
-            *notes_on_instants(against, pairs, logs),
+            *notes_on_frames(table),
             *notes_on_equal_ghosts(reasons),
             *notes_on_rows(table, pairs.values(), false_positives_per_min),
         ),
@@ -476,6 +467,7 @@ def _compare_each_log(
         for one, pair in pairs.items():
             first = lay_out_configuration(one, tables[one.results], grid)
             _check_same_episodes(one, first, against, second, log, grid)
+            _check_same_frames(one, first, against, second, log)
             regrets = list(compute_regrets(first, second, grid, settings[one], metrics))
             pair.add(first, second, regrets, grid, more=len(logs) > 1)
             over = choose_over(min(pair.objects[-1], 1), pair.objects[-1])
@@ -535,6 +527,29 @@ def _check_same_episodes(
             )
 
 
+def _check_same_frames(
+    one: LabelledConfiguration,
+    first: ConfigurationData,
+    against: LabelledConfiguration,
+    second: ConfigurationData,
+    log: str,
+) -> None:
+    """Raise InputError where what is held is told at other frames, so that its values are no pairs."""
+    if first.accuracy is None or second.accuracy is None:
+        return
+    found, expected = first.accuracy, second.accuracy
+    both = first.there & second.there
+    same = len(found.frame_s) == len(expected.frame_s)
+    same = same and bool((np.abs(found.frame_s - expected.frame_s) <= SAME_INSTANT_S).all())
+    for name in ("first", "length"):
+        same = same and np.array_equal(getattr(found, name)[both], getattr(expected, name)[both])
+    if not same:
+        raise InputError(
+            f"{one.results.folder}: log {log}: {one.configuration}: expected the frames of {against.configuration} in "
+            f"{against.results.folder}, found others; {AGAIN}"
+        )
+
+
 def _is_fixed(metric: str, *sides: LabelledConfiguration) -> bool:
     """Whether a metric is equal in every run, on all sides."""
     if metric == "pass_share":
@@ -564,6 +579,8 @@ def _make_row(
         only = figure.items["only"].sum(axis=0)
         row |= {"only_configuration": int(only[0]), "only_baseline": int(only[1])}
         row["p_value"] = mcnemar_p_value(int(only[0]), int(only[1])) if len(figure.items["n"]) else None
+    if regret.held is not None:
+        row |= regret.held.columns()
     if regret.kept is not None:
         for name, kept in zip(("", "baseline_"), regret.kept, strict=True):
             row[f"{name}existence"], row[f"{name}ghosts_kept_per_min"] = kept.existence, kept.false_positives_per_min

@@ -1,13 +1,15 @@
-"""Metrics of a comparison: differences of two configurations, over the rows and lists that both have.
+"""Metrics of a comparison: differences of two configurations, over the rows that both have and what both hold.
 
-Rows are paired by log, object and run, lists by instant; differences are first − second. Definitions are those of
+Rows are paired by log, object and run, what is held by frame; differences are first − second. Definitions are those of
 `summary.csv`, except:
 
 *ttd_rmst_s*: the difference of the two restricted means over the rows that both have; never detected counts as the
 horizon, an object still there when observation ends is censored.
 *dad_median_m*: the median of the differences, not the difference of the medians. Never detected is below every
 distance, so it differs infinitely from a distance, and not at all from never.
-*gospa_m*: a list counts where an object is measured in it, on or after its onset.
+*position_rmse_held_m*: over the frames of the truth at which both hold an entry about the object, from the first frame
+at which both have issued a list (`metrics/accuracy/held.py`). *gospa_held_m*: over all these frames at which an object
+is measured, on or after its onset, also where one side holds no list.
 *ttd_rmst_s_equal_ghosts*: ttd_rmst_s, with entries below a threshold of existence left out, so that each side has as
 many ghosts per minute over all logs and runs as is asked for (`explain_incomparable`: where that means nothing). Stale
 ghosts are not counted: a late list that was right at its capture is not cleaner without them. Between two thresholds
@@ -18,7 +20,8 @@ other, as between two points of a ROC curve. Intervals keep the thresholds and t
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from functools import reduce
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -44,7 +47,7 @@ from copem_replay.results.compare.pairing import (
     float_column,
     integer_column,
     list_column,
-    pair_lists,
+    pair_held_lists,
 )
 from copem_replay.results.schema import AGAIN
 
@@ -197,8 +200,14 @@ def notes_on_equal_ghosts(reasons: Mapping[str, str | None]) -> Iterator[str]:
         yield f"{labels}: no ttd_rmst_s_equal_ghosts: {reason}"
 
 
-METRICS = {name: METRIC[name.removesuffix("_equal_ghosts")].better for name in (
-    "detected_share", "ttd_rmst_s", "ttd_rmst_s_equal_ghosts", "dad_median_m", "position_rmse_m", "gospa_m",
+LIKE = {
+    "ttd_rmst_s_equal_ghosts": "ttd_rmst_s",
+    "position_rmse_held_m": "position_rmse_m",
+    "gospa_held_m": "gospa_m",
+}
+"""Metrics that the summary does not have, and those of it that they are like."""
+METRICS = {name: METRIC[LIKE.get(name, name)].better for name in (
+    "detected_share", "ttd_rmst_s", "ttd_rmst_s_equal_ghosts", "dad_median_m", "position_rmse_held_m", "gospa_held_m",
     "false_positives_per_min", "pass_share",
 )}  # fmt: skip
 """All metrics, and whether more (1) or less (−1) is better."""
@@ -214,12 +223,51 @@ class PairSettings:
 
 
 @dataclass(frozen=True)
+class HeldCounts:
+    """What is said beside figures of what both hold; counts of several logs add up. (2,): of the first, of the second.
+
+    `frames`: object frames are not counted twice: a frame of a run counts once. `without_truth` is over all frames.
+    """
+
+    frames: int
+    pairs: int
+    only: Int  # (2,) pairs of object and frame that only this side lists
+    age_s: Float  # (2,) Σ of the ages of the pairs
+    without_list: Int  # (2,) frames at which this side holds no list
+    without_truth: Int  # (2,) held entries whose object has no truth at the frame
+
+    def __add__(self, other: HeldCounts) -> HeldCounts:
+        return HeldCounts(*(getattr(self, of.name) + getattr(other, of.name) for of in fields(HeldCounts)))
+
+    def columns(self) -> dict[str, object]:
+        """The columns of a comparison with these counts."""
+        columns: dict[str, object] = {"frames": self.frames}
+        for k, (name, only) in enumerate((("", "only_configuration"), ("baseline_", "only_baseline"))):
+            columns[only] = int(self.only[k])
+            columns[f"{name}age_s"] = float(self.age_s[k] / self.pairs) if self.pairs else None
+            columns[f"{name}no_list_share"] = float(self.without_list[k] / self.frames) if self.frames else None
+            columns[f"{name}without_truth"] = int(self.without_truth[k])
+        return columns
+
+
+@dataclass(frozen=True)
 class Regret:
-    """A metric of a pair; `kept`: operating points of the first and the second, for times at equal ghosts."""
+    """A metric of a pair; `kept`: operating points of the first and the second, for times at equal ghosts.
+
+    `held`: beside figures of what both hold.
+    """
 
     metric: str
     figure: PairStatistic
     kept: tuple[OperatingPoint, OperatingPoint] | None = None
+    held: HeldCounts | None = None
+
+    @staticmethod
+    def joined(of_logs: Sequence[Regret]) -> Regret:
+        """The same metric over several logs."""
+        figures, counts = [one.figure for one in of_logs], [one.held for one in of_logs if one.held is not None]
+        held = reduce(HeldCounts.__add__, counts) if counts else None
+        return replace(of_logs[0], figure=type(figures[0]).joined(figures), held=held)
 
 
 @dataclass(frozen=True)
@@ -319,19 +367,24 @@ def _distance_regrets(pair: _Pair) -> Iterator[Regret]:
     yield Regret("dad_median_m", MedianStatistic(parts=(items,)))
 
 
-def _list_regrets(pair: _Pair) -> Iterator[Regret]:
-    """Errors and GOSPA; lists belong to no object, so that their number stays where objects are clusters."""
+def _held_regrets(pair: _Pair) -> Iterator[Regret]:
+    """Errors and GOSPA; frames belong to no object, so that their number stays where objects are clusters."""
     if pair.first.accuracy is None or pair.second.accuracy is None:
         return
-    both = pair_lists(pair.first.accuracy, pair.second.accuracy, pair.grid, pair.cells)
-    matched = both.matched > 0
-    squares = np.concatenate([both.squared_m2, both.matched[:, None]], axis=1)[matched]
-    errors = pair.items(pair.cells[matched], n=both.matched[matched], sums=squares)
-    yield Regret("position_rmse_m", SumStatistic(parts=(errors,), of=_make_power_mean(2.0)))
+    both = pair_held_lists(pair.first.accuracy, pair.second.accuracy, pair.grid, pair.cells)
+    without_truth = [0 if side.ghosts is None else int(side.ghosts.without_truth.sum()) for side in pair.sides]
+    counts = HeldCounts(
+        int(both.frames.sum()), int(both.pairs.sum()), both.only, both.age_s, both.without_list, np.array(without_truth)
+    )
+    paired = both.pairs > 0
+    squares = np.concatenate([both.squared_m2, both.pairs[:, None]], axis=1)[paired]
+    errors = pair.items(pair.cells[paired], n=both.pairs[paired], sums=squares)
+    yield Regret("position_rmse_held_m", SumStatistic(parts=(errors,), of=_make_power_mean(2.0)), held=counts)
     measured = both.measured > 0
     parts = np.concatenate([both.gospa, np.zeros((len(pair.cells), 1))], axis=1)[measured]
-    items = _append_run_items(pair, pair.cells[measured], parts, np.outer(both.lists, [0.0, 0.0, 1.0]), both.lists)
-    yield Regret("gospa_m", SumStatistic(parts=(items,), of=_make_power_mean(pair.setting.power), weighed_by=2))
+    items = _append_run_items(pair, pair.cells[measured], parts, np.outer(both.frames, [0.0, 0.0, 1.0]), both.frames)
+    of_pairs = _make_power_mean(pair.setting.power)
+    yield Regret("gospa_held_m", SumStatistic(parts=(items,), of=of_pairs, weighed_by=2), held=counts)
 
 
 def _false_positive_regrets(pair: _Pair) -> Iterator[Regret]:
@@ -395,7 +448,7 @@ _METRICS = {
     ("detected_share", "ttd_rmst_s"): _detection_regrets,
     ("ttd_rmst_s_equal_ghosts",): _equal_ghosts_regrets,
     ("dad_median_m",): _distance_regrets,
-    ("position_rmse_m", "gospa_m"): _list_regrets,
+    ("position_rmse_held_m", "gospa_held_m"): _held_regrets,
     ("false_positives_per_min",): _false_positive_regrets,
     ("pass_share",): _braking_regrets,
 }

@@ -1,9 +1,9 @@
 """Pairing of results, log by log: a grid with a cell for every measured object and run, common to all sides.
 
-Rows of two configurations about the same object in the same run are in the same cell. Lists are paired instant by
-instant; only instants that both have count (within 1 µs is one), and for other latencies or rates there may be none.
+Rows of two configurations about the same object in the same run are in the same cell. What both hold is paired frame by
+frame of the truth (`metrics/accuracy/held.py`), from the first frame at which both have issued a list.
 
-Letters of the shapes: N measured objects of the log, S runs; N·S cells, object by object.
+Letters of the shapes: N measured objects of the log, S runs, G frames; N·S cells, object by object.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int
 from copem_replay.metrics.survival import COMPETES
 from copem_replay.results.compare.labels import LabelledConfiguration
-from copem_replay.results.schema import AGAIN
+from copem_replay.results.schema import AGAIN, HELD
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -104,21 +104,22 @@ T = TypeVar("T", bound=np.generic)
 
 @dataclass(frozen=True)
 class AccuracyData:
-    """Accuracy of a configuration: each cell has `length` lists from the instant `first` on, at `start` in values.
+    """Accuracy of a configuration: each cell has `length` frames from frame `first` on, at `start` in values.
 
-    `first` counts in the instants of the cell's run, `available_s[of_run[run]]`, which are equal in all runs unless
-    `by_run`, where runs differ in their units.
+    What is held at frames is equal in all runs unless runs differ in their units: run s has row `of_run[s]`.
     """
 
     start: Int  # (N·S,)
     length: Int  # (N·S,)
     first: Int  # (N·S,)
     ghosts: Int  # (N·S,) false entries nearest to this object
-    error_m: Float  # (V,) NaN: not matched
-    gospa: Float  # (V,) this object's part of GOSPA to its power; NaN: before the onset
-    available_s: tuple[Float, ...]  # (K,) each
+    error_m: Float  # (V,) NaN: not listed
+    age_s: Float  # (V,) NaN: not listed
+    gospa: Float  # (V,) this object's part of GOSPA to its power; NaN: it does not count at the frame
+    frame_s: Float  # (G,)
+    begins: Int  # (R,) the first frame at which a list has been issued, G: there is none
+    holds: Bool  # (R, G) whether a list is held
     of_run: Int  # (S,)
-    by_run: bool
 
 
 @dataclass(frozen=True)
@@ -128,6 +129,7 @@ class FalsePositiveData:
     there: Bool  # (S,)
     minutes: Float  # (S,)
     count: Int  # (S,)
+    without_truth: Int  # (S,) held entries whose object has no truth at the frame
 
 
 @dataclass(frozen=True)
@@ -225,36 +227,49 @@ def _accuracy_data(folder: Path, tables: dict[str, pa.Table], cell: Int, grid: P
     rows, place = tables["accuracy.parquet"], folder / "accuracy.parquet"
     if not np.array_equal(grid.cells(rows), cell):
         raise InputError(f"{place}: expected the rows of detections.parquet, found others; {AGAIN}")
-    length, error_m = list_column(rows["error_m"])
-    parts, gospa = list_column(rows["gospa_m2"])
-    if not np.array_equal(length, parts):
-        raise InputError(f"{place}: expected error_m and gospa_m2 of equal length, found others; {AGAIN}")
-    instants = tables["instants.parquet"]
-    counts, flat_s = list_column(instants["available_s"])
-    by_run, until = "run" in instants.column_names, np.cumsum(counts)
-    times_s = [flat_s[until[k] - counts[k] : until[k]] for k in range(len(counts))]
-    available_s = (*times_s, np.empty(0))  # the last: none
-    of_run = np.full(grid.runs, -1 if by_run else len(counts) - 1)  # −1: the last, none
-    if by_run:
-        run = grid.runs_of(instants)
-        of_run[run[run >= 0]] = np.flatnonzero(run >= 0)
-    first, size = integer_column(rows["first_list"]), len(grid.objects) * grid.runs
+    columns = {name: list_column(rows[name]) for name in HELD}
+    length = columns["error_held_m"][0]
+    if any(not np.array_equal(length, of) for of, _ in columns.values()):
+        raise InputError(f"{place}: expected {', '.join(HELD)} of equal length, found others; {AGAIN}")
+    frame_s, begins, holds, of_run = _read_frames(folder / "instants.parquet", tables["instants.parquet"], grid)
+    first, size = integer_column(rows["first_frame"]), len(grid.objects) * grid.runs
     kept = cell >= 0
-    last = np.array([len(times) for times in available_s], dtype=np.int64)[of_run[cell[kept] % grid.runs]]
-    if (first[kept] < 0).any() or ((first + length)[kept] > last)[length[kept] > 0].any():
-        raise InputError(f"{place}: expected lists of instants.parquet, found more; {AGAIN}")
-    start = np.cumsum(length) - length
+    if (first[kept] < 0).any() or ((first + length)[kept] > len(frame_s))[length[kept] > 0].any():
+        raise InputError(f"{place}: expected frames of instants.parquet, found more; {AGAIN}")
     return AccuracyData(
-        start=_lay_out(start, cell, size),
+        start=_lay_out(np.cumsum(length) - length, cell, size),
         length=_lay_out(length, cell, size),
         first=_lay_out(first, cell, size),
         ghosts=_lay_out(integer_column(rows["ghosts"]), cell, size),
-        error_m=error_m,
-        gospa=gospa,
-        available_s=available_s,
+        error_m=columns["error_held_m"][1],
+        age_s=columns["age_held_s"][1],
+        gospa=columns["gospa_held_m2"][1],
+        frame_s=frame_s,
+        begins=begins,
+        holds=holds,
         of_run=of_run,
-        by_run=by_run,
     )
+
+
+def _read_frames(place: Path, rows: pa.Table, grid: PairingGrid) -> tuple[Float, Int, Bool, Int]:
+    """`frame_s`, `begins`, `holds` and `of_run` of `AccuracyData`; the last row holds nothing, for runs without one."""
+    counts, every_s = list_column(rows["frame_s"])
+    numbers, held = list_column(rows["held_list"])
+    issued, available_s = list_column(rows["available_s"])
+    frames = int(counts[0]) if len(counts) else 0
+    same = (counts == frames).all() and (numbers == frames).all()
+    if not same or (every_s.reshape(len(counts), frames) != every_s[:frames]).any():
+        raise InputError(f"{place}: expected the same frame_s in all rows of a log, and as many held_list; {AGAIN}")
+    frame_s = every_s[:frames]
+    first_s = np.append(available_s, np.inf)[np.where(issued > 0, np.cumsum(issued) - issued, len(available_s))]
+    begins = np.searchsorted(frame_s, first_s - SAME_INSTANT_S, side="left")
+    holds = np.concatenate([~np.isnan(held).reshape(len(counts), frames), np.zeros((1, frames), dtype=bool)])
+    by_run = "run" in rows.column_names
+    of_run = np.full(grid.runs, -1 if by_run else len(counts) - 1)
+    if by_run:
+        run = grid.runs_of(rows)
+        of_run[run[run >= 0]] = np.flatnonzero(run >= 0)
+    return frame_s, np.append(begins, frames), holds, of_run
 
 
 def _false_positive_data(
@@ -269,6 +284,7 @@ def _false_positive_data(
         there=_lay_out(np.ones(len(run), dtype=bool), run, grid.runs),
         minutes=_lay_out(float_column(rows["minutes"]), run, grid.runs),
         count=_lay_out(integer_column(rows["ghosts"]), run, grid.runs),
+        without_truth=_lay_out(integer_column(rows["without_truth"]), run, grid.runs),
     )
 
 
@@ -281,93 +297,66 @@ def _step_data(tables: dict[str, pa.Table], grid: PairingGrid) -> StepData | Non
     return StepData(cell[kept], float_column(rows["existence"])[kept], float_column(rows["detection_s"])[kept])
 
 
-# Fused lists of two configurations, paired instant by instant.
+# What two configurations hold, paired frame by frame.
 
 _VALUES = 4_000_000
 """Values paired at a time, a few hundred MB: the size of blocks, which changes no result."""
 
 
 @dataclass(frozen=True)
-class PairedListSums:
-    """Sums over the lists that two configurations share. (…, 2): of the first and of the second."""
+class PairedHeldSums:
+    """Sums over the frames from which on both sides have issued a list. (…, 2): of the first and of the second."""
 
-    matched: Int  # (C,) lists in which both match the object of the cell
+    pairs: Int  # (C,) frames at which both list the object of the cell
     squared_m2: Float  # (C, 2) Σ e² over them
-    measured: Int  # (C,) lists in which the object of the cell is measured
+    age_s: Float  # (2,) Σ of ages over them, in all cells
+    only: Int  # (2,) frames at which one lists the object of a cell and the other does not
+    measured: Int  # (C,) frames at which the object of the cell counts
     gospa: Float  # (C, 2) Σ of its parts of GOSPA over them
-    lists: Int  # (S,) shared lists in which an object of the cells is measured
+    frames: Int  # (S,) frames at which the object of any of the cells counts
+    without_list: Int  # (2,) of these, in all runs, frames without a list
 
 
-def pair_lists(first: AccuracyData, second: AccuracyData, grid: PairingGrid, cells: Int) -> PairedListSums:
-    """Pair the lists of cells (C,)."""
-    run_of = cells % grid.runs
-    other, offset = _match_instants(first, second, np.arange(grid.runs))
-    most = max((len(times) for times in first.available_s), default=0)
-    matched, measured = np.zeros((2, len(cells)), dtype=np.int64)
-    squared, gospa = np.zeros((2, len(cells), 2))
-    counted = np.zeros(grid.runs * most, dtype=bool)
+def pair_held_lists(first: AccuracyData, second: AccuracyData, grid: PairingGrid, cells: Int) -> PairedHeldSums:
+    """Pair what both sides hold of cells (C,)."""
+    sides, frames = (first, second), len(first.frame_s)
+    begins = np.maximum(*(side.begins[side.of_run] for side in sides))
+    pairs, measured = np.zeros((2, len(cells)), dtype=np.int64)
+    squared_m2, gospa = np.zeros((2, len(cells), 2))
+    age_s, only = np.zeros(2), np.zeros(2, dtype=np.int64)
+    counted = np.zeros((grid.runs, frames), dtype=bool)
     until = np.cumsum(first.length[cells])
     bounds = np.searchsorted(until, np.arange(_VALUES, int(until[-1]) if len(until) else 0, _VALUES))
     for part in np.split(np.arange(len(cells)), bounds):
-        row, place, number, partner = _align_values(first, second, other, offset[run_of], cells, part)
-        errors_m = [side.error_m[k].astype(float) for side, k in ((first, place), (second, partner))]
-        k = ~np.isnan(errors_m[0] + errors_m[1])
-        matched += np.bincount(row[k], minlength=len(cells))
-        parts = [side.gospa[k] for side, k in ((first, place), (second, partner))]
-        g = ~np.isnan(parts[0] + parts[1])
-        measured += np.bincount(row[g], minlength=len(cells))
+        row, frame, places = _align_frames(first, second, begins[cells % grid.runs], cells, part)
+        errors_m = [side.error_m[k] for side, k in zip(sides, places, strict=True)]
+        parts = [side.gospa[k] for side, k in zip(sides, places, strict=True)]
+        listed = [~np.isnan(of) for of in errors_m]
+        both, counts = listed[0] & listed[1], ~np.isnan(parts[0] + parts[1])
+        pairs += np.bincount(row[both], minlength=len(cells))
+        measured += np.bincount(row[counts], minlength=len(cells))
         for side in (0, 1):
-            squared[:, side] += np.bincount(row[k], errors_m[side][k] ** 2, minlength=len(cells))
-            gospa[:, side] += np.bincount(row[g], parts[side][g], minlength=len(cells))
-        counted[run_of[row[g]] * most + number[g]] = True
-    return PairedListSums(matched, squared, measured, gospa, counted.reshape(grid.runs, most).sum(axis=1))
+            squared_m2[:, side] += np.bincount(row[both], errors_m[side][both] ** 2, minlength=len(cells))
+            gospa[:, side] += np.bincount(row[counts], parts[side][counts], minlength=len(cells))
+            age_s[side] += sides[side].age_s[places[side][both]].sum()
+            only[side] += (listed[side] & ~both).sum()
+        counted[cells[row[counts]] % grid.runs, frame[counts]] = True
+    without = np.array([int((counted & ~side.holds[side.of_run]).sum()) for side in sides])
+    return PairedHeldSums(pairs, squared_m2, age_s, only, measured, gospa, counted.sum(axis=1), without)
 
 
-def count_shared_instants(first: AccuracyData, second: AccuracyData) -> Int:
-    """(3,) number of instants that both have, and that each has; over all runs where those of a side differ."""
-    sides = (first, second)
-    runs = np.arange(len(first.of_run) if first.by_run or second.by_run else 1)
-    other, offset = _match_instants(first, second, runs)
-    counts = [np.array([len(times) for times in side.available_s])[side.of_run[runs]] for side in sides]
-    has = np.append(0, np.cumsum(other >= 0))
-    return np.array([(has[offset + counts[0]] - has[offset]).sum(), *(count.sum() for count in counts)])
+def _align_frames(
+    first: AccuracyData, second: AccuracyData, begins: Int, cells: Int, part: Int
+) -> tuple[Int, Int, tuple[Int, Int]]:
+    """(V,) rows of `cells`, frames, and places in the values of both: of the rows `part` of `cells (C,)`.
 
-
-def _match_instants(first: AccuracyData, second: AccuracyData, runs: Int) -> tuple[Int, Int]:
-    """For instants of the first their numbers in the second, −1: none; and the place where those of each run begin,
-    (R,).
-    """
-    pairs, which = np.unique(np.stack([first.of_run[runs], second.of_run[runs]]), axis=1, return_inverse=True)
-    numbers = []
-    for mine, others in pairs.T.tolist():
-        mine_s, other_s = first.available_s[mine], second.available_s[others]
-        # The nearest of the other's, to the left or to the right.
-        right = np.searchsorted(other_s, mine_s)
-        near = np.full(len(mine_s), -1, dtype=np.int64)
-        for k in (right - 1, right):
-            close = (k >= 0) & (k < len(other_s))
-            close[close] = np.abs(other_s[k[close]] - mine_s[close]) <= SAME_INSTANT_S * (1 + 1e-6)
-            near[close] = k[close]
-        numbers.append(near)
-    counts = np.array([len(near) for near in numbers], dtype=np.int64)
-    begins = (np.cumsum(counts) - counts)[which.ravel()]
-    return np.concatenate([np.empty(0, dtype=np.int64), *numbers]), begins
-
-
-def _align_values(
-    first: AccuracyData, second: AccuracyData, other: Int, offset: Int, cells: Int, part: Int
-) -> tuple[Int, Int, Int, Int]:
-    """(V,) rows of `cells`, places in the first's values, numbers of its instants, places in the second's values.
-
-    Of the rows `part` of `cells (C,)`, whose instants begin at `offset (C,)` in `other`.
+    `begins (C,)`: the first frame that counts.
     """
     length = first.length[cells[part]]
     row = np.repeat(part, length)
     within = np.arange(len(row)) - np.repeat(np.cumsum(length) - length, length)
     cell = cells[row]
-    number = first.first[cell] + within
-    same = other[offset[row] + number] - second.first[cell]
-    shared = (other[offset[row] + number] >= 0) & (same >= 0) & (same < second.length[cell])
-    if not shared.all():
-        row, within, cell, number, same = (values[shared] for values in (row, within, cell, number, same))
-    return row, first.start[cell] + within, number, second.start[cell] + same
+    frame = first.first[cell] + within
+    kept = frame >= begins[row]
+    row, within, cell, frame = (values[kept] for values in (row, within, cell, frame))
+    return row, frame, (first.start[cell] + within, second.start[cell] + within)

@@ -31,22 +31,27 @@ _WITHOUT = {ALL_ALIKE: "all alike", NOTHING_DRAWN: NOTHING_DRAWN}
 
 
 def comparison_text(comparison: Comparison, width: int | None = None) -> str:
-    """The comparison as text: a row per configuration, a column per metric, and lines on them. `width`: None for a
-    pipe.
+    """The comparison as text: a row per configuration, a column per metric, lines on them, and what errors are over.
+
+    `width`: None for a pipe.
     """
     lines = (part for line in comparison_lines(comparison) for part in wrap_line(line, width))
-    return "\n".join([format_table(_format_cells(comparison), width), *lines])
+    held = held_cells(comparison)
+    tables = [format_table(held, width)] if len(held) else []
+    return "\n".join([format_table(_format_cells(comparison), width), *lines, *tables])
 
 
 def comparison_markdown(comparison: Comparison) -> str:
-    """The comparison as a Markdown table, with lines and notes as a list after it; ends with a newline."""
-    cells = _format_cells(comparison)
-    notes = (f"note: {note}" for note in comparison.notes)
-    rows = [list(cells.columns), ["---"] * len(cells.columns), *cells.itertuples(index=False)]
-    lines = ["| " + " | ".join(escape_markdown(str(cell)) for cell in row) + " |" for row in rows]
-    return "\n".join(
-        [*lines, "", *(f"- {escape_markdown(line)}" for line in (*comparison_lines(comparison), *notes)), ""]
-    )
+    """The comparison as Markdown: its table, lines and notes as a list, what errors are over; ends with a newline."""
+    held, notes = held_cells(comparison), (f"note: {note}" for note in comparison.notes)
+    lines = [f"- {escape_markdown(line)}" for line in (*comparison_lines(comparison), *notes)]
+    beside = ["", *_markdown_rows(held)] if len(held) else []
+    return "\n".join([*_markdown_rows(_format_cells(comparison)), "", *lines, *beside, ""])
+
+
+def _markdown_rows(cells: pd.DataFrame) -> Iterator[str]:
+    for row in (list(cells.columns), ["---"] * len(cells.columns), *cells.itertuples(index=False)):
+        yield "| " + " | ".join(escape_markdown(str(cell)) for cell in row) + " |"
 
 
 def check_out(path: Path) -> None:
@@ -117,7 +122,8 @@ def comparison_lines(comparison: Comparison) -> Iterator[str]:
     """Lines on the table: its meaning, and the configurations that are better than the baseline."""
     overall = comparison.overall
     shown = set(overall["metric"])
-    yield f"differences to {comparison.baseline}, paired by log, object and run; accuracy at instants that both have"
+    of_lists = "accuracy of what both hold at each frame"
+    yield f"differences to {comparison.baseline}, paired by log, object and run; {of_lists}"
     limited = overall.dropna(subset="interval_over")
     over = limited.groupby(["interval_over", "clusters"], sort=False)["metric"].unique()
     kinds = [
@@ -140,6 +146,7 @@ def comparison_lines(comparison: Comparison) -> Iterator[str]:
             f"certain entries of each left out until {comparison.false_positives_per_min:.4g} ghosts per minute "
             "remain, not counting stale ones"
         )
+    yield from _describe_held(comparison)
     for metric, better in METRICS.items():
         of_metric = overall[overall["metric"] == metric]
         beyond = of_metric["low"] > NOTHING if better > 0 else of_metric["high"] < -NOTHING
@@ -168,6 +175,43 @@ def _name_with_logs(row: Any) -> str:
 def describe_gain(row: Any) -> str:
     """In how many logs a configuration is better than the baseline: `7 of 8 logs gain`."""
     return f"{row.logs_better} of {row.clusters} logs gain"
+
+
+def _describe_held(comparison: Comparison) -> Iterator[str]:
+    """Lines on figures of what both hold, and on the table beside them."""
+    if not len(held_cells(comparison)):
+        return
+    yield (
+        "position_rmse_held_m: RMSE of the newest list available at each frame, as it stands, against the truth then, "
+        "over pairs of object and frame that both list; a difference: what is held may be nearer to the truth than the "
+        f"list of {comparison.baseline}"
+    )
+    yield (
+        f"listed by one only, mean age of the entries in pairs, no list at a share of the frames, no truth: of the "
+        f"configuration / of {comparison.baseline}. No list: the newest is older than max_age_s; such frames count in "
+        "gospa_held_m. No truth: entries whose object has none at the frame, which are in no error"
+    )
+
+
+def held_cells(comparison: Comparison) -> pd.DataFrame:
+    """What `position_rmse_held_m` is over, a row per configuration, as text; no rows: it is not compared."""
+    overall = comparison.overall
+    rows = overall[(overall["metric"] == "position_rmse_held_m") & overall["frames"].notna()]
+    columns: dict[str, list[str]] = {"configuration": list(rows["configuration"])}
+    columns["pairs"], columns["frames"] = ([str(count) for count in rows[name]] for name in ("n", "frames"))
+    for header, names, shown in (
+        ("listed by one only", ("only_configuration", "only_baseline"), str),
+        ("mean age, s", ("age_s", "baseline_age_s"), format_limit),
+        ("no list", ("no_list_share", "baseline_no_list_share"), _format_percent),
+        ("no truth", ("without_truth", "baseline_without_truth"), str),
+    ):
+        both = zip(*(rows[name] for name in names), strict=True)
+        columns[header] = [" / ".join("–" if pd.isna(one) else shown(one) for one in sides) for sides in both]
+    return pd.DataFrame(columns)
+
+
+def _format_percent(share: float) -> str:
+    return f"{100 * share:.3g} %"
 
 
 _HTML = {"&": "&amp;", "<": "&lt;", ">": "&gt;"}
