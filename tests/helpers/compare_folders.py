@@ -31,7 +31,8 @@ def limits_of(
 
 
 INSTANTS = [0.0, 1.0, 2.0, 3.0]
-"""Of the fused lists of every configuration, unless told otherwise."""
+"""Of the frames of the truth, and of the fused lists of every configuration, unless told otherwise."""
+MAX_AGE_S = 1.0
 
 _DETECTIONS = {
     "log": pa.string(),
@@ -51,9 +52,10 @@ _ACCURACY = {
     "configuration": pa.string(),
     "run": pa.int64(),
     "object_id": pa.string(),
-    "first_list": pa.int64(),
-    "error_m": pa.list_(pa.float32()),
-    "gospa_m2": pa.list_(pa.float32()),
+    "first_frame": pa.int64(),
+    "error_held_m": pa.list_(pa.float32()),
+    "age_held_s": pa.list_(pa.float32()),
+    "gospa_held_m2": pa.list_(pa.float32()),
     "ghosts": pa.int64(),
 }
 _LISTS = {
@@ -64,10 +66,17 @@ _LISTS = {
     "minutes": pa.float64(),
     "ghosts": pa.int64(),
     "duplicates": pa.int64(),
+    "without_truth": pa.int64(),
     "existence": pa.list_(pa.float64()),
     "ghosts_at": pa.list_(pa.int64()),
 }
-_INSTANTS = {"log": pa.string(), "configuration": pa.string(), "available_s": pa.list_(pa.float64())}
+_INSTANTS = {
+    "log": pa.string(),
+    "configuration": pa.string(),
+    "available_s": pa.list_(pa.float64()),
+    "frame_s": pa.list_(pa.float64()),
+    "held_list": pa.list_(pa.int64()),
+}
 _THRESHOLDS = {
     "log": pa.string(),
     "configuration": pa.string(),
@@ -112,15 +121,26 @@ def row(configuration: str, detection_s: float | None, distance_m: float | None 
 
 
 def seen(configuration: str, error_m: Sequence[float | None], gospa_m2: Sequence[float | None], **more: Any) -> Row:
-    """The same row with what its lists say of the object: of all instants from `first_list` on."""
-    accuracy = {"first_list": 0, "error_m": list(error_m), "gospa_m2": list(gospa_m2), "ghosts": 0}
-    return row(configuration, 0.0, 20.0) | accuracy | more
+    """The same row with what is held of the object, at all frames from `first_frame` on. `age_s`: of its entries."""
+    age_s = more.pop("age_s", 0.25)
+    ages = [None if error is None else age_s for error in error_m]
+    held = {"error_held_m": list(error_m), "age_held_s": ages, "gospa_held_m2": list(gospa_m2)}
+    return row(configuration, 0.0, 20.0) | held | {"first_frame": 0, "ghosts": 0} | more
+
+
+def held_lists(available_s: Sequence[float]) -> list[int | None]:
+    """The list that is held at each of INSTANTS, none where the newest is older than MAX_AGE_S."""
+    held: list[int | None] = []
+    for time_s in INSTANTS:
+        by_then = [k for k, since_s in enumerate(available_s) if since_s <= time_s + 1e-6]
+        held.append(by_then[-1] if by_then and time_s - available_s[by_then[-1]] <= MAX_AGE_S + 1e-6 else None)
+    return held
 
 
 def ghosts(configuration: str, count: int, **more: Any) -> Row:
     """Lists of log `a` in run 0, over a minute, `count` ghosts in them."""
     given = {"log": "a", "configuration": configuration, "run": 0, "lists": 4, "minutes": 1.0, "ghosts": count}
-    return given | {"duplicates": 0, "existence": [0.0], "ghosts_at": [count]} | more
+    return given | {"duplicates": 0, "without_truth": 0, "existence": [0.0], "ghosts_at": [count]} | more
 
 
 def step(configuration: str, existence: float, detection_s: float, **more: Any) -> Row:
@@ -159,12 +179,13 @@ def write_folder(
     (path / "provenance.json").write_text(json.dumps(said))
     (path / "experiment.yaml").write_text(f"version: 1\nego: {'null' if ego is None else ego}\n")
     _write(path / "detections.parquet", rows, _DETECTIONS | (_VERDICTS if said["braking"] else {}))
-    if any("error_m" in r for r in rows):
+    if any("error_held_m" in r for r in rows):
         _write(path / "accuracy.parquet", rows, _ACCURACY)
         of = [(log, name) for log in names for name in dict.fromkeys(r["configuration"] for r in rows)]
+        issued_s = [list((available_s or {}).get(name, INSTANTS)) for _, name in of]
         instants = [
-            {"log": log, "configuration": name, "available_s": list((available_s or {}).get(name, INSTANTS))}
-            for log, name in of
+            {"log": log, "configuration": name, "available_s": a, "frame_s": INSTANTS, "held_list": held_lists(a)}
+            for (log, name), a in zip(of, issued_s, strict=True)
         ]
         _write(path / "instants.parquet", instants, _INSTANTS)
     if lists:

@@ -63,24 +63,22 @@ def distances(found: Sequence[Pair]) -> list[tuple[float, float]]:
     return [(one, other) for one, other in both if one is not None and other is not None]
 
 
-def shared_lists(pair: Pair, instants: dict[str, Sequence[float]]) -> Iterator[tuple[float, int, int]]:
-    """Instants at which both sides have the object of a pair, and its places in their lists."""
-    when: list[dict[float, int]] = []
-    for row in pair:
-        available_s = instants[row["configuration"]]
-        when.append({available_s[row["first_list"] + k]: k for k in range(len(row["error_m"]))})
-    for time_s, k in when[0].items():
-        if time_s in when[1]:
-            yield time_s, k, when[1][time_s]
+FRAMES_S = (0.0, 1.0, 2.0, 3.0)
+MAX_AGE_S = 1.0
+
+
+def shared_frames(pair: Pair, instants: dict[str, Sequence[float]]) -> Iterator[tuple[float, int]]:
+    """Frames of the object of a pair from which on both sides have issued a list, and their places in its columns."""
+    begins_s = max(min(instants[row["configuration"]]) for row in pair)
+    for k in range(len(pair[0]["error_held_m"])):
+        frame_s = FRAMES_S[pair[0]["first_frame"] + k]
+        if frame_s >= begins_s:
+            yield frame_s, k
 
 
 def position_rmse(found: Sequence[Pair], instants: dict[str, Sequence[float]]) -> tuple[list[float] | None, int]:
-    """Of both sides, and over how many lists."""
-    both = [
-        (pair[0]["error_m"][k], pair[1]["error_m"][other])
-        for pair in found
-        for _, k, other in shared_lists(pair, instants)
-    ]
+    """Of both sides, and over how many pairs of object and frame."""
+    both = [tuple(row["error_held_m"][k] for row in pair) for pair in found for _, k in shared_frames(pair, instants)]
     errors = [one for one in both if None not in one]
     if not errors:
         return None, 0
@@ -88,14 +86,36 @@ def position_rmse(found: Sequence[Pair], instants: dict[str, Sequence[float]]) -
 
 
 def gospa(found: Sequence[Pair], instants: dict[str, Sequence[float]]) -> tuple[list[float] | None, int]:
-    sums, lists = [0.0, 0.0], set()
+    sums, frames = [0.0, 0.0], set()
     for pair in found:
-        for time_s, k, other in shared_lists(pair, instants):
-            parts = pair[0]["gospa_m2"][k], pair[1]["gospa_m2"][other]
+        for frame_s, k in shared_frames(pair, instants):
+            parts = [row["gospa_held_m2"][k] for row in pair]
             if None not in parts:
                 sums = [so_far + part for so_far, part in zip(sums, parts, strict=True)]
-                lists.add((pair[0]["log"], pair[0]["run"], time_s))
-    return ([(of / len(lists)) ** 0.5 for of in sums], len(lists)) if lists else (None, 0)
+                frames.add((pair[0]["log"], pair[0]["run"], frame_s))
+    return ([(of / len(frames)) ** 0.5 for of in sums], len(frames)) if frames else (None, 0)
+
+
+def beside_held(found: Sequence[Pair], instants: dict[str, Sequence[float]]) -> dict[str, float]:
+    """What a comparison says beside the errors of what is held."""
+    frames, only, ages = set(), [0, 0], []
+    for pair in found:
+        for frame_s, k in shared_frames(pair, instants):
+            listed = [row["error_held_m"][k] is not None for row in pair]
+            only = [
+                count + (listed == alone) for count, alone in zip(only, ([True, False], [False, True]), strict=True)
+            ]
+            if all(listed):
+                ages.append([row["age_held_s"][k] for row in pair])
+            if pair[0]["gospa_held_m2"][k] is not None:
+                frames.add((pair[0]["log"], pair[0]["run"], frame_s))
+    said: dict[str, float] = {"frames": len(frames), "only_configuration": only[0], "only_baseline": only[1]}
+    for side, (prefix, name) in enumerate((("", "late"), ("baseline_", "ideal"))):
+        said[f"{prefix}age_s"] = sum(age[side] for age in ages) / len(ages) if ages else float("nan")
+        newest_s = {t: max(since_s for since_s in instants[name] if since_s <= t) for _, _, t in frames}
+        without = [t for _, _, t in frames if t - newest_s[t] > MAX_AGE_S]
+        said[f"{prefix}no_list_share"] = len(without) / len(frames) if frames else float("nan")
+    return said
 
 
 def ghosts_per_min(lists: Sequence[Row], first: str, second: str) -> list[float]:

@@ -220,11 +220,20 @@ def fewer_rows(folder: Path) -> None:
 
 
 def other_lengths(folder: Path) -> None:
-    changed(folder / "accuracy.parquet", "gospa_m2", pa.array([[1.0]] * 2))
+    changed(folder / "accuracy.parquet", "gospa_held_m2", pa.array([[1.0]] * 2))
 
 
-def later_lists(folder: Path) -> None:
-    changed(folder / "accuracy.parquet", "first_list", pa.array([1, 1]))
+def later_frames(folder: Path) -> None:
+    changed(folder / "accuracy.parquet", "first_frame", pa.array([1, 1]))
+
+
+def fewer_frames(folder: Path) -> None:
+    for name in ("error_held_m", "age_held_s", "gospa_held_m2"):
+        changed(folder / "accuracy.parquet", name, pa.array([[1.0] * 4, [1.0] * 3]))
+
+
+def other_frames(folder: Path) -> None:
+    changed(folder / "instants.parquet", "frame_s", pa.array([[0.0, 1.0, 2.0, 3.0], [0.0, 1.0, 2.0, 3.5]]))
 
 
 def other_thresholds(folder: Path) -> None:
@@ -246,8 +255,10 @@ def another_log(folder: Path) -> None:
 DAMAGES = {
     rows_twice: "ideal: expected each log, run and object once, found some twice",
     fewer_rows: "expected the rows of detections.parquet, found others",
-    other_lengths: "expected error_m and gospa_m2 of equal length, found others",
-    later_lists: "expected lists of instants.parquet, found more",
+    other_lengths: "expected error_held_m, age_held_s, gospa_held_m2 of equal length, found others",
+    later_frames: "expected frames of instants.parquet, found more",
+    fewer_frames: "log a: late: expected the frames of ideal in ",
+    other_frames: "expected the frames of ideal in ",
     other_thresholds: "expected the same ascending existence and as many ghosts_at in all rows, found others",
     no_onset: "column onset_s: expected a number in every row, found none in some",
     no_object: "column object_id: expected text in every row, found none in some",
@@ -326,7 +337,7 @@ def test_without_accuracy_the_rest_is_compared(tmp_path):
     second = write_folder(tmp_path / "second", ROWS)
     comparison = compare_folders([first, second], baseline="first:ideal")
     by = comparison.table.groupby("configuration")["metric"].agg(set)
-    accuracy = ("position_rmse_m", "gospa_m", "false_positives_per_min", "ttd_rmst_s_equal_ghosts")
+    accuracy = ("position_rmse_held_m", "gospa_held_m", "false_positives_per_min", "ttd_rmst_s_equal_ghosts")
     assert by["first:late"] - by["second:late"] == set(accuracy)
     assert note_of("without accuracy", comparison.notes) == (
         f"{second}: no accuracy.parquet, instants.parquet, lists.parquet, thresholds.parquet (without "

@@ -30,7 +30,8 @@ OF_INTERVALS = (
     "hangs_on",
     "difference_without_it",
 )
-INSTANTS = {"ideal": [0.0, 1.0, 2.0, 3.0], "late": [1.0, 2.0, 2.5, 3.0]}
+INSTANTS = {"ideal": [0.0, 1.0, 2.0, 3.0], "late": [0.5, 1.0]}
+"""At the frame 0 s the late one has issued nothing, at 3 s its newest list is too old to be held."""
 
 
 def study(seed: int, logs: int, fewest: int = 0) -> dict[str, Any]:
@@ -42,8 +43,10 @@ def study(seed: int, logs: int, fewest: int = 0) -> dict[str, Any]:
         for thing in range(rnd.randint(fewest if rows else 1, 3)):
             of = {"onset_s": rnd.choice([0.0, 1.0]), "ended_s": rnd.choice([6.0, 10.0]), "object_id": str(thing)}
             of |= {"ended_by": rnd.choice(["object_left", "log_end"]), "log": log, "conflict": rnd.random() < 0.7}
+            of["first_frame"] = rnd.randint(0, 2)
+            present = [rnd.random() < 0.8 for _ in range(rnd.randint(0, 4 - of["first_frame"]))]
             rows += [
-                one(rnd, name, run, of)
+                one(rnd, name, run, of, present)
                 for name in (["ideal", "late"] if not rows or rnd.random() < 0.8 else [rnd.choice(["ideal", "late"])])
                 for run in range(runs)
             ]
@@ -63,16 +66,15 @@ def study(seed: int, logs: int, fewest: int = 0) -> dict[str, Any]:
     return {"rows": rows, "lists": lists, "steps": steps, "logs": names, "available_s": INSTANTS, "braking": BRAKING}
 
 
-def one(rnd: Random, name: str, run: int, of: Row) -> Row:
-    """A row, and what its lists say."""
+def one(rnd: Random, name: str, run: int, of: Row, present: list[bool]) -> Row:
+    """A row, and what is held of it; `present`: frames at which the truth has the object."""
     seen_s = rnd.choice([None, of["onset_s"] + 0.5, of["onset_s"] + 2.0, of["onset_s"] + 2.25])
-    first = rnd.randint(0, 2)
-    size = rnd.randint(0, 4 - first)
+    error_m = [rnd.choice([None, 0.5, 1.0, 3.0]) if there else None for there in present]
     return row(name, seen_s, rnd.choice([None, 10.0, 20.0, 20.5]), run=run, **of) | {
         "braking_pass": rnd.random() < 0.5,
-        "first_list": first,
-        "error_m": [rnd.choice([None, 0.5, 1.0, 3.0]) for _ in range(size)],
-        "gospa_m2": [rnd.choice([None, 1.0, 2.25]) for _ in range(size)],
+        "error_held_m": error_m,
+        "age_held_s": [None if error is None else rnd.choice([0.0, 0.25, 0.5]) for error in error_m],
+        "gospa_held_m2": [rnd.choice([1.0, 2.25]) if there else None for there in present],
         "ghosts": rnd.randint(0, 3),
     }
 
@@ -113,8 +115,12 @@ def test_figures_are_those_of_pairs_one_by_one(seed, count):
         only = [(pair[0]["braking_pass"], pair[1]["braking_pass"]) for pair in judged]
         counts = mine.loc["pass_share", ["only_configuration", "only_baseline"]].tolist()
         assert counts == [only.count((True, False)), only.count((False, True))]
-        is_as("position_rmse_m", *oracle.position_rmse(found, INSTANTS))
-        is_as("gospa_m", *oracle.gospa(found, INSTANTS))
+        is_as("position_rmse_held_m", *oracle.position_rmse(found, INSTANTS))
+        is_as("gospa_held_m", *oracle.gospa(found, INSTANTS))
+        beside = oracle.beside_held(found, INSTANTS)
+        assert mine.loc["position_rmse_held_m", list(beside)].astype(float).to_dict() == pytest.approx(
+            beside, nan_ok=True
+        )
         minutes = len({(of["log"], of["run"]) for of in both})
         is_as("false_positives_per_min", oracle.ghosts_per_min(both, "late", "ideal"), minutes)
 

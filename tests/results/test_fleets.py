@@ -52,33 +52,29 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def plainly(folder: Path, name: str, metric: str) -> tuple[float, float]:
-    """Of a configuration and of ideal fusion, over the instants at which both have a value, run by run."""
+    """Of a configuration and of ideal fusion, frame by frame from the first list of both on, run by run."""
     accuracy = parquet.read_table(folder / "accuracy.parquet").to_pandas()
-    instants = parquet.read_table(folder / "instants.parquet").to_pandas()
-    sums, lists = np.zeros(2), set()
-    count = 0
-    for (run_number, _), both in accuracy.groupby(["run", "object_id"]):
-        values = []
-        for one in (name, "ideal"):
-            row = both[both["configuration"] == one].iloc[0]
-            mine = (instants["configuration"] == one) & (instants["run"] == run_number)
-            times = instants[mine]["available_s"].iloc[0]
-            said = row["error_m"] if metric == "position_rmse_m" else row["gospa_m2"]
-            here = times[row["first_list"] : row["first_list"] + len(said)]
-            values.append({round(t, 6): v for t, v in zip(here, said, strict=True) if v is not None and v == v})
-        for t in values[0].keys() & values[1].keys():
-            pair = np.array([values[0][t], values[1][t]])
-            sums += pair**2 if metric == "position_rmse_m" else pair
-            count += 1
-            lists.add((run_number, t))
-    n = count if metric == "position_rmse_m" else len(lists)
+    instants = parquet.read_table(folder / "instants.parquet").to_pandas().set_index(["configuration", "run"])
+    column = "error_held_m" if metric == "position_rmse_held_m" else "gospa_held_m2"
+    sums, frames, count = np.zeros(2), set(), 0
+    for (run, _), both in accuracy.groupby(["run", "object_id"]):
+        begins_s = max(instants.loc[one, run]["available_s"][0] for one in (name, "ideal"))
+        rows = [both[both["configuration"] == one].iloc[0] for one in (name, "ideal")]
+        frame_s = instants.loc["ideal", run]["frame_s"][rows[0]["first_frame"] :]
+        for t, *pair in zip(frame_s, *(row[column] for row in rows), strict=False):
+            values = np.array(pair, dtype=float)
+            if t >= begins_s - 1e-6 and not np.isnan(values).any():
+                sums += values**2 if metric == "position_rmse_held_m" else values
+                count += 1
+                frames.add((run, t))
+    n = count if metric == "position_rmse_held_m" else len(frames)
     first, second = np.sqrt(sums / n)
     return float(first), float(second)
 
 
-@pytest.mark.parametrize("metric", ["position_rmse_m", "gospa_m"])
+@pytest.mark.parametrize("metric", ["position_rmse_held_m", "gospa_held_m"])
 @pytest.mark.parametrize("name", ["gnn", "alone"])
-def test_regret_over_shared_instants_of_each_run(folder: Path, name: str, metric: str) -> None:
+def test_regret_over_frames_of_each_run(folder: Path, name: str, metric: str) -> None:
     table = compare_folders([folder], configurations=[name]).overall.set_index("metric")
     expected = plainly(folder, name, metric)
     assert table.loc[metric, ["value", "baseline_value"]].tolist() == pytest.approx(expected, rel=1e-6)
@@ -86,19 +82,20 @@ def test_regret_over_shared_instants_of_each_run(folder: Path, name: str, metric
 
 
 def test_what_is_compared_is_that_of_other_configurations(folder: Path) -> None:
-    """All metrics, with intervals; what is left out are instants that one side does not have, counted over the runs."""
+    """All metrics, with intervals, over frames that all runs have alike whatever the instants of their lists."""
     comparison = compare_folders([folder])
     metrics = comparison.overall.groupby("configuration")["metric"].agg(set)
-    assert {"position_rmse_m", "gospa_m", "false_positives_per_min"} <= metrics["gnn"] & metrics["alone"]
+    assert {"position_rmse_held_m", "gospa_held_m", "false_positives_per_min"} <= metrics["gnn"] & metrics["alone"]
     assert not any("no accuracy.parquet" in note for note in comparison.notes)
     instants = parquet.read_table(folder / "instants.parquet").to_pandas()
     counts = instants.groupby("configuration")["available_s"].agg(lambda of: sum(map(len, of)))
     assert counts["alone"] == 6 * 21
     assert counts["gnn"] == counts["ideal"] > counts["alone"]
     assert instants[instants["configuration"] == "gnn"]["available_s"].map(len).nunique() > 1
-    assert any(f"of {counts['alone']} and the {counts['ideal']} of ideal" in note for note in comparison.notes)
+    assert instants["frame_s"].map(tuple).nunique() == 1
     rows = comparison.overall.set_index(["configuration", "metric"])
-    assert pd.notna(rows.loc[("gnn", "position_rmse_m"), "low"])
+    assert rows.loc[("gnn", "gospa_held_m"), "frames"] == rows.loc[("alone", "gospa_held_m"), "frames"] == 6 * 21
+    assert pd.notna(rows.loc[("gnn", "position_rmse_held_m"), "low"])
 
 
 def test_fewer_runs_are_the_first_ones(folder: Path) -> None:
@@ -116,6 +113,7 @@ def test_fewer_runs_are_the_first_ones(folder: Path) -> None:
     six, two = (lay_out_configuration(gnn, tables, grid).accuracy for grid in (whole, fewer))
     assert six is not None
     assert two is not None
-    assert (six.by_run, len(six.of_run), len(two.of_run)) == (True, 6, 2)
+    assert (len(six.of_run), len(two.of_run)) == (6, 2)
     for place in range(2):
-        np.testing.assert_array_equal(six.available_s[six.of_run[place]], two.available_s[two.of_run[place]])
+        assert six.begins[six.of_run[place]] == two.begins[two.of_run[place]]
+        np.testing.assert_array_equal(six.holds[six.of_run[place]], two.holds[two.of_run[place]])

@@ -1,4 +1,4 @@
-"""Comparisons of what the fused lists hold: errors, GOSPA, ghosts, and times at equal ghosts."""
+"""Comparisons of what is held at frames of the truth: errors, GOSPA; of ghosts, and of times at equal ghosts."""
 
 from __future__ import annotations
 
@@ -36,40 +36,84 @@ def of(comparison: Comparison, metric: str) -> Any:
 # ------------------------------------------------------------------------------------------------- errors
 
 
-def test_errors_are_compared_where_both_match(tmp_path):
-    rows = [seen("ideal", [0, 1, None, 2], FOUR), seen("late", [3, None, 1, 4], FOUR)]
-    error = of(compared(tmp_path, rows), "position_rmse_m")
+def test_errors_are_compared_where_both_list_the_object(tmp_path):
+    rows = [
+        seen("ideal", [0, 1, None, 2], [*FOUR[:3], 1.0], age_s=0.125),
+        seen("late", [3, None, 1, 4], [1.0] * 4, age_s=0.5),
+    ]
+    error = of(compared(tmp_path, rows), "position_rmse_held_m")
     assert error["n"] == 2
     assert error["value"] == pytest.approx(math.sqrt((9 + 16) / 2))
     assert error["baseline_value"] == pytest.approx(math.sqrt(4 / 2))
     assert error["difference"] == pytest.approx(math.sqrt(12.5) - math.sqrt(2))
+    assert (error["only_configuration"], error["only_baseline"]) == (1, 1)
+    assert (error["age_s"], error["baseline_age_s"]) == (0.5, 0.125)
+    assert pd.isna(error["p_value"])
 
 
-def test_lists_are_paired_by_instant_whatever_their_number(tmp_path):
-    # Of the late lists the first two are at 1 s and 2 s, to half a microsecond; the third is at an instant of its own.
-    instants = {"late": [1.0000005, 2.0, 2.5]}
-    rows = [seen("ideal", [9, 1, 2, 9], FOUR), seen("late", [3, 4, 100], FOUR[:3])]
-    error = of(compared(tmp_path, rows, available_s=instants), "position_rmse_m")
-    assert error["n"] == 2
+def test_frames_count_from_the_first_list_of_both_on_whatever_their_instants(tmp_path):
+    """No list of the one is at an instant of the other. Of the late one none is there by 1 s, to a microsecond."""
+    rows = [seen("ideal", [9, 9, 1, 2], [1.0] * 4), seen("late", [None, None, 3, 4], [1.0] * 4)]
+    instants = {"ideal": [-0.5, 0.5, 1.5, 2.5], "late": [1.000002, 2.25]}
+    comparison = compared(tmp_path, rows, available_s=instants)
+    error = of(comparison, "position_rmse_held_m")
+    assert (error["n"], error["frames"]) == (2, 2)
     assert error["value"] == pytest.approx(math.sqrt((9 + 16) / 2))
     assert error["baseline_value"] == pytest.approx(math.sqrt((1 + 4) / 2))
-
-
-def test_lists_begin_where_the_objects_stay_does(tmp_path):
-    rows = [seen("ideal", [1, 2], FOUR[:2], first_list=1), seen("late", [3, 5, 7], FOUR[:3])]
-    error = of(compared(tmp_path, rows), "position_rmse_m")  # the instants 1 s and 2 s
-    assert error["value"] == pytest.approx(math.sqrt((25 + 49) / 2))
-    assert error["baseline_value"] == pytest.approx(math.sqrt((1 + 4) / 2))
+    assert not any("no frame" in note for note in comparison.notes)
     back = compare_folders([tmp_path / "study"], baseline="late")
-    assert of(back, "position_rmse_m")["difference"] == pytest.approx(-error["difference"])
+    assert of(back, "position_rmse_held_m")["difference"] == pytest.approx(-error["difference"])
 
 
-def test_without_a_common_instant_there_is_nothing_to_compare(tmp_path):
-    rows = [seen("ideal", [1, 1, 1, 1], [1, 1, 1, 1]), seen("late", [1, 1], [1, 1])]
-    comparison = compared(tmp_path, rows, available_s={"late": [1.000003, 1.5]})
-    for metric in ("position_rmse_m", "gospa_m"):
-        assert of(comparison, metric)["n"] == 0
+def test_a_list_at_a_frame_to_a_microsecond_is_there(tmp_path):
+    rows = [seen(name, [1] * 4, [1.0] * 4) for name in ("ideal", "late")]
+    late = {"late": [1.0000005, 2.0, 3.0]}
+    assert of(compared(tmp_path, rows, available_s=late), "position_rmse_held_m")["frames"] == 3
+
+
+def test_columns_begin_at_the_frame_they_say(tmp_path):
+    rows = [
+        seen("ideal", [1, 2], [1.0] * 2, first_frame=1), seen("late", [3, 5], [1.0] * 2, first_frame=1),
+    ]  # fmt: skip
+    error = of(compared(tmp_path, rows, available_s={"late": [1.5]}), "position_rmse_held_m")  # the frame 2 s
+    assert (error["value"], error["baseline_value"], error["n"]) == (5.0, 2.0, 1)
+
+
+def test_frames_without_a_list_stay_and_are_counted(tmp_path):
+    """The late list of 0 s is 2 s old at the third frame: nothing is held, GOSPA has the miss."""
+    rows = [seen("ideal", [1] * 4, [1.0] * 4), seen("late", [1, 1, None, None], [4.0, 4.0, 9.0, 9.0])]
+    comparison = compared(tmp_path, rows, available_s={"late": [0.0]})
+    for metric in ("position_rmse_held_m", "gospa_held_m"):
+        row = of(comparison, metric)
+        assert (row["frames"], row["no_list_share"], row["baseline_no_list_share"]) == (4, 0.5, 0.0)
+    assert of(comparison, "position_rmse_held_m")["n"] == 2
+    assert of(comparison, "gospa_held_m")["value"] == pytest.approx(math.sqrt((4 + 4 + 9 + 9) / 4))
+
+
+def test_who_has_issued_nothing_is_not_compared(tmp_path):
+    rows = [seen("ideal", [1] * 4, [1] * 4), seen("late", FOUR, [1] * 4)]
+    comparison = compared(tmp_path, rows, available_s={"late": []})
+    for metric in ("position_rmse_held_m", "gospa_held_m"):
+        assert of(comparison, metric)["n"] == of(comparison, metric)["frames"] == 0
         assert pd.isna(of(comparison, metric)["difference"])
+    assert "late: no frame at which an object is measured and both sides have issued a list" in comparison.notes
+
+
+def test_entries_without_a_true_object_are_counted(tmp_path):
+    rows = [seen(name, [1] * 4, [1.0] * 4) for name in ("ideal", "late")]
+    lists = [ghosts("ideal", 0), ghosts("late", 0, without_truth=7)]
+    error = of(compared(tmp_path, rows, lists=lists), "position_rmse_held_m")
+    assert (error["without_truth"], error["baseline_without_truth"]) == (7, 0)
+
+
+def test_counts_of_several_logs_add_up(tmp_path):
+    rows = [
+        seen("ideal", [1] * 4, [1.0] * 4, log="a"), seen("late", [1, 1, None, None], [1.0] * 4, log="a", age_s=1.0),
+        seen("ideal", [1] * 4, [1.0] * 4, log="b"), seen("late", [1] * 4, [1.0] * 4, log="b", age_s=0.25),
+    ]  # fmt: skip
+    error = of(compared(tmp_path, rows), "position_rmse_held_m")
+    assert (error["n"], error["frames"], error["only_baseline"]) == (6, 8, 2)
+    assert error["age_s"] == pytest.approx((2 * 1.0 + 4 * 0.25) / 6)
 
 
 def test_errors_of_objects_are_left_out_whole(tmp_path):
@@ -80,7 +124,7 @@ def test_errors_of_objects_are_left_out_whole(tmp_path):
         for key in errors
         for side, name in enumerate(("late", "ideal"))
     ]
-    error = of(compared(tmp_path, rows), "position_rmse_m")
+    error = of(compared(tmp_path, rows), "position_rmse_held_m")
 
     def regret(drawn: list[str]) -> float:
         both = np.concatenate([errors[key[2:]] for key in drawn], axis=1).astype(float)
@@ -104,8 +148,8 @@ def two_objects() -> list[Row]:
     ]
 
 
-def test_gospa_is_the_root_of_the_mean_over_lists_of_the_sum_over_objects(tmp_path):
-    gospa = of(compared(tmp_path, two_objects()), "gospa_m")
+def test_gospa_is_the_root_of_the_mean_over_frames_of_the_sum_over_objects(tmp_path):
+    gospa = of(compared(tmp_path, two_objects()), "gospa_held_m")
     assert gospa["n"] == 4
     assert gospa["value"] == pytest.approx(math.sqrt(16 / 4))
     assert gospa["baseline_value"] == pytest.approx(math.sqrt(10 / 4))
@@ -114,42 +158,42 @@ def test_gospa_is_the_root_of_the_mean_over_lists_of_the_sum_over_objects(tmp_pa
 
 def test_gospa_has_the_power_of_the_experiment(tmp_path):
     of_power = {"gospa": {"cutoff_m": 2.0, "power": 1.0}}
-    assert of(compared(tmp_path, two_objects(), measure=of_power), "gospa_m")["difference"] == 4.0 - 2.5
+    assert of(compared(tmp_path, two_objects(), measure=of_power), "gospa_held_m")["difference"] == 4.0 - 2.5
 
 
-def test_lists_in_which_nobody_is_measured_do_not_count(tmp_path):
+def test_frames_at_which_nobody_is_measured_do_not_count(tmp_path):
     rows = [seen(name, FOUR, [None, None, part, part]) for name, part in (("ideal", 1), ("late", 9))]
-    gospa = of(compared(tmp_path, rows), "gospa_m")
+    gospa = of(compared(tmp_path, rows), "gospa_held_m")
     assert (gospa["value"], gospa["baseline_value"], gospa["n"]) == (3.0, 1.0, 2)
 
 
-def test_an_object_that_no_list_is_measured_by_is_no_cluster(tmp_path):
+def test_an_object_that_no_frame_measures_is_no_cluster(tmp_path):
     rows = [
         seen(name, FOUR, [1.0 if k < 4 else None] * 4, object_id=str(k)) for k in range(5) for name in ("ideal", "late")
     ]
     comparison = compared(tmp_path, rows)
     assert of(comparison, "detected_share")["interval_over"] == "objects"
-    assert pd.isna(of(comparison, "gospa_m")["interval_over"])
+    assert pd.isna(of(comparison, "gospa_held_m")["interval_over"])
 
 
-def test_each_run_has_its_lists(tmp_path):
+def test_each_run_has_its_frames(tmp_path):
     rows = [
         seen(name, FOUR[:2], [part + run] * 2, run=run) for name, part in (("ideal", 1), ("late", 4)) for run in (0, 1)
     ]
-    gospa = of(compared(tmp_path, rows), "gospa_m")
+    gospa = of(compared(tmp_path, rows), "gospa_held_m")
     assert gospa["n"] == 4
     assert gospa["difference"] == pytest.approx(math.sqrt(4.5) - math.sqrt(1.5))
 
 
-def test_without_an_object_the_number_of_lists_is_as_it_was(tmp_path):
+def test_without_an_object_the_number_of_frames_is_as_it_was(tmp_path):
     parts = {str(k): (float(k), 1.0) for k in range(5)}
     rows = [
         seen(name, FOUR, [parts[key][side]] * 4, object_id=key)
         for key in parts
         for side, name in enumerate(("late", "ideal"))
     ]
-    gospa = of(compared(tmp_path, rows), "gospa_m")
-    # Every list has five objects: without one the others stand for it.
+    gospa = of(compared(tmp_path, rows), "gospa_held_m")
+    # Every frame has five objects: without one the others stand for it.
 
     def regret(drawn: list[str]) -> float:
         some, times = [parts[key[2:]] for key in drawn], 5 / len(drawn)
@@ -160,7 +204,7 @@ def test_without_an_object_the_number_of_lists_is_as_it_was(tmp_path):
     assert (gospa["low"], gospa["high"]) == pytest.approx(expected, abs=1e-8)
 
 
-def test_lists_are_paired_part_by_part_as_well_as_at_once(tmp_path, monkeypatch):
+def test_frames_are_paired_part_by_part_as_well_as_at_once(tmp_path, monkeypatch):
     rng = np.random.default_rng(4)
     rows = [
         seen(
@@ -369,8 +413,8 @@ def test_the_same_folder_again_differs_in_nothing(tmp_path):
     folders = [write_folder(tmp_path / name, rows, lists=lists, steps=steps) for name in ("first", "second")]
     comparison = compare_folders(folders, baseline="first:x")
     assert comparison.table["metric"].tolist() == [
-        "detected_share", "ttd_rmst_s", "ttd_rmst_s_equal_ghosts", "dad_median_m", "position_rmse_m", "gospa_m",
-        "false_positives_per_min",
+        "detected_share", "ttd_rmst_s", "ttd_rmst_s_equal_ghosts", "dad_median_m", "position_rmse_held_m",
+        "gospa_held_m", "false_positives_per_min",
     ]  # fmt: skip
     assert (comparison.table["difference"] == 0.0).all()
     # None of six can differ, one way or the other, where up to 46 % of all do: 1 − 0.025^(1/6).
@@ -381,23 +425,6 @@ def test_the_same_folder_again_differs_in_nothing(tmp_path):
     assert (others["interval"] == "all clusters alike").all()
     assert others[["low", "high", "interval_over"]].isna().all(axis=None)
     assert comparison.notes == ()
-
-
-def test_how_few_lists_both_have_is_said(tmp_path):
-    """Of four instants two are the other's; of the second log none."""
-    rows = [seen(name, FOUR, FOUR, log=log) for name in ("ideal", "late") for log in ("a", "b")]
-    folder = write_folder(tmp_path / "one", rows[::2], available_s={"late": [0.0, 0.5, 2.0, 2.5]})
-    assert compare_folders([folder]).notes[-2:][0] == (
-        "late: position_rmse_m and gospa_m are over the 2 instants that both have, of 4 and the 4 of ideal"
-    )
-    folder = write_folder(tmp_path / "two", rows, available_s={"late": [0.25, 0.5, 0.75, 2.5]})
-    assert any(
-        note == "late: position_rmse_m and gospa_m are over the 0 instants that both have, of 8 and the 8 of ideal; "
-        "none in a, b"
-        for note in compare_folders([folder]).notes
-    )
-    folder = write_folder(tmp_path / "same", rows)
-    assert not any("instants that both have" in note for note in compare_folders([folder]).notes)
 
 
 @pytest.mark.parametrize(("always", "said"), [(False, 1), (True, 0)])

@@ -144,7 +144,7 @@ def test_the_table_has_signs_and_intervals(tmp_path):
 def test_what_the_table_shows_is_said_below(tmp_path):
     lines = comparison_text(six_objects(tmp_path)).splitlines()[4:]
     assert lines == [
-        "differences to ideal, paired by log, object and run; accuracy at instants that both have",
+        "differences to ideal, paired by log, object and run; accuracy of what is held at each frame",
         "[95 %]: over 6 objects of this drive: how far other objects of this drive may differ; nothing about other "
         "drives",
         "detected_share: exact binomial limits where the difference is the same in every cluster",
@@ -238,7 +238,8 @@ def test_csv_has_a_row_for_each_log_configuration_and_metric(tmp_path):
         "interval", "interval_over", "n", "p_value", "only_configuration", "only_baseline", "existence",
         "baseline_existence",
         "ghosts_kept_per_min", "baseline_ghosts_kept_per_min", "clusters", "logs_better", "hangs_on",
-        "difference_without_it",
+        "difference_without_it", "frames", "age_s", "baseline_age_s", "no_list_share", "baseline_no_list_share",
+        "without_truth", "baseline_without_truth",
     ]  # fmt: skip
     assert [(r["log"], r["configuration"], r["metric"]) for r in read[3:6]] == [
         ("all", "fast", "detected_share"), ("all", "fast", "ttd_rmst_s"), ("all", "fast", "dad_median_m"),

@@ -122,7 +122,7 @@ def comparison_lines(comparison: Comparison) -> Iterator[str]:
     """Lines on the table: its meaning, and the configurations that are better than the baseline."""
     overall = comparison.overall
     shown = set(overall["metric"])
-    of_lists = "accuracy of what both hold at each frame"
+    of_lists = "accuracy of what is held at each frame"
     yield f"differences to {comparison.baseline}, paired by log, object and run; {of_lists}"
     limited = overall.dropna(subset="interval_over")
     over = limited.groupby(["interval_over", "clusters"], sort=False)["metric"].unique()
