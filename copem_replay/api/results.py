@@ -45,10 +45,10 @@ def compare(
 ) -> Comparison:
     """Compare configurations with a baseline, paired by log, object and run, within or across results folders.
 
-    `configurations`: only these; None: all. `baseline`: None: the one named `ideal`. `false_positives_per_min`: false
-    positives per minute at which times to detection are compared once more; None: those of the baseline. `table` of the
-    result has a row per log, configuration and metric: `difference` with the limits `low` and `high` of its 95 %
-    interval.
+    `configurations`: only these; None: all. `baseline`: None: the one named `ideal`, else the ideal fusion of the same
+    inputs, else the first that is not the truth. `false_positives_per_min`: false positives per minute at which times
+    to detection are compared once more; None: those of the baseline. `table` of the result has a row per log,
+    configuration and metric: `difference` with the limits `low` and `high` of its 95 % interval.
 
     Raises InputError with every reason why the results are unreadable or not comparable.
 
@@ -71,7 +71,7 @@ def compare(
 def write_report(results: AnyResults, file: str | PathLike[str] | None = None, *, baseline: str | None = None) -> Path:
     """Write the report of a results folder as one HTML file that opens offline. Returns its path.
 
-    `file`: None: `report.html` in the folder. `baseline`: None: the configuration named `ideal`, if any.
+    `file`: None: `report.html` in the folder. `baseline`: None: as in `compare`.
 
     Raises InputError where the results are unreadable, OutputError where the file is not writable.
 

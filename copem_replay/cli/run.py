@@ -158,7 +158,17 @@ def _write_results(
     print(format_summary(result.summary, width_of(sys.stdout)))
     if result.sweep is not None:
         print_line(f"sweep of {', '.join(dict.fromkeys(result.sweep['sweep']))} in {place.shown / 'sweep.csv'}")
+    _print_baseline(study.experiment)
     print_line(f"results in {place.shown}")
+
+
+def _print_baseline(experiment: Experiment) -> None:
+    """Print which configuration `compare` and `report` hold the others against."""
+    from copem_replay.results.compare.labels import find_baseline
+
+    if len(names := list(experiment.configurations)) > 1:
+        baseline = find_baseline(experiment.as_written(), names)
+        print_line(f"baseline of compare and report: {baseline.name}, {baseline.why}")
 
 
 def _print_next(folder: Path) -> None:

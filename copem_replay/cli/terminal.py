@@ -46,7 +46,7 @@ OneDrive: TypeAlias = Annotated[
     bool, typer.Option("--together", help="The recordings are of one drive: estimate their clock offsets.")
 ]
 Baseline: TypeAlias = Annotated[
-    str | None, typer.Option("--baseline", metavar="NAME", help="Configuration to compare with [the one named ideal].")
+    str | None, typer.Option("--baseline", metavar="NAME", help="Configuration to compare with [the ideal].")
 ]
 
 

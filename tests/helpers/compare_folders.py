@@ -159,9 +159,13 @@ def write_folder(
     logs: dict[str, str] | None = None,
     ego: str | None = None,
     measure: dict[str, Any] | None = None,
+    experiment: dict[str, Any] | None = None,
     **provenance: Any,
 ) -> Path:
-    """A results folder. `logs`: names and contents; `available_s`: by configuration, where not INSTANTS."""
+    """A results folder. `logs`: names and contents; `available_s`: by configuration, where not INSTANTS.
+
+    `experiment`: further keys of experiment.yaml.
+    """
     path.mkdir(parents=True)
     names = list(dict.fromkeys(r["log"] for r in rows))
     logs = logs or {name: f"content of {name}" for name in names}
@@ -177,7 +181,8 @@ def write_folder(
     }
     said |= provenance
     (path / "provenance.json").write_text(json.dumps(said))
-    (path / "experiment.yaml").write_text(f"version: 1\nego: {'null' if ego is None else ego}\n")
+    more = "".join(f"{key}: {json.dumps(value)}\n" for key, value in (experiment or {}).items())
+    (path / "experiment.yaml").write_text(f"version: 1\nego: {'null' if ego is None else ego}\n{more}")
     _write(path / "detections.parquet", rows, _DETECTIONS | (_VERDICTS if said["braking"] else {}))
     if any("error_held_m" in r for r in rows):
         _write(path / "accuracy.parquet", rows, _ACCURACY)

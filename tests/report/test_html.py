@@ -380,12 +380,16 @@ class TestWords:
     def test_the_baseline_is_ideal_else_the_first_else_as_asked(self, made: Path, tmp_path: Path) -> None:
         assert load_study(made).baseline == "late"
         assert load_study(made, "hit").baseline == "hit"
-        assert "No configuration is named ideal, so this is the first" in build_page(load_study(made))
+        first = (
+            "Each configuration minus <b>late</b>: the first that is not the truth; --baseline of copem-replay report"
+        )
+        assert first in build_page(load_study(made))
+        assert "Each configuration minus <b>hit</b>: chosen with --baseline." in build_page(load_study(made, "hit"))
         with pytest.raises(InputError, match="no configuration is named 'hti'"):
             load_study(made, "hti")
         named = replayed(tmp_path, changed(ONE, ("  hit:", "  ideal:")))
         assert load_study(named).baseline == "ideal"
-        assert "Each configuration minus the ideal fusion: the regret." in build_page(load_study(named))
+        assert "minus <b>ideal</b>: by its name; " in build_page(load_study(named))
 
 
 class TestNeverDetected:

@@ -82,18 +82,107 @@ def test_a_configurations_own_name_goes_before_that_with_a_folders(tmp_path):
 
 def test_a_baseline_is_one_configuration(tmp_path):
     folders = [study(tmp_path, "a", "ideal", "GT"), study(tmp_path, "b", "ideal", "GT")]
-    assert problem(*folders) == "--baseline: expected one of a:ideal, b:ideal, found ideal, which may be any"
+    assert problem(*folders, baseline="ideal") == (
+        "--baseline: expected one of a:ideal, b:ideal, found ideal, which may be any"
+    )
     assert problem(*folders, baseline="GT") == "--baseline: expected one of a:GT, b:GT, found GT, which may be any"
     assert compare_folders(folders, baseline="b:ideal").configurations == ("a:ideal", "a:GT", "b:GT")
 
 
-def test_without_an_ideal_the_baseline_has_to_be_named(tmp_path):
+def test_a_baseline_that_nobody_is(tmp_path):
     folder = study(tmp_path, "a", "GT", "PEM")
-    assert problem(folder) == (
-        "--baseline: expected a configuration to compare with, as none is named ideal; there are GT, PEM"
-    )
     assert problem(folder, baseline="PEN") == "--baseline: no configuration is named 'PEN'; did you mean PEM?"
     assert problem(folder, baseline="zzz") == "--baseline: no configuration is named 'zzz'; there are GT, PEM"
+
+
+UNITS = {"ego": {"on": "ego", "pem": "p"}, "rsu": {"on": "7", "pem": "p"}, "box": {"recorded": {"topic": "box"}}}
+GT, EGO, BOTH, GNN = {"units": "truth"}, {"units": ["ego"]}, {"units": "all"}, {"fusion": {"kind": "gnn"}}
+
+
+def chosen(tmp_path: Path, **configurations: dict[str, Any]) -> tuple[str, str | None]:
+    """Baseline and reason where none is asked for."""
+    experiment = {"units": UNITS, "configurations": configurations}
+    found = compare_folders([study(tmp_path, "a", *configurations, experiment=experiment)])
+    return found.baseline, found.baseline_why
+
+
+FIRST = "the first that is not the truth"
+
+
+@pytest.mark.parametrize(
+    ("configurations", "expected"),
+    [
+        ({"GT": GT, "PEM": EGO, "ideal": BOTH}, ("ideal", "by its name")),
+        ({"GT": GT, "PEM": EGO, "coPEM": BOTH}, ("PEM", FIRST)),  # each is its own ideal
+        ({"GT": GT, "car": EGO | GNN, "x": BOTH | GNN}, ("car", FIRST)),  # neither has one
+        ({"GT": GT, "also": GT}, ("GT", "the first")),
+        ({"GT": GT, "PEM": EGO, "co": BOTH, "x": BOTH | GNN}, ("co", "ideal fusion of the inputs of x")),
+        # The order of the units does not matter, and `all` are the modelled ones.
+        ({"PEM": EGO, "co": {"units": ["rsu", "ego"]}, "x": BOTH | GNN}, ("co", "ideal fusion of the inputs of x")),
+        ({"PEM": EGO, "co": {"units": ["rsu", "ego", "box"]}, "x": BOTH | GNN}, ("PEM", FIRST)),
+        # `car` has no ideal, the next one has.
+        ({"car": EGO | GNN, "co": BOTH, "x": BOTH | GNN}, ("co", "ideal fusion of the inputs of x")),
+        # Posterior is another fusion, no baseline of itself.
+        ({"co": BOTH | {"fusion": {"kind": "ideal", "combine": "posterior"}}, "x": BOTH | GNN}, ("co", FIRST)),
+    ],
+)  # fmt: skip
+def test_the_baseline_is_the_ideal_of_the_same_inputs_else_the_first(tmp_path, configurations, expected):
+    assert chosen(tmp_path, **configurations) == expected
+
+
+LATE, LINK = {"latency_s": 0.5}, {"link": "radio"}
+
+
+@pytest.mark.parametrize(
+    ("own", "expected"),
+    [
+        (LATE, "late"),
+        ({"latency_s": {"default": 0.5}}, "late"),
+        ({"latency_s": {"ego": 0.0}}, "co"),
+        (LINK, "linked"),
+        ({"link": {"ego": "none", "default": "radio"}}, "wired ego"),
+        ({"issue_hz": 10.0}, "ticks"),
+    ],
+)
+def test_the_ideal_has_the_lists_as_they_come(tmp_path, own, expected):
+    ideals = {
+        "co": {}, "late": LATE, "linked": LINK, "wired ego": {"link": {"rsu": "radio"}}, "ticks": {"issue_hz": 10.0},
+    }  # fmt: skip
+    known = {name: BOTH | more for name, more in ideals.items()}
+    assert chosen(tmp_path, **known, x=BOTH | GNN | own) == (expected, "ideal fusion of the inputs of x")
+
+
+def test_without_that_the_ideal_of_the_same_units(tmp_path):
+    found = chosen(tmp_path, PEM=EGO, co=BOTH, x=BOTH | GNN | LATE)
+    assert found == ("co", "ideal fusion of the units of x")
+
+
+def test_a_recorded_output_has_the_ideal_of_its_inputs_as_they_arrived(tmp_path):
+    stack = {"recorded": {"topic": "out"}, "inputs": ["box"]}
+    late, ideal = {"units": ["box"], "latency_s": 0.1}, {"units": ["box"]}
+    found = chosen(tmp_path, GT=GT, late=late, stack=stack, **{"stack:ideal": ideal})
+    assert found == ("stack:ideal", "ideal fusion of the inputs of stack")
+
+
+def test_of_several_folders_the_first_with_an_ideal_has_the_baseline(tmp_path):
+    def folder(name: str, **configurations: dict[str, Any]) -> Path:
+        return study(tmp_path, name, *configurations, experiment={"units": UNITS, "configurations": configurations})
+
+    none, one, other = folder("none", PEM=EGO), folder("one", co=BOTH, x=BOTH | GNN), folder("other", ideal=BOTH)
+    assert compare_folders([none, one]).baseline == "co"
+    assert compare_folders([one, none, other]).baseline == "ideal"
+    assert compare_folders([none, folder("two", PEM=EGO)]).baseline == "none:PEM"
+    again = study(tmp_path, "again", "ideal", "GT")
+    assert compare_folders([again, other]).baseline == "again:ideal"
+
+
+def test_the_baseline_is_said_in_a_line_unless_it_was_asked_for(tmp_path):
+    folder = study(tmp_path, "a", "PEM", "coPEM")
+    said = "baseline PEM: the first that is not the truth; --baseline names another"
+    assert said in comparison_text(compare_folders([folder])).splitlines()
+    asked = compare_folders([folder], baseline="PEM")
+    assert asked.baseline_why is None
+    assert "--baseline" not in comparison_text(asked)
 
 
 def test_every_unknown_configuration_is_said(tmp_path):
@@ -145,6 +234,7 @@ def test_what_the_table_shows_is_said_below(tmp_path):
     lines = comparison_text(six_objects(tmp_path)).splitlines()[4:]
     assert lines == [
         "differences to ideal, paired by log, object and run; accuracy of what is held at each frame",
+        "baseline ideal: by its name; --baseline names another",
         "[95 %]: over 6 objects of this drive: how far other objects of this drive may differ; nothing about other "
         "drives",
         "detected_share: exact binomial limits where the difference is the same in every cluster",

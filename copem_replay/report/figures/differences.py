@@ -16,8 +16,6 @@ from copem_replay.report.figures.style import (
     Dot,
     add_note,
     choose_appearances,
-    compare_with_default,
-    default_baseline,
     describe_over,
     describe_results,
     draw_rows,
@@ -28,6 +26,7 @@ from copem_replay.report.figures.style import (
     new_figure,
     sort_soonest_first,
 )
+from copem_replay.results.compare.labels import find_baseline
 from copem_replay.results.compare.tables import NOTHING, describe_gain, explain_no_interval
 
 if TYPE_CHECKING:
@@ -50,7 +49,8 @@ def no_differences(results: Results, names: Sequence[str], differences: Comparis
     """The reason why the figure cannot be drawn; None if it can."""
     if not len(results.known):
         return "no object is measured"
-    against = default_baseline(results) if differences is None else differences.baseline
+    all_names = tuple(results.experiment.configurations)
+    against = find_baseline(results.source.data, all_names).name if differences is None else differences.baseline
     return None if set(names) - {against} else "there is nothing to compare with"
 
 
@@ -59,12 +59,15 @@ def differences_figure(
 ) -> Figure:
     """Differences to a baseline in the mean time to detection and in the share that passes, the soonest first.
 
-    `differences`: computed before; None: to the default baseline. Raises InputError without any.
+    `differences`: computed before; None: to the baseline of `compare`. Raises InputError
+    without any.
     """
+    from copem_replay.results.compare import compare_folders
+
     names = results.chosen(configurations)
     if (reason := no_differences(results, names, differences)) is not None:
         raise InputError(f"{results.folder}: no differences: {reason}")
-    comparison = differences or compare_with_default(results, names, tuple(_PANELS))
+    comparison = differences or compare_folders([results], configurations=names, metrics=tuple(_PANELS))
     compared = [name for name in comparison.configurations if name in names]
     drawn = [name for name in compared if name not in find_truths(results)] or compared
     names = sort_soonest_first(results, drawn)

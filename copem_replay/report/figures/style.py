@@ -23,13 +23,11 @@ import pandas as pd
 from copem_replay.core.colours import configuration_colours
 from copem_replay.core.errors import count_noun
 from copem_replay.metrics.intervals import choose_clusters, describe_absent, describe_clusters, explain_no_clusters
-from copem_replay.results.compare.labels import DEFAULT_BASELINE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from copem_replay.results.compare import Comparison
     from copem_replay.results.read import Results
 
 
@@ -357,7 +355,7 @@ def _round_coordinates(svg: bytes) -> bytes:
     return _PATH.sub(lambda path: _LONG.sub(lambda number: b"%.2f" % float(number[0]), path[0]), svg)
 
 
-# Contenders, their order, and the default baseline.
+# Contenders, and their order.
 
 RANKED_BY = "ttd_rmst_s"
 """Metric of the ranking: the mean time to detection that includes objects never detected."""
@@ -396,19 +394,6 @@ def find_with_fewer_rows(results: Results, names: Sequence[str]) -> tuple[str, .
     """Configurations with fewer rows than the others, because some logs lack their units."""
     rows = results.summary.set_index("configuration")["n"].loc[list(names)]
     return tuple(name for name in names if rows[name] < rows.max())
-
-
-def default_baseline(results: Results) -> str:
-    """The configuration `ideal`; without one the first that is not the ground truth."""
-    names = tuple(results.experiment.configurations)
-    return DEFAULT_BASELINE if DEFAULT_BASELINE in names else find_contenders(results)[0]
-
-
-def compare_with_default(results: Results, names: Sequence[str], metrics: Sequence[str]) -> Comparison:
-    """Differences of configurations to the default baseline, in some metrics. Raises InputError."""
-    from copem_replay.results.compare import compare_folders
-
-    return compare_folders([results], configurations=names, baseline=default_baseline(results), metrics=metrics)
 
 
 # Dots with intervals, a row per configuration, for the figures of the answer and of differences.

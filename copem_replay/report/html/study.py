@@ -18,7 +18,6 @@ from copem_replay.report.figures.style import (
     RANKED_BY,
     Appearance,
     choose_appearances,
-    default_baseline,
     explain_no_intervals,
     find_contenders,
     sort_soonest_first,
@@ -111,8 +110,7 @@ class ReportData:
 def load_study(folder: Path, baseline: str | None = None) -> ReportData:
     """Read a results folder and compare its configurations with a baseline.
 
-    None: `ideal`, else the first configuration that is not the truth. Raises InputError: no or damaged results, no such
-    baseline.
+    None: that of `compare`. Raises InputError: no or damaged results, no such baseline.
     """
     results = read_results(folder, rowless=True)
     _check_summary(results)
@@ -125,16 +123,15 @@ def load_study(folder: Path, baseline: str | None = None) -> ReportData:
     best = sort_soonest_first(results, ranked)[0]
     if len(names) < 2:
         return ReportData(results, None, None, best, None)
-    against = baseline or default_baseline(results)
-    regret = compare_folders([results], baseline=against)
+    regret = compare_folders([results], baseline=baseline)
     lead = None
     if len(ranked) > 1:
         lead = (
             regret
-            if best == against and ranked == names
+            if best == regret.baseline and ranked == names
             else compare_folders([results], configurations=ranked, baseline=best, metrics=(RANKED_BY,))
         )
-    return ReportData(results, against, regret, best, lead)
+    return ReportData(results, regret.baseline, regret, best, lead)
 
 
 def _check_summary(results: Results) -> None:

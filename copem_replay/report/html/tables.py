@@ -314,18 +314,11 @@ def _held_table(study: ReportData, regret: Comparison) -> Html:
 
 def baseline_words(study: ReportData) -> Html:
     """Words on which configuration is the baseline, and why."""
-    if study.baseline is None:
+    if study.regret is None:
         return Html()
-    if study.baseline == "ideal":
-        return make_tag("p", "Each configuration minus the ideal fusion: the regret. It is a baseline, not a bound.")
-    by_default = study.baseline == study.contenders[0] and "ideal" not in study.names
-    why = (
-        "No configuration is named ideal, so this is the first that is not the ground truth; --baseline of "
-        "copem-replay report chooses another."
-        if by_default
-        else "It is chosen with --baseline, or the only one to compare with."
-    )
-    return make_tag("p", "Each configuration minus ", make_tag("b", study.baseline), f". {why}")
+    why = study.regret.baseline_why
+    words = "chosen with --baseline" if why is None else f"{why}; --baseline of copem-replay report chooses another"
+    return make_tag("p", "Each configuration minus ", make_tag("b", study.regret.baseline), f": {words}.")
 
 
 def _difference_cell(row: Any, metric: str) -> Html:

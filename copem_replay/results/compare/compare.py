@@ -22,6 +22,7 @@ from copem_replay.metrics.intervals import FEWEST_CLUSTERS, FEWEST_LOGS, choose_
 from copem_replay.results.compare.labels import (
     LabelledConfiguration,
     check_log_names,
+    choose_baseline,
     choose_configurations,
     label_configurations,
     log_keys,
@@ -347,7 +348,8 @@ class Comparison:
     """Differences to a baseline: a row per log (`all`, and each where there are several), configuration and metric.
 
     Columns of `table` as in COLUMNS, missing where there is none; times are up to `horizon_s`, those at equal ghosts at
-    `false_positives_per_min`. `notes`: what has to be said, a line each.
+    `false_positives_per_min`. `baseline_why`: why it is the baseline, None if it was asked for. `notes`: what has to be
+    said, a line each.
 
     >>> comparison = cr.compare("out/tc016d", baseline="PEM")
     >>> comparison.baseline, comparison.configurations
@@ -356,6 +358,7 @@ class Comparison:
 
     table: pd.DataFrame
     baseline: str
+    baseline_why: str | None
     configurations: tuple[str, ...]
     horizon_s: float
     false_positives_per_min: float | None
@@ -375,16 +378,18 @@ def compare_folders(
     false_positives_per_min: float | None = None,
     metrics: Sequence[str] | None = None,
 ) -> Comparison:
-    """Compare configurations (None: all) with a baseline (None: `ideal`), pair by pair, in some metrics (None: all).
+    """Compare configurations (None: all) with a baseline, pair by pair, in some metrics (None: all).
 
-    `false_positives_per_min`: at which times to detection are compared once more; None: as many as the baseline has.
-    Raises InputError, a line for every reason why something cannot be read or compared.
+    `baseline`: None: the configuration named `ideal`, else the ideal fusion of the same inputs, else the first that is
+    not the truth. `false_positives_per_min`: at which times to detection are compared once more; None: as many as the
+    baseline has. Raises InputError, a line for every reason why something cannot be read or compared.
     """
     _check_rate(false_positives_per_min)
     read = read_folders(folders)
     check_comparable(read)
     read, renames = rename_logs(read)
-    against, *others = choose_configurations(label_configurations(read), configurations, baseline)
+    known = label_configurations(read)
+    against, *others = choose_configurations(known, configurations, baseline)
     check_log_names(against, others, renames)
     used = list(dict.fromkeys(one.results for one in (against, *others)))
     logs, runs = [log.name for log in read[0].provenance.logs], min(folder.provenance.runs for folder in read)
@@ -399,6 +404,7 @@ def compare_folders(
     return Comparison(
         table=table,
         baseline=against.label,
+        baseline_why=choose_baseline(known)[1] if baseline is None else None,
         configurations=tuple(one.label for one in others),
         horizon_s=setting.horizon_s,
         false_positives_per_min=false_positives_per_min,

@@ -10,9 +10,10 @@ import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from copem_replay.core.errors import InputError, unknown_name_message
+from copem_replay.core.tracks import TRUTH
 
 if TYPE_CHECKING:
     from copem_replay.results.read import Results
@@ -143,53 +144,104 @@ def _rates_by_configuration(results: Results) -> dict[str, float]:
     return {str(name): float(rate) for name, rate in rates.items()}
 
 
-# The ideal of a recorded output, to which its regret is: ideal fusion of its inputs.
+# The baseline where none is asked for, and the ideal of a configuration: ideal fusion of its inputs.
+
+IDEAL_NAME = "ideal"
+"""A configuration of this name is the baseline where none is asked for."""
 
 
-def find_ideals(results: Results) -> dict[str, str | None]:
-    """By recorded output its ideal; None: it has no `inputs`, or no configuration is their ideal fusion."""
-    configurations = results.source.data.get("configurations") or {}
-    settings_of = {str(name): settings for name, settings in configurations.items() if isinstance(settings, dict)}
-    return {
-        name: next(
-            (other for other, candidate in settings_of.items() if _is_ideal_over(candidate, settings.get("inputs"))),
-            None,
-        )
-        for name, settings in settings_of.items()
-        if settings.get("recorded")
-    }
+class Baseline(NamedTuple):
+    """The baseline of an experiment where none is asked for. `why`: in words; `rank`: 0 by name, 1 the ideal of the
+    same inputs, 2 the first.
+    """
+
+    rank: int
+    name: str
+    why: str
 
 
-def _is_ideal_over(configuration: dict[str, Any], inputs: object) -> bool:
-    units, fusion = configuration.get("units"), configuration.get("fusion") or {}
-    return (
-        isinstance(units, list)
-        and isinstance(inputs, list)
-        and set(map(str, units)) == set(map(str, inputs))
-        and {"kind": "ideal", "combine": "samples"} | fusion == {"kind": "ideal", "combine": "samples"}
-        and not configuration.get("latency_s")
-        and not configuration.get("link")
-        and not configuration.get("issue_hz")
-    )
+def find_baseline(data: Mapping[str, Any], names: Sequence[str]) -> Baseline:
+    """The baseline among `names`, the configurations of an experiment's plain `data`: one rule for all commands.
+
+    It is the configuration named `ideal`; else the ideal of the first configuration that fuses otherwise and has one
+    (`find_ideal`); else the first that is not the truth.
+    """
+    if IDEAL_NAME in names:
+        return Baseline(0, IDEAL_NAME, "by its name")
+    settings_of = _settings_by_name(data)
+    for name in names:
+        ideal, alike = find_ideal(data, name) if _is_other_fusion(settings_of.get(name, {})) else (None, False)
+        if ideal in names:
+            of = "inputs" if alike else "units"
+            return Baseline(1, str(ideal), f"ideal fusion of the {of} of {name}")
+    fused = [name for name in names if settings_of.get(name, {}).get("units") != TRUTH]
+    return Baseline(2, fused[0], "the first that is not the truth") if fused else Baseline(2, names[0], "the first")
+
+
+def find_ideal(data: Mapping[str, Any], name: str) -> tuple[str | None, bool]:
+    """The ideal of a configuration: ideal fusion of its units or `inputs`; and whether their lists come alike.
+
+    With the same latency, link and `issue_hz` if there is one so, else with the same units; None: there is neither. A
+    recorded output has its inputs as they arrived, without latency or link.
+    """
+    settings_of, every = _settings_by_name(data), _modelled_units(data)
+    settings = settings_of.get(name, {})
+    own = {"units": settings.get("inputs")} if settings.get("recorded") else settings
+    units, arrivals = _list_inputs(own, every)
+    ideals = {other: _list_inputs(one, every) for other, one in settings_of.items() if _is_ideal(one)}
+    same = {other: inputs for other, inputs in ideals.items() if units and inputs[0] == units}
+    alike = next((other for other, inputs in same.items() if inputs[1] == arrivals), None)
+    return alike or next(iter(same), None), alike is not None
+
+
+def _settings_by_name(data: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    configurations = data.get("configurations") or {}
+    return {str(name): settings for name, settings in configurations.items() if isinstance(settings, dict)}
+
+
+def _modelled_units(data: Mapping[str, Any]) -> list[str]:
+    units = data.get("units") or {}
+    return [str(name) for name, unit in units.items() if not (isinstance(unit, dict) and unit.get("recorded"))]
+
+
+def _is_ideal(settings: Mapping[str, Any]) -> bool:
+    fusion, samples = settings.get("fusion") or {}, {"kind": "ideal", "combine": "samples"}
+    return not settings.get("recorded") and samples | fusion == samples
+
+
+def _is_other_fusion(settings: Mapping[str, Any]) -> bool:
+    return bool(settings.get("recorded")) or (settings.get("fusion") or {}).get("kind", "ideal") != "ideal"
+
+
+def _list_inputs(settings: Mapping[str, Any], every: Sequence[str]) -> tuple[frozenset[str], object]:
+    """The units of a configuration, none of the truth; and how their lists come: by unit latency and link, the rate."""
+    units = settings.get("units")
+    names = every if units == "all" else map(str, units) if isinstance(units, list | tuple) else ()
+    latency, link = settings.get("latency_s") or 0.0, settings.get("link")
+
+    def come(unit: str) -> tuple[object, object]:
+        delay_s = latency.get(unit, latency.get("default", 0.0)) if isinstance(latency, dict) else latency
+        own = link.get(unit, link.get("default")) if isinstance(link, dict) and "kind" not in link else link
+        return delay_s, None if own == "none" else own
+
+    inputs = frozenset(names)
+    return inputs, ({unit: come(unit) for unit in inputs}, settings.get("issue_hz"))
 
 
 def notes_on_output_baseline(baseline: LabelledConfiguration, others: Sequence[LabelledConfiguration]) -> Iterator[str]:
     """Notes on recorded outputs whose difference to the baseline is no regret."""
     for one in others:
-        of_folder = find_ideals(one.results)
-        if one.configuration not in of_folder:
+        data = one.results.source.data
+        if not _settings_by_name(data).get(one.configuration, {}).get("recorded"):
             continue
-        ideal = of_folder[one.configuration]
-        if ideal is None:
+        ideal, alike = find_ideal(data, one.configuration)
+        if not alike:
             yield f"{one.label}: no regret, for it has no `inputs`: only a difference to {baseline.label}"
         elif baseline.configuration != ideal:
             yield f"{one.label}: its regret is to {ideal}, ideal fusion of its inputs (--baseline {ideal})"
 
 
 # Labels, and the configurations that are meant.
-
-DEFAULT_BASELINE = "ideal"
-"""The baseline where none is given and a configuration has this name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,11 +281,11 @@ def choose_configurations(
 ) -> tuple[LabelledConfiguration, ...]:
     """The baseline, then the configurations to compare with it, each once. Raises InputError.
 
-    By default the baseline is `ideal`, else the only ideal fusion of the inputs of a recorded output. A name that
-    several folders have stands for all of them; as a baseline it has to be one.
+    `baseline`: None: that of `choose_baseline`. A name that several folders have stands for all of them; as a baseline
+    it has to be one.
     """
     labels = [one.label for one in known]
-    against = _find_baseline(known, labels, baseline)
+    against = choose_baseline(known)[0] if baseline is None else _find_named_baseline(known, labels, baseline)
     wanted: list[LabelledConfiguration] = list(known) if configurations is None else []
     problems = []
     for name in configurations or ():
@@ -249,24 +301,30 @@ def choose_configurations(
     return against, *others
 
 
+def choose_baseline(known: Sequence[LabelledConfiguration]) -> tuple[LabelledConfiguration, str]:
+    """The baseline where none is asked for, and why: by the first clause of `find_baseline` that holds in a folder.
+
+    Where it holds in several folders, that of the first one.
+    """
+    folders: dict[Results, dict[str, LabelledConfiguration]] = {}
+    for one in known:
+        folders.setdefault(one.results, {})[one.configuration] = one
+    found = [(find_baseline(folder.source.data, list(those)), those) for folder, those in folders.items()]
+    baseline, those = min(found, key=lambda pair: pair[0].rank)
+    return those[baseline.name], baseline.why
+
+
 def _find_meant(known: Sequence[LabelledConfiguration], name: str) -> list[LabelledConfiguration]:
     return [one for one in known if one.label == name] or [one for one in known if one.is_meant_by(name)]
 
 
-def _find_baseline(
-    known: Sequence[LabelledConfiguration], labels: Sequence[str], name: str | None
+def _find_named_baseline(
+    known: Sequence[LabelledConfiguration], labels: Sequence[str], name: str
 ) -> LabelledConfiguration:
-    meant = _find_meant(known, DEFAULT_BASELINE if name is None else name)
-    if not meant and name is None:
-        meant = [one for one in known if one.configuration in find_ideals(one.results).values()]
+    meant = _find_meant(known, name)
     if len(meant) == 1:
         return meant[0]
     if meant:
         several = ", ".join(one.label for one in meant)
         raise InputError(f"--baseline: expected one of {several}, found {meant[0].configuration}, which may be any")
-    if name is None:
-        raise InputError(
-            f"--baseline: expected a configuration to compare with, as none is named {DEFAULT_BASELINE}; "
-            f"there are {', '.join(labels)}"
-        )
     raise InputError(f"--baseline: {unknown_name_message('configuration', name, labels)}")

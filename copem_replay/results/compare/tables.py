@@ -124,6 +124,8 @@ def comparison_lines(comparison: Comparison) -> Iterator[str]:
     shown = set(overall["metric"])
     of_lists = "accuracy of what is held at each frame"
     yield f"differences to {comparison.baseline}, paired by log, object and run; {of_lists}"
+    if comparison.baseline_why is not None:
+        yield f"baseline {comparison.baseline}: {comparison.baseline_why}; --baseline names another"
     limited = overall.dropna(subset="interval_over")
     over = limited.groupby(["interval_over", "clusters"], sort=False)["metric"].unique()
     kinds = [
