@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from copem_replay.core.errors import unknown_name_message
+from copem_replay.core.tracks import TRUTH
 from copem_replay.core.yaml import Key
 from copem_replay.experiment.file import ExperimentSource
 from copem_replay.metrics.config import LONGEST_CHAIN, onset_requirement
@@ -254,16 +255,24 @@ def _check_configuration(
     for unit in latency if isinstance(latency, dict) else ():
         if unit not in [*units, "default", "truth"]:
             yield source.at((*key, "latency_s", unit), unknown_name_message("unit", unit, [*units, "default"]))
-    yield from _check_link(source, (*key, "link"), configuration.get("link"), units)
+    yield from _check_link(source, (*key, "link"), configuration, units)
 
 
-def _check_link(source: ExperimentSource, key: Key, link: object, units: Sequence[str]) -> Iterator[str]:
-    """Undefined links, and undefined units that send by links."""
+def _check_link(
+    source: ExperimentSource, key: Key, configuration: dict[str, Any], units: Sequence[str]
+) -> Iterator[str]:
+    """Undefined links, and units that send by links and are undefined or not the configuration's."""
+    link, members = configuration.get("link"), configuration.get("units")
+    own = _list_modelled_units(source.data) if members == "all" else members
+    heard = [str(one) for one in own] if isinstance(own, list) else [TRUTH] if members == TRUTH else [*units, TRUTH]
     links = _mapping_names(source.data.get("links"))
     by_unit = isinstance(link, dict) and "kind" not in link
     for unit, name in link.items() if isinstance(link, dict) and by_unit else [(None, link)]:
         if by_unit and str(unit) not in [*units, "default", "truth"]:
             yield source.at((*key, str(unit)), unknown_name_message("unit", unit, [*units, "default"]))
+        elif by_unit and str(unit) not in [*heard, "default"]:
+            message = f"the configuration has no unit {str(unit)!r} to send by a link (units: {', '.join(heard)})"
+            yield source.at((*key, str(unit)), f"{message}; add it to `units`, or leave it out here")
         if _is_name(name) and str(name) not in [*links, "none"]:
             choices = f"there {'are' if len(links) > 1 else 'is'} {', '.join(links) or 'none'}"
             yield source.at((*key, str(unit)) if by_unit else key, f"no link {str(name)!r} ({choices})")

@@ -6,8 +6,10 @@ not read.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Self
 
@@ -15,9 +17,23 @@ import numpy as np
 
 from copem_replay.communication.arrivals import receiver_instants
 from copem_replay.communication.link import sample_arrivals
+from copem_replay.communication.radio import Radio
+from copem_replay.communication.reception import RadioPath, ReceptionModel, ask_reception_probability
 from copem_replay.core.errors import count_noun
 from copem_replay.core.interpolation import wrap_angles
-from copem_replay.core.tracks import CLASSES, SAME_INSTANT_S, TRUTH, WHOLE, Bool, Scene, Solid, Tracks, class_indices
+from copem_replay.core.tracks import (
+    CLASS_GROUPS,
+    CLASSES,
+    SAME_INSTANT_S,
+    TRUTH,
+    WHOLE,
+    Bool,
+    Float,
+    Scene,
+    Solid,
+    Tracks,
+    class_indices,
+)
 from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.experiment.drive import resolve_for_log, settings_notes
 from copem_replay.experiment.schema import Experiment, ideal_over, output_unit
@@ -30,9 +46,10 @@ from copem_replay.perception.config import Carriers
 from copem_replay.perception.observation import interpolate_worlds
 from copem_replay.perception.pem.model import ObjectSidePlace, Pem
 from copem_replay.perception.sensor_poses import UnitPoses
+from copem_replay.pipeline.expansion import ExpandedExperiment
 from copem_replay.pipeline.receiver import hear_units, perceive_all_units
 from copem_replay.pipeline.sweep import describe_unswept
-from copem_replay.pipeline.world import WorldChunk
+from copem_replay.pipeline.world import WorldChunk, asks_for_path
 
 if TYPE_CHECKING:
     from copem_replay.pipeline.prepare import Replay
@@ -192,6 +209,7 @@ def study_notes(
     notes += describe_unswept(experiment)
     notes += _find_unused_memory(experiment)
     notes += notes_on_output_regret(experiment)
+    notes += _find_empty_classes(recordings, experiment)
     return notes
 
 
@@ -209,6 +227,24 @@ def _group_by_log(notes: Iterable[tuple[str, str]]) -> list[str]:
         elif log == first[0]:
             lines.append(f"{', '.join(first)} and {count_noun(more, 'other log')}: {note}")
     return lines
+
+
+def _find_empty_classes(recordings: Sequence[Recording], experiment: Experiment) -> Iterator[str]:
+    """Measured classes that are named like their group and select nobody, though the group would: `vehicle`."""
+    selects, others = Counter[str](), Counter[str]()  # by class, all logs together: the measured objects, and the rest
+    asked: dict[str, None] = {}
+    for recording in recordings:
+        scene = recording.scene
+        classes = resolve_for_log(experiment, scene.log).measure.objects.classes or ()
+        asked |= dict.fromkeys(classes)
+        there = scene.object_class[np.arange(len(scene.object_class)) != scene.ego_ix]
+        measured = np.isin(there, class_indices(classes))
+        selects.update(CLASSES[k] for k in there[measured])
+        others.update(CLASSES[k] for k in there[~measured])
+    for group, members in CLASS_GROUPS.items():
+        name, more = group.removesuffix("s"), ", ".join(f"{others[one]} {one}" for one in members if others[one])
+        if name in asked and name in CLASSES and not selects[name] and more:
+            yield f"measure.objects.classes: no object is a {name!r}; `{group}` would select {more}"
 
 
 def _find_unused_memory(experiment: Experiment) -> Iterator[str]:
@@ -239,7 +275,8 @@ def list_oddities(replay: Replay, experiment: Experiment, met: Bool | None = Non
     for name, unit in experiment.units.items():
         if isinstance(unit.on, Carriers) and name not in replay.expanded.named:
             yield f"unit {name}: the log has no object to carry it ({', '.join(unit.on.classes)})"
-    yield from _find_clock_errors(experiment)
+    yield from _find_ignored_errors(experiment)
+    yield from _find_dead_links(replay, experiment)
     yield from _find_missing_hosts(replay, experiment)
     end_s = replay.scene.end_s
     for name, configuration in experiment.configurations.items():
@@ -249,12 +286,68 @@ def list_oddities(replay: Replay, experiment: Experiment, met: Bool | None = Non
             yield f"configuration {name}: the latency of {', '.join(late)} is longer than the log"
 
 
-def _find_clock_errors(experiment: Experiment) -> Iterator[str]:
-    """Configurations whose fusion knows the true captures although the clock of a unit is off."""
+def _find_ignored_errors(experiment: Experiment) -> Iterator[str]:
+    """Configurations whose fusion knows the true captures and ids although a clock is off, or a unit has ghosts."""
     for name, configuration in experiment.configurations.items():
-        off = [unit for unit in experiment.units_of(configuration) if experiment.units[unit].clock is not None]
-        if off and isinstance(configuration.fusion, IdealFusion):
+        if not isinstance(configuration.fusion, IdealFusion):
+            continue
+        units = {unit: experiment.units[unit] for unit in experiment.units_of(configuration)}
+        off = [unit for unit, made in units.items() if made.clock is not None]
+        if off:
             yield f"configuration {name}: ideal fusion uses true captures, ignoring clock errors of {', '.join(off)}"
+        ghostly = [unit for unit, made in units.items() if made.pem is not None and experiment.pems[made.pem].ghosts]
+        if ghostly:
+            yield f"configuration {name}: ideal fusion uses truth ids, ignoring ghosts of {', '.join(ghostly)}"
+
+
+_LOST = 0.001
+"""With a reception below this at every list of a unit its link is as good as down: hardly one of 1000 lists arrives."""
+_DRAWS = (1e-9, 0.5, 1 - 1e-9)
+"""Numbers that a reception model is handed in place of drawn ones: both ends, one of them the best, and the middle."""
+
+
+def _find_dead_links(replay: Replay, experiment: Experiment) -> Iterator[str]:
+    """Links that lose all lists of a unit, whatever is drawn."""
+    units = replay.expanded.with_(experiment)
+    best_of: dict[tuple[str, str], float] = {}
+    for name, configuration in units.configurations.items():
+        members = units.units_of(configuration) or (TRUTH,)
+        for of in units.links_of(name):
+            if isinstance(of.link, Radio) and of.link.loses:
+                senders = [unit for unit in members if of.units is None or unit in of.units]
+                for sender, best in _find_best_receptions(replay, units, of.link.reception, senders, of.where):
+                    best_of[of.where, sender] = max(best, best_of.get((of.where, sender), 0.0))
+    for (where, sender), best in best_of.items():
+        if best < _LOST:
+            yield f"{where}: no list of {sender} arrives, its reception is {'at most ' * (best > 0)}{best:.1g}"
+
+
+def _find_best_receptions(
+    replay: Replay, units: ExpandedExperiment, reception: ReceptionModel, senders: Sequence[str], where: str
+) -> Iterator[tuple[str, float]]:
+    """Units that send by a link, by their names in the experiment, and the highest reception of any list of each."""
+    named = dict(zip(units.units, units.named, strict=True))
+    if not reception.by_path:
+        best = _ask_best_reception(reception, RadioPath(np.full(1, np.nan), np.full(1, np.nan)), where)
+        yield from ((named.get(sender, sender), float(best[0])) for sender in senders)
+    elif asks_for_path(units, replay.scene):
+        best = _ask_best_reception(reception, replay.paths, where)
+        for sender in senders:
+            lists = replay.senders == sender
+            if lists.any():
+                yield named.get(sender, sender), float(best[lists].max())
+
+
+def _ask_best_reception(reception: ReceptionModel, path: RadioPath, where: str) -> Float:
+    """(F,) the highest reception of each list, whatever is drawn."""
+    lists = len(path.distance_m)
+
+    def give(drawn: float, name: str, *, lasts_s: float | None = None) -> Float:
+        return np.full((1, lists), drawn)
+
+    asked = [ask_reception_probability(reception, path, partial(give, drawn), f"{where}.reception") for drawn in _DRAWS]
+    best: Float = np.max(asked, axis=0)
+    return best
 
 
 def _find_missing_hosts(replay: Replay, experiment: Experiment) -> Iterator[str]:

@@ -364,8 +364,16 @@ class Replay:
     @cached_property
     def paths(self) -> RadioPath:
         """The radio path of each list of all units to the ego."""
-        lists = perceive_all_units(self.lists_only(self.expanded.written), np.zeros(1, dtype=np.int64), states="true")
-        return find_radio_paths(self.rows_of(np.array([self.scene.ego_ix])), self.scene, self.expanded, lists)
+        return find_radio_paths(self.rows_of(np.array([self.scene.ego_ix])), self.scene, self.expanded, self._lists)
+
+    @property
+    def senders(self) -> np.ndarray:
+        """(F,) the unit of each list of all units, by name."""
+        return np.array(self._lists.units)[self._lists.frame_unit_ix]
+
+    @cached_property
+    def _lists(self) -> Tracks:
+        return perceive_all_units(self.lists_only(self.expanded.written), np.zeros(1, dtype=np.int64), states="true")
 
 
 def prepare_log(recording: Recording, experiment: Experiment, *, onsets_of: Experiment | None = None) -> Replay:

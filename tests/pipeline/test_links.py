@@ -406,3 +406,22 @@ def test_a_link_that_there_is_not() -> None:
         "experiment: configurations.coop.link: no link 'v2y' (there is v2x)",
         "experiment: configurations.two.link.nobody: no unit is named 'nobody'; there are ego, east, west, default",
     ]
+
+
+def test_a_link_for_a_unit_that_the_configuration_lacks() -> None:
+    data = plan("v2x").as_written()
+    data["units"]["box"] = {"recorded": {"topic": "box"}}
+    data["configurations"] = {
+        "coop": {"units": ["east"], "link": {"east": "v2x", "west": "v2x", "default": "none"}},
+        "all": {"units": "all", "link": {"ego": "none", "east": "v2x", "box": "v2x"}},
+        "truth": {"units": "truth", "link": {"truth": "v2x", "ego": "v2x"}},
+        "no truth": {"units": ["ego", "box"], "link": {"truth": "v2x", "box": "v2x"}},
+    }
+    ending = "; add it to `units`, or leave it out here"
+    start, what = "experiment: configurations", "the configuration has no unit"
+    assert [line for line in find_problems(filed(data))[1] if "link" in line] == [
+        f"{start}.coop.link.west: {what} 'west' to send by a link (units: east){ending}",
+        f"{start}.all.link.box: {what} 'box' to send by a link (units: ego, east, west){ending}",
+        f"{start}.truth.link.ego: {what} 'ego' to send by a link (units: truth){ending}",
+        f"{start}.no truth.link.truth: {what} 'truth' to send by a link (units: ego, box){ending}",
+    ]

@@ -17,8 +17,10 @@ from copem_replay.pipeline import notes
 from copem_replay.pipeline.notes import list_notes
 from copem_replay.pipeline.prepare import Replay, prepare_log
 from copem_replay.pipeline.run import run_experiment
+from tests.helpers import scenes
 from tests.helpers.experiments import TEXT, changed, drive, source_of
 from tests.helpers.recordings import Obj, write_recording
+from tests.helpers.scenes import Thing, experiment, standing
 
 MAST = "  mast: {{at: {at}, yaw_deg: {yaw}, height_m: 5.0, pem: onboard}}"
 
@@ -259,3 +261,105 @@ class TestMemory:
         assert memory.free_bytes() == 7 * 1024
         files.clear()
         assert memory.free_bytes() is None
+
+
+# ------------------------------------------------------------------------------- what is seen by nobody, or by nothing
+
+
+SURE = {"detection": {"kind": "constant", "probability": 1.0}}
+NEAR = {"kind": "field", "range_m": [5, 30]}
+
+
+def street(**changes: Any) -> list[str]:
+    """Notes on a car, a truck and a pedestrian that stand some 50 m from a mast, the ego 100 m from it, in two configurations."""
+    things = [
+        Thing("ego", "car", standing(100, 0)),
+        Thing("a", "car", standing(50, 0)),
+        Thing("b", "truck", standing(60, 0)),
+        Thing("c", "pedestrian", standing(55, 5)),
+    ]
+    mast = {"at": [0, 0], "height_m": 5, "pem": "eye"}
+    data: dict[str, Any] = {
+        "pems": {"eye": [SURE], "haunted": {"couples": [SURE], "ghosts": [{"in_list": 0.5, "where": NEAR}]}},
+        "units": {"mast": mast, "ego": {"on": "ego", "pem": "eye"}},
+        "configurations": {"ideal": {"units": "all"}, "gnn": {"units": "all", "fusion": {"kind": "gnn"}}},
+        "measure": {"onset": {"kind": "appears"}},
+    }
+    plan = experiment(**(data | changes))
+    recording = scenes.recording(things, until_s=1.0)
+    found = list_notes([recording], [prepare_log(recording, plan)], plan, replayed=False)
+    assert [note for note in run_experiment(plan, [recording]).notes if not note.startswith("no interval")] == found
+    return found
+
+
+HAUNTED = {
+    "mast": {"at": [0, 0], "height_m": 5, "pem": "haunted"}, "ego": {"on": "ego", "pem": "eye"},
+    "mast2": {"at": [9, 9], "height_m": 5, "pem": "haunted"},
+}  # fmt: skip
+
+
+def test_ideal_fusion_shows_no_ghosts_and_is_said_not_to() -> None:
+    said = "scene: configuration ideal: ideal fusion uses truth ids, ignoring ghosts of mast, mast2"
+    assert street(units=HAUNTED) == [said]
+    assert street(units=HAUNTED, configurations={"gnn": {"units": "all", "fusion": {"kind": "gnn"}}}) == []
+    assert street(units=HAUNTED, configurations={"ego": {"units": ["ego"]}}) == []
+    assert street() == []
+
+
+TABLE = {"kind": "table", "distance_m": [0, 99, 99.1], "probability": [1, 1, 0]}  # the ego is 100 m from the mast
+
+
+@pytest.mark.parametrize(
+    ("reception", "lost"),
+    [
+        ({"kind": "constant", "probability": 0.0}, {"mast": "0", "ego": "0"}),
+        ({"kind": "constant", "probability": 0.0005}, {"mast": "at most 0.0005", "ego": "at most 0.0005"}),
+        ({"kind": "constant", "probability": 0.002}, {}),
+        ({"kind": "gilbert_elliott", "bad_share": 1.0, "bad_lasts_s": 1.0}, {"mast": "0", "ego": "0"}),
+        ({"kind": "gilbert_elliott", "bad_share": 0.999, "bad_lasts_s": 1.0}, {}),  # now and then it is good
+        (
+            {"kind": "gilbert_elliott", "bad_share": 0.5, "bad_lasts_s": 1.0, "good_loss": 1.0},
+            {"mast": "0", "ego": "0"},
+        ),
+        ({"kind": "gilbert_elliott", "bad_share": 0.5, "bad_lasts_s": 1.0, "good_loss": 1.0, "bad_loss": 0.9}, {}),
+        (TABLE, {"mast": "0"}),  # the ego's own lists have no way to go
+        (TABLE | {"distance_m": [0, 101, 102]}, {}),
+        # 10 · 2 · lg(1 / 100) = −40 dB of 10 dB: Φ(−4) = 3.2e-5.
+        ({"kind": "shadowing", "half_at_m": 1, "exponent": 2.0, "sigma_db": 10}, {"mast": "at most 3e-05"}),
+    ],
+)
+def test_a_link_that_loses_everything_is_said(reception: dict[str, Any], lost: dict[str, str]) -> None:
+    both = {"units": "all", "link": "radio"}
+    found = street(
+        links={"radio": {"reception": reception}},
+        configurations={"one": both, "other": both | {"fusion": {"kind": "gnn"}}, "wired": {"units": "all"}},
+    )
+    assert found == [
+        f"scene: links.radio: no list of {unit} arrives, its reception is {best}" for unit, best in lost.items()
+    ]
+
+
+def test_only_the_units_that_send_by_it_are_lost() -> None:
+    dead = {"kind": "radio", "reception": {"kind": "constant", "probability": 0.0}}
+    own = {"one": {"units": "all", "link": {"mast": "radio"}}, "truth": {"units": "truth", "link": dead}}
+    assert street(links={"radio": dead, "unused": dead}, configurations=own) == [
+        "scene: links.radio: no list of mast arrives, its reception is 0",
+        "scene: configurations.truth.link: no list of truth arrives, its reception is 0",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("classes", "said"),
+    [
+        (
+            ["vru", "vehicle"],
+            ["measure.objects.classes: no object is a 'vehicle'; `vehicles` would select 1 car, 1 truck"],
+        ),
+        (["car", "vehicle"], ["measure.objects.classes: no object is a 'vehicle'; `vehicles` would select 1 truck"]),
+        (["vehicles", "vehicle"], []),
+        (["car"], []),
+        (None, []),
+    ],
+)
+def test_a_class_that_is_named_like_its_group(classes: list[str] | None, said: list[str]) -> None:
+    assert street(measure={"onset": {"kind": "appears"}, "objects": {"classes": classes}}) == said
