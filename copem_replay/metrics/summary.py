@@ -240,6 +240,8 @@ def _split_by_configuration(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
 # Tables as plain text, nothing cut off: whole in a pipe, in blocks that fit the width of a terminal.
 
 _GAP = "  "
+RARE = ("left_undetected_share", "open_share")
+"""Columns that the table has only where one is above 0."""
 SETUP = ("n", "list_rate_hz", "n_conflict")
 """Columns of the set-up, not of results: written once, below the table, where all configurations are alike."""
 
@@ -275,6 +277,7 @@ def format_summary(summary: pd.DataFrame, width: int | None = None) -> str:
 def _part_lines(summary: pd.DataFrame, part: str, width: int | None, share: str = "") -> list[str]:
     """The columns of a part, the limits of its share beside it; below them the set-up that all have alike."""
     names = ["configuration", *(metric.name for metric in METRICS if metric.part == part and metric.name in summary)]
+    names = [name for name in names if name not in RARE or (summary[name] > 0).any()]
     alike = {name: format_cell(summary[name].iloc[0]) for name in names if name in SETUP and _is_alike(summary[name])}
     names = [name for name in names if name not in alike]
     if share:

@@ -141,6 +141,44 @@ def estimate_detected_share(inputs: MetricInputs) -> ShareEstimate:
     return _estimate_share(inputs.rows, np.where(_is_known(inputs.rows), runs, 0), fixed=inputs.lists_fixed)
 
 
+@dataclass(frozen=True)
+class UnknownTimes:
+    """How long objects are unknown, and what became of those that are never detected.
+
+    `mean_s`: mean seconds from the onset to the detection or to the end of the episode, 0 where the object was known
+    before. `left_share`: of the rows, those whose object left undetected; `open_share`: those still undetected when the
+    ego or the log ended, of which what would have come later is not known. All None without rows.
+    """
+
+    mean_s: float | None = None
+    left_share: float | None = None
+    open_share: float | None = None
+
+
+def _measure_unknown(rows: pd.DataFrame, known: Bool, weight: Float) -> UnknownTimes:
+    """Of rows (n,) that count by their `weight (n,)`; `known (n,)`: which are detected."""
+    total = float(weight.sum())
+    if not total:
+        return UnknownTimes()
+    unknown_s = compute_unknown_s(*(rows[name].to_numpy(dtype=float) for name in ("detection_s", "onset_s", "ended_s")))
+    left = is_competing(rows["ended_by"]) & ~known
+    return UnknownTimes(
+        float(weight @ unknown_s) / total,
+        float(weight[left].sum()) / total,
+        float(weight[~known & ~left].sum()) / total,
+    )
+
+
+def compute_unknown_s(detection_s: Float, onset_s: Float, ended_s: Float) -> Float:
+    """(n,) seconds from the onset to the detection, NaN for never, or the end of the episode; not below 0."""
+    return np.maximum(np.fmin(detection_s, ended_s) - onset_s, 0.0)
+
+
+def measure_unknown(inputs: MetricInputs) -> UnknownTimes:
+    """How long objects are unknown in the rows of the tally."""
+    return _measure_unknown(inputs.rows, _is_known(inputs.rows), inputs.rows["runs"].to_numpy(dtype=float))
+
+
 def estimate_foreseen_share(inputs: MetricInputs) -> float | None:
     """The share of the rows in which a list implies a collision; NaN without rows."""
     if inputs.conflicts is None:
@@ -163,6 +201,7 @@ class ExactStatistics:
 
     share: float | None
     times: DetectionStatistics
+    unknown: UnknownTimes
     missed: dict[str, float | None]
 
 
@@ -177,12 +216,13 @@ def summarise_exact(inputs: MetricInputs) -> ExactStatistics | None:
         return None
     missed = _summarise_missed(part[part["detection_s"].isna()])
     if not len(part):
-        return ExactStatistics(None, _detection_statistics(part, np.empty(0, dtype=bool), np.empty(0), None), missed)
+        times = _detection_statistics(part, np.empty(0, dtype=bool), np.empty(0), None)
+        return ExactStatistics(None, times, UnknownTimes(), missed)
     part = part[part["probability"] > 0]
     weight = part["probability"].to_numpy(dtype=float)
     known = part["detection_s"].notna().to_numpy()
     times = _detection_statistics(part, known, weight, inputs.horizon_s, 1 / int(inputs.rows["runs"].sum()))
-    return ExactStatistics(weight[known].sum() / weight.sum(), times, missed)
+    return ExactStatistics(weight[known].sum() / weight.sum(), times, _measure_unknown(part, known, weight), missed)
 
 
 def _summarise_missed(never: pd.DataFrame) -> dict[str, float | None]:
@@ -268,6 +308,13 @@ _DETECTION_METRICS = (
            "mean time to detection, never detected counting as the horizon", "summary",
            "mean time to detection, never detected counting as the horizon"),
     Metric("ttd_rmst_horizon_s", summarise_detections, lambda of: of.horizon_s, 0, "the horizon of ttd_rmst_s"),
+    Metric("unknown_s", measure_unknown, lambda of: of.mean_s, -1,
+           "mean seconds from the onset to the detection or the end of the episode; needs no horizon", "summary",
+           "mean seconds unknown, to the detection or the end of the episode"),
+    Metric("left_undetected_share", measure_unknown, lambda of: of.left_share, -1,
+           "share of the rows whose object left undetected: never detected", "summary"),
+    Metric("open_share", measure_unknown, lambda of: of.open_share, 0,
+           "share of the rows still undetected when the log or the ego ended: censored", "summary"),
     Metric("dad_median_m", summarise_detections, lambda of: of.distance_quantile_m(0.5), 1, _DISTANCE, "summary",
            "median of the differences of distances at detection"),
     Metric("dad_p5_m", summarise_detections, lambda of: of.distance_quantile_m(0.05), 1,
@@ -311,6 +358,7 @@ _EXACT_METRICS = (
     _exact_metric("ttd_median_s", lambda of: of.times.quantile_s(0.5), -1),
     _exact_metric("ttd_p95_s", lambda of: of.times.quantile_s(0.95), -1),
     _exact_metric("ttd_rmst_s", lambda of: of.times.mean_s(), -1),
+    _exact_metric("unknown_s", lambda of: of.unknown.mean_s, -1),
     _exact_metric("dad_median_m", lambda of: of.times.distance_quantile_m(0.5), 1),
     _exact_metric("dad_p5_m", lambda of: of.times.distance_quantile_m(0.05), 1),
     _exact_missed("miss_log10", "log₁₀ of the mean probability that an episode misses its object"),

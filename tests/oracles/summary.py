@@ -25,7 +25,21 @@ def figures(rows: pd.DataFrame, horizon_s: float, prefix: str = "") -> dict[str,
         f"{prefix}ttd_p95_s": quantile_time(*incidence, 0.95),
         f"{prefix}ttd_rmst_s": restricted_mean(*incidence, horizon_s),
     }
+    if not prefix:
+        found |= unknown(rows)
     for name, q in (("dad_median_m", 0.5), ("dad_p5_m", 0.05)):
         if placed.any() and (not prefix or q == 0.5):
             found[prefix + name] = quantile_with_never(away_m[placed], known[placed], q)
     return found
+
+
+def unknown(rows: pd.DataFrame) -> dict[str, float | None]:
+    """How long objects are unknown, row by row, and what became of those that are never detected."""
+    unknown_s, left, still_there = 0.0, 0, 0
+    for row in rows.itertuples():
+        until_s = min(row.detection_s, row.ended_s) if row.detected else row.ended_s
+        unknown_s += max(until_s - row.onset_s, 0.0)
+        left += not row.detected and CODES[row.ended_by] == 2
+        still_there += not row.detected and CODES[row.ended_by] == 0
+    return {"unknown_s": unknown_s / len(rows), "left_undetected_share": left / len(rows),
+            "open_share": still_there / len(rows)}  # fmt: skip

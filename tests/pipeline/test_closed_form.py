@@ -415,6 +415,7 @@ class TestByHand:
         """E min(T, 1 s) = Σ 0.1 s · P(T > 0.1 k s), k = 0 … 9: 0.1 · (1 − 2⁻¹⁰)."""
         row = run_experiment(masts(1), [one_walker()]).summary.iloc[0]
         assert row["ttd_rmst_s_exact"] == pytest.approx(0.1 * (1 - 2**-10), abs=1e-15)
+        assert row["unknown_s_exact"] == pytest.approx(0.1 * (1 - 2**-10), abs=1e-15)  # its end is the horizon
         assert row["ttd_rmst_horizon_s"] == 1
 
     @pytest.mark.parametrize("count", [1, 2, 3, 7])
@@ -478,7 +479,7 @@ class TestByHand:
             assert rows["probability"].tolist() == [1]
             assert rows["detection_s"].isna().all()
             row = run_experiment(plan, [one_walker()]).summary.iloc[0]
-            assert (row["detected_share_exact"], row["ttd_rmst_s_exact"]) == (0, 1)
+            assert (row["detected_share_exact"], row["ttd_rmst_s_exact"], row["unknown_s_exact"]) == (0, 1, 1)
 
     def test_nothing_to_look_at(self) -> None:
         plan = masts(1, measure={"onset": {"kind": "in_range", "range_m": 5}, "exact": True})

@@ -14,6 +14,7 @@ from scipy.stats import binomtest
 from copem_replay.core.errors import InputError
 from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_incidence, restricted_mean
 from copem_replay.results.compare import Comparison, compare_folders
+from copem_replay.results.compare.tables import comparison_text
 from copem_replay.results.read import open_results
 from tests.helpers.compare_folders import BRAKING, Row, limits_of, row, write_folder
 
@@ -73,6 +74,38 @@ def test_who_was_still_there_is_censored(tmp_path):
     assert (time["value"], time["baseline_value"], time["difference"]) == (6.0, 3.5, 2.5)
     away = [row("ideal", 1.0, 30.0, ended_s=4.0), row("late", None, ended_s=4.0), *others]
     assert of(compared(tmp_path / "away", away), "ttd_rmst_s")["value"] == 8.0
+
+
+def test_times_of_both_are_of_those_that_both_detect_and_say_who_is_missing(tmp_path):
+    """.5 s later, whatever the horizon and however many are never detected; of three rows one is the ideal's alone."""
+    for horizon_s in (1.25, 20.0):
+        folder = tmp_path / str(horizon_s)
+        comparison = compared(folder, THREE, measure={"horizon_s": horizon_s})
+        time = of(comparison, "ttd_both_s")
+        assert (time["value"], time["baseline_value"], time["difference"], time["n"]) == (1.5, 1.0, 0.5, 1)
+        assert (time["only_configuration"], time["only_baseline"]) == (0, 1)
+        assert pd.isna(time["p_value"])
+        assert "+0.5 (only it 0 %, only the baseline 33.3 %)" in comparison_text(comparison)
+    nobody = of(compared(tmp_path, [*THREE[:1], row("late", None)]), "ttd_both_s")
+    assert pd.isna(nobody["difference"])
+    assert (nobody["n"], nobody["only_baseline"]) == (0, 1)
+
+
+def test_unknown_until_the_detection_or_the_end_of_the_episode(tmp_path):
+    """Episodes from 2 to 10, 2 to 6 and 2 to 3 s, whatever ends them; one is known before, one after the end."""
+    rows = [
+        row("ideal", 3.0, 30.0, onset_s=2.0),
+        row("ideal", None, object_id="8", onset_s=2.0, ended_s=6.0),
+        row("ideal", 1.0, 30.0, object_id="9", onset_s=2.0, ended_s=3.0),
+        row("late", None, onset_s=2.0, ended_by="log_end"),
+        row("late", 6.5, 20.0, object_id="8", onset_s=2.0, ended_s=6.0),
+        row("late", 2.5, 20.0, object_id="9", onset_s=2.0, ended_s=3.0),
+    ]
+    unknown = of(compared(tmp_path, rows, measure={"horizon_s": 0.5}), "unknown_s")
+    assert unknown["baseline_value"] == pytest.approx((1 + 4 + 0) / 3)
+    assert unknown["value"] == pytest.approx((8 + 4 + 0.5) / 3)
+    assert unknown["difference"] == pytest.approx((7 + 0 + 0.5) / 3)
+    assert unknown["n"] == 3
 
 
 def test_times_count_from_the_onset(tmp_path):
@@ -225,7 +258,10 @@ def test_few_objects_have_no_interval_and_that_is_said(tmp_path):
     comparison = compared(tmp_path, [r for k in range(4) for r in pairs_of([(1.0, 0.0)] * 50, object_id=str(k))])
     assert comparison.table["low"].isna().all()
     assert comparison.table["interval_over"].isna().all()
-    assert any("no interval of detected_share, ttd_rmst_s, dad_median_m" in note for note in comparison.notes)
+    assert any(
+        "no interval of detected_share, ttd_rmst_s, ttd_both_s, unknown_s, dad_median_m" in note
+        for note in comparison.notes
+    )
 
 
 def test_a_single_run_of_a_single_object_has_no_interval(tmp_path):
@@ -296,7 +332,7 @@ def test_rows_are_in_the_order_of_logs_configurations_and_metrics(tmp_path):
     table = compared(tmp_path, random_rows(["ideal", "z", "b"])).table
     assert table["log"].drop_duplicates().tolist() == ["all", "log0", "log1"]
     assert table["configuration"].drop_duplicates().tolist() == ["z", "b"]
-    assert table["metric"].tolist() == ["detected_share", "ttd_rmst_s", "dad_median_m"] * 6
+    assert table["metric"].tolist() == ["detected_share", "ttd_rmst_s", "ttd_both_s", "unknown_s", "dad_median_m"] * 6
     assert (table["baseline"] == "ideal").all()
 
 

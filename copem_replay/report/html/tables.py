@@ -31,7 +31,7 @@ from copem_replay.report.html.markup import (
     make_table,
     make_tag,
 )
-from copem_replay.results.compare.metrics import LIKE
+from copem_replay.results.compare.metrics import LIKE, OF_PAIRS
 from copem_replay.results.compare.metrics import METRICS as COMPARED
 from copem_replay.results.compare.tables import NOTHING, comparison_lines, explain_no_interval, held_cells
 
@@ -49,6 +49,10 @@ _HEADERS = {
     "ttd_median_s": "median time to detection, s",
     "ttd_p95_s": "95 % detected by, s",
     "ttd_rmst_s": "mean time to detection, s",
+    "ttd_both_s": "mean time where both detect, s",
+    "unknown_s": "mean time unknown, s",
+    "left_undetected_share": "left undetected, %",
+    "open_share": "undetected at the end, %",
     "ttd_rmst_s_equal_ghosts": "mean time at equal false positives, s",
     "dad_median_m": "median distance at detection, m",
     "dad_p5_m": "95 % detected beyond, m",
@@ -254,9 +258,7 @@ def _column_meanings(columns: Iterable[tuple[str, str]], names: Any = column_hea
     return make_tag("dl", *terms)
 
 
-_WORDS = {name: METRIC[LIKE.get(name, name)].compared for name in COMPARED} | {
-    "ttd_rmst_s_equal_ghosts": "the same at as many false positives per minute as the baseline has",
-}
+_WORDS = {name: METRIC[LIKE.get(name, name)].compared for name in COMPARED} | OF_PAIRS
 
 
 _LISTS = ("position_rmse_held_m", "gospa_held_m", "false_positives_per_min")

@@ -584,7 +584,8 @@ def _make_row(
     if "only" in figure.items.columns:
         only = figure.items["only"].sum(axis=0)
         row |= {"only_configuration": int(only[0]), "only_baseline": int(only[1])}
-        row["p_value"] = mcnemar_p_value(int(only[0]), int(only[1])) if len(figure.items["n"]) else None
+    if figure.share and len(figure.items["n"]):
+        row["p_value"] = mcnemar_p_value(*map(int, figure.items["only"].sum(axis=0)))
     if regret.held is not None:
         row |= regret.held.columns()
     if regret.kept is not None:

@@ -128,7 +128,7 @@ class ClusterIndex:
     def count_objects(self, items: StatisticItems) -> Float:
         """(K,) objects with items in each cluster; runs where clusters are runs."""
         cluster, by = self.of(items), "objects" if self.over != "runs" else "runs"
-        counted = (cluster >= 0) & (items[by] >= 0)
+        counted = (cluster >= 0) & (items[by] >= 0) & (items["n"] > 0)
         pairs = np.unique(np.stack([cluster[counted], items[by][counted]]), axis=1)
         return np.bincount(pairs[0], minlength=len(self.names)).astype(float)
 
@@ -136,7 +136,8 @@ class ClusterIndex:
 def index_clusters(items: StatisticItems, over: str, names: ClusterNames) -> ClusterIndex | None:
     """The logs, objects or runs with items, in the order of their names; None: too few have the figure."""
     all_names = {"logs": names.logs, "objects": names.objects, "runs": [str(run) for run in range(names.runs)]}[over]
-    present = sorted(np.unique(items[over][items[over] >= 0]).tolist(), key=lambda k: all_names[k])
+    counted = items[over][(items[over] >= 0) & (items["n"] > 0)]
+    present = sorted(np.unique(counted).tolist(), key=lambda k: all_names[k])
     if len(present) < (FEWEST_LOGS if over == "logs" else FEWEST_CLUSTERS):
         return None
     number = np.full(len(all_names) + 1, -1, dtype=np.int64)
@@ -170,13 +171,15 @@ def mcnemar_p_value(only_first: int, only_second: int) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class PairStatistic(ABC):
-    """A figure of two configurations. Items of shares have `only (i, 2)`: whether only the first, or second, succeeded.
+    """A figure of two configurations. Items may have `only (i, 2)`: whether only the first, or second, succeeded.
 
-    `by_object`: whether the items are known by object, so that objects can be clusters.
+    `by_object`: whether the items are known by object, so that objects can be clusters. `share`: whether the figure is
+    a share of the items, which then have `only`.
     """
 
     parts: tuple[StatisticItems, ...]
     by_object: bool = True
+    share: bool = False
 
     @property
     def items(self) -> StatisticItems:
@@ -218,7 +221,7 @@ class PairStatistic(ABC):
         if np.abs(without - difference).max() > _SAME:
             low, high = limit_figure(difference, without, weights, self.bounds)
             return JACKKNIFE, float(low), float(high)
-        if "only" not in self.items.columns:
+        if not self.share:
             return ALL_ALIKE, math.nan, math.nan
         return EXACT, *alike_limits(difference, self.weights(clusters))
 
@@ -270,7 +273,7 @@ class SumStatistic(PairStatistic):
     @property
     def bounds(self) -> tuple[float, float]:
         """−1 and 1 for a difference of shares."""
-        return (-1.0, 1.0) if "only" in self.items.columns else super().bounds
+        return (-1.0, 1.0) if self.share else super().bounds
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,6 +5,8 @@ Rows are paired by log, object and run, what is held by frame; differences are f
 
 *ttd_rmst_s*: the difference of the two restricted means over the rows that both have; never detected counts as the
 horizon, an object still there when observation ends is censored.
+*ttd_both_s*: the difference of the mean times to detection over the rows that both detect. It says nothing of the rows
+that one alone detects; their numbers stand beside it.
 *dad_median_m*: the median of the differences, not the difference of the medians. Never detected is below every
 distance, so it differs infinitely from a distance, and not at all from never.
 *position_rmse_held_m*: over the frames of the truth at which both hold an entry about the object, from the first frame
@@ -29,7 +31,7 @@ from numpy.typing import NDArray
 
 from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import Bool, Float, Int
-from copem_replay.metrics.summary_metrics import METRIC
+from copem_replay.metrics.summary_metrics import METRIC, compute_unknown_s
 from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT
 from copem_replay.results.compare.labels import LabelledConfiguration
 from copem_replay.results.compare.limits import (
@@ -201,14 +203,20 @@ def notes_on_equal_ghosts(reasons: Mapping[str, str | None]) -> Iterator[str]:
 
 
 LIKE = {
+    "ttd_both_s": "ttd_rmst_s",
     "ttd_rmst_s_equal_ghosts": "ttd_rmst_s",
     "position_rmse_held_m": "position_rmse_m",
     "gospa_held_m": "gospa_m",
 }
 """Metrics that the summary does not have, and those of it that they are like."""
+OF_PAIRS = {
+    "ttd_both_s": "mean time to detection over the rows that both detect; beside it those that one alone detects",
+    "ttd_rmst_s_equal_ghosts": "the same at as many false positives per minute as the baseline has",
+}
+"""Words of metrics that are not those of the one they are like."""
 METRICS = {name: METRIC[LIKE.get(name, name)].better for name in (
-    "detected_share", "ttd_rmst_s", "ttd_rmst_s_equal_ghosts", "dad_median_m", "position_rmse_held_m", "gospa_held_m",
-    "false_positives_per_min", "pass_share",
+    "detected_share", "ttd_rmst_s", "ttd_both_s", "unknown_s", "ttd_rmst_s_equal_ghosts", "dad_median_m",
+    "position_rmse_held_m", "gospa_held_m", "false_positives_per_min", "pass_share",
 )}  # fmt: skip
 """All metrics, and whether more (1) or less (−1) is better."""
 
@@ -319,6 +327,20 @@ def _detection_regrets(pair: _Pair) -> Iterator[Regret]:
     )
     times = [((1.0, side.detection_s),) for side in pair.sides]
     yield Regret("ttd_rmst_s", _restricted_means(pair, times))
+    yield Regret("ttd_both_s", _both_detected(pair))
+    unknown_s = [compute_unknown_s(side.detection_s, side.onset_s, side.ended_s)[pair.cells] for side in pair.sides]
+    sums = np.stack([*unknown_s, np.ones(len(pair.cells))], axis=1)
+    yield Regret("unknown_s", SumStatistic(parts=(pair.items(pair.cells, sums=sums),), of=_divide_mean))
+
+
+def _both_detected(pair: _Pair) -> SumStatistic:
+    """Mean times to detection of the cells that both sides detect; `only`: the cells that one side alone does."""
+    first, second = (side.detected[pair.cells] for side in pair.sides)
+    both = first & second
+    times_s = (side.detection_s[pair.cells] - side.onset_s[pair.cells] for side in pair.sides)
+    sums = np.stack([*(np.where(both, time_s, 0.0) for time_s in times_s), both.astype(float)], axis=1)
+    only = np.stack([first & ~second, second & ~first], axis=1).astype(np.int64)
+    return SumStatistic(parts=(pair.items(pair.cells, n=both.astype(np.int64), only=only, sums=sums),), of=_divide_mean)
 
 
 def _equal_ghosts_regrets(pair: _Pair) -> Iterator[Regret]:
@@ -418,7 +440,7 @@ def _braking_regrets(pair: _Pair) -> Iterator[Regret]:
 def _share_statistic(pair: _Pair, cells: Int, first: Bool, second: Bool) -> SumStatistic:
     only = np.stack([first & ~second, second & ~first], axis=1).astype(np.int64)
     sums = np.stack([first, second, np.ones(len(cells))], axis=1)
-    return SumStatistic(parts=(pair.items(cells, only=only, sums=sums),), of=_divide_mean)
+    return SumStatistic(parts=(pair.items(cells, only=only, sums=sums),), of=_divide_mean, share=True)
 
 
 def _append_run_items(pair: _Pair, cells: Int, of_cells: Float, of_runs: Float, n: Int) -> StatisticItems:
@@ -445,7 +467,7 @@ def _divide_rates(sums: Float) -> tuple[Float, Float]:
 
 
 _METRICS = {
-    ("detected_share", "ttd_rmst_s"): _detection_regrets,
+    ("detected_share", "ttd_rmst_s", "ttd_both_s", "unknown_s"): _detection_regrets,
     ("ttd_rmst_s_equal_ghosts",): _equal_ghosts_regrets,
     ("dad_median_m",): _distance_regrets,
     ("position_rmse_held_m", "gospa_held_m"): _held_regrets,

@@ -85,7 +85,22 @@ def _format_cells(comparison: Comparison) -> pd.DataFrame:
     columns: dict[str, list[str]] = {"configuration": list(comparison.configurations)}
     for metric in metrics:
         columns[metric] = [_format_cell(rows.get((name, metric))) for name in comparison.configurations]
+    if "ttd_both_s" in columns:
+        alone = [format_alone(comparison, name) for name in comparison.configurations]
+        columns["ttd_both_s"] = [
+            f"{cell} {words}".strip() for cell, words in zip(columns["ttd_both_s"], alone, strict=True)
+        ]
     return pd.DataFrame(columns)
+
+
+def format_alone(comparison: Comparison, configuration: str) -> str:
+    """What `ttd_both_s` leaves out: `(only it 5.4 %, only the baseline 0 %)` of the rows; empty: not compared."""
+    of_pair = comparison.overall[comparison.overall["configuration"] == configuration].set_index("metric")
+    if not {"ttd_both_s", "detected_share"} <= set(of_pair.index) or not of_pair.loc["detected_share", "n"]:
+        return ""
+    row, rows = of_pair.loc["ttd_both_s"], int(of_pair.loc["detected_share", "n"])
+    shares = (100 * row[name] / rows for name in ("only_configuration", "only_baseline"))
+    return "(only it {:.3g} %, only the baseline {:.3g} %)".format(*shares)
 
 
 def _format_cell(row: Any) -> str:
