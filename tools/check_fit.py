@@ -157,6 +157,17 @@ def fitted_to(path: Path) -> cr.FittedPem:
     return cr.FittedPem(study.experiment, study.recordings, fit_unit(study.experiment, study.recordings, "rsu", how))
 
 
+def fitted_unit(logs: Sequence[str], **how: Any) -> cr.FittedPem:
+    """The model of the recorded roadside unit by some of its trials."""
+    unit = {"at": [0, 0], "height_m": 5, "recorded": {"topic": "mcity.RSU.SensorData"}}
+    plan = {
+        "version": 1, "logs": list(logs), "ego": "none", "units": {"rsu": unit},
+        "configurations": {"recorded": {"units": ["rsu"]}},
+        "measure": {"onset": {"kind": "appears"}, "distance_to": "rsu"},
+    }  # fmt: skip
+    return cr.fit(plan, "rsu", **how)
+
+
 def declared(fitted: cr.FittedPem, pem: Mapping[str, Any], outages: Mapping[str, float]) -> dict[str, float]:
     """By the name of an estimate the number that was put in, of all that there is one for."""
     [couple], [ghosts], memory = pem["couples"], pem["ghosts"], pem["memory"]

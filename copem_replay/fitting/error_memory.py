@@ -119,9 +119,12 @@ def sum_whitened_moments(
 
 
 @nb.njit(cache=True)
-def sum_squared_correlations(decay: Float, new: Bool, bin_ix: Int, bins: int, drift: float, constant: float) -> Float:
-    """(B,) Σ ρ² over all pairs of rows of a bin, a row with itself as 1: a variance has n² over it effective rows."""
-    out = np.zeros(bins)
+def sum_correlations(decay: Float, new: Bool, bin_ix: Int, bins: int, drift: float, constant: float) -> Float:
+    """(2, B) Σ ρ and Σ ρ² over all pairs of rows of a bin, a row with itself as 1.
+
+    A mean is worth n² over the first effective rows, a variance n² over the second.
+    """
+    out = np.zeros((2, bins))
     once, twice, count = np.zeros(bins), np.zeros(bins), np.zeros(bins)
     for t in range(len(decay)):
         if new[t]:
@@ -134,8 +137,9 @@ def sum_squared_correlations(decay: Float, new: Bool, bin_ix: Int, bins: int, dr
                 once[b] *= f
                 twice[b] *= f * f
         b = bin_ix[t]
+        out[0, b] += 1.0 + 2.0 * (drift * once[b] + constant * count[b])
         pairs = drift * drift * twice[b] + 2 * drift * constant * once[b] + constant * constant * count[b]
-        out[b] += 1.0 + 2.0 * pairs
+        out[1, b] += 1.0 + 2.0 * pairs
         once[b] += 1.0
         twice[b] += 1.0
         count[b] += 1.0
@@ -146,6 +150,8 @@ def sum_squared_correlations(decay: Float, new: Bool, bin_ix: Int, bins: int, dr
 
 _ODDS = 8.0
 """Log-odds beyond which a share counts as none, or all."""
+_LEAST = 1e-3
+"""A share below this is a bound that the search has met, and no part of its own."""
 _FEWEST = 12
 """Rows below which no memory is fitted: three parameters, and a scale and a mean of each column."""
 _ENOUGH = 10_000
@@ -294,7 +300,9 @@ def fit_error_memory(z: Float, series: ResidualSeries, *, centred: bool, interva
         "drift": _unpack_drift(drift),
     }
     models["both"] = shares_of_both
-    chosen = next(name for name, allowed in _ALLOWED.items() if likelihoods["both"] - likelihoods[name] <= allowed)
+    chosen = next(name for name, allowed in ALLOWED.items() if likelihoods["both"] - likelihoods[name] <= allowed)
+    if chosen == "both" and min(shares_of_both.drift, shares_of_both.constant) < _LEAST:
+        chosen = "drift" if shares_of_both.constant < _LEAST else "constant"
     fit = ErrorMemoryFit(models[chosen], (), likelihoods)
     return _add_intervals(fit, of, (both, highest), bounds, (n, count)) if intervals else fit
 
@@ -315,7 +323,7 @@ def _polish_fit(
         drift, likelihoods["drift"] = maximise_likelihood(
             lambda x: of(_unpack_drift(x)), [start], [bounds[0], bounds[2]]
         )
-        shares = _unpack_drift(drift) if highest - likelihoods["drift"] <= _ALLOWED["drift"] else shares
+        shares = _unpack_drift(drift) if highest - likelihoods["drift"] <= ALLOWED["drift"] else shares
     fit = ErrorMemoryFit(shares, (), likelihoods)
     return _add_intervals(fit, of, (both, highest), bounds, (len(z), int(series.new.sum()))) if intervals else fit
 
@@ -327,7 +335,7 @@ def _bound_parameters(series: ResidualSeries) -> list[tuple[float, float]]:
     return [(-_ODDS, _ODDS), (-_ODDS, _ODDS), (shortest, max(np.log(20 * max(longest_s, 1e-3)), shortest + 1))]
 
 
-_ALLOWED = {"none": 3.907, "constant": 2.996, "drift": DROP, "both": 0.0}
+ALLOWED = {"none": 3.907, "constant": 2.996, "drift": DROP, "both": 0.0}
 """By how much the log-likelihood of a simpler model may be less: half of the 95 % quantile of χ²₃, χ²₂ and χ²₁."""
 
 

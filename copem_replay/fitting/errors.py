@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2, t
+from scipy.stats import t
 
 from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import Bool, Float, Int
@@ -20,7 +20,7 @@ from copem_replay.fitting.error_memory import (
     ResidualSeries,
     fit_error_memory,
     refit_error_memory,
-    sum_squared_correlations,
+    sum_correlations,
     whiten_series,
 )
 from copem_replay.fitting.estimate import (
@@ -32,163 +32,19 @@ from copem_replay.fitting.estimate import (
     held_out_possible,
     round_digits,
 )
+from copem_replay.fitting.moments import (
+    ErrorBin,
+    RangeBin,
+    estimate_bin,
+    estimate_variance,
+    find_bin,
+    fit_moments,
+    lag_one_correlation,
+    range_bins,
+    share_bins,
+)
 from copem_replay.fitting.pose import PoseFit
 from copem_replay.fitting.rows import FitLists, FitRows
-
-# Moments: means and covariances by bins of range and visible share, under a memory, shrunk towards the pooled ones.
-
-EFFECTIVE_ROWS = 20
-"""Independent rows that a bin holds at least: a standard deviation is then known to about 16 %."""
-MOST_BINS = 5
-"""Bins of range at most: errors change slowly with range. More: a longer PEM, each number from fewer rows."""
-_WHOLE = 0.95
-"""Visible share from which on an object counts as wholly visible: it is 1 only up to rounding and small overlaps."""
-_STRENGTHS = np.geomspace(4, 1e5, 60)
-"""Degrees of freedom of the inverse Wishart prior that are tried; with 3 or fewer it has no mean."""
-_RIDGE = 1e-3
-"""Rows that every bin borrows from the mean of all: an empty bin has this mean."""
-
-
-@dataclass(frozen=True)
-class RangeBin:
-    """Where one covariance holds: an interval of range, and of visible share where bins are split by it."""
-
-    range_m: tuple[float, float]
-    visible_share: tuple[float, float] | None = None
-
-    @property
-    def when(self) -> dict[str, Any]:
-        """The condition of a couple."""
-        when = {"range_m": list(self.range_m)}
-        return when if self.visible_share is None else when | {"visible_share": list(self.visible_share)}
-
-
-@dataclass(frozen=True)
-class Moments:
-    """Moments by bin: `mean_m (B, 2)`, `covariance_m2 (B, 2, 2)`, rows `n (B,)`, and their precision (B,).
-
-    `of_mean`: the variance of the mean as a share of the covariance. `freedom`: degrees of freedom of the covariance.
-    """
-
-    mean_m: Float
-    covariance_m2: Float
-    n: Int
-    of_mean: Float
-    freedom: Float
-
-    def standardised(self, error_m: Float, bin_ix: Int) -> Float:
-        """(n, 2) standardised errors: L⁻¹ (e − mean) by the bin of each row."""
-        first, below, second = _factorise(self.covariance_m2)
-        rest = error_m - self.mean_m[bin_ix]
-        z = rest[:, 0] / first[bin_ix]
-        return np.column_stack([z, (rest[:, 1] - below[bin_ix] * z) / second[bin_ix]])
-
-    def log_determinant(self) -> Float:
-        """(B,) ln |L|."""
-        first, _, second = _factorise(self.covariance_m2)
-        log: Float = np.log(first * second)
-        return log
-
-
-def _factorise(covariance: Float) -> tuple[Float, Float, Float]:
-    """Cholesky factors of (B, 2, 2), as the replayed model has them: first, below, second, (B,) each."""
-    first = np.sqrt(covariance[:, 0, 0])
-    below = covariance[:, 0, 1] / first
-    return first, below, np.sqrt(np.maximum(covariance[:, 1, 1] - below**2, 1e-12))
-
-
-def range_bins(view: ViewGeometry, worth: float, edges_m: tuple[float, ...] | None = None) -> tuple[RangeBin, ...]:
-    """Bins of range with about equal numbers of rows, as many as EFFECTIVE_ROWS allows; `worth`: effective per row."""
-    far_m = float(np.ceil(10 * view.range_m.max()) / 10)
-    if edges_m is None:
-        count = int(np.clip(len(view.range_m) * worth / EFFECTIVE_ROWS, 1, MOST_BINS))
-        inner = np.round(np.quantile(view.range_m, np.arange(1, count) / count), 1)
-        edges_m = tuple(float(edge) for edge in inner)
-    inside = [edge for edge in sorted(set(edges_m)) if 0 < edge < far_m]
-    return tuple(RangeBin(pair) for pair in zip([0.0, *inside], [*inside, far_m], strict=True))
-
-
-def share_bins(bins: tuple[RangeBin, ...], view: ViewGeometry, worth: float) -> tuple[RangeBin, ...]:
-    """Bins split at the median visible share of partly hidden objects, where both halves hold enough rows."""
-    hidden = view.visible_share[view.visible_share < _WHOLE]
-    if len(hidden) * worth < EFFECTIVE_ROWS:
-        return bins
-    median_share = float(np.round(np.median(hidden), 2))
-    out: list[RangeBin] = []
-    bin_ix = find_bin(view, bins)
-    for b, range_bin in enumerate(bins):
-        low = (view.visible_share[bin_ix == b] <= median_share).sum() * worth
-        enough = min(low, (bin_ix == b).sum() * worth - low) >= EFFECTIVE_ROWS
-        out += (
-            [RangeBin(range_bin.range_m, (0.0, median_share)), RangeBin(range_bin.range_m, (median_share, 1.0))]
-            if enough
-            else [range_bin]
-        )
-    return tuple(out)
-
-
-def find_bin(view: ViewGeometry, bins: tuple[RangeBin, ...]) -> Int:
-    """(P,) the first bin that holds each row, bounds included, as couples apply; without any the last bin."""
-    out = np.full(len(view.range_m), len(bins) - 1)
-    for b in reversed(range(len(bins))):
-        low, high = bins[b].range_m
-        holds = (view.range_m >= low) & (view.range_m <= high)
-        if (share := bins[b].visible_share) is not None:
-            holds &= (view.visible_share >= share[0]) & (view.visible_share <= share[1])
-        out[holds] = b
-    return out
-
-
-def fit_moments(error_m: Float, bin_ix: Int, bins: int, series: ResidualSeries, shares: MemoryShares) -> Moments:
-    """Means by generalised least squares under a memory, covariances by moments, shrunk to the pooled one.
-
-    A covariance is that of the residuals, over the number of rows reduced by the uncertainty of their mean; its degrees
-    of freedom are n² / Σ ρ². It is shrunk by an inverse Wishart prior whose mean is the pooled covariance, with the
-    strength that makes all bins most probable: similar bins become equal, others stay.
-    """
-    n = np.bincount(bin_ix, minlength=bins)
-    design = (bin_ix[:, None] == np.arange(bins)).astype(float)
-    centre = error_m.mean(axis=0)
-    covariance = np.repeat(np.cov(error_m.T, bias=True)[None] + 1e-9 * np.eye(2), bins, axis=0)
-    pairs = sum_squared_correlations(
-        series.decay(shares.tau_s), series.new, bin_ix, bins, shares.drift, shares.constant
-    )
-    for _ in range(2):
-        plain = Moments(np.repeat(centre[None], bins, axis=0), covariance, n, pairs, pairs)
-        out, _ = whiten_series(np.column_stack([plain.standardised(error_m, bin_ix), design]), series, shares)
-        of_design = np.linalg.inv(out[:, 2:].T @ out[:, 2:] + _RIDGE * np.eye(bins))
-        first, below, second = _factorise(covariance)
-        m = of_design @ (out[:, 2:].T @ out[:, :2])
-        mean = centre + np.column_stack([first * m[:, 0], below * m[:, 0] + second * m[:, 1]])
-        of_mean = np.minimum(np.diag(of_design), 0.9)
-        rest = error_m - mean[bin_ix]
-        left = np.maximum(n * (1 - of_mean), 1.0)
-        freedom = np.maximum(n.astype(float) ** 2 / np.maximum(pairs, 1.0) * (1 - of_mean), 1e-3)
-        moments = np.array([rest[bin_ix == b].T @ rest[bin_ix == b] for b in range(bins)]) / left[:, None, None]
-        covariance, freedom = _shrink_covariances(moments, freedom)
-    return Moments(mean, covariance, n, of_mean, freedom)
-
-
-def _shrink_covariances(covariance: Float, freedom: Float) -> tuple[Float, Float]:
-    """Covariances (B, 2, 2) shrunk towards the pooled one, and their degrees of freedom (B,)."""
-    from scipy.special import multigammaln
-
-    pooled = (covariance * freedom[:, None, None]).sum(axis=0) / freedom.sum() + 1e-9 * np.eye(2)
-    if len(freedom) == 1:
-        return covariance + 1e-9 * np.eye(2), freedom
-    scatter = covariance * freedom[:, None, None]
-
-    def evidence(strength: float) -> float:
-        prior = (strength - 3) * pooled
-        both = strength + freedom
-        gammas = multigammaln(both / 2, 2) - multigammaln(strength / 2, 2)
-        dets = strength * np.log(np.linalg.det(prior)) - both * np.log(np.linalg.det(prior + scatter))
-        return float((gammas + dets / 2).sum())
-
-    strength = max(_STRENGTHS, key=evidence)
-    shrunk = ((strength - 3) * pooled + scatter) / (strength - 3 + freedom)[:, None, None]
-    return shrunk, np.minimum(freedom + strength, freedom.sum())
-
 
 # Fits of errors.
 
@@ -199,15 +55,6 @@ _REVERSED, _STILL_MPS = 0.05, 1.0
 """Share from which on entries that point backwards are no outliers, and speed below which an entry does not count as
 backwards: there its sign is noise."""
 _ONE, _RANGE, _SHARE, _MEMORY = "one covariance", "by range", "by range and visible share", " + memory"
-
-
-@dataclass(frozen=True)
-class ErrorBin:
-    """One couple's error: where it holds, the mean (m), and the covariance's entries (m²) xx, xy and yy."""
-
-    where: RangeBin
-    mean_m: tuple[Estimate, Estimate]
-    covariance_m2: tuple[Estimate, Estimate, Estimate]
 
 
 @dataclass(frozen=True)
@@ -308,7 +155,7 @@ def fit_errors(
     los_m = errors["line_of_sight"]
     z = fit_moments(los_m, everything, 1, series, MemoryShares()).standardised(los_m, everything)
     start = fit_error_memory(z, series, centred=True, intervals=False).shares
-    worth = 1 / float(fit_moments(los_m, everything, 1, series, start).of_mean[0]) / len(listed)
+    worth = float(fit_moments(los_m, everything, 1, series, start).freedom.min()) / len(listed)
     candidates = _list_candidates(entries.view, worth, edges_m)
     trial = _ModelTrial(entries, series, worth, simplest)
     wide = list(candidates.values())[-1]
@@ -319,16 +166,16 @@ def fit_errors(
     name, bins = list(candidates.items())[bins_ix]
     bin_ix = find_bin(entries.view, bins)
     memory = _fit_error_memory(error_m, bin_ix, len(bins), series, start)
-    last_ix, last = trial.choose({name: (error_m, bins, None), name + _MEMORY: (error_m, bins, memory.shares)})
-    if last_ix == 0:
-        instead = memory.untold or f"no better on passes held out ({last[1].words()})"
-        memory = ErrorMemoryFit(log_likelihood=memory.log_likelihood, untold=instead)
+    _, last = trial.choose({name: (error_m, bins, None), name + _MEMORY: (error_m, bins, memory.shares)})
+    if simplest and memory.parts:
+        memory = ErrorMemoryFit(log_likelihood=memory.log_likelihood, untold="the simplest model was asked for")
+    last = tuple(replace(rung, chosen=k == bool(memory.parts)) for k, rung in enumerate(last))
     moments = fit_moments(error_m, bin_ix, len(bins), series, memory.shares)
     spreads, lasting, untold = _fit_spreads(entries, simplest=simplest)
     if memory.untold is not None:
         untold = {"memory.position": memory.untold} | untold
     return ErrorFit(
-        frame, tuple(_estimate_bin(one, moments, b) for b, one in enumerate(bins)),
+        frame, tuple(estimate_bin(one, moments, b) for b, one in enumerate(bins)),
         spreads["yaw"], spreads["speed"], spreads["size"],
         {"position": memory.parts} | lasting, memory.shares, _measure_shape(moments.standardised(error_m, bin_ix)),
         listed, bin_ix, (*(rung for rung in ladder if not rung.chosen), *last), frames, untold,
@@ -431,26 +278,6 @@ class _ModelTrial:
         return scored_
 
 
-def _estimate_bin(where: RangeBin, moments: Moments, b: int) -> ErrorBin:
-    (xx, xy), (_, yy) = moments.covariance_m2[b]
-    n, worth, freedom = int(moments.n[b]), 1 / float(moments.of_mean[b]), float(moments.freedom[b])
-    quantile = t.ppf(0.975, max(worth - 1, 1))
-    means = [
-        Estimate(float(value), float(value - quantile * error), float(value + quantile * error), n, worth)
-        for value, error in zip(moments.mean_m[b], np.sqrt(np.array([xx, yy]) / worth), strict=True)
-    ]
-    half_width = 1.96 * np.sqrt((xx * yy + xy**2) / freedom)
-    between = Estimate(float(xy), float(xy - half_width), float(xy + half_width), n, freedom)
-    return ErrorBin(
-        where, (means[0], means[1]), (_estimate_variance(xx, n, freedom), between, _estimate_variance(yy, n, freedom))
-    )
-
-
-def _estimate_variance(value: float, n: int, freedom: float) -> Estimate:
-    low, high = freedom * value / chi2.ppf([0.975, 0.025], max(freedom, 1.0))
-    return Estimate(float(value), float(low), float(high), n, freedom)
-
-
 def _explain_no_gaussian(listed: NDArray[Any], backwards: Bool) -> str | None:
     """Why errors of a listed field (n,) are no Gaussian: the field is constant, or often points backwards."""
     finite = np.isfinite(listed)
@@ -476,9 +303,10 @@ def _fit_spread(
     memory = ErrorMemoryFit() if simplest else fit_error_memory(values[finite] / sigma, series, centred=False)
     shares = memory.shares
     zeros = np.zeros(n, dtype=np.int64)
-    pairs = sum_squared_correlations(series.decay(shares.tau_s), series.new, zeros, 1, shares.drift, shares.constant)
-    freedom = C * n**2 / float(pairs[0])
-    square = _estimate_variance(sigma**2, C * n, freedom)
+    _, twice = sum_correlations(series.decay(shares.tau_s), series.new, zeros, 1, shares.drift, shares.constant)
+    phi = np.mean([lag_one_correlation(column, series.new) for column in values[finite].T])
+    freedom = C * min(n**2 / float(twice[0]), n * (1 - phi**2) / (1 + phi**2))
+    square = estimate_variance(sigma**2, C * n, freedom)
     return (
         Estimate(sigma, float(np.sqrt(square.low)), float(np.sqrt(square.high)), C * n, freedom),
         memory.parts,

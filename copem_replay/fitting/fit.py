@@ -18,7 +18,7 @@ from copem_replay.core.errors import InputError, count_noun
 from copem_replay.core.yaml import CommentedValue, strip_comments
 from copem_replay.experiment.schema import Experiment
 from copem_replay.fitting.detection import DetectionCouple, DetectionFit, fit_detection
-from copem_replay.fitting.errors import ErrorBin, ErrorFit, fit_errors, remove_pose
+from copem_replay.fitting.errors import ErrorFit, fit_errors, remove_pose
 from copem_replay.fitting.estimate import PER_ROW, Estimate
 from copem_replay.fitting.gather import (
     LONGEST_S,
@@ -30,6 +30,7 @@ from copem_replay.fitting.gather import (
     raw_lists,
     view_log,
 )
+from copem_replay.fitting.moments import ErrorBin
 from copem_replay.fitting.pose import DelayFit, unit_delay
 from copem_replay.fitting.replay_check import StatisticCheck, remove_memory, replay_check
 from copem_replay.fitting.rest import RestFit, fit_rest

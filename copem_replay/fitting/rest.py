@@ -11,7 +11,7 @@ from scipy.special import expit
 from scipy.stats import beta, f
 
 from copem_replay.core.tracks import CLASSES, Float, Int
-from copem_replay.fitting.error_memory import LastingPart, ResidualSeries, sum_squared_correlations
+from copem_replay.fitting.error_memory import LastingPart, ResidualSeries, sum_correlations
 from copem_replay.fitting.errors import build_series
 from copem_replay.fitting.estimate import Estimate, Note, drop_note, maximise_likelihood, profile_limits, round_digits
 from copem_replay.fitting.false_positives import GhostsFit, estimate_duration, fit_ghosts, garwood_interval, log_classes
@@ -84,7 +84,7 @@ def fit_classes(rows: FitRows, series: ResidualSeries) -> ClassesFit:
             ),
         )  # fmt: skip
     half = np.sqrt(series.decay(tau_s))
-    pairs = sum_squared_correlations(half, series.new, true, len(CLASSES), share, 0.0)
+    _, pairs = sum_correlations(half, series.new, true, len(CLASSES), share, 0.0)
     confusion = {}
     for k in np.flatnonzero(counts.sum(axis=1)):
         n = int(counts[k].sum())

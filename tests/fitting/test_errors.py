@@ -108,6 +108,29 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
     assert np.mean(held) >= 0.88  # four standard errors below 0.95 of 160 numbers
 
 
+def test_memory_is_declined_only_where_white_noise_is_not_refused() -> None:
+    """Three passes drift and one is white: held out memory is no better, and yet errors last."""
+    rows, lists = rows_of(2, passes=4, lists_each=150, memory=(0.9, 4.0, 0.0), mean_m=(0.0, 0.0), folds=4)
+    white_m = np.random.default_rng(2).normal(0, 0.6, (2, len(rows.log))) + np.where(rows.listed, 0.0, np.nan)
+    along_m, across_m = np.where(rows.pass_ix == 3, white_m, (rows.along_m, rows.across_m))
+    cos, sin = np.cos(rows.view.bearing_rad), np.sin(rows.view.bearing_rad)
+    mixed = replace(
+        rows, along_m=along_m, across_m=across_m,
+        east_m=cos * along_m - sin * across_m, north_m=sin * along_m + cos * across_m,
+    )  # fmt: skip
+    fit = fit_errors(mixed, lists)
+    without, with_memory = fit.ladder[-2:]
+    assert without.score > with_memory.score
+    assert with_memory.chosen
+    assert fit.memory["position"]
+    simplest = fit_errors(mixed, lists, simplest=True)
+    assert not simplest.memory["position"]
+    for mean in (*fit.bins[0].mean_m, *simplest.bins[0].mean_m):
+        assert mean.n_effective < 100
+    white, lists = rows_of(2, passes=4, lists_each=150, memory=(0.0, 1.0, 0.0))
+    assert not fit_errors(white, lists).memory["position"]
+
+
 def test_bins_and_frame_are_chosen_where_they_explain_more() -> None:
     rows, lists = rows_of(5, passes=40, spread=lambda r: (0.1 + 0.02 * r, 0.1 + 0.005 * r), memory=(0.3, 0.3, 0.0))
     fit = fit_errors(rows, lists, edges_m=(20.0,))

@@ -70,6 +70,16 @@ def test_no_outage_is_said() -> None:
     assert fit.down_share.words() == "not identifiable: 0 of 99 gaps are longer than 2.5 medians"
 
 
+def test_outages_by_hand() -> None:
+    """96 gaps of .1 s, then .3, .4, .4 and .5 s: 2 + 3 + 3 + 4 lists are missing.
+
+    Beyond two they go on 4 times of 8, so 4/½ outages begin in 100 gaps, and ½ of a list each ends: .08/(.08 + .5).
+    """
+    gaps_s = np.array([0.1] * 96 + [0.3, 0.4, 0.4, 0.5])
+    fit = fit_list_times(_lists(np.append(0.0, np.cumsum(gaps_s))))
+    assert fit.down_share.value == pytest.approx(0.08 / 0.58)
+
+
 def _confused(seed: int, share: float, tau_s: float, wrong: float, passes: int = 40) -> FitRows:
     rows, _ = rows_of(seed, passes=passes, listed=1.0)
     rng = np.random.default_rng(seed + 1000)
@@ -96,6 +106,20 @@ def test_classes_and_their_memory_are_found_again() -> None:
         held += _holds(row[CLASSES[4]], 0.15), _holds(part.share, 0.8), _holds(part.correlation_s, 0.5)
     assert (held >= 12).all()
     assert fit.keys()["confusion"][CLASSES[3]].keys() == {CLASSES[3], CLASSES[4]}
+
+
+def test_a_class_counts_for_as_many_rows_as_its_memory_leaves() -> None:
+    """n²/Σ s² e^(−Δ/τ) over all pairs of rows of a pass, a row with itself as 1."""
+    rows = _confused(3, 0.8, 0.5, 0.15, passes=6)
+    fit = fit_classes(rows, build_series(rows))
+    [part] = fit.memory
+    assert not isinstance(part.correlation_s, str)
+    apart_s = np.abs(rows.captured_s[:, None] - rows.captured_s)
+    pairs = part.share.value**2 * np.exp(-apart_s / part.correlation_s.value)
+    pairs *= rows.pass_ix[:, None] == rows.pass_ix
+    np.fill_diagonal(pairs, 1.0)
+    found = fit.confusion[CLASSES[3]][CLASSES[4]]
+    assert found.n_effective == pytest.approx(len(rows.log) ** 2 / pairs.sum(), rel=1e-6)
 
 
 def test_classes_that_are_never_mistaken() -> None:
