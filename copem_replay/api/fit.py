@@ -94,19 +94,9 @@ def fill_fit_folder(place: ResultsPlace, fitted: FittedPem) -> None:
 
 
 def _write_page(path: Path, found: Fit) -> None:
-    from copem_replay.fitting.diagnostics import FitStudy
-    from copem_replay.fitting.page import fit_page, list_estimates
+    from copem_replay.fitting.page import fit_page
 
-    gathered, parts, checks = found.gathered, found.parts, found.checks
-    study = FitStudy(
-        found.unit, found.logs, gathered.rows, gathered.lists, parts.detection, parts.errors, parts.rest,
-        found.delay.seconds, dict(list_estimates(found)),
-        {check.statistic: check.pit for check in (checks.fitted if checks else ())},
-        {check.statistic: check.pit for check in (checks.memoryless if checks else ())},
-        {check.statistic: check.verdict for check in (checks.fitted if checks else ())},
-        found.said,
-    )  # fmt: skip
-    path.write_text(fit_page(study), encoding="utf-8")
+    path.write_text(fit_page(found), encoding="utf-8")
 
 
 def _write_places(path: Path, found: Fit) -> None:
@@ -166,7 +156,15 @@ def check_fit_options(
 
 
 def read_study_to_fit(source: ExperimentSource, unit: str) -> LoadedStudy:
-    """An experiment and its recordings; the lists of `unit` need no stated covariance, for the fit estimates it."""
+    """An experiment and its recordings; the lists of `unit` need no stated covariance, for the fit estimates it.
+
+    Raises InputError: the experiment has no such unit.
+    """
+    units = source.data.get("units")
+    if isinstance(units, dict) and unit not in units:
+        recorded = [name for name, keys in units.items() if isinstance(keys, dict) and "recorded" in keys]
+        names = ", ".join(recorded) or "none"
+        raise InputError(f"unit {unit}: expected a unit whose lists are recorded ({names}), found no such unit")
     return read_study(replace(source, data=_add_covariance(source.data, unit)))
 
 

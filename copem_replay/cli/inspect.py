@@ -106,7 +106,8 @@ def check(
 ) -> int:
     """Report every problem of an experiment, with file and line.
 
-    It reports all problems at once, and checks the experiment against its recordings, too.
+    It reports all problems at once, and checks the experiment against its recordings, too. Of recorded units it says
+    what `fit` would say.
     """
     from copem_replay.api.study import prepare_study, read_study
 
@@ -115,6 +116,11 @@ def check(
 
     replays, warnings = prepare_study(study)
     print_notes([*list_notes(study.recordings, replays, study.experiment, replayed=False), *warnings])
+    if study.experiment.recorded:
+        from copem_replay.fitting.fit import preview_fit
+
+        for unit in study.experiment.recorded:
+            print_notes(preview_fit(study.experiment, study.recordings, unit))
     print_line(f"{experiment}: no problem found; logs: {', '.join(r.scene.log for r in study.recordings)}")
     return 0
 

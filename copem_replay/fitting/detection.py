@@ -189,6 +189,14 @@ class DetectionCouple:
         conditions = {"classes": self.classes, "azimuth_deg": self.azimuth_deg}
         return {name: list(value) for name, value in conditions.items() if value is not None}
 
+    def place_words(self, i: int, j: int) -> str:
+        """Where the probability at range i and visible share j holds, in words."""
+        parts = [f"at {self.range_m[i]:g} m"] if len(self.range_m) > 1 else ["within reach"]
+        parts += [f"visible share {self.visible_share[j]:g}"] if len(self.visible_share) > 1 else []
+        parts += [", ".join(self.classes)] if self.classes else []
+        parts += ["azimuth {:g} to {:g}°".format(*self.azimuth_deg)] if self.azimuth_deg else []
+        return ", ".join(parts)
+
     def detection(self) -> dict[str, Any]:
         """The detection model as the experiment file has it."""
         values = [[_round_probability(one.value) for one in row] for row in self.probability]

@@ -126,13 +126,19 @@ def remove_pose(fit: ErrorFit, placed: PoseFit) -> ErrorFit:
         parts = (0.0, 1.0) if fit.frame == "line_of_sight" else (0.5, 0.5)
         first, between, second = one.covariance_m2
         xx, yy = (
-            replace(of, **{name: max(getattr(of, name) - shift_m2 - part * turned_m2, of.value / 20)
-                           for name in ("value", "low", "high")})
-            for of, part in zip((first, second), parts, strict=True)
-        )  # fmt: skip
+            _remove_variance(of, shift_m2 + part * turned_m2) for of, part in zip((first, second), parts, strict=True)
+        )
         most = np.sqrt(xx.value * yy.value / (first.value * second.value))
         bins.append(replace(one, covariance_m2=(xx, replace(between, value=between.value * min(most, 1.0)), yy)))
     return replace(fit, bins=tuple(bins))
+
+
+def _remove_variance(of: Estimate, pose_m2: float) -> Estimate:
+    """A variance less that of the pose, and a twentieth of it at least; then the data leave open what it is."""
+    least = of.value / 20
+    value, low, high = (max(one - pose_m2, least) for one in (of.value, of.low, of.high))
+    why = "the pose of the unit explains nearly all of it" if value == least and of.why is None else of.why
+    return replace(of, value=value, low=0.0 if why else low, high=high, why=why)
 
 
 def fit_errors(

@@ -35,12 +35,15 @@ class Estimate:
     """`value` with its 95 % interval, from `n` observations that are worth `n_effective` independent ones.
 
     `n_effective` NaN: not known. `why`: why the data do not determine the number; then `value` is what is used instead,
-    and `low` and `high` bound what the data leave open (NaN: no bound). `chosen`: set, not estimated.
+    and `low` and `high` bound what the data leave open (NaN: no bound). `chosen`: set, not estimated. Without an
+    observation a number is not identifiable, whatever its value.
 
     >>> Estimate(0.9, 0.85, 0.94, n=400, n_effective=120.0).words()
     '0.9 (95 %: 0.85 … 0.94, n 400, effective 120)'
     >>> Estimate(1.0, why="no miss in 161 lists").words()
     'not identifiable: no miss in 161 lists'
+    >>> Estimate(0.0315, 0.0315, 0.0315, n=40, n_effective=40.0).words()
+    '0.0315 (the same in all 40)'
     """
 
     value: float
@@ -51,14 +54,22 @@ class Estimate:
     why: str | None = None
     chosen: bool = False
 
+    def __post_init__(self) -> None:
+        if self.n == 0 and self.why is None and not self.chosen:
+            object.__setattr__(self, "why", "no rows")
+
     def words(self) -> str:
-        """The estimate in words, as files and the report have it."""
+        """The estimate in words, as files and the report have it: with so many digits that its limits differ."""
         if self.why is not None:
             return f"not identifiable: {self.why}"
         if self.chosen:
             return "chosen"
+        if self.low == self.high:
+            return f"{self.value:.3g} (the same in all {self.n})"
+        digits = next((k for k in range(3, 10) if f"{self.low:.{k}g}" != f"{self.high:.{k}g}"), 10)
         effective = "" if math.isnan(self.n_effective) else f", effective {self.n_effective:.3g}"
-        return f"{self.value:.3g} (95 %: {self.low:.3g} … {self.high:.3g}, n {self.n}{effective})"
+        value, low, high = (f"{one:.{digits}g}" for one in (self.value, self.low, self.high))
+        return f"{value} (95 %: {low} … {high}, n {self.n}{effective})"
 
 
 # Maximum likelihood over a few numbers, and profile intervals.

@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from copem_replay.core.errors import InputError, count_noun
+from copem_replay.core.tracks import CLASSES
 from copem_replay.core.yaml import CommentedValue, strip_comments
 from copem_replay.experiment.schema import Experiment
 from copem_replay.fitting.detection import DetectionCouple, DetectionFit, fit_detection
@@ -32,7 +33,7 @@ from copem_replay.fitting.gather import (
 )
 from copem_replay.fitting.moments import ErrorBin
 from copem_replay.fitting.pose import DelayFit, unit_delay
-from copem_replay.fitting.replay_check import StatisticCheck, remove_memory, replay_check
+from copem_replay.fitting.replay_check import FEWEST_PASSES, StatisticCheck, remove_memory, replay_check
 from copem_replay.fitting.rest import RestFit, fit_rest
 from copem_replay.fitting.rows import FitLists
 from copem_replay.io.recording import Recording
@@ -141,8 +142,12 @@ class ReplayChecks:
 
     @property
     def fails(self) -> bool:
-        """Whether any statistic is too often outside of what the model gives; Bonferroni over their number."""
-        return any(one.verdict == "too sure" and one.p * len(self.fitted) < SURE for one in self.fitted)
+        """Whether any statistic is too often outside of what the model gives."""
+        return any(self.refuses(one) for one in self.fitted)
+
+    def refuses(self, one: StatisticCheck) -> bool:
+        """Whether a statistic contradicts the model, over as many as there are (Bonferroni)."""
+        return one.verdict == "too sure" and one.p * len(self.fitted) < SURE
 
     def lines(self) -> Iterator[str]:
         """A line per statistic."""
@@ -183,6 +188,48 @@ class Fit:
         more += [f"no memory of detection: {why}" for why in (self.parts.detection.memory_why,) if why is not None]
         more += [f"another gate: {line}" for line in self.gates]
         return (*self.notes, *more)
+
+
+def judge_use(fit: Fit) -> str:
+    """What the model may be used for and what not, in one sentence."""
+    low_m, high_m = fit.gathered.reach.range_m
+    rows = fit.gathered.rows
+    kinds = ", ".join(CLASSES[k] for k in np.unique(rows.view.class_ix[rows.listed]).tolist())
+    where = f"{kinds} at {low_m:g} to {high_m:g} m"
+    if fit.checks is None:
+        return f"Use it for nothing yet ({where}): it was not replayed beside the recording."
+    wrong = [one.statistic for one in fit.checks.fitted if fit.checks.refuses(one)]
+    if wrong:
+        return f"Do not use it for results: replays of it differ from the recording ({where}) in {'; '.join(wrong)}."
+    if all(one.verdict == "too few passes to tell" for one in fit.checks.fitted):
+        most = count_noun(max((len(one.pit) for one in fit.checks.fitted), default=0), "pass", "passes")
+        few = f"{most} cannot tell whether it behaves like the recording, {FEWEST_PASSES} could"
+        return f"Use it to try an experiment out ({where}), not for results: {few}."
+    known = "" if fit.checks.held_out else ", which it knows already (--hold-out)"
+    ghosts = "" if fit.truth == "complete" else ", nor for ghosts, as the truth is partial"
+    return (
+        f"Use it for {where}, where no statistic of the replay check contradicts it on "
+        f"{'logs held out' if fit.checks.held_out else 'the logs it was fitted to'}{known}; "
+        f"not beyond, not for other classes{ghosts}."
+    )
+
+
+def preview_fit(experiment: Experiment, recordings: Sequence[Recording], unit: str) -> tuple[str, ...]:
+    """What a fit of the recorded unit would say of its place, its delay, and its matches with the truth."""
+    label = f"copem-replay fit --unit {unit}"
+    try:
+        check_unit(experiment, unit)
+        lists = raw_lists(recordings, experiment, unit)
+        delay = unit_delay(list(zip(recordings, lists, strict=True)), _declared_delay_s(experiment, unit))
+        views = _view_logs(recordings, experiment, unit, delay.seconds)
+        gathered = gather_rows(views, gate_m=experiment.measure.match.gate_m, max_gap_s=experiment.max_gap_s, name=unit)
+    except InputError as error:
+        return (f"{label} would refuse: {error}",)
+    truth: Truth = "partial" if gathered.crowded else "complete"
+    matched = count_noun(gathered.matched, "entry", "entries")
+    passes = count_noun(gathered.number_of_passes, "pass", "passes")
+    first = f"{matched} of true objects in {passes}; delay (s) {delay.estimate.words()}"
+    return tuple(f"{label}: {line}" for line in (first, *_note_data(gathered, truth, FitOptions())))
 
 
 def fit_unit(experiment: Experiment, recordings: Sequence[Recording], unit: str, how: FitOptions | None = None) -> Fit:

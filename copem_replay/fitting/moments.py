@@ -43,6 +43,13 @@ class RangeBin:
         when = {"range_m": list(self.range_m)}
         return when if self.visible_share is None else when | {"visible_share": list(self.visible_share)}
 
+    @property
+    def words(self) -> str:
+        """Where it holds, in words."""
+        low_m, high_m = self.range_m
+        shares = "" if self.visible_share is None else ", visible share {:g} to {:g}".format(*self.visible_share)
+        return f"{low_m:g} to {high_m:g} m{shares}"
+
 
 @dataclass(frozen=True)
 class Moments:

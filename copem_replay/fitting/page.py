@@ -15,9 +15,9 @@ from copem_replay.core.errors import OutputError, count_noun
 from copem_replay.core.tracks import CLASSES, Float, Int
 from copem_replay.core.yaml import dump_with_comments, dump_yaml
 from copem_replay.experiment.schema import Experiment
-from copem_replay.fitting.diagnostics import FIT_FIGURES, FitStudy
+from copem_replay.fitting.diagnostics import FIT_FIGURES
 from copem_replay.fitting.estimate import Estimate, Rung
-from copem_replay.fitting.fit import Fit, build_experiment, build_snippet, name_estimates, to_plain_data
+from copem_replay.fitting.fit import Fit, build_experiment, build_snippet, judge_use, name_estimates, to_plain_data
 from copem_replay.fitting.gather import Gathered
 from copem_replay.fitting.rows import FitLists, FitRows
 from copem_replay.io.recording import Recording
@@ -43,56 +43,54 @@ if TYPE_CHECKING:
 # The page: the numbers, the choices, what is not determined, and the figures with plain words.
 
 
-def fit_page(study: FitStudy) -> str:
+def fit_page(fit: Fit) -> str:
     """The whole page as HTML, which loads nothing from elsewhere."""
     sections = [
-        ("estimates", "What was estimated", _estimates_table(study)),
-        ("choices", "Which models were compared", _choice_tables(study)),
-        ("untold", "What cannot be told", make_list(_list_untold(study)) or make_tag("p", "Nothing is left open.")),
-        *_figure_sections(study),
+        *_figure_sections(fit),
+        ("estimates", "What was estimated", _estimates_table(fit)),
+        ("choices", "Which models were compared", _choice_tables(fit)),
+        ("untold", "What cannot be told", make_list(_list_untold(fit)) or make_tag("p", "Nothing is left open.")),
     ]
-    rows, first = study.rows, study.first_rows
+    rows = fit.gathered.rows
     lead = (
-        f"{count_noun(len(study.lists.log), 'list')} in {count_noun(len(study.logs), 'log')}, "
+        f"{count_noun(len(fit.gathered.lists.log), 'list')} in {count_noun(len(fit.logs), 'log')}, "
         f"{count_noun(len(rows.log), 'row')} (a list and a true object within reach), of which "
-        f"{int(rows.listed.sum())} are listed, in {count_noun(len(first) - 1, 'pass', 'passes')}."
+        f"{int(rows.listed.sum())} are listed, in {count_noun(fit.gathered.number_of_passes, 'pass', 'passes')}."
     )
     head = make_tag(
         "header",
-        make_tag("h1", f"The perception of {study.unit}"),
-        make_tag("p", "A perception error model that was fitted to recorded lists.", class_="question"),
+        make_tag("h1", f"The perception of {fit.unit}"),
+        make_tag("p", judge_use(fit), class_="question"),
         make_tag("p", lead, class_="lead"),
-        make_list(study.notes),
+        make_list(fit.said),
         section_links((id_, title) for id_, title, _ in sections),
     )
     below = (make_tag("section", make_tag("h2", title), body, id_=id_) for id_, title, body in sections)
-    return whole_page(f"Fit of {study.unit}", join_html([head, *below]))
+    return whole_page(f"Fit of {fit.unit}", join_html([head, *below]))
 
 
-def _figure_sections(study: FitStudy) -> Iterator[tuple[str, str, Html]]:
+def _figure_sections(fit: Fit) -> Iterator[tuple[str, str, Html]]:
     for name, kind in FIT_FIGURES.items():
-        why = kind.missing(study)
+        why = kind.missing(fit)
         if why is None:
-            body = join_html(
-                [figure_element(name, kind.draw(study), kind.title, kind.shows), make_tag("p", kind.about)]
-            )
+            body = join_html([figure_element(name, kind.draw(fit), kind.title, kind.shows), make_tag("p", kind.about)])
         else:
             body = make_tag("p", f"No figure: {why}.")
         yield f"section-{name}", kind.title, body
 
 
-def _estimates_table(study: FitStudy) -> Html:
+def _estimates_table(fit: Fit) -> Html:
     rows = [
         make_tag(
             "tr",
-            make_tag("th", allow_breaks(name), scope="row"),
+            make_tag("th", allow_breaks(describe_name(fit, name)), scope="row"),
             make_tag("td", _format_value(one)),
             make_tag("td", _format_interval(one)),
             make_tag("td", str(one.n) if one.n else "–"),
             make_tag("td", format_three_digits(one.n_effective) if one.n_effective > 0 else "–"),
             make_tag("td", one.why or ("chosen" if one.chosen else ""), class_="text"),
         )
-        for name, one in study.estimates.items()
+        for name, one in list_estimates(fit)
     ]
     head = ("number", "estimate", "95 %", "n", "effective n", "not identifiable")
     return make_table(head, rows, caption="Every number with its interval", id_="numbers")
@@ -108,11 +106,11 @@ def _format_interval(one: Estimate) -> str:
     return f"{format_three_digits(one.low)} … {'∞' if np.isinf(one.high) else format_three_digits(one.high)}"
 
 
-def _choice_tables(study: FitStudy) -> Html:
+def _choice_tables(fit: Fit) -> Html:
     ladders: Sequence[tuple[str, Sequence[Rung]]] = (
-        ("Detection", study.detection.ladder),
-        ("Position error", study.errors.ladder),
-        ("Frame of the position error", study.errors.frames),
+        ("Detection", fit.parts.detection.ladder),
+        ("Position error", fit.parts.errors.ladder),
+        ("Frame of the position error", fit.parts.errors.frames),
     )
     intro = (
         "Each model is scored on passes it was not fitted to; the simplest within one standard error of the best is "
@@ -141,11 +139,54 @@ def _format_below(rung: Rung) -> str:
     return f"{format_three_digits(rung.below)} ± {format_three_digits(rung.below_se)}"
 
 
-def _list_untold(study: FitStudy) -> list[str]:
-    reasons = {**study.errors.untold, **study.rest.untold}
-    if study.detection.memory_why is not None:
-        reasons = {"memory.detection": study.detection.memory_why, **reasons}
+def _list_untold(fit: Fit) -> list[str]:
+    reasons = {**fit.parts.errors.untold, **fit.parts.rest.untold}
+    if fit.parts.detection.memory_why is not None:
+        reasons = {"memory.detection": fit.parts.detection.memory_why, **reasons}
     return [f"{name}: {why}" for name, why in reasons.items()]
+
+
+# Names in words.
+
+_WORDS = {
+    "delay_s": "delay of the lists, s",
+    "rate_hz": "lists per second",
+    "ids_last_s": "track ids last, s",
+    "list_times.period_s": "time between lists, s",
+    "list_times.jitter_s": "its standard deviation, s",
+    "list_times.down_share": "outages: share of the time",
+    "list_times.lasts_s": "outages last, s",
+    "errors.yaw_sigma_deg": "error of yaw: standard deviation, °",
+    "errors.speed_sigma_mps": "error of speed: standard deviation, m/s",
+    "errors.size_sigma_m": "error of size: standard deviation, m",
+    "placed.position_sigma_m": "pose of the unit: standard deviation, m",
+    "placed.yaw_sigma_deg": "pose of the unit: standard deviation of the heading, °",
+    "ghosts.per_minute": "ghosts that begin in a minute",
+}
+_LASTING = {"share": "share that lasts", "correlation_s": "correlation time, s"}
+
+
+def describe_name(fit: Fit, name: str) -> str:
+    """The name of an estimate in words: `errors.bins.0.mean_m.0` is `error, 0 to 30 m: mean along, m`."""
+    words, errors = name.split("."), fit.parts.errors
+    axes = ("along", "across") if errors.frame == "line_of_sight" else ("east", "north")
+    if name.startswith("errors.bins."):
+        kinds = {
+            "mean_m": [f"mean {axis}, m" for axis in axes],
+            "covariance_m2": [f"variance {axes[0]}, m²", "covariance, m²", f"variance {axes[1]}, m²"],
+        }
+        return f"error, {errors.bins[int(words[2])].where.words}: {kinds[words[3]][int(words[4])]}"
+    if name.startswith("detection.couples."):
+        couple = fit.parts.detection.couples[int(words[2])]
+        return f"detected, {couple.place_words(int(words[4]), int(words[5]))}"
+    if words[-1] in _LASTING and "memory" in words:
+        of = "detection" if words[0] == "detection" else "class" if words[0] == "classes" else words[2]
+        of = "pose of the unit" if words[0] == "placed" else of
+        number = f", part {int(words[-2]) + 1}" if words[-2].isdigit() else ""
+        return f"memory of {of}{number}: {_LASTING[words[-1]]}"
+    if name.startswith("classes.confusion."):
+        return f"{words[2]} listed as {words[3]}"
+    return _WORDS.get(name, " ".join(words).replace("_", " "))
 
 
 # The folder: the PEM to paste, the experiment that replays it beside the recording, rows and estimates. It is complete
@@ -207,6 +248,7 @@ def pem_text(fit: Fit, experiment: Experiment) -> str:
     """`pem.yaml`: a head on the whole fit, and the interval of every number as a comment."""
     rest = fit.parts.rest
     head = [
+        judge_use(fit),
         f"Unit {fit.unit}, fitted to {count_noun(len(fit.logs), 'log')}: {', '.join(fit.logs)}",
         *([f"Held out: {', '.join(fit.held_out)}"] if fit.held_out else []),
         f"{fit.gathered.matched} entries of true objects in {len(fit.gathered.lists.log)} lists, "
@@ -288,7 +330,7 @@ def _build_rows(gathered: Gathered, logs: Sequence[str], recordings: Sequence[Re
 def table_lines(fit: Fit) -> list[str]:
     """The estimates as lines of a table, what is not fitted, and which models were compared."""
     parts = fit.parts
-    lines = [f"{name}: {one.words()}" for name, one in list_estimates(fit)]
+    lines = [judge_use(fit), *(f"{describe_name(fit, name)}: {one.words()}" for name, one in list_estimates(fit))]
     untold = {**parts.errors.untold, **parts.rest.untold}
     lines += [f"{name}: not fitted: {why}" for name, why in untold.items()]
     ladders = {"detection": parts.detection.ladder, "errors": parts.errors.ladder, "frame": parts.errors.frames}

@@ -227,7 +227,7 @@ def _covariance_columns(lists: RecordedLists, asked: RecordedTopic, path: Path) 
         if unsaid.any():
             raise RecordingError(
                 f"{unsaid.sum()} of {count_noun(len(unsaid), 'entry', 'entries')} say nothing of their "
-                "covariance; give `covariance_m2`",
+                "covariance; give `covariance_m2`, which `copem-replay fit` estimates",
                 path=path,
                 topic=asked.topic,
             )

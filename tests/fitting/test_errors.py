@@ -178,6 +178,9 @@ def test_what_the_pose_explains_is_not_in_the_errors_too() -> None:
     assert less.covariance_m2[2].high < one.covariance_m2[2].high
     huge = remove_pose(fit, PoseFit(Estimate(5.0), Estimate(0.0))).bins[0]
     assert huge.covariance_m2[0].value == pytest.approx(one.covariance_m2[0].value / 20)
+    assert huge.covariance_m2[0].low == 0.0
+    assert huge.covariance_m2[0].why == "the pose of the unit explains nearly all of it"
+    assert less.covariance_m2[0].why is None
 
 
 def test_few_passes_are_scored_by_bic() -> None:

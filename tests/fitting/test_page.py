@@ -9,103 +9,137 @@ from functools import cache
 import numpy as np
 import pytest
 
+from copem_replay.core.tracks import CLASSES
 from copem_replay.fitting.detection import fit_detection
 from copem_replay.fitting.diagnostics import (
     FIT_FIGURES,
-    FitStudy,
-    _count_longer,
-    _draw_hits,
-    _find_runs,
     _mean_products,
-    _rmse_by_delay,
     calibration_figure,
-    probability_map_figure,
+    error_map_figure,
+    gaussian_figure,
     ranks_figure,
 )
 from copem_replay.fitting.errors import fit_errors
 from copem_replay.fitting.estimate import Estimate
-from copem_replay.fitting.page import fit_page
+from copem_replay.fitting.fit import Fit, FitOptions, FittedParts, ReplayChecks, judge_use
+from copem_replay.fitting.gather import FitReach, Gathered
+from copem_replay.fitting.page import describe_name, fit_page, list_estimates
+from copem_replay.fitting.pose import DelayFit
+from copem_replay.fitting.replay_check import StatisticCheck
 from copem_replay.fitting.rest import fit_rest
 from tests.helpers.fit_rows import nothing_else, rows_of
 
 
+def check_of(name: str, p: float, passes: int = 12) -> StatisticCheck:
+    verdict = "too few passes to tell" if passes < 8 else "holds" if p >= 0.05 else "too sure"
+    return StatisticCheck(name, np.linspace(0, 1, passes), passes, p, verdict)  # type: ignore[arg-type]
+
+
 @cache
-def _study() -> FitStudy:
+def _fit() -> Fit:
     rows, lists = rows_of(3, passes=12, lists_each=40)
     rows = replace(rows, view=replace(rows.view, speed_mps=np.full(len(rows.log), 8.0)))
-    detection, errors = fit_detection(rows, lists, intervals=False), fit_errors(rows, lists)
-    rest = fit_rest(rows, lists, nothing_else(), truth="partial")
-    ranks = {"longest run": np.linspace(0, 1, 12)}
-    estimates = {"delay_s": Estimate(0.13, 0.1, 0.16, 480, 40.0), "<b>": Estimate(1.0, why="no <i>miss</i>")}
-    return FitStudy(
-        "rsu", ["drive"], rows, lists, detection, errors, rest, 0.13, estimates, ranks, ranks,
-        {"longest run": "holds"}, ["a note"],
+    parts = FittedParts(
+        fit_detection(rows, lists, intervals=False), fit_errors(rows, lists),
+        fit_rest(rows, lists, nothing_else(), truth="partial"),
+    )  # fmt: skip
+    gathered = Gathered(lists, rows, nothing_else(), FitReach((0.0, 45.0), None), 384, 0.0, False, ())
+    delay = DelayFit(Estimate(1.0, why="no <i>miss</i>"))
+    checks = ReplayChecks(True, (check_of("longest run", 0.5),), (check_of("longest run", 0.001),))
+    return Fit(
+        "rsu", ("drive",), (), FitOptions(), "partial", delay, Estimate(10.0, 9.9, 10.1, 479, 479.0), parts, gathered,
+        None, (), ("a note",), checks,
     )  # fmt: skip
 
 
 def test_the_page_has_all_and_loads_nothing() -> None:
-    page = fit_page(_study())
+    page = fit_page(_fit())
+    assert set(FIT_FIGURES) == {"ranks", "calibration", "error_map", "autocorrelation", "gaussian"}
     for name in FIT_FIGURES:
         assert page.count(f'id="section-{name}"') == 1
         assert f'id="{name}" class="plot"' in page
     assert len(page.encode()) < 1_500_000
     assert not re.search(r'(?:src|href)="(?!#|data:)', page)
-    assert "&lt;b&gt;" in page
+    assert "&lt;i&gt;" in page
     assert "<i>" not in page
-    assert fit_page(_study()) == page  # the same bytes
+    assert fit_page(_fit()) == page  # the same bytes
+
+
+def test_what_the_model_is_for_stands_on_top() -> None:
+    fit = _fit()
+    page = fit_page(fit)
+    said = judge_use(fit)
+    assert said.startswith(f"Use it for {CLASSES[3]} at 0 to 45 m, where no statistic of the replay check contradicts")
+    assert "logs held out" in said
+    assert "nor for ghosts" in said
+    assert page.index("Use it for") < page.index("<h2")
+    wrong = ReplayChecks(True, (check_of("gap, s", 0.001), check_of("RMSE, m", 0.6)), ())
+    assert "differ from the recording" in judge_use(replace(fit, checks=wrong))
+    assert "in gap, s." in judge_use(replace(fit, checks=wrong))
+    few = ReplayChecks(True, (check_of("gap, s", 0.001, passes=5),), ())
+    assert judge_use(replace(fit, checks=few)).endswith(
+        "5 passes cannot tell whether it behaves like the recording, 8 could."
+    )
+    assert judge_use(replace(fit, checks=None)).startswith("Use it for nothing yet")
+
+
+def test_every_number_has_a_name_in_words() -> None:
+    fit = _fit()
+    names = {name: describe_name(fit, name) for name, _ in list_estimates(fit)}
+    assert not [
+        words for words in names.values() if re.search(r"[._][0-9a-z]", words.replace("0.", "").replace(".5", ""))
+    ]
+    far_m = fit.parts.errors.bins[0].where.range_m[1]
+    axes = ("along", "across") if fit.parts.errors.frame == "line_of_sight" else ("east", "north")
+    assert names["errors.bins.0.mean_m.0"] == f"error, 0 to {far_m:g} m: mean {axes[0]}, m"
+    assert names["errors.bins.0.covariance_m2.2"] == f"error, 0 to {far_m:g} m: variance {axes[1]}, m²"
+    assert names["errors.memory.position.0.correlation_s"] == "memory of position, part 1: correlation time, s"
+    assert names["rate_hz"] == "lists per second"
+    assert len(set(names.values())) == len(names)
+
+
+def test_nothing_is_no_number() -> None:
+    assert Estimate(0.3, 0.1, 0.5).words() == "not identifiable: no rows"
+    assert Estimate(0.3, 0.1, 0.5, n=1, n_effective=1.0).words() == "0.3 (95 %: 0.1 … 0.5, n 1, effective 1)"
+    assert Estimate(0.5, chosen=True).words() == "chosen"
+    near = Estimate(0.0315, 0.03149, 0.03151, n=9, n_effective=9.0)
+    assert near.words() == "0.0315 (95 %: 0.03149 … 0.03151, n 9, effective 9)"
+    assert Estimate(0.9, 0.9, 0.9, n=9, n_effective=9.0).words() == "0.9 (the same in all 9)"
 
 
 def test_what_is_missing_is_said() -> None:
-    study = _study()
-    all_listed = replace(study.rows, listed=np.ones(len(study.rows.log), dtype=bool))
-    page = fit_page(replace(study, ranks={}, rows=all_listed))
+    page = fit_page(replace(_fit(), checks=None))
     assert "No figure: nothing was replayed beside what was recorded." in page
-    assert "No figure: no miss in 480 rows." in page
 
 
 def test_calibration_counts_rows() -> None:
-    study = _study()
-    [axes] = calibration_figure(study).axes
+    fit = _fit()
+    [axes] = calibration_figure(fit).axes
     points = axes.containers[0].lines[0].get_xydata()
-    assert np.average(points[:, 0]) == pytest.approx(study.probability.mean(), abs=0.02)
-    if len(points) == 1:
-        assert points[0, 1] == pytest.approx(study.rows.listed.mean())
+    line = axes.lines[0].get_xydata()
+    range_m, listed = fit.gathered.rows.view.range_m, fit.gathered.rows.listed
+    assert points[:, 1].mean() == pytest.approx(listed.mean(), abs=0.02)  # bins of about equal numbers
+    assert line[:, 1].mean() == pytest.approx(fit.parts.detection.probability(fit.gathered.rows.view).mean(), abs=0.02)
+    near = range_m < np.quantile(range_m, 1 / 12)
+    assert points[0, 1] == pytest.approx(listed[near].mean(), abs=0.03)
+    assert points[0, 0] == pytest.approx(range_m[near].mean(), abs=0.2)
 
 
-def test_the_map_has_the_number_of_rows_of_each_cell() -> None:
-    study = _study()
-    left, right = probability_map_figure(study).axes
-    said = [text.get_text().split("\n") for text in left.texts]
-    assert sum(int(n) for _, n in said) == len(study.rows.log)
-    assert [n for _, n in said] == [text.get_text().split("\n")[1] for text in right.texts]
-    hits = sum(float(share) * int(n) for share, n in said)
-    assert hits == pytest.approx(study.rows.listed.sum(), abs=0.005 * len(study.rows.log))
+def test_the_map_has_every_row() -> None:
+    rows = _fit().gathered.rows
+    axes = error_map_figure(_fit()).axes[0]
+    listed, missed = (collection.get_offsets() for collection in axes.collections[:2])
+    assert (len(listed), len(missed)) == (rows.listed.sum(), (~rows.listed).sum())
+    centre = rows.state_m.mean(axis=0)
+    np.testing.assert_allclose(np.asarray(missed), rows.state_m[~rows.listed] - centre)
 
 
-def test_strips_are_runs_of_hits() -> None:
-    which = np.array([True, True, False, True, False])
-    since_s = np.array([0.0, 0.1, 0.2, 0.3, 2.0])  # a gap
-    found = _find_runs(which, since_s, 0.1)
-    np.testing.assert_allclose(found, [(0.0, 0.2), (0.3, 0.2)])
-    np.testing.assert_allclose(_find_runs(~which, since_s, 0.1), [(0.2, 0.1), (2.0, 0.1)])
-
-
-def test_runs_of_misses_are_counted() -> None:
-    missed = np.array([[1, 0], [1, 1], [0, 1], [1, 1], [1, 0]], dtype=bool)
-    new = np.array([True, False, False, True, False])
-    # First column: 2 and, in another pass, 2; second: 2, then 1 in the other pass.
-    assert _count_longer(missed, new).tolist() == [[2, 2], [2, 1]]
-
-
-def test_drawn_again_has_the_share_and_the_memory_of_the_model() -> None:
-    p, gap_s = np.full(400, 0.6), np.full(400, 0.1)
-    new = np.arange(400) % 100 == 0
-    for share, expected in ((0.0, 0.0), (1.0, np.exp(-0.1))):
-        hits = _draw_hits(p, gap_s, new, share, 1.0).astype(float)
-        assert hits.mean() == pytest.approx(0.6, abs=0.02)
-        later = ~new[1:]
-        lag = np.corrcoef(hits[:-1][later].ravel(), hits[1:][later].ravel())[0, 1]
-        assert lag == pytest.approx(expected, abs=0.02)
+def test_quantiles_are_those_of_the_errors() -> None:
+    left, _ = gaussian_figure(_fit()).axes
+    z = _fit().parts.errors.shape.z
+    along = left.lines[1].get_xydata()
+    assert along[len(along) // 2, 1] == pytest.approx(np.median(z[:, 0]), abs=0.05)
+    assert along[0, 1] >= z[:, 0].min()
 
 
 def test_correlations_are_within_series_and_at_their_lags() -> None:
@@ -115,15 +149,7 @@ def test_correlations_are_within_series_and_at_their_lags() -> None:
     np.testing.assert_allclose(found, [[0.0, -1.0], [-1.0, 1.0]])
 
 
-def test_a_delay_moves_entries_along_the_way() -> None:
-    heading, speed = np.full(3, np.pi / 2), np.array([1.0, 2.0, 3.0])
-    north_m = 0.2 * speed  # entries are ahead, as if the lists were 0.2 s younger than is taken
-    plain, centred = _rmse_by_delay(np.zeros(3), north_m, heading, speed, np.array([-0.2, 0.0]))
-    np.testing.assert_allclose(plain, [0.0, 0.2 * np.sqrt(14 / 3)], atol=1e-12)
-    np.testing.assert_allclose(centred, [0.0, 0.2 * np.sqrt(2 / 3)], atol=1e-12)
-
-
 def test_ranks_are_a_point_each() -> None:
-    [axes] = ranks_figure(_study()).axes
+    [axes] = ranks_figure(_fit()).axes
     assert [len(line.get_xdata()) for line in axes.lines] == [12, 12]
     assert [text.get_text().strip() for text in axes.texts] == ["holds"]

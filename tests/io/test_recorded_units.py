@@ -139,7 +139,8 @@ class TestWhatIsSaid:
 
     def test_no_covariance_from_anywhere(self, tmp_path: Path) -> None:
         path = drive(tmp_path / "a.mcap", list_of(0.5, car(30, sigma_m=(1, 1)), car(40), car(50)))
-        said = "rsu: 2 of 3 entries say nothing of their covariance; give `covariance_m2`"
+        said = "rsu: 2 of 3 entries say nothing of their covariance; give `covariance_m2`, which "
+        said += "`copem-replay fit` estimates"
         assert refused(path, unit={"covariance_m2": None}) == said
         assert read(drive(tmp_path / "b.mcap", list_of(0.5, car(30, sigma_m=(1, 2)))), unit={"covariance_m2": None})
 

@@ -13,6 +13,7 @@ import pytest
 
 import copem_replay as cr
 from copem_replay.cli import main as cli
+from copem_replay.core.errors import InputError
 from copem_replay.core.yaml import dump_yaml, parse_yaml
 from copem_replay.experiment.schema import Experiment
 from tests.helpers.recordings import SHARED
@@ -121,6 +122,24 @@ def test_what_cannot_be_fitted_is_said_in_a_line(
     assert found.startswith(said)
     assert "\n" not in found
     assert not (folder / "refused").exists()
+
+
+def test_a_typo_names_the_units_whatever_the_lists_state() -> None:
+    unit = {"rsu": check_fit.PLACE | {"recorded": {"topic": check_fit.TOPIC}}}
+    data = check_fit.experiment_of(unit, {"recorded": {"units": ["rsu"]}}, logs=["missing.mcap"])
+    with pytest.raises(InputError, match=r"^unit rsuu: expected .* lists are recorded \(rsu\), found no such unit$"):
+        cr.fit(data, "rsuu")
+
+
+def test_check_says_what_a_fit_will_say(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(folder)
+    assert called(monkeypatch, "check", "radar.yaml") == 0
+    notes = [line for line in told(capsys).splitlines() if line.startswith("note: copem-replay fit --unit rsu: ")]
+    fitted = json.loads((folder / "one/fit.json").read_text())
+    assert f"{fitted['matched']} entries of true objects in {fitted['passes']} passes" in notes[0]
+    assert all(line.removeprefix("note: copem-replay fit --unit rsu: ") in fitted["notes"] for line in notes[1:])
 
 
 def test_numbers_that_were_put_in_are_inside_their_intervals(tmp_path: Path) -> None:
