@@ -112,7 +112,7 @@ def fit(
     hold_out: Sequence[str] = (),
     folds: int | None = None,
     truth: str | None = None,
-    by: Sequence[str] = ("range", "visible_share"),
+    by: Sequence[str] = ("range", "visible_share", "class", "azimuth"),
     monotone: bool = True,
     simplest: bool = False,
 ) -> FittedPem:
@@ -121,8 +121,8 @@ def fit(
     `unit`: one whose lists are `recorded`, with its place (`at` or `on`). `hold_out`: names of logs that are left for
     the check. `folds`: parts of the cross-validation that chooses between models. `truth`: `partial`, if entries may be
     about objects that the truth lacks, or `complete`; None: partial where a list has more of them than true objects are
-    within reach. `by`: what detection depends on. `monotone`: farther and more hidden is never better. `simplest`: the
-    first rung of every ladder.
+    within reach. `by`: what detection may depend on. `monotone`: farther and more hidden is never better. `simplest`:
+    the first rung of every ladder.
 
     Raises InputError: no such unit or log, no place, nothing of it near a true object.
 

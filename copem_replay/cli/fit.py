@@ -26,7 +26,7 @@ def fit(
         typer.Option(metavar="KIND", help="partial: the truth may lack objects of entries; complete: it has all."),
     ] = None,
     by: Annotated[
-        str, typer.Option(metavar="A,B,…", help="What detection depends on: range, visible_share, azimuth, class.")
+        str, typer.Option(metavar="A,B,…", help="What detection may depend on: range, visible_share, azimuth, class.")
     ] = "range,visible_share",
     simplest: Annotated[bool, typer.Option("--simplest", help="Take the simplest of the candidate models.")] = False,
     not_monotone: Annotated[

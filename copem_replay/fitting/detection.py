@@ -7,7 +7,7 @@ those of the profile likelihood: all values at which it is within half of χ²'s
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise, product
 from typing import Any
 
@@ -53,12 +53,15 @@ _FINE = 601
 class DetectionMemoryFit:
     """The `share` of lists that use a held number, and its `correlation_s`; ∞: the number is always the same.
 
-    `gain`: log-likelihood per list above that without memory, on the passes it is fitted to.
+    `gain`: log-likelihood per list above that without memory, on the passes it is fitted to. `common`: all objects of
+    the unit share the number; `gains`: by `common` what either kind gains.
     """
 
     share: Estimate
     correlation_s: Estimate
     gain: float
+    common: bool = False
+    gains: Mapping[bool, float] = field(default_factory=dict)
 
 
 def pass_starts(pass_ix: Int) -> Int:
@@ -73,6 +76,12 @@ def build_sequences(listed: Bool, probability: Float, captured_s: Float, pass_ix
     return Sequences.of(
         pass_starts(pass_ix), (np.bincount(level, probability) / count)[level], listed, captured_s
     )  # fmt: skip
+
+
+def build_common_sequences(rows: FitRows, probability: Float) -> Sequences:
+    """Hits and misses of whole logs, list by list: all objects of a list share one number, as `of: unit` has it."""
+    order = np.lexsort((rows.list, rows.log))
+    return build_sequences(rows.listed[order], probability[order], rows.captured_s[order], rows.log[order])
 
 
 def explain_no_memory(listed: Bool, pass_ix: Int) -> str | None:
@@ -167,7 +176,11 @@ _MOST_NODES = {"range": 6, "visible_share": 4}
 _SECTORS = 4
 """Nodes of an axis and sectors of azimuth at most. More: finer tables where rows allow it, and longer fits."""
 _WORDS = {"range": "range", "visible_share": "visible share", "azimuth": "azimuth", "class": "class"}
-_NOTHING = "lists held out are no better predicted with a part that lasts"
+_NOTHING = "hits and misses do not refuse that every list is new"
+BY = ("range", "visible_share", "class", "azimuth")
+"""All that detection may depend on."""
+WORTH_IT = 2.996
+"""Log-likelihood that memory must gain: half of the 95 % quantile of χ²₂."""
 _DECIMALS = {"range": 1, "visible_share": 2}
 _KEEP_OFF = 1e-4
 """Distance from 0 and 1 that written probabilities keep."""
@@ -216,8 +229,8 @@ class DetectionFit:
 
     `couples`: the first that applies is used. `memory`: `share` and `correlation_s` of what lasts; None: nothing lasts,
     for the reason `memory_why`. `ladder`: the models that were compared. `covariance (K, K)` of all probabilities,
-    couple by couple, range by range. `rows_per_effective`: how many rows are worth one that is independent. `notes`: on
-    the rows, a line each.
+    couple by couple, range by range. `rows_per_effective`: how many rows are worth one that is independent. `notes`: a
+    line each. `common`: what lasts is shared by all objects of the unit.
     """
 
     couples: tuple[DetectionCouple, ...]
@@ -227,6 +240,7 @@ class DetectionFit:
     covariance: Float
     rows_per_effective: float
     notes: tuple[str, ...]
+    common: bool = False
 
     def probability(self, view: ViewGeometry) -> Float:
         """(P,) the probability that each row is listed, regardless of memory."""
@@ -249,21 +263,24 @@ class DetectionFit:
             couples.append({**when, "detection": couple.detection()})
         if self.memory is None:
             return {"couples": couples}
+        part: dict[str, Any]
         tau_s = self.memory["correlation_s"].value
         lasts = "always" if np.isinf(tau_s) else float(f"{tau_s:.3g}")
         part = {"share": round(self.memory["share"].value, 3), "correlation_s": lasts}
+        part |= {"of": "unit"} if self.common else {}
         return {"couples": couples, "memory": {"detection": [part]}}
 
 
 @dataclass(frozen=True)
 class _Rung:
-    """One model of the ladder: its axes, its conditions, and the rows (R,) in it."""
+    """One model of the ladder: its axes, its conditions, by what it is split, and the rows (R,) in it."""
 
     name: str
     axes: tuple[Float, Float]
     when: list[dict[str, Any]]
     rows: NodeWeights
     entries: PooledRows
+    split: tuple[str, ...] = ()
 
 
 def fit_detection(
@@ -271,30 +288,33 @@ def fit_detection(
     lists: FitLists,
     *,
     monotone: bool = True,
-    by: tuple[str, ...] = ("range", "visible_share"),
+    by: tuple[str, ...] = BY,
     simplest: bool = False,
     intervals: bool = True,
 ) -> DetectionFit:
     """Fit the detection model to rows of objects within reach.
 
-    `by`: what the probability may depend on, of `range`, `visible_share`, `azimuth`, `class`. How many of them, from
-    the first on, is chosen on passes held out, and then whether detection lasts. `monotone`: farther and more hidden is
-    never better. `simplest`: always one constant. Without `intervals` limits are NaN.
+    `by`: what the probability may depend on, of `range`, `visible_share`, `azimuth`, `class`: of the first two as many
+    as passes held out ask for, and then class and azimuth. What `by` does not name is scored, too, and noted where it
+    explains more: what lasts is then told given that. `monotone`: farther and more hidden is never better. `simplest`:
+    always one constant. Without `intervals` limits are NaN.
     """
     _, pass_ix = np.unique(rows.pass_ix, return_inverse=True)
-    worth = _rows_per_effective(rows, pass_ix, by, monotone)
-    ladder = _build_ladder(rows, pass_ix, by, worth)
-    rung, table, lasts, why = _choose_table(rows, pass_ix, ladder, worth, monotone, simplest)
-    all_passes = np.ones(int(pass_ix.max()) + 1)
-    fit = fit_table(rung.entries, all_passes, worth, monotone=monotone)
-    memory = None
-    seen = build_sequences(rows.listed, rung.rows.chances(fit.theta), rows.captured_s, pass_ix)
-    if why is None:
-        memory_fit = fit_detection_memory(seen, intervals=intervals)
-        worth = design_effect(memory_fit.share.value, memory_fit.correlation_s.value, seen)
-        fit = replace(fit, worth=worth)
-        if lasts:
-            memory = {"share": memory_fit.share, "correlation_s": memory_fit.correlation_s}
+    trial = _TableTrial(rows, pass_ix, _rows_per_effective(rows, pass_ix, monotone), monotone)
+    ladder = trial.build_axes(by)
+    first, table = trial.choose(ladder, simplest)
+    rung, splits = ladder[first], trial.build_splits(ladder[first])
+    allowed = [rung, *(one for one in splits if set(one.split) <= set(by))]
+    chosen, more = trial.choose(allowed, simplest)
+    rung, table = allowed[chosen], _join_rungs(table, more)
+    apart, others = trial.choose([rung, *(one for one in splits if one not in allowed)], simplest)
+    notes = _note_rows(rows) + tuple(
+        f"{one.name}: {others[0].below - one.below:+.3g} nats per list, but --by does not name it" for one in others[1:]
+    )
+    explained = [rung, *(one for one in splits if one not in allowed)][apart]
+    memory, why, tried = _choose_memory(rows, pass_ix, trial.chances(explained), simplest, intervals)
+    fit = fit_table(rung.entries, np.ones(int(pass_ix.max()) + 1), trial.worth, monotone=monotone)
+    fit = fit if tried is None else replace(fit, worth=tried)
     values, covariance = estimate_nodes(rung.entries, rung.rows, fit, monotone=monotone, resampled=intervals)
     grid = np.array(values, dtype=object).reshape(rung.rows.shape)
     axes = tuple(tuple(axis.tolist()) for axis in rung.axes)
@@ -303,52 +323,120 @@ def fit_detection(
         for when, one in zip(rung.when, grid.tolist(), strict=True)
     )
     return DetectionFit(
-        couples, memory, why if why else (None if lasts else _NOTHING), table, covariance, worth, _note_rows(rows)
-    )
+        couples, None if memory is None else {"share": memory.share, "correlation_s": memory.correlation_s},
+        why, _add_gains(table, memory), covariance, fit.worth, notes, memory is not None and memory.common,
+    )  # fmt: skip
 
 
-def _choose_table(
-    rows: FitRows, pass_ix: Int, ladder: list[_Rung], worth: float, monotone: bool, simplest: bool
-) -> tuple[_Rung, tuple[Rung, ...], bool, str | None]:
-    """The rung, the table of all, whether detection lasts, and why the data do not tell that (None: they do)."""
-    names, why = [rung.name for rung in ladder], explain_no_memory(rows.listed, pass_ix)
-    starts = pass_starts(pass_ix)
-    if not held_out_possible(pass_ix, rows.fold):
-        fits = [fit_table(rung.entries, np.ones(len(starts) - 1), worth, monotone=monotone) for rung in ladder]
-        log_likelihoods = [_log_likelihood(rung, fit.theta).sum() for rung, fit in zip(ladder, fits, strict=True)]
-        size, n = np.array([len(fit.theta) for fit in fits]), len(pass_ix)
-        index, table = choose_by_bic(names, np.array(log_likelihoods), size, n, n / worth, simplest=simplest)
-        return ladder[index], table, False, why or "all passes in one fold: none is held out to tell by"
-    fold = rows.fold[starts[:-1]]
-    scores = np.zeros((len(ladder) + 1, len(fold)))
-    theta = {}
-    for f, (k, rung) in product(np.unique(fold).tolist(), enumerate(ladder)):
-        theta[f, k] = fit_table(rung.entries, (fold != f).astype(float), worth, monotone=monotone).theta
-        scores[k, fold == f] = _log_likelihood(rung, theta[f, k])[fold == f]
-    weights = np.diff(starts)
-    index, table = choose_rung(names, scores[:-1], weights, simplest=simplest)
-    if why is not None:
-        return ladder[index], table, False, why
-    for f in np.unique(fold).tolist():
-        chances = ladder[index].rows.chances(theta[f, index])
-        held_out = rows.fold == f
-        inside, outside = (
-            build_sequences(rows.listed[some], chances[some], rows.captured_s[some], pass_ix[some])
-            for some in (~held_out, held_out)
-        )
-        memory_fit = fit_detection_memory(inside, intervals=False)
-        given_past = outside.log_probability(memory_fit.share.value, memory_fit.correlation_s.value)
-        scores[-1, fold == f] = np.add.reduceat(given_past, outside.start[:-1])
-    pair = [index, len(ladder)]
-    names.append(f"{names[index]} + memory")
-    with_memory, _ = choose_rung([names[k] for k in pair], scores[pair], weights, simplest=simplest)
-    _, table = choose_rung(names, scores, weights)
-    return (
-        ladder[index],
-        tuple(replace(one, chosen=k == pair[with_memory]) for k, one in enumerate(table)),
-        with_memory == 1,
-        None,
-    )
+def _choose_memory(
+    rows: FitRows, pass_ix: Int, probability: Float, simplest: bool, intervals: bool
+) -> tuple[DetectionMemoryFit | None, str | None, float | None]:
+    """What lasts, or None and why; and rows per effective row (None: as residuals say).
+
+    A number of each object and one that all objects of the unit share: the likelier, if white noise is refused.
+    """
+    if (why := explain_no_memory(rows.listed, pass_ix)) is not None:
+        return None, why, None
+    own = build_sequences(rows.listed, probability, rows.captured_s, pass_ix)
+    sequences = {False: own}
+    if (np.bincount(rows.list) > 1).any():
+        sequences[True] = build_common_sequences(rows, probability)
+    fits = {common: fit_detection_memory(seen, intervals=False) for common, seen in sequences.items()}
+    common = max(fits, key=lambda one: fits[one].gain)
+    best = fit_detection_memory(sequences[common], intervals=intervals)
+    worth = design_effect(best.share.value, best.correlation_s.value, sequences[common])
+    if simplest or best.gain * len(rows.listed) <= WORTH_IT:
+        return None, "the simplest model was asked for" if simplest else _NOTHING, worth
+    return replace(best, common=common, gains={one: fit.gain for one, fit in fits.items()}), None, worth
+
+
+def _join_rungs(table: tuple[Rung, ...], more: tuple[Rung, ...]) -> tuple[Rung, ...]:
+    """One table of two, of which the second begins with what the first has chosen; `below` the best of all."""
+    best = max(one.score for one in (*table, *more))
+    both = (*(more[0] if one.chosen else one for one in table), *more[1:])
+    return tuple(replace(one, below=best - one.score) for one in both)
+
+
+def _add_gains(table: tuple[Rung, ...], memory: DetectionMemoryFit | None) -> tuple[Rung, ...]:
+    """The tables, and what memory of either kind adds to the chosen one on the passes it is fitted to."""
+    if memory is None:
+        return table
+    [chosen], most = [one for one in table if one.chosen], max(memory.gains.values())
+    names = {False: f"{chosen.name} + memory", True: f"{chosen.name} + memory of all objects"}
+    more = [
+        Rung(names[common], chosen.score + gain, most - gain, 0.0, common == memory.common, "likelihood")
+        for common, gain in memory.gains.items()
+    ]
+    return (*(replace(one, below=one.below + most, chosen=False) for one in table), *more)
+
+
+@dataclass(frozen=True)
+class _TableTrial:
+    """Compares tables on passes they were not fitted to, or by BIC. `worth`: rows per effective row."""
+
+    rows: FitRows
+    pass_ix: Int
+    worth: float
+    monotone: bool
+
+    def choose(self, ladder: list[_Rung], simplest: bool) -> tuple[int, tuple[Rung, ...]]:
+        """The index of the table that is used, from the simplest to the richest, and what each scores."""
+        names, starts = [rung.name for rung in ladder], pass_starts(self.pass_ix)
+        if not held_out_possible(self.pass_ix, self.rows.fold):
+            thetas = [self.fit(rung, np.ones(len(starts) - 1)) for rung in ladder]
+            score = [_log_likelihood(rung, theta).sum() for rung, theta in zip(ladder, thetas, strict=True)]
+            size, n = np.array([len(theta) for theta in thetas]), len(self.pass_ix)
+            return choose_by_bic(names, np.array(score), size, n, n / self.worth, simplest=simplest)
+        fold = self.rows.fold[starts[:-1]]
+        scores = np.zeros((len(ladder), len(fold)))
+        for f, (k, rung) in product(np.unique(fold).tolist(), enumerate(ladder)):
+            scores[k, fold == f] = _log_likelihood(rung, self.fit(rung, (fold != f).astype(float)))[fold == f]
+        return choose_rung(names, scores, np.diff(starts), simplest=simplest)
+
+    def fit(self, rung: _Rung, times: Float) -> Float:
+        """(K,) probabilities at the nodes; `times (passes,)`: how often each counts."""
+        return fit_table(rung.entries, times, self.worth, monotone=self.monotone).theta
+
+    def chances(self, rung: _Rung) -> Float:
+        """(R,) the fitted probability of each row."""
+        return rung.rows.chances(self.fit(rung, np.ones(int(self.pass_ix.max()) + 1)))
+
+    def build_axes(self, by: tuple[str, ...]) -> list[_Rung]:
+        """Tables from one constant to all axes of `by`, without those that rows are too few to tell from others."""
+        least, alone = LEAST_ROWS * self.worth, np.zeros(1)
+        values = {"range": self.rows.view.range_m, "visible_share": self.rows.view.visible_share}
+        axes, used = (alone, alone), list[str]()
+        ladder = [self._build("constant", axes, [{}])]
+        for name in (one for one in by if one in values):
+            k = list(values).index(name)
+            most = int(min(len(self.pass_ix) / least, _MOST_NODES[name]))
+            nodes = choose_nodes(values[name], most, least, _DECIMALS[name]) if most > 1 else alone
+            nodes = nodes if len(nodes) > 1 else alone
+            axes = (nodes, axes[1]) if k == 0 else (axes[0], nodes)
+            rung = self._build(" × ".join([*used, _WORDS[name]]), axes, [{}])
+            if rung.rows.shape != ladder[-1].rows.shape:
+                used.append(_WORDS[name])
+                ladder.append(rung)
+        return ladder
+
+    def build_splits(self, rung: _Rung) -> list[_Rung]:
+        """The table split by class, by azimuth and by both, where rows allow it."""
+        least, out = LEAST_ROWS * self.worth, list[_Rung]()
+        for split in (("class",), ("azimuth",), ("class", "azimuth")):
+            when = rung.when
+            for name in split:
+                when = _split_conditions(self.rows, when, name, least)
+            if len(when) > max([len(rung.when), *(len(one.when) for one in out if len(split) > 1)]):
+                words = [*([] if rung.name == "constant" else [rung.name]), *(_WORDS[name] for name in split)]
+                out.append(self._build(" × ".join(words), rung.axes, when, split))
+        return out
+
+    def _build(
+        self, name: str, axes: tuple[Float, Float], when: list[dict[str, Any]], split: tuple[str, ...] = ()
+    ) -> _Rung:
+        values = self.rows.view.range_m, self.rows.view.visible_share
+        where = weigh_nodes(axes, values, _first_that_holds(when, self.rows.view))
+        return _Rung(name, axes, when, where, pool_rows(where, self.rows.listed, self.pass_ix), split)
 
 
 def _log_likelihood(rung: _Rung, theta: Float) -> Float:
@@ -356,41 +444,6 @@ def _log_likelihood(rung: _Rung, theta: Float) -> Float:
     p = rung.entries.placed.chances(theta)
     result: Float = rung.entries.count @ np.log(np.where(rung.entries.hit, p, 1 - p))
     return result
-
-
-def _build_ladder(rows: FitRows, pass_ix: Int, by: tuple[str, ...], worth: float) -> list[_Rung]:
-    """Models from one constant to all of `by`, without those that rows are too few to tell from the one before."""
-    least, alone = LEAST_ROWS * worth, np.zeros(1)
-    values = {"range": rows.view.range_m, "visible_share": rows.view.visible_share}
-    both = values["range"], values["visible_share"]
-    axes, when = (alone, alone), list[dict[str, Any]]([{}])
-    ladder, used = [_build_rung("constant", axes, when, both, rows, pass_ix)], list[str]()
-    for name in by:
-        if name in values:
-            k = list(values).index(name)
-            most = int(min(len(pass_ix) / least, _MOST_NODES[name]))
-            nodes = choose_nodes(both[k], most, least, _DECIMALS[name]) if most > 1 else alone
-            nodes = nodes if len(nodes) > 1 else alone
-            axes = (nodes, axes[1]) if k == 0 else (axes[0], nodes)
-        else:
-            when = _split_conditions(rows, when, name, least)
-        rung = _build_rung(" × ".join([*used, _WORDS[name]]), axes, when, both, rows, pass_ix)
-        if rung.rows.shape != ladder[-1].rows.shape:
-            used.append(_WORDS[name])
-            ladder.append(rung)
-    return ladder
-
-
-def _build_rung(
-    name: str,
-    axes: tuple[Float, Float],
-    when: list[dict[str, Any]],
-    values: tuple[Float, Float],
-    rows: FitRows,
-    pass_ix: Int,
-) -> _Rung:
-    where = weigh_nodes(axes, values, _first_that_holds(when, rows.view))
-    return _Rung(name, axes, when, where, pool_rows(where, rows.listed, pass_ix))
 
 
 def _split_conditions(rows: FitRows, when: list[dict[str, Any]], name: str, least: float) -> list[dict[str, Any]]:
@@ -419,13 +472,14 @@ def _first_that_holds(when: list[dict[str, Any]], view: ViewGeometry) -> Int:
     return out
 
 
-def _rows_per_effective(rows: FitRows, pass_ix: Int, by: tuple[str, ...], monotone: bool) -> float:
+def _rows_per_effective(rows: FitRows, pass_ix: Int, monotone: bool) -> float:
     """Rows per effective row, by the residuals of the richest model fitted as if rows were independent; else 1."""
     if rows.listed.all() or not rows.listed.any():
         return 1.0
-    richest = _build_ladder(rows, pass_ix, by, 1.0)[-1]
-    fit = fit_table(richest.entries, np.ones(int(pass_ix.max()) + 1), 1.0, monotone=monotone)
-    return count_rows_per_effective(rows.listed - richest.rows.chances(fit.theta), pass_ix)
+    trial = _TableTrial(rows, pass_ix, 1.0, monotone)
+    axes = trial.build_axes(BY)[-1]
+    richest = [axes, *trial.build_splits(axes)][-1]
+    return count_rows_per_effective(rows.listed - trial.chances(richest), pass_ix)
 
 
 def _note_rows(rows: FitRows) -> tuple[str, ...]:

@@ -188,7 +188,7 @@ FEWEST_PASSES = 4
 class Rung:
     """One model of a ladder: its score per list, and how far that is below the best, ± one standard error.
 
-    `score`: held-out log-likelihood (nats per list), or −BIC / 2n.
+    `score`: held-out log-likelihood (nats per list), −BIC / 2n, or the log-likelihood of what it is fitted to.
     """
 
     name: str
@@ -196,7 +196,7 @@ class Rung:
     below: float
     below_se: float
     chosen: bool
-    by: Literal["held out", "BIC"]
+    by: Literal["held out", "BIC", "likelihood"]
 
     def words(self) -> str:
         """The rung in words, as files and the report have it."""

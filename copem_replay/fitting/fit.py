@@ -18,7 +18,7 @@ from copem_replay.core.errors import InputError, count_noun
 from copem_replay.core.tracks import CLASSES
 from copem_replay.core.yaml import CommentedValue, strip_comments
 from copem_replay.experiment.schema import Experiment
-from copem_replay.fitting.detection import DetectionCouple, DetectionFit, fit_detection
+from copem_replay.fitting.detection import BY, DetectionCouple, DetectionFit, fit_detection
 from copem_replay.fitting.errors import ErrorFit, fit_errors, remove_pose
 from copem_replay.fitting.estimate import PER_ROW, Estimate
 from copem_replay.fitting.gather import (
@@ -100,7 +100,6 @@ def to_plain_data(part: Any) -> Any:
 # Fitting a unit.
 
 Truth = Literal["partial", "complete"]
-BY = ("range", "visible_share")
 SURE = 0.05
 """p below which a replay check fails, over the number of statistics: the usual level of five per cent."""
 _GATES = (0.75, 1.25)
@@ -434,7 +433,10 @@ def _build_memories(fit: Fit) -> Iterator[tuple[str, list[Tree]]]:
     detection = fit.parts.detection.memory
     if detection is not None:
         [part] = fit.parts.detection.yaml_detection()["memory"]["detection"]
-        yield "detection", [{key: CommentedValue(value, detection[key].words()) for key, value in part.items()}]
+        words = {key: one.words() for key, one in detection.items()} | {
+            "of": "all objects of a list: likelier than each"
+        }
+        yield "detection", [{key: CommentedValue(value, words[key]) for key, value in part.items()}]
     for quantity, parts in fit.parts.errors.memory.items():
         if parts:
             yield quantity, [part.keys(CommentedValue) for part in parts]
