@@ -33,7 +33,8 @@ class FusedTracks:
     """The fused lists as tracks, and the entries of the units' lists that each fused row (P,) is made of.
 
     Fusions without truth ids give the rows alone: `said` (P,) then holds the entries of the fusion, in one run, and
-    `object_ix` of a track the true object it is matched with, −1: none.
+    `object_ix` of a track the true object it is matched with, −1: none. `stated_s` (P,): their captures as units state
+    them, where those are not the true ones.
 
     >>> fused = cr.fused_tracks("logs/tc016d.yaml", "logs/tc016d.mcap")["PEM"]
     >>> fused.fused.valid.sum() == len(fused.to_dataframe())
@@ -48,6 +49,7 @@ class FusedTracks:
     said: Entries | None = None
     scene: Scene | None = None  # of the log, where rows are to be named
     faults: UnitFaults | None = None  # of `heard`, in one run: where a unit has outages or ghosts
+    stated_s: Float | None = None  # None: the captures that are stated are the true ones
     by_link: Bool | None = None  # (F,) lists of `heard` that units send by a link, in one run; None: there is none
 
     def to_dataframe(self) -> pd.DataFrame:

@@ -68,8 +68,9 @@ class RunTracks:
                     result[name] = output.fused_tracks
                 else:
                     matches = match_lists(truth_cache, output, self.experiment.measure)
+                    stated_s = None if output.stated is None else output.told.entries["captured_s"]
                     result[name] = convert_to_tracks(
-                        output.lists, 0, matches, output.heard, output.at.issue_s, output.at.newest
+                        output.lists, 0, matches, output.heard, output.at.issue_s, output.at.newest, stated_s
                     )
                 if output.faults is not None:
                     result[name] = replace(result[name], faults=output.faults)

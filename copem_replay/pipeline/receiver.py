@@ -117,11 +117,13 @@ def _fill_words(
 
 
 def convert_to_tracks(
-    lists: ObjectLists, run: int, matches: Matches, heard: Tracks, issue_s: Float, newest: Int
-) -> FusedTracks:
+    lists: ObjectLists, run: int, matches: Matches, heard: Tracks, issue_s: Float, newest: Int,
+    stated_s: Float | None = None,
+) -> FusedTracks:  # fmt: skip
     """The lists of one run as tracks: one of each matched object, one of each identity else, one of each entry else.
 
-    `issue_s (K,)`: the receiver's instants. `newest (K, U)`: the newest list of each unit then, −1: none.
+    `issue_s (K,)`: the receiver's instants. `newest (K, U)`: the newest list of each unit then, −1: none. `stated_s
+    (N,)`: captures of all entries as the fusion was told of them; None: the true ones.
     """
     first, last = int(lists.start[run, 0]), int(lists.start[run, -1])
     entries = lists.entries[first:last]
@@ -151,7 +153,8 @@ def convert_to_tracks(
         **{name: entries[name][order][None] for name in (*VALUES, *COVARIANCES)},
     )
     none = np.zeros(len(order) + 1, dtype=np.int64)
-    return FusedTracks(fused, heard, none[:0], none, None, entries[order])
+    stated_s = None if stated_s is None else stated_s[first:last][order]
+    return FusedTracks(fused, heard, none[:0], none, None, entries[order], stated_s=stated_s)
 
 
 # Stated captures: when lists were captured, as fusions are told of it.

@@ -77,7 +77,8 @@ def drawn(seed: int, lists: int, longest: int, said: bool, exact: bool) -> Fused
         claims["captured_s"][claims["unit_ix"] < 0] = -np.inf
     many = np.abs(numbers(UNITS * captures))
     view = None if said or exact else ViewGeometry(*(many if k != 3 else many / 3 for k in range(_FIELDS)))
-    return FusedTracks(fused, heard, entries, start, view, claims, SCENE)
+    stated_s = rng.choice([-0.05, 0.0, 0.2], P) if said and rng.random() < 0.5 else None
+    return FusedTracks(fused, heard, entries, start, view, claims, SCENE, stated_s=stated_s)
 
 
 _FIELDS = len(ViewGeometry.__dataclass_fields__)

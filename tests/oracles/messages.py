@@ -174,6 +174,10 @@ def detail(
             one |= {"length_m": float(fused.length_m[0, p]), "width_m": float(fused.width_m[0, p])}
         for name in UNCERTAINTIES:
             one[name] = None if getattr(fused, name) is None else float(getattr(fused, name)[0, p])
+        newest_s = float(fused_tracks.captured_s[0, p])
+        one["newest_captured_ns"] = scene.t0_ns + round(newest_s * 1e9) if math.isfinite(newest_s) else None
+        if fused_tracks.stated_s is not None:
+            one["stated_captured_ns"] = scene.t0_ns + round(float(fused_tracks.stated_s[p]) * 1e9)
         used = entries_of(fused_tracks, p)
         one["units"] = [heard.units[heard.row_unit_ix[k]] for k in used]
         one["captured_ns"] = [int(heard.stamp_ns[heard.frame_ix[k]]) for k in used]

@@ -2,7 +2,9 @@
 
 `detail` has one message per list: the full covariance and variances of each object, the entries of the units' lists it
 was made of (parallel lists of unit, capture, range, visible share), and what was detected with it. With a fusion
-without truth ids it has the claimed existence, and no entries. Objects are in the order of the list. Where units have
+without truth ids it has the claimed existence, and no entries. `newest_captured_ns` of an object is the newest capture
+that contributed, by which it counts as captured after an onset or not; `stated_captured_ns`, the same as units state it,
+is there where a fusion was told of clocks that are off. Objects are in the order of the list. Where units have
 ghosts or outages, `ghosts` are the entries about no object in the lists that came in with this one, and `down` the
 units whose last list was not made.
 
@@ -187,6 +189,8 @@ DETAIL_JSON = {
                     "id": {"type": "string"},
                     "existence": {"type": "number"},
                     **dict.fromkeys(UNCERTAINTIES, _NUMBER),
+                    "newest_captured_ns": {"type": ["integer", "null"]},
+                    "stated_captured_ns": {"type": "integer"},
                     "units": {"type": "array", "items": {"type": "string"}},
                     "captured_ns": {"type": "array", "items": {"type": "integer"}},
                     "range_m": {"type": "array", "items": _NUMBER},
@@ -197,6 +201,13 @@ DETAIL_JSON = {
         "events": {"type": "array", "items": {"type": "object"}},
     },
 }
+
+
+def _encode_captures(captured_ns: Int) -> list[RecordPart]:
+    """Stamps, null where there is no capture."""
+    known = start_offsets(captured_ns != NO_CAPTURE_NS)
+    stamps = encode_numbers(captured_ns[np.diff(known) > 0], int(known[-1]))
+    return [RowGroups(known, [stamps]), TextPool.of([b"null", b""]).at(np.diff(known))]
 
 
 class DetailWriter:
@@ -213,7 +224,7 @@ class DetailWriter:
         events: Mapping[int, Sequence[Event]],
         sizes_of: Bool | None = None,
     ) -> None:
-        self._fused_tracks, self._events = fused_tracks, events
+        self._fused_tracks, self._events, self._t0_ns = fused_tracks, events, scene.t0_ns
         names, self._name = fused_tracks.names_of(scene)
         self._names, self._units = encode_texts(names), encode_texts(fused_tracks.heard.units)
         self._faults = faults_by_list(fused_tracks)
@@ -224,15 +235,12 @@ class DetailWriter:
         rows, bounds = self._fused_tracks.listed_rows
         for first, last in split_into_blocks(bounds):
             captured_ns, lists = self._fused_tracks.fused.stamp_ns[first:last], last - first
-            captured = start_offsets(captured_ns != NO_CAPTURE_NS)
-            capture = RowGroups(captured, [encode_numbers(captured_ns[np.diff(captured) > 0], int(captured[-1]))])
             start = bounds[first : last + 1] - bounds[first]
             parts: list[RecordPart] = [
                 repeat_text(b'{"available_ns":', lists),
                 encode_numbers(available_ns[first:last], lists),
                 repeat_text(b',"captured_ns":', lists),
-                capture,
-                TextPool.of([b"null", b""]).at(np.diff(captured)),
+                *_encode_captures(captured_ns),
                 repeat_text(b',"objects":', lists),
                 *encode_arrays(start, self._objects(rows[bounds[first] : bounds[last]])),
                 TextPool.of([self._besides(frame) for frame in range(first, last)]).at(np.arange(lists)),
@@ -257,7 +265,25 @@ class DetailWriter:
                 repeat_text(f',"{name}":'.encode(), count),
                 encode_numbers(None if variance is None else variance[0, rows], count),
             ]
-        return [*parts, *self._entries(rows), repeat_text(b"}", count)]
+        return [*parts, *self._captures(rows), *self._entries(rows), repeat_text(b"}", count)]
+
+    def _captures(self, rows: Int) -> list[RecordPart]:
+        """The parts of the newest captures that the objects of some rows go back to."""
+        newest_s, stated_s = self._fused_tracks.captured_s[0, rows], self._fused_tracks.stated_s
+        parts = [
+            repeat_text(b',"newest_captured_ns":', len(rows)),
+            *_encode_captures(self._stamps(newest_s)),
+        ]
+        if stated_s is not None:
+            stamps_ns = self._stamps(stated_s[rows])
+            parts += [repeat_text(b',"stated_captured_ns":', len(rows)), encode_numbers(stamps_ns, len(rows))]
+        return parts
+
+    def _stamps(self, captured_s: Float) -> Int:
+        """Instants of the log as stamps; −∞ is no capture."""
+        known = np.isfinite(captured_s)
+        since_ns = np.rint(np.where(known, captured_s, 0.0) * 1e9).astype(np.int64)
+        return np.where(known, self._t0_ns + since_ns, NO_CAPTURE_NS)
 
     def _entries(self, rows: Int) -> list[RecordPart]:
         """The parts of the entries that the objects of some rows were made of."""
