@@ -25,11 +25,10 @@ from copem_replay.experiment.validate import find_problems, read_logs
 from copem_replay.io.write.osi import write_osi_trace
 from copem_replay.metrics.braking.driver import ConstantDeceleration, GammaReaction
 from copem_replay.metrics.braking.verdict import find_passing_intervals, pass_probability
-from copem_replay.metrics.intervals import wilson_limits
 from copem_replay.pipeline.closed_form import compute_distributions
 from copem_replay.pipeline.prepare import Replay, prepare_log
 from make_logs import tc016d
-from paper import PASSED, RUNS
+from paper import PASSED, RUNS, wilson_limits
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 EDGES_M: Final = tuple(round(-2.12 + 0.005 * k, 3) for k in range(-9, 10))

@@ -1,11 +1,17 @@
-"""How often intervals of shares hold the true share, and how wide they are: over few clusters, near 0 and 1.
+"""How often intervals over logs hold the truth, how wide they are, and how often a `*` is false.
 
-    python tools/coverage.py                       # all designs, 2,000 trials each: two minutes on one core
+    nice -n 10 python tools/coverage.py            # all rows, 2,000 studies each: minutes on one core
 
-A trial draws the share of every cluster (a log, an object) from a distribution whose mean is the true share, and, where
-weights are lognormal (σ = 1), how many rows each cluster has. `bootstrap`: percentiles alone; `reported`: as in
-`summary.csv`, nowhere narrower than the exact limits where few clusters decide. 95 % is what is asked for. With 2,000
-trials a coverage is off by .005 (one standard error at .95).
+A study has K logs with 1, 5 or 30 objects each, or unequal ones (lognormal, σ = 1, at least one), and its intervals are
+those of the package (`metrics/intervals.py`). *Shares*: of each log drawn from a Beta distribution of so much between
+logs (a + b: 2, 10, 40) and mean .5 or .9, or .95, and .2 in one log of ten; of its objects so many are detected. *Other
+figures*: means over objects of a part of the log and one of the object, both of the named distribution, variances 1 : 4
+(a correlation of .2); where it is zero but for a tenth, or bad in one log of ten, the object's part is normal. *RMST*:
+restricted means of exponential times at 3 times their mean, of which about a third are censored, from logs whose mean
+times are gamma distributed. *False `*`*: of the difference of two such configurations on the same logs, truly 0, how
+often the interval excludes 0: a difference of shares that all logs have alike has exact limits.
+
+Gates are those of the guide, less two standard errors; a row below its gate makes the exit code 1.
 """
 
 from __future__ import annotations
@@ -14,117 +20,241 @@ if __name__ == "coverage":  # numba looks for the package of that name, and with
     raise ImportError("tools/coverage.py is a program, not the package")
 
 import argparse
-from collections.abc import Callable, Sequence
+import math
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 import pandas as pd
 
-from copem_replay.core.tracks import Float
-from copem_replay.metrics.intervals import bootstrap_share, draw_resamples, share_limits
+from copem_replay.core.tracks import Float, Int
+from copem_replay.metrics.intervals import alike_limits, limit_figure, limit_share
 from copem_replay.metrics.summary import format_table
+from copem_replay.metrics.survival import (
+    CENSORED,
+    DETECTED,
+    cumulative_incidence,
+    restricted_mean,
+    restricted_means_without,
+)
 
-CLUSTERS: Final = (5, 8, 12, 20, 30, 60, 120)
-Draw = Callable[[np.random.Generator, int], Float]
+LOGS: Final = (3, 4, 5, 8, 12, 20)
+OBJECTS: Final = (1, 5, 30)
+_SAME: Final = 1e-9
 
 
 @dataclass(frozen=True)
 class Design:
-    """What shares clusters have: their mean, and how to draw (K,) of them."""
+    """A kind of study: `study(rng, w)` gives sums over the objects (S, K) of logs with `w (S, K)` objects.
+
+    `truth`: the mean over objects of all such logs. `gate(K)`: the least coverage; None: printed only.
+    """
 
     name: str
-    share: float
-    draw: Draw
+    kind: str
+    truth: float
+    study: Callable[[np.random.Generator, Int], Float]
+    gate: Callable[[int], float | None]
 
 
-def _beta(a: float, b: float) -> Draw:
-    return lambda rng, clusters: rng.beta(a, b, clusters)
+def draw_sizes(rng: np.random.Generator, studies: int, logs: int, objects: int, *, equal: bool) -> Int:
+    """(S, K) objects of each log."""
+    if equal:
+        return np.full((studies, logs), objects)
+    return np.maximum(1, np.rint(objects * rng.lognormal(0.0, 1.0, (studies, logs)))).astype(np.int64)
 
 
-def _all_or_nothing(share: float) -> Draw:
-    return lambda rng, clusters: (rng.random(clusters) < share).astype(float)
+def sum_objects(values: Float, w: Int) -> Float:
+    """(S, K) sums of values of all objects (Σw,), log by log."""
+    return np.add.reduceat(values, np.append(0, np.cumsum(w.ravel())[:-1])).reshape(w.shape)
 
 
+# Shares.
+
+
+def _beta_share(mean: float, between: float) -> Design:
+    def study(rng: np.random.Generator, w: Int) -> Float:
+        p = rng.beta(between * mean, between * (1 - mean), w.shape)
+        return rng.binomial(w, p).astype(float)
+
+    return Design(f"Beta({between:g}) at {mean:g}", "share", mean, study, lambda logs: 0.93)
+
+
+def _bad_share(rng: np.random.Generator, w: Int) -> Float:
+    return rng.binomial(w, np.where(rng.random(w.shape) < 0.1, 0.2, 0.95)).astype(float)
+
+
+# Other figures.
+
+
+def _mean_of(
+    name: str, draw: Callable[[np.random.Generator, tuple[int, ...]], Float], gate: Callable[[int], float | None]
+) -> Design:
+    """Means of objects with a part of the log and their own; `draw`: a distribution of mean 0 and variance 1."""
+
+    def study(rng: np.random.Generator, w: Int) -> Float:
+        own = sum_objects(draw(rng, (int(w.sum()),)), w)
+        return math.sqrt(0.2) * w * draw(rng, w.shape) + math.sqrt(0.8) * own
+
+    return Design(name, "mean", 0.0, study, gate)
+
+
+def _seldom(name: str, draw: Callable[[np.random.Generator, tuple[int, ...]], Float]) -> Design:
+    """Means of objects that are otherwise in a tenth of the logs, normal about that."""
+
+    def study(rng: np.random.Generator, w: Int) -> Float:
+        return w * draw(rng, w.shape) + sum_objects(rng.normal(0.0, 1.0, int(w.sum())), w)
+
+    return Design(name, "mean", 0.0, study, lambda logs: None)
+
+
+_E: Final = math.e
 DESIGNS: Final = (
-    Design("Beta(.9, .1)", 0.9, _beta(0.9, 0.1)),
-    Design("Beta(8, 1)", 8 / 9, _beta(8, 1)),
-    Design("U(0, 1)", 0.5, _beta(1, 1)),
-    *(Design(f"0/1 at {share:g}", share, _all_or_nothing(share)) for share in (0.5, 0.9, 0.97)),
+    *(_beta_share(mean, between) for between in (2, 10, 40) for mean in (0.5, 0.9)),
+    Design("one bad log in ten", "share", 0.1 * 0.2 + 0.9 * 0.95, _bad_share, lambda logs: 0.93 if logs <= 8 else 0.85),
+    _mean_of("normal", lambda rng, n: rng.normal(0.0, 1.0, n), lambda logs: 0.93),
+    _mean_of("uniform", lambda rng, n: rng.uniform(-math.sqrt(3), math.sqrt(3), n), lambda logs: 0.93),
+    _mean_of("exponential", lambda rng, n: rng.exponential(1.0, n) - 1.0, lambda logs: 0.90),
+    _mean_of(
+        "lognormal",
+        lambda rng, n: (rng.lognormal(0.0, 1.0, n) - math.sqrt(_E)) / math.sqrt(_E * (_E - 1)),
+        lambda logs: 0.85,
+    ),
+    _seldom("zero-inflated", lambda rng, n: np.where(rng.random(n) < 0.9, 0.0, rng.exponential(5.0, n)) - 0.5),
+    _seldom("one bad log in ten", lambda rng, n: np.where(rng.random(n) < 0.1, 5.0, 0.0) - 0.5),
 )
-WEIGHTS: Final[dict[str, Draw]] = {
-    "equal": lambda rng, clusters: np.ones(clusters),
-    "lognormal": lambda rng, clusters: rng.lognormal(0.0, 1.0, clusters),
-}
+RMST: Final = "censored RMST"
+HORIZON_S: Final = 3.0
 
 
-def held(design: Design, weights: str, clusters: int, trials: int, seed: int) -> dict[str, object]:
-    """How many of the trials' intervals hold the true share, and their mean width."""
-    rng = np.random.default_rng([seed, clusters, *design.name.encode(), *weights.encode()])
-    resampled = draw_resamples([str(k) for k in range(clusters)], seed)
-    limits = np.empty((trials, 2, 2))
-    for trial in range(trials):
-        totals = WEIGHTS[weights](rng, clusters)
-        successes = np.minimum(totals * design.draw(rng, clusters), totals)
-        limits[trial, 0] = bootstrap_share(successes, totals, resampled)
-        limits[trial, 1] = share_limits(successes, totals, resampled)[1:]
-    # Sums of ones over sums of ones are 1 but for rounding.
-    holds = (limits[:, :, 0] <= design.share + 1e-12) & (design.share - 1e-12 <= limits[:, :, 1])
-    coverage, width = holds.mean(axis=0), np.diff(limits, axis=2)[:, :, 0].mean(axis=0)
+def mean_limits(sums: Float, w: Int) -> tuple[Float, Float, Float]:
+    """The mean of each study (S,), without each log (S, K), and its limits: (mean, low, high)."""
+    total, n = sums.sum(axis=-1, keepdims=True), w.sum(axis=-1, keepdims=True)
+    mean = (total / n)[..., 0]
+    low, high = limit_figure(mean, (total - sums) / (n - w), w.astype(float))
+    return mean, low, high
+
+
+def false_star(sums: Float, w: Int) -> float:
+    """How often the interval of a mean difference excludes 0."""
+    difference, low, high = mean_limits(sums, w)
+    for k in np.flatnonzero(np.ptp(sums / w, axis=-1) <= _SAME):
+        low[k], high[k] = alike_limits(float(difference[k]), w[k])
+    return float(((low > _SAME) | (high < -_SAME)).mean())
+
+
+def draw_times(rng: np.random.Generator, w: Int) -> tuple[Float, Int, Int]:
+    """Times to detection of all objects of one study, how they end, and their logs; `w (K,)`."""
+    log = np.repeat(np.arange(len(w)), w)
+    time_s = rng.exponential(1.0, len(log)) * rng.gamma(5.0, 0.2, len(w))[log]
+    ended_s = rng.uniform(0.3, 5.0, len(log))
+    ending = np.where(time_s <= ended_s, DETECTED, CENSORED)
+    return np.round(np.minimum(time_s, ended_s), 9), ending, log
+
+
+def true_rmst_s() -> float:
+    """The mean of min(T, h) by the midpoint rule over the quantiles of the logs' gamma distribution: E[m(1 − e^(−h/m))]."""
+    from scipy.special import gammaincinv
+
+    mean_s = 0.2 * gammaincinv(5.0, (np.arange(200_000) + 0.5) / 200_000)
+    return float((mean_s * -np.expm1(-HORIZON_S / mean_s)).mean())
+
+
+def rmst_of(times: tuple[Float, Int, Int], logs: int) -> tuple[float, Float]:
+    """The restricted mean of a study, and without each log."""
+    time_s, ending, log = times
+    weight = np.ones(len(time_s))
+    value = restricted_mean(*cumulative_incidence(time_s, ending, weight), HORIZON_S)
+    return value, restricted_means_without(time_s, ending, weight, log, logs, HORIZON_S)
+
+
+def rmst_row(rng: np.random.Generator, w: Int) -> tuple[Float, Float, float]:
+    """Limits (S,) of restricted means of studies, and how often those of differences exclude 0."""
+    studies, logs = w.shape
+    value, without = np.empty((2, studies)), np.empty((2, studies, logs))
+    for k in range(studies):
+        for side in (0, 1):
+            value[side, k], without[side, k] = rmst_of(draw_times(rng, w[k]), logs)
+    weights = w.astype(float)
+    low, high = limit_figure(value[0], without[0], weights, (0.0, HORIZON_S))
+    least, most = limit_figure(value[0] - value[1], without[0] - without[1], weights, (-HORIZON_S, HORIZON_S))
+    return low, high, float(((least > _SAME) | (most < -_SAME)).mean())
+
+
+def describe_row(low: Float, high: Float, truth: float, star: float, gate: float | None) -> dict[str, object]:
+    """Coverage, width and false `*` of a row of the table, its gate, and whether it fails."""
+    held = float(((low <= truth + _SAME) & (truth - _SAME <= high)).mean())
+    least = None if gate is None else gate - 2 * math.sqrt(gate * (1 - gate) / len(low))
     return {
-        "shares": design.name,
-        "weights": weights,
-        "clusters": clusters,
-        "bootstrap holds": float(coverage[0]),
-        "width": float(width[0]),
-        "reported holds": float(coverage[1]),
-        "its width": float(width[1]),
+        "coverage": held,
+        "width": float((high - low).mean()),
+        "false *": star,
+        "gate": gate,
+        "fails": least is not None and held < least,
     }
 
 
-def coverage(clusters: Sequence[int] = CLUSTERS, trials: int = 2000, seed: int = 1) -> pd.DataFrame:
-    """A row per design, kind of weights and number of clusters."""
-    return pd.DataFrame(
-        [
-            held(design, weights, number, trials, seed)
-            for weights in WEIGHTS
-            for design in DESIGNS
-            for number in clusters
-        ]
-    )
+def table_rows(logs: Sequence[int], objects: Sequence[int], studies: int, seed: int) -> Iterator[dict[str, object]]:
+    """A row per design, number of logs and of objects, equal and unequal; random numbers by the row alone."""
+    rmst_s = true_rmst_s()
+    for number, name in enumerate([*range(len(DESIGNS)), RMST]):
+        for equal in (True, False):
+            for size in objects:
+                for K in logs:
+                    rng = np.random.default_rng([seed, number, equal, size, K])
+                    w = draw_sizes(rng, studies, K, size, equal=equal)
+                    row = {"kind": "mean", "design": RMST, "objects": size, "sizes": "equal" if equal else "unequal"}
+                    if name == RMST:
+                        *limits, star = rmst_row(rng, w)
+                        found = describe_row(*limits, rmst_s, star, 0.90 if K >= 8 else 0.85)
+                    else:
+                        design = DESIGNS[number]
+                        sums, others = design.study(rng, w), design.study(rng, w)
+                        limits = (
+                            limit_share(sums, w, w.sum(axis=-1)) if design.kind == "share" else mean_limits(sums, w)[1:]
+                        )
+                        found = describe_row(*limits, design.truth, false_star(sums - others, w), design.gate(K))
+                        row |= {"kind": design.kind, "design": design.name}
+                    yield row | {"logs": K} | found
 
 
-def cost(table: pd.DataFrame) -> pd.DataFrame:
-    """How often each kind holds at least, and how wide it is on the average, by weights and number of clusters."""
-    rows = []
-    for (weights, number), of in table.groupby(["weights", "clusters"]):
-        widths = of["width"].mean(), of["its width"].mean()
-        least = of["bootstrap holds"].min(), of["reported holds"].min()
-        rows.append(
-            {
-                "weights": weights,
-                "clusters": number,
-                "bootstrap holds, least": least[0],
-                "mean width": widths[0],
-                "reported holds, least": least[1],
-                "its mean width": widths[1],
-                "times as wide": round(widths[1] / widths[0], 2),
-            }
-        )
-    return pd.DataFrame(rows)
+def coverage(
+    logs: Sequence[int] = LOGS, objects: Sequence[int] = OBJECTS, studies: int = 2000, seed: int = 1
+) -> pd.DataFrame:
+    """The table: a row per design, number of logs and of objects, equal and unequal."""
+    return pd.DataFrame(list(table_rows(logs, objects, studies, seed)))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Coverage and mean width of the intervals of shares.")
-    parser.add_argument("--trials", type=int, default=2000)
+def worst(table: pd.DataFrame) -> pd.DataFrame:
+    """By design and number of logs: the least coverage, the mean width and the most false `*` of all numbers of objects."""
+    of = table.groupby(["kind", "design", "logs"], sort=False)
+    columns = {
+        "coverage, least": of["coverage"].min(),
+        "width, mean": of["width"].mean(),
+        "false *, most": of["false *"].max(),
+    }
+    return pd.DataFrame(columns).reset_index()
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="Coverage, width and false * of intervals over logs.")
+    parser.add_argument("--studies", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--clusters", type=int, nargs="+", default=list(CLUSTERS))
+    parser.add_argument("--logs", type=int, nargs="+", default=list(LOGS))
+    parser.add_argument("--objects", type=int, nargs="+", default=list(OBJECTS))
     asked = parser.parse_args()
-    table = coverage(asked.clusters, asked.trials, asked.seed)
-    print(format_table(table.round(3)))
-    print("\nOver all shares of clusters:")
-    print(format_table(cost(table).round(3)))
+    table = coverage(asked.logs, asked.objects, asked.studies, asked.seed)
+    print(format_table(table.drop(columns="fails").round(3)))
+    print("\nOver all numbers of objects:")
+    print(format_table(worst(table).round(3)))
+    failing = table[table["fails"]]
+    print(f"\n{len(failing)} of {int(table['gate'].notna().sum())} rows are below their gate")
+    if len(failing):
+        print(format_table(failing.drop(columns="fails").round(3)))
+    return 1 if len(failing) else 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

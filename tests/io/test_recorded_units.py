@@ -319,7 +319,7 @@ class TestInARun:
         more: Any = {"pems": {"p": [{"detection": {"kind": "constant", "probability": 1.0}}]}}
         more["units"] = plan_of(path).as_written()["units"] | {"ego": {"on": "ego", "pem": "p"}}
         more["configurations"] = {"both": {"units": ["ego", "rsu"]}}
-        assert replayed(path, **more).summary["interval"].tolist() == ["wilson"]
+        assert replayed(path, **more).summary["interval"].tolist() == ["exact"]
 
     def test_its_results_run_again(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         path = drive(tmp_path / "a.mcap", *(list_of(k / 10, car(30 + k % 3)) for k in range(21)))

@@ -41,19 +41,19 @@ def reacting(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_truth_has_no_interval_over_runs(made: Path) -> None:
     rows = summary_of(made)
     for name in ("interval", "pass_interval"):
-        assert rows[name].to_dict() == dict.fromkeys(["late", "half", "never"], "wilson") | dict.fromkeys(
+        assert rows[name].to_dict() == dict.fromkeys(["late", "half", "never"], "exact") | dict.fromkeys(
             ["GT", "hit"], "nothing drawn"
         )
     nothing = ["detected_share_low", "detected_share_high", "pass_share_low", "pass_share_high", "interval_over",
                "pass_interval_over"]  # fmt: skip
     assert rows.loc[["GT", "hit"], nothing].isna().all(axis=None)
-    # By kind of unit: a PEM that always detects is drawn, too. 6 of 6, Wilson: 6 / (6 + 1.96²).
-    assert rows.loc["late", "detected_share_low"] == pytest.approx(6 / (6 + 1.959964**2), abs=1e-6)
+    # By kind of unit: a PEM that always detects is drawn, too. 6 of 6: .025^(1/6).
+    assert rows.loc["late", "detected_share_low"] == pytest.approx(0.025 ** (1 / 6))
 
 
 def test_a_reaction_that_is_drawn_gives_the_truth_an_interval_of_what_passes(reacting: Path) -> None:
     rows = summary_of(reacting)
-    assert (rows["pass_interval"] == "wilson").all()
+    assert (rows["pass_interval"] == "exact").all()
     assert rows.loc["GT", "interval"] == "nothing drawn"
 
 
@@ -62,7 +62,11 @@ def test_the_table_says_which_have_none(made: Path) -> None:
     (gt,) = (line for line in lines[:6] if line.startswith("GT"))
     assert gt.split()[1:3] == ["1", "–"]
     said = "no 95 % of GT, hit: nothing drawn, every run is the same"
-    assert [line for line in lines if "95 %" in line][1:3] == ["95 %: Wilson interval over runs", said]
+    over = (
+        "95 %: exact binomial limits over 6 runs of this one object: how far other draws of the same models may differ "
+        "for this one object; nothing about other traffic"
+    )
+    assert [line for line in lines if "95 %" in line][1:3] == [over, said]
     assert lines.count(said) == 2
 
 

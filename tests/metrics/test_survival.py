@@ -11,15 +11,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from copem_replay.metrics.intervals import wilson_limits
 from copem_replay.metrics.survival import (
     CENSORED,
     DETECTED,
     LEFT,
     cumulative_incidence,
+    incidences_without,
     quantile_time,
     quantile_with_never,
     restricted_mean,
+    restricted_means_without,
 )
 
 Array = npt.NDArray[np.float64]
@@ -336,51 +337,30 @@ def test_a_distance_in_other_units_is_the_same_distance(distances: list[int | No
     assert quantile_with_never(values * factor, detected, fortieths / 40) == expected
 
 
-# --------------------------------------------------------------------------------------- Wilson
+# ------------------------------------------------------------------------------ without each cluster
 
 
-@pytest.mark.parametrize(
-    ("successes", "low", "high"),
-    [
-        (500, 0.9924, 1.0),
-        (499, 0.9888, 0.9996),
-        (474, 0.9249, 0.9643),
-        (426, 0.8182, 0.8804),
-        (323, 0.6031, 0.6867),
-        (0, 0.0, 0.0076),
-    ],
-)
-def test_intervals_of_the_published_shares_of_500(successes: int, low: float, high: float):
-    assert wilson_limits(successes, 500) == pytest.approx((low, high), abs=5e-5)
+clustered = st.lists(st.tuples(st.integers(0, 12), st.sampled_from([CENSORED, DETECTED, LEFT]), st.integers(0, 2),
+                               st.integers(1, 3)), min_size=1, max_size=14)  # fmt: skip
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 7, 500, 999_983])
-@pytest.mark.parametrize("confidence", [0.5, 0.9, 0.95, 0.999])
-def test_the_ends_are_exact(n: int, confidence: float):
-    low, high = wilson_limits(0, n, confidence=confidence)
-    assert low == 0.0
-    assert 0.0 < high < 1.0
-    low, high = wilson_limits(n, n, confidence=confidence)
-    assert 0.0 < low < 1.0
-    assert high == 1.0
-
-
-@given(st.integers(1, 2000), st.data())
-def test_the_limits_solve_the_equation_that_defines_them(n: int, data: st.DataObject):
-    successes = data.draw(st.integers(0, n))
-    # Quantiles of the normal distribution as tabulated.
-    for confidence, z in ((0.90, 1.6448536269514722), (0.95, 1.959963984540054), (0.99, 2.5758293035489004)):
-        low, high = wilson_limits(successes, n, confidence=confidence)
-        assert low <= successes / n <= high
-        for p in (low, high):
-            assert (successes / n - p) ** 2 == pytest.approx(z * z * p * (1 - p) / n, abs=1e-13)
-
-
-@given(st.integers(1, 2000), st.data())
-def test_failures_have_the_mirrored_interval(n: int, data: st.DataObject):
-    successes = data.draw(st.integers(0, n))
-    low, high = wilson_limits(successes, n)
-    assert wilson_limits(n - successes, n) == pytest.approx((1 - high, 1 - low), abs=1e-14)
+@given(clustered, st.integers(0, 14))
+def test_without_a_cluster_it_is_the_curve_and_the_mean_of_the_other_rows(
+    rows: list[tuple[int, int, int, int]], quarters: int
+):
+    time_s, ending, cluster, weight = (np.array(column) for column in zip(*rows, strict=True))
+    horizon_s, at_s = quarters / 4, np.arange(-1, 14) / 4
+    means = restricted_means_without(time_s / 4, ending, weight.astype(float), cluster, 3, horizon_s)
+    shares = incidences_without(time_s / 4, ending, weight.astype(float), cluster, 3, at_s)
+    for k in range(3):
+        kept = np.repeat(np.arange(len(rows)), np.where(cluster == k, 0, weight))  # each row as often as it counts
+        if not len(kept):
+            assert np.isnan([means[k], *shares[k]]).all()
+            continue
+        times_s, incidence = cumulative_incidence(time_s[kept] / 4, ending[kept])
+        assert means[k] == pytest.approx(restricted_mean(times_s, incidence, horizon_s), abs=1e-9)
+        expected = [float(incidence[times_s <= t][-1]) if (times_s <= t).any() else 0.0 for t in at_s]
+        assert shares[k] == pytest.approx(expected, abs=1e-9)
 
 
 # --------------------------------------------------------------------------- what is not accepted

@@ -17,14 +17,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.axes import Axes
+from numpy.typing import NDArray
 
 from copem_replay.core.colours import configuration_colours
 from copem_replay.core.errors import InputError
-from copem_replay.metrics.intervals import list_resamples
 from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_incidence, restricted_mean
 from copem_replay.report.figures import FIGURES, Selection
 from copem_replay.report.figures.answer import answer_figure
-from copem_replay.report.figures.detection_curves import curves_figure, mean_limits
+from copem_replay.report.figures.detection_curves import RowClusters, curves_figure, mean_limits
 from copem_replay.report.figures.differences import differences_figure
 from copem_replay.report.figures.selection import choose_object_and_run, find_differing, find_most_telling
 from copem_replay.report.figures.style import (
@@ -54,6 +54,7 @@ from copem_replay.results.compare import compare_folders
 from copem_replay.results.read import Results, read_results
 from copem_replay.viewer.sink import choose_telling_objects
 from tests.helpers.report_pages import ALONE, ONE, changed, eighteen, replayed, with_rows
+from tests.oracles import intervals as oracle
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +127,7 @@ class TestAnswer:
         figure = answer_figure(two)
         assert intervals(figure.axes[0]) == {}
         assert note(figure).startswith("No interval of the mean time")
-        assert ": 2 objects. " in note(figure)
+        assert ": 2 objects of one drive, fewer than 5; " in note(figure)
         assert "95 % intervals" not in note(figure)
 
     def test_only_some(self, results: Results) -> None:
@@ -138,27 +139,25 @@ class TestAnswer:
 class TestMeanLimits:
     @given(st.data())
     @settings(max_examples=60, deadline=None)
-    def test_they_are_quantiles_of_the_means_of_all_resamples(self, data: st.DataObject) -> None:
-        """Of four clusters all 256 resamples, each written out row by row; some rows are censored."""
+    def test_they_come_of_the_means_without_each_log(self, data: st.DataObject) -> None:
+        """Of four logs, each left out row by row; some rows are censored."""
         count = data.draw(st.integers(4, 14))
         time_s = np.array(data.draw(st.lists(st.integers(0, 12), min_size=count, max_size=count))) / 4
         codes = st.sampled_from([CENSORED, DETECTED, LEFT] if data.draw(st.booleans()) else [DETECTED, LEFT])
         ending = np.array(data.draw(st.lists(codes, min_size=count, max_size=count)))
         of = np.array([*range(4), *data.draw(st.lists(st.integers(0, 3), min_size=count - 4, max_size=count - 4))])
-        found = mean_limits(time_s, ending, [f"c{k}" for k in of], 2.5, 1)
-        resampled = list_resamples(4)
-        means: list[float] = []
-        for chosen, times in zip(resampled.count, resampled.times, strict=True):
-            kept = np.repeat(np.arange(count), chosen[of])
-            means += [restricted_mean(*cumulative_incidence(time_s[kept], ending[kept]), 2.5)] * int(times)
-        if max(means) - min(means) < 1e-9:
+        clusters = RowClusters("logs", [f"c{k}" for k in of], [f"object {k}" for k in range(count)])
+        found = mean_limits(time_s, ending, clusters, 2.5)
+
+        def mean_s(kept: NDArray[np.bool_]) -> float:
+            return restricted_mean(*cumulative_incidence(time_s[kept], ending[kept]), 2.5)
+
+        value, without = mean_s(of >= 0), [mean_s(of != k) for k in range(4)]
+        if max(abs(one - value) for one in without) < 1e-9:
             assert found is None
             return
-        assert found is None or min(means) - 1e-9 <= found[0] < found[1] <= max(means) + 1e-9
-        # Four clusters are few: the levels are beyond 2.5 %, so that the limits lie near the ends.
-        if found is not None:
-            assert found[0] <= np.quantile(means, 0.025) + 1e-9
-            assert found[1] >= np.quantile(means, 0.975) - 1e-9
+        limits = oracle.figure(value, without, np.bincount(of).tolist())
+        assert found == pytest.approx((max(limits[0], 0.0), min(limits[1], 2.5)), abs=1e-9)
 
 
 class TestDifferences:
@@ -193,7 +192,7 @@ class TestDifferences:
             differences_figure(alone)
 
     def test_a_missing_interval_is_said_first(self, two: Results) -> None:
-        assert note(differences_figure(two)).startswith("No intervals: 2 objects. ")
+        assert note(differences_figure(two)).startswith("No intervals: 2 objects of one drive, fewer than 5; ")
 
 
 class TestTradeOff:

@@ -30,10 +30,10 @@ from copem_replay.cli import main as cli
 from copem_replay.core.errors import InputError
 from copem_replay.experiment.file import log_paths, read_experiment_file
 from copem_replay.experiment.validate import find_problems, read_logs
-from copem_replay.metrics.intervals import choose_clusters, draw_resamples, share_limits
-from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_incidence
+from copem_replay.metrics.intervals import choose_clusters
+from copem_replay.metrics.survival import DETECTED, LEFT, cumulative_incidence
 from copem_replay.pipeline.run import run_experiment
-from copem_replay.report.figures.detection_curves import curves_figure, incidence_limits, resample_incidence
+from copem_replay.report.figures.detection_curves import RowClusters, curves_figure, incidence_limits
 from copem_replay.report.figures.distances import FAIL, KINDS, NEUTRAL, PASS, Strip, distances_figure
 from copem_replay.report.figures.latency_breakdown import latency_breakdown_figure
 from copem_replay.report.figures.registry import write_figure_files
@@ -46,6 +46,7 @@ from copem_replay.results.write import write_results
 from copem_replay.viewer.rrd import EXPORTERS
 from tests.helpers.recordings import Obj, pedestrian, write_recording
 from tests.helpers.report_pages import with_rows
+from tests.oracles import intervals as oracle
 
 TEXT = """\
 version: 1
@@ -544,7 +545,7 @@ class TestCurves:
             assert y == pytest.approx([0, last, last])
             assert (x[0], x[-1]) == pytest.approx(axes.get_xlim())
         assert list(line(axes, "never")[1]) == [0, 0]
-        assert "No bands: fewer than 5 logs and fewer than 5 objects" in note(figure)
+        assert "No bands: 2 objects of one drive, fewer than 5; more runs" in note(figure)
         assert [text.get_text() for text in figure.legends[0].get_texts()] == ["GT", "late", "near", "hit", "never"]
 
     def test_one_object_has_bands_over_runs(self, tmp_path: Path) -> None:
@@ -564,7 +565,7 @@ class TestCurves:
         low, high = at_first[at_first > 0].min(), at_first.max()
         half = 1.96 * (share[0] * (1 - share[0]) / 40) ** 0.5
         assert (low, high) == (pytest.approx(share[0] - half, abs=0.05), pytest.approx(share[0] + half, abs=0.05))
-        assert "Bands: 95 %, bootstrap over whole runs, or exact binomial limits where few decide" in note(figure)
+        assert "Bands: 95 %, over 40 runs of this one object: how far other draws" in " ".join(note(figure).split())
 
     def test_exact(self, mine: Path) -> None:
         # Of two objects one is known at once or after a second, the other half the time after a second, else never.
@@ -580,42 +581,37 @@ class TestCurves:
 
 
 class TestBands:
-    @pytest.mark.parametrize("seed", range(5))
-    def test_all_resamples_at_once_are_as_each_by_itself(self, seed: int) -> None:
-        generator = np.random.default_rng(seed)
-        n, resamples = 40, 7
-        time_s = np.sort(generator.integers(0, 12, n) / 4)  # many ties
-        ending = generator.choice([CENSORED, DETECTED, LEFT], n)
-        count = generator.integers(0, 3, (resamples, n))
-        at_s = np.arange(-1, 4, 0.125)
-        found = resample_incidence(time_s, ending, count, at_s)
-        for r in range(resamples):
-            rows = np.repeat(np.arange(n), count[r])
-            times_s, share = cumulative_incidence(time_s[rows], ending[rows])
-            k = np.searchsorted(times_s, at_s, side="right")
-            assert found[r] == pytest.approx(np.append(0.0, share)[k])
-
     def test_clusters_stay_whole(self) -> None:
-        # Each of five objects is always or never known: a share is then a number of fifths.
+        # Each of five objects is always or never known, in any of its runs.
         time_s = np.repeat([1.0, 1.0, 1.0, 5.0, 5.0], 20)
         ending = np.repeat([DETECTED, DETECTED, DETECTED, LEFT, LEFT], 20)
-        names = np.repeat(list("abcde"), 20)
-        low, high = incidence_limits(time_s, ending, list(names), np.array([0.5, 1.0]), 1)
-        # None known by then: none of five, 1 − 0.025^(1/5). Then three of five: all or none is drawn often enough.
+        names = list(np.repeat(list("abcde"), 20))
+        low, high = incidence_limits(time_s, ending, RowClusters("objects", names, names), np.array([0.5, 1.0]))
+        # None known by then: none of five, 1 − 0.025^(1/5). Then three of five, whose spread tells of four.
         assert (low[0], high[0]) == (0, pytest.approx(0.521824, abs=1e-6))
-        assert (low[1], high[1]) == (0.0, 1.0)
+        assert (low[1], high[1]) == pytest.approx(oracle.exact(0.6, 4.0))
 
     def test_bands_end_where_the_summary_does(self) -> None:
-        """Twelve objects of 20 runs: at last the share detected and its limits, but for fewer resamples."""
+        """Five logs of one to four objects in 20 runs: at last the share detected and its limits."""
         generator = np.random.default_rng(4)
-        totals, known = np.full(12, 20), generator.binomial(20, generator.beta(4, 1, 12))
-        names = [f"object {k}" for k in range(12)]
-        rows = [(name, DETECTED if k < n else LEFT) for name, n in zip(names, known, strict=True) for k in range(20)]
-        cluster, ending = [name for name, _ in rows], np.array([how for _, how in rows])
-        low, high = incidence_limits(np.ones(240), ending, cluster, np.array([1.0]), 1)
-        kind, least, most = share_limits(known, totals, draw_resamples(sorted(names), 1))
-        assert kind == "bootstrap+exact"
-        assert (low[0], high[0]) == pytest.approx((least, most), abs=0.02)
+        rows, clusters = [], []
+        for log in range(5):
+            known = generator.binomial(20, generator.beta(4, 1, log % 4 + 1))
+            clusters.append((known.sum() / 20, len(known)))
+            rows += [(f"log {log}", f"{log} {thing}", DETECTED if run < n else LEFT)
+                     for thing, n in enumerate(known) for run in range(20)]  # fmt: skip
+        logs, things, ending = zip(*rows, strict=True)
+        of = RowClusters("logs", logs, things)
+        low, high = incidence_limits(np.ones(len(rows)), np.array(ending), of, np.array([1.0]))
+        assert (low[0], high[0]) == pytest.approx(oracle.share(clusters), abs=1e-8)
+
+    def test_bands_of_runs_are_binomial(self) -> None:
+        runs = RowClusters("runs", [str(k) for k in range(10)], ["a"] * 10)
+        ending = np.array([DETECTED] * 7 + [LEFT] * 3)
+        low, high = incidence_limits(np.arange(10.0), ending, runs, np.array([2.0, 9.0]))
+        assert [(low[0], high[0]), (low[1], high[1])] == [
+            pytest.approx(oracle.exact(k / 10, 10)) for k in (3, 7)
+        ]  # fmt: skip
 
     def test_which_clusters(self) -> None:
         def rows(logs: int, things: int, runs: int = 2) -> pd.DataFrame:
@@ -628,8 +624,8 @@ class TestBands:
         assert choose_clusters(rows(1, 1))[1].nunique() == 2
         assert choose_clusters(rows(1, 4))[0] is None
         assert choose_clusters(rows(1, 5))[0] == "objects"
-        assert choose_clusters(rows(4, 2))[0] == "objects"
-        assert choose_clusters(rows(5, 1))[0] == "logs"
+        assert choose_clusters(rows(2, 5))[0] is None
+        assert choose_clusters(rows(3, 1))[0] == "logs"
 
 
 class TestSweeps:
@@ -644,7 +640,9 @@ class TestSweeps:
         columns = ["sweep", "value", "configuration", "list_rate_hz", "detected_share", "detected_share_low",
                    "detected_share_high", "ttd_p5_s", "ttd_median_s", "ttd_p95_s", "pass_share", "pass_share_low",
                    "pass_share_high"]  # fmt: skip
-        table = pd.DataFrame(rows, columns=columns).assign(n=6, interval="wilson", interval_over="runs")
+        table = pd.DataFrame(rows, columns=columns).assign(
+            n=6, interval="exact", interval_over="runs", interval_clusters=6
+        )
         table["pass_share_exact"] = [0.79, 0.91, 1.0, None]
         table.to_csv(mine / "sweep.csv", index=False)
         return read_results(mine)
@@ -673,7 +671,7 @@ class TestSweeps:
         said = note(figure).replace("\u00a0", " ")
         assert (
             "n = 6 per point, seed 1. Latency: 10 fused lists per second. "
-            "Bands of shares: 95 %, Wilson interval over runs" in said
+            "Bands of shares, 95 %: exact binomial limits over 6 runs of this one object" in said
         )
         assert "reaches the top" in said
 

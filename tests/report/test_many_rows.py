@@ -16,7 +16,7 @@ from copem_replay.metrics.intervals import choose_clusters
 from copem_replay.metrics.summary import DETECTED, tally_rows
 from copem_replay.report import write_html_report
 from copem_replay.report.figures import Selection
-from copem_replay.report.figures.detection_curves import build_curve, detection_endings, mean_limits
+from copem_replay.report.figures.detection_curves import build_curve, cluster_rows, detection_endings, mean_limits
 from copem_replay.report.figures.latency_breakdown import (
     FUSION,
     HIDDEN,
@@ -136,15 +136,17 @@ def test_counts_say_what_rows_say(rows: pd.DataFrame) -> None:
     assert counted["runs"].sum() == len(rows)
     over = choose_clusters(counted)[0]
     banded = over in ("logs", "objects")
-    # Of one object runs are resampled, for which the tally is not taken.
-    one, all_ = (build_curve(of, choose_clusters(of)[1] if banded else None, 1) for of in (counted, each))
+    # Of one object runs are the clusters, for which the tally is not taken.
+    clusters = [cluster_rows(of, str(over), choose_clusters(of)[1]) if banded else None for of in (counted, each)]
+    one, all_ = (build_curve(*of) for of in zip((counted, each), clusters, strict=True))
     for name in ("times_s", "share", *(("low", "high") if banded and len(one.times_s) else ())):
         np.testing.assert_array_equal(getattr(one, name), getattr(all_, name))
     if banded:
         limits = []
-        for of in (counted, each):
+        for of, its in zip((counted, each), clusters, strict=True):
             time_s, ending, runs = detection_endings(of)
-            limits.append(mean_limits(time_s, ending, list(choose_clusters(of)[1]), 4.0, 1, runs))
+            assert its is not None
+            limits.append(mean_limits(time_s, ending, its, 4.0, runs))
         assert (limits[0] is None) == (limits[1] is None)
         assert limits[0] is None or limits[0] == pytest.approx(limits[1], abs=1e-9)
     columns = ["log", "object_id", "missed", "runs", "ended_s", "ended_by"]

@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.stats import binom
 
 from copem_replay.experiment.file import read_experiment_file
 from copem_replay.experiment.validate import find_problems, read_logs
-from copem_replay.metrics.intervals import wilson_limits
 from copem_replay.pipeline.run import run_experiment
 from tests.helpers.reports import inputs_of
 
@@ -214,6 +215,17 @@ def test_paper_counts_and_what_stands_beside_them() -> None:
     assert table["exact within"].tolist() == ["no", "yes", "no", "no", "no", "no"]
 
 
+@given(st.integers(1, 2000), st.data())
+def test_wilson_limits_solve_the_equation_that_defines_them(n: int, data: st.DataObject) -> None:
+    successes = data.draw(st.integers(0, n))
+    # Quantiles of the normal distribution as tabulated.
+    for confidence, z in ((0.90, 1.6448536269514722), (0.95, 1.959963984540054), (0.99, 2.5758293035489004)):
+        low, high = paper.wilson_limits(successes, n, confidence=confidence)
+        assert low <= successes / n <= high
+        for p in (low, high):
+            assert (successes / n - p) ** 2 == pytest.approx(z * z * p * (1 - p) / n, abs=1e-13)
+
+
 def test_misfit_by_hand() -> None:
     """None at the paper's own rates; at .5 everywhere 2 n log 2 for each of the three with all or none."""
     rates = {name: passed / paper.RUNS for name, passed in paper.PASSED.items()}
@@ -249,7 +261,7 @@ def test_the_table_is_the_papers() -> None:
     )
     exact = rows["pass_share_exact"]
     for name, passed in paper.PASSED.items():
-        low, high = wilson_limits(passed, paper.RUNS)
+        low, high = paper.wilson_limits(passed, paper.RUNS)
         assert low <= exact[name] <= high, name
         at_least, at_most = binom.interval(0.99, 500, exact[name]) if exact[name] > 0 else (0, 0)
         assert at_least <= rows["pass_share"][name] * 500 <= at_most, name
