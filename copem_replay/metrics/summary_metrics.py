@@ -160,7 +160,8 @@ def _measure_unknown(rows: pd.DataFrame, known: Bool, weight: Float) -> UnknownT
     total = float(weight.sum())
     if not total:
         return UnknownTimes()
-    unknown_s = compute_unknown_s(*(rows[name].to_numpy(dtype=float) for name in ("detection_s", "onset_s", "ended_s")))
+    length_s = (rows["ended_s"] - rows["onset_s"]).to_numpy(dtype=float)
+    unknown_s = compute_unknown_s(rows["time_to_detection_s"].to_numpy(dtype=float), length_s)
     left = is_competing(rows["ended_by"]) & ~known
     return UnknownTimes(
         float(weight @ unknown_s) / total,
@@ -169,9 +170,9 @@ def _measure_unknown(rows: pd.DataFrame, known: Bool, weight: Float) -> UnknownT
     )
 
 
-def compute_unknown_s(detection_s: Float, onset_s: Float, ended_s: Float) -> Float:
-    """(n,) seconds from the onset to the detection, NaN for never, or the end of the episode; not below 0."""
-    return np.maximum(np.fmin(detection_s, ended_s) - onset_s, 0.0)
+def compute_unknown_s(time_s: Float, length_s: Float) -> Float:
+    """(n,) seconds unknown: the time to detection, NaN for never, or the length of the episode; not below 0."""
+    return np.maximum(np.fmin(time_s, length_s), 0.0)
 
 
 def measure_unknown(inputs: MetricInputs) -> UnknownTimes:

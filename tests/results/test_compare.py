@@ -305,14 +305,16 @@ def test_the_same_rows_in_another_folder_differ_in_nothing(tmp_path):
     rows = [r | {"configuration": "x"} for r in random_rows(["x"], logs=3)]
     folders = [write_folder(tmp_path / name, rows, braking=BRAKING) for name in ("first", "second")]
     table = compare_folders(folders, baseline="first:x").table
-    assert set(table["metric"]) == {"detected_share", "ttd_rmst_s", "dad_median_m", "pass_share"}
+    assert set(table["metric"]) == {
+        "detected_share", "ttd_rmst_s", "ttd_both_s", "unknown_s", "dad_median_m", "pass_share",
+    }  # fmt: skip
     assert (table["difference"] == 0.0).all()
     table = table[table["log"] == "all"].set_index("metric")
     # None of twelve objects in three logs differs, and of the nine in conflict none: 12/1.6 and 9/1.4 of them count.
     for metric, limit in (("detected_share", 1 - 0.025 ** (1.6 / 12)), ("pass_share", 1 - 0.025 ** (1.4 / 9))):
         assert tuple(table.loc[metric, ["low", "high"]]) == pytest.approx((-limit, limit), abs=1e-6)
         assert table.loc[metric, "interval"] == "exact"
-    others = table.loc[["ttd_rmst_s", "dad_median_m"]]
+    others = table.loc[["ttd_rmst_s", "ttd_both_s", "unknown_s", "dad_median_m"]]
     assert (others["interval"] == "all clusters alike").all()
     assert others[["low", "high", "interval_over"]].isna().all(axis=None)
 

@@ -306,9 +306,9 @@ def test_times_are_at_exactly_so_many_ghosts(tmp_path, per_min, existence, time_
     assert time["baseline_existence"] == 0.0
     assert (time["ghosts_kept_per_min"], time["baseline_ghosts_kept_per_min"]) == (kept, 0)
     assert (time["value"], time["baseline_value"], time["difference"]) == (time_s, 0.5, time_s - 0.5)
-    said = [note for note in comparison.notes if "all its entries make only" in note]
+    said = [note for note in comparison.notes if "all entries make only" in note]
     assert [note for note in said if note.startswith("late")] == (
-        ["late: all its entries make only 60 ghosts per minute: its ttd_rmst_s_equal_ghosts is at that rate"]
+        ["late: all entries make only 60 ghosts per minute: ttd_rmst_s_equal_ghosts is at that rate"]
         if kept < per_min
         else []
     )
@@ -413,8 +413,8 @@ def test_the_same_folder_again_differs_in_nothing(tmp_path):
     folders = [write_folder(tmp_path / name, rows, lists=lists, steps=steps) for name in ("first", "second")]
     comparison = compare_folders(folders, baseline="first:x")
     assert comparison.table["metric"].tolist() == [
-        "detected_share", "ttd_rmst_s", "ttd_rmst_s_equal_ghosts", "dad_median_m", "position_rmse_held_m",
-        "gospa_held_m", "false_positives_per_min",
+        "detected_share", "ttd_rmst_s", "ttd_both_s", "unknown_s", "ttd_rmst_s_equal_ghosts", "dad_median_m",
+        "position_rmse_held_m", "gospa_held_m", "false_positives_per_min",
     ]  # fmt: skip
     assert (comparison.table["difference"] == 0.0).all()
     # None of six can differ, one way or the other, where up to 46 % of all do: 1 − 0.025^(1/6).

@@ -216,15 +216,23 @@ def six_objects(tmp_path: Path) -> Comparison:
 
 def test_the_table_has_signs_and_intervals(tmp_path):
     lines = comparison_text(six_objects(tmp_path)).splitlines()
-    assert lines[0].split() == ["configuration", "detected_share", "ttd_rmst_s", "dad_median_m"]
+    assert lines[0].split() == [
+        "configuration",
+        "detected_share",
+        "ttd_rmst_s",
+        "ttd_both_s",
+        "unknown_s",
+        "dad_median_m",
+    ]
     by_name = {line.split()[0]: line for line in lines[1:4]}
     # Of six: 1 − 0.025^(1/6).
     assert by_name["same"].split(maxsplit=1)[1].split("  ")[0] == "±0 [-0.459, 0.459]"
-    assert by_name["same"].count("±0 (all alike)") == 2
+    assert by_name["same"].count("±0 (all alike)") == 4
     assert "-0.25 (all alike)" in by_name["fast"]
     assert "+2.5 (all alike)" in by_name["fast"]
     # Of six objects half: ± t of 5 degrees · √(.3/6) = ± .5748, and no less than −1.
     assert "-0.5 [-1, 0.0748]" in by_name["a|worse"]
+    assert "±0 (all alike) (only it 0 %, only the baseline 50 %)" in by_name["a|worse"]
     assert "+4.5 [" in by_name["a|worse"]
     assert by_name["a|worse"].endswith("–")  # half of them never: no median
     assert all("…" not in line and "..." not in line for line in lines)
@@ -249,10 +257,8 @@ def test_who_is_better_beyond_the_interval_is_said(tmp_path):
     rows = [row("ideal", 1.0, 30.0, object_id=str(k)) for k in range(6)]
     rows += [row("fast", 0.75 - k / 100, 32.5 + k, object_id=str(k)) for k in range(6)]
     lines = comparison_text(compare_folders([write_folder(tmp_path / "study", rows)])).splitlines()
-    assert lines[-2:] == [
-        "better than ideal in ttd_rmst_s, the interval excluding 0: fast",
-        "better than ideal in dad_median_m, the interval excluding 0: fast",
-    ]
+    metrics = "ttd_rmst_s, ttd_both_s, unknown_s, dad_median_m"
+    assert lines[-1] == f"better than ideal in {metrics}, the interval excluding 0: fast"
 
 
 def test_without_an_interval_nothing_is_claimed(tmp_path):
@@ -267,8 +273,8 @@ def test_without_an_interval_nothing_is_claimed(tmp_path):
 def test_markdown_has_the_same_content(tmp_path):
     comparison = six_objects(tmp_path)
     text, markdown = comparison_text(comparison).splitlines(), comparison_markdown(comparison).splitlines()
-    assert markdown[0] == "| configuration | detected_share | ttd_rmst_s | dad_median_m |"
-    assert markdown[1] == "| --- | --- | --- | --- |"
+    assert markdown[0] == "| configuration | detected_share | ttd_rmst_s | ttd_both_s | unknown_s | dad_median_m |"
+    assert markdown[1] == "| --- | --- | --- | --- | --- | --- |"
     cells = [line.replace("\\|", "\0").strip("| ").split(" | ") for line in markdown[2:5]]
     assert [c[0] for c in cells] == ["same", "fast", "a\0worse"]
     for line, of_row in zip(text[1:4], cells, strict=True):
@@ -331,14 +337,13 @@ def test_csv_has_a_row_for_each_log_configuration_and_metric(tmp_path):
         "difference_without_it", "frames", "age_s", "baseline_age_s", "no_list_share", "baseline_no_list_share",
         "without_truth", "baseline_without_truth",
     ]  # fmt: skip
-    assert [(r["log"], r["configuration"], r["metric"]) for r in read[3:6]] == [
-        ("all", "fast", "detected_share"), ("all", "fast", "ttd_rmst_s"), ("all", "fast", "dad_median_m"),
-    ]  # fmt: skip
-    fast, share = read[4], read[6]
+    metrics = ["detected_share", "ttd_rmst_s", "ttd_both_s", "unknown_s", "dad_median_m"]
+    assert [(r["log"], r["configuration"], r["metric"]) for r in read[5:10]] == [("all", "fast", m) for m in metrics]
+    fast, share = read[6], read[10]
     assert (fast["value"], fast["baseline_value"], fast["difference"], fast["n"]) == ("0.75", "1", "-0.25", "6")
     assert (fast["p_value"], fast["only_baseline"], fast["existence"]) == ("", "", "")
     assert (share["only_configuration"], share["only_baseline"], share["p_value"]) == ("0", "3", "0.25")
-    assert (read[8]["difference"], read[8]["low"], read[8]["interval_over"]) == ("", "", "")
+    assert (read[14]["difference"], read[14]["low"], read[14]["interval_over"]) == ("", "", "")
     assert (fast["low"], fast["interval"], share["interval"]) == ("", "all clusters alike", "jackknife")
 
 
@@ -366,6 +371,6 @@ def test_results_are_not_overwritten_with_their_comparison(tmp_path):
 def test_rows_of_single_logs_are_in_the_csv_only(tmp_path):
     found = [row(name, 1.0, 30.0, log=log) for name in ("ideal", "late") for log in ("all", "b")]
     comparison = compare_folders([write_folder(tmp_path / "study", found)])
-    assert comparison.table["log"].tolist() == ["all"] * 6 + ["b"] * 3  # a log may have that name, too
-    assert comparison.overall["n"].tolist() == [2, 2, 2]
+    assert comparison.table["log"].tolist() == ["all"] * 10 + ["b"] * 5  # a log may have that name, too
+    assert comparison.overall["n"].tolist() == [2] * 5
     assert len([line for line in comparison_text(comparison).splitlines() if line.startswith("late")]) == 1

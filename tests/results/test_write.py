@@ -69,8 +69,8 @@ ACCURACY = {
 SUMMARY = [
     "configuration", "n", "list_rate_hz", "detected_share", "detected_share_low", "detected_share_high", "interval",
     "interval_over", "interval_clusters",
-    "ttd_p5_s", "ttd_median_s", "ttd_p95_s", "ttd_rmst_s", "ttd_rmst_horizon_s", "dad_median_m",
-    "dad_p5_m",
+    "ttd_p5_s", "ttd_median_s", "ttd_p95_s", "ttd_rmst_s", "ttd_rmst_horizon_s", "unknown_s",
+    "left_undetected_share", "open_share", "dad_median_m", "dad_p5_m",
 ]  # fmt: skip
 FIGURES = [
     "position_rmse_m", "position_rmse_captured_m", "bias_east_m", "bias_north_m", "velocity_rmse_mps",

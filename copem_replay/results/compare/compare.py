@@ -226,9 +226,9 @@ def notes_on_rows(table: pd.DataFrame, pairs: Iterable[AllLogs], asked: float | 
         yield f"hangs on log {log}; without it: {', '.join(listed)}"
     ghosts = overall[overall["metric"] == "ttd_rmst_s_equal_ghosts"]
     fewer = ghosts[ghosts["ghosts_kept_per_min"] < asked * (1 - 1e-9)] if asked is not None else ghosts[:0]
-    for row in fewer.itertuples():
+    for rate, rows in fewer.groupby("ghosts_kept_per_min", sort=False):
         yield (
-            f"{row.configuration}: all its entries make only {row.ghosts_kept_per_min:.4g} ghosts per minute: its "
+            f"{', '.join(rows['configuration'])}: all entries make only {rate:.4g} ghosts per minute: "
             "ttd_rmst_s_equal_ghosts is at that rate"
         )
 

@@ -128,7 +128,7 @@ class ClusterIndex:
     def count_objects(self, items: StatisticItems) -> Float:
         """(K,) objects with items in each cluster; runs where clusters are runs."""
         cluster, by = self.of(items), "objects" if self.over != "runs" else "runs"
-        counted = (cluster >= 0) & (items[by] >= 0) & (items["n"] > 0)
+        counted = (cluster >= 0) & (items[by] >= 0)
         pairs = np.unique(np.stack([cluster[counted], items[by][counted]]), axis=1)
         return np.bincount(pairs[0], minlength=len(self.names)).astype(float)
 
@@ -136,8 +136,7 @@ class ClusterIndex:
 def index_clusters(items: StatisticItems, over: str, names: ClusterNames) -> ClusterIndex | None:
     """The logs, objects or runs with items, in the order of their names; None: too few have the figure."""
     all_names = {"logs": names.logs, "objects": names.objects, "runs": [str(run) for run in range(names.runs)]}[over]
-    counted = items[over][(items[over] >= 0) & (items["n"] > 0)]
-    present = sorted(np.unique(counted).tolist(), key=lambda k: all_names[k])
+    present = sorted(np.unique(items[over][items[over] >= 0]).tolist(), key=lambda k: all_names[k])
     if len(present) < (FEWEST_LOGS if over == "logs" else FEWEST_CLUSTERS):
         return None
     number = np.full(len(all_names) + 1, -1, dtype=np.int64)

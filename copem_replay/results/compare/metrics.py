@@ -328,7 +328,10 @@ def _detection_regrets(pair: _Pair) -> Iterator[Regret]:
     times = [((1.0, side.detection_s),) for side in pair.sides]
     yield Regret("ttd_rmst_s", _restricted_means(pair, times))
     yield Regret("ttd_both_s", _both_detected(pair))
-    unknown_s = [compute_unknown_s(side.detection_s, side.onset_s, side.ended_s)[pair.cells] for side in pair.sides]
+    unknown_s = [
+        compute_unknown_s(side.detection_s - side.onset_s, side.ended_s - side.onset_s)[pair.cells]
+        for side in pair.sides
+    ]
     sums = np.stack([*unknown_s, np.ones(len(pair.cells))], axis=1)
     yield Regret("unknown_s", SumStatistic(parts=(pair.items(pair.cells, sums=sums),), of=_divide_mean))
 
@@ -340,7 +343,8 @@ def _both_detected(pair: _Pair) -> SumStatistic:
     times_s = (side.detection_s[pair.cells] - side.onset_s[pair.cells] for side in pair.sides)
     sums = np.stack([*(np.where(both, time_s, 0.0) for time_s in times_s), both.astype(float)], axis=1)
     only = np.stack([first & ~second, second & ~first], axis=1).astype(np.int64)
-    return SumStatistic(parts=(pair.items(pair.cells, n=both.astype(np.int64), only=only, sums=sums),), of=_divide_mean)
+    items = pair.items(pair.cells, n=both.astype(np.int64), only=only, sums=sums)
+    return SumStatistic(parts=(items,), of=_divide_mean, weighed_by=2)
 
 
 def _equal_ghosts_regrets(pair: _Pair) -> Iterator[Regret]:

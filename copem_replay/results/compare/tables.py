@@ -164,12 +164,20 @@ def comparison_lines(comparison: Comparison) -> Iterator[str]:
             "remain, not counting stale ones"
         )
     yield from _describe_held(comparison)
+    yield from _describe_better(comparison)
+
+
+def _describe_better(comparison: Comparison) -> Iterator[str]:
+    """Lines on the configurations that are better than the baseline; metrics with the same ones share a line."""
+    metrics: dict[str, list[str]] = {}
     for metric, better in METRICS.items():
-        of_metric = overall[overall["metric"] == metric]
+        of_metric = comparison.overall[comparison.overall["metric"] == metric]
         beyond = of_metric["low"] > NOTHING if better > 0 else of_metric["high"] < -NOTHING
         if beyond.any():
             names = ", ".join(map(_name_with_logs, of_metric[beyond].itertuples(index=False)))
-            yield f"better than {comparison.baseline} in {metric}, the interval excluding 0: {names}"
+            metrics.setdefault(names, []).append(metric)
+    for names, of_names in metrics.items():
+        yield f"better than {comparison.baseline} in {', '.join(of_names)}, the interval excluding 0: {names}"
 
 
 def _describe_logs(limited: pd.DataFrame) -> Iterator[str]:
