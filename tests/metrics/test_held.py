@@ -76,7 +76,7 @@ def measured(
     *runs: Sequence[Any], issue_s: Sequence[float], frame_s: Sequence[float], places: Places,
     episodes: dict[int, tuple[float, float]], about: Matches | None = None, max_age_s: float = 1.0,
 ) -> HeldAccuracy:  # fmt: skip
-    """Lists around an ego at the origin, GOSPA of cut-off 3 m. `about` None: they tell of the frames of their issue."""
+    """Lists around an ego at the origin, GOSPA of cut-off 3 m. `about`: None: each tells of when it is issued."""
     lists, scene = lists_of(runs), scene_of("car", "car", "car")
     given_episodes, reference = episodes_of(episodes), reference_of([(0.0, 0.0)] * len(frame_s))
 

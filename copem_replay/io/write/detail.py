@@ -3,10 +3,10 @@
 `detail` has one message per list: the full covariance and variances of each object, the entries of the units' lists it
 was made of (parallel lists of unit, capture, range, visible share), and what was detected with it. With a fusion
 without truth ids it has the claimed existence, and no entries. `newest_captured_ns` of an object is the newest capture
-that contributed, by which it counts as captured after an onset or not; `stated_captured_ns`, the same as units state
-it, is there where a fusion was told of clocks that are off. Objects are in the order of the list. Where units have
-ghosts or outages, `ghosts` are the entries about no object in the lists that came in with this one, and `down` the
-units whose last list was not made.
+that contributed, which tells whether it was captured after an onset; `stated_captured_ns`, the same as units state it,
+is there where a fusion was told of clocks that are off. Objects are in the order of the list. Where units have ghosts
+or outages, `ghosts` are the entries about no object in the lists that came in with this one, and `down` the units whose
+last list was not made.
 
 `status` has the status of each measured object at each list, for State Transitions panels. An object is known as the
 detections table has it: from `detection_s` on, while the newest list holds it.
