@@ -7,7 +7,7 @@ those of the package (`metrics/intervals.py`). *Shares*: of each log drawn from 
 logs (a + b: 2, 10, 40) and mean .5 or .9, or .95, and .2 in one log of ten; of its objects so many are detected. *Other
 figures*: means over objects of a part of the log and one of the object, both of the named distribution, variances 1 : 4
 (a correlation of .2); where it is zero but for a tenth, or bad in one log of ten, the object's part is normal. *RMST*:
-restricted means of exponential times at 3 times their mean, of which about a third are censored, from logs whose mean
+restricted means of exponential times at 3 times their mean, of which a sixth are censored, from logs whose mean
 times are gamma distributed. *False `*`*: of the difference of two such configurations on the same logs, truly 0, how
 often the interval excludes 0: a difference of shares that all logs have alike has exact limits.
 
@@ -155,7 +155,7 @@ def draw_times(rng: np.random.Generator, w: Int) -> tuple[Float, Int, Int]:
 
 
 def true_rmst_s() -> float:
-    """The mean of min(T, h) by the midpoint rule over the quantiles of the logs' gamma distribution: E[m(1 − e^(−h/m))]."""
+    """The mean of min(T, h), E[m(1 − e^(−h/m))], by the midpoint rule over quantiles of the logs' mean times m."""
     from scipy.special import gammaincinv
 
     mean_s = 0.2 * gammaincinv(5.0, (np.arange(200_000) + 0.5) / 200_000)
@@ -196,6 +196,13 @@ def describe_row(low: Float, high: Float, truth: float, star: float, gate: float
     }
 
 
+def row_of(design: Design, rng: np.random.Generator, w: Int) -> dict[str, object]:
+    """A row of the table, of studies whose logs have `w (S, K)` objects."""
+    sums, others = design.study(rng, w), design.study(rng, w)
+    limits = limit_share(sums, w, w.sum(axis=-1)) if design.kind == "share" else mean_limits(sums, w)[1:]
+    return describe_row(*limits, design.truth, false_star(sums - others, w), design.gate(w.shape[1]))
+
+
 def table_rows(logs: Sequence[int], objects: Sequence[int], studies: int, seed: int) -> Iterator[dict[str, object]]:
     """A row per design, number of logs and of objects, equal and unequal; random numbers by the row alone."""
     rmst_s = true_rmst_s()
@@ -211,12 +218,8 @@ def table_rows(logs: Sequence[int], objects: Sequence[int], studies: int, seed: 
                         found = describe_row(*limits, rmst_s, star, 0.90 if K >= 8 else 0.85)
                     else:
                         design = DESIGNS[number]
-                        sums, others = design.study(rng, w), design.study(rng, w)
-                        limits = (
-                            limit_share(sums, w, w.sum(axis=-1)) if design.kind == "share" else mean_limits(sums, w)[1:]
-                        )
-                        found = describe_row(*limits, design.truth, false_star(sums - others, w), design.gate(K))
                         row |= {"kind": design.kind, "design": design.name}
+                        found = row_of(design, rng, w)
                     yield row | {"logs": K} | found
 
 
@@ -228,7 +231,7 @@ def coverage(
 
 
 def worst(table: pd.DataFrame) -> pd.DataFrame:
-    """By design and number of logs: the least coverage, the mean width and the most false `*` of all numbers of objects."""
+    """By design and number of logs: least coverage, mean width and most false `*` of all numbers of objects."""
     of = table.groupby(["kind", "design", "logs"], sort=False)
     columns = {
         "coverage, least": of["coverage"].min(),

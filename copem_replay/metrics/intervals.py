@@ -86,17 +86,15 @@ def describe_clusters(over: str, number: int | None = None) -> str:
     return f"{counted}{whose}: {_TELLS[over]}"
 
 
+NOT_ENOUGH = "neither more runs nor objects of several logs together tell how other drives differ"
+"""What is said beside the reason why there is no interval."""
+
+
 def explain_no_clusters(logs: int, objects: int) -> str:
-    """Why there is no interval, where `choose_over` says so."""
+    """Why there is no interval, where `choose_over` says so: `2 logs, fewer than 3`."""
     if logs == 1:
-        return (
-            f"{count_noun(objects, 'object')} of one drive, fewer than {FEWEST_CLUSTERS}; more runs say nothing about "
-            "other traffic"
-        )
-    return (
-        f"{count_noun(logs, 'log')}, fewer than {FEWEST_LOGS}: how drives differ cannot be told, and objects of "
-        "several logs are not pooled"
-    )
+        return f"{count_noun(objects, 'object')} of one drive, fewer than {FEWEST_CLUSTERS}"
+    return f"{count_noun(logs, 'log')}, fewer than {FEWEST_LOGS}"
 
 
 def absent_share(logs: int) -> float:

@@ -18,6 +18,7 @@ from copem_replay.core.tracks import Int
 from copem_replay.metrics.accuracy.metrics import beyond_gate_share
 from copem_replay.metrics.accuracy.statistics import AccuracyTotal
 from copem_replay.metrics.intervals import (
+    NOT_ENOUGH,
     NOTHING_DRAWN,
     FixedOutcomes,
     choose_over,
@@ -205,7 +206,7 @@ def _note_no_interval(detections: pd.DataFrame) -> list[str]:
     for share, rows in (("detected", detections), ("pass", conflicts)):
         logs, objects = rows["log"].nunique(), rows.groupby(["log", "object_id"], sort=False).ngroups
         if len(rows) and choose_over(logs, objects) is None:
-            notes.append(f"no interval of the {share} share: {explain_no_clusters(logs, objects)}")
+            notes.append(f"no interval of the {share} share: {explain_no_clusters(logs, objects)}; {NOT_ENOUGH}")
     return notes
 
 

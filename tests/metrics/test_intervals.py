@@ -321,7 +321,7 @@ def test_two_logs_have_no_interval_whatever_is_in_them() -> None:
     table, notes = summarise_rows(drives([[1.0] * 9, [0.5] * 9]), ["c"], {"c": 10.0}, horizon_s=2.0)
     assert table[["detected_share_low", "interval", "interval_over", "interval_clusters"]].isna().all(axis=None)
     (note,) = notes
-    assert note.startswith("no interval of the detected share: 2 logs, fewer than 3: ")
+    assert note.startswith("no interval of the detected share: 2 logs, fewer than 3; ")
 
 
 def test_one_object_has_the_binomial_interval_of_its_runs() -> None:

@@ -127,7 +127,7 @@ class TestAnswer:
         figure = answer_figure(two)
         assert intervals(figure.axes[0]) == {}
         assert note(figure).startswith("No interval of the mean time")
-        assert ": 2 objects of one drive, fewer than 5; " in note(figure)
+        assert ": 2 objects of one drive, fewer than 5" in note(figure)
         assert "95 % intervals" not in note(figure)
 
     def test_only_some(self, results: Results) -> None:
@@ -192,7 +192,7 @@ class TestDifferences:
             differences_figure(alone)
 
     def test_a_missing_interval_is_said_first(self, two: Results) -> None:
-        assert note(differences_figure(two)).startswith("No intervals: 2 objects of one drive, fewer than 5; ")
+        assert note(differences_figure(two)).startswith("No intervals: 2 objects of one drive, fewer than 5")
 
 
 class TestTradeOff:

@@ -545,7 +545,7 @@ class TestCurves:
             assert y == pytest.approx([0, last, last])
             assert (x[0], x[-1]) == pytest.approx(axes.get_xlim())
         assert list(line(axes, "never")[1]) == [0, 0]
-        assert "No bands: 2 objects of one drive, fewer than 5; more runs" in note(figure)
+        assert "No bands: 2 objects of one drive, fewer than 5" in note(figure)
         assert [text.get_text() for text in figure.legends[0].get_texts()] == ["GT", "late", "near", "hit", "never"]
 
     def test_one_object_has_bands_over_runs(self, tmp_path: Path) -> None:

@@ -228,18 +228,18 @@ class TestWords:
             for line in lines
         )
         assert "GT is the ground truth: the upper bound, not ranked." in lines
-        assert any("over runs" in line and "say nothing about other traffic" in line for line in lines)
+        assert any("over 6 runs of this one object" in line and "nothing about other traffic" in line for line in lines)
 
     def test_without_intervals_it_says_so(self, tmp_path: Path) -> None:
         lines = lines_of(replayed(tmp_path, changed()))
         assert re.fullmatch(
-            r"No interval: 2 objects\. half has the shortest mean time, \S+ s "
+            r"No interval: 2 objects of one drive, fewer than 5\. half has the shortest mean time, \S+ s "
             r"\(an object that is never detected counts as 4\.5 s\)\.",
             lines[2],
         )
         assert lines[3].startswith("Later, without an interval: late (+")
         assert "[" not in lines[3]
-        assert any(line.startswith("There are no intervals: there are fewer than 5 logs") for line in lines)
+        assert any(line.startswith("There are no intervals: 2 objects of one drive, fewer than 5. ") for line in lines)
         assert not any("excluding 0" in line for line in lines)
 
     def test_what_a_log_leaves_out_is_no_winner(self, tmp_path: Path) -> None:
@@ -280,16 +280,14 @@ class TestWords:
         """Of units that surely see both objects at the onset none is the first; of two objects there is no interval."""
         second = ("  hit: {units: [ego], latency_s: 1.8}", "  second: {units: [ego]}")
         lines = lines_of(replayed(tmp_path, changed(("  half: {units: [weak]}", "  half: {units: [ego]}"), second)))
-        assert (
-            lines[2]
-            == "No interval: 2 objects. half and second detect every object at its onset. The other 2 are below."
-        )
+        few = "No interval: 2 objects of one drive, fewer than 5. "
+        assert lines[2] == few + "half and second detect every object at its onset. The other 2 are below."
         assert re.match(r"Later, without an interval: late \(\+0\.5 s\), never \(\+4\.5 s\)\.", lines[3])
         assert not any("shortest" in line or "soonest" in line for line in lines)
         three = ("  late: {units: [ego], latency_s: 0.5}", "  late: {units: [ego]}")
         text = changed(("  half: {units: [weak]}", "  half: {units: [ego]}"), second, three, ALONE[3])
         lines = lines_of(replayed(tmp_path / "all", text))
-        assert lines[2] == "No interval: 2 objects. late, half and second detect every object at its onset."
+        assert lines[2] == few + "late, half and second detect every object at its onset."
         assert not lines[3].startswith("Later")
 
     def test_the_same_mean_at_other_times_is_a_tie_too(self, tmp_path: Path) -> None:
@@ -304,8 +302,8 @@ class TestWords:
         )  # fmt: skip
         lines = lines_of(replayed(tmp_path, text))
         assert lines[2] == (
-            "No interval: 2 objects. hit and half have the same mean time, 0.05 s (an object that is never detected "
-            "counts as 0.1 s), though they do not always detect at the same time."
+            "No interval: 2 objects of one drive, fewer than 5. hit and half have the same mean time, 0.05 s (an object "
+            "that is never detected counts as 0.1 s), though they do not always detect at the same time."
         )
 
     def test_of_equal_lists_none_is_the_best(self, tmp_path: Path) -> None:
@@ -339,7 +337,7 @@ class TestWords:
             r"other includes 0\.",
             lines[2],
         )
-        assert re.search(r'half \(<span class="tight">\+\S+ s \[0, \S+\]</span>\)', html), "no line breaks within"
+        assert re.search(r'half \(<span class="tight">\+\S+ s \[−\S+, \S+\]</span>\)', html), "no line breaks within"
 
     def test_one_configuration_is_compared_with_nothing(self, tmp_path: Path) -> None:
         folder = replayed(tmp_path, changed(ONE, *ALONE))

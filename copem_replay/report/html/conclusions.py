@@ -10,7 +10,7 @@ from typing import Any
 import pandas as pd
 
 from copem_replay.core.errors import count_noun
-from copem_replay.metrics.intervals import ALL_ALIKE, NOTHING_DRAWN
+from copem_replay.metrics.intervals import ALL_ALIKE, NOT_ENOUGH, NOTHING_DRAWN
 from copem_replay.report.figures.style import (
     RANKED_BY,
     describe_over,
@@ -277,7 +277,7 @@ def _certainty_sentences(study: ReportData) -> Iterator[str]:
     if not len(over):
         yield (
             f"There are no intervals: {explain_no_intervals(study.results)}. The result holds for these objects; "
-            "additional runs of the same traffic say nothing about other traffic."
+            f"{NOT_ENOUGH}."
         )
         return
     yield f"Intervals are 95 %, in brackets, over {describe_over(study.results)}."

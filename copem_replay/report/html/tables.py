@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from copem_replay.core.errors import count_noun
+from copem_replay.metrics.intervals import NOT_ENOUGH
 from copem_replay.metrics.metric import RowMetric, own_metrics
 from copem_replay.metrics.summary import describe_intervals, format_cell
 from copem_replay.metrics.summary_metrics import METRIC, METRICS, PARTS
@@ -238,7 +239,7 @@ def _interval_sentences(study: ReportData, part: SummaryPart, columns: Iterable[
     sentences = []
     for column in (name for name in columns if name in _INTERVALS):
         lines = describe_intervals(rows, _INTERVALS[column])
-        none = ["no interval: too few logs and objects; additional runs say nothing about other traffic"]
+        none = [f"no interval: too few logs, or objects of one log; {NOT_ENOUGH}"]
         words = [line.replace("95 %: ", "95 % ").replace("no 95 % of", "no 95 % interval of") for line in lines or none]
         sentences += [_replace_metric_names(f"{strip_unit(column)}: {line}") for line in words]
     horizon = rows["ttd_rmst_horizon_s"].dropna() if "ttd_rmst_s" in columns else pd.Series(dtype=float)

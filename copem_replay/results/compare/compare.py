@@ -18,7 +18,7 @@ import pandas as pd
 
 from copem_replay.core.errors import InputError, count_noun
 from copem_replay.core.tracks import SAME_INSTANT_S
-from copem_replay.metrics.intervals import FEWEST_CLUSTERS, FEWEST_LOGS, choose_over, explain_no_clusters
+from copem_replay.metrics.intervals import FEWEST_CLUSTERS, FEWEST_LOGS, NOT_ENOUGH, choose_over, explain_no_clusters
 from copem_replay.results.compare.labels import (
     LabelledConfiguration,
     check_log_names,
@@ -206,7 +206,7 @@ _FEW_HAVE_IT = (
 def notes_on_rows(table: pd.DataFrame, pairs: Iterable[AllLogs], asked: float | None) -> Iterator[str]:
     """Notes on missing intervals, on decisive logs, and on configurations with fewer ghosts than `asked` a minute."""
     none = [of.objects for of in pairs if any(of.objects) and of.over is None]
-    why = explain_no_clusters(sum(count > 0 for count in none[0]), sum(none[0])) if none else None
+    why = f"{explain_no_clusters(sum(n > 0 for n in none[0]), sum(none[0]))}; {NOT_ENOUGH}" if none else None
     overall = table.drop_duplicates(["configuration", "metric"])
     without = overall[overall["difference"].notna() & overall["interval"].isna()]
     with_interval = set(overall.loc[overall["interval_over"].notna(), "configuration"])
