@@ -201,8 +201,8 @@ def figure_variance(value: Float, without: Float, weights: Float) -> tuple[Float
     covariance of e/√(1 − w/n) for clusters that vary alike: K − 1 where all weigh the same. Clusters of weight 0 do
     not count.
 
-    Source: C. F. J. Wu, "Jackknife, bootstrap and other resampling methods in regression analysis", Ann. Statist. 14
-    (1986) 1261–1295 (weighted delete-one jackknife); F. E. Satterthwaite, Biometrics Bulletin 2 (1946) 110–114.
+    Source: R. M. Bell, D. F. McCaffrey, "Bias reduction in standard errors for linear regression with multi-stage
+    samples", Survey Methodology 28 (2002) 169–181, whose formula for a mean this is, with a jackknife's residuals.
     """
     u = weights / weights.sum(axis=-1, keepdims=True)
     rest = np.where(u < 1.0, 1.0 - u, 1.0)
