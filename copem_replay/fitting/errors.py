@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t
+from scipy.stats import chi2, t
 
 from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import Bool, Float, Int
@@ -35,6 +35,7 @@ from copem_replay.fitting.estimate import (
 from copem_replay.fitting.moments import (
     ErrorBin,
     RangeBin,
+    class_bins,
     estimate_bin,
     estimate_variance,
     find_bin,
@@ -54,6 +55,7 @@ FEWEST = 8
 _REVERSED, _STILL_MPS = 0.05, 1.0
 """Share from which on entries that point backwards are no outliers, and speed below which an entry does not count as
 backwards: there its sign is noise."""
+_EVERYWHERE = (RangeBin((0.0, np.inf)),)
 _ONE, _RANGE, _SHARE, _MEMORY = "one covariance", "by range", "by range and visible share", " + memory"
 
 
@@ -159,9 +161,9 @@ def fit_errors(
     }
     everything = np.zeros(len(listed), dtype=np.int64)
     los_m = errors["line_of_sight"]
-    z = fit_moments(los_m, everything, 1, series, MemoryShares()).standardised(los_m, everything)
+    z = fit_moments(los_m, everything, _EVERYWHERE, series, MemoryShares()).standardised(los_m, everything)
     start = fit_error_memory(z, series, centred=True, intervals=False).shares
-    worth = float(fit_moments(los_m, everything, 1, series, start).freedom.min()) / len(listed)
+    worth = float(fit_moments(los_m, everything, _EVERYWHERE, series, start).freedom.min()) / len(listed)
     candidates = _list_candidates(entries.view, worth, edges_m)
     trial = _ModelTrial(entries, series, worth, simplest)
     wide = list(candidates.values())[-1]
@@ -171,12 +173,26 @@ def fit_errors(
     bins_ix, ladder = trial.choose({name: (error_m, bins, None) for name, bins in candidates.items()})
     name, bins = list(candidates.items())[bins_ix]
     bin_ix = find_bin(entries.view, bins)
-    memory = _fit_error_memory(error_m, bin_ix, len(bins), series, start)
-    _, last = trial.choose({name: (error_m, bins, None), name + _MEMORY: (error_m, bins, memory.shares)})
+    memory = _fit_error_memory(error_m, bin_ix, bins, series, start)
+    base = (error_m, bins, memory.shares)
+    _, last = trial.choose({name: (error_m, bins, None), name + _MEMORY: base})
+    split = class_bins(bins, entries.view, worth)
+    by_class: tuple[Rung, ...] = ()
+    if len(split) > len(bins) and not simplest:
+        split_ix = find_bin(entries.view, split)
+        again = _fit_error_memory(error_m, split_ix, split, series, memory.shares)
+        gain = trial.gain((error_m, split, again.shares), base)
+        needed = float(chi2.ppf(0.95, 5 * (len(split) - len(bins)))) / 2
+        by_class = _tabulate_split(f"{name} and class", gain, needed, len(listed), last[bool(memory.parts)])
+        if gain > needed:
+            bins, bin_ix, memory = split, split_ix, again
     if simplest and memory.parts:
         memory = ErrorMemoryFit(log_likelihood=memory.log_likelihood, untold="the simplest model was asked for")
-    last = tuple(replace(rung, chosen=k == bool(memory.parts)) for k, rung in enumerate(last))
-    moments = fit_moments(error_m, bin_ix, len(bins), series, memory.shares)
+    last = tuple(
+        replace(rung, chosen=k == bool(memory.parts) and not any(one.chosen for one in by_class))
+        for k, rung in enumerate(last)
+    )
+    moments = fit_moments(error_m, bin_ix, bins, series, memory.shares)
     spreads, lasting, untold = _fit_spreads(entries, simplest=simplest)
     if memory.untold is not None:
         untold = {"memory.position": memory.untold} | untold
@@ -184,8 +200,14 @@ def fit_errors(
         frame, tuple(estimate_bin(one, moments, b) for b, one in enumerate(bins)),
         spreads["yaw"], spreads["speed"], spreads["size"],
         {"position": memory.parts} | lasting, memory.shares, _measure_shape(moments.standardised(error_m, bin_ix)),
-        listed, bin_ix, (*(rung for rung in ladder if not rung.chosen), *last), frames, untold,
+        listed, bin_ix, (*(rung for rung in ladder if not rung.chosen), *last, *by_class), frames, untold,
     )  # fmt: skip
+
+
+def _tabulate_split(name: str, gain: float, needed: float, n: int, base: Rung) -> tuple[Rung, ...]:
+    """The split by class beside the model without: its gain in likelihood, and whether that is beyond chance."""
+    each = gain / n
+    return (Rung(f"{name}{_MEMORY}", base.score + each, max(-each, 0.0), 0.0, gain > needed, "likelihood"),)
 
 
 def _list_candidates(
@@ -228,7 +250,7 @@ def build_series(rows: FitRows) -> ResidualSeries:
 
 
 def _fit_error_memory(
-    error_m: Float, bin_ix: Int, bins: int, series: ResidualSeries, start: MemoryShares
+    error_m: Float, bin_ix: Int, bins: tuple[RangeBin, ...], series: ResidualSeries, start: MemoryShares
 ) -> ErrorMemoryFit:
     """The memory of errors by bins, jointly with their moments: in turns, twice."""
     for last in (False, True):
@@ -268,6 +290,11 @@ class _ModelTrial:
                 scores[k] += np.bincount(which[held_out], self._scores(model, ~held_out, held_out), len(passes))
         return choose_rung(names, scores, np.bincount(which), simplest=self.simplest)
 
+    def gain(self, model: _Model, base: _Model) -> float:
+        """By how much the log-likelihood of all rows is higher under a model than under another, both fitted to all."""
+        whole = np.ones(len(self.rows.log), dtype=bool)
+        return float(self._scores(model, whole, whole).sum() - self._scores(base, whole, whole).sum())
+
     def _scores(self, model: _Model, into: Any, of: Any) -> Float:
         """Log-likelihood of each of the rows `of` given those before it, fitted to the rows `into`."""
         error_m, bins, memory = model
@@ -275,9 +302,9 @@ class _ModelTrial:
         fitted, scored = build_series(self.rows.take(into)), build_series(self.rows.take(of))
         shares = memory or MemoryShares()
         if memory is not None and not np.all(into):
-            first = fit_moments(error_m[into], bin_ix[into], len(bins), fitted, memory)
+            first = fit_moments(error_m[into], bin_ix[into], bins, fitted, memory)
             shares = refit_error_memory(first.standardised(error_m[into], bin_ix[into]), fitted, memory, centred=True)
-        moments = fit_moments(error_m[into], bin_ix[into], len(bins), fitted, shares)
+        moments = fit_moments(error_m[into], bin_ix[into], bins, fitted, shares)
         out, variance = whiten_series(moments.standardised(error_m[of], bin_ix[of]), scored, shares)
         log: Float = -0.5 * (out**2).sum(axis=1) - np.log(variance) - np.log(2 * np.pi)
         scored_: Float = log - moments.log_determinant()[bin_ix[of]]

@@ -18,7 +18,7 @@ from copem_replay.core.errors import InputError, count_noun
 from copem_replay.core.tracks import CLASSES
 from copem_replay.core.yaml import CommentedValue, strip_comments
 from copem_replay.experiment.schema import Experiment
-from copem_replay.fitting.detection import BY, DetectionCouple, DetectionFit, fit_detection
+from copem_replay.fitting.detection import BY, DetectionCouple, DetectionFit, fit_detection, pass_starts
 from copem_replay.fitting.errors import ErrorFit, fit_errors, remove_pose
 from copem_replay.fitting.estimate import PER_ROW, Estimate
 from copem_replay.fitting.gather import (
@@ -145,8 +145,8 @@ class ReplayChecks:
         return any(self.refuses(one) for one in self.fitted)
 
     def refuses(self, one: StatisticCheck) -> bool:
-        """Whether a statistic contradicts the model, over as many as there are (Bonferroni)."""
-        return one.verdict == "too sure" and one.p * len(self.fitted) < SURE
+        """Whether a statistic contradicts the model, at a level that as many share (Bonferroni)."""
+        return one.verdict == "too sure" and one.p * one.among < SURE
 
     def lines(self) -> Iterator[str]:
         """A line per statistic."""
@@ -193,8 +193,11 @@ def judge_use(fit: Fit) -> str:
     """What the model may be used for and what not, in one sentence."""
     low_m, high_m = fit.gathered.reach.range_m
     rows = fit.gathered.rows
-    kinds = ", ".join(CLASSES[k] for k in np.unique(rows.view.class_ix[rows.listed]).tolist())
-    where = f"{kinds} at {low_m:g} to {high_m:g} m"
+    classes, count = np.unique(rows.view.class_ix[pass_starts(rows.pass_ix)[:-1]], return_counts=True)
+    passes = {CLASSES[k]: n for k, n in zip(classes.tolist(), count.tolist(), strict=True)}
+    many = [kind for kind, n in passes.items() if n >= FEWEST_PASSES]
+    few = [f"{kind} ({count_noun(n, 'pass', 'passes')})" for kind, n in passes.items() if n < FEWEST_PASSES]
+    where = f"{', '.join(many or passes)} at {low_m:g} to {high_m:g} m"
     if fit.checks is None:
         return f"Use it for nothing yet ({where}): it was not replayed beside the recording."
     wrong = [one.statistic for one in fit.checks.fitted if fit.checks.refuses(one)]
@@ -202,14 +205,14 @@ def judge_use(fit: Fit) -> str:
         return f"Do not use it for results: replays of it differ from the recording ({where}) in {'; '.join(wrong)}."
     if all(one.verdict == "too few passes to tell" for one in fit.checks.fitted):
         most = count_noun(max((len(one.pit) for one in fit.checks.fitted), default=0), "pass", "passes")
-        few = f"{most} cannot tell whether it behaves like the recording, {FEWEST_PASSES} could"
-        return f"Use it to try an experiment out ({where}), not for results: {few}."
+        why = f"{most} cannot tell whether it behaves like the recording, {FEWEST_PASSES} could"
+        return f"Use it to try an experiment out ({where}), not for results: {why}."
     known = "" if fit.checks.held_out else ", which it knows already (--hold-out)"
     ghosts = "" if fit.truth == "complete" else ", nor for ghosts, as the truth is partial"
     return (
         f"Use it for {where}, where no statistic of the replay check contradicts it on "
         f"{'logs held out' if fit.checks.held_out else 'the logs it was fitted to'}{known}; "
-        f"not beyond, not for other classes{ghosts}."
+        f"not beyond, not for {', '.join([*few, 'other classes'])}{ghosts}."
     )
 
 
@@ -363,7 +366,10 @@ def annotate_estimate(estimate: Estimate) -> CommentedValue:
 def build_pem(fit: Fit) -> Tree:
     """The PEM, with the interval of every number as a comment."""
     couples = [
-        _build_couple(fit, detection, of_bin) for detection in fit.parts.detection.couples for of_bin in _list_bins(fit)
+        _build_couple(fit, detection, of_bin)
+        for detection in fit.parts.detection.couples
+        for of_bin in _list_bins(fit)
+        if detection.classes is None or of_bin[1].where.of_class in (None, *detection.classes)
     ]
     more = fit.parts.rest.pem_keys(CommentedValue)
     memory = dict(_build_memories(fit)) | more.pop("memory", {})

@@ -7,13 +7,13 @@ more rows than either the memory or the autoregression leaves.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from scipy.stats import chi2, t
 
-from copem_replay.core.tracks import Bool, Float, Int
+from copem_replay.core.tracks import CLASSES, Bool, Float, Int
 from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.fitting.error_memory import MemoryShares, ResidualSeries, sum_correlations
 from copem_replay.fitting.estimate import Estimate
@@ -22,6 +22,9 @@ EFFECTIVE_ROWS = 20
 """Independent rows that a bin holds at least: a standard deviation is then known to about 16 %."""
 MOST_BINS = 5
 """Bins of range at most: errors change slowly with range. More: a longer PEM, each number from fewer rows."""
+CLASS_ROWS = 5
+"""Independent rows of a class from which on its errors may differ from those of others: with fewer they are drawn
+towards those of all so far that a split says nothing."""
 FEWEST_PASSES = 5
 """Passes from which on the mean's interval is by passes alone (docs/develop/decisions/0044-how-sure-a-fit-is.md)."""
 _WHOLE = 0.95
@@ -32,23 +35,25 @@ _STRENGTHS = np.geomspace(4, 1e5, 60)
 
 @dataclass(frozen=True)
 class RangeBin:
-    """Where one covariance holds: an interval of range, and of visible share where bins are split by it."""
+    """Where one covariance holds: an interval of range, and of visible share and a class where bins are split by it."""
 
     range_m: tuple[float, float]
     visible_share: tuple[float, float] | None = None
+    of_class: str | None = None
 
     @property
     def when(self) -> dict[str, Any]:
         """The condition of a couple."""
-        when = {"range_m": list(self.range_m)}
-        return when if self.visible_share is None else when | {"visible_share": list(self.visible_share)}
+        when: dict[str, Any] = {"range_m": list(self.range_m)}
+        when |= {} if self.visible_share is None else {"visible_share": list(self.visible_share)}
+        return when if self.of_class is None else when | {"classes": [self.of_class]}
 
     @property
     def words(self) -> str:
         """Where it holds, in words."""
         low_m, high_m = self.range_m
         shares = "" if self.visible_share is None else ", visible share {:g} to {:g}".format(*self.visible_share)
-        return f"{low_m:g} to {high_m:g} m{shares}"
+        return f"{low_m:g} to {high_m:g} m{shares}{'' if self.of_class is None else f', {self.of_class}'}"
 
 
 @dataclass(frozen=True)
@@ -116,6 +121,16 @@ def share_bins(bins: tuple[RangeBin, ...], view: ViewGeometry, worth: float) -> 
     return tuple(out)
 
 
+def class_bins(bins: tuple[RangeBin, ...], view: ViewGeometry, worth: float) -> tuple[RangeBin, ...]:
+    """Bins split by class; classes of fewer than CLASS_ROWS effective rows stay together, in bins behind the others."""
+    kinds, n = np.unique(view.class_ix, return_counts=True)
+    apart = [CLASSES[k] for k in kinds[n * worth >= CLASS_ROWS].tolist()]
+    if not apart or len(kinds) < 2:
+        return bins
+    split = tuple(replace(one, of_class=kind) for kind in apart for one in bins)
+    return split if len(apart) == len(kinds) else (*split, *bins)
+
+
 def find_bin(view: ViewGeometry, bins: tuple[RangeBin, ...]) -> Int:
     """(P,) the first bin that holds each row, bounds included, as couples apply; without any the last bin."""
     out = np.full(len(view.range_m), len(bins) - 1)
@@ -124,17 +139,22 @@ def find_bin(view: ViewGeometry, bins: tuple[RangeBin, ...]) -> Int:
         holds = (view.range_m >= low) & (view.range_m <= high)
         if (share := bins[b].visible_share) is not None:
             holds &= (view.visible_share >= share[0]) & (view.visible_share <= share[1])
+        if (kind := bins[b].of_class) is not None:
+            holds &= view.class_ix == CLASSES.index(kind)
         out[holds] = b
     return out
 
 
-def fit_moments(error_m: Float, bin_ix: Int, bins: int, series: ResidualSeries, shares: MemoryShares) -> Moments:
-    """Means of rows, and covariances by moments that are shrunk to the pooled one.
+def fit_moments(
+    error_m: Float, bin_ix: Int, where: tuple[RangeBin, ...], series: ResidualSeries, shares: MemoryShares
+) -> Moments:
+    """Means of rows, and covariances by moments that are shrunk to that of all bins of their class.
 
     A covariance is that of the residuals, over the number of rows reduced by the uncertainty of their mean under the
     memory. It is shrunk by an inverse Wishart prior whose mean is the pooled covariance, with the strength that makes
     all bins most probable: similar bins become equal, others stay. A bin without rows has the mean of all.
     """
+    bins = len(where)
     n = np.bincount(bin_ix, minlength=bins)
     sums = sum_correlations(series.decay(shares.tau_s), series.new, bin_ix, bins, shares.drift, shares.constant)
     once, twice = np.maximum(sums, 1.0)
@@ -151,12 +171,15 @@ def fit_moments(error_m: Float, bin_ix: Int, bins: int, series: ResidualSeries, 
         moments[b] = rest.T @ rest / max(n[b] * (1 - of_mean[b]), 1.0)
         for k in range(2):
             phi = lag_one_correlation(rest[:, k], new)
-            least = n[b] * (1 - phi**2) / (1 + phi**2)
-            freedom[b, k] = max(min(n[b] ** 2 / twice[b] * (1 - of_mean[b]), least), 1e-3)
+            neighbours = n[b] * (1 - phi**2) / (1 + phi**2)
+            freedom[b, k] = max(min(n[b] ** 2 / twice[b] * (1 - of_mean[b]), neighbours), 1e-3)
             half_width_m[b, k] = mean_half_width(rest[:, k], new, phi, float(moments[b, k, k]))
-    covariance, pooled_freedom = _shrink_covariances(moments, freedom.min(axis=1))
-    freedom *= (pooled_freedom / freedom.min(axis=1))[:, None]
-    return Moments(mean, covariance, n, passes, half_width_m, freedom)
+    for kind in {one.of_class: None for one in where}:
+        alike = np.flatnonzero([one.of_class == kind for one in where])
+        least = freedom[alike].min(axis=1)
+        moments[alike], more = _shrink_covariances(moments[alike], least)
+        freedom[alike] *= (more / least)[:, None]
+    return Moments(mean, moments, n, passes, half_width_m, freedom)
 
 
 def lag_one_correlation(rest: Float, new: Bool) -> float:

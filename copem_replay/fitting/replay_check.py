@@ -11,7 +11,7 @@ Sources: A. P. Dawid, J. Roy. Statist. Soc. A 147 (1984) 278–292 (PIT); J. Bes
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from typing import Literal
@@ -22,7 +22,7 @@ import numpy as np
 from copem_replay.core.lasting import ListStamps, drop_unshared
 from copem_replay.core.memory import Parts, UnitDraws
 from copem_replay.core.random import CounterRng, RandomKey, object_words
-from copem_replay.core.tracks import Bool, Float, Int
+from copem_replay.core.tracks import CLASSES, Bool, Float, Int
 from copem_replay.fitting.detection import pass_starts
 from copem_replay.fitting.rows import FitLists, FitRows
 from copem_replay.perception.config import PoseError
@@ -45,13 +45,17 @@ Statistics = dict[str, Float]
 
 @dataclass(frozen=True)
 class StatisticCheck:
-    """The check of one statistic: `pit (passes,)` of passes that have it, those `inside` 95 %, Monte-Carlo `p`."""
+    """The check of one statistic: `pit (passes,)` of passes that have it, those `inside` 95 %, Monte-Carlo `p`.
+
+    `among`: how many checks share its level.
+    """
 
     statistic: str
     pit: Float
     inside: int
     p: float
     verdict: Literal["holds", "too sure", "too few passes to tell"]
+    among: int = 1
 
 
 def replay_check(
@@ -59,12 +63,22 @@ def replay_check(
 ) -> tuple[StatisticCheck, ...]:
     """Rank the recording among runs of the model at the same rows, which it should not have been fitted to.
 
+    All passes, and where they are of several classes those of each with FEWEST_PASSES.
+
     `placed`: the error of the unit's pose, drawn beside the model's errors.
     """
     recorded = compute_statistics(rows.listed[None], rows.along_m[None], rows.across_m[None], rows)
-    return compare_statistics(
-        recorded, replay_statistics(pem, rows, lists, placed=placed, runs=runs, seed=seed), seed=seed
-    )
+    replayed = replay_statistics(pem, rows, lists, placed=placed, runs=runs, seed=seed)
+    checks = compare_statistics(recorded, replayed, seed=seed)
+    class_of_pass = rows.view.class_ix[pass_starts(rows.pass_ix)[:-1]]
+    classes, count = np.unique(class_of_pass, return_counts=True)
+    kinds = classes[count >= FEWEST_PASSES].tolist()
+    for kind in kinds if len(classes) > 1 else []:
+        both = ({name: of[:, class_of_pass == kind] for name, of in one.items()} for one in (recorded, replayed))
+        each = compare_statistics(*both, seed=seed)
+        among = len(each) * len(kinds)
+        checks += tuple(replace(one, statistic=f"{one.statistic}, {CLASSES[kind]}", among=among) for one in each)
+    return checks
 
 
 def remove_memory(pem: Pem) -> Pem:
@@ -228,7 +242,7 @@ def compare_statistics(recorded: Statistics, runs: Statistics, *, seed: int = 0)
         verdict: Literal["holds", "too sure", "too few passes to tell"]
         verdict = "too few passes to tell" if too_few else "holds" if p >= 0.05 else "too sure"
         checks.append(StatisticCheck(name, recorded_pit, inside, p, verdict))
-    return tuple(checks)
+    return tuple(replace(one, among=len(checks)) for one in checks)
 
 
 def _rank_values(values: Float, name: str, passes: Int, seed: int) -> Float:

@@ -7,6 +7,7 @@ import pytest
 from statsmodels.tsa.statespace.sarimax import SARIMAX
 
 from copem_replay.core.errors import InputError
+from copem_replay.core.tracks import CLASSES
 from copem_replay.fitting.error_memory import (
     MemoryShares,
     ResidualSeries,
@@ -17,8 +18,11 @@ from copem_replay.fitting.error_memory import (
 from copem_replay.fitting.errors import fit_errors, remove_pose
 from copem_replay.fitting.estimate import Estimate
 from copem_replay.fitting.pose import PoseFit
+from copem_replay.fitting.rows import FitRows
 from copem_replay.perception.pem.error import Gaussian
 from tests.helpers.fit_rows import lasting_normals, rows_of
+
+ERRORS_M = ("along_m", "across_m", "east_m", "north_m")
 
 
 def _series(rng: np.random.Generator, count: int, lists: int, **of: float) -> tuple[np.ndarray, ResidualSeries]:
@@ -140,6 +144,31 @@ def test_bins_and_frame_are_chosen_where_they_explain_more() -> None:
     assert 2 * near.covariance_m2[0].high < far.covariance_m2[0].low
     assert [rung.name for rung in fit.ladder if rung.chosen] == ["by range + memory"]
     assert len(fit_errors(rows, lists, simplest=True).bins) == 1
+
+
+def by_class(spread: float, seed: int = 4) -> FitRows:
+    """16 passes, every other that of a pedestrian, whose errors are `spread` times as large."""
+    rows, _ = rows_of(seed, passes=16, lists_each=60, mean_m=(0.0, 0.0))
+    walks = rows.pass_ix % 2 == 1
+    kind = np.where(walks, CLASSES.index("pedestrian"), CLASSES.index("car")).astype(np.int8)
+    scaled = {name: getattr(rows, name) * np.where(walks, spread, 1.0) for name in ERRORS_M}
+    return replace(rows, view=replace(rows.view, class_ix=kind), fold=rows.pass_ix // 2 % 4, **scaled)
+
+
+def test_classes_have_errors_of_their_own_where_these_differ() -> None:
+    """Cars of .16 m² and pedestrians of .01 m² along: pooled neither is held. Alike they stay together."""
+    _, lists = rows_of(4, passes=16, lists_each=60)
+    fit = fit_errors(by_class(0.25), lists)
+    kinds = {one.where.of_class: one for one in fit.bins}
+    assert kinds.keys() == {"car", "pedestrian"}
+    for kind, along_m2 in (("car", 0.16), ("pedestrian", 0.01)):
+        variance = kinds[kind].covariance_m2[0]
+        assert variance.low <= along_m2 <= variance.high
+        assert kinds[kind].where.when["classes"] == [kind]
+    assert [rung.name for rung in fit.ladder if rung.chosen] == ["one covariance and class + memory"]
+    alike = [fit_errors(by_class(1.0, seed), lists) for seed in range(4, 8)]
+    assert sum(len(one.bins) == 1 for one in alike) >= 3
+    assert len(fit_errors(by_class(0.25), lists, simplest=True).bins) == 1
 
 
 def test_what_is_written_is_what_is_replayed() -> None:

@@ -8,6 +8,7 @@ from scipy.stats import chi2, t
 
 from copem_replay.fitting.error_memory import ALLOWED, MemoryShares, ResidualSeries, sum_correlations
 from copem_replay.fitting.moments import (
+    RangeBin,
     count_effective,
     estimate_bin,
     fit_moments,
@@ -16,6 +17,8 @@ from copem_replay.fitting.moments import (
     range_bins,
 )
 from tests.helpers.detection_rows import view_of
+
+ALL = (RangeBin((0.0, 100.0)),)
 
 
 def begins(*lengths: int) -> np.ndarray:
@@ -82,7 +85,7 @@ def test_unequal_passes_against_sums_over_all_rows() -> None:
 def test_a_variance_is_over_the_rows_less_those_of_its_mean() -> None:
     """−1, 0, 1 without memory: 2/(3 − 1); two degrees of freedom, fewer than 3(1 − φ²)/(1 + φ²) = 2.4 at φ = ⅓."""
     error_m = np.array([[-1.0, 1], [0, 0], [1, -1]])
-    found = fit_moments(error_m, np.zeros(3, dtype=int), 1, series_of(3), MemoryShares())
+    found = fit_moments(error_m, np.zeros(3, dtype=int), ALL, series_of(3), MemoryShares())
     assert found.covariance_m2[0, 0, 0] == pytest.approx(1.0)
     assert found.freedom[0, 0] == pytest.approx(2.0)
 
@@ -90,7 +93,7 @@ def test_a_variance_is_over_the_rows_less_those_of_its_mean() -> None:
 def test_without_memory_a_variance_counts_what_neighbours_share() -> None:
     """Rows 2, 2, −2, −2, … : a φ of .53 leaves fewer of them."""
     error_m = np.tile([2.0, 2, -2, -2], 25)[:, None] * [1.0, 1.0] + np.random.default_rng(0).normal(size=(100, 2))
-    found = fit_moments(error_m, np.zeros(100, dtype=int), 1, series_of(100), MemoryShares())
+    found = fit_moments(error_m, np.zeros(100, dtype=int), ALL, series_of(100), MemoryShares())
     rest = error_m - error_m.mean(axis=0)
     for k in range(2):
         phi = sum(rest[i, k] * rest[i + 1, k] for i in range(99)) / 99 / (sum(rest[:, k] ** 2) / 100)
@@ -129,6 +132,19 @@ def test_means_are_held_although_no_memory_is_written(lengths: tuple[int, ...]) 
         for k in range(1, n):
             if not new[k]:
                 error_m[k] = 0.95 * error_m[k - 1] + np.sqrt(1 - 0.95**2) * error_m[k]
-        found = fit_moments(error_m, zeros, 1, series_of(*lengths), MemoryShares())
+        found = fit_moments(error_m, zeros, ALL, series_of(*lengths), MemoryShares())
         held += int((np.abs(found.mean_m[0]) <= found.half_width_m[0]).sum())
     assert held / 800 >= 0.92
+
+
+def test_bins_are_drawn_towards_those_of_their_class() -> None:
+    """Two bins of the same spread become equal, that of another class, a tenth of it, keeps its own."""
+    rng = np.random.default_rng(0)
+    where = (RangeBin((0, 20), of_class="car"), RangeBin((20, 40), of_class="car"), RangeBin((0, 40), of_class="bus"))
+    bin_ix = np.repeat([0, 1, 2], 40)
+    error_m = rng.normal(size=(120, 2)) * np.where(bin_ix == 2, 0.1, 1.0)[:, None]
+    found = fit_moments(error_m, bin_ix, where, series_of(*[1] * 120), MemoryShares())
+    near, far, other = found.covariance_m2[:, 0, 0]
+    own = [error_m[bin_ix == b, 0].var(ddof=1) for b in range(3)]
+    assert abs(near - far) < 0.2 * abs(own[0] - own[1]) + 1e-9
+    assert other == pytest.approx(own[2], rel=1e-6)

@@ -7,6 +7,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
+from copem_replay.core.tracks import CLASSES
 from copem_replay.fitting.replay_check import (
     STATISTICS,
     Statistics,
@@ -133,6 +134,24 @@ def test_without_memory_is_too_sure() -> None:
     for name in ("longest run of misses", "share listed", "gap, s"):
         assert (holds[name], fails[name]) == ("holds", "too sure"), name
     assert "RMSE, m" not in holds  # as recorded there are no errors
+
+
+def test_a_class_that_differs_is_seen() -> None:
+    """Half of the passes are pedestrians', listed with .5 and .9 in place of .7: together neither is told."""
+    rows = passes(0, 40, 60, flat)
+    kind = np.array([CLASSES.index("car"), CLASSES.index("pedestrian")], dtype=np.int8)[rows.pass_ix % 2]
+    listed = np.random.default_rng(0).random(2400) < np.where(rows.pass_ix % 2 == 0, 0.9, 0.5)
+    rows = replace(rows, view=replace(rows.view, class_ix=kind), listed=listed)
+    checks = {one.statistic: one for one in replay_check(remove_memory(pem_of()), rows, lists_of(rows), runs=200)}
+    assert {"share listed", "share listed, car", "share listed, pedestrian"} <= checks.keys()
+    of_class = [one for name, one in checks.items() if name.endswith(", car")]
+    assert {one.among for one in of_class} == {2 * len(of_class)}
+    assert checks["share listed, car"].p < 0.01
+    assert len(checks["share listed, car"].pit) == 20
+    few = rows.take(rows.pass_ix < 14)
+    assert not [one for one in replay_check(pem_of(), few, lists_of(rows), runs=50) if "car" in one.statistic]
+    alone = replace(rows, view=replace(rows.view, class_ix=0 * kind))
+    assert {one.statistic for one in replay_check(pem_of(), alone, lists_of(rows), runs=50)} <= set(STATISTICS)
 
 
 def test_same_bits() -> None:
