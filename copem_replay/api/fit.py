@@ -115,6 +115,7 @@ def fit(
     by: Sequence[str] = ("range", "visible_share", "class", "azimuth"),
     monotone: bool = True,
     simplest: bool = False,
+    delay_by: str | None = None,
 ) -> FittedPem:
     """Fit a perception error model to the lists of a recorded unit and the truth beside them.
 
@@ -122,7 +123,7 @@ def fit(
     the check. `folds`: parts of the cross-validation that chooses between models. `truth`: `partial`, if entries may be
     about objects that the truth lacks, or `complete`; None: partial where a list has more of them than true objects are
     within reach. `by`: what detection may depend on. `monotone`: farther and more hidden is never better. `simplest`:
-    the first rung of every ladder.
+    the first rung of every ladder. `delay_by`: `log`, each log has a delay of its own.
 
     Raises InputError: no such unit or log, no place, nothing of it near a true object.
 
@@ -133,12 +134,18 @@ def fit(
     return fit_study(
         read_study_to_fit(load_source(experiment)[0], unit),
         unit,
-        check_fit_options(hold_out, folds, truth, by, monotone, simplest),
+        check_fit_options(hold_out, folds, truth, by, monotone, simplest, delay_by),
     )
 
 
 def check_fit_options(
-    hold_out: Sequence[str], folds: int | None, truth: str | None, by: Sequence[str], monotone: bool, simplest: bool
+    hold_out: Sequence[str],
+    folds: int | None,
+    truth: str | None,
+    by: Sequence[str],
+    monotone: bool,
+    simplest: bool,
+    delay_by: str | None = None,
 ) -> Any:
     """FitOptions of these values. Raises InputError for a value that is not allowed."""
     from copem_replay.fitting.fit import FitOptions
@@ -152,7 +159,10 @@ def check_fit_options(
     for name in by:
         if name not in ("range", "visible_share", "azimuth", "class"):
             raise InputError(f"--by: expected some of range, visible_share, azimuth, class; found {name!r}")
-    return FitOptions(tuple(hold_out), folds, truth, tuple(by), monotone, simplest)  # type: ignore[arg-type]
+    if delay_by not in (None, "log"):
+        raise InputError(f"--delay-by: expected log, found {delay_by}")
+    kind: Any = truth
+    return FitOptions(tuple(hold_out), folds, kind, tuple(by), monotone, simplest, delay_by_log=delay_by == "log")
 
 
 def read_study_to_fit(source: ExperimentSource, unit: str) -> LoadedStudy:

@@ -32,6 +32,10 @@ def fit(
     not_monotone: Annotated[
         bool, typer.Option("--not-monotone", help="Detection may improve with range and occlusion.")
     ] = False,
+    delay_by: Annotated[
+        str | None,
+        typer.Option("--delay-by", metavar="KIND", help="log: each log has a delay of its own [one for all]."),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Folder of the fit [out/<experiment>_fit].")
     ] = None,
@@ -47,7 +51,9 @@ def fit(
     from copem_replay.fitting.page import PEM, table_lines
     from copem_replay.results.folder import EXPERIMENT, check_inputs, take_place
 
-    options = check_fit_options(hold_out or (), folds, truth, split_names(by) or (), not not_monotone, simplest)
+    options = check_fit_options(
+        hold_out or (), folds, truth, split_names(by) or (), not not_monotone, simplest, delay_by
+    )
     with take_place(out or Path("out") / f"{experiment.stem}_fit", overwrite=overwrite) as place:
         print_notes(place.notes)
         place.notes.clear()

@@ -26,19 +26,23 @@ from copem_replay.fitting.error_memory import (
 from copem_replay.fitting.estimate import (
     PER_ROW,
     Estimate,
+    Note,
     Rung,
     choose_by_bic,
     choose_rung,
+    drop_note,
     held_out_possible,
     round_digits,
 )
 from copem_replay.fitting.moments import (
+    BetweenLogs,
     ErrorBin,
     RangeBin,
     class_bins,
     estimate_bin,
     estimate_variance,
     find_bin,
+    fit_between_logs,
     fit_moments,
     lag_one_correlation,
     range_bins,
@@ -77,7 +81,7 @@ class ErrorFit:
 
     `memory`: by quantity the parts that last; `shares`: those of the position as numbers. `rows (n,)`: which rows of
     `FitRows` have an entry; `bin_ix`: their bin. `ladder`: the models that were compared; `frames`: the two frames.
-    `untold`: by key why the data do not determine it.
+    `untold`: by key why the data do not determine it. `between_logs`: None of fewer than three logs.
     """
 
     frame: Frame
@@ -93,6 +97,7 @@ class ErrorFit:
     ladder: tuple[Rung, ...]
     frames: tuple[Rung, ...]
     untold: Mapping[str, str]
+    between_logs: BetweenLogs | None = None
 
     def yaml_error(self, bin_: ErrorBin) -> dict[str, Any]:
         """The keys of an error model, as it is replayed."""
@@ -106,10 +111,26 @@ class ErrorFit:
                 out[name] = round_digits(sigma.value)
         return out
 
-    @property
-    def yaml_memory(self) -> dict[str, list[dict[str, Any]]]:
-        """The keys of `memory`."""
-        return {name: [part.yaml for part in parts] for name, parts in self.memory.items() if parts}
+    def memory_keys(self, note: Note = drop_note) -> dict[str, list[dict[str, Any]]]:
+        """The keys of `memory`; a part of all objects of the unit is what differs between logs, and taken off others.
+
+        It is taken off what is constant, then off what drifts, for a fit of single objects has it in these.
+        """
+        out = {name: [part.keys(note) for part in parts] for name, parts in self.memory.items() if parts}
+        if self.between_logs is None or self.between_logs.untold is not None:
+            return out
+        share = round(self.between_logs.share, 3)
+        left, parts = share, []
+        for part in sorted(self.memory["position"], key=lambda one: one.correlation_s != "always"):
+            taken = min(left, part.share.value)
+            left -= taken
+            less = round(part.share.value - taken, 3)
+            if less > 0:
+                words = f"{part.share.words()}; {taken:.3g} of it differs between logs" if taken else part.share.words()
+                parts.append(part.keys(note) | {"share": note(less, words)})
+        words = "between logs: " + " and ".join(f"{one.words()} m" for one in self.between_logs.sigma_m)
+        log_part = {"share": note(share, words), "correlation_s": "always", "of": "unit"}
+        return out | {"position": [*parts, log_part]}
 
 
 def remove_pose(fit: ErrorFit, placed: PoseFit) -> ErrorFit:
@@ -193,6 +214,9 @@ def fit_errors(
         for k, rung in enumerate(last)
     )
     moments = fit_moments(error_m, bin_ix, bins, series, memory.shares)
+    between = fit_between_logs(error_m - moments.mean_m[bin_ix], entries.log, series, memory.shares)
+    if between is not None:
+        moments = replace(moments, half_width_m=np.maximum(moments.half_width_m, between.half_width_m))
     spreads, lasting, untold = _fit_spreads(entries, simplest=simplest)
     if memory.untold is not None:
         untold = {"memory.position": memory.untold} | untold
@@ -200,7 +224,7 @@ def fit_errors(
         frame, tuple(estimate_bin(one, moments, b) for b, one in enumerate(bins)),
         spreads["yaw"], spreads["speed"], spreads["size"],
         {"position": memory.parts} | lasting, memory.shares, _measure_shape(moments.standardised(error_m, bin_ix)),
-        listed, bin_ix, (*(rung for rung in ladder if not rung.chosen), *last, *by_class), frames, untold,
+        listed, bin_ix, (*(rung for rung in ladder if not rung.chosen), *last, *by_class), frames, untold, between,
     )  # fmt: skip
 
 

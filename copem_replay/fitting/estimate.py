@@ -252,3 +252,53 @@ def _tabulate_rungs(
     index = 0 if simplest else int(np.argmax(below <= error))
     columns = zip(names, score.tolist(), below.tolist(), error.tolist(), strict=True)
     return index, tuple(Rung(name, s, b, e, k == index, by) for k, (name, s, b, e) in enumerate(columns))
+
+
+# A number of several logs: its mean, and how far it scatters between them.
+
+FEWEST_LOGS = 3
+"""Logs from which on a scatter between them is estimated: of two it would have one degree of freedom."""
+
+
+@dataclass(frozen=True)
+class LogPool:
+    """A number over logs: its `mean`, its standard deviation `between` logs, and whether they contradict each other."""
+
+    mean: Estimate
+    between: Estimate
+    contradict: bool
+
+
+def pool_logs(values: Float, variances: Float, n: int) -> LogPool:
+    """The mean of values (K,) with variances (K,), and the standard deviation τ of what they are the values of.
+
+    τ² by Paule and Mandel, Σ w (y − mean)² = K − 1 with w = 1/(v + τ²); its limits by the Q-profile; the mean's by
+    Student's t with K − 1 degrees of freedom, its variance max(1, q)/Σw with q = Σ w (y − mean)²/(K − 1). `contradict`:
+    scatter within logs alone is refused at five per cent.
+
+    Sources: R. C. Paule, J. Mandel, J. Res. NBS 87 (1982) 377–385; W. Viechtbauer, Statist. Med. 26 (2007) 37–52.
+    """
+    from scipy.optimize import brentq
+    from scipy.stats import chi2, t
+
+    K = len(values)
+    most = (np.ptp(values) + np.sqrt(variances.max())) ** 2 * 1e4
+
+    def scatter(tau_m2: float) -> float:
+        w = 1 / (variances + tau_m2)
+        return float((w * (values - (w @ values) / w.sum()) ** 2).sum())
+
+    def where(level: float) -> float:
+        if scatter(0.0) <= level:
+            return 0.0
+        return float(brentq(lambda x: scatter(x) - level, 0.0, most)) if scatter(most) < level else float("inf")
+
+    tau_m2 = where(K - 1)
+    w = 1 / (variances + tau_m2)
+    mean = float(w @ values / w.sum())
+    half = float(t.ppf(0.975, K - 1) * np.sqrt(max(1.0, scatter(tau_m2) / (K - 1)) / w.sum()))
+    low, high = (float(np.sqrt(where(float(chi2.ppf(level, K - 1))))) for level in (0.975, 0.025))
+    return LogPool(
+        Estimate(mean, mean - half, mean + half, n, K), Estimate(float(np.sqrt(tau_m2)), low, high, n, K),
+        scatter(0.0) > float(chi2.ppf(0.95, K - 1)),
+    )  # fmt: skip

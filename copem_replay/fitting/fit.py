@@ -117,6 +117,7 @@ class FitOptions:
     monotone: bool = True
     simplest: bool = False
     other_gates: bool = True
+    delay_by_log: bool = False
 
 
 @dataclass(frozen=True)
@@ -185,6 +186,8 @@ class Fit:
         """All notes: on the data, on detection, and on estimates that another gate moves."""
         more = [f"detection: {line}" for line in self.parts.detection.notes]
         more += [f"no memory of detection: {why}" for why in (self.parts.detection.memory_why,) if why is not None]
+        between = self.parts.errors.between_logs
+        more += [f"errors that differ between logs: {between.untold}"] if between is not None and between.untold else []
         more += [f"another gate: {line}" for line in self.gates]
         return (*self.notes, *more)
 
@@ -223,7 +226,7 @@ def preview_fit(experiment: Experiment, recordings: Sequence[Recording], unit: s
         check_unit(experiment, unit)
         lists = raw_lists(recordings, experiment, unit)
         delay = unit_delay(list(zip(recordings, lists, strict=True)), _declared_delay_s(experiment, unit))
-        views = _view_logs(recordings, experiment, unit, delay.seconds)
+        views = _view_logs(recordings, experiment, unit, delay)
         gathered = gather_rows(views, gate_m=experiment.measure.match.gate_m, max_gap_s=experiment.max_gap_s, name=unit)
     except InputError as error:
         return (f"{label} would refuse: {error}",)
@@ -244,8 +247,8 @@ def fit_unit(experiment: Experiment, recordings: Sequence[Recording], unit: str,
     fitted, held_out = _split_held_out(recordings, how)
     lists = raw_lists(fitted, experiment, unit)
     declared_s = _declared_delay_s(experiment, unit)
-    delay = unit_delay(list(zip(fitted, lists, strict=True)), declared_s)
-    views = _view_logs(fitted, experiment, unit, delay.seconds)
+    delay = unit_delay(list(zip(fitted, lists, strict=True)), declared_s, by_log=how.delay_by_log)
+    views = _view_logs(fitted, experiment, unit, delay)
     gate_m, max_gap_s = experiment.measure.match.gate_m, experiment.max_gap_s
     try:
         gathered = gather_rows(views, gate_m=gate_m, max_gap_s=max_gap_s, folds=how.folds, name=unit)
@@ -263,7 +266,7 @@ def fit_unit(experiment: Experiment, recordings: Sequence[Recording], unit: str,
     }  # fmt: skip
     held = None
     if held_out:
-        held_views = _view_logs(held_out, experiment, unit, delay.seconds)
+        held_views = _view_logs(held_out, experiment, unit, delay)
         held = gather_rows(held_views, gate_m=gate_m, max_gap_s=max_gap_s, reach=gathered.reach)
     return Fit(
         unit, tuple(r.scene.log for r in fitted), tuple(r.scene.log for r in held_out), how, truth, delay,
@@ -272,10 +275,10 @@ def fit_unit(experiment: Experiment, recordings: Sequence[Recording], unit: str,
     )  # fmt: skip
 
 
-def _view_logs(recordings: Sequence[Recording], experiment: Experiment, unit: str, delay_s: float) -> list[LogView]:
+def _view_logs(recordings: Sequence[Recording], experiment: Experiment, unit: str, delay: DelayFit) -> list[LogView]:
     lists = raw_lists(recordings, experiment, unit)
     return [
-        view_log(recording, unit_lists, experiment, unit, delay_s)
+        view_log(recording, unit_lists, experiment, unit, delay.seconds_of(recording.scene.log))
         for recording, unit_lists in zip(recordings, lists, strict=True)
     ]
 
@@ -283,7 +286,7 @@ def _view_logs(recordings: Sequence[Recording], experiment: Experiment, unit: st
 def _check_delay(recordings: Sequence[Recording], experiment: Experiment, unit: str) -> None:
     """Raises InputError, with the delay, where entries are near true objects if lists are later than assumed."""
     for delay_s in np.arange(0.0, LONGEST_S + 0.01, 0.05).round(2).tolist():
-        views = _view_logs(recordings, experiment, unit, delay_s)
+        views = _view_logs(recordings, experiment, unit, DelayFit(Estimate(delay_s, chosen=True)))
         with suppress(NothingMatchedError):
             gather_rows(views, gate_m=experiment.measure.match.gate_m, max_gap_s=experiment.max_gap_s)
             raise InputError(
@@ -443,9 +446,7 @@ def _build_memories(fit: Fit) -> Iterator[tuple[str, list[Tree]]]:
             "of": "all objects of a list: likelier than each"
         }
         yield "detection", [{key: CommentedValue(value, words[key]) for key, value in part.items()}]
-    for quantity, parts in fit.parts.errors.memory.items():
-        if parts:
-            yield quantity, [part.keys(CommentedValue) for part in parts]
+    yield from fit.parts.errors.memory_keys(CommentedValue).items()
 
 
 def build_unit(fit: Fit, experiment: Experiment, pem: str) -> Tree:
@@ -476,8 +477,14 @@ def build_experiment(fit: Fit, experiment: Experiment, logs: Sequence[Any]) -> T
     late_s = max(round_significant(fit.delay.seconds), 0.0)
     stated = {"delay_s": late_s, "covariance_m2": _pool_covariance(fit)}
     recorded = _complete_unit(data["units"][name], stated)
+    replayed = fit.held_out or fit.logs
     units = {key: value for key, value in data["units"].items() if key != name}
     entries = [_build_both_settings(entry, name, other, stated) for entry in logs]
+    if fit.delay.of_log:
+        entries = [
+            _add_delay(entry, other, recorded, round_significant(fit.delay.seconds_of(log)))
+            for entry, log in zip(entries, replayed, strict=True)
+        ]
     latency = {"latency_s": {name: late_s}}
     return {
         **{key: value for key, value in data.items() if key not in ("sweep", "show")},
@@ -524,6 +531,17 @@ def _build_both_settings(entry: Any, name: str, other: str, told: Tree) -> Any:
         {name: fitted} if fitted or unit_settings is None else {}
     )
     return entry | {"units": {key: value for key, value in settings.items() if key != name} | both}
+
+
+def _add_delay(entry: Any, other: str, recorded: Tree, delay_s: float) -> Tree:
+    """The settings of a log whose recorded lists have a delay of their own."""
+    settings = entry if isinstance(entry, dict) else {"file": entry}
+    units = settings.get("units") or {}
+    if units.get(other, {}) is None:
+        return settings
+    own = units.get(other) or {}
+    topic = (own.get("recorded") or recorded["recorded"]) | {"delay_s": max(delay_s, 0.0)}
+    return settings | {"units": units | {other: own | {"recorded": topic}}}
 
 
 # The replay check.

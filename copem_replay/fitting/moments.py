@@ -7,7 +7,7 @@ more rows than either the memory or the autoregression leaves.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from scipy.stats import chi2, t
 from copem_replay.core.tracks import CLASSES, Bool, Float, Int
 from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.fitting.error_memory import MemoryShares, ResidualSeries, sum_correlations
-from copem_replay.fitting.estimate import Estimate
+from copem_replay.fitting.estimate import FEWEST_LOGS, PER_ROW, Estimate, pool_logs
 
 EFFECTIVE_ROWS = 20
 """Independent rows that a bin holds at least: a standard deviation is then known to about 16 %."""
@@ -25,6 +25,8 @@ MOST_BINS = 5
 CLASS_ROWS = 5
 """Independent rows of a class from which on its errors may differ from those of others: with fewer they are drawn
 towards those of all so far that a split says nothing."""
+LOGS_WRITTEN = 4
+"""Logs from which on a part that is drawn once per log and unit is written."""
 FEWEST_PASSES = 5
 """Passes from which on the mean's interval is by passes alone (docs/develop/decisions/0044-how-sure-a-fit-is.md)."""
 _WHOLE = 0.95
@@ -247,6 +249,56 @@ def _shrink_covariances(covariance: Float, freedom: Float) -> tuple[Float, Float
     strength = max(_STRENGTHS, key=evidence)
     shrunk = ((strength - 3) * pooled + scatter) / (strength - 3 + freedom)[:, None, None]
     return shrunk, np.minimum(freedom + strength, freedom.sum())
+
+
+# Between logs.
+
+
+@dataclass(frozen=True)
+class BetweenLogs:
+    """By how much the mean differs between logs: `sigma_m` along both axes, and that as a `share` of the variance.
+
+    `untold`: why it is not written; None: it is. `half_width_m (2,)`: of the mean's interval over logs.
+    """
+
+    sigma_m: tuple[Estimate, Estimate]
+    share: float
+    untold: str | None
+    half_width_m: Float = field(metadata={PER_ROW: True})
+
+
+def fit_between_logs(rest_m: Float, log: Int, series: ResidualSeries, shares: MemoryShares) -> BetweenLogs | None:
+    """The scatter of the means of logs, from residuals (n, 2) about the mean of their bin; None of too few logs.
+
+    A log's mean has the variance that the memory leaves it, or an autoregression if that is more. It is written from
+    LOGS_WRITTEN logs on, where its lower limit is above 0.
+    """
+    logs, log_ix = np.unique(log, return_inverse=True)
+    K = len(logs)
+    if K < FEWEST_LOGS:
+        return None
+    n = np.bincount(log_ix)
+    once, _ = sum_correlations(series.decay(shares.tau_s), series.new, log_ix, K, shares.drift, shares.constant)
+    lengths = np.diff(np.append(np.flatnonzero(series.new), len(log)))
+    log_of_pass = log_ix[series.new]
+    pools, variances = [], (rest_m**2).mean(axis=0)
+    for k in range(2):
+        phi = lag_one_correlation(rest_m[:, k], series.new)
+        alone = np.array([1 / count_effective(phi, lengths[log_of_pass == g]) for g in range(K)])
+        means = np.bincount(log_ix, rest_m[:, k]) / n
+        pools.append(pool_logs(means, variances[k] * np.maximum(once / n**2, alone), len(log)))
+    sigmas = pools[0].between, pools[1].between
+    share = float(min((sigmas[0].value ** 2 + sigmas[1].value ** 2) / variances.sum(), 1.0))
+    untold = None
+    if K < LOGS_WRITTEN:
+        untold = f"{K} logs, it is written from {LOGS_WRITTEN} on"
+    elif not max(one.low for one in sigmas) > 0:
+        untold = (
+            f"the means of {K} logs differ no more than chance makes them (by less than {sigmas[0].high:.2g} m and "
+        )
+        untold += f"{sigmas[1].high:.2g} m)"
+    half = np.array([(one.mean.high - one.mean.low) / 2 for one in pools])
+    return BetweenLogs(sigmas, share, untold, np.zeros(2) if untold else half)
 
 
 # The estimates of a bin.

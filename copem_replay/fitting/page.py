@@ -179,6 +179,8 @@ def describe_name(fit: Fit, name: str) -> str:
     if name.startswith("detection.couples."):
         couple = fit.parts.detection.couples[int(words[2])]
         return f"detected, {couple.place_words(int(words[4]), int(words[5]))}"
+    if name.startswith("errors.between_logs."):
+        return f"error: standard deviation between logs {axes[int(words[3])]}, m"
     if words[-1] in _LASTING and "memory" in words:
         of = "detection" if words[0] == "detection" else "class" if words[0] == "classes" else words[2]
         of = "pose of the unit" if words[0] == "placed" else of
@@ -246,7 +248,7 @@ def _list_settings(experiment: Experiment, recordings: Sequence[Recording]) -> l
 
 def pem_text(fit: Fit, experiment: Experiment) -> str:
     """`pem.yaml`: a head on the whole fit, and the interval of every number as a comment."""
-    rest = fit.parts.rest
+    rest, between = fit.parts.rest, fit.parts.errors.between_logs
     head = [
         judge_use(fit),
         f"Unit {fit.unit}, fitted to {count_noun(len(fit.logs), 'log')}: {', '.join(fit.logs)}",
@@ -256,6 +258,7 @@ def pem_text(fit: Fit, experiment: Experiment) -> str:
         f"delay of its lists: `latency_s: {{{fit.unit}: {fit.delay.seconds:.3g}}}` in a configuration: "
         f"{fit.delay.estimate.words()}",
         *(f"{name}: not fitted: {why}" for name, why in rest.untold.items()),
+        *([f"between_logs: not written: {between.untold}"] if between is not None and between.untold else []),
         *fit.gates,
     ]
     return "".join(f"# {' '.join(line.split())}\n" for line in head) + dump_with_comments(

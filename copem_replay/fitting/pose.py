@@ -7,7 +7,7 @@ errors of objects do not correlate between objects: products over pairs give the
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from scipy.stats import chi2, t
 
 from copem_replay.core.tracks import Float, Int
 from copem_replay.fitting.error_memory import LastingPart
-from copem_replay.fitting.estimate import Estimate, Note, drop_note, round_digits
+from copem_replay.fitting.estimate import FEWEST_LOGS, Estimate, LogPool, Note, drop_note, pool_logs, round_digits
 from copem_replay.fitting.rows import FitLists, FitRows
 from copem_replay.io.clock_offset import TimeOffset
 from copem_replay.io.recorded_lists import RecordedLists
@@ -194,21 +194,32 @@ _Z = 1.96
 
 @dataclass(frozen=True)
 class DelayFit:
-    """The delay from capture to stamp of every list that does not state its capture (s). `notes`: a line per log."""
+    """The delay from capture to stamp of every list that does not state its capture (s). `notes`: a line per log.
+
+    `of_log`: by log what is used in place of that of all (`--delay-by log`).
+    """
 
     estimate: Estimate
     notes: tuple[str, ...] = ()
+    of_log: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def seconds(self) -> float:
         """The delay that is used."""
         return self.estimate.value
 
+    def seconds_of(self, log: str) -> float:
+        """The delay that is used for a log."""
+        return self.of_log.get(log, self.estimate.value)
 
-def unit_delay(logs: Sequence[tuple[Recording, RecordedLists]], declared_s: float | None) -> DelayFit:
+
+def unit_delay(
+    logs: Sequence[tuple[Recording, RecordedLists]], declared_s: float | None, *, by_log: bool = False
+) -> DelayFit:
     """The delay of the lists of all logs, or `declared_s` where they do not tell it; None: none is declared.
 
-    A delay that could also be a shift along the way is used only where none is declared.
+    A delay that could also be a shift along the way is used only where none is declared. `by_log`: each log has its
+    own, where it tells one.
     """
     if all(found.capture_said.all() for _, found in logs):
         late_s = np.concatenate([found.tracks.arrives_s[0] - found.tracks.captured_s for _, found in logs])
@@ -216,12 +227,14 @@ def unit_delay(logs: Sequence[tuple[Recording, RecordedLists]], declared_s: floa
         note = "every list says when it was captured; the interval holds 95 % of the lists"
         return DelayFit(Estimate(float(middle), float(low), float(high), len(late_s), float(len(late_s))), (note,))
     delays = {recording.scene.log: estimate_delay(found, recording.scene, recording.truth) for recording, found in logs}
-    return pool_delays(delays, declared_s)
+    pooled = pool_delays(delays, declared_s)
+    of_log = {log: one.offset_s for log, one in delays.items() if one.untold is None} if by_log else {}
+    return replace(pooled, of_log=of_log)
 
 
 def pool_delays(told: Mapping[str, TimeOffset], declared_s: float | None) -> DelayFit:
-    """The delay of several logs: their mean by precision, with a wider interval where logs disagree beyond chance."""
-    notes = tuple(f"delay in {log}: {delay_words(one)}" for log, one in told.items())
+    """The delay of several logs: their mean, with what they scatter by from three logs on (`pool_logs`)."""
+    notes = tuple(f"delay in {log}: {delay_words(one)}" for log, one in told.items()) + _note_contradiction(told)
     unambiguous = [one for one in told.values() if one.untold is None and not one.unbiased]
     if unambiguous:
         return DelayFit(_weigh_delays(unambiguous), notes)
@@ -234,7 +247,23 @@ def pool_delays(told: Mapping[str, TimeOffset], declared_s: float | None) -> Del
     return DelayFit(Estimate(mean.value, mean.low, mean.high, mean.n, mean.n_effective, why=why_used), notes)
 
 
+def _pool_offsets(told: Sequence[TimeOffset]) -> LogPool:
+    sigma_s = np.array([(one.high_s - one.low_s) / (2 * _Z) for one in told])
+    return pool_logs(np.array([one.offset_s for one in told]), sigma_s**2, sum(one.entries for one in told))
+
+
+def _note_contradiction(told: Mapping[str, TimeOffset]) -> tuple[str, ...]:
+    """A line with the delays of all logs where chance does not make them differ so."""
+    usable = {log: one for log, one in told.items() if one.untold is None}
+    if len(usable) < FEWEST_LOGS or not _pool_offsets(list(usable.values())).contradict:
+        return ()
+    each = ", ".join(f"{one.offset_s:.3f} s in {log}" for log, one in usable.items())
+    return (f"delays contradict each other beyond chance: {each}; --delay-by log takes each log's own",)
+
+
 def _weigh_delays(told: Sequence[TimeOffset]) -> Estimate:
+    if len(told) >= FEWEST_LOGS:
+        return _pool_offsets(told).mean
     offset_s = np.array([one.offset_s for one in told])
     sigma_s = np.array([(one.high_s - one.low_s) / (2 * _Z) for one in told])
     weight = 1 / sigma_s**2

@@ -180,7 +180,7 @@ def test_what_is_written_is_what_is_replayed() -> None:
     assert fit.untold["speed"] == "the lists have no such field"
     flat_m = np.array([np.zeros(len(rows.listed)), np.zeros(len(rows.listed)), np.full(len(rows.listed), np.nan)])
     assert fit_errors(replace(rows, size_m=flat_m), lists).untold["size"] == "the lists have only some of its fields"
-    assert fit.yaml_memory["position"][0]["share"] == pytest.approx(fit.shares.drift, abs=1e-3)
+    assert fit.memory_keys()["position"][0]["share"] == pytest.approx(fit.shares.drift, abs=1e-3)
 
 
 def test_a_field_that_is_never_filled_is_no_measurement() -> None:

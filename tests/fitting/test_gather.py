@@ -161,6 +161,19 @@ class TestDelay:
         assert found.high - found.value == pytest.approx(1.96 * math.sqrt(1.8) / math.sqrt(12_500), rel=1e-6)
         assert (found.n, found.why) == (150, None)
 
+    def test_logs_that_contradict_each_other_are_said_with_their_values(self) -> None:
+        offsets = {"a": (0.147, 0.013), "b": (0.137, 0.024), "c": (0.119, 0.098), "d": (0.469, 0.058)}
+        told = {log: TimeOffset(at, at - half, at + half, 100) for log, (at, half) in offsets.items()}
+        found = pool_delays(told, None)
+        each = "0.147 s in a, 0.137 s in b, 0.119 s in c, 0.469 s in d"
+        assert found.notes[-1] == (
+            f"delays contradict each other beyond chance: {each}; --delay-by log takes each log's own"
+        )
+        assert found.estimate.low < 0.14 < found.estimate.high
+        assert found.estimate.high - found.estimate.low > 0.3  # three degrees of freedom, and one far away
+        same = {log: replace(one, offset_s=0.14, low_s=0.12, high_s=0.16) for log, one in told.items()}
+        assert len(pool_delays(same, None).notes) == 4
+
     def test_what_no_log_tells_is_kept_as_declared(self) -> None:
         shifted = TimeOffset(0.2, 0.15, 0.25, 100, unbiased=True)
         assert pool_delays({"a": shifted}, 0.1).estimate.value == 0.1

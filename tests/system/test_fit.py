@@ -110,6 +110,7 @@ def test_it_is_replaced_only_when_asked_and_by_the_same_bytes(
         (("--unit", "rsu", "--hold-out", "radar"), "--hold-out: expected a log that is left to fit, found all"),
         (("--unit", "rsu", "--truth", "all"), "--truth: expected partial or complete, found all"),
         (("--unit", "rsu", "--by", "range,colour"), "--by: expected some of range, visible_share, azimuth, class;"),
+        (("--unit", "rsu", "--delay-by", "class"), "--delay-by: expected log, found class"),
         (("--unit", "rsu", "--hold-out", "radar", "--folds", "3"), "--folds: expected either folds or logs to hold"),
     ],
 )  # fmt: skip
@@ -187,3 +188,17 @@ def test_few_passes_of_a_real_unit_are_no_thousand_rows() -> None:
     for mean in (mean for one in found.bins for mean in one.mean_m):
         assert mean.n_effective < 30
         assert mean.high - mean.low > 0.3
+
+
+@pytest.mark.skipif(not (SHARED / "msight_trial14.mcap").exists(), reason="no shared/data beside the project")
+def test_a_delay_of_each_log(tmp_path: Path) -> None:
+    """Three drives say .12 to .15 s, a fourth .47 s: said with their values, and by log each is read at its own."""
+    logs = [str(SHARED / f"msight_trial{k}.mcap") for k in ("3", "4", "5", "11_ped")]
+    fitted = check_fit.fitted_unit(logs, delay_by="log", simplest=True)
+    [note] = [note for note in fitted.notes if note.startswith("delays contradict each other")]
+    assert "0.147 s in msight_trial3" in note
+    assert "0.469 s in msight_trial11_ped" in note
+    folder = fitted.save(tmp_path / "fit")
+    experiment = cr.load_experiment(folder / "experiment.yaml")
+    delays = [entry.units["rsu_recorded"]["recorded"]["delay_s"] for entry in experiment.logs]  # type: ignore[union-attr]
+    assert delays == pytest.approx([0.147, 0.137, 0.119, 0.469], abs=1e-3)
