@@ -267,7 +267,12 @@ def open_from_start(path: Path, index_error: BaseException | None = None, promis
         went_on=stream.went_on,
         start_ns=start_ns,
         end_ns=end_ns,
+        notes=(UNPROTECTED,) if stream.unprotected else (),
     )
+
+
+UNPROTECTED = "no checksum is over its messages: bits that changed since it was written are not noticed"
+"""The note on a file whose messages lie outside of chunks, written without the checksum of its data."""
 
 
 def _describe_error(error: BaseException) -> str:

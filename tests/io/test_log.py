@@ -161,7 +161,7 @@ def test_a_disk_that_fails_is_no_damage(path, monkeypatch):
         {"index_types": IndexType.NONE},
         {"index_types": IndexType.CHUNK},
         {"index_types": IndexType.MESSAGE},
-        {"use_chunking": False},
+        {"use_chunking": False, "enable_data_crcs": True},
         {"use_statistics": False},
         {"repeat_channels": False},
         {"repeat_schemas": False},
@@ -251,6 +251,38 @@ def test_cut_off_in_a_message_without_chunks(path):
     end_of_data = data.rindex(FRAMES_LAST := truth_topic(FRAMES).messages[-1][1]) + len(FRAMES_LAST)
     path.write_bytes(data[: end_of_data - 3])
     assert read_log(path, name="log").damage == f"damaged after 0.800 s: 9 messages read ({CUT_OFF})"
+
+
+def test_a_bit_flipped_anywhere_in_a_file_without_chunks_is_noticed(path):
+    """It is refused, or read with what is damaged: one bit made 4.25 m of a length of 4 m."""
+    whole = write_recording(path, FRAMES[:2], use_chunking=False, enable_data_crcs=True).read_bytes()
+    for bit in range(8 * len(MAGIC), 8 * (len(whole) - len(MAGIC)), 29):
+        data = bytearray(whole)
+        data[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(data)
+        read = outcome(path)
+        assert isinstance(read, tuple) or read.damage is not None, f"bit {bit}"
+
+
+def test_the_end_of_the_data_is_missing(path):
+    """The record with the checksum was hit in its kind: the messages are read, and are not trusted."""
+    write_recording(path, FRAMES, use_chunking=False, enable_data_crcs=True)
+    data = bytearray(path.read_bytes())
+    at = data.rindex(b"\x0f" + (4).to_bytes(8, "little"))
+    data[at] = 0x8F  # a record of some other program
+    path.write_bytes(data)
+    recording = read_log(path, name="log")
+    assert len(recording.truth.stamp_ns) == 10
+    assert recording.damage == ("damaged after 0.900 s: 10 messages read (the record that ends the data is missing)")
+
+
+def test_no_checksum_is_over_the_messages(path):
+    """As several writers do by default: nothing can tell a changed bit, which a note says."""
+    recording = read_log(write_recording(path, FRAMES, use_chunking=False), name="log")
+    assert recording.notes == (
+        "no checksum is over its messages: bits that changed since it was written are not noticed",
+    )
+    assert recording.damage is None
 
 
 def test_recorder_was_killed(path):

@@ -355,6 +355,7 @@ class RecordsFromStart:
         self.error: BaseException | None = None  # the first one
         self.complete = True  # whether all messages were read all the same
         self.went_on = False  # whether messages were read after the damage
+        self.unprotected = False  # whether messages lie outside of chunks, and no checksum is over them
 
     def __iter__(self) -> Iterator[McapRecord]:
         for record in self._records():
@@ -372,7 +373,7 @@ class RecordsFromStart:
         self._file.seek(0)
         size, allowance = os.fstat(self._file.fileno()).st_size, ChunkAllowance(self._file)
         checksum = zlib.crc32(self._file.read(len(MAGIC)))
-        data_ended = False
+        data_ended = unchunked = False
         while True:
             head = self._file.read(HEAD.size)
             if len(head) < HEAD.size:
@@ -389,13 +390,17 @@ class RecordsFromStart:
             if opcode == Opcode.DATA_END:
                 data_ended = True
                 expected = int.from_bytes(body[:4], "little")
+                self.unprotected = unchunked and expected == 0
                 if expected not in (0, checksum):
                     self._failed(ValueError("the checksum of the data fails"))
             if opcode == Opcode.FOOTER:
+                if not data_ended:  # a flipped bit in the head of that record would hide the checksum, too
+                    self._failed(ValueError("the record that ends the data is missing"))
                 return
             checksum = zlib.crc32(body, zlib.crc32(head, checksum))
             if data_ended:
                 continue  # what follows only repeats
+            unchunked |= opcode == Opcode.MESSAGE
             try:
                 for record in read_chunk(body, allowance) if opcode == Opcode.CHUNK else (parse_record(opcode, body),):
                     self.went_on |= self.error is not None and isinstance(record, Message)

@@ -226,6 +226,7 @@ def _join_bag_files(folder: Path, logs: Sequence[Log], lost: Sequence[str], note
             channels[number] = _merge_channels(channels[number], c) if number in channels else replace(c, number=number)
         parts.append(BagFile(log, numbers_of_log))
     last = max(log.start_ns for log in logs)
+    of_files = [f"{log.path.name}: {note}" for log in logs for note in log.notes]
     return BagLog(
         path=folder,
         channels=tuple(channels[number] for number in sorted(channels)),
@@ -235,7 +236,7 @@ def _join_bag_files(folder: Path, logs: Sequence[Log], lost: Sequence[str], note
         went_on=bool(lost) or any(log.went_on or log.start_ns < last for log in logs if not log.complete),
         start_ns=min(log.start_ns for log in logs),
         end_ns=max(log.end_ns for log in logs),
-        notes=notes,
+        notes=tuple(dict.fromkeys([*notes, *of_files])),
         parts=tuple(parts),
         lost=tuple(lost),
     )
