@@ -13,7 +13,15 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from copem_replay.api.study import AnyExperiment, AnyPath, AnyRecordings, LoadedStudy, make_study, prepare_study
+from copem_replay.api.study import (
+    AnyExperiment,
+    AnyPath,
+    AnyRecordings,
+    LoadedStudy,
+    check_any_counted,
+    make_study,
+    prepare_study,
+)
 from copem_replay.core.errors import InputError, OutputError, count_noun
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import CLASSES
@@ -173,8 +181,9 @@ def run(
 
 def read_with_crew(read: Callable[[], LoadedStudy], crew: Crew) -> LoadedStudy:
     """The study that `read` returns, with all pieces computed; it is read again after a log that killed workers."""
-    while crew.fill((study := read()).experiment, study.recordings):
-        pass
+    check_any_counted(study := read())
+    while crew.fill(study.experiment, study.recordings):
+        study = read()
     return study
 
 

@@ -217,10 +217,27 @@ def _describe_misread(experiment: Experiment, recording: Recording) -> Iterator[
             yield f"{recording.path}: expected the recorded output {name}, found none; {way_out}"
 
 
+def check_any_counted(study: LoadedStudy, replays: Sequence[Replay] = ()) -> None:
+    """Raise ExperimentError where no object of any log counts (`measure.began`).
+
+    `replays`: the prepared logs; of the others it is known from the survey.
+    """
+    from copem_replay.pipeline.notes import check_counted, count_began
+
+    numbers = [count_began(replay.episodes) for replay in replays]
+    surveys = [recording.survey for recording in study.recordings if recording.survey is not None]
+    numbers += [survey.said["facts"]["began"] for survey in surveys if "facts" in survey.said]
+    numbers += study.survey.began if study.survey is not None else []
+    try:
+        check_counted(numbers, study.experiment)
+    except ExperimentError as error:
+        raise ExperimentError([study.source.at(("measure", "began"), one) for one in error.problems]) from None
+
+
 def prepare_study(study: LoadedStudy) -> tuple[list[Replay], list[str]]:
     """The recordings in memory, prepared for the replay, and notes on the memory that it takes.
 
-    Raises ExperimentError: times without a closed form, runs that no memory holds.
+    Raises ExperimentError: no object that counts, times without a closed form, runs that no memory holds.
     """
     from copem_replay.pipeline.cost import memory_notes
     from copem_replay.pipeline.prepare import prepare_log
@@ -230,6 +247,7 @@ def prepare_study(study: LoadedStudy) -> tuple[list[Replay], list[str]]:
         for recording in study.recordings
         if recording.survey is None
     ]
+    check_any_counted(study, replays)
     key: tuple[str, ...] = ("measure", "exact")
     try:
         if study.experiment.measure.exact:

@@ -112,7 +112,7 @@ def check(
     from copem_replay.api.study import prepare_study, read_study
 
     study = read_study(override_source(experiment, {"ego": ego}, log or (), (from_s, to_s)))
-    from copem_replay.pipeline.notes import list_notes
+    from copem_replay.pipeline.notes import list_began, list_notes
 
     replays, warnings = prepare_study(study)
     print_notes([*list_notes(study.recordings, replays, study.experiment, replayed=False), *warnings])
@@ -121,6 +121,8 @@ def check(
 
         for unit in study.experiment.recorded:
             print_notes(preview_fit(study.experiment, study.recordings, unit))
+    for line in list_began(replays, study.experiment):
+        print_line(line)
     print_line(f"{experiment}: no problem found; logs: {', '.join(r.scene.log for r in study.recordings)}")
     return 0
 

@@ -27,6 +27,7 @@ from copem_replay.cli.terminal import (
     width_of,
 )
 from copem_replay.core.errors import InputError
+from copem_replay.core.tracks import TRUTH
 
 if TYPE_CHECKING:
     from copem_replay.api.run import StudyResult
@@ -146,7 +147,7 @@ def _write_results(
 ) -> None:  # fmt: skip
     """Fill the results folder, then print notes, problems and the summary."""
     from copem_replay.api.run import fill_results_folder
-    from copem_replay.metrics.summary import format_summary
+    from copem_replay.metrics.summary import describe_began, format_summary
 
     notes = fill_results_folder(place, result, skipped=study.skipped, viewer=viewer)
     if cache is not None:
@@ -156,6 +157,11 @@ def _write_results(
     print_notes([*place.notes, *skipped, *notes, *result.replayed.costs, *advice])
     print_problems(place.failed)
     print(format_summary(result.summary, width_of(sys.stdout)))
+    replayed, configurations = result.replayed, study.experiment.configurations
+    if len(replayed.tally):
+        modelled = (name for name, one in configurations.items() if one.units != TRUTH)
+        reference, words = next(modelled, next(iter(configurations))), study.experiment.measure.began
+        print_line(describe_began(replayed.tally, reference, replayed.horizon_s, words))
     if result.sweep is not None:
         print_line(f"sweep of {', '.join(dict.fromkeys(result.sweep['sweep']))} in {place.shown / 'sweep.csv'}")
     _print_baseline(study.experiment)

@@ -6,13 +6,14 @@ import operator
 from collections.abc import Mapping
 from typing import Annotated, Literal, Protocol, Self
 
-from pydantic import BaseModel, Field, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from copem_replay.core.components import Flag, Frozen, Id, NotNegative, Positive, Slot
+from copem_replay.core.errors import unknown_name_message
 from copem_replay.metrics.braking.driver import DRIVERS, Driver
 from copem_replay.metrics.metric import RowMetric
-from copem_replay.metrics.onset import ONSETS, InRange, Onset, Requires
+from copem_replay.metrics.onset import BEGAN, ONSETS, Began, InRange, Onset, Requires
 from copem_replay.perception.config import InPlane, PerceptionSetup, check_polygon
 from copem_replay.perception.pem.condition import ClassNames
 
@@ -142,8 +143,28 @@ class Gospa(Frozen):
     power: Annotated[float, Field(strict=True, ge=1, le=10)] = 2.0
 
 
+def _check_began(value: object) -> object:
+    if isinstance(value, str) and value not in BEGAN:
+        raise ValueError(f"{unknown_name_message('way to begin', value, BEGAN)} (of {', '.join(BEGAN)})")
+    return value
+
+
+def _check_no_repeats(value: tuple[Began, ...]) -> tuple[Began, ...]:
+    if repeated := [word for word in BEGAN if value.count(word) > 1]:
+        raise ValueError(f"expected each word once, found {repeated[0]} {value.count(repeated[0])} times")
+    return value
+
+
+BeganWords = Annotated[
+    tuple[Annotated[Began, BeforeValidator(_check_began)], ...],
+    Field(min_length=1),
+    AfterValidator(_check_no_repeats),
+]
+
+
 class Measure(Frozen):
-    """What is measured, and from which onset. `accuracy`: also measure how far off the fused lists are.
+    """What is measured, and from which onset. `began`: which episodes count for times, shares and distances at
+    detection, by how they began; everything else is measured of all. `accuracy`: also how far off the fused lists are.
 
     `annotated`: the area in which entries at no true object are ghosts, by default everywhere. `metrics`: your own
     columns of the summary.
@@ -155,6 +176,7 @@ class Measure(Frozen):
 
     objects: Objects = Objects()
     onset: Annotated[Onset, _ONSET] = InRange()
+    began: BeganWords = ("crossed", "appeared")
     count_earlier: Flag = False
     confirm: Confirm = Confirm()
     match: Match = Match()

@@ -26,6 +26,7 @@ from copem_replay.metrics.braking.verdict import Verdicts, judge_braking
 from copem_replay.metrics.config import MetricsSetup
 from copem_replay.metrics.detection.by_truth_id import FirstDetections
 from copem_replay.metrics.episodes import Episodes, Reference, locate_reference
+from copem_replay.metrics.onset import began_texts
 from copem_replay.metrics.survival import end_reason_texts
 from copem_replay.perception.visibility import rectangle_corners
 
@@ -197,7 +198,7 @@ def _configuration_columns(
         "object_id": np.array(scene.object_ids, dtype=object)[flat(episodes.object_ix)],
         "object_class": np.array(CLASSES, dtype=object)[scene.object_class[flat(episodes.object_ix)]],
         "onset_s": onset_s,
-        "onset_at_start": flat(episodes.onset_at_start),
+        "began": began_texts(flat(episodes.began)),
         "detected": ~np.isnan(detection_s),
         "detection_s": detection_s,
         "captured_s": flat(detections.captured_s),

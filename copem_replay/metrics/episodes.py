@@ -1,6 +1,8 @@
 """Episodes: from when until when each measured object is observed, and when units first have it in sight.
 
-Onset: the first frame at which its condition holds while the ego is in the log. The episode ends at the object's own
+Onset: the first frame at which its condition holds while the ego is in the log. An episode began at the log's start if
+the condition held at the first instant at which it could be asked of any object; the object appeared if it held at its
+own first frame, later; else it crossed. The episode ends at the object's own
 last frame (`object_left`: an object that leaves undetected is never detected), the ego's (`ego_left`) or the log's
 (`log_end`); only the last two are censoring. An object is in sight of a unit when a list of the unit, at whatever range
 and in whatever field of view, has a visible share of it above 0, detected or not. Definitions: docs/guide/metrics.md.
@@ -18,7 +20,7 @@ from copem_replay.core.errors import ExperimentError
 from copem_replay.core.interpolation import interpolate_states, wrap_angles
 from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int, Scene, Tracks, class_indices
 from copem_replay.metrics.config import Measure, MetricsSetup
-from copem_replay.metrics.onset import OnsetView, evaluate_onset
+from copem_replay.metrics.onset import APPEARED, CROSSED, LOG_START, OnsetView, evaluate_onset
 from copem_replay.metrics.survival import END_REASONS, EndReason
 from copem_replay.perception.config import Carriers
 from copem_replay.perception.observation import Observations
@@ -81,7 +83,7 @@ class Episodes:
 
     object_ix: Int
     onset_s: Float
-    onset_at_start: Bool
+    began: Int  # index into BEGAN
     ended_s: Float
     ended_by: Int  # index into END_REASONS
 
@@ -112,7 +114,7 @@ def find_episodes(scene: Scene, truth: Tracks, static: Statics, experiment: Metr
         onset_s = np.full(len(first_s), instant_s)
         has_onset = (onset_s >= first_s - SAME_INSTANT_S) & (onset_s <= last_s + SAME_INSTANT_S)
         has_onset &= (onset_s >= ego_first_s - SAME_INSTANT_S) & (onset_s <= ego_last_s + SAME_INSTANT_S)
-        at_start = onset_s <= first_s + SAME_INSTANT_S
+        began = np.full(len(first_s), CROSSED)
     else:
         possible = ego_there[world.frame_ix]
         view = OnsetView(
@@ -123,8 +125,9 @@ def find_episodes(scene: Scene, truth: Tracks, static: Statics, experiment: Metr
         onset_row, has_onset = _find_first_true(evaluate_onset(measure.onset, view) & possible, world.start)
         first_possible, _ = _find_first_true(possible, world.start)
         onset_s = world.row_captured_s[onset_row]
-        # The condition holds already at the object's first frame that the ego shares.
-        at_start = onset_row == first_possible
+        asked_from_s = truth.captured_s[np.argmax(ego_there)] if ego_there.any() else np.inf
+        began = np.where(onset_s <= asked_from_s + SAME_INSTANT_S, LOG_START, APPEARED)
+        began = np.where(onset_row == first_possible, began, CROSSED)
     end_s = scene.end_s
     ended_s = np.minimum(np.minimum(last_s, ego_last_s), end_s)
     object_left = (last_s < end_s - SAME_INSTANT_S) & (last_s <= ego_last_s + SAME_INSTANT_S)
@@ -134,7 +137,7 @@ def find_episodes(scene: Scene, truth: Tracks, static: Statics, experiment: Metr
     ended_by = np.where(object_left, left, np.where(ego_left, ego, end))
     order = np.flatnonzero(has_onset)
     order = order[np.argsort(world.object_ix[order], kind="stable")]
-    return Episodes(world.object_ix[order], onset_s[order], at_start[order], ended_s[order], ended_by[order])
+    return Episodes(world.object_ix[order], onset_s[order], began[order], ended_s[order], ended_by[order])
 
 
 def _ego_stay(scene: Scene, truth: Tracks) -> tuple[float, float, Bool]:

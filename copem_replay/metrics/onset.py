@@ -1,4 +1,4 @@
-"""Onsets, as components: the condition that starts the clock of a measured object.
+"""Onsets, as components: the condition that starts the clock of a measured object; and how each episode began.
 
 An own onset derives from `Onset` and answers `holds`; the experiment names it with `kind: package.module:Class`. The
 meanings of the built-in ones: docs/guide/metrics.md.
@@ -7,19 +7,52 @@ meanings of the built-in ones: docs/guide/metrics.md.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, get_args
 
 import numpy as np
 from pydantic import Field
 
 from copem_replay.core.components import Component, NotNegative, Positive, Share, ask_component, wrong_answer_error
-from copem_replay.core.tracks import Bool, Float, Tracks
+from copem_replay.core.tracks import Bool, Float, Int, Tracks
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _TOLERANCE_M = 1e-6
 """Far below any distance that matters, far above the rounding of coordinates."""
+
+
+# How an episode began, and which episodes count.
+
+Began = Literal["log_start", "appeared", "crossed"]
+"""`log_start`: the condition held at the first instant at which it could be asked of any object; `appeared`: at the
+object's own first frame, later; `crossed`: it came true while the object was followed."""
+BEGAN: tuple[Began, ...] = get_args(Began)
+"""`Episodes.began` holds positions in this tuple."""
+LOG_START, APPEARED, CROSSED = range(len(BEGAN))
+
+
+def began_texts(position: Int) -> np.ndarray:
+    """(n,) words for positions (n,) in `BEGAN`."""
+    return np.array(BEGAN, dtype=object)[position]
+
+
+def is_counted(began: pd.Series, words: Sequence[str]) -> Bool:
+    """(n,) whether rows count for times, shares and distances at detection: they began in one of these ways.
+
+    `began`: the column of the rows. `words`: `measure.began`. Everything else is measured of all rows.
+    """
+    counted: Bool = began.isin(words).to_numpy(dtype=bool)
+    return counted
+
+
+def select_counted(rows: pd.DataFrame, words: Sequence[str]) -> pd.DataFrame:
+    """The rows that count, of a table with the column `began`."""
+    counted = is_counted(rows["began"], words)
+    return rows if counted.all() else rows[counted]
 
 
 class Requires(Enum):

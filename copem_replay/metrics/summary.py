@@ -36,7 +36,8 @@ from copem_replay.metrics.metric import (
     own_metrics,
     own_sums,
 )
-from copem_replay.metrics.summary_metrics import METRIC, METRICS
+from copem_replay.metrics.onset import BEGAN
+from copem_replay.metrics.summary_metrics import METRIC, METRICS, summarise_detections
 
 DETECTED = "detected"
 """The event of the first list that confirms the object."""
@@ -57,7 +58,7 @@ _EVENT_COLUMNS = {
     },
 }
 """By event the columns of the tally, and their names in `detections.parquet`; null in the row for never."""
-_OBJECT_COLUMNS = ("object_id", "object_class", "onset_s", "ended_s", "ended_by")
+_OBJECT_COLUMNS = ("object_id", "object_class", "onset_s", "began", "ended_s", "ended_by")
 
 
 def tally_rows(rows: pd.DataFrame) -> pd.DataFrame:
@@ -197,6 +198,25 @@ def summarise_tally(
         )
         rows.append({"configuration": name, **evaluate_metrics(columns, inputs)})
     return pd.DataFrame(rows), notes
+
+
+def describe_began(tallied: pd.DataFrame, configuration: str, horizon_s: float | None, words: Sequence[str]) -> str:
+    """A line: how many objects began how, and the mean time of each group in one configuration.
+
+    `tallied`: the whole tally. `words`: `measure.began`, those that count.
+    """
+    rows = tallied[(tallied["event"] == DETECTED) & (tallied["configuration"] == configuration)]
+    groups = []
+    for word in reversed(BEGAN):
+        part = rows[rows["began"] == word]
+        mean_s = summarise_detections(MetricInputs(part, None, horizon_s)).mean_s()
+        number = part.groupby(["log", "object_id"]).ngroups
+        groups.append(f"{number} {word}" + ("" if mean_s is None else f" {format_cell(mean_s)} s"))
+    line = f"objects by how they began, and their ttd_rmst_s in {configuration}: {', '.join(groups)}"
+    line += f"; counted: {', '.join(words)}"
+    if (rows["began"] == "appeared").any():
+        line += "; on annotated drives `appeared` may be where annotation began"
+    return line
 
 
 def _note_no_interval(detections: pd.DataFrame) -> list[str]:

@@ -32,6 +32,7 @@ from copem_replay.metrics.braking.verdict import fail_probability, pass_probabil
 from copem_replay.metrics.detection.by_truth_id import capture_instants
 from copem_replay.metrics.detections_table import measure_distances
 from copem_replay.metrics.exact_survival import FirstKnown, LastingDetection, first_confirmed, first_known
+from copem_replay.metrics.onset import began_texts
 from copem_replay.metrics.survival import end_reason_texts
 from copem_replay.perception.observation import rows_by_unit
 from copem_replay.perception.pem.model import Pem
@@ -391,6 +392,7 @@ def _exact_columns(
         "object_id": np.array(scene.object_ids, dtype=object)[object_ix],
         "object_class": np.array(CLASSES, dtype=object)[scene.object_class[object_ix]],
         "onset_s": episodes.onset_s[episode],
+        "began": began_texts(episodes.began[episode]),
         "detection_s": detection_s,
         "probability": rows(np.append(of.probability, np.exp(of.log_never)) for of in distributions),
         "incidence": rows(np.append(np.minimum(np.cumsum(of.probability), 1), np.nan) for of in distributions),

@@ -19,7 +19,7 @@ from copem_replay.communication.arrivals import receiver_instants
 from copem_replay.communication.link import sample_arrivals
 from copem_replay.communication.radio import Radio
 from copem_replay.communication.reception import RadioPath, ReceptionModel, ask_reception_probability
-from copem_replay.core.errors import count_noun
+from copem_replay.core.errors import ExperimentError, count_noun
 from copem_replay.core.interpolation import wrap_angles
 from copem_replay.core.tracks import (
     CLASS_GROUPS,
@@ -40,8 +40,9 @@ from copem_replay.experiment.schema import Experiment, ideal_over, output_unit
 from copem_replay.fusion.interface import IdealFusion
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.detection.conflict import describe_excluded
-from copem_replay.metrics.episodes import measured_objects
+from copem_replay.metrics.episodes import Episodes, measured_objects
 from copem_replay.metrics.metric import LinkTimes, OutputTimes, link_times
+from copem_replay.metrics.onset import BEGAN, InRange
 from copem_replay.perception.config import Carriers
 from copem_replay.perception.observation import interpolate_worlds
 from copem_replay.perception.pem.model import ObjectSidePlace, Pem
@@ -467,6 +468,8 @@ def _explain_unmeasured(replay: Replay, experiment: Experiment) -> Iterator[str]
         yield "no rows: no object with an onset matters by `objects.within`"
     elif not len(episodes.object_ix):
         yield f"no rows: no measured object has an onset ({measure.onset.kind})"
+    elif not count_counted(numbers := count_began(episodes), measure.began):
+        yield f"no object counts: {describe_numbers(numbers)}; `measure.began` has {', '.join(measure.began)}"
     if experiment.braking is not None and len(episodes.object_ix) and not replay.encounters:
         recorded = experiment.braking.ego == "recorded"
         yield (
@@ -476,6 +479,64 @@ def _explain_unmeasured(replay: Replay, experiment: Experiment) -> Iterator[str]
         )
 
 
+# How many episodes began how.
+
+COUNT_ALL = "measure: {began: [log_start, crossed, appeared]}"
+"""The line with which all episodes count."""
+
+
+def count_began(episodes: Episodes) -> tuple[int, ...]:
+    """How many episodes began in each of the ways `BEGAN`."""
+    return tuple(np.bincount(episodes.began, minlength=len(BEGAN)).tolist())
+
+
+def count_counted(numbers: Sequence[int], words: Sequence[str]) -> int:
+    """How many of the episodes, by how they began, count by `measure.began`."""
+    return sum(number for word, number in zip(BEGAN, numbers, strict=True) if word in words)
+
+
+def describe_numbers(numbers: Sequence[int]) -> str:
+    """`5 log_start, 2 appeared, 9 crossed`."""
+    return ", ".join(f"{number} {word}" for word, number in zip(BEGAN, numbers, strict=True))
+
+
+def check_counted(by_log: Sequence[Sequence[int]], experiment: Experiment) -> None:
+    """Raises ExperimentError where objects have an onset, but none counts in any log. `by_log`: as by `count_began`."""
+    total = np.sum(by_log, axis=0).tolist() if by_log else []
+    if sum(total) and not count_counted(total, experiment.measure.began):
+        words = ", ".join(experiment.measure.began)
+        raise ExperimentError(
+            f"expected objects that count ({words}), found none: of {count_noun(sum(total), 'object')} with an onset "
+            f"{describe_numbers(total)}; `{COUNT_ALL}` counts all"
+        )
+
+
+RANGES_M = (30.0, 40.0, 50.0)
+"""Ranges for which `check` says how many objects begin how: those that studies use."""
+
+
+def list_began(ready: Sequence[Replay], experiment: Experiment) -> list[str]:
+    """Lines of `check`: how many objects of all logs begin how, with `in_range` at each of `RANGES_M`."""
+    onset = experiment.measure.onset
+    asked: dict[str, Onset] = {f"within {range_m:g} m": InRange(range_m=range_m) for range_m in RANGES_M}
+    if not isinstance(onset, InRange):
+        asked = {onset.kind: onset}
+    elif onset.range_m not in RANGES_M:
+        asked[f"within {onset.range_m:g} m"] = onset
+    lines = []
+    for label, one in asked.items():
+        total = np.zeros(len(BEGAN), dtype=np.int64)
+        for replay in ready:
+            alone = resolve_for_log(experiment, replay.scene.log)
+            measure = alone.measure.model_copy(update={"onset": one})
+            measured = alone.model_copy(update={"measure": measure})
+            same = one == alone.measure.onset
+            total += count_began(replay.episodes if same else replay.find_episodes_of(measured))
+        chosen = "; chosen" if one == onset and len(asked) > 1 else ""
+        lines.append(f"{label}: {describe_numbers(total.tolist())}{chosen}")
+    return [f"objects by how they began, {line}" for line in lines]
+
+
 # Facts of a log, and its scene, as plain data.
 
 
@@ -483,10 +544,12 @@ def _explain_unmeasured(replay: Replay, experiment: Experiment) -> Iterator[str]
 class LogFacts:
     """What results say of one log in one experiment beside its rows. `times`: as `measure_list_rates` gives them.
 
-    `episodes`: rows of a run and configuration. `listable`: observation rows, by which the time of a run is estimated.
+    `episodes`: rows of a run and configuration; `began`: how many began in each of the ways `BEGAN`. `listable`:
+    observation rows, by which the time of a run is estimated.
     """
 
     episodes: int
+    began: tuple[int, ...]
     same_instants: bool
     oddities: tuple[str, ...]
     times: dict[str, ListRate]
@@ -498,6 +561,7 @@ class LogFacts:
         """The facts of a prepared log; `experiment`: resolved for it."""
         return cls(
             len(replay.episodes.object_ix),
+            count_began(replay.episodes),
             has_same_instants([replay]),
             tuple(list_oddities(replay, experiment, replay.ever_met)),
             measure_list_rates(replay, experiment),
@@ -510,6 +574,7 @@ class LogFacts:
         """From plain data, as `as_json` gives it."""
         return cls(
             data["episodes"],
+            tuple(data["began"]),
             data["same_instants"],
             tuple(data["oddities"]),
             {name: ListRate.read(times) for name, times in data["times"].items()},

@@ -15,6 +15,7 @@ from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import SAME_INSTANT_S, TRUTH, WHOLE, Bool, Float, Int, Tracks
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
+from copem_replay.metrics.onset import select_counted
 from copem_replay.perception.observation import Observations
 from copem_replay.perception.sensor_poses import find_carrier
 from copem_replay.pipeline.expansion import Presence, resolve_for_run
@@ -112,12 +113,14 @@ def select_shown_runs(experiment: Experiment, result: ExperimentResult, log: str
     """The runs of a log that are written to MCAP and .rrd, in the order of the experiment; none with `run: null`.
 
     `median` (of an even number the lower), `worst` and `best` go by the time to detection summed over all
-    configurations and measured objects, where never detected counts as the horizon; of equal runs the first is taken.
-    Of a log without rows it is the first run.
+    configurations and the measured objects that count (`measure.began`; all where none does), each up to the horizon,
+    which never detected counts as; of equal runs the first is taken. Of a log without rows it is the first run.
     """
     asked = experiment.show.asked() if experiment.show is not None else ()
     stems = [STEM if k == 0 else f"{STEM}_{one}" for k, one in enumerate(asked)]
     rows = result.tables.rows(log)
+    counted = select_counted(rows, experiment.measure.began)
+    rows = counted if len(counted) else rows
     return tuple(
         ShownRun(one, "", stem) if isinstance(one, int) else ShownRun(*_rank_run(rows, result.horizon_s, one), stem)
         for one, stem in zip(asked, stems, strict=True)
@@ -128,7 +131,7 @@ def _rank_run(rows: pd.DataFrame, horizon_s: float | None, rank: str) -> tuple[i
     """The run that is `median`, `worst` or `best` among the rows of a log, and why."""
     if not len(rows):
         return 0, f"first, not {rank}, as no measured object has an onset"
-    time_s = rows["time_to_detection_s"].fillna(horizon_s)
+    time_s = rows["time_to_detection_s"].fillna(horizon_s).clip(upper=horizon_s)
     total = np.rint(time_s.groupby(rows["run"]).sum() / SAME_INSTANT_S)
     ranked = np.sort(total.to_numpy())
     position = {"best": 0, "median": (len(ranked) - 1) // 2, "worst": -1}[rank]

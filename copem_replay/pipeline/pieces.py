@@ -205,6 +205,7 @@ NOT_OF_A_PIECE: Mapping[str, str] = {
     "units": "only those that the configuration, the onset or the reference of distances goes by",
     "pems": "only those of these units",
     "links": "only those that the configuration sends by",
+    "measure.began": "rows that do not count are replayed, too",
     "measure.horizon_s": "restricted means are taken of all rows",
     "measure.exact": "closed forms draw nothing",
     "measure.metrics": "own metrics are taken of all rows",

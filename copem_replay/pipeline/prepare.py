@@ -180,6 +180,10 @@ class Replay:
             each.episode_ix: find_passing_intervals(each, braking.driver, braking.margin_m) for each in self.encounters
         }
 
+    def find_episodes_of(self, experiment: Experiment) -> Episodes:
+        """The episodes of this log by another `measure`."""
+        return _find_kept_episodes(self.scene, self.truth, self.placed, experiment)[0]
+
     @property
     def first_sights_s(self) -> Float:
         """(U, M) when each modelled unit first has each episode in sight; inf: never."""
@@ -376,6 +380,13 @@ class Replay:
         return perceive_all_units(self.lists_only(self.expanded.written), np.zeros(1, dtype=np.int64), states="true")
 
 
+def _find_kept_episodes(
+    scene: Scene, truth: Tracks, placed: SensorPoses, experiment: Experiment
+) -> tuple[Episodes, Int]:
+    """The episodes that `within` keeps, and the objects that it leaves out."""
+    return keep_episodes_within(scene, truth, find_episodes(scene, truth, placed.static, experiment), experiment)
+
+
 def prepare_log(recording: Recording, experiment: Experiment, *, onsets_of: Experiment | None = None) -> Replay:
     """Everything about a log that all runs and configurations share. Raises ExperimentError where an ego is missing.
 
@@ -395,9 +406,7 @@ def prepare_log(recording: Recording, experiment: Experiment, *, onsets_of: Expe
     recorded = join_recorded_units(
         lists, scene, truth, gate_m=experiment.measure.match.gate_m, max_gap_s=experiment.max_gap_s
     )
-    episodes, outside_ix = keep_episodes_within(
-        scene, truth, find_episodes(scene, truth, placed.static, onsets_of or experiment), onsets_of or experiment
-    )
+    episodes, outside_ix = _find_kept_episodes(scene, truth, placed, onsets_of or experiment)
     encounters = find_encounters(scene, truth, episodes, experiment)
     chunks = time_chunks(scene, truth, expanded)
     return Replay(

@@ -26,6 +26,7 @@ from copem_replay.io.recording import Recording
 from copem_replay.metrics.accuracy.statistics import AccuracyTotal
 from copem_replay.metrics.intervals import find_fixed_outcomes
 from copem_replay.metrics.metric import OutputTimes, OwnSums
+from copem_replay.metrics.onset import select_counted
 from copem_replay.metrics.summary import add_own_sums, horizon_s, own_sums_by_log, summarise_tally, tally_rows
 from copem_replay.pipeline.closed_form import check_closed_form, exact_table
 from copem_replay.pipeline.cost import RunCost, memory_notes, watch_cost
@@ -294,15 +295,15 @@ def run_experiment(
 def _run_study(experiment: Experiment, logs: Sequence[StudyLog], gatherer: Gatherer) -> ExperimentResult:
     exact = _compute_exact(logs, experiment, gatherer)
     sums = _sum_tables(logs, experiment, gatherer)
-    facts, tallied = [log.facts(experiment) for log in logs], sums.tally
-    horizon = horizon_s(tallied, experiment.measure.horizon_s)
+    facts, counted = [log.facts(experiment) for log in logs], select_counted(sums.tally, experiment.measure.began)
+    horizon = horizon_s(counted, experiment.measure.horizon_s)
     times = _rates_by_configuration(facts, experiment)
     rows, summary_notes = summarise_tally(
-        tallied,
+        counted,
         list(experiment.configurations),
         {name: one.rate_hz for name, one in times.items()},
         horizon_s=horizon,
-        exact=exact,
+        exact=None if exact is None else select_counted(exact, experiment.measure.began),
         accuracy=total_over_logs(sums.totals),
         fixed=find_fixed_outcomes(experiment.as_written()),
         own=experiment.measure.metrics,
@@ -329,7 +330,7 @@ def _run_study(experiment: Experiment, logs: Sequence[StudyLog], gatherer: Gathe
         tabulate_bands(sums.totals) if accurate else None,
     )
     alike = all(sums.same_instants for sums in facts)
-    return replace(result, sweep=sweep, tally=tallied, logs=tuple(logs), facts=tuple(facts), same_instants=alike)
+    return replace(result, sweep=sweep, tally=sums.tally, logs=tuple(logs), facts=tuple(facts), same_instants=alike)
 
 
 class _StudySums(NamedTuple):
@@ -353,7 +354,8 @@ def _sum_tables(logs: Sequence[StudyLog], experiment: Experiment, gatherer: Gath
         rows = tables.add(batch)
         tallies.append(tally_rows(rows))
         totals |= total_by_log(batch)
-        for _, rows_of_log in rows.groupby("log", sort=False) if experiment.measure.metrics else ():
+        counted = select_counted(rows, experiment.measure.began) if experiment.measure.metrics else rows.iloc[:0]
+        for _, rows_of_log in counted.groupby("log", sort=False):
             sums = add_own_sums(sums, own_sums_by_log(rows_of_log, experiment.measure.metrics))
     return _StudySums(tables, pd.concat(tallies, ignore_index=True), totals, sums)
 
@@ -381,11 +383,11 @@ def _summarise_point(
     exact, sums = _compute_exact(logs, experiment, gatherer), _sum_tables(logs, experiment, gatherer)
     times = _rates_by_configuration([log.facts(experiment) for log in logs], experiment)
     rows, _ = summarise_tally(
-        sums.tally,
+        select_counted(sums.tally, experiment.measure.began),
         list(experiment.configurations),
         {name: one.rate_hz for name, one in times.items()},
         horizon_s=horizon,
-        exact=exact,
+        exact=None if exact is None else select_counted(exact, experiment.measure.began),
         accuracy=total_over_logs(sums.totals),
         fixed=find_fixed_outcomes(experiment.as_written()),
         conflicts_asked=experiment.measure.conflict is not None,

@@ -30,7 +30,7 @@ from copem_replay.io.open import (
     sha256_of,
 )
 from copem_replay.io.recording import Recording, StoredSurvey, read_whole_recording
-from copem_replay.pipeline.notes import LogFacts, scene_as_json, scene_from_json
+from copem_replay.pipeline.notes import LogFacts, count_began, scene_as_json, scene_from_json
 from copem_replay.pipeline.pieces import (
     PieceCache,
     canonical_json,
@@ -178,7 +178,7 @@ def survey_key(place: Place, experiment: Experiment, seen: Sequence[Stamp] | Non
 @cache_last_experiment
 def _survey_parts(experiment: Experiment) -> tuple[str, list[Component]]:
     data = {key: value for key, value in experiment.as_written().items() if key not in _NOT_OF_A_SURVEY}
-    of_all = recipe_key(canonical_json({"survey": 2, "fingerprint": take_fingerprint(), "experiment": data}))
+    of_all = recipe_key(canonical_json({"survey": 3, "fingerprint": take_fingerprint(), "experiment": data}))
     return of_all, own_components(experiment)
 
 
@@ -236,12 +236,13 @@ stays; others are read again when it is their turn. No result depends on it."""
 class LogSurvey:
     """Reads and checks the logs of a study before any run. `sizes`: of the logs that are dropped.
 
-    `problems`: why logs that are dropped have no closed form, where one is asked for.
+    `began`: how many of their episodes began how. `problems`: why they have no closed form, where one is asked for.
     """
 
     def __init__(self, pieces: PieceCache | None = None) -> None:
         self.pieces = pieces
         self.sizes: list[Size] = []
+        self.began: list[tuple[int, ...]] = []
         self.problems: list[str] = []
         self._states = 0
 
@@ -268,4 +269,5 @@ class LogSurvey:
         except ExperimentError as error:
             self.problems += (problem for problem in error.problems if problem not in self.problems)
         self.sizes.append(estimate_size(replay))
+        self.began.append(count_began(replay.episodes))
         return drop_content(recording, read)

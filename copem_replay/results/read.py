@@ -28,6 +28,7 @@ from copem_replay.io.open import File, Place, fetch_place, first_recording, read
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.config import Objects
 from copem_replay.metrics.intervals import FixedOutcomes, choose_clusters, find_fixed_outcomes
+from copem_replay.metrics.onset import select_counted
 from copem_replay.metrics.summary import DETECTED
 from copem_replay.pipeline.prepare import Replay, prepare_log
 from copem_replay.pipeline.study_log import read_content_digest
@@ -219,13 +220,20 @@ class Results:
         check_unchanged(self.folder, self.seen)
         return rows
 
-    def each(self, *columns: str, log: str | None = None) -> Iterator[pd.DataFrame]:
-        """Rows log by log, or of one log, with the named columns; none named: all but the log's name."""
-        rows = self.rows.only(columns or [name for name in self.rows.without_rows.column_names if name != "log"])
+    def each(self, *columns: str, log: str | None = None, every: bool = False) -> Iterator[pd.DataFrame]:
+        """Rows that count, or `every` row, log by log or of one log; with `columns`, none named: all but `log`."""
+        columns = columns or tuple(name for name in self.rows.without_rows.column_names if name != "log")
+        rows = self.rows.only(dict.fromkeys((*columns, "began")))
         for name_of_log in self.rows.where if log is None else [log]:
             table = rows.of(name_of_log)
             check_unchanged(self.folder, self.seen)
-            yield table.to_pandas()
+            frame = table.to_pandas()
+            counted = frame if every else self.counted(frame)
+            yield counted if "began" in columns else counted.drop(columns="began")
+
+    def counted(self, rows: pd.DataFrame) -> pd.DataFrame:
+        """The rows that count for times, shares and distances at detection (`measure.began`)."""
+        return select_counted(rows, self.provenance.measure["began"])
 
     @cached_property
     def tally(self) -> pd.DataFrame:
@@ -234,8 +242,8 @@ class Results:
 
     @cached_property
     def known(self) -> pd.DataFrame:
-        """The tally of detections; for a single object a row per run, as runs are then the clusters."""
-        tally = self.tally[self.tally["event"] == DETECTED]
+        """The tally of detections that count; for a single object a row per run, as runs are then the clusters."""
+        tally = self.counted(self.tally[self.tally["event"] == DETECTED])
         if not len(tally) or choose_clusters(tally)[0] != "runs":
             return tally
         columns = [name for name in TALLY if name not in ("log", "event", "runs")]
@@ -408,7 +416,8 @@ def check_complete(results: Results, *, rowless: bool = False) -> Results:
         raise InputError(f"{rows.place}: expected the column {missing[0]}, found none; {AGAIN}")
     if rows.where or not rowless:
         _check_rows(rows, experiment)
-    counts = results.known.groupby(["log", "configuration"])["runs"].sum()
+    tally = results.tally[results.tally["event"] == DETECTED]
+    counts = tally.groupby(["log", "configuration"])["runs"].sum()
     if counts.to_dict() != rows.counts:
         expected, found = sum(rows.counts.values()), int(counts.sum())
         raise InputError(

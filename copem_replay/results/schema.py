@@ -35,17 +35,18 @@ def table_file(table: Path, log: str) -> Path:
     return table / f"{quote(log, safe=' ')}.parquet"
 
 
-FORMAT = 2
+FORMAT = 3
 """The format of results folders: raised when columns, files or their meaning change so that readers have to know."""
 
 AGAIN = "run the experiment again with --overwrite"
 """The way out for a table that is damaged or of an older version."""
 
-EXACT = ("log", "configuration", "object_id", "time_to_detection_s", "probability")
+EXACT = ("log", "configuration", "object_id", "began", "time_to_detection_s", "probability")
 _KEYS = {"log": "text", "configuration": "text", "run": "whole numbers"}
 _OBJECT = _KEYS | {"object_id": "text"}
 DETECTIONS = _OBJECT | {
     "onset_s": "numbers",
+    "began": "text",
     "detected": "true or false",
     "detection_s": "numbers",
     "distance_at_detection_m": "numbers",
@@ -61,7 +62,7 @@ CONFLICT = {
     "conflict_detection_s": "numbers",
     "distance_at_conflict_detection_m": "numbers",
 }
-_OBJECT_COLUMNS = ("object_id", "object_class", "onset_s", "ended_s", "ended_by")
+_OBJECT_COLUMNS = ("object_id", "object_class", "onset_s", "began", "ended_s", "ended_by")
 TALLY = ("log", "configuration", "event", *_OBJECT_COLUMNS, "time_to_detection_s", "distance_at_detection_m", "runs")
 HELD = ("error_held_m", "age_held_s", "gospa_held_m2")
 """Columns of `accuracy.parquet` with a value for each frame."""

@@ -32,16 +32,16 @@ from copem_replay.viewer.sink import (
 
 # Text panels: events, differences, summary, legend.
 
+_BEGAN = {"log_start": ", there from the log's start", "appeared": ", as it appears", "crossed": ""}
+"""What is added to an onset, by how the episode began."""
+
 
 def write_onset_texts(out: RecordingSink, scene: Scene, table: pd.DataFrame) -> None:
     """Write an event per onset; onsets are the same in all configurations."""
     import rerun as rr
 
     episodes = table.drop_duplicates("object_id").sort_values("onset_s", kind="stable")
-    text = [
-        f"onset of {_name_object(episode, scene)}" + (", already at its first frame" if episode.onset_at_start else "")
-        for episode in table_rows(episodes)
-    ]
+    text = [f"onset of {_name_object(episode, scene)}{_BEGAN[episode.began]}" for episode in table_rows(episodes)]
     out.columns(
         ["events", "onsets"],
         to_nanoseconds(episodes["onset_s"]),

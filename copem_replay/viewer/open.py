@@ -66,7 +66,7 @@ def opening_s(folder: Path, files: Sequence[Path]) -> dict[Path, float]:
             stem = _FURTHER_FILE.sub("", path.relative_to(folder.absolute()).with_suffix("").as_posix())
             if stem in runs:
                 log, run = runs[stem]
-                (rows,) = results.each(log=log)
+                (rows,) = results.each(log=log, every=True)
                 onset_s = _first_onset_s(rows[rows["run"] == run], truths)
                 if onset_s is not None:
                     instants_s[path] = max(0.0, onset_s - BEFORE_ONSET_S)

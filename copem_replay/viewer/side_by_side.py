@@ -244,7 +244,7 @@ def _replay_side(results: Results, chosen: Sequence[LabelledConfiguration], log:
     configurations = {name: configuration for name, configuration in alone.configurations.items() if name in labels}
     experiment = alone.model_copy(update={"configurations": configurations, "sweep": None})
     replayed = replay_run(reread_recording(results, log, experiment), experiment, run)
-    (detections,) = results.each(log=log)
+    (detections,) = results.each(log=log, every=True)
     rows = detections[(detections["run"] == run) & detections["configuration"].isin(list(configurations))].assign(
         log=log
     )

@@ -40,6 +40,7 @@ _DETECTIONS = {
     "run": pa.int64(),
     "object_id": pa.string(),
     "onset_s": pa.float64(),
+    "began": pa.string(),
     "detected": pa.bool_(),
     "detection_s": pa.float64(),
     "distance_at_detection_m": pa.float64(),
@@ -89,6 +90,7 @@ _THRESHOLDS = {
 MEASURE = {
     "objects": {"classes": None, "ids": None},
     "onset": {"kind": "in_range", "range_m": 50.0},
+    "began": ["crossed", "appeared"],
     "count_earlier": False,
     "confirm": {"hits": 1, "of": 1},
     "match": {"gate_m": 3.0, "always": False},
@@ -111,6 +113,7 @@ def row(configuration: str, detection_s: float | None, distance_m: float | None 
         "run": 0,
         "object_id": "7",
         "onset_s": 0.0,
+        "began": "crossed",
         "detected": detection_s is not None,
         "detection_s": detection_s,
         "distance_at_detection_m": distance_m,
@@ -170,7 +173,7 @@ def write_folder(
     names = list(dict.fromkeys(r["log"] for r in rows))
     logs = logs or {name: f"content of {name}" for name in names}
     said = {
-        "format": 2,
+        "format": 3,
         "seed": 1,
         "runs": max(r["run"] for r in rows) + 1,
         "logs": [{"log": name, "topic": "ground_truth", "sha256": content} for name, content in logs.items()],

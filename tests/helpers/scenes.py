@@ -89,7 +89,10 @@ EGO_UNIT = {"on": "ego", "height_m": 1.8, "pem": "sure"}
 
 
 def experiment(**changes: Any) -> Experiment:
-    """An experiment of one run: GT, and one unit on the ego that surely sees to 60 m; `changes` replace keys."""
+    """An experiment of one run: GT, and one unit on the ego that surely sees to 60 m; `changes` replace keys.
+
+    All episodes count, however they began, unless `measure` says so.
+    """
     data: dict[str, Any] = {
         "version": 1,
         "logs": ["scene.mcap"],
@@ -99,7 +102,9 @@ def experiment(**changes: Any) -> Experiment:
         "configurations": {"GT": {"units": "truth"}, "PEM": {"units": ["ego"]}},
         "measure": {"onset": {"kind": "in_range", "range_m": 80}},
     }
-    return Experiment.model_validate(data | changes)
+    data |= changes
+    measure = {"began": ["log_start", "crossed", "appeared"]} | data["measure"]
+    return Experiment.model_validate(data | {"measure": measure})
 
 
 def oncoming_car() -> Recording:

@@ -93,7 +93,7 @@ def test_an_own_onset_is_in_detections_report_and_figure(tmp_path: Path) -> None
     table = pd.read_parquet(folder / "detections.parquet")
     assert set(table["object_id"]) == {"2"}
     assert table["onset_s"].to_numpy() == pytest.approx(1.0)
-    assert not table["onset_at_start"].any()
+    assert set(table["began"]) == {"crossed"}
     words = Page(build_page(load_study(folder))).words
     assert "The clock of an object starts when it is in the lane, 20 m from the ego." in words
     figure = runs_figure(read_results(folder), Selection(["late"]))

@@ -37,7 +37,7 @@ class TestOncomingCar:
     def test_without_latency(self) -> None:
         found = row(replayed(scenes.oncoming_car()), "PEM")
         assert found["onset_s"] == pytest.approx(2.0)
-        assert not found["onset_at_start"]
+        assert found["began"] == "crossed"
         assert found["detected"]
         assert found["captured_s"] == found["detection_s"] == pytest.approx(4.0)
         assert found["time_to_detection_s"] == pytest.approx(2.0)
@@ -149,7 +149,7 @@ class TestOncomingCar:
         assert at["detection_s"] == pytest.approx(3.3), "the first list captured at or after it"
         appears = row(replayed(scenes.oncoming_car(), measure={"onset": {"kind": "appears"}}), "GT")
         assert appears["onset_s"] == 0
-        assert appears["onset_at_start"]
+        assert appears["began"] == "log_start"
 
     def test_starts_moving_within_a_distance_of_the_front(self) -> None:
         """The front of the ego is at x = 2, so the car, always moving, is 30 m before it when at x = 32: 6.8 s."""

@@ -66,7 +66,7 @@ def bag(path: Path, lists_s: Sequence[float], topic: str = "stack", *, x_m: floa
 def results(folder: Path, path: Path, topic: str = "stack", **changes: Any) -> Path:
     recorded = {"topic": topic, "covariance_m2": COVARIANCE}
     experiment = Experiment.model_validate({
-        "version": 1, "logs": [str(path)], "measure": {"onset": {"kind": "appears"}}, "runs": 3,
+        "version": 1, "logs": [str(path)], "measure": {"onset": {"kind": "appears"}, "began": ["log_start"]}, "runs": 3,
         "configurations": {"GT": {"units": "truth"}, "stack": {"recorded": recorded}},
     } | changes)  # fmt: skip
     recordings, refused = read_logs(experiment, [path], None)

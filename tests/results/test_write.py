@@ -40,7 +40,7 @@ COLUMNS = {
     "object_id": pa.string(),
     "object_class": pa.string(),
     "onset_s": pa.float64(),
-    "onset_at_start": pa.bool_(),
+    "began": pa.string(),
     "detected": pa.bool_(),
     "detection_s": pa.float64(),
     "captured_s": pa.float64(),
@@ -242,7 +242,7 @@ def test_the_files_of_accuracy_say_the_same_as_rows_and_summary(two_logs: list[P
 
 def made_up(times: list[float | None]) -> ExperimentResult:
     """A result of one log with these times to detection, run by run; the horizon is 9 s."""
-    of = {"log": "scene", "configuration": "PEM", "object_id": "a"}
+    of = {"log": "scene", "configuration": "PEM", "object_id": "a", "began": "crossed"}
     table = pd.DataFrame({**of, "run": range(len(times)), "time_to_detection_s": times})
     return ExperimentResult(
         of_one_log(table), pd.DataFrame(), (), (prepare_log(scenes.oncoming_car(), experiment()),), 9.0
@@ -281,7 +281,14 @@ def test_several_runs_are_shown_each_as_it_was_asked_for() -> None:
     times = [1.0, 1.0, 1.0, 1.0], [2.0, 2.0, 2.0, 2.0], [0.0, 1.0, 1.0, 2.0], [2.0, 2.0, 4.0, 0.0]
     keys = [(name, one) for name in ("GT", "PEM") for one in ("a", "b")]
     rows = [
-        {"log": "scene", "configuration": name, "object_id": one, "run": k, "time_to_detection_s": of_run[n]}
+        {
+            "log": "scene",
+            "configuration": name,
+            "object_id": one,
+            "run": k,
+            "began": "crossed",
+            "time_to_detection_s": of_run[n],
+        }
         for k, of_run in enumerate(times)
         for n, (name, one) in enumerate(keys)
     ]

@@ -174,7 +174,8 @@ def curves_figure(results: Results, *, configurations: Sequence[str] | None = No
     chosen = results.chosen(configurations)
     names = find_differing(results, chosen)
     over, curves = build_curves(results, names, bands=len(names) <= MOST_BANDS)
-    exact = {name: exact_curve(results.exact, name) for name in names} if results.exact is not None else {}
+    counted = None if results.exact is None else results.counted(results.exact)
+    exact = {} if counted is None else {name: exact_curve(counted, name) for name in names}
     with figure_style():
         figure = _draw_curves(results, curves, exact)
         _add_caption(figure, results, names, over, curves, bool(exact), describe_left_out(chosen, names))

@@ -124,7 +124,7 @@ _FEW, _MANY = 600, 4000
 def distances_figure(results: Results, *, configurations: Sequence[str] | None = None) -> Figure:
     """Distance at detection of all rows, a strip per configuration; a second panel where collisions are foreseen."""
     names, braking = results.chosen(configurations), results.experiment.braking
-    tally = results.tally[results.tally["configuration"].isin(names)]
+    tally = results.counted(results.tally[results.tally["configuration"].isin(names)])
     events = [event for event in _COLUMNS if (tally["event"] == event).any()]
     detections = tally[tally["event"] == DETECTED]
     top_m = float(np.nanmax(tally["distance_at_detection_m"].to_numpy(dtype=float), initial=1.0))

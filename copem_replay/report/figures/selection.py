@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 
 from copem_replay.core.errors import InputError
+from copem_replay.metrics.summary import DETECTED
 from copem_replay.report.figures.style import find_truths, shorten_names, sort_soonest_first
 
 if TYPE_CHECKING:
@@ -55,10 +56,11 @@ class Choice:
 def choose_object_and_run(results: Results, selection: Selection) -> Choice:
     """The selected object, run and configurations.
 
-    By default these are the most telling object (`find_most_telling`), the run shown in the .rrd, else the first, and
-    four configurations from worst to best. Raises InputError for a selection that is not among the results.
+    By default these are the most telling object that counts (`find_most_telling`), the run shown in the .rrd, else the
+    first, and four configurations from worst to best. Any object may be named. Raises InputError for a selection that
+    is not among the results.
     """
-    known = results.known
+    known = results.tally[results.tally["event"] == DETECTED]
     for key, column, value in (("log", "log", selection.log), ("object", "object_id", selection.object_id)):
         if value is not None:
             values = list(dict.fromkeys(known[column]))
@@ -66,11 +68,13 @@ def choose_object_and_run(results: Results, selection: Selection) -> Choice:
             if not len(known):
                 some = ", ".join(map(str, values[:_NAMED])) + (", …" if len(values) > _NAMED else "")
                 raise InputError(f"{results.folder}: {key}: expected one of {some}; found {value!r}")
+    counted = results.counted(known)
+    known = counted if len(counted) else known
     asked_names = results.chosen(selection.configurations)
     of_run = _rows_of_run(results, known, selection.run)
     log, object_id = find_most_telling(of_run, find_truths(results))
     run = int(of_run.loc[of_run["log"] == log, "run"].iloc[0])
-    (rows,) = results.each("object_id", "configuration", *_RANKED_BY, log=log)
+    (rows,) = results.each("object_id", "configuration", *_RANKED_BY, log=log, every=True)
     present_names = tuple(name for name in asked_names if (rows["configuration"] == name).any())
     if not present_names:
         raise InputError(
@@ -88,7 +92,7 @@ def _rows_of_run(results: Results, known: pd.DataFrame, run: int | None) -> pd.D
     """Rows of a run for logs and objects in `known`; None: of each log's run shown in the .rrd, else run 0."""
     parts = []
     for log in dict.fromkeys(known["log"]):
-        (rows,) = results.each("object_id", "configuration", "run", *_RANKED_BY, log=log)
+        (rows,) = results.each("object_id", "configuration", "run", *_RANKED_BY, log=log, every=True)
         rows = rows[rows["object_id"].isin(known.loc[known["log"] == log, "object_id"])]
         wanted_run = results.provenance.run_shown.get(log, 0) if run is None else run
         parts.append(rows[rows["run"] == wanted_run].assign(log=log))

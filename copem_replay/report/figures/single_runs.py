@@ -287,7 +287,7 @@ def runs_figure(results: Results, selection: Selection) -> Figure:
     """
     choice = choose_object_and_run(results, selection)
     replay = reread_log(results, choice.log, choice.object_id)
-    (rows,) = results.each(log=choice.log)
+    (rows,) = results.each(log=choice.log, every=True)
     of_run = rows[(rows["object_id"] == choice.object_id) & (rows["run"] == choice.run)].set_index(
         "configuration", drop=False
     )
@@ -385,7 +385,7 @@ def _draw_share(axes: Axes, story: Story, results: Results, replay: Replay, look
 
 def _note_sentences(results: Results, choice: Choice, stories: Sequence[Story]) -> list[str]:
     experiment, braking = results.experiment, results.experiment.braking
-    kind = results.known.loc[results.known["object_id"] == choice.object_id, "object_class"].iloc[0]
+    kind = results.tally.loc[results.tally["object_id"] == choice.object_id, "object_class"].iloc[0]
     thin = ""
     if braking is not None and any(story.encounter is not None for story in stories):
         course = "as recorded" if braking.ego == "recorded" else "with constant speed from the onset"

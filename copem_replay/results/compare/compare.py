@@ -64,11 +64,10 @@ from copem_replay.results.schema import AGAIN, OPTIONAL
 
 @dataclass
 class AllLogs:
-    """The sums of a pair, log by log: `objects`: with rows of both sides; `alone`: rows that only one side has, (first,
-    second); `differences`: by metric, of each log that has one.
+    """The sums of a pair, log by log: `alone`: rows that only one side has, (first, second); `differences`: by metric,
+    of each log that has one.
     """
 
-    objects: list[int] = field(default_factory=list)
     alone: list[tuple[int, int]] = field(default_factory=list)
     differences: dict[str, list[float]] = field(default_factory=dict)
     _regrets: dict[str, list[Regret]] = field(default_factory=dict)
@@ -78,24 +77,21 @@ class AllLogs:
         first: ConfigurationData,
         second: ConfigurationData,
         regrets: Sequence[Regret],
-        grid: PairingGrid,
         *,
         more: bool,
     ) -> None:
         """Add a log with its regrets. `more`: there are other logs."""
-        both = np.flatnonzero(first.there & second.there)
-        objects = len(np.unique(both // grid.runs))
-        self.objects.append(objects)
         self.alone.append((int((first.there & ~second.there).sum()), int((second.there & ~first.there).sum())))
         for regret in regrets:
             # Runs stay apart for a single object: they are the clusters if no log has another.
-            figure = regret.figure.condensed(runs=objects <= 1) if more else regret.figure
+            figure = regret.figure.condensed(runs=regret.objects[0] <= 1) if more else regret.figure
             self._regrets.setdefault(regret.metric, []).append(replace(regret, figure=figure))
 
     @property
-    def over(self) -> str | None:
-        """The clusters of intervals."""
-        return choose_over(sum(count > 0 for count in self.objects), sum(self.objects))
+    def objects(self) -> tuple[int, ...]:
+        """By log, the number of objects of which both sides have rows."""
+        of_logs = next(iter(self._regrets.values()), [])
+        return tuple(number for regret in of_logs for number in regret.objects)
 
     def count_better(self, metric: str) -> int:
         """The number of logs whose own difference is for the better."""
@@ -205,8 +201,9 @@ _FEW_HAVE_IT = (
 
 def notes_on_rows(table: pd.DataFrame, pairs: Iterable[AllLogs], asked: float | None) -> Iterator[str]:
     """Notes on missing intervals, on decisive logs, and on configurations with fewer ghosts than `asked` a minute."""
-    none = [of.objects for of in pairs if any(of.objects) and of.over is None]
-    why = f"{explain_no_clusters(sum(n > 0 for n in none[0]), sum(none[0]))}; {NOT_ENOUGH}" if none else None
+    counts = [(sum(number > 0 for number in of.objects), sum(of.objects)) for of in pairs]
+    none = [count for count in counts if count[0] and choose_over(*count) is None]
+    why = f"{explain_no_clusters(*none[0])}; {NOT_ENOUGH}" if none else None
     overall = table.drop_duplicates(["configuration", "metric"])
     without = overall[overall["difference"].notna() & overall["interval"].isna()]
     with_interval = set(overall.loc[overall["interval_over"].notna(), "configuration"])
@@ -235,7 +232,18 @@ def notes_on_rows(table: pd.DataFrame, pairs: Iterable[AllLogs], asked: float | 
 
 # What folders must have in common to be compared.
 
-_MEASURE = ("objects", "onset", "count_earlier", "confirm", "match", "distance_to", "horizon_s", "gospa", "annotated")
+_MEASURE = (
+    "objects",
+    "onset",
+    "began",
+    "count_earlier",
+    "confirm",
+    "match",
+    "distance_to",
+    "horizon_s",
+    "gospa",
+    "annotated",
+)
 """Keys of `measure` that the compared metrics depend on."""
 
 
@@ -475,12 +483,11 @@ def _compare_each_log(
             _check_same_episodes(one, first, against, second, log, grid)
             _check_same_frames(one, first, against, second, log)
             regrets = list(compute_regrets(first, second, grid, settings[one], metrics))
-            pair.add(first, second, regrets, grid, more=len(logs) > 1)
-            over = choose_over(min(pair.objects[-1], 1), pair.objects[-1])
+            pair.add(first, second, regrets, more=len(logs) > 1)
             for regret in regrets if len(logs) > 1 else ():
                 values = regret.figure.values()
                 pair.differences.setdefault(regret.metric, []).append(values[2])
-                rows.append({"log": log, **_make_row(regret, values, one, against, over, names)})
+                rows.append({"log": log, **_make_row(regret, values, one, against, names)})
     return pairs, [*_overall_rows(against, pairs, names), *rows]
 
 
@@ -491,7 +498,7 @@ def _overall_rows(
     for one, pair in pairs.items():
         for regret in pair.regrets():
             values = regret.figure.values()
-            row = {"log": ALL, **_make_row(regret, values, one, against, pair.over, names)}
+            row = {"log": ALL, **_make_row(regret, values, one, against, names)}
             if row.get("interval_over") == "logs":
                 row["logs_better"] = pair.count_better(regret.metric)
                 if (decisive := find_decisive_log(regret.figure, values[2], names)) is not None:
@@ -568,11 +575,10 @@ def _make_row(
     values: tuple[float, float, float],
     one: LabelledConfiguration,
     against: LabelledConfiguration,
-    over: str | None,
     names: ClusterNames,
 ) -> dict[str, object]:
-    """The row of a regret with its `values`, of one log or all. `over`: the clusters of its interval."""
-    figure, (value, baseline_value, difference) = regret.figure, values
+    """The row of a regret with its `values`, of one log or all."""
+    figure, over, (value, baseline_value, difference) = regret.figure, regret.over, values
     row: dict[str, object] = {"configuration": one.label, "baseline": against.label, "metric": regret.metric}
     row |= {
         "value": _number_or_none(value),

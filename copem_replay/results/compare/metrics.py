@@ -1,6 +1,7 @@
 """Metrics of a comparison: differences of two configurations, over the rows that both have and what both hold.
 
-Rows are paired by log, object and run, what is held by frame; differences are first − second. Definitions are those of
+Rows are paired by log, object and run, what is held by frame; differences are first − second. Shares, times and
+distances are of the rows that count (`measure.began`), accuracy and ghosts of all. Definitions are those of
 `summary.csv`, except:
 
 *ttd_rmst_s*: the difference of the two restricted means over the rows that both have; never detected counts as the
@@ -31,6 +32,7 @@ from numpy.typing import NDArray
 
 from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import Bool, Float, Int
+from copem_replay.metrics.intervals import choose_over
 from copem_replay.metrics.summary_metrics import METRIC, compute_unknown_s
 from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT
 from copem_replay.results.compare.labels import LabelledConfiguration
@@ -262,25 +264,32 @@ class HeldCounts:
 class Regret:
     """A metric of a pair; `kept`: operating points of the first and the second, for times at equal ghosts.
 
-    `held`: beside figures of what both hold.
+    `held`: beside figures of what both hold. `objects`: by log the number of objects of which both sides have rows.
     """
 
     metric: str
     figure: PairStatistic
     kept: tuple[OperatingPoint, OperatingPoint] | None = None
     held: HeldCounts | None = None
+    objects: tuple[int, ...] = ()
+
+    @property
+    def over(self) -> str | None:
+        """The clusters of its interval; None: there are too few."""
+        return choose_over(sum(number > 0 for number in self.objects), sum(self.objects))
 
     @staticmethod
     def joined(of_logs: Sequence[Regret]) -> Regret:
         """The same metric over several logs."""
         figures, counts = [one.figure for one in of_logs], [one.held for one in of_logs if one.held is not None]
         held = reduce(HeldCounts.__add__, counts) if counts else None
-        return replace(of_logs[0], figure=type(figures[0]).joined(figures), held=held)
+        objects = tuple(number for one in of_logs for number in one.objects)
+        return replace(of_logs[0], figure=type(figures[0]).joined(figures), held=held, objects=objects)
 
 
 @dataclass(frozen=True)
 class _Pair:
-    """Two sides in a log, and the cells (C,) that both have."""
+    """Two sides in a log, and the cells (C,) that both have: all, or those that count."""
 
     first: ConfigurationData
     second: ConfigurationData
@@ -315,10 +324,13 @@ def compute_regrets(
     only: Sequence[str] | None = None,
 ) -> Iterator[Regret]:
     """The metrics of a log, all or `only` some, for which both sides have the data."""
-    pair = _Pair(first, second, grid, np.flatnonzero(first.there & second.there), setting)
     for names, compute in _METRICS.items():
+        there = first.there & second.there if compute in _OF_ALL else first.counted & second.counted
+        pair = _Pair(first, second, grid, np.flatnonzero(there), setting)
+        objects = (len(np.unique(pair.cells // grid.runs)),)
         if only is None or not set(names).isdisjoint(only):
-            yield from (regret for regret in compute(pair) if only is None or regret.metric in only)
+            regrets = (regret for regret in compute(pair) if only is None or regret.metric in only)
+            yield from (replace(regret, objects=objects) for regret in regrets)
 
 
 def _detection_regrets(pair: _Pair) -> Iterator[Regret]:
@@ -479,3 +491,5 @@ _METRICS = {
     ("pass_share",): _braking_regrets,
 }
 """By metrics the function that computes them, in the order of a comparison."""
+_OF_ALL = (_held_regrets, _false_positive_regrets)
+"""Functions over all rows that both sides have, not those alone that count."""

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int
+from copem_replay.metrics.onset import is_counted
 from copem_replay.metrics.survival import COMPETES
 from copem_replay.results.compare.labels import LabelledConfiguration
 from copem_replay.results.schema import AGAIN, HELD
@@ -143,11 +144,15 @@ class StepData:
 
 @dataclass(frozen=True)
 class ConfigurationData:
-    """A configuration on the grid: columns by cell, without meaning where it is not `there`. None: not written."""
+    """A configuration on the grid: columns by cell, without meaning where it is not `there`. None: not written.
+
+    `counted`: there, and counts for times, shares and distances at detection.
+    """
 
     label: str
     path: Path
     there: Bool
+    counted: Bool
     detected: Bool
     left: Bool  # never detected, if it was not
     onset_s: Float
@@ -187,6 +192,7 @@ def lay_out_configuration(
         label=one.label,
         path=results.folder,
         there=_lay_out(np.ones(len(cell), dtype=bool), cell, size),
+        counted=_lay_out(is_counted(rows["began"].to_pandas(), results.provenance.measure["began"]), cell, size),
         detected=_lay_out(detected, cell, size),
         left=_lay_out(_is_left(rows), cell, size),
         onset_s=_lay_out(float_column(rows["onset_s"]), cell, size),
