@@ -181,7 +181,7 @@ class Measure(Frozen):
     confirm: Confirm = Confirm()
     match: Match = Match()
     distance_to: Id = "ego"
-    horizon_s: Positive | None = None
+    horizon_s: Positive = 5.0
     conflict: Conflict | None = None
     exact: Flag = False
     accuracy: Flag = True

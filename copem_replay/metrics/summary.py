@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from copem_replay.core.errors import wrap_line
-from copem_replay.core.tracks import Int
+from copem_replay.core.errors import count_noun, wrap_line
+from copem_replay.core.tracks import SAME_INSTANT_S, Int
 from copem_replay.metrics.accuracy.metrics import beyond_gate_share
 from copem_replay.metrics.accuracy.statistics import AccuracyTotal
 from copem_replay.metrics.intervals import (
@@ -115,11 +115,28 @@ MUCH_BEYOND = 0.01
 """
 
 
-def horizon_s(table: pd.DataFrame, given_s: float | None) -> float | None:
-    """The horizon of restricted means in seconds: as given, else the longest episode; None without rows."""
-    if given_s is not None:
-        return given_s
-    return float((table["ended_s"] - table["onset_s"]).max()) if len(table) else None
+FEWEST_FOLLOWED = 5
+"""As many episodes last at least as long as the horizon; of more than fifty a tenth, of fewer than five half."""
+
+
+def settle_horizon(counted: pd.DataFrame, asked_s: float) -> tuple[float, list[str]]:
+    """The horizon of restricted means in seconds, and a note where it is shorter than `asked_s`.
+
+    `counted`: rows that count, of all logs. It is the longest that enough episodes last, `asked_s` at most: a mean up
+    to where hardly anybody is followed would hang on a few long episodes.
+    """
+    episodes = counted.drop_duplicates(["log", "object_id"])
+    length_s = np.sort(np.round((episodes["ended_s"] - episodes["onset_s"]).to_numpy(dtype=float), 9))[::-1]
+    number = len(length_s)
+    needed = -(-number // 2) if number < FEWEST_FOLLOWED else max(FEWEST_FOLLOWED, -(-number // 10))
+    followed = int((length_s >= asked_s - SAME_INSTANT_S).sum())
+    if followed >= needed:
+        return asked_s, []
+    shorter_s = float(length_s[needed - 1])
+    return shorter_s, [
+        f"horizon_s: {followed} of {count_noun(number, 'episode')} that count ({100 * followed / number:.3g} %) last "
+        f"{asked_s:g} s; means are of min(time, {format_cell(shorter_s)} s), which {needed} of them last"
+    ]
 
 
 Sums = Mapping[str, Mapping[str, OwnSums]]
@@ -276,9 +293,8 @@ def format_summary(summary: pd.DataFrame, width: int | None = None) -> str:
     lines += describe_intervals(summary, "interval")
     horizon = summary["ttd_rmst_horizon_s"].dropna()
     if len(horizon):
-        lines.append(
-            f"ttd_rmst_s: mean time to detection, never detected counting as {format_cell(float(horizon.iloc[0]))} s"
-        )
+        up_to = f"{format_cell(float(horizon.iloc[0]))} s"
+        lines.append(f"ttd_rmst_s: mean of min(time to detection, {up_to}), never detected counting as {up_to}")
     if "conflict_detected_share" in summary:
         lines += ["", *_part_lines(summary, "conflict", width)]
         lines.append("conflict_*: the same for the first list that implies a collision")

@@ -42,7 +42,7 @@ from copem_replay.io.recording import Recording
 from copem_replay.metrics.detection.conflict import describe_excluded
 from copem_replay.metrics.episodes import Episodes, measured_objects
 from copem_replay.metrics.metric import LinkTimes, OutputTimes, link_times
-from copem_replay.metrics.onset import BEGAN, InRange
+from copem_replay.metrics.onset import BEGAN, InRange, Onset
 from copem_replay.perception.config import Carriers
 from copem_replay.perception.observation import interpolate_worlds
 from copem_replay.perception.pem.model import ObjectSidePlace, Pem

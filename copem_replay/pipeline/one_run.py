@@ -127,7 +127,7 @@ def select_shown_runs(experiment: Experiment, result: ExperimentResult, log: str
     )
 
 
-def _rank_run(rows: pd.DataFrame, horizon_s: float | None, rank: str) -> tuple[int, str]:
+def _rank_run(rows: pd.DataFrame, horizon_s: float, rank: str) -> tuple[int, str]:
     """The run that is `median`, `worst` or `best` among the rows of a log, and why."""
     if not len(rows):
         return 0, f"first, not {rank}, as no measured object has an onset"

@@ -27,7 +27,7 @@ from copem_replay.metrics.accuracy.statistics import AccuracyTotal
 from copem_replay.metrics.intervals import find_fixed_outcomes
 from copem_replay.metrics.metric import OutputTimes, OwnSums
 from copem_replay.metrics.onset import select_counted
-from copem_replay.metrics.summary import add_own_sums, horizon_s, own_sums_by_log, summarise_tally, tally_rows
+from copem_replay.metrics.summary import add_own_sums, own_sums_by_log, settle_horizon, summarise_tally, tally_rows
 from copem_replay.pipeline.closed_form import check_closed_form, exact_table
 from copem_replay.pipeline.cost import RunCost, memory_notes, watch_cost
 from copem_replay.pipeline.notes import ListRate, LogFacts, join_list_rates, study_notes
@@ -240,7 +240,7 @@ class ExperimentResult:
     summary: pd.DataFrame  # summary.csv
     notes: tuple[str, ...]  # one line each
     replays: tuple[Replay, ...]  # one per log
-    horizon_s: float | None
+    horizon_s: float
     exact: pd.DataFrame | None = None  # exact.parquet, with `measure: {exact: true}`
     bands: pd.DataFrame | None = None  # bands.csv, with `measure: {accuracy: true}`
     sweep: pd.DataFrame | None = None  # sweep.csv, with `sweep:`
@@ -296,13 +296,13 @@ def _run_study(experiment: Experiment, logs: Sequence[StudyLog], gatherer: Gathe
     exact = _compute_exact(logs, experiment, gatherer)
     sums = _sum_tables(logs, experiment, gatherer)
     facts, counted = [log.facts(experiment) for log in logs], select_counted(sums.tally, experiment.measure.began)
-    horizon = horizon_s(counted, experiment.measure.horizon_s)
+    horizon_s, horizon_notes = settle_horizon(counted, experiment.measure.horizon_s)
     times = _rates_by_configuration(facts, experiment)
     rows, summary_notes = summarise_tally(
         counted,
         list(experiment.configurations),
         {name: one.rate_hz for name, one in times.items()},
-        horizon_s=horizon,
+        horizon_s=horizon_s,
         exact=None if exact is None else select_counted(exact, experiment.measure.began),
         accuracy=total_over_logs(sums.totals),
         fixed=find_fixed_outcomes(experiment.as_written()),
@@ -312,7 +312,7 @@ def _run_study(experiment: Experiment, logs: Sequence[StudyLog], gatherer: Gathe
         conflicts_asked=experiment.measure.conflict is not None,
         links={name: one.links for name, one in times.items() if one.links is not None},
     )
-    swept = [_summarise_point(point, logs, gatherer, horizon) for point in list_points(experiment)]
+    swept = [_summarise_point(point, logs, gatherer, horizon_s) for point in list_points(experiment)]
     recordings = [log.recording for log in logs]
     notes = study_notes(
         recordings, {log.name: sums.oddities for log, sums in zip(logs, facts, strict=True)}, experiment
@@ -323,9 +323,9 @@ def _run_study(experiment: Experiment, logs: Sequence[StudyLog], gatherer: Gathe
     result = ExperimentResult(
         sums.tables,
         rows,
-        (*notes, *summary_notes),
+        (*notes, *horizon_notes, *summary_notes),
         ready,
-        horizon,
+        horizon_s,
         exact,
         tabulate_bands(sums.totals) if accurate else None,
     )
@@ -373,9 +373,7 @@ def _batch_tables(each: Iterable[LogTables]) -> Iterator[list[LogTables]]:
         yield batch
 
 
-def _summarise_point(
-    point: SweepPoint, logs: Sequence[StudyLog], gatherer: Gatherer, horizon: float | None
-) -> pd.DataFrame:
+def _summarise_point(point: SweepPoint, logs: Sequence[StudyLog], gatherer: Gatherer, horizon_s: float) -> pd.DataFrame:
     """The rows of `sweep.csv` of one point: summaries of its configurations, at the horizon of the experiment."""
     experiment = point.experiment
     if not point.same_units:
@@ -386,7 +384,7 @@ def _summarise_point(
         select_counted(sums.tally, experiment.measure.began),
         list(experiment.configurations),
         {name: one.rate_hz for name, one in times.items()},
-        horizon_s=horizon,
+        horizon_s=horizon_s,
         exact=None if exact is None else select_counted(exact, experiment.measure.began),
         accuracy=total_over_logs(sums.totals),
         fixed=find_fixed_outcomes(experiment.as_written()),

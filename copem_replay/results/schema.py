@@ -176,7 +176,7 @@ class Provenance:
     window_s: object
     measure: dict[str, Any]
     braking: dict[str, Any] | None
-    horizon_used_s: float | None
+    horizon_used_s: float
     run_shown: dict[str, int]  # by log
     data: dict[str, Any]
 
@@ -197,7 +197,7 @@ def read_provenance(path: Path) -> Provenance:
             RecordedLog(str(log["log"]), log.get("topic"), str(log["sha256"]), log.get("truth")) for log in data["logs"]
         )
         measure, braking, gap_s = dict(data["measure"]), data.get("braking"), data.get("max_gap_s")
-        used_s, run_shown = measure.pop("horizon_used_s", None), data.get("run_shown") or {}
+        used_s, run_shown = float(measure.pop("horizon_used_s")), data.get("run_shown") or {}
         return Provenance(
             logs=logs,
             seed=int(data["seed"]),
@@ -208,7 +208,7 @@ def read_provenance(path: Path) -> Provenance:
             # A missing key, from an older version, stands for its default.
             measure=Measure().model_dump(mode="json", by_alias=True) | measure,
             braking=None if braking is None else dict(braking),
-            horizon_used_s=None if used_s is None else float(used_s),
+            horizon_used_s=used_s,
             run_shown={str(log): int(run) for log, run in run_shown.items() if run is not None},
             data=data,
         )

@@ -57,7 +57,7 @@ measure:
   count_earlier: false
   confirm: {hits: 1, of: 1}
   distance_to: ego
-  horizon_s: null
+  horizon_s: 5
 show: {logs: [first], run: 0}
 """
 """The contract's example, without what this version does not have."""

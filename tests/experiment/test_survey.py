@@ -102,6 +102,7 @@ def test_survey(path):
                         {"at": [40.0, 0.0], "yaw_deg": 180},
                         {"at": [20.0, 0.0], "yaw_deg": 0},
                     ],
+                    "began": {"crossed": 0, "appeared": 0, "log_start": 1},
                 },
             }
         ],

@@ -95,7 +95,7 @@ MEASURE = {
     "confirm": {"hits": 1, "of": 1},
     "match": {"gate_m": 3.0, "always": False},
     "distance_to": "ego",
-    "horizon_s": None,
+    "horizon_s": 10.0,
     "conflict": None,
     "exact": False,
     "accuracy": True,

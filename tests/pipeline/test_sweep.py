@@ -416,7 +416,8 @@ class TestResults:
         measure = plan().measure.model_dump(exclude_defaults=True) | {"horizon_s": 1.5}
         table = swept({"latency_s": [0, 3]}, measure=measure)
         assert set(table["ttd_rmst_horizon_s"]) == {1.5}
-        assert set(swept({"latency_s": [0, 3]})["ttd_rmst_horizon_s"]) == {4.0}
+        # Episodes of 4, 2.9 and 0.4 s: none lasts 5 s, and two of the three 2.9 s.
+        assert set(swept({"latency_s": [0, 3]})["ttd_rmst_horizon_s"]) == {2.9}
 
     def test_nothing_else_changes(self) -> None:
         whole, plain = (run_experiment(plan(sweep), [crossing()]) for sweep in (EVERYTHING, None))

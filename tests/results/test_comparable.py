@@ -43,7 +43,11 @@ DIFFERENCES = [
         'measure.confirm: expected {{"hits": 1, "of": 1}} as in {first}, found {{"hits": 2, "of": 3}}',
     ),
     ({}, {"measure": {"count_earlier": True}}, "measure.count_earlier: expected false as in {first}, found true"),
-    ({}, {"measure": {"horizon_s": 4.0}}, "measure.horizon_s: expected null as in {first}, found 4.0"),
+    (
+        {},
+        {"measure": {"began": ["crossed"]}},
+        'measure.began: expected ["crossed", "appeared"] as in {first}, found ["crossed"]',
+    ),
     ({}, {"measure": {"distance_to": "mast"}}, 'measure.distance_to: expected "ego" as in {first}, found "mast"'),
     (
         {"measure": SIGHT},

@@ -59,7 +59,7 @@ def test_never_detected_counts_as_the_horizon(tmp_path):
 
 
 def test_the_horizon_that_was_given_cuts_all_times(tmp_path):
-    comparison = compared(tmp_path, THREE, measure={"horizon_s": 1.25})
+    comparison = compared(tmp_path, THREE, measure={"horizon_used_s": 1.25})
     assert comparison.horizon_s == 1.25
     # 1.5 and never are 1.25 now, and so is the baseline's 2.
     assert of(comparison, "ttd_rmst_s")["difference"] == pytest.approx((0.25 + 0 + 0) / 3)
@@ -388,7 +388,7 @@ def test_of_a_detection_and_a_censoring_at_one_time_the_detection_comes_first(tm
     censored = {"onset_s": 0.8, "ended_s": 1.0, "ended_by": "log_end"}
     rows = [row("ideal", 0.2, 30.0), row("late", 0.2, 30.0)]
     rows += [row(name, None, object_id="8", **censored) for name in ("ideal", "late")]
-    time = of(compared(tmp_path, rows, measure={"horizon_s": 1.0}), "ttd_rmst_s")
+    time = of(compared(tmp_path, rows, measure={"horizon_used_s": 1.0}), "ttd_rmst_s")
     assert time["value"] == pytest.approx(0.2 + 0.5 * 0.8)
 
 

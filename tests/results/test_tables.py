@@ -248,7 +248,7 @@ def test_what_the_table_shows_is_said_below(tmp_path):
         "detected_share: exact binomial limits where the difference is the same in every cluster",
         "(all alike): the difference is the same in every cluster, or a median in nearly all, so how it varies is "
         "not known",
-        "ttd_rmst_s: mean time to detection up to 10 s, never detected counting as that; objects still there at the "
+        "ttd_rmst_s: mean of min(time to detection, 10 s), never detected counting as 10 s; objects still there at the "
         "end are censored",
     ]
 

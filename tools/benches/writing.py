@@ -14,7 +14,7 @@ from copem_replay.io.write.detail import DetailWriter
 from copem_replay.io.write.mcap import write_mcap
 from copem_replay.io.write.osi import SensorDataWriter
 from copem_replay.io.write.scene import FoxgloveSceneWriter
-from copem_replay.metrics.summary import horizon_s, summarise_rows
+from copem_replay.metrics.summary import settle_horizon, summarise_rows
 from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.replay import replay_block
@@ -69,7 +69,7 @@ def writing() -> Iterator[common.Line]:
     run_tracks = tracks_of_run(ready, experiment, 0)
     table = replay_block(ready, experiment, np.arange(1))
     rates: dict[str, float | None] = dict.fromkeys(experiment.configurations)
-    rows, _ = summarise_rows(table, list(experiment.configurations), rates, horizon_s=horizon_s(table, None))
+    rows, _ = summarise_rows(table, list(experiment.configurations), rates, horizon_s=settle_horizon(table, 5.0)[0])
     listed = sum(int(lists.fused.valid.sum()) for lists in run_tracks.values())
     shown = listed + len(ready.truth.frame_ix)
     with common.scratch() as folder:

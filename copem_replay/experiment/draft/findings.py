@@ -76,7 +76,8 @@ class Suggestion:
     """An experiment to begin with.
 
     `ego`: value of the key, None: the host vehicle of the log. `classes`: measured classes, None: all that moves.
-    `masts`: two, the one with more room around it first.
+    `masts`: two, the one with more room around it first. `began`: how many of the measured objects cross, appear, or
+    are there at the log's start, within `RANGE_M`; None: nobody is measured by distance.
     """
 
     ego: str | dict[str, str] | None
@@ -84,6 +85,7 @@ class Suggestion:
     classes: list[str] | None
     onset: str
     masts: list[Mast]
+    began: dict[str, int] | None
 
 
 @dataclass(frozen=True)
@@ -159,8 +161,10 @@ def survey_as_json(survey: RecordingSurvey) -> dict[str, Any]:
 
 # Suggestions for an experiment.
 
-RANGE_M = 50.0
-"""Distance to the ego within which objects are measured: the default of the onset `in_range`."""
+RANGE_M = 40.0
+"""Distance to the ego within which objects are measured, the same in all drafts, so that drives stay comparable."""
+FEWEST_COUNTED = 5
+"""With fewer objects that cross or appear, those of the log's start count, too."""
 MAST_M = 10.0
 """Distance of the mast from the busiest place: beside the lane, not on it."""
 _CELL_M = 10.0
@@ -184,7 +188,29 @@ def suggest_experiment(log: Log, recording: Recording, fields: Fields | None = N
     classes, onset, rows = _suggest_measured(scene, truth, number)
     if not len(rows):
         rows = np.arange(len(objects))
-    return Suggestion(ego, why, classes, onset, _suggest_masts(truth, rows, objects))
+    masts = _suggest_masts(truth, rows, objects)
+    began = None if onset == "appears" else _count_began(scene, truth, number, classes, masts[0])
+    return Suggestion(ego, why, classes, onset, masts, began)
+
+
+def _count_began(scene: Scene, truth: Tracks, ego_ix: int, classes: list[str] | None, mast: Mast) -> dict[str, int]:
+    """How many measured objects begin how, as `find_episodes` has it: near the ego, or the first mast without one."""
+    objects, time_s = truth.row_object_ix, truth.row_captured_s
+    if ego_ix >= 0:
+        near, shared = _is_near_ego(truth, objects, ego_ix), np.zeros(len(truth.stamp_ns), dtype=bool)
+        shared[truth.frame_ix[objects == ego_ix]] = True
+    else:
+        near = np.hypot(truth.x_m[0] - mast.at[0], truth.y_m[0] - mast.at[1]) <= RANGE_M
+        shared = np.ones(len(truth.stamp_ns), dtype=bool)
+    first_s, near_s = np.full((2, len(scene.object_ids)), np.inf)
+    asked = shared[truth.frame_ix]
+    np.minimum.at(first_s, objects[asked], time_s[asked])
+    np.minimum.at(near_s, objects[asked & near], time_s[asked & near])
+    measured = scene.moving if classes is None else np.isin(scene.object_class, class_indices(tuple(classes)))
+    measured = measured & np.isfinite(near_s) & (np.arange(len(measured)) != ego_ix)
+    at_once, at_start = near_s <= first_s, first_s <= time_s[asked].min(initial=np.inf)
+    groups = {"crossed": ~at_once, "appeared": at_once & ~at_start, "log_start": at_once & at_start}
+    return {word: int((measured & group).sum()) for word, group in groups.items()}
 
 
 def _suggest_ego(

@@ -11,6 +11,8 @@ from typing import Final
 from copem_replay.core.errors import count_noun, escape_unprintable
 from copem_replay.core.yaml import dump_on_one_line
 from copem_replay.experiment.draft.findings import (
+    FEWEST_COUNTED,
+    RANGE_M,
     ProposalFound,
     RecordingSurvey,
     Role,
@@ -224,12 +226,27 @@ def _draft_measure(guess: Suggestion, *, ego: bool) -> Iterator[str]:
     else:
         yield "  # objects: {classes: [vru]}   # left out: all that moves but the ego"
     if guess.onset == "appears":
-        yield "  onset: {kind: appears}   # the clock starts; no object comes within 50 m of the ego (in_range)"
+        yield f"  onset: {{kind: appears}}   # the clock starts; in_range: nobody is within {RANGE_M:g} m of the ego"
     else:
-        yield "  onset: {kind: in_range, range_m: 50}   # the clock starts; or appears, starts_moving, line_of_sight"
+        yield (
+            f"  onset: {{kind: in_range, range_m: {RANGE_M:g}}}   # the clock starts; or appears, starts_moving, "
+            "line_of_sight"
+        )
+    yield _draft_began(guess)
+    yield "  horizon_s: 5   # means are of min(time, 5 s)"
     if not ego:
         yield "  distance_to: roadside   # there is no ego: ranges and distances are from here"
     yield "  confirm: {hits: 1, of: 1}   # known when so many of the last lists hold it"
+
+
+def _draft_began(guess: Suggestion) -> str:
+    """The line of `began`: its default as a comment, or all three words, with the reason."""
+    if guess.began is None:
+        return "  began: [log_start, crossed, appeared]   # who counts: all, for nobody crosses into view"
+    numbers = ", ".join(f"{number} {word}" for word, number in guess.began.items())
+    if guess.began["crossed"] + guess.began["appeared"] < FEWEST_COUNTED:
+        return f"  began: [log_start, crossed, appeared]   # who counts: all, for there are only {numbers}"
+    return f"  # began: [crossed, appeared]   # who counts; left out: these ({numbers})"
 
 
 def _name_recorded(truth: TruthFound) -> tuple[list[tuple[str, UnitFound]], list[tuple[str, UnitFound]]]:

@@ -166,8 +166,11 @@ def _note_sentences(results: Results, names: Sequence[str], rows: pd.DataFrame, 
         sentences.append(f"Lines: 95 % intervals over {describe_over(results)}")
         sentences.append("Two that overlap may differ for sure: see the differences")
     horizon = rows["ttd_rmst_horizon_s"].dropna()
-    if (rows.loc[list(names), "detected_share"] < 1).any() and len(horizon):
-        sentences.append(f"An object that is never detected counts as {format_three_digits(float(horizon.iloc[0]))} s")
+    if len(horizon):
+        up_to = f"{format_three_digits(float(horizon.iloc[0]))} s"
+        missed = (rows.loc[list(names), "detected_share"] < 1).any()
+        also = f"; an object that is never detected counts as {up_to}" if missed else ""
+        sentences.append(f"Mean of min(time, {up_to}){also}")
     if find_truths(results):
         sentences.append("Dashed: the ground truth, an upper bound, not ranked")
     return sentences

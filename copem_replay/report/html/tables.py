@@ -244,9 +244,8 @@ def _interval_sentences(study: ReportData, part: SummaryPart, columns: Iterable[
         sentences += [_replace_metric_names(f"{strip_unit(column)}: {line}") for line in words]
     horizon = rows["ttd_rmst_horizon_s"].dropna() if "ttd_rmst_s" in columns else pd.Series(dtype=float)
     if len(horizon):
-        sentences.append(
-            f"In means an object that is never detected counts as {format_three_digits(float(horizon.iloc[0]))} s."
-        )
+        up_to = f"{format_three_digits(float(horizon.iloc[0]))} s"
+        sentences.append(f"Means are of min(time, {up_to}); an object that is never detected counts as {up_to}.")
     return sentences
 
 

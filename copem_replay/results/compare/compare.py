@@ -52,8 +52,6 @@ from copem_replay.results.compare.pairing import (
     ConfigurationData,
     PairingGrid,
     build_grid,
-    configuration_rows,
-    float_column,
     lay_out_configuration,
 )
 from copem_replay.results.read import Results, open_results
@@ -232,18 +230,7 @@ def notes_on_rows(table: pd.DataFrame, pairs: Iterable[AllLogs], asked: float | 
 
 # What folders must have in common to be compared.
 
-_MEASURE = (
-    "objects",
-    "onset",
-    "began",
-    "count_earlier",
-    "confirm",
-    "match",
-    "distance_to",
-    "horizon_s",
-    "gospa",
-    "annotated",
-)
+_MEASURE = ("objects", "onset", "began", "count_earlier", "confirm", "match", "distance_to", "gospa", "annotated")
 """Keys of `measure` that the compared metrics depend on."""
 
 
@@ -405,7 +392,8 @@ def compare_folders(
     own_rate = false_positives_per_min is None
     if own_rate and against in totals:
         false_positives_per_min = totals[against].per_min
-    setting = PairSettings(_horizon_s(read, against, logs), float(read[0].provenance.measure["gospa"]["power"]))
+    horizon_s, horizon_notes = _settle_horizon(used)
+    setting = PairSettings(horizon_s, float(read[0].provenance.measure["gospa"]["power"]))
     settings, reasons = _settle_ghosts(setting, against, others, totals, false_positives_per_min, asked=not own_rate)
     pairs, rows = _compare_each_log(against, settings, ClusterNames(logs, [], runs), metrics)
     table = pd.DataFrame(rows, columns=list(COLUMNS)).astype(COLUMNS)
@@ -418,6 +406,7 @@ def compare_folders(
         false_positives_per_min=false_positives_per_min,
         notes=(
             *notes_on_folders(used),
+            *horizon_notes,
             *notes_on_differences(used, renames),
             *notes_on_pairs(against, pairs),
             *note_on_measuring(against, others),
@@ -506,15 +495,14 @@ def _overall_rows(
             yield row
 
 
-def _horizon_s(folders: Sequence[Results], against: LabelledConfiguration, logs: Sequence[str]) -> float:
-    """The horizon in seconds: that of `measure`, else the longest episode of any folder."""
-    horizon_s = folders[0].provenance.measure["horizon_s"]
-    used_s = [one.provenance.horizon_used_s for one in folders if one.provenance.horizon_used_s is not None]
-    if horizon_s is None and not used_s:
-        for log in logs:
-            rows = configuration_rows(against, against.results.rows_of(log, "detections.parquet"))["detections.parquet"]
-            used_s += (float_column(rows["ended_s"]) - float_column(rows["onset_s"])).tolist()
-    return float(np.nanmax(used_s) if horizon_s is None else horizon_s)
+def _settle_horizon(folders: Sequence[Results]) -> tuple[float, list[str]]:
+    """The horizon in seconds, the shortest that any folder has, and a note where they differ."""
+    used_s = {str(folder.folder): folder.provenance.horizon_used_s for folder in folders}
+    horizon_s = min(used_s.values())
+    if horizon_s == max(used_s.values()):
+        return horizon_s, []
+    has = ", ".join(f"{path} {one_s:.4g} s" for path, one_s in used_s.items())
+    return horizon_s, [f"other horizons ({has}): times are up to {horizon_s:.4g} s"]
 
 
 def _check_same_episodes(

@@ -154,8 +154,8 @@ def comparison_lines(comparison: Comparison) -> Iterator[str]:
         yield f"{APART}: the interval excludes 0"
     yield from _describe_intervals(overall)
     yield (
-        f"ttd_rmst_s: mean time to detection up to {comparison.horizon_s:.4g} s, never detected counting as that; "
-        "objects still there at the end are censored"
+        f"ttd_rmst_s: mean of min(time to detection, {comparison.horizon_s:.4g} s), never detected counting as "
+        f"{comparison.horizon_s:.4g} s; objects still there at the end are censored"
     )
     if "ttd_rmst_s_equal_ghosts" in shown:
         yield (
