@@ -297,7 +297,8 @@ class TestWords:
         text = changed(
             ("  blind:", pems + "  blind:"),
             ("measure: {onset", "measure: {horizon_s: 0.1, onset"),
-            ("pem: half}", "pem: other}"), ("  eye: {", "  near: {on: ego, height_m: 1.8, pem: one}\n  eye: {"),
+            ("pem: half}", "pem: other}"),
+            ("  eye: {", "  near: {on: ego, height_m: 1.8, pem: one}\n  eye: {"),
             ("  hit: {units: [ego], latency_s: 1.8}", "  hit: {units: [near]}"), ALONE[1], ALONE[3],
         )  # fmt: skip
         lines = lines_of(replayed(tmp_path, text))
