@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -91,20 +92,22 @@ def inspect_recording(path: AnyPath) -> dict[str, Any]:
     return survey_as_json(survey_recording(Path(path)))
 
 
-def draft_experiment(path: AnyPath) -> str:
-    """Draft an experiment that replays a recording: YAML with comments, its paths relative to the working folder.
+def draft_experiment(path: AnyPath, *more: AnyPath) -> str:
+    """Draft an experiment that replays a recording, or several drives: YAML with comments.
 
-    The text is what `copem-replay init` prints. Ego, a mast and recorded units are guesses, each with a comment.
+    Its paths are relative to the working folder. The text is what `copem-replay init` prints. Ego, a mast and recorded
+    units are guesses, each with a comment.
 
-    Raises RecordingError where no list of true objects is readable, or the path of the recording is not UTF-8.
+    Raises RecordingError where no list of true objects is readable in one of them, where a path is not UTF-8, or where
+    one is given twice.
 
     >>> print(cr.draft_experiment("logs/tc016d.mcap").splitlines()[0])
     # Replays tc016d.mcap, 8.0 s: 2 pedestrian, 1 bicycle, 4 car, 1 truck.
     """
-    text, survey = draft_recording(Path(path))
+    paths = [Path(one) for one in (path, *more)]
+    text, surveys = draft_drives(paths)
     if text is None:
-        raise RecordingError(survey.reason or f"{path}: no list of true objects")
-    check_encodable(path)
+        raise RecordingError(explain_undrafted(surveys))
     return text
 
 
@@ -116,21 +119,23 @@ def check_encodable(path: AnyPath) -> None:
         raise RecordingError(f"{path}: its path is not UTF-8: no experiment could name it") from None
 
 
-def draft_joint_recordings(paths: Sequence[Path]) -> tuple[str | None, RecordingSurvey]:
+def draft_joint_recordings(paths: Sequence[Path]) -> tuple[str | None, list[RecordingSurvey]]:
     """The draft for several recordings of one drive, with their clock offsets, 0 where none can be estimated.
 
-    Returns the text, None where no list of true objects is readable, and the joint survey.
+    Returns the text, None where no list of true objects is readable, and the joint survey, alone in a list.
     """
     from copem_replay.experiment.draft.survey import compare_clocks, survey_recording
-    from copem_replay.experiment.draft.template import format_draft, format_proposed_draft, quote_yaml
+    from copem_replay.experiment.draft.template import format_draft, quote_yaml, take_proposal
     from copem_replay.io.open import DriveRecordings
 
+    for path in paths:
+        check_encodable(path)
     clocks = compare_clocks(paths)
     ahead_s = [0.0, *(0.0 if clock.offset.untold else round(clock.offset.offset_s, 3) for clock in clocks)]
     survey = survey_recording(DriveRecordings(tuple(paths), tuple(ahead_s)))
-    text = format_draft(survey) if survey.readable else format_proposed_draft(survey)
-    if text is None:
-        return None, survey
+    drafted = take_proposal(survey)
+    if drafted is None:
+        return None, [survey]
     entry = [
         "logs:   # relative to this file, or absolute",
         f"  - together: [{', '.join(quote_yaml(str(p)) for p in paths)}]",
@@ -139,15 +144,33 @@ def draft_joint_recordings(paths: Sequence[Path]) -> tuple[str | None, Recording
     for clock, offset_s in zip(clocks, ahead_s[1:], strict=True):
         lists = " and ".join(clock.lists)
         entry.append(f"      {quote_yaml(str(clock.path))}: {offset_s}   # {clock.words()}; by {lists}")
-    lines = text.splitlines()
+    lines = format_draft(drafted).splitlines()
     logs_line = next(k for k, line in enumerate(lines) if line.startswith("logs: ["))
-    return "\n".join([*lines[:logs_line], *entry, *lines[logs_line + 1 :]]) + "\n", survey
+    return "\n".join([*lines[:logs_line], *entry, *lines[logs_line + 1 :]]) + "\n", [survey]
 
 
-def draft_recording(path: Path) -> tuple[str | None, RecordingSurvey]:
-    """The draft, None where no list of true objects is readable, and the survey behind it."""
+def draft_drives(paths: Sequence[Path]) -> tuple[str | None, list[RecordingSurvey]]:
+    """The draft for recordings of one drive each, None where one has no readable list of true objects; the surveys.
+
+    Raises RecordingError for a path that is not UTF-8, and for a recording that is given twice.
+    """
     from copem_replay.experiment.draft.survey import survey_recording
-    from copem_replay.experiment.draft.template import format_draft, format_proposed_draft
+    from copem_replay.experiment.draft.template import format_draft, take_proposal
 
-    survey = survey_recording(path)
-    return (format_draft(survey) if survey.readable else format_proposed_draft(survey)), survey
+    given: dict[str, Path] = {}
+    for path in paths:
+        check_encodable(path)
+        first = given.setdefault(os.path.realpath(path), path)
+        if first is not path:
+            also = "" if str(first) == str(path) else f", as {first}, too"
+            raise RecordingError(f"expected each recording once, found it twice{also}", path=path)
+    surveys = [survey_recording(path) for path in paths]
+    drafted = [one for survey in surveys if (one := take_proposal(survey)) is not None]
+    return (format_draft(*drafted) if len(drafted) == len(surveys) else None), surveys
+
+
+def explain_undrafted(surveys: Sequence[RecordingSurvey]) -> list[str]:
+    """A line for each recording that cannot be drafted."""
+    from copem_replay.experiment.draft.template import take_proposal
+
+    return [one.reason or f"{one.log}: no list of true objects" for one in surveys if take_proposal(one) is None]

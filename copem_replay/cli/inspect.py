@@ -76,23 +76,20 @@ def _print_clocks(logs: Sequence[Path], *, as_json: bool) -> int:
 
 
 def init(logs: LogFiles, together: OneDrive = False) -> int:
-    """Print an experiment that replays a recording, with comments.
+    """Print an experiment that replays recordings, with comments.
 
-    copem-replay init LOG > experiment.yaml. Its paths are relative to the working folder. For lists of an unknown
-    schema, `read:` is proposed from the names of their fields. The exit code is 2 when no list of true objects is
-    readable.
+    copem-replay init LOG > experiment.yaml. Several recordings are several drives, each with its own ego and masts; or
+    one drive, with --together. Paths are relative to the working folder. For lists of an unknown schema, `read:` is
+    proposed from the names of their fields. The exit code is 2 when a recording has no readable list of true objects.
     """
-    from copem_replay.api.recordings import check_encodable, draft_joint_recordings, draft_recording
+    from copem_replay.api.recordings import draft_drives, draft_joint_recordings, explain_undrafted
     from copem_replay.experiment.draft.template import format_unfinished_draft
 
-    if len(logs) > 1 and not together:
-        raise InputError(f"{logs[1]}: expected one recording, found {len(logs)}; `--together`: they are of one drive")
-    for log in logs:
-        check_encodable(log)
-    text, survey = draft_recording(logs[0]) if len(logs) == 1 else draft_joint_recordings(logs)
+    text, surveys = draft_joint_recordings(logs) if together and len(logs) > 1 else draft_drives(logs)
     if text is None:
-        print(format_unfinished_draft(survey), end="")
-        raise InputError(survey.reason or f"{logs[0]}: no list of true objects")
+        if len(surveys) == 1:
+            print(format_unfinished_draft(surveys[0]), end="")
+        raise InputError(explain_undrafted(surveys))
     print(text, end="")
     return 0
 

@@ -102,7 +102,11 @@ def test_survey(path):
                         {"at": [40.0, 0.0], "yaw_deg": 180},
                         {"at": [20.0, 0.0], "yaw_deg": 0},
                     ],
-                    "began": {"crossed": 0, "appeared": 0, "log_start": 1},
+                    "began": {
+                        "all": {"crossed": 0, "appeared": 0, "log_start": 2},
+                        "vru": {"crossed": 0, "appeared": 0, "log_start": 1},
+                        "vehicles": {"crossed": 0, "appeared": 0, "log_start": 1},
+                    },
                 },
             }
         ],

@@ -89,7 +89,7 @@ def test_the_host_of_the_log_is_the_ego(tmp_path: Path, replayed: Callable[..., 
     assert "ego" not in experiment
     assert experiment["logs"] == ["log.mcap"]
     assert experiment["units"]["ego"]["on"] == "ego"
-    assert list(experiment["configurations"]) == ["GT", "PEM", "coPEM:0s", "coPEM:0.5s", "gnn:0.5s"]
+    assert list(experiment["configurations"]) == ["GT", "ideal", "gnn", "alone", "late"]
     assert experiment["measure"]["objects"] == {"classes": ["vru"]}
     assert "# ego: <id>   # left out: the log names its host vehicle: 2 (car)" in format_draft(
         survey_recording("log.mcap")
@@ -379,12 +379,198 @@ def test_what_cannot_be_replayed_is_one_line(tmp_path: Path, call: Call) -> None
 
 def test_usage(call: Call, tmp_path: Path) -> None:
     drive(tmp_path / "drive.mcap")
-    for arguments, said in (([], "Missing argument 'LOG'."), (["a", "b"], "expected one recording, found 2")):
-        ended = call("init", *arguments)
-        assert (ended.code, ended.out) == (2, "")
-        assert said in ended.err[0]
+    ended = call("init")
+    assert (ended.code, ended.out) == (2, "")
+    assert "Missing argument 'LOG'." in ended.err[0]
     assert call("init", "--help").out.startswith("Usage: copem-replay init ")
     assert call("init", "drive.mcap").out == call("init", "drive.mcap").out
+
+
+# ------------------------------------------------------------------------------------------- several drives at once
+
+Drafts = Callable[..., dict[str, Any]]
+
+
+@pytest.fixture
+def replayed_together(call: Call, tmp_path: Path) -> Drafts:
+    """Init, check, run and compare recordings of a drive each; gives the experiment as data."""
+
+    def through(*logs: str) -> dict[str, Any]:
+        made = call("init", *logs)
+        assert (made.code, made.err) == (0, [])
+        (tmp_path / "begun.yaml").write_text(made.out, encoding="utf-8")
+        assert call("check", "begun.yaml").code == 0
+        run = call("run", "begun.yaml", "--runs", "2", "--jobs", "1", "--overwrite")
+        assert run.code == 0, run.err
+        assert call("compare", "out/begun").code == 0
+        data, _lines, problems = plain_yaml.parse_yaml(made.out)
+        assert problems == []
+        return data  # type: ignore[no-any-return]
+
+    return through
+
+
+def passing() -> Frames:
+    """Cars 2, 3 and 4 come by, each for two of six seconds: nobody is there long enough to be an ego."""
+    return [
+        (t, [Obj(id=n, x=12 * (t - 2 * n), y=4.0 * n, vx=12) for n in (2, 3, 4) if 0 <= t - 2 * (n - 2) <= 2])
+        for t in (k / 10 for k in range(61))
+    ]
+
+
+def test_several_drives_have_each_its_ego_and_mast(tmp_path: Path, replayed_together: Drafts) -> None:
+    write_recording(tmp_path / "host.mcap", street(), host=2)
+    moved = [(t, [Obj(**vars(o) | {"x": o.x + 1000}) for o in objects]) for t, objects in street()]
+    write_recording(tmp_path / "guess.mcap", moved)
+    draft = replayed_together("host.mcap", "guess.mcap")
+    # As the single drafts: the mast 10 m to the north-east of the pedestrian at (30, 6), or 1 km farther east.
+    first, second = draft["logs"]
+    assert first == {"file": "host.mcap", "units": {"roadside": {"at": [37.1, 13.1], "yaw_deg": -135}}}
+    assert second == {
+        "file": "guess.mcap", "ego": 1, "units": {"roadside": {"at": [1037.1, 13.1], "yaw_deg": -135}},
+    }  # fmt: skip
+    assert "ego" not in draft
+    assert draft["units"]["roadside"]["at"] == [37.1, 13.1]
+
+
+def test_a_drive_without_ego_beside_one_that_has_one(tmp_path: Path, replayed_together: Drafts) -> None:
+    write_recording(tmp_path / "street.mcap", street(), host=1)
+    write_recording(tmp_path / "site.mcap", passing())
+    draft = replayed_together("street.mcap", "site.mcap")
+    street_log, site = draft["logs"]
+    assert "ego" not in street_log
+    assert (site["ego"], site["units"]["ego"], site["measure"]) == ("none", None, {"distance_to": "roadside"})
+    assert list(draft["units"]) == ["ego", "roadside"]
+    assert "distance_to" not in draft["measure"]
+    assert draft["measure"]["objects"] == {"classes": ["vru", "vehicles"]}  # of the street, of the site
+    assert draft["links"]["radio"]["reception"]["kind"] == "constant"  # without an ego no distance to it is known
+
+
+def test_drives_without_an_ego_have_two_masts_each(tmp_path: Path, replayed_together: Drafts) -> None:
+    for name in ("a.mcap", "b.mcap"):
+        write_recording(tmp_path / name, passing())
+    draft = replayed_together("a.mcap", "b.mcap")
+    assert [list(log["units"]) for log in draft["logs"]] == [["roadside", "across"]] * 2
+    assert [log["ego"] for log in draft["logs"]] == ["none", "none"]
+    assert "measure" not in draft["logs"][0]
+    assert draft["measure"]["distance_to"] == "roadside"
+
+
+def test_units_that_only_some_drives_have(tmp_path: Path, replayed_together: Drafts) -> None:
+    """Both have lists on `radar`, one has them on `lidar`, too; a stack's output that one lacks is a unit."""
+    lists = [unit("radar/objects"), unit("lidar/objects"), unit("fusion/objects")]
+    write_recording(tmp_path / "a.mcap", street(), host=1, more=lists[:1])
+    write_recording(tmp_path / "b.mcap", street(), host=1, more=lists)
+    draft = replayed_together("a.mcap", "b.mcap")
+    assert [name for name, made in draft["units"].items() if "recorded" in made] == ["radar", "lidar", "fusion"]
+    first, second = (log["units"] for log in draft["logs"])
+    assert {name: first[name] for name in ("lidar", "fusion")} == {"lidar": None, "fusion": None}
+    assert None not in second.values()
+    assert draft["configurations"]["recorded"]["units"] == ["radar", "lidar", "fusion"]
+    both = replayed_together("b.mcap", "a.mcap")
+    assert [log["units"].get("lidar", "there") for log in both["logs"]] == ["there", None]
+
+
+def test_drives_of_different_formats(tmp_path: Path, replayed_together: Drafts) -> None:
+    write_recording(tmp_path / "osi.mcap", street(), host=1)
+    write_mcap(tmp_path / "scene.mcap", [scene_update("/a"), scene_update("/b"), poses("/pose")])
+    first, second = replayed_together("osi.mcap", "scene.mcap")["logs"]
+    assert "read" not in first
+    assert second["read"] == {"topic": "/a"}
+    assert second["ego"] == {"topic": "/pose"}
+
+
+def test_drives_of_one_name_in_two_folders(tmp_path: Path, replayed_together: Drafts, call: Call) -> None:
+    for folder in ("monday", "tuesday"):
+        (tmp_path / folder).mkdir()
+        write_recording(tmp_path / folder / "drive.mcap", street(), host=1)
+    replayed_together("monday/drive.mcap", "tuesday/drive.mcap")
+    assert call("check", "begun.yaml").out.endswith("no problem found; logs: monday/drive, tuesday/drive\n")
+
+
+def test_a_recording_given_twice(tmp_path: Path, call: Call) -> None:
+    drive(tmp_path / "drive.mcap")
+    (tmp_path / "link.mcap").symlink_to("drive.mcap")
+    twice = "expected each recording once, found it twice"
+    for other, said in (("drive.mcap", ""), ("./link.mcap", ", as drive.mcap, too")):
+        ended = call("init", "drive.mcap", other)
+        assert (ended.code, ended.out) == (2, "")
+        assert ended.err == [f"{Path(other)}: {twice}{said}"]
+
+
+def test_of_several_every_one_that_cannot_be_read_is_said_and_nothing_is_written(tmp_path: Path, call: Call) -> None:
+    drive(tmp_path / "drive.mcap")
+    (tmp_path / "empty.mcap").touch()
+    write_mcap(tmp_path / "poses.mcap", [poses("/pose")])
+    ended = call("init", "drive.mcap", "none.mcap", "empty.mcap", "poses.mcap")
+    assert (ended.code, ended.out) == (2, "")
+    assert [line.split(":")[0] for line in ended.err] == ["none.mcap", "empty.mcap", "poses.mcap"]
+    assert ended.err[0] == "none.mcap: no such file"
+
+
+# ----------------------------------------------------------------------------------- what stands there as a comment
+
+EXAMPLES = ("memory", "ghosts", "placed", "clock", "sends", "radio", "window_s", "others")
+
+
+def uncommented(text: str) -> list[tuple[str, str]]:
+    """The draft once for each example in a comment, with that line alone made a key."""
+    lines = text.splitlines()
+    found = []
+    for k, line in enumerate(lines):
+        name = line.lstrip().removeprefix("# ").partition(":")[0]
+        if line.lstrip().startswith("# ") and name in EXAMPLES:
+            one = line.replace("# ", "", 1)
+            found.append((name, "\n".join([*lines[:k], one, *lines[k + 1 :]]) + "\n"))
+    return found
+
+
+def check_each_alone(call: Call, tmp_path: Path, *logs: str | Path) -> list[str]:
+    """Check the draft with each example; the names of these."""
+    made = call("init", *logs)
+    assert made.code == 0
+    plain, _, _ = plain_yaml.parse_yaml(made.out)
+    names = []
+    for name, text in uncommented(made.out):
+        changed, _, problems = plain_yaml.parse_yaml(text)
+        assert problems == []
+        assert changed != plain, name
+        (tmp_path / "e.yaml").write_text(text, encoding="utf-8")
+        checked = call("check", "e.yaml")
+        assert (checked.code, checked.out[:25]) == (0, "e.yaml: no problem found;"), (name, checked.err)
+        assert not [line for line in checked.err if "no list of" in line], name
+        names.append(name)
+    return names
+
+
+def test_every_example_in_a_comment_holds_as_it_stands(tmp_path: Path, call: Call) -> None:
+    write_recording(tmp_path / "ego.mcap", street(), host=1)
+    write_recording(tmp_path / "site.mcap", passing())
+    of_pem, of_unit = ["memory", "ghosts"], ["placed", "clock", "sends"]
+    ego = ["window_s", *of_pem, *of_pem, *of_unit, "others", "radio"]
+    assert check_each_alone(call, tmp_path, "ego.mcap") == ego
+    assert check_each_alone(call, tmp_path, "site.mcap") == ["window_s", *of_pem, *of_unit, *of_unit, "radio"]
+    assert check_each_alone(call, tmp_path, "ego.mcap", "site.mcap") == ["window_s", *ego]
+
+
+OF_EACH_SOURCE = {path.stem.split("_")[0]: path for path in sorted(SHARED.glob("*.mcap"), reverse=True)}
+
+
+@pytest.mark.parametrize("path", OF_EACH_SOURCE.values() or [None], ids=lambda p: p.stem if p else "absent")
+def test_every_example_holds_on_real_recordings(tmp_path: Path, call: Call, path: Path | None) -> None:
+    if path is None:
+        pytest.skip(f"{SHARED} has no recordings")
+    assert set(check_each_alone(call, tmp_path, path)) >= {*EXAMPLES} - {"others"}
+
+
+def test_the_first_configuration_beside_the_ideal_is_a_real_fusion(
+    tmp_path: Path, replayed: Callable[..., Any]
+) -> None:
+    """With ghosts it shows some, which the ideal does not."""
+    write_recording(tmp_path / "log.mcap", street(), host=1)
+    configurations = replayed("log.mcap")["configurations"]
+    assert [configurations[name]["fusion"]["kind"] for name in list(configurations)[1:3]] == ["ideal", "gnn"]
+    assert configurations["ideal"]["units"] == configurations["gnn"]["units"] == ["ego", "roadside"]
 
 
 @given(st.text(st.characters(exclude_categories=["Cs"])))

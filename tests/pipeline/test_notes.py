@@ -271,7 +271,7 @@ NEAR = {"kind": "field", "range_m": [5, 30]}
 
 
 def street(**changes: Any) -> list[str]:
-    """Notes on a car, a truck and a pedestrian some 50 m from a mast, the ego 100 m from it, in two configurations."""
+    """Notes on a car, a truck and a pedestrian some 50 m from a mast, with the ego 100 m from it."""
     things = [
         Thing("ego", "car", standing(100, 0)),
         Thing("a", "car", standing(50, 0)),

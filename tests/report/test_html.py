@@ -303,8 +303,8 @@ class TestWords:
         )  # fmt: skip
         lines = lines_of(replayed(tmp_path, text))
         assert lines[2] == (
-            "No interval: 2 objects of one drive, fewer than 5. hit and half have the same mean time, 0.05 s (an object "
-            "that is never detected counts as 0.1 s), though they do not always detect at the same time."
+            "No interval: 2 objects of one drive, fewer than 5. hit and half have the same mean time, 0.05 s (an "
+            "object that is never detected counts as 0.1 s), though they do not always detect at the same time."
         )
 
     def test_of_equal_lists_none_is_the_best(self, tmp_path: Path) -> None:

@@ -76,8 +76,8 @@ class Suggestion:
     """An experiment to begin with.
 
     `ego`: value of the key, None: the host vehicle of the log. `classes`: measured classes, None: all that moves.
-    `masts`: two, the one with more room around it first. `began`: how many of the measured objects cross, appear, or
-    are there at the log's start, within `RANGE_M`; None: nobody is measured by distance.
+    `masts`: two, the one with more room around it first. `began`: how many objects cross, appear, or are there at the
+    log's start, within `RANGE_M`, of each group of classes and of all that moves (`all`).
     """
 
     ego: str | dict[str, str] | None
@@ -85,7 +85,7 @@ class Suggestion:
     classes: list[str] | None
     onset: str
     masts: list[Mast]
-    began: dict[str, int] | None
+    began: dict[str, dict[str, int]]
 
 
 @dataclass(frozen=True)
@@ -189,12 +189,15 @@ def suggest_experiment(log: Log, recording: Recording, fields: Fields | None = N
     if not len(rows):
         rows = np.arange(len(objects))
     masts = _suggest_masts(truth, rows, objects)
-    began = None if onset == "appears" else _count_began(scene, truth, number, classes, masts[0])
+    groups = {"all": scene.moving} | {
+        name: np.isin(scene.object_class, class_indices((name,))) for name in ("vru", "vehicles")
+    }
+    began = {name: _count_began(truth, number, measured, masts[0]) for name, measured in groups.items()}
     return Suggestion(ego, why, classes, onset, masts, began)
 
 
-def _count_began(scene: Scene, truth: Tracks, ego_ix: int, classes: list[str] | None, mast: Mast) -> dict[str, int]:
-    """How many measured objects begin how, as `find_episodes` has it: near the ego, or the first mast without one."""
+def _count_began(truth: Tracks, ego_ix: int, measured: Bool, mast: Mast) -> dict[str, int]:
+    """How many of the objects `measured (N,)` begin how, as `find_episodes` has it: near the ego, else a mast."""
     objects, time_s = truth.row_object_ix, truth.row_captured_s
     if ego_ix >= 0:
         near, shared = _is_near_ego(truth, objects, ego_ix), np.zeros(len(truth.stamp_ns), dtype=bool)
@@ -202,11 +205,10 @@ def _count_began(scene: Scene, truth: Tracks, ego_ix: int, classes: list[str] | 
     else:
         near = np.hypot(truth.x_m[0] - mast.at[0], truth.y_m[0] - mast.at[1]) <= RANGE_M
         shared = np.ones(len(truth.stamp_ns), dtype=bool)
-    first_s, near_s = np.full((2, len(scene.object_ids)), np.inf)
+    first_s, near_s = np.full((2, len(measured)), np.inf)
     asked = shared[truth.frame_ix]
     np.minimum.at(first_s, objects[asked], time_s[asked])
     np.minimum.at(near_s, objects[asked & near], time_s[asked & near])
-    measured = scene.moving if classes is None else np.isin(scene.object_class, class_indices(tuple(classes)))
     measured = measured & np.isfinite(near_s) & (np.arange(len(measured)) != ego_ix)
     at_once, at_start = near_s <= first_s, first_s <= time_s[asked].min(initial=np.inf)
     groups = {"crossed": ~at_once, "appeared": at_once & ~at_start, "log_start": at_once & at_start}

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shlex
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 from copem_replay.core.errors import count_noun, escape_unprintable
+from copem_replay.core.tracks import CLASSES
 from copem_replay.core.yaml import dump_on_one_line
 from copem_replay.experiment.draft.findings import (
     FEWEST_COUNTED,
@@ -31,23 +34,36 @@ _FUSED = {"fusion", "fused", "stack"}
 _OTHERS = 6  # topics listed in comments, at most: a line each
 
 
-def format_draft(survey: RecordingSurvey) -> str:
-    """The experiment with a comment on each key; it runs unchanged."""
-    truth = max(survey.truth, key=lambda truth: truth.states)
-    guess = truth.suggested
-    recorded, outputs = _name_recorded(truth)
-    ego = guess.ego != "none"
+@dataclass(frozen=True)
+class _Drive:
+    """A log of a draft: its survey, and the list of true objects that is taken."""
+
+    survey: RecordingSurvey
+    truth: TruthFound
+
+    @property
+    def guess(self) -> Suggestion:
+        return self.truth.suggested
+
+    @property
+    def has_ego(self) -> bool:
+        return self.guess.ego != "none"
+
+    def find_unit(self, topic: str) -> UnitFound | None:
+        """The lists on a topic; None: the log has none, or none that can be read."""
+        return next((unit for unit in self.truth.units if unit.topic == topic and unit.problem is None), None)
+
+
+def format_draft(*surveys: RecordingSurvey) -> str:
+    """The experiment on one log or several, each surveyed, with a comment on each key; it runs unchanged."""
+    drives = [_Drive(survey, max(survey.truth, key=lambda truth: truth.states)) for survey in surveys]
+    recorded, outputs = _name_recorded(drives)
+    ego = any(drive.has_ego for drive in drives)
     first = ["ego", "roadside"] if ego else ["roadside", "across"]
     lines = [
-        f"# Replays {_format_comment(survey.recording)}, {truth.span_s:.1f} s: {_describe_objects(truth)}.",
-        "# Written by `copem-replay init`, as a starting point.",
-        "#",
-        "#   copem-replay check experiment.yaml",
-        "#   copem-replay run experiment.yaml && copem-replay view out/experiment",
+        *_draft_head(drives),
         "version: 1",
-        f"logs: [{quote_yaml(survey.log)}]   # relative to this file, or absolute; globs work",
-        *_draft_read(survey, truth),
-        *_draft_ego(truth, guess),
+        *(_draft_only_log(drives[0]) if len(drives) == 1 else _draft_logs(drives, first, recorded)),
         "runs: 20   # each with its own draws, the same in all configurations; more make the intervals narrower",
         "seed: 1",
         "",
@@ -58,25 +74,100 @@ def format_draft(survey: RecordingSurvey) -> str:
         *_ROADSIDE,
         "",
         "units:",
-        *_draft_units(guess, recorded, truth.units, ego=ego),
+        *_draft_units(drives, recorded, ego=ego),
+        "",
+        *_draft_links(drives),
         "",
         "configurations:",
         *_draft_configurations(first, [name for name, _ in recorded], ego=ego),
         *_draft_outputs(outputs, [name for name, _ in recorded]),
         "",
-        *_draft_measure(guess, ego=ego),
+        *_draft_measure(_merge_measured(drives), ego=ego),
         "show: {run: 0}   # the run that replay.mcap and replay.rrd show; {run: null} writes none",
     ]
     return "\n".join(lines) + "\n"
 
 
-def format_proposed_draft(survey: RecordingSurvey) -> str | None:
-    """The experiment on a list that is read by the names of its fields; None: no proposal is complete."""
+def _draft_head(drives: Sequence[_Drive]) -> Iterator[str]:
+    of = _format_comment(drives[0].survey.recording) if len(drives) == 1 else f"{len(drives)} drives"
+    span_s = sum(drive.truth.span_s for drive in drives)
+    yield f"# Replays {of}, {span_s:.1f} s: {_describe_objects([drive.truth for drive in drives])}."
+    yield "# Written by `copem-replay init`, as a starting point. A key behind a `#` can be used as it stands, without"
+    yield "# the `#` (<id> stands for an object's)."
+    yield "#"
+    yield "#   copem-replay check experiment.yaml"
+    yield "#   copem-replay run experiment.yaml && copem-replay view out/experiment"
+    yield "#   copem-replay compare out/experiment   # what late lists, one unit alone, a real fusion cost"
+
+
+def _draft_only_log(drive: _Drive) -> Iterator[str]:
+    yield f"logs: [{quote_yaml(drive.survey.log)}]   # relative to this file, or absolute; globs work"
+    yield from _draft_read(drive.survey, drive.truth)
+    yield from _draft_ego(drive.truth, drive.guess)
+    yield _draft_window(drive.truth)
+
+
+def _draft_window(truth: TruthFound) -> str:
+    return f"# window_s: [0, {math.ceil(10 * truth.span_s) / 10:.1f}]   # the part that is read; left out: all of it"
+
+
+def _draft_logs(
+    drives: Sequence[_Drive], first: Sequence[str], recorded: Sequence[tuple[str, UnitFound]]
+) -> Iterator[str]:
+    """`logs:`, an entry for each, with what is its own: the ego, how it is read, where the masts are, which units."""
+    yield "logs:   # relative to this file, or absolute; keys of an entry replace those below, in this log only"
+    for drive in drives:
+        truth = drive.truth
+        yield f"  - file: {quote_yaml(drive.survey.log)}   # {truth.span_s:.1f} s: {_describe_objects([truth])}"
+        own = [*_draft_read(drive.survey, truth), *_draft_ego(truth, drive.guess), _draft_window(truth)]
+        own += [
+            f"# {quote_yaml(u.topic)} cannot be a unit: {_format_comment(u.problem)}" for u in truth.units if u.problem
+        ]
+        own.append(f"units: {{{', '.join(_draft_own_units(drive, first, recorded))}}}")
+        if not drive.has_ego and first[0] == "ego":
+            own.append("measure: {distance_to: roadside}   # there is no ego: ranges and distances are from here")
+        yield from (f"    {line}" for line in own)
+
+
+def _draft_own_units(drive: _Drive, first: Sequence[str], recorded: Sequence[tuple[str, UnitFound]]) -> Iterator[str]:
+    """What is otherwise of the units in one log: the places of masts, and units that it lacks."""
+    if first[0] == "ego" and not drive.has_ego:
+        yield "ego: null"
+    for name, mast in zip((name for name in first if name != "ego"), drive.guess.masts, strict=False):
+        yield f"{name}: {{at: {dump_on_one_line(mast.at)}, yaw_deg: {mast.yaw_deg}}}"
+    for name, everywhere in recorded:
+        unit = drive.find_unit(everywhere.topic)
+        if unit is None:
+            yield f"{name}: null"
+        elif _format_recorded(unit) != _format_recorded(everywhere):
+            yield f"{name}: {{recorded: {_format_recorded(unit)}}}"
+
+
+def _merge_measured(drives: Sequence[_Drive]) -> Suggestion:
+    """What is measured in all logs alike: the classes that any of them suggests, from the instant that suits most."""
+    guesses = [drive.guess for drive in drives]
+    classes = None if any(guess.classes is None for guess in guesses) else [
+        name for name in ("vru", "vehicles") if any(name in (guess.classes or ()) for guess in guesses)
+    ]  # fmt: skip
+    onset = "appears" if all(guess.onset == "appears" for guess in guesses) else "in_range"
+    began = {
+        name: {word: sum(guess.began[name][word] for guess in guesses) for word in words}
+        for name, words in guesses[0].began.items()
+    }
+    return replace(guesses[0], classes=classes, onset=onset, began=began)
+
+
+def take_proposal(survey: RecordingSurvey) -> RecordingSurvey | None:
+    """The survey as it can be drafted: as it is where it is readable, else with the best list that is read by the names
+    of its fields; None: no proposal is complete.
+    """
+    if survey.readable:
+        return survey
     whole = [(truth, proposal) for proposal in survey.proposals if (truth := proposal.truth) is not None]
     if not whole:
         return None
     truth, best = max(whole, key=lambda one: one[0].states)
-    return format_draft(replace(survey, truth=[truth], proposals=[best]))
+    return replace(survey, truth=[truth], proposals=[best])
 
 
 def format_unfinished_draft(survey: RecordingSurvey) -> str:
@@ -108,26 +199,43 @@ _ON_KEYS = {
 _NEEDED = dict.fromkeys(("length_m", "width_m"), "a path, or one number for all")
 
 
+_OF_PEM = [
+    "    # memory: {detection: [{share: 0.8, correlation_s: 1.0}]}   # who is missed is missed for a while",
+    "    # ghosts: [{in_list: 0.2, lasts_s: 1.0, where: {kind: field, range_m: [5, 60], azimuth_deg: [-60, 60]}}]",
+]
 _ONBOARD = [
     "  onboard:",
-    "    - when: {range_m: [0, 80], azimuth_deg: [-60, 60]}   # far ahead",
-    "      detection: {kind: visible_share}   # listed with the probability of its visible share; or constant, table",
-    "      # variances in m² along and across the line of sight; left out: exact",
-    "      error: {kind: gaussian, frame: line_of_sight, covariance_m2: [[0.5, 0.0], [0.0, 0.1]]}",
-    "    - when: {range_m: [0, 30]}   # near, all around",
-    "      detection: {kind: visible_share}",
-    "      error: {kind: gaussian, frame: line_of_sight, covariance_m2: [[0.3, 0.0], [0.0, 0.1]]}",
+    "    couples:",
+    "      - when: {range_m: [0, 80], azimuth_deg: [-60, 60]}   # far ahead",
+    "        detection: {kind: visible_share}   # listed with the probability of its visible share; or constant, table",
+    "        # variances in m² along and across the line of sight; left out: exact",
+    "        error: {kind: gaussian, frame: line_of_sight, covariance_m2: [[0.5, 0.0], [0.0, 0.1]]}",
+    "      - when: {range_m: [0, 30]}   # near, all around",
+    "        detection: {kind: visible_share}",
+    "        error: {kind: gaussian, frame: line_of_sight, covariance_m2: [[0.3, 0.0], [0.0, 0.1]]}",
+    *_OF_PEM,
 ]
 _ROADSIDE = [
     "  roadside:",
-    "    - when: {range_m: [0, 70], azimuth_deg: [-60, 60]}",
-    "      detection: {kind: visible_share}",
-    "      error: {kind: gaussian, frame: line_of_sight, covariance_m2: [[0.6, 0.0], [0.0, 0.3]]}",
+    "    couples:",
+    "      - when: {range_m: [0, 70], azimuth_deg: [-60, 60]}",
+    "        detection: {kind: visible_share}",
+    "        error: {kind: gaussian, frame: line_of_sight, covariance_m2: [[0.6, 0.0], [0.0, 0.3]]}",
+    *_OF_PEM,
 ]
+_OF_UNIT = [
+    "    # placed: {position_sigma_m: 0.2, yaw_sigma_deg: 0.5}   # it errs about its own pose",
+    "    # clock: {offset_sigma_s: 0.02}   # its clock is off",
+    "    # sends: {kind: cpm, interval_s: 0.1}   # which of its lists and objects it sends; left out: all",
+]
+_LATENCY = "latency: {kind: gamma, min_s: 0.02, mean_s: 0.06, shape: 2}"
 
 
-def _describe_objects(truth: TruthFound) -> str:
-    return ", ".join(f"{number} {name}" for name, number in truth.moving.items()) or "nothing that moves"
+def _describe_objects(truths: Sequence[TruthFound]) -> str:
+    moving = Counter[str]()
+    for truth in truths:
+        moving.update(truth.moving)
+    return ", ".join(f"{moving[name]} {name}" for name in CLASSES if moving[name]) or "nothing that moves"
 
 
 def _draft_read(survey: RecordingSurvey, truth: TruthFound) -> Iterator[str]:
@@ -159,20 +267,23 @@ def _draft_ego(truth: TruthFound, guess: Suggestion) -> Iterator[str]:
             yield f"# ego: <id>   # of {_format_comment(ids)}"
 
 
-def _draft_units(
-    guess: Suggestion,
-    recorded: Sequence[tuple[str, UnitFound]],
-    lists: Sequence[UnitFound],
-    *,
-    ego: bool,
-) -> Iterator[str]:
+def _draft_units(drives: Sequence[_Drive], recorded: Sequence[tuple[str, UnitFound]], *, ego: bool) -> Iterator[str]:
     if ego:
-        yield "  ego: {on: ego, pem: onboard}   # on the roof, or at height_m; a list per frame, or rate_hz"
+        yield "  ego:   # makes a list per frame, or `rate_hz`"
+        yield "    on: ego   # on the roof, or at `height_m`"
+        yield "    pem: onboard"
         yield "  # A mast where most measured objects come by: x, y in metres as in the log, yaw_deg from the x axis"
     else:
         yield "  # Two masts that face each other where most objects come by: x, y in metres as in the log"
-    for name, mast in zip(("roadside", "across"), guess.masts[: 1 if ego else 2], strict=False):
-        yield f"  {name}: {{at: {dump_on_one_line(mast.at)}, yaw_deg: {mast.yaw_deg}, height_m: 6.0, pem: roadside}}"
+    if len(drives) > 1:
+        yield "  # (as in the first log: each log has its own above)"
+    for name, mast in zip(("roadside", "across"), drives[0].guess.masts[: 1 if ego else 2], strict=False):
+        yield f"  {name}:"
+        yield f"    at: {dump_on_one_line(mast.at)}"
+        yield f"    yaw_deg: {mast.yaw_deg}"
+        yield "    height_m: 6.0"
+        yield "    pem: roadside"
+        yield from _OF_UNIT
     if ego:
         yield "  # others: {on: {classes: [car, truck], penetration_rate: 0.3}, pem: onboard}   # 30 % of them (V2V)"
     if recorded:
@@ -182,30 +293,43 @@ def _draft_units(
         yield from (f"  # {_format_comment(line)}" for line in unit.oddities)
         late = "" if unit.delay is None else f"   # delay_s {_format_comment(unit.delay)}"
         yield f"  {name}: {{recorded: {_format_recorded(unit)}}}{late}"
-    for unit in lists:
+    for unit in drives[0].truth.units if len(drives) == 1 else ():
         if unit.problem:
             yield f"  # {quote_yaml(unit.topic)} cannot be a unit: {_format_comment(unit.problem)}"
 
 
+def _draft_links(drives: Sequence[_Drive]) -> Iterator[str]:
+    """A link that no configuration uses yet; without an ego its reception cannot go by the way to it."""
+    to_ego = all(drive.has_ego for drive in drives)
+    yield "links:   # how lists travel: only a configuration with `link` uses it, such as the last one"
+    yield f"  radio: {{{_LATENCY}, reception: " + (
+        "{kind: shadowing, half_at_m: 150, exponent: 2.27, sigma_db: 3, blocked_db: 9}}"
+        if to_ego
+        else "{kind: constant, probability: 0.9}}"
+    )
+
+
 def _draft_configurations(first: Sequence[str], recorded: Sequence[str], *, ego: bool) -> Iterator[str]:
-    """Configurations: the truth, one unit alone, both at once and late, and with a fusion without truth ids."""
-    both = f"{{units: [{', '.join(first)}]"
+    """Configurations: the truth, all units by ideal and by a real fusion, one unit alone, and all of them late."""
+    both, gnn = f"{{units: [{', '.join(first)}]", "fusion: {kind: gnn}"
     rows = [
         ("GT", "{units: truth}", "all that is there, at once, without error"),
-        ("PEM", f"{{units: [{first[0]}]}}", "the vehicle on its own" if ego else "one mast on its own"),
-        ("coPEM:0s", f"{both}, fusion: {{kind: ideal}}}}", "together"),
-        ("coPEM:0.5s", f"{both}, fusion: {{kind: ideal}}, latency_s: 0.5}}", "the whole list late"),
-        ("gnn:0.5s", f"{both}, fusion: {{kind: gnn}}, latency_s: 0.5}}", "a fusion without truth ids"),
+        ("ideal", f"{both}, fusion: {{kind: ideal}}}}", "all units, fused by truth ids: the baseline of `compare`"),
+        ("gnn", f"{both}, {gnn}}}", "a fusion without truth ids"),
+        ("alone", f"{{units: [{first[0]}], {gnn}}}", "the vehicle on its own" if ego else "one mast on its own"),
+        ("late", f"{both}, {gnn}, latency_s: 0.5}}", "all lists half a second late"),
     ]  # fmt: skip
     for name in recorded:
-        rows.append((name, f"{{units: [{name}], fusion: {{kind: gnn}}}}", "as it was recorded"))
+        rows.append((name, f"{{units: [{name}], {gnn}}}", "as it was recorded"))
         if not (ego and name.startswith("ego")):  # else the ego twice, as recorded and as modelled
-            rows.append((f"with {name}", f"{{units: [{first[0]}, {name}], fusion: {{kind: gnn}}}}", "and together"))
+            rows.append((f"with {name}", f"{{units: [{first[0]}, {name}], {gnn}}}", "and together"))
     if len(recorded) > 1:
-        rows.append(("recorded", f"{{units: [{', '.join(recorded)}], fusion: {{kind: gnn}}}}", "all of them"))
+        rows.append(("recorded", f"{{units: [{', '.join(recorded)}], {gnn}}}", "all of them"))
+    link = "{ego: none, default: radio}" if ego else "radio"
     width = max(len(name) for name, _, _ in rows) + 1
     for name, value, what in rows:
         yield f"  {name + ':':<{width}} {value}   # {what}"
+    yield f"  # radio: {both}, {gnn}, link: {link}}}   # the lists{' of the others' * ego} by radio"
 
 
 def _draft_outputs(outputs: Sequence[tuple[str, UnitFound]], recorded: Sequence[str]) -> Iterator[str]:
@@ -241,28 +365,48 @@ def _draft_measure(guess: Suggestion, *, ego: bool) -> Iterator[str]:
 
 def _draft_began(guess: Suggestion) -> str:
     """The line of `began`: its default as a comment, or all three words, with the reason."""
-    if guess.began is None:
+    if guess.onset == "appears":
         return "  began: [log_start, crossed, appeared]   # who counts: all, for nobody crosses into view"
-    numbers = ", ".join(f"{number} {word}" for word, number in guess.began.items())
-    if guess.began["crossed"] + guess.began["appeared"] < FEWEST_COUNTED:
+    began = Counter[str]()
+    for name in guess.classes or ["all"]:
+        began.update(guess.began[name])
+    numbers = ", ".join(f"{number} {word}" for word, number in began.items())
+    if began["crossed"] + began["appeared"] < FEWEST_COUNTED:
         return f"  began: [log_start, crossed, appeared]   # who counts: all, for there are only {numbers}"
     return f"  # began: [crossed, appeared]   # who counts; left out: these ({numbers})"
 
 
-def _name_recorded(truth: TruthFound) -> tuple[list[tuple[str, UnitFound]], list[tuple[str, UnitFound]]]:
-    """The lists that could be read, by names made from their topics: those of units, and outputs of a stack."""
+_TAKEN = frozenset({
+    "ego", "roadside", "across", "others", "default", "truth", "all", "gt", "ideal", "gnn", "alone", "late", "radio",
+    "recorded",
+})  # fmt: skip
+"""Names that units and configurations of a draft have already."""
+
+
+def _name_recorded(drives: Sequence[_Drive]) -> tuple[list[tuple[str, UnitFound]], list[tuple[str, UnitFound]]]:
+    """The lists that could be read, by names made from their topics: those of units, and outputs of a stack.
+
+    Of a topic that several logs have the lists of the first one. An output is the same in all logs, so what only some
+    have is a unit.
+    """
+    by_topic: dict[str, UnitFound] = {}
+    for drive in drives:
+        for unit in drive.truth.units:
+            if unit.problem is None:
+                by_topic.setdefault(unit.topic, unit)
     named: dict[str, UnitFound] = {}
-    taken = {"ego", "roadside", "across", "others", "default", "truth", "all", "gt", "pem", "copem", "gnn", "recorded"}
-    for unit in truth.units:
-        if unit.problem:
-            continue
+    for unit in by_topic.values():
         words = [word for word in re.split(r"[^a-z0-9]+", unit.topic.lower()) if word]
         telling = [word for word in words if word not in _GENERIC and word[0].isalpha() and word not in _WORDS]
         stem = telling[-1] if telling else "lists"
-        tries = [stem, *([f"{stem}_recorded"] if stem in taken else []), *(f"{stem}{k}" for k in range(2, 99))]
-        name = next(name for name in tries if name not in taken and name not in named)
+        tries = [stem, *([f"{stem}_recorded"] if stem in _TAKEN else []), *(f"{stem}{k}" for k in range(2, 99))]
+        name = next(name for name in tries if name not in _TAKEN and name not in named)
         named[name] = unit
-    fused = {name for name, unit in named.items() if _FUSED & set(re.split(r"[^a-z0-9]+", unit.topic.lower()))}
+    fused = {
+        name
+        for name, unit in named.items()
+        if _FUSED & set(re.split(r"[^a-z0-9]+", unit.topic.lower())) and all(d.find_unit(unit.topic) for d in drives)
+    }
     fused = fused if len(fused) < len(named) else set()
     return [one for one in named.items() if one[0] not in fused], [one for one in named.items() if one[0] in fused]
 
