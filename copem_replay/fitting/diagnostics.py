@@ -311,12 +311,7 @@ def gaussian_figure(fit: Fit) -> Figure:
         right.set_xlabel("Probability of a smaller error, as fitted")
         right.set_ylabel("Errors, relative to even")
         left.legend(loc="upper left")
-        tails = "heavier" if shape.t4_gain > 0 else "no heavier"
-        add_note(
-            figure,
-            [f"{len(z)} entries; excess kurtosis {shape.excess_kurtosis:.2g}; Student's t₄ explains "
-             f"{shape.t4_gain:+.2g} nats per row more: tails are {tails} than a Gaussian's"],
-        )  # fmt: skip
+        add_note(figure, [f"{len(z)} entries; {shape.words()}"])
     return figure
 
 

@@ -8,7 +8,8 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2, t
+from scipy.special import gammaln
+from scipy.stats import chi2
 
 from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import Bool, Float, Int
@@ -24,6 +25,7 @@ from copem_replay.fitting.error_memory import (
     whiten_series,
 )
 from copem_replay.fitting.estimate import (
+    DROP,
     PER_ROW,
     Estimate,
     Note,
@@ -32,11 +34,14 @@ from copem_replay.fitting.estimate import (
     choose_rung,
     drop_note,
     held_out_possible,
+    maximise_likelihood,
+    profile_limits,
     round_digits,
 )
 from copem_replay.fitting.moments import (
     BetweenLogs,
     ErrorBin,
+    Moments,
     RangeBin,
     class_bins,
     estimate_bin,
@@ -59,20 +64,42 @@ FEWEST = 8
 _REVERSED, _STILL_MPS = 0.05, 1.0
 """Share from which on entries that point backwards are no outliers, and speed below which an entry does not count as
 backwards: there its sign is noise."""
+_FREEDOMS = (2.05, 200.0)
+"""Degrees of freedom of Student's t that are tried: at 2 it has no variance, at 200 it is a Gaussian."""
 _EVERYWHERE = (RangeBin((0.0, np.inf)),)
 _ONE, _RANGE, _SHARE, _MEMORY = "one covariance", "by range", "by range and visible share", " + memory"
 
 
 @dataclass(frozen=True)
 class ErrorShape:
-    """Whether errors are Gaussian: standardised errors `z (n, 2)`, their excess kurtosis, and the gain of Student's t₄.
+    """Whether errors are Gaussian: standardised errors `z (n, 2)`, their excess kurtosis, and Student's t beside it.
 
-    `t4_gain`: nats per row that t₄ explains more than a Gaussian; negative: less.
+    `degrees_of_freedom`: of the likeliest t; `gain`: nats per row that it explains more than a Gaussian. `heavier`:
+    beyond chance; `untold`: why it is not written nonetheless.
     """
 
     z: Float = field(metadata={PER_ROW: True})
     excess_kurtosis: float
-    t4_gain: float
+    degrees_of_freedom: Estimate
+    gain: float
+    heavier: bool
+    untold: str | None = None
+
+    @property
+    def written(self) -> bool:
+        """Whether the model has Student's t."""
+        return self.heavier and self.untold is None
+
+    def words(self) -> str:
+        """What the tails are like."""
+        if not self.heavier:
+            return f"tails no heavier than a Gaussian's (excess kurtosis {self.excess_kurtosis:.2g})"
+        nu = self.degrees_of_freedom
+        return (
+            f"tails are heavier than a Gaussian's: Student's t with {nu.value:.3g} degrees of freedom "
+            f"({nu.low:.3g} … {nu.high:.3g}) explains {self.gain:.2g} nats per entry more"
+            f"{f', but is not written: {self.untold}' if self.untold else ', and is written'}"
+        )
 
 
 @dataclass(frozen=True)
@@ -104,6 +131,8 @@ class ErrorFit:
         xx, xy, yy = (round_digits(one.value) for one in bin_.covariance_m2)
         within = 0.9999 * np.sqrt(xx * yy)  # rounding must not make it singular
         out: dict[str, Any] = {"kind": "gaussian", "frame": self.frame}
+        if self.shape.written:
+            out |= {"kind": "student_t", "degrees_of_freedom": round_digits(self.shape.degrees_of_freedom.value, 3)}
         xy = round_digits(float(np.clip(xy, -within, within)))
         out |= {"mean_m": [round_digits(one.value) for one in bin_.mean_m], "covariance_m2": [[xx, xy], [xy, yy]]}
         for name in ("yaw_sigma_deg", "speed_sigma_mps", "size_sigma_m"):
@@ -117,6 +146,17 @@ class ErrorFit:
         It is taken off what is constant, then off what drifts, for a fit of single objects has it in these.
         """
         out = {name: [part.keys(note) for part in parts] for name, parts in self.memory.items() if parts}
+        if self.shape.written and "position" in out:
+            kept = gaussian_share(self.shape.degrees_of_freedom.value)
+            out["position"] = [
+                part.keys(note)
+                | {
+                    "share": note(
+                        round(part.share.value / kept, 3), f"{part.share.words()}, of which t keeps {kept:.2g}"
+                    )
+                }
+                for part in self.memory["position"]
+            ]
         if self.between_logs is None or self.between_logs.untold is not None:
             return out
         share = round(self.between_logs.share, 3)
@@ -217,13 +257,23 @@ def fit_errors(
     between = fit_between_logs(error_m - moments.mean_m[bin_ix], entries.log, series, memory.shares)
     if between is not None:
         moments = replace(moments, half_width_m=np.maximum(moments.half_width_m, between.half_width_m))
+    shape = _measure_shape(moments.standardised(error_m, bin_ix), series, memory.shares)
+    if simplest or (between is not None and between.untold is None):
+        why = "the simplest model was asked for" if simplest else "errors differ between logs, which is written instead"
+        shape = replace(shape, untold=why)
+    nu = shape.degrees_of_freedom
+    if shape.written:
+        moments = weigh_covariances(moments, error_m, bin_ix, nu.value)
+    estimated = tuple(estimate_bin(one, moments, b) for b, one in enumerate(bins))
+    if shape.written:
+        estimated = tuple(_widen_by_tails(one, nu) for one in estimated)
     spreads, lasting, untold = _fit_spreads(entries, simplest=simplest)
     if memory.untold is not None:
         untold = {"memory.position": memory.untold} | untold
     return ErrorFit(
-        frame, tuple(estimate_bin(one, moments, b) for b, one in enumerate(bins)),
+        frame, estimated,
         spreads["yaw"], spreads["speed"], spreads["size"],
-        {"position": memory.parts} | lasting, memory.shares, _measure_shape(moments.standardised(error_m, bin_ix)),
+        {"position": memory.parts} | lasting, memory.shares, shape,
         listed, bin_ix, (*(rung for rung in ladder if not rung.chosen), *last, *by_class), frames, untold, between,
     )  # fmt: skip
 
@@ -371,12 +421,64 @@ def _fit_spread(
     )
 
 
-def _measure_shape(z: Float) -> ErrorShape:
-    """The shape of standardised errors (n, 2); t₄ at the best of some scales."""
-    from scipy.stats import norm
+def _measure_shape(z: Float, series: ResidualSeries, shares: MemoryShares) -> ErrorShape:
+    """The shape of standardised errors (n, 2), by what is new in each of them given those before."""
+    new, _ = whiten_series(z, series, shares)
+    squares = (new**2).sum(axis=1)
+    n = len(squares)
+    kurtosis = float((((z - z.mean(axis=0)) / z.std(axis=0)) ** 4).mean()) - 3
 
-    each = (z - z.mean(axis=0)) / z.std(axis=0)
-    scales = np.geomspace(0.4, 1.1, 36)
-    of_t4 = max(float((t.logpdf(each / scale, 4) - np.log(scale)).mean()) for scale in scales)
-    kurtosis = float((each**4).mean()) - 3
-    return ErrorShape(z, kurtosis, of_t4 - float(norm.logpdf(each).mean()))
+    def of(x: Float) -> float:
+        nu, scale = np.exp(x)
+        log = gammaln(nu / 2 + 1) - gammaln(nu / 2) - np.log(nu * np.pi * scale)
+        return float(n * log - (nu / 2 + 1) * np.log1p(squares / (nu * scale)).sum())
+
+    bounds = (np.log(_FREEDOMS), np.log([1e-3, 1e3]))
+    pairs = [(float(low), float(high)) for low, high in bounds]
+    best, value = maximise_likelihood(of, [(np.log(4.0), -0.5), (np.log(20.0), 0.0)], pairs)
+    gain = value + n * (np.log(np.pi * squares.mean()) + 1)
+    nu = float(np.exp(best[0]))
+    low, high = np.exp(profile_limits(of, best, value, 0, pairs)) if gain > DROP else (nu, np.inf)
+    estimate = Estimate(nu, float(low), float(high), n, float(n))
+    kept = gaussian_share(nu)
+    why = None
+    if shares.drift + shares.constant > kept:
+        why = f"what lasts is more than the share of {kept:.2g} of the variance that it could have"
+    return ErrorShape(z, kurtosis, estimate, gain / n, bool(gain > DROP), why)
+
+
+def gaussian_share(nu: float) -> float:
+    """The share of the correlation of the normals behind it that Student's t keeps, where its factor is always new."""
+    return float((nu - 2) / 2 * np.exp(2 * (gammaln((nu - 1) / 2) - gammaln(nu / 2))))
+
+
+def weigh_covariances(moments: Moments, error_m: Float, bin_ix: Int, nu: float) -> Moments:
+    """Covariances of Student's t by its likelihood: far errors count for less, ν/(ν − 2) makes up for it.
+
+    Their degrees of freedom are those of a Gaussian's over (ν + 4)/(ν + 2) · (1 + 1/ν).
+    """
+    scatter = moments.covariance_m2 * (nu - 2) / nu
+    for _ in range(30):
+        d = (replace(moments, covariance_m2=scatter).standardised(error_m, bin_ix) ** 2).sum(axis=1)
+        weight = (nu + 2) / (nu + d)
+        rest = error_m - moments.mean_m[bin_ix]
+        for b in np.flatnonzero(moments.n).tolist():
+            mine = bin_ix == b
+            scatter[b] = (weight[mine, None] * rest[mine]).T @ rest[mine] / max(int(mine.sum()) - 1, 1)
+    less = (nu + 4) / (nu + 2) * (1 + 1 / nu)
+    return replace(moments, covariance_m2=scatter * nu / (nu - 2), freedom=moments.freedom / less)
+
+
+def _widen_by_tails(one: ErrorBin, nu: Estimate) -> ErrorBin:
+    """The variances' limits with those of ν: a variance is ν/(ν − 2) times what the bulk of the errors tells."""
+    at, least, most = (
+        value / (value - 2) if value > 2.0001 else np.inf for value in (nu.value, min(nu.high, 1e6), nu.low)
+    )
+
+    def widen(of: Estimate) -> Estimate:
+        if not np.isfinite(most):
+            return replace(of, low=of.low * least / at, high=np.inf)
+        return replace(of, low=of.low * least / at, high=of.high * most / at)
+
+    xx, xy, yy = one.covariance_m2
+    return replace(one, covariance_m2=(widen(xx), xy, widen(yy)))

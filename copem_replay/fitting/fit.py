@@ -186,7 +186,8 @@ class Fit:
         """All notes: on the data, on detection, and on estimates that another gate moves."""
         more = [f"detection: {line}" for line in self.parts.detection.notes]
         more += [f"no memory of detection: {why}" for why in (self.parts.detection.memory_why,) if why is not None]
-        between = self.parts.errors.between_logs
+        between, shape = self.parts.errors.between_logs, self.parts.errors.shape
+        more += [f"errors: {shape.words()}"] if shape.heavier else []
         more += [f"errors that differ between logs: {between.untold}"] if between is not None and between.untold else []
         more += [f"another gate: {line}" for line in self.gates]
         return (*self.notes, *more)
@@ -433,6 +434,9 @@ def _build_error(errors: ErrorFit, error_bin: ErrorBin) -> Tree:
     tree["mean_m"] = [
         CommentedValue(value, mean.words()) for value, mean in zip(tree["mean_m"], error_bin.mean_m, strict=True)
     ]
+    if "degrees_of_freedom" in tree:
+        nu = errors.shape.degrees_of_freedom
+        tree["degrees_of_freedom"] = CommentedValue(tree["degrees_of_freedom"], f"{nu.words()}; {errors.shape.words()}")
     for key in tree.keys() & {"yaw_sigma_deg", "speed_sigma_mps", "size_sigma_m"}:
         tree[key] = CommentedValue(tree[key], getattr(errors, key).words())
     return tree

@@ -159,6 +159,7 @@ _WORDS = {
     "errors.yaw_sigma_deg": "error of yaw: standard deviation, °",
     "errors.speed_sigma_mps": "error of speed: standard deviation, m/s",
     "errors.size_sigma_m": "error of size: standard deviation, m",
+    "errors.shape.degrees_of_freedom": "errors: degrees of freedom of Student's t (many: Gaussian)",
     "placed.position_sigma_m": "pose of the unit: standard deviation, m",
     "placed.yaw_sigma_deg": "pose of the unit: standard deviation of the heading, °",
     "ghosts.per_minute": "ghosts that begin in a minute",
@@ -248,7 +249,7 @@ def _list_settings(experiment: Experiment, recordings: Sequence[Recording]) -> l
 
 def pem_text(fit: Fit, experiment: Experiment) -> str:
     """`pem.yaml`: a head on the whole fit, and the interval of every number as a comment."""
-    rest, between = fit.parts.rest, fit.parts.errors.between_logs
+    rest, between, shape = fit.parts.rest, fit.parts.errors.between_logs, fit.parts.errors.shape
     head = [
         judge_use(fit),
         f"Unit {fit.unit}, fitted to {count_noun(len(fit.logs), 'log')}: {', '.join(fit.logs)}",
@@ -258,6 +259,7 @@ def pem_text(fit: Fit, experiment: Experiment) -> str:
         f"delay of its lists: `latency_s: {{{fit.unit}: {fit.delay.seconds:.3g}}}` in a configuration: "
         f"{fit.delay.estimate.words()}",
         *(f"{name}: not fitted: {why}" for name, why in rest.untold.items()),
+        *([f"errors: {shape.words()}"] if shape.heavier else []),
         *([f"between_logs: not written: {between.untold}"] if between is not None and between.untold else []),
         *fit.gates,
     ]

@@ -15,11 +15,12 @@ from copem_replay.fitting.error_memory import (
     log_likelihood,
     whiten_series,
 )
-from copem_replay.fitting.errors import fit_errors, remove_pose
+from copem_replay.fitting.errors import fit_errors, gaussian_share, remove_pose, weigh_covariances
 from copem_replay.fitting.estimate import Estimate
+from copem_replay.fitting.moments import RangeBin, fit_moments
 from copem_replay.fitting.pose import PoseFit
-from copem_replay.fitting.rows import FitRows
-from copem_replay.perception.pem.error import Gaussian
+from copem_replay.fitting.rows import FitLists, FitRows
+from copem_replay.perception.pem.error import Gaussian, StudentT
 from tests.helpers.fit_rows import lasting_normals, rows_of
 
 ERRORS_M = ("along_m", "across_m", "east_m", "north_m")
@@ -144,6 +145,51 @@ def test_bins_and_frame_are_chosen_where_they_explain_more() -> None:
     assert 2 * near.covariance_m2[0].high < far.covariance_m2[0].low
     assert [rung.name for rung in fit.ladder if rung.chosen] == ["by range + memory"]
     assert len(fit_errors(rows, lists, simplest=True).bins) == 1
+
+
+def student(seed: int, nu: float, passes: int = 40) -> tuple[FitRows, FitLists]:
+    """Errors of variance .16 and .04 m², new in every list: normals over the root of a χ² that both axes share."""
+    rows, lists = rows_of(seed, passes=passes, lists_each=60, memory=(0.0, 1.0, 0.0), mean_m=(0.0, 0.0))
+    factor = np.sqrt((nu - 2) / np.random.default_rng(seed + 7).chisquare(nu, len(rows.log)))
+    return replace(rows, **{name: getattr(rows, name) * factor for name in ERRORS_M}), lists
+
+
+def test_heavy_tails_are_said_and_written() -> None:
+    """Student's t₃: ν and both variances are held; a Gaussian's are off by more than a tenth as often as not."""
+    held = np.zeros(3)
+    for seed in range(8):
+        fit = fit_errors(*student(seed, 3.0))
+        nu, [bin_] = fit.shape.degrees_of_freedom, fit.bins
+        assert fit.shape.written
+        assert "explains" in fit.shape.words()
+        model = StudentT.model_validate(fit.yaml_error(bin_))
+        assert model.degrees_of_freedom == pytest.approx(nu.value, rel=1e-2)
+        pairs = ((nu, 3.0), (bin_.covariance_m2[0], 0.16), (bin_.covariance_m2[2], 0.04))
+        held += [one.low <= true <= one.high for one, true in pairs]
+    assert (held >= 7).all()
+
+
+def test_a_gaussian_has_no_heavy_tails() -> None:
+    fits = [fit_errors(*rows_of(seed, passes=20)) for seed in range(5)]
+    assert sum(fit.shape.heavier for fit in fits) <= 1
+    assert fits[0].yaml_error(fits[0].bins[0])["kind"] == "gaussian"
+    assert "no heavier" in fits[0].shape.words()
+
+
+def test_tails_by_hand() -> None:
+    """(E f)² of f = √(1/χ²₃): (½ Γ(1)²/Γ(1.5)²) = 2/π. A scatter is the mean at its own weights."""
+    assert gaussian_share(3.0) == pytest.approx(2 / np.pi)
+    assert gaussian_share(1e6) == pytest.approx(1.0, abs=1e-5)
+    error_m = np.array([[1.0, 0], [0, 1], [-1, 0], [0, -1], [7, 7], [-7, -7], [1, -1], [-1, 1]])
+    zeros = np.zeros(8, dtype=int)
+    new = np.ones(8, dtype=bool)
+    plain = fit_moments(error_m, zeros, (RangeBin((0, 9)),), ResidualSeries(0.0 * zeros, new), MemoryShares())
+    scale = weigh_covariances(plain, error_m, zeros, 3.0).covariance_m2[0] / 3
+    fixed = np.zeros((2, 2))  # at its own weights it is what it was
+    for one in error_m:
+        fixed += 5 / (3 + one @ np.linalg.inv(scale) @ one) * np.outer(one, one) / 7
+    np.testing.assert_allclose(scale, fixed, rtol=1e-3)
+    assert scale[0, 0] < plain.covariance_m2[0, 0, 0]
 
 
 def by_class(spread: float, seed: int = 4) -> FitRows:

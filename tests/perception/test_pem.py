@@ -19,7 +19,7 @@ from copem_replay.core.tracks import CLASSES
 from copem_replay.core.view_geometry import Errors, Noise, ViewGeometry
 from copem_replay.perception.pem.condition import Condition, Couple, find_couples
 from copem_replay.perception.pem.detection import DetectionModel
-from copem_replay.perception.pem.error import ErrorModel, Gaussian
+from copem_replay.perception.pem.error import ErrorModel, Gaussian, StudentT
 
 Array = npt.NDArray[np.float64]
 
@@ -249,6 +249,23 @@ def turned(vector_or_matrix: Any, degrees: float) -> Array:
     given = np.array(vector_or_matrix, dtype=float)
     result: Array = axes @ given if given.ndim == 1 else axes @ given @ axes.T
     return result
+
+
+def test_students_t_by_its_law() -> None:
+    """Each axis over √(variance · ⅓) is t₃, whose 2.5 % quantile is 3.182; both axes share the factor."""
+    rng = np.random.default_rng(0)
+    normals = {name: rng.normal(size=(200_000, 1)) for name in ("position 1", "position 2", "tails")}
+    keys = {"covariance_m2": [[0.3, 0.0], [0.0, 0.03]], "degrees_of_freedom": 3.0}
+    found = StudentT.model_validate(keys).perturb(view([10.0]), normals.__getitem__)
+    for error_m, variance_m2 in ((found.east_m, 0.3), (found.north_m, 0.03)):
+        scaled = np.abs(error_m) / math.sqrt(variance_m2 / 3)
+        for level in (0.5, 0.05, 0.01):
+            assert (scaled > stats.t.ppf(1 - level / 2, 3)).mean() == pytest.approx(level, rel=0.06)
+    far = np.abs(found.east_m) > 4 * math.sqrt(0.1)
+    assert (np.abs(found.north_m) > 2 * math.sqrt(0.01))[far].mean() > 0.4  # of independent axes .14
+    assert [found.cov_ee_m2[0], found.cov_nn_m2[0]] == [0.3, 0.03]
+    with pytest.raises(ValidationError):
+        StudentT.model_validate(keys | {"degrees_of_freedom": 2.0})
 
 
 class TestGaussian:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import fields
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field
 
 from copem_replay.core.components import Component, Covariance, NotNegative, Pair, ask_component, wrong_answer_error
 from copem_replay.core.errors import FAILURES
@@ -89,21 +90,19 @@ def find_noise_names(model: ErrorModel) -> frozenset[str] | None:
     return frozenset(asked)
 
 
-class Gaussian(ErrorModel):
-    """Gaussian errors with full covariance.
+class _Covariant(ErrorModel):
+    """Position errors of a mean and a covariance, and spreads of yaw, size and speed; their shape is a subclass's."""
 
-    `frame: absolute` (the paper's): covariance and mean in easting and northing. `frame: line_of_sight`: along and
-    across the line from the unit to the object (across: to its left), rotated to easting and northing.
-    Optional standard deviations of yaw, of size (length, width and height independently) and of speed along the track.
-    """
-
-    kind: Literal["gaussian"] = "gaussian"
     covariance_m2: Covariance
     mean_m: Pair = (0.0, 0.0)
     frame: Literal["absolute", "line_of_sight"] = "absolute"
     yaw_sigma_deg: NotNegative = 0.0
     size_sigma_m: NotNegative = 0.0
     speed_sigma_mps: NotNegative = 0.0
+
+    def draw_position(self, noise: Noise) -> tuple[Float, Float]:
+        """(S, P) two uncorrelated numbers of mean 0 and variance 1."""
+        return noise("position 1"), noise("position 2")
 
     def perturb(self, view: ViewGeometry, noise: Noise) -> Errors:
         """Offsets = mean + L·z with L·Lᵀ the covariance, turned into easting and northing."""
@@ -112,7 +111,7 @@ class Gaussian(ErrorModel):
         # Rounding of a singular matrix must not be amplified: no row is longer than its variance says.
         l21 = float(np.clip(b / l11, -np.sqrt(d), np.sqrt(d))) if l11 > 0 else 0.0
         l22 = np.sqrt(max(d - l21 * l21, 0.0))
-        z1, z2 = noise("position 1"), noise("position 2")
+        z1, z2 = self.draw_position(noise)
         first = self.mean_m[0] + l11 * z1
         second = self.mean_m[1] + l21 * z1 + l22 * z2
         n = len(view.range_m)
@@ -142,5 +141,38 @@ class Gaussian(ErrorModel):
         )  # fmt: skip
 
 
-ERROR_MODELS = {"gaussian": "copem_replay.perception.pem.error:Gaussian"}
+class Gaussian(_Covariant):
+    """Gaussian errors with full covariance.
+
+    `frame: absolute` (the paper's): covariance and mean in easting and northing. `frame: line_of_sight`: along and
+    across the line from the unit to the object (across: to its left), rotated to easting and northing.
+    Optional standard deviations of yaw, of size (length, width and height independently) and of speed along the track.
+    """
+
+    kind: Literal["gaussian"] = "gaussian"
+
+
+class StudentT(_Covariant):
+    """As `gaussian`, of the same mean and covariance, but with heavier tails: position errors of Student's t.
+
+    `degrees_of_freedom`: the fewer, the more errors are many times as large as usual; above 30 hardly any are. Both
+    components of an error share a factor, √((ν − 2)/χ²), which is new in every list unless `memory` has `tails`.
+    """
+
+    kind: Literal["student_t"] = "student_t"
+    degrees_of_freedom: Annotated[float, Field(strict=True, gt=2)]
+
+    def draw_position(self, noise: Noise) -> tuple[Float, Float]:
+        """(S, P) two numbers of mean 0 and variance 1, of a Student's t in two dimensions."""
+        from scipy.special import chdtri, ndtr  # its import takes long
+
+        nu = self.degrees_of_freedom
+        factor = np.sqrt((nu - 2) / np.maximum(chdtri(nu, ndtr(-noise("tails"))), 1e-12))
+        return factor * noise("position 1"), factor * noise("position 2")
+
+
+ERROR_MODELS = {
+    "gaussian": "copem_replay.perception.pem.error:Gaussian",
+    "student_t": "copem_replay.perception.pem.error:StudentT",
+}
 """Built-in names of `error: {kind: …}`."""
