@@ -21,7 +21,7 @@ try:  # an interrupt during the imports, too, ends without a traceback
 
     from copem_replay.cli import convert, fit, inspect, results, run
     from copem_replay.cli.terminal import print_problems
-    from copem_replay.core.compiled import cache_note
+    from copem_replay.core.compiled import cache_note, recompiled_note
     from copem_replay.core.errors import CopemError, InputError
 except KeyboardInterrupt:
     print("interrupted", file=sys.stderr)
@@ -80,8 +80,8 @@ def main() -> None:
         if number == signal.SIGTERM or signal.getsignal(number) != signal.SIG_IGN:  # nohup ignores SIGHUP
             signal.signal(number, lambda number, frame: sys.exit(128 + number))
     code = _run_to_exit_code()
-    if (note := cache_note()) is not None and "numba" in sys.modules:  # something may have been compiled
-        print_problems([f"note: {note}"])
+    if "numba" in sys.modules:  # something may have been compiled
+        print_problems(f"note: {note}" for note in (cache_note(), recompiled_note()) if note is not None)
     sys.exit(code)
 
 

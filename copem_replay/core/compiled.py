@@ -8,7 +8,8 @@ docs/develop/decisions/0039-counted-references.md.
 Numba caches code beside the source or in the user's cache. Where neither can be written, the cache is a folder of the
 user's own under the system's temporary one. An index in a cache names the classes of arguments. Numba reads it before
 it compares it with the source, so an index that names a class that is gone fails: indices older than their source are
-removed first.
+removed first. Any other code in the cache that cannot be used (truncated, of a module that is gone) is compiled again:
+Numba itself would raise, at every call, what reading it raises.
 
 Cached code is run. So the folder must be the user's, without rights for others, and no link; where something else is in
 its place, a folder of this process alone is made.
@@ -16,6 +17,7 @@ its place, a folder of this process alone is made.
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import stat
 import sys
@@ -53,7 +55,17 @@ VARIABLE = "NUMBA_CACHE_DIR"
 @cache
 def cache_note() -> str | None:
     """Prepare the place for compiled code, once. Returns a note for the user, or None."""
+    watch_numba()
     return prepare_cache(Path(__file__).parents[1])
+
+
+def recompiled_note() -> str | None:
+    """A note where cached code could not be used in this process and was compiled again, or None."""
+    if not _unusable:
+        return None
+    (name, why), more = _unusable[0], len(_unusable) - 1
+    others = f", and {more} more," if more else ""
+    return f"compiled code of {name}{others} could not be read from its cache ({why}): compiled again"
 
 
 def prepare_cache(package: Path, environment: Mapping[str, str] = os.environ) -> str | None:
@@ -119,3 +131,61 @@ def _own_folder() -> tuple[str, str]:
     own = tempfile.mkdtemp(prefix=f"copem_replay-{os.geteuid()}-")
     atexit.register(shutil.rmtree, own, ignore_errors=True)
     return own, f" for this process alone ({folder} is not a folder of this user alone)"
+
+
+# Cached code that cannot be used. Numba offers no place for this: the method that reads its cache is replaced, for the
+# functions of this package alone, when Numba is imported.
+
+_CACHING = "numba.core.caching"
+_unusable: list[tuple[str, str]] = []
+"""The functions whose cached code could not be used in this process, and why."""
+
+
+class _NumbaWatch:
+    """An entry of `sys.meta_path` that has Numba's module of caches tolerant as soon as it is imported."""
+
+    def find_spec(self, name: str, path: Any = None, target: Any = None) -> Any:
+        """The specification of that one module, once; None for all others."""
+        if name != _CACHING:
+            return None
+        sys.meta_path.remove(self)
+        spec = importlib.util.find_spec(name)
+        if spec is not None and spec.loader is not None:
+            run = spec.loader.exec_module
+
+            def run_and_tolerate(module: Any) -> None:
+                run(module)
+                _tolerate(module.FunctionCache)
+
+            spec.loader.exec_module = run_and_tolerate  # type: ignore[method-assign]
+        return spec
+
+
+def watch_numba() -> None:
+    """From now on cached code of this package that cannot be used is compiled again, whoever imports Numba."""
+    if _CACHING in sys.modules:
+        _tolerate(sys.modules[_CACHING].FunctionCache)
+    else:
+        sys.meta_path.insert(0, _NumbaWatch())
+
+
+def _tolerate(caches: Any) -> None:
+    """Replace how a class of Numba's caches loads: what cannot be loaded is forgotten, and there is nothing."""
+    load = caches.load_overload
+
+    def load_or_forget(self: Any, sig: Any, target_context: Any) -> Any:
+        try:
+            return load(self, sig, target_context)
+        except MemoryError:
+            raise
+        except Exception as error:  # whatever unpickling anything raises
+            function = self._py_func
+            if not function.__module__.startswith(f"{__package__.partition('.')[0]}."):
+                raise
+            why = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+            _unusable.append((f"{function.__module__}.{function.__qualname__}", why))
+            with suppress(OSError):  # of a cache that cannot be written nothing is taken, either
+                self.flush()
+            return None
+
+    caches.load_overload = load_or_forget

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -97,6 +98,16 @@ def test_a_folder_that_was_named_is_taken(run: Run, tmp_path: Path) -> None:
     assert (ended.returncode, ended.stderr) == (0, "")
     assert os.listdir(tmp_path / "mine") != []
     assert os.listdir(tmp_path / "tmp") == []
+    cached = list((tmp_path / "mine").rglob("*.nb?"))
+    assert {path.suffix for path in cached} == {".nbi", ".nbc"}
+    for path in cached:
+        path.write_bytes(path.read_bytes()[:60])
+    ended = run("check", "e.yaml", NUMBA_CACHE_DIR=str(tmp_path / "mine"))
+    assert ended.returncode == 0
+    (line,) = ended.stderr.splitlines()
+    assert line.startswith("note: compiled code of copem_replay.core.random._draw_bernoulli could not be read from its")
+    assert line.endswith("): compiled again")
+    assert run("check", "e.yaml", NUMBA_CACHE_DIR=str(tmp_path / "mine")).stderr == ""
 
 
 def test_the_users_cache_is_taken_as_ever(run: Run, tmp_path: Path) -> None:
@@ -131,3 +142,63 @@ def test_an_index_older_than_its_source_is_removed(tmp_path: Path) -> None:
     assert prepare_cache(tmp_path, {}) is None
     kept = ["gone.f-1.py311.nbi", "new.f-1.py311.1.nbc", "new.f-1.py311.nbi", "old.f-1.py311.1.nbc"]
     assert sorted(path.name for path in cached.iterdir()) == kept
+
+
+DAMAGED = """
+import json, pickle, sys
+from pathlib import Path
+
+import copem_replay
+
+assert "numba" not in sys.modules
+import numba
+import numpy as np
+
+from copem_replay.core import compiled
+from copem_replay.core.geometry import is_in_polygon
+
+SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+GONE = b"cno_such_module\\nThing\\n."
+(index,) = Path(sys.argv[1]).rglob("geometry.is_in_polygon-*.nbi") if is_in_polygon(0.5, 0.5, SQUARE) else ()
+(code,) = index.parent.glob("geometry.is_in_polygon-*.nbc")
+whole = index.read_bytes(), code.read_bytes()
+version = pickle.dumps(numba.__version__)
+for name, path, content in (
+    ("an empty index", index, b""),
+    ("an index cut off in its version", index, whole[0][:10]),
+    ("an index cut off behind its version", index, whole[0][:-10]),
+    ("an index whose version is of a module that is gone", index, GONE),
+    ("an index that names a module that is gone", index, version + GONE),
+    ("an index that is no pair", index, version + pickle.dumps(7)),
+    ("code cut off", code, whole[1][:-10]),
+    ("code of a module that is gone", code, GONE),
+    ("code of another form", code, pickle.dumps((1, 2))),
+):
+    index.write_bytes(whole[0]), code.write_bytes(whole[1])
+    path.write_bytes(content)
+    del compiled._unusable[:]
+    first = compiled.borrowing(is_in_polygon.py_func)
+    inside = [bool(first(x, 0.5, SQUARE)) for x in (0.5, 1.5)]
+    note = compiled.recompiled_note()
+    second = compiled.borrowing(is_in_polygon.py_func)
+    second(0.5, 0.5, SQUARE)
+    print(json.dumps([name, inside, note, len(first.stats.cache_hits), len(second.stats.cache_hits)]))
+"""
+
+
+def test_cached_code_that_cannot_be_used_is_compiled_again(tmp_path: Path) -> None:
+    """With a note, and once: the next process finds what this one compiled."""
+    ended = subprocess.run(
+        [sys.executable, "-c", DAMAGED, str(tmp_path)], cwd=PACKAGE.parent, capture_output=True, text=True, timeout=100,
+        env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)},
+    )  # fmt: skip
+    assert (ended.returncode, ended.stderr) == (0, "")
+    found = [json.loads(line) for line in ended.stdout.splitlines()]
+    assert len(found) == 9
+    for name, inside, note, hits, hits_again in found:
+        assert (inside, hits, hits_again) == ([True, False], 0, 1), name
+        assert note.startswith(
+            "compiled code of copem_replay.core.geometry.is_in_polygon could not be read from its cache ("
+        ), name
+        assert note.endswith("): compiled again")
+    assert "No module named 'no_such_module'" in found[4][2]
