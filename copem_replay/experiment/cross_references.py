@@ -12,6 +12,7 @@ from copem_replay.core.errors import unknown_name_message
 from copem_replay.core.tracks import TRUTH
 from copem_replay.core.yaml import Key
 from copem_replay.experiment.file import ExperimentSource
+from copem_replay.io.ground_truth import MAX_GAP_S
 from copem_replay.metrics.config import LONGEST_CHAIN, onset_requirement
 from copem_replay.metrics.onset import Requires
 
@@ -43,6 +44,7 @@ def check_references(source: ExperimentSource) -> Iterator[str]:
         kind = onset.get("kind") if isinstance(onset, dict) else None
         if isinstance(kind, str) and onset_requirement(kind) is Requires.UNIT and not _list_modelled_units(data):
             yield source.at(("measure", "onset"), f"{kind}: there is no unit to see anything")
+    yield from _check_again(source, data)
     yield from _check_braking(source, data)
     yield from _check_carried(source, data)
     yield from _check_sweep(source, data, units)
@@ -59,6 +61,25 @@ def check_references(source: ExperimentSource) -> Iterator[str]:
     for key, number in shown:
         if type(number) is int and isinstance(runs, int) and 1 <= runs <= number:
             yield source.at(key, f"expected a run below {runs}, found {number}")
+
+
+def _check_again(source: ExperimentSource, data: dict[str, Any]) -> Iterator[str]:
+    """Onsets after which an object comes back sooner than a gap of its track is filled."""
+    gap_s, logs = data.get("max_gap_s", MAX_GAP_S), data.get("logs")
+    places: list[tuple[Key, Any]] = [(("measure",), data.get("measure"))]
+    places += [
+        (("logs", k, "measure"), one.get("measure"))
+        for k, one in enumerate(logs if isinstance(logs, list) else ())
+        if isinstance(one, dict)
+    ]
+    for key, measure in places:
+        onset = measure.get("onset") if isinstance(measure, dict) else None
+        again_s = onset.get("again_after_s") if isinstance(onset, dict) else None
+        if isinstance(again_s, int | float) and isinstance(gap_s, int | float) and 0 < again_s <= gap_s:
+            yield source.at(
+                (*key, "onset", "again_after_s"),
+                f"expected more than max_gap_s, {gap_s:g} s, over which gaps are filled; found {again_s:g}",
+            )
 
 
 def _check_braking(source: ExperimentSource, data: dict[str, Any]) -> Iterator[str]:

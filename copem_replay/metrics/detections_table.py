@@ -44,6 +44,12 @@ def build_frame(columns: Mapping[str, Any]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+def first_episodes(rows: pd.DataFrame) -> pd.DataFrame:
+    """The rows of the first episode of each object: what is drawn of a single run."""
+    first = rows.groupby("object_id", sort=False)["episode"].transform("min") == rows["episode"]
+    return rows if first.all() else rows[first]
+
+
 @dataclass(frozen=True)
 class Way:
     """The way of each detection to the receiver. All (S | 1, M), NaN: there is none.
@@ -63,13 +69,19 @@ WAY = tuple(Way.__dataclass_fields__)
 
 def first_listed_s(seen: Tracks, episodes: Episodes, units: Collection[str], *, count_earlier: bool) -> Float:
     """(S, M) capture of the first list of `units` that has the object of each episode; NaN: none."""
+    parts = [_first_listed_s(seen, one, units, count_earlier=count_earlier) for _, one in episodes.passes]
+    return episodes.join_passes(parts)
+
+
+def _first_listed_s(seen: Tracks, episodes: Episodes, units: Collection[str], *, count_earlier: bool) -> Float:
     episode_of = np.full(int(max(episodes.object_ix.max(initial=-1), seen.object_ix.max(initial=-1))) + 2, -1)
     episode_of[episodes.object_ix] = np.arange(len(episodes.object_ix))
     episode, captured_s = episode_of[seen.row_object_ix], seen.row_captured_s
     in_units = np.array([name in units for name in seen.units], dtype=bool)[seen.row_unit_ix]
     rows = np.flatnonzero(in_units & (episode >= 0) & np.isfinite(seen.common_arrives_s)[seen.frame_ix])
     during = captured_s[rows] <= episodes.ended_s[episode[rows]] + SAME_INSTANT_S
-    rows = rows[during & (count_earlier | (captured_s[rows] >= episodes.onset_s[episode[rows]] - SAME_INSTANT_S))]
+    from_s = episodes.counts_from_s(count_earlier=count_earlier)
+    rows = rows[during & (captured_s[rows] >= from_s[episode[rows]])]
     first_s = np.full((len(seen.valid), len(episodes.object_ix)), np.inf)
     for s, valid in enumerate(seen.valid):
         listed = rows[valid[rows]]
@@ -197,6 +209,7 @@ def _configuration_columns(
         "run": np.repeat(runs, M),
         "object_id": np.array(scene.object_ids, dtype=object)[flat(episodes.object_ix)],
         "object_class": np.array(CLASSES, dtype=object)[scene.object_class[flat(episodes.object_ix)]],
+        "episode": flat(episodes.number),
         "onset_s": onset_s,
         "began": began_texts(flat(episodes.began)),
         "detected": ~np.isnan(detection_s),

@@ -2,7 +2,8 @@
 
 Onset: the first frame at which its condition holds while the ego is in the log. An episode began at the log's start if
 the condition held at the first instant at which it could be asked of any object; the object appeared if it held at its
-own first frame, later; else it crossed. The episode ends at the object's own
+own first frame, later; else it crossed. With `again_after_s` an object that comes back after so long has another
+episode, and the one before ends with the last frame at which the condition held. Else it ends at the object's own
 last frame (`object_left`: an object that leaves undetected is never detected), the ego's (`ego_left`) or the log's
 (`log_end`); only the last two are censoring. An object is in sight of a unit when a list of the unit, at whatever range
 and in whatever field of view, has a visible share of it above 0, detected or not. Definitions: docs/guide/metrics.md.
@@ -11,8 +12,9 @@ and in whatever field of view, has a visible share of it above 0, detected or no
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -77,15 +79,62 @@ def _interpolate_state(
     return interpolate_states(truth, np.full(len(time_s), object_ix), time_s, t0_ns=scene.t0_ns, max_gap_s=max_gap_s)
 
 
+AGAIN_AFTER_S = 10.0
+"""Where `again_after_s` is not given, objects that come back after longer than this are said in a note."""
+
+
 @dataclass(frozen=True)
 class Episodes:
-    """One episode per measured object that has an onset. All (M,)."""
+    """The episodes of measured objects that have an onset, object by object, of one object in order. All (M,).
+
+    `number`: of the episode among those of its object, from 0 on. `before_s`: end of the episode before, −inf: there is
+    none. `returns`: how often the object comes back during the episode after longer than `AGAIN_AFTER_S`.
+    """
 
     object_ix: Int
+    number: Int
     onset_s: Float
     began: Int  # index into BEGAN
     ended_s: Float
     ended_by: Int  # index into END_REASONS
+    before_s: Float
+    returns: Int
+
+    def take(self, which: Int | Bool) -> Episodes:
+        """Some of the episodes."""
+        return Episodes(**{f.name: getattr(self, f.name)[which] for f in fields(self)})
+
+    @cached_property
+    def passes(self) -> tuple[tuple[Int, Episodes], ...]:
+        """Episodes with at most one of each object, and which they are: the first of each, then the second of each, …
+
+        What looks up the episode of an object measures them pass by pass (`join_passes`).
+        """
+        if not len(self.object_ix):
+            return ((np.empty(0, dtype=np.int64), self),)
+        first = np.flatnonzero(np.diff(self.object_ix, prepend=-1) != 0)
+        rank = np.arange(len(self.object_ix)) - np.repeat(first, np.diff(np.append(first, len(self.object_ix))))
+        each = (np.flatnonzero(rank == k) for k in range(int(rank.max()) + 1))
+        return tuple((which, self.take(which)) for which in each)
+
+    def join_passes(self, parts: Sequence[np.ndarray]) -> np.ndarray:
+        """(…, M) the columns of all episodes, from those of each pass (…, m)."""
+        if len(parts) == 1:
+            return parts[0]
+        order = np.argsort(np.concatenate([which for which, _ in self.passes]))
+        return np.concatenate(parts, axis=-1)[..., order]
+
+    @property
+    def firsts(self) -> Episodes:
+        """The first episode of each object, up to where its last ends: what accuracy is measured of."""
+        which, first = self.passes[0]
+        ends = np.append(which, len(self.object_ix))[1:] - 1
+        return replace(first, ended_s=self.ended_s[ends], ended_by=self.ended_by[ends])
+
+    def counts_from_s(self, *, count_earlier: bool) -> Float:
+        """(M,) captures from here on count: the onset, or with `count_earlier` all after the episode before."""
+        earliest_s = np.where(np.isfinite(self.before_s), self.before_s + SAME_INSTANT_S, -np.inf)
+        return earliest_s if count_earlier else self.onset_s - SAME_INSTANT_S
 
 
 def measured_objects(scene: Scene, measure: Measure) -> Int:
@@ -107,47 +156,106 @@ def find_episodes(scene: Scene, truth: Tracks, static: Statics, experiment: Metr
     measure = experiment.measure
     is_measured = np.isin(truth.object_ix, measured_objects(scene, measure))
     world = truth.take_tracks(is_measured)
-    ego_first_s, ego_last_s, ego_there = _ego_stay(scene, truth)
-    first_s, last_s = world.row_captured_s[world.start[:-1]], world.row_captured_s[world.start[1:] - 1]
-    instant_s = measure.onset.instant_s
-    if instant_s is not None:
-        onset_s = np.full(len(first_s), instant_s)
-        has_onset = (onset_s >= first_s - SAME_INSTANT_S) & (onset_s <= last_s + SAME_INSTANT_S)
-        has_onset &= (onset_s >= ego_first_s - SAME_INSTANT_S) & (onset_s <= ego_last_s + SAME_INSTANT_S)
-        began = np.full(len(first_s), CROSSED)
+    stay = _ego_stay(scene, truth)
+    if measure.onset.instant_s is not None:
+        found = _begin_at(measure.onset.instant_s, world, stay)
     else:
-        possible = ego_there[world.frame_ix]
+        possible = stay.there[world.frame_ix]
         view = OnsetView(
             world,
             lambda place: _measure_distance(scene, truth, world, experiment, place),
             lambda seen_by: _find_best_share(scene, truth, static, experiment, seen_by)[is_measured[truth.track_ix]],
         )
-        onset_row, has_onset = _find_first_true(evaluate_onset(measure.onset, view) & possible, world.start)
-        first_possible, _ = _find_first_true(possible, world.start)
-        onset_s = world.row_captured_s[onset_row]
-        asked_from_s = truth.captured_s[np.argmax(ego_there)] if ego_there.any() else np.inf
-        began = np.where(onset_s <= asked_from_s + SAME_INSTANT_S, LOG_START, APPEARED)
-        began = np.where(onset_row == first_possible, began, CROSSED)
-    end_s = scene.end_s
+        holding = evaluate_onset(measure.onset, view) & possible
+        found = _begin_holding(world, holding, possible, truth.captured_s, stay, measure.onset.again_after_s)
+    last_s = world.row_captured_s[world.start[found.track + 1] - 1] if len(found.track) else np.empty(0)
+    ended_s, ended_by = _find_ends(last_s, stay.last_s, scene.end_s)
+    leaves = np.isfinite(found.held_until_s)
+    ended_s = np.where(leaves, found.held_until_s, ended_s)
+    ended_by = np.where(leaves, END_REASONS.index(EndReason.OBJECT_LEFT), ended_by)
+    number = np.arange(len(found.track)) - np.searchsorted(found.track, found.track)
+    before_s = np.where(number > 0, np.append(-np.inf, ended_s)[:-1], -np.inf)
+    object_ix = world.object_ix[found.track]
+    order = np.argsort(object_ix, kind="stable")
+    return Episodes(
+        object_ix, number, found.onset_s, found.began, ended_s, ended_by, before_s, found.returns
+    ).take(order)  # fmt: skip
+
+
+class _Begun(NamedTuple):
+    """Where episodes begin, track by track. All (M,). `held_until_s`: end of those before a return; inf: the others."""
+
+    track: Int
+    onset_s: Float
+    began: Int
+    held_until_s: Float
+    returns: Int
+
+
+class _EgoStay(NamedTuple):
+    """First and last instant of the ego, and whether it is there at each frame (F,). Without an ego: the whole log."""
+
+    first_s: float
+    last_s: float
+    there: Bool
+
+
+def _begin_at(instant_s: float, world: Tracks, stay: _EgoStay) -> _Begun:
+    """The episodes of all objects that are there at an instant, with the ego."""
+    first_s, last_s = world.row_captured_s[world.start[:-1]], world.row_captured_s[world.start[1:] - 1]
+    track = np.flatnonzero((instant_s >= first_s - SAME_INSTANT_S) & (instant_s <= last_s + SAME_INSTANT_S))
+    if not stay.first_s - SAME_INSTANT_S <= instant_s <= stay.last_s + SAME_INSTANT_S:
+        track = track[:0]
+    count = len(track)
+    none = np.zeros(count, dtype=np.int64)
+    return _Begun(track, np.full(count, instant_s), np.full(count, CROSSED), np.full(count, np.inf), none)
+
+
+def _begin_holding(
+    world: Tracks, holding: Bool, possible: Bool, frames_s: Float, stay: _EgoStay, again_after_s: float | None
+) -> _Begun:
+    """The episodes from rows (P,) at which the condition holds, and can be asked."""
+    rows = np.flatnonzero(holding)
+    track, time_s = world.track_ix[rows], world.row_captured_s[rows]
+    first = np.diff(track, prepend=-1) != 0
+    away_s = np.diff(time_s, prepend=-np.inf)
+    # Out: at some frame in between the condition does not hold, or the object is absent.
+    out = ~first & (np.diff(world.frame_ix[rows], prepend=-2) > 1)
+    returned = out & (away_s > (AGAIN_AFTER_S if again_after_s is None else again_after_s) + SAME_INSTANT_S)
+    begins = np.flatnonzero(first | returned if again_after_s is not None else first)
+    onset_row, onset_first = rows[begins], first[begins]
+    asked_from_s = frames_s[np.argmax(stay.there)] if stay.there.any() else np.inf
+    earlier, _ = _find_first_true(possible, world.start)
+    own_first = earlier[track[begins]] == onset_row
+    # Who comes back crosses if it was followed up to then, else it appears again.
+    followed = (onset_row > 0) & (world.frame_ix[onset_row] - world.frame_ix[onset_row - 1] == 1)
+    began = np.where(np.where(onset_first, own_first, ~followed), APPEARED, CROSSED)
+    began = np.where(onset_first & own_first & (time_s[begins] <= asked_from_s + SAME_INSTANT_S), LOG_START, began)
+    held_until_s = np.full(len(begins), np.inf)
+    again = np.flatnonzero(~onset_first)
+    held_until_s[again - 1] = time_s[begins[again] - 1]
+    count = np.append(0, np.cumsum(returned & ~np.isin(np.arange(len(rows)), begins)))
+    returns = np.diff(count[np.append(begins, len(rows))])
+    return _Begun(track[begins], time_s[begins], began, held_until_s, returns)
+
+
+def _find_ends(last_s: Float, ego_last_s: float, end_s: float) -> tuple[Float, Int]:
+    """When and why episodes end that last as long as object and ego do. `last_s (M,)`: of the object."""
     ended_s = np.minimum(np.minimum(last_s, ego_last_s), end_s)
     object_left = (last_s < end_s - SAME_INSTANT_S) & (last_s <= ego_last_s + SAME_INSTANT_S)
     ego_left = ~object_left & (ego_last_s < end_s - SAME_INSTANT_S)
     reasons = EndReason.OBJECT_LEFT, EndReason.EGO_LEFT, EndReason.LOG_END
     left, ego, end = (END_REASONS.index(reason) for reason in reasons)
-    ended_by = np.where(object_left, left, np.where(ego_left, ego, end))
-    order = np.flatnonzero(has_onset)
-    order = order[np.argsort(world.object_ix[order], kind="stable")]
-    return Episodes(world.object_ix[order], onset_s[order], began[order], ended_s[order], ended_by[order])
+    return ended_s, np.where(object_left, left, np.where(ego_left, ego, end))
 
 
-def _ego_stay(scene: Scene, truth: Tracks) -> tuple[float, float, Bool]:
-    """First and last instant of the ego, and whether it is there at each frame (F,). Without an ego: the whole log."""
+def _ego_stay(scene: Scene, truth: Tracks) -> _EgoStay:
     if scene.ego_ix < 0:
-        return 0.0, scene.end_s, np.ones(len(truth.stamp_ns), dtype=bool)
+        return _EgoStay(0.0, scene.end_s, np.ones(len(truth.stamp_ns), dtype=bool))
     frames = truth.frame_ix[truth.row_object_ix == scene.ego_ix]
     present = np.zeros(len(truth.stamp_ns), dtype=bool)
     present[frames] = True
-    return float(truth.captured_s[frames[0]]), float(truth.captured_s[frames[-1]]), present
+    return _EgoStay(float(truth.captured_s[frames[0]]), float(truth.captured_s[frames[-1]]), present)
 
 
 def _find_first_true(flags: Bool, start: Int) -> tuple[Int, Bool]:
@@ -201,6 +309,10 @@ def _find_best_share(
 
 def first_sights(observations: Observations, episodes: Episodes) -> Float:
     """(U, M) capture of each modelled unit's first list of an episode that has the object in sight; inf: none."""
+    return episodes.join_passes([_first_sights(observations, one) for _, one in episodes.passes])
+
+
+def _first_sights(observations: Observations, episodes: Episodes) -> Float:
     tracks = observations.tracks
     episode_of = np.full(int(max(episodes.object_ix.max(initial=-1), tracks.object_ix.max(initial=-1))) + 1, -1)
     episode_of[episodes.object_ix] = np.arange(len(episodes.object_ix))

@@ -10,10 +10,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, get_args
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from copem_replay.core.components import Component, NotNegative, Positive, Share, ask_component, wrong_answer_error
 from copem_replay.core.tracks import Bool, Float, Int, Tracks
@@ -91,6 +91,8 @@ class OnsetView:
 class Onset(Component, ABC):
     """Base of onsets. The onset of an object is the first frame, with the ego in the log, at which `holds`.
 
+    `again_after_s`: who was out of the condition for longer has a new episode on coming back; None: the first alone counts.
+
     >>> class Fast(cr.Onset):
     ...     def holds(self, view):
     ...         return view.speed_mps > 15.0
@@ -98,6 +100,7 @@ class Onset(Component, ABC):
     'Fast'
     """
 
+    again_after_s: Annotated[Positive | None, Field(exclude_if=lambda value: value is None)] = None
     requires: ClassVar[Requires] = Requires.NOTHING
     """What the experiment needs for this onset; `check` says where it lacks. A property of the class, no field."""
 
@@ -241,6 +244,12 @@ class At(Onset):
 
     kind: Literal["at"] = "at"
     time_s: NotNegative
+
+    @model_validator(mode="after")
+    def _once(self) -> Self:
+        if self.again_after_s is not None:
+            raise ValueError("again_after_s: `at` is one instant, to which nobody comes back; leave it out")
+        return self
 
     @property
     def instant_s(self) -> float:

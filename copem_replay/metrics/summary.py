@@ -58,7 +58,11 @@ _EVENT_COLUMNS = {
     },
 }
 """By event the columns of the tally, and their names in `detections.parquet`; null in the row for never."""
-_OBJECT_COLUMNS = ("object_id", "object_class", "onset_s", "began", "ended_s", "ended_by")
+_OBJECT_COLUMNS = ("object_id", "object_class", "episode", "onset_s", "began", "ended_s", "ended_by")
+
+
+EPISODE = ("log", "object_id", "episode")
+"""Columns that name an episode."""
 
 
 def tally_rows(rows: pd.DataFrame) -> pd.DataFrame:
@@ -78,7 +82,7 @@ def _tally_event(rows: pd.DataFrame, event: str) -> pd.DataFrame:
     happened = rows["detected" if event == DETECTED else "conflict_detected"].to_numpy(dtype=bool)
     time_s = np.where(happened, time_s + 0.0, np.inf)  # −0 is 0, and never comes last
     episode = np.zeros(len(rows), dtype=np.int64)
-    for name in ("log", "configuration", "object_id"):
+    for name in ("configuration", *EPISODE):
         episode = _number_pairs(episode, rows[name])[0]
     group, number, instant_s = _number_pairs(episode, time_s)
     first_of = np.empty(len(number), dtype=np.int64)
@@ -125,7 +129,7 @@ def settle_horizon(counted: pd.DataFrame, asked_s: float) -> tuple[float, list[s
     `counted`: rows that count, of all logs. It is the longest that enough episodes last, `asked_s` at most: a mean up
     to where hardly anybody is followed would hang on a few long episodes.
     """
-    episodes = counted.drop_duplicates(["log", "object_id"])
+    episodes = counted.drop_duplicates([*EPISODE])
     length_s = np.sort(np.round((episodes["ended_s"] - episodes["onset_s"]).to_numpy(dtype=float), 9))[::-1]
     number = len(length_s)
     needed = -(-number // 2) if number < FEWEST_FOLLOWED else max(FEWEST_FOLLOWED, -(-number // 10))
@@ -218,7 +222,7 @@ def summarise_tally(
 
 
 def describe_began(tallied: pd.DataFrame, configuration: str, horizon_s: float | None, words: Sequence[str]) -> str:
-    """A line: how many objects began how, and the mean time of each group in one configuration.
+    """A line: how many episodes began how, and the mean time of each group in one configuration.
 
     `tallied`: the whole tally. `words`: `measure.began`, those that count.
     """
@@ -227,7 +231,7 @@ def describe_began(tallied: pd.DataFrame, configuration: str, horizon_s: float |
     for word in reversed(BEGAN):
         part = rows[rows["began"] == word]
         mean_s = summarise_detections(MetricInputs(part, None, horizon_s)).mean_s()
-        number = part.groupby(["log", "object_id"]).ngroups
+        number = part.groupby([*EPISODE]).ngroups
         groups.append(f"{number} {word}" + ("" if mean_s is None else f" {format_cell(mean_s)} s"))
     line = f"objects by how they began, and their ttd_rmst_s in {configuration}: {', '.join(groups)}"
     line += f"; counted: {', '.join(words)}"

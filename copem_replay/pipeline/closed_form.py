@@ -244,7 +244,7 @@ def exact_table(replay: Replay, experiment: Experiment) -> pd.DataFrame:
         columns = _exact_columns(replay, experiment, name, compute_distributions(replay, experiment, name))
         if braking is not None:
             columns |= _verdict_columns(replay, columns, braking.driver.reaction)
-        parts.append(pd.DataFrame(columns).drop(columns="episode"))
+        parts.append(pd.DataFrame(columns).drop(columns="episode_ix"))
     return pd.concat(parts, ignore_index=True)
 
 
@@ -304,12 +304,12 @@ def compute_distributions(replay: Replay, experiment: Experiment, name: str) -> 
     first, last = (
         np.searchsorted(heard.row_object_ix[by_object], episodes.object_ix, side) for side in ("left", "right")
     )
+    from_s = episodes.counts_from_s(count_earlier=experiment.measure.count_earlier)
     result = []
     for m in range(len(episodes.object_ix)):
         rows = by_object[first[m] : last[m]]
         counts = arrives_s[rows] <= episodes.ended_s[m] + SAME_INSTANT_S
-        if not experiment.measure.count_earlier:
-            counts &= heard.row_captured_s[rows] >= episodes.onset_s[m] - SAME_INSTANT_S
+        counts &= heard.row_captured_s[rows] >= from_s[m]
         rows = rows[counts]
         if instants is None:
             share = replay.expanded.share if configuration.units != TRUTH else np.ones(1)
@@ -388,9 +388,10 @@ def _exact_columns(
     return {
         "log": scene.log,
         "configuration": name,
-        "episode": episode,
+        "episode_ix": episode,
         "object_id": np.array(scene.object_ids, dtype=object)[object_ix],
         "object_class": np.array(CLASSES, dtype=object)[scene.object_class[object_ix]],
+        "episode": episodes.number[episode],
         "onset_s": episodes.onset_s[episode],
         "began": began_texts(episodes.began[episode]),
         "detection_s": detection_s,
@@ -414,7 +415,7 @@ def _log10(log: float) -> float:
 
 def _verdict_columns(replay: Replay, columns: Mapping[str, Any], reaction: Reaction) -> dict[str, Any]:
     """Whether each row's episode is in conflict, and the probabilities to pass and to fail if it is detected then."""
-    episode = columns["episode"]
+    episode = columns["episode_ix"]
     detection_s = columns["detection_s"]
     known_s = np.where(np.isnan(detection_s), np.inf, np.maximum(detection_s, replay.episodes.onset_s[episode]))
     passes, fails = np.full(len(episode), np.nan), np.full(len(episode), np.nan)

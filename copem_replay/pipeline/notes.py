@@ -40,7 +40,7 @@ from copem_replay.experiment.schema import Experiment, ideal_over, output_unit
 from copem_replay.fusion.interface import IdealFusion
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.detection.conflict import describe_excluded
-from copem_replay.metrics.episodes import Episodes, measured_objects
+from copem_replay.metrics.episodes import AGAIN_AFTER_S, Episodes, measured_objects
 from copem_replay.metrics.metric import LinkTimes, OutputTimes, link_times
 from copem_replay.metrics.onset import BEGAN, InRange, Onset
 from copem_replay.perception.config import Carriers
@@ -470,6 +470,7 @@ def _explain_unmeasured(replay: Replay, experiment: Experiment) -> Iterator[str]
         yield f"no rows: no measured object has an onset ({measure.onset.kind})"
     elif not count_counted(numbers := count_began(episodes), measure.began):
         yield f"no object counts: {describe_numbers(numbers)}; `measure.began` has {', '.join(measure.began)}"
+    yield from _find_returns(replay)
     if experiment.braking is not None and len(episodes.object_ix) and not replay.encounters:
         recorded = experiment.braking.ego == "recorded"
         yield (
@@ -477,6 +478,20 @@ def _explain_unmeasured(replay: Replay, experiment: Experiment) -> Iterator[str]
             f"more than {experiment.braking.margin_m:g} m from all measured objects"
             + ("; `ego: constant_speed` assumes that it had not braked" if recorded else "")
         )
+
+
+def _find_returns(replay: Replay) -> Iterator[str]:
+    """Objects that come back to the condition, of which only the first episode counts."""
+    back = np.flatnonzero(replay.episodes.returns)
+    if not len(back):
+        return
+    most, number = back[np.argmax(replay.episodes.returns[back])], int(replay.episodes.returns.max())
+    others = f", {count_noun(len(back) - 1, 'other object')} too" if len(back) > 1 else ""
+    yield (
+        f"object {replay.scene.object_ids[replay.episodes.object_ix[most]]} comes back {count_noun(number, 'time')} "
+        f"after more than {AGAIN_AFTER_S:g} s{others}; only the first episode counts (`onset: {{again_after_s: "
+        f"{AGAIN_AFTER_S:g}}}` counts each)"
+    )
 
 
 # How many episodes began how.

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from copem_replay.communication.link import sample_arrivals
-from copem_replay.core.tracks import TRUTH, WHOLE, Float, Int, Tracks, splice_rows
+from copem_replay.core.tracks import TRUTH, WHOLE, Bool, Float, Int, Tracks, splice_rows
 from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.detection.by_truth_id import FirstDetections, detect_by_truth_id
 from copem_replay.metrics.detection.conflict import ConflictDetector
@@ -65,12 +65,14 @@ WORTH_A_BLOCK = 2_000_000
 class BlockOutcome:
     """What a block of runs (S,) gives: columns of `detections.parquet`, and the scores of the lists by configuration.
 
-    `worked_s`: seconds that it takes; `accuracy_s`: those that `measure: {accuracy: false}` would save.
+    `assessed (M,)`: of which episodes accuracy is measured, the first of each object. `worked_s`: seconds it took;
+    `accuracy_s`: those that `measure: {accuracy: false}` would save.
     """
 
     log: str
     runs: Int
     columns: dict[str, Any]
+    assessed: Bool
     all_scores: dict[str, ConfigurationScores]
     worked_s: float
     accuracy_s: float
@@ -158,11 +160,13 @@ def _replay_runs(
         replay.scene, replay.truth, experiment, replay.episodes, replay.encounters, runs, events
     )
     shape = len(events), len(pieces), -1
+    assessed = np.zeros(len(replay.episodes.object_ix), dtype=bool)
+    assessed[replay.episodes.passes[0][0]] = True
     each_s = (time.perf_counter() - began_s) / len(pieces)
     return [
         BlockOutcome(
             replay.scene.log, piece, {name: column.reshape(shape)[:, k].ravel() for name, column in columns.items()},
-            results[k].all_scores, each_s, results[k].accuracy_s,
+            assessed, results[k].all_scores, each_s, results[k].accuracy_s,
         )
         for k, piece in enumerate(pieces)
     ]  # fmt: skip

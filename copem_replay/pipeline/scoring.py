@@ -180,19 +180,24 @@ class Scorer:
         self.accuracy_s = 0.0
         """Seconds that measuring accuracy took, without matching."""
         runs = len(output.lists.start)
-        self._known = FirstMatches(
-            episodes, runs=runs, confirm=measure.confirm, count_earlier=measure.count_earlier,
-            captures=collect_captures(output.heard, instants=measure.confirm.hits > 1),
-        )  # fmt: skip
+        self._episodes = episodes
+        captures = collect_captures(output.heard, instants=measure.confirm.hits > 1)
+        self._known = [
+            FirstMatches(
+                one, runs=runs, confirm=measure.confirm, count_earlier=measure.count_earlier, captures=captures
+            )
+            for _, one in episodes.passes
+        ]
         self._aggregator = self._held = None
         if frames is not None:
+            firsts = episodes.firsts
             settings, classes = accuracy_settings(measure, around.scene.end_s), around.classes(measure)
             self._aggregator = Aggregator(
-                issue_s, around.scene, episodes, around.since_s(episodes), around.reference(issue_s), classes,
+                issue_s, around.scene, firsts, around.since_s(firsts), around.reference(issue_s), classes,
                 settings=settings, runs=runs,
             )  # fmt: skip
             self._held = HeldErrors(
-                frames, issue_s, max_age_s, around.scene, episodes, classes, settings=settings, runs=runs
+                frames, issue_s, max_age_s, around.scene, firsts, classes, settings=settings, runs=runs
             )
 
     def add(self, around: TruthCache, output: ReceiverOutput) -> Matches:
@@ -206,20 +211,37 @@ class Scorer:
             self._aggregator.add(lists, matches, now, around.at(issue_s))
             self._held.add(lists, matches)
             self.accuracy_s += time.perf_counter() - began_s
-        self._known.add(lists, matches, issue_s)
+        for known in self._known:
+            known.add(lists, matches, issue_s)
         return matches
 
     def result(self, runs: int) -> ConfigurationScores:
         """The scores in this number of runs."""
-        detections, steps = self._known.result()
+        detections, steps = self._join_known()
         accuracy = None if self._aggregator is None else repeat_for_runs(self._aggregator.result(), runs)
         held = None if self._held is None else self._held.result().repeated(runs)
         return ConfigurationScores(self._issue_s, detections, steps, accuracy, held)
 
+    def _join_known(self) -> tuple[FirstDetections, DetectionSteps]:
+        """The detections of all episodes, and their steps in the order of runs and episodes."""
+        results = [known.result() for known in self._known]
+        detections = FirstDetections(
+            *(self._episodes.join_passes(columns) for columns in zip(*(one for one, _ in results), strict=True))
+        )
+        if len(results) == 1:
+            return detections, results[0][1]
+        parts = [
+            (steps.run_ix, which[steps.episode_ix], steps.existence, steps.detection_s)
+            for (which, _), (_, steps) in zip(self._episodes.passes, results, strict=True)
+        ]
+        run_ix, episode_ix, existence, detection_s = (np.concatenate(column) for column in zip(*parts, strict=True))
+        order = np.lexsort((episode_ix, run_ix))
+        return detections, DetectionSteps(*(column[order] for column in (run_ix, episode_ix, existence, detection_s)))
+
 
 def make_log_frames(around: TruthCache, episodes: Episodes) -> HeldFrames:
     """The frames of a log at which it is measured what is held."""
-    return make_held_frames(around.truth.captured_s, episodes, around.between, around.reference)
+    return make_held_frames(around.truth.captured_s, episodes.firsts, around.between, around.reference)
 
 
 # What accuracy is measured by: bands of distance, time and existence.

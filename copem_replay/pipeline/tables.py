@@ -21,7 +21,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from copem_replay.core.tracks import Float, Int
+from copem_replay.core.tracks import Bool, Float, Int
 from copem_replay.metrics.accuracy.statistics import Accuracy, AccuracyTotal, join_totals, sum_accuracy
 from copem_replay.metrics.detections_table import WAY, build_frame, concatenate_columns
 
@@ -35,14 +35,26 @@ if TYPE_CHECKING:
 
 def add_row_accuracy(*outcomes: BlockOutcome) -> dict[str, Any]:
     """The columns of `detections` with the figures of each row, block after block."""
-    parts = [_row_columns(accuracy) for outcome in outcomes for _, _, accuracy in list_accuracies(outcome)]
+    parts = [
+        _row_columns(accuracy, outcome.assessed) for outcome in outcomes for _, _, accuracy in list_accuracies(outcome)
+    ]
     columns = concatenate_columns([outcome.columns for outcome in outcomes])
     return columns | (concatenate_columns(parts) if parts else {})
 
 
-def _row_columns(accuracy: Accuracy) -> dict[str, Any]:
-    """The figures of each row, (S · M,) each; NaN where nothing was matched."""
-    sums = accuracy.by_object.ravel()
+def _spread(values: np.ndarray, assessed: Bool) -> np.ndarray:
+    """(…, M) values (…, m) of the episodes that are assessed, 0 of the others."""
+    if assessed.all():
+        return values
+    spread = np.zeros((*values.shape[:-1], len(assessed)), dtype=values.dtype)
+    spread[..., assessed] = values
+    return spread
+
+
+def _row_columns(accuracy: Accuracy, assessed: Bool) -> dict[str, Any]:
+    """The figures of each row, (S · M,) each; NaN where nothing was matched, or the object came back."""
+    sums = _spread(accuracy.by_object, assessed).ravel()
+    first = np.tile(assessed, len(accuracy.by_object))
 
     def mean(name: str, of: str = "pairs") -> Float:
         return np.where(sums[of] > 0, sums[name] / np.maximum(sums[of], 1), np.nan)
@@ -59,7 +71,7 @@ def _row_columns(accuracy: Accuracy) -> dict[str, Any]:
         "age_of_information_s": mean("age_of_information_s"),
         "identity_switches": np.where(sums["tracked"] > 0, sums["switches"], np.nan),
         "duplicates": sums["duplicates"],
-        "longest_gap_s": sums["longest_gap_s"],
+        "longest_gap_s": np.where(first, sums["longest_gap_s"], np.nan),
     }
 
 
@@ -97,7 +109,7 @@ class AccuracyTables:
 
 def accuracy_tables(logs: Sequence[LogTables], rows: pd.DataFrame, *, same_instants: bool) -> AccuracyTables:
     """The tables of accuracy of several logs; `rows`: those of `detections`."""
-    keys = pa.Table.from_pandas(rows[["log", "configuration", "run", "object_id"]], preserve_index=False)
+    keys = pa.Table.from_pandas(rows[["log", "configuration", "run", "object_id", "episode"]], preserve_index=False)
     beside = pa.concat_tables([log.beside for log in logs if log.beside is not None])
     runs = pa.concat_tables([log.runs for log in logs if log.runs is not None])
     per_list = keys
@@ -271,16 +283,16 @@ def _build_beside(outcomes: Sequence[BlockOutcome]) -> pa.Table:
     for outcome in outcomes:
         runs = len(outcome.runs)
         for _, scores, accuracy in list_accuracies(outcome):
-            held = scores.held
+            held, assessed = scores.held, outcome.assessed
             assert held is not None
             count, existence, steps_s = _count_steps(scores, runs)
-            lists, frames = np.tile(accuracy.count, runs), np.tile(held.count, runs)
+            lists, frames = (np.tile(_spread(of.count, assessed), runs) for of in (accuracy, held))
             columns = {
-                "first_list": np.tile(accuracy.first_list, runs),
+                "first_list": np.tile(_spread(accuracy.first_list, assessed), runs),
                 "error_m": (lists, accuracy.error_m.ravel()),
                 "gospa_m2": (lists, accuracy.gospa.ravel()),
-                "ghosts": accuracy.by_object["ghosts"].ravel(),
-                "first_frame": np.tile(held.first, runs),
+                "ghosts": _spread(accuracy.by_object["ghosts"], assessed).ravel(),
+                "first_frame": np.tile(_spread(held.first, assessed), runs),
                 "error_held_m": (frames, held.error_m.ravel()),
                 "age_held_s": (frames, held.age_s.ravel()),
                 "gospa_held_m2": (frames, held.gospa.ravel()),

@@ -41,10 +41,11 @@ FORMAT = 3
 AGAIN = "run the experiment again with --overwrite"
 """The way out for a table that is damaged or of an older version."""
 
-EXACT = ("log", "configuration", "object_id", "began", "time_to_detection_s", "probability")
+EXACT = ("log", "configuration", "object_id", "episode", "began", "time_to_detection_s", "probability")
 _KEYS = {"log": "text", "configuration": "text", "run": "whole numbers"}
 _OBJECT = _KEYS | {"object_id": "text"}
 DETECTIONS = _OBJECT | {
+    "episode": "whole numbers",
     "onset_s": "numbers",
     "began": "text",
     "detected": "true or false",
@@ -62,13 +63,13 @@ CONFLICT = {
     "conflict_detection_s": "numbers",
     "distance_at_conflict_detection_m": "numbers",
 }
-_OBJECT_COLUMNS = ("object_id", "object_class", "onset_s", "began", "ended_s", "ended_by")
+_OBJECT_COLUMNS = ("object_id", "object_class", "episode", "onset_s", "began", "ended_s", "ended_by")
 TALLY = ("log", "configuration", "event", *_OBJECT_COLUMNS, "time_to_detection_s", "distance_at_detection_m", "runs")
 HELD = ("error_held_m", "age_held_s", "gospa_held_m2")
 """Columns of `accuracy.parquet` with a value for each frame."""
 OPTIONAL = {
     "accuracy.parquet": _OBJECT
-    | {"ghosts": "whole numbers", "first_frame": "whole numbers"}
+    | {"episode": "whole numbers", "ghosts": "whole numbers", "first_frame": "whole numbers"}
     | dict.fromkeys(HELD, "lists of numbers"),
     "instants.parquet": {
         "log": "text",
@@ -85,7 +86,7 @@ OPTIONAL = {
         "existence": "lists of numbers",
         "ghosts_at": "lists of whole numbers",
     },
-    "thresholds.parquet": _OBJECT | {"existence": "numbers", "detection_s": "numbers"},
+    "thresholds.parquet": _OBJECT | {"episode": "whole numbers", "existence": "numbers", "detection_s": "numbers"},
 }
 """Optional files of a results folder, and their columns that comparisons read."""
 MAY_HAVE = {"detections.parquet": ROWS | BRAKING | CONFLICT, "instants.parquet": {"run": "whole numbers"}}

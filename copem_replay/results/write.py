@@ -38,6 +38,7 @@ from copem_replay.io.recording import Recording
 from copem_replay.io.write.message_family import EGO_FRAME, MIDDLE_FRAME
 from copem_replay.io.write.scene import Ellipse, Entity, Line, Pose, Rgba, Text, TruthFrame, TruthScene
 from copem_replay.io.write.scene import Place as ScenePlace
+from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.perception.sensor_poses import UnitPoses, couple_outlines, mounting_height
 from copem_replay.pipeline.one_run import ReplayedRun, ShownRun, replay_run, select_shown_logs, select_shown_runs
 from copem_replay.pipeline.run import ExperimentResult, find_log_path
@@ -67,8 +68,8 @@ class RunToExport:
     """One run of one log, in the configurations that are shown.
 
     `one`: the replayed run. `every`: all configurations of the experiment, whose order determines colours. `table`: the
-    rows of `detections.parquet` of this log and run. `summary`: over all logs and runs. `manifest`: the provenance that
-    the file states.
+    rows of `detections.parquet` of this log and run, of the first episode of each object. `summary`: over all logs and
+    runs. `manifest`: the provenance that the file states.
     """
 
     recording: Recording
@@ -316,7 +317,7 @@ def _make_run_to_export(
         shown,
         replay_run(recording, shown_experiment, shown.run, replay),
         experiment.configurations,
-        rows[(rows["run"] == shown.run) & rows["configuration"].isin(names)],
+        first_episodes(rows[(rows["run"] == shown.run) & rows["configuration"].isin(names)]),
         result.summary[result.summary["configuration"].isin(names)],
         manifest,
     )

@@ -27,6 +27,7 @@ from urllib.parse import quote, unquote, urlsplit
 import pandas as pd
 
 from copem_replay.core.errors import CopemError, OutputError
+from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.results.read import Results, open_results
 from copem_replay.viewer.sink import ELAPSED, SHOWN_OBJECTS, choose_telling_objects
 
@@ -67,7 +68,7 @@ def opening_s(folder: Path, files: Sequence[Path]) -> dict[Path, float]:
             if stem in runs:
                 log, run = runs[stem]
                 (rows,) = results.each(log=log, every=True)
-                onset_s = _first_onset_s(rows[rows["run"] == run], truths)
+                onset_s = _first_onset_s(first_episodes(rows[rows["run"] == run]), truths)
                 if onset_s is not None:
                     instants_s[path] = max(0.0, onset_s - BEFORE_ONSET_S)
     except (CopemError, KeyError, TypeError):

@@ -20,6 +20,7 @@ from copem_replay.core.tracks import SAME_INSTANT_S
 from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.experiment.schema import Configuration, Experiment, Unit
 from copem_replay.io.recording import Recording
+from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.perception.pem.model import Pem
 from copem_replay.pipeline.one_run import STEM, ReplayedRun, replay_run
 from copem_replay.pipeline.prepare import prepare_log
@@ -249,7 +250,7 @@ def _replay_side(results: Results, chosen: Sequence[LabelledConfiguration], log:
         log=log
     )
     again = replay_block(replayed.replay, replayed.experiment, np.array([run]))
-    keys = ["configuration", "object_id"]
+    keys = ["configuration", "object_id", "episode"]
     times = [table.set_index(keys)["detection_s"].sort_index() for table in (rows, again)]
     same = times[0].index.equals(times[1].index) and np.allclose(
         times[0], times[1], rtol=0, atol=SAME_INSTANT_S, equal_nan=True
@@ -259,7 +260,7 @@ def _replay_side(results: Results, chosen: Sequence[LabelledConfiguration], log:
             f"{results.folder}: log {log}: run {run} comes out otherwise than in detections.parquet: another version "
             "made it; run the experiment again with --overwrite"
         )
-    return _Side(results, labels, replayed, rows)
+    return _Side(results, labels, replayed, first_episodes(rows))
 
 
 def _join_summaries(sides: Sequence[_Side], labels: Sequence[str]) -> pd.DataFrame:

@@ -103,9 +103,9 @@ def test_survey(path):
                         {"at": [20.0, 0.0], "yaw_deg": 0},
                     ],
                     "began": {
-                        "all": {"crossed": 0, "appeared": 0, "log_start": 2},
+                        "all": {"crossed": 0, "appeared": 0, "log_start": 1},
                         "vru": {"crossed": 0, "appeared": 0, "log_start": 1},
-                        "vehicles": {"crossed": 0, "appeared": 0, "log_start": 1},
+                        "vehicles": {"crossed": 0, "appeared": 0, "log_start": 0},
                     },
                 },
             }

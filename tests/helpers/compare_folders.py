@@ -39,6 +39,7 @@ _DETECTIONS = {
     "configuration": pa.string(),
     "run": pa.int64(),
     "object_id": pa.string(),
+    "episode": pa.int64(),
     "onset_s": pa.float64(),
     "began": pa.string(),
     "detected": pa.bool_(),
@@ -53,6 +54,7 @@ _ACCURACY = {
     "configuration": pa.string(),
     "run": pa.int64(),
     "object_id": pa.string(),
+    "episode": pa.int64(),
     "first_frame": pa.int64(),
     "error_held_m": pa.list_(pa.float32()),
     "age_held_s": pa.list_(pa.float32()),
@@ -83,6 +85,7 @@ _THRESHOLDS = {
     "configuration": pa.string(),
     "run": pa.int64(),
     "object_id": pa.string(),
+    "episode": pa.int64(),
     "existence": pa.float64(),
     "detection_s": pa.float64(),
 }
@@ -112,6 +115,7 @@ def row(configuration: str, detection_s: float | None, distance_m: float | None 
         "configuration": configuration,
         "run": 0,
         "object_id": "7",
+        "episode": 0,
         "onset_s": 0.0,
         "began": "crossed",
         "detected": detection_s is not None,
@@ -148,7 +152,7 @@ def ghosts(configuration: str, count: int, **more: Any) -> Row:
 
 def step(configuration: str, existence: float, detection_s: float, **more: Any) -> Row:
     """Object 7 of log `a` in run 0 is detected at `detection_s` with thresholds up to `existence`."""
-    given = {"log": "a", "configuration": configuration, "run": 0, "object_id": "7"}
+    given = {"log": "a", "configuration": configuration, "run": 0, "object_id": "7", "episode": 0}
     return given | {"existence": existence, "detection_s": detection_s} | more
 
 

@@ -16,7 +16,14 @@ from tests.helpers.compare_folders import row, write_folder
 def rows(lengths_s: Sequence[float]) -> pd.DataFrame:
     """Two rows of each episode, one per configuration."""
     return pd.DataFrame(
-        {"log": "a", "configuration": name, "object_id": str(k), "onset_s": 1.1, "ended_s": 1.1 + length_s}
+        {
+            "log": "a",
+            "configuration": name,
+            "object_id": str(k),
+            "episode": 0,
+            "onset_s": 1.1,
+            "ended_s": 1.1 + length_s,
+        }
         for name in ("GT", "PEM")
         for k, length_s in enumerate(lengths_s)
     )
@@ -44,7 +51,9 @@ def rows(lengths_s: Sequence[float]) -> pd.DataFrame:
     ],
 )  # fmt: skip
 def test_the_horizon(lengths_s: list[float], asked_s: float, expected_s: float, note: str | None) -> None:
-    table = rows(lengths_s) if lengths_s else pd.DataFrame(columns=["log", "object_id", "onset_s", "ended_s"])
+    table = (
+        rows(lengths_s) if lengths_s else pd.DataFrame(columns=["log", "object_id", "episode", "onset_s", "ended_s"])
+    )
     found_s, notes = settle_horizon(table, asked_s)
     assert found_s == pytest.approx(expected_s, abs=1e-9)
     assert notes == ([] if note is None else [f"horizon_s: {note}"])

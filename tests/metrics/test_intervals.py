@@ -279,7 +279,7 @@ def rows_of(detected: list[list[bool]]) -> pd.DataFrame:
             for run, known in enumerate(of_object)
         ]
     )
-    return found.assign(log="a", configuration="c", onset_s=0.0, ended_s=2.0, ended_by="object_left",
+    return found.assign(log="a", configuration="c", episode=0, onset_s=0.0, ended_s=2.0, ended_by="object_left",
                         distance_at_detection_m=5.0)  # fmt: skip
 
 

@@ -101,7 +101,7 @@ def test_without_own_metrics_the_key_is_not_written(tmp_path: Path) -> None:
 
 def rows_of(*logs: str) -> pd.DataFrame:
     """Two rows of each log in one configuration: known after 1 s, and after 3 s."""
-    one = {"configuration": "c", "detected": True, "onset_s": 0.0, "ended_s": 5.0, "ended_by": "log_end",
+    one = {"configuration": "c", "detected": True, "episode": 0, "onset_s": 0.0, "ended_s": 5.0, "ended_by": "log_end",
            "distance_at_detection_m": 9.0, "run": 0}  # fmt: skip
     return pd.DataFrame(
         [one | {"log": log, "object_id": str(k), "time_to_detection_s": 1.0 + 2 * k} for log in logs for k in (0, 1)]

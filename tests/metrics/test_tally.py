@@ -24,7 +24,7 @@ def tables(draw: st.DrawFn) -> pd.DataFrame:
     for log in range(logs):
         for k in range(draw(st.integers(1, 3))):
             onset, length = draw(st.integers(0, 40)) / 8, draw(st.integers(1, 80)) / 10
-            base = {"log": f"log {log}", "object_id": str(k), "object_class": "car", "onset_s": onset,
+            base = {"log": f"log {log}", "object_id": str(k), "object_class": "car", "episode": 0, "onset_s": onset,
                     "ended_s": onset + length, "ended_by": draw(st.sampled_from(REASONS)),
                     "conflict": draw(st.booleans())}  # fmt: skip
             gap = draw(whole)  # the truth has a gap there: no distance
@@ -82,7 +82,7 @@ def test_counts_are_those_of_the_rows_in_whatever_order(table: pd.DataFrame, ran
 
 
 def test_rows_are_by_log_configuration_event_object_and_instant() -> None:
-    base = {"object_class": "car", "onset_s": 1.0, "ended_s": 5.0, "ended_by": "log_end"}
+    base = {"object_class": "car", "episode": 0, "onset_s": 1.0, "ended_s": 5.0, "ended_by": "log_end"}
     rows = [
         base | {"log": log, "configuration": name, "run": run, "object_id": thing, "detected": s is not None,
                 "detection_s": s, "time_to_detection_s": None if s is None else s - 1, "distance_at_detection_m": s}
@@ -103,8 +103,8 @@ def test_rows_are_by_log_configuration_event_object_and_instant() -> None:
 
 @pytest.mark.parametrize("conflicts", [False, True])
 def test_without_rows_there_is_no_figure_and_no_column_more(conflicts: bool) -> None:
-    columns = ["log", "configuration", "run", "object_id", "onset_s", "ended_s", "ended_by", "detected", "detection_s",
-               "time_to_detection_s", "distance_at_detection_m"]  # fmt: skip
+    columns = ["log", "configuration", "run", "object_id", "episode", "onset_s", "ended_s", "ended_by", "detected",
+               "detection_s", "time_to_detection_s", "distance_at_detection_m"]  # fmt: skip
     more = ["conflict_detected", "conflict_detection_s", "time_to_conflict_detection_s",
             "distance_at_conflict_detection_m"] if conflicts else []  # fmt: skip
     found, _ = summarise_rows(pd.DataFrame(columns=columns + more), ["a"], {"a": None}, horizon_s=None)

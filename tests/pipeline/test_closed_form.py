@@ -1019,7 +1019,8 @@ def test_the_file(
     table = parquet.read_table(tmp_path / "out" / "e" / "exact.parquet")
     number, text = pa.float64(), pa.string()
     columns = {
-        "log": text, "configuration": text, "object_id": text, "object_class": text, "onset_s": number,
+        "log": text, "configuration": text, "object_id": text, "object_class": text,
+        "episode": pa.int64(), "onset_s": number, "began": text,
         "detection_s": number, "probability": number, "incidence": number, "time_to_detection_s": number,
         "distance_at_detection_m": number, "gap_at_detection_m": number, "ended_s": number, "ended_by": text,
         "miss_log10": number, "miss_per_logit": number, "miss_log10_half_odds": number,
@@ -1131,8 +1132,8 @@ class TestSummary:
             ended_by = data.draw(st.sampled_from(["object_left", "log_end", "ego_left"]))
             marks = st.one_of(st.none(), st.sampled_from([0.0, 0.25, 0.5]))
             times = data.draw(st.lists(marks, min_size=16, max_size=16))
-            base = {"log": "x", "configuration": "c", "object_id": str(k), "onset_s": 0.0, "ended_s": ended_s,
-                    "ended_by": ended_by}  # fmt: skip
+            base = {"log": "x", "configuration": "c", "object_id": str(k), "episode": 0, "onset_s": 0.0,
+                    "ended_s": ended_s, "ended_by": ended_by}  # fmt: skip
             # Of each episode there is a row for never, be it that it cannot be.
             for t, count in ({NEVER: 0} | Counter(times)).items():
                 at = math.nan if t is None else t

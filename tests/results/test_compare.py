@@ -51,6 +51,26 @@ def test_the_share_detected_loses_the_one_that_is_not_seen(tmp_path):
     assert share["p_value"] == 1.0
 
 
+def test_each_episode_of_an_object_has_its_partner_and_they_are_one_object(tmp_path):
+    """Twice after 1 and 2 s, on the other side after 2 and 5 s: 2 s later on average, over one object's runs."""
+    times = {"ideal": (1.0, 2.0), "late": (2.0, 5.0)}
+    rows = [row(name, s, episode=k) for name, both in times.items() for k, s in enumerate(both)]
+    time = of(compared(tmp_path, rows), "ttd_rmst_s")
+    assert (time["n"], time["difference"]) == (2, pytest.approx(2.0))
+    assert pd.isna(time["interval_over"]), "one run of one object is no sample"
+
+
+def test_only_rows_that_count_are_compared(tmp_path):
+    """Of two objects the one that was there at the log's start has no say in times and shares."""
+    rows = [row("ideal", 1.0), row("late", 2.0)]
+    rows += [row(name, 9.0, object_id="8", began="log_start") for name in ("ideal", "late")]
+    time = of(compared(tmp_path / "a", rows), "ttd_rmst_s")
+    assert (time["n"], time["difference"]) == (1, pytest.approx(1.0))
+    every = {"began": ["log_start", "crossed", "appeared"]}
+    time = of(compared(tmp_path / "b", rows, measure=every), "ttd_rmst_s")
+    assert (time["n"], time["difference"]) == (2, pytest.approx(0.5))
+
+
 def test_never_detected_counts_as_the_horizon(tmp_path):
     time = of(compared(tmp_path, THREE), "ttd_rmst_s")
     assert time["value"] == pytest.approx((1.5 + 10 + 10) / 3)

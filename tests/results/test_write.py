@@ -39,6 +39,7 @@ COLUMNS = {
     "run": pa.int64(),
     "object_id": pa.string(),
     "object_class": pa.string(),
+    "episode": pa.int64(),
     "onset_s": pa.float64(),
     "began": pa.string(),
     "detected": pa.bool_(),

@@ -262,6 +262,8 @@ def find_encounters(scene: Scene, truth: Tracks, episodes: Episodes, experiment:
         track = track_of[int(object_ix)]
         rows = np.arange(truth.start[track], truth.start[track + 1])
         onset_s = float(episodes.onset_s[k])
+        if k + 1 < len(episodes.object_ix) and episodes.object_ix[k + 1] == object_ix:  # it comes back
+            rows = rows[truth.row_captured_s[rows] < episodes.onset_s[k + 1] - SAME_INSTANT_S]
         constant_from_s = onset_s if braking.ego == "constant_speed" else None
         if _may_meet(ego, truth, rows, onset_s, constant_from_s, braking.margin_m):
             encounter = _find_encounter(ego, truth, rows, k, onset_s, constant_from_s, braking.margin_m)

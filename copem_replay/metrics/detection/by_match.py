@@ -237,7 +237,7 @@ class FirstMatches:
         count = len(episodes.object_ix)
         episode_of = np.full(int(episodes.object_ix.max(initial=-1)) + 1, -1)
         episode_of[episodes.object_ix] = np.arange(count)
-        not_before_s = np.full(count, -np.inf) if count_earlier else episodes.onset_s - SAME_INSTANT_S
+        not_before_s = episodes.counts_from_s(count_earlier=count_earlier)
         self._stays = EpisodeWindows(episode_of, not_before_s, episodes.ended_s + SAME_INSTANT_S)
         self._confirm, self._captures = confirm, captures
         # Captures are numbered: first the capture instants, without a unit, then the lists of the units.

@@ -48,9 +48,20 @@ def detect_by_truth_id(
     Every list counts at the instant at which the receiver takes it in, also beside or after a newer one of its unit.
     `max_age_s` counts from capture, on top of a list's own way to the receiver.
     """
+    parts = [
+        _detect_first(heard, one, confirm=confirm, count_earlier=count_earlier, max_age_s=max_age_s)
+        for _, one in episodes.passes
+    ]
+    return FirstDetections(*(episodes.join_passes(columns) for columns in zip(*parts, strict=True)))
+
+
+def _detect_first(
+    heard: Tracks, episodes: Episodes, *, confirm: Confirm, count_earlier: bool, max_age_s: float
+) -> FirstDetections:
+    """The same of episodes with one of each object at most."""
     captured_s = heard.row_captured_s
     order, bounds = _group_by_episode(heard, episodes)
-    not_before_s = np.full(len(episodes.object_ix), -np.inf) if count_earlier else episodes.onset_s - SAME_INSTANT_S
+    not_before_s = episodes.counts_from_s(count_earlier=count_earlier)
     shape = (heard.valid.shape[0], len(episodes.object_ix))
     out = FirstDetections(np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, -1))
     # The instant from which on a list is no longer used: at its greatest age, within a microsecond, it still is.

@@ -12,7 +12,6 @@ episode.
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numba as nb
@@ -45,8 +44,7 @@ class ConflictDetector:
 
     def __init__(self, ego: EgoPath, episodes: Episodes, conflict: Conflict, *, confirm: Confirm, count_earlier: bool):
         self._ego, self._episodes, self._conflict, self._confirm = ego, episodes, conflict, confirm
-        never = np.full(len(episodes.object_ix), -np.inf)
-        self._not_before_s = never if count_earlier else episodes.onset_s - SAME_INSTANT_S
+        self._not_before_s = episodes.counts_from_s(count_earlier=count_earlier)
         self._lists, self._runs, self._issue_s = 0, 1, [np.empty(0)]
         self._held: dict[tuple[int, int], list[Int]] = {}  # by run and episode: numbers of the lists that imply one
 
@@ -210,7 +208,7 @@ _TOLERANCE_M = 1e-6
 def keep_episodes_within(
     scene: Scene, truth: Tracks, episodes: Episodes, experiment: MetricsSetup
 ) -> tuple[Episodes, Int]:
-    """The episodes that `measure.objects.within` keeps, and the object indices (K,) of the others.
+    """The episodes that `measure.objects.within` keeps, and the indices (K,) of objects of which it keeps none.
 
     Raises ExperimentError where the condition needs the path of an ego and there is none.
     """
@@ -221,9 +219,7 @@ def keep_episodes_within(
         raise ExperimentError(f"{scene.log}: measure.objects.within: no ego in this study, and so no path of it")
     decide = _is_within_at_onset if within.conflict_s is None else _will_conflict
     kept = decide(scene, truth, episodes, experiment)
-    return replace(episodes, **{f.name: getattr(episodes, f.name)[kept] for f in fields(episodes)}), episodes.object_ix[
-        ~kept
-    ]
+    return episodes.take(kept), np.setdiff1d(episodes.object_ix, episodes.object_ix[kept])
 
 
 def describe_excluded(within: Within) -> str:
@@ -274,12 +270,14 @@ def _will_conflict(scene: Scene, truth: Tracks, episodes: Episodes, experiment: 
     ego = EgoPath(scene, truth, experiment.max_gap_s)
     tracks = truth.take_tracks(np.isin(truth.object_ix, episodes.object_ix))
     implied = find_conflicts(tracks, ego, Conflict(horizon_s=within.conflict_s, margin_m=margin_m))[0]
-    episode_of = np.full(len(scene.object_ids), -1)
-    episode_of[episodes.object_ix] = np.arange(len(episodes.object_ix))
-    episode, time_s = episode_of[tracks.row_object_ix], tracks.row_captured_s
-    implied &= (time_s >= episodes.onset_s[episode] - SAME_INSTANT_S) & (
-        time_s <= episodes.ended_s[episode] + SAME_INSTANT_S
-    )
-    kept = np.zeros(len(episodes.object_ix), dtype=bool)
-    kept[episode[implied]] = True
-    return kept
+    parts = []
+    for _, one in episodes.passes:
+        episode_of = np.full(len(scene.object_ids), -1)
+        episode_of[one.object_ix] = np.arange(len(one.object_ix))
+        rows = np.flatnonzero(implied & (episode_of[tracks.row_object_ix] >= 0))
+        episode, time_s = episode_of[tracks.row_object_ix[rows]], tracks.row_captured_s[rows]
+        during = (time_s >= one.onset_s[episode] - SAME_INSTANT_S) & (time_s <= one.ended_s[episode] + SAME_INSTANT_S)
+        kept = np.zeros(len(one.object_ix), dtype=bool)
+        kept[episode[during]] = True
+        parts.append(kept)
+    return episodes.join_passes(parts)

@@ -237,7 +237,7 @@ def exact_curve(exact: pd.DataFrame, name: str) -> DetectionCurve:
     detections = rows[rows["time_to_detection_s"].notna() & (rows["probability"] > 0)]
     times_s, place = np.unique(detections["time_to_detection_s"].to_numpy(dtype=float), return_inverse=True)
     mass = np.bincount(place, weights=detections["probability"].to_numpy(dtype=float), minlength=len(times_s))
-    return DetectionCurve(times_s, np.cumsum(mass) / max(rows.groupby(["log", "object_id"]).ngroups, 1))
+    return DetectionCurve(times_s, np.cumsum(mass) / max(rows.groupby(["log", "object_id", "episode"]).ngroups, 1))
 
 
 def _draw_curves(results: Results, curves: dict[str, DetectionCurve], exact: dict[str, DetectionCurve]) -> Figure:

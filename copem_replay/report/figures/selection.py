@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 
 from copem_replay.core.errors import InputError
+from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.metrics.summary import DETECTED
 from copem_replay.report.figures.style import find_truths, shorten_names, sort_soonest_first
 
@@ -92,7 +93,8 @@ def _rows_of_run(results: Results, known: pd.DataFrame, run: int | None) -> pd.D
     """Rows of a run for logs and objects in `known`; None: of each log's run shown in the .rrd, else run 0."""
     parts = []
     for log in dict.fromkeys(known["log"]):
-        (rows,) = results.each("object_id", "configuration", "run", *_RANKED_BY, log=log, every=True)
+        (rows,) = results.each("object_id", "episode", "configuration", "run", *_RANKED_BY, log=log, every=True)
+        rows = first_episodes(rows)
         rows = rows[rows["object_id"].isin(known.loc[known["log"] == log, "object_id"])]
         wanted_run = results.provenance.run_shown.get(log, 0) if run is None else run
         parts.append(rows[rows["run"] == wanted_run].assign(log=log))
@@ -145,9 +147,10 @@ def find_differing(results: Results, names: Sequence[str], most: int = MOST_LINE
 
 
 def pivot_by_run(results: Results, column: str) -> Iterator[pd.DataFrame]:
-    """Per log a table of one column's times, a row per object and run, a column per configuration; NaN: never."""
-    for rows in results.each("object_id", "run", "configuration", column):
-        times = rows.set_index(["object_id", "run", "configuration"])[column].unstack("configuration")
+    """Per log a table of one column's times, a row per episode and run, a column per configuration; NaN: never."""
+    keys = ["object_id", "episode", "run", "configuration"]
+    for rows in results.each(*keys, column):
+        times = rows.set_index(keys)[column].unstack("configuration")
         yield times.reindex(columns=list(results.experiment.configurations))
 
 

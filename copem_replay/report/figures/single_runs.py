@@ -19,6 +19,7 @@ from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.braking.driver import Driver
 from copem_replay.metrics.braking.encounter import EgoPath, Encounter
 from copem_replay.metrics.braking.verdict import simulate_braking
+from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.metrics.survival import EndReason
 from copem_replay.pipeline.one_run import BY_EGO, share_curves
 from copem_replay.pipeline.prepare import Replay
@@ -201,7 +202,8 @@ def tell_story(replay: Replay, experiment: Experiment, row: Any) -> Story:
     """The story of one row of `detections.parquet`."""
     object_ix = replay.scene.object_number[row.object_id]
     braking = experiment.braking
-    encounter = next((e for e in replay.encounters if replay.episodes.object_ix[e.episode_ix] == object_ix), None)
+    of_row = (replay.episodes.object_ix == object_ix) & (replay.episodes.number == row.episode)
+    encounter = next((e for e in replay.encounters if of_row[e.episode_ix]), None)
     occurred = [(row.onset_s, "onset", experiment.measure.onset.label(CLASSES[replay.scene.object_class[object_ix]]))]
     result = "never known"
     if row.detected:
@@ -288,9 +290,8 @@ def runs_figure(results: Results, selection: Selection) -> Figure:
     choice = choose_object_and_run(results, selection)
     replay = reread_log(results, choice.log, choice.object_id)
     (rows,) = results.each(log=choice.log, every=True)
-    of_run = rows[(rows["object_id"] == choice.object_id) & (rows["run"] == choice.run)].set_index(
-        "configuration", drop=False
-    )
+    of_run = first_episodes(rows[(rows["object_id"] == choice.object_id) & (rows["run"] == choice.run)])
+    of_run = of_run.set_index("configuration", drop=False)
     stories = [tell_story(replay, results.experiment, of_run.loc[name]) for name in choice.configurations]
     with figure_style():
         figure = _draw_stories(results, replay, stories)

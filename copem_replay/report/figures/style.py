@@ -226,11 +226,12 @@ def describe_results(results: Results, names: Sequence[str]) -> str:
     """Runs, objects, logs, rows per configuration and seed of the results, in words."""
     counted = results.known[results.known["configuration"].isin(list(names))]
     things = counted.groupby(["log", "object_id"]).ngroups
-    logs = counted["log"].nunique()
+    logs, episodes = counted["log"].nunique(), counted.groupby(["log", "object_id", "episode"]).ngroups
+    times = f" ({count_noun(episodes, 'episode')})" if episodes > things else ""
     in_logs = f" in {count_noun(logs, 'log')}" if logs > 1 else ""
     rows = counted["runs"].sum() / max(counted["configuration"].nunique(), 1)
     return (
-        f"{count_noun(results.experiment.runs, 'run')} of {count_noun(things, 'object')}{in_logs}, "
+        f"{count_noun(results.experiment.runs, 'run')} of {count_noun(things, 'object')}{times}{in_logs}, "
         f"n = {rows:.0f} per configuration, seed {results.experiment.seed}"
     )
 

@@ -181,12 +181,14 @@ def describe_setting(study: ReportData) -> str:
     """How it was measured: number of rows, seed, start of the clock, confirmation, errors of units."""
     results, experiment = study.results, study.results.experiment
     things = results.known.groupby(["log", "object_id"]).ngroups
+    episodes = results.known.groupby(["log", "object_id", "episode"]).ngroups
+    times = f" with {count_noun(episodes, 'episode')}" if episodes > things else ""
     rows = int(results.known["runs"].sum()) // len(study.names)
     confirm = experiment.measure.confirm
     hits = f" An object is known when {confirm.hits} of {confirm.of} captures hold it." if confirm.hits > 1 else ""
     return (
-        f"{count_noun(things, 'measured object')}, {count_noun(experiment.runs, 'run')}, so {count_noun(rows, 'row')} "
-        f"for each configuration; common random numbers per run (seed {experiment.seed}). "
+        f"{count_noun(things, 'measured object')}{times}, {count_noun(experiment.runs, 'run')}, so "
+        f"{count_noun(rows, 'row')} for each configuration; common random numbers per run (seed {experiment.seed}). "
         f"The clock of an object starts {_describe_onset(experiment)}.{hits}{describe_unit_errors(experiment)}"
     )
 

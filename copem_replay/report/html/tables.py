@@ -415,8 +415,8 @@ def format_power(log10: float) -> Html:
 
 
 def count_misses(known: pd.DataFrame) -> pd.DataFrame:
-    """Rows by log, object and configuration with `missed` > 0: runs without detection, of `runs`."""
-    keys = ["log", "object_id", "configuration"]
+    """Rows by log, episode and configuration with `missed` > 0: runs without detection, of `runs`."""
+    keys = ["log", "object_id", "episode", "configuration"]
     missed = known["runs"].where(known["time_to_detection_s"].isna(), 0)
     grouped = known.assign(missed=missed).groupby(keys, sort=False)
     counts = grouped.agg(
@@ -431,21 +431,22 @@ def count_misses(known: pd.DataFrame) -> pd.DataFrame:
 
 
 def _group_misses(missed: pd.DataFrame, order: Sequence[str]) -> list[tuple[pd.Series, tuple[str, ...]]]:
-    by_key: dict[tuple[str, str, int, int], tuple[pd.Series, list[str]]] = {}
+    by_key: dict[tuple[str, str, int, int, int], tuple[pd.Series, list[str]]] = {}
     for _, row in missed.iterrows():
-        key = (str(row["log"]), str(row["object_id"]), int(row["missed"]), int(row["runs"]))
+        key = (str(row["log"]), str(row["object_id"]), int(row["episode"]), int(row["missed"]), int(row["runs"]))
         by_key.setdefault(key, (row, []))[1].append(str(row["configuration"]))
-    ranked = sorted(by_key, key=lambda key: (-key[2] / key[3], -len(by_key[key][1]), key))
+    ranked = sorted(by_key, key=lambda key: (-key[3] / key[4], -len(by_key[key][1]), key))
     return [(by_key[key][0], tuple(name for name in order if name in by_key[key][1])) for key in ranked]
 
 
 def _missed_row(study: ReportData, row: pd.Series, names: list[str]) -> Html:
     by_all = len(names) == len(study.names) > 1
     by = f"all {len(names)} configurations" if by_all else ", ".join(names)
+    again = f", episode {row['episode']}" if row["episode"] else ""
     return make_tag(
         "tr",
         make_tag("th", str(row["log"]), scope="row"),
-        make_tag("td", str(row["object_id"]), class_="text"),
+        make_tag("td", f"{row['object_id']}{again}", class_="text"),
         make_tag("td", str(row["object_class"]), class_="text"),
         make_tag("td", f"{count_noun(int(row['runs']), 'run') if row['missed'] == row['runs'] else row['missed']}"
             + (" (all)" if row["missed"] == row["runs"] else f" of {count_noun(int(row['runs']), 'run')}"),

@@ -521,7 +521,7 @@ def _check_same_episodes(
         found, expected = getattr(first, what), getattr(second, what)
         other = np.flatnonzero(both & (np.abs(found - expected) > SAME_INSTANT_S))
         if len(other):
-            name = grid.objects[other[0] // grid.runs]
+            name = grid.episodes[other[0] // grid.runs][0]
             raise InputError(
                 f"{one.results.folder}: log {log}: object {name}: expected {what} {expected[other[0]]:g} as in "
                 f"{against.results.folder}, found {found[other[0]]:g}: not the same ego, recording or units"

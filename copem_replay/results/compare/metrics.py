@@ -309,7 +309,7 @@ class _Pair:
 
     def items(self, cells: Int, **columns: NDArray[Any]) -> StatisticItems:
         """An item for each of `cells`; −1 − r stands for run r and no object."""
-        objects = np.where(cells < 0, -1, cells // self.grid.runs + self.grid.before)
+        objects = np.where(cells < 0, -1, self.grid.object_of(cells) + self.grid.before)
         runs = np.where(cells < 0, -1 - cells, cells % self.grid.runs)
         numbers = {"logs": np.full(len(cells), self.grid.log_ix), "objects": objects, "runs": runs}
         n = {"n": np.ones(len(cells), dtype=np.int64)}
@@ -327,7 +327,7 @@ def compute_regrets(
     for names, compute in _METRICS.items():
         there = first.there & second.there if compute in _OF_ALL else first.counted & second.counted
         pair = _Pair(first, second, grid, np.flatnonzero(there), setting)
-        objects = (len(np.unique(pair.cells // grid.runs)),)
+        objects = (len(np.unique(grid.object_of(pair.cells))),)
         if only is None or not set(names).isdisjoint(only):
             regrets = (regret for regret in compute(pair) if only is None or regret.metric in only)
             yield from (replace(regret, objects=objects) for regret in regrets)

@@ -1,15 +1,16 @@
-"""Pairing of results, log by log: a grid with a cell for every measured object and run, common to all sides.
+"""Pairing of results, log by log: a grid with a cell for every episode and run, common to all sides.
 
-Rows of two configurations about the same object in the same run are in the same cell. What both hold is paired frame by
-frame of the truth (`metrics/accuracy/held.py`), from the first frame at which both have issued a list.
+Rows of two configurations about the same episode of an object in the same run are in the same cell. What both hold is
+paired frame by frame of the truth (`metrics/accuracy/held.py`), from the first frame at which both have issued a list.
 
-Letters of the shapes: N measured objects of the log, S runs, G frames; N·S cells, object by object.
+Letters of the shapes: N episodes of the log, S runs, G frames; N·S cells, episode by episode.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -29,15 +30,26 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PairingGrid:
-    """The objects measured in a log, and the runs that all folders have.
+    """The episodes of a log, and the runs that all folders have.
 
     `log_ix`: number of the log; `before`: number of objects in the logs before it.
     """
 
     log_ix: int
-    objects: tuple[str, ...]  # N
+    episodes: tuple[tuple[str, int], ...]  # N: object, and number of the episode
     runs: int  # S
     before: int = 0
+
+    @cached_property
+    def objects(self) -> tuple[str, ...]:
+        """The measured objects, each once."""
+        return tuple(dict.fromkeys(name for name, _ in self.episodes))
+
+    def object_of(self, cells: Int) -> Int:
+        """(C,) the object of each cell, as a position in `objects`; −1 of a negative one."""
+        number = {name: k for k, name in enumerate(self.objects)}
+        object_ix = np.array([*(number[name] for name, _ in self.episodes), -1], dtype=np.int64)
+        return object_ix[np.where(cells < 0, -1, cells // self.runs)]
 
     def cells(self, table: pa.Table) -> Int:
         """(n,) the cell of each row of a table, −1: a run that is not compared, or an object that is not measured."""
@@ -47,8 +59,13 @@ class PairingGrid:
         object_ix = integer_column(
             pc.index_in(table["object_id"], value_set=pa.array(self.objects, pa.string())), missing=-1
         )
-        run = self.runs_of(table)
-        return np.where((object_ix >= 0) & (run >= 0), object_ix * self.runs + run, -1)
+        number, run = integer_column(table["episode"], missing=-1), self.runs_of(table)
+        most = max((n for _, n in self.episodes), default=0) + 1
+        place_of = np.full((len(self.objects) + 1, most + 1), -1)
+        for k, (name, n) in enumerate(self.episodes):
+            place_of[self.objects.index(name), n] = k
+        place = place_of[object_ix, np.where((number >= 0) & (number < most), number, most)]
+        return np.where((place >= 0) & (run >= 0), place * self.runs + run, -1)
 
     def runs_of(self, table: pa.Table) -> Int:
         """(n,) the run of each row, −1: one that is not compared."""
@@ -58,10 +75,13 @@ class PairingGrid:
 
 def build_grid(log_ix: int, tables: Iterable[pa.Table], runs: int, before: int) -> PairingGrid:
     """The grid of a log, from its rows of `detections.parquet` in several folders."""
-    objects: dict[str, None] = {}
+    episodes: dict[tuple[str, int], None] = {}
     for table in tables:
-        objects |= dict.fromkeys(table["object_id"].unique().to_pylist())
-    return PairingGrid(log_ix, tuple(objects), runs, before)
+        pairs = (
+            table.select(["object_id", "episode"]).group_by(["object_id", "episode"], use_threads=False).aggregate([])
+        )
+        episodes |= dict.fromkeys(zip(pairs["object_id"].to_pylist(), pairs["episode"].to_pylist(), strict=True))
+    return PairingGrid(log_ix, tuple(episodes), runs, before)
 
 
 def integer_column(column: pa.ChunkedArray, *, missing: int = 0) -> Int:
@@ -187,7 +207,7 @@ def lay_out_configuration(
         if (np.isnan(float_column(rows[name])) & needed).any():
             raise InputError(f"{place}: column {name}: expected a number in every row, found none in some; {AGAIN}")
     braking = results.provenance.braking is not None
-    size = len(grid.objects) * grid.runs
+    size = len(grid.episodes) * grid.runs
     return ConfigurationData(
         label=one.label,
         path=results.folder,
@@ -238,7 +258,7 @@ def _accuracy_data(folder: Path, tables: dict[str, pa.Table], cell: Int, grid: P
     if any(not np.array_equal(length, of) for of, _ in columns.values()):
         raise InputError(f"{place}: expected {', '.join(HELD)} of equal length, found others; {AGAIN}")
     frame_s, begins, holds, of_run = _read_frames(folder / "instants.parquet", tables["instants.parquet"], grid)
-    first, size = integer_column(rows["first_frame"]), len(grid.objects) * grid.runs
+    first, size = integer_column(rows["first_frame"]), len(grid.episodes) * grid.runs
     kept = cell >= 0
     if (first[kept] < 0).any() or ((first + length)[kept] > len(frame_s))[length[kept] > 0].any():
         raise InputError(f"{place}: expected frames of instants.parquet, found more; {AGAIN}")
