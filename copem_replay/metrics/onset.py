@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from copem_replay.core.components import Component, NotNegative, Positive, Share, ask_component, wrong_answer_error
-from copem_replay.core.tracks import Bool, Float, Int, Tracks
+from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int, Tracks
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -40,18 +40,25 @@ def began_texts(position: Int) -> np.ndarray:
     return np.array(BEGAN, dtype=object)[position]
 
 
-def is_counted(began: pd.Series, words: Sequence[str]) -> Bool:
-    """(n,) whether rows count for times, shares and distances at detection: they began in one of these ways.
+def has_frame_after(rows: pd.DataFrame) -> Bool:
+    """(n,) whether the object is followed beyond its onset: of an episode of one frame nothing can be told."""
+    after: Bool = (rows["ended_s"] - rows["onset_s"]).to_numpy(dtype=float) > SAME_INSTANT_S
+    return after
 
-    `began`: the column of the rows. `words`: `measure.began`. Everything else is measured of all rows.
+
+def is_counted(rows: pd.DataFrame, words: Sequence[str]) -> Bool:
+    """(n,) whether rows count for times, shares and distances at detection. Everything else is measured of all rows.
+
+    They began in one of the ways `words` (`measure.began`), and have a frame after the onset. `rows`: a table with the
+    columns `began`, `onset_s`, `ended_s`.
     """
-    counted: Bool = began.isin(words).to_numpy(dtype=bool)
+    counted: Bool = rows["began"].isin(words).to_numpy(dtype=bool) & has_frame_after(rows)
     return counted
 
 
 def select_counted(rows: pd.DataFrame, words: Sequence[str]) -> pd.DataFrame:
-    """The rows that count, of a table with the column `began`."""
-    counted = is_counted(rows["began"], words)
+    """The rows that count, of a table with the columns that `is_counted` reads."""
+    counted = is_counted(rows, words)
     return rows if counted.all() else rows[counted]
 
 
@@ -91,7 +98,7 @@ class OnsetView:
 class Onset(Component, ABC):
     """Base of onsets. The onset of an object is the first frame, with the ego in the log, at which `holds`.
 
-    `again_after_s`: who was out of the condition for longer has a new episode on coming back; None: the first alone counts.
+    `again_after_s`: who was out of the condition for longer has a new episode on coming back; None: only the first.
 
     >>> class Fast(cr.Onset):
     ...     def holds(self, view):

@@ -36,7 +36,7 @@ from copem_replay.metrics.metric import (
     own_metrics,
     own_sums,
 )
-from copem_replay.metrics.onset import BEGAN
+from copem_replay.metrics.onset import BEGAN, has_frame_after
 from copem_replay.metrics.summary_metrics import METRIC, METRICS, summarise_detections
 
 DETECTED = "detected"
@@ -235,6 +235,8 @@ def describe_began(tallied: pd.DataFrame, configuration: str, horizon_s: float |
         groups.append(f"{number} {word}" + ("" if mean_s is None else f" {format_cell(mean_s)} s"))
     line = f"objects by how they began, and their ttd_rmst_s in {configuration}: {', '.join(groups)}"
     line += f"; counted: {', '.join(words)}"
+    if short := rows[~has_frame_after(rows)].groupby([*EPISODE]).ngroups:
+        line += f"; left out, with no frame after the onset: {short}"
     if (rows["began"] == "appeared").any():
         line += "; on annotated drives `appeared` may be where annotation began"
     return line

@@ -206,13 +206,13 @@ def lay_out_configuration(
     for name, needed in (("onset_s", True), ("ended_s", True), ("detection_s", detected)):
         if (np.isnan(float_column(rows[name])) & needed).any():
             raise InputError(f"{place}: column {name}: expected a number in every row, found none in some; {AGAIN}")
-    braking = results.provenance.braking is not None
+    braking, began = results.provenance.braking is not None, rows.select(["began", "onset_s", "ended_s"]).to_pandas()
     size = len(grid.episodes) * grid.runs
     return ConfigurationData(
         label=one.label,
         path=results.folder,
         there=_lay_out(np.ones(len(cell), dtype=bool), cell, size),
-        counted=_lay_out(is_counted(rows["began"].to_pandas(), results.provenance.measure["began"]), cell, size),
+        counted=_lay_out(is_counted(began, results.provenance.measure["began"]), cell, size),
         detected=_lay_out(detected, cell, size),
         left=_lay_out(_is_left(rows), cell, size),
         onset_s=_lay_out(float_column(rows["onset_s"]), cell, size),
