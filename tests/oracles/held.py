@@ -17,19 +17,6 @@ Key = tuple[int, int, int]
 """Run, episode and frame."""
 
 
-def thinned(frame_s: Sequence[float]) -> list[float]:
-    """Frames a tenth of a second apart on average: each is the first no earlier than 0.01 s before its turn."""
-    kept: list[float] = []
-    turn_s = -np.inf
-    for time_s in frame_s:
-        if time_s < turn_s - 0.01:
-            continue
-        kept.append(time_s)
-        late = time_s >= turn_s + 0.1
-        turn_s = time_s + 0.1 if late else turn_s + 0.1
-    return kept
-
-
 def list_at(issue_s: Sequence[float], time_s: float, max_age_s: float) -> int | None:
     """The newest list that is available then, none where it has been for too long."""
     there = [k for k, since_s in enumerate(issue_s) if since_s <= time_s + SAME_S]

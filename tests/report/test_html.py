@@ -155,8 +155,8 @@ class TestNumbers:
         ]  # fmt: skip
         assert read.rows["regret"][0][1:3] == ["mean time to detection, s", "detected, percentage points"]
         assert read.rows["regret-lists"][0][1:] == [
-            "position error (RMSE), m",
-            "GOSPA, m",
+            "error of what is held (RMSE), m",
+            "GOSPA of what is held, m",
             "false positives per minute",
         ]
 
@@ -173,6 +173,17 @@ class TestNumbers:
                         assert found is None or float(found) == pytest.approx(wanted, rel=1e-8, abs=1e-12)
                     seen += 1
         assert seen == len(rows)
+
+    def test_what_errors_are_over_stands_beside_them(self, read: Page, made: Path) -> None:
+        rows = compare_folders([made], baseline="late").overall
+        rows = rows[rows["metric"] == "position_rmse_held_m"].set_index("configuration")
+        head, *lines = read.rows["regret-held"]
+        assert head == ["configuration", "pairs", "frames", "listed by one only", "mean age, s", "no list", "no truth"]
+        assert [line[0] for line in lines] == ["GT", "half", "hit", "never"]
+        for name, pairs, frames, only, *_ in lines:
+            row = rows.loc[name]
+            assert (pairs, frames) == (str(row["n"]), str(row["frames"]))
+            assert only == f"{row['only_configuration']} / {row['only_baseline']}"
 
     def test_differences_whose_interval_excludes_0_are_bold(self, read: Page, html: str) -> None:
         for id_ in ("regret", "regret-lists"):

@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 import pytest
+from pyarrow import parquet
 
 from copem_replay.results.compare import Comparison, compare_folders
 from copem_replay.results.compare import pairing as lists_module
@@ -104,6 +106,19 @@ def test_entries_without_a_true_object_are_counted(tmp_path):
     lists = [ghosts("ideal", 0), ghosts("late", 0, without_truth=7)]
     error = of(compared(tmp_path, rows, lists=lists), "position_rmse_held_m")
     assert (error["without_truth"], error["baseline_without_truth"]) == (7, 0)
+
+
+def test_a_log_that_lacks_a_configuration_adds_nothing(tmp_path):
+    rows = [seen("ideal", [1] * 4, [1.0] * 4, log=log) for log in ("a", "b")]
+    rows.append(seen("late", [2] * 4, [1.0] * 4, log="a"))
+    folder = write_folder(tmp_path / "study", rows)
+    table = parquet.read_table(folder / "instants.parquet").to_pandas()
+    kept = table[(table["log"] == "a") | (table["configuration"] == "ideal")]
+    parquet.write_table(pa.Table.from_pandas(kept, preserve_index=False), folder / "instants.parquet")
+    comparison = compare_folders([folder])
+    error = of(comparison, "position_rmse_held_m")
+    assert (error["n"], error["frames"], error["value"]) == (4, 4, 2.0)
+    assert "log b: late: no frame at which an object is measured and both sides have issued a list" in comparison.notes
 
 
 def test_counts_of_several_logs_add_up(tmp_path):

@@ -86,12 +86,15 @@ def make_held_frames(
 
 
 def thin_frames(frame_s: Float) -> Float:
-    """The frames (F,) of a truth thinned to ten a second (G,): the first, then the next when another is due."""
-    kept, due_s = [], -np.inf
+    """The frames (F,) of a truth thinned to ten a second (G,): the first, then the next when another is due.
+
+    A frame that is late by up to half of the time between two does not put off the next.
+    """
+    kept, due_s = [], float(frame_s[0]) if len(frame_s) else 0.0
     for time_s in frame_s.tolist():
         if time_s >= due_s - _EARLY_S:
             kept.append(time_s)
-            due_s = (due_s if time_s - due_s < EVERY_S else time_s) + EVERY_S
+            due_s = max(due_s, time_s - EVERY_S / 2) + EVERY_S
     return np.array(kept, dtype=np.float64)
 
 

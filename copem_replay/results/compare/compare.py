@@ -536,10 +536,10 @@ def _check_same_frames(
     log: str,
 ) -> None:
     """Raise InputError where what is held is told at other frames, so that its values are no pairs."""
-    if first.accuracy is None or second.accuracy is None:
+    both = first.there & second.there
+    if first.accuracy is None or second.accuracy is None or not both.any():
         return
     found, expected = first.accuracy, second.accuracy
-    both = first.there & second.there
     same = len(found.frame_s) == len(expected.frame_s)
     same = same and bool((np.abs(found.frame_s - expected.frame_s) <= SAME_INSTANT_S).all())
     for name in ("first", "length"):

@@ -367,7 +367,9 @@ def pair_held_lists(first: AccuracyData, second: AccuracyData, grid: PairingGrid
             age_s[side] += sides[side].age_s[places[side][both]].sum()
             only[side] += (listed[side] & ~both).sum()
         counted[cells[row[counts]] % grid.runs, frame[counts]] = True
-    without = np.array([int((counted & ~side.holds[side.of_run]).sum()) for side in sides])
+    without = np.zeros(2, dtype=np.int64)
+    if counted.any():  # a side that is not in the log has no frames
+        without[:] = [(counted & ~side.holds[side.of_run]).sum() for side in sides]
     return PairedHeldSums(pairs, squared_m2, age_s, only, measured, gospa, counted.sum(axis=1), without)
 
 
