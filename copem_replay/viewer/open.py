@@ -37,6 +37,8 @@ HOST = "127.0.0.1"
 READY_S, AGAIN_S = 60.0, 0.2
 """Time for a viewer to load a recording, and the interval of asking it: after that it opens at its beginning."""
 _PATTERNS = ("replay.rrd", "replay.*.rrd", "replay/**/*.rrd", "replay_*.rrd", "replay_*/**/*.rrd")
+_OWN_HOSTS = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?", re.IGNORECASE)
+"""What browsers call this server, of any port, as it may be forwarded. Other names that lead here are of others."""
 _FURTHER_FILE = re.compile(r"\.configurations_\d+(-\d+)?$")
 
 
@@ -363,6 +365,10 @@ class _Handler(BaseHTTPRequestHandler):
         """Print no requests: the terminal shows only the address."""
 
     def _answer(self, *, body: bool) -> None:
+        hosts = self.headers.get_all("Host", [])
+        if len(hosts) != 1 or not _OWN_HOSTS.fullmatch(hosts[0].strip()):
+            self.send_error(421)
+            return
         name = unquote(urlsplit(self.path).path).strip("/") or PAGE
         site = self.server.site
         if name in site.assets:

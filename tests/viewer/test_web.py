@@ -12,7 +12,7 @@ import threading
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
-from http.client import HTTPMessage
+from http.client import HTTPConnection, HTTPMessage
 from pathlib import Path
 
 import psutil
@@ -48,6 +48,21 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def got(url: str) -> tuple[bytes, HTTPMessage]:
     with urllib.request.build_opener(urllib.request.ProxyHandler({})).open(url, timeout=60) as answer:
         return answer.read(), answer.headers
+
+
+def asked(server: Server, hosts: list[str], path: str) -> tuple[int, bytes]:
+    """Status and content of an answer to a request with these `Host` lines; `{port}` is the server's."""
+    port = server.socket.getsockname()[1]
+    connection = HTTPConnection("127.0.0.1", port, timeout=60)
+    connection.putrequest("GET", path, skip_host=True)
+    for host in hosts:
+        connection.putheader("Host", host.format(port=port))
+    connection.endheaders()
+    answer = connection.getresponse()
+    try:
+        return answer.status, answer.read()
+    finally:
+        connection.close()
 
 
 class TestOpening:
@@ -129,6 +144,25 @@ class TestServer:
             got(server.url + name)
         assert refused.value.code == 404
         refused.value.close()
+
+    @pytest.mark.parametrize("name", ["", "a%20b.rrd", "re_viewer.js"])
+    @pytest.mark.parametrize(
+        "hosts",
+        [["evil.example"], ["evil.example:{port}"], ["127.0.0.1.evil.example"], ["localhost@evil.example"], [""], [],
+         ["0.0.0.0:{port}"], ["localhost:{port}", "evil.example"], ["localhost."]],
+    )  # fmt: skip
+    def test_under_another_name_nothing(self, server: Server, hosts: list[str], name: str) -> None:
+        """A page elsewhere whose name leads to 127.0.0.1 (DNS rebinding) reads no recording."""
+        status, body = asked(server, hosts, f"/{name}")
+        assert status == 421
+        assert b"recording" not in body
+        assert b"viewer" not in body
+
+    @pytest.mark.parametrize("host", ["127.0.0.1:{port}", "localhost:{port}", "LOCALHOST:9000", "localhost"])
+    def test_under_its_own_names_and_forwarded_to_any_port(self, server: Server, host: str) -> None:
+        status, body = asked(server, [host], "/a%20b.rrd")
+        assert status == 200
+        assert body == b"\x00recording" * 100_000
 
     def test_the_policy_names_no_other_place(self) -> None:
         assert "http" not in POLICY
