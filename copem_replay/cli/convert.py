@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from copem_replay.cli.terminal import tidy_outputs
 from copem_replay.core.errors import InputError, escape_unprintable
 
 app = typer.Typer(
@@ -130,6 +131,7 @@ def _convert_sources(format: str, source: Path, out: Path, overwrite: bool, /, *
 
     conversion = Conversion()
     outputs = plan_outputs(source, out, format=format, overwrite=overwrite)
+    tidy_outputs(outputs)
     for line in convert_all(outputs, conversion, format=format, options=options):
         print(escape_unprintable(line))
     for note in conversion.note_lines():

@@ -76,13 +76,18 @@ def main() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a terminal without “×” gets `\\xd7`
-    for number in (signal.SIGTERM, signal.SIGHUP):  # SystemExit, so that unfinished files are removed
-        if number == signal.SIGTERM or signal.getsignal(number) != signal.SIG_IGN:  # nohup ignores SIGHUP
-            signal.signal(number, lambda number, frame: sys.exit(128 + number))
+    exit_on_signals()
     code = _run_to_exit_code()
     if "numba" in sys.modules:  # something may have been compiled
         print_problems(f"note: {note}" for note in (cache_note(), recompiled_note()) if note is not None)
     sys.exit(code)
+
+
+def exit_on_signals() -> None:
+    """Have SIGTERM and, where the system has it, SIGHUP raise SystemExit, so that unfinished files are removed."""
+    for number in (signal.SIGTERM, getattr(signal, "SIGHUP", None)):
+        if number == signal.SIGTERM or (number and signal.getsignal(number) != signal.SIG_IGN):  # nohup ignores SIGHUP
+            signal.signal(number, lambda number, frame: sys.exit(128 + number))
 
 
 def _run_to_exit_code() -> int:

@@ -162,6 +162,7 @@ def layout(
     with atomic_file(path) as scratch:
         scratch.write_text(json.dumps(foxglove_layout, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
         add_to_made_list(results_folder, [path])
+    tidy_leftovers(path)
     print_line(f"layout in {path}")
     return 0
 

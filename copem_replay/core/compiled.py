@@ -122,13 +122,14 @@ def _own_folder() -> tuple[str, str]:
     import shutil
     import tempfile
 
-    folder = f"{tempfile.gettempdir()}/copem_replay-{os.geteuid()}"
+    user = os.geteuid() if hasattr(os, "geteuid") else 0  # Windows: a temporary folder per user, and all files of 0
+    folder = f"{tempfile.gettempdir()}/copem_replay-{user}"
     with suppress(FileExistsError):
         os.mkdir(folder, 0o700)
     status = os.lstat(folder)
-    if stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid() and not status.st_mode & 0o077:
+    if stat.S_ISDIR(status.st_mode) and status.st_uid == user and not status.st_mode & 0o077:
         return folder, ""
-    own = tempfile.mkdtemp(prefix=f"copem_replay-{os.geteuid()}-")
+    own = tempfile.mkdtemp(prefix=f"copem_replay-{user}-")
     atexit.register(shutil.rmtree, own, ignore_errors=True)
     return own, f" for this process alone ({folder} is not a folder of this user alone)"
 

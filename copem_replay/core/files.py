@@ -8,7 +8,6 @@ docs/develop/decisions/0020-results-folder.md.
 from __future__ import annotations
 
 import errno
-import fcntl
 import filecmp
 import hashlib
 import json
@@ -23,10 +22,24 @@ from pathlib import Path
 
 from copem_replay.core.errors import OutputError
 
+try:
+    import fcntl
+except ImportError:  # not on Windows
+    fcntl = None  # type: ignore[assignment]
+
+IS_WINDOWS = os.name == "nt"
+"""Where open files cannot be removed, and folders cannot be flushed."""
+NO_LINK = sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC", "O_BINARY"))
+"""Flags to open a file as it is: no link is followed, no pipe waited for; those that the system has."""
+_LOCKED_BYTE = 1 << 30
+"""The byte of a file that is locked on Windows: far behind its content, which others could not read otherwise."""
+
 MANIFEST = "files.json"
 """In a scratch folder: its list, and its lock."""
 OLD = "old"
 """In a scratch folder: what was under the final name, where folders cannot be exchanged in one step."""
+_NEW = "new"
+"""In a scratch folder of several files: the folder that is exchanged."""
 _RANDOM = r"\.[a-z0-9_]{8}\.tmp"
 _TEMPORARY = re.compile(r"\..+" + _RANDOM, re.DOTALL)
 _LONGEST = 200
@@ -55,34 +68,156 @@ def atomic_file(path: Path) -> Iterator[Path]:
 def atomic_files(folder: Path, names: Sequence[str], *, way_out: str = "") -> Iterator[Path]:
     """A folder to write files of these names in. They replace those in `folder` when all went well, and none before.
 
-    A name that is not written in the end goes from `folder`, too. Missing folders are made. `way_out`: the end of the
-    message where nothing can be written. Raises OutputError.
+    The folder is exchanged with the new one in one step, its other files linked into it. Where it cannot be (it has
+    folders in it, belongs to another user, is a mount point or a process's working folder, or cannot have links), its
+    files are replaced one by one. A name that is not written in the end goes from `folder`, too. Missing folders are
+    made. `way_out`: the end of the message where nothing can be written. Raises OutputError.
     """
     try:
         if folder.exists() and not folder.is_dir():
             raise OutputError(f"{folder}: cannot be written: expected a folder, found a file{way_out}")
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with make_scratch_folder(folder, folder if folder.is_dir() else folder.parent) as scratch:
-            scratch.will_hold(names)
-            yield scratch.path
-            flush_all(scratch.path)
-            folder.mkdir(exist_ok=True)
-            for name in names:
-                if (scratch.path / name).exists():
-                    os.replace(scratch.path / name, folder / name)
-                else:
-                    (folder / name).unlink(missing_ok=True)
+        place = Path(os.path.realpath(folder))  # what a link leads to is replaced, not the link
+        place.parent.mkdir(parents=True, exist_ok=True)
+        beside = not place.exists() or os.access(place.parent, os.W_OK | os.X_OK)
+        with make_scratch_folder(place, place.parent if beside else place) as scratch:
+            scratch.will_hold(f"{_NEW}/{name}" for name in names)
+            new = scratch.path / _NEW
+            new.mkdir()
+            yield new
+            flush_all(new)
+            if not (beside and _replace_folder(scratch, place, names)):
+                _replace_each(new, place, names)
     except OSError as error:
         raise OutputError(f"{folder}: cannot be written: {error.strerror or error}{way_out}") from error
 
 
+def _replace_folder(scratch: ScratchFolder, folder: Path, names: Sequence[str]) -> bool:
+    """Put the new folder in the place of `folder`, with its files of other names; False where it cannot be."""
+    new, old = scratch.path / _NEW, scratch.path / OLD
+    if not folder.exists():
+        os.rename(new, folder)
+        flush_file(folder.parent)
+        return True
+    others = {entry.name for entry in os.scandir(folder)}.difference(names)
+    same = {f"{at}/{name}": f"{folder.name}/{name}" for at in (_NEW, OLD) for name in others}
+    scratch.will_hold([f"{at}/{name}" for at in (_NEW, OLD) for name in names], same)
+    try:
+        state, here = folder.stat(), Path.cwd()
+        if os.path.ismount(folder) or folder in (here, *here.parents) or state.st_uid != new.stat().st_uid:
+            return False
+        for name in others:
+            os.link(folder / name, new / name, follow_symlinks=False)
+        new.chmod(stat.S_IMODE(state.st_mode))
+    except OSError:  # a folder among them, or a file system without links
+        return False
+    flush_file(new)
+    if exchange_folders(new, folder):
+        old = new
+    else:
+        exchange_in_two_steps(new, folder, old)
+    flush_file(folder.parent)
+    for late in [entry for entry in os.scandir(old) if entry.name not in others.union(names)]:
+        with suppress(OSError):
+            os.rename(late.path, folder / late.name)
+    return True
+
+
+def _replace_each(new: Path, folder: Path, names: Sequence[str]) -> None:
+    folder.mkdir(exist_ok=True)
+    for name in names:
+        if (new / name).exists():
+            os.replace(new / name, folder / name)
+        else:
+            (folder / name).unlink(missing_ok=True)
+
+
+# The exchange of two names in one step, where the system has it (Linux, most of its file systems).
+
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # fcntl.h, linux/fs.h
+_CANNOT = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EPERM)
+"""Errors of an old kernel, of a file system without the exchange, and of containers that refuse unknown calls."""
+
+
+def exchange_folders(first: Path, second: Path) -> bool:
+    """Exchange two names of one file system by renameat2(2); neither is missing at any instant. Raises OSError.
+
+    False: the system has no such exchange.
+    """
+    import ctypes
+
+    function = None if IS_WINDOWS else getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    if function is None:
+        return False
+    if function(_AT_FDCWD, os.fsencode(first), _AT_FDCWD, os.fsencode(second), ctypes.c_uint(_RENAME_EXCHANGE)) == 0:
+        return True
+    code = ctypes.get_errno()
+    if code in _CANNOT:
+        return False
+    raise OSError(code, os.strerror(code), str(second))
+
+
+def exchange_in_two_steps(new: Path, name: Path, old: Path) -> None:
+    """Move the folder `name` to `old` and `new` to `name`. A process killed between: `remove_leftovers` repairs it."""
+    os.rename(name, old)
+    try:
+        os.rename(new, name)
+    except BaseException:
+        with suppress(OSError):
+            os.rename(old, name)
+        raise
+
+
 def try_lock(fd: int) -> bool | None:
-    """Whether the lock of an open file is now this process's. None: the file system has no locks."""
+    """Whether the lock of an open file is now this process's. None: the system, or the file system, has no locks."""
+    if fcntl is None:
+        return _try_lock_byte(fd)
     try:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:  # EACCES is how SMB says that it is held
         return False if error.errno in (errno.EWOULDBLOCK, errno.EACCES) else None
     return True
+
+
+def _try_lock_byte(fd: int) -> bool | None:
+    """`try_lock` on Windows."""
+    try:
+        import msvcrt
+    except ImportError:
+        return None
+    os.lseek(fd, _LOCKED_BYTE, os.SEEK_SET)
+    try:
+        msvcrt.locking(fd, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined, unused-ignore]
+    except OSError as error:
+        return False if error.errno in (errno.EACCES, errno.EDEADLOCK) else None
+    return True
+
+
+def overwrite_file(fd: int, content: bytes) -> None:
+    """Make this the content of an open file. Raises OSError."""
+    os.lseek(fd, 0, os.SEEK_SET)
+    os.write(fd, content)
+    os.ftruncate(fd, len(content))
+
+
+_REFUSED = re.compile(r'[<>:"\\|?*%\x00-\x1f]|[. ]$')
+_DEVICES = re.compile(r"(con|prn|aux|nul|(com|lpt)[0-9¹²³])(\..*)?", re.IGNORECASE | re.DOTALL)
+
+
+def portable_name(name: str) -> str:
+    """The path of a file called by any name, as every system takes it: `a:b` is `a%3Ab`, and `aux` is `%61ux`.
+
+    Characters, ends and names of devices that Windows refuses are written as in URLs; `/` divides folders.
+    """
+    return "/".join(avoid_device_name(_REFUSED.sub(_encode, part)) for part in name.split("/"))
+
+
+def avoid_device_name(name: str) -> str:
+    """The name of a file, its first character as in URLs where Windows takes the name for that of a device."""
+    return f"%{ord(name[0]):02X}{name[1:]}" if _DEVICES.fullmatch(name) else name
+
+
+def _encode(found: re.Match[str]) -> str:
+    return f"%{ord(found[0]):02X}"
 
 
 def hidden_name(name: str) -> str:
@@ -96,6 +231,13 @@ def hidden_name(name: str) -> str:
 def is_scratch(folder: Path) -> bool:
     """Whether a folder is a scratch folder, of this process, of another, or of one that was killed."""
     return _TEMPORARY.fullmatch(folder.name) is not None and os.path.lexists(folder / MANIFEST)
+
+
+def find_scratch_names(folder: Path) -> list[str]:
+    """Names of all scratch folders in a folder, in order; none where it cannot be read."""
+    with suppress(OSError):
+        return sorted(name for name in os.listdir(folder) if _TEMPORARY.fullmatch(name))
+    return []
 
 
 @dataclass(frozen=True)
@@ -119,9 +261,7 @@ class ScratchFolder:
         self.will_hold(known.union(files), known_same | dict(same or {}))
 
     def _write_list(self, content: object) -> None:
-        data = json.dumps(content).encode()
-        os.pwrite(self.fd, data, 0)
-        os.ftruncate(self.fd, len(data))
+        overwrite_file(self.fd, json.dumps(content).encode())
 
 
 @contextmanager
@@ -131,16 +271,19 @@ def make_scratch_folder(path: Path, place: Path | None = None) -> Iterator[Scrat
     try:
         yield scratch
     finally:
+        if IS_WINDOWS:
+            os.close(scratch.fd)
         with suppress(OSError):
             _remove_listed(scratch.path)
-        os.close(scratch.fd)
+        if not IS_WINDOWS:  # locked until all is gone
+            os.close(scratch.fd)
 
 
 def _create_scratch(place: Path, prefix: str) -> ScratchFolder:
     while True:
         path = Path(tempfile.mkdtemp(dir=place, prefix=f"{prefix}.", suffix=".tmp"))
         try:
-            fd = os.open(path / MANIFEST, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
+            fd = os.open(path / MANIFEST, os.O_RDWR | os.O_CREAT | os.O_EXCL | NO_LINK, 0o600)
         except FileNotFoundError:  # taken for a leftover before it had its lock
             continue
         if try_lock(fd) is not False and (path / MANIFEST).exists():
@@ -183,14 +326,18 @@ def _remove_leftover(left: Path, path: Path) -> list[str]:
 def _hold_lock(scratch: Path) -> Iterator[bool]:
     """Hold the lock of a scratch folder, if it is free. One that has none yet is free."""
     try:
-        fd = os.open(scratch / MANIFEST, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK)
+        fd = os.open(scratch / MANIFEST, os.O_RDWR | NO_LINK)
     except FileNotFoundError:
         yield True
         return
-    try:
-        yield try_lock(fd) is True
-    finally:
+    free = try_lock(fd) is True
+    if IS_WINDOWS:
         os.close(fd)
+    try:
+        yield free
+    finally:
+        if not IS_WINDOWS:
+            os.close(fd)
 
 
 def _remove_listed(scratch: Path) -> bool:
@@ -259,7 +406,9 @@ def flush_all(folder: Path) -> None:
 
 def flush_file(path: str | Path) -> None:
     """Flush a file, or the names in a folder, to the disk. Raises OSError."""
-    fd = os.open(path, os.O_RDONLY)
+    if IS_WINDOWS and os.path.isdir(path):
+        return
+    fd = os.open(path, os.O_RDWR if IS_WINDOWS else os.O_RDONLY)
     try:
         os.fsync(fd)
     except OSError as error:

@@ -6,7 +6,7 @@ Whether the rows of a replay fit in free memory is checked before the first run.
 from __future__ import annotations
 
 import re
-import resource
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
+import psutil
 from numba.core.event import Event, Listener, install_listener
 
 from copem_replay.core.errors import ExperimentError
@@ -22,6 +23,11 @@ from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.notes import measure_list_rates
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.replay import BlockOutcome
+
+try:
+    import resource
+except ImportError:  # not on Windows
+    resource = None  # type: ignore[assignment]
 
 # Time.
 
@@ -151,8 +157,10 @@ def free_bytes() -> int | None:
 
 
 def _free_machine_bytes() -> int | None:
-    sizes_kb = re.findall(r"^(?:MemAvailable|SwapFree):\s+(\d+) kB$", _read_text("/proc/meminfo"), re.MULTILINE)
-    return sum(map(int, sizes_kb)) * 1024 if sizes_kb else None
+    try:
+        return int(psutil.virtual_memory().available + psutil.swap_memory().free)
+    except OSError:  # nothing says so: a container without /proc
+        return None
 
 
 def _free_group_bytes() -> int | None:
@@ -164,9 +172,19 @@ def _free_group_bytes() -> int | None:
 
 
 def _free_process_bytes() -> int | None:
+    if resource is None:
+        return None
     most, _ = resource.getrlimit(resource.RLIMIT_AS)
-    used = re.search(r"^VmSize:\s+(\d+) kB$", _read_text("/proc/self/status"), re.MULTILINE)
-    return None if most == resource.RLIM_INFINITY or used is None else max(most - int(used[1]) * 1024, 0)
+    return None if most == resource.RLIM_INFINITY else max(most - int(psutil.Process().memory_info().vms), 0)
+
+
+def peak_bytes() -> int | None:
+    """The most memory that this process had at a time; None: the system does not say."""
+    if resource is None:
+        peak_wset: int | None = getattr(psutil.Process().memory_info(), "peak_wset", None)  # Windows
+        return peak_wset
+    peak: int = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024  # KiB but on macOS
 
 
 def _read_text(path: str) -> str:

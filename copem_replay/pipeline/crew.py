@@ -215,7 +215,7 @@ class Crew:
         self._pieces, self._tell = pieces, tell
         self._progress = CrewProgress("", 0, 0)
         self._lost: dict[str, WorkerDiedError] = {}  # logs at which workers died, by their identities
-        self.peak_bytes = 0  # the most memory a worker has had
+        self.peak_bytes = 0  # the most memory a worker has had, 0 where no system says so
 
     def survey(
         self,
@@ -361,7 +361,7 @@ class Crew:
                 raise
             deaths, host = error.allowed_failures + 1, error.last_worker.address  # type: ignore[attr-defined]
             raise WorkerDiedError(deaths, host, alone=True) from None
-        self.peak_bytes = max(receipt.peak_bytes, self.peak_bytes)
+        self.peak_bytes = max(receipt.peak_bytes or 0, self.peak_bytes)
         if receipt.failure is not None:
             pieces = "".join(f", runs {work.runs}: {', '.join(work.keys)}" for work in task.work)
             raise TaskFailedError(f"{task.log.place}{pieces}: on worker {receipt.host}:\n{receipt.failure}")

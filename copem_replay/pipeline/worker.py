@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import os
 import platform
-import resource
 import time
 import traceback
 from collections.abc import Mapping
@@ -25,6 +24,7 @@ from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import RefusedLog, read_logs
 from copem_replay.io.open import Place
 from copem_replay.pipeline.closed_form import check_exact, exact_table
+from copem_replay.pipeline.cost import peak_bytes
 from copem_replay.pipeline.pieces import PieceCache, recipe_key, take_fingerprint, write_recipe
 from copem_replay.pipeline.replay import cut_blocks, replay_outcomes
 from copem_replay.pipeline.study_log import STATES_HELD, StudyLog, file_stamps
@@ -90,7 +90,7 @@ class Receipt:
 
     host: str
     seconds: float
-    peak_bytes: int  # the most memory the worker has had so far
+    peak_bytes: int | None  # the most memory the worker has had so far, where its system says so
     refused: tuple[RefusedLog, ...] = ()
     problems: tuple[str, ...] = ()
     key: tuple[str, ...] = ()
@@ -117,8 +117,7 @@ def do_task(task: Task) -> Receipt:
     began_s, host = time.perf_counter(), platform.node()
 
     def receipt(**said: object) -> Receipt:
-        peak_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        return Receipt(host, time.perf_counter() - began_s, peak_kib * 1024, **said)  # type: ignore[arg-type]
+        return Receipt(host, time.perf_counter() - began_s, peak_bytes(), **said)  # type: ignore[arg-type]
 
     try:
         if other := describe_mismatch(dict(task.log.fingerprint)):

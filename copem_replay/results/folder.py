@@ -21,13 +21,18 @@ from typing import Any
 
 from copem_replay.core.errors import CopemError, InputError, OutputError
 from copem_replay.core.files import (
+    IS_WINDOWS,
+    NO_LINK,
     OLD,
     ScratchFolder,
+    exchange_folders,
+    exchange_in_two_steps,
     flush_all,
     flush_file,
     hidden_name,
     is_scratch,
     make_scratch_folder,
+    overwrite_file,
     remove_leftovers,
     try_lock,
 )
@@ -104,7 +109,7 @@ def add_to_made_list(folder: Path, files: Iterable[Path]) -> None:
     cut_off = _read_made_list(folder)[-1:] not in (b"", b"\n")  # the last line, by a killed process
     text = "\n" * cut_off + "".join(f"{json.dumps(name)}\n" for name in new)
     try:
-        fd = os.open(folder / MADE, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
+        fd = os.open(folder / MADE, os.O_WRONLY | os.O_CREAT | os.O_APPEND | NO_LINK, 0o666)
         try:
             os.write(fd, text.encode())
             os.fsync(fd)
@@ -117,7 +122,7 @@ def add_to_made_list(folder: Path, files: Iterable[Path]) -> None:
 def _read_made_list(folder: Path) -> bytes:
     """The content of the list; empty where there is none, or something else in its place."""
     try:
-        fd = os.open(folder / MADE, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+        fd = os.open(folder / MADE, os.O_RDONLY | NO_LINK)
         with open(fd, "rb") as file:
             return file.read() if stat.S_ISREG(os.fstat(fd).st_mode) else b""
     except OSError:
@@ -202,8 +207,7 @@ def lock_folder(folder: Path) -> Iterator[None]:
     fd, locked = _try_lock(path, folder)
     if locked:
         with suppress(OSError):
-            os.pwrite(fd, (name := f"process {os.getpid()} on {platform.node()}\n").encode(), 0)
-            os.ftruncate(fd, len(name.encode()))
+            overwrite_file(fd, f"process {os.getpid()} on {platform.node()}\n".encode())
     try:
         yield
     finally:
@@ -211,7 +215,7 @@ def lock_folder(folder: Path) -> Iterator[None]:
             with suppress(OSError):
                 path.unlink()
         os.close(fd)
-        if not locked:
+        if not locked or IS_WINDOWS:
             with suppress(OSError):
                 path.unlink()
 
@@ -225,7 +229,8 @@ def _try_lock(path: Path, folder: Path) -> tuple[int, bool]:
             return fd, bool(locked)
         try:
             if locked is False:
-                name = os.pread(fd, 200, 0).decode(errors="replace").strip()
+                os.lseek(fd, 0, os.SEEK_SET)
+                name = os.read(fd, 200).decode(errors="replace").strip()
                 raise OutputError(
                     f"{folder}: another run ({name or 'just started'}) is writing its results there; wait until it has "
                     "ended, or choose another folder with --out"
@@ -236,11 +241,10 @@ def _try_lock(path: Path, folder: Path) -> tuple[int, bool]:
 
 
 def _open_lock(path: Path) -> int:
-    flags = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     try:
-        return os.open(path, os.O_RDWR | os.O_CREAT | flags, 0o666)
+        return os.open(path, os.O_RDWR | os.O_CREAT | NO_LINK, 0o666)
     except PermissionError:  # left by another user
-        return os.open(path, os.O_RDONLY | flags)
+        return os.open(path, os.O_RDONLY | NO_LINK)
 
 
 def _is_still(path: Path, fd: int) -> bool:
@@ -250,36 +254,13 @@ def _is_still(path: Path, fd: int) -> bool:
     return False
 
 
-# The exchange of two names in one step, where the system has it (Linux, most of its file systems).
-
-_AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # fcntl.h, linux/fs.h
-_CANNOT = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EPERM)
-"""Errors of an old kernel, of a file system without the exchange, and of containers that refuse unknown calls."""
-
-
-def exchange_folders(first: Path, second: Path) -> bool:
-    """Exchange two names of one file system by renameat2(2); neither is missing at any instant. Raises OSError.
-
-    False: the system has no such exchange.
-    """
-    import ctypes
-
-    function = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
-    if function is None:
-        return False
-    if function(_AT_FDCWD, os.fsencode(first), _AT_FDCWD, os.fsencode(second), ctypes.c_uint(_RENAME_EXCHANGE)) == 0:
-        return True
-    code = ctypes.get_errno()
-    if code in _CANNOT:
-        return False
-    raise OSError(code, os.strerror(code), str(second))
-
-
 # The place of the results of one run.
 
 EXPERIMENT = "experiment.yaml"
 _NEW, _SPARE = "results", "copy"
 _OTHERS = "something else came there during the run, and stays"
+_PATH_BYTES = 32_767
+"""Length of the longest path where the system does not say it: on Windows, where long paths are enabled."""
 _ROOM = 600
 """Bytes left for paths in a results folder and in scratch folders beside it: two names and a half of 255 bytes."""
 
@@ -374,7 +355,7 @@ class ResultsPlace:
             old = self.new
         else:
             old = self.scratch.path / OLD
-            _move_in(self.new, self.folder, old)
+            exchange_in_two_steps(self.new, self.folder, old)
         self._keep_late(old, held, kept)
         return None
 
@@ -440,17 +421,6 @@ def _try_rename(new: Path, name: Path) -> bool:
     return True
 
 
-def _move_in(new: Path, name: Path, old: Path) -> None:
-    """Put a folder in the place of another in two steps. The next run repairs a process killed between them."""
-    os.rename(name, old)
-    try:
-        os.rename(new, name)
-    except BaseException:
-        with suppress(OSError):
-            os.rename(old, name)
-        raise
-
-
 @contextmanager
 def take_place(folder: Path, *, overwrite: bool) -> Iterator[ResultsPlace]:
     """Lock the place of a results folder and remove leftovers of killed runs. Raises OutputError, nothing being
@@ -469,7 +439,7 @@ def take_place(folder: Path, *, overwrite: bool) -> Iterator[ResultsPlace]:
 
 def _take_place(folder: Path, overwrite: bool, stack: ExitStack) -> ResultsPlace:
     path = folder.resolve()
-    room = os.pathconf("/", "PC_PATH_MAX") - _ROOM
+    room = (os.pathconf("/", "PC_PATH_MAX") if hasattr(os, "pathconf") else _PATH_BYTES) - _ROOM
     if len(os.fsencode(path)) > room:
         raise OutputError(f"{folder}: cannot be written: its whole path has more than {room} bytes")
     for parent in (missing := [parent for parent in path.parents if not parent.exists()])[::-1]:

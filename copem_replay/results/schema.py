@@ -17,6 +17,7 @@ import pyarrow as pa
 from pyarrow import parquet
 
 from copem_replay.core.errors import InputError, RemoteFile
+from copem_replay.core.files import avoid_device_name
 from copem_replay.experiment.file import relocate_settings
 from copem_replay.experiment.schema import LogSettings
 from copem_replay.experiment.validate import resolve_place
@@ -32,7 +33,7 @@ MANY_ROWS = 10_000_000
 
 def table_file(table: Path, log: str) -> Path:
     """The file with the rows of a log, of a table that is a folder."""
-    return table / f"{quote(log, safe=' ')}.parquet"
+    return table / avoid_device_name(f"{quote(log, safe=' ')}.parquet")
 
 
 FORMAT = 3

@@ -21,6 +21,7 @@ import pandas as pd
 
 from copem_replay.core.colours import configuration_colours
 from copem_replay.core.errors import OutputError, RecordingError
+from copem_replay.core.files import portable_name
 from copem_replay.core.tracks import CLASSES, Scene, Tracks
 from copem_replay.core.yaml import dump_yaml
 from copem_replay.experiment.drive import resolve_for_log
@@ -205,12 +206,12 @@ def _table_files(name: str, counts: Mapping[str, int]) -> list[str]:
     """The file of a table, or one per log where it has many rows. `counts`: rows by log."""
     if sum(counts.values()) <= MANY_ROWS:
         return [name]
-    return [str(table_file(Path(name), log)) for log, count in counts.items() if count]
+    return [table_file(Path(name), log).as_posix() for log, count in counts.items() if count]
 
 
 def _run_stem(shown: ShownRun, log: str, recordings: Sequence[Recording]) -> str:
     """The name of a shown run's files, relative to the folder, without suffix."""
-    return shown.stem if len(recordings) == 1 else f"{shown.stem}/{log}"
+    return shown.stem if len(recordings) == 1 else f"{shown.stem}/{portable_name(log)}"
 
 
 def _write_files(

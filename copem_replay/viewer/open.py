@@ -27,6 +27,7 @@ from urllib.parse import quote, unquote, urlsplit
 import pandas as pd
 
 from copem_replay.core.errors import CopemError, OutputError
+from copem_replay.core.files import portable_name
 from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.results.read import Results, open_results
 from copem_replay.viewer.sink import ELAPSED, SHOWN_OBJECTS, choose_telling_objects
@@ -83,7 +84,7 @@ def _map_runs(results: Results) -> dict[str, tuple[str, int]]:
     shown = results.provenance.data["runs_shown"]
     several = len(shown) > 1
     return {
-        (f"{shown_run['file']}/{log}" if several else shown_run["file"]): (log, int(shown_run["run"]))
+        (f"{shown_run['file']}/{portable_name(log)}" if several else shown_run["file"]): (log, int(shown_run["run"]))
         for log, runs in shown.items()
         for shown_run in runs
     }

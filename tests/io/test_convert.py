@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import subprocess
@@ -44,6 +45,25 @@ def test_it_runs_as_a_command(tmp_path: Path) -> None:
     assert done.stdout.startswith(f"{tmp_path / 'a.mcap'}: 1 frame, 1 car\nnote: 1 row without height_m")
     shown = subprocess.run([*command, "info", tmp_path / "a.mcap"], capture_output=True, text=True, check=True)
     assert "moving: 1 car" in shown.stdout
+
+
+def test_what_a_killed_conversion_left_goes_with_the_next(tmp_path: Path) -> None:
+    """It ends where its file is whole and has no name yet; a conversion beside it leaves what is not its own."""
+    (tmp_path / "table.csv").write_text(f"{HEADER}\n{CAR}\n")
+    code = "import os\nfrom copem_replay.cli.main import main\nfrom copem_replay.core import files\n{}\nmain()\n"
+
+    def convert_to(name: str, before: str = "") -> subprocess.CompletedProcess[str]:
+        words = [sys.executable, "-c", code.format(before), "convert", "csv", "table.csv", "--out", name]
+        return subprocess.run(words, capture_output=True, text=True, cwd=tmp_path)
+
+    assert convert_to("a.mcap", "files.flush_file = lambda _: os._exit(9)").returncode == 9
+    (left,) = tmp_path.glob(".a.mcap.*.tmp")
+    assert convert_to("b.mcap").returncode == 0
+    assert left.exists()
+    done = convert_to("a.mcap")
+    assert done.returncode == 0
+    assert done.stderr == f"note: {left.name}: removed, left by a process that was killed\n"
+    assert sorted(os.listdir(tmp_path)) == ["a.mcap", "b.mcap", "table.csv"]
 
 
 def test_a_wrong_command_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:

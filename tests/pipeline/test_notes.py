@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import psutil
 import pytest
 
 from copem_replay.core.errors import ExperimentError
@@ -199,6 +201,10 @@ def test_notes_of_the_recording_are_among_them(tmp_path: Path) -> None:
     assert found == after(tmp_path, TEXT)[: len(found)]
 
 
+def raises_no_such_file() -> None:
+    raise FileNotFoundError("/proc/meminfo")
+
+
 def with_free(monkeypatch: pytest.MonkeyPatch, free: int | None) -> None:
     monkeypatch.setattr(memory, "free_bytes", lambda: free)
 
@@ -251,15 +257,17 @@ class TestMemory:
             run_experiment(experiment, recordings)
 
     def test_what_is_free(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        files: dict[str, Any] = {"/proc/meminfo": "MemTotal: 9 kB\nMemAvailable:   6 kB\nSwapFree:  1 kB\n"}
+        files: dict[str, Any] = {}
         monkeypatch.setattr(memory, "_read_text", lambda path: files.get(path, ""))
+        monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(total=9 * 1024, available=6 * 1024))
+        monkeypatch.setattr(psutil, "swap_memory", lambda: SimpleNamespace(total=9 * 1024, free=1024))
         assert memory.free_bytes() == 7 * 1024
         group = "/sys/fs/cgroup/memory."
         files |= {f"{group}max": "5000\n", f"{group}current": "4000\n", f"{group}stat": "anon 3500\nfile 400\n"}
         assert memory.free_bytes() == 1400
         files[f"{group}max"] = "max\n"
         assert memory.free_bytes() == 7 * 1024
-        files.clear()
+        monkeypatch.setattr(psutil, "virtual_memory", raises_no_such_file)
         assert memory.free_bytes() is None
 
 
@@ -363,3 +371,11 @@ def test_only_the_units_that_send_by_it_are_lost() -> None:
 )
 def test_a_class_that_is_named_like_its_group(classes: list[str] | None, said: list[str]) -> None:
     assert street(measure={"onset": {"kind": "appears"}, "objects": {"classes": classes}}) == said
+
+    def test_without_what_unix_says(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Elsewhere the peak is what the system says, if it does."""
+        monkeypatch.setattr(memory, "resource", None)
+        assert memory.free_bytes() is not None
+        for told, peak in ((SimpleNamespace(rss=5, peak_wset=7), 7), (SimpleNamespace(rss=5), None)):
+            monkeypatch.setattr(psutil, "Process", lambda told=told: SimpleNamespace(memory_info=lambda: told))
+            assert memory.peak_bytes() == peak
