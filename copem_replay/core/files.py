@@ -1,5 +1,7 @@
 """Files that are complete under their name, or not there: they are written in a scratch folder and then moved.
 
+What is read again of them is JSON, and may be damaged or a stranger's: `parse_json`.
+
 A scratch folder is `.NAME.xxxxxxxx.tmp` beside NAME, locked as long as its process lives, with a list of what is in it.
 When its process is killed it stays, its lock free; `remove_leftovers` then removes what its list names, and only that:
 docs/develop/decisions/0020-results-folder.md.
@@ -19,6 +21,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from copem_replay.core.errors import OutputError
 
@@ -44,6 +47,27 @@ _RANDOM = r"\.[a-z0-9_]{8}\.tmp"
 _TEMPORARY = re.compile(r"\..+" + _RANDOM, re.DOTALL)
 _LONGEST = 200
 """Bytes of the longest name that the names made of it keep whole: a name has 255 at most, and they are longer."""
+
+
+DEEPEST_JSON = 64
+"""Most values within values of what is read as JSON: what is written has ten."""
+
+
+def parse_json(text: bytes | str) -> Any:
+    """The value of a JSON text. Raises ValueError: no JSON, or nested deeper than anything that is written."""
+    try:
+        value = json.loads(text)
+    except RecursionError:
+        raise ValueError("values within values without end") from None
+    inner = [value]
+    for _ in range(DEEPEST_JSON):
+        inner = [
+            v for of in inner for v in (of.values() if isinstance(of, dict) else of if isinstance(of, list) else ())
+            if isinstance(v, dict | list)
+        ]  # fmt: skip
+        if not inner:
+            return value
+    raise ValueError(f"more than {DEEPEST_JSON} values within values")
 
 
 @contextmanager
@@ -378,7 +402,7 @@ def _remove_listed(scratch: Path) -> bool:
 def _read_scratch_list(scratch: Path) -> tuple[set[str], dict[str, str]]:
     """The names in the list of a scratch folder, `files` and `same`; empty where it cannot be read."""
     try:
-        data = json.loads((scratch / MANIFEST).read_bytes())
+        data = parse_json((scratch / MANIFEST).read_bytes())
         return set(data["files"]), dict(data["same"])
     except (OSError, ValueError, KeyError, TypeError):
         return set(), {}

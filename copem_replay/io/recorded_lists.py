@@ -11,8 +11,8 @@ captures and full covariances, and these are taken from there.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -20,6 +20,7 @@ import numpy as np
 from google.protobuf.message import DecodeError
 
 from copem_replay.core.errors import RecordingError
+from copem_replay.core.files import parse_json
 from copem_replay.core.interpolation import wrap_angles
 from copem_replay.core.tracks import CLASSES, UNCERTAINTIES, VALUES, Bool, Float, Int, Scene, Tracks
 from copem_replay.io.channel import LAST_NS, schema_name
@@ -159,8 +160,9 @@ def _read_messages(log: Log, topic: str) -> tuple[_EntryRows, dict[int, dict[str
     details: dict[int, dict[str, Any]] = {}
     for number, log_time_ns, payload in log.payloads(frozenset({*chosen, *beside})):
         if number in beside:
-            content = json.loads(payload)
-            details[content["available_ns"]] = {item["id"]: item for item in content["objects"]}
+            with suppress(ValueError, TypeError, KeyError):  # else not written by `copem-replay`
+                content = parse_json(payload)
+                details[content["available_ns"]] = {item["id"]: item for item in content["objects"]}
         else:
             try:
                 message = load_sensor_data_class().FromString(payload)
@@ -360,9 +362,9 @@ def _read_details(log: Log, topic: str) -> dict[int, dict[str, Any]]:
             continue
         for word in columns.levels[""].texts["data"].words:
             try:
-                content = json.loads(word)
+                content = parse_json(word)
                 details[int(content["available_ns"])] = {**content, "objects": list(content["objects"])}
-            except (ValueError, TypeError, KeyError, RecursionError):  # not written by `copem-replay`
+            except (ValueError, TypeError, KeyError):  # not written by `copem-replay`
                 continue
     return details
 

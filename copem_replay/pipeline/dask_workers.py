@@ -5,7 +5,6 @@ Dask unpickles what it is sent, on both sides: a scheduler has to be trusted lik
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import platform
@@ -20,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from copem_replay.core.errors import CopemError, InputError, is_url
+from copem_replay.core.files import parse_json
 from copem_replay.pipeline.crew import WorkerDiedError, Workers
 from copem_replay.pipeline.pieces import PieceCache, open_store, take_fingerprint
 from copem_replay.pipeline.worker import LogTask, Receipt, Task, describe_mismatch, do_task
@@ -272,7 +272,7 @@ def _read_address(file: Path, until_s: float) -> str:
     """The address in a scheduler file, once it is written. Raises TimeoutError."""
     while True:
         with suppress(OSError, ValueError, KeyError, TypeError):
-            return str(json.loads(file.read_bytes())["address"])
+            return str(parse_json(file.read_bytes())["address"])
         if time.monotonic() > until_s:
             raise TimeoutError("expected the file of `dask scheduler --scheduler-file`, found none")
         time.sleep(0.1)

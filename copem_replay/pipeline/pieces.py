@@ -44,6 +44,7 @@ from copem_replay.core.errors import (
     reraise_in_one_line,
     strip_credentials,
 )
+from copem_replay.core.files import parse_json
 from copem_replay.experiment.drive import RecordedLatency, cache_last_experiment
 from copem_replay.experiment.schema import Configuration, Experiment
 from copem_replay.metrics.accuracy.statistics import BAND, EXISTENCE, OBJECT, RUN, AccuracySettings, AccuracyTotal
@@ -390,7 +391,7 @@ class PieceCache:
     def known(self, about: str) -> dict[str, Any] | None:
         """The facts of a log, kept under `about`, all that they depend on; None: missing or damaged."""
         try:
-            facts: Any = json.loads(self.store.read(f"logs/{recipe_key(about)}.json") or b"")
+            facts: Any = parse_json(self.store.read(f"logs/{recipe_key(about)}.json") or b"")
             digest = facts.pop("digest")
         except (OSError, ValueError, KeyError, AttributeError):
             return None
@@ -456,7 +457,7 @@ def _read_piece(content: bytes, store: Store, recipe: str, log: str, configurati
     if sums_content is None or _compute_digest(sums_content) != metadata[b"sums"]:
         raise ValueError("other sums")
     sums = _unseal_table(sums_content)
-    nodes = [(count, _total_from_json(of)) for count, of in json.loads(sums.schema.metadata[b"sums"])]
+    nodes = [(count, _total_from_json(of)) for count, of in parse_json(sums.schema.metadata[b"sums"])]
     beside = table.select([name for name in table.column_names if name.startswith(_BESIDE)])
     beside = beside.rename_columns([name.removeprefix(_BESIDE) for name in beside.column_names])
     runs = _piece_columns(sums.replace_schema_metadata(None), log, configuration).cast(RUNS)

@@ -33,6 +33,7 @@ from copem_replay.core.files import (
     is_scratch,
     make_scratch_folder,
     overwrite_file,
+    parse_json,
     remove_leftovers,
     try_lock,
 )
@@ -68,7 +69,7 @@ class FolderFiles:
 def list_belongings(folder: Path) -> FolderFiles | None:
     """The files of a results folder; None: it is not one. Raises OSError, OutputError for a mount point in it."""
     try:
-        provenance: Any = json.loads((folder / MARK).read_bytes())
+        provenance: Any = parse_json((folder / MARK).read_bytes())
     except (OSError, ValueError):
         return None
     if not isinstance(provenance, dict) or "copem_replay" not in provenance:
@@ -86,8 +87,8 @@ def read_made_names(folder: Path) -> frozenset[str]:
     names = {MADE}
     for line in _read_made_list(folder).splitlines():
         try:
-            name = json.loads(line)
-        except (ValueError, RecursionError):
+            name = parse_json(line)
+        except ValueError:
             continue
         if isinstance(name, str):
             names.add(name)

@@ -80,7 +80,8 @@ class LogRows:
             if (file, k) not in self._last:
                 self._last.clear()
                 with _report_damage(self.place):
-                    self._last[file, k] = parquet.ParquetFile(file).read_row_group(k, names)
+                    group = parquet.ParquetFile(file).read_row_group(k, names)
+                    self._last[file, k] = group.replace_schema_metadata(None)  # pandas would parse any text in it
             parts.append(self._last[file, k].slice(begin, end - begin))
         table = pa.concat_tables(parts) if parts else self.without_rows.select(names)
         for k, name in enumerate(names):
@@ -120,7 +121,7 @@ def log_rows(place: Path, kinds: Mapping[str, str], files: Sequence[Path] = ()) 
     for path in files or [place]:
         with _report_damage(place):
             file = parquet.ParquetFile(path, read_dictionary=names)
-            schema = file.schema_arrow
+            schema = file.schema_arrow.remove_metadata()
         if missing := [name for name in kinds if name not in schema.names]:
             raise InputError(f"{place}: expected the column {missing[0]}, found none; {AGAIN}")
         kinds = dict(kinds) | {name: k for name, k in MAY_HAVE.get(place.name, {}).items() if name in schema.names}
@@ -367,7 +368,7 @@ class Results:
         def as_frame(place: Path) -> pd.DataFrame:
             from pyarrow import parquet
 
-            table = parquet.read_table(self._files(place) or place)
+            table = parquet.read_table(self._files(place) or place).replace_schema_metadata(None)
             return table.to_pandas(
                 split_blocks=True, self_destruct=True
             )  # column by column, so that no column is in memory twice

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 from collections.abc import Callable, Iterable, Sequence
@@ -17,7 +16,7 @@ import pyarrow as pa
 from pyarrow import parquet
 
 from copem_replay.core.errors import InputError, RemoteFile
-from copem_replay.core.files import avoid_device_name
+from copem_replay.core.files import avoid_device_name, parse_json
 from copem_replay.experiment.file import relocate_settings
 from copem_replay.experiment.schema import LogSettings
 from copem_replay.experiment.validate import resolve_place
@@ -192,7 +191,7 @@ def check_format(folder: Path) -> None:
 def read_provenance(path: Path) -> Provenance:
     """Read `provenance.json`. Raises InputError."""
     try:
-        data: Any = json.loads(path.read_text(encoding="utf-8"))
+        data: Any = parse_json(path.read_text(encoding="utf-8"))
         if (found := dict(data).get("format", 1)) != FORMAT:
             raise InputError(f"{path.parent}: expected results of format {FORMAT}, found format {found}; {AGAIN}")
         logs = tuple(

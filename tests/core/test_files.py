@@ -14,7 +14,14 @@ import pytest
 
 from copem_replay.core import files
 from copem_replay.core.errors import OutputError
-from copem_replay.core.files import atomic_file, atomic_files, portable_name, remove_leftovers
+from copem_replay.core.files import (
+    DEEPEST_JSON,
+    atomic_file,
+    atomic_files,
+    parse_json,
+    portable_name,
+    remove_leftovers,
+)
 
 NAMES = ("a", "b", "c")
 
@@ -229,3 +236,17 @@ class TestLockWithoutFlock:
         monkeypatch.setitem(sys.modules, "msvcrt", None)
         with (tmp_path / "lock").open("w+b") as file:
             assert files.try_lock(file.fileno()) is None
+
+
+@pytest.mark.parametrize(("open_", "close"), [("[", "]"), ('{"a":', "}")])
+def test_json_is_read_as_deep_as_anything_that_is_written(open_: str, close: str) -> None:
+    """Deeper it is damage, whether Python could read it or not."""
+    value: object = 1
+    for _ in range(DEEPEST_JSON):
+        value = [value] if close == "]" else {"a": value}
+    assert parse_json(open_ * DEEPEST_JSON + "1" + close * DEEPEST_JSON) == value
+    for deep in (DEEPEST_JSON + 1, 900, 100_000):
+        with pytest.raises(ValueError, match="values within values"):
+            parse_json(open_ * deep + "1" + close * deep)
+    with pytest.raises(ValueError, match="values within values"):
+        parse_json((open_ * 100_000).encode())

@@ -270,6 +270,14 @@ class TestMemory:
         monkeypatch.setattr(psutil, "virtual_memory", raises_no_such_file)
         assert memory.free_bytes() is None
 
+    def test_without_what_unix_says(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Elsewhere the peak is what the system says, if it does."""
+        monkeypatch.setattr(memory, "resource", None)
+        assert memory.free_bytes() is not None
+        for told, peak in ((SimpleNamespace(rss=5, peak_wset=7), 7), (SimpleNamespace(rss=5), None)):
+            monkeypatch.setattr(psutil, "Process", lambda told=told: SimpleNamespace(memory_info=lambda: told))
+            assert memory.peak_bytes() == peak
+
 
 # ------------------------------------------------------------------------------- what is seen by nobody, or by nothing
 
@@ -371,11 +379,3 @@ def test_only_the_units_that_send_by_it_are_lost() -> None:
 )
 def test_a_class_that_is_named_like_its_group(classes: list[str] | None, said: list[str]) -> None:
     assert street(measure={"onset": {"kind": "appears"}, "objects": {"classes": classes}}) == said
-
-    def test_without_what_unix_says(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        """Elsewhere the peak is what the system says, if it does."""
-        monkeypatch.setattr(memory, "resource", None)
-        assert memory.free_bytes() is not None
-        for told, peak in ((SimpleNamespace(rss=5, peak_wset=7), 7), (SimpleNamespace(rss=5), None)):
-            monkeypatch.setattr(psutil, "Process", lambda told=told: SimpleNamespace(memory_info=lambda: told))
-            assert memory.peak_bytes() == peak

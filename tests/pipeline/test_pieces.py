@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
+from pyarrow import parquet
 
 from copem_replay.core.errors import InputError, OutputError
 from copem_replay.experiment import validate
@@ -156,6 +159,45 @@ def test_what_is_damaged_is_computed_again(here: Path) -> None:
     store = cr.run("e.yaml", pieces="kept").replayed.logs[0].pieces
     assert store is not None
     assert re.fullmatch(r"kept/pieces/../[0-9a-f.]+parquet: damaged, computed again \(.*\)", store.damaged[0])
+
+
+def test_a_record_of_a_log_that_nests_without_end_is_as_none(here: Path) -> None:
+    """The log is read again, and the record written anew."""
+    first, _, _ = replayed(study(runs=3), "first")
+    records = {path: path.read_bytes() for path in Path("kept/logs").iterdir()}
+    for path in records:
+        path.write_bytes(b"[" * 100_000)
+    again, computed, found = replayed(study(runs=3), "again")
+    assert (computed, found, again) == (0, len(list(Path("kept/pieces").rglob("*[0-9a-f].parquet"))), first)
+    assert {path: path.read_bytes() for path in Path("kept/logs").iterdir()} == records
+
+
+def sealed(table: pa.Table, metadata: dict[bytes, bytes]) -> bytes:
+    """A table as a piece is kept: with the digest of its file, in which there are zeros in the place of that."""
+    stream = pa.BufferOutputStream()
+    parquet.write_table(table.replace_schema_metadata(metadata | {b"seal": b"seal:" + b"0" * 40}), stream)
+    content = stream.getvalue().to_pybytes()
+    digest = hashlib.blake2b(content, digest_size=20).hexdigest().encode()
+    return content.replace(b"seal:" + b"0" * 40, b"seal:" + digest)
+
+
+@pytest.mark.parametrize("deep", [200, 100_000])
+def test_a_piece_whose_sums_nest_without_end_is_computed_again(here: Path, deep: int) -> None:
+    """One whose seal is right: it was made so."""
+    whole, _, _ = replayed(study(runs=5), "whole")
+    place = min(Path("kept/pieces").rglob("*.sums.parquet"))
+    piece = Path(str(place).replace(".sums", ""))
+    sums = sealed(parquet.read_table(place), {b"sums": b"[" * deep + b"]" * deep})
+    place.write_bytes(sums)
+    table = parquet.read_table(piece)
+    digest = hashlib.blake2b(sums, digest_size=20).hexdigest().encode()
+    piece.write_bytes(sealed(table, {b"recipe": table.schema.metadata[b"recipe"], b"sums": digest}))
+    store = cr.run("e.yaml", pieces="kept").replayed.logs[0].pieces
+    assert store is not None
+    (note,) = store.damaged
+    assert note.startswith(f"{piece}: damaged, computed again (")
+    assert "values within values" in note
+    assert replayed(study(runs=5), "again")[0] == whole
 
 
 @pytest.mark.parametrize(

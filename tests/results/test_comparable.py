@@ -12,6 +12,8 @@ from pyarrow import parquet
 
 from copem_replay.core.errors import InputError
 from copem_replay.results.compare import compare_folders
+from copem_replay.results.folder import list_belongings
+from copem_replay.results.read import open_results
 from tests.helpers.compare_folders import BRAKING, MEASURE, Row, ghosts, row, seen, write_folder
 
 ROWS = [row("ideal", 1.0, 30.0), row("late", 2.0, 20.0)]
@@ -170,13 +172,38 @@ FILES = ["accuracy.parquet", "detections.parquet", "instants.parquet", "lists.pa
 
 
 @pytest.mark.parametrize("name", ["provenance.json", "experiment.yaml", *FILES])
-@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe\x00"])
+@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe\x00", b"[" * 100_000])
 def test_a_file_that_cannot_be_read(tmp_path, name, content):
     folder = write_folder(tmp_path / "first", ROWS)
     (folder / name).write_bytes(content)
     (problem,) = problems(folder)
     assert problem.startswith(f"{folder / name}: expected ")
     assert "found damage" in problem
+
+
+@pytest.mark.parametrize("key", ["format", "logs", "measure", "window_s", "run_shown"])
+@pytest.mark.parametrize("deep", [200, 900, 100_000])
+def test_provenance_with_values_within_values(tmp_path, key, deep):
+    """Also as deep as Python can read and not write: `run --overwrite` takes the folder for nobody's results."""
+    folder = write_folder(tmp_path / "first", ROWS)
+    said = json.loads((folder / "provenance.json").read_text())
+    text = json.dumps(said | {key: "HERE"}).replace('"HERE"', "[" * deep + "]" * deep)
+    (folder / "provenance.json").write_text(text)
+    (problem,) = problems(folder)
+    assert problem.startswith(f"{folder}/provenance.json: expected the provenance of results, found damage: ")
+    assert "values within values" in problem
+    assert list_belongings(folder) is None
+
+
+@pytest.mark.parametrize("metadata", [b"[" * 100_000, b"{", b'{"columns": 7}'], ids=["deep", "cut", "else"])
+def test_what_a_table_says_to_pandas_is_not_read(tmp_path, metadata):
+    """A stranger's file may hold any text there."""
+    first, second = write_folder(tmp_path / "first", ROWS), write_folder(tmp_path / "second", ROWS)
+    for path in first.glob("*.parquet"):
+        table = parquet.read_table(path)
+        parquet.write_table(table.replace_schema_metadata({b"pandas": metadata}), path)
+    (mine,), (theirs,) = open_results(first).each(), open_results(second).each()
+    assert mine.equals(theirs)
 
 
 @pytest.mark.parametrize("key", ["seed", "runs", "logs", "measure"])

@@ -8,7 +8,6 @@ where others have a list. Track ids are the keys of `objects`.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from decimal import Decimal
@@ -18,6 +17,7 @@ from typing import Any, Final
 import numpy as np
 
 from copem_replay.core.errors import InputError
+from copem_replay.core.files import parse_json
 from copem_replay.core.tracks import Float
 from copem_replay.io.convert.conversion import (
     KINDS,
@@ -209,10 +209,10 @@ def _read_labels(path: Path, rate_hz: float | None, target: str | None) -> Itera
 
 def _read_root(path: Path) -> dict[str, Any]:
     try:
-        document = json.loads(path.read_bytes())
+        document = parse_json(path.read_bytes())
     except OSError as error:
         raise InputError(f"{path}: cannot be opened: {error.strerror}") from None
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise InputError(f"{path}: expected JSON, found something else: {error}") from None
     root = document.get("openlabel") if isinstance(document, dict) else None
     if not isinstance(root, dict) or not isinstance(root.get("frames"), dict):
