@@ -33,7 +33,7 @@ from copem_replay.fitting.gather import (
 )
 from copem_replay.fitting.moments import ErrorBin
 from copem_replay.fitting.pose import DelayFit, unit_delay
-from copem_replay.fitting.replay_check import FEWEST_PASSES, StatisticCheck, remove_memory, replay_check
+from copem_replay.fitting.replay_check import FEWEST_PASSES, TOTALS, StatisticCheck, remove_memory, replay_check
 from copem_replay.fitting.rest import RestFit, fit_rest
 from copem_replay.fitting.rows import FitLists
 from copem_replay.io.recording import Recording
@@ -160,6 +160,8 @@ class ReplayChecks:
 
 
 def _format_verdict(one: StatisticCheck) -> str:
+    if one.statistic in TOTALS:
+        return f"{one.verdict} (all passes, p {one.p:.2g})"
     return f"{one.verdict} ({one.inside} of {count_noun(len(one.pit), 'pass', 'passes')} inside 95 %, p {one.p:.2g})"
 
 

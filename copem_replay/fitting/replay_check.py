@@ -2,7 +2,8 @@
 
 Each pass is ranked among runs of the model (PIT, ties broken at random: a pass in which the object is never listed is
 as late as the runs that never list it). Where the model is right, ranks are uniform. Over passes: Fisher's sum of
-−2 ln p, its distribution that of the runs themselves, each ranked among all others.
+−2 ln p, its distribution that of the runs themselves, each ranked among all others. Beside it totals of all passes, for
+what no pass tells by itself: how far they are from the mean, in standard deviations, among the runs.
 
 Sources: A. P. Dawid, J. Roy. Statist. Soc. A 147 (1984) 278–292 (PIT); J. Besag, P. Clifford, Biometrika 76 (1989)
 633–642 (Monte-Carlo p). A high p does not show that a model is right: only that these passes do not contradict it.
@@ -68,16 +69,22 @@ def replay_check(
     `placed`: the error of the unit's pose, drawn beside the model's errors.
     """
     recorded = compute_statistics(rows.listed[None], rows.along_m[None], rows.across_m[None], rows)
-    replayed = replay_statistics(pem, rows, lists, placed=placed, runs=runs, seed=seed)
-    checks = compare_statistics(recorded, replayed, seed=seed)
+    each, totals = [], [compute_totals(rows.listed[None], rows)]
+    for listed, along_m, across_m in _replay_blocks(pem, rows, lists, placed, runs, seed):
+        each.append(compute_statistics(listed, along_m, across_m, rows))
+        totals.append(compute_totals(listed, rows))
+    replayed = {name: np.concatenate([one[name] for one in each]) for name in STATISTICS}
     class_of_pass = rows.view.class_ix[pass_starts(rows.pass_ix)[:-1]]
+    checks = compare_statistics(recorded, replayed, seed=seed)
+    checks += compare_totals(np.concatenate(totals), len(class_of_pass))
+    checks = tuple(replace(one, among=len(checks)) for one in checks)
     classes, count = np.unique(class_of_pass, return_counts=True)
     kinds = classes[count >= FEWEST_PASSES].tolist()
     for kind in kinds if len(classes) > 1 else []:
         both = ({name: of[:, class_of_pass == kind] for name, of in one.items()} for one in (recorded, replayed))
-        each = compare_statistics(*both, seed=seed)
-        among = len(each) * len(kinds)
-        checks += tuple(replace(one, statistic=f"{one.statistic}, {CLASSES[kind]}", among=among) for one in each)
+        of_class = compare_statistics(*both, seed=seed)
+        among = len(of_class) * len(kinds)
+        checks += tuple(replace(one, statistic=f"{one.statistic}, {CLASSES[kind]}", among=among) for one in of_class)
     return checks
 
 
@@ -91,10 +98,18 @@ def replay_statistics(
     pem: Pem, rows: FitRows, lists: FitLists, *, placed: PoseError | None = None, runs: int = RUNS, seed: int = 0
 ) -> Statistics:
     """The statistics (S, passes) of runs of the model."""
-    step = max(1, _CELLS // len(rows.listed))
-    blocks = [np.arange(first, min(first + step, runs)) for first in range(0, runs, step)]
-    each = [compute_statistics(*simulate_lists(pem, rows, lists, block, seed, placed), rows) for block in blocks]
+    blocks = _replay_blocks(pem, rows, lists, placed, runs, seed)
+    each = [compute_statistics(*block, rows) for block in blocks]
     return {name: np.concatenate([one[name] for one in each]) for name in STATISTICS}
+
+
+def _replay_blocks(
+    pem: Pem, rows: FitRows, lists: FitLists, placed: PoseError | None, runs: int, seed: int
+) -> Iterator[tuple[Bool, Float, Float]]:
+    """What the model lists in runs, some at a time."""
+    step = max(1, _CELLS // len(rows.listed))
+    for first in range(0, runs, step):
+        yield simulate_lists(pem, rows, lists, np.arange(first, min(first + step, runs)), seed, placed)
 
 
 def simulate_lists(
@@ -242,7 +257,45 @@ def compare_statistics(recorded: Statistics, runs: Statistics, *, seed: int = 0)
         verdict: Literal["holds", "too sure", "too few passes to tell"]
         verdict = "too few passes to tell" if too_few else "holds" if p >= 0.05 else "too sure"
         checks.append(StatisticCheck(name, recorded_pit, inside, p, verdict))
-    return tuple(replace(one, among=len(checks)) for one in checks)
+    return tuple(checks)
+
+
+# Totals: what no pass tells by itself.
+
+TOTALS = ("misses at once", "share listed by azimuth")
+_SECTORS = 4
+
+
+def compute_totals(listed: Bool, rows: FitRows) -> Float:
+    """(S, 1 + sectors) over all passes, of what is listed (S, R): Σ of squared misses of a list, NaN where no list has
+    two objects; and the share listed in each quarter of the rows by azimuth.
+    """
+    edges = np.quantile(rows.view.azimuth_rad, np.arange(1, _SECTORS) / _SECTORS)
+    sector = np.searchsorted(edges, rows.view.azimuth_rad, side="right")
+    size = np.bincount(sector, minlength=_SECTORS)
+    shared = bool((np.bincount(rows.list) > 1).any())
+    out = np.full((len(listed), 1 + _SECTORS), np.nan)
+    for s, hits in enumerate(listed):
+        out[s, 1:] = np.bincount(sector[hits], minlength=_SECTORS) / np.maximum(size, 1)
+        if shared:
+            out[s, 0] = (np.bincount(rows.list, ~hits) ** 2).sum()
+    return out
+
+
+def compare_totals(totals: Float, passes: int) -> tuple[StatisticCheck, ...]:
+    """The check of totals (1 + S, 1 + sectors) of the recording, first, among those of runs."""
+    checks = []
+    for name, columns in zip(TOTALS, (totals[:, :1], totals[:, 1:]), strict=True):
+        spread = columns.std(axis=0)
+        if not np.isfinite(spread).all() or not (spread > 1e-12).any():
+            continue
+        moved = columns[:, spread > 1e-12]
+        far = (((moved - moved.mean(axis=0)) / moved.std(axis=0)) ** 2).sum(axis=1)
+        p = float((far >= far[0] - 1e-12).mean())
+        verdict: Literal["holds", "too sure", "too few passes to tell"]
+        verdict = "too few passes to tell" if passes < FEWEST_PASSES else "holds" if p >= 0.05 else "too sure"
+        checks.append(StatisticCheck(name, np.array([1 - p]), int(p > 0.05), p, verdict))
+    return tuple(checks)
 
 
 def _rank_values(values: Float, name: str, passes: Int, seed: int) -> Float:

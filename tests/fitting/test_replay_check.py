@@ -7,12 +7,16 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
+from copem_replay.core.memory import MemoryPart
 from copem_replay.core.tracks import CLASSES
 from copem_replay.fitting.replay_check import (
     STATISTICS,
+    TOTALS,
     Statistics,
     compare_statistics,
+    compare_totals,
     compute_statistics,
+    compute_totals,
     remove_memory,
     replay_check,
     replay_statistics,
@@ -146,12 +150,43 @@ def test_a_class_that_differs_is_seen() -> None:
     assert {"share listed", "share listed, car", "share listed, pedestrian"} <= checks.keys()
     of_class = [one for name, one in checks.items() if name.endswith(", car")]
     assert {one.among for one in of_class} == {2 * len(of_class)}
+    assert {one.among for one in checks.values()} == {2 * len(of_class), len(checks) - 2 * len(of_class)}
     assert checks["share listed, car"].p < 0.01
     assert len(checks["share listed, car"].pit) == 20
     few = rows.take(rows.pass_ix < 14)
     assert not [one for one in replay_check(pem_of(), few, lists_of(rows), runs=50) if "car" in one.statistic]
     alone = replace(rows, view=replace(rows.view, class_ix=0 * kind))
-    assert {one.statistic for one in replay_check(pem_of(), alone, lists_of(rows), runs=50)} <= set(STATISTICS)
+    names = {one.statistic for one in replay_check(pem_of(), alone, lists_of(rows), runs=50)}
+    assert names <= {*STATISTICS, *TOTALS}
+
+
+def test_totals_by_hand() -> None:
+    """Two objects in three lists: 2, 1 and 0 of them missed; by quarters of the azimuth 1 of 2, 0, ⋯ listed."""
+    view = replace(view_of(np.ones(6), np.ones(6)), azimuth_rad=np.array([0.0, 1, 2, 3, 4, 5]))
+    rows = rows_of(np.repeat([0, 1], 3), np.ones(6, dtype=bool), view)
+    listed = np.array([[False, True, True, False, False, True], [True] * 6])
+    found = compute_totals(listed, rows)
+    assert found[:, 0].tolist() == [4 + 1 + 0, 0]
+    assert found[0, 1:].tolist() == [0.5, 1.0, 0.0, 0.5]
+    alone = replace(rows, list=np.arange(6))
+    assert np.isnan(compute_totals(listed, alone)[:, 0]).all()
+    totals = np.column_stack([np.r_[9.0, np.tile([4.0, 5, 6], 33)], np.full((100, 4), 0.5)])
+    [check] = compare_totals(totals, 12)
+    assert (check.statistic, check.p, check.verdict) == ("misses at once", 0.01, "too sure")
+    assert compare_totals(totals, 7)[0].verdict == "too few passes to tell"
+
+
+def test_misses_of_all_objects_at_once_are_no_memory_of_each() -> None:
+    """Recorded with a number that all objects share; a model that holds one for each has the same passes."""
+    rows = passes(0, 40, 60, flat)
+    tree = pem_of().model_dump(mode="json")["memory"]["detection"]
+    common = pem_of().model_copy(update={"memory": {"detection": (MemoryPart(**tree[0] | {"of": "unit"}),)}})
+    listed, _, _ = simulate_lists(common, rows, lists_of(rows), np.array([7]), seed=5)
+    rows = replace(rows, listed=listed[0])
+    right = {one.statistic: one.p for one in replay_check(common, rows, lists_of(rows), runs=200)}
+    wrong = {one.statistic: one.p for one in replay_check(pem_of(), rows, lists_of(rows), runs=200)}
+    assert right["misses at once"] > 0.05
+    assert wrong["misses at once"] < 0.01
 
 
 def test_same_bits() -> None:
