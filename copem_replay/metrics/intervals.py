@@ -79,11 +79,15 @@ def choose_clusters(table: pd.DataFrame) -> tuple[str | None, pd.Series]:
     return over, log if over == "logs" else episode
 
 
-def describe_clusters(over: str, number: int | None = None) -> str:
-    """What an interval is over, and what it tells: `8 logs: how far other drives of this kind may differ`."""
+def describe_clusters(over: str, number: int | None = None, fewest: int | None = None) -> str:
+    """What an interval is over, and what it tells: `8 logs: how far other drives of this kind may differ`.
+
+    `fewest`: where intervals are over different numbers of clusters, up to `number`.
+    """
     noun, whose = _UNITS[over]
     counted = f"{noun}s" if number is None else count_noun(number, noun)
-    return f"{counted}{whose}: {_TELLS[over]}"
+    up_to = "" if fewest is None or fewest == number else f"{fewest} to "
+    return f"{up_to}{counted}{whose}: {_TELLS[over]}"
 
 
 NOT_ENOUGH = "neither more runs nor objects of several logs together tell how other drives differ"

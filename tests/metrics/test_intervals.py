@@ -262,6 +262,8 @@ def test_what_a_sample_cannot_exclude():
 
 def test_an_interval_says_what_it_is_over():
     assert describe_clusters("logs", 8) == "8 logs: how far other drives of this kind may differ"
+    assert describe_clusters("logs", 8, 8) == describe_clusters("logs", 8)
+    assert describe_clusters("logs", 8, 5).startswith("5 to 8 logs: ")
     assert describe_clusters("objects", 12).startswith("12 objects of this drive: ")
     assert "nothing about other drives" in describe_clusters("objects")
     assert describe_clusters("runs", 1).startswith("1 run of this one object: ")

@@ -261,6 +261,38 @@ def test_who_is_better_beyond_the_interval_is_said(tmp_path):
     assert lines[-1] == f"better than ideal in {metrics}, the interval excluding 0: fast"
 
 
+def four_logs(tmp_path, gains_s):
+    """Of four logs one object each; `fast` knows it so much sooner."""
+    rows = [row("ideal", 5.0, 30.0, log=f"log {k}") for k in range(4)]
+    rows += [row("fast", 5.0 - gain_s, 30.0, log=f"log {k}") for k, gain_s in enumerate(gains_s)]
+    return compare_folders([write_folder(tmp_path / "study", rows)], metrics=("ttd_rmst_s",))
+
+
+def test_over_logs_it_is_said_in_how_many_a_configuration_gains(tmp_path):
+    comparison = four_logs(tmp_path, [1.0, 1.5, 2.0, 1.5])
+    lines = comparison_text(comparison).splitlines()
+    # 1.5 ± 3.182446 · √(.166667/4).
+    assert lines[1].split(maxsplit=1)[1] == "-1.5 [-2.15, -0.85] *"
+    assert lines[3:6] == [
+        "[95 %]: over 4 logs: how far other drives of this kind may differ",
+        "logs that gain: ttd_rmst_s fast 4 of 4",
+        "whatever the interval, a kind of drive that makes up to 53 % of such traffic can be absent",  # 1 − .05^(1/4)
+    ]
+    assert lines[-1] == "better than ideal in ttd_rmst_s, the interval excluding 0: fast (4 of 4 logs gain)"
+    assert not any("hangs on" in note for note in comparison.notes)
+
+
+def test_a_difference_that_hangs_on_one_log_names_it(tmp_path):
+    comparison = four_logs(tmp_path, [0.25, 4.0, -0.25, 0.0])
+    (found,) = comparison.overall.to_dict("records")
+    assert (found["difference"], found["clusters"], found["logs_better"]) == (-1.0, 4, 2)
+    assert (found["hangs_on"], found["difference_without_it"]) == ("log 1", 0.0)
+    assert "hangs on log log 1; without it: ttd_rmst_s of fast +0" in comparison.notes
+    # Without it half is left: 1 of 2 s. Of the others none takes as much.
+    (half,) = four_logs(tmp_path / "half", [1.0, 5.0, 1.0, 1.0]).overall.to_dict("records")
+    assert (half["difference"], half["hangs_on"], half["difference_without_it"]) == (-2.0, "log 1", -1.0)
+
+
 def test_without_an_interval_nothing_is_claimed(tmp_path):
     text = comparison_text(
         compare_folders([write_folder(tmp_path / "a", [row("ideal", 1.0, 30.0), row("fast", 0.5, 35.0)])])

@@ -142,11 +142,8 @@ def comparison_lines(comparison: Comparison) -> Iterator[str]:
     if comparison.baseline_why is not None:
         yield f"baseline {comparison.baseline}: {comparison.baseline_why}; --baseline names another"
     limited = overall.dropna(subset="interval_over")
-    over = limited.groupby(["interval_over", "clusters"], sort=False)["metric"].unique()
-    kinds = [
-        describe_clusters(kind, number) + (f" ({', '.join(metrics)})" if len(over) > 1 else "")
-        for (kind, number), metrics in over.items()
-    ]
+    by_kind = limited.groupby("interval_over", sort=False)
+    kinds = [describe_clusters(str(kind), int(of["clusters"].max()), int(of["clusters"].min())) for kind, of in by_kind]
     if kinds:
         yield f"[95 %]: over {'; '.join(kinds)}"
     yield from _describe_logs(limited[limited["interval_over"] == "logs"])
