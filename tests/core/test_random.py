@@ -134,7 +134,7 @@ CONFIGURATIONS: dict[str, Any] = {
 def plan(runs: int = 12, **changes: Any) -> Any:
     base = {
         "pems": PEMS, "units": UNITS, "configurations": CONFIGURATIONS, "runs": runs,
-        "measure": {"onset": {"kind": "appears"}},
+        "measure": {"onset": {"kind": "appears"}, "began": ["log_start", "appeared"]},
     }  # fmt: skip
     return experiment(**(base | changes))
 

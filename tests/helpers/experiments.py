@@ -29,7 +29,7 @@ configurations:
   GT: {units: truth}
   PEM: {units: [ego]}
   coPEM: {units: all, latency_s: 0.5}
-measure: {onset: {kind: in_range, range_m: 60}}
+measure: {onset: {kind: in_range, range_m: 60}, horizon_s: 2}
 show: null
 """
 

@@ -72,7 +72,7 @@ def plan_of(path: Path, *, unit: Any = None, measure: Any = None, **changes: Any
         "units": {"rsu": {"recorded": {k: v for k, v in recorded.items() if v is not None}}},
         "configurations": {"GT": {"units": "truth"}, "ideal": {"units": ["rsu"]}}
         | {kind: {"units": ["rsu"], "fusion": {"kind": kind}} for kind in KINDS},
-        "measure": {"onset": {"kind": "appears"}} | (measure or {}),
+        "measure": {"onset": {"kind": "appears"}, "began": ["log_start", "appeared"]} | (measure or {}),
     }
     return Experiment.model_validate(data | changes)
 

@@ -67,7 +67,7 @@ PLAN: dict[str, Any] = {
         for name in ("ego", "rsu")
     },
     "configurations": {"both": {"units": ["ego", "rsu"], "fusion": {"kind": "gnn"}}},
-    "measure": {"onset": {"kind": "appears"}},
+    "measure": {"onset": {"kind": "appears"}, "began": ["log_start", "appeared"]},
 }
 
 

@@ -121,7 +121,7 @@ def plan(**changes: Any) -> Experiment:
                         "error": {"kind": "gaussian", "covariance_m2": [[1.0, 0.2], [0.2, 1.0]]}}]},
         "units": {"ego": {"on": "ego", "height_m": 1.8, "pem": "p"}},
         "configurations": {"GT": {"units": "truth"}, "PEM": {"units": ["ego"], "latency_s": 0.2}},
-        "measure": {"onset": {"kind": "appears"}},
+        "measure": {"onset": {"kind": "appears"}, "began": ["log_start", "appeared"]},
     }  # fmt: skip
     return Experiment.model_validate(data | changes)
 
@@ -367,7 +367,9 @@ def call(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
     """The command in a folder with `drive.mcap` and `e.yaml`: exit code, stdout, stderr."""
     monkeypatch.chdir(tmp_path)
     drive(tmp_path / "drive.mcap", chunk_size=2000)
-    (tmp_path / "e.yaml").write_text(changed("show: {run: 0}", "measure: {onset: {kind: appears}}"))
+    (tmp_path / "e.yaml").write_text(
+        changed("show: {run: 0}", "measure: {onset: {kind: appears}, began: [log_start, appeared]}")
+    )
 
     def called(*words: str) -> tuple[int, str, str]:
         monkeypatch.setattr("sys.argv", ["copem-replay", *words])

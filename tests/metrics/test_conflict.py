@@ -1290,7 +1290,7 @@ class TestCommand:
 
     def test_results(self, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         text = changed(
-            "runs: 4", "measure: {onset: {kind: appears}, conflict: {}}",
+            "runs: 4", "measure: {onset: {kind: appears}, began: [log_start, appeared], conflict: {}}",
             f"braking: {{{BRAKES}, brakes_for: conflict}}",
         )  # fmt: skip
         (here / "e.yaml").write_text(text, encoding="utf-8")
@@ -1331,7 +1331,7 @@ class TestCommand:
     ) -> None:
         text = changed(
             "  ego: {on: ego, height_m: 1.8, pem: onboard}", "  PEM: {units: [mast]}",
-            "measure: {onset: {kind: appears}, conflict: {}, distance_to: mast}",
+            "measure: {onset: {kind: appears}, began: [log_start, appeared], conflict: {}, distance_to: mast}",
         ).replace("  ego: {on: ego, height_m: 1.8, pem: onboard}\n", "")  # fmt: skip
         if how == "file":
             text += "ego: none\n"

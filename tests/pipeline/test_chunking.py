@@ -396,7 +396,7 @@ def test_the_results_folder(
         "version: 1\nlogs: [drive.mcap]\nruns: 2\npems: {p: [{detection: {kind: constant, probability: 0.7}}]}\n"
         "units: {ego: {on: ego, height_m: 1.8, pem: p}, mast: {at: [9, 9], height_m: 5, pem: p}}\n"
         "configurations: {GT: {units: truth}, ideal: {units: all, latency_s: 0.2}, gnn: {units: all, fusion: "
-        "{kind: gnn}}, tracker: {units: all, fusion: {kind: tracker}}}\n"
+        "{kind: gnn}}, tracker: {units: all, fusion: {kind: tracker}}}\nmeasure: {began: [log_start, crossed]}\n"
     )
     monkeypatch.chdir(tmp_path)
     for out, count in (("whole", 10**9), ("pieces", 60)):

@@ -722,7 +722,7 @@ units:
 configurations:
   GT: {units: truth}
   V2V: {units: all, latency_s: {ego: 0, default: 0.2}}
-measure: {objects: {classes: [pedestrian]}, onset: {kind: appears}, exact: true}
+measure: {objects: {classes: [pedestrian]}, onset: {kind: appears}, began: [log_start, appeared], exact: true}
 show: {run: SHOWN}
 """
 

@@ -70,7 +70,7 @@ def test_few_logs_are_in_memory_at_a_time(kept: str | None, here: Path, monkeypa
 
 def test_all_that_is_wrong_is_said_before_any_run(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(log_survey, "STATES_HELD", 0)
-    twice = "measure: {onset: {kind: appears}, confirm: {hits: 2, of: 2}, exact: true}"
+    twice = "measure: {onset: {kind: appears}, began: [log_start, appeared], confirm: {hits: 2, of: 2}, exact: true}"
     Path("e.yaml").write_text(study("logs: ['[a-d].mcap']", twice).replace("latency_s: 0.5", "latency_s: {mast: 0.03}"))
     done: list[int] = []
     with pytest.raises(InputError, match=r"e.yaml:\d+: measure.exact: .* no closed form") as wrong:

@@ -163,7 +163,8 @@ def fleet(folder: Path, *, far: int) -> str:
     cars += [Obj(id=10 + k, x=1000.0 * (k + 1), y=500.0) for k in range(far)]
     write_recording(folder / "drive.mcap", [(k / 10, [Obj(id=1), *cars]) for k in range(5)], host=1)
     return changed(
-        "  mast: {on: {classes: [car], penetration_rate: 0.5}, pem: onboard}", "measure: {onset: {kind: appears}}"
+        "  mast: {on: {classes: [car], penetration_rate: 0.5}, pem: onboard}",
+        "measure: {onset: {kind: appears}, began: [log_start], horizon_s: 3}",
     ).replace(", latency_s: 0.5", "")
 
 
@@ -179,7 +180,8 @@ def test_a_fleet_of_one(tmp_path: Path) -> None:
     frames = [(k / 10, [Obj(id=1), Obj(id=2, x=300.0)]) for k in range(5)]
     write_recording(tmp_path / "drive.mcap", frames, host=1)
     text = changed(
-        "  mast: {on: {classes: [car], penetration_rate: 1}, pem: onboard}", "measure: {onset: {kind: appears}}"
+        "  mast: {on: {classes: [car], penetration_rate: 1}, pem: onboard}",
+        "measure: {onset: {kind: appears}, began: [log_start], horizon_s: 3}",
     )
     assert before(tmp_path, text)[1] == f"drive: unit mast, on 1 of its 1 carrier: {UNMET}"
 

@@ -56,7 +56,7 @@ def plan(path: Path, *, inputs: Any = ("rsu",), output: Any = None, **changes: A
     units = {"rsu": {"recorded": {"topic": "rsu", "covariance_m2": COVARIANCE, "delay_s": 0.05}}}
     data: dict[str, Any] = {
         "version": 1, "logs": [str(path)], "units": {} if inputs is None else units,
-        "configurations": {"stack": stack}, "measure": {"onset": {"kind": "appears"}, "match": {"gate_m": 1.0}},
+        "configurations": {"stack": stack}, "measure": {"onset": {"kind": "appears"}, "began": ["log_start", "appeared"], "match": {"gate_m": 1.0}},
     }  # fmt: skip
     return Experiment.model_validate(data | changes)
 
@@ -274,7 +274,7 @@ def test_the_list_of_a_real_roadside_unit(trial: str) -> None:
         "configurations": {
             "stack": {"recorded": recorded, "inputs": ["rsu"]}, "union": {"units": ["rsu"], "fusion": {"kind": "union"}}
         },
-        "measure": {"onset": {"kind": "appears"}, "distance_to": "rsu"},
+        "measure": {"onset": {"kind": "appears"}, "began": ["log_start", "appeared"], "distance_to": "rsu"},
     })  # fmt: skip
     _, result = replayed(experiment)
     same_as_union(result, "stack")
@@ -366,7 +366,9 @@ class TestRefused:
 
     def test_exact(self, tmp_path: Path) -> None:
         path = drive(tmp_path / "a.mcap", [list_of(0.7, car(30))])
-        experiment = plan(path, inputs=None, measure={"onset": {"kind": "appears"}, "exact": True})
+        experiment = plan(
+            path, inputs=None, measure={"onset": {"kind": "appears"}, "began": ["log_start", "appeared"], "exact": True}
+        )
         recordings, _ = read_logs(experiment, [path], None)
         with pytest.raises(ExperimentError, match="it is recorded, and nothing says how probable its lists were"):
             check_closed_form([prepare_log(recordings[0], experiment)], experiment)

@@ -571,7 +571,7 @@ class TestCurves:
         # Of two objects one is known at once or after a second, the other half the time after a second, else never.
         columns = ["object_id", "time_to_detection_s", "probability"]
         rows = [("2", 0.0, 0.5), ("2", 1.0, 0.5), ("3", 1.0, 0.5), ("3", None, 0.5), ("3", 2.0, 0.0)]
-        exact = pd.DataFrame(rows, columns=columns).assign(log="drive", configuration="GT")
+        exact = pd.DataFrame(rows, columns=columns).assign(log="drive", configuration="GT", episode=0, began="crossed")
         exact.to_parquet(mine / "exact.parquet")
         figure = curves_figure(read_results(mine), configurations=["GT"])
         x, y = line(figure.axes[0], "exact")

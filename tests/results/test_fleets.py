@@ -39,7 +39,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     fleet = {"on": {"classes": ["car"], "penetration_rate": 0.5}, "pem": "sure", "rate_hz": 7.0, "height_m": 1.5}
     more: dict[str, Any] = {
         "pems": {"sure": SEES}, "units": {"ego": EGO_UNIT, "obu": fleet}, "runs": 6,
-        "measure": {"onset": {"kind": "appears"}},
+        "measure": {"onset": {"kind": "appears"}, "began": ["log_start", "appeared"]},
         "configurations": {
             "ideal": {"units": "all", **LATE}, "gnn": {"units": "all", "fusion": {"kind": "gnn"}, **LATE},
             "alone": {"units": ["ego"]},
