@@ -108,7 +108,10 @@ def experiment_of(units: Mapping[str, Any], configurations: Mapping[str, Any], *
     return {
         "version": 1, "ego": "none", "units": dict(units), "obstacles": OBSTACLES,
         "configurations": dict(configurations),
-        "measure": {"objects": {"classes": ["vru"]}, "onset": {"kind": "appears"}, "distance_to": "rsu"},
+        "measure": {
+            "objects": {"classes": ["vru"]}, "onset": {"kind": "appears"}, "began": ["log_start", "appeared"],
+            "distance_to": "rsu",
+        },
     } | more  # fmt: skip
 
 
@@ -173,7 +176,7 @@ def fitted_unit(logs: Sequence[str], **how: Any) -> cr.FittedPem:
     plan = {
         "version": 1, "logs": list(logs), "ego": "none", "units": {"rsu": unit},
         "configurations": {"recorded": {"units": ["rsu"]}},
-        "measure": {"onset": {"kind": "appears"}, "distance_to": "rsu"},
+        "measure": {"onset": {"kind": "appears"}, "began": ["log_start", "appeared"], "distance_to": "rsu"},
     }  # fmt: skip
     return cr.fit(plan, "rsu", **how)
 

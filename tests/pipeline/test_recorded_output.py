@@ -56,7 +56,8 @@ def plan(path: Path, *, inputs: Any = ("rsu",), output: Any = None, **changes: A
     units = {"rsu": {"recorded": {"topic": "rsu", "covariance_m2": COVARIANCE, "delay_s": 0.05}}}
     data: dict[str, Any] = {
         "version": 1, "logs": [str(path)], "units": {} if inputs is None else units,
-        "configurations": {"stack": stack}, "measure": {"onset": {"kind": "appears"}, "began": ["log_start", "appeared"], "match": {"gate_m": 1.0}},
+        "configurations": {"stack": stack},
+        "measure": {"onset": {"kind": "appears"}, "began": ["log_start", "appeared"], "match": {"gate_m": 1.0}},
     }  # fmt: skip
     return Experiment.model_validate(data | changes)
 

@@ -150,7 +150,8 @@ def test_the_units_of_that_run(call: Compare, tmp_path: Path) -> None:
         "pems: {p: [{detection: {kind: constant, probability: 0.6}}]}\n"
         "units: {ego: {on: ego, pem: p}, fleet: {on: {classes: [car], penetration_rate: 0.5}, pem: p}}\n"
         "configurations: {alone: {units: [ego]}, V2V: {units: all, latency_s: {ego: 0, default: 0.2}}}\n"
-        "measure: {objects: {classes: [pedestrian]}, onset: {kind: appears}, began: [log_start, appeared]}\nshow: {run: [3, 4]}\n"
+        "measure: {objects: {classes: [pedestrian]}, onset: {kind: appears}, began: [log_start, appeared]}\n"
+        "show: {run: [3, 4]}\n"
     )
     assert call("run", "f.yaml", "--out", "f")[0] == 0
     seen = {}
