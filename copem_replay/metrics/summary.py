@@ -290,6 +290,15 @@ SETUP = ("n", "list_rate_hz", "n_conflict")
 """Columns of the set-up, not of results: written once, below the table, where all configurations are alike."""
 
 
+def describe_mean(horizon_s: float, *, censored: bool) -> str:
+    """What a restricted mean is of. `censored`: whether rows are still undetected when the ego or the log ends."""
+    up_to = f"{format_cell(horizon_s)} s"
+    words = f"mean of min(time to detection, {up_to}), never detected counting as {up_to}"
+    if not censored:
+        return words
+    return f"{words}; an object still undetected when the log or the ego ends counts as those that are followed longer"
+
+
 def format_summary(summary: pd.DataFrame, width: int | None = None) -> str:
     """The summary for a terminal: detections, then conflicts, braking, recorded outputs and own metrics.
 
@@ -299,8 +308,9 @@ def format_summary(summary: pd.DataFrame, width: int | None = None) -> str:
     lines += describe_intervals(summary, "interval")
     horizon = summary["ttd_rmst_horizon_s"].dropna()
     if len(horizon):
-        up_to = f"{format_cell(float(horizon.iloc[0]))} s"
-        lines.append(f"ttd_rmst_s: mean of min(time to detection, {up_to}), never detected counting as {up_to}")
+        lines.append(
+            f"ttd_rmst_s: {describe_mean(float(horizon.iloc[0]), censored=bool((summary['open_share'] > 0).any()))}"
+        )
     if "conflict_detected_share" in summary:
         lines += ["", *_part_lines(summary, "conflict", width)]
         lines.append("conflict_*: the same for the first list that implies a collision")

@@ -70,7 +70,8 @@ def episodes_of(episodes: Mapping[int, tuple[float, float]]) -> Episodes:
     """Onset and end by object."""
     onset, end = (np.array([episode[q] for episode in episodes.values()], dtype=float) for q in (0, 1))
     nothing = np.zeros(len(onset), dtype=int)
-    return Episodes(np.array(list(episodes), dtype=int), onset, nothing > 0, end, nothing)
+    before_s = np.full(len(onset), -np.inf)
+    return Episodes(np.array(list(episodes), dtype=int), nothing, onset, nothing, end, nothing, before_s, nothing)
 
 
 def reference_of(places: Sequence[tuple[float, float] | None]) -> Reference:

@@ -12,7 +12,7 @@ import pandas as pd
 from copem_replay.core.errors import OutputError, escape_unprintable, wrap_line
 from copem_replay.core.files import atomic_file
 from copem_replay.metrics.intervals import ALL_ALIKE, EXACT, NOTHING_DRAWN, describe_absent, describe_clusters
-from copem_replay.metrics.summary import format_table
+from copem_replay.metrics.summary import describe_mean, format_table
 from copem_replay.results.compare.metrics import METRICS
 from copem_replay.results.folder import add_to_made_list
 
@@ -150,10 +150,7 @@ def comparison_lines(comparison: Comparison) -> Iterator[str]:
     if any(_excludes_0(low, high) for low, high in zip(overall["low"], overall["high"], strict=True)):
         yield f"{APART}: the interval excludes 0"
     yield from _describe_intervals(overall)
-    yield (
-        f"ttd_rmst_s: mean of min(time to detection, {comparison.horizon_s:.4g} s), never detected counting as "
-        f"{comparison.horizon_s:.4g} s; objects still there at the end are censored"
-    )
+    yield f"ttd_rmst_s: {describe_mean(comparison.horizon_s, censored=True)}"
     if "ttd_rmst_s_equal_ghosts" in shown:
         yield (
             "ttd_rmst_s_equal_ghosts: the same mean by match (also for ideal fusion and the truth), with the least "
