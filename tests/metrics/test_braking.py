@@ -1434,11 +1434,11 @@ def test_noise_of_a_place_is_no_reversing(back_m: float, meets: bool) -> None:
 
 
 def test_two_in_conflict_have_no_interval_and_it_is_said() -> None:
-    """Two stand in the way, one behind the other: too few to resample, and their runs are no other traffic."""
+    """Two stand in the way, one behind the other: too few objects, and their runs are no other traffic."""
     things = [straight_ego(), *(Thing(name, "pedestrian", standing(x, 0)) for name, x in (("a", 20), ("b", 25)))]
     result = run_experiment(plan(runs=3), [recording(things, until_s=4.0)])
     assert result.summary["pass_interval"].isna().all()
-    assert any("no interval of the pass share: fewer than 5 logs and fewer than 5 objects" in n for n in result.notes)
+    assert any("no interval of the pass share: 2 objects of one drive, fewer than 5; " in n for n in result.notes)
 
 
 # ------------------------------------------------------------------------------------------------ at the boundaries

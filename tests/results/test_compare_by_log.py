@@ -163,6 +163,27 @@ def test_intervals_leave_out_whole_logs(seed, count):
                 assert pd.isna(row["hangs_on"])
 
 
+@settings(max_examples=6)
+@given(seeds)
+def test_more_runs_do_not_narrow_intervals_over_logs(seed):
+    """The same again as further runs, as often: no limit moves."""
+    once = study(seed, 3, fewest=2)
+    runs = max(of["run"] for of in once["rows"]) + 1
+    twice = once | {
+        name: [of | {"run": of["run"] + k * runs} for k in range(2) for of in once[name]]
+        for name in ("rows", "lists", "steps")
+    }
+    with TemporaryDirectory() as scratch:
+        one, two = (
+            compare_folders([write_folder(Path(scratch) / name, **of)]).overall.set_index("metric")
+            for name, of in (("once", once), ("twice", twice))
+        )
+    over_logs = one.index[one["interval_over"] == "logs"].difference(["ttd_rmst_s_equal_ghosts"])
+    for name in ("low", "high", "clusters", "difference_without_it"):
+        found = two.loc[over_logs, name].astype(float).to_numpy()
+        assert found == pytest.approx(one.loc[over_logs, name].astype(float).to_numpy(), abs=1e-9, nan_ok=True)
+
+
 @settings(max_examples=10)
 @given(seeds)
 def test_limits_of_medians_are_those_of_shares_inverted(seed):
