@@ -27,7 +27,6 @@ from copem_replay.cli.terminal import (
     width_of,
 )
 from copem_replay.core.errors import InputError
-from copem_replay.core.tracks import TRUTH
 
 if TYPE_CHECKING:
     from copem_replay.api.run import StudyResult
@@ -147,6 +146,7 @@ def _write_results(
 ) -> None:  # fmt: skip
     """Fill the results folder, then print notes, problems and the summary."""
     from copem_replay.api.run import fill_results_folder
+    from copem_replay.core.tracks import TRUTH
     from copem_replay.metrics.summary import describe_began, format_summary
 
     notes = fill_results_folder(place, result, skipped=study.skipped, viewer=viewer)

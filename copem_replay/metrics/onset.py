@@ -13,9 +13,17 @@ from enum import Enum
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, get_args
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
-from copem_replay.core.components import Component, NotNegative, Positive, Share, ask_component, wrong_answer_error
+from copem_replay.core.components import (
+    Component,
+    NotNegative,
+    Positive,
+    Share,
+    ask_component,
+    drop_python_examples,
+    wrong_answer_error,
+)
 from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int, Tracks
 
 if TYPE_CHECKING:
@@ -246,8 +254,16 @@ class LineOfSight(_InSight):
     seen_by: ClassVar[Literal["ego", "any"]] = "ego"
 
 
+def _drop_again(schema: dict[str, Any]) -> None:
+    """Leave out the key that the onset `at` refuses."""
+    drop_python_examples(schema)
+    schema["properties"].pop("again_after_s", None)
+
+
 class At(Onset):
     """An instant of the log, the same for all objects that are then in it."""
+
+    model_config = ConfigDict(json_schema_extra=_drop_again)
 
     kind: Literal["at"] = "at"
     time_s: NotNegative

@@ -505,7 +505,8 @@ def test_refusals(
 def test_options_take_the_place_of_what_the_file_says(
     call: Callable[..., Any], tmp_path: Path, options: tuple[str, ...], expected: list[float]
 ) -> None:
-    (tmp_path / "e.yaml").write_text(changed("window_s: [3, 5]"))
+    every = "measure: {began: [log_start, crossed, appeared]}"
+    (tmp_path / "e.yaml").write_text(changed("window_s: [3, 5]", every))
     assert call("run", "e.yaml", "--out", "cut", *options)[0] == 0
     data, _, _ = read_yaml((tmp_path / "cut/experiment.yaml").read_text())
     assert data["window_s"] == expected
@@ -514,7 +515,8 @@ def test_options_take_the_place_of_what_the_file_says(
 def test_a_window_of_each_of_several_logs(call: Callable[..., Any], tmp_path: Path) -> None:
     """Seconds count in each of its own; the second is too short."""
     drive(tmp_path / "short.mcap", seconds=3)
-    (tmp_path / "e.yaml").write_text(changed("logs: [drive.mcap, short.mcap]", "window_s: [2, 2.5]"))
+    every = "measure: {began: [log_start, crossed, appeared]}"
+    (tmp_path / "e.yaml").write_text(changed("logs: [drive.mcap, short.mcap]", "window_s: [2, 2.5]", every))
     assert call("run", "e.yaml", "--out", "cut")[0] == 0
     data, _, _ = read_yaml((tmp_path / "cut/experiment.yaml").read_text())
     assert dump_yaml(data).count("window_s") == 1

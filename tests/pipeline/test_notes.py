@@ -164,7 +164,7 @@ def fleet(folder: Path, *, far: int) -> str:
     write_recording(folder / "drive.mcap", [(k / 10, [Obj(id=1), *cars]) for k in range(5)], host=1)
     return changed(
         "  mast: {on: {classes: [car], penetration_rate: 0.5}, pem: onboard}",
-        "measure: {onset: {kind: appears}, began: [log_start], horizon_s: 3}",
+        "measure: {onset: {kind: appears}, began: [log_start], horizon_s: 0.4}",
     ).replace(", latency_s: 0.5", "")
 
 
@@ -181,7 +181,7 @@ def test_a_fleet_of_one(tmp_path: Path) -> None:
     write_recording(tmp_path / "drive.mcap", frames, host=1)
     text = changed(
         "  mast: {on: {classes: [car], penetration_rate: 1}, pem: onboard}",
-        "measure: {onset: {kind: appears}, began: [log_start], horizon_s: 3}",
+        "measure: {onset: {kind: appears}, began: [log_start], horizon_s: 0.4}",
     )
     assert before(tmp_path, text)[1] == f"drive: unit mast, on 1 of its 1 carrier: {UNMET}"
 

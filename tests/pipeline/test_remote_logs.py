@@ -208,7 +208,9 @@ def test_two_hundred_names_are_replayed_with_few_words_and_found_again_unread(
 ) -> None:
     for k in range(200):
         (here / f"name{k}.mcap").hardlink_to(here / "drives/b.mcap")
-    text = changed("logs: ['name*.mcap']", "measure: {accuracy: false}", "configurations: {PEM: {units: [ego]}}")
+    text = changed(
+        "logs: ['name*.mcap']", "measure: {accuracy: false, horizon_s: 1}", "configurations: {PEM: {units: [ego]}}"
+    )
     Path("e.yaml").write_text(
         "".join(line for line in text.splitlines(True) if not line.startswith(("  GT", "  PEM", "  co")))
     )

@@ -32,7 +32,8 @@ from tests.system.test_cli import Call, call
 __all__ = ["call"]  # a fixture
 
 WHEN_S = 1_700_000_000
-SHOWN = changed("show: {run: 0}")
+MEASURE = "measure: {onset: {kind: in_range, range_m: 60}, horizon_s: 1}"
+SHOWN = changed("show: {run: 0}", MEASURE)
 
 
 def approach(path: Path, from_m: float) -> Path:
@@ -71,7 +72,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     approach(tmp_path / "drive.mcap", 70.0)
     approach(tmp_path / "other.mcap", 75.0)
-    (tmp_path / "e.yaml").write_text(changed())
+    (tmp_path / "e.yaml").write_text(changed(MEASURE))
     one, two = (os.stat(tmp_path / f"{name}.mcap") for name in ("drive", "other"))
     assert (one.st_size, one.st_mtime_ns) == (two.st_size, two.st_mtime_ns)
     return tmp_path
