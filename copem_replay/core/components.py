@@ -31,7 +31,14 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError, core_schema
 
-from copem_replay.core.errors import FAILURES, InputError, describe_failure, describe_source_line, is_own
+from copem_replay.core.errors import (
+    FAILURES,
+    InputError,
+    describe_failure,
+    describe_source_line,
+    is_own,
+    near_name_hint,
+)
 from copem_replay.core.tracks import Float
 
 T = TypeVar("T")
@@ -201,7 +208,9 @@ class Slot:
             target = kind
         else:
             kinds = f"one of {', '.join(self.kinds())}, or " if self.kinds() else ""
-            raise _pydantic_error(f"kind: expected {kinds}package.module:Class; found {kind!r}")
+            raise _pydantic_error(
+                f"kind: expected {kinds}package.module:Class; found {kind!r}{near_name_hint(kind, self.kinds())}"
+            )
         module, _, name = target.partition(":")
         try:
             component = getattr(importlib.import_module(module), name)

@@ -164,6 +164,14 @@ def unknown_name_message(what: str, name: object, known: Iterable[str]) -> str:
     return f"no {what} is named {str(name)!r}{hint}"
 
 
+def near_name_hint(name: str, known: Iterable[str]) -> str:
+    """`; did you mean …?` with the known name that is alike, or the only one of this initial and about this length."""
+    names = list(dict.fromkeys(known))
+    alike = [one for one in names if one[:1] == name[:1] and abs(len(one) - len(name)) <= 1]
+    near = difflib.get_close_matches(name, names, n=1) or (alike if len(alike) == 1 else [])
+    return f"; did you mean {near[0]}?" if near else ""
+
+
 # Files under URLs, which fsspec opens; it is not loaded where all files are on this machine. Access data (endpoints,
 # profiles, keys) are in fsspec's own environment and files, never in an experiment; a URL is written and shown without
 # its user and its query.

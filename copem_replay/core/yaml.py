@@ -61,6 +61,8 @@ def compose_nodes(text: str) -> Node | None:
         why = error.problem or error.context
         if why.startswith("but ") and error.context:
             why = f"{error.context} {why}"
+        if r"'\t'" in why:
+            why = "found a tab where only spaces may stand; indent with spaces"
     except YAMLError as error:
         position = getattr(error, "position", 0)
         line = text.count("\n", 0, position) + 1

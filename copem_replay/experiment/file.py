@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import glob
 import os
+import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -23,7 +24,7 @@ from copem_replay.core.errors import (
 )
 from copem_replay.core.yaml import AliasesError, Key, NotYamlError, parse_yaml
 from copem_replay.experiment.schema import Experiment, LogSettings
-from copem_replay.io.open import DriveRecordings, File, Place, first_recording
+from copem_replay.io.open import DriveRecordings, File, Place, first_recording, name_log
 
 # Problems of shape in the words of the file: the key, what was expected, what was found.
 
@@ -42,8 +43,9 @@ def describe_by_key(
         items_by_key.setdefault((*above, *_file_key(data, item)), []).append(item)
     for part in reversed(above):
         data = {str(part): data}
+    above_others = {key[:n] for key in items_by_key for n in range(len(key))}
     for key, items in items_by_key.items():
-        if any(other[: len(key)] == key and len(other) > len(key) for other in items_by_key):
+        if key in above_others:
             continue  # another alternative fits so far, and its message names the deeper key
         yield key, _problem_message(model, items, key, data)
 
@@ -111,7 +113,8 @@ def _problem_message(model: type[BaseModel], items: Sequence[Any], key: Key, dat
     if first["type"] == "too_short" and isinstance(first["input"], Mapping):
         return "expected at least one, found none"
     words = dict.fromkeys(_EXPECTED[item["type"]].format(**item.get("ctx", {})) for item in items)
-    return f"expected {', or '.join(words)}, found {_shorten_value(first['input'])}{_percent_hint(first)}"
+    hint = _percent_hint(first) or _list_hint(items, key)
+    return f"expected {', or '.join(words)}, found {_shorten_value(first['input'])}{hint}"
 
 
 _RENAMED = {"share": "penetration_rate"}
@@ -123,6 +126,37 @@ def _variance_hint(sigma_m: object) -> str:
     """The `covariance_m2` that stands for a standard deviation."""
     variance = f"{sigma_m**2:g}" if isinstance(sigma_m, int | float) else "σ²"
     return f"`covariance_m2: [[{variance}, 0], [0, {variance}]]`"
+
+
+LIST_EXAMPLES = {
+    "at": "[0, 0]",
+    "at_m": "[[12, 3]]",
+    "classes": "[pedestrian]",
+    "covariance_m2": "[[0.4, 0.0], [0.0, 0.4]]",
+    "ids": "[7, 12]",
+    "inputs": "[car, rsu]",
+    "logs": "[drive.mcap]",
+    "mean_m": "[0.2, 0.0]",
+    "metrics": '[{kind: "my_package.metrics:Late"}]',
+    "obstacles": "[{polygon_m: [[20, -1], [22, -1], [22, 1]], height_m: 3}]",
+    "offset_m": "[0.4, 0.0]",
+    "polygon_m": "[[0, 8], [4, 8], [4, 9]]",
+    "range_m": "[0, 80]",
+    "together": "[ego.mcap, rsu.mcap]",
+    "window_s": "[0, 20]",
+}
+"""A list for each key that takes one, for who writes a single value: as docs/reference/keys.md has it."""
+
+
+def _list_hint(items: Sequence[Any], key: Key) -> str:
+    """An example where a list is expected and a single value found; else empty."""
+    name = str(key[-1]) if key else ""
+    if key[:1] == ("show",):  # whose logs are names
+        return ""
+    wants_list = any(item["type"] in ("list_type", "tuple_type") for item in items)
+    if not wants_list or isinstance(items[0]["input"], Mapping) or name not in LIST_EXAMPLES:
+        return ""
+    return f"; such as `{name}: {LIST_EXAMPLES[name]}`"
 
 
 def _percent_hint(item: Any) -> str:
@@ -240,6 +274,13 @@ def format_key(key: Key) -> str:
     return text
 
 
+_RECORDINGS = (".mcap", ".osi", ".db3")
+
+
+def _recording_hint(path: Path) -> str:
+    return f"; `copem-replay init {shlex.quote(str(path))} > experiment.yaml` makes one that replays it"
+
+
 def read_experiment_file(path: Path) -> ExperimentSource:
     """An experiment file as plain data. Raises ExperimentError when it cannot be read or is not YAML."""
     try:
@@ -247,8 +288,13 @@ def read_experiment_file(path: Path) -> ExperimentSource:
     except FileNotFoundError:
         raise ExperimentError(f"{path}: no such file") from None
     except IsADirectoryError:
-        raise ExperimentError(f"{path}: is a folder; expected an experiment file (YAML)") from None
+        hint = _recording_hint(path) if (path / "metadata.yaml").is_file() else ""
+        raise ExperimentError(f"{path}: is a folder; expected an experiment file (YAML){hint}") from None
     except UnicodeDecodeError as error:
+        if path.suffix in _RECORDINGS:
+            raise ExperimentError(
+                f"{path}: expected an experiment file (YAML), found a recording{_recording_hint(path)}"
+            ) from None
         line, byte = error.object.count(b"\n", 0, error.start) + 1, error.object[error.start]
         raise ExperimentError(f"{path}:{line}: expected YAML text in UTF-8, found byte {byte:#x}") from None
     except OSError as error:
@@ -429,7 +475,32 @@ def replace_logs(source: ExperimentSource, paths: Sequence[str], option: str = "
         )
         entries.append({**entry, "file": path} if (entry := next(matching, None)) is not None else path)
     options = dict(source.options) | ({("logs",): option} if option != "--log" else {})
-    return replace(source, data=source.data | {"logs": entries}, logs=tuple(paths), options=options)
+    data = _without_shown(source, _names_of(entries, Path(), source.listed)) | {"logs": entries}
+    return replace(source, data=data, logs=tuple(paths), options=options)
+
+
+def _without_shown(source: ExperimentSource, kept: set[str]) -> dict[str, Any]:
+    """The data without those names in `show: {logs}` that are of logs of the file, and not among `kept`."""
+    show, named = source.data.get("show"), source.data.get("logs")
+    if not isinstance(show, dict) or not isinstance(show.get("logs"), list) or not isinstance(named, list):
+        return source.data
+    gone = _names_of(named, source.path.parent, source.listed) - kept
+    logs = [name for name in show["logs"] if str(name).rpartition("/")[2] not in gone]
+    return source.data | {"show": show | {"logs": logs or ["first"]}}
+
+
+def _names_of(entries: Sequence[object], folder: Path, listed: Listed) -> set[str]:
+    """Names of the logs of entries of `logs`, without the folders that tell logs of one name apart."""
+    names: set[str] = set()
+    for entry in entries:
+        name, pattern = (entry.get("name"), entry.get("file")) if isinstance(entry, dict) else (None, entry)
+        if name is not None:
+            names.add(str(name))
+        elif isinstance(pattern, str):
+            names |= {
+                f.path.stem if isinstance(f, RemoteFile) else name_log(f) for f in match_files(pattern, folder, listed)
+            }
+    return names
 
 
 def drop_settings(data: dict[str, Any], keys: Sequence[str]) -> dict[str, Any]:

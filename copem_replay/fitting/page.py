@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from copem_replay.core.colours import Rgb
-from copem_replay.core.errors import OutputError, count_noun
+from copem_replay.core.errors import count_noun
 from copem_replay.core.tracks import CLASSES, Float, Int
 from copem_replay.core.yaml import dump_with_comments, dump_yaml
 from copem_replay.experiment.schema import Experiment
@@ -234,7 +234,7 @@ def fill_fit(
         (new / MARK).write_text(_format_json(provenance | {"files": files}), encoding="utf-8")
         place.finish(files)
     except OSError as error:
-        raise OutputError(f"{place.folder}: cannot be written: {error.strerror or error}") from error
+        raise place.cannot_be_written(error) from error
 
 
 def _format_json(data: Mapping[str, Any]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Discriminator, Field, Tag
+from pydantic import AfterValidator, Discriminator, Tag
 
 from copem_replay.core.components import Covariance, Either, Frozen, Id, Latency, NotNegative, Number, Positive, Share
 from copem_replay.io.schemas.object_lists import Fields
@@ -17,7 +17,7 @@ class RecordedTopic(Frozen):
     its positions; `existence` of its entries.
     """
 
-    topic: Annotated[str, Field(min_length=1)]
+    topic: str
     delay_s: Latency = 0.0
     covariance_m2: Covariance | None = None
     existence: Share = 0.9
@@ -42,7 +42,7 @@ class TruthTopic(Frozen):
 class TruthFields(Fields):
     """The truth on a topic whose schema is not known by name: which of its fields hold what."""
 
-    topic: Annotated[str, Field(min_length=1)]
+    topic: str
 
 
 class EgoTopic(Frozen):
@@ -52,7 +52,7 @@ class EgoTopic(Frozen):
     forward to the centre of its box. `frame`: the frame of the ego, where the topic has poses of several.
     """
 
-    topic: Annotated[str, Field(min_length=1)]
+    topic: str
     size_m: tuple[Positive, Positive, Positive] | None = None
     centre_from_rear_axle_m: Number | None = None
     frame: str | None = None

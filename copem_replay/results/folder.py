@@ -311,6 +311,10 @@ class ResultsPlace:
                 why = why.removeprefix(f"{name}: ")
             self.failed.append(f"{', '.join(shown)}: not written ({why}); all other results are there")
 
+    def cannot_be_written(self, error: OSError) -> OutputError:
+        """The error for a place that cannot be written: it names the folder that was asked for."""
+        return OutputError(f"{self.asked}: cannot be written: {os.strerror(error.errno) if error.errno else error}")
+
     def _reason(self, error: Exception) -> str:
         """The reason of an error in a line."""
         if isinstance(error, CopemError):
@@ -472,6 +476,12 @@ def check_target(folder: Path, *, overwrite: bool) -> None:
         raise OutputError(f"{folder}: cannot be written: {error.strerror}") from None
     if not parent.is_dir():
         raise OutputError(f"{folder}: cannot be written: {parent} is a file")
+    try:
+        os.fsencode(os.path.abspath(folder)).decode()
+    except UnicodeDecodeError:
+        raise OutputError(
+            f"{folder}: cannot be written: expected a path in UTF-8, found other bytes; choose another with --out"
+        ) from None
     if not os.access(parent, os.W_OK | os.X_OK):
         raise OutputError(f"{folder}: cannot be written: no permission to write in {parent}")
     if not exists:

@@ -181,7 +181,7 @@ def fill_place(
         (place.new / MARK).write_text(json.dumps(provenance, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
         place.finish(files)
     except OSError as error:
-        raise OutputError(f"{place.folder}: cannot be written: {error.strerror or error}") from error
+        raise place.cannot_be_written(error) from error
     return notes
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from copem_replay.core.errors import EgoError, EmptyWindowError, RecordingError
+from copem_replay.core.errors import EgoError, EmptyWindowError, RecordingError, near_name_hint
 
 LOG = Path("logs/a.mcap")
 
@@ -48,3 +48,18 @@ def test_workers_hand_errors_on_whole() -> None:
     assert type(error) is EmptyWindowError
     assert error.problems == ("logs/a.mcap: t: one", "logs/a.mcap: t: two")
     assert (error.path, error.topic, error.key) == (LOG, "t", ("window_s",))
+
+
+@pytest.mark.parametrize(
+    ("name", "known", "hint"),
+    [
+        ("gmm", ["ideal", "union", "nms", "gnn", "tracker"], "; did you mean gnn?"),
+        ("traker", ["ideal", "union", "nms", "gnn", "tracker"], "; did you mean tracker?"),
+        ("gmm", ["gaussian"], ""),
+        ("gmm", ["gnn", "gap"], ""),  # which of them
+        ("", ["gnn"], ""),
+        ("x", [], ""),
+    ],
+)
+def test_a_name_that_is_alike(name: str, known: list[str], hint: str) -> None:
+    assert near_name_hint(name, known) == hint

@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import math
 import re
+import shlex
+import time
 import tracemalloc
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -10,6 +12,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import BaseModel, ValidationError
 
 from copem_replay.core import components
 from copem_replay.core import yaml as plain_yaml
@@ -18,7 +21,13 @@ from copem_replay.core.errors import ExperimentError
 from copem_replay.core.object_list import Entries
 from copem_replay.core.tracks import Float
 from copem_replay.core.view_geometry import ViewGeometry
-from copem_replay.experiment.file import log_paths, parse_experiment, read_experiment_file
+from copem_replay.experiment.file import (
+    LIST_EXAMPLES,
+    describe_by_key,
+    log_paths,
+    parse_experiment,
+    read_experiment_file,
+)
 from copem_replay.experiment.schema import Experiment
 from copem_replay.fusion.interface import IdealFusion, Inbox, StepFusion
 from copem_replay.fusion.tracker import Tracker
@@ -191,7 +200,8 @@ class TestNotAnExperimentFile:
             ("# nothing\n", "1: expected keys and values such as `version: 1`, found an empty file"),
             ("- version: 1\n", "1: expected keys and values such as `version: 1`, found a list"),
             ("version 1\n", "1: expected keys and values such as `version: 1`, found text"),
-            ("version: 1\n\tlogs: []\n", r"2: not YAML: found character '\t' that cannot start any token"),
+            ("version: 1\n\tlogs: []\n", "2: not YAML: found a tab where only spaces may stand; indent with spaces"),
+            ("a:\n  b: 1\n\tc: 2\n", "3: not YAML: found a tab where only spaces may stand; indent with spaces"),
             ("a: [1, 2\nb: 3\n", "2: not YAML: expected ',' or ']', but got ':'"),
             ("a: 'x\n", "2: not YAML: found unexpected end of stream"),
             ("a: *b\n", "1: not YAML: found undefined alias 'b'"),
@@ -210,6 +220,22 @@ class TestNotAnExperimentFile:
     def test_absent(self, tmp_path: Path) -> None:
         with pytest.raises(ExperimentError, match=r"^.*/none\.yaml: no such file$"):
             read_experiment_file(tmp_path / "none.yaml")
+
+    @pytest.mark.parametrize("name", ["my drive.mcap", "drive.osi", "bag"])
+    def test_recording(self, tmp_path: Path, name: str) -> None:
+        """Of a command that takes experiments: it is said what makes one."""
+        path = tmp_path / name
+        if name == "bag":
+            path.mkdir()
+            (path / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
+        else:
+            path.write_bytes(b"\x89MCAP0\r\n")
+        with pytest.raises(ExperimentError) as refused:
+            read_experiment_file(path)
+        (problem,) = refused.value.problems
+        makes = f"`copem-replay init {shlex.quote(str(path))} > experiment.yaml` makes one that replays it"
+        assert problem.endswith(f"; {makes}")
+        assert "expected an experiment file (YAML)" in problem
 
     def test_folder(self, tmp_path: Path) -> None:
         with pytest.raises(ExperimentError, match="is a folder; expected an experiment file"):
@@ -350,7 +376,7 @@ CASES = [
     (TOP, "version: 2", "1: version: expected 1, found 2"),
     (TOP, "version: '1'", "1: version: expected 1, found '1'"),
     (TOP, "version: true", "1: version: expected 1, found true"),
-    (TOP, "logs: drive.mcap", "2: logs: expected a list, found 'drive.mcap'"),
+    (TOP, "logs: drive.mcap", "2: logs: expected a list, found 'drive.mcap'; such as `logs: [drive.mcap]`"),
     (TOP, "logs: []", "2: logs: expected at least 1 in the list, found []"),
     (TOP, "logs: [drive.mcap, 5]", "2: logs[1]: expected text, found 5"),
     (TOP, "runs: 0", "3: runs: expected at least 1, found 0"),
@@ -369,7 +395,7 @@ CASES = [
     (TOP, "window_s: [0, '9']", "19: window_s[1]: expected a number, found '9'"),
     (TOP, "window_s: [0]", "19: window_s[1]: missing"),
     (TOP, "window_s: [0, 1, 2]", "19: window_s: expected at most 2 in the list, found [0, 1, 2]"),
-    (TOP, "window_s: 5", "19: window_s: expected a list, found 5"),
+    (TOP, "window_s: 5", "19: window_s: expected a list, found 5; such as `window_s: [0, 20]`"),
     (TOP, "max_gap_s: 0", "19: max_gap_s: expected more than 0, found 0"),
     (TOP, "max_gap_s: .inf", "19: max_gap_s: expected a finite number, found inf"),
     (TOP, "max_gap_s: .nan", "19: max_gap_s: expected a finite number, found nan"),
@@ -386,7 +412,8 @@ CASES = [
     (WHEN, "azimuth_deg: [1]", ".azimuth_deg[1]: missing"),
     (WHEN, "azimuth_deg: [-400, 60]", f".azimuth_deg: {A_TURN}, found -400 (through 0: [350, 10])"),
     (WHEN, "azimuth_deg: [0, 360.5]", f".azimuth_deg: {A_TURN}, found 360.5 (through 0: [350, 10])"),
-    (WHEN, "classes: car", ".classes: expected a list, found 'car'"),
+    (WHEN, "range_m: 80", ".range_m: expected a list, found 80; such as `range_m: [0, 80]`"),
+    (WHEN, "classes: car", ".classes: expected a list, found 'car'; such as `classes: [pedestrian]`"),
     (WHEN, "classes: []", ".classes: expected at least 1 in the list, found []"),
     (WHEN, "classes: [car, cow]", f".classes[1]: expected one of {CLASSES}; found 'cow'"),
     (WHEN, "visible_share: [0, 2]", ".visible_share[1]: expected at most 1, found 2"),
@@ -431,7 +458,6 @@ CASES = [
     (UNIT, "recorded: {topic: lists}, on: {classes: [car], penetration_rate: 0.5}", f": {RECORDED}"),
     (UNIT, "recorded: lists", ".recorded: expected keys and values, found 'lists'"),
     (UNIT, "recorded: {}", ".recorded.topic: missing"),
-    (UNIT, "recorded: {topic: ''}", ".recorded.topic: expected at least 1 character, found ''"),
     (UNIT, "recorded: {topic: lists, delay: 1}", ".recorded.delay: unknown key; did you mean delay_s?"),
     (UNIT, "recorded: {topic: lists, delay_s: -1, existence: 1.5, covariance_m2: [[1, 2], [2, 1]]}",
      ".recorded.delay_s: expected at least 0, found -1",
@@ -471,7 +497,7 @@ CASES = [
     (MAST, "at: [a, 1e300], height_m: 1, pem: onboard",
      ".at[0]: expected a number, found 'a'",
      ".at[1]: expected at most 1e+12, found 1e+300"),
-    (MAST, "at: 5, height_m: 1, pem: onboard", ".at: expected a list, found 5"),
+    (MAST, "at: 5, height_m: 1, pem: onboard", ".at: expected a list, found 5; such as `at: [0, 0]`"),
     (BRAKING, "{}", ".driver: missing"),
     (BRAKING, "{driver: hard}",
      ".driver: expected {kind: …}, kind one of constant_deceleration; found 'hard'"),
@@ -486,7 +512,8 @@ CASES = [
     (BRAKING, "{driver: {kind: constant_deceleration, a_max_mps2: 8}, margin_m: 1000}",
      ".margin_m: expected at most 100, found 1000"),
     (DRIVER, "kind: constant_deceleration, a_max_mps2: 8, reaction: {kind: gama, shape: 1, mean_s: 1}",
-     ".reaction: kind: expected one of constant, gamma, lognormal, or package.module:Class; found 'gama'"),
+     ".reaction: kind: expected one of constant, gamma, lognormal, or package.module:Class; found 'gama'; "
+     "did you mean gamma?"),
     (DRIVER, "kind: constant_deceleration, a_max_mps2: 8, reaction: {kind: gamma, shape: 1}",
      ".reaction.mean_s: missing"),
     (MEASURE, "conflict: {horizon_s: 0}", ".conflict.horizon_s: expected more than 0, found 0"),
@@ -517,7 +544,8 @@ CASES = [
     (COPEM, "latncy_s: 1", ".latncy_s: unknown key; did you mean latency_s?"),
     (COPEM, "latency_ms: 500", ".latency_ms: unknown key; did you mean latency_s? (in s, not ms)"),
     (COPEM, "fusion: ideal", f".fusion: expected {{kind: …}}, kind one of {FUSIONS}; found 'ideal'"),
-    (COPEM, "fusion: {kind: real}", f".fusion: kind: expected one of {FUSIONS}, or package.module:Class; found 'real'"),
+    (COPEM, "fusion: {kind: real}",
+     f".fusion: kind: expected one of {FUSIONS}, or package.module:Class; found 'real'; did you mean ideal?"),
     (COPEM, "fusion: {combine: mean}", ".fusion.combine: expected 'samples' or 'posterior', found 'mean'"),
     (COPEM, "fusion: {colour: red}", ".fusion.colour: unknown key; known here: combine, kind"),
     (COPEM, "fusion: {kind: ideal, colour: red}", ".fusion.colour: unknown key; known here: combine, kind"),
@@ -640,6 +668,26 @@ class TestProblems:
     def test_pem_that_is_no_list(self, tmp_path: Path) -> None:
         text = TEXT.replace("    - when:", "      when:")
         assert problems(tmp_path, text)[0].startswith("6: pems.onboard: expected a list, found {'when': {'range_m'")
+
+    @pytest.mark.parametrize("number", [30, 20_000])
+    def test_each_key_is_looked_at_once(self, number: int) -> None:
+        """Time grows with the number of problems: 20 000 take seconds, and took a quarter of an hour."""
+
+        class Sizes(BaseModel):
+            of: dict[str, int]
+            deeper: dict[str, dict[str, int]] = {}
+
+        data = {"of": {f"k{k}": "x" for k in range(number)}, "deeper": {"a": {"b": "x"}}}
+        with pytest.raises(ValidationError) as wrong:
+            Sizes.model_validate(data)
+        began_s = time.process_time()
+        found = list(describe_by_key(Sizes, wrong.value, data))
+        assert time.process_time() - began_s < 10
+        assert [key for key, _ in found] == [*(("of", f"k{k}") for k in range(number)), ("deeper", "a", "b")]
+
+    def test_examples_of_lists_are_those_of_the_page_of_keys(self) -> None:
+        page = (Path(__file__).parents[2] / "docs/reference/keys.md").read_text(encoding="utf-8")
+        assert [key for key, example in LIST_EXAMPLES.items() if f"`{key}: {example}`" not in page] == []
 
     @pytest.mark.parametrize("name", ["a/b", "''", '"a\\nb"', '"\\e[31m"'])
     def test_name_of_a_configuration(self, tmp_path: Path, name: str) -> None:

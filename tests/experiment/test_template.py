@@ -229,6 +229,17 @@ def test_lists_of_the_log_become_units(tmp_path: Path, replayed: Callable[..., A
     assert "  # broken cannot be a unit: " in format_draft(survey_recording("log.mcap"))
 
 
+def test_topics_without_a_name(tmp_path: Path, replayed: Callable[..., Any]) -> None:
+    """Of a unit's lists, of one of two truths, of the poses of an ego."""
+    write_recording(tmp_path / "unit.mcap", street(host=1), more=[unit("")])
+    recorded = [unit["recorded"]["topic"] for unit in replayed("unit.mcap")["units"].values() if "recorded" in unit]
+    assert recorded == [""]
+    write_mcap(tmp_path / "truths.mcap", [truth_topic(street(host=1), name=""), truth_topic(street()[:3], name="b")])
+    assert replayed("truths.mcap")["read"]["topic"] == ""
+    write_recording(tmp_path / "ego.mcap", street(), more=[poses("")])
+    assert replayed("ego.mcap")["ego"]["topic"] == ""
+
+
 def test_what_a_stack_made_of_lists_is_no_unit_beside_them(tmp_path: Path, replayed: Callable[..., Any]) -> None:
     output = unit("/fusion/objects", covariance=True, captured=True)
     write_recording(tmp_path / "log.mcap", street(), host=1, more=[unit("rsu"), output])

@@ -9,14 +9,18 @@ from typing import Any
 import pytest
 from mcap.reader import make_reader
 
+import copem_replay as cr
 from copem_replay.cli import main as cli
+from copem_replay.cli.results import layout
 from copem_replay.core.errors import InputError
 from copem_replay.experiment.file import log_paths, read_experiment_file
 from copem_replay.experiment.validate import find_problems, read_logs
 from copem_replay.io.write.foxglove_layout import build_layout, split_panels
 from copem_replay.pipeline.run import run_experiment
+from copem_replay.results.folder import read_made_names
 from copem_replay.results.write import write_results
 from copem_replay.viewer.rrd import EXPORTERS
+from tests.helpers import experiments
 from tests.io.test_write_ros2 import EXPERIMENT, drive
 
 ROOT = Path(__file__).parents[2]
@@ -34,6 +38,29 @@ def replay(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("layout") / "tc016d"
     write_results(folder, once, recordings, run_experiment(once, recordings), exporters=EXPORTERS)
     return folder / "replay.mcap"
+
+
+def test_results_of_several_logs_have_a_layout_each(tmp_path: Path) -> None:
+    for name in ("drive.mcap", "again.mcap"):
+        experiments.drive(tmp_path / name)
+    (tmp_path / "e.yaml").write_text(
+        experiments.changed("logs: [drive.mcap, again.mcap]", "show: {run: 0, logs: [all]}")
+    )
+    folder = cr.run(tmp_path / "e.yaml").save(tmp_path / "r")
+    assert layout(folder) == 0
+    written = {path.name: json.loads(path.read_text()) for path in (folder / "replay").glob("*.foxglove.json")}
+    assert sorted(written) == ["again.foxglove.json", "drive.foxglove.json"]
+    assert written["drive.foxglove.json"] == build_layout(folder / "replay/drive.mcap")
+    assert {"replay/again.foxglove.json", "replay/drive.foxglove.json"} <= read_made_names(folder)
+    with pytest.raises(
+        InputError, match=r"--out: expected one replay, found 2 of several logs; name one: .*again\.mcap"
+    ):
+        layout(folder, out=tmp_path / "x.json")
+    assert layout(folder / "replay/drive.mcap", out=tmp_path / "x.json") == 0
+    (folder / "replay/drive.mcap").rename(tmp_path / "drive.mcap")
+    (folder / "replay/again.mcap").unlink()
+    with pytest.raises(InputError, match=r"replay\.mcap: cannot be read"):
+        layout(folder)
 
 
 def leaves(part: Any) -> list[tuple[str, float, float]]:

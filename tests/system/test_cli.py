@@ -700,6 +700,37 @@ class TestLive:
         assert call("run", "e.yaml", "--live") == (2, "", [said])
 
 
+class TestOtherLogs:
+    """`--log` in the place of the logs of the file, of which `show` names some."""
+
+    @pytest.mark.parametrize(
+        ("shown", "logs", "written_of"),
+        [
+            ("[drive]", ["other.mcap"], "other"),
+            ("[drive, other]", ["other.mcap"], "other"),
+            ("[drive, all]", ["other.mcap"], "other"),
+            ("[drive]", ["other.mcap", "drive.mcap"], "drive"),
+        ],
+    )
+    def test_what_is_not_replayed_is_not_shown(
+        self, here: Path, call: Call, shown: str, logs: list[str], written_of: str
+    ) -> None:
+        drive(here / "other.mcap")
+        (here / "e.yaml").write_text(changed(f"show: {{run: 0, logs: {shown}}}"))
+        options = [word for log in logs for word in ("--log", log)]
+        assert call("run", "e.yaml", *options).code == 0
+        provenance = json.loads((here / "out/e/provenance.json").read_text())
+        assert list(provenance["runs_shown"]) == [written_of]
+        assert call("run", "out/e/experiment.yaml", "--out", "again").code == 0
+
+    def test_a_log_that_the_file_does_not_have_is_a_mistake_still(self, here: Path, call: Call) -> None:
+        drive(here / "other.mcap")
+        (here / "e.yaml").write_text(changed("show: {run: 0, logs: [drvie]}"))
+        ended = call("run", "e.yaml", "--log", "other.mcap")
+        assert ended.code == 2
+        assert "no log is named 'drvie'" in ended.lines[0]
+
+
 class TestWrittenExperiment:
     def test_runs_as_it_is_and_gives_the_same(self, here: Path, call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
         drive(here / "a/drive.mcap")
@@ -903,6 +934,10 @@ class TestTarget:
             ("loop", "loop: cannot be written: Too many levels of symbolic links"),
             ("loop/e", "loop/e: cannot be written: Too many levels of symbolic links"),
             ("x/" * 2000, "x/" * 1999 + "x: cannot be written: its whole path has more than 3496 bytes"),
+            (
+                "o\udcff",
+                "o\\udcff: cannot be written: expected a path in UTF-8, found other bytes; choose another with --out",
+            ),
             ("/proc/x", "/proc/x: cannot be written: No such file or directory"),
         ],
     )
@@ -996,7 +1031,12 @@ class Failure(NamedTuple):
 DEFECT = "copem-replay: internal error; please report it with the lines above"
 DISK = OSError(errno.ENOSPC, "No space left on device")
 FAILURES = [
-    Failure(DISK, 2, "{here}/out/e: cannot be written: No space left on device"),
+    Failure(DISK, 2, "out/e: cannot be written: No space left on device"),
+    Failure(
+        OSError(errno.ENOSPC, "Error writing bytes to file. Detail: [errno 28] No space left on device"),  # of Arrow
+        2,
+        "out/e: cannot be written: No space left on device",
+    ),
     Failure(RuntimeError("oops"), 70, DEFECT),
     Failure(KeyboardInterrupt(), 130, "interrupted"),
     Failure(MemoryError(), 2, "copem-replay: not enough memory; take fewer runs, units or objects at a time"),
@@ -1030,7 +1070,7 @@ class TestFailure:
         monkeypatch.setattr(results, step, raising(failure.error))
         self.fails(here, call, arguments, failure)
 
-    @pytest.mark.parametrize("failure", FAILURES[1:], ids=[type(f.error).__name__ for f in FAILURES[1:]])
+    @pytest.mark.parametrize("failure", FAILURES[2:], ids=[type(f.error).__name__ for f in FAILURES[2:]])
     def test_while_replaying(
         self, here: Path, call: Call, arguments: list[str], failure: Failure, monkeypatch: pytest.MonkeyPatch
     ) -> None:

@@ -77,6 +77,13 @@ def _detection_gap(times_ns: dict[str, int], configurations: int) -> int:
     return last - min(times_ns.values())
 
 
+def list_replays(place: Path) -> list[Path]:
+    """The replays of a results folder, `replay.mcap` or one for each shown log, or the one that is named."""
+    if not place.is_dir() or (place / "replay.mcap").is_file():
+        return [place / "replay.mcap" if place.is_dir() else place]
+    return sorted((place / "replay").rglob("*.mcap")) or [place / "replay.mcap"]
+
+
 def build_layout(replay: Path, compare: Sequence[str] = ()) -> dict[str, Any]:
     """The layout: a panel per configuration, or of `compare` one with all of them and one of each.
 
