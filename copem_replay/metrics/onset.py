@@ -48,6 +48,10 @@ def began_texts(position: Int) -> np.ndarray:
     return np.array(BEGAN, dtype=object)[position]
 
 
+COUNTS_BY = ("began", "onset_s", "ended_s")
+"""The columns that say whether a row counts."""
+
+
 def has_frame_after(rows: pd.DataFrame) -> Bool:
     """(n,) whether the object is followed beyond its onset: of an episode of one frame nothing can be told."""
     after: Bool = (rows["ended_s"] - rows["onset_s"]).to_numpy(dtype=float) > SAME_INSTANT_S
@@ -58,14 +62,14 @@ def is_counted(rows: pd.DataFrame, words: Sequence[str]) -> Bool:
     """(n,) whether rows count for times, shares and distances at detection. Everything else is measured of all rows.
 
     They began in one of the ways `words` (`measure.began`), and have a frame after the onset. `rows`: a table with the
-    columns `began`, `onset_s`, `ended_s`.
+    columns `COUNTS_BY`.
     """
     counted: Bool = rows["began"].isin(words).to_numpy(dtype=bool) & has_frame_after(rows)
     return counted
 
 
 def select_counted(rows: pd.DataFrame, words: Sequence[str]) -> pd.DataFrame:
-    """The rows that count, of a table with the columns that `is_counted` reads."""
+    """The rows that count, of a table with the columns `COUNTS_BY`."""
     counted = is_counted(rows, words)
     return rows if counted.all() else rows[counted]
 

@@ -28,7 +28,7 @@ from copem_replay.io.open import File, Place, fetch_place, first_recording, read
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.config import Objects
 from copem_replay.metrics.intervals import FixedOutcomes, choose_clusters, find_fixed_outcomes
-from copem_replay.metrics.onset import select_counted
+from copem_replay.metrics.onset import COUNTS_BY, select_counted
 from copem_replay.metrics.summary import DETECTED
 from copem_replay.pipeline.prepare import Replay, prepare_log
 from copem_replay.pipeline.study_log import read_content_digest
@@ -224,13 +224,13 @@ class Results:
     def each(self, *columns: str, log: str | None = None, every: bool = False) -> Iterator[pd.DataFrame]:
         """Rows that count, or `every` row, log by log or of one log; with `columns`, none named: all but `log`."""
         columns = columns or tuple(name for name in self.rows.without_rows.column_names if name != "log")
-        rows = self.rows.only(dict.fromkeys((*columns, "began")))
+        rows = self.rows.only(dict.fromkeys((*columns, *COUNTS_BY)))
         for name_of_log in self.rows.where if log is None else [log]:
             table = rows.of(name_of_log)
             check_unchanged(self.folder, self.seen)
             frame = table.to_pandas()
             counted = frame if every else self.counted(frame)
-            yield counted if "began" in columns else counted.drop(columns="began")
+            yield counted[[name for name in columns if name in counted]]
 
     def counted(self, rows: pd.DataFrame) -> pd.DataFrame:
         """The rows that count for times, shares and distances at detection (`measure.began`)."""

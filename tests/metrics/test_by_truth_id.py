@@ -17,6 +17,7 @@ from copem_replay.fusion.ideal import fuse_ideal
 from copem_replay.metrics.config import Confirm
 from copem_replay.metrics.detection.by_truth_id import capture_instants, detect_by_truth_id
 from copem_replay.metrics.episodes import Episodes
+from tests.oracles.accuracy import episodes_of
 
 NEVER = None
 Held = frozenset[tuple[int, int]]
@@ -88,9 +89,7 @@ def tracks(world: World) -> Tracks:
 
 
 def episodes(world: World) -> Episodes:
-    onset, end = (np.array([episode[k] for episode in world.episodes.values()], dtype=float) / 1000 for k in (0, 1))
-    nothing = np.zeros(len(onset), dtype=int)
-    return Episodes(np.array(list(world.episodes), dtype=int), onset, nothing > 0, end, nothing)
+    return episodes_of({name: (onset / 1000, end / 1000) for name, (onset, end) in world.episodes.items()})
 
 
 def detected(world: World, heard: Tracks | None = None) -> dict[tuple[int, int], Found | None]:

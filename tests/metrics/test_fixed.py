@@ -73,7 +73,7 @@ def test_the_table_says_which_have_none(made: Path) -> None:
 def test_differences_of_what_is_not_drawn_have_no_interval(made: Path) -> None:
     table = compare_folders([made], configurations=["hit", "late"], baseline="GT").table
     hit = table[table["configuration"] == "hit"]
-    assert set(hit["metric"]) >= {"detected_share", "ttd_rmst_s", "pass_share", "gospa_m"}
+    assert set(hit["metric"]) >= {"detected_share", "ttd_rmst_s", "pass_share", "gospa_held_m"}
     assert (hit["interval"] == "nothing drawn").all()
     assert hit[["low", "high", "interval_over"]].isna().all(axis=None)
     assert hit.set_index("metric").loc["ttd_rmst_s", "difference"] == pytest.approx(0.5)
@@ -86,7 +86,7 @@ def test_differences_of_what_is_not_drawn_have_no_interval(made: Path) -> None:
 def test_what_passes_depends_on_a_drawn_reaction(reacting: Path) -> None:
     table = compare_folders([reacting], configurations=["hit"], baseline="GT").table.set_index("metric")
     assert table.loc["ttd_rmst_s", "interval"] == "nothing drawn"
-    assert table.loc["pass_share", "interval"] in ("bootstrap", "exact")
+    assert table.loc["pass_share", "interval"] in ("jackknife", "exact")
 
 
 def test_why_there_is_none_is_said_once(made: Path) -> None:

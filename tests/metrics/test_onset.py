@@ -116,8 +116,8 @@ def test_the_schema_has_built_in_and_installed_onsets(monkeypatch: pytest.Monkey
     onset = Experiment.model_json_schema()["$defs"]["Measure"]["properties"]["onset"]
     kinds = {one["properties"]["kind"].get("const"): set(one["properties"]) for one in onset["anyOf"]}
     assert list(kinds) == [*ONSETS, "in_lane", None]
-    assert kinds["in_lane"] == {"kind", "reach_m"}
-    assert kinds["starts_moving"] == {"kind", "speed_mps", "within_m", "from"}
+    assert kinds["in_lane"] == {"kind", "reach_m", "again_after_s"}
+    assert kinds["starts_moving"] == {"kind", "speed_mps", "within_m", "from", "again_after_s"}
     assert onset["default"] == {"kind": "in_range", "range_m": 50.0}
 
 

@@ -24,10 +24,10 @@ from copem_replay.fusion.ideal import fuse_ideal
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.config import Confirm
 from copem_replay.metrics.detection.by_truth_id import detect_by_truth_id
-from copem_replay.metrics.episodes import Episodes
 from copem_replay.pipeline.run import run_experiment
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
 from tests.oracles import ideal
+from tests.oracles.accuracy import episodes_of
 from tests.oracles.ideal import SentList
 
 STEP = 10
@@ -94,9 +94,7 @@ def test_states_and_detections_are_those_of_the_oracle(
     heard = tracks(runs, units, tick)
     fused_tracks = fuse_ideal(heard, max_age_s=max_age / 1000)
     fused = fused_tracks.fused
-    began = np.full(OBJECTS, onset * STEP / 1000)
-    nothing = np.zeros(OBJECTS, dtype=int)
-    looked_at = Episodes(np.arange(OBJECTS), began, nothing > 0, np.full(OBJECTS, 0.9), nothing)
+    looked_at = episodes_of(dict.fromkeys(range(OBJECTS), (onset * STEP / 1000, 0.9)))
     found = detect_by_truth_id(heard, looked_at, confirm=Confirm(), count_earlier=False, max_age_s=max_age / 1000)
     for s, lists in enumerate(runs):
         expected = ideal.known(lists, tick, max_age)

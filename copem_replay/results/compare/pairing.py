@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int
-from copem_replay.metrics.onset import is_counted
+from copem_replay.metrics.onset import COUNTS_BY, is_counted
 from copem_replay.metrics.survival import COMPETES
 from copem_replay.results.compare.labels import LabelledConfiguration
 from copem_replay.results.schema import AGAIN, HELD
@@ -206,7 +206,7 @@ def lay_out_configuration(
     for name, needed in (("onset_s", True), ("ended_s", True), ("detection_s", detected)):
         if (np.isnan(float_column(rows[name])) & needed).any():
             raise InputError(f"{place}: column {name}: expected a number in every row, found none in some; {AGAIN}")
-    braking, began = results.provenance.braking is not None, rows.select(["began", "onset_s", "ended_s"]).to_pandas()
+    braking, began = results.provenance.braking is not None, rows.select([*COUNTS_BY]).to_pandas()
     size = len(grid.episodes) * grid.runs
     return ConfigurationData(
         label=one.label,
