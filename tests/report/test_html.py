@@ -455,7 +455,7 @@ class TestNeverDetected:
                 ("b", "1", "A", 0.1, 1), ("b", "1", "A", 0.7, 1), ("b", "1", "A", None, 1),
             ],
             columns=["log", "object_id", "configuration", "time_to_detection_s", "runs"],
-        ).assign(object_class="car", onset_s=0.0, ended_s=1.0, ended_by="log_end")  # fmt: skip
+        ).assign(object_class="car", episode=0, onset_s=0.0, ended_s=1.0, ended_by="log_end")  # fmt: skip
         found = count_misses(rows)[["log", "object_id", "configuration", "missed", "runs"]].to_numpy().tolist()
         assert found == [["a", "1", "A", 2, 3], ["b", "1", "A", 1, 3]]
 

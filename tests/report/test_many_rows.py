@@ -51,8 +51,8 @@ def test_neither_holds_all_rows(several: Path, tmp_path: Path, monkeypatch: pyte
     most: list[int] = []
     each = Results.each
 
-    def watched(results: Results, *columns: str, log: str | None = None) -> Any:
-        for rows in each(results, *columns, log=log):
+    def watched(results: Results, *columns: str, **given: Any) -> Any:
+        for rows in each(results, *columns, **given):
             most.append(len(rows))
             yield rows
 
@@ -114,7 +114,7 @@ def tables(draw: st.DrawFn) -> pd.DataFrame:
         [[f"log {k}" for k in range(logs)], range(runs), [f"{k}" for k in range(things)]],
         names=["log", "run", "object_id"],
     )
-    rows = index.to_frame(index=False).assign(configuration="A", object_class="car", onset_s=1.0)
+    rows = index.to_frame(index=False).assign(configuration="A", object_class="car", episode=0, onset_s=1.0)
     steps = draw(st.lists(st.integers(-2, 12), min_size=len(rows), max_size=len(rows)))
     rows["time_to_detection_s"] = [step / 4 if step <= 8 else np.nan for step in steps]
     ends = draw(st.lists(st.sampled_from(["object_left", "log_end"]), min_size=logs * things, max_size=logs * things))
