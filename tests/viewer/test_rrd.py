@@ -405,7 +405,7 @@ def test_events_in_words(made: Made) -> None:
 
     found = rows(made.path, "/events/onsets")
     assert [(row[ELAPSED] * 1e-9, row["TextLog:text"][0]) for row in found] == [
-        (0.0, "onset of 9 pedestrian, already at its first frame"),
+        (0.0, "onset of 9 pedestrian, there from the log's start"),
         (2.0, "onset of 7 car"),
     ]
     assert told("GT") == [
