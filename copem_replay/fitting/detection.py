@@ -6,7 +6,7 @@ those of the profile likelihood: all values at which it is within half of χ²'s
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise, product
 from typing import Any
@@ -95,8 +95,10 @@ def explain_no_memory(listed: Bool, pass_ix: Int) -> str | None:
     return None
 
 
-def fit_detection_memory(seen: Sequences, *, intervals: bool = True) -> DetectionMemoryFit:
-    """Share and correlation time of the greatest likelihood, given the probabilities of detection.
+def fit_detection_memory(
+    seen: Sequences, *, intervals: bool = True, instead: Sequence[Sequences] = ()
+) -> DetectionMemoryFit:
+    """Share and correlation time of the greatest likelihood, given the probabilities of detection, or one of `instead`.
 
     Correlation times from a third of the period up to twenty of the longest pass are tried; the last is `always`.
     """
@@ -106,7 +108,7 @@ def fit_detection_memory(seen: Sequences, *, intervals: bool = True) -> Detectio
 
     def likelihood(at: Float) -> float:
         share, tau = np.clip(at, bounds[:, 0], bounds[:, 1])
-        return float(seen.log_probability(expit(share), np.exp(tau)).sum())
+        return max(float(one.log_probability(expit(share), np.exp(tau)).sum()) for one in (seen, *instead))
 
     starts = [
         np.array([s, t])
@@ -177,6 +179,8 @@ _SECTORS = 4
 """Nodes of an axis and sectors of azimuth at most. More: finer tables where rows allow it, and longer fits."""
 _WORDS = {"range": "range", "visible_share": "visible share", "azimuth": "azimuth", "class": "class"}
 _NOTHING = "hits and misses do not refuse that every list is new"
+_SHIFTS = [by for by in np.linspace(-0.9, 0.9, 13).tolist() if abs(by) > 0.01]
+"""Log-odds by which all probabilities are shifted where a number of all objects is fitted."""
 BY = ("range", "visible_share", "class", "azimuth")
 """All that detection may depend on."""
 WORTH_IT = 2.996
@@ -343,7 +347,10 @@ def _choose_memory(
         sequences[True] = build_common_sequences(rows, probability)
     fits = {common: fit_detection_memory(seen, intervals=False) for common, seen in sequences.items()}
     common = max(fits, key=lambda one: fits[one].gain)
-    best = fit_detection_memory(sequences[common], intervals=intervals)
+    # Few numbers of all objects leave the probability open, and on which side of it they are.
+    odds = logit(np.clip(probability, _KEEP_OFF, 1 - _KEEP_OFF))
+    instead = [build_common_sequences(rows, expit(odds + by)) for by in _SHIFTS] if common else []
+    best = fit_detection_memory(sequences[common], intervals=intervals, instead=instead)
     worth = design_effect(best.share.value, best.correlation_s.value, sequences[common])
     if simplest or best.gain * len(rows.listed) <= WORTH_IT:
         return None, "the simplest model was asked for" if simplest else _NOTHING, worth
