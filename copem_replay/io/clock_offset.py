@@ -288,6 +288,11 @@ class TimeOffset:
     untold: str | None = None
     unbiased: bool = False
 
+    def reversed(self) -> TimeOffset:
+        """The offset of the first list's clock against the other one's, from the other's against the first's."""
+        drift = None if self.drift is None else (-self.drift[0], -self.drift[2], -self.drift[1])
+        return replace(self, offset_s=-self.offset_s, low_s=-self.high_s, high_s=-self.low_s, drift=drift)
+
 
 def estimate_time_offset(
     reference: ListPoints, other: ListPoints, *, from_s: float = -2.0, to_s: float = 2.0, shifted: bool = False
@@ -301,14 +306,8 @@ def estimate_time_offset(
     if len(tracks.time_s) < _FOLLOWED * len(reference.time_s):
         turned = short_tracks(other)
         if len(turned.time_s) > len(tracks.time_s):
-            return _reverse_offset(_estimate_offset(turned, reference.thinned(_AT_MOST), (-to_s, -from_s), shifted))
+            return _estimate_offset(turned, reference.thinned(_AT_MOST), (-to_s, -from_s), shifted).reversed()
     return _estimate_offset(tracks, other.thinned(_AT_MOST), (from_s, to_s), shifted)
-
-
-def _reverse_offset(estimate: TimeOffset) -> TimeOffset:
-    """The offset of the first list's clock against the other one's, from that of the other's against the first's."""
-    drift = None if estimate.drift is None else (-estimate.drift[0], -estimate.drift[2], -estimate.drift[1])
-    return replace(estimate, offset_s=-estimate.offset_s, low_s=-estimate.high_s, high_s=-estimate.low_s, drift=drift)
 
 
 def _estimate_offset(
@@ -431,19 +430,24 @@ class _Fit:
         np.add.at(self._score, block_of, self.ways.score)
         np.add.at(self._information, block_of, self.ways.information)
 
-    def half_width(self, k: int, certain: float = 0.975) -> float:
-        """Half of the 95 % interval of coefficient `k`.
+    def half_width(self, k: int) -> float:
+        """Half of the 95 % interval of coefficient `k`."""
+        return find_half_width(self._score, self._information, k, self._beyond) * float(self.ways.stretch)
 
-        Where blocks move the coefficient by more than independent errors of entries would, the interval is wider in
-        proportion (Birge's ratio). It is never narrower than independent errors make it.
-        """
-        from scipy.stats import t
 
-        inverse = np.linalg.pinv(self._information.sum(axis=0))[k]
-        moved, variance = self._score @ inverse, np.einsum("c,gcd,d->g", inverse, self._information, inverse)
-        freedom = max(self.blocks - len(inverse), 1)
-        ratio = self._beyond * (moved**2 / np.maximum(variance, 1e-12 * variance.sum())).sum() / freedom
-        return float(t.ppf(certain, freedom) * np.sqrt(max(ratio, 1.0) * variance.sum()) * self.ways.stretch)
+def find_half_width(score: Float, information: Float, k: int, beyond: float = 1.0) -> float:
+    """Half of the 95 % interval of coefficient `k`, from scores (G, C) and information (G, C, C) of G blocks.
+
+    Where blocks move the coefficient by more than independent errors of entries would, the interval is wider in
+    proportion (Birge's ratio, times `beyond`). It is never narrower than independent errors make it.
+    """
+    from scipy.stats import t
+
+    inverse = np.linalg.pinv(information.sum(axis=0))[k]
+    moved, variance = score @ inverse, np.einsum("c,gcd,d->g", inverse, information, inverse)
+    freedom = max(len(score) - len(inverse), 1)
+    ratio = beyond * (moved**2 / np.maximum(variance, 1e-12 * variance.sum())).sum() / freedom
+    return float(t.ppf(0.975, freedom) * np.sqrt(max(ratio, 1.0) * variance.sum()))
 
 
 def _number_blocks(pieces: TrackPieces, long_s: float) -> Int:

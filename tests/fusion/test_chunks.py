@@ -116,6 +116,19 @@ def test_a_track_goes_on_over_a_cut(late: str) -> None:
     assert found.entries["cov_ee_m2"][0] < 0.8
 
 
+@pytest.mark.parametrize("late", ["stale", "predict", "replay"])
+def test_a_memory_is_left_as_it_was(late: str) -> None:
+    """Going on from it twice gives the same lists twice."""
+    fusion, told = Tracker(late=late), world(0)
+    half = len(told.issue_s) // 2
+    _, memory = ask_resumed_fusion(fusion, cut_chunk(told, 0, half, fusion.looks_back_s), None, "fusion")
+    rest = cut_chunk(told, half, len(told.issue_s), fusion.looks_back_s)
+    first, again = (ask_resumed_fusion(fusion, rest, memory, "fusion")[0] for _ in range(2))
+    assert len(first.entries) > 20
+    assert again.start.tolist() == first.start.tolist()
+    assert again.entries.tobytes() == first.entries.tobytes()
+
+
 def test_whoever_hears_again_needs_what_was_heard_of_late() -> None:
     fusion, told = Tracker(late="replay"), world(2)
     each = list(pairwise(range(len(told.issue_s) + 1)))

@@ -5,6 +5,7 @@ Over more seeds and recordings: tools/check_time_offsets.py.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from copem_replay.core.tracks import Float
-from copem_replay.io.clock_offset import TimeOffset, estimate_time_offset
+from copem_replay.io.clock_offset import TimeOffset, estimate_time_offset, find_half_width
 from copem_replay.io.short_tracks import ListPoints, follow_points, short_tracks
 from tools.check_time_offsets import listed, tried
 
@@ -101,6 +102,25 @@ def test_at_one_speed_a_shift_cannot_be_told_from_an_offset_and_it_is_said() -> 
     assert found.untold is None
     assert found.unbiased
     assert found.offset_s == pytest.approx(0.25, abs=0.01)
+
+
+def test_the_width_of_an_interval_by_hand() -> None:
+    """Three blocks and one coefficient leave two degrees of freedom: t(2) = 4.303, over √3 of the blocks."""
+    score, information = np.array([[1.0], [-1.0], [0.0]]), np.ones((3, 1, 1))
+    # Blocks move it by 1/3, −1/3, 0, each with a variance of 1/9: a ratio of (1 + 1 + 0) / 2 = 1.
+    assert find_half_width(score, information, 0) == pytest.approx(4.302653 / math.sqrt(3))
+    assert find_half_width(2 * score, information, 0) == pytest.approx(2 * 4.302653 / math.sqrt(3))  # Birge: √4
+    assert find_half_width(0.1 * score, information, 0) == pytest.approx(4.302653 / math.sqrt(3))  # never narrower
+    # Of two coefficients one degree is left: t(1) = 12.706.
+    two = np.array([np.eye(2)] * 3)
+    assert find_half_width(np.zeros((3, 2)), two, 1) == pytest.approx(12.7062 / math.sqrt(3), rel=1e-5)
+
+
+def test_reversed() -> None:
+    """Clock a against clock b, from b against a: limits change sides with their signs."""
+    turned = TimeOffset(0.2, 0.1, 0.5, entries=7, drift=(1e-3, 5e-4, 2e-3), unbiased=True).reversed()
+    assert turned == TimeOffset(-0.2, -0.5, -0.1, entries=7, drift=(-1e-3, -2e-3, -5e-4), unbiased=True)
+    assert TimeOffset(untold="why").reversed().drift is None
 
 
 def test_drift_is_told_of_a_minute_and_no_less() -> None:

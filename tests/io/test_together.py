@@ -80,6 +80,11 @@ def joint(folder: Path, ahead_s: float = AHEAD_S) -> dict[str, Any]:
     return {"together": paths, "clock_offset_s": {paths[1]: ahead_s}, "name": "drive"}
 
 
+def test_clock_offsets_are_rounded_to_a_nanosecond() -> None:
+    """1.001 · 1e9 is 1 000 999 999.999 999 9 in binary."""
+    assert DriveRecordings((Path("a.mcap"), Path("b.mcap")), (0.0, 1.001)).ahead_ns == (0, 1_001_000_000)
+
+
 def test_messages_come_in_order_of_time_and_topics_are_told_apart(folder: Path) -> None:
     log = open_log(place(folder))
     assert {c.topic for c in log.channels} == {"truth", "ego:objects", "rsu:objects"}

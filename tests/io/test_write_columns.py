@@ -30,7 +30,7 @@ SCENE = Scene(
     log="drive", t0_ns=T0_NS, end_ns=T0_NS + 10**10,
     object_ids=("0", "7", "300", str(2**63), str(2**64 - 1), "stationary:5", "Müller's car", "18446744073709551616"),
     object_class=np.array([0, 1, 2, 3, 4, 5, 6, 7], dtype=np.int8) % len(CLASSES),
-    moving=np.array([True, True, False, True, True, False, True, True]),
+    moving=np.array([True, True, False, True, True, False, True, False]),  # of object −1, too, were it an index
 )  # fmt: skip
 COUNT = len(SCENE.object_ids)
 

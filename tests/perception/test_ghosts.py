@@ -173,6 +173,15 @@ class TestPlaces:
             assert set(of_unit) == {0, 1}
             assert (np.abs(tracks.x_m[0] - (30 + 200 * of_unit)) <= 4 + 3 + 1e-9).all()
 
+    def test_beside_objects_they_stand_on_the_same_ground(self) -> None:
+        """A truck of 3.5 m: cars of 1.6 m beside it have their centre .8 m above the ground, as has its lower edge."""
+        where = {"kind": "beside", "classes": ["truck"], "within_m": 3}
+        sort = {"in_list": 2, "where": where, "classes": {"car": 1.0}}
+        [rows] = found(plan_of(sort), scene_of(Thing("truck", "truck", standing(30, 0)), until_s=3), 1)
+        assert rows.found.tracks.z_m.size > 10
+        assert rows.found.tracks.z_m[0] == pytest.approx(rows.found.tracks.height_m[0] / 2)
+        assert set(rows.found.tracks.height_m[0]) == {1.6}
+
     def test_classes_have_their_sizes(self) -> None:
         shares = {"pedestrian": 0.7, "car": 0.3}
         made = found(plan_of({"in_list": 2, "where": FIELD, "classes": shares}), scene_of(until_s=30), 4)
@@ -252,6 +261,14 @@ class TestEachBirthIsAnother:
         replay = prepare_log(TestEachBirthIsAnother.RECORDING, TestEachBirthIsAnother.PLAN)
         drawn = make_ghost_draws(replay.scene, rows, replay.expanded, run_number)
         return draw_claims(rows.found, replay.expanded, drawn, rows.sort)
+
+    def test_equal_sorts_that_last_share_no_address(self) -> None:
+        """Else what lasts of one of them would be that of another."""
+        sort = {"in_list": 1, "lasts_s": 0.5, "where": {"kind": "field", "range_m": [5, 60]}}
+        [rows] = found(plan_of(sort, sort), scene_of(), 1)
+        first, second = (set(rows.words[rows.sort == k].tolist()) for k in (0, 1))
+        assert min(len(first), len(second)) > 60
+        assert first & second == set()
 
     def test_ids_and_scores(self) -> None:
         made = found(self.PLAN, self.RECORDING, 3)

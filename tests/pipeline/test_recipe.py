@@ -174,6 +174,16 @@ def test_what_a_piece_is_of() -> None:
     assert key(experiment(), "another") != base
 
 
+def test_where_a_unit_is_that_distances_are_to_is_in_it() -> None:
+    """Also of configurations that it is no member of."""
+    far = DATA["units"]["far"]
+    units = [DATA["units"] | {"far": far | {"at": at}} for at in ([9, 9], [500, 9])]
+    to_far = {"measure": DATA["measure"] | {"distance_to": "far"}}
+    near_key, far_key = (key(experiment(units=where, **to_far)) for where in units)
+    assert near_key != far_key
+    assert len({key(experiment(units=where)) for where in units}) == 1
+
+
 def test_names_of_configurations_and_other_units_do_not_matter_but_their_order_does() -> None:
     mine = DATA["configurations"]["mine"]
     assert key(experiment(configurations={"renamed": mine}), "renamed") == key(experiment())

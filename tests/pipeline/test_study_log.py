@@ -185,6 +185,14 @@ class TestReplaced:
         assert not Path("out").exists()
 
 
+def test_a_stamp_tells_times_a_nanosecond_apart(tmp_path: Path) -> None:
+    (path := tmp_path / "a").write_bytes(b"x")
+    os.utime(path, ns=(0, 1_700_000_000_000_000_001))
+    before = checksum.FileStamp.of(path)
+    os.utime(path, ns=(0, 1_700_000_000_000_000_002))
+    assert (before.mtime_ns, checksum.FileStamp.of(path).mtime_ns - before.mtime_ns) == (1_700_000_000_000_000_001, 1)
+
+
 class TestWhileItIsRead:
     """One line, exit code 2, no results: else rows could be of another content than the digest."""
 

@@ -111,6 +111,19 @@ def test_lost_late_and_overtaken(made: Made, tmp_path: Path) -> None:
     assert {entity for entity in entities(path) if "lists" in entity} == {"/lists/2_air/pole", "/events/air/lists"}
 
 
+def test_how_long_lists_usually_take_is_of_those_that_arrive(made: Made) -> None:
+    """Most are lost; of the others one takes .30 s where .05 s is usual: late, though a list counts for 1 s."""
+    of = made.run_tracks["air"]
+    arrives_s, pole = np.full_like(of.heard.arrives_s, LOST), of.heard.units.index("pole")
+    frames = np.flatnonzero(of.heard.frame_unit_ix == pole)
+    frames = frames[np.argsort(of.heard.captured_s[frames])]
+    for k, way_s in enumerate((0.05, 0.05, 0.05, 0.30)):
+        arrives_s[0, frames[k]] = of.heard.captured_s[frames[k]] + way_s
+    [lists] = find_linked_lists(replace(of, heard=replace(of.heard, arrives_s=arrives_s)), 1, "air", 1.0)
+    fates = [FATES[fate] for fate in lists.fate]
+    assert fates == ["in time"] * 3 + ["late"] + ["lost"] * 47
+
+
 def test_lists_that_arrive_together_are_not_overtaken(made: Made, tmp_path: Path) -> None:
     """Those of 2.0 to 2.3 s arrive at 2.35 s, within a microsecond: two of them are late."""
     path = arriving(made, tmp_path / "x.rrd", {20: 0.35 + 0.9e-6, 21: 0.25, 22: 0.15})
