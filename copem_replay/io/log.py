@@ -32,6 +32,7 @@ from copem_replay.io.containers.mcap_records import (
     read_by_log_time,
     read_summary,
 )
+from copem_replay.io.decoded_size import DecodeAllowance, OversizeError
 from copem_replay.io.window import ALWAYS, Span, Window, WindowSeconds, describe_window, is_kept
 
 # Files that are not read: what they are by their first bytes and their names, and what to do about it.
@@ -136,6 +137,10 @@ class Log:
     def within(self, window: Window | None) -> Log:
         """The log restricted to a window; None: the whole recording."""
         return replace(self, window=window)
+
+    def file_bytes(self) -> int:
+        """Size of the recording's files."""
+        return self.path.stat().st_size
 
     def spans(self, numbers: Set[int]) -> dict[int, Span]:
         """The log time that is read of some channels, by their numbers."""
@@ -340,7 +345,8 @@ class Messages:
 
 
 def gather_messages(log: Log, numbers: frozenset[int]) -> Messages:
-    """All messages of some channels in memory. Raises BrokenIndexError."""
+    """All messages of some channels in memory. Raises RecordingError: too much memory; BrokenIndexError."""
+    allowance = DecodeAllowance(log.file_bytes())
     payloads: dict[int, list[bytes]] = {number: [] for number in numbers}
     times: dict[int, list[int]] = {number: [] for number in numbers}
     skipped = 0
@@ -348,6 +354,11 @@ def gather_messages(log: Log, numbers: frozenset[int]) -> Messages:
         if log_time_ns > LAST_NS:
             skipped += 1
             continue
+        try:
+            allowance.spend(len(payload))
+        except OversizeError as error:
+            topic = next(c.topic for c in log.channels if c.number == number)
+            raise RecordingError(str(error), path=log.path, topic=topic) from None
         payloads[number].append(payload)
         times[number].append(log_time_ns)
     return Messages(payloads, times, skipped)

@@ -187,6 +187,10 @@ class JoinedLog(Log):
                 streams.append((part.log.start_ns - part.ahead_ns, partial(_read_moved, part, numbers_in_log)))
         yield from merge_streams(streams)
 
+    def file_bytes(self) -> int:
+        """Size of the files of all recordings."""
+        return sum(part.log.file_bytes() for part in self.parts)
+
     def within(self, window: Window | None) -> Log:
         """The log restricted to a window, which each recording gets by its own clock."""
         parts = tuple(replace(part, log=part.log.within(_shift_window(window, part.ahead_ns))) for part in self.parts)

@@ -24,6 +24,7 @@ from copem_replay.core.files import parse_json
 from copem_replay.core.interpolation import wrap_angles
 from copem_replay.core.tracks import CLASSES, UNCERTAINTIES, VALUES, Bool, Float, Int, Scene, Tracks
 from copem_replay.io.channel import LAST_NS, schema_name
+from copem_replay.io.decoded_size import DecodeAllowance, OversizeError, check_objects
 from copem_replay.io.encodings import make_definition
 from copem_replay.io.encodings.columns import DefinitionError, shred_messages
 from copem_replay.io.frames import LogContext, read_decoded_lists, read_log_context, transform_to_world
@@ -31,7 +32,7 @@ from copem_replay.io.log import BrokenIndexError, Log, gather_messages
 from copem_replay.io.open import Local, open_log
 from copem_replay.io.schemas import osi_ground_truth as osi
 from copem_replay.io.schemas.object_lists import DecodedLists
-from copem_replay.io.schemas.osi_ground_truth import SENSOR_DATA, load_sensor_data_class, osi_id
+from copem_replay.io.schemas.osi_ground_truth import SENSOR_DATA, check_osi, load_sensor_data_class, osi_id
 from copem_replay.io.schemas.registry import DETAIL_SCHEMA, known_lists
 from copem_replay.io.window import Window
 
@@ -156,7 +157,7 @@ def _read_messages(log: Log, topic: str) -> tuple[_EntryRows, dict[int, dict[str
         raise RecordingError(_no_lists_message(log, topic), path=log.path)
     detail_topic = f"{topic.removesuffix('/objects')}/detail"
     beside = {c.number for c in log.channels if c.topic == detail_topic and c.schema == DETAIL_SCHEMA}
-    rows = _EntryRows()
+    rows, allowance = _EntryRows(), DecodeAllowance(log.file_bytes())
     details: dict[int, dict[str, Any]] = {}
     for number, log_time_ns, payload in log.payloads(frozenset({*chosen, *beside})):
         if number in beside:
@@ -165,7 +166,13 @@ def _read_messages(log: Log, topic: str) -> tuple[_EntryRows, dict[int, dict[str
                 details[content["available_ns"]] = {item["id"]: item for item in content["objects"]}
         else:
             try:
-                message = load_sensor_data_class().FromString(payload)
+                message_class = load_sensor_data_class()
+                check_osi(message_class, payload)
+                message = message_class.FromString(payload)
+                check_objects(len(message.moving_object))
+                allowance.spend(0, len(message.moving_object))
+            except OversizeError as error:
+                raise RecordingError(str(error), path=log.path, topic=topic) from None
             except DecodeError as error:
                 raise RecordingError(f"a message cannot be decoded: {error}", path=log.path, topic=topic) from None
             _add_message(rows, message, log_time_ns)

@@ -19,6 +19,7 @@ import numpy as np
 from copem_replay.core.errors import EgoError, RecordingError, RemoteFile, count_noun, escape_unprintable
 from copem_replay.core.tracks import CLASSES, Float, Scene, Tracks
 from copem_replay.io.channel import Channel
+from copem_replay.io.decoded_size import DecodeAllowance, OversizeError
 from copem_replay.io.ground_truth import DecodedObjects, assemble_truth
 from copem_replay.io.log import BrokenIndexError, Log, cut_window, window_notes
 from copem_replay.io.open import (
@@ -313,13 +314,18 @@ def _add_notes(columns: DecodedObjects, around: LogContext) -> DecodedObjects:
 
 
 def _decode_topic(log: Log, topic: str) -> DecodedObjects:
-    """All messages of the truth on a topic. Raises BrokenIndexError."""
+    """All messages of the truth on a topic. Raises RecordingError, BrokenIndexError."""
     channels = {c.number: c for c in log.channels if c.topic == topic and is_truth(c)}
-    decoder = osi.GroundTruthDecoder()
-    for number, log_time_ns, payload in log.payloads(frozenset(channels)):
-        decoder.add(
-            payload, schema=channels[number].schema, log_time_ns=log_time_ns, ahead_ns=channels[number].ahead_ns
-        )
+    decoder, allowance = osi.GroundTruthDecoder(), DecodeAllowance(log.file_bytes())
+    try:
+        for number, log_time_ns, payload in log.payloads(frozenset(channels)):
+            before = decoder.states
+            decoder.add(
+                payload, schema=channels[number].schema, log_time_ns=log_time_ns, ahead_ns=channels[number].ahead_ns
+            )
+            allowance.spend(0, decoder.states - before)
+    except OversizeError as error:
+        raise RecordingError(str(error), path=log.path, topic=topic) from None
     return decoder.columns()
 
 

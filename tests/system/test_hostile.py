@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import json
+import os
+import random
 import struct
+import subprocess
 import sys
 import tracemalloc
 from pathlib import Path
 
 import pytest
+from osi3.osi_groundtruth_pb2 import GroundTruth
+from osi3.osi_lane_pb2 import LaneBoundary
 
 from copem_replay.core.errors import CopemError, RecordingError
 from copem_replay.experiment.draft.survey import survey_recording
@@ -273,3 +278,93 @@ def test_message_of_no_channel(path):
     sample.messages[3] = Message(77, 0, 0, 0, b"")
     written(path, whole(sample))
     assert len(read_log(path, name="log").truth.stamp_ns) == 19
+
+
+# A message may be small in the file, as large as a chunk out of it, and ten times as large once parsed.
+
+EMPTY = 20_000_000  # objects: 2.3 GB as Google's parser has them, 1.4 GB as dictionaries
+SURVEYED = """
+import resource, sys
+from pathlib import Path
+
+resource.setrlimit(resource.RLIMIT_AS, (3 << 29, 3 << 29))
+from copem_replay.experiment.draft.survey import survey_recording
+
+print(survey_recording(Path(sys.argv[1])).reason)
+"""
+
+
+def inside(kind: type, name: str, content: bytes) -> bytes:
+    """A field of a protobuf message that is a message itself."""
+    number = kind.DESCRIPTOR.fields_by_name[name].number  # type: ignore[attr-defined]
+    return varint(number << 3 | 2) + varint(len(content)) + content
+
+
+def of_one_message(path: Path, sample: Sample, payload: bytes) -> Path:
+    """A sample with that message alone, in a file that is not too small for its content."""
+    ballast = Raw(0x80, random.Random(1).randbytes(300_000), 300_000)
+    sample.messages[:] = [Message(sample.channels[0].id, 0, 0, 0, payload)]
+    return written(path, Piece([*sample.schemas, *sample.channels, ballast, *sample.messages]))
+
+
+def osi() -> Sample:
+    return taken_apart(ROOT / "logs/tc016d.mcap", 1)
+
+
+@pytest.mark.parametrize(
+    ("sample", "payload"),
+    [
+        (json_updates, lambda: b'{"entities":[' + b"{}," * (EMPTY - 1) + b"{}]}"),
+        (osi, lambda: inside(GroundTruth, "moving_object", b"") * EMPTY),
+        (osi, lambda: inside(GroundTruth, "lane_boundary", inside(LaneBoundary, "boundary_line", b"") * EMPTY)),
+        (protobuf_updates, lambda: b"\x12\0" * EMPTY),
+    ],
+    ids=["JSON", "OSI", "points of one OSI lane boundary", "protobuf"],
+)
+def test_millions_of_empty_objects_in_one_message_take_little_memory(path, sample, payload):
+    """Less than 1.5 GB of addresses, which the interpreter and its libraries have 0.3 of."""
+    of_one_message(path, sample(), payload())
+    assert path.stat().st_size < 500_000
+    ended = subprocess.run(
+        [sys.executable, "-c", SURVEYED, str(path)], cwd=ROOT, capture_output=True, text=True, timeout=100,
+        env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
+    )  # fmt: skip
+    assert (ended.returncode, ended.stderr) == (0, "")
+    reason = ended.stdout.strip().removeprefix(f"{path}: ")
+    assert reason.partition(": ")[2] == "a message would take more than 384 MiB of memory: no list of objects does"
+
+
+def test_more_objects_than_a_city_has(path):
+    of_one_message(path, osi(), inside(GroundTruth, "moving_object", b"") * 100_001)
+    assert line(path) == "ground_truth: a message lists 100001 objects: expected at most 100000"
+    entity = json.dumps(json.loads(json_updates().messages[0].data)["entities"][0])
+    more = b',{"id":"a","cubes":[{"pose":{"position":{"x":1}}}]}' * 100_000
+    of_one_message(path, json_updates(), f'{{"entities":[{entity}'.encode() + more + b"]}")
+    assert line(path) == "/objects: a message lists 100001 objects: expected at most 100000"
+
+
+def test_a_map_with_many_boundary_points_is_read(path):
+    """They are no objects; a message as long is looked through before it is parsed."""
+    truth = GroundTruth()
+    truth.ParseFromString(osi().messages[0].data)
+    boundary = truth.lane_boundary.add()
+    for k in range(150_000):
+        boundary.boundary_line.add().position.x = k / 7
+    of_one_message(path, osi(), truth.SerializeToString())
+    recording = read_log(path, name="log")
+    assert max(map(len, recording.lane_boundaries)) == 150_000
+    assert recording.damage is None
+
+
+def test_all_messages_together(path, monkeypatch):
+    """20 messages with 3 objects each: 400 B a message, or its own bytes, against so many sizes of the file."""
+    for sample, text in ((OSI, "ground_truth: "), (json_updates(), "/objects: ")):
+        written(path, whole(sample))
+        read_log(path, name="log")
+        with monkeypatch.context() as patch:
+            patch.setattr("copem_replay.io.decoded_size.SMALL_BYTES", 0)
+            patch.setattr("copem_replay.io.decoded_size.MOST_GROWTH", 0)
+            assert line(path) == (
+                f"{text}its messages would take more than 0 MiB and 0 times the size of the file in memory: "
+                "no recording of traffic does"
+            )

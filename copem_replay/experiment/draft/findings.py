@@ -262,7 +262,7 @@ def _find_poses(log: Log) -> list[dict[str, str]]:
             messages = gather_messages(log, frozenset([channel.number]))
             times = np.array(messages.log_time_ns[channel.number], dtype=np.int64)
             poses = decode_poses(channel, messages.payloads[channel.number], times)
-        except (DefinitionError, KeyError, BrokenIndexError):
+        except (DefinitionError, KeyError, BrokenIndexError, RecordingError):
             continue
         if len(set(poses.stamp_ns.tolist())) < 2:  # a place, not a way
             continue

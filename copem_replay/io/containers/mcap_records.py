@@ -119,14 +119,14 @@ class _ExactStream(ReadDataStream):
         return data
 
 
-def parse_record(opcode: int, body: bytes) -> McapRecord | None:
+def parse_record(opcode: int, body: bytes | memoryview) -> McapRecord | None:
     """The record of an opcode other than a chunk's; None: a kind that is not needed. Raises DAMAGE."""
     if opcode == Opcode.MESSAGE:
         channel, sequence, log_time, publish_time = _MESSAGE_HEAD.unpack_from(body)
         return Message(
             channel_id=channel,
             log_time=log_time,
-            data=body[_MESSAGE_HEAD.size :],
+            data=bytes(body[_MESSAGE_HEAD.size :]),
             publish_time=publish_time,
             sequence=sequence,
         )
@@ -186,6 +186,7 @@ def read_record_at(file: IO[bytes], offset: int, opcode: int) -> bytes:
 
 def _split_records(plain: bytes | bytearray) -> Iterator[McapRecord]:
     offset = number = 0
+    view = memoryview(plain)  # a slice of it copies nothing: a message may be as large as its chunk
     while offset < len(plain):
         number += 1
         if number > MOST_RECORDS:
@@ -199,7 +200,7 @@ def _split_records(plain: bytes | bytearray) -> Iterator[McapRecord]:
         if length > len(plain) - offset:
             raise EndOfFile()
         if opcode in _IN_CHUNKS:
-            record = parse_record(opcode, bytes(plain[offset : offset + length]))
+            record = parse_record(opcode, view[offset : offset + length])
             if record is not None:
                 yield record
         offset += length

@@ -26,8 +26,9 @@ from mcap.records import Message
 from copem_replay.core.errors import RecordingError, count_noun
 from copem_replay.io.channel import LAST_NS, Channel
 from copem_replay.io.containers.mcap_records import CHUNK_LIMIT_BYTES, MAGIC
+from copem_replay.io.decoded_size import OversizeError
 from copem_replay.io.log import Log, open_file, unsupported_file_error
-from copem_replay.io.schemas.osi_ground_truth import GROUND_TRUTH, SENSOR_DATA, SENSOR_VIEW
+from copem_replay.io.schemas.osi_ground_truth import GROUND_TRUTH, SENSOR_DATA, SENSOR_VIEW, check_osi
 
 _LENGTH_BYTES = 4
 _TRIED = 10  # messages by which the kind is told; more make opening slower
@@ -85,7 +86,10 @@ def open_trace(path: Path) -> TraceLog:
     with open_file(path) as file:
         for offset, payload in _read_payloads(file, cut):
             try:
+                check_osi(message_class, payload)
                 message = message_class.FromString(payload)
+            except OversizeError as error:
+                raise RecordingError(str(error), path=path) from None
             except DecodeError:
                 skipped["cannot be decoded"] += 1
                 continue
@@ -187,8 +191,9 @@ def _explained_share(payloads: Sequence[bytes], schema: str) -> float:
     kept = 0
     for payload in payloads:
         try:
-            message = load_message_class(schema).FromString(payload)
-        except DecodeError:
+            check_osi(message_class := load_message_class(schema), payload)
+            message = message_class.FromString(payload)
+        except (DecodeError, OversizeError):
             continue
         message.DiscardUnknownFields()
         kept += min(len(payload), message.ByteSize())

@@ -169,6 +169,10 @@ class BagLog(Log):
                 streams.append((part.log.start_ns, _RenumberedFile(part.log, numbers_in_log).__iter__))
         yield from merge_streams(streams)
 
+    def file_bytes(self) -> int:
+        """Size of the files that are read."""
+        return sum(part.log.file_bytes() for part in self.parts)
+
     def within(self, window: Window | None) -> Log:
         """The log with every file restricted to a window."""
         parts = tuple(replace(part, log=part.log.within(window)) for part in self.parts)

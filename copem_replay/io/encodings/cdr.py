@@ -19,7 +19,9 @@ import numpy as np
 from numba import njit
 
 from copem_replay.core.tracks import Bool, Int
+from copem_replay.io.decoded_size import check_decoded_bytes
 from copem_replay.io.encodings.columns import (
+    COLUMN_BYTES,
     Definition,
     DefinitionError,
     RawColumn,
@@ -355,7 +357,7 @@ class CdrDefinition(Definition):
         return 0 <= item < self._arrays.get(array, 0)
 
     def shred(self, payloads: Sequence[bytes], numbers: Iterable[str], texts: Iterable[str]) -> ShreddedMessages:
-        """The columns of messages. Raises KeyError for a path that is neither offered nor picked."""
+        """The columns of messages. Raises KeyError for a path that is neither offered nor picked; OversizeError."""
         wanted = self._known((*(numbers := tuple(numbers)), *(texts := tuple(texts))))
         levels = list_levels(wanted)
         builder = CdrProgram(self._types, wanted, levels)
@@ -418,6 +420,7 @@ def _walk_batch(
     none = np.zeros(0, dtype=np.uint64), np.zeros(0, dtype=np.int64), np.zeros((levels, 0), dtype=np.int64)
     rows = walk_cdr(octets, bounds, program, first, np.zeros(levels, dtype=np.int64), *none, decoded)
     np.cumsum(rows[level_ix], out=first[1:])
+    check_decoded_bytes(COLUMN_BYTES * int(first[-1]) + 8 * levels * int(rows.max(initial=0)))
     bits, lengths = np.empty(first[-1], dtype=np.uint64), np.empty(first[-1], dtype=np.int64)
     parent = np.empty((levels, int(rows.max(initial=0))), dtype=np.int64)
     walk_cdr(octets, bounds, program, first, rows, bits, lengths, parent, decoded)

@@ -113,6 +113,8 @@ def shred_messages(
     return ShreddedMessages(levels, shredded.decoded)
 
 
+COLUMN_BYTES = 17
+"""Memory of a value while messages are walked through: its bits, its length, and whether it is there."""
 BATCH_BYTES = 4_000_000
 """Bytes of messages that are decoded at once: as much as a cache holds."""
 

@@ -16,6 +16,7 @@ import numpy as np
 import orjson
 
 from copem_replay.core.tracks import Float, Int
+from copem_replay.io.decoded_size import check_json
 from copem_replay.io.encodings.columns import (
     Definition,
     DistinctTexts,
@@ -47,10 +48,12 @@ _UNLIKE = (TypeError, ValueError, AttributeError, RecursionError, OverflowError)
 
 
 class JsonDefinition(Definition):
-    """The definition of JSON messages, from some of them."""
+    """The definition of JSON messages, from some of them. Raises OversizeError."""
 
     def __init__(self, samples: Sequence[bytes]) -> None:
         super().__init__()
+        for payload in samples:
+            check_json(payload)
         self._filled: dict[str, bool] = {}  # of each list, whether a message had something in it
         telling = 0
         later: Sequence[bytes] = ()
@@ -65,7 +68,9 @@ class JsonDefinition(Definition):
             self._look_at(payload)
 
     def shred(self, payloads: Sequence[bytes], numbers: Iterable[str], texts: Iterable[str]) -> ShreddedMessages:
-        """The columns of messages. Raises KeyError for a path that is not offered."""
+        """The columns of messages. Raises KeyError for a path that is not offered; OversizeError."""
+        for payload in payloads:
+            check_json(payload)
         numbers, texts = tuple(dict.fromkeys(numbers)), tuple(dict.fromkeys(texts))
         self._known((*numbers, *texts))
         table = _RowTable(numbers, texts)

@@ -17,6 +17,7 @@ import numpy as np
 
 from copem_replay.core.errors import count_noun
 from copem_replay.core.tracks import CLASSES, VALUES, Bool, Float, Int
+from copem_replay.io.decoded_size import check_objects
 from copem_replay.io.encodings.columns import (
     Definition,
     DistinctTexts,
@@ -231,7 +232,7 @@ class DecodedLists:
 def decode_lists(
     definition: Definition, description: Description, payloads: Sequence[bytes], log_time_ns: Int
 ) -> DecodedLists:
-    """The lists in messages that were logged at `log_time_ns (F,)`. Raises FieldsError."""
+    """The lists in messages that were logged at `log_time_ns (F,)`. Raises FieldsError, OversizeError."""
     with np.errstate(over="ignore", invalid="ignore"):  # states that are not finite are left out later
         return _BatchReader(definition, description, payloads).listed(log_time_ns)
 
@@ -246,6 +247,7 @@ class _BatchReader:
         self._wanted = WantedPaths(description, definition.offers())
         self._found: ShreddedMessages = shred_messages(definition, payloads, self._wanted.numbers, self._wanted.texts)
         self._names = definition.names
+        check_objects(int(np.bincount(ancestor_rows(self._found, self._fields.objects, "")).max(initial=0)))
         self._messages = len(payloads)
 
     def rows(self, level: str) -> int:

@@ -11,6 +11,7 @@ import itertools
 import math
 from array import array
 from collections import Counter
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from google.protobuf.message import DecodeError
 from copem_replay.core.errors import count_noun
 from copem_replay.core.tracks import CLASSES, VALUES, Float, Solid
 from copem_replay.io.channel import LAST_NS
+from copem_replay.io.decoded_size import check_objects
 from copem_replay.io.ground_truth import FARTHEST_M, DecodedObjects
 
 GROUND_TRUTH = "osi3.GroundTruth"
@@ -71,6 +73,23 @@ def osi_class_index(kind: int, vehicle: int | None) -> int:
     return VEHICLE if vehicle is None else _CLASS_OF_VEHICLE.get(vehicle, VEHICLE)
 
 
+_SMALL_MESSAGE_BYTES = 1 << 20
+"""An OSI message this long is within the limit: its types have some 30 fields at most."""
+
+
+def check_osi(message_class: Any, payload: bytes) -> None:
+    """Raises OversizeError where a message of one of OSI's classes would take too much memory."""
+    if len(payload) > _SMALL_MESSAGE_BYTES:
+        _osi_size(message_class).check(payload)
+
+
+@cache
+def _osi_size(message_class: Any) -> Any:
+    from copem_replay.io.encodings.protobuf import ProtobufSize  # with Numba, which few recordings of OSI need
+
+    return ProtobufSize(message_class.DESCRIPTOR)
+
+
 class GroundTruthDecoder:
     """Collects messages of one topic: `add` each payload, then take `columns`."""
 
@@ -96,10 +115,12 @@ class GroundTruthDecoder:
     def add(self, payload: bytes, *, schema: str, log_time_ns: int, ahead_ns: int = 0) -> None:
         """Add a message of `schema`, one of `TRUTH_SCHEMAS`; one that cannot be decoded is skipped with a note.
 
-        `ahead_ns`: how far the clock of its stamp is ahead of that of the log times.
+        `ahead_ns`: how far the clock of its stamp is ahead of that of the log times. Raises OversizeError.
         """
+        message_class = self._message_of[schema]
+        check_osi(message_class, payload)
         try:
-            message = self._message_of[schema].FromString(payload)
+            message = message_class.FromString(payload)
         except DecodeError:
             self._notes["message", "cannot be decoded: skipped"] += 1
             return
@@ -123,9 +144,15 @@ class GroundTruthDecoder:
         if not self._lane_boundaries and len(truth.lane_boundary):  # the lanes of one message are those of all
             self._add_lanes(truth.lane_boundary)
         before = len(self._object_ix)
+        check_objects(len(truth.moving_object) + len(truth.stationary_object))
         self._add_moving(truth.moving_object)
         self._add_stationary(truth.stationary_object)
         self._rows.append(len(self._object_ix) - before)
+
+    @property
+    def states(self) -> int:
+        """Number of object states of all messages that were added."""
+        return len(self._object_ix)
 
     def columns(self) -> DecodedObjects:
         """The columns of all messages that were added."""
