@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -18,6 +19,7 @@ from copem_replay.io.encodings import column_bytes as list_blocks
 from copem_replay.io.write import scene as foxglove_scene
 from copem_replay.io.write.detail import DetailWriter, Statuses, StatusWriter
 from copem_replay.io.write.osi import SensorDataWriter
+from copem_replay.io.write.ros2 import DetectedObjectsWriter
 from copem_replay.io.write.scene import FoxgloveSceneWriter, UncertaintyWriter, principal_axes
 from tests.oracles import messages as plain
 
@@ -112,6 +114,19 @@ def test_sensor_data(fused_tracks: FusedTracks) -> None:
         fused_tracks,
         lambda frame, time_ns: plain.sensor_data(SCENE, fused_tracks, NUMBERS, frame, time_ns),
     )
+
+
+def test_entries_about_no_object_move_in_messages_of_ros() -> None:
+    """Whatever the last object does, as whose index −1 could be read."""
+    fused_tracks = drawn(3, 4, 6, True, False)
+    fused_tracks = replace(
+        fused_tracks, fused=replace(fused_tracks.fused, object_ix=np.full_like(fused_tracks.fused.object_ix, -1))
+    )
+    still, moves = (replace(SCENE, moving=np.append(SCENE.moving[:-1], last)) for last in (False, True))
+    of_both = [DetectedObjectsWriter(scene, fused_tracks, "map") for scene in (still, moves)]
+    messages = [[writer.message(frame, 10**9) for frame in range(4)] for writer in of_both]
+    assert max(map(len, messages[0])) > 500
+    assert messages[0] == messages[1]
 
 
 @given(LISTS, st.sampled_from(["global", ""]))
