@@ -285,6 +285,7 @@ class TestMemory:
 
 
 SURE = {"detection": {"kind": "constant", "probability": 1.0}}
+MEASURED = {"onset": {"kind": "appears"}, "began": ["log_start", "appeared"], "horizon_s": 1.0}
 NEAR = {"kind": "field", "range_m": [5, 30]}
 
 
@@ -301,7 +302,7 @@ def street(**changes: Any) -> list[str]:
         "pems": {"eye": [SURE], "haunted": {"couples": [SURE], "ghosts": [{"in_list": 0.5, "where": NEAR}]}},
         "units": {"mast": mast, "ego": {"on": "ego", "pem": "eye"}},
         "configurations": {"ideal": {"units": "all"}, "gnn": {"units": "all", "fusion": {"kind": "gnn"}}},
-        "measure": {"onset": {"kind": "appears"}},
+        "measure": MEASURED,
     }
     plan = experiment(**(data | changes))
     recording = scenes.recording(things, until_s=1.0)
@@ -380,4 +381,4 @@ def test_only_the_units_that_send_by_it_are_lost() -> None:
     ],
 )
 def test_a_class_that_is_named_like_its_group(classes: list[str] | None, said: list[str]) -> None:
-    assert street(measure={"onset": {"kind": "appears"}, "objects": {"classes": classes}}) == said
+    assert street(measure=MEASURED | {"objects": {"classes": classes}}) == said
