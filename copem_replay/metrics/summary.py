@@ -227,15 +227,15 @@ def describe_began(tallied: pd.DataFrame, configuration: str, horizon_s: float |
     `tallied`: the whole tally. `words`: `measure.began`, those that count.
     """
     rows = tallied[(tallied["event"] == DETECTED) & (tallied["configuration"] == configuration)]
-    groups = []
+    groups, followed = [], has_frame_after(rows)
     for word in reversed(BEGAN):
-        part = rows[rows["began"] == word]
+        part = rows[(rows["began"] == word) & followed]
         mean_s = summarise_detections(MetricInputs(part, None, horizon_s)).mean_s()
         number = part.groupby([*EPISODE]).ngroups
         groups.append(f"{number} {word}" + ("" if mean_s is None else f" {format_cell(mean_s)} s"))
     line = f"objects by how they began, and their ttd_rmst_s in {configuration}: {', '.join(groups)}"
     line += f"; counted: {', '.join(words)}"
-    if short := rows[~has_frame_after(rows)].groupby([*EPISODE]).ngroups:
+    if short := rows[~followed].groupby([*EPISODE]).ngroups:
         line += f"; left out, with no frame after the onset: {short}"
     if (rows["began"] == "appeared").any():
         line += "; on annotated drives `appeared` may be where annotation began"

@@ -50,7 +50,7 @@ def scene() -> Recording:
         Thing("near", "car", standing(30, 0)),
         Thing("enters", "car", driving(80, 0, -10)),
         Thing("pops", "car", standing(20, 20), there=lambda t: t > 1.99),
-        Thing("goes", "car", standing(20, -20), there=lambda t: 1.99 < t < 2.01),
+        Thing("goes", "car", standing(20, -20), there=lambda t: 1.99 < t < 2.11),
     ]
     return recording(things, until_s=12.0)
 
@@ -128,6 +128,18 @@ def test_the_line_on_groups() -> None:
     )
     crossed = result.tally[result.tally["began"] == "crossed"]
     assert describe_began(crossed, "GT", 5.0, ("crossed",)).endswith("0 log_start; counted: crossed")
+
+
+def test_who_is_there_for_one_frame_is_left_out_and_counted() -> None:
+    """Nothing can be told of it: it is known at its onset, or it is gone."""
+    blink = Thing("blinks", "car", standing(25, 0), there=lambda t: 2.99 < t < 3.01)
+    things = [Thing("ego", "car", standing(0, 0)), Thing("enters", "car", driving(80, 0, -10)), blink]
+    result = run_experiment(plan(), [recording(things, until_s=12.0)])
+    assert of(result, "late")[["n", "detected_share", "unknown_s"]].tolist() == [1, 1.0, pytest.approx(0.5)]
+    assert set(result.table["object_id"]) == {"enters", "blinks"}
+    line = describe_began(result.tally, "late", 5.0, ("crossed", "appeared"))
+    assert "1 crossed 0.5 s, 0 appeared, 0 log_start;" in line
+    assert "; left out, with no frame after the onset: 1;" in line
 
 
 def test_own_metrics_are_of_what_counts() -> None:
