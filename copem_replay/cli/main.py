@@ -23,6 +23,7 @@ try:  # an interrupt during the imports, too, ends without a traceback
     from copem_replay.cli.terminal import print_problems
     from copem_replay.core.compiled import cache_note, recompiled_note
     from copem_replay.core.errors import CopemError, InputError
+    from copem_replay.core.waiting import tell_waits
 except KeyboardInterrupt:
     print("interrupted", file=sys.stderr)
     sys.exit(130)
@@ -77,6 +78,7 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a terminal without “×” gets `\\xd7`
     exit_on_signals()
+    tell_waits(lambda words: print_problems([words]))
     code = _run_to_exit_code()
     if "numba" in sys.modules:  # something may have been compiled
         print_problems(f"note: {note}" for note in (cache_note(), recompiled_note()) if note is not None)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, TextIO, TypeAlias, TypeVar
 
 import typer
 
-from copem_replay.core.errors import count_noun, wrap_line
+from copem_replay.core.errors import InputError, count_noun, is_url, local_path, strip_credentials, wrap_line
 
 if TYPE_CHECKING:
     from copem_replay.pipeline.crew import CrewProgress
@@ -26,8 +26,30 @@ if TYPE_CHECKING:
 
 ExperimentFile: TypeAlias = Annotated[Path, typer.Argument(metavar="EXPERIMENT", help="Experiment file (YAML).")]
 ResultsFolder: TypeAlias = Annotated[Path, typer.Argument(metavar="FOLDER", help="Results folder.")]
+
+
+def take_local_paths(paths: list[Path]) -> list[Path]:
+    """The paths, those of `file://` URLs without it. Raises InputError for any other URL."""
+    return [_take_local_path(path) for path in paths]
+
+
+def _take_local_path(path: Path) -> Path:
+    scheme, colon, rest = str(path).partition(":/")  # two slashes are one in a path
+    if not colon or not is_url(url := f"{scheme}://{rest}") or path.exists():
+        return path
+    if scheme.lower() == "file":
+        return Path(local_path(f"file:///{rest.lstrip('/')}"))
+    raise InputError(
+        f"{strip_credentials(url)}: expected a recording on this machine, found a URL; fetch it first "
+        "(`run`, `check` and `--log` take URLs)"
+    )
+
+
 LogFiles: TypeAlias = Annotated[
-    list[Path], typer.Argument(metavar="LOG", help="Recordings: MCAP files, rosbag2 folders, .osi files.")
+    list[Path],
+    typer.Argument(
+        metavar="LOG", help="Recordings: MCAP files, rosbag2 folders, .osi files.", callback=take_local_paths
+    ),
 ]
 Logs: TypeAlias = Annotated[
     list[str] | None,

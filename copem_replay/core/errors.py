@@ -21,12 +21,14 @@ import re
 import textwrap
 import traceback
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import unquote, urlsplit
+
+from copem_replay.core.waiting import await_server
 
 
 def escape_unprintable(text: str) -> str:
@@ -49,7 +51,7 @@ class CopemError(Exception):
 
     def __init__(self, problems: str | Sequence[str]) -> None:
         lines = (problems,) if isinstance(problems, str) else problems
-        self.problems: tuple[str, ...] = tuple(escape_unprintable(line) for line in lines)
+        self.problems: tuple[str, ...] = tuple(hide_credentials(escape_unprintable(line)) for line in lines)
         super().__init__("\n".join(self.problems))
 
 
@@ -103,7 +105,7 @@ class RecordingError(InputError):
     def within(self, path: Path, topic: str | None = None) -> list[str]:
         """Return the problems without the path and topic that are these, for messages that name them already."""
         lines = self._lines(None if self.path == path else self.path, None if self.topic == topic else self.topic)
-        return [escape_unprintable(line) for line in lines]
+        return [hide_credentials(escape_unprintable(line)) for line in lines]
 
 
 class EgoError(RecordingError):
@@ -174,9 +176,14 @@ def near_name_hint(name: str, known: Iterable[str]) -> str:
 
 # Files under URLs, which fsspec opens; it is not loaded where all files are on this machine. Access data (endpoints,
 # profiles, keys) are in fsspec's own environment and files, never in an experiment; a URL is written and shown without
-# its user and its query.
+# its user, its query and what is behind `#`.
 
-_SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*)://")
+PROTOCOLS = (
+    "s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "https", "http", "sftp", "ftp", "hdfs", "webhdfs", "memory",
+)  # fmt: skip
+"""Protocols of URLs that are opened: fsspec knows more, which read files of this machine, run programs, or open what a
+file elsewhere names."""
+_SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*)(::\S*)?://")
 _STAMPS = ("ETag", "etag", "md5Hash", "Last-Modified", "LastModified", "last_modified", "updated", "created")
 """Entries of a file system's listing that change with a file's content. Not `mtime`: the program that writes a file
 (`rsync -t`) can set it."""
@@ -214,7 +221,7 @@ class RemoteFile:
         with reraise_in_one_line(self.url):
             fs.invalidate_cache()
             try:
-                entry: Mapping[str, Any] = fs.info(path)
+                entry: Mapping[str, Any] = await_server(str(self), lambda _: fs.info(path))
             except FileNotFoundError as error:
                 if (cause := error.__cause__) is not None and self.url.lower().startswith("http"):
                     raise cause from None  # the server may have failed for another reason
@@ -232,7 +239,9 @@ class RemoteFile:
         """Copy it to a path on this machine. Raises InputError."""
         fs, path = open_file_system(self.url)
         with reraise_in_one_line(self.url):
-            fs.get_file(path, to)
+            from fsspec.callbacks import Callback
+
+            await_server(str(self), lambda heard: fs.get_file(path, to, callback=Callback(hooks={"heard": heard})))
 
 
 def is_url(text: str) -> bool:
@@ -242,13 +251,23 @@ def is_url(text: str) -> bool:
 
 def local_path(text: str) -> str:
     """A path as it is, and that of a `file://` URL, which is on this machine."""
-    return unquote(urlsplit(text).path) if text.lower().startswith("file://") else text
+    of_a_file = text.lower().startswith("file://") and "::" not in text
+    return unquote(urlsplit(text).path) if of_a_file else text
 
 
 def strip_credentials(url: str) -> str:
-    """A URL without user and query."""
-    scheme, _, rest = url.partition("://")
-    host, slash, path = rest.partition("?")[0].partition("/")
+    """A URL without user, query and what is behind `#`; of a chain of URLs (`a::b`) each."""
+    return "::".join(map(_strip_one, url.split("::")))
+
+
+def _strip_one(url: str) -> str:
+    scheme, separator, rest = url.partition("://")
+    if not separator:
+        return url
+    rest = re.split(r"[?#]", rest, maxsplit=1)[0]
+    host, slash, path = rest.partition("/")
+    if "@" in path and not re.fullmatch(r"[^:]*(:\d*)?", host) and "@" not in host:  # a slash in the password
+        return f"{scheme}://{path.rpartition('@')[2]}"
     return f"{scheme}://{host.rpartition('@')[2]}{slash}{path}"
 
 
@@ -263,10 +282,19 @@ def find_remote_files(pattern: str) -> list[RemoteFile]:
     fs, path = open_file_system(pattern)
     with reraise_in_one_line(pattern):
         fs.invalidate_cache()
-        listing: dict[str, dict[str, Any]] = fs.glob(path, detail=True)
+        check_answering(pattern, fs, re.split(r"[*\[]", path, maxsplit=1)[0].rpartition("/")[0])
+        listing: dict[str, dict[str, Any]] = await_server(
+            strip_credentials(pattern), lambda _: fs.glob(path, detail=True), works=True
+        )
     scheme = pattern.partition("://")[0]
     files = {name: info for name, info in listing.items() if info.get("type") != "directory"}
     return [RemoteFile(f"{scheme}://{name.lstrip('/')}", files[name]) for name in sorted(files)]
+
+
+def check_answering(url: str, fs: Any, path: str) -> None:
+    """Ask for a path, which takes a server no time: a listing may take minutes. Raises TimeoutError."""
+    with suppress(FileNotFoundError, PermissionError):
+        await_server(strip_credentials(url), lambda _: fs.info(path))
 
 
 def open_file_system(url: str, what: str = "") -> tuple[Any, str]:
@@ -275,23 +303,23 @@ def open_file_system(url: str, what: str = "") -> tuple[Any, str]:
     `what`: the beginning of the line.
     """
     protocol, place = url.partition("://")[0].lower(), f"{what}{strip_credentials(url)}"
+    if "::" in url:
+        raise InputError(f"{place}: expected the URL of a file, found URLs within a URL (`::`)")
+    if protocol not in PROTOCOLS:
+        raise InputError(f"{place}: expected a protocol of {', '.join(PROTOCOLS)}, found {protocol!r}")
     try:
         from fsspec.core import url_to_fs
         from fsspec.registry import known_implementations
     except ImportError:
         raise InputError(f"{place}: fsspec is not installed: pip install 'copem-replay[cluster]'") from None
-    implementation = known_implementations.get(protocol)
     try:
         fs, path = url_to_fs(url)
     except ImportError:
-        package = str((implementation or {}).get("class", protocol)).partition(".")[0]
+        package = str(known_implementations.get(protocol, {}).get("class", protocol)).partition(".")[0]
         if package == "fsspec":  # fsspec has the protocol, but not the package it needs
             package = f"'fsspec[{'http' if protocol == 'https' else protocol}]'"
         raise InputError(f"{place}: {protocol}:// is not installed: pip install {package}") from None
     except ValueError as error:
-        if implementation is None:
-            reason = f"expected a protocol that fsspec knows (s3, gs, az, https, …), found {protocol!r}"
-            raise InputError(f"{place}: {reason}") from None
         raise InputError(f"{place}: {_hide_credentials(str(error))}") from None
     return fs, path
 
@@ -314,8 +342,27 @@ def reraise_in_one_line(url: str, failed: type[CopemError] = InputError, what: s
 
 def _hide_credentials(text: str) -> str:
     """An error in one line, without users and queries of URLs in it."""
-    text = re.sub(r"://[^\s/@'\"]*@", "://", " ".join(text.split()))
-    return re.sub(r"(://[^\s?'\"]*)\?[^\s'\")]*", r"\1", text)[:300]
+    return hide_credentials(" ".join(text.split()))[:300]
+
+
+_A_URL = re.compile(r"(?<![\w+.-])([A-Za-z][A-Za-z0-9+.-]+:/{1,2})([^\s'\"<>)]+)")
+"""Also with one slash, which is what is left of two where a URL was taken for a path."""
+
+
+def hide_credentials(text: str) -> str:
+    """A text whose URLs have no user, no query and nothing behind `#`."""
+    if ":/" not in text:
+        return text
+
+    def strip(found: re.Match[str]) -> str:
+        begin, rest = found[1], found[2]
+        if not begin.endswith("//") and begin.removesuffix(":/").lower() not in PROTOCOLS:
+            return found[0]  # `rsu:/objects`: a topic
+        end = rest[len(rest.rstrip(".,;:")) :]  # of the sentence around it
+        whole = strip_credentials(f"{begin.rstrip('/')}//{rest.removesuffix(end)}")
+        return begin + whole.partition("://")[2] + end
+
+    return _A_URL.sub(strip, text)
 
 
 # What code of the user's own raises.

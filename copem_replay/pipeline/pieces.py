@@ -37,6 +37,7 @@ from copem_replay.core.components import Component
 from copem_replay.core.errors import (
     InputError,
     OutputError,
+    check_answering,
     is_own,
     is_url,
     local_path,
@@ -45,6 +46,7 @@ from copem_replay.core.errors import (
     strip_credentials,
 )
 from copem_replay.core.files import parse_json
+from copem_replay.core.waiting import await_server
 from copem_replay.experiment.drive import RecordedLatency, cache_last_experiment
 from copem_replay.experiment.schema import Configuration, Experiment
 from copem_replay.metrics.accuracy.statistics import BAND, EXISTENCE, OBJECT, RUN, AccuracySettings, AccuracyTotal
@@ -168,7 +170,7 @@ class BucketStore:
             return None
         with reraise_in_one_line(f"{self.url}/{name}", what=_OPTION):
             try:
-                content: bytes = fs.cat_file(f"{path}/{name}")
+                content: bytes = await_server(self.where, lambda _: fs.cat_file(f"{path}/{name}"))
             except FileNotFoundError:  # removed after the listing
                 return None
         return content
@@ -177,7 +179,7 @@ class BucketStore:
         """Write an object in one request: complete, or not at all. Raises OutputError."""
         fs, path = self._opened
         with reraise_in_one_line(f"{self.url}/{name}", OutputError, _OPTION):
-            fs.pipe_file(f"{path}/{name}", content)
+            await_server(self.where, lambda _: fs.pipe_file(f"{path}/{name}", content), works=True)
         if "_listed" in self.__dict__:
             self._listed.add(name)
 
@@ -186,7 +188,8 @@ class BucketStore:
         fs, path = self._opened
         with reraise_in_one_line(self.url, what=_OPTION):
             fs.invalidate_cache()
-            paths = fs.find(path)
+            check_answering(self.url, fs, f"{path}/{MARK}")
+            paths = await_server(self.where, lambda _: fs.find(path), works=True)
         self._listed = {name.partition(f"{path}/")[2] for name in paths}
         return self._listed
 

@@ -229,7 +229,7 @@ def test_more_runs_have_the_same_ranges_but_the_last(episodes: int) -> None:
 
 def test_where_nothing_can_be_kept(here: Path) -> None:
     Path("e.yaml").write_text(study())
-    with pytest.raises(InputError, match=r"^--pieces: drives://here: expected a protocol that fsspec knows"):
+    with pytest.raises(InputError, match=r"^--pieces: drives://here: expected a protocol of s3"):
         cr.run("e.yaml", pieces="drives://here")
     with pytest.raises(OutputError, match=r"^--pieces: a.mcap: cannot be written: Not a directory$"):
         cr.run("e.yaml", pieces="a.mcap")

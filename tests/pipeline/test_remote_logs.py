@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import socket
 import sys
 import tempfile
 import threading
@@ -13,9 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fsspec.config import conf as fsspec_settings
 
 from copem_replay.cli import main as cli
-from copem_replay.core.errors import RemoteFile
+from copem_replay.core import waiting
+from copem_replay.core.errors import CopemError, RemoteFile, hide_credentials, strip_credentials
 from copem_replay.experiment import validate
 from copem_replay.results.read import reread_log
 from tests.cli.test_api import cr
@@ -159,7 +162,7 @@ def test_no_user_and_no_query_of_a_url_gets_anywhere(
         ("['BUCKET/drives/c.mcap']", "e.yaml:2: logs[0]: BUCKET/drives/c.mcap: no such file"),
         ("['BUCKET/drives/1']", "BUCKET/drives/1: expected a file, found a folder; a rosbag2 folder is read"),
         ("['BUCKET/drives/notes.txt']", "BUCKET/drives/notes.txt: text, which is not read;"),
-        ("[drives://b/a.mcap]", "e.yaml:2: logs[0]: drives://b/a.mcap: expected a protocol that fsspec knows"),
+        ("[drives://b/a.mcap]", "e.yaml:2: logs[0]: drives://b/a.mcap: expected a protocol of s3, s3a, gs,"),
         ("['https://nobody@there/*.mcap']", "e.yaml:2: logs[0]: https://there/*.mcap: a web server lists nothing;"),
         ("['http://127.0.0.1:1/a.mcap']", "e.yaml:2: logs[0]: http://127.0.0.1:1/a.mcap: Cannot connect to host"),
         ("[{together: [drives/b.mcap, s3://x/a.mcap]}]",
@@ -174,6 +177,147 @@ def test_what_cannot_be_had_is_said_in_one_line(
     assert code == 2
     assert len(lines) == 1
     assert lines[0].startswith(said.replace("BUCKET", drives.url))
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "file:///etc/passwd::https://there/a.mcap", "simplecache::file:///etc/passwd", "zip://a.mcap::file:///a.zip",
+        "zip:///etc/passwd", "reference://a.mcap", "local:///etc/passwd", "github://a:b@/c", "dask://x/a.mcap",
+        "https://there/a.mcap::reference://", "s3://bucket/a::b.mcap",
+    ],
+)  # fmt: skip
+def test_protocols_that_open_what_is_here_or_what_a_file_names_are_refused(
+    url: str, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("e.yaml").write_text(changed(f"logs: ['{url}']"))
+    code, (line,) = ran("copem-replay check e.yaml", capsys)
+    assert code == 2
+    assert "URLs within a URL" in line or ": expected a protocol of s3, s3a, gs, gcs, az, " in line
+    code, (line,) = ran(f"copem-replay run e.yaml --pieces {url}", capsys)
+    assert code == 2
+    assert "URLs within a URL" in line or ": expected a protocol of s3, s3a, gs, gcs, az, " in line
+
+
+SIGNED = "https://nobody:secret@there:443/drives/b.mcap?X-Signature=secret&token=secret#secret"
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "info '{}'", "init '{}'", "info --json '{}'", "info --together drives/b.mcap '{}'", "check '{}'", "run '{}'",
+        "report '{}'", "compare '{}'", "plot '{}'", "view '{}'", "layout '{}'", "convert csv '{}' out.mcap",
+        "fit '{}' --from '{}'", "run e.yaml --out '{}/secret'",
+    ],
+)  # fmt: skip
+def test_no_command_says_who_may_read_a_url(command: str, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("e.yaml").write_text("version: 1\n")
+    code, lines = ran(f"copem-replay {command.replace('{}', SIGNED)}", capsys)
+    assert code == 2
+    assert lines
+    assert not any("secret" in line.replace("/secret: ", "") or "nobody" in line for line in lines), lines
+
+
+@pytest.mark.parametrize("command", ["info", "init"])
+def test_a_recording_under_a_url_is_fetched_before_it_is_looked_at(
+    command: str, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert ran(f"copem-replay {command} '{SIGNED}'", capsys) == (2, [
+        "https://there:443/drives/b.mcap: expected a recording on this machine, found a URL; fetch it first "
+        "(`run`, `check` and `--log` take URLs)"
+    ])  # fmt: skip
+    assert ran(f"copem-replay {command} file://{here}/drives/b.mcap", capsys)[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("url", "said"),
+    [
+        (SIGNED, "https://there:443/drives/b.mcap"),
+        ("s3://bucket/a@b.mcap", "s3://bucket/a@b.mcap"),
+        ("https://there:80/a@b.mcap", "https://there:80/a@b.mcap"),
+        ("https://nobody:sec/ret@there/a.mcap", "https://there/a.mcap"),
+        ("zip://x::https://a:secret@there/y.zip?z=secret", "zip://x::https://there/y.zip"),
+        ("https://there/a.mcap#secret", "https://there/a.mcap"),
+    ],
+)
+def test_a_url_as_it_is_said(url: str, said: str) -> None:
+    assert strip_credentials(url) == said
+    assert hide_credentials(f"x: '{url}', and so on") == f"x: '{said}', and so on"
+    assert CopemError(f"{url}: not there").problems == (f"{said}: not there",)
+
+
+@pytest.mark.parametrize("text", ["rsu:/objects#1?", "a: /objects?", "C:/a@b", "1:/2@3", "ego:/x@y"])
+def test_what_is_no_url_is_said_as_it_is(text: str) -> None:
+    assert hide_credentials(text) == text
+
+
+@pytest.fixture
+def silent(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """A server that takes what it is sent and never answers; it is given up sooner than others."""
+    monkeypatch.setattr(waiting, "IDLE_LIMIT_S", 0.4)
+    monkeypatch.setattr(waiting, "TOLD_AFTER_S", 0.1)
+    with socket.create_server(("127.0.0.1", 0)) as served:
+        yield f"127.0.0.1:{served.getsockname()[1]}"
+
+
+@pytest.mark.parametrize("protocol", ["http", "s3"])
+@pytest.mark.parametrize("name", ["a.mcap", "*.mcap"])
+def test_a_server_that_never_answers_is_given_up(
+    protocol: str, name: str, here: Path, silent: str, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    if (protocol, name) == ("http", "*.mcap"):
+        pytest.skip("a web server lists nothing")
+    monkeypatch.setitem(fsspec_settings, "s3", {"endpoint_url": f"http://{silent}", "anon": True})
+    told: list[str] = []
+    waiting.tell_waits(told.append)
+    url = f"http://{silent}/{name}" if protocol == "http" else f"s3://nobody/{name}"
+    Path("e.yaml").write_text(changed(f"logs: ['{url}']"))
+    code, (line,) = ran("copem-replay run e.yaml", capsys)
+    assert code == 2
+    assert line == f"e.yaml:2: logs[0]: {url}: no byte came for 0.4 s; is it reachable from here?"
+    assert set(told) == {f"{url}: waiting, no byte for 0.1 s; given up after 0.4 s"}
+
+
+def test_a_server_that_stops_in_the_middle_is_given_up(
+    here: Path, silent: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It says how long the recording is, and sends half of it."""
+
+    class Half(SimpleHTTPRequestHandler):
+        def log_message(self, *_: object) -> None:
+            """Say nothing."""
+
+        def copyfile(self, source: Any, outputfile: Any) -> None:
+            outputfile.write(source.read()[:1000])
+            outputfile.flush()
+            ended.wait(20)
+
+    ended = threading.Event()
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Half, directory=str(here))) as served:
+        thread = threading.Thread(target=served.serve_forever)
+        thread.start()
+        url = f"http://127.0.0.1:{served.server_address[1]}/drives/b.mcap"
+        Path("e.yaml").write_text(changed(f"logs: ['{url}']"))
+        code, (line,) = ran("copem-replay run e.yaml", capsys)
+        ended.set()
+        served.shutdown()
+        thread.join()
+    assert code == 2
+    assert line.endswith(f"{url}: no byte came for 0.4 s; is it reachable from here?")
+
+
+def test_a_slow_server_is_waited_for_as_long_as_bytes_come(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(waiting, "IDLE_LIMIT_S", 0.3)
+    pause = threading.Event()
+
+    def ask(heard: Any) -> str:
+        for _ in range(8):
+            pause.wait(0.1)
+            heard()
+        return "all"
+
+    assert waiting.await_server("there", ask) == "all"
 
 
 def test_what_cannot_be_read_is_left_out_when_that_is_asked_for(
