@@ -69,10 +69,13 @@ def replay_check(
     `placed`: the error of the unit's pose, drawn beside the model's errors.
     """
     recorded = compute_statistics(rows.listed[None], rows.along_m[None], rows.across_m[None], rows)
-    each, totals = [], [compute_totals(rows.listed[None], rows)]
+    each, totals = [], list[Float]()
     for listed, along_m, across_m in _replay_blocks(pem, rows, lists, placed, runs, seed):
+        if not totals:
+            expected = listed.mean(axis=0)
+            totals.append(compute_totals(rows.listed[None], rows, expected))
         each.append(compute_statistics(listed, along_m, across_m, rows))
-        totals.append(compute_totals(listed, rows))
+        totals.append(compute_totals(listed, rows, expected))
     replayed = {name: np.concatenate([one[name] for one in each]) for name in STATISTICS}
     class_of_pass = rows.view.class_ix[pass_starts(rows.pass_ix)[:-1]]
     checks = compare_statistics(recorded, replayed, seed=seed)
@@ -266,9 +269,11 @@ TOTALS = ("misses at once", "share listed by azimuth")
 _SECTORS = 4
 
 
-def compute_totals(listed: Bool, rows: FitRows) -> Float:
-    """(S, 1 + sectors) over all passes, of what is listed (S, R): Σ of squared misses of a list, NaN where no list has
-    two objects; and the share listed in each quarter of the rows by azimuth.
+def compute_totals(listed: Bool, rows: FitRows, expected: Float) -> Float:
+    """(S, 1 + sectors) over all passes, of what is listed (S, R), of which the model expects `expected (R,)`.
+
+    Σ d·d' over pairs of objects in a list, d = listed − expected, NaN where no list has two; and the share listed in
+    each quarter of the rows by azimuth.
     """
     edges = np.quantile(rows.view.azimuth_rad, np.arange(1, _SECTORS) / _SECTORS)
     sector = np.searchsorted(edges, rows.view.azimuth_rad, side="right")
@@ -278,7 +283,8 @@ def compute_totals(listed: Bool, rows: FitRows) -> Float:
     for s, hits in enumerate(listed):
         out[s, 1:] = np.bincount(sector[hits], minlength=_SECTORS) / np.maximum(size, 1)
         if shared:
-            out[s, 0] = (np.bincount(rows.list, ~hits) ** 2).sum()
+            d = hits - expected
+            out[s, 0] = (np.bincount(rows.list, d) ** 2 - np.bincount(rows.list, d * d)).sum() / 2
     return out
 
 

@@ -161,15 +161,15 @@ def test_a_class_that_differs_is_seen() -> None:
 
 
 def test_totals_by_hand() -> None:
-    """Two objects in three lists: 2, 1 and 0 of them missed; by quarters of the azimuth 1 of 2, 0, ⋯ listed."""
+    """Two objects in three lists, expected in half: both missed, one, none: ¼ − ¼ + ¼; by azimuth 1 of 2, 1, ⋯."""
     view = replace(view_of(np.ones(6), np.ones(6)), azimuth_rad=np.array([0.0, 1, 2, 3, 4, 5]))
     rows = rows_of(np.repeat([0, 1], 3), np.ones(6, dtype=bool), view)
     listed = np.array([[False, True, True, False, False, True], [True] * 6])
-    found = compute_totals(listed, rows)
-    assert found[:, 0].tolist() == [4 + 1 + 0, 0]
+    found = compute_totals(listed, rows, np.full(6, 0.5))
+    assert found[:, 0].tolist() == [0.25 - 0.25 + 0.25, 0.75]
     assert found[0, 1:].tolist() == [0.5, 1.0, 0.0, 0.5]
     alone = replace(rows, list=np.arange(6))
-    assert np.isnan(compute_totals(listed, alone)[:, 0]).all()
+    assert np.isnan(compute_totals(listed, alone, np.full(6, 0.5))[:, 0]).all()
     totals = np.column_stack([np.r_[9.0, np.tile([4.0, 5, 6], 33)], np.full((100, 4), 0.5)])
     [check] = compare_totals(totals, 12)
     assert (check.statistic, check.p, check.verdict) == ("misses at once", 0.01, "too sure")
