@@ -187,7 +187,7 @@ def test_few_passes_of_a_real_unit_are_no_thousand_rows() -> None:
     assert found.memory["position"]
     for mean in (mean for one in found.bins for mean in one.mean_m):
         assert mean.n_effective < 30
-        assert mean.high - mean.low > 0.3
+        assert mean.high - mean.low > 0.2
 
 
 @pytest.mark.skipif(not (SHARED / "msight_trial14.mcap").exists(), reason="no shared/data beside the project")
