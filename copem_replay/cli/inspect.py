@@ -114,14 +114,14 @@ def check(
 
     replays, warnings = prepare_study(study)
     print_notes([*list_notes(study.recordings, replays, study.experiment, replayed=False), *warnings])
-    if study.experiment.recorded:
-        from copem_replay.fitting.fit import preview_fit
-
-        for unit in study.experiment.recorded:
-            print_notes(preview_fit(study.experiment, study.recordings, unit))
     for line in list_began(replays, study.experiment):
         print_line(line)
     print_line(f"{experiment}: no problem found; logs: {', '.join(r.scene.log for r in study.recordings)}")
+    for unit in study.experiment.recorded:
+        from copem_replay.fitting.fit import preview_fit
+
+        for line in preview_fit(study.experiment, study.recordings, unit):
+            print_line(line)
     return 0
 
 
