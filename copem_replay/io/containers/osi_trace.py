@@ -81,8 +81,7 @@ def open_trace(path: Path) -> TraceLog:
     schema, notes = _find_schema(path, name["type"] if name else "")
     message_class, skipped = load_message_class(schema), Counter[str]()
     offsets, lengths, times_ns = array("q"), array("q"), array("q")
-    cut: list[str] = []
-    release = ""
+    cut, release = list[str](), ""
     with open_file(path) as file:
         for offset, payload in _read_payloads(file, cut):
             try:
