@@ -15,6 +15,7 @@ from mcap.writer import Writer
 from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from copem_replay.core.colours import configuration_colours
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import CLASSES, NO_CAPTURE_NS, UNCERTAINTIES, VALUES, Scene
 from copem_replay.experiment.file import log_paths, read_experiment_file
@@ -337,7 +338,8 @@ def test_scene_updates_draw_each_list_anew(written: Written) -> None:
             yaw = 2 * np.arctan2(cube.pose.orientation.z, cube.pose.orientation.w)
             assert np.cos(yaw - fused.yaw_rad[0, p]) == pytest.approx(1)
             assert color.a == 0.5
-            assert 0 < color.r + color.g + color.b < 3
+            shades = configuration_colours(written.run_tracks)["gnn"]
+            assert (color.r, color.g, color.b) == tuple(shade / 255 for shade in shades)
 
 
 @pytest.mark.parametrize("configuration", ["GT", "coPEM", "gnn"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from importlib.metadata import EntryPoint
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,7 +15,7 @@ from copem_replay.core import components
 from copem_replay.core.errors import InputError
 from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.episodes import find_episodes
-from copem_replay.metrics.onset import ONSETS, Onset, OnsetView, Requires
+from copem_replay.metrics.onset import ONSETS, LineOfSightAny, Onset, OnsetView, Requires
 from copem_replay.perception.visibility import NO_STATICS
 from copem_replay.report.figures.selection import Selection
 from copem_replay.report.figures.single_runs import runs_figure
@@ -157,3 +158,11 @@ def test_what_it_requires_is_a_property_of_the_class() -> None:
     for given in ("unit", 5):
         with pytest.raises(TypeError, match="requires: expected a property of the class"):
             type("Wrong", (Onset,), {"requires": given, "__module__": __name__})
+
+
+def test_a_share_is_reached_in_spite_of_rounding() -> None:
+    """`visible_share: 1.0` comes where all is seen: a sum of parts may end at 1 − 1e-16."""
+    onset = LineOfSightAny(visible_share=1.0)
+    shares = np.array([1.0, 1 - 1e-12, 0.999])
+    view: Any = SimpleNamespace(visible_share=lambda by: shares)
+    assert onset.holds(view).tolist() == [True, True, False]
