@@ -294,12 +294,10 @@ def fit_error_memory(z: Float, series: ResidualSeries, *, centred: bool, interva
         "drift": of_drift,
         "both": max(highest, of_drift),
     }
+    constant_alone = MemoryShares(constant=float(expit(constant[0])))
     models = {
-        "none": MemoryShares(),
-        "constant": MemoryShares(constant=float(expit(constant[0]))),
-        "drift": _unpack_drift(drift),
-    }
-    models["both"] = shares_of_both
+        "none": MemoryShares(), "constant": constant_alone, "drift": _unpack_drift(drift), "both": shares_of_both,
+    }  # fmt: skip
     chosen = next(name for name, allowed in ALLOWED.items() if likelihoods["both"] - likelihoods[name] <= allowed)
     if chosen == "both" and min(shares_of_both.drift, shares_of_both.constant) < _LEAST:
         chosen = "drift" if shares_of_both.constant < _LEAST else "constant"

@@ -237,16 +237,10 @@ def fit_errors(
     memory = _fit_error_memory(error_m, bin_ix, bins, series, start)
     base = (error_m, bins, memory.shares)
     _, last = trial.choose({name: (error_m, bins, None), name + _MEMORY: base})
-    split = class_bins(bins, entries.view, worth)
     by_class: tuple[Rung, ...] = ()
-    if len(split) > len(bins) and not simplest:
-        split_ix = find_bin(entries.view, split)
-        again = _fit_error_memory(error_m, split_ix, split, series, memory.shares)
-        gain = trial.gain((error_m, split, again.shares), base)
-        needed = float(chi2.ppf(0.95, 5 * (len(split) - len(bins)))) / 2
-        by_class = _tabulate_split(f"{name} and class", gain, needed, len(listed), last[bool(memory.parts)])
-        if gain > needed:
-            bins, bin_ix, memory = split, split_ix, again
+    if not simplest:
+        bins, memory, by_class = _split_by_class(trial, base, memory, f"{name} and class", last[bool(memory.parts)])
+        bin_ix = find_bin(entries.view, bins)
     if simplest and memory.parts:
         memory = ErrorMemoryFit(log_likelihood=memory.log_likelihood, untold="the simplest model was asked for")
     last = tuple(
@@ -257,16 +251,8 @@ def fit_errors(
     between = fit_between_logs(error_m - moments.mean_m[bin_ix], entries.log, series, memory.shares)
     if between is not None:
         moments = replace(moments, half_width_m=np.maximum(moments.half_width_m, between.half_width_m))
-    shape = _measure_shape(moments.standardised(error_m, bin_ix), series, memory.shares)
-    if simplest or (between is not None and between.untold is None):
-        why = "the simplest model was asked for" if simplest else "errors differ between logs, which is written instead"
-        shape = replace(shape, untold=why)
-    nu = shape.degrees_of_freedom
-    if shape.written:
-        moments = weigh_covariances(moments, error_m, bin_ix, nu.value)
-    estimated = tuple(estimate_bin(one, moments, b) for b, one in enumerate(bins))
-    if shape.written:
-        estimated = tuple(_widen_by_tails(one, nu) for one in estimated)
+    shape = _measure_shape(moments.standardised(error_m, bin_ix), series, memory.shares, between, simplest)
+    estimated = _estimate_bins(bins, moments, shape, error_m, bin_ix)
     spreads, lasting, untold = _fit_spreads(entries, simplest=simplest)
     if memory.untold is not None:
         untold = {"memory.position": memory.untold} | untold
@@ -276,6 +262,22 @@ def fit_errors(
         {"position": memory.parts} | lasting, memory.shares, shape,
         listed, bin_ix, (*(rung for rung in ladder if not rung.chosen), *last, *by_class), frames, untold, between,
     )  # fmt: skip
+
+
+def _split_by_class(
+    trial: _ModelTrial, base: _Model, memory: ErrorMemoryFit, name: str, rung: Rung
+) -> tuple[tuple[RangeBin, ...], ErrorMemoryFit, tuple[Rung, ...]]:
+    """The bins and their memory, by class if the likelihood rises beyond chance, and a row for the table."""
+    error_m, bins, shares = base
+    split = class_bins(bins, trial.rows.view, trial.worth)
+    if len(split) == len(bins):
+        return bins, memory, ()
+    split_ix = find_bin(trial.rows.view, split)
+    again = _fit_error_memory(error_m, split_ix, split, trial.series, shares or MemoryShares())
+    gain = trial.gain((error_m, split, again.shares), base)
+    needed = float(chi2.ppf(0.95, 5 * (len(split) - len(bins)))) / 2
+    table = _tabulate_split(name, gain, needed, len(error_m), rung)
+    return (split, again, table) if gain > needed else (bins, memory, table)
 
 
 def _tabulate_split(name: str, gain: float, needed: float, n: int, base: Rung) -> tuple[Rung, ...]:
@@ -421,7 +423,9 @@ def _fit_spread(
     )
 
 
-def _measure_shape(z: Float, series: ResidualSeries, shares: MemoryShares) -> ErrorShape:
+def _measure_shape(
+    z: Float, series: ResidualSeries, shares: MemoryShares, between: BetweenLogs | None, simplest: bool
+) -> ErrorShape:
     """The shape of standardised errors (n, 2), by what is new in each of them given those before."""
     new, _ = whiten_series(z, series, shares)
     squares = (new**2).sum(axis=1)
@@ -444,7 +448,20 @@ def _measure_shape(z: Float, series: ResidualSeries, shares: MemoryShares) -> Er
     why = None
     if shares.drift + shares.constant > kept:
         why = f"what lasts is more than the share of {kept:.2g} of the variance that it could have"
+    if simplest or (between is not None and between.untold is None):
+        why = "the simplest model was asked for" if simplest else "errors differ between logs, which is written instead"
     return ErrorShape(z, kurtosis, estimate, gain / n, bool(gain > DROP), why)
+
+
+def _estimate_bins(
+    bins: tuple[RangeBin, ...], moments: Moments, shape: ErrorShape, error_m: Float, bin_ix: Int
+) -> tuple[ErrorBin, ...]:
+    """The numbers of all bins, of Student's t where that is written."""
+    nu = shape.degrees_of_freedom
+    if not shape.written:
+        return tuple(estimate_bin(one, moments, b) for b, one in enumerate(bins))
+    moments = weigh_covariances(moments, error_m, bin_ix, nu.value)
+    return tuple(_widen_by_tails(estimate_bin(one, moments, b), nu) for b, one in enumerate(bins))
 
 
 def gaussian_share(nu: float) -> float:
