@@ -572,6 +572,7 @@ class TestCurves:
         columns = ["object_id", "time_to_detection_s", "probability"]
         rows = [("2", 0.0, 0.5), ("2", 1.0, 0.5), ("3", 1.0, 0.5), ("3", None, 0.5), ("3", 2.0, 0.0)]
         exact = pd.DataFrame(rows, columns=columns).assign(log="drive", configuration="GT", episode=0, began="crossed")
+        exact = exact.assign(onset_s=0.0, ended_s=5.0)
         exact.to_parquet(mine / "exact.parquet")
         figure = curves_figure(read_results(mine), configurations=["GT"])
         x, y = line(figure.axes[0], "exact")
