@@ -498,7 +498,9 @@ def _names_of(entries: Sequence[object], folder: Path, listed: Listed) -> set[st
             names.add(str(name))
         elif isinstance(pattern, str):
             names |= {
-                f.path.stem if isinstance(f, RemoteFile) else name_log(f) for f in match_files(pattern, folder, listed)
+                f.path.stem if isinstance(f, RemoteFile) else name_log(f)
+                for f in match_files(pattern, folder, listed)
+                if isinstance(f, RemoteFile) or place_exists(f)  # else the name may be an impossible one
             }
     return names
 

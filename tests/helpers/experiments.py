@@ -51,6 +51,10 @@ def drive(path: Path, *, host: int | None = 1, first: int = 1) -> Path:
     return write_recording(path, frames, host=host)
 
 
+ALL_COUNT = "measure: {onset: {kind: in_range, range_m: 60}, horizon_s: 2, began: [log_start, crossed, appeared]}"
+"""A line for drives whose objects are within range from the start."""
+
+
 def changed(*changes: str) -> str:
     """The text with lines replaced: each of `changes` takes the place of the line that starts with the same key.
 

@@ -22,7 +22,7 @@ from copem_replay.io.open import open_log
 from copem_replay.io.recorded_lists import read_recorded
 from copem_replay.io.recording import read_log
 from copem_replay.io.write.mcap import OSI_RECORD
-from tests.helpers.experiments import changed
+from tests.helpers.experiments import ALL_COUNT, changed
 from tests.helpers.recordings import SHARED, Obj, ground_truth, pedestrian, sensor_view, write_recording
 
 FRAMES: list[tuple[float, list[Obj]]] = [
@@ -269,7 +269,7 @@ def test_replay_is_a_multi_channel_trace(tmp_path, monkeypatch, capsys):
     for message in TRUTHS:
         message.version.version_major, message.version.version_minor, message.version.version_patch = 3, 5, 0
     trace(tmp_path, TRUTHS, "drive.osi")
-    Path("e.yaml").write_text(changed("logs: [drive.osi]", "show: {run: 0}"))
+    Path("e.yaml").write_text(changed(ALL_COUNT, "logs: [drive.osi]", "show: {run: 0}"))
     assert run("run", "e.yaml", monkeypatch=monkeypatch) == 0, capsys.readouterr().err
     replay = Path("out/e/replay.mcap")
     with replay.open("rb") as file:

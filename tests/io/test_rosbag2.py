@@ -26,7 +26,7 @@ from copem_replay.io.containers.rosbag2 import merge_streams
 from copem_replay.io.log import Log
 from copem_replay.io.open import open_log
 from copem_replay.io.recording import Recording, read_log
-from tests.helpers.experiments import changed
+from tests.helpers.experiments import ALL_COUNT, changed
 from tests.helpers.recordings import Obj, Topic, truth_topic, write_mcap, write_recording
 from tests.helpers.ros2 import STORE, odometry
 
@@ -319,7 +319,7 @@ def test_a_folder_replays_as_one_file_does(bag, monkeypatch, capsys):
     (bag.parent / "one").mkdir()
     write_recording(bag.parent / "one" / "drive.2026.mcap", FRAMES, host=1)
     for name, log in (("bag", "drive.2026"), ("one", "one/drive.2026.mcap")):
-        Path(f"{name}.yaml").write_text(changed(f"logs: [{log}]", SHOWN))
+        Path(f"{name}.yaml").write_text(changed(ALL_COUNT, f"logs: [{log}]", SHOWN))
         assert run("run", f"{name}.yaml", monkeypatch=monkeypatch) == 0, capsys.readouterr().err
     of_bag, of_one = Path("out/bag"), Path("out/one")
     for table in ("detections.parquet", "summary.csv"):
@@ -342,7 +342,7 @@ def messages(path: Path) -> list[tuple[str, str, int, bytes]]:
 def test_results_of_a_folder_are_drawn_from_it_again(bag, monkeypatch, capsys):
     """As long as its files, one after the other, are what was replayed."""
     monkeypatch.chdir(bag.parent)
-    Path("bag.yaml").write_text(changed("logs: [drive.2026]"))
+    Path("bag.yaml").write_text(changed(ALL_COUNT, "logs: [drive.2026]"))
     assert run("run", "bag.yaml", monkeypatch=monkeypatch) == 0
     capsys.readouterr()
     assert run("plot", "out/bag", monkeypatch=monkeypatch) == 0
@@ -367,7 +367,7 @@ def test_records_of_the_files_are_kept_once(bag, monkeypatch):
             out.add_attachment(0, 0, "part", "text/plain", f"{k}".encode())
             out.finish()
     monkeypatch.chdir(bag.parent)
-    Path("bag.yaml").write_text(changed("logs: [drive.2026]", SHOWN))
+    Path("bag.yaml").write_text(changed(ALL_COUNT, "logs: [drive.2026]", SHOWN))
     assert run("run", "bag.yaml", monkeypatch=monkeypatch) == 0
     with Path("out/bag/replay.mcap").open("rb") as file:
         reader = make_reader(file)
@@ -385,7 +385,7 @@ def test_replay_of_a_damaged_folder_copies_what_there_is(bag, monkeypatch, capsy
     cut_off(bag / "bag_2.mcap")
     (bag / "bag_1.mcap").write_bytes(b"")
     monkeypatch.chdir(bag.parent)
-    Path("bag.yaml").write_text(changed("logs: [drive.2026]", SHOWN))
+    Path("bag.yaml").write_text(changed(ALL_COUNT, "logs: [drive.2026]", SHOWN))
     assert run("run", "bag.yaml", monkeypatch=monkeypatch) == 0
     assert "damaged: its messages are copied as far as they can be read" in capsys.readouterr().err
     assert len([m for m in messages(Path("out/bag/replay.mcap")) if m[0] == "truth"]) == 17
@@ -393,7 +393,7 @@ def test_replay_of_a_damaged_folder_copies_what_there_is(bag, monkeypatch, capsy
 
 def test_files_named_by_a_glob_are_logs_of_their_own(bag, monkeypatch, capsys):
     monkeypatch.chdir(bag.parent)
-    Path("bag.yaml").write_text(changed("logs: [drive.2026/*.mcap]"))
+    Path("bag.yaml").write_text(changed(ALL_COUNT, "logs: [drive.2026/*.mcap]"))
     assert run("check", "bag.yaml", monkeypatch=monkeypatch) == 0
     assert capsys.readouterr().out.endswith("logs: bag_0, bag_1, bag_2\n")
 
@@ -401,7 +401,7 @@ def test_files_named_by_a_glob_are_logs_of_their_own(bag, monkeypatch, capsys):
 @pytest.mark.parametrize("where", [".", "../drive.2026/", "../drive.2026"])
 def test_name_of_a_folder_however_it_is_named(bag, monkeypatch, capsys, where):
     monkeypatch.chdir(bag)
-    (bag.parent / "bag.yaml").write_text(changed("logs: [x]"))
+    (bag.parent / "bag.yaml").write_text(changed(ALL_COUNT, "logs: [x]"))
     assert run("check", "../bag.yaml", "--log", where, monkeypatch=monkeypatch) == 0
     assert capsys.readouterr().out.endswith("logs: drive.2026\n")
 
@@ -418,7 +418,7 @@ def test_info_and_init_of_a_folder(bag, monkeypatch, capsys):
 
 def test_results_are_not_written_over_a_folder(bag, monkeypatch, capsys):
     monkeypatch.chdir(bag.parent)
-    Path("bag.yaml").write_text(changed("logs: [drive.2026]"))
+    Path("bag.yaml").write_text(changed(ALL_COUNT, "logs: [drive.2026]"))
     before = sorted(os.listdir(bag))
     assert run("run", "bag.yaml", "--out", "drive.2026", "--overwrite", monkeypatch=monkeypatch) == 2
     assert "not empty and no results folder" in capsys.readouterr().err

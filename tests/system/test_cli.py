@@ -26,7 +26,7 @@ from copem_replay.results import folder as place
 from copem_replay.results import write as results
 from copem_replay.results.compare import compare_folders, comparison_markdown, comparison_text
 from copem_replay.results.read import read_results
-from tests.helpers.experiments import TEXT, changed, drive
+from tests.helpers.experiments import ALL_COUNT, TEXT, changed, drive
 from tests.helpers.recordings import Obj, truth_topic, write_mcap, write_recording
 from tests.helpers.viewer import free_port
 
@@ -314,12 +314,21 @@ class TestInfo:
         assert ended.lines == [r"a\nb\x1b[31m.mcap: no such file"]
 
 
+BEGAN = (
+    "objects by how they began, within 30 m: 0 log_start, 0 appeared, 0 crossed\n"
+    "objects by how they began, within 40 m: 0 log_start, 0 appeared, 1 crossed\n"
+    "objects by how they began, within 50 m: 0 log_start, 0 appeared, 1 crossed\n"
+    "objects by how they began, within 60 m: 0 log_start, 0 appeared, 1 crossed; chosen\n"
+)
+BEGAN_OF_TWO = BEGAN.replace("1 crossed", "2 crossed")
+
+
 class TestCheck:
     def test_fine(self, here: Path, call: Call) -> None:
         drive(here / "two.mcap")
         (here / "e.yaml").write_text(changed("logs: ['*.mcap']"))
         ended = call("check", "e.yaml")
-        assert ended == (0, "e.yaml: no problem found; logs: drive, two\n", [])
+        assert ended == (0, f"{BEGAN_OF_TWO}e.yaml: no problem found; logs: drive, two\n", [])
 
     def test_every_problem_at_once(self, here: Path, call: Call) -> None:
         drive(here / "drive.mcap", host=None)
@@ -348,7 +357,11 @@ class TestCheck:
         [
             ("none.yaml", "none.yaml: no such file"),
             (".", ".: is a folder; expected an experiment file (YAML)"),
-            ("drive.mcap", "drive.mcap:1: expected YAML text in UTF-8, found byte 0x89"),
+            (
+                "drive.mcap",
+                "drive.mcap: expected an experiment file (YAML), found a recording; `copem-replay init "
+                "drive.mcap > experiment.yaml` makes one that replays it",
+            ),
             ("x" * 300, "x" * 300 + ": cannot be read: File name too long"),
         ],
     )
@@ -367,7 +380,7 @@ class TestCheck:
         )
         checked, run = call("check", "e.yaml"), call("run", "e.yaml")
         assert (checked.code, run.code) == (0, 0)
-        assert checked.out == "e.yaml: no problem found; logs: drive\n"
+        assert checked.out == f"{BEGAN}e.yaml: no problem found; logs: drive\n"
         assert checked.lines == run.lines
         assert [line.partition(":")[0] for line in checked.lines] == ["note"] * 4
         for part in ("logs[0], logs[1]", "450 km away", "unit mast: no object ever meets", "longer than the log"):
@@ -408,7 +421,7 @@ class TestCheck:
         (here / "sub").mkdir()
         monkeypatch.chdir(here / "sub")
         ended = call("check", "../e.yaml")
-        assert ended == (0, "../e.yaml: no problem found; logs: drive\n", [])
+        assert ended == (0, f"{BEGAN}../e.yaml: no problem found; logs: drive\n", [])
 
 
 class TestRun:
@@ -454,7 +467,7 @@ class TestRun:
         assert len(found) == 0
         assert found.dtypes["onset_s"].kind == "f"
         assert list(pd.read_csv(here / "out/e/summary.csv")["n"]) == [0, 0, 0]
-        assert ended.out.splitlines()[1].split() == ["GT", "–", "–", "–", "–", "–", "–", "–"]
+        assert ended.out.splitlines()[1].split() == ["GT", "–", "–", "–", "–", "–", "–", "–", "–"]
         assert "all configurations: n 0, list_rate_hz 10" in ended.out.splitlines()
         refused = call("compare", "out/e", "--baseline", "PEM")
         assert (refused.code, refused.lines) == (
@@ -1380,10 +1393,10 @@ class TestExtremes:
             "      error: {kind: gaussian, covariance_m2: [[1e-300, 0], [0, 0]], yaw_sigma_deg: 1e12}",
             "      error: {kind: gaussian, covariance_m2: [[0, 0], [0, 0]], speed_sigma_mps: 1e12}",
             "      error: {kind: gaussian, covariance_m2: [[1, 0], [0, 1]], size_sigma_m: 1e12}",
-            "measure: {onset: {kind: in_range, range_m: 1e12}, horizon_s: 1e12, confirm: {hits: 1000, of: 1000}}",
-            "measure: {onset: {kind: in_range, range_m: 1e12}, horizon_s: 1e-300}",
+            "measure: {onset: {kind: in_range, range_m: 1e12}, began: [log_start, crossed, appeared], horizon_s: 1e12, confirm: {hits: 1000, of: 1000}}",
+            "measure: {onset: {kind: in_range, range_m: 1e12}, began: [log_start, crossed, appeared], horizon_s: 1e-300}",
             "measure: {onset: {kind: at, time_s: 1e12}}",
-            "measure: {onset: {kind: starts_moving, speed_mps: 1e-300, within_m: 1e12}}",
+            "measure: {onset: {kind: starts_moving, speed_mps: 1e-300, within_m: 1e12}, began: [log_start, crossed, appeared]}",
             "max_gap_s: 1e12",
             "max_gap_s: 1e-300",
             "obstacles: [{polygon_m: [[-1e12, -1e12], [1e12, -1e12], [0, 1e12]], height_m: 1e12, ground_z_m: 1e12}]",
@@ -1398,5 +1411,5 @@ class TestExtremes:
 
     def test_recording_of_one_instant(self, here: Path, call: Call) -> None:
         write_recording(here / "drive.mcap", [(0.0, [Obj(id=1), Obj(id=2, x=5.0)])], host=1)
-        (here / "e.yaml").write_text(changed("show: {run: 0}"))
+        (here / "e.yaml").write_text(changed(ALL_COUNT, "show: {run: 0}"))
         assert call("run", "e.yaml").code == 0
