@@ -1393,10 +1393,12 @@ class TestExtremes:
             "      error: {kind: gaussian, covariance_m2: [[1e-300, 0], [0, 0]], yaw_sigma_deg: 1e12}",
             "      error: {kind: gaussian, covariance_m2: [[0, 0], [0, 0]], speed_sigma_mps: 1e12}",
             "      error: {kind: gaussian, covariance_m2: [[1, 0], [0, 1]], size_sigma_m: 1e12}",
-            "measure: {onset: {kind: in_range, range_m: 1e12}, began: [log_start, crossed, appeared], horizon_s: 1e12, confirm: {hits: 1000, of: 1000}}",
-            "measure: {onset: {kind: in_range, range_m: 1e12}, began: [log_start, crossed, appeared], horizon_s: 1e-300}",
+            "measure: {onset: {kind: in_range, range_m: 1e12}, began: [log_start, crossed, appeared]"
+            ", horizon_s: 1e12, confirm: {hits: 1000, of: 1000}}",
+            "measure: {onset: {kind: in_range, range_m: 1e12}, began: [log_start, crossed, appeared]"
+            ", horizon_s: 1e-300}",
             "measure: {onset: {kind: at, time_s: 1e12}}",
-            "measure: {onset: {kind: starts_moving, speed_mps: 1e-300, within_m: 1e12}, began: [log_start, crossed, appeared]}",
+            "measure: {onset: {kind: starts_moving, speed_mps: 1e-300, within_m: 1e12}, began: [log_start]}",
             "max_gap_s: 1e12",
             "max_gap_s: 1e-300",
             "obstacles: [{polygon_m: [[-1e12, -1e12], [1e12, -1e12], [0, 1e12]], height_m: 1e12, ground_z_m: 1e12}]",
