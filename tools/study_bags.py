@@ -153,7 +153,7 @@ def _lists(
 ) -> Iterator[tuple[str, SensorData]]:
     """The lists as messages, stamped `late_ns` after they were made; `at_s`: the newest at each of these instants."""
     assert tracks.scene is not None
-    writer = SensorDataWriter(tracks.scene, tracks, {name: k + 1 for k, name in enumerate(tracks.heard.units)})
+    writer = SensorDataWriter(tracks.scene, tracks, {name: k + 1 for k, name in enumerate(tracks.received.units)})
     made_ns = np.rint(tracks.fused.arrives_s[0] * NANOS_PER_SECOND).astype(np.int64)
     which, stamps_ns = np.arange(len(made_ns)), made_ns + late_ns
     if at_s is not None:

@@ -93,16 +93,16 @@ def fill_fit_folder(place: ResultsPlace, fitted: FittedPem) -> None:
     fill_fit(place, fitted.found, fitted.experiment, fitted.recordings, pages)
 
 
-def _write_page(path: Path, found: Fit) -> None:
+def _write_page(path: Path, fit: Fit) -> None:
     from copem_replay.fitting.page import fit_page
 
-    path.write_text(fit_page(found), encoding="utf-8")
+    path.write_text(fit_page(fit), encoding="utf-8")
 
 
-def _write_places(path: Path, found: Fit) -> None:
+def _write_places(path: Path, fit: Fit) -> None:
     from copem_replay.fitting.page import write_fit_places
 
-    write_fit_places(path, found.unit, found.logs, found.gathered.rows, found.gathered.lists)
+    write_fit_places(path, fit.unit, fit.logs, fit.gathered.rows, fit.gathered.lists)
 
 
 def fit(

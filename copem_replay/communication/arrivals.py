@@ -51,17 +51,17 @@ class FusionSchedule:
         )
 
 
-def fusion_schedule(heard: Tracks, *, max_age_s: float) -> FusionSchedule:
+def fusion_schedule(received: Tracks, *, max_age_s: float) -> FusionSchedule:
     """The receiver's instants for lists whose arrival times are common to all runs."""
-    arrives_s = heard.common_arrives_s
+    arrives_s = received.common_arrives_s
     arrived = np.flatnonzero(np.isfinite(arrives_s))
     arrived = arrived[np.argsort(arrives_s[arrived], kind="stable")]
     last = _ends_instant(arrives_s[arrived])
     issue_s = arrives_s[arrived][last]
-    newest = np.full((len(issue_s), max(len(heard.units), 1)), -1)
-    frame = arrived[~find_out_of_sequence(heard)[arrived]]
+    newest = np.full((len(issue_s), max(len(received.units), 1)), -1)
+    frame = arrived[~find_out_of_sequence(received)[arrived]]
     instant = np.searchsorted(issue_s + SAME_INSTANT_S, arrives_s[frame])
-    newest[instant, heard.frame_unit_ix[frame]] = frame  # of lists of a unit that arrive together the last
+    newest[instant, received.frame_unit_ix[frame]] = frame  # of lists of a unit that arrive together the last
     since = np.maximum.accumulate(np.where(newest >= 0, np.arange(len(issue_s))[:, None], 0), axis=0)
     newest = np.take_along_axis(newest, since, axis=0)
     outdated_s = arrives_s[newest] + max_age_s + SAME_INSTANT_S
@@ -69,9 +69,9 @@ def fusion_schedule(heard: Tracks, *, max_age_s: float) -> FusionSchedule:
     return FusionSchedule(issue_s, newest, arrived, np.append(0, np.flatnonzero(last) + 1))
 
 
-def receiver_instants(heard: Tracks) -> Float:
+def receiver_instants(received: Tracks) -> Float:
     """(K,) the receiver's instants: `issue_s` of its schedule."""
-    arrives_s = np.sort(heard.common_arrives_s[np.isfinite(heard.common_arrives_s)])
+    arrives_s = np.sort(received.common_arrives_s[np.isfinite(received.common_arrives_s)])
     instants_s: Float = arrives_s[_ends_instant(arrives_s)]
     return instants_s
 
@@ -81,14 +81,14 @@ def _ends_instant(ordered_s: Float) -> Bool:
     return np.append(np.diff(ordered_s) > SAME_INSTANT_S, True) if len(ordered_s) else np.empty(0, dtype=bool)
 
 
-def find_out_of_sequence(heard: Tracks) -> Bool:
+def find_out_of_sequence(received: Tracks) -> Bool:
     """(F,) lists that arrive together with a newer one of their unit, or after it, or not at all."""
-    arrives_s, unit = heard.common_arrives_s, heard.frame_unit_ix
+    arrives_s, unit = received.common_arrives_s, received.frame_unit_ix
     result: Bool = ~np.isfinite(arrives_s)
     arriving = np.flatnonzero(~result)
     # Unit by unit; of lists that arrive together the newest counts.
-    arriving = arriving[np.lexsort((-heard.stamp_ns[arriving], arrives_s[arriving], unit[arriving]))]
-    age = unit[arriving] * len(arriving) + np.unique(heard.stamp_ns[arriving], return_inverse=True)[1]
+    arriving = arriving[np.lexsort((-received.stamp_ns[arriving], arrives_s[arriving], unit[arriving]))]
+    age = unit[arriving] * len(arriving) + np.unique(received.stamp_ns[arriving], return_inverse=True)[1]
     newest = np.maximum.accumulate(age)
     result[arriving[1:][age[1:] <= newest[:-1]]] = True
     return result
@@ -139,20 +139,26 @@ class SentEntries(NamedTuple):
 
 
 def keep_entries(
-    heard: Tracks, sent: SentEntries, partial: Bool, schedule: FusionSchedule, at: FusionSchedule, *, max_age_s: float
+    received: Tracks,
+    sent: SentEntries,
+    partial: Bool,
+    schedule: FusionSchedule,
+    instants: FusionSchedule,
+    *,
+    max_age_s: float,
 ) -> KeptEntries:
-    """At the instants `at`, some of `schedule`, the newest entry of each object of the units that are `partial (U,)`.
+    """The newest entry of each object of the units that are `partial (U,)`, at `instants`, some of `schedule`.
 
     An entry is kept for `max_age_s` after it arrived. It may be in a message that arrives after a newer one.
     """
-    before = int(np.searchsorted(schedule.issue_s, at.issue_s[0])) if len(at.issue_s) else 0
-    frame = np.repeat(np.arange(len(heard.stamp_ns)), np.diff(sent.start))
-    same = np.where(partial[heard.frame_unit_ix[frame]], sent.same, -1)
+    before = int(np.searchsorted(schedule.issue_s, instants.issue_s[0])) if len(instants.issue_s) else 0
+    frame = np.repeat(np.arange(len(received.stamp_ns)), np.diff(sent.start))
+    same = np.where(partial[received.frame_unit_ix[frame]], sent.same, -1)
     lists = _PartialLists(
-        sent.start, heard.frame_unit_ix, heard.captured_s, heard.common_arrives_s + max_age_s + SAME_INSTANT_S
+        sent.start, received.frame_unit_ix, received.captured_s, received.common_arrives_s + max_age_s + SAME_INSTANT_S
     )
     columns = _keep_newest(
-        schedule.issue_s, schedule.arrived, schedule.arrived_start, before, at.newest, lists, frame, same,
+        schedule.issue_s, schedule.arrived, schedule.arrived_start, before, instants.newest, lists, frame, same,
         np.flatnonzero(partial),
     )  # fmt: skip
     return KeptEntries(*columns, partial)

@@ -156,13 +156,13 @@ class Delays:
 def transmit(
     seen: Tracks,
     links: Sequence[UnitLinks],
-    heard: Container[str] | None = None,
+    received: Container[str] | None = None,
     *,
     air: LinkInput | None = None,
 ) -> Tracks:
     """The tracks with the arrival times of their lists at the receiver, inf: never.
 
-    A list takes the delays of all `links` that its unit sends by, one after the other. `heard`: names of the units
+    A list takes the delays of all `links` that its unit sends by, one after the other. `received`: names of the units
     whose lists reach the receiver, None: all. Raises InputError, naming where a link stands, where an own one fails.
     """
     arrives_s = seen.common_arrives_s
@@ -175,8 +175,8 @@ def transmit(
             delay_s = np.where(_is_of_units(seen, unit_link.units), delay_s, 0.0)
         arrives_s = arrives_s + delay_s
         made = made & np.isfinite(delay_s)
-    if heard is not None:
-        arrives_s = np.where(_is_of_units(seen, heard), arrives_s, np.inf)
+    if received is not None:
+        arrives_s = np.where(_is_of_units(seen, received), arrives_s, np.inf)
     return seen.with_values(arrives_s=arrives_s[None])
 
 

@@ -241,7 +241,9 @@ class RemoteFile:
         with reraise_in_one_line(self.url):
             from fsspec.callbacks import Callback
 
-            await_server(str(self), lambda heard: fs.get_file(path, to, callback=Callback(hooks={"heard": heard})))
+            await_server(
+                str(self), lambda received: fs.get_file(path, to, callback=Callback(hooks={"heard": received}))
+            )
 
 
 def is_url(text: str) -> bool:

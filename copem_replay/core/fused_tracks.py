@@ -42,15 +42,15 @@ class FusedTracks:
     """
 
     fused: Tracks
-    heard: Tracks
-    entries: Int  # (C,) rows of `heard`, those that were not detected too
+    received: Tracks
+    entries: Int  # (C,) rows of `received`, those that were not detected too
     start: Int  # (P + 1,) where the entries of each fused row begin
-    view: ViewGeometry | None = None  # how the rows of `heard` look from their units; the truth needs none
+    view: ViewGeometry | None = None  # how the rows of `received` look from their units; the truth needs none
     said: Entries | None = None
     scene: Scene | None = None  # of the log, where rows are to be named
-    faults: UnitFaults | None = None  # of `heard`, in one run: where a unit has outages or ghosts
+    faults: UnitFaults | None = None  # of `received`, in one run: where a unit has outages or ghosts
     stated_s: Float | None = None  # None: the captures that are stated are the true ones
-    by_link: Bool | None = None  # (F,) lists of `heard` that units send by a link, in one run; None: there is none
+    by_link: Bool | None = None  # (F,) lists of `received` that units send by a link, in one run; None: there is none
 
     def to_dataframe(self) -> pd.DataFrame:
         """The entries of all lists of one run, in the order of the lists.
@@ -81,20 +81,20 @@ class FusedTracks:
             columns[name] = np.zeros(len(rows)) if values is None else values[0, rows]
         return pd.DataFrame(columns)
 
-    def arriving(self, heard: Tracks, issue_s: Float) -> FusedTracks:
-        """These tracks with lists `heard` arriving at other times; `issue_s (F,)`: when fused lists are available."""
-        return replace(self, heard=heard, fused=replace(self.fused, arrives_s=issue_s[None]))
+    def arriving(self, received: Tracks, issue_s: Float) -> FusedTracks:
+        """These tracks of lists `received` at other times; `issue_s (F,)`: when fused lists are available."""
+        return replace(self, received=received, fused=replace(self.fused, arrives_s=issue_s[None]))
 
     @cached_property
     def used(self) -> Int:
-        """The entries that were detected, (C',) rows of `heard`, grouped by `used_start`."""
-        detected: Bool = self.heard.valid[0, self.entries]
+        """The entries that were detected, (C',) rows of `received`, grouped by `used_start`."""
+        detected: Bool = self.received.valid[0, self.entries]
         return self.entries[detected]
 
     @cached_property
     def used_start(self) -> Int:
         """(P + 1,) where the detected entries of each fused row begin."""
-        before: Int = np.concatenate([[0], np.cumsum(self.heard.valid[0, self.entries])])
+        before: Int = np.concatenate([[0], np.cumsum(self.received.valid[0, self.entries])])
         starts: Int = before[self.start]
         return starts
 
@@ -121,9 +121,11 @@ class FusedTracks:
     @property
     def sources(self) -> EntrySources:
         """What the rows are made of, for compiled code."""
-        heard = self.heard
-        arrives_s = heard.common_arrives_s[heard.frame_ix]
-        return EntrySources(heard.valid, heard.row_captured_s, arrives_s, heard.row_unit_ix, self.entries, self.start)
+        received = self.received
+        arrives_s = received.common_arrives_s[received.frame_ix]
+        return EntrySources(
+            received.valid, received.row_captured_s, arrives_s, received.row_unit_ix, self.entries, self.start
+        )
 
     @cached_property
     def _place(self) -> Int:

@@ -38,12 +38,12 @@ def await_server(where: str, ask: Callable[[Callable[..., None]], Answer], *, wo
     failures: list[BaseException] = []
     ended, heard_s = threading.Event(), [time.monotonic()]
 
-    def heard(*_: object, **__: object) -> None:
+    def received(*_: object, **__: object) -> None:
         heard_s[0] = time.monotonic()
 
     def run() -> None:
         try:
-            answers.append(ask(heard))
+            answers.append(ask(received))
         except BaseException as error:  # of this thread; raised in the one that waits
             failures.append(error)
         ended.set()

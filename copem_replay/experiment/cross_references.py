@@ -285,14 +285,14 @@ def _check_link(
     """Undefined links, and units that send by links and are undefined or not the configuration's."""
     link, members = configuration.get("link"), configuration.get("units")
     own = _list_modelled_units(source.data) if members == "all" else members
-    heard = [str(one) for one in own] if isinstance(own, list) else [TRUTH] if members == TRUTH else [*units, TRUTH]
+    received = [str(one) for one in own] if isinstance(own, list) else [TRUTH] if members == TRUTH else [*units, TRUTH]
     links = _mapping_names(source.data.get("links"))
     by_unit = isinstance(link, dict) and "kind" not in link
     for unit, name in link.items() if isinstance(link, dict) and by_unit else [(None, link)]:
         if by_unit and str(unit) not in [*units, "default", "truth"]:
             yield source.at((*key, str(unit)), unknown_name_message("unit", unit, [*units, "default"]))
-        elif by_unit and str(unit) not in [*heard, "default"]:
-            message = f"the configuration has no unit {str(unit)!r} to send by a link (units: {', '.join(heard)})"
+        elif by_unit and str(unit) not in [*received, "default"]:
+            message = f"the configuration has no unit {str(unit)!r} to send by a link (units: {', '.join(received)})"
             yield source.at((*key, str(unit)), f"{message}; add it to `units`, or leave it out here")
         if _is_name(name) and str(name) not in [*links, "none"]:
             choices = f"there {'are' if len(links) > 1 else 'is'} {', '.join(links) or 'none'}"

@@ -99,11 +99,11 @@ def maximise_likelihood(
     return max(maxima, key=lambda one: one[1])
 
 
-def _climb(of: LogLikelihood, at: Float, low: Float, high: Float) -> tuple[Float, float]:
-    value, damping = of(at), 1e-3
-    for _ in range(60 if len(at) else 0):
-        slope, curvature = _differentiate(of, at, value, low, high)
-        free = ~(((at <= low) & (slope < 0)) | ((at >= high) & (slope > 0)))
+def _climb(of: LogLikelihood, point: Float, low: Float, high: Float) -> tuple[Float, float]:
+    value, damping = of(point), 1e-3
+    for _ in range(60 if len(point) else 0):
+        slope, curvature = _differentiate(of, point, value, low, high)
+        free = ~(((point <= low) & (slope < 0)) | ((point >= high) & (slope > 0)))
         slope = np.where(free, slope, 0.0)
         curvature *= np.outer(free, free)
         size, axes = np.linalg.eigh(curvature)
@@ -111,25 +111,25 @@ def _climb(of: LogLikelihood, at: Float, low: Float, high: Float) -> tuple[Float
         while True:
             step = axes @ (along / (np.abs(size) * (1 + damping) + damping + 1e-9))
             step *= min(1.0, _FAR / max(np.abs(step).max(), 1e-12))
-            ahead = np.clip(at + step, low, high)
-            if slope @ (ahead - at) < _GAIN:
-                return at, value
+            ahead = np.clip(point + step, low, high)
+            if slope @ (ahead - point) < _GAIN:
+                return point, value
             if (better := of(ahead)) > value:
-                at, value, damping = ahead, better, damping / 8
+                point, value, damping = ahead, better, damping / 8
                 break
             damping *= 10
-    return at, value
+    return point, value
 
 
-def _differentiate(of: LogLikelihood, at: Float, value: float, low: Float, high: Float) -> tuple[Float, Float]:
+def _differentiate(of: LogLikelihood, point: Float, value: float, low: Float, high: Float) -> tuple[Float, Float]:
     """Gradient (k,) and curvature (k, k), just inside the bounds."""
-    steps = _H * np.eye(len(at))
-    at = np.clip(at, low + _H, high - _H)
-    up, down = ([of(at + sign * step) for step in steps] for sign in (1, -1))
+    steps = _H * np.eye(len(point))
+    point = np.clip(point, low + _H, high - _H)
+    up, down = ([of(point + sign * step) for step in steps] for sign in (1, -1))
     curvature = np.diag([(u + d - 2 * value) / _H**2 for u, d in zip(up, down, strict=True)])
-    for i in range(len(at)):
+    for i in range(len(point)):
         for j in range(i):
-            both = of(at + steps[i] + steps[j])
+            both = of(point + steps[i] + steps[j])
             curvature[i, j] = curvature[j, i] = (both - up[i] - up[j] + value) / _H**2
     return (np.array(up) - np.array(down)) / (2 * _H), curvature
 
@@ -144,11 +144,11 @@ def profile_limits(of: LogLikelihood, best: Float, value: float, k: int, bounds:
     def limit(towards: float) -> float:
         starts = [best[others], np.clip(best[others], low, high)]
 
-        def fall(at: float) -> float:
+        def fall(point: float) -> float:
             nonlocal starts
             if np.array_equal(starts[0], starts[-1]):
                 starts = starts[:1]
-            warm, highest = maximise_likelihood(lambda x: of(np.insert(x, k, at)), starts, rest)
+            warm, highest = maximise_likelihood(lambda x: of(np.insert(x, k, point)), starts, rest)
             starts = [warm]
             return value - highest - DROP
 
@@ -163,11 +163,11 @@ def profile_limits(of: LogLikelihood, best: Float, value: float, k: int, bounds:
         before = fall(inner) if inner != best[k] else -DROP
         for _ in range(6):  # the profile is about a parabola: secants of its root meet fast
             near, far = np.sqrt(max(before + DROP, 0.0)), np.sqrt(below + DROP)
-            at = inner + (outer - inner) * np.clip((np.sqrt(DROP) - near) / (far - near), 0.02, 0.98)
-            here = fall(at)
+            point = inner + (outer - inner) * np.clip((np.sqrt(DROP) - near) / (far - near), 0.02, 0.98)
+            here = fall(point)
             if abs(here) < 0.02:
-                return float(at)
-            inner, before, outer, below = (at, here, outer, below) if here < 0 else (inner, before, at, here)
+                return float(point)
+            inner, before, outer, below = (point, here, outer, below) if here < 0 else (inner, before, point, here)
         return float(inner)
 
     return limit(-1.0), limit(1.0)

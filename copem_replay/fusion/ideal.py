@@ -27,39 +27,41 @@ SMALLEST_VARIANCE = 1e-9
 
 
 def fuse_ideal(
-    heard: Tracks,
+    received: Tracks,
     *,
     max_age_s: float,
     without_object_ix: int = -1,
-    at: FusionSchedule | None = None,
+    instants: FusionSchedule | None = None,
     kept: KeptEntries | None = None,
     weighed: WeightedRows | None = None,
 ) -> FusedTracks:
-    """One fused list per instant of the receiver, as tracks of the one unit `fused`. `at`: some of the instants.
+    """One fused list per instant of the receiver, as tracks of the one unit `fused`. `instants`: some of the instants.
 
     `kept`: the entries that `keep_by_object` keeps of units with partial messages; None: there are none. `weighed`:
-    weights of the rows of `heard`; None: they are computed.
+    weights of the rows of `received`; None: they are computed.
 
-    `heard`: lists with truth ids; arrival times common to all runs. `without_object_ix`: the receiver's own body,
+    `received`: lists with truth ids; arrival times common to all runs. `without_object_ix`: the receiver's own body,
     which it does not list. Frames are the receiver's instants: `arrives_s` is when the list is available,
     `captured_s` the newest capture among the lists that it uses. NaN where an object is in none of them.
     """
-    at = at or fusion_schedule(heard, max_age_s=max_age_s)
-    beside = find_lists_beside_newest(heard, at, kept)
-    rows, start, object_ix, instant = _find_contributions(heard, at, beside, without_object_ix, kept)
+    instants = instants or fusion_schedule(received, max_age_s=max_age_s)
+    beside = find_lists_beside_newest(received, instants, kept)
+    rows, start, object_ix, instant = _find_contributions(received, instants, beside, without_object_ix, kept)
     counts, rows, start = (
-        _select_newest_entries(heard, rows, start) if len(beside.frame) else (heard.valid, rows, start)
+        _select_newest_entries(received, rows, start) if len(beside.frame) else (received.valid, rows, start)
     )
     valid = _any_valid(counts, rows, start)
     out = {name: np.full(valid.shape, np.nan) for name in ("x_m", "y_m", "cov_ee_m2", "cov_en_m2", "cov_nn_m2")}
-    weighed = weighed or WeightedRows.of(heard)
-    positions = Positions(heard.x_m, heard.y_m, *weighed.covariances)
+    weighed = weighed or WeightedRows.of(received)
+    positions = Positions(received.x_m, received.y_m, *weighed.covariances)
     _combine_position(counts, positions, weighed.information, rows, start, Positions(*out.values()))
-    spread = _combine_scalars(heard, counts, weighed, rows, start, out)
-    captured = np.where(at.newest >= 0, heard.captured_s[at.newest], -np.inf).max(axis=1, initial=-np.inf)
-    stamps = np.where(at.newest >= 0, heard.stamp_ns[at.newest], NO_CAPTURE_NS).max(axis=1)
-    np.maximum.at(captured, beside.instant, heard.captured_s[beside.frame])
-    np.maximum.at(stamps, beside.instant, heard.stamp_ns[beside.frame])
+    spread = _combine_scalars(received, counts, weighed, rows, start, out)
+    captured = np.where(instants.newest >= 0, received.captured_s[instants.newest], -np.inf).max(
+        axis=1, initial=-np.inf
+    )
+    stamps = np.where(instants.newest >= 0, received.stamp_ns[instants.newest], NO_CAPTURE_NS).max(axis=1)
+    np.maximum.at(captured, beside.instant, received.captured_s[beside.frame])
+    np.maximum.at(stamps, beside.instant, received.stamp_ns[beside.frame])
     first = np.flatnonzero(np.diff(object_ix, prepend=-1) != 0)
     fused = Tracks(
         units=("fused",),
@@ -69,13 +71,13 @@ def fuse_ideal(
         frame_ix=instant,
         stamp_ns=stamps,
         captured_s=captured,
-        frame_unit_ix=np.zeros(len(at.issue_s), dtype=np.int64),
-        arrives_s=at.issue_s[None],
+        frame_unit_ix=np.zeros(len(instants.issue_s), dtype=np.int64),
+        arrives_s=instants.issue_s[None],
         valid=valid,
         **spread,
         **out,
     )
-    return FusedTracks(fused, heard, rows, start)
+    return FusedTracks(fused, received, rows, start)
 
 
 def draw_posterior(fused_tracks: FusedTracks, scene: Scene, seed: int, runs: Int) -> FusedTracks:
@@ -98,17 +100,24 @@ def draw_posterior(fused_tracks: FusedTracks, scene: Scene, seed: int, runs: Int
 
 
 def keep_by_object(
-    heard: Tracks, partial: Bool, schedule: FusionSchedule, at: FusionSchedule, *, max_age_s: float
+    received: Tracks, partial: Bool, schedule: FusionSchedule, instants: FusionSchedule, *, max_age_s: float
 ) -> KeptEntries:
-    """The newest row of each object of the units whose messages are `partial (U,)`, in one run, at the instants `at`.
+    """The newest row of each object of the units whose messages are `partial (U,)`, in one run, at `instants`.
 
     Entries are counted list by list, as in `Tracks.by_frame`.
     """
-    order, bounds = heard.by_frame
-    kept = heard.valid[0] & (heard.row_object_ix >= 0)
-    object_of = np.unique(np.stack([heard.row_unit_ix, heard.row_object_ix]), axis=1, return_inverse=True)[1].ravel()
+    order, bounds = received.by_frame
+    kept = received.valid[0] & (received.row_object_ix >= 0)
+    object_of = np.unique(np.stack([received.row_unit_ix, received.row_object_ix]), axis=1, return_inverse=True)[
+        1
+    ].ravel()
     return keep_entries(
-        heard, SentEntries(bounds, np.where(kept, object_of, -1)[order]), partial, schedule, at, max_age_s=max_age_s
+        received,
+        SentEntries(bounds, np.where(kept, object_of, -1)[order]),
+        partial,
+        schedule,
+        instants,
+        max_age_s=max_age_s,
     )
 
 
@@ -119,46 +128,48 @@ class BesideNewest(NamedTuple):
     frame: Int
 
 
-def find_lists_beside_newest(heard: Tracks, at: FusionSchedule, kept: KeptEntries | None) -> BesideNewest:
-    """The lists beside the newest ones at the instants `at`, without those of partial messages, which `kept` holds."""
-    instant, frame = at.beside_newest()
+def find_lists_beside_newest(received: Tracks, instants: FusionSchedule, kept: KeptEntries | None) -> BesideNewest:
+    """The lists beside the newest ones at `instants`, without those of partial messages, which `kept` holds."""
+    instant, frame = instants.beside_newest()
     if kept is not None:
-        whole = ~kept.partial[heard.frame_unit_ix[frame]]
+        whole = ~kept.partial[received.frame_unit_ix[frame]]
         instant, frame = instant[whole], frame[whole]
     return BesideNewest(instant, frame)
 
 
-def _select_lists(heard: Tracks, at: FusionSchedule, beside: BesideNewest, kept: KeptEntries | None) -> tuple[Int, Int]:
+def _select_lists(
+    received: Tracks, instants: FusionSchedule, beside: BesideNewest, kept: KeptEntries | None
+) -> tuple[Int, Int]:
     """Instants, ascending, and the lists that are used at each: unit by unit, the newest first."""
-    newest = at.newest if kept is None else kept.newest
+    newest = instants.newest if kept is None else kept.newest
     instant, unit = np.nonzero(newest >= 0)
     frame = newest[newest >= 0]
     if not len(beside.frame):
         return instant, frame
-    age = np.append(np.full(len(frame), np.iinfo(np.int64).min), -heard.stamp_ns[beside.frame])
+    age = np.append(np.full(len(frame), np.iinfo(np.int64).min), -received.stamp_ns[beside.frame])
     instant, frame = np.append(instant, beside.instant), np.append(frame, beside.frame)
-    order = np.lexsort((age, np.append(unit, heard.frame_unit_ix[beside.frame]), instant))
+    order = np.lexsort((age, np.append(unit, received.frame_unit_ix[beside.frame]), instant))
     return instant[order], frame[order]
 
 
 def _find_contributions(
-    heard: Tracks, at: FusionSchedule, beside: BesideNewest, without_object_ix: int, kept: KeptEntries | None
+    received: Tracks, instants: FusionSchedule, beside: BesideNewest, without_object_ix: int, kept: KeptEntries | None
 ) -> tuple[Int, Int, Int, Int]:
-    """Contributions: the rows (C,) of `heard` that make up each fused row, start (P + 1,), object and instant (P,).
+    """Contributions: the rows (C,) of `received` that make up each fused row, start (P + 1,), object and instant (P,).
 
     Entries without truth id (of recorded units) contribute to none.
     """
-    order, bounds = heard.by_frame
+    order, bounds = received.by_frame
     begin, count = bounds[:-1], np.diff(bounds)
     if kept is not None:
         begin, count = np.append(begin, kept.start[:-1] + len(order)), np.append(count, np.diff(kept.start))
         order = np.append(order, order[kept.entry])
-    instant, frame = _select_lists(heard, at, beside, kept)
+    instant, frame = _select_lists(received, instants, beside, kept)
     begin, count = begin[frame], count[frame]
     within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
     rows = order[np.repeat(begin, count) + within]
     instant = np.repeat(instant, count)
-    object_ix = heard.row_object_ix[rows]
+    object_ix = received.row_object_ix[rows]
     keep = (object_ix != without_object_ix) & (object_ix >= 0)
     rows, instant, object_ix = rows[keep], instant[keep], object_ix[keep]
     # Rows of an object are in order of instants and units already; the sort of small integers is fast.
@@ -168,15 +179,15 @@ def _find_contributions(
     return rows, np.append(new, len(rows)), object_ix[new], instant[new]
 
 
-def _select_newest_entries(heard: Tracks, rows: Int, start: Int) -> tuple[Bool, Int, Int]:
+def _select_newest_entries(received: Tracks, rows: Int, start: Int) -> tuple[Bool, Int, Int]:
     """(S, P) the rows that count: of a unit's entries about one object at an instant only the newest that was detected.
 
     Also the contributions, as in `_find_contributions`, without those that were detected and count in no run. A list
     beside a newest one is at one instant only, so its rows count there or nowhere.
     """
-    counts, unit_ix = heard.valid.copy(), heard.row_unit_ix
-    _drop_older_entries(heard.valid, rows, start, unit_ix, counts)
-    stay = counts[:, rows].any(axis=0) | ~heard.valid[:, rows].any(axis=0)
+    counts, unit_ix = received.valid.copy(), received.row_unit_ix
+    _drop_older_entries(received.valid, rows, start, unit_ix, counts)
+    stay = counts[:, rows].any(axis=0) | ~received.valid[:, rows].any(axis=0)
     return counts, rows[stay], np.append(0, np.cumsum(stay))[start]
 
 
@@ -198,16 +209,16 @@ def _drop_older_entries(valid: Bool, rows: Int, start: Int, unit_ix: Int, counts
                 newer = newer or valid[s, r]
 
 
-def _inverse_covariances(heard: Tracks) -> tuple[Float, Float, Float]:
+def _inverse_covariances(received: Tracks) -> tuple[Float, Float, Float]:
     """Inverse position covariances ee, en, nn (1 | S, P), with the eigenvalues of `floor_covariances` inverted."""
-    high, low, c2, s2 = _covariance_axes(*_stated_covariances(heard))
+    high, low, c2, s2 = _covariance_axes(*_stated_covariances(received))
     mean, difference = (1 / high + 1 / low) / 2, (1 / high - 1 / low) / 2
     return mean + difference * c2, difference * s2, mean - difference * c2
 
 
-def floor_covariances(heard: Tracks) -> tuple[Float, Float, Float]:
+def floor_covariances(received: Tracks) -> tuple[Float, Float, Float]:
     """Position covariances ee, en, nn (1 | S, P) as stated, but no eigenvalue too small: see `floor_eigenvalues`."""
-    stated = _stated_covariances(heard)
+    stated = _stated_covariances(received)
     high, low, c2, s2 = _covariance_axes(*stated)
     mean, difference = (high + low) / 2, (high - low) / 2
     wide = low <= (stated[0] + stated[2]) / 2 - np.hypot((stated[0] - stated[2]) / 2, stated[1])
@@ -215,10 +226,10 @@ def floor_covariances(heard: Tracks) -> tuple[Float, Float, Float]:
     return np.where(wide, stated[0], ee), np.where(wide, stated[1], en), np.where(wide, stated[2], nn)
 
 
-def _stated_covariances(heard: Tracks) -> tuple[Float, Float, Float]:
+def _stated_covariances(received: Tracks) -> tuple[Float, Float, Float]:
     """Position covariances ee, en, nn (1 | S, P) as stated, 0 where they are not."""
-    none = np.zeros((1, len(heard.frame_ix)))
-    ee, en, nn = (none if c is None else c for c in (heard.cov_ee_m2, heard.cov_en_m2, heard.cov_nn_m2))
+    none = np.zeros((1, len(received.frame_ix)))
+    ee, en, nn = (none if c is None else c for c in (received.cov_ee_m2, received.cov_en_m2, received.cov_nn_m2))
     return ee, en, nn
 
 
@@ -249,17 +260,17 @@ class WeightedRows(NamedTuple):
     weights: Float
 
     @classmethod
-    def of(cls, heard: Tracks) -> WeightedRows:
-        """Values and weights of the rows of `heard`."""
-        none = np.zeros((1, len(heard.frame_ix)))
+    def of(cls, received: Tracks) -> WeightedRows:
+        """Values and weights of the rows of `received`."""
+        none = np.zeros((1, len(received.frame_ix)))
         information = [
             1 / np.maximum(none if variance is None else variance, SMALLEST_VARIANCE)
-            for variance in _stated_variances(heard)
+            for variance in _stated_variances(received)
         ]
-        yaw = {"sin": np.sin(heard.yaw_rad), "cos": np.cos(heard.yaw_rad)}
-        values = [yaw[name] if name in yaw else getattr(heard, name) for name in _WEIGHED_BY]
+        yaw = {"sin": np.sin(received.yaw_rad), "cos": np.cos(received.yaw_rad)}
+        values = [yaw[name] if name in yaw else getattr(received, name) for name in _WEIGHED_BY]
         scalars, weights = _stack_columns(values), _stack_columns([*information, none + 1])
-        return cls(floor_covariances(heard), PositionInformation(*_inverse_covariances(heard)), scalars, weights)
+        return cls(floor_covariances(received), PositionInformation(*_inverse_covariances(received)), scalars, weights)
 
     @staticmethod
     def alike(tracks: Tracks, other: Tracks) -> bool:
@@ -267,12 +278,12 @@ class WeightedRows(NamedTuple):
         return all(getattr(tracks, name) is getattr(other, name) for name in (*VALUES[2:], *UNCERTAINTIES))
 
 
-def _stated_variances(heard: Tracks) -> list[Float | None]:
-    return [getattr(heard, name) for name in _VARIANCES]
+def _stated_variances(received: Tracks) -> list[Float | None]:
+    return [getattr(received, name) for name in _VARIANCES]
 
 
 def _combine_scalars(
-    heard: Tracks, counts: Bool, weighed: WeightedRows, rows: Int, start: Int, out: dict[str, Float]
+    received: Tracks, counts: Bool, weighed: WeightedRows, rows: Int, start: Int, out: dict[str, Float]
 ) -> dict[str, Float]:
     """Put inverse-variance means (S, P) of scalars over the contributions into `out`; return their variances.
 
@@ -288,7 +299,7 @@ def _combine_scalars(
     out.update(mean_of)
     return {
         name: np.where(np.isnan(spread), np.nan, 0.0) if variance is None else spread
-        for name, variance, spread in zip(_VARIANCES, _stated_variances(heard), spreads, strict=False)
+        for name, variance, spread in zip(_VARIANCES, _stated_variances(received), spreads, strict=False)
     }
 
 

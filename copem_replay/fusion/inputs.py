@@ -46,10 +46,10 @@ class RowEntries:
         return ObjectLists(start, entries)
 
 
-def listed_rows(heard: Tracks, drawn: Float, *, without_object_ix: int) -> tuple[Int, Int]:
+def listed_rows(received: Tracks, drawn: Float, *, without_object_ix: int) -> tuple[Int, Int]:
     """(S, F + 1) where each list begins, and (N,) the row of each entry, in the order of `drawn (S, P)`."""
-    valid = heard.valid if without_object_ix < 0 else heard.valid & (heard.row_object_ix != without_object_ix)
-    order, bounds = heard.by_frame
+    valid = received.valid if without_object_ix < 0 else received.valid & (received.row_object_ix != without_object_ix)
+    order, bounds = received.by_frame
     start = np.zeros((len(valid), len(bounds)), dtype=np.int64)
     picked = np.empty(int(valid.sum()), dtype=np.int64)
     _pick_rows(valid, drawn, order, bounds, start, picked)
@@ -57,52 +57,53 @@ def listed_rows(heard: Tracks, drawn: Float, *, without_object_ix: int) -> tuple
 
 
 def make_inputs(
-    heard: Tracks,
+    received: Tracks,
     lists: ObjectLists,
     *,
     max_age_s: float,
-    at: FusionSchedule | None = None,
+    instants: FusionSchedule | None = None,
     captured_s: Float | None = None,
 ) -> Inputs:
     """Lists as the input of a fusion: when the receiver of a configuration has each, and which it uses when.
 
-    `at`: some of its instants; None: all. `captured_s (F,)`: the captures that fusion is told; None: the true ones.
+    `instants`: some of its instants; None: all. `captured_s (F,)`: the captures that fusion is told; None: the true
+    ones.
     """
-    at = at or fusion_schedule(heard, max_age_s=max_age_s)
-    captured_s = heard.captured_s if captured_s is None else captured_s
+    instants = instants or fusion_schedule(received, max_age_s=max_age_s)
+    captured_s = received.captured_s if captured_s is None else captured_s
     return Inputs(
-        heard.units, heard.frame_unit_ix, captured_s, heard.common_arrives_s, lists,
-        at.issue_s, at.newest, at.arrived, at.arrived_start,
+        received.units, received.frame_unit_ix, captured_s, received.common_arrives_s, lists,
+        instants.issue_s, instants.newest, instants.arrived, instants.arrived_start,
     )  # fmt: skip
 
 
-def add_kept_entries(told: Inputs, kept: KeptEntries, partial: Bool, max_age_s: float) -> Inputs:
+def add_kept_entries(inputs: Inputs, kept: KeptEntries, partial: Bool, max_age_s: float) -> Inputs:
     """The input in one run, with the entries that the receiver keeps of units with partial messages, for `max_age_s`.
 
     `partial (U,)`: those units.
     """
-    lists, frame = told.lists, kept.frame
+    lists, frame = inputs.lists, kept.frame
     start = np.concatenate([lists.start[0], lists.start[0, -1] + kept.start[1:]])[None]
     return replace(
-        told,
-        unit_ix=np.append(told.unit_ix, told.unit_ix[frame]),
-        captured_s=np.append(told.captured_s, told.captured_s[frame]),
-        arrives_s=np.append(told.arrives_s, told.arrives_s[frame]),
+        inputs,
+        unit_ix=np.append(inputs.unit_ix, inputs.unit_ix[frame]),
+        captured_s=np.append(inputs.captured_s, inputs.captured_s[frame]),
+        arrives_s=np.append(inputs.arrives_s, inputs.arrives_s[frame]),
         lists=ObjectLists(start, join_entries([lists.entries, take_entries(lists.entries, kept.entry)])),
         newest=kept.newest,
         keeps_s=np.where(partial, max_age_s, 0.0),
     )
 
 
-def _make_template(heard: Tracks, claims: EntryClaims, columns: Mapping[str, Float]) -> Entries:
+def _make_template(received: Tracks, claims: EntryClaims, columns: Mapping[str, Float]) -> Entries:
     """(P,) entries with all columns that the runs share."""
-    entries = np.zeros(len(heard.frame_ix), dtype=ENTRY)
+    entries = np.zeros(len(received.frame_ix), dtype=ENTRY)
     for name, values in columns.items():
         if len(values) == 1:
             entries[name] = values[0]
     entries["existence"], entries["class_probability"] = claims.existence, claims.class_probability
     entries["track_id"] = claims.track_id
-    entries["captured_s"], entries["unit_ix"] = heard.row_captured_s, heard.row_unit_ix
+    entries["captured_s"], entries["unit_ix"] = received.row_captured_s, received.row_unit_ix
     return entries
 
 

@@ -176,12 +176,12 @@ def ask_resumed_fusion(fusion: ListFusion, inputs: Inputs, memory: Any, where: s
     return _check_lists(lists, fusion, inputs, where), memory
 
 
-def _check_lists(found: ObjectLists, fusion: ListFusion, inputs: Inputs, where: str) -> ObjectLists:
+def _check_lists(answer: ObjectLists, fusion: ListFusion, inputs: Inputs, where: str) -> ObjectLists:
     """The lists found. Raises InputError where their form or content is wrong."""
-    problem = form_problem(found, inputs) or content_problem(found, inputs)
+    problem = form_problem(answer, inputs) or content_problem(answer, inputs)
     if problem is not None:
         raise wrong_answer_error(fusion, where, problem, "step", "fuse", "resume")
-    return found
+    return answer
 
 
 def pair_problem(given: object) -> str | None:
@@ -191,58 +191,58 @@ def pair_problem(given: object) -> str | None:
     return f"resume: expected ObjectLists and a memory, found {type(given).__name__}"
 
 
-def form_problem(found: object, inputs: Inputs) -> str | None:
+def form_problem(answer: object, inputs: Inputs) -> str | None:
     """What is wrong with the form of the lists a fusion gave; None: nothing."""
     shape = (len(inputs.lists.start), len(inputs.issue_s) + 1)
-    if not isinstance(found, ObjectLists):
-        return f"fuse: expected Lists, found {type(found).__name__}"
-    if found.start.shape != shape or found.entries.dtype != ENTRY:
+    if not isinstance(answer, ObjectLists):
+        return f"fuse: expected Lists, found {type(answer).__name__}"
+    if answer.start.shape != shape or answer.entries.dtype != ENTRY:
         return (
-            f"fuse: expected lists of ENTRY with start {shape}, found {found.entries.dtype.name} with start "
-            f"{found.start.shape}"
+            f"fuse: expected lists of ENTRY with start {shape}, found {answer.entries.dtype.name} with start "
+            f"{answer.start.shape}"
         )
-    begin, end = np.append(found.start[:, 0], len(found.entries)), np.append(0, found.start[:, -1])
-    if found.start.dtype != np.int64 or (begin != end).any() or (np.diff(found.start) < 0).any():
-        expected = f"expected start of whole numbers from 0 to {len(found.entries)}, list after list, run after run"
-        return f"{expected}, found {found.start.tolist()}"
+    begin, end = np.append(answer.start[:, 0], len(answer.entries)), np.append(0, answer.start[:, -1])
+    if answer.start.dtype != np.int64 or (begin != end).any() or (np.diff(answer.start) < 0).any():
+        expected = f"expected start of whole numbers from 0 to {len(answer.entries)}, list after list, run after run"
+        return f"{expected}, found {answer.start.tolist()}"
     return None
 
 
-def content_problem(found: ObjectLists, inputs: Inputs) -> str | None:
+def content_problem(answer: ObjectLists, inputs: Inputs) -> str | None:
     """What is wrong with the entries of lists of the right form; None: nothing."""
     for name in (*VALUES, *COVARIANCES, "existence", "captured_s", "class_probability"):
-        if not np.isfinite(found.entries[name]).all():
+        if not np.isfinite(answer.entries[name]).all():
             return f"{name}: expected numbers, found NaN or infinity"
-    existence = found.entries["existence"]
+    existence = answer.entries["existence"]
     if ((existence < -1e-9) | (existence > 1 + 1e-9)).any():
         return f"existence: expected probabilities, found {existence.min():g} … {existence.max():g}"
-    ee, en, nn = (found.entries[name] for name in COVARIANCES)
+    ee, en, nn = (answer.entries[name] for name in COVARIANCES)
     if ((ee <= 0) | (nn <= 0) | (ee * nn - en * en <= 0)).any():
         return "cov_*_m2: expected positive definite covariances"
-    if not (arrived := _has_arrived(found, inputs)).all():
-        wrong = float(found.entries["captured_s"][np.argmin(arrived)])
+    if not (arrived := _has_arrived(answer, inputs)).all():
+        wrong = float(answer.entries["captured_s"][np.argmin(arrived)])
         return f"captured_s: expected the capture of a list that has arrived, found {wrong:.9g} s"
-    tracked = found.entries["track_id"] >= 0
-    of_list = np.repeat(np.arange(found.start[:, 1:].size), np.diff(found.start, axis=1).ravel())[tracked]
-    order = np.lexsort((found.entries["track_id"][tracked], of_list))
+    tracked = answer.entries["track_id"] >= 0
+    of_list = np.repeat(np.arange(answer.start[:, 1:].size), np.diff(answer.start, axis=1).ravel())[tracked]
+    order = np.lexsort((answer.entries["track_id"][tracked], of_list))
     twice = np.diff(of_list[order]) == 0
-    if (twice & (np.diff(found.entries["track_id"][tracked][order]) == 0)).any():
+    if (twice & (np.diff(answer.entries["track_id"][tracked][order]) == 0)).any():
         return "track_id: expected each once in a list, found one twice (−1: no track is kept)"
-    unit_ix = found.entries["unit_ix"]
+    unit_ix = answer.entries["unit_ix"]
     if ((unit_ix < -1) | (unit_ix >= len(inputs.units))).any():
         return f"unit_ix: expected −1 … {len(inputs.units) - 1}, found {unit_ix.min()} … {unit_ix.max()}"
     return None
 
 
-def _has_arrived(found: ObjectLists, inputs: Inputs) -> Bool:
+def _has_arrived(answer: ObjectLists, inputs: Inputs) -> Bool:
     """(N,) whether a list with the capture that an entry states has arrived when the entry's list is issued."""
     captured_s, which = np.unique(inputs.captured_s, return_inverse=True)
     first_s = np.full(len(captured_s), np.inf)
     np.minimum.at(first_s, which, inputs.arrives_s)
-    arrived: Bool = np.zeros(len(found.entries), dtype=bool)
+    arrived: Bool = np.zeros(len(answer.entries), dtype=bool)
     if len(captured_s):
         _mark_arrived(
-            found.start, found.entries["captured_s"], inputs.issue_s, captured_s, first_s, SAME_INSTANT_S, arrived
+            answer.start, answer.entries["captured_s"], inputs.issue_s, captured_s, first_s, SAME_INSTANT_S, arrived
         )
     return arrived
 

@@ -34,7 +34,9 @@ from copem_replay.fusion.interface import (
 # List f is one list in all of them, but has its entries only in the time chunks that need it.
 
 
-def needed_lists(captured_s: Float, at: FusionSchedule | Inputs, first: int, after: int, looks_back_s: float) -> Bool:
+def needed_lists(
+    captured_s: Float, instants: FusionSchedule | Inputs, first: int, after: int, looks_back_s: float
+) -> Bool:
     """(F,) lists whose entries are needed at the instants `first` … `after` − 1; `captured_s (F,)`: their captures.
 
     The units' newest, those that arrive, and, where `ListFusion.looks_back_s` is not 0, those that have arrived before
@@ -43,11 +45,11 @@ def needed_lists(captured_s: Float, at: FusionSchedule | Inputs, first: int, aft
     needed: Bool = np.zeros(len(captured_s), dtype=bool)
     if first == after:
         return needed
-    newest = at.newest[first:after]
+    newest = instants.newest[first:after]
     needed[newest[newest >= 0]] = True
-    begin, end = at.arrived_start[first], at.arrived_start[after]
-    needed[at.arrived[begin:end]] = True
-    before = at.arrived[:begin]
+    begin, end = instants.arrived_start[first], instants.arrived_start[after]
+    needed[instants.arrived[begin:end]] = True
+    before = instants.arrived[:begin]
     if looks_back_s > 0 and len(before):
         # Twice: a fusion that looks back has a tolerance of its own.
         oldest_s = captured_s[before].max() - looks_back_s - 2 * SAME_INSTANT_S
@@ -128,11 +130,11 @@ class SmallScene:
         )
         no_rows, no_values = np.empty(0, dtype=np.int64), np.empty((1, 0))
         stamp_ns = np.rint(self.captured_s * 1e9).astype(np.int64)
-        heard = Tracks(
+        received = Tracks(
             self.units, np.zeros(1, dtype=np.int64), no_rows, no_rows, no_rows, stamp_ns, self.captured_s, self.unit_ix,
             self.arrives_s[None], no_values.astype(bool), **dict.fromkeys(VALUES, no_values),
         )  # fmt: skip
-        return make_inputs(heard, ObjectLists(start, entries), max_age_s=1.0)
+        return make_inputs(received, ObjectLists(start, entries), max_age_s=1.0)
 
     def of_runs(self, runs: Sequence[int]) -> SmallScene:
         """The scene with the runs `runs`, in this order."""

@@ -28,7 +28,7 @@ TRACK = np.dtype(
         ("P", "f8", (4, 4)),
         ("common", "f8", (4, 4)),  # the part of P that may be correlated with later entries; 0 without a share
         ("at_s", "f8"),
-        ("ee", "f8"), ("en", "f8"), ("nn", "f8"),  # R of the entry heard last
+        ("ee", "f8"), ("en", "f8"), ("nn", "f8"),  # R of the entry received last
         ("z_m", "f8"),  # z and yaw of the newest entry
         ("yaw_rad", "f8"),
         ("length_m", "f8"),  # sums over all entries, sizes and class
@@ -64,7 +64,7 @@ class StoredMemory(NamedTuple):
     """
 
     memory: TrackerMemory
-    heard: Int  # (H,) the lists heard of late, in order
+    received: Int  # (H,) the lists received of late, in order
     sizes: Int  # (B,)
     tracks: NDArray[Any]  # (Σ sizes,) of TRACK
     claims: NDArray[Any]  # (Σ sizes, U) of CLAIM
@@ -80,13 +80,13 @@ def empty_memory(units: int) -> StoredMemory:
 
 @nb.njit(cache=True, nogil=True)
 def recall_memory(so_far: StoredMemory, captured_s: Float) -> tuple[TrackerMemory, list[TrackerMemory], Int]:
-    """A copy of the memory, the memory before each of the lists heard of late, and these lists."""
+    """A copy of the memory, the memory before each of the lists received of late, and these lists."""
     memory = _copy_memory(so_far.memory)
     before = [memory]
     before.pop()
     track = pair = b = 0
-    for h in range(len(so_far.heard)):
-        if h > 0 and captured_s[so_far.heard[h]] == captured_s[so_far.heard[h - 1]]:
+    for h in range(len(so_far.received)):
+        if h > 0 and captured_s[so_far.received[h]] == captured_s[so_far.received[h - 1]]:
             before.append(before[h - 1])
             continue
         n = so_far.sizes[b]
@@ -95,21 +95,21 @@ def recall_memory(so_far: StoredMemory, captured_s: Float) -> tuple[TrackerMemor
             TrackerMemory(so_far.tracks[track : track + n].copy(), so_far.claims[track : track + n].copy(), together_s)
         )
         track, pair, b = track + n, pair + n * n, b + 1
-    return memory, before, so_far.heard.copy()
+    return memory, before, so_far.received.copy()
 
 
 @nb.njit(cache=True, nogil=True)
-def store_memory(memory: TrackerMemory, before: list[TrackerMemory], heard: Int, captured_s: Float) -> StoredMemory:
+def store_memory(memory: TrackerMemory, before: list[TrackerMemory], received: Int, captured_s: Float) -> StoredMemory:
     """What `recall_memory` gives, in the form in which it is stored."""
-    first = np.empty(len(heard), np.int64)
+    first = np.empty(len(received), np.int64)
     instants = tracks = pairs = 0
-    for h in range(len(heard)):
-        if h == 0 or captured_s[heard[h]] != captured_s[heard[h - 1]]:
+    for h in range(len(received)):
+        if h == 0 or captured_s[received[h]] != captured_s[received[h - 1]]:
             first[instants] = h
             n = len(before[h].tracks)
             instants, tracks, pairs = instants + 1, tracks + n, pairs + n * n
     kept = StoredMemory(
-        memory, heard.copy(), np.empty(instants, np.int64), np.empty(tracks, TRACK),
+        memory, received.copy(), np.empty(instants, np.int64), np.empty(tracks, TRACK),
         np.empty((tracks, memory.claims.shape[1]), CLAIM), np.empty(pairs),
     )  # fmt: skip
     track = pair = 0
@@ -364,12 +364,12 @@ def track_run(
     unit_lists: HeardLists, rules: TrackerRules, so_far: StoredMemory, issue_s: Float, arrived: Int, arrived_start: Int
 ) -> tuple[Int, Entries, StoredMemory]:
     """Fused lists of one run at the next instants: where each begins (K + 1,), their entries, and what to remember."""
-    memory, before, heard = recall_memory(so_far, unit_lists.captured_s)
+    memory, before, received = recall_memory(so_far, unit_lists.captured_s)
     start, entries = np.zeros(len(issue_s) + 1, np.int64), np.zeros(256, ENTRY)
     for k in range(len(issue_s)):
         arriving = _order_by_capture(unit_lists, arrived[arrived_start[k] : arrived_start[k + 1]])
         if rules.late == REPLAY:
-            memory, before, heard = _replay_memory(memory, before, heard, arriving, unit_lists, rules)
+            memory, before, received = _replay_memory(memory, before, received, arriving, unit_lists, rules)
         else:
             for f in arriving:
                 memory = _hear_list(memory, unit_lists, rules, f, issue_s[k])
@@ -379,35 +379,35 @@ def track_run(
             grown[: start[k]] = entries[: start[k]]
             entries = grown
         start[k + 1] = start[k] + _publish_tracks(memory, rules, issue_s[k], entries[start[k] :])
-    return start, entries[: start[-1]].copy(), store_memory(memory, before, heard, unit_lists.captured_s)
+    return start, entries[: start[-1]].copy(), store_memory(memory, before, received, unit_lists.captured_s)
 
 
 @nb.njit(cache=True, nogil=True)
 def _replay_memory(
     memory: TrackerMemory,
     before: list[TrackerMemory],
-    heard: Int,
+    received: Int,
     arriving: Int,
     unit_lists: HeardLists,
     rules: TrackerRules,
 ) -> tuple[TrackerMemory, list[TrackerMemory], Int]:
-    """The memory as if the lists `arriving` had been heard at their captures, those before each list, and these lists.
+    """The memory as if the lists `arriving` had been received at their captures, those before each list, and these lists.
 
     Goes back to the memory `before` the first list that was captured no earlier than the oldest `arriving`, and hears
     all lists from there on again.
     """
-    if len(heard):
-        oldest_s = unit_lists.captured_s[heard[-1]] - rules.buffer_s - SAME_INSTANT_S
+    if len(received):
+        oldest_s = unit_lists.captured_s[received[-1]] - rules.buffer_s - SAME_INSTANT_S
         arriving = arriving[unit_lists.captured_s[arriving] >= oldest_s]
     if len(arriving) == 0:
-        return memory, before, heard
-    back = len(heard)
-    while back > 0 and unit_lists.captured_s[heard[back - 1]] >= unit_lists.captured_s[arriving[0]]:
+        return memory, before, received
+    back = len(received)
+    while back > 0 and unit_lists.captured_s[received[back - 1]] >= unit_lists.captured_s[arriving[0]]:
         back -= 1
     while len(before) > back:
         memory = before.pop()
-    again = _order_by_capture(unit_lists, np.concatenate((heard[back:], arriving)))
-    heard = np.concatenate((heard[:back], again))
+    again = _order_by_capture(unit_lists, np.concatenate((received[back:], arriving)))
+    received = np.concatenate((received[:back], again))
     for k in range(len(again)):
         now_s = unit_lists.captured_s[again[k]]
         if k == 0 or unit_lists.captured_s[again[k - 1]] < now_s:
@@ -418,9 +418,9 @@ def _replay_memory(
         if k + 1 == len(again) or unit_lists.captured_s[again[k + 1]] > now_s:
             memory = _settle_tracks(memory, rules, now_s)
     done = 0
-    while unit_lists.captured_s[heard[done]] < unit_lists.captured_s[heard[-1]] - rules.buffer_s - SAME_INSTANT_S:
+    while unit_lists.captured_s[received[done]] < unit_lists.captured_s[received[-1]] - rules.buffer_s - SAME_INSTANT_S:
         done += 1
-    return memory, before[done:], heard[done:]
+    return memory, before[done:], received[done:]
 
 
 @nb.njit(cache=True, nogil=True)
@@ -591,7 +591,7 @@ def _start_track(
 
 @nb.njit(cache=True, nogil=True)
 def _describe_track(track: Any, entry: Any, captured_s: float) -> None:
-    """Takes in what the filter leaves out; of lists captured together the last one heard counts as the newest."""
+    """Takes in what the filter leaves out; of lists captured together the last one received counts as the newest."""
     if captured_s >= track.last_s:
         track.z_m, track.yaw_rad = entry.z_m, entry.yaw_rad
     track.first_s, track.last_s = min(track.first_s, captured_s), max(track.last_s, captured_s)

@@ -89,22 +89,22 @@ def _first_listed_s(seen: Tracks, episodes: Episodes, units: Collection[str], *,
     return np.where(np.isfinite(first_s), first_s, np.nan)
 
 
-def find_informing_list(heard: Tracks, known: FirstDetections) -> Int:
+def find_informing_list(received: Tracks, known: FirstDetections) -> Int:
     """(S | 1, M) index of the list (F,) that made each object known; −1: none.
 
     Of the lists of that capture the last that the receiver had at the detection, of simultaneous ones that of the first
     unit.
     """
     list_ix, latest_s = np.full(known.detection_s.shape, -1), np.full(known.detection_s.shape, -np.inf)
-    arrives_s = heard.common_arrives_s
-    for unit_ix in range(len(heard.units)):
-        frames = np.flatnonzero((heard.frame_unit_ix == unit_ix) & np.isfinite(arrives_s))
+    arrives_s = received.common_arrives_s
+    for unit_ix in range(len(received.units)):
+        frames = np.flatnonzero((received.frame_unit_ix == unit_ix) & np.isfinite(arrives_s))
         if not len(frames):
             continue
-        frames = frames[np.argsort(heard.captured_s[frames], kind="stable")]
-        place = np.searchsorted(heard.captured_s[frames], known.captured_s - SAME_INSTANT_S)
+        frames = frames[np.argsort(received.captured_s[frames], kind="stable")]
+        place = np.searchsorted(received.captured_s[frames], known.captured_s - SAME_INSTANT_S)
         frame = frames[np.minimum(place, len(frames) - 1)]
-        matches = np.abs(heard.captured_s[frame] - known.captured_s) <= SAME_INSTANT_S
+        matches = np.abs(received.captured_s[frame] - known.captured_s) <= SAME_INSTANT_S
         matches &= arrives_s[frame] <= known.detection_s + SAME_INSTANT_S
         later = arrives_s[frame] > latest_s + SAME_INSTANT_S
         is_first_unit = (known.first_unit_ix == unit_ix) & (arrives_s[frame] >= latest_s - SAME_INSTANT_S)

@@ -197,22 +197,22 @@ class LinkTimes:
         return float(np.interp(q * passed[-1], passed, ages[order])) if len(ages) and passed[-1] > 0 else None
 
 
-def link_times(seen: Tracks, arriving: Tracks, heard: Tracks, units: Collection[str], end_s: float) -> LinkTimes:
+def link_times(seen: Tracks, arriving: Tracks, received: Tracks, units: Collection[str], end_s: float) -> LinkTimes:
     """Sums over the lists that `units` send in one run, up to the end of the log, `end_s`.
 
-    `seen`: the lists as they are sent; `arriving`: as they arrive, which decides whether they are overtaken; `heard`:
-    as the receiver takes them in.
+    `seen`: the lists as they are sent; `arriving`: as they arrive, which decides whether they are overtaken;
+    `received`: as the receiver takes them in.
     """
-    arrives_s, late = heard.common_arrives_s, find_out_of_sequence(heard)
+    arrives_s, late = received.common_arrives_s, find_out_of_sequence(received)
     sent = np.isfinite(seen.common_arrives_s)
-    sent &= np.array([name in units for name in heard.units], dtype=bool)[heard.frame_unit_ix]
+    sent &= np.array([name in units for name in received.units], dtype=bool)[received.frame_unit_ix]
     arrived = sent & np.isfinite(arrives_s)
     ages: list[tuple[Float, Float]] = []
-    for unit in np.unique(heard.frame_unit_ix[sent]):
-        frames = np.flatnonzero((heard.frame_unit_ix == unit) & ~late & (arrives_s <= end_s))
+    for unit in np.unique(received.frame_unit_ix[sent]):
+        frames = np.flatnonzero((received.frame_unit_ix == unit) & ~late & (arrives_s <= end_s))
         frames = frames[np.argsort(arrives_s[frames], kind="stable")]
         until_s = np.append(arrives_s[frames][1:], end_s)
-        ages.append((arrives_s[frames] - heard.captured_s[frames], until_s - heard.captured_s[frames]))
+        ages.append((arrives_s[frames] - received.captured_s[frames], until_s - received.captured_s[frames]))
     from_s, to_s = (np.concatenate([np.empty(0), *(part[k] for part in ages)]) for k in (0, 1))
     return LinkTimes(
         int(sent.sum()),

@@ -48,7 +48,7 @@ class GhostRows:
     has, the one that applies where it is, else the first.
     """
 
-    found: Observations
+    observations: Observations
     words: Words
     sort: Int
 
@@ -62,7 +62,7 @@ class _UnitLists:
     frame_ix: Int
     stamp_ns: Int
     poses: UnitPoses
-    at: Int  # (L,) places among the poses
+    pose_ix: Int  # (L,) places among the poses
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class _Born:
 
 def draw_ghosts(
     scene: Scene,
-    found: Observations,
+    observations: Observations,
     setup: PerceptionSetup,
     placed: SensorPoses,
     run: int,
@@ -89,25 +89,25 @@ def draw_ghosts(
 ) -> GhostRows | None:
     """The ghosts in one run's lists that are captured from the first instant on and before the second.
 
-    `found`: what can be listed then, of all objects; its lists are those of the whole log. None: no PEM has any.
+    `observations`: what can be listed then, of all objects; its lists are those of the whole log. None: no PEM has any.
     """
     from_s, until_s = between_s
     if not any(setup.pems[str(unit.pem)].ghosts for unit in setup.modelled.values()):
         return None
-    rng, runs, pieces = CounterRng(setup.seed, scene.log), np.array([run]), [_no_ghosts(found)]
+    rng, runs, pieces = CounterRng(setup.seed, scene.log), np.array([run]), [_no_ghosts(observations)]
     for u, (name, unit) in enumerate(setup.modelled.items()):
-        frames = np.flatnonzero(found.tracks.frame_unit_ix == u)
+        frames = np.flatnonzero(observations.tracks.frame_unit_ix == u)
         poses = placed.poses[name]
-        captured_s = found.tracks.captured_s[frames]
+        captured_s = observations.tracks.captured_s[frames]
         asked = (captured_s >= from_s) & (captured_s < until_s)
-        stamps = found.tracks.stamp_ns[frames[asked]]
+        stamps = observations.tracks.stamp_ns[frames[asked]]
         lists = _UnitLists(u, name, frames[asked], stamps, poses, np.flatnonzero(poses.present)[asked])
         for n, sort in enumerate(setup.pems[str(unit.pem)].ghosts):
             if sort.in_list > 0 and len(stamps):
-                born = _draw_born(rng, scene, found, lists, (n, sort), runs)
+                born = _draw_born(rng, scene, observations, lists, (n, sort), runs)
                 if len(born.ghost):
                     couples = setup.pems[str(unit.pem)].couples
-                    tracks, view = _place_ghosts(rng, found.tracks, lists, (n, sort), runs, born)
+                    tracks, view = _place_ghosts(rng, observations.tracks, lists, (n, sort), runs, born)
                     couple_ix = np.maximum(find_couples(couples, view), 0)
                     sure = np.ones(len(couple_ix))
                     rows = Observations(tracks, view, couple_ix, sure, sure)
@@ -117,7 +117,7 @@ def draw_ghosts(
 
 def make_ghost_draws(scene: Scene, ghosts: GhostRows, setup: PerceptionSetup, run: int) -> UnitDraws:
     """The random numbers of the rows of ghosts in one run."""
-    tracks = ghosts.found.tracks
+    tracks = ghosts.observations.tracks
     random_key = RandomKey(tracks.units, tracks.row_unit_ix, ghosts.words, tracks.stamp_ns[tracks.frame_ix])
     lists = ListStamps(tracks.stamp_ns, tracks.frame_unit_ix, tracks.frame_ix)
     return UnitDraws(CounterRng(setup.seed, scene.log), random_key, lists, np.array([run]))
@@ -219,7 +219,7 @@ def _place_ghosts(
     turn_rad = 2 * np.pi * rng.uniform(f"ghosts {n} turn", random_key, runs)[0]
     shares = class_row(sort.classes)[None]
     class_ix = draw_classes(shares, none, rng.uniform(f"ghosts {n} class", random_key, runs)[0])[born.ghost]
-    pose_ix, poses, host = lists.at[born.list_ix], lists.poses, born.host
+    pose_ix, poses, host = lists.pose_ix[born.list_ix], lists.poses, born.host
     x_m, y_m, heading_rad = poses.x_m[pose_ix], poses.y_m[pose_ix], poses.heading_rad[pose_ix]
     ground_m, length_m, width_m = poses.ground_m[pose_ix], np.zeros(len(born.words)), np.zeros(len(born.words))
     if sort.where.frame == "world":
@@ -272,15 +272,15 @@ def _no_ghosts(observations: Observations) -> GhostRows:
 
 def _join_ghosts(pieces: Sequence[GhostRows]) -> GhostRows:
     """Rows of several sorts and units one after the other."""
-    tracks = pieces[0].found.tracks
+    tracks = pieces[0].observations.tracks
     for piece in pieces[1:]:
-        tracks = append_tracks(tracks, piece.found.tracks)
+        tracks = append_tracks(tracks, piece.observations.tracks)
 
     def rows(name: str) -> Float:
-        return np.concatenate([getattr(piece.found, name) for piece in pieces])
+        return np.concatenate([getattr(piece.observations, name) for piece in pieces])
 
-    view = ViewGeometry.joined([piece.found.view for piece in pieces])
-    couple_ix = np.concatenate([piece.found.couple_ix for piece in pieces])
+    view = ViewGeometry.joined([piece.observations.view for piece in pieces])
+    couple_ix = np.concatenate([piece.observations.couple_ix for piece in pieces])
     observations = Observations(tracks, view, couple_ix, rows("probability"), rows("existence"))
     return GhostRows(
         observations,

@@ -179,29 +179,31 @@ def _interpolate_world(
     return world.captured_between(from_s, until_s)
 
 
-def view_world_from_unit(world: Tracks, at: UnitPoses, carrier_ix: int, share: Float) -> tuple[Tracks, ViewGeometry]:
+def view_world_from_unit(world: Tracks, poses: UnitPoses, carrier_ix: int, share: Float) -> tuple[Tracks, ViewGeometry]:
     """The rows of one unit: all objects but its carrier, at lists with the unit present; and their view but class."""
-    keep = at.present[world.frame_ix] & (world.row_object_ix != carrier_ix)
-    frames = np.flatnonzero(at.present)
+    keep = poses.present[world.frame_ix] & (world.row_object_ix != carrier_ix)
+    frames = np.flatnonzero(poses.present)
     frame = world.frame_ix[keep]
     tracks = replace(
         world.take_rows(np.flatnonzero(keep)),
-        frame_ix=(np.cumsum(at.present) - 1)[frame],
+        frame_ix=(np.cumsum(poses.present) - 1)[frame],
         stamp_ns=world.stamp_ns[frames],
         captured_s=world.captured_s[frames],
         frame_unit_ix=world.frame_unit_ix[frames],
         arrives_s=world.arrives_s[:, frames],
     )
-    return tracks, compute_view(tracks, at, frame, share[keep], np.empty(0, dtype=np.int8))
+    return tracks, compute_view(tracks, poses, frame, share[keep], np.empty(0, dtype=np.int8))
 
 
-def compute_view(tracks: Tracks, at: UnitPoses, pose_ix: Int, share: Float, class_ix: NDArray[np.int8]) -> ViewGeometry:
+def compute_view(
+    tracks: Tracks, poses: UnitPoses, pose_ix: Int, share: Float, class_ix: NDArray[np.int8]
+) -> ViewGeometry:
     """View geometry of rows (P,) from a unit, each from the pose `pose_ix (P,)` of the unit."""
-    dx, dy = tracks.x_m[0] - at.x_m[pose_ix], tracks.y_m[0] - at.y_m[pose_ix]
+    dx, dy = tracks.x_m[0] - poses.x_m[pose_ix], tracks.y_m[0] - poses.y_m[pose_ix]
     bearing = np.arctan2(dy, dx)
     return ViewGeometry(
         range_m=np.hypot(dx, dy),
-        azimuth_rad=wrap_angles(bearing - at.heading_rad[pose_ix]),
+        azimuth_rad=wrap_angles(bearing - poses.heading_rad[pose_ix]),
         bearing_rad=bearing,
         visible_share=share,
         class_ix=class_ix,

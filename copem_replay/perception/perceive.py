@@ -35,7 +35,7 @@ SMALLEST_SIZE_M = 0.05
 
 def perceive(
     scene: Scene,
-    found: Observations,
+    observations: Observations,
     experiment: PerceptionSetup,
     runs: Int,
     *,
@@ -48,19 +48,19 @@ def perceive(
     detection times by truth id need), the expected ones (true state plus the mean error) or sampled. What was listed
     does not depend on `states`.
     """
-    tracks, draws = found.tracks, make_draws(scene, found, experiment, runs)
-    valid = _draw_detected(found, experiment, draws)
+    tracks, draws = observations.tracks, make_draws(scene, observations, experiment, runs)
+    valid = _draw_detected(observations, experiment, draws)
     if equipped is not None:
         valid &= equipped[:, tracks.row_unit_ix]
     seen = tracks.with_values(valid=valid)
     if states == "true":
         return seen
-    return add_states(scene, seen, found, experiment, None if states == "expected" else draws)
+    return add_states(scene, seen, observations, experiment, None if states == "expected" else draws)
 
 
-def make_draws(scene: Scene, found: Observations, experiment: PerceptionSetup, runs: Int) -> UnitDraws:
+def make_draws(scene: Scene, observations: Observations, experiment: PerceptionSetup, runs: Int) -> UnitDraws:
     """The random numbers of the rows of objects (P,) in the runs (S,)."""
-    tracks = found.tracks
+    tracks = observations.tracks
     random_key = RandomKey(
         tracks.units,
         tracks.row_unit_ix,
@@ -72,32 +72,38 @@ def make_draws(scene: Scene, found: Observations, experiment: PerceptionSetup, r
 
 
 def add_states(
-    scene: Scene, seen: Tracks, found: Observations, experiment: PerceptionSetup, draws: UnitDraws | None
+    scene: Scene, seen: Tracks, observations: Observations, experiment: PerceptionSetup, draws: UnitDraws | None
 ) -> Tracks:
     """The lists with the errors of their couples and of the units' poses; `draws` None: with the mean errors alone."""
-    seen = _add_errors(seen, found, experiment, draws)
-    return seen if draws is None else apply_pose_errors(scene, seen, found.tracks, found.view, experiment, draws.runs)
+    seen = _add_errors(seen, observations, experiment, draws)
+    return (
+        seen
+        if draws is None
+        else apply_pose_errors(scene, seen, observations.tracks, observations.view, experiment, draws.runs)
+    )
 
 
-def _draw_detected(found: Observations, experiment: PerceptionSetup, draws: UnitDraws) -> Bool:
+def _draw_detected(observations: Observations, experiment: PerceptionSetup, draws: UnitDraws) -> Bool:
     """(S, P) which rows are detected: the addressed uniform is below the probability (0: never, 1: always)."""
-    P = len(found.probability)
+    P = len(observations.probability)
     by_parts: dict[tuple[MemoryPart, ...], list[Int]] = {}
-    for unit, unit_rows in zip(experiment.modelled.values(), rows_by_unit(found.tracks), strict=True):
+    for unit, unit_rows in zip(experiment.modelled.values(), rows_by_unit(observations.tracks), strict=True):
         pem = experiment.pems[str(unit.pem)]
         for c in range(len(pem.couples)):
             if parts := pem.memory_of(c).get("detection", ()):
-                by_parts.setdefault(parts, []).append(unit_rows[found.couple_ix[unit_rows] == c])
+                by_parts.setdefault(parts, []).append(unit_rows[observations.couple_ix[unit_rows] == c])
     if not by_parts:
-        return draws.rng.bernoulli("detection", draws.random_key, draws.runs, found.probability)
+        return draws.rng.bernoulli("detection", draws.random_key, draws.runs, observations.probability)
     valid = np.empty((len(draws.runs), P), dtype=np.bool_)
     fresh = np.ones(P, dtype=np.bool_)
     for parts, pieces in by_parts.items():
         rows = np.sort(np.concatenate(pieces))
         fresh[rows] = False
-        valid[:, rows] = draws.take(rows).uniform("detection", parts) < found.probability[rows]
+        valid[:, rows] = draws.take(rows).uniform("detection", parts) < observations.probability[rows]
     rest = np.flatnonzero(fresh)
-    valid[:, rest] = draws.rng.bernoulli("detection", draws.random_key.take(rest), draws.runs, found.probability[rest])
+    valid[:, rest] = draws.rng.bernoulli(
+        "detection", draws.random_key.take(rest), draws.runs, observations.probability[rest]
+    )
     return valid
 
 
@@ -108,7 +114,9 @@ def _draw_noise(draws: UnitDraws | None, memory: Mapping[str, Parts], valid: Boo
     return draws.normal(f"error {name}", memory.get(noise_quantity(name), ()), np.ascontiguousarray(valid))
 
 
-def _add_errors(seen: Tracks, found: Observations, experiment: PerceptionSetup, draws: UnitDraws | None) -> Tracks:
+def _add_errors(
+    seen: Tracks, observations: Observations, experiment: PerceptionSetup, draws: UnitDraws | None
+) -> Tracks:
     """The lists with the errors of the couples that apply, and the variances that units state."""
     S, P = seen.valid.shape
     columns: dict[str, Any] = {}
@@ -127,7 +135,7 @@ def _add_errors(seen: Tracks, found: Observations, experiment: PerceptionSetup, 
     for unit, unit_rows in zip(experiment.modelled.values(), rows_by_unit(seen), strict=True):
         pem = experiment.pems[str(unit.pem)]
         for c, couple in enumerate(pem.couples):
-            rows = unit_rows[found.couple_ix[unit_rows] == c]
+            rows = unit_rows[observations.couple_ix[unit_rows] == c]
             if couple.error is None or not len(rows):
                 continue
             where = f"pems.{unit.pem}[{c}].error"
@@ -135,7 +143,7 @@ def _add_errors(seen: Tracks, found: Observations, experiment: PerceptionSetup, 
             # Consecutive rows are a view, others a copy.
             columns_at = slice(rows[0], rows[-1] + 1) if rows[-1] - rows[0] < len(rows) else rows
             noise = partial(_draw_noise, drawn, pem.memory_of(c), seen.valid[:, columns_at])
-            errors = ask_errors(couple.error, found.view.take(rows), noise, S, where)
+            errors = ask_errors(couple.error, observations.view.take(rows), noise, S, where)
             per_run("x_m")[:, columns_at] += errors.east_m
             per_run("y_m")[:, columns_at] += errors.north_m
             for name in ("cov_ee_m2", "cov_en_m2", "cov_nn_m2"):
@@ -150,7 +158,7 @@ def _add_errors(seen: Tracks, found: Observations, experiment: PerceptionSetup, 
                     size[:, columns_at] = np.maximum(size[:, columns_at] + errors.size_m[axis], SMALLEST_SIZE_M)
                 spread["size_var_m2"][0, columns_at] = errors.size_var_m2
             if errors.speed_mps is not None:
-                east, north = _travel_direction(seen, found.view.speed_mps[rows], columns_at)
+                east, north = _travel_direction(seen, observations.view.speed_mps[rows], columns_at)
                 per_run("vx_mps")[:, columns_at] += errors.speed_mps * east
                 per_run("vy_mps")[:, columns_at] += errors.speed_mps * north
                 spread["speed_var_m2ps2"][0, columns_at] = errors.speed_var_m2ps2
@@ -183,32 +191,34 @@ class DrawnClaims:
 
 
 def draw_claims(
-    found: Observations, setup: PerceptionSetup, draws: UnitDraws, ghost_sort: Int | None = None
+    observations: Observations, setup: PerceptionSetup, draws: UnitDraws, ghost_sort: Int | None = None
 ) -> DrawnClaims:
     """The claims of the units about rows (P,) in one run, that of `draws`.
 
     `ghost_sort (P,)`: the rows are ghosts, of these sorts of their PEMs; None: they are objects.
     """
     claims = DrawnClaims(
-        found.existence.copy(), np.eye(len(CLASSES))[found.view.class_ix], np.full(len(found.couple_ix), -1)
+        observations.existence.copy(),
+        np.eye(len(CLASSES))[observations.view.class_ix],
+        np.full(len(observations.couple_ix), -1),
     )
-    for unit, rows in zip(setup.modelled.values(), rows_by_unit(found.tracks), strict=True):
+    for unit, rows in zip(setup.modelled.values(), rows_by_unit(observations.tracks), strict=True):
         pem = setup.pems[str(unit.pem)]
         if not len(rows) or not pem.draws_claims:
             continue
         unit_draws = draws.take(rows)
         sort = None if ghost_sort is None else ghost_sort[rows]
-        claims.existence[rows] = _claim_existence(pem, found, rows, unit_draws, sort)
-        claims.class_probability[rows] = _claim_classes(pem, found, rows, unit_draws, of_ghosts=sort is not None)
+        claims.existence[rows] = _claim_existence(pem, observations, rows, unit_draws, sort)
+        claims.class_probability[rows] = _claim_classes(pem, observations, rows, unit_draws, of_ghosts=sort is not None)
         if pem.tracks is not None:
             claims.track_id[rows] = _claim_track_ids(unit_draws, pem.tracks.lasts_s)
     return claims
 
 
-def _claim_existence(pem: Pem, found: Observations, rows: Int, draws: UnitDraws, sort: Int | None) -> Float:
+def _claim_existence(pem: Pem, observations: Observations, rows: Int, draws: UnitDraws, sort: Int | None) -> Float:
     """(P,) existence as claimed of rows of one unit; `sort`: the rows are ghosts of these sorts, None: objects."""
-    existence = found.existence[rows]
-    couple_ix = found.couple_ix[rows]
+    existence = observations.existence[rows]
+    couple_ix = observations.couple_ix[rows]
     for c, couple in enumerate(pem.couples):
         for n in range(1 if sort is None else len(pem.ghosts)):
             of_sort = np.flatnonzero((couple_ix == c) & (True if sort is None else sort == n))
@@ -223,17 +233,19 @@ def _claim_existence(pem: Pem, found: Observations, rows: Int, draws: UnitDraws,
                     uniform, of_ghosts=sort is not None, ghosts_in_list=pem.ghosts_in_list
                 )
             else:
-                existence[of_sort] = found.view.visible_share[rows[of_sort]] if claimed == "visible_share" else claimed
+                existence[of_sort] = (
+                    observations.view.visible_share[rows[of_sort]] if claimed == "visible_share" else claimed
+                )
     return existence
 
 
-def _claim_classes(pem: Pem, found: Observations, rows: Int, draws: UnitDraws, *, of_ghosts: bool) -> Float:
+def _claim_classes(pem: Pem, observations: Observations, rows: Int, draws: UnitDraws, *, of_ghosts: bool) -> Float:
     """(P, C) class probabilities of rows of one unit; the listed class of a ghost is drawn at its birth."""
-    class_ix = found.view.class_ix[rows].astype(np.int64)
+    class_ix = observations.view.class_ix[rows].astype(np.int64)
     if pem.classes is None:
         return np.eye(len(CLASSES))[class_ix]
     if pem.classes.confusion and not of_ghosts:
-        couple_ix, true = found.couple_ix[rows], class_ix.copy()
+        couple_ix, true = observations.couple_ix[rows], class_ix.copy()
         for c in range(len(pem.couples)):
             of_couple = np.flatnonzero(couple_ix == c)
             if len(of_couple):

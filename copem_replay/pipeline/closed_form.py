@@ -50,7 +50,7 @@ def check_lasting(experiment: ExpandedExperiment, name: str, hits: int) -> bool:
 
 
 def find_lasting_detection(
-    replay: Replay, experiment: ExpandedExperiment, name: str, heard: Tracks
+    replay: Replay, experiment: ExpandedExperiment, name: str, received: Tracks
 ) -> LastingDetection | None:
     """How the detection of each row (P,) lasts in what a configuration hears; None: no detection lasts.
 
@@ -59,10 +59,10 @@ def find_lasting_detection(
     of_unit = _find_processes(experiment, name, 1)
     if not of_unit:
         return None
-    found = replay.measured
-    P, keys = len(found.probability), list(dict.fromkeys(key for key, _ in of_unit.values()))
+    observations = replay.measured
+    P, keys = len(observations.probability), list(dict.fromkeys(key for key, _ in of_unit.values()))
     process, share, tau_s = np.full(P, -1), np.zeros(P), np.full(P, np.inf)
-    for (unit, settings), rows in zip(experiment.modelled.items(), rows_by_unit(found.tracks), strict=True):
+    for (unit, settings), rows in zip(experiment.modelled.items(), rows_by_unit(observations.tracks), strict=True):
         if unit not in of_unit:
             continue
         key, time_s = of_unit[unit]
@@ -70,11 +70,11 @@ def find_lasting_detection(
         by_couple = np.array(
             [*(sum(part.share for part in _list_lasting_parts(pem, c)) for c in range(len(pem.couples))), 0.0]
         )
-        process[rows], share[rows], tau_s[rows] = keys.index(key), by_couple[found.couple_ix[rows]], time_s
+        process[rows], share[rows], tau_s[rows] = keys.index(key), by_couple[observations.couple_ix[rows]], time_s
     for number in range(len(keys)):
         units = [unit for unit, (key, _) in of_unit.items() if keys.index(key) == number]
-        _check_order(replay, experiment, name, heard, units)
-    return LastingDetection(process, share, tau_s, heard.row_captured_s)
+        _check_order(replay, experiment, name, received, units)
+    return LastingDetection(process, share, tau_s, received.row_captured_s)
 
 
 def _find_processes(experiment: ExpandedExperiment, name: str, hits: int) -> dict[str, tuple[str, float]]:
@@ -134,11 +134,11 @@ def _count_in_words(count: int) -> str:
     return {2: "two", 3: "three"}.get(count, str(count))
 
 
-def _check_order(replay: Replay, experiment: ExpandedExperiment, name: str, heard: Tracks, units: list[str]) -> None:
+def _check_order(replay: Replay, experiment: ExpandedExperiment, name: str, received: Tracks, units: list[str]) -> None:
     """Raises ExperimentError unless lists that share a held number arrive as they were captured."""
     ixs = [list(experiment.units).index(unit) for unit in units]
-    frames = np.flatnonzero(np.isin(heard.frame_unit_ix, ixs) & np.isfinite(heard.common_arrives_s))
-    arrives_s: Float = heard.common_arrives_s[frames[np.argsort(heard.captured_s[frames], kind="stable")]]
+    frames = np.flatnonzero(np.isin(received.frame_unit_ix, ixs) & np.isfinite(received.common_arrives_s))
+    arrives_s: Float = received.common_arrives_s[frames[np.argsort(received.captured_s[frames], kind="stable")]]
     late: Int = np.flatnonzero(arrives_s < np.maximum.accumulate(arrives_s) - SAME_INSTANT_S)
     if len(late):
         senders = f"unit {units[0]}" if len(units) == 1 else f"the {count_noun(len(units), 'unit')} {', '.join(units)}"
@@ -154,7 +154,7 @@ def _refuse_lasting(name: str, why: str, log: str = "") -> ExperimentError:
 # Links: when lists arrive, and how probably, without a draw.
 
 
-def hear_without_loss(replay: Replay, experiment: ExpandedExperiment, name: str, hits: int) -> tuple[Tracks, Float]:
+def receive_without_loss(replay: Replay, experiment: ExpandedExperiment, name: str, hits: int) -> tuple[Tracks, Float]:
     """What reaches the receiver of a configuration if no list is lost, and the probability that each (F,) is not.
 
     `hits`: how many confirm an object. Raises ExperimentError where drawn arrivals have no closed form.
@@ -169,7 +169,7 @@ def hear_without_loss(replay: Replay, experiment: ExpandedExperiment, name: str,
     if not of_truth:
         rng = CounterRng(experiment.seed, replay.scene.log)
         seen = delay_until_ready(seen, experiment.ready, rng, np.zeros(1, dtype=np.int64))
-    received = np.ones(len(seen.stamp_ns))
+    reception = np.ones(len(seen.stamp_ns))
     lossless: list[UnitLinks] = []
     for unit_links in experiment.links_of(name):
         if unit_links.link.drawn:
@@ -179,10 +179,10 @@ def hear_without_loss(replay: Replay, experiment: ExpandedExperiment, name: str,
             if unit_links.units is not None:
                 concerned = np.array([unit in unit_links.units for unit in seen.units], dtype=bool)[seen.frame_unit_ix]
                 share = np.where(concerned, share, 1.0)
-            received *= share
+            reception *= share
             unit_links = replace(unit_links, link=unit_links.link.model_copy(update={"reception": ConstantReception()}))
         lossless.append(unit_links)
-    return sample_arrivals(transmit(seen, lossless, None if of_truth else units), configuration.issue_hz), received
+    return sample_arrivals(transmit(seen, lossless, None if of_truth else units), configuration.issue_hz), reception
 
 
 def _check_link(unit_links: UnitLinks, link: Radio, name: str, hits: int) -> None:
@@ -279,54 +279,54 @@ def check_exact(ready: Sequence[Replay], experiment: Experiment) -> None:
             lasts = check_lasting(units, name, hits)
             if hits == 1 and not lasts and not units.arrivals_differ:
                 continue
-            heard, received = hear_without_loss(replay, units, name, hits)
+            received, reception = receive_without_loss(replay, units, name, hits)
             if hits > 1:
-                _number_shared_instants(replay, heard, name)
+                _number_shared_instants(replay, received, name)
             else:
-                _find_lasting(replay, units, name, heard, received)
+                _find_lasting(replay, units, name, received, reception)
 
 
 def compute_distributions(replay: Replay, experiment: Experiment, name: str) -> list[FirstKnown]:
     """For each episode the distribution of the instant at which its object is first known."""
     units, episodes, confirm = replay.expanded.with_(experiment), replay.episodes, experiment.measure.confirm
     configuration = units.configurations[name]
-    heard, received = hear_without_loss(replay, units, name, confirm.hits)
+    received, reception = receive_without_loss(replay, units, name, confirm.hits)
     # A model of the user's own may be above 1 by rounding.
     listed = (
-        np.ones(len(heard.frame_ix)) if configuration.units == TRUTH else np.minimum(replay.measured.probability, 1)
+        np.ones(len(received.frame_ix)) if configuration.units == TRUTH else np.minimum(replay.measured.probability, 1)
     )
-    if (received < 1).any():
-        listed = listed * received[heard.frame_ix]
-    instants = _number_shared_instants(replay, heard, name) if confirm.hits > 1 else None
-    lasting = None if instants is not None else _find_lasting(replay, units, name, heard, received)
-    arrives_s = heard.common_arrives_s[heard.frame_ix]
-    by_object = np.argsort(heard.row_object_ix, kind="stable")
+    if (reception < 1).any():
+        listed = listed * reception[received.frame_ix]
+    instants = _number_shared_instants(replay, received, name) if confirm.hits > 1 else None
+    lasting = None if instants is not None else _find_lasting(replay, units, name, received, reception)
+    arrives_s = received.common_arrives_s[received.frame_ix]
+    by_object = np.argsort(received.row_object_ix, kind="stable")
     first, last = (
-        np.searchsorted(heard.row_object_ix[by_object], episodes.object_ix, side) for side in ("left", "right")
+        np.searchsorted(received.row_object_ix[by_object], episodes.object_ix, side) for side in ("left", "right")
     )
     from_s = episodes.counts_from_s(count_earlier=experiment.measure.count_earlier)
     result = []
     for m in range(len(episodes.object_ix)):
         rows = by_object[first[m] : last[m]]
         counts = arrives_s[rows] <= episodes.ended_s[m] + SAME_INSTANT_S
-        counts &= heard.row_captured_s[rows] >= from_s[m]
+        counts &= received.row_captured_s[rows] >= from_s[m]
         rows = rows[counts]
         if instants is None:
             share = replay.expanded.share if configuration.units != TRUTH else np.ones(1)
             lasting_rows = None if lasting is None else lasting.take(rows)
-            result.append(first_known(arrives_s[rows], listed[rows], heard.row_unit_ix[rows], share, lasting_rows))
+            result.append(first_known(arrives_s[rows], listed[rows], received.row_unit_ix[rows], share, lasting_rows))
         else:
-            instant = instants[heard.frame_ix[rows]]
+            instant = instants[received.frame_ix[rows]]
             result.append(first_confirmed(instant, arrives_s[rows], listed[rows], confirm.hits, confirm.of))
     return result
 
 
 def _find_lasting(
-    replay: Replay, experiment: ExpandedExperiment, name: str, heard: Tracks, received: Float
+    replay: Replay, experiment: ExpandedExperiment, name: str, received: Tracks, reception: Float
 ) -> LastingDetection | None:
-    """How detection lasts. Raises ExperimentError if lists are lost, too: by `received (F,)`, probabilities."""
-    lasting = find_lasting_detection(replay, experiment, name, heard)
-    if lasting is not None and (received < 1).any():
+    """How detection lasts. Raises ExperimentError if lists are lost, too: by `reception (F,)`, probabilities."""
+    lasting = find_lasting_detection(replay, experiment, name, received)
+    if lasting is not None and (reception < 1).any():
         raise ExperimentError(
             f"exact: configuration {name}: detection lasts and lists are lost, and both together have no closed form "
             "here; leave one of them, or leave exact out"
@@ -334,27 +334,27 @@ def _find_lasting(
     return lasting
 
 
-def _number_shared_instants(replay: Replay, heard: Tracks, name: str) -> Int:
+def _number_shared_instants(replay: Replay, received: Tracks, name: str) -> Int:
     """(F,) the capture instant of each list. Raises ExperimentError unless all units share all of them."""
-    arrived = np.isfinite(heard.common_arrives_s)
-    if heard.units != (TRUTH,) and (replay.expanded.share[heard.frame_unit_ix[arrived]] < 1).any():
+    arrived = np.isfinite(received.common_arrives_s)
+    if received.units != (TRUTH,) and (replay.expanded.share[received.frame_unit_ix[arrived]] < 1).any():
         raise ExperimentError(
             f"{replay.scene.log}: exact: configuration {name}: some units are only in some runs, and "
             "confirmation by several hits then has no closed form; confirm with one hit, or leave `exact` out"
         )
-    instants = capture_instants(heard)
+    instants = capture_instants(received)
     instants_of_all = np.unique(instants[arrived])
-    for unit in np.unique(heard.frame_unit_ix[arrived]):
-        of_unit = arrived & (heard.frame_unit_ix == unit)
+    for unit in np.unique(received.frame_unit_ix[arrived]):
+        of_unit = arrived & (received.frame_unit_ix == unit)
         if not np.array_equal(np.unique(instants[of_unit]), instants_of_all):
             raise ExperimentError(
-                f"{replay.scene.log}: exact: configuration {name}: unit {heard.units[unit]} does not list at "
+                f"{replay.scene.log}: exact: configuration {name}: unit {received.units[unit]} does not list at "
                 "every instant at which another does, and confirmation over such lists has no closed form; give all "
                 "units one rate_hz and phase_s, confirm with one hit, or leave `exact` out"
             )
     latest_s = -np.inf
     for instant in instants_of_all:
-        arrivals = heard.common_arrives_s[arrived & (instants == instant)]
+        arrivals = received.common_arrives_s[arrived & (instants == instant)]
         if np.ptp(arrivals) > SAME_INSTANT_S:
             how = f"lists captured together arrive up to {np.ptp(arrivals):g} s apart"
         elif arrivals.min() < latest_s - SAME_INSTANT_S:

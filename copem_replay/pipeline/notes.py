@@ -48,7 +48,7 @@ from copem_replay.perception.observation import interpolate_worlds
 from copem_replay.perception.pem.model import ObjectSidePlace, Pem
 from copem_replay.perception.sensor_poses import UnitPoses
 from copem_replay.pipeline.expansion import ExpandedExperiment
-from copem_replay.pipeline.receiver import hear_units, perceive_all_units
+from copem_replay.pipeline.receiver import perceive_all_units, receive_lists
 from copem_replay.pipeline.sweep import describe_unswept
 from copem_replay.pipeline.world import WorldChunk, asks_for_path
 
@@ -110,15 +110,15 @@ def _add_run(result: dict[str, list[ListRate]], world: WorldChunk, seen: Tracks)
     """Append to `result` the rate of each configuration in one run, whose lists are `seen`."""
     end_s = world.scene.end_s
     for name, configuration in world.experiment.configurations.items():
-        arriving = hear_units(seen, world, name, ticks=False)
-        heard = sample_arrivals(arriving, configuration.issue_hz)
-        issue_s = receiver_instants(heard)
+        arriving = receive_lists(seen, world, name, ticks=False)
+        received = sample_arrivals(arriving, configuration.issue_hz)
+        issue_s = receiver_instants(received)
         issue_s = issue_s[(issue_s >= -SAME_INSTANT_S) & (issue_s <= end_s + SAME_INSTANT_S)]
         covered_s = float(issue_s[-1] - issue_s[0]) if len(issue_s) > 1 else 0.0
         links = None
         if linked := world.experiment.linked(name):
             sent = world.truth if configuration.units == TRUTH else seen
-            links = link_times(sent, arriving, heard, linked, end_s)
+            links = link_times(sent, arriving, received, linked, end_s)
         result.setdefault(name, []).append(ListRate(max(len(issue_s) - 1, 0), covered_s, links))
 
 
@@ -581,7 +581,7 @@ class LogFacts:
             tuple(list_oddities(replay, experiment, replay.ever_met)),
             measure_list_rates(replay, experiment),
             sum_output_times([recording], experiment),
-            len((replay.found(WHOLE) if replay.chunks == (WHOLE,) else replay.measured).tracks.frame_ix),
+            len((replay.observe(WHOLE) if replay.chunks == (WHOLE,) else replay.measured).tracks.frame_ix),
         )
 
     @classmethod

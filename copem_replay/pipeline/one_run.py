@@ -71,7 +71,13 @@ class RunTracks:
                     matches = match_lists(truth_cache, output, self.experiment.measure)
                     stated_s = None if output.stated is None else output.told.entries["captured_s"]
                     result[name] = convert_to_tracks(
-                        output.lists, 0, matches, output.heard, output.at.issue_s, output.at.newest, stated_s
+                        output.lists,
+                        0,
+                        matches,
+                        output.received,
+                        output.instants.issue_s,
+                        output.instants.newest,
+                        stated_s,
                     )
                 if output.faults is not None:
                     result[name] = replace(result[name], faults=output.faults)
@@ -190,15 +196,15 @@ class Curve:
     share: Float
 
 
-def share_curves(replay: Replay, found: Observations, object_ix: int) -> dict[str, Curve]:
-    """The curves of an object by name, without those that have no unit. `found`: its observation rows, at least."""
-    scene, experiment, tracks = replay.scene, replay.expanded, found.tracks
+def share_curves(replay: Replay, observations: Observations, object_ix: int) -> dict[str, Curve]:
+    """The curves of an object by name, without those that have no unit. `observations`: its rows, at least."""
+    scene, experiment, tracks = replay.scene, replay.expanded, observations.tracks
     stamps, newest = _newest_lists(tracks, experiment.max_gap_s)
     carriers = np.array([find_carrier(scene, unit) for unit in experiment.modelled.values()], dtype=np.int64)
     own = (carriers == scene.ego_ix) & (scene.ego_ix >= 0)
     share = np.full(len(tracks.stamp_ns) + 1, np.nan)  # one more: what −1 points at
     rows = np.flatnonzero(tracks.row_object_ix == object_ix)
-    share[tracks.frame_ix[rows]] = found.view.visible_share[rows]
+    share[tracks.frame_ix[rows]] = observations.view.visible_share[rows]
     # NaN of a unit without a list of the object does not count: the best of the others does.
     return {
         name: Curve(stamps - scene.t0_ns, np.fmax.reduce(share[newest[units]], axis=0))

@@ -36,8 +36,8 @@ from copem_replay.pipeline.expansion import ExpandedExperiment, Presence, expand
 from copem_replay.pipeline.receiver import (
     StatedCaptures,
     draw_shown_ghosts,
-    hear_units,
     perceive_all_units,
+    receive_lists,
     state_captures,
 )
 from copem_replay.pipeline.scoring import TruthCache, make_log_frames
@@ -95,20 +95,20 @@ def _can_be_cut(configurations: Iterable[Configuration]) -> bool:
 class Reach:
     """The earliest captures that the receivers need in a time chunk: of lists that arrive, are kept, or looked back to.
 
-    `heard`: by configuration the lists that its receiver hears, whatever is in them. `stated`: the captures that their
-    units state, None where these are true.
+    `received`: by configuration the lists that reach its receiver, whatever is in them. `stated`: the captures that
+    their units state, None where these are true.
     """
 
     def __init__(
         self,
         experiment: ExpandedExperiment,
-        heard: Mapping[str, Tracks],
+        received: Mapping[str, Tracks],
         stated: Mapping[str, StatedCaptures | None] | None = None,
     ) -> None:
         self._oldest: list[tuple[Float, Float]] = []  # instants, and the oldest capture that each needs
         self._again: list[tuple[Float, Float]] = []
         for name, configuration in experiment.configurations.items():
-            lists = heard[name]
+            lists = received[name]
             schedule = fusion_schedule(lists, max_age_s=configuration.max_age_s)
             if not len(schedule.issue_s):
                 continue
@@ -199,9 +199,9 @@ class Replay:
         sights: list[Float] = []
         met: list[Bool] = []
         for chunk in self.chunks:
-            found = self.found(chunk)
-            sights.append(first_sights(found, self.episodes))
-            met.append(found.ever_met)
+            observations = self.observe(chunk)
+            sights.append(first_sights(observations, self.episodes))
+            met.append(observations.ever_met)
         return np.min(sights, axis=0), np.any(met, axis=0)
 
     @cached_property
@@ -235,9 +235,9 @@ class Replay:
 
     def rows_of(self, object_ix: Int) -> Observations:
         """The observation rows of some objects."""
-        return join_observations([self.found(chunk).of_objects(object_ix) for chunk in self.chunks])
+        return join_observations([self.observe(chunk).of_objects(object_ix) for chunk in self.chunks])
 
-    def found(self, chunk: TimeChunk, from_s: float | None = None) -> Observations:
+    def observe(self, chunk: TimeChunk, from_s: float | None = None) -> Observations:
         """The observation rows captured in a time chunk, or from `from_s` on. Those of a whole log are kept."""
         if chunk == WHOLE:
             return self._whole
@@ -275,22 +275,22 @@ class Replay:
         if self.chunks == (WHOLE,):
             on_air = self.on_air(experiment, runs, equipped, perceived)
             whole = replace(self.world(experiment), on_air=on_air, perceived=perceived)
-            yield replace(whole, found=self.measured.listable) if measured_only else whole
+            yield replace(whole, observations=self.measured.listable) if measured_only else whole
             return
         lists = self.lists_only(experiment, runs[:1], equipped)
         units, seen = lists.experiment, perceive_all_units(lists, runs[:1], states="true")
-        heard = {name: hear_units(seen, lists, name, sending) for name in units.configurations}
+        received = {name: receive_lists(seen, lists, name, sending) for name in units.configurations}
         stated = None
         if units.runs_apart:
-            stated = {name: state_captures(self.scene, of, units, int(runs[0])) for name, of in heard.items()}
-        reach = Reach(units, heard, stated)
+            stated = {name: state_captures(self.scene, of, units, int(runs[0])) for name, of in received.items()}
+        reach = Reach(units, received, stated)
         for chunk in self.chunks:
             earliest_s = reach.earliest_s(chunk)
-            found = self.found(chunk, earliest_s).listable
+            observations = self.observe(chunk, earliest_s).listable
             yield WorldChunk(
                 self.scene,
                 self.truth.captured_between(earliest_s, chunk.until_s),
-                found.of_objects(self.episodes.object_ix) if measured_only else found,
+                observations.of_objects(self.episodes.object_ix) if measured_only else observations,
                 None if self.recorded is None else self.recorded.captured_between(earliest_s, chunk.until_s),
                 units,
                 chunk,
@@ -302,11 +302,11 @@ class Replay:
     def lists_only(self, experiment: Experiment, runs: Int | None = None, equipped: Bool | None = None) -> WorldChunk:
         """The lists of the whole log without entries. `runs (S,)`: one if arrivals are drawn; None: no draws."""
         none = np.empty(0, dtype=np.int64)
-        found = observe_objects(self.scene, self.truth, self.expanded, self.placed, from_s=np.inf)
+        observations = observe_objects(self.scene, self.truth, self.expanded, self.placed, from_s=np.inf)
         recorded = None if self.recorded is None else self.recorded.captured_between(np.inf, np.inf)
         units = self.expanded.with_(experiment)
         on_air = None if runs is None else self.on_air(experiment, runs, equipped)
-        return WorldChunk(self.scene, self.truth.take_rows(none), found, recorded, units, on_air=on_air)
+        return WorldChunk(self.scene, self.truth.take_rows(none), observations, recorded, units, on_air=on_air)
 
     def on_air(
         self, experiment: Experiment, runs: Int, equipped: Bool | None = None, perceived: Perceived | None = None
@@ -339,9 +339,9 @@ class Replay:
     ) -> Iterator[tuple[WorldChunk, Tracks, ClaimedRows]]:
         """What the modelled units list in one run, chunk by chunk."""
         for chunk in self.chunks:
-            found = self.found(chunk).listable
+            observations = self.observe(chunk).listable
             world = WorldChunk(
-                self.scene, self.truth, found, None, units, chunk, self.placed, chunk.from_s, perceived=perceived
+                self.scene, self.truth, observations, None, units, chunk, self.placed, chunk.from_s, perceived=perceived
             )
             ghosts = draw_shown_ghosts(world, runs)
             seen = perceive_all_units(world, runs, states="sampled", equipped=equipped, ghosts=ghosts)
@@ -354,9 +354,18 @@ class Replay:
         counts = np.zeros(0, dtype=np.int64)
         for chunk in self.chunks:
             recorded = None if self.recorded is None else self.recorded.captured_between(chunk.from_s, chunk.until_s)
-            found = self.found(chunk).listable
+            observations = self.observe(chunk).listable
             world = WorldChunk(
-                self.scene, self.truth, found, recorded, units, chunk, self.placed, chunk.from_s, on_air, perceived
+                self.scene,
+                self.truth,
+                observations,
+                recorded,
+                units,
+                chunk,
+                self.placed,
+                chunk.from_s,
+                on_air,
+                perceived,
             )
             seen = perceive_all_units(
                 world, runs, states="true", equipped=equipped, ghosts=draw_shown_ghosts(world, runs)
@@ -402,7 +411,7 @@ def prepare_log(recording: Recording, experiment: Experiment, *, onsets_of: Expe
         recording.truth, recording.truth.stamp_ns, t0_ns=scene.t0_ns, max_gap_s=experiment.max_gap_s
     )
     placed = place_units(scene, truth, expanded)
-    lists = {name: found for name, found in recording.lists.items() if name in expanded.units}
+    lists = {name: observations for name, observations in recording.lists.items() if name in expanded.units}
     recorded = join_recorded_units(
         lists, scene, truth, gate_m=experiment.measure.match.gate_m, max_gap_s=experiment.max_gap_s
     )

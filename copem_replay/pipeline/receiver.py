@@ -117,7 +117,7 @@ def _fill_words(
 
 
 def convert_to_tracks(
-    lists: ObjectLists, run: int, matches: Matches, heard: Tracks, issue_s: Float, newest: Int,
+    lists: ObjectLists, run: int, matches: Matches, received: Tracks, issue_s: Float, newest: Int,
     stated_s: Float | None = None,
 ) -> FusedTracks:  # fmt: skip
     """The lists of one run as tracks: one of each matched object, one of each identity else, one of each entry else.
@@ -137,8 +137,8 @@ def convert_to_tracks(
         new[1:] &= key[order][1:] == key[order][:-1]
     new[1:] = ~new[1:]
     start = np.append(np.flatnonzero(new), len(order))
-    stamps = np.where(newest >= 0, heard.stamp_ns[newest], NO_CAPTURE_NS).max(axis=1, initial=NO_CAPTURE_NS)
-    captured = np.where(newest >= 0, heard.captured_s[newest], -np.inf).max(axis=1, initial=-np.inf)
+    stamps = np.where(newest >= 0, received.stamp_ns[newest], NO_CAPTURE_NS).max(axis=1, initial=NO_CAPTURE_NS)
+    captured = np.where(newest >= 0, received.captured_s[newest], -np.inf).max(axis=1, initial=-np.inf)
     fused = Tracks(
         units=("fused",),
         start=start,
@@ -154,7 +154,7 @@ def convert_to_tracks(
     )
     none = np.zeros(len(order) + 1, dtype=np.int64)
     stated_s = None if stated_s is None else stated_s[first:last][order]
-    return FusedTracks(fused, heard, none[:0], none, None, entries[order], stated_s=stated_s)
+    return FusedTracks(fused, received, none[:0], none, None, entries[order], stated_s=stated_s)
 
 
 # Stated captures: when lists were captured, as fusions are told of it.
@@ -208,29 +208,29 @@ class StatedCaptures:
             place = np.where(early, place - 1, place)
 
 
-def state_captures(scene: Scene, heard: Tracks, experiment: ExpandedExperiment, run: int) -> StatedCaptures | None:
+def state_captures(scene: Scene, received: Tracks, experiment: ExpandedExperiment, run: int) -> StatedCaptures | None:
     """What a receiver is told of the captures of the lists it hears, none after its arrival; None: the truth."""
-    error_s = clock_errors_s(scene, heard.units, experiment, heard.captured_s, heard.frame_unit_ix, run)
+    error_s = clock_errors_s(scene, received.units, experiment, received.captured_s, received.frame_unit_ix, run)
     if error_s is None:
         return None
-    arrives_s = heard.common_arrives_s
-    return StatedCaptures(np.minimum(heard.captured_s + error_s, arrives_s), heard.captured_s, arrives_s)
+    arrives_s = received.common_arrives_s
+    return StatedCaptures(np.minimum(received.captured_s + error_s, arrives_s), received.captured_s, arrives_s)
 
 
 @dataclass(frozen=True)
 class ReceiverOutput:
-    """What one configuration's receiver issues in the runs (S,) at its instants, `at`.
+    """What one configuration's receiver issues in the runs (S,) at its instants, `instants`.
 
-    `heard`: the lists that reach it; `sent`: these before links delay or lose them. `fused_tracks`: of ideal fusion and
-    the truth, which have truth ids, else None. `fused`: what another fusion gave, else None; one run where all runs
+    `received`: the lists that reach it; `sent`: these before links delay or lose them. `fused_tracks`: of ideal fusion
+    and the truth, which have truth ids, else None. `fused`: what another fusion gave, else None; one run where all runs
     agree. `tells_of`: of which instant entries tell. `whole`: the instants are those of the whole log, not of a time
     chunk. `stated`: the captures that a fusion is told of, in one run; None: the true ones. `faults`: ghosts and lists
     that outages leave out, in one run; None: units have neither.
     """
 
-    heard: Tracks
+    received: Tracks
     sent: Tracks
-    at: FusionSchedule
+    instants: FusionSchedule
     fused_tracks: FusedTracks | None
     scene: Scene
     fused: ObjectLists | None
@@ -242,7 +242,7 @@ class ReceiverOutput:
     @cached_property
     def lists(self) -> ObjectLists:
         """The fused lists without truth ids; their entries go back to true captures."""
-        return self.told if self.stated is None else self.stated.true_lists(self.told, self.at.issue_s)
+        return self.told if self.stated is None else self.stated.true_lists(self.told, self.instants.issue_s)
 
     @cached_property
     def told(self) -> ObjectLists:
@@ -254,8 +254,8 @@ class ReceiverOutput:
 
     @property
     def captures_told_s(self) -> Float:
-        """(F,) the captures of the lists that were heard, as fusion was told of them."""
-        return self.heard.captured_s if self.stated is None else self.stated.stated_s
+        """(F,) the captures of the lists that were received, as fusion was told of them."""
+        return self.received.captured_s if self.stated is None else self.stated.stated_s
 
 
 def perceive_all_units(
@@ -278,11 +278,13 @@ def perceive_all_units(
         seen = perceive_modelled(world, runs, states, equipped)
     if ghosts is not None:
         drawn = make_ghost_draws(world.scene, ghosts, experiment, int(runs[0]))
-        seen = append_tracks(seen, add_states(world.scene, ghosts.found.tracks, ghosts.found, experiment, drawn))
+        seen = append_tracks(
+            seen, add_states(world.scene, ghosts.observations.tracks, ghosts.observations, experiment, drawn)
+        )
     seen = remove_outages(world.scene, seen, experiment, runs)
     seen = delay_until_ready(seen, experiment.ready, CounterRng(experiment.seed, world.scene.log), runs)
     if world.on_air is not None and (sent := world.on_air.sent) is not None:
-        words = object_words(world.scene.object_ids)[world.found.tracks.row_object_ix]
+        words = object_words(world.scene.object_ids)[world.observations.tracks.row_object_ix]
         seen = sent.of(seen, words if ghosts is None else np.concatenate([words, ghosts.words]))
     if world.recorded is None:
         return seen
@@ -295,7 +297,7 @@ def perceive_all_units(
     return replace(both, units=names, unit_ix=place[both.unit_ix], frame_unit_ix=place[both.frame_unit_ix])
 
 
-def hear_units(
+def receive_lists(
     seen: Tracks,
     world: WorldChunk,
     name: str,
@@ -314,10 +316,10 @@ def hear_units(
     of_truth = configuration.units == TRUTH
     lists = world.truth if of_truth else seen
     air = None if on_air is None else on_air.of(lists, scene, experiment.seed)
-    heard = None if of_truth else set(experiment.units_of(configuration))
-    if heard is not None and present is not None:
-        heard &= {unit for unit, here in zip(seen.units, present, strict=True) if here}
-    arriving = transmit(lists, links, heard, air=air)
+    received = None if of_truth else set(experiment.units_of(configuration))
+    if received is not None and present is not None:
+        received &= {unit for unit, here in zip(seen.units, present, strict=True) if here}
+    arriving = transmit(lists, links, received, air=air)
     return sample_arrivals(arriving, configuration.issue_hz) if ticks else arriving
 
 
@@ -356,15 +358,15 @@ class Receivers:
         posterior = isinstance(fusion, IdealFusion) and fusion.combine == "posterior" and not of_truth
         states: States = "expected" if posterior else "sampled"
         seen = shared.seen(states)
-        heard = hear_units(seen, world, name, self._present)
+        received = receive_lists(seen, world, name, self._present)
         if name not in self._schedules:
-            self._schedules[name] = fusion_schedule(heard, max_age_s=configuration.max_age_s)
+            self._schedules[name] = fusion_schedule(received, max_age_s=configuration.max_age_s)
         faults = None if of_truth else _find_faults(world, seen, None if posterior else shared.ghosts)
         if isinstance(fusion, IdealFusion) and faults is not None:
             faults = replace(faults, ghosts=faults.ghosts[:0])  # ideal fusion leaves ghosts out
         output = ReceiverOutput(
-            heard=heard, sent=world.truth if of_truth else seen,
-            at=self._schedules[name].between(world.chunk.from_s, world.chunk.until_s),
+            received=received, sent=world.truth if of_truth else seen,
+            instants=self._schedules[name].between(world.chunk.from_s, world.chunk.until_s),
             fused_tracks=None, scene=world.scene, fused=None, whole=world.chunk == WHOLE, faults=faults,
         )  # fmt: skip
         if isinstance(fusion, ListFusion):
@@ -378,20 +380,20 @@ class Receivers:
         self, shared: _SharedLists, name: str, fusion: ListFusion, output: ReceiverOutput
     ) -> ReceiverOutput:
         """Fusion of lists without truth ids, told of the captures that units state."""
-        experiment, heard, at = shared.world.experiment, output.heard, output.at
+        experiment, received, instants = shared.world.experiment, output.received, output.instants
         max_age_s = experiment.configurations[name].max_age_s
         lists, same = shared.without_truth_ids
         stated = None
         if experiment.runs_apart:  # then the block has one run
-            stated = state_captures(shared.world.scene, heard, experiment, int(self._runs[0]))
+            stated = state_captures(shared.world.scene, received, experiment, int(self._runs[0]))
         if stated is not None:
             lists = stated.as_told(lists)
         captured_s = None if stated is None else stated.stated_s
-        inputs = make_inputs(heard, lists, max_age_s=max_age_s, at=at, captured_s=captured_s)
-        partial = _mark_partial(experiment, heard)
+        inputs = make_inputs(received, lists, max_age_s=max_age_s, instants=instants, captured_s=captured_s)
+        partial = _mark_partial(experiment, received)
         if partial.any():
             sent = SentEntries(lists.start[0], same)
-            kept = keep_entries(heard, sent, partial, self._schedules[name], at, max_age_s=max_age_s)
+            kept = keep_entries(received, sent, partial, self._schedules[name], instants, max_age_s=max_age_s)
             inputs = add_kept_entries(inputs, kept, partial, max_age_s)
         where = f"configurations.{name}.fusion"
         if fusion.resumable:
@@ -403,14 +405,16 @@ class Receivers:
     def _fuse_by_truth_id(self, shared: _SharedLists, name: str, states: States, output: ReceiverOutput) -> FusedTracks:
         """Ideal fusion, or the truth itself, at the instants of the configuration."""
         world, configuration = shared.world, shared.world.experiment.configurations[name]
-        heard, at, of_truth, kept = output.heard, output.at, configuration.units == TRUTH, None
-        partial = _mark_partial(world.experiment, heard)
+        received, instants, of_truth, kept = output.received, output.instants, configuration.units == TRUTH, None
+        partial = _mark_partial(world.experiment, received)
         if partial.any():
-            kept = keep_by_object(heard, partial, self._schedules[name], at, max_age_s=configuration.max_age_s)
-        fused_tracks = shared.fuse_ideal(heard, at, kept, states, of_truth=of_truth, max_age_s=configuration.max_age_s)
-        fused_tracks = fused_tracks.arriving(heard, at.issue_s)
+            kept = keep_by_object(received, partial, self._schedules[name], instants, max_age_s=configuration.max_age_s)
+        fused_tracks = shared.fuse_ideal(
+            received, instants, kept, states, of_truth=of_truth, max_age_s=configuration.max_age_s
+        )
+        fused_tracks = fused_tracks.arriving(received, instants.issue_s)
         if not of_truth and world.recorded is None:
-            fused_tracks = replace(fused_tracks, view=world.found.view)
+            fused_tracks = replace(fused_tracks, view=world.observations.view)
         return fused_tracks
 
 
@@ -436,28 +440,33 @@ class _SharedLists:
         return remove_truth_ids(self.world, self.seen("sampled"), self._runs, self.ghosts)
 
     def fuse_ideal(
-        self, heard: Tracks, at: FusionSchedule, kept: KeptEntries | None, states: States, *,
+        self, received: Tracks, instants: FusionSchedule, kept: KeptEntries | None, states: States, *,
         of_truth: bool, max_age_s: float,
     ) -> FusedTracks:  # fmt: skip
-        """Ideal fusion of what is heard: later lists of the same captures, as in a sweep, are fused once."""
+        """Ideal fusion of what is received: later lists of the same captures, as in a sweep, are fused once."""
         entries = b"" if kept is None else kept.entry.tobytes()
-        beside = b"".join(part.tobytes() for part in find_lists_beside_newest(heard, at, kept))
-        made_of = (of_truth, states, at.newest.tobytes(), beside + entries)
+        beside = b"".join(part.tobytes() for part in find_lists_beside_newest(received, instants, kept))
+        made_of = (of_truth, states, instants.newest.tobytes(), beside + entries)
         if self._last_fused is None or self._last_fused[0] != made_of:
             weighed = None
             if self.world.perceived is not None and not of_truth:
-                weighed = self.world.perceived.weighed(self.world, states, heard)
+                weighed = self.world.perceived.weighed(self.world, states, received)
             fused_tracks = fuse_ideal(
-                heard, max_age_s=max_age_s, without_object_ix=self.world.scene.ego_ix, at=at, kept=kept, weighed=weighed
+                received,
+                max_age_s=max_age_s,
+                without_object_ix=self.world.scene.ego_ix,
+                instants=instants,
+                kept=kept,
+                weighed=weighed,
             )
             self._last_fused = made_of, fused_tracks
         return self._last_fused[1]
 
 
-def _mark_partial(experiment: ExpandedExperiment, heard: Tracks) -> Bool:
-    """(U,) which of the units that are heard leave objects out of their messages."""
+def _mark_partial(experiment: ExpandedExperiment, received: Tracks) -> Bool:
+    """(U,) which of the units that are received leave objects out of their messages."""
     partial = set(experiment.partial)
-    return np.array([unit in partial for unit in heard.units], dtype=bool)
+    return np.array([unit in partial for unit in received.units], dtype=bool)
 
 
 def draw_shown_ghosts(world: WorldChunk, runs: Int) -> GhostRows | None:
@@ -465,7 +474,7 @@ def draw_shown_ghosts(world: WorldChunk, runs: Int) -> GhostRows | None:
     if not world.experiment.runs_apart or world.placed is None:
         return None
     between_s = world.earliest_s, world.chunk.until_s
-    return draw_ghosts(world.scene, world.found, world.experiment, world.placed, int(runs[0]), between_s)
+    return draw_ghosts(world.scene, world.observations, world.experiment, world.placed, int(runs[0]), between_s)
 
 
 def run_receivers(world: WorldChunk, runs: Int, present: Bool | None) -> Iterator[tuple[str, ReceiverOutput]]:
@@ -477,7 +486,7 @@ def _find_faults(world: WorldChunk, seen: Tracks, ghosts: GhostRows | None) -> U
     """Rows of ghosts and lists that outages leave out, in one run; None: no unit has ghosts or outages."""
     if ghosts is None and not world.experiment.outages:
         return None
-    first = len(world.found.tracks.frame_ix)
+    first = len(world.observations.tracks.frame_ix)
     rows = np.arange(first, first + (0 if ghosts is None else len(ghosts.words)))
     not_made = np.isinf(seen.common_arrives_s)
     if world.on_air is not None and (sent := world.on_air.sent) is not None:

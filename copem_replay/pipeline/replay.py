@@ -38,8 +38,8 @@ from copem_replay.pipeline.receiver import (
     Receivers,
     convert_to_tracks,
     has_truth_ids,
-    hear_units,
     perceive_all_units,
+    receive_lists,
 )
 from copem_replay.pipeline.scoring import ConfigurationScores, Scorer, TruthCache
 from copem_replay.pipeline.world import OnAir, Perceived, WorldChunk, has_channel
@@ -93,7 +93,7 @@ def cut_blocks(replay: Replay, experiment: Experiment, jobs: int, runs: tuple[in
     else:
         # What units send, and how long it is on air, depends on all that they list.
         needs_all_rows = _needs_all(experiment) or bool(units.sends) or has_channel(units)
-        observations = replay.found(WHOLE) if needs_all_rows else replay.measured
+        observations = replay.observe(WHOLE) if needs_all_rows else replay.measured
         rows = max(len(observations.tracks.frame_ix), 1)
     even = -(-(end - begin) // jobs)
     # Smaller blocks show progress and can be interrupted sooner; below this size they only cost time.
@@ -226,7 +226,7 @@ class _Judge:
         self, replay: Replay, experiment: Experiment, name: str, first: ReceiverOutput, issue_s: Float, runs: int
     ) -> None:
         measure = experiment.measure
-        self.units, self._runs = first.heard.units, runs
+        self.units, self._runs = first.received.units, runs
         self._scorer = self._conflicts = None
         if _needs_all(experiment):
             frames = replay.held_frames if measure.accuracy else None
@@ -253,10 +253,10 @@ class _Judge:
             assert matches is not None
             for s in range(len(output.lists.start)):
                 fused_tracks = convert_to_tracks(
-                    output.lists, s, matches, output.heard, output.at.issue_s, output.at.newest
+                    output.lists, s, matches, output.received, output.instants.issue_s, output.instants.newest
                 )
                 self._conflicts.add(fused_tracks, s)
-        self._conflicts.next(output.at.issue_s)
+        self._conflicts.next(output.instants.issue_s)
 
     @property
     def accuracy_s(self) -> float:
@@ -311,16 +311,16 @@ class _BlockLists:
     def arriving(self, name: str) -> Tracks:
         """The lists that the receiver of a configuration hears, by when links deliver them."""
         if name not in self._arriving:
-            self._arriving[name] = hear_units(self._sent, self._world, name, self.presence.sending, ticks=False)
+            self._arriving[name] = receive_lists(self._sent, self._world, name, self.presence.sending, ticks=False)
         return self._arriving[name]
 
-    def heard(self, name: str) -> Tracks:
+    def received(self, name: str) -> Tracks:
         """The lists that the receiver of a configuration hears, by when it takes them in (`issue_hz`)."""
         return sample_arrivals(self.arriving(name), self.units.configurations[name].issue_hz)
 
     def way(self, name: str, known: FirstDetections) -> Way:
         """When known objects were first listed, and their informing list was sent and arrived."""
-        configuration, informing = self.units.configurations[name], find_informing_list(self.heard(name), known)
+        configuration, informing = self.units.configurations[name], find_informing_list(self.received(name), known)
         of_truth, count_earlier = configuration.units == TRUTH, self.units.measure.count_earlier
         listed, sent = (self._world.truth,) * 2 if of_truth else (self._listed, self._sent)
         units = self.units.units_of(configuration) or (TRUTH,)
@@ -339,15 +339,15 @@ def _detect_by_truth_id(
     for name, configuration in lists.units.configurations.items():
         if not has_truth_ids(configuration):
             continue
-        heard = lists.heard(name)
+        received = lists.received(name)
         result = detect_by_truth_id(
-            heard,
+            received,
             lists.replay.episodes,
             confirm=experiment.measure.confirm,
             count_earlier=experiment.measure.count_earlier,
             max_age_s=configuration.max_age_s,
         )
-        events[name] = DetectionEvents(heard.units, result, sight_s[name])
+        events[name] = DetectionEvents(received.units, result, sight_s[name])
     return events
 
 
@@ -362,13 +362,15 @@ def _draw_sightings(
     """The rows listed in the runs (S,), at least those of measured objects; without states if a log has many chunks."""
     pieces = []
     for chunk in replay.chunks:
-        found = replay.measured if chunk == WHOLE else replay.found(chunk).of_objects(replay.episodes.object_ix)
-        found = found.listable
+        observations = (
+            replay.measured if chunk == WHOLE else replay.observe(chunk).of_objects(replay.episodes.object_ix)
+        )
+        observations = observations.listable
         recorded = None
         if replay.recorded is not None:
             recorded = replay.recorded.captured_between(chunk.from_s, chunk.until_s)
         world = WorldChunk(
-            replay.scene, replay.truth, found, recorded, experiment, chunk, on_air=on_air, perceived=perceived
+            replay.scene, replay.truth, observations, recorded, experiment, chunk, on_air=on_air, perceived=perceived
         )
         seen = perceive_all_units(world, runs, states="true", equipped=presence.listing)
         if chunk == WHOLE:

@@ -134,7 +134,7 @@ class ConfigurationScores:
 
 def match_lists(around: TruthCache, output: ReceiverOutput, measure: Measure) -> Matches:
     """Which true object each entry of the fused lists is about, at the instant it tells of."""
-    world = around.at(output.at.issue_s) if output.tells_of == "now" else _interpolate_told_world(around, output)
+    world = around.at(output.instants.issue_s) if output.tells_of == "now" else _interpolate_told_world(around, output)
     return match_entries(output.told, world, around.scene, gate_m=measure.match.gate_m, tells_of=output.tells_of)
 
 
@@ -143,7 +143,7 @@ def _match_at_both_times(around: TruthCache, output: ReceiverOutput, measure: Me
     if output.tells_of == "now":
         matches = match_lists(around, output, measure)
         return matches, matches
-    then, now = _interpolate_told_world(around, output), around.at(output.at.issue_s)
+    then, now = _interpolate_told_world(around, output), around.at(output.instants.issue_s)
     return match_at_both_times(output.told, then, now, around.scene, gate_m=measure.match.gate_m)
 
 
@@ -156,7 +156,7 @@ def _interpolate_told_world(around: TruthCache, output: ReceiverOutput) -> Track
 
 
 def _list_captures(output: ReceiverOutput) -> Float:
-    """Captures, ascending: all that were heard; in a time chunk those about the captures that entries name."""
+    """Captures, ascending: all that were received; in a time chunk those about the captures that entries name."""
     captures: Float = np.unique(output.captures_told_s)
     if output.whole:
         return captures
@@ -181,7 +181,7 @@ class Scorer:
         """Seconds that measuring accuracy took, without matching."""
         runs = len(output.lists.start)
         self._episodes = episodes
-        captures = collect_captures(output.heard, instants=measure.confirm.hits > 1)
+        captures = collect_captures(output.received, instants=measure.confirm.hits > 1)
         self._known = [
             FirstMatches(
                 one, runs=runs, confirm=measure.confirm, count_earlier=measure.count_earlier, captures=captures
@@ -202,7 +202,7 @@ class Scorer:
 
     def add(self, around: TruthCache, output: ReceiverOutput) -> Matches:
         """Take in the lists of a time chunk. Returns their matches."""
-        lists, issue_s = output.lists, output.at.issue_s
+        lists, issue_s = output.lists, output.instants.issue_s
         if self._aggregator is None or self._held is None:
             matches = match_lists(around, output, self._measure)
         else:

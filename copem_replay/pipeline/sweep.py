@@ -140,8 +140,8 @@ def describe_unswept(experiment: Experiment) -> list[str]:
 
 def _explain_unstated(experiment: Experiment, kind: str) -> str:
     assert experiment.sweep is not None
-    heard = [c for c in experiment.configurations.values() if c.units != TRUTH and not c.latency_s]
-    if kind != "latency_s" or experiment.sweep.chosen(kind) or not heard:
+    received = [c for c in experiment.configurations.values() if c.units != TRUTH and not c.latency_s]
+    if kind != "latency_s" or experiment.sweep.chosen(kind) or not received:
         return ""
     return "; none states a latency above 0 or by unit, and `sweep: {configurations: […]}` does not name any"
 
@@ -207,9 +207,9 @@ def _set_configuration(
         return configuration.model_copy(update={"link": set_link(configuration.link, kind, value)})
     if kind != "units":
         return configuration
-    heard = experiment.units_of(configuration)
-    others = [name for name in heard if not _is_ego(experiment.units[name])]
-    kept = [name for name in heard if name not in others[int(value) :]]
+    received = experiment.units_of(configuration)
+    others = [name for name in received if not _is_ego(experiment.units[name])]
+    kept = [name for name in received if name not in others[int(value) :]]
     if value > len(others) or not kept:
         return None
     return configuration.model_copy(update={"units": tuple(kept)})

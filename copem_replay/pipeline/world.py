@@ -38,7 +38,7 @@ def perceive_modelled(world: WorldChunk, runs: Int, states: States, equipped: Bo
     """What the modelled units list in the runs (S,); `equipped (S, U)`: which of all units there are, None: all."""
     if equipped is not None:
         equipped = equipped[:, [k for k, unit in enumerate(world.experiment.units.values()) if unit.recorded is None]]
-    return perceive(world.scene, world.found, world.experiment, runs, states=states, equipped=equipped)
+    return perceive(world.scene, world.observations, world.experiment, runs, states=states, equipped=equipped)
 
 
 class Perceived:
@@ -60,14 +60,14 @@ class Perceived:
         self, world: WorldChunk, run: int, compute: Callable[[Tracks], tuple[RowEntries, RandomKey]]
     ) -> tuple[int, RowEntries, RandomKey]:
         """The index of the run, and rows as entries with their key: `compute` of what all runs list with errors."""
-        if self._entries is None or self._entries[0] is not world.found:
-            self._entries = world.found, *compute(self._all(world, "sampled"))
+        if self._entries is None or self._entries[0] is not world.observations:
+            self._entries = world.observations, *compute(self._all(world, "sampled"))
         return self._number[run], *self._entries[1:]
 
-    def weighed(self, world: WorldChunk, states: States, heard: Tracks) -> WeightedRows | None:
+    def weighed(self, world: WorldChunk, states: States, received: Tracks) -> WeightedRows | None:
         """The weights of ideal fusion in all runs, if it hears what is listed in all; None: it hears other lists."""
         listed = self._all(world, states)
-        if not WeightedRows.alike(listed, heard):
+        if not WeightedRows.alike(listed, received):
             return None
         if self._weighed is None or self._weighed[0] is not listed:
             self._weighed = listed, WeightedRows.of(listed)
@@ -80,11 +80,11 @@ class Perceived:
         return self._on_air[1]
 
     def _all(self, world: WorldChunk, states: States) -> Tracks:
-        for found, kind, seen in self._seen:
-            if found is world.found and kind == states:
+        for observations, kind, seen in self._seen:
+            if observations is world.observations and kind == states:
                 return seen
         seen = perceive_modelled(world, self._runs, states, self._equipped)
-        self._seen.append((world.found, states, seen))
+        self._seen.append((world.observations, states, seen))
         return seen
 
 
@@ -92,7 +92,7 @@ class Perceived:
 class WorldChunk:
     """A log, or a time chunk of one, as the units of an experiment have it: what is the same in all runs.
 
-    `truth` at its own frames; `found`: observation rows of the modelled units; `recorded`: lists of the recorded ones.
+    `truth` at its own frames; `observations`: rows of the modelled units; `recorded`: lists of the recorded ones.
     Includes earlier captures that the chunk needs, back to `earliest_s`. `placed`: where units are, for their ghosts.
     `on_air`: the input of drawn links. `perceived`: what units list in all runs of a block that are replayed one by
     one; None: each call perceives anew.
@@ -100,7 +100,7 @@ class WorldChunk:
 
     scene: Scene
     truth: Tracks
-    found: Observations
+    observations: Observations
     recorded: RecordedUnits | None
     experiment: ExpandedExperiment
     chunk: TimeChunk = WHOLE
@@ -211,15 +211,17 @@ class ClaimedRows:
 
 def claim_rows(world: WorldChunk, runs: Int, ghosts: GhostRows | None) -> ClaimedRows:
     """The claims of the rows of a time chunk, the same in all runs where no claim is drawn."""
-    found, experiment = world.found, world.experiment
-    words = object_words(world.scene.object_ids)[found.tracks.row_object_ix]
-    claims = DrawnClaims(found.existence, np.eye(len(CLASSES))[found.view.class_ix], np.full(len(words), -1))
+    observations, experiment = world.observations, world.experiment
+    words = object_words(world.scene.object_ids)[observations.tracks.row_object_ix]
+    claims = DrawnClaims(
+        observations.existence, np.eye(len(CLASSES))[observations.view.class_ix], np.full(len(words), -1)
+    )
     if experiment.runs_apart and experiment.draws_claims:  # else no receiver needs it
-        claims = draw_claims(found, experiment, make_draws(world.scene, found, experiment, runs))
+        claims = draw_claims(observations, experiment, make_draws(world.scene, observations, experiment, runs))
     same = words
     if ghosts is not None:
         drawn = make_ghost_draws(world.scene, ghosts, experiment, int(runs[0]))
-        of_ghosts = draw_claims(ghosts.found, experiment, drawn, ghosts.sort)
+        of_ghosts = draw_claims(ghosts.observations, experiment, drawn, ghosts.sort)
         claims = DrawnClaims(
             np.concatenate([claims.existence, of_ghosts.existence]),
             np.concatenate([claims.class_probability, of_ghosts.class_probability]),

@@ -75,7 +75,7 @@ class RunToExport:
 
     recording: Recording
     shown: ShownRun
-    one: ReplayedRun
+    replayed: ReplayedRun
     every: Mapping[str, Configuration]
     table: pd.DataFrame
     summary: pd.DataFrame
@@ -114,13 +114,13 @@ def _write_mcap(path: Path, run: RunToExport) -> list[str]:
         notes = write_mcap(
             path,
             here,
-            run.one.replay.scene,
-            run.one.run_tracks,
+            run.replayed.replay.scene,
+            run.replayed.run_tracks,
             run.table,
             run.manifest,
             find_family(recording),
             recording.window,
-            truth_scene(run.one, run.table),
+            truth_scene(run.replayed, run.table),
             configuration_colours(run.every),
         )
         check_files_unchanged(stamps)
@@ -253,7 +253,7 @@ def _export(
                     with place.may_fail(names):
                         lines = exporter.write(place.new / f"{stem}{exporter.suffix}", run)
                         notes += [f"{log}: {line}" for line in lines if f"{log}: {line}" not in notes]
-        next(one for one in result.logs if one.name == log).drop()
+        next(replayed for replayed in result.logs if replayed.name == log).drop()
     return notes
 
 
@@ -262,7 +262,7 @@ def _find_recorded_latencies(data: dict[str, Any]) -> list[dict[str, Any]]:
     configurations = [c.get("link") for c in data["configurations"].values()]
     links = [link for link in (*data.get("links", {}).values(), *configurations) if isinstance(link, dict)]
     latencies = [*(link.get("latency") for link in links), *(unit.get("ready") for unit in data["units"].values())]
-    return [one for one in latencies if isinstance(one, dict) and one.get("kind") == "recorded"]
+    return [replayed for replayed in latencies if isinstance(replayed, dict) and replayed.get("kind") == "recorded"]
 
 
 def _logs_table(folder: Path, result: ExperimentResult, skipped: Sequence[tuple[File, str]]) -> pd.DataFrame:
@@ -271,7 +271,7 @@ def _logs_table(folder: Path, result: ExperimentResult, skipped: Sequence[tuple[
         {
             "log": log.name,
             "path": _escape_name(
-                " + ".join(recording_name(one, folder) for one in list_recordings(log.recording.place))
+                " + ".join(recording_name(replayed, folder) for replayed in list_recordings(log.recording.place))
             ),
             "sha256": log.digests["sha256"],
             "episodes": facts.episodes,
@@ -298,7 +298,7 @@ def _make_run_to_export(
     log: str, shown: ShownRun, experiment: Experiment, recordings: Sequence[Recording], result: ExperimentResult
 ) -> RunToExport:
     """One run of one log, in the configurations that the experiment shows."""
-    study_log = next(one for one in result.logs if one.name == log)
+    study_log = next(replayed for replayed in result.logs if replayed.name == log)
     replay, recording = study_log.replay(), study_log.whole()
     experiment = resolve_for_log(experiment, log)
     shown_experiment = experiment.model_copy(update={"configurations": experiment.shown()})
@@ -413,13 +413,15 @@ MANY_MOVING = 8
 _MARK_M, _ABOVE_M = 0.5, 0.05
 
 
-def truth_scene(one: ReplayedRun, table: pd.DataFrame) -> TruthScene:
+def truth_scene(replayed: ReplayedRun, table: pd.DataFrame) -> TruthScene:
     """The truth of a run; `table`: the rows of `detections.parquet` of its log and run."""
-    stamps_ns = one.replay.placed.stamps_ns
-    fixed = [name for name, unit in one.experiment.modelled.items() if unit.at is not None and len(stamps_ns[name])]
-    units = [_draw_unit(one, name, _unit_pose(one.replay.placed.poses[name], 0)) for name in fixed]
-    follow = EGO_FRAME if one.replay.scene.ego_ix >= 0 else MIDDLE_FRAME
-    return TruthScene([*_draw_obstacles(one), *units], _Frames(one, choose_named_objects(table)), follow)
+    stamps_ns = replayed.replay.placed.stamps_ns
+    fixed = [
+        name for name, unit in replayed.experiment.modelled.items() if unit.at is not None and len(stamps_ns[name])
+    ]
+    units = [_draw_unit(replayed, name, _unit_pose(replayed.replay.placed.poses[name], 0)) for name in fixed]
+    follow = EGO_FRAME if replayed.replay.scene.ego_ix >= 0 else MIDDLE_FRAME
+    return TruthScene([*_draw_obstacles(replayed), *units], _Frames(replayed, choose_named_objects(table)), follow)
 
 
 def choose_named_objects(table: pd.DataFrame) -> list[str]:
@@ -432,15 +434,15 @@ def choose_named_objects(table: pd.DataFrame) -> list[str]:
 class _Frames:
     """The frames of the truth, made one at a time; it can be iterated repeatedly."""
 
-    def __init__(self, one: ReplayedRun, names: Sequence[str]) -> None:
-        self._one, self._names = one, {one.replay.scene.object_number[name] for name in names}
-        moving = [name for name, unit in one.experiment.modelled.items() if unit.at is None]
+    def __init__(self, replayed: ReplayedRun, names: Sequence[str]) -> None:
+        self._replayed, self._names = replayed, {replayed.replay.scene.object_number[name] for name in names}
+        moving = [name for name, unit in replayed.experiment.modelled.items() if unit.at is None]
         self._moving = moving if len(moving) <= MANY_MOVING else []
         self._marked = moving
-        self._middle = _scene_centre(one.replay.truth) if one.replay.scene.ego_ix < 0 else None
+        self._middle = _scene_centre(replayed.replay.truth) if replayed.replay.scene.ego_ix < 0 else None
 
     def __iter__(self) -> Iterator[TruthFrame]:
-        scene, truth = self._one.replay.scene, self._one.replay.truth
+        scene, truth = self._replayed.replay.scene, self._replayed.replay.truth
         order, bounds = truth.by_frame
         for frame, time_ns in enumerate(truth.stamp_ns.tolist()):
             rows = order[bounds[frame] : bounds[frame + 1]]
@@ -452,12 +454,12 @@ class _Frames:
 
     def _units(self, time_ns: int) -> Iterator[Entity]:
         """Marks of carried units, at their poses of the newest list."""
-        placed = self._one.replay.placed
+        placed = self._replayed.replay.placed
         for name in self._marked:
             newest = int(np.searchsorted(placed.stamps_ns[name], time_ns, side="right")) - 1
             if newest >= 0 and placed.poses[name].present[newest]:
                 pose = _unit_pose(placed.poses[name], newest)
-                yield _draw_unit(self._one, name, pose, field=name in self._moving)
+                yield _draw_unit(self._replayed, name, pose, field=name in self._moving)
 
 
 def _scene_centre(truth: Tracks) -> Pose | None:
@@ -481,22 +483,22 @@ def _draw_body(scene: Scene, truth: Tracks, row: int, *, named: bool) -> Entity:
     return Entity(scene.object_ids[k], metadata, [Line(points, BODY, pose)], texts)
 
 
-def _draw_unit(one: ReplayedRun, name: str, pose: Pose, *, field: bool = True) -> Entity:
+def _draw_unit(replayed: ReplayedRun, name: str, pose: Pose, *, field: bool = True) -> Entity:
     """A mark at a unit, its name over it, and its field of view on the ground under it."""
-    replay, unit = one.replay, one.experiment.modelled[name]
+    replay, unit = replayed.replay, replayed.experiment.modelled[name]
     lines = []
     if field:
         down_m = _ABOVE_M - mounting_height(replay.scene, replay.truth, unit)
-        for border in couple_outlines(one.experiment.pems[str(unit.pem)].couples):
+        for border in couple_outlines(replayed.experiment.pems[str(unit.pem)].couples):
             lines.append(Line([(x, y, down_m) for x, y in border.tolist()], FIELD, pose))
     over = Pose(pose.x_m, pose.y_m, pose.z_m + _MARK_M)
     mark = Ellipse((_MARK_M, _MARK_M, _MARK_M / 2), UNIT, pose)
     return Entity(f"unit {name}", {"unit": name}, lines, [Text(name, UNIT, over)], [mark])
 
 
-def _draw_obstacles(one: ReplayedRun) -> Iterator[Entity]:
+def _draw_obstacles(replayed: ReplayedRun) -> Iterator[Entity]:
     """Outlines of the convex parts of obstacles, at the bottom and at the top."""
-    static, solids = one.replay.placed.static, one.replay.placed.solids
+    static, solids = replayed.replay.placed.static, replayed.replay.placed.solids
     for part in range(len(static.body)):
         corners = static.xy_m[static.start[part] : static.start[part + 1]].tolist()
         around = [*corners, *corners[:1]]

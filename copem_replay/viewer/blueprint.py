@@ -121,7 +121,7 @@ class RecordingContent:
         """Entities of the lanes of lists under those of an object."""
         return [make_entity_path(*path) for path in select_list_lanes(self.lists, self.axes_s[object_ix])]
 
-    def heard(self, configuration: str) -> tuple[str, ...]:
+    def received(self, configuration: str) -> tuple[str, ...]:
         """The units of a configuration, by name."""
         return self.experiment.units_of(self.experiment.configurations[configuration])
 
@@ -185,7 +185,7 @@ def reasons_page(content: RecordingContent) -> rrb.Container:
     pages = []
     for k, eye in zip(content.objects[:NEAR_BY], content.eyes, strict=False):
         views = [
-            world_view(content, name, title, eye, units=content.heard(name), fields=True)
+            world_view(content, name, title, eye, units=content.received(name), fields=True)
             for name, title in _last_and_first(content, k)
         ]
         origin = make_entity_path("plots", "visible_share", entity_names(content.replay.scene)[k])
@@ -264,8 +264,8 @@ def units_page(content: RecordingContent) -> rrb.Container:
     """The configuration with most units from above: units, fields of view, fused tracks."""
     import rerun.blueprint as rrb
 
-    largest = max(content.configurations, key=lambda name: len(content.heard(name)))
-    units = content.heard(largest)
+    largest = max(content.configurations, key=lambda name: len(content.received(name)))
+    units = content.received(largest)
     title = f"In colour: what {largest} lists. Grey: the truth. Pale ground: fields of view. Lines: listed it first"
     view = world_view(
         content, largest, title, content.above, units=units, fields=True, named=[n for n in content.named if n in units]
@@ -293,7 +293,7 @@ def tracks_views(content: RecordingContent, title_suffix: str = "") -> list[rrb.
     """A view of the fused tracks per configuration, from the ego's side."""
     marks = len(content.objects) == 1
     return [
-        world_view(content, name, name + title_suffix, content.eye, units=content.heard(name), marks=marks)
+        world_view(content, name, name + title_suffix, content.eye, units=content.received(name), marks=marks)
         for name in content.configurations
     ]
 
@@ -392,7 +392,7 @@ def build_blueprint(content: RecordingContent) -> tuple[rrb.Blueprint, str]:
     if content.objects:
         pages += [lanes_page(content), reasons_page(content)]
     pages += [tracks_page(content), errors_page(content)]
-    if any(content.heard(name) for name in content.configurations):
+    if any(content.received(name) for name in content.configurations):
         pages.append(units_page(content))
     pages.append(text_page())
     onset_ns = int(to_nanoseconds(content.table["onset_s"].min())) if len(content.table) else 0
@@ -420,7 +420,7 @@ def build_blueprint(content: RecordingContent) -> tuple[rrb.Blueprint, str]:
     parts = (
         LAYOUT,
         list(content.configurations),
-        [content.heard(name) for name in content.configurations],
+        [content.received(name) for name in content.configurations],
         [scene.object_ids[k] for k in content.objects],
         eyes,
         [content.axes_s[k] for k in content.objects],

@@ -185,23 +185,23 @@ def find_linked_lists(fused_tracks: FusedTracks, place: int, name: str, max_age_
     Late: on its way for longer than `max_age_s`, or for longer than the median by more than one interval of the unit's
     lists. Overtaken: arrives later than a newer list of the unit; lists that arrive at one tick arrive together.
     """
-    heard, by_link = fused_tracks.heard, fused_tracks.by_link
+    received, by_link = fused_tracks.received, fused_tracks.by_link
     if by_link is None:
         return []
-    late_after_newer, linked = find_overtaken_lists(heard), []
-    for k, entity in enumerate(make_distinct([plain_part(unit) for unit in heard.units])):
-        frames = np.flatnonzero(by_link & (heard.frame_unit_ix == k))
+    late_after_newer, linked = find_overtaken_lists(received), []
+    for k, entity in enumerate(make_distinct([plain_part(unit) for unit in received.units])):
+        frames = np.flatnonzero(by_link & (received.frame_unit_ix == k))
         if not len(frames):
             continue
-        frames = frames[np.argsort(heard.captured_s[frames], kind="stable")]
-        captured_s, arrives_s = heard.captured_s[frames], heard.common_arrives_s[frames]
+        frames = frames[np.argsort(received.captured_s[frames], kind="stable")]
+        captured_s, arrives_s = received.captured_s[frames], received.common_arrives_s[frames]
         latency_s, arrived = arrives_s - captured_s, np.isfinite(arrives_s)
         interval_s = float(np.median(np.diff(captured_s))) if len(frames) > 1 else np.inf
         usual_s = float(np.median(latency_s[arrived])) if arrived.any() else np.inf
         late = latency_s > min(max_age_s, usual_s + interval_s) + SAME_INSTANT_S
         fate = np.select([~arrived, late_after_newer[frames], late], [LOST, OVERTAKEN, LATE], IN_TIME)
         path = ("lists", f"{place + 1}_{plain_part(name)}", entity)
-        linked.append(UnitLists(heard.units[k], path, captured_s, arrives_s, fate, interval_s))
+        linked.append(UnitLists(received.units[k], path, captured_s, arrives_s, fate, interval_s))
     return linked
 
 

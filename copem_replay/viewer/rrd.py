@@ -309,13 +309,13 @@ def make_rrd_exporter(viewer: str | None) -> Exporter:
     """The exporter of `.rrd` files; it also sends each recording to the Rerun viewer at this address, if any."""
 
     def write(path: Path, run: RunToExport) -> list[str]:
-        shown = run.one.experiment.configurations
+        shown = run.replayed.experiment.configurations
         configurations = {name: shown.get(name, configuration) for name, configuration in run.every.items()}
         return write_rrd(
             path,
-            run.one.replay,
-            run.one.experiment.model_copy(update={"configurations": configurations}),
-            run.one.run_tracks,
+            run.replayed.replay,
+            run.replayed.experiment.model_copy(update={"configurations": configurations}),
+            run.replayed.run_tracks,
             run.table,
             run.summary,
             run.shown.run,
@@ -345,7 +345,7 @@ class _TrackPieces:
     `source_keys`: keys of the rows of units' lists that each fused row is made of, `count` (R,) of them.
     """
 
-    heard: list[Tracks] = field(default_factory=list)
+    received: list[Tracks] = field(default_factory=list)
     keys: list[Int] = field(default_factory=list)
     fused: list[Tracks] = field(default_factory=list)
     source_keys: list[Int] = field(default_factory=list)
@@ -364,13 +364,13 @@ class TrackCollector:
         """Add the next time chunk's fused tracks, by configuration; rows are copied."""
         for name, fused_tracks in run_tracks.items():
             pieces = self._pieces.setdefault(name, _TrackPieces())
-            self._add_heard(pieces, fused_tracks.heard)
+            self._add_received(pieces, fused_tracks.received)
             rows = np.flatnonzero(self._is_of_objects(fused_tracks.fused))
             count = np.diff(fused_tracks.start)[rows]
             within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
             entries = fused_tracks.entries[np.repeat(fused_tracks.start[rows], count) + within]
             pieces.fused.append(fused_tracks.fused.take_rows(rows))
-            pieces.source_keys.append(self._key(fused_tracks.heard)[entries])
+            pieces.source_keys.append(self._key(fused_tracks.received)[entries])
             pieces.count.append(count)
             if fused_tracks.said is not None:
                 pieces.said.append(fused_tracks.said[rows])
@@ -379,17 +379,17 @@ class TrackCollector:
         """By configuration, the fused tracks of all time chunks as those of one; without view geometry."""
         return {name: _join_pieces(pieces) for name, pieces in self._pieces.items()}
 
-    def _add_heard(self, pieces: _TrackPieces, heard: Tracks) -> None:
+    def _add_received(self, pieces: _TrackPieces, received: Tracks) -> None:
         """Add rows of units' lists that no earlier chunk had: rows captured before a chunk may be in it again."""
-        of_objects, key = self._is_of_objects(heard), self._key(heard)
+        of_objects, key = self._is_of_objects(received), self._key(received)
         before = np.concatenate([np.empty(0, dtype=np.int64), *pieces.keys])
         fresh = np.flatnonzero(of_objects & ~np.isin(key, before))
-        rows = heard.take_rows(fresh)
-        if pieces.heard:  # every time chunk has the lists of the whole log: they are kept once
-            first = pieces.heard[0]
+        rows = received.take_rows(fresh)
+        if pieces.received:  # every time chunk has the lists of the whole log: they are kept once
+            first = pieces.received[0]
             lists = ("stamp_ns", "captured_s", "frame_unit_ix", "arrives_s")
             rows = replace(rows, **{column: getattr(first, column) for column in lists})
-        pieces.heard.append(rows)
+        pieces.received.append(rows)
         pieces.keys.append(key[fresh])
 
     def _is_of_objects(self, tracks: Tracks) -> Bool:
@@ -403,7 +403,7 @@ class TrackCollector:
 
 
 def _join_pieces(pieces: _TrackPieces) -> FusedTracks:
-    heard, order = splice_rows(pieces.heard)
+    received, order = splice_rows(pieces.received)
     keys = np.concatenate(pieces.keys)[order]
     fused, order = _concatenate_lists(pieces.fused)
     count = np.concatenate(pieces.count)
@@ -414,7 +414,7 @@ def _join_pieces(pieces: _TrackPieces) -> FusedTracks:
     by_key = np.argsort(keys, kind="stable")
     entries = by_key[np.searchsorted(keys[by_key], source_keys)]
     said = np.concatenate(pieces.said)[order] if pieces.said else None
-    return FusedTracks(fused, heard, entries, start, said=said)
+    return FusedTracks(fused, received, entries, start, said=said)
 
 
 def _concatenate_lists(fused: Sequence[Tracks]) -> tuple[Tracks, Int]:

@@ -195,7 +195,7 @@ class FaultsShown:
             candidates,
             key=lambda fused_tracks: len(fused_tracks.faults.ghosts) if fused_tracks.faults is not None else 0,
         )
-        lists, faults = fullest.heard, fullest.faults
+        lists, faults = fullest.received, fullest.faults
         assert faults is not None
         until_ns = int(lists.stamp_ns[lists.frame_ix].max(initial=np.iinfo(np.int64).min))
         for unit_ix, name in enumerate(lists.units):

@@ -114,14 +114,16 @@ def compute_status(
     clock: EpisodeClocks,
 ) -> Status:
     """The status of all shown objects at every instant at which one may change."""
-    heard, numbers = fused_tracks.heard, {name: u for u, name in enumerate(experiment.units)}
+    received, numbers = fused_tracks.received, {name: u for u, name in enumerate(experiment.units)}
     asked_configuration = experiment.configurations[configuration]
     of_truth = asked_configuration.units == TRUTH
     heard_of = (
-        [TRUTH] if of_truth else [name for name in experiment.units_of(asked_configuration) if name in heard.units]
+        [TRUTH] if of_truth else [name for name in experiment.units_of(asked_configuration) if name in received.units]
     )
     modelled = [numbers[name] for name in heard_of if name in experiment.modelled]
-    listed = [[_find_object_lists(heard, heard.units.index(name), k) for name in heard_of] for k in sight.object_ix]
+    listed = [
+        [_find_object_lists(received, received.units.index(name), k) for name in heard_of] for k in sight.object_ix
+    ]
     instants = _find_instants(sight, fused_tracks.fused, listed, clock, replay.scene.end_ns - replay.scene.t0_ns)
     frame = np.searchsorted(sight.elapsed_ns, instants + SAME_INSTANT_NS, side="right") - 1
     shape = (len(instants), len(sight.object_ix))
@@ -442,7 +444,7 @@ def write_listing_lines(
 
     if not len(sight.object_ix):
         return
-    lists = fused_tracks.heard
+    lists = fused_tracks.received
     schedule = fusion_schedule(lists, max_age_s=experiment.configurations[name].max_age_s)
     place = unit_places(replay, experiment, lists)
     row_of = np.full((len(lists.stamp_ns) + 1, len(sight.object_ix)), -1)  # the row more, index −1: no list

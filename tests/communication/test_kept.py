@@ -39,16 +39,16 @@ def test_of_each_object_the_newest_entry_that_is_not_too_old(seed: int) -> None:
     unit_ix, captured_s = np.repeat([0, 1], F // 2), np.tile(np.arange(F // 2) / 10, 2)
     arrives_s = captured_s + rng.integers(0, 40, F) / 100
     arrives_s[rng.random(F) < 0.3] = np.inf
-    heard = lists(unit_ix, captured_s, arrives_s)
+    received = lists(unit_ix, captured_s, arrives_s)
     start = np.append(0, np.cumsum(rng.integers(0, 4, F)))
     frame, same = np.repeat(np.arange(F), np.diff(start)), rng.integers(0, 6, start[-1])
     for f in range(F):  # an object is in a message once
         mine = slice(start[f], start[f + 1])
         same[mine] = rng.permutation(6)[: start[f + 1] - start[f]]
-    schedule = fusion_schedule(heard, max_age_s=0.4)
+    schedule = fusion_schedule(received, max_age_s=0.4)
     cut_s = schedule.issue_s[len(schedule.issue_s) // 3]
     for at in (schedule, schedule.between(cut_s, np.inf)):
-        kept = keep_entries(heard, SentEntries(start, same), np.array([True, False]), schedule, at, max_age_s=0.4)
+        kept = keep_entries(received, SentEntries(start, same), np.array([True, False]), schedule, at, max_age_s=0.4)
         np.testing.assert_array_equal(kept.newest[:, 1], at.newest[:, 1])
         for k, now_s in enumerate(at.issue_s):
             known: dict[int, int] = {}

@@ -34,7 +34,7 @@ USUAL: Says = dict.fromkeys(VALUES, 0.0) | dict.fromkeys(UNCERTAINTIES, 0.0) | {
 USUAL |= {"length_m": 1.0, "width_m": 1.0, "height_m": 1.0, "cov_ee_m2": 1.0, "cov_nn_m2": 1.0}
 
 
-def heard(units: dict[str, ObjectLists], latency_s: dict[str, float] | None = None, runs: int = 1) -> Tracks:
+def received(units: dict[str, ObjectLists], latency_s: dict[str, float] | None = None, runs: int = 1) -> Tracks:
     """The lists of `units` as tracks, in the order of the units; without `latency_s` they arrive as captured."""
     frames = [(unit, k) for unit in units for k in range(len(units[unit]))]
     start, unit_ix, object_ix, frame_ix = [0], [], [], []
@@ -111,7 +111,7 @@ NONE = [[0.0, 0.0], [0.0, 0.0]]
 
 def at_once(*said: Says) -> Says:
     """What is believed of an object of which several units say something at the same time."""
-    (one,) = issued(heard({f"u{k}": [(0.0, {0: s})] for k, s in enumerate(said)}))
+    (one,) = issued(received({f"u{k}": [(0.0, {0: s})] for k, s in enumerate(said)}))
     result: Says = one["holds"][0]
     return result
 
@@ -155,7 +155,7 @@ class TestWeights:
         assert place(uneven) == pytest.approx((2.5, 4.5))
 
     def test_no_uncertainty_given_at_all_is_exact(self) -> None:
-        of = heard({"a": [(0.0, {0: {"x_m": 1.0}})], "b": [(0.0, {0: {"x_m": 3.0}})]})
+        of = received({"a": [(0.0, {0: {"x_m": 1.0}})], "b": [(0.0, {0: {"x_m": 3.0}})]})
         of = replace(of, **dict.fromkeys(UNCERTAINTIES))
         assert issued(of)[0]["holds"][0]["x_m"] == pytest.approx(2.0)
 
@@ -406,7 +406,7 @@ class TestStaleLists:
         listing = {
             name: [(k / 10, {1: gauss(k, 0, [[c, 0], [0, c]])}) for k in range(21)] for name, c in (("a", 1), ("b", 3))
         }
-        found = issued(heard(listing, {"b": 0.3}))
+        found = issued(received(listing, {"b": 0.3}))
         at = {round(one["at"], 6): one for one in found}
         assert place(at[1.0]["holds"][1]) == pytest.approx((9.25, 0))
         assert at[1.0]["captured"] == pytest.approx(1.0)
@@ -420,19 +420,19 @@ class TestStaleLists:
 
     def test_no_list_before_the_latency(self) -> None:
         listing = {"a": [(k / 10, {0: gauss(0, 0, SMALL)}) for k in range(5)]}
-        found = issued(heard(listing, {"a": 0.35}))
+        found = issued(received(listing, {"a": 0.35}))
         assert [one["at"] for one in found] == pytest.approx([0.35, 0.45, 0.55, 0.65, 0.75])
         assert [one["captured"] for one in found] == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
         assert [one["stamp"] for one in found] == [0, 100_000_000, 200_000_000, 300_000_000, 400_000_000]
 
     def test_an_empty_list_is_a_list(self) -> None:
-        found = issued(heard({"a": [(0.0, {}), (0.1, {0: gauss(1, 1, SMALL)}), (0.2, {})]}))
+        found = issued(received({"a": [(0.0, {}), (0.1, {0: gauss(1, 1, SMALL)}), (0.2, {})]}))
         assert [sorted(one["holds"]) for one in found] == [[], [0], []]
 
     def test_an_object_that_one_unit_lists(self) -> None:
         """It is believed as that unit says, to the last digit; and gone from the next list that does not hold it."""
         says = gauss(0.1 + 0.2, 1 / 3, [[0.7, 0.1], [0.1, 0.4]], vx_mps=0.3, yaw_rad=1.0)
-        found = issued(heard({
+        found = issued(received({
             "a": [(0.0, {0: says}), (0.2, {}), (0.4, {})],
             "b": [(0.0, {}), (0.1, {1: gauss(9, 9, SMALL)}), (0.2, {1: gauss(9, 9, SMALL)})],
         }))  # fmt: skip
@@ -445,7 +445,7 @@ class TestStaleLists:
             "a": [(0.0, {0: gauss(0, 0, SMALL, valid=[True, True, False, False])})],
             "b": [(0.0, {0: gauss(4, 0, SMALL, valid=[True, False, True, False])})],
         }
-        fused = fuse_ideal(heard(listing, runs=4), max_age_s=1.0).fused
+        fused = fuse_ideal(received(listing, runs=4), max_age_s=1.0).fused
         assert fused.valid[:, 0].tolist() == [True, True, True, False]
         assert fused.x_m[:3, 0].tolist() == [2, 0, 4]
         assert fused.cov_ee_m2 is not None
@@ -458,7 +458,7 @@ class TestStaleLists:
             "once": [(0.0, {0: gauss(1, 1, SMALL)})],
             "on": [(k / 10, {1: gauss(9, 9, SMALL)}) for k in range(9)],
         }
-        found = issued(heard(listing, {"once": latency_s}), max_age_s=0.3)
+        found = issued(received(listing, {"once": latency_s}), max_age_s=0.3)
         holding = [one["at"] for one in found if 0 in one["holds"]]
         assert (min(holding), max(holding)) == pytest.approx((latency_s, last_s))
         assert all(1 in one["holds"] for one in found)
@@ -468,10 +468,10 @@ class TestStaleLists:
             "a": [(0.0, {0: gauss(0, 0, SMALL)}), (0.1, {0: gauss(0, 0, SMALL)})],
             "b": [(0.0, {0: gauss(2, 0, SMALL)}), (0.1, {0: gauss(2, 0, SMALL)})],
         }
-        near = issued(heard(listing, {"b": 0.7e-6}))
+        near = issued(received(listing, {"b": 0.7e-6}))
         assert [one["at"] for one in near] == pytest.approx([0.0, 0.1], abs=1.1e-6)
         assert [place(one["holds"][0]) for one in near] == [(1, 0), (1, 0)]
-        apart = issued(heard(listing, {"b": 3e-6}))
+        apart = issued(received(listing, {"b": 3e-6}))
         assert [one["at"] for one in apart] == pytest.approx([0.0, 3e-6, 0.1, 0.1 + 3e-6], abs=1e-9)
         assert [place(one["holds"][0])[0] for one in apart] == [0, 1, 1, 1]
 
@@ -481,12 +481,12 @@ class TestStaleLists:
             "a": [(k / 10, {0: gauss(0, 0, SMALL)}) for k in range(6)],
             "b": [(k / 10, {0: gauss(2, 0, SMALL)}) for k in range(6)],
         }
-        found = issued(heard(listing, {"a": 0.2}))
+        found = issued(received(listing, {"a": 0.2}))
         assert [one["at"] for one in found] == pytest.approx([k / 10 for k in range(8)])
 
     def test_lost_lists_never_arrive(self) -> None:
         """`arrives_s` is infinite for the list of 0.1 s: at 0.1 s nothing is issued, at 0.2 s all is as ever."""
-        of = heard({"a": [(k / 10, {0: gauss(k, 0, SMALL)}) for k in range(4)]})
+        of = received({"a": [(k / 10, {0: gauss(k, 0, SMALL)}) for k in range(4)]})
         lost = replace(of, arrives_s=np.array([[0.0, np.inf, 0.2, 0.3]]))
         found = issued(lost)
         assert [(one["at"], place(one["holds"][0])[0]) for one in found] == [(0.0, 0), (0.2, 2), (0.3, 3)]
@@ -494,9 +494,9 @@ class TestStaleLists:
         assert [(one["at"], place(one["holds"][0])[0]) for one in all_but_one] == [(0.3, 3)]
 
     def test_nothing_heard_at_all(self) -> None:
-        assert issued(heard({"a": [], "b": []})) == []
-        assert issued(heard({"a": []})) == []
-        assert fusion_schedule(heard({"a": []}), max_age_s=1.0).issue_s.tolist() == []
+        assert issued(received({"a": [], "b": []})) == []
+        assert issued(received({"a": []})) == []
+        assert fusion_schedule(received({"a": []}), max_age_s=1.0).issue_s.tolist() == []
 
 
 TICK = 10
@@ -540,7 +540,7 @@ def test_against_the_words(
     """A list at every instant at which one arrives; each unit's newest that has arrived and is not too old."""
     units, latency = world
     in_seconds: dict[str, ObjectLists] = {u: [(t / 1000, held) for t, held in its] for u, its in units.items()}
-    of = heard(in_seconds, {u: late / 1000 for u, late in latency.items()}, runs=2)
+    of = received(in_seconds, {u: late / 1000 for u, late in latency.items()}, runs=2)
     fused = fuse_ideal(of, max_age_s=max_age / 1000, without_object_ix=own).fused
     instants = sorted({t + latency[u] for u, its in units.items() for t, _ in its})
     assert fused.arrives_s[0] == pytest.approx([t / 1000 for t in instants])
@@ -579,7 +579,7 @@ def test_against_the_words(
 
 def test_neither_the_receivers_own_body_nor_what_has_no_truth_id_is_in_the_list() -> None:
     """Object 2 carries the receiver; −1: an entry of a recorded unit about nobody known."""
-    of = heard({"a": [(0.0, {-1: {}, 1: {}, 2: {}})], "b": [(0.0, {-1: {}, 2: {}, 3: {}})]})
+    of = received({"a": [(0.0, {-1: {}, 1: {}, 2: {}})], "b": [(0.0, {-1: {}, 2: {}, 3: {}})]})
     (everything,) = issued(of)
     assert sorted(everything["holds"]) == [1, 2, 3]
     (others,) = issued(of, without_object_ix=2)

@@ -187,11 +187,11 @@ class Plain:
             begin, end = self.inputs.arrived_start[k : k + 2]
             if self.of.late == "replay":
                 self.tracks = []
-                heard = sorted(self.inputs.arrived[:end].tolist(), key=self.order)
-                for n, f in enumerate(heard):
+                received = sorted(self.inputs.arrived[:end].tolist(), key=self.order)
+                for n, f in enumerate(received):
                     captured_s = float(self.inputs.captured_s[f])
                     self.hear(f, captured_s)
-                    if n + 1 == len(heard) or self.inputs.captured_s[heard[n + 1]] > captured_s:
+                    if n + 1 == len(received) or self.inputs.captured_s[received[n + 1]] > captured_s:
                         self.settle(captured_s)
             else:
                 there = self.inputs.arrived[:end].tolist()

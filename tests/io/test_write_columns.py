@@ -49,7 +49,7 @@ def drawn(seed: int, lists: int, longest: int, said: bool, exact: bool) -> Fused
 
     captures = 6
     units = np.arange(UNITS)
-    heard = Tracks(
+    received = Tracks(
         units=tuple(NUMBERS), start=np.arange(UNITS + 1) * captures, unit_ix=units, object_ix=units % COUNT,
         frame_ix=np.tile(np.arange(captures), UNITS), stamp_ns=T0_NS + np.arange(captures) * 10**8 - 10**8,
         captured_s=np.arange(captures) * 0.1 - 0.1, frame_unit_ix=np.zeros(captures, dtype=int),
@@ -80,7 +80,7 @@ def drawn(seed: int, lists: int, longest: int, said: bool, exact: bool) -> Fused
     many = np.abs(numbers(UNITS * captures))
     view = None if said or exact else ViewGeometry(*(many if k != 3 else many / 3 for k in range(_FIELDS)))
     stated_s = rng.choice([-0.05, 0.0, 0.2], P) if said and rng.random() < 0.5 else None
-    return FusedTracks(fused, heard, entries, start, view, claims, SCENE, stated_s=stated_s)
+    return FusedTracks(fused, received, entries, start, view, claims, SCENE, stated_s=stated_s)
 
 
 _FIELDS = len(ViewGeometry.__dataclass_fields__)

@@ -167,11 +167,11 @@ def test_sensor_data_says_what_was_believed(written: Written, configuration: str
                 assert (spread.velocity.x, spread.velocity.y) == (sigma("speed_var_m2ps2", p),) * 2
             assert item.header.existence_probability == 1
             entries = fused_tracks.entries[fused_tracks.start[p] : fused_tracks.start[p + 1]]
-            behind = [k for k in entries if fused_tracks.heard.valid[0, k]]
+            behind = [k for k in entries if fused_tracks.received.valid[0, k]]
             assert [units[i.value] for i in item.header.sensor_id] == [
-                fused_tracks.heard.units[fused_tracks.heard.row_unit_ix[k]] for k in behind
+                fused_tracks.received.units[fused_tracks.received.row_unit_ix[k]] for k in behind
             ]
-            newest = max(fused_tracks.heard.stamp_ns[fused_tracks.heard.frame_ix[k]] for k in behind)
+            newest = max(fused_tracks.received.stamp_ns[fused_tracks.received.frame_ix[k]] for k in behind)
             assert (item.header.measurement_state == 2) == (newest == captured), "measured, or only from an older list"
     assert seen > 100
 
@@ -225,7 +225,7 @@ def test_details_tell_entries_and_detections(written: Written) -> None:
 def test_details_are_of_the_object_they_stand_beside(written: Written) -> None:
     """Object by object in the order of the list: what it was made of, and its variances."""
     fused_tracks, scene = written.run_tracks["mixed"], written.replay.scene
-    fused, heard, view = fused_tracks.fused, fused_tracks.heard, fused_tracks.view
+    fused, received, view = fused_tracks.fused, fused_tracks.received, fused_tracks.view
     assert view is not None
     contents = [json.loads(m[4]) for m in messages(written.path) if m[0] == "copem/mixed/detail"]
     assert len(contents) == len(fused.stamp_ns)
@@ -240,11 +240,13 @@ def test_details_are_of_the_object_they_stand_beside(written: Written) -> None:
         for one in content["objects"]:
             (p,) = [p for p in rows if scene.object_ids[fused.row_object_ix[p]] == one["id"]]
             used = [
-                k for k in fused_tracks.entries[fused_tracks.start[p] : fused_tracks.start[p + 1]] if heard.valid[0, k]
+                k
+                for k in fused_tracks.entries[fused_tracks.start[p] : fused_tracks.start[p + 1]]
+                if received.valid[0, k]
             ]
             several += len(used) > 1
-            assert one["units"] == [heard.units[heard.row_unit_ix[k]] for k in used]
-            assert one["captured_ns"] == [heard.stamp_ns[heard.frame_ix[k]] for k in used]
+            assert one["units"] == [received.units[received.row_unit_ix[k]] for k in used]
+            assert one["captured_ns"] == [received.stamp_ns[received.frame_ix[k]] for k in used]
             assert one["range_m"] == [view.range_m[k] for k in used]
             assert one["visible_share"] == [view.visible_share[k] for k in used]
             assert [one[name] for name in UNCERTAINTIES] == [getattr(fused, name)[0, p] for name in UNCERTAINTIES]

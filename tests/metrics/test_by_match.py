@@ -186,9 +186,9 @@ def test_captures_are_those_that_were_heard() -> None:
     """By the same clusters as with truth ids; what never arrives is none."""
     b = Unit(0, ((0, holds()), (1000, holds()), (2000, holds())))
     a = Unit(100, ((300, holds()), (1300, holds())))
-    heard = tracks(World({"b": b, "a": a, "lost": Unit(0, ((900, holds()),))}, {}))
-    arrives_s = np.where(heard.captured_s == 0.9, np.inf, heard.arrives_s)
-    captures = collect_captures(replace(heard, arrives_s=arrives_s))
+    received = tracks(World({"b": b, "a": a, "lost": Unit(0, ((900, holds()),))}, {}))
+    arrives_s = np.where(received.captured_s == 0.9, np.inf, received.arrives_s)
+    captures = collect_captures(replace(received, arrives_s=arrives_s))
     assert captures.captured_s.tolist() == [0.0, 1.0, 2.0, 0.3, 1.3]
     assert captures.unit_ix.tolist() == [0, 0, 0, 1, 1]
     assert captures.instant.tolist() == [0, 1, 2, 0, 1]

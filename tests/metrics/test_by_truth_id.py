@@ -92,10 +92,10 @@ def episodes(world: World) -> Episodes:
     return episodes_of({name: (onset / 1000, end / 1000) for name, (onset, end) in world.episodes.items()})
 
 
-def detected(world: World, heard: Tracks | None = None) -> dict[tuple[int, int], Found | None]:
+def detected(world: World, received: Tracks | None = None) -> dict[tuple[int, int], Found | None]:
     """What `detect` says for each run and object, in milliseconds."""
     result = detect_by_truth_id(
-        tracks(world) if heard is None else heard,
+        tracks(world) if received is None else received,
         episodes(world),
         confirm=Confirm(hits=world.hits, of=world.of),
         count_earlier=world.count_earlier,
@@ -221,22 +221,22 @@ class TestByHand:
     def test_arrivals_within_a_microsecond_are_one_instant(self, offset_us: float) -> None:
         """The later of two, by 0.4 µs, belongs to the unit that comes first in the experiment."""
         world = World({"ego": at_rate(100, ".x"), "mast": at_rate(100, ".x")}, {0: (0, 900)})
-        heard = tracks(world)
-        moved = heard.arrives_s + offset_us * 1e-6 + 0.4e-6 * (heard.frame_unit_ix == 0)
-        assert detected(world, replace(heard, arrives_s=moved)) == {(0, 0): Found(100, 100, "ego")}
+        received = tracks(world)
+        moved = received.arrives_s + offset_us * 1e-6 + 0.4e-6 * (received.frame_unit_ix == 0)
+        assert detected(world, replace(received, arrives_s=moved)) == {(0, 0): Found(100, 100, "ego")}
 
     def test_lost_lists_never_arrive(self) -> None:
         world = World({"ego": at_rate(100, ".xxx..")}, {0: (0, 900)})
-        heard = tracks(world)
-        lost = np.where(heard.captured_s == 0.1, np.inf, heard.arrives_s)
-        assert detected(world, replace(heard, arrives_s=lost)) == {(0, 0): Found(200, 200, "ego")}
-        assert detected(world, replace(heard, arrives_s=np.full_like(lost, np.inf))) == {(0, 0): NEVER}
+        received = tracks(world)
+        lost = np.where(received.captured_s == 0.1, np.inf, received.arrives_s)
+        assert detected(world, replace(received, arrives_s=lost)) == {(0, 0): Found(200, 200, "ego")}
+        assert detected(world, replace(received, arrives_s=np.full_like(lost, np.inf))) == {(0, 0): NEVER}
 
     def test_who_has_no_truth_id_is_nobody(self) -> None:
         """`object_ix = -1` means: no truth id."""
         world = World({"ego": at_rate(100, "xxx")}, {0: (0, 900), 1: (0, 900)})
-        heard = tracks(world)
-        assert detected(world, replace(heard, object_ix=np.array([-1, -1]))) == {(0, 0): NEVER, (0, 1): NEVER}
+        received = tracks(world)
+        assert detected(world, replace(received, object_ix=np.array([-1, -1]))) == {(0, 0): NEVER, (0, 1): NEVER}
 
     def test_nothing_to_hear_and_nothing_to_look_at(self) -> None:
         assert detected(World({"ego": Unit(0, ()), "mast": Unit(0, ())}, {0: (0, 900)})) == {(0, 0): NEVER}
@@ -311,19 +311,19 @@ class TestConfirmed:
         With the mast, which lists nothing, they are four capture instants.
         """
         world = World({"ego": at_rate(100, "x..x.."), "mast": at_rate(100, "......")}, {0: (0, 900)}, hits=2, of=3)
-        heard = tracks(world)
-        lost = np.where((heard.captured_s == 0.2) & (heard.frame_unit_ix == 0), np.inf, heard.arrives_s)
-        assert detected(world, replace(heard, arrives_s=lost)) == {(0, 0): Found(300, 300, "ego")}
+        received = tracks(world)
+        lost = np.where((received.captured_s == 0.2) & (received.frame_unit_ix == 0), np.inf, received.arrives_s)
+        assert detected(world, replace(received, arrives_s=lost)) == {(0, 0): Found(300, 300, "ego")}
         assert detected(world) == {(0, 0): NEVER}
 
     def test_every_list_counts_when_it_is_taken_in(self) -> None:
         """Lists of 0.1 to 0.5 s come in at 0.5 s, and the newest does not hold it; that of 0.6 s is overtaken."""
         world = World({"ego": at_rate(100, "..x...x.")}, {0: (50, 900), 1: (250, 900)})
-        heard = tracks(world)
+        received = tracks(world)
         late_s = np.array([[0.0, 0.5, 0.5, 0.5, 0.5, 0.5, 0.9, 0.7]])
-        assert detected(world, replace(heard, arrives_s=late_s)) == {(0, 0): Found(500, 200, "ego"), (0, 1): NEVER}
+        assert detected(world, replace(received, arrives_s=late_s)) == {(0, 0): Found(500, 200, "ego"), (0, 1): NEVER}
         after = replace(world, episodes={0: (250, 900)})
-        assert detected(after, replace(heard, arrives_s=late_s)) == {(0, 0): Found(900, 600, "ego")}
+        assert detected(after, replace(received, arrives_s=late_s)) == {(0, 0): Found(900, 600, "ego")}
 
     @pytest.mark.parametrize(("held", "captured"), [("..x.x...", 400), ("..xx....", 300)])
     def test_what_confirms_at_one_instant_contributes_though_a_newer_list_came_with_it(
@@ -389,10 +389,10 @@ def test_capture_instants_against_the_oracle(world: World) -> None:
 @given(worlds(confirm=False))
 def test_detected_when_the_ideal_fusion_first_lists_it(world: World) -> None:
     """From what was captured at or after the onset, as long as we look; nothing is left to confirm."""
-    heard = tracks(world)
+    received = tracks(world)
     for o, (onset, end) in world.episodes.items():
-        counted = (heard.row_captured_s >= onset / 1000 - 1e-6) | world.count_earlier
-        fused = fuse_ideal(replace(heard, valid=heard.valid & counted), max_age_s=world.max_age / 1000).fused
+        counted = (received.row_captured_s >= onset / 1000 - 1e-6) | world.count_earlier
+        fused = fuse_ideal(replace(received, valid=received.valid & counted), max_age_s=world.max_age / 1000).fused
         for run in range(world.runs):
             rows = np.flatnonzero((fused.row_object_ix == o) & fused.valid[run])
             times = fused.arrives_s[0, fused.frame_ix[rows]]

@@ -160,21 +160,21 @@ def swept(x_m: float, y_m: float, yaw_rad: float, vx_mps: float, vy_mps: float, 
 
 def heard_at(fused_tracks: FusedTracks, object_ix: int, issue_s: float, s: int, max_age_s: float) -> float | None:
     """Newest capture of the object in the units' newest lists at an instant; None: in none of them."""
-    heard, newest = fused_tracks.heard, None
-    for unit in range(len(heard.units)):
+    received, newest = fused_tracks.received, None
+    for unit in range(len(received.units)):
         came = [
             f
-            for f in range(len(heard.stamp_ns))
-            if heard.frame_unit_ix[f] == unit and heard.arrives_s[0, f] <= issue_s + 1e-9
+            for f in range(len(received.stamp_ns))
+            if received.frame_unit_ix[f] == unit and received.arrives_s[0, f] <= issue_s + 1e-9
         ]
         if not came:
             continue
-        frame = max(came, key=lambda f: heard.captured_s[f])
-        if issue_s > heard.arrives_s[0, frame] + max_age_s + 1e-9:
+        frame = max(came, key=lambda f: received.captured_s[f])
+        if issue_s > received.arrives_s[0, frame] + max_age_s + 1e-9:
             continue
-        mine = (heard.frame_ix == frame) & (heard.row_object_ix == object_ix) & (heard.row_unit_ix == unit)
-        if heard.valid[s, mine].any():
-            newest = max(newest or -np.inf, float(heard.captured_s[frame]))
+        mine = (received.frame_ix == frame) & (received.row_object_ix == object_ix) & (received.row_unit_ix == unit)
+        if received.valid[s, mine].any():
+            newest = max(newest or -np.inf, float(received.captured_s[frame]))
     return newest
 
 

@@ -39,14 +39,14 @@ def name_of(scene: Scene, fused_tracks: FusedTracks, row: int) -> str:
 
 def entries_of(fused_tracks: FusedTracks, row: int) -> list[int]:
     entries = fused_tracks.entries[fused_tracks.start[row] : fused_tracks.start[row + 1]].tolist()
-    return [k for k in entries if fused_tracks.heard.valid[0, k]]
+    return [k for k in entries if fused_tracks.received.valid[0, k]]
 
 
 def sensor_data(
     scene: Scene, fused_tracks: FusedTracks, numbers: Mapping[str, int], frame: int, available_ns: int
 ) -> bytes:
     """osi3.SensorData."""
-    fused, said, heard = fused_tracks.fused, fused_tracks.said, fused_tracks.heard
+    fused, said, received = fused_tracks.fused, fused_tracks.said, fused_tracks.received
     data = SensorData()
     data.version.version_major, data.version.version_minor, data.version.version_patch = 3, 8, 0
     data.timestamp.seconds, data.timestamp.nanos = divmod(available_ns, 10**9)
@@ -76,14 +76,15 @@ def sensor_data(
                     candidate.vehicle_classification.type = vehicle
         if said is None:
             units = [
-                (heard.row_unit_ix[k], int(heard.stamp_ns[heard.frame_ix[k]])) for k in entries_of(fused_tracks, p)
+                (received.row_unit_ix[k], int(received.stamp_ns[received.frame_ix[k]]))
+                for k in entries_of(fused_tracks, p)
             ]
         elif said["unit_ix"][p] >= 0:
             units = [(said["unit_ix"][p], scene.t0_ns + round(float(said["captured_s"][p]) * 1e9))]
         else:
             units = []
         for unit, _ in units:
-            item.header.sensor_id.add().value = numbers[heard.units[unit]]
+            item.header.sensor_id.add().value = numbers[received.units[unit]]
         item.header.measurement_state = 2 if captured_ns in [stamp_ns for _, stamp_ns in units] else 1
         base, spread = item.base, item.base_rmse
         base.position.x, base.position.y, base.position.z = (a[0, p] for a in (fused.x_m, fused.y_m, fused.z_m))
@@ -164,7 +165,7 @@ def detail(
     scene: Scene, fused_tracks: FusedTracks, events: Sequence[Any], sized: Sequence[bool], frame: int, available_ns: int
 ) -> bytes:
     """copem_replay.ListDetail."""
-    fused, said, heard, view = fused_tracks.fused, fused_tracks.said, fused_tracks.heard, fused_tracks.view
+    fused, said, received, view = fused_tracks.fused, fused_tracks.said, fused_tracks.received, fused_tracks.view
     objects = []
     for p in rows_of(fused_tracks, frame):
         one: dict[str, Any] = {"id": name_of(scene, fused_tracks, p)}
@@ -179,8 +180,8 @@ def detail(
         if fused_tracks.stated_s is not None:
             one["stated_captured_ns"] = scene.t0_ns + round(float(fused_tracks.stated_s[p]) * 1e9)
         used = entries_of(fused_tracks, p)
-        one["units"] = [heard.units[heard.row_unit_ix[k]] for k in used]
-        one["captured_ns"] = [int(heard.stamp_ns[heard.frame_ix[k]]) for k in used]
+        one["units"] = [received.units[received.row_unit_ix[k]] for k in used]
+        one["captured_ns"] = [int(received.stamp_ns[received.frame_ix[k]]) for k in used]
         one["range_m"] = [None if view is None else float(view.range_m[k]) for k in used]
         one["visible_share"] = [None if view is None else float(view.visible_share[k]) for k in used]
         objects.append(one)

@@ -49,7 +49,7 @@ def found(plan: Experiment, recording: Recording, runs: int) -> list[GhostRows]:
     replay = prepare_log(recording, plan)
     world = replay.world(plan)
     made = [
-        draw_ghosts(replay.scene, world.found, replay.expanded, replay.placed, k, (-np.inf, np.inf))
+        draw_ghosts(replay.scene, world.observations, replay.expanded, replay.placed, k, (-np.inf, np.inf))
         for k in range(runs)
     ]
     return [one for one in made if one is not None]
@@ -288,12 +288,12 @@ class TestEachBirthIsAnother:
     def test_they_are_the_same_in_a_part_of_the_log(self) -> None:
         [whole, *_], replay = found(self.PLAN, self.RECORDING, 1), prepare_log(self.RECORDING, self.PLAN)
         world = replay.world(self.PLAN)
-        part = draw_ghosts(replay.scene, world.found, replay.expanded, replay.placed, 0, (3.05, 5.05))
+        part = draw_ghosts(replay.scene, world.observations, replay.expanded, replay.placed, 0, (3.05, 5.05))
         assert part is not None
-        captured_s = whole.found.tracks.row_captured_s
+        captured_s = whole.observations.tracks.row_captured_s
         there = np.flatnonzero((captured_s > 3.05) & (captured_s < 5.05))
         assert part.words.tolist() == whole.words[there].tolist()
-        assert part.found.tracks.x_m[0].tolist() == whole.found.tracks.x_m[0, there].tolist()
+        assert part.observations.tracks.x_m[0].tolist() == whole.observations.tracks.x_m[0, there].tolist()
         assert self.claimed(part, 0).track_id.tolist() == self.claimed(whole, 0).track_id[there].tolist()
 
 

@@ -255,7 +255,7 @@ class TestPlaced:
         replay = ready(recording, plan)
         world = replay.world(plan)
         seen = perceive_all_units(world, np.arange(runs), states="sampled")
-        return seen, world.found.tracks, replay.scene
+        return seen, world.observations.tracks, replay.scene
 
     def test_one_degree_at_fifty_metres(self) -> None:
         seen, _, scene = self.listed({"yaw_sigma_deg": 1.0, "stated": True}, 4000)

@@ -28,7 +28,7 @@ from copem_replay.pipeline import prepare as chunking
 from copem_replay.pipeline.expansion import Presence
 from copem_replay.pipeline.one_run import RunTracks
 from copem_replay.pipeline.prepare import Reach, prepare_log
-from copem_replay.pipeline.receiver import hear_units, perceive_all_units
+from copem_replay.pipeline.receiver import perceive_all_units, receive_lists
 from copem_replay.pipeline.run import ExperimentResult, run_experiment
 from copem_replay.pipeline.tables import AccuracyTables
 from tests.helpers import scenes
@@ -252,7 +252,7 @@ def test_a_foreseen_collision_without_accuracy_holds_only_what_is_looked_at() ->
     pedestrians = {whole.replays[0].scene.object_number[name] for name in ("crossing", "blinking")}
     for replay in (whole.replays[0], pieces.replays[0]):
         worlds = list(replay.worlds(plan, np.arange(1), ALL, measured_only=True))
-        assert {int(k) for world in worlds for k in world.found.tracks.row_object_ix} == pedestrians
+        assert {int(k) for world in worlds for k in world.observations.tracks.row_object_ix} == pedestrians
 
 
 def test_sweeps() -> None:
@@ -282,8 +282,8 @@ def test_chunks_cover_the_log_once(monkeypatch: pytest.MonkeyPatch) -> None:
     cuts = replay.chunks
     assert (cuts[0].from_s, cuts[-1].until_s) == (-np.inf, np.inf)
     assert all(one.until_s == after.from_s for one, after in pairwise(cuts))
-    rows = [len(replay.found(time_chunk).tracks.frame_ix) for time_chunk in cuts]
-    assert sum(rows) == len(replay.found(WHOLE).tracks.frame_ix)
+    rows = [len(replay.observe(time_chunk).tracks.frame_ix) for time_chunk in cuts]
+    assert sum(rows) == len(replay.observe(WHOLE).tracks.frame_ix)
     assert max(rows) <= 40
     alone = RunTracks(replay, experiment(), 0).whole()["GT"].fused  # held at once all the same: it is not that long
     assert len(alone.frame_ix) == len(replay.truth.frame_ix) - 91  # but for the ego
@@ -323,10 +323,10 @@ def test_what_no_run_lists_is_not_held(rows_at_once: int, monkeypatch: pytest.Mo
     near = [{"when": {"range_m": [0, 20]}, "detection": {"kind": "constant", "probability": 0.5}}]
     plan = experiment(pems={"sure": near})
     replay = prepare_log(traffic(), plan)
-    found = replay.found(WHOLE)
+    found = replay.observe(WHOLE)
     listed = np.flatnonzero((found.view.range_m >= 0) & (found.view.range_m < 20))
     assert 0 < len(listed) < len(found.view.range_m) / 2
-    held = [set(world.found.view.range_m.tolist()) for world in replay.worlds(plan, np.arange(1), ALL)]
+    held = [set(world.observations.view.range_m.tolist()) for world in replay.worlds(plan, np.arange(1), ALL)]
     assert set().union(*held) == set(found.view.range_m[listed].tolist())
 
 
@@ -355,8 +355,8 @@ def test_how_far_back_a_chunk_reaches() -> None:
     """Lists captured every second arrive 0.4 s later; the receiver goes by each until the next; a tracker by 2 s."""
     plan = experiment(configurations={"ideal": {"units": ["ego"], "latency_s": 0.4}})
     log = scenes.recording([Thing("ego", "car", standing(0, 0))], until_s=10.0, rate_hz=1.0)
-    heard = log.truth.captured_between(np.inf, np.inf)  # what is in the lists does not matter
-    late = Recording(**{**vars(log), "truth": heard}).truth
+    received = log.truth.captured_between(np.inf, np.inf)  # what is in the lists does not matter
+    late = Recording(**{**vars(log), "truth": received}).truth
     late = type(late)(**{**{f: getattr(late, f) for f in late.__dataclass_fields__}, "arrives_s": late.arrives_s + 0.4})
     reach = Reach(plan, {"ideal": late})
     # From 5.2 s on: the first instant is 5.4 s, at which the list captured at 5 s arrives.
@@ -379,8 +379,8 @@ def test_a_chunk_reaches_back_to_a_list_that_another_unit_still_goes_by() -> Non
     replay = prepare_log(traffic(), plan)
     lists = replay.lists_only(plan)
     seen = perceive_all_units(lists, np.arange(1), states="true")
-    heard = {"ideal": hear_units(seen, lists, "ideal")}
-    assert Reach(plan, heard).earliest_s(TimeChunk(2.85, 3.0)) == pytest.approx(2.0, abs=0.01)
+    received = {"ideal": receive_lists(seen, lists, "ideal")}
+    assert Reach(plan, received).earliest_s(TimeChunk(2.85, 3.0)) == pytest.approx(2.0, abs=0.01)
 
 
 def test_the_results_folder(

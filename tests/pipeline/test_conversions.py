@@ -240,7 +240,7 @@ class TestBackToTracks:
             issue_s, newest = told.at.issue_s, told.at.newest
             matches = match_entries(told.lists, replay.truth_cache.at(issue_s), replay.scene, gate_m=3.0)
             for s in range(3):
-                fused_tracks = convert_to_tracks(told.lists, s, matches, told.heard, issue_s, newest)
+                fused_tracks = convert_to_tracks(told.lists, s, matches, told.received, issue_s, newest)
                 fused, said = fused_tracks.fused, fused_tracks.said
                 assert said is not None
                 assert Counter(map(bytes, said)) == Counter(map(bytes, entries_in(told.lists, s))), name
@@ -263,7 +263,7 @@ class TestBackToTracks:
         replay = prepare_log(crowd(), plan)
         for name, told in run_receivers(replay.world(plan), np.arange(1), None):
             matches = match_entries(told.lists, replay.truth_cache.at(told.at.issue_s), replay.scene, gate_m=1e-6)
-            fused_tracks = convert_to_tracks(told.lists, 0, matches, told.heard, told.at.issue_s, told.at.newest)
+            fused_tracks = convert_to_tracks(told.lists, 0, matches, told.received, told.at.issue_s, told.at.newest)
             assert set(fused_tracks.fused.object_ix) == {-1}
             ids = entries_in(told.lists, 0)["track_id"]
             assert len(fused_tracks.fused.object_ix) == (len(set(ids)) if name == "tracker" else len(ids))
@@ -294,6 +294,6 @@ def test_a_belief_of_a_run_without_entries_is_empty() -> None:
     replay = prepare_log(crowd(), plan)
     ((_, told),) = run_receivers(replay.world(plan), np.arange(1), None)
     matches = match_entries(told.lists, replay.truth_cache.at(told.at.issue_s), replay.scene, gate_m=3.0)
-    fused_tracks = convert_to_tracks(told.lists, 0, matches, told.heard, told.at.issue_s, told.at.newest)
+    fused_tracks = convert_to_tracks(told.lists, 0, matches, told.received, told.at.issue_s, told.at.newest)
     assert (len(fused_tracks.fused.frame_ix), len(fused_tracks.fused.object_ix)) == (0, 0)
     assert len(fused_tracks.fused.stamp_ns) == 11, "its lists are there, and empty"

@@ -91,11 +91,11 @@ def test_states_and_detections_are_those_of_the_oracle(
     drawn: tuple[list[list[SentList]], int], tick: int | None, max_age: int, onset: int
 ) -> None:
     runs, units = drawn
-    heard = tracks(runs, units, tick)
-    fused_tracks = fuse_ideal(heard, max_age_s=max_age / 1000)
+    received = tracks(runs, units, tick)
+    fused_tracks = fuse_ideal(received, max_age_s=max_age / 1000)
     fused = fused_tracks.fused
     looked_at = episodes_of(dict.fromkeys(range(OBJECTS), (onset * STEP / 1000, 0.9)))
-    found = detect_by_truth_id(heard, looked_at, confirm=Confirm(), count_earlier=False, max_age_s=max_age / 1000)
+    found = detect_by_truth_id(received, looked_at, confirm=Confirm(), count_earlier=False, max_age_s=max_age / 1000)
     for s, lists in enumerate(runs):
         expected = ideal.known(lists, tick, max_age)
         np.testing.assert_allclose(fused.arrives_s[0], np.array(list(expected)) / 1000, atol=1e-9)
@@ -129,7 +129,7 @@ def test_in_one_run_a_fused_entry_is_made_of_one_entry_of_each_unit(
     for p in np.flatnonzero(made.fused.valid[0]):
         of = made.used[made.used_start[p] : made.used_start[p + 1]]
         entries = {
-            int(made.heard.row_unit_ix[r]): round(float(made.heard.row_captured_s[r]) * 1000) for r in of.tolist()
+            int(made.received.row_unit_ix[r]): round(float(made.received.row_captured_s[r]) * 1000) for r in of.tolist()
         }
         assert len(entries) == len(of)
         assert entries == expected[made.fused.frame_ix[p]][int(made.fused.row_object_ix[p])]

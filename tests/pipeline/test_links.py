@@ -21,7 +21,7 @@ from copem_replay.perception.perceive import perceive
 from copem_replay.pipeline import prepare as chunking
 from copem_replay.pipeline import world as perceived
 from copem_replay.pipeline.prepare import prepare_log
-from copem_replay.pipeline.receiver import draw_shown_ghosts, hear_units, perceive_all_units
+from copem_replay.pipeline.receiver import draw_shown_ghosts, perceive_all_units, receive_lists
 from copem_replay.pipeline.replay import replay_outcomes
 from copem_replay.pipeline.run import ExperimentResult, run_experiment
 from copem_replay.pipeline.sweep import list_points
@@ -51,10 +51,10 @@ def plan(link: object, **changes: Any) -> Experiment:
     """Two masts and the ego, each of which lists half of what there is, by ideal fusion and by nearest neighbours."""
     masts = {name: {"at": [x, 8], "height_m": 5, "pem": "half"} for name, x in (("east", 30.0), ("west", -30.0))}
     units = {"ego": {"on": "ego", "height_m": 1.8, "pem": "half"}, **masts}
-    heard = {"units": "all", "link": link} if link is not None else {"units": "all"}
+    received = {"units": "all", "link": link} if link is not None else {"units": "all"}
     data: dict[str, Any] = {
         "pems": {"half": HALF}, "units": units, "runs": 4, "links": {"v2x": RADIO, "bursts": BURSTS},
-        "configurations": {"coop": heard, "gnn": {**heard, "fusion": {"kind": "gnn"}}},
+        "configurations": {"coop": received, "gnn": {**received, "fusion": {"kind": "gnn"}}},
     }  # fmt: skip
     return experiment(**(data | changes))
 
@@ -63,7 +63,7 @@ def heard_by(experiment: Experiment, name: str = "coop", one: int = 0, recording
     """What reaches a receiver in one run."""
     replay, runs = prepare_log(recording or traffic(), experiment), np.array([one])
     world = replay.lists_only(experiment, runs)
-    return hear_units(perceive_all_units(world, runs, states="true"), world, name)
+    return receive_lists(perceive_all_units(world, runs, states="true"), world, name)
 
 
 def assert_same(one: ExperimentResult, other: ExperimentResult) -> None:
@@ -96,9 +96,9 @@ def test_a_link_that_is_sure_is_a_latency_to_the_last_bit() -> None:
 def test_the_ego_has_its_own_lists_at_once_and_latency_comes_on_top() -> None:
     """No other unit's list is before its capture, nor a moment as any other's."""
     wired = {"coop": {"units": "all", "link": {"default": "v2x", "ego": "none"}, "latency_s": {"ego": 0.25}}}
-    heard = heard_by(plan(None, configurations=wired))
-    delay_s = heard.common_arrives_s - heard.captured_s
-    of_ego = heard.frame_unit_ix == 0
+    received = heard_by(plan(None, configurations=wired))
+    delay_s = received.common_arrives_s - received.captured_s
+    of_ego = received.frame_unit_ix == 0
     np.testing.assert_allclose(delay_s[of_ego], 0.25, atol=1e-12)
     others = delay_s[~of_ego]
     assert others[np.isfinite(others)].min() > 0.02
@@ -197,10 +197,10 @@ def test_false_positives_are_in_the_air_too() -> None:
     replay, runs = prepare_log(traffic(), slow), np.array([3])
     found = draw_shown_ghosts(replay.world(slow), runs)
     assert found is not None
-    heard = heard_by(slow, "gnn", one=3)
-    g = np.bincount(found.found.tracks.frame_ix, minlength=len(heard.stamp_ns))
+    received = heard_by(slow, "gnn", one=3)
+    g = np.bincount(found.found.tracks.frame_ix, minlength=len(received.stamp_ns))
     assert len(np.unique(g)) > 3
-    np.testing.assert_allclose(heard.common_arrives_s - heard.captured_s, 8 * (121 + 35 * g) / 100_000, atol=1e-9)
+    np.testing.assert_allclose(received.common_arrives_s - received.captured_s, 8 * (121 + 35 * g) / 100_000, atol=1e-9)
 
 
 def test_lists_queue_for_as_long_as_they_are_in_their_run() -> None:
@@ -210,9 +210,9 @@ def test_lists_queue_for_as_long_as_they_are_in_their_run() -> None:
     seen = perceive_all_units(replay.world(slow), runs, states="true")
     objects = np.bincount(seen.frame_ix[seen.valid[0]], minlength=len(seen.stamp_ns))
     assert len(np.unique(objects)) > 2
-    heard = heard_by(slow, one=3)
+    received = heard_by(slow, one=3)
     expected = 8 * (121 + 35 * objects) / 100_000  # less than a tenth of a second: none waits
-    np.testing.assert_allclose(heard.common_arrives_s - heard.captured_s, expected, atol=1e-9)
+    np.testing.assert_allclose(received.common_arrives_s - received.captured_s, expected, atol=1e-9)
 
 
 def test_nothing_is_known_sooner_than_without_the_link() -> None:
@@ -316,13 +316,13 @@ def test_lists_of_wired_units_are_none_of_the_links() -> None:
     unheard = {"far": {"at": [90.0, 8], "height_m": 5, "pem": "half"}}
     units = plan(None).as_written()["units"] | unheard
     some = plan(None, links={"slow": slow}, configurations=wired, runs=30, units=units)
-    heard = [heard_by(some, one=k) for k in range(30)]
-    sent = [one.common_arrives_s[np.isin(one.frame_unit_ix, (1, 2))] for one in heard]
+    received = [heard_by(some, one=k) for k in range(30)]
+    sent = [one.common_arrives_s[np.isin(one.frame_unit_ix, (1, 2))] for one in received]
     [row] = run_experiment(some, [traffic()]).summary.to_dict("records")
     assert row["lost_share"] == np.mean([np.isinf(one).mean() for one in sent])
     assert row["lost_share"] == pytest.approx(0.5, abs=0.04)
     overtaken, came = 0, 0
-    for one in heard:  # arrived after a newer one of its unit
+    for one in received:  # arrived after a newer one of its unit
         for unit in (1, 2):
             mine = np.flatnonzero((one.frame_unit_ix == unit) & np.isfinite(one.common_arrives_s))
             at = one.common_arrives_s[mine]
@@ -347,8 +347,8 @@ def test_lists_that_are_taken_in_at_once_are_not_overtaken(sends: object) -> Non
     some = experiment(units=units, links={"sure": {"latency": 0.05}, "slow": slow}, configurations=configurations)
     rows = run_experiment(some, [scenes.oncoming_car()]).summary.set_index("configuration")
     shares = rows["overtaken_share"].to_dict()
-    heard = heard_by(some, "slow0", recording=scenes.oncoming_car()).common_arrives_s
-    overtaken = np.mean([(heard[k + 1 :] <= heard[k]).any() for k in range(len(heard))])
+    received = heard_by(some, "slow0", recording=scenes.oncoming_car()).common_arrives_s
+    overtaken = np.mean([(received[k + 1 :] <= received[k]).any() for k in range(len(received))])
     assert 0.3 < overtaken < 0.6
     assert shares == {"sure0": 0.0, "sure4": 0.0, "slow0": overtaken, "slow4": overtaken}
 

@@ -105,8 +105,8 @@ class TestWhatDoesNotMatter:
         world = prepare_log(crowd(), plan).world(plan)
         seen = perceive_all_units(world, runs, states="sampled")
         lists = remove_truth_ids(world, seen, runs)[0]
-        heard = transmit(seen, [UnitLinks("link", ConstantLink(latency_s=latency_s))])
-        told = make_inputs(heard, lists, max_age_s=1.0)
+        received = transmit(seen, [UnitLinks("link", ConstantLink(latency_s=latency_s))])
+        told = make_inputs(received, lists, max_age_s=1.0)
         rng = np.random.default_rng(0)
         names = tuple(told.units[k] for k in (2, 0, 1))
         order = rng.permutation(len(told.unit_ix))

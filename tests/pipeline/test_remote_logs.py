@@ -311,10 +311,10 @@ def test_a_slow_server_is_waited_for_as_long_as_bytes_come(monkeypatch: pytest.M
     monkeypatch.setattr(waiting, "IDLE_LIMIT_S", 0.3)
     pause = threading.Event()
 
-    def ask(heard: Any) -> str:
+    def ask(received: Any) -> str:
         for _ in range(8):
             pause.wait(0.1)
-            heard()
+            received()
         return "all"
 
     assert waiting.await_server("there", ask) == "all"

@@ -196,8 +196,8 @@ class TestPoints:
 
     def test_what_becomes_equal_at_all_values_is_there_once(self) -> None:
         """`late` has a life of its own as soon as it is not its latency that varies."""
-        heard = {"x": ["a", "ego"], "y": ["ego", "a"], "z": ["a", "ego"]}
-        twins = {name: {"units": units, "latency_s": 0.1} for name, units in heard.items()}
+        received = {"x": ["a", "ego"], "y": ["ego", "a"], "z": ["a", "ego"]}
+        twins = {name: {"units": units, "latency_s": 0.1} for name, units in received.items()}
         wanted = plan({"units": [0, 1], "latency_s": [0.1]}, configurations=twins | {"late": CONFIGURATIONS["late"]})
         assert told(wanted) == [
             ("latency_s", 0.1, ["x", "y", "late"]),

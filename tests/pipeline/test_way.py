@@ -16,7 +16,7 @@ from copem_replay.metrics.detection.by_truth_id import FirstDetections
 from copem_replay.metrics.detections_table import WAY, find_informing_list
 from copem_replay.pipeline import prepare as chunking
 from copem_replay.pipeline.prepare import prepare_log
-from copem_replay.pipeline.receiver import hear_units, perceive_all_units
+from copem_replay.pipeline.receiver import perceive_all_units, receive_lists
 from copem_replay.pipeline.run import run_experiment
 from copem_replay.report.figures.latency_breakdown import mean_stages
 from tests.helpers import scenes
@@ -100,8 +100,8 @@ def plainly(some: Experiment, name: str, one: int) -> dict[str, list[float]]:
     replay, runs = prepare_log(traffic(), some), np.array([one])
     world = replace(replay.world(some), on_air=replay.on_air(some, runs))
     seen = perceive_all_units(world, runs, states="true")
-    heard = hear_units(seen, world, name)
-    sent_s, arrives_s, captured_s = seen.common_arrives_s, heard.common_arrives_s, seen.captured_s
+    received = receive_lists(seen, world, name)
+    sent_s, arrives_s, captured_s = seen.common_arrives_s, received.common_arrives_s, seen.captured_s
     holds = {
         (int(f), int(o)) for f, o, there in zip(seen.frame_ix, seen.row_object_ix, seen.valid[0], strict=True) if there
     }
@@ -202,11 +202,11 @@ def test_of_units_that_listed_it_together() -> None:
 
     def told(at_s: tuple[float, float], detection_s: float, first_unit_ix: int, captured_s: float = 1.0) -> int:
         one = np.array([[detection_s]]), np.array([[captured_s]]), np.array([[first_unit_ix]])
-        heard = Tracks(
+        received = Tracks(
             ("a", "b"), np.zeros(1, dtype=int), *(np.zeros(0, dtype=int),) * 3, np.array([0, 0]), np.array([1.0, 1.0]),
             np.array([0, 1]), np.array([at_s]), np.zeros((1, 0), dtype=bool), *(np.zeros((1, 0)),) * 9,
         )  # fmt: skip
-        return int(find_informing_list(heard, FirstDetections(*one))[0, 0])
+        return int(find_informing_list(received, FirstDetections(*one))[0, 0])
 
     assert told((1.1, 1.2), 1.2, 0) == 1
     assert told((1.1, 1.2), 1.1, 1) == 0

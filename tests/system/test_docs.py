@@ -136,8 +136,8 @@ def test_what_is_put_into_the_bags_is_in_the_intervals_of_the_study(monkeypatch:
     assert f"of {put_in.STACK_AGE_S:g} s before" in page
     assert f"takes {put_in.RADIO_S:g} s" in page
     # By hand, in ms: the stack last heard the vehicle (10 Hz) or the unit (8 Hz from 30 ms), and publishes each 100 ms
-    heard = [*range(70, 60_000, 100), *range(30 + 90 + 100, 60_000, 125)]
-    ages = [min(now - one for one in heard if one <= now) for now in range(1000, 60_000, 100)]
+    received = [*range(70, 60_000, 100), *range(30 + 90 + 100, 60_000, 125)]
+    ages = [min(now - one for one in received if one <= now) for now in range(1000, 60_000, 100)]
     assert sum(ages) / len(ages) == pytest.approx(put_in.STACK_AGE_S * 1000, abs=0.1)
 
 

@@ -41,12 +41,12 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
 
 def arriving(made: Made, path: Path, way_s: dict[int, float], of: str = "air") -> Path:
     """The recording in which some lists of the pole have been so long on their way."""
-    heard = made.run_tracks[of].heard
-    arrives_s, pole = heard.arrives_s.copy(), heard.units.index("pole")
+    received = made.run_tracks[of].received
+    arrives_s, pole = received.arrives_s.copy(), received.units.index("pole")
     for k, way in way_s.items():
-        [frame] = np.flatnonzero((heard.frame_unit_ix == pole) & (np.rint(heard.captured_s * 10) == k))
-        arrives_s[0, frame] = heard.captured_s[frame] + way
-    changed = replace(made.run_tracks[of], heard=replace(heard, arrives_s=arrives_s))
+        [frame] = np.flatnonzero((received.frame_unit_ix == pole) & (np.rint(received.captured_s * 10) == k))
+        arrives_s[0, frame] = received.captured_s[frame] + way
+    changed = replace(made.run_tracks[of], received=replace(received, arrives_s=arrives_s))
     made.write(path, run_tracks=made.run_tracks | {of: changed})
     return path
 
@@ -114,12 +114,12 @@ def test_lost_late_and_overtaken(made: Made, tmp_path: Path) -> None:
 def test_how_long_lists_usually_take_is_of_those_that_arrive(made: Made) -> None:
     """Most are lost; of the others one takes .30 s where .05 s is usual: late, though a list counts for 1 s."""
     of = made.run_tracks["air"]
-    arrives_s, pole = np.full_like(of.heard.arrives_s, LOST), of.heard.units.index("pole")
-    frames = np.flatnonzero(of.heard.frame_unit_ix == pole)
-    frames = frames[np.argsort(of.heard.captured_s[frames])]
+    arrives_s, pole = np.full_like(of.received.arrives_s, LOST), of.received.units.index("pole")
+    frames = np.flatnonzero(of.received.frame_unit_ix == pole)
+    frames = frames[np.argsort(of.received.captured_s[frames])]
     for k, way_s in enumerate((0.05, 0.05, 0.05, 0.30)):
-        arrives_s[0, frames[k]] = of.heard.captured_s[frames[k]] + way_s
-    [lists] = find_linked_lists(replace(of, heard=replace(of.heard, arrives_s=arrives_s)), 1, "air", 1.0)
+        arrives_s[0, frames[k]] = of.received.captured_s[frames[k]] + way_s
+    [lists] = find_linked_lists(replace(of, received=replace(of.received, arrives_s=arrives_s)), 1, "air", 1.0)
     fates = [FATES[fate] for fate in lists.fate]
     assert fates == ["in time"] * 3 + ["late"] + ["lost"] * 47
 
@@ -189,10 +189,10 @@ def test_shown_are_those_of_the_run_shown(tmp_path: Path) -> None:
     made = make(tmp_path / "x.rrd", standing_by(), **DRAWN)
     said, counts = {}, np.zeros(len(FATES), dtype=int)
     for run in range(4):
-        heard = tracks_of_run(made.replay, made.given, run)["air"].heard
-        pole = np.flatnonzero(heard.frame_unit_ix == heard.units.index("pole"))
-        pole = pole[np.argsort(heard.captured_s[pole])]
-        arrives_s = heard.arrives_s[0, pole]
+        received = tracks_of_run(made.replay, made.given, run)["air"].received
+        pole = np.flatnonzero(received.frame_unit_ix == received.units.index("pole"))
+        pole = pole[np.argsort(received.captured_s[pole])]
+        arrives_s = received.arrives_s[0, pole]
         lost = np.isinf(arrives_s)
         overtaken = [not lost[k] and bool((arrives_s[k + 1 :] <= arrives_s[k]).any()) for k in range(len(pole))]
         tracks = tracks_of_run(made.replay, made.given, run)
@@ -202,7 +202,7 @@ def test_shown_are_those_of_the_run_shown(tmp_path: Path) -> None:
         made.write(tmp_path / f"{run}.rrd", run_tracks=tracks)
         states = dict(lane(tmp_path / f"{run}.rrd"))
         said[run] = tuple(at for at, state in states.items() if state is not None and state.endswith("lost"))
-        assert set(said[run]) <= {round(float(s), 9) for s in heard.captured_s[pole[lost]]}
+        assert set(said[run]) <= {round(float(s), 9) for s in received.captured_s[pole[lost]]}
         counts += np.bincount(of.fate, minlength=len(FATES))
     assert len(set(said.values())) == 4
     links = measure_list_rates(made.replay, made.given)["air"].links

@@ -334,11 +334,11 @@ def test_a_list_that_never_arrives_is_lost(hiding: Made) -> None:
 
     fused_tracks = hiding.run_tracks["both"]
     # Pedestrian 4 is in the pole's lists only: those of the first half of a second never arrive.
-    arrives = np.where(fused_tracks.heard.captured_s < 0.45, np.inf, fused_tracks.heard.arrives_s)
+    arrives = np.where(fused_tracks.received.captured_s < 0.45, np.inf, fused_tracks.received.arrives_s)
     silent = fused_tracks.fused.valid & (fused_tracks.fused.arrives_s[:, fused_tracks.fused.frame_ix] > 0.45)
     lossy = replace(
         fused_tracks,
-        heard=replace(fused_tracks.heard, arrives_s=arrives),
+        received=replace(fused_tracks.received, arrives_s=arrives),
         fused=replace(fused_tracks.fused, valid=silent),
     )
     seen = compute_sight(hiding.replay, hiding.given, [hiding.replay.scene.object_number["4"]])
@@ -360,16 +360,16 @@ def test_what_a_units_next_list_no_longer_holds_is_neither_lost_nor_unmatched(hi
     from copem_replay.viewer.status import compute_status, read_episode_clocks
 
     fused_tracks, number = hiding.run_tracks["both"], hiding.replay.scene.object_number["4"]
-    heard = fused_tracks.heard
-    late = heard.captured_s[heard.frame_ix] > 0.15
-    heard = replace(heard, valid=heard.valid & ~(late & (heard.row_object_ix == number)))
+    received = fused_tracks.received
+    late = received.captured_s[received.frame_ix] > 0.15
+    received = replace(received, valid=received.valid & ~(late & (received.row_object_ix == number)))
     if not arrives:
-        heard = replace(heard, arrives_s=np.full_like(heard.arrives_s, np.inf))
+        received = replace(received, arrives_s=np.full_like(received.arrives_s, np.inf))
     nothing = replace(fused_tracks.fused, valid=np.zeros_like(fused_tracks.fused.valid))
     seen = compute_sight(hiding.replay, hiding.given, [number])
     clock = read_episode_clocks(hiding.replay.scene, hiding.table.assign(detected=False, detection_s=np.nan), "both")
     made = compute_status(
-        hiding.replay, hiding.given, "both", replace(fused_tracks, heard=heard, fused=nothing), seen, clock
+        hiding.replay, hiding.given, "both", replace(fused_tracks, received=received, fused=nothing), seen, clock
     )
     early = made.elapsed_ns < 199_000_000
     assert {STATUSES[k] for k in made.status[early, 0]} == {STATUSES[UNMATCHED if arrives else LOST]}

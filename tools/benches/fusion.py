@@ -29,7 +29,7 @@ from copem_replay.fusion.tracker import Tracker
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.gospa import gospa, gospa_pairs
 from copem_replay.pipeline.prepare import prepare_log
-from copem_replay.pipeline.receiver import hear_units, perceive_all_units, remove_truth_ids
+from copem_replay.pipeline.receiver import perceive_all_units, receive_lists, remove_truth_ids
 from copem_replay.pipeline.replay import cut_blocks
 from copem_replay.pipeline.world import WorldChunk
 from tests.oracles import gnn as gnn_oracle
@@ -100,14 +100,14 @@ def crossing(experiment: Experiment, recording: Recording) -> Iterator[common.Li
 
 def _fusing(world: WorldChunk, name: str, seen: Tracks, told: ObjectLists) -> tuple[Callable[[], object], int]:
     """Fuses one block of runs as one configuration does; how many lists each run gets."""
-    heard = hear_units(seen, world, name)
+    received = receive_lists(seen, world, name)
     configuration = world.experiment.configurations[name]
     age_of_information_s, fusion = configuration.max_age_s, configuration.fusion
-    count = len(fusion_schedule(heard, max_age_s=age_of_information_s).issue_s)
+    count = len(fusion_schedule(received, max_age_s=age_of_information_s).issue_s)
     if isinstance(fusion, ListFusion):
-        ready = make_inputs(heard, told, max_age_s=age_of_information_s)
+        ready = make_inputs(received, told, max_age_s=age_of_information_s)
         return lambda: fusion.fuse(ready), count
-    return lambda: fuse_ideal(heard, max_age_s=age_of_information_s, without_object_ix=world.scene.ego_ix), count
+    return lambda: fuse_ideal(received, max_age_s=age_of_information_s, without_object_ix=world.scene.ego_ix), count
 
 
 # -------------------------------------------------------------------------------------------------- nearest neighbours

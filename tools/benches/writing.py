@@ -31,7 +31,7 @@ def encoding(scene: Scene, all_tracks: dict[str, FusedTracks], compared: str) ->
         made = []
         for name, of in chosen.items():
             available_ns = scene.t0_ns + np.rint(of.fused.arrives_s[0] * 1e9).astype(np.int64)
-            numbers = {unit: k + 1 for k, unit in enumerate(of.heard.units)}
+            numbers = {unit: k + 1 for k, unit in enumerate(of.received.units)}
             writers = (
                 SensorDataWriter(scene, of, numbers),
                 FoxgloveSceneWriter(scene, of, name, _GREY),
@@ -42,7 +42,7 @@ def encoding(scene: Scene, all_tracks: dict[str, FusedTracks], compared: str) ->
 
     def theirs(name: str) -> list[bytes]:
         of = all_tracks[name]
-        numbers = {unit: k + 1 for k, unit in enumerate(of.heard.units)}
+        numbers = {unit: k + 1 for k, unit in enumerate(of.received.units)}
         every = list(enumerate((scene.t0_ns + np.rint(of.fused.arrives_s[0] * 1e9).astype(np.int64)).tolist()))
         sized = [False] * len(of.fused.frame_ix)
         return [

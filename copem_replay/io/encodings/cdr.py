@@ -52,11 +52,11 @@ _SPARE = 8  # bytes that may be left over at the end: padding
 
 
 @njit(cache=True)
-def _read_number(data, at, size, swapped):  # type: ignore[no-untyped-def]
+def _read_number(data, offset, size, swapped):  # type: ignore[no-untyped-def]
     """The bits of a number."""
     bits = np.uint64(0)
     for k in range(size):
-        byte = data[at + k] if swapped else data[at + size - 1 - k]
+        byte = data[offset + k] if swapped else data[offset + size - 1 - k]
         bits = (bits << np.uint64(8)) | np.uint64(byte)
     return bits
 
@@ -83,16 +83,16 @@ def walk_cdr(data, bounds, program, first, room, bits, lengths, parent, decoded)
         good = end >= begin and data[bounds[m]] == 0 and data[bounds[m] + 1] in (0, 1, 6, 7)
         swapped = good and data[bounds[m] + 1] in (0, 6)
         most = 4 if good and data[bounds[m] + 1] >= 6 else 8  # XCDR2 aligns to four bytes at most
-        at, pc, depth, mark = begin, 0, 0, begin
+        offset, pc, depth, mark = begin, 0, 0, begin
         while good:
             op, a, b, c = program[pc, 0], program[pc, 1], program[pc, 2], program[pc, 3]
             pc += 1
             if op in (SKIP, TAKE, BYTES):
                 step = a if op != BYTES else 1
                 step = min(step, most)
-                at += -(at - begin) % step
+                offset += -(offset - begin) % step
                 size = b if op == SKIP else a
-                if size > end - at:
+                if size > end - offset:
                     good = False
                     break
                 if op != SKIP:
@@ -101,11 +101,11 @@ def walk_cdr(data, bounds, program, first, room, bits, lengths, parent, decoded)
                     row = rows[level] - 1
                     if row < room[level]:
                         if op == TAKE:
-                            bits[first[slot] + row] = _read_number(data, at, a, swapped)
+                            bits[first[slot] + row] = _read_number(data, offset, a, swapped)
                         else:
-                            bits[first[slot] + row] = np.uint64(at)
+                            bits[first[slot] + row] = np.uint64(offset)
                             lengths[first[slot] + row] = a
-                at += size
+                offset += size
             elif op == NEXT:
                 left[depth - 1] -= 1
                 if left[depth - 1] > 0:
@@ -118,50 +118,50 @@ def walk_cdr(data, bounds, program, first, room, bits, lengths, parent, decoded)
                 else:
                     depth -= 1
             elif op == MARK:
-                mark = at
+                mark = offset
             elif op == BACK:
-                at = mark
+                offset = mark
             elif op == SIZE:
                 if most == 4:
-                    at += -(at - begin) % 4 + 4
-                    if at > end:
+                    offset += -(offset - begin) % 4 + 4
+                    if offset > end:
                         good = False
                         break
             elif op == END:
-                good = end - at <= _SPARE
+                good = end - offset <= _SPARE
                 break
             else:
                 if op == ARRAY:
                     number, stop, level = a, b, c
                 else:
-                    at += -(at - begin) % 4
-                    if end - at < 4:
+                    offset += -(offset - begin) % 4
+                    if end - offset < 4:
                         good = False
                         break
-                    number, stop, level = np.int64(_read_number(data, at, 4, swapped)), a, b
-                    at += 4
+                    number, stop, level = np.int64(_read_number(data, offset, 4, swapped)), a, b
+                    offset += 4
                 if op == TEXT:
                     size = number * b
-                    if size > end - at:
+                    if size > end - offset:
                         good = False
                         break
                     if a >= 0:
                         row = rows[c] - 1
                         if row < room[c]:
-                            bits[first[a] + row] = np.uint64(at)
+                            bits[first[a] + row] = np.uint64(offset)
                             lengths[first[a] + row] = size
-                    at += size
+                    offset += size
                 elif op == NUMBERS:
                     if number > 0:
-                        at += -(at - begin) % min(a, most)
-                    if number > (end - at) // a:
+                        offset += -(offset - begin) % min(a, most)
+                    if number > (end - offset) // a:
                         good = False
                         break
-                    at += number * a
+                    offset += number * a
                 elif number == 0:
                     pc = stop
                 else:
-                    if number > end - at:  # an item is a byte at least
+                    if number > end - offset:  # an item is a byte at least
                         good = False
                         break
                     back[depth], left[depth], owner[depth] = pc, number, level

@@ -1,7 +1,7 @@
 """Records encoded from columns, many at once: protobuf messages and JSON texts.
 
 First the sizes of all records are computed, then their bytes are put into one buffer. A part of a record knows its size
-in every row, `sizes` (N,), and puts its bytes at the places `at` (N,). A record is its parts one after the other.
+in every row, `sizes` (N,), and puts its bytes at the places `offset` (N,). A record is its parts one after the other.
 Letters: N rows, M rows of a repeated part.
 """
 
@@ -47,14 +47,14 @@ def expand_ranges(start: Int, rows: Int) -> tuple[Int, Int]:
 
 
 @njit(cache=True, nogil=True)
-def _put_varint(out, at, value):  # type: ignore[no-untyped-def]
+def _put_varint(out, offset, value):  # type: ignore[no-untyped-def]
     """Put a number in groups of seven bits; returns the place after it."""
     while value >= np.uint64(128):
-        out[at] = np.uint8(value & np.uint64(127)) | np.uint8(128)
+        out[offset] = np.uint8(value & np.uint64(127)) | np.uint8(128)
         value >>= np.uint64(7)
-        at += 1
-    out[at] = np.uint8(value)
-    return at + 1
+        offset += 1
+    out[offset] = np.uint8(value)
+    return offset + 1
 
 
 @njit(cache=True, nogil=True)
@@ -71,29 +71,29 @@ def varint_sizes(values):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def put_varints(out, at, sizes, tag, values):  # type: ignore[no-untyped-def]
-    """Put tags and varints at places `at` (N,), except where the size is 0."""
-    for k in range(len(at)):
+def put_varints(out, offset, sizes, tag, values):  # type: ignore[no-untyped-def]
+    """Put tags and varints at places `offset` (N,), except where the size is 0."""
+    for k in range(len(offset)):
         if sizes[k]:
-            _put_varint(out, _put_varint(out, at[k], tag), values[k])
+            _put_varint(out, _put_varint(out, offset[k], tag), values[k])
 
 
 @njit(cache=True, nogil=True)
-def put_fixed(out, at, sizes, tag, bits):  # type: ignore[no-untyped-def]
+def put_fixed(out, offset, sizes, tag, bits):  # type: ignore[no-untyped-def]
     """Put tags and eight bytes each, the lowest first, except where the size is 0."""
-    for k in range(len(at)):
+    for k in range(len(offset)):
         if sizes[k]:
-            place = _put_varint(out, at[k], tag)
+            place = _put_varint(out, offset[k], tag)
             for i in range(8):
                 out[place + i] = np.uint8((bits[k] >> np.uint64(8 * i)) & np.uint64(255))
 
 
 @njit(cache=True, nogil=True)
-def put_pieces(out, at, pool, first, sizes):  # type: ignore[no-untyped-def]
-    """Put `pool[first[k]:first[k] + sizes[k]]` at `at[k]`."""
-    for k in range(len(at)):
+def put_pieces(out, offset, pool, first, sizes):  # type: ignore[no-untyped-def]
+    """Put `pool[first[k]:first[k] + sizes[k]]` at `offset[k]`."""
+    for k in range(len(offset)):
         for i in range(sizes[k]):
-            out[at[k] + i] = pool[first[k] + i]
+            out[offset[k] + i] = pool[first[k] + i]
 
 
 # Parts of records.
@@ -108,8 +108,8 @@ class RecordPart(Protocol):
     def sizes(self) -> Int:
         """(N,) size in each row, in bytes."""
 
-    def put(self, out: Bytes, at: Int) -> None:
-        """Put the bytes of every row at its place in `out`, `at` (N,)."""
+    def put(self, out: Bytes, offset: Int) -> None:
+        """Put the bytes of every row at its place in `out`, `offset` (N,)."""
 
 
 class TextPool:
@@ -136,9 +136,9 @@ class RowTexts:
     def __init__(self, pool: Bytes, first: Int, lengths: Int) -> None:
         self._pool, self._first, self.sizes = pool, first, lengths
 
-    def put(self, out: Bytes, at: Int) -> None:
-        """Put the bytes of every row at its place in `out`, `at` (N,)."""
-        put_pieces(out, at, self._pool, self._first, self.sizes)
+    def put(self, out: Bytes, offset: Int) -> None:
+        """Put the bytes of every row at its place in `out`, `offset` (N,)."""
+        put_pieces(out, offset, self._pool, self._first, self.sizes)
 
 
 def repeat_text(text: bytes, rows: int) -> RowTexts:
@@ -158,10 +158,10 @@ class NumberField:
         sizes = np.full(len(values), head + 8) if self._fixed else varint_sizes(self._bits) + head
         self.sizes: Int = sizes if always else np.where(self._bits != 0, sizes, 0)
 
-    def put(self, out: Bytes, at: Int) -> None:
-        """Put the bytes of every row at its place in `out`, `at` (N,)."""
+    def put(self, out: Bytes, offset: Int) -> None:
+        """Put the bytes of every row at its place in `out`, `offset` (N,)."""
         fill = put_fixed if self._fixed else put_varints
-        fill(out, at, self.sizes, self._tag, self._bits)
+        fill(out, offset, self.sizes, self._tag, self._bits)
 
 
 class SizedField:
@@ -173,10 +173,10 @@ class SizedField:
         self._head = NumberField(tag, inner, always)
         self.sizes = self._head.sizes + inner
 
-    def put(self, out: Bytes, at: Int) -> None:
-        """Put the bytes of every row at its place in `out`, `at` (N,)."""
-        self._head.put(out, at)
-        put_parts(self._parts, out, at + self._head.sizes)
+    def put(self, out: Bytes, offset: Int) -> None:
+        """Put the bytes of every row at its place in `out`, `offset` (N,)."""
+        self._head.put(out, offset)
+        put_parts(self._parts, out, offset + self._head.sizes)
 
 
 class RowGroups:
@@ -191,9 +191,9 @@ class RowGroups:
         """(N,) size in each row, in bytes."""
         return np.diff(self._before[self._start])
 
-    def put(self, out: Bytes, at: Int) -> None:
-        """Put the bytes of every row at its place in `out`, `at` (N,)."""
-        shift = at - self._before[self._start[:-1]]
+    def put(self, out: Bytes, offset: Int) -> None:
+        """Put the bytes of every row at its place in `out`, `offset` (N,)."""
+        shift = offset - self._before[self._start[:-1]]
         put_parts(self._parts, out, np.repeat(shift, np.diff(self._start)) + self._before[:-1])
 
 
@@ -211,11 +211,11 @@ def count_bytes(parts: Sequence[RecordPart], rows: int) -> Int:
     return result
 
 
-def put_parts(parts: Sequence[RecordPart], out: Bytes, at: Int) -> None:
-    """Put the parts one after the other, from `at` (N,) on."""
+def put_parts(parts: Sequence[RecordPart], out: Bytes, offset: Int) -> None:
+    """Put the parts one after the other, from `offset` (N,) on."""
     for part in parts:
-        part.put(out, at)
-        at = at + part.sizes
+        part.put(out, offset)
+        offset = offset + part.sizes
 
 
 def encode_records(parts: Sequence[RecordPart], rows: int) -> list[bytes]:

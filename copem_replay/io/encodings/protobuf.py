@@ -48,43 +48,43 @@ DEEPEST = 32
 
 
 @njit(cache=True)
-def _read_varint(data, at, end):  # type: ignore[no-untyped-def]
+def _read_varint(data, offset, end):  # type: ignore[no-untyped-def]
     """A number and the place after it, which is beyond `end` if the number does not end before."""
     value, shift = np.uint64(0), 0
-    while at < end and shift < 70:
-        byte = data[at]
+    while offset < end and shift < 70:
+        byte = data[offset]
         value |= np.uint64(byte & 127) << np.uint64(shift)
-        at += 1
+        offset += 1
         shift += 7
         if byte < 128:
-            return value, at
+            return value, offset
     return value, end + 1
 
 
 @njit(cache=True)
-def _read_fixed(data, at, size):  # type: ignore[no-untyped-def]
+def _read_fixed(data, offset, size):  # type: ignore[no-untyped-def]
     value = np.uint64(0)
     for k in range(size):
-        value |= np.uint64(data[at + k]) << np.uint64(8 * k)
+        value |= np.uint64(data[offset + k]) << np.uint64(8 * k)
     return value
 
 
 @njit(cache=True)
-def _skip_value(data, at, end, wire):  # type: ignore[no-untyped-def]
-    """The end of a value that begins at `at`, of a group the place of its end tag; beyond `end`: it has no end."""
+def _skip_value(data, offset, end, wire):  # type: ignore[no-untyped-def]
+    """The end of a value that begins at `offset`, of a group the place of its end tag; beyond `end`: it has no end."""
     if wire == VARINT:
-        return _read_varint(data, at, end)[1]
+        return _read_varint(data, offset, end)[1]
     if wire == FIXED64:
-        return at + 8
+        return offset + 8
     if wire == FIXED32:
-        return at + 4
+        return offset + 4
     if wire == BYTES:
-        size, at = _read_varint(data, at, end)
-        return end + 1 if at > end or size > np.uint64(end - at) else at + np.int64(size)
+        size, offset = _read_varint(data, offset, end)
+        return end + 1 if offset > end or size > np.uint64(end - offset) else offset + np.int64(size)
     depth = 1
-    while at < end:
-        mark = at
-        tag, at = _read_varint(data, at, end)
+    while offset < end:
+        mark = offset
+        tag, offset = _read_varint(data, offset, end)
         inner = np.int64(tag & np.uint64(7))
         if inner == GROUP:
             depth += 1
@@ -95,19 +95,19 @@ def _skip_value(data, at, end, wire):  # type: ignore[no-untyped-def]
         elif inner > FIXED32:
             return end + 1
         else:
-            at = _skip_plain_value(data, at, end, inner)
+            offset = _skip_plain_value(data, offset, end, inner)
     return end + 1
 
 
 @njit(cache=True)
-def _skip_plain_value(data, at, end, wire):  # type: ignore[no-untyped-def]
-    """The end of a value other than a group that begins at `at`; beyond `end`: it has no end."""
-    value, after = _read_varint(data, at, end)
+def _skip_plain_value(data, offset, end, wire):  # type: ignore[no-untyped-def]
+    """The end of a value other than a group that begins at `offset`; beyond `end`: it has no end."""
+    value, after = _read_varint(data, offset, end)
     if wire == VARINT:
         return after
     if wire == BYTES:
         return end + 1 if after > end or value > np.uint64(end - after) else after + np.int64(value)
-    return at + (8 if wire == FIXED64 else 4)
+    return offset + (8 if wire == FIXED64 else 4)
 
 
 @njit(cache=True)
@@ -128,7 +128,7 @@ def walk_protobuf(  # type: ignore[no-untyped-def]
         if rows[0] < room[0]:
             parent[0, rows[0]] = m
         rows[0] += 1
-        at, depth, entered = bounds[m], 0, True
+        offset, depth, entered = bounds[m], 0, True
         ends[0], nodes[0] = bounds[m + 1], 0
         while depth >= 0:
             node, end = nodes[depth], ends[depth]
@@ -139,16 +139,16 @@ def walk_protobuf(  # type: ignore[no-untyped-def]
                     for k in range(blank_first[node], blank_first[node + 1]):
                         place = first[blank[k]] + row
                         bits[place], lengths[place], said[place] = 0, 0, True
-            if at >= end:
-                at, depth = end, depth - 1
+            if offset >= end:
+                offset, depth = end, depth - 1
                 continue
-            tag, at = _read_varint(data, at, end)
+            tag, offset = _read_varint(data, offset, end)
             wire, number = np.int64(tag & np.uint64(7)), np.int64(tag >> np.uint64(3))
-            if at > end or wire > FIXED32:
+            if offset > end or wire > FIXED32:
                 break
             if wire == END_GROUP:  # of the one that was stepped into
                 continue
-            after = _skip_value(data, at, end, wire)
+            after = _skip_value(data, offset, end, wire)
             if after > end:
                 break
             found = -1
@@ -157,20 +157,20 @@ def walk_protobuf(  # type: ignore[no-untyped-def]
                     found = k
                     break
             if found < 0:
-                at = after
+                offset = after
                 continue
             what, column, level, into = fields[found, 1], fields[found, 2], fields[found, 3], fields[found, 4]
-            begin = _read_varint(data, at, end)[1] if wire == BYTES else at
+            begin = _read_varint(data, offset, end)[1] if wire == BYTES else offset
             if what == MESSAGE:
                 if (wire != BYTES and wire != GROUP) or depth + 1 == DEEPEST:
-                    at = after
+                    offset = after
                     continue
                 if level >= 0:
                     if rows[level] < room[level]:
                         parent[level, rows[level]] = rows[node_level[node]] - 1
                     rows[level] += 1
                 depth += 1
-                ends[depth], nodes[depth], at, entered = after, into, begin, True
+                ends[depth], nodes[depth], offset, entered = after, into, begin, True
                 continue
             if what == wire or (wire == BYTES and level >= 0):  # one value, or many in one
                 while True:
@@ -195,7 +195,7 @@ def walk_protobuf(  # type: ignore[no-untyped-def]
                     begin = next_at
                     if begin >= after:
                         break
-            at = after
+            offset = after
     return rows
 
 
@@ -213,23 +213,23 @@ def estimate_decoded_bytes(data, fields, first, sizes, limit):  # type: ignore[n
     ends = np.zeros(_PARSED_DEEPEST, dtype=np.int64)
     types = np.zeros(_PARSED_DEEPEST, dtype=np.int64)
     total = len(data) + sizes[0]
-    at, depth = 0, 0
+    offset, depth = 0, 0
     ends[0] = len(data)
     while depth >= 0 and total <= limit:
         end = ends[depth]
-        if at >= end:
-            at, depth = end, depth - 1
+        if offset >= end:
+            offset, depth = end, depth - 1
             continue
-        tag, at = _read_varint(data, at, end)
+        tag, offset = _read_varint(data, offset, end)
         wire, number = np.int64(tag & np.uint64(7)), np.int64(tag >> np.uint64(3))
-        if at > end or wire > FIXED32:
+        if offset > end or wire > FIXED32:
             break
         if wire == END_GROUP:
             continue
-        after = _skip_value(data, at, end, wire)
+        after = _skip_value(data, offset, end, wire)
         if after > end:
             break
-        begin = _read_varint(data, at, end)[1] if wire == BYTES else at
+        begin = _read_varint(data, offset, end)[1] if wire == BYTES else offset
         low, high = first[types[depth]], first[types[depth] + 1]
         while low < high:
             middle = (low + high) // 2
@@ -241,14 +241,14 @@ def estimate_decoded_bytes(data, fields, first, sizes, limit):  # type: ignore[n
             total += 32  # kept as it is
         elif fields[low, 1] == 0 and wire in (BYTES, GROUP) and depth + 1 < _PARSED_DEEPEST:
             depth += 1
-            ends[depth], types[depth], at = after, fields[low, 2], begin
+            ends[depth], types[depth], offset = after, fields[low, 2], begin
             total += sizes[types[depth]]
             continue
         elif fields[low, 1] == 1:
             total += 24
         else:
             total += 8 * max(after - begin, 1) if wire == BYTES else 8  # many in one: a byte may be a number
-        at = after
+        offset = after
     return total
 
 

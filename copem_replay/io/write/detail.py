@@ -140,30 +140,30 @@ def faults_by_list(fused_tracks: FusedTracks) -> list[dict[str, Any]]:
 
     A unit is down while the last list that it should have captured was not made. Empty: no unit has such faults.
     """
-    faults, heard = fused_tracks.faults, fused_tracks.heard
+    faults, received = fused_tracks.faults, fused_tracks.received
     if faults is None:
         return []
     issue_s = fused_tracks.fused.common_arrives_s
     faults_of_list: list[dict[str, Any]] = [{"ghosts": [], "down": []} for _ in issue_s]
-    arrives_s = heard.common_arrives_s[heard.frame_ix[faults.ghosts]]
-    came = faults.ghosts[np.isfinite(arrives_s) & heard.valid[0, faults.ghosts]]
+    arrives_s = received.common_arrives_s[received.frame_ix[faults.ghosts]]
+    came = faults.ghosts[np.isfinite(arrives_s) & received.valid[0, faults.ghosts]]
     # A list belongs to the last instant within a microsecond of its arrival, or the next.
-    number = np.searchsorted(issue_s, heard.common_arrives_s[heard.frame_ix[came]] - SAME_INSTANT_S)
+    number = np.searchsorted(issue_s, received.common_arrives_s[received.frame_ix[came]] - SAME_INSTANT_S)
     for row, k in zip(came.tolist(), number.tolist(), strict=True):
         if k < len(faults_of_list):
-            frame = heard.frame_ix[row]
+            frame = received.frame_ix[row]
             faults_of_list[k]["ghosts"].append(
                 {
-                    "unit": heard.units[heard.frame_unit_ix[frame]],
-                    "captured_ns": int(heard.stamp_ns[frame]),
-                    **{name: float(getattr(heard, name)[0, row]) for name in ("x_m", "y_m", "z_m")},
+                    "unit": received.units[received.frame_unit_ix[frame]],
+                    "captured_ns": int(received.stamp_ns[frame]),
+                    **{name: float(getattr(received, name)[0, row]) for name in ("x_m", "y_m", "z_m")},
                 }
             )
-    for unit_ix, unit in enumerate(heard.units):
-        lists = np.flatnonzero(heard.frame_unit_ix == unit_ix)
+    for unit_ix, unit in enumerate(received.units):
+        lists = np.flatnonzero(received.frame_unit_ix == unit_ix)
         if not faults.not_made[lists].any():
             continue
-        last = np.searchsorted(heard.captured_s[lists], issue_s + SAME_INSTANT_S, side="right") - 1
+        last = np.searchsorted(received.captured_s[lists], issue_s + SAME_INSTANT_S, side="right") - 1
         for k in np.flatnonzero((last >= 0) & faults.not_made[lists[np.maximum(last, 0)]]):
             faults_of_list[k]["down"].append(unit)
     return faults_of_list
@@ -226,7 +226,7 @@ class DetailWriter:
     ) -> None:
         self._fused_tracks, self._events, self._t0_ns = fused_tracks, events, scene.t0_ns
         names, self._name = fused_tracks.names_of(scene)
-        self._names, self._units = encode_texts(names), encode_texts(fused_tracks.heard.units)
+        self._names, self._units = encode_texts(names), encode_texts(fused_tracks.received.units)
         self._faults = faults_by_list(fused_tracks)
         self._sizes_of = np.zeros(len(self._name), dtype=bool) if sizes_of is None else sizes_of
 
@@ -287,12 +287,12 @@ class DetailWriter:
 
     def _entries(self, rows: Int) -> list[RecordPart]:
         """The parts of the entries that the objects of some rows were made of."""
-        heard, view = self._fused_tracks.heard, self._fused_tracks.view
+        received, view = self._fused_tracks.received, self._fused_tracks.view
         start, places = expand_ranges(self._fused_tracks.used_start, rows)
         used = self._fused_tracks.used[places]
         columns = {
-            "units": self._units.at(heard.row_unit_ix[used]),
-            "captured_ns": encode_numbers(heard.stamp_ns[heard.frame_ix[used]], len(used)),
+            "units": self._units.at(received.row_unit_ix[used]),
+            "captured_ns": encode_numbers(received.stamp_ns[received.frame_ix[used]], len(used)),
             "range_m": encode_numbers(None if view is None else view.range_m[used], len(used)),
             "visible_share": encode_numbers(None if view is None else view.visible_share[used], len(used)),
         }

@@ -86,7 +86,7 @@ def write_mcap(
     rest = iter(run_tracks)
     first = next(rest)  # names the configurations and the units
     colours = colours or configuration_colours(first)
-    units = dict.fromkeys(unit for fused_tracks in first.values() for unit in fused_tracks.heard.units)
+    units = dict.fromkeys(unit for fused_tracks in first.values() for unit in fused_tracks.received.units)
     numbers = {unit: k + 1 for k, unit in enumerate(units)}
     with atomic_mcap(path, profile=original.profile) as writer:
         catalogue = Catalogue(writer)

@@ -135,13 +135,13 @@ class SensorDataWriter:
 
     def __init__(self, scene: Scene, fused_tracks: FusedTracks, unit_numbers: Mapping[str, int]) -> None:
         self._scene, self._fused_tracks = scene, fused_tracks
-        object_ix, claims, heard = fused_tracks.fused.row_object_ix, fused_tracks.said, fused_tracks.heard
+        object_ix, claims, received = fused_tracks.fused.row_object_ix, fused_tracks.said, fused_tracks.received
         self._moving = np.where(object_ix >= 0, scene.moving[object_ix], True)
         self._ids = np.array([osi_id(name) for name in scene.object_ids], dtype=np.uint64)
-        numbers = np.array([unit_numbers[name] for name in heard.units])
+        numbers = np.array([unit_numbers[name] for name in received.units])
         if claims is None:
-            self._unit = numbers[heard.row_unit_ix[fused_tracks.used]]
-            self._captured_ns = heard.stamp_ns[heard.frame_ix[fused_tracks.used]]
+            self._unit = numbers[received.row_unit_ix[fused_tracks.used]]
+            self._captured_ns = received.stamp_ns[received.frame_ix[fused_tracks.used]]
             self._used_start = fused_tracks.used_start
         else:  # of the contributing entries only the first unit and the newest capture are known
             has_unit = claims["unit_ix"] >= 0

@@ -215,13 +215,13 @@ class CaptureInstants:
     instant: Int
 
 
-def collect_captures(heard: Tracks, *, instants: bool = True) -> CaptureInstants:
+def collect_captures(received: Tracks, *, instants: bool = True) -> CaptureInstants:
     """The captures of the lists that arrive. `instants`: whether capture instants are needed; else all are 0."""
-    arrives = np.isfinite(heard.common_arrives_s)
+    arrives = np.isfinite(received.common_arrives_s)
     order = np.flatnonzero(arrives)
-    order = order[np.lexsort((heard.captured_s[order], heard.frame_unit_ix[order]))]
-    instant = capture_instants(heard)[order] if instants else np.zeros(len(order), dtype=np.int64)
-    return CaptureInstants(heard.captured_s[order], heard.frame_unit_ix[order], instant)
+    order = order[np.lexsort((received.captured_s[order], received.frame_unit_ix[order]))]
+    instant = capture_instants(received)[order] if instants else np.zeros(len(order), dtype=np.int64)
+    return CaptureInstants(received.captured_s[order], received.frame_unit_ix[order], instant)
 
 
 class FirstMatches:

@@ -36,107 +36,113 @@ class FirstDetections(NamedTuple):
 
 
 def detect_by_truth_id(
-    heard: Tracks,
+    received: Tracks,
     episodes: Episodes,
     *,
     confirm: Confirm,
     count_earlier: bool,
     max_age_s: float,
 ) -> FirstDetections:
-    """First detection of every episode, from the lists of all units heard, whose arrival times all runs share.
+    """First detection of every episode, from the lists of all units as received, whose arrival times all runs share.
 
     Every list counts at the instant at which the receiver takes it in, also beside or after a newer one of its unit.
     `max_age_s` counts from capture, on top of a list's own way to the receiver.
     """
     parts = [
-        _detect_first(heard, one, confirm=confirm, count_earlier=count_earlier, max_age_s=max_age_s)
+        _detect_first(received, one, confirm=confirm, count_earlier=count_earlier, max_age_s=max_age_s)
         for _, one in episodes.passes
     ]
     return FirstDetections(*(episodes.join_passes(columns) for columns in zip(*parts, strict=True)))
 
 
 def _detect_first(
-    heard: Tracks, episodes: Episodes, *, confirm: Confirm, count_earlier: bool, max_age_s: float
+    received: Tracks, episodes: Episodes, *, confirm: Confirm, count_earlier: bool, max_age_s: float
 ) -> FirstDetections:
     """The same of episodes with one of each object at most."""
-    captured_s = heard.row_captured_s
-    order, bounds = _group_by_episode(heard, episodes)
+    captured_s = received.row_captured_s
+    order, bounds = _group_by_episode(received, episodes)
     not_before_s = episodes.counts_from_s(count_earlier=count_earlier)
-    shape = (heard.valid.shape[0], len(episodes.object_ix))
+    shape = (received.valid.shape[0], len(episodes.object_ix))
     out = FirstDetections(np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, -1))
     # The instant from which on a list is no longer used: at its greatest age, within a microsecond, it still is.
-    arrives_s = heard.common_arrives_s
-    outdated_s, cluster = arrives_s + max_age_s + 2 * SAME_INSTANT_S, np.zeros(len(heard.stamp_ns), dtype=np.int64)
-    place, units_in_place = cluster, heard.frame_unit_ix
+    arrives_s = received.common_arrives_s
+    outdated_s, cluster = arrives_s + max_age_s + 2 * SAME_INSTANT_S, np.zeros(len(received.stamp_ns), dtype=np.int64)
+    place, units_in_place = cluster, received.frame_unit_ix
     if confirm.hits > 1:  # one hit confirms at once, whatever the instants and the lists before
-        outdated_s, cluster = np.minimum(first_newer_arrival_s(heard), outdated_s), capture_instants(heard)
-        place, units_in_place = _sort_by_unit(heard)
+        outdated_s, cluster = np.minimum(first_newer_arrival_s(received), outdated_s), capture_instants(received)
+        place, units_in_place = _sort_by_unit(received)
     rows = _ListedRows(
-        heard.valid, arrives_s[heard.frame_ix], captured_s, outdated_s[heard.frame_ix], heard.row_unit_ix,
-        cluster[heard.frame_ix], place[heard.frame_ix],
+        received.valid, arrives_s[received.frame_ix], captured_s, outdated_s[received.frame_ix], received.row_unit_ix,
+        cluster[received.frame_ix], place[received.frame_ix],
     )  # fmt: skip
     stays = _EpisodeRows(order, bounds, not_before_s, episodes.ended_s + SAME_INSTANT_S)
     _find_first(rows, units_in_place, stays, confirm.hits, confirm.of, out)
     return out
 
 
-def capture_instants(heard: Tracks) -> Int:
+def capture_instants(received: Tracks) -> Int:
     """(F,) the capture instant each list belongs to, counted from the first; 0 for lists that never arrive.
 
     Captures of several units within half the shortest list period of the first one are one instant; two captures of
     one unit never are.
     """
-    arrives = np.isfinite(heard.common_arrives_s)  # what never arrives is no capture to the receiver
-    reach_s = shortest_period_s(heard) / 2 + SAME_INSTANT_S
+    arrives = np.isfinite(received.common_arrives_s)  # what never arrives is no capture to the receiver
+    reach_s = shortest_period_s(received) / 2 + SAME_INSTANT_S
     order = np.flatnonzero(arrives)
-    order = order[np.argsort(heard.captured_s[order], kind="stable")]
+    order = order[np.argsort(received.captured_s[order], kind="stable")]
     cluster = np.zeros(len(arrives), dtype=np.int64)
-    _cluster_captures(heard.captured_s, heard.frame_unit_ix, np.full(len(heard.units), -1), reach_s, order, cluster)
+    _cluster_captures(
+        received.captured_s, received.frame_unit_ix, np.full(len(received.units), -1), reach_s, order, cluster
+    )
     return cluster
 
 
-def shortest_period_s(heard: Tracks) -> float:
+def shortest_period_s(received: Tracks) -> float:
     """The shortest of the units' list periods in seconds, each the median between two captures; 0 without any."""
-    lists = np.flatnonzero(np.isfinite(heard.common_arrives_s))
-    lists = lists[np.lexsort((heard.captured_s[lists], heard.frame_unit_ix[lists]))]
-    unit = heard.frame_unit_ix[lists]
+    lists = np.flatnonzero(np.isfinite(received.common_arrives_s))
+    lists = lists[np.lexsort((received.captured_s[lists], received.frame_unit_ix[lists]))]
+    unit = received.frame_unit_ix[lists]
     same = unit[1:] == unit[:-1]
-    steps_s, unit_of_step = np.diff(heard.captured_s[lists])[same], unit[1:][same]
+    steps_s, unit_of_step = np.diff(received.captured_s[lists])[same], unit[1:][same]
     steps_s = steps_s[np.lexsort((steps_s, unit_of_step))]
     _, first, count = np.unique(unit_of_step, return_index=True, return_counts=True)
     medians_s = (steps_s[first + (count - 1) // 2] + steps_s[first + count // 2]) / 2
     return min(medians_s.tolist(), default=0.0)
 
 
-def _sort_by_unit(heard: Tracks) -> tuple[Int, Int]:
+def _sort_by_unit(received: Tracks) -> tuple[Int, Int]:
     """(F,) the place of each list, unit by unit in order of capture, lists that never arrive last; (F,) the unit at
     each.
     """
-    arrives = np.isfinite(heard.common_arrives_s)
-    unit = np.where(arrives, heard.frame_unit_ix, len(heard.units))  # what never arrives is no capture to the receiver
-    order = np.lexsort((heard.captured_s, unit))
+    arrives = np.isfinite(received.common_arrives_s)
+    unit = np.where(
+        arrives, received.frame_unit_ix, len(received.units)
+    )  # what never arrives is no capture to the receiver
+    order = np.lexsort((received.captured_s, unit))
     place = np.empty(len(order), dtype=np.int64)
     place[order] = np.arange(len(order))
     return place, unit[order]
 
 
-def _group_by_episode(heard: Tracks, episodes: Episodes) -> tuple[Int, Int]:
+def _group_by_episode(received: Tracks, episodes: Episodes) -> tuple[Int, Int]:
     """Rows, episode by episode, in order of arrival and then of units; where those of each episode begin, (M + 1,)."""
     # One place more than there are objects: index −1, no truth id, has no episode.
-    episode_of = np.full(int(max(episodes.object_ix.max(initial=-1), heard.object_ix.max(initial=-1))) + 2, -1)
+    episode_of = np.full(int(max(episodes.object_ix.max(initial=-1), received.object_ix.max(initial=-1))) + 2, -1)
     episode_of[episodes.object_ix] = np.arange(len(episodes.object_ix))
-    episode = episode_of[heard.row_object_ix]
-    arrives_s = heard.common_arrives_s
-    rows = np.flatnonzero((episode >= 0) & np.isfinite(arrives_s)[heard.frame_ix])
+    episode = episode_of[received.row_object_ix]
+    arrives_s = received.common_arrives_s
+    rows = np.flatnonzero((episode >= 0) & np.isfinite(arrives_s)[received.frame_ix])
     # Arrivals within a microsecond are one instant: among them the experiment's order of units decides.
     held = np.zeros(len(arrives_s), dtype=bool)
-    held[heard.frame_ix[rows]] = True
+    held[received.frame_ix[rows]] = True
     ordered = np.unique(arrives_s[held])
     instant = np.cumsum(np.diff(ordered, prepend=-np.inf) > SAME_INSTANT_S)
     place = np.zeros(len(arrives_s), dtype=np.int64)
-    place[held] = instant[np.searchsorted(ordered, arrives_s[held])] * len(heard.units) + heard.frame_unit_ix[held]
+    place[held] = (
+        instant[np.searchsorted(ordered, arrives_s[held])] * len(received.units) + received.frame_unit_ix[held]
+    )
     # Sorted as one number, as the rows are nearly in order.
-    place_of_row = episode[rows] * ((len(ordered) + 1) * len(heard.units)) + place[heard.frame_ix[rows]]
+    place_of_row = episode[rows] * ((len(ordered) + 1) * len(received.units)) + place[received.frame_ix[rows]]
     rows = rows[np.argsort(place_of_row, kind="stable")]
     return rows, np.searchsorted(episode[rows], np.arange(len(episodes.object_ix) + 1))
 
@@ -151,7 +157,7 @@ def _cluster_captures(captured_s: Float, unit_ix: Int, last_of: Int, reach_s: fl
 
 
 class _ListedRows(NamedTuple):
-    # Rows (P,) of the lists that are heard; `outdated_s`: from then on the row no longer counts.
+    # Rows (P,) of the lists that are received; `outdated_s`: from then on the row no longer counts.
     valid: Bool  # (S, P)
     arrives_s: Float
     captured_s: Float

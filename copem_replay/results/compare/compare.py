@@ -166,9 +166,9 @@ def notes_on_folders(folders: Sequence[Results]) -> Iterator[str]:
 
 def notes_on_pairs(baseline: LabelledConfiguration, pairs: Mapping[LabelledConfiguration, AllLogs]) -> Iterator[str]:
     """Notes on rows without a partner."""
-    for one, pair in pairs.items():
+    for labelled, pair in pairs.items():
         counts = np.sum(pair.alone, axis=0).tolist()
-        for (one_side, other), count in zip(((one, baseline), (baseline, one)), counts, strict=True):
+        for (one_side, other), count in zip(((labelled, baseline), (baseline, labelled)), counts, strict=True):
             if count:
                 yield f"{count_noun(count, 'row')} of {one_side.label} left out: {other.label} has no such object"
 
@@ -183,11 +183,11 @@ def notes_on_frames(table: pd.DataFrame) -> Iterator[str]:
 
 def note_on_measuring(baseline: LabelledConfiguration, others: Sequence[LabelledConfiguration]) -> Iterator[str]:
     """A note on configurations that detect by truth id while others detect by match."""
-    by_id = [one for one in (baseline, *others) if one.configuration in one.results.by_truth_id]
+    by_id = [labelled for labelled in (baseline, *others) if labelled.configuration in labelled.results.by_truth_id]
     if by_id and len(by_id) <= len(others):
         yield (
-            f"{', '.join(one.label for one in by_id)}: detected by truth id, the others by match within the gate "
-            "(`match: {always: true}` matches all alike)"
+            f"{', '.join(labelled.label for labelled in by_id)}: detected by truth id, the others by match within the "
+            "gate (`match: {always: true}` matches all alike)"
         )
 
 
@@ -386,7 +386,7 @@ def compare_folders(
     known = label_configurations(read)
     against, *others = choose_configurations(known, configurations, baseline)
     check_log_names(against, others, renames)
-    used = list(dict.fromkeys(one.results for one in (against, *others)))
+    used = list(dict.fromkeys(labelled.results for labelled in (against, *others)))
     logs, runs = [log.name for log in read[0].provenance.logs], min(folder.provenance.runs for folder in read)
     totals = ghost_totals((against, *others), logs, runs)
     own_rate = false_positives_per_min is None
@@ -401,7 +401,7 @@ def compare_folders(
         table=table,
         baseline=against.label,
         baseline_why=choose_baseline(known)[1] if baseline is None else None,
-        configurations=tuple(one.label for one in others),
+        configurations=tuple(labelled.label for labelled in others),
         horizon_s=setting.horizon_s,
         false_positives_per_min=false_positives_per_min,
         notes=(
@@ -441,11 +441,11 @@ def _settle_ghosts(
     """
     settings, reasons = {}, {}
     truth = against.configuration in against.results.truth
-    for one in others:
-        both = totals.get(one), totals.get(against)
+    for labelled in others:
+        both = totals.get(labelled), totals.get(against)
         why = explain_incomparable(*both, per_min, asked=asked, truth=truth)
         kept = None if why is not None else find_operating_points(*both, per_min)
-        reasons[one.label], settings[one] = why, replace(setting, kept=kept)
+        reasons[labelled.label], settings[labelled] = why, replace(setting, kept=kept)
     return settings, reasons
 
 
@@ -459,24 +459,27 @@ def _compare_each_log(
 
     The objects of the logs are appended to `names`.
     """
-    logs, pairs = names.logs, {one: AllLogs() for one in settings}
+    logs, pairs = names.logs, {labelled: AllLogs() for labelled in settings}
     rows: list[dict[str, object]] = []
     for k, log in enumerate(logs):
-        tables = {results: results.rows_of(log) for results in dict.fromkeys(one.results for one in (against, *pairs))}
+        tables = {
+            results: results.rows_of(log)
+            for results in dict.fromkeys(labelled.results for labelled in (against, *pairs))
+        }
         detections = (of_folder["detections.parquet"] for of_folder in tables.values())
         grid = build_grid(k, detections, names.runs, len(names.objects))
         names.objects.extend(f"{log}\n{name}" for name in grid.objects)
         second = lay_out_configuration(against, tables[against.results], grid)
-        for one, pair in pairs.items():
-            first = lay_out_configuration(one, tables[one.results], grid)
-            _check_same_episodes(one, first, against, second, log, grid)
-            _check_same_frames(one, first, against, second, log)
-            regrets = list(compute_regrets(first, second, grid, settings[one], metrics))
+        for labelled, pair in pairs.items():
+            first = lay_out_configuration(labelled, tables[labelled.results], grid)
+            _check_same_episodes(labelled, first, against, second, log, grid)
+            _check_same_frames(labelled, first, against, second, log)
+            regrets = list(compute_regrets(first, second, grid, settings[labelled], metrics))
             pair.add(first, second, regrets, more=len(logs) > 1)
             for regret in regrets if len(logs) > 1 else ():
                 values = regret.figure.values()
                 pair.differences.setdefault(regret.metric, []).append(values[2])
-                rows.append({"log": log, **_make_row(regret, values, one, against, names)})
+                rows.append({"log": log, **_make_row(regret, values, labelled, against, names)})
     return pairs, [*_overall_rows(against, pairs, names), *rows]
 
 
@@ -484,10 +487,10 @@ def _overall_rows(
     against: LabelledConfiguration, pairs: Mapping[LabelledConfiguration, AllLogs], names: ClusterNames
 ) -> Iterator[dict[str, object]]:
     """The rows of all logs. Of intervals over logs: how many logs are better, and on which the difference hangs."""
-    for one, pair in pairs.items():
+    for labelled, pair in pairs.items():
         for regret in pair.regrets():
             values = regret.figure.values()
-            row = {"log": ALL, **_make_row(regret, values, one, against, names)}
+            row = {"log": ALL, **_make_row(regret, values, labelled, against, names)}
             if row.get("interval_over") == "logs":
                 row["logs_better"] = pair.count_better(regret.metric)
                 if (decisive := find_decisive_log(regret.figure, values[2], names)) is not None:
@@ -506,7 +509,7 @@ def _settle_horizon(folders: Sequence[Results]) -> tuple[float, list[str]]:
 
 
 def _check_same_episodes(
-    one: LabelledConfiguration,
+    labelled: LabelledConfiguration,
     first: ConfigurationData,
     against: LabelledConfiguration,
     second: ConfigurationData,
@@ -514,7 +517,7 @@ def _check_same_episodes(
     grid: PairingGrid,
 ) -> None:
     """Raise InputError where an episode begins or ends at another instant, so that its rows are no pair."""
-    if one.results is against.results:
+    if labelled.results is against.results:
         return
     both = first.there & second.there
     for what in ("onset_s", "ended_s"):
@@ -523,13 +526,13 @@ def _check_same_episodes(
         if len(other):
             name = grid.episodes[other[0] // grid.runs][0]
             raise InputError(
-                f"{one.results.folder}: log {log}: object {name}: expected {what} {expected[other[0]]:g} as in "
+                f"{labelled.results.folder}: log {log}: object {name}: expected {what} {expected[other[0]]:g} as in "
                 f"{against.results.folder}, found {found[other[0]]:g}: not the same ego, recording or units"
             )
 
 
 def _check_same_frames(
-    one: LabelledConfiguration,
+    labelled: LabelledConfiguration,
     first: ConfigurationData,
     against: LabelledConfiguration,
     second: ConfigurationData,
@@ -546,8 +549,8 @@ def _check_same_frames(
         same = same and np.array_equal(getattr(found, name)[both], getattr(expected, name)[both])
     if not same:
         raise InputError(
-            f"{one.results.folder}: log {log}: {one.configuration}: expected the frames of {against.configuration} in "
-            f"{against.results.folder}, found others; {AGAIN}"
+            f"{labelled.results.folder}: log {log}: {labelled.configuration}: expected the frames of "
+            f"{against.configuration} in {against.results.folder}, found others; {AGAIN}"
         )
 
 
@@ -561,20 +564,20 @@ def _is_fixed(metric: str, *sides: LabelledConfiguration) -> bool:
 def _make_row(
     regret: Regret,
     values: tuple[float, float, float],
-    one: LabelledConfiguration,
+    labelled: LabelledConfiguration,
     against: LabelledConfiguration,
     names: ClusterNames,
 ) -> dict[str, object]:
     """The row of a regret with its `values`, of one log or all."""
     figure, over, (value, baseline_value, difference) = regret.figure, regret.over, values
-    row: dict[str, object] = {"configuration": one.label, "baseline": against.label, "metric": regret.metric}
+    row: dict[str, object] = {"configuration": labelled.label, "baseline": against.label, "metric": regret.metric}
     row |= {
         "value": _number_or_none(value),
         "baseline_value": _number_or_none(baseline_value),
         "n": int(figure.items["n"].sum()),
     }
     row["difference"] = _number_or_none(difference)
-    row |= difference_limits(figure, difference, over, names, fixed=_is_fixed(regret.metric, one, against))
+    row |= difference_limits(figure, difference, over, names, fixed=_is_fixed(regret.metric, labelled, against))
     if "only" in figure.items.columns:
         only = figure.items["only"].sum(axis=0)
         row |= {"only_configuration": int(only[0]), "only_baseline": int(only[1])}

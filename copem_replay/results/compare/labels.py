@@ -67,26 +67,27 @@ def check_log_names(
 ) -> None:
     """Raise InputError, a line for every log of another name, where random draws are compared."""
     problems: list[str] = []
-    for one in others:
-        mine, theirs = names.get(one.results, {}), names.get(against.results, {})
-        if mine == theirs or (_is_same_in_every_run(one) and _is_same_in_every_run(against)):
+    for labelled in others:
+        own_names, theirs = names.get(labelled.results, {}), names.get(against.results, {})
+        if own_names == theirs or (_is_same_in_every_run(labelled) and _is_same_in_every_run(against)):
             continue
-        for log in sorted({*mine, *theirs}):
-            found, expected = mine.get(log, log), theirs.get(log, log)
+        for log in sorted({*own_names, *theirs}):
+            found, expected = own_names.get(log, log), theirs.get(log, log)
             problem = (
-                f"{one.results.folder}: log {found}: expected the name {expected} as in {against.results.folder}, for "
-                f"what is drawn depends on it; run it again with `logs: [{{file: …, name: {expected}}}]`"
+                f"{labelled.results.folder}: log {found}: expected the name {expected} as in "
+                f"{against.results.folder}, for what is drawn depends on it; run it again with "
+                f"`logs: [{{file: …, name: {expected}}}]`"
             )
             problems += [] if found == expected or problem in problems else [problem]
     if problems:
         raise InputError(problems)
 
 
-def _is_same_in_every_run(one: LabelledConfiguration) -> bool:
-    fixed = one.results.fixed
-    if one.results.provenance.braking is not None and not fixed.passes(one.configuration):
+def _is_same_in_every_run(labelled: LabelledConfiguration) -> bool:
+    fixed = labelled.results.fixed
+    if labelled.results.provenance.braking is not None and not fixed.passes(labelled.configuration):
         return False
-    return fixed.known(one.configuration)
+    return fixed.known(labelled.configuration)
 
 
 def notes_on_differences(folders: Sequence[Results], names: Mapping[Results, Mapping[str, str]]) -> Iterator[str]:
@@ -99,9 +100,9 @@ def notes_on_differences(folders: Sequence[Results], names: Mapping[Results, Map
 
 
 def _describe_differences(first: Results, other: Results, names: Mapping[Results, Mapping[str, str]]) -> Iterator[str]:
-    mine, theirs = log_keys(first, other)
-    for key in mine:
-        log, other_log = mine[key], theirs[key]
+    own_names, theirs = log_keys(first, other)
+    for key in own_names:
+        log, other_log = own_names[key], theirs[key]
         names_of_log = [names.get(folder, {}).get(log.name, log.name) for folder in (first, other)]
         if names_of_log[0] != names_of_log[1]:
             yield f"the name of log {names_of_log[0]} ({names_of_log[1]})"
@@ -188,7 +189,7 @@ def find_ideal(data: Mapping[str, Any], name: str) -> tuple[str | None, bool]:
     settings = settings_of.get(name, {})
     own = {"units": settings.get("inputs")} if settings.get("recorded") else settings
     units, arrivals = _list_inputs(own, every)
-    ideals = {other: _list_inputs(one, every) for other, one in settings_of.items() if _is_ideal(one)}
+    ideals = {other: _list_inputs(labelled, every) for other, labelled in settings_of.items() if _is_ideal(labelled)}
     same = {other: inputs for other, inputs in ideals.items() if units and inputs[0] == units}
     alike = next((other for other, inputs in same.items() if inputs[1] == arrivals), None)
     return alike or next(iter(same), None), alike is not None
@@ -230,15 +231,15 @@ def _list_inputs(settings: Mapping[str, Any], every: Sequence[str]) -> tuple[fro
 
 def notes_on_output_baseline(baseline: LabelledConfiguration, others: Sequence[LabelledConfiguration]) -> Iterator[str]:
     """Notes on recorded outputs whose difference to the baseline is no regret."""
-    for one in others:
-        data = one.results.source.data
-        if not _settings_by_name(data).get(one.configuration, {}).get("recorded"):
+    for labelled in others:
+        data = labelled.results.source.data
+        if not _settings_by_name(data).get(labelled.configuration, {}).get("recorded"):
             continue
-        ideal, alike = find_ideal(data, one.configuration)
+        ideal, alike = find_ideal(data, labelled.configuration)
         if not alike:
-            yield f"{one.label}: no regret, for it has no `inputs`: only a difference to {baseline.label}"
+            yield f"{labelled.label}: no regret, for it has no `inputs`: only a difference to {baseline.label}"
         elif baseline.configuration != ideal:
-            yield f"{one.label}: its regret is to {ideal}, ideal fusion of its inputs (--baseline {ideal})"
+            yield f"{labelled.label}: its regret is to {ideal}, ideal fusion of its inputs (--baseline {ideal})"
 
 
 # Labels, and the configurations that are meant.
@@ -263,10 +264,12 @@ def label_configurations(folders: Sequence[Results]) -> list[LabelledConfigurati
         LabelledConfiguration(folder, name, name) for folder in folders for name in _configuration_names(folder)
     ]
     for prefix in (lambda folder: folder.name, lambda folder: str(folder.folder)):
-        times = Counter(one.label for one in labelled)
+        times = Counter(labelled.label for labelled in labelled)
         labelled = [
-            replace(one, label=f"{prefix(one.results)}:{one.configuration}") if times[one.label] > 1 else one
-            for one in labelled
+            replace(labelled, label=f"{prefix(labelled.results)}:{labelled.configuration}")
+            if times[labelled.label] > 1
+            else labelled
+            for labelled in labelled
         ]
     return labelled
 
@@ -284,7 +287,7 @@ def choose_configurations(
     `baseline`: None: that of `choose_baseline`. A name that several folders have stands for all of them; as a baseline
     it has to be one.
     """
-    labels = [one.label for one in known]
+    labels = [labelled.label for labelled in known]
     against = choose_baseline(known)[0] if baseline is None else _find_named_baseline(known, labels, baseline)
     wanted: list[LabelledConfiguration] = list(known) if configurations is None else []
     problems = []
@@ -295,7 +298,7 @@ def choose_configurations(
             problems.append(f"--configurations: {unknown_name_message('configuration', name, labels)}")
     if problems:
         raise InputError(problems)
-    others = [one for one in dict.fromkeys(wanted) if one is not against]
+    others = [labelled for labelled in dict.fromkeys(wanted) if labelled is not against]
     if not others:
         raise InputError(f"compare: expected a configuration beside the baseline {against.label}, found none")
     return against, *others
@@ -307,15 +310,17 @@ def choose_baseline(known: Sequence[LabelledConfiguration]) -> tuple[LabelledCon
     Where it holds in several folders, that of the first one.
     """
     folders: dict[Results, dict[str, LabelledConfiguration]] = {}
-    for one in known:
-        folders.setdefault(one.results, {})[one.configuration] = one
+    for labelled in known:
+        folders.setdefault(labelled.results, {})[labelled.configuration] = labelled
     found = [(find_baseline(folder.source.data, list(those)), those) for folder, those in folders.items()]
     baseline, those = min(found, key=lambda pair: pair[0].rank)
     return those[baseline.name], baseline.why
 
 
 def _find_meant(known: Sequence[LabelledConfiguration], name: str) -> list[LabelledConfiguration]:
-    return [one for one in known if one.label == name] or [one for one in known if one.is_meant_by(name)]
+    return [labelled for labelled in known if labelled.label == name] or [
+        labelled for labelled in known if labelled.is_meant_by(name)
+    ]
 
 
 def _find_named_baseline(
@@ -325,6 +330,6 @@ def _find_named_baseline(
     if len(meant) == 1:
         return meant[0]
     if meant:
-        several = ", ".join(one.label for one in meant)
+        several = ", ".join(labelled.label for labelled in meant)
         raise InputError(f"--baseline: expected one of {several}, found {meant[0].configuration}, which may be any")
     raise InputError(f"--baseline: {unknown_name_message('configuration', name, labels)}")

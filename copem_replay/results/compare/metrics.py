@@ -108,16 +108,18 @@ def ghost_totals(
     """Totals of the sides whose folders have the tables for it. Raises InputError where these are damaged."""
     totals: dict[LabelledConfiguration, GhostTotals] = {}
     for log in logs:
-        for results in dict.fromkeys(one.results for one in sides if {*_FILES} <= set(one.results.by_log)):
+        for results in dict.fromkeys(
+            labelled.results for labelled in sides if {*_FILES} <= set(labelled.results.by_log)
+        ):
             tables = results.rows_of(log, *_FILES)
-            for one in (one for one in sides if one.results is results):
-                rows, steps = configuration_rows(one, tables).values()
-                totals[one] = _add_log(one, totals.get(one), rows, steps, runs)
+            for labelled in (labelled for labelled in sides if labelled.results is results):
+                rows, steps = configuration_rows(labelled, tables).values()
+                totals[labelled] = _add_log(labelled, totals.get(labelled), rows, steps, runs)
     return totals
 
 
 def _add_log(
-    one: LabelledConfiguration, before: GhostTotals | None, rows: pa.Table, steps: pa.Table, runs: int
+    labelled: LabelledConfiguration, before: GhostTotals | None, rows: pa.Table, steps: pa.Table, runs: int
 ) -> GhostTotals:
     """The totals of the earlier logs and of one more, in the first `runs` runs."""
     lengths, existence = list_column(rows["existence"])
@@ -129,8 +131,8 @@ def _add_log(
     size = len(lengths), len(thresholds)
     if not consistent or (existence.reshape(size) != thresholds).any() or (np.diff(thresholds) <= 0).any():
         raise InputError(
-            f"{one.results.folder / _FILES[0]}: expected the same ascending existence and as many ghosts_at in all "
-            f"rows, found others; {AGAIN}"
+            f"{labelled.results.folder / _FILES[0]}: expected the same ascending existence and as many ghosts_at in "
+            f"all rows, found others; {AGAIN}"
         )
     compared = integer_column(rows["run"], missing=runs) < runs
     minutes = float(float_column(rows["minutes"])[compared].sum())
@@ -281,9 +283,12 @@ class Regret:
     @staticmethod
     def joined(of_logs: Sequence[Regret]) -> Regret:
         """The same metric over several logs."""
-        figures, counts = [one.figure for one in of_logs], [one.held for one in of_logs if one.held is not None]
+        figures, counts = (
+            [labelled.figure for labelled in of_logs],
+            [labelled.held for labelled in of_logs if labelled.held is not None],
+        )
         held = reduce(HeldCounts.__add__, counts) if counts else None
-        objects = tuple(number for one in of_logs for number in one.objects)
+        objects = tuple(number for labelled in of_logs for number in labelled.objects)
         return replace(of_logs[0], figure=type(figures[0]).joined(figures), held=held, objects=objects)
 
 

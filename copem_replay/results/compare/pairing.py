@@ -186,22 +186,24 @@ class ConfigurationData:
     steps: StepData | None
 
 
-def configuration_rows(one: LabelledConfiguration, tables: dict[str, pa.Table]) -> dict[str, pa.Table]:
+def configuration_rows(labelled: LabelledConfiguration, tables: dict[str, pa.Table]) -> dict[str, pa.Table]:
     """The rows of a configuration, by table."""
     import pyarrow.compute as pc
 
-    return {name: table.filter(pc.equal(table["configuration"], one.configuration)) for name, table in tables.items()}
+    return {
+        name: table.filter(pc.equal(table["configuration"], labelled.configuration)) for name, table in tables.items()
+    }
 
 
 def lay_out_configuration(
-    one: LabelledConfiguration, tables: dict[str, pa.Table], grid: PairingGrid
+    labelled: LabelledConfiguration, tables: dict[str, pa.Table], grid: PairingGrid
 ) -> ConfigurationData:
     """A configuration's rows of a log on the grid. Raises InputError where tables are damaged or contradictory."""
-    results, rows_of = one.results, configuration_rows(one, tables)
+    results, rows_of = labelled.results, configuration_rows(labelled, tables)
     rows = rows_of["detections.parquet"]
     cell = grid.cells(rows)
     place = results.folder / "detections.parquet"
-    _check_once(place, cell, one.configuration)
+    _check_once(place, cell, labelled.configuration)
     detected = flag_column(rows["detected"])
     for name, needed in (("onset_s", True), ("ended_s", True), ("detection_s", detected)):
         if (np.isnan(float_column(rows[name])) & needed).any():
@@ -209,7 +211,7 @@ def lay_out_configuration(
     braking, began = results.provenance.braking is not None, rows.select([*COUNTS_BY]).to_pandas()
     size = len(grid.episodes) * grid.runs
     return ConfigurationData(
-        label=one.label,
+        label=labelled.label,
         path=results.folder,
         there=_lay_out(np.ones(len(cell), dtype=bool), cell, size),
         counted=_lay_out(is_counted(began, results.provenance.measure["began"]), cell, size),
@@ -222,7 +224,7 @@ def lay_out_configuration(
         conflict=_lay_out(flag_column(rows["conflict"]), cell, size) if braking else None,
         passes=_lay_out(flag_column(rows["braking_pass"]), cell, size) if braking else None,
         accuracy=_accuracy_data(results.folder, rows_of, cell, grid),
-        ghosts=_false_positive_data(results.folder / "lists.parquet", rows_of, grid, one.configuration),
+        ghosts=_false_positive_data(results.folder / "lists.parquet", rows_of, grid, labelled.configuration),
         steps=_step_data(rows_of, grid),
     )
 
