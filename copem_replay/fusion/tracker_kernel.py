@@ -391,7 +391,7 @@ def _replay_memory(
     unit_lists: HeardLists,
     rules: TrackerRules,
 ) -> tuple[TrackerMemory, list[TrackerMemory], Int]:
-    """The memory as if the lists `arriving` had been received at their captures, those before each list, and these lists.
+    """The memory as if the lists `arriving` had been received at their captures, those before each, and these lists.
 
     Goes back to the memory `before` the first list that was captured no earlier than the oldest `arriving`, and hears
     all lists from there on again.

@@ -195,7 +195,7 @@ class TestWhatIsSaid:
         said = [found.captured_s, found.arrives_s[0], found.x_m[0]]
         np.testing.assert_allclose(said, [[0.5, 0.9, 0.7], [0.7, 1.1, 1.3], [30.0, 33.0, 31.0]])
         union = told(path)["union"]
-        assert union.at.newest[:, 0].tolist() == [0, 1, 1]
+        assert union.instants.newest[:, 0].tolist() == [0, 1, 1]
         assert [union.lists.of(0, k)["x_m"].tolist() for k in range(3)] == [[30.0], [33.0], [33.0]]
 
     @pytest.mark.parametrize(("vx", "jitter_m", "said"), [(-8.0, 0.0, True), (8.0, 0.0, False), (-8.0, 0.05, False)])

@@ -58,7 +58,7 @@ def standing_child(until_s: float = 20.0) -> Recording:
 def claims(plan: Experiment, recording: Recording, runs: int) -> tuple[list[DrawnClaims], Replay]:
     """By run what a unit says of a child in each of its lists."""
     replay = prepare_log(recording, plan)
-    found = replay.world(plan).found
+    found = replay.world(plan).observations
     by_run = [
         draw_claims(found, replay.expanded, make_draws(replay.scene, found, replay.expanded, np.array([k])))
         for k in range(runs)

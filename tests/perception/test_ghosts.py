@@ -57,7 +57,7 @@ def found(plan: Experiment, recording: Recording, runs: int) -> list[GhostRows]:
 
 def counts(rows: GhostRows, unit: int = 0) -> Any:
     """(F,) how many ghosts there are in each list of a unit."""
-    tracks = rows.found.tracks
+    tracks = rows.observations.tracks
     of = np.bincount(tracks.frame_ix, minlength=len(tracks.stamp_ns))
     return of[tracks.frame_unit_ix == unit]
 
@@ -78,7 +78,7 @@ class TestCounts:
         assert_poisson(every, 0.8)
         # A life in which there is a list goes on from there as if it began anew: P(more than k lists, given one) is
         # e^(-k T / τ). Those at the ends of the log are cut.
-        lists = np.concatenate([np.diff(rows.found.tracks.start) for rows in made])
+        lists = np.concatenate([np.diff(rows.observations.tracks.start) for rows in made])
         n = np.arange(0, round(2 * rate_hz))
         expected = np.exp(-n / rate_hz / 0.7)
         assert len(lists) > 1000
@@ -90,14 +90,18 @@ class TestCounts:
             for rate in (5.0, 50.0)
         )
         assert (counts(fast)[::10] == counts(slow)).all()
-        both = np.isin(fast.found.tracks.stamp_ns[fast.found.tracks.frame_ix], slow.found.tracks.stamp_ns)
-        assert np.sort(fast.found.tracks.x_m[0, both]).tolist() == np.sort(slow.found.tracks.x_m[0]).tolist()
+        both = np.isin(
+            fast.observations.tracks.stamp_ns[fast.observations.tracks.frame_ix], slow.observations.tracks.stamp_ns
+        )
+        assert (
+            np.sort(fast.observations.tracks.x_m[0, both]).tolist() == np.sort(slow.observations.tracks.x_m[0]).tolist()
+        )
 
     def test_others_in_every_list(self) -> None:
         made = found(plan_of({"in_list": 1.5, "lasts_s": 0, "where": FIELD}), scene_of(), 4)
         assert_poisson(np.concatenate([counts(rows) for rows in made]), 1.5)
-        assert all((np.diff(rows.found.tracks.start) == 1).all() for rows in made)
-        assert len(np.unique(made[0].found.tracks.x_m)) == made[0].found.tracks.x_m.size
+        assert all((np.diff(rows.observations.tracks.start) == 1).all() for rows in made)
+        assert len(np.unique(made[0].observations.tracks.x_m)) == made[0].observations.tracks.x_m.size
 
     def test_units_have_each_their_own(self) -> None:
         mast = {"at": [0.0, 0.0], "height_m": 5.0, "pem": "eyes"}
@@ -115,7 +119,7 @@ class TestCounts:
 class TestPlaces:
     def test_a_field_has_equally_many_by_area(self) -> None:
         view = np.concatenate([
-            np.stack([rows.found.view.range_m, rows.found.view.azimuth_rad])
+            np.stack([rows.observations.view.range_m, rows.observations.view.azimuth_rad])
             for rows in found(plan_of({"in_list": 2, "lasts_s": 0, "where": FIELD}), scene_of(until_s=30), 4)
         ], axis=1)  # fmt: skip
         range_m, azimuth_rad = view
@@ -127,16 +131,16 @@ class TestPlaces:
         recording = scenes.recording([Thing("ego", "car", driving(0, 0, 10))], until_s=10.0)
         plan = plan_of({"in_list": 1.0, "lasts_s": 5.0, "where": FIELD}, units={"ego": ego})
         [rows] = found(plan, recording, 1)
-        tracks = rows.found.tracks
+        tracks = rows.observations.tracks
         first = tracks.start[np.argmax(np.diff(tracks.start))]
         assert tracks.x_m[0, first + 5] - tracks.x_m[0, first] == pytest.approx(5.0)
-        assert rows.found.view.range_m[first + 5] == pytest.approx(rows.found.view.range_m[first])
+        assert rows.observations.view.range_m[first + 5] == pytest.approx(rows.observations.view.range_m[first])
 
     def test_places_of_the_world(self) -> None:
         where = {"kind": "places", "at_m": [[12, 3], [-4, 7]], "spread_m": 0.5}
         made = found(plan_of({"in_list": 2, "lasts_s": 0, "where": where}), scene_of(until_s=30), 4)
-        x_m = np.concatenate([rows.found.tracks.x_m[0] for rows in made])
-        y_m = np.concatenate([rows.found.tracks.y_m[0] for rows in made])
+        x_m = np.concatenate([rows.observations.tracks.x_m[0] for rows in made])
+        y_m = np.concatenate([rows.observations.tracks.y_m[0] for rows in made])
         east = x_m > 4
         assert east.mean() == pytest.approx(0.5, abs=0.04)
         assert stats.kstest((x_m[east] - 12) / 0.5, "norm").pvalue > 1e-3
@@ -153,7 +157,7 @@ class TestPlaces:
         assert near.mean() == pytest.approx(0.5, abs=4 * math.sqrt(0.5 / (60 * 8)))
         assert not any(counts(rows)[51:].any() for rows in made)
         for rows in made:
-            tracks = rows.found.tracks
+            tracks = rows.observations.tracks
             off_m = tracks.x_m[0] - (10 + 10 * tracks.row_captured_s)
             assert (np.abs(off_m) <= 4 + 3 + 1e-9).all()
             assert (np.abs(tracks.y_m[0]) <= 1.25 + 3 + 1e-9).all()
@@ -168,7 +172,7 @@ class TestPlaces:
         trucks = [Thing(f"truck{x_m:.0f}", "truck", standing(x_m + 30, 0)) for x_m in (0.0, 200.0)]
         plan = plan_of({"in_list": 1, "lasts_s": 0.3, "where": where}, units=masts)
         for rows in found(plan, scene_of(*trucks, until_s=5), 4):
-            tracks = rows.found.tracks
+            tracks = rows.observations.tracks
             of_unit = tracks.row_unit_ix
             assert set(of_unit) == {0, 1}
             assert (np.abs(tracks.x_m[0] - (30 + 200 * of_unit)) <= 4 + 3 + 1e-9).all()
@@ -178,18 +182,18 @@ class TestPlaces:
         where = {"kind": "beside", "classes": ["truck"], "within_m": 3}
         sort = {"in_list": 2, "where": where, "classes": {"car": 1.0}}
         [rows] = found(plan_of(sort), scene_of(Thing("truck", "truck", standing(30, 0)), until_s=3), 1)
-        assert rows.found.tracks.z_m.size > 10
-        assert rows.found.tracks.z_m[0] == pytest.approx(rows.found.tracks.height_m[0] / 2)
-        assert set(rows.found.tracks.height_m[0]) == {1.6}
+        assert rows.observations.tracks.z_m.size > 10
+        assert rows.observations.tracks.z_m[0] == pytest.approx(rows.observations.tracks.height_m[0] / 2)
+        assert set(rows.observations.tracks.height_m[0]) == {1.6}
 
     def test_classes_have_their_sizes(self) -> None:
         shares = {"pedestrian": 0.7, "car": 0.3}
         made = found(plan_of({"in_list": 2, "where": FIELD, "classes": shares}), scene_of(until_s=30), 4)
-        class_ix = np.concatenate([rows.found.view.class_ix for rows in made])
+        class_ix = np.concatenate([rows.observations.view.class_ix for rows in made])
         assert (class_ix == CLASSES.index("pedestrian")).mean() == pytest.approx(0.7, abs=0.04)
         assert set(class_ix) == {CLASSES.index(name) for name in shares}
-        tracks = made[0].found.tracks
-        of_cars = made[0].found.view.class_ix == CLASSES.index("car")
+        tracks = made[0].observations.tracks
+        of_cars = made[0].observations.view.class_ix == CLASSES.index("car")
         assert (tracks.length_m[0, of_cars] == 4.5).all()
         assert np.allclose(tracks.z_m[0], tracks.height_m[0] / 2)  # on the ground
 
@@ -260,7 +264,7 @@ class TestEachBirthIsAnother:
     def claimed(rows: GhostRows, run_number: int) -> DrawnClaims:
         replay = prepare_log(TestEachBirthIsAnother.RECORDING, TestEachBirthIsAnother.PLAN)
         drawn = make_ghost_draws(replay.scene, rows, replay.expanded, run_number)
-        return draw_claims(rows.found, replay.expanded, drawn, rows.sort)
+        return draw_claims(rows.observations, replay.expanded, drawn, rows.sort)
 
     def test_equal_sorts_that_last_share_no_address(self) -> None:
         """Else what lasts of one of them would be that of another."""
@@ -280,7 +284,7 @@ class TestEachBirthIsAnother:
         for rows, one in zip(made, of_runs, strict=True):
             # Of one run the words differ in each unit: two units draw by the same words, but not the same numbers.
             for unit in (0, 1):
-                words = rows.words[rows.found.tracks.row_unit_ix == unit]
+                words = rows.words[rows.observations.tracks.row_unit_ix == unit]
                 assert len(np.unique(words)) == len(words)
             assert len(np.unique(one.existence)) > 0.99 * len(one.existence)
             assert one.existence.mean() == pytest.approx(2 / 6, abs=0.02)
@@ -313,9 +317,9 @@ def test_errors_of_the_couple_that_applies() -> None:
     replay = prepare_log(scene_of(until_s=30), plan)
     [rows] = found(plan, scene_of(until_s=30), 1)
     drawn = make_ghost_draws(replay.scene, rows, replay.expanded, 0)
-    listed = add_states(replay.scene, rows.found.tracks, rows.found, replay.expanded, drawn)
-    off_m: Float = listed.x_m[0] - rows.found.tracks.x_m[0]
-    near = rows.found.view.range_m < 30
+    listed = add_states(replay.scene, rows.observations.tracks, rows.observations, replay.expanded, drawn)
+    off_m: Float = listed.x_m[0] - rows.observations.tracks.x_m[0]
+    near = rows.observations.view.range_m < 30
     assert off_m[near].std() == pytest.approx(1.0, rel=0.15)
     assert off_m[~near].std() == pytest.approx(3.0, rel=0.1)
     assert listed.cov_ee_m2 is not None

@@ -121,7 +121,7 @@ def test_a_detection_model_that_fails_is_named(kind: str, said: str) -> None:
     with pytest.raises(
         InputError, match=rf"^pems\.sure\[0\]\.detection: tests.perception.test_own_models:{kind}: .*{said}"
     ):
-        prepare_log(scenes.oncoming_car(), plan({"kind": f"tests.perception.test_own_models:{kind}"})).found(WHOLE)
+        prepare_log(scenes.oncoming_car(), plan({"kind": f"tests.perception.test_own_models:{kind}"})).observe(WHOLE)
 
 
 def test_an_error_model_that_fails_is_named() -> None:

@@ -43,7 +43,7 @@ def ready(recording: Recording, plan: Experiment) -> Replay:
 def down(plan: Experiment, recording: Recording, runs: int) -> Bool:
     """(S, F) lists of the one unit that are not made."""
     replay = ready(recording, plan)
-    tracks = replay.lists_only(plan).found.tracks
+    tracks = replay.lists_only(plan).observations.tracks
     found = lists_not_made(replay.scene, tracks, replay.expanded, np.arange(runs))
     assert found is not None
     return found

@@ -237,7 +237,7 @@ class TestBackToTracks:
         replay = prepare_log(crowd(), plan)
         roles: Counter[int] = Counter()
         for name, told in run_receivers(replay.world(plan), np.arange(3), None):
-            issue_s, newest = told.at.issue_s, told.at.newest
+            issue_s, newest = told.instants.issue_s, told.instants.newest
             matches = match_entries(told.lists, replay.truth_cache.at(issue_s), replay.scene, gate_m=3.0)
             for s in range(3):
                 fused_tracks = convert_to_tracks(told.lists, s, matches, told.received, issue_s, newest)
@@ -262,8 +262,10 @@ class TestBackToTracks:
         plan = experiment(pems=pem([[1, 0], [0, 1]]), units=TWO_UNITS, configurations=self.configurations())
         replay = prepare_log(crowd(), plan)
         for name, told in run_receivers(replay.world(plan), np.arange(1), None):
-            matches = match_entries(told.lists, replay.truth_cache.at(told.at.issue_s), replay.scene, gate_m=1e-6)
-            fused_tracks = convert_to_tracks(told.lists, 0, matches, told.received, told.at.issue_s, told.at.newest)
+            matches = match_entries(told.lists, replay.truth_cache.at(told.instants.issue_s), replay.scene, gate_m=1e-6)
+            fused_tracks = convert_to_tracks(
+                told.lists, 0, matches, told.received, told.instants.issue_s, told.instants.newest
+            )
             assert set(fused_tracks.fused.object_ix) == {-1}
             ids = entries_in(told.lists, 0)["track_id"]
             assert len(fused_tracks.fused.object_ix) == (len(set(ids)) if name == "tracker" else len(ids))
@@ -293,7 +295,7 @@ def test_a_belief_of_a_run_without_entries_is_empty() -> None:
     plan = experiment(pems=pem(probability=0.0), configurations=union, units=TWO_UNITS)
     replay = prepare_log(crowd(), plan)
     ((_, told),) = run_receivers(replay.world(plan), np.arange(1), None)
-    matches = match_entries(told.lists, replay.truth_cache.at(told.at.issue_s), replay.scene, gate_m=3.0)
-    fused_tracks = convert_to_tracks(told.lists, 0, matches, told.received, told.at.issue_s, told.at.newest)
+    matches = match_entries(told.lists, replay.truth_cache.at(told.instants.issue_s), replay.scene, gate_m=3.0)
+    fused_tracks = convert_to_tracks(told.lists, 0, matches, told.received, told.instants.issue_s, told.instants.newest)
     assert (len(fused_tracks.fused.frame_ix), len(fused_tracks.fused.object_ix)) == (0, 0)
     assert len(fused_tracks.fused.stamp_ns) == 11, "its lists are there, and empty"

@@ -198,7 +198,7 @@ def test_false_positives_are_in_the_air_too() -> None:
     found = draw_shown_ghosts(replay.world(slow), runs)
     assert found is not None
     received = heard_by(slow, "gnn", one=3)
-    g = np.bincount(found.found.tracks.frame_ix, minlength=len(received.stamp_ns))
+    g = np.bincount(found.observations.tracks.frame_ix, minlength=len(received.stamp_ns))
     assert len(np.unique(g)) > 3
     np.testing.assert_allclose(received.common_arrives_s - received.captured_s, 8 * (121 + 35 * g) / 100_000, atol=1e-9)
 
