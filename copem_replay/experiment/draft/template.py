@@ -64,7 +64,7 @@ def format_draft(*surveys: RecordingSurvey) -> str:
         *_draft_head(drives),
         "version: 1",
         *(_draft_only_log(drives[0]) if len(drives) == 1 else _draft_logs(drives, first, recorded)),
-        "runs: 20   # each with its own draws, the same in all configurations; more narrow what is drawn, not what other drives would say",
+        "runs: 20   # each with its own draws, the same in all configurations; more say nothing of other drives",
         "seed: 1",
         "",
         "# Perception error models: is an object in a unit's list, and how far off? The first couple whose `when`",
