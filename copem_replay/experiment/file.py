@@ -131,7 +131,7 @@ def _variance_hint(sigma_m: object) -> str:
 LIST_EXAMPLES = {
     "at": "[0, 0]",
     "at_m": "[[12, 3]]",
-    "classes": "[pedestrian]",
+    "classes": "[vru]",
     "covariance_m2": "[[0.4, 0.0], [0.0, 0.4]]",
     "ids": "[7, 12]",
     "inputs": "[car, rsu]",

@@ -413,7 +413,7 @@ CASES = [
     (WHEN, "azimuth_deg: [-400, 60]", f".azimuth_deg: {A_TURN}, found -400 (through 0: [350, 10])"),
     (WHEN, "azimuth_deg: [0, 360.5]", f".azimuth_deg: {A_TURN}, found 360.5 (through 0: [350, 10])"),
     (WHEN, "range_m: 80", ".range_m: expected a list, found 80; such as `range_m: [0, 80]`"),
-    (WHEN, "classes: car", ".classes: expected a list, found 'car'; such as `classes: [pedestrian]`"),
+    (WHEN, "classes: car", ".classes: expected a list, found 'car'; such as `classes: [vru]`"),
     (WHEN, "classes: []", ".classes: expected at least 1 in the list, found []"),
     (WHEN, "classes: [car, cow]", f".classes[1]: expected one of {CLASSES}; found 'cow'"),
     (WHEN, "visible_share: [0, 2]", ".visible_share[1]: expected at most 1, found 2"),

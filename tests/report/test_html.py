@@ -101,6 +101,17 @@ def lines_of(folder: Path) -> list[str]:
     return Page(build_page(load_study(folder))).lines()
 
 
+def test_what_does_not_count_is_said(tmp_path: Path) -> None:
+    """2 is within 31 m from the start, 3 comes within them after 2.3 s."""
+    near = ("onset: {kind: at, time_s: 0.5}", "onset: {kind: in_range, range_m: 31}")
+    page = Page(build_page(load_study(replayed(tmp_path, changed(near)))))
+    said = "1 measured object, 6 runs, so 6 rows for each configuration; common random numbers per run (seed 1). "
+    said += (
+        "Beside them 1 episode does not count: what counts began crossed or appeared, and has a frame after its onset."
+    )
+    assert said in page.words
+
+
 class TestNumbers:
     def test_the_summary_has_the_numbers_of_the_file(self, read: Page, made: Path) -> None:
         rows = summary_rows(made)

@@ -10,6 +10,7 @@ from copem_replay.core.errors import count_noun
 from copem_replay.core.tracks import TRUTH
 from copem_replay.experiment.schema import Configuration, Experiment, Unit
 from copem_replay.io.window import describe_window
+from copem_replay.metrics.summary import DETECTED
 from copem_replay.perception.pem.model import Pem
 from copem_replay.report.html.markup import Html, allow_breaks, fold_parts, join_html, make_list, make_table, make_tag
 from copem_replay.report.html.tables import row_head
@@ -183,12 +184,19 @@ def describe_setting(study: ReportData) -> str:
     things = results.known.groupby(["log", "object_id"]).ngroups
     episodes = results.known.groupby(["log", "object_id", "episode"]).ngroups
     times = f" with {count_noun(episodes, 'episode')}" if episodes > things else ""
+    tally = results.tally[results.tally["event"] == DETECTED]
+    left = tally.groupby(["log", "object_id", "episode"]).ngroups - episodes
+    others = (
+        f" Beside them {count_noun(left, 'episode')} {'does' if left == 1 else 'do'} not count: what counts began "
+        f"{' or '.join(experiment.measure.began)}, and has a frame after its onset."
+    )
     rows = int(results.known["runs"].sum()) // len(study.names)
     confirm = experiment.measure.confirm
     hits = f" An object is known when {confirm.hits} of {confirm.of} captures hold it." if confirm.hits > 1 else ""
     return (
         f"{count_noun(things, 'measured object')}{times}, {count_noun(experiment.runs, 'run')}, so "
-        f"{count_noun(rows, 'row')} for each configuration; common random numbers per run (seed {experiment.seed}). "
+        f"{count_noun(rows, 'row')} for each configuration; common random numbers per run (seed {experiment.seed})."
+        f"{others if left else ''} "
         f"The clock of an object starts {_describe_onset(experiment)}.{hits}{describe_unit_errors(experiment)}"
     )
 
