@@ -52,7 +52,7 @@ ALONE = {
             "  mast: {at: [3.0, 4.0], height_m: 2.0, pem: onboard}",
             "ego: 2",
             "window_s: [0, 2]",
-            "measure: {objects: {ids: [1]}, onset: {kind: appears}}",
+            "measure: {objects: {ids: [1]}, onset: {kind: appears}, began: [log_start]}",
             "obstacles: [{polygon_m: [[20, -1], [22, -1], [22, 1]], height_m: 9}]",
         ],
     ),
