@@ -243,7 +243,7 @@ def test_the_files_of_accuracy_say_the_same_as_rows_and_summary(two_logs: list[P
 
 def made_up(times: list[float | None]) -> ExperimentResult:
     """A result of one log with these times to detection, run by run; the horizon is 9 s."""
-    of = {"log": "scene", "configuration": "PEM", "object_id": "a", "began": "crossed"}
+    of = {"log": "scene", "configuration": "PEM", "object_id": "a", "began": "crossed", "onset_s": 0.0, "ended_s": 10.0}
     table = pd.DataFrame({**of, "run": range(len(times)), "time_to_detection_s": times})
     return ExperimentResult(
         of_one_log(table), pd.DataFrame(), (), (prepare_log(scenes.oncoming_car(), experiment()),), 9.0
@@ -288,6 +288,8 @@ def test_several_runs_are_shown_each_as_it_was_asked_for() -> None:
             "object_id": one,
             "run": k,
             "began": "crossed",
+            "onset_s": 0.0,
+            "ended_s": 10.0,
             "time_to_detection_s": of_run[n],
         }
         for k, of_run in enumerate(times)
@@ -357,7 +359,7 @@ def test_blocks_bound_what_is_held_at_once(monkeypatch: pytest.MonkeyPatch) -> N
         measure = {"onset": {"kind": "appears"}, "objects": {"ids": ["a"]}, "accuracy": accuracy}
         many = experiment(runs=100, measure=measure, pems={"sure": NOISY})
         ready = prepare_log(log, many)
-        candidates = ready.found(WHOLE) if accuracy else ready.measured
+        candidates = ready.observe(WHOLE) if accuracy else ready.measured
         rows = len(candidates.tracks.frame_ix)
         assert rows == (62 if accuracy else 31)
         whole = run_experiment(many, [log])
