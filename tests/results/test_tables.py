@@ -248,8 +248,8 @@ def test_what_the_table_shows_is_said_below(tmp_path):
         "detected_share: exact binomial limits where the difference is the same in every cluster",
         "(all alike): the difference is the same in every cluster, or a median in nearly all, so how it varies is "
         "not known",
-        "ttd_rmst_s: mean of min(time to detection, 10 s), never detected counting as 10 s; objects still there at the "
-        "end are censored",
+        "ttd_rmst_s: mean of min(time to detection, 10 s), never detected counting as 10 s; an object still undetected "
+        "when the log or the ego ends counts as those that are followed longer",
     ]
 
 
@@ -273,7 +273,7 @@ def test_over_logs_it_is_said_in_how_many_a_configuration_gains(tmp_path):
     lines = comparison_text(comparison).splitlines()
     # 1.5 ± 3.182446 · √(.166667/4).
     assert lines[1].split(maxsplit=1)[1] == "-1.5 [-2.15, -0.85] *"
-    assert lines[3:6] == [
+    assert lines[4:7] == [
         "[95 %]: over 4 logs: how far other drives of this kind may differ",
         "logs that gain: ttd_rmst_s fast 4 of 4",
         "whatever the interval, a kind of drive that makes up to 53 % of such traffic can be absent",  # 1 − .05^(1/4)
