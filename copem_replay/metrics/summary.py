@@ -284,8 +284,6 @@ def _split_by_configuration(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
 # Tables as plain text, nothing cut off: whole in a pipe, in blocks that fit the width of a terminal.
 
 _GAP = "  "
-RARE = ("left_undetected_share", "open_share")
-"""Columns that the table has only where one is above 0."""
 SETUP = ("n", "list_rate_hz", "n_conflict")
 """Columns of the set-up, not of results: written once, below the table, where all configurations are alike."""
 
@@ -299,6 +297,11 @@ def describe_mean(horizon_s: float, *, censored: bool) -> str:
     return f"{words}; an object still undetected when the log or the ego ends counts as those that are followed longer"
 
 
+def has_undetected(summary: pd.DataFrame) -> bool:
+    """Whether any row of any configuration was never detected."""
+    return bool((summary[["left_undetected_share", "open_share"]] > 0).any(axis=None))
+
+
 def format_summary(summary: pd.DataFrame, width: int | None = None) -> str:
     """The summary for a terminal: detections, then conflicts, braking, recorded outputs and own metrics.
 
@@ -310,6 +313,11 @@ def format_summary(summary: pd.DataFrame, width: int | None = None) -> str:
     if len(horizon):
         lines.append(
             f"ttd_rmst_s: {describe_mean(float(horizon.iloc[0]), censored=bool((summary['open_share'] > 0).any()))}"
+        )
+    if has_undetected(summary):
+        lines += ["", *_part_lines(summary, "undetected", width)]
+        lines.append(
+            "left_undetected_share: the object left; open_share: still undetected when the log or the ego ended"
         )
     if "conflict_detected_share" in summary:
         lines += ["", *_part_lines(summary, "conflict", width)]
@@ -330,7 +338,6 @@ def format_summary(summary: pd.DataFrame, width: int | None = None) -> str:
 def _part_lines(summary: pd.DataFrame, part: str, width: int | None, share: str = "") -> list[str]:
     """The columns of a part, the limits of its share beside it; below them the set-up that all have alike."""
     names = ["configuration", *(metric.name for metric in METRICS if metric.part == part and metric.name in summary)]
-    names = [name for name in names if name not in RARE or (summary[name] > 0).any()]
     alike = {name: format_cell(summary[name].iloc[0]) for name in names if name in SETUP and _is_alike(summary[name])}
     names = [name for name in names if name not in alike]
     if share:

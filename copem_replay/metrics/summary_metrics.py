@@ -313,9 +313,9 @@ _DETECTION_METRICS = (
            "mean seconds from the onset to the detection or the end of the episode; needs no horizon", "summary",
            "mean seconds unknown, to the detection or the end of the episode"),
     Metric("left_undetected_share", measure_unknown, lambda of: of.left_share, -1,
-           "share of the rows whose object left undetected: never detected", "summary"),
+           "share of the rows whose object left undetected: never detected", "undetected"),
     Metric("open_share", measure_unknown, lambda of: of.open_share, 0,
-           "share of the rows still undetected when the log or the ego ended: censored", "summary"),
+           "share of the rows still undetected when the log or the ego ended: censored", "undetected"),
     Metric("dad_median_m", summarise_detections, lambda of: of.distance_quantile_m(0.5), 1, _DISTANCE, "summary",
            "median of the differences of distances at detection"),
     Metric("dad_p5_m", summarise_detections, lambda of: of.distance_quantile_m(0.05), 1,
@@ -390,6 +390,7 @@ METRIC: dict[str, Metric] = {metric.name: metric for metric in METRICS}
 
 PARTS = {
     "summary": "When, and how far away",
+    "undetected": "What became of those never detected",
     "braking": "Braking in time",
     "conflict": "When a collision was foreseen",
     "accuracy": "How far off",

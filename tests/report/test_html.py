@@ -116,7 +116,7 @@ class TestNumbers:
     def test_the_summary_has_the_numbers_of_the_file(self, read: Page, made: Path) -> None:
         rows = summary_rows(made)
         checked = 0
-        for id_ in ("summary", "braking", "accuracy", "lists"):
+        for id_ in ("summary", "undetected", "braking", "accuracy", "lists"):
             assert list(read.tables[id_]) == list(NAMES)
             for name, cells in read.tables[id_].items():
                 for column, cell in cells.items():
@@ -125,7 +125,7 @@ class TestNumbers:
                         assert (cell.low or "") == rows[name][f"{column}_low"]
                         assert (cell.high or "") == rows[name][f"{column}_high"]
                     checked += 1
-        assert checked == len(NAMES) * (9 + 1 + 11)
+        assert checked == len(NAMES) * (7 + 2 + 1 + 11)
 
     def test_cells_have_three_digits_and_shares_are_in_per_cent(self, read: Page, made: Path) -> None:
         rows = summary_rows(made)
@@ -141,7 +141,7 @@ class TestNumbers:
             return format(short.normalize(), "f").replace("-", "−") if short else "0"
 
         seen = 0
-        for id_ in ("summary", "braking", "accuracy", "lists"):
+        for id_ in ("summary", "undetected", "braking", "accuracy", "lists"):
             for name, cells in read.tables[id_].items():
                 for column, cell in cells.items():
                     expected = plainly(column, rows[name][column])
@@ -162,8 +162,7 @@ class TestNumbers:
     def test_times_come_first_and_headers_have_units(self, read: Page) -> None:
         assert read.rows["summary"][0] == [
             "configuration", "mean time to detection, s", "median time to detection, s", "95 % detected by, s",
-            "detected, %", "mean time unknown, s", "left undetected, %", "undetected at the end, %",
-            "median distance at detection, m", "95 % detected beyond, m",
+            "detected, %", "mean time unknown, s", "median distance at detection, m", "95 % detected beyond, m",
         ]  # fmt: skip
         assert read.rows["regret"][0][1:3] == ["mean time to detection, s", "detected, percentage points"]
         assert read.rows["regret-lists"][0][1:] == [
@@ -208,7 +207,7 @@ class TestNumbers:
                     assert bold == sure, (name, column)
 
     def test_every_column_shown_is_explained(self, read: Page) -> None:
-        tables = ("summary", "braking", "accuracy", "lists", "regret", "regret-lists")
+        tables = ("summary", "undetected", "braking", "accuracy", "lists", "regret", "regret-lists")
         shown = {name for id_ in tables for name in read.rows[id_][0][1:]}
         terms = re.findall(r"<dt>([^<]*?)</dt><dd>(.+?) <code>(\w+)</code></dd>", read.html)
         assert shown == {name for name, _, _ in terms}

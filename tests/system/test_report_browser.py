@@ -86,7 +86,7 @@ def test_the_summary_has_the_numbers_of_the_file(opened: Browser, folder: Path) 
         rows = list(csv.DictReader(file))
     assert [name for name, _ in shown] == [row["configuration"] for row in rows] == NAMES
     for (_, cells), row in zip(shown, rows, strict=True):
-        assert len(cells) == 6
+        assert len(cells) == 7
         assert cells == {name: row[name] for name in cells}
 
 

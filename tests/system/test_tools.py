@@ -55,7 +55,7 @@ def test_bench_of_fitting_finds_what_it_put_in(monkeypatch: pytest.MonkeyPatch) 
     """60 of its drives: all rungs, and the share .6 of what lasts."""
     monkeypatch.setattr(fit, "PASSES", 60)
     fitted, checked = fit.fit()
-    assert (fitted["rows"], fitted["rungs"], checked["runs"]) == (6000, 4, 500)
+    assert (fitted["rows"], fitted["rungs"], checked["runs"]) == (6000, 6, 500)
     assert fitted["share"] == pytest.approx(0.6, abs=0.1)
 
 

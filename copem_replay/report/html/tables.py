@@ -16,7 +16,7 @@ import pandas as pd
 from copem_replay.core.errors import count_noun
 from copem_replay.metrics.intervals import NOT_ENOUGH
 from copem_replay.metrics.metric import RowMetric, own_metrics
-from copem_replay.metrics.summary import describe_intervals, format_cell
+from copem_replay.metrics.summary import describe_intervals, format_cell, has_undetected
 from copem_replay.metrics.summary_metrics import METRIC, METRICS, PARTS
 from copem_replay.metrics.survival import EndReason
 from copem_replay.report.figures.differences import excludes_0
@@ -165,6 +165,8 @@ def summary_tables(study: ReportData) -> Html:
     rows = study.results.summary
     parts = []
     for part in _list_parts(study.results.experiment.measure.metrics):
+        if part.id == "undetected" and not has_undetected(rows):
+            continue
         present = {name: says for name, says in part.columns.items() if name in rows and rows[name].notna().any()}
         once = [name for name in present if name in _ONCE and rows[name].nunique(dropna=False) == 1]
         columns = {name: present[name] for name in sort_columns(list(present)) if name not in once}
