@@ -108,12 +108,14 @@ def _check_runs_unique(runs: tuple[WhichRun, ...]) -> tuple[WhichRun, ...]:
 class Show(Frozen):
     """Which logs, run or runs, and configurations (by default all) are written to MCAP and .rrd.
 
-    `run: null` writes none; `pipeline/one_run.py` says which run is `median`, `worst` or `best`.
+    `run: null` writes none; `pipeline/one_run.py` says which run is `median`, `worst` or `best`. `truth: false` leaves the
+    drawn truth out of the MCAP, the topics `copem/truth/…`; the recorded one is always in it.
     """
 
     logs: Annotated[tuple[Id, ...], Field(min_length=1)] = ("first",)
     run: WhichRun | Annotated[tuple[WhichRun, ...], Field(min_length=1), AfterValidator(_check_runs_unique)] | None = 0
     configurations: Annotated[tuple[Id, ...], Field(min_length=1)] | None = None
+    truth: bool = True
 
     def asked(self) -> tuple[WhichRun, ...]:
         """The runs in their order: several, one or none."""

@@ -1,28 +1,25 @@
 """The results folder is written: complete under its name, or not at all.
 
 Everything is written into a folder beside it first, which then takes its name (`results/folder.py`). Equal input and
-seed give equal bytes in all files but the .rrd. The MCAP of a shown run has the truth as a scene for Foxglove and
-Lichtblick.
+seed give equal bytes in all files but the .rrd.
 """
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import pandas as pd
 
 from copem_replay.core.colours import configuration_colours
 from copem_replay.core.errors import OutputError, RecordingError
 from copem_replay.core.files import portable_name
-from copem_replay.core.tracks import CLASSES, Scene, Tracks
 from copem_replay.core.yaml import dump_yaml
 from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.experiment.schema import Experiment
@@ -36,11 +33,7 @@ from copem_replay.io.open import (
     sha256_of,
 )
 from copem_replay.io.recording import Recording
-from copem_replay.io.write.message_family import EGO_FRAME, MIDDLE_FRAME
-from copem_replay.io.write.scene import Ellipse, Entity, Line, Pose, Rgba, Text, TruthFrame, TruthScene
-from copem_replay.io.write.scene import Place as ScenePlace
 from copem_replay.metrics.detections_table import first_episodes
-from copem_replay.perception.sensor_poses import UnitPoses, couple_outlines, mounting_height
 from copem_replay.pipeline.one_run import ReplayedRun, ShownRun, replay_run, select_shown_logs, select_shown_runs
 from copem_replay.pipeline.run import ExperimentResult, find_log_path
 from copem_replay.pipeline.sweep import resolve_sweep
@@ -56,6 +49,7 @@ from copem_replay.results.schema import (
     table_file,
     write_parquet,
 )
+from copem_replay.results.truth_scene import draw_truth
 
 if TYPE_CHECKING:
     from copem_replay.experiment.schema import Configuration
@@ -105,7 +99,7 @@ def _write_mcap(path: Path, run: RunToExport) -> list[str]:
     from copem_replay.io.write.mcap import write_mcap
     from copem_replay.io.write.message_family import find_family
 
-    recording = run.recording
+    recording, show = run.recording, run.replayed.experiment.show
     with fetch_place(recording.place) as here:
         stamps = read_file_stamps(here)
         has_digest = recording.sha256 is not None or recording.stamps is not None
@@ -120,7 +114,7 @@ def _write_mcap(path: Path, run: RunToExport) -> list[str]:
             run.manifest,
             find_family(recording),
             recording.window,
-            truth_scene(run.replayed, run.table),
+            draw_truth(run.replayed, run.table) if show is None or show.truth else None,
             configuration_colours(run.every),
         )
         check_files_unchanged(stamps)
@@ -397,119 +391,3 @@ def _write_by_log(rows: pd.DataFrame, folder: Path) -> None:
 def write_csv(table: pd.DataFrame, path: Path) -> None:
     """Write a table as CSV: nulls empty, numbers with nine significant digits, names quoted for spreadsheets."""
     quote_formulas(table).to_csv(path, index=False, float_format="%.9g", lineterminator="\n")
-
-
-# The truth of a run as a scene: outlines, units, fields of view, texts, the ego.
-
-BODY: Rgba = (0.62, 0.62, 0.62, 1.0)
-UNIT: Rgba = (0.85, 0.85, 0.85, 1.0)
-FIELD: Rgba = (0.45, 0.45, 0.38, 1.0)
-STATIC: Rgba = (0.4, 0.4, 0.4, 1.0)
-"""Greys: the truth is thin and neutral, so that the colours of configurations stand out."""
-NAMED_OBJECTS = 6
-"""Measured objects with a name, at most: those that configurations detect at the most different times."""
-MANY_MOVING = 8
-"""With more moving units than this their fields of view are not drawn, as they would cover the scene."""
-_MARK_M, _ABOVE_M = 0.5, 0.05
-
-
-def truth_scene(replayed: ReplayedRun, table: pd.DataFrame) -> TruthScene:
-    """The truth of a run; `table`: the rows of `detections.parquet` of its log and run."""
-    stamps_ns = replayed.replay.placed.stamps_ns
-    fixed = [
-        name for name, unit in replayed.experiment.modelled.items() if unit.at is not None and len(stamps_ns[name])
-    ]
-    units = [_draw_unit(replayed, name, _unit_pose(replayed.replay.placed.poses[name], 0)) for name in fixed]
-    follow = EGO_FRAME if replayed.replay.scene.ego_ix >= 0 else MIDDLE_FRAME
-    return TruthScene([*_draw_obstacles(replayed), *units], _Frames(replayed, choose_named_objects(table)), follow)
-
-
-def choose_named_objects(table: pd.DataFrame) -> list[str]:
-    """Ids of the objects that are named: those that configurations detect at the most different times."""
-    time_s = table["time_to_detection_s"].fillna(table["ended_s"] - table["onset_s"])
-    apart = time_s.groupby(table["object_id"], sort=False).agg(lambda times: times.max() - times.min())
-    return list(apart.sort_values(ascending=False, kind="stable").index[:NAMED_OBJECTS])
-
-
-class _Frames:
-    """The frames of the truth, made one at a time; it can be iterated repeatedly."""
-
-    def __init__(self, replayed: ReplayedRun, names: Sequence[str]) -> None:
-        self._replayed, self._names = replayed, {replayed.replay.scene.object_number[name] for name in names}
-        moving = [name for name, unit in replayed.experiment.modelled.items() if unit.at is None]
-        self._moving = moving if len(moving) <= MANY_MOVING else []
-        self._marked = moving
-        self._middle = _scene_centre(replayed.replay.truth) if replayed.replay.scene.ego_ix < 0 else None
-
-    def __iter__(self) -> Iterator[TruthFrame]:
-        scene, truth = self._replayed.replay.scene, self._replayed.replay.truth
-        order, bounds = truth.by_frame
-        for frame, time_ns in enumerate(truth.stamp_ns.tolist()):
-            rows = order[bounds[frame] : bounds[frame + 1]]
-            rows = rows[truth.valid[0, rows]].tolist()
-            bodies = [_draw_body(scene, truth, row, named=int(truth.row_object_ix[row]) in self._names) for row in rows]
-            own = [row for row in rows if truth.row_object_ix[row] == scene.ego_ix]
-            followed = _truth_pose(truth, own[0]) if own else self._middle
-            yield TruthFrame(time_ns, [*bodies, *self._units(time_ns)], followed)
-
-    def _units(self, time_ns: int) -> Iterator[Entity]:
-        """Marks of carried units, at their poses of the newest list."""
-        placed = self._replayed.replay.placed
-        for name in self._marked:
-            newest = int(np.searchsorted(placed.stamps_ns[name], time_ns, side="right")) - 1
-            if newest >= 0 and placed.poses[name].present[newest]:
-                pose = _unit_pose(placed.poses[name], newest)
-                yield _draw_unit(self._replayed, name, pose, field=name in self._moving)
-
-
-def _scene_centre(truth: Tracks) -> Pose | None:
-    """The median of all places of all objects; None: there are none."""
-    valid = truth.valid[0]
-    if not valid.any():
-        return None
-    return Pose(*(float(np.median(getattr(truth, name)[0, valid])) for name in ("x_m", "y_m", "z_m")))
-
-
-def _draw_body(scene: Scene, truth: Tracks, row: int, *, named: bool) -> Entity:
-    """The outline of an object: the footprint, up one edge, and around the roof."""
-    k = int(truth.row_object_ix[row])
-    half = [float(getattr(truth, name)[0, row]) / 2 for name in ("length_m", "width_m", "height_m")]
-    around = [(half[0] * a, half[1] * b) for a, b in ((1, 1), (-1, 1), (-1, -1), (1, -1), (1, 1))]
-    points: list[ScenePlace] = [(x, y, z) for z in (-half[2], half[2]) for x, y in around]
-    pose, kind = _truth_pose(truth, row), CLASSES[int(scene.object_class[k])]
-    metadata = {"object": scene.object_ids[k], "class": kind}
-    over = Pose(pose.x_m, pose.y_m, pose.z_m + half[2] + _MARK_M)
-    texts = [Text(f"{scene.object_ids[k]} {kind}", BODY, over)] if named or k == scene.ego_ix else []
-    return Entity(scene.object_ids[k], metadata, [Line(points, BODY, pose)], texts)
-
-
-def _draw_unit(replayed: ReplayedRun, name: str, pose: Pose, *, field: bool = True) -> Entity:
-    """A mark at a unit, its name over it, and its field of view on the ground under it."""
-    replay, unit = replayed.replay, replayed.experiment.modelled[name]
-    lines = []
-    if field:
-        down_m = _ABOVE_M - mounting_height(replay.scene, replay.truth, unit)
-        for border in couple_outlines(replayed.experiment.pems[str(unit.pem)].couples):
-            lines.append(Line([(x, y, down_m) for x, y in border.tolist()], FIELD, pose))
-    over = Pose(pose.x_m, pose.y_m, pose.z_m + _MARK_M)
-    mark = Ellipse((_MARK_M, _MARK_M, _MARK_M / 2), UNIT, pose)
-    return Entity(f"unit {name}", {"unit": name}, lines, [Text(name, UNIT, over)], [mark])
-
-
-def _draw_obstacles(replayed: ReplayedRun) -> Iterator[Entity]:
-    """Outlines of the convex parts of obstacles, at the bottom and at the top."""
-    static, solids = replayed.replay.placed.static, replayed.replay.placed.solids
-    for part in range(len(static.body)):
-        corners = static.xy_m[static.start[part] : static.start[part + 1]].tolist()
-        around = [*corners, *corners[:1]]
-        solid = solids[static.body[part]]
-        lines = [Line([(x, y, z) for x, y in around], STATIC) for z in (solid.bottom_m, solid.top_m)]
-        yield Entity(f"{solid.name}:{part}", {"obstacle": solid.name.split()[-1]}, lines)
-
-
-def _truth_pose(truth: Tracks, row: int) -> Pose:
-    return Pose(*(float(getattr(truth, name)[0, row]) for name in ("x_m", "y_m", "z_m", "yaw_rad")))
-
-
-def _unit_pose(poses: UnitPoses, k: int) -> Pose:
-    return Pose(*(float(column[k]) for column in (poses.x_m, poses.y_m, poses.z_m, poses.heading_rad)))

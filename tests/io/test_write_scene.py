@@ -22,7 +22,16 @@ from copem_replay.io.write import scene as foxglove_scene_ros2
 from copem_replay.io.write.detail import KNOWN, LISTED, NOT_LISTED
 from copem_replay.io.write.message_family import STATUS, TRANSFORM
 from copem_replay.io.write.ros2 import SCENE_UPDATE, message_definition
-from copem_replay.io.write.scene import Ellipse, Entity, Line, Pose, Text, principal_axes
+from copem_replay.io.write.scene import (
+    Ellipse,
+    Entity,
+    Line,
+    MovingEntities,
+    Pose,
+    Text,
+    encode_moving,
+    principal_axes,
+)
 from tests.helpers.experiments import changed, drive
 
 mcap_ros2 = pytest.importorskip(
@@ -34,12 +43,13 @@ DRAWN = [
     Entity(
         "odd",
         {"class": "car", "object": "1"},
-        lines=[Line([(0, 0, 0), (1, 2, 3), (4, 5, 6)], GREY, Pose(1, 2, 3, 0.5))],
-        texts=[Text("a text", GREY, Pose(7, 8, 9))],
-        ellipses=[Ellipse((4, 2, 0.1), GREY, Pose(yaw_rad=math.pi / 2)), Ellipse((1, 1, 1), GREY, Pose())],
+        lines=[Line([(0, 0, 0), (1, 2, 3), (4, 5, 6)], GREY)],
+        texts=[Text("a text", GREY, above_m=(0.75, 0.5))],
+        ellipses=[Ellipse((4, 2, 0.1), GREY), Ellipse((1, 1, 1), GREY)],
+        pose=Pose(1, 2, 3, 0.5),
     ),
     Entity("nothing"),
-    Entity("text alone", texts=[Text("x", GREY, Pose())] * 2),
+    Entity("text alone", texts=[Text("x", GREY)] * 2),
 ]
 
 
@@ -151,6 +161,21 @@ class TestTruth:
         assert not messages(folder / "replay.mcap", "copem/truth/transform")
 
 
+    def test_is_left_out_where_it_is_not_to_be_shown(self, tmp_path: Path) -> None:
+        drive(tmp_path / "drive.mcap")
+        (tmp_path / "e.yaml").write_text(changed("show: {run: 0, truth: false}"))
+        folder = cr.run(tmp_path / "e.yaml").save(tmp_path / "r")
+        with (folder / "replay.mcap").open("rb") as file, (tmp_path / "drive.mcap").open("rb") as recorded:
+            ours, theirs = make_reader(file), make_reader(recorded)
+            topics = {channel.topic for channel in ours.get_summary().channels.values()}
+            assert not [topic for topic in topics if topic.startswith("copem/truth")]
+            assert "copem/PEM/objects" in topics
+            truth = [c.topic for c in theirs.get_summary().channels.values()]
+            passed = [(m.log_time, m.data) for *_, m in ours.iter_messages(topics=truth)]
+            assert passed == [(m.log_time, m.data) for *_, m in theirs.iter_messages(topics=truth)]
+            assert passed
+
+
 class TestUncertainty:
     @pytest.mark.parametrize(
         ("covariance", "expected"),
@@ -199,6 +224,26 @@ def test_both_families_draw_the_same() -> None:
         assert [(c.size.x, c.size.y, c.size.z, c.top_scale) for c in one.cylinders] == [
             (c.size.x, c.size.y, c.size.z, c.top_scale) for c in other.cylinders
         ]
+
+
+def test_moving_entities_are_the_messages_of_each_frame_alone() -> None:
+    """Frames of nothing, of one and of several entities; at 0, where protobuf leaves numbers out, and turned by π."""
+    looks, look_ix = DRAWN, [0, 2, 1, 0, 0]
+    moving = MovingEntities(
+        looks, np.array([0, 1_500_000_000, 2_000_000_000, 3_000_000_001]), np.array([0, 1, 1, 4, 5]),
+        np.array(look_ix), *(np.array(column) for column in (
+            [0.0, 1.0, 2.0, -3.0, 4.0], [0.0, 5.0, 6.0, 7.0, -8.0], [0.0, -0.75, 1.0, 2.0, 3.0],
+            [0.0, 0.5, math.pi, -2.0, 1e-9],
+        ))
+    )  # fmt: skip
+    frames = [[0], [], [1, 2, 3], [4]]
+    expected = []
+    for at_ns, rows in zip(moving.time_ns.tolist(), frames, strict=True):
+        columns = moving.x_m, moving.y_m, moving.z_m, moving.yaw_rad
+        drawn = [looks[look_ix[r]].placed(Pose(*(float(column[r]) for column in columns))) for r in rows]
+        expected.append(foxglove_scene.encode_scene(drawn, at_ns, "map"))
+        assert moving.entities(len(expected) - 1) == drawn
+    assert list(encode_moving(moving, "map")) == expected
 
 
 def test_both_families_place_a_frame_alike() -> None:

@@ -174,14 +174,13 @@ def _encode_chunk_extras(
 
 def _encode_truth(writer: TruthWriter, truth: TruthScene) -> Iterator[Message]:
     """The messages of the truth's scene; static entities once, at the start."""
-    for k, frame in enumerate(truth.frames):
-        time_ns = frame.time_ns
+    frames = zip(truth.moving.time_ns.tolist(), writer.moving(truth.moving), truth.followed, strict=True)
+    for k, (time_ns, moving, followed) in enumerate(frames):
         if k == 0:
             yield Message(writer.static, time_ns, writer.drawn(truth.static, time_ns), time_ns, 0)
-        yield Message(writer.scene, time_ns, writer.drawn(frame.entities, time_ns), time_ns, 0)
-        if frame.followed is not None:
-            placed = writer.followed(frame.followed, time_ns, truth.follow)
-            yield Message(writer.transform, time_ns, placed, time_ns, 0)
+        yield Message(writer.scene, time_ns, moving, time_ns, 0)
+        if followed is not None:
+            yield Message(writer.transform, time_ns, writer.followed(followed, time_ns, truth.follow), time_ns, 0)
 
 
 def _merge_by_time(streams: Sequence[Iterator[Message]]) -> Iterator[Message]:

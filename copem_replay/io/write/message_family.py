@@ -68,10 +68,12 @@ from copem_replay.io.write.scene import (
     Ellipses,
     Entity,
     FoxgloveSceneWriter,
+    MovingEntities,
     Pose,
     Ros2SceneWriter,
     UncertaintyWriter,
     encode_ellipses,
+    encode_moving,
     encode_ros2_scene,
     encode_ros2_transform,
     encode_scene,
@@ -258,6 +260,7 @@ class TruthWriter:
     static: int
     transform: int
     drawn: Callable[[Sequence[Entity], int], bytes]
+    moving: Callable[[MovingEntities], Iterator[bytes]]
     followed: Callable[[Pose, int, str], bytes]
 
 
@@ -341,10 +344,8 @@ class _OsiFamily:
         schemas = zip(TRUTH_TOPICS, (self._scenes, self._scenes, moves), strict=True)
         scene, static, ego = (self._catalogue.channel(topic, "protobuf", schema, {}) for topic, schema in schemas)
         placed = partial(encode_transform, self._frame_id)
-        return TruthWriter(scene, static, ego, self.drawn, placed)
-
-    def drawn(self, entities: Sequence[Entity], time_ns: int) -> bytes:
-        return encode_scene(entities, time_ns, self._frame_id)
+        drawn, moving = partial(encode_scene, frame_id=self._frame_id), partial(encode_moving, frame_id=self._frame_id)
+        return TruthWriter(scene, static, ego, drawn, moving, placed)
 
 
 class _Ros2Family:
@@ -392,7 +393,10 @@ class _Ros2Family:
         schemas = zip(TRUTH_TOPICS, (self._schemas[1], self._schemas[1], moves), strict=True)
         scene, static, ego = (self._channel(topic, schema) for topic, schema in schemas)
         placed = partial(encode_ros2_transform, self._frame_id)
-        return TruthWriter(scene, static, ego, self.drawn, placed)
+        return TruthWriter(scene, static, ego, self.drawn, self._moving, placed)
+
+    def _moving(self, moving: MovingEntities) -> Iterator[bytes]:
+        return (self.drawn(moving.entities(frame), at_ns) for frame, at_ns in enumerate(moving.time_ns.tolist()))
 
     def drawn(self, entities: Sequence[Entity], time_ns: int) -> bytes:
         return encode_ros2_scene(entities, time_ns, self._frame_id)

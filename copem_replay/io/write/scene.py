@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -22,9 +22,11 @@ from copem_replay.io.encodings.column_bytes import (
     RepeatedMessages,
     TextPool,
     encode_messages,
+    expand_ranges,
     optional_message,
     repeat_text,
     split_into_blocks,
+    start_offsets,
 )
 from copem_replay.io.write.ros2 import HEAD, CdrMessage, encode_count, encode_string, encode_time, pad_to_size
 
@@ -46,22 +48,27 @@ class Pose:
 
 @dataclass(frozen=True)
 class Line:
-    """A line through points (K, 3) of its own frame; `width` in pixels."""
+    """A line through points (K, 3) of the entity's own frame; `width` in pixels."""
 
     points: Sequence[Place]
     colour: Rgba
-    pose: Pose = field(default_factory=Pose)
     width: float = 1.5
 
 
 @dataclass(frozen=True)
 class Text:
-    """A text that faces the camera; `size` in pixels."""
+    """A text that faces the camera, over the entity's pose by the heights `above_m` one after the other; `size` in
+    pixels.
+    """
 
     text: str
     colour: Rgba
-    pose: Pose
+    above_m: tuple[float, ...] = ()
     size: float = 14.0
+
+    def place(self, pose: Pose) -> Pose:
+        """Where it is when its entity has a pose."""
+        return Pose(pose.x_m, pose.y_m, sum(self.above_m, start=pose.z_m))
 
 
 @dataclass(frozen=True)
@@ -70,35 +77,54 @@ class Ellipse:
 
     size: Place
     colour: Rgba
-    pose: Pose
 
 
 @dataclass(frozen=True)
 class Entity:
-    """A named entity: its metadata, which a viewer shows for a selected entity, and its elements."""
+    """A named entity: its metadata, which a viewer shows for a selected entity, its elements, and its pose."""
 
     name: str
     says: Mapping[str, str] = field(default_factory=dict)
     lines: Sequence[Line] = ()
     texts: Sequence[Text] = ()
     ellipses: Sequence[Ellipse] = ()
+    pose: Pose = field(default_factory=Pose)
+
+    def placed(self, pose: Pose) -> Entity:
+        """The entity with another pose."""
+        return replace(self, pose=pose)
 
 
 @dataclass(frozen=True)
-class TruthFrame:
-    """The moving entities at an instant of the log's clock; `followed`: the pose of the frame to follow, None: none."""
+class MovingEntities:
+    """Entities in frames: frame f, at `time_ns[f]` of the log's clock, has the rows `start[f]:start[f + 1]` of (P,).
 
-    time_ns: int
-    entities: Sequence[Entity]
-    followed: Pose | None
+    `looks`: what entities look like; `look_ix (P,)`: which look a row has, at its pose.
+    """
+
+    looks: Sequence[Entity]
+    time_ns: Int
+    start: Int
+    look_ix: Int
+    x_m: Float
+    y_m: Float
+    z_m: Float
+    yaw_rad: Float
+
+    def entities(self, frame: int) -> list[Entity]:
+        """The entities of one frame."""
+        rows = slice(self.start[frame], self.start[frame + 1])
+        columns = (getattr(self, name)[rows].tolist() for name in ("look_ix", "x_m", "y_m", "z_m", "yaw_rad"))
+        return [self.looks[look].placed(Pose(*pose)) for look, *pose in zip(*columns, strict=True)]
 
 
 @dataclass(frozen=True)
 class TruthScene:
-    """The truth as a scene: static entities, frames of moving ones, and the name of the frame to follow."""
+    """The truth as a scene: static entities, moving ones, and in each frame the pose of the frame `follow`, if any."""
 
     static: Sequence[Entity]
-    frames: Iterable[TruthFrame]
+    moving: MovingEntities
+    followed: Sequence[Pose | None]
     follow: str
 
 
@@ -134,7 +160,8 @@ class Ellipses:
             Entity(
                 name,
                 {"age_s": age} if age else {},
-                ellipses=[Ellipse((length, width, self.height_m), (*self.colour, alpha), Pose(x, y, z, yaw))],
+                ellipses=[Ellipse((length, width, self.height_m), (*self.colour, alpha))],
+                pose=Pose(x, y, z, yaw),
             )
             for name, age, x, y, z, yaw, length, width, alpha in zip(self.names, self.ages, *numbers, strict=True)
         ]
@@ -301,8 +328,8 @@ def box_metadata(name: str, class_ix: int, configuration: str) -> dict[str, str]
     return {"configuration": configuration, "class": CLASSES[class_ix], "object": name}
 
 
-def _encode_metadata(metadata: dict[str, str]) -> bytes:
-    """The metadata of a box as encoded fields of a SceneEntity."""
+def _encode_metadata(metadata: Mapping[str, str]) -> bytes:
+    """Metadata as encoded fields of a SceneEntity."""
     from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 
     entity = SceneEntity()
@@ -328,16 +355,110 @@ def encode_scene(entities: Sequence[Entity], time_ns: int, frame_id: str) -> byt
         for ellipse in each.ellipses:
             element = entity.cylinders.add(bottom_scale=1.0, top_scale=1.0)
             element.size.x, element.size.y, element.size.z = ellipse.size
-            _place_primitive(element, ellipse.pose, ellipse.colour)
+            _place_primitive(element, each.pose, ellipse.colour)
         for line in each.lines:
             element = entity.lines.add(thickness=line.width, scale_invariant=True)
             for x, y, z in line.points:
                 element.points.add(x=x, y=y, z=z)
-            _place_primitive(element, line.pose, line.colour)
+            _place_primitive(element, each.pose, line.colour)
         for text in each.texts:
             element = entity.texts.add(billboard=True, font_size=text.size, scale_invariant=True, text=text.text)
-            _place_primitive(element, text.pose, text.colour)
+            _place_primitive(element, text.place(each.pose), text.colour)
     encoded: bytes = update.SerializeToString(deterministic=True)
+    return encoded
+
+
+def encode_moving(moving: MovingEntities, frame_id: str) -> Iterator[bytes]:
+    """A message for each frame, as `encode_scene` gives it, many at once."""
+    looks = _EncodedLooks(moving.looks)
+    for first, last in split_into_blocks(moving.start):
+        bounds = moving.start[first : last + 1]
+        entities = looks.content(moving, slice(bounds[0], bounds[-1]))
+        yield from encode_updates(moving.time_ns[first:last], bounds - bounds[0], entities, frame_id)
+
+
+class _EncodedLooks:
+    """What entities look like, encoded once; elements of all looks are numbered, (E,)."""
+
+    def __init__(self, looks: Sequence[Entity]) -> None:
+        self._names = TextPool.of([look.name.encode() for look in looks])
+        self._says = TextPool.of([_encode_metadata(look.says) for look in looks])
+        self._first = {
+            kind: start_offsets(np.array([len(getattr(look, kind)) for look in looks], dtype=np.int64))
+            for kind in _ELEMENTS
+        }
+        self._lines = [line for look in looks for line in look.lines]
+        self._texts = [text for look in looks for text in look.texts]
+        self._ellipses = [ellipse for look in looks for ellipse in look.ellipses]
+        self._points = TextPool.of([_encode_points(line.points) for line in self._lines])
+        self._words = TextPool.of([text.text.encode() for text in self._texts])
+
+    def content(self, moving: MovingEntities, rows: slice) -> Content:
+        """The entities of some rows (P,)."""
+        look = moving.look_ix[rows]
+        (lines, line, of_line), (texts, text, of_text), (ellipses, ellipse, of_ellipse) = (
+            self._list_elements(kind, look) for kind in _ELEMENTS
+        )
+        columns = [getattr(moving, name)[rows] for name in ("x_m", "y_m", "z_m", "yaw_rad")]
+        above = _column([each.above_m for each in self._texts])
+        x, y, z, _ = (column[of_text] for column in columns)
+        for step in range(above.shape[1]):
+            z = z + above[text, step]
+        size = _column([each.size for each in self._ellipses])
+        return {
+            "id": self._names.at(look),
+            "metadata": self._says.at(look),
+            "lines": RepeatedMessages(lines, {
+                "pose": _encode_pose(*(column[of_line] for column in columns)),
+                "thickness": _column([[each.width] for each in self._lines])[line, 0], "scale_invariant": 1,
+                "points": self._points.at(line), "color": _encode_colours(self._lines, line),
+            }),
+            "texts": RepeatedMessages(texts, {
+                "pose": _encode_pose(x, y, z, np.zeros(len(x))), "billboard": 1,
+                "font_size": _column([[each.size] for each in self._texts])[text, 0], "scale_invariant": 1,
+                "color": _encode_colours(self._texts, text), "text": self._words.at(text),
+            }),
+            "cylinders": RepeatedMessages(ellipses, {
+                "pose": _encode_pose(*(column[of_ellipse] for column in columns)),
+                "size": {axis: size[ellipse, k] for k, axis in enumerate("xyz")},
+                "bottom_scale": 1.0, "top_scale": 1.0, "color": _encode_colours(self._ellipses, ellipse),
+            }),
+        }  # fmt: skip
+
+    def _list_elements(self, kind: str, look: Int) -> tuple[Int, Int, Int]:
+        """(P + 1,) the first element of each row, which elements these are, and of which row."""
+        start, elements = expand_ranges(self._first[kind], look)
+        return start, elements, np.repeat(np.arange(len(look)), np.diff(start))
+
+
+_ELEMENTS = ("lines", "texts", "ellipses")
+
+
+def _column(values: Sequence[Sequence[float]]) -> Float:
+    """(E, K) numbers of elements, 0 where one has fewer."""
+    table = np.zeros((len(values), max(map(len, values), default=3)))
+    for k, numbers in enumerate(values):
+        table[k, : len(numbers)] = numbers
+    return table
+
+
+def _encode_colours(elements: Sequence[Line | Text | Ellipse], which: Int) -> Content:
+    colours = np.array([element.colour for element in elements], dtype=float).reshape(-1, 4)
+    return {shade: colours[which, k] for k, shade in enumerate("rgba")}
+
+
+def _encode_pose(x_m: Float, y_m: Float, z_m: Float, yaw_rad: Float) -> Content:
+    return {"position": {"x": x_m, "y": y_m, "z": z_m}, "orientation": encode_orientation(yaw_rad)}
+
+
+def _encode_points(points: Sequence[Place]) -> bytes:
+    """The points of a line as encoded fields of a LinePrimitive."""
+    from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
+
+    line = LinePrimitive()
+    for x, y, z in points:
+        line.points.add(x=x, y=y, z=z)
+    encoded: bytes = line.SerializeToString(deterministic=True)
     return encoded
 
 
@@ -445,14 +566,14 @@ def encode_ros2_scene(entities: Sequence[Entity], time_ns: int, frame_id: str) -
                 out.text(text)
         out.add("I", 0, 0, 0, len(each.ellipses))  # arrows, cubes, spheres, cylinders
         for ellipse in each.ellipses:
-            _write_pose(out, ellipse.pose)
+            _write_pose(out, each.pose)
             out.add("d", *ellipse.size, 1.0, 1.0, *ellipse.colour)
         out.add("I", len(each.lines))
         for line in each.lines:
-            _write_line(out, line.points, line.width, line.pose, line.colour)
+            _write_line(out, line.points, line.width, each.pose, line.colour)
         out.add("I", 0, len(each.texts))  # triangles, texts
         for words in each.texts:
-            _write_pose(out, words.pose)
+            _write_pose(out, words.place(each.pose))
             out.add("B", 1)  # billboard
             out.add("d", words.size)
             out.add("B", 1)  # scale_invariant
