@@ -34,6 +34,8 @@ _COMPUTED = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast
              ast.BitOr: ast.BitAnd, ast.FloorDiv: ast.Mult, ast.Mod: ast.Mult}  # fmt: skip
 _CALLED = {"min": "max", "minimum": "maximum", "any": "all", "sin": "cos", "argmin": "argmax", "floor": "ceil",
            "cumsum": "sort", "ones": "zeros"}  # fmt: skip
+_COMPILED = re.compile(r"\b(njit|borrowing|making)\b")
+"""What names compiled functions in a module (`core/compiled.py`)."""
 _CALLED |= {after: before for before, after in _CALLED.items() if before != "cumsum"}
 
 
@@ -126,7 +128,7 @@ def chosen(count: int, seed: int) -> list[Mutant]:
 def killed_by(mutant: Mutant, copy: Path, *, near: bool) -> tuple[str, str]:
     """Among which tests (`module`, `wing`, `all`) one tells a mutant, and its name; ("", "") where none does."""
     place = copy / mutant.path.relative_to(ROOT)
-    kernel = "njit" in mutant.text
+    kernel = _COMPILED.search(mutant.text) is not None
     stale = _compiled_with(mutant, copy) if kernel else []
     env = {**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1", "CI": "true"}
     place.write_text(mutant.text, encoding="utf-8")
