@@ -108,8 +108,8 @@ def _check_runs_unique(runs: tuple[WhichRun, ...]) -> tuple[WhichRun, ...]:
 class Show(Frozen):
     """Which logs, run or runs, and configurations (by default all) are written to MCAP and .rrd.
 
-    `run: null` writes none; `pipeline/one_run.py` says which run is `median`, `worst` or `best`. `truth: false` leaves the
-    drawn truth out of the MCAP, the topics `copem/truth/…`; the recorded one is always in it.
+    `run: null` writes none; `pipeline/one_run.py` says which run is `median`, `worst` or `best`. `truth: false` leaves
+    the drawn truth out of the MCAP, the topics `copem/truth/…`; the recorded one is always in it.
     """
 
     logs: Annotated[tuple[Id, ...], Field(min_length=1)] = ("first",)

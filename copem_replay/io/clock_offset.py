@@ -441,13 +441,13 @@ def find_half_width(score: Float, information: Float, k: int, beyond: float = 1.
     Where blocks move the coefficient by more than independent errors of entries would, the interval is wider in
     proportion (Birge's ratio, times `beyond`). It is never narrower than independent errors make it.
     """
-    from scipy.stats import t
+    from scipy.special import stdtrit  # of Student's t; scipy.stats takes long to import
 
     inverse = np.linalg.pinv(information.sum(axis=0))[k]
     moved, variance = score @ inverse, np.einsum("c,gcd,d->g", inverse, information, inverse)
     freedom = max(len(score) - len(inverse), 1)
     ratio = beyond * (moved**2 / np.maximum(variance, 1e-12 * variance.sum())).sum() / freedom
-    return float(t.ppf(0.975, freedom) * np.sqrt(max(ratio, 1.0) * variance.sum()))
+    return float(stdtrit(freedom, 0.975) * np.sqrt(max(ratio, 1.0) * variance.sum()))
 
 
 def _number_blocks(pieces: TrackPieces, long_s: float) -> Int:

@@ -188,8 +188,6 @@ def _draw_fresh(
 
     A ghost's word contains the capture, its instant of birth: so ids, and draws that last, are its own.
     """
-    from scipy.stats import poisson
-
     n, sort = numbered
     H, L = len(hosts.words), len(lists.stamp_ns)
     host_ix, list_ix = np.divmod(np.arange(H * L), L)
@@ -199,13 +197,23 @@ def _draw_fresh(
     none = np.zeros(len(host_ix), dtype=np.int64)
     random_key = RandomKey((lists.name,), none, hosts.words[host_ix], lists.stamp_ns[list_ix])
     [uniform] = rng.uniform(f"ghosts {n}", random_key, runs)
-    count = poisson.ppf(uniform, sort.in_list).astype(np.int64)
+    count = _count_ghosts(uniform, sort.in_list)
     which = np.repeat(np.arange(len(count)), count)
     number = np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)
     born_ns = lists.stamp_ns[list_ix[which]].astype(np.uint64)
     words = hosts.words[host_ix[which]] + born_ns + (number.astype(np.uint64) << _NUMBER_BITS) + salt
     host = hosts.row[host_ix[which], list_ix[which]] if hosts.row is not None else np.full(len(which), -1)
     return _Born(words, np.arange(len(which)), list_ix[which], host)
+
+
+def _count_ghosts(uniform: Float, mean: float) -> Int:
+    """The least numbers whose Poisson distribution reaches `uniform`; `pdtrik` is a real number near them."""
+    from scipy.special import pdtr, pdtrik
+
+    above = np.ceil(pdtrik(uniform, mean))
+    below = np.maximum(above - 1, 0)
+    count: Int = np.where(pdtr(below, mean) >= uniform, below, above).astype(np.int64)
+    return count
 
 
 def _place_ghosts(
