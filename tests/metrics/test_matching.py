@@ -71,6 +71,12 @@ def test_only_the_preferred_of_the_rest_gets_the_free_object() -> None:
     assert of_one_list(*entries, objects=objects) == [(0, MATCH), (0, DUPLICATE), (1, MATCH), (0, DUPLICATE)]
 
 
+def test_of_a_rest_of_two_the_preferred_comes_first_in_whatever_order_they_are_listed() -> None:
+    objects = {(0.0, 0.0): "car", (0.0, 2.5): "car"}
+    entries = [entry(0, y, existence=e) for y, e in ((0.0, 0.9), (1.0, 0.4), (0.0, 0.6))]
+    assert of_one_list(*entries, objects=objects) == [(0, MATCH), (0, DUPLICATE), (1, MATCH)]
+
+
 def test_the_rest_take_the_nearest_object_that_is_free() -> None:
     objects = {(0.0, 0.0): "car", (1.0, 0.0): "car", (-1.5, 0.0): "car"}
     entries = [entry(0.0, existence=0.9), entry(0.1, existence=0.8), entry(0.2, existence=0.7)]
