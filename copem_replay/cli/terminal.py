@@ -160,21 +160,40 @@ def show_progress(what: str, work: Callable[[Progress], T]) -> T:
         return work(lambda done, total: bar.update(task, completed=done, total=total))
 
 
+class _TimeLeft:
+    """How long the rest takes, by how long what was done since the first report took.
+
+    What comes before the first report is no measure of the rest: kernels are compiled in it, and logs are read.
+    """
+
+    def __init__(self) -> None:
+        self._first: tuple[float, int] | None = None
+
+    def words(self, now_s: float, done: int, total: int) -> list[str]:
+        """`4 minutes left`, as a list; empty where nothing is known of it, or nothing is left."""
+        if done and self._first is None:
+            self._first = now_s, done
+        if self._first is None or not self._first[1] < done < total:
+            return []
+        first_s, first = self._first
+        return [f"{format_duration((now_s - first_s) * (total - done) / (done - first))} left"]
+
+
 class ProgressLines:
     """Progress for logs and pipes: `replaying: 37 %, 4 minutes left`. `clock`: monotonic seconds."""
 
     def __init__(self, what: str, clock: Callable[[], float] = time.monotonic) -> None:
-        self._what, self._clock = what, clock
-        self._begun_s = self._printed_s = clock()
+        self._what, self._clock, self._left = what, clock, _TimeLeft()
+        self._printed_s = clock()
 
     def __call__(self, done: int, total: int) -> None:
         """Print a line if the last one is at least `EVERY_S` old."""
         now_s = self._clock()
+        left = self._left.words(now_s, done, total)
         if now_s - self._printed_s < EVERY_S or not 0 < done < total:
             return
         self._printed_s = now_s
-        left_s = (now_s - self._begun_s) * (total - done) / done
-        print_problems([f"{self._what}: {100 * done // total} %, {format_duration(left_s)} left"])
+        print_problems([", ".join([f"{self._what}: {100 * done // total} %", *left])])
 
 
 @contextmanager
@@ -202,8 +221,8 @@ class CrewProgressLines:
     """Progress of a crew in lines: `replaying: 412 of 5000 logs, 83 M rows, 9 minutes left, 1 worker lost`."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock, self._what = clock, ""
-        self._begun_s = self._printed_s = clock()
+        self._clock, self._what, self._left = clock, "", _TimeLeft()
+        self._printed_s = clock()
 
     def __call__(self, progress: CrewProgress) -> None:
         """Print a line if the last one is at least `EVERY_S` old."""
@@ -213,15 +232,13 @@ class CrewProgressLines:
             print_problems([words])
 
     def words(self, progress: CrewProgress) -> str:
-        """The progress in one line; the time left is estimated from the time since this kind of work began."""
+        """The progress in one line; the time left is that of this kind of work."""
         if progress.what != self._what:
-            self._what, self._begun_s = progress.what, self._clock()
+            self._what, self._left = progress.what, _TimeLeft()
         parts = [f"{progress.what}: {progress.logs_done} of {count_noun(progress.logs, 'log')}"]
         if progress.rows_done:
             parts.append(f"{_round_count(progress.rows_done)} rows")
-        if 0 < progress.done < progress.total:
-            left_s = (self._clock() - self._begun_s) * (progress.total - progress.done) / progress.done
-            parts.append(f"{format_duration(left_s)} left")
+        parts += self._left.words(self._clock(), progress.done, progress.total)
         if progress.lost:
             parts.append(f"{count_noun(progress.lost, 'worker')} lost")
         return ", ".join(parts)

@@ -24,13 +24,18 @@ def test_a_line_a_minute_with_logs_rows_time_left_and_lost_workers(capsys: pytes
     lines(surveyed)
     now_s[0] = 100.0
     lines(CrewProgress("replaying", 0, 5000, 0, 1000_000_000))
-    now_s[0] = 149.3  # 83 M rows in 49.3 s: 917 M more take 545 s
+    now_s[0] = 149.3
     lines(CrewProgress("replaying", 412, 5000, 83_000_000, 1000_000_000, lost=1))
     now_s[0] = 150.0
     lines(CrewProgress("replaying", 413, 5000, 83_000_000, 1000_000_000, lost=1))
+    now_s[0] = 247.9  # 166 M rows more in 98.6 s: 751 M take 446 s
+    lines(CrewProgress("replaying", 1236, 5000, 249_000_000, 1000_000_000, lost=1))
     said = capsys.readouterr().err.splitlines()
-    assert said[0] == "surveying: 100 of 5000 logs, 50 minutes left"
-    assert said[1:] == ["replaying: 412 of 5000 logs, 83 M rows, 9 minutes left, 1 worker lost"]
+    assert said == [
+        "surveying: 100 of 5000 logs",
+        "replaying: 412 of 5000 logs, 83 M rows, 1 worker lost",
+        "replaying: 1236 of 5000 logs, 249 M rows, 7 minutes left, 1 worker lost",
+    ]
 
 
 @pytest.mark.parametrize(("count", "words"), [(999, "999 rows"), (12_345, "12 k rows"), (2_100_000_000, "2 G rows")])

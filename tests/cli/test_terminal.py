@@ -204,6 +204,17 @@ class TestProgress:
             180: "replaying: 90 %, 20 seconds left\n",
         }
 
+    def test_the_time_left_is_that_of_what_came_after_the_first_block(self, capsys: pytest.CaptureFixture[str]) -> None:
+        """The first block compiles for 100 s, each of the others takes 10 s; a first line has no time left."""
+        now_s = 0.0
+        lines = ProgressLines("replaying", lambda: now_s)
+        said = []
+        for reported_s, done in ((100.0, 1), (110.0, 2), (120.0, 3), (160.0, 7)):
+            now_s = reported_s
+            lines(done, 20)
+            said += capsys.readouterr().err.splitlines()
+        assert said == ["replaying: 5 %", "replaying: 35 %, 2 minutes left"]  # 13 blocks
+
     def test_nothing_when_it_is_done_or_not_begun(self, capsys: pytest.CaptureFixture[str]) -> None:
         now_s = 0.0
         lines = ProgressLines("replaying", lambda: now_s)
