@@ -99,7 +99,7 @@ def _run_to_exit_code() -> int:
             sys.stdout.flush()
         return code
     except CopemError as error:
-        print_problems(error.problems)
+        print_problems(str(error).splitlines())
         return 2
     except (KeyboardInterrupt, typer.Abort) as error:
         print_problems([str(error) or "interrupted"])

@@ -36,10 +36,17 @@ def escape_unprintable(text: str) -> str:
     return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
+MOST_LISTED = 50
+"""So many problems, or names in a message, are listed; of more it is said how many they are."""
+_COMPARED = 100
+"""With so many names one that is not known is compared: 20 µs each, and a file may have 10 000 of both."""
+
+
 class CopemError(Exception):
     """Base of all errors that are not defects.
 
-    `problems` holds one line each: where, what was expected, what was found, what to do.
+    `problems` holds one line each: where, what was expected, what was found, what to do. The error's own text has the
+    first 50 of them, and says how many more there are.
 
     >>> try:
     ...     cr.load_experiment({"version": 1, "runs": 0})
@@ -52,7 +59,8 @@ class CopemError(Exception):
     def __init__(self, problems: str | Sequence[str]) -> None:
         lines = (problems,) if isinstance(problems, str) else problems
         self.problems: tuple[str, ...] = tuple(hide_credentials(escape_unprintable(line)) for line in lines)
-        super().__init__("\n".join(self.problems))
+        more = len(self.problems) - MOST_LISTED
+        super().__init__("\n".join([*self.problems[:MOST_LISTED], *([f"and {more:,} more"] if more > 0 else [])]))
 
 
 class InputError(CopemError):
@@ -159,10 +167,11 @@ def count_noun(number: int, noun: str, plural: str = "") -> str:
 
 
 def unknown_name_message(what: str, name: object, known: Iterable[str]) -> str:
-    """A message that a name is unknown, with the likely name, or else all known ones."""
+    """A message that a name is unknown, with the likely name, or else the known ones."""
     names = list(dict.fromkeys(known))
-    near = difflib.get_close_matches(str(name), names, n=1)
-    hint = f"; did you mean {near[0]}?" if near else f"; there {'are ' + ', '.join(names) if names else 'are none'}"
+    near = difflib.get_close_matches(str(name), names[:_COMPARED], n=1)
+    more = [f"… ({len(names):,} in all)"] if len(names) > MOST_LISTED else []
+    hint = f"; did you mean {near[0]}?" if near else f"; there are {', '.join([*names[:MOST_LISTED], *more]) or 'none'}"
     return f"no {what} is named {str(name)!r}{hint}"
 
 

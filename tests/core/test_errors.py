@@ -7,7 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from copem_replay.core.errors import EgoError, EmptyWindowError, RecordingError, near_name_hint
+from copem_replay.core.errors import (
+    CopemError,
+    EgoError,
+    EmptyWindowError,
+    RecordingError,
+    near_name_hint,
+    unknown_name_message,
+)
 
 LOG = Path("logs/a.mcap")
 
@@ -41,6 +48,23 @@ def test_names_cannot_break_the_line() -> None:
     error = RecordingError("no\nlist", path=LOG, topic="a\x1b[1m")
     assert error.problems == (r"logs/a.mcap: a\x1b[1m: no\nlist",)
     assert error.within(LOG) == [r"a\x1b[1m: no\nlist"]
+
+
+@pytest.mark.parametrize(("number", "last"), [(50, "problem 49"), (51, "and 1 more"), (10_000, "and 9,950 more")])
+def test_the_first_fifty_problems_are_said(number: int, last: str) -> None:
+    error = CopemError([f"problem {k}" for k in range(number)])
+    assert str(error).splitlines() == [*(f"problem {k}" for k in range(50)), *([last] if number > 50 else [])]
+    assert error.problems[-1] == f"problem {number - 1}"
+    assert str(error).splitlines()[-1] == last
+
+
+def test_the_first_fifty_names_are_said() -> None:
+    assert unknown_name_message("unit", "x", ["ego", "rsu"]) == "no unit is named 'x'; there are ego, rsu"
+    assert unknown_name_message("unit", "x", []) == "no unit is named 'x'; there are none"
+    fifty = ", ".join(f"unit{k}" for k in range(50))
+    assert unknown_name_message("unit", "x", [f"unit{k}" for k in range(50)]).endswith(f"; there are {fifty}")
+    message = unknown_name_message("unit", "x", [f"unit{k}" for k in range(10_000)])
+    assert message == f"no unit is named 'x'; there are {fifty}, … (10,000 in all)"
 
 
 def test_workers_hand_errors_on_whole() -> None:

@@ -685,6 +685,20 @@ class TestProblems:
         assert time.process_time() - began_s < 10
         assert [key for key, _ in found] == [*(("of", f"k{k}") for k in range(number)), ("deeper", "a", "b")]
 
+    def test_ten_thousand_unknown_keys(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Which keys there are is found out once, not for each of them (0.1 s a time)."""
+        asked, schema = [], Experiment.model_json_schema()
+
+        def ask() -> dict[str, Any]:
+            assert not asked
+            asked.append(1)
+            return schema
+
+        monkeypatch.setattr(Experiment, "model_json_schema", ask)
+        units = "".join(f"  u{k}: {{on: ego, pem: onboard, heigth_m: 1}}\n" for k in range(10_000))
+        found = problems(tmp_path, TEXT.replace("configurations:", f"{units}configurations:"))
+        assert found == [f"{13 + k}: units.u{k}.heigth_m: unknown key; did you mean height_m?" for k in range(10_000)]
+
     def test_examples_of_lists_are_those_of_the_page_of_keys(self) -> None:
         page = (Path(__file__).parents[2] / "docs/reference/keys.md").read_text(encoding="utf-8")
         assert [key for key, example in LIST_EXAMPLES.items() if f"`{key}: {example}`" not in page] == []

@@ -346,6 +346,13 @@ class TestCheck:
             "e.yaml:2: logs[1]: none.mcap: no such fi",
         ]
 
+    def test_the_first_fifty_of_many_problems(self, here: Path, call: Call) -> None:
+        (here / "e.yaml").write_text(TEXT + "".join(f"k{k}: 1\n" for k in range(300)))
+        ended = call("check", "e.yaml")
+        assert (ended.code, len(ended.lines)) == (2, 51)
+        assert ended.lines[49].startswith("e.yaml:68: k49: unknown key; ")
+        assert ended.lines[50] == "and 250 more"
+
     def test_a_key_cannot_break_the_line(self, here: Path, call: Call) -> None:
         (here / "e.yaml").write_text(TEXT + '"a\\nb\\e[31m\\u2028": 1\n')
         ended = call("check", "e.yaml")
