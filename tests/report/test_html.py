@@ -38,6 +38,7 @@ from copem_replay.report.figures.latency_breakdown import (
 from copem_replay.report.figures.registry import write_figure_files
 from copem_replay.report.figures.selection import choose_object_and_run
 from copem_replay.report.figures.style import figure_style, new_figure
+from copem_replay.report.html.conclusions import write_details
 from copem_replay.report.html.markup import Html, make_tag
 from copem_replay.report.html.page import build_page
 from copem_replay.report.html.study import load_study
@@ -348,6 +349,33 @@ class TestWords:
         assert re.search(r", but the interval of its difference to (hit|half) includes 0\.$", lines[2])
         assert re.match(r"No difference to it is shown, the interval including 0: (hit|half) \(\+0\.\d+ s \[", lines[3])
         assert lines[3].endswith("]). That does not show that there is none.")
+
+    @pytest.mark.parametrize(
+        ("low", "high", "includes"),
+        [
+            (-0.3, 0.2, True),
+            (-0.3, 0.0, True),
+            (0.0, 0.3, True),
+            (-0.3, -1e-12, True),  # what is left of 0 when floats are summed
+            (1e-12, 0.3, True),
+            (-0.3, -1e-9 / 100, True),  # in percentage points, what counts as nothing, exactly
+            (1e-9 / 100, 0.3, True),
+            (-0.3, -2e-11, False),
+            (2e-11, 0.3, False),
+            (-0.3, -0.01, False),
+            (0.01, 0.3, False),
+        ],
+    )
+    def test_an_interval_of_shares_that_includes_0_is_said_to(
+        self, made: Path, low: float, high: float, includes: bool
+    ) -> None:
+        study = load_study(made, "hit")
+        assert study.regret is not None
+        table = study.regret.table.copy()
+        table.loc[table["metric"] == "pass_share", ["low", "high"]] = low, high
+        words = write_details(replace(study, regret=replace(study.regret, table=table)))
+        assert "against hit" in words
+        assert ("the interval includes 0, so no difference can be shown" in words) is includes
 
     def test_winners_that_cannot_be_told_from_others_are_said_to_be_so(self, tmp_path: Path) -> None:
         """Two configurations of the same unit tie; a third differs by draws of its own, and by an interval with 0."""
