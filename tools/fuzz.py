@@ -1,13 +1,16 @@
-"""Read hostile files: recordings that were hit in every way, and what becomes of them.
+"""Read hostile files: recordings, experiments and results folders that were hit in every way, and what becomes of them.
 
     python tools/fuzz.py --inputs 20000 --seed 1 --minutes 30
-    python tools/fuzz.py folder
+    python tools/fuzz.py results --inputs 20000
 
-Targets are `mcap`, `trace` (OSI) and `folder` (rosbag2); with none, eight of ten inputs are MCAP. Every input is made
-from a seed. It is surveyed and read, then its other lists are read and its messages copied, in a process whose memory
-is watched and that is ended when either takes more than 10 s of computing. Good ends: it was read (and what was skipped
-is said), or it is refused in single lines. Printed are lines of JSON: each defect with its seed and where the input is
-that shows it, at the end the counts.
+Targets are `mcap`, `trace` (OSI) and `folder` (rosbag2), with none of these given eight of ten inputs are MCAP; and
+`experiment` (checked and run), `results` (compared, viewed, plotted, reported, run again over it with damaged parts),
+`fit` and `convert`. Every input is made from a seed. A recording is surveyed and read, then its other lists are read
+and its messages copied; on the others commands are called. That is done in a process whose memory is watched and that
+is ended when it takes more than 10 s of computing, 30 s for commands. Good ends: it was read (and what was skipped is
+said), or it is refused in single lines. Printed are lines of JSON: each defect with its seed and where the input is
+that shows it, at the end the counts, and how many inputs got past the header: of a recording messages were found, a
+document is of its format.
 """
 
 from __future__ import annotations
@@ -28,11 +31,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from fuzzing.commands import COMMANDS, make_originals, outcome_of, put_case
 from fuzzing.containers import TARGETS, put
 from fuzzing.mcap_model import Model, Piece
 from fuzzing.samples import samples
 
-LONGEST_S = 10.0
+LONGEST_S, LONGEST_COMMAND_S = 10.0, 30.0
 MOST_BYTES = 1_000_000_000
 _ROOM_BYTES = 3 << 30  # of address space beside what is taken at the start
 READ, REFUSED = "read", "refused"
@@ -55,11 +59,13 @@ def outcome(path: Path, looked: Callable[[], None] = lambda: None) -> dict[str, 
     from copem_replay.io.write.source import open_source
 
     said: list[str] = []
+    past = False  # the header: messages were found
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         try:
             found = survey_recording(path)
             json.dumps(survey_as_json(found), allow_nan=False)
+            past = any(topic.messages for topic in found.topics)
             said += [*describe_survey(found), *([found.reason] if found.reason else [])]
             try:
                 recording = read_log(path, name="log")
@@ -97,7 +103,7 @@ def outcome(path: Path, looked: Callable[[], None] = lambda: None) -> dict[str, 
     for line in said:
         if len(line.splitlines()) > 1 or not all(c.isprintable() for c in line):
             return {"outcome": "defect", "what": f"not one printable line: {line[:150]!r}"}
-    return {"outcome": end, "said": said}
+    return {"outcome": end, "said": said, "past": past}
 
 
 def _peak_bytes() -> int:
@@ -107,23 +113,42 @@ def _peak_bytes() -> int:
     return 0
 
 
-def _serve(pipe: Any, folder: str, most: int, own: bool, target: str | None) -> None:
-    """Make and read the inputs that are asked for, until there are no more."""
+def _reader(folder: Path, most: int, own: bool, target: str | None) -> Callable[[str, Any], dict[str, Any]]:
+    """What makes the input of a seed, tells of it through a pipe, and says what becomes of it."""
+    if target in COMMANDS:
+        originals = make_originals(folder / "originals", str(target))
+
+        def command(seed: str, pipe: Any) -> dict[str, Any]:
+            case = put_case(originals, seed, folder, str(target))
+            pipe.send({"seed": seed, "done": case.done, "file": str(case.folder)})
+            return outcome_of(case, originals.expected)
+
+        return command
     all_samples = samples(most, own=own)
-    warm = Path(folder) / "warm.mcap"
+    warm = folder / "warm.mcap"
     for sample in all_samples:  # compiles
         warm.write_bytes(Model([Piece([*sample.schemas, *sample.channels, *sample.messages])]).written())
         outcome(warm)
+
+    def read(seed: str, pipe: Any) -> dict[str, Any]:
+        path, done = put(all_samples, seed, folder, target)
+        pipe.send({"seed": seed, "done": done, "file": str(path)})
+        return outcome(path, lambda: pipe.send(None))
+
+    return read
+
+
+def _serve(pipe: Any, folder: str, most: int, own: bool, target: str | None) -> None:
+    """Make and read the inputs that are asked for, until there are no more."""
+    read = _reader(Path(folder), most, own, target)
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     room = pages * resource.getpagesize() + _ROOM_BYTES
     resource.setrlimit(resource.RLIMIT_AS, (room, room))
     pipe.send("ready")
     while (seed := pipe.recv()) is not None:
-        path, done = put(all_samples, seed, Path(folder), target)
-        pipe.send({"seed": seed, "done": done, "file": str(path)})
         Path("/proc/self/clear_refs").write_text("5")
         begin = time.process_time()
-        found = outcome(path, lambda: pipe.send(None))
+        found = read(seed, pipe)
         found |= {"seconds": time.process_time() - begin, "bytes": _peak_bytes()}
         pipe.send(found)
 
@@ -133,6 +158,7 @@ class _Worker:
 
     def __init__(self, folder: Path, most: int, own: bool, target: str | None) -> None:
         self._arguments = (str(folder), most, own, target)
+        self._longest_s = LONGEST_COMMAND_S if target in COMMANDS else LONGEST_S
         self._start()
 
     def _start(self) -> None:
@@ -151,7 +177,7 @@ class _Worker:
         """Wait for an answer: as long as it may compute, which on a busy machine is longer."""
         begin, wall = self._computed_s(), time.monotonic()
         while not self._pipe.poll(0.2):
-            if self._computed_s() - begin > LONGEST_S or time.monotonic() - wall > 6 * LONGEST_S:
+            if self._computed_s() - begin > self._longest_s or time.monotonic() - wall > 6 * self._longest_s:
                 return False
         return True
 
@@ -170,7 +196,8 @@ class _Worker:
                     break
                 if (end := self._pipe.recv()) is not None:
                     return about | end
-            found = {"outcome": "defect", "what": f"takes more than {LONGEST_S:g} s", "seconds": LONGEST_S}
+            found = {"outcome": "defect", "what": f"takes more than {self._longest_s:g} s"}
+            found["seconds"] = self._longest_s
         except EOFError:
             found = {"outcome": "defect", "what": "the process died", "seconds": 0.0}
         self.end()
@@ -193,7 +220,7 @@ def fuzz(
     target: str | None = None,
 ) -> dict[str, Any]:
     """Read `inputs` files. The counts, the worst, and the defects; `keep`: where files that show one are put."""
-    counts, worst_s, worst_bytes = Counter[str](), (0.0, ""), (0, "")
+    counts, past, worst_s, worst_bytes = Counter[str](), 0, (0.0, ""), (0, "")
     defects: list[dict[str, Any]] = []
     until = time.monotonic() + 60 * minutes
     with tempfile.TemporaryDirectory() as folder:
@@ -205,6 +232,7 @@ def fuzz(
             if found["outcome"] != "defect" and found["bytes"] > MOST_BYTES:
                 found |= {"outcome": "defect", "what": f"takes {found['bytes'] / 1e6:.0f} MB"}
             counts[found["outcome"]] += 1
+            past += found.get("past", False)
             worst_s = max(worst_s, (found["seconds"], name))
             worst_bytes = max(worst_bytes, (found["bytes"], name))
             if found["outcome"] == "defect":
@@ -217,6 +245,7 @@ def fuzz(
     return {
         "inputs": sum(counts.values()),
         "outcomes": dict(counts),
+        "past_header": past,
         "worst_s": round(worst_s[0], 3),
         "worst_s_seed": worst_s[1],
         "worst_mb": round(worst_bytes[0] / 1e6),
@@ -230,7 +259,7 @@ def _kept(made: Path, place: Path) -> Path:
     place = place / made.name
     place.parent.mkdir(parents=True, exist_ok=True)
     if made.is_dir():
-        shutil.copytree(made, place, dirs_exist_ok=True)
+        shutil.copytree(made, place, dirs_exist_ok=True, symlinks=True)
     else:
         shutil.copyfile(made, place)
     return place
@@ -238,7 +267,7 @@ def _kept(made: Path, place: Path) -> Path:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("target", nargs="?", choices=TARGETS)
+    parser.add_argument("target", nargs="?", choices=(*TARGETS, *COMMANDS))
     parser.add_argument("--inputs", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--minutes", type=float, default=10.0)
@@ -247,6 +276,7 @@ def main() -> int:
     found = fuzz(asked.inputs, asked.seed, minutes=asked.minutes, keep=asked.keep, target=asked.target)
     kinds = Counter(d["what"].split(": ")[0] for d in found["defects"])
     print(json.dumps({**found, "defects": dict(kinds.most_common())}))
+    print(f"got past the header: {found['past_header']} of {found['inputs']}")
     return 1 if kinds else 0
 
 

@@ -189,13 +189,13 @@ def taken_apart(path: Path, most: int) -> Sample:
     return Sample(path.stem, schemas, channels, messages)
 
 
-def model_of(sample: Sample, dice: random.Random) -> Model:
-    """A sound file of a sample, in chunks of some size and compression."""
+def model_of(sample: Sample, dice: random.Random, most: tuple[int, ...] = (5, 10, 40)) -> Model:
+    """A sound file of so many messages of a sample, in chunks of some size and compression."""
     import copy
 
     schemas, channels, messages = copy.deepcopy((sample.schemas, sample.channels, sample.messages))
     first = dice.randrange(max(1, len(messages) // 2))
-    messages = messages[first : first + dice.choice((5, 10, 40))]
+    messages = messages[first : first + dice.choice(most)]
     size = dice.choice((3, 10, 100))
     groups = [messages[k : k + size] for k in range(0, len(messages), size)] or [[]]
     compression = dice.choice(("zstd", "zstd", "lz4", ""))

@@ -1,12 +1,17 @@
-"""What `fuzz.py` does to recordings: every way in which a file can be wrong, drawn from a seed."""
+"""What `fuzz.py` does to recordings and documents: every way in which a file can be wrong, drawn from a seed."""
 
 from __future__ import annotations
 
+import copy
+import csv
+import io
+import json
 import random
 import re
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import Any
 
 from fuzzing.mcap_model import Channel, Message, Model, Raw, Sample, Schema, compressed, model_of, record
 
@@ -383,11 +388,11 @@ MUTATORS: tuple[tuple[Callable[[Model, Sample, Dice], None], float], ...] = (
 )
 
 
-def hostile(samples: list[Sample], seed: str) -> tuple[bytes, str]:
-    """The file of a seed, and what was done to it."""
+def hostile(samples: list[Sample], seed: str, messages: tuple[int, ...] = (5, 10, 40)) -> tuple[bytes, str]:
+    """The file of a seed, of so many messages, and what was done to it."""
     dice = random.Random(seed)
     sample = dice.choice(samples)
-    model = model_of(sample, dice)
+    model = model_of(sample, dice, messages)
     done = [sample.name]
     if dice.random() < 0.8:
         for _ in range(dice.choice((1, 1, 1, 2, 4))):
@@ -403,3 +408,163 @@ def hostile(samples: list[Sample], seed: str) -> tuple[bytes, str]:
             data = change_bytes(data, dice)
             done.append(change_bytes.__name__)
     return data, " ".join(done)
+
+
+# ------------------------------------------------------------------------------- documents
+
+
+_VALUES: tuple[Any, ...] = (
+    None, True, False, "", "ego", "truth", "all", "none", "default", "PEM", "1", "a\nb", "\x1b[31m", "\ud800",
+    "é\u2028", "x" * 5000, "..", "/", "../..", "C:\\x", "=1+1", "<b>", "nan", "os:system", "no.module:Class", [], {},
+    [[]], [0], [0, 0], [1, 0], [-1, 1], {"kind": "constant"}, {"kind": "nothing"}, {"default": 0}, 0.5, 3, 1000, 1e-9,
+    "gaussian", "visible_share", "tracker", "gnn", "union", "ideal", "median",
+)  # fmt: skip
+Place = tuple[Any, Any]
+"""A container of plain data, and a key of it."""
+
+
+def _places(value: Any) -> Iterator[Place]:
+    for key, inner in list(value.items() if isinstance(value, dict) else enumerate(value)):
+        yield value, key
+        if isinstance(inner, dict | list):
+            yield from _places(inner)
+
+
+def tree_hit(value: Any, dice: Dice) -> Any:
+    """Plain data with one place of it changed: another value, left out, doubled, put elsewhere, under another name."""
+    value = copy.deepcopy(value)
+    places = list(_places(value)) if isinstance(value, dict | list) else []
+    if not places:
+        return dice.choice(_VALUES)
+    (inner, key), (other, other_key), pick = dice.choice(places), dice.choice(places), dice.random()
+    numbers = [place for place in places if type(place[0][place[1]]) in (int, float)]
+    if numbers and pick < 0.4:
+        inner, key = dice.choice(numbers)
+        inner[key] = inner[key] * dice.choice((-1, 0, 0.5, 2, 10, 1e3)) + dice.choice((0, 0, 1, -1))
+    elif pick < 0.5:
+        inner[key] = dice.choice((*_INTS, *_FLOATS))
+    elif pick < 0.65:
+        inner[key] = copy.deepcopy(dice.choice(_VALUES))
+    elif pick < 0.75:
+        del inner[key]
+    elif pick < 0.85:
+        inner[key] = copy.deepcopy(other[other_key])
+    elif pick < 0.95 and isinstance(inner, dict):
+        names = (*(key for _, key in places if isinstance(key, str)), f"{key}x", *map(str, _VALUES[3:24]))
+        inner[dice.choice(names)] = inner.pop(key) if dice.random() < 0.7 else copy.deepcopy(inner[key])
+    elif isinstance(inner, list):
+        inner.insert(key, copy.deepcopy(other[other_key]))
+    else:
+        for _ in range(dice.choice((1, 3, 200))):
+            inner[key] = [inner[key]] if dice.random() < 0.5 else {"kind": inner[key]}
+    return value
+
+
+def rows_hit(data: bytes, dice: Dice) -> bytes:
+    """A table of CSV with a cell, a row or a column changed."""
+    rows = list(csv.reader(io.StringIO(data.decode(errors="replace"))))
+    if not rows or not rows[0]:
+        return data + b"\x00,"
+    at, column, pick = dice.randrange(len(rows)), dice.randrange(len(rows[0])), dice.random()
+    if pick < 0.5:
+        cells = rows[at] or [""]
+        values = (*map(str, (*_INTS, *_FLOATS, *_VALUES[:24])), *dice.choice(rows))
+        cells[dice.randrange(len(cells))] = dice.choice(values)
+    elif pick < 0.65:
+        rows = [row[:column] + row[column + 1 :] for row in rows]
+    elif pick < 0.8:
+        rows.insert(dice.randrange(len(rows)), list(rows[at]))
+    elif pick < 0.9:
+        del rows[at]
+    else:
+        dice.shuffle(rows[0] if dice.random() < 0.5 else rows)
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue().encode(errors="replace")
+
+
+def table_hit(table: Any, dice: Dice) -> Any:
+    """An Arrow table with a column of other values, of another kind or name, or with other rows or metadata."""
+    import pyarrow as pa
+
+    if not table.num_columns or dice.random() < 0.2:
+        rows = dice.choice((0, 1, table.num_rows // 2, 2 * table.num_rows))
+        return table.take(
+            pa.array([dice.randrange(table.num_rows) for _ in range(rows if table.num_rows else 0)], pa.int64())
+        )
+    k, pick = dice.randrange(table.num_columns), dice.random()
+    name, column = table.field(k).name, table.column(k)
+    if pick < 0.1:
+        return table.remove_column(k)
+    if pick < 0.2:
+        names = [*table.column_names]
+        names[k] = dice.choice((*table.column_names, "x", "", "a\nb"))
+        return table.rename_columns(names)
+    if pick < 0.3 and table.schema.metadata:
+        metadata = {
+            key: dice.choice((flipped, cut, json_hit))(text, dice) for key, text in table.schema.metadata.items()
+        }
+        return table.replace_schema_metadata(metadata)
+    count = table.num_rows
+    if pick < 0.5:
+        kind = dice.choice((pa.string(), pa.float64(), pa.int64(), pa.bool_(), pa.null(), pa.list_(pa.int8())))
+        value: Any = dice.choice((None, *([0] if pa.types.is_integer(kind) or pa.types.is_floating(kind) else [])))
+        changed = pa.array([value] * count, type=kind)
+    else:
+        values = column.to_pylist()
+        for at in dice.sample(range(count), min(count, dice.choice((1, 1, 3, count)))):
+            values[at] = dice.choice(
+                (None, values[dice.randrange(count)], *_FLOATS[:6], -1, 0, 1, 2**53, "", "x", "a\nb")
+            )
+        try:
+            changed = pa.array(values, type=column.type, from_pandas=False)
+        except (pa.ArrowInvalid, pa.ArrowTypeError, OverflowError):
+            changed = pa.array([None if v is None else str(v) for v in values])
+    return table.set_column(k, name, changed)
+
+
+def document_hit(name: str, data: bytes, dice: Dice) -> bytes:
+    """A document changed by what it is: plain data, rows, an Arrow table; or some of its bytes."""
+    kind, pick = name.rpartition(".")[2], dice.random()
+    if pick < 0.12:
+        return dice.choice(BYTES)(data, dice)
+    if pick < 0.15:
+        return dice.choice((b"", b"[" * 100_000, b"\xff\xfe", b"null", b"[]", b"{}", b"0", b"\n", b"\0" * 1000))
+    if kind in ("parquet", "feather"):
+        return _arrow_hit(kind, data, dice)
+    if kind == "csv":
+        return rows_hit(data, dice)
+    if kind == "json":
+        value = json.loads(data)
+        for _ in range(dice.choice((1, 1, 2, 4))):
+            value = tree_hit(value, dice)
+        return json.dumps(value).encode()
+    if kind == "yaml":
+        return yaml_hit(data, dice)
+    if kind in ("xml", "jsonl", "txt"):
+        return json_hit(data, dice)
+    return dice.choice(BYTES)(data, dice)
+
+
+def yaml_hit(data: bytes, dice: Dice) -> bytes:
+    """An experiment with some of its places changed."""
+    from copem_replay.core.yaml import parse_yaml
+
+    value = parse_yaml(data.decode())[0]
+    for _ in range(dice.choice((1, 1, 1, 2, 3))):
+        value = tree_hit(value, dice)
+    return json.dumps(value).replace("Infinity", ".inf").replace("NaN", ".nan").encode()
+
+
+def _arrow_hit(kind: str, data: bytes, dice: Dice) -> bytes:
+    from pyarrow import BufferOutputStream, BufferReader, feather, parquet
+
+    table = parquet.read_table(BufferReader(data)) if kind == "parquet" else feather.read_table(BufferReader(data))
+    out = BufferOutputStream()
+    for _ in range(dice.choice((1, 1, 2))):
+        table = table_hit(table, dice)
+    if kind == "parquet":
+        parquet.write_table(table, out)
+    else:
+        feather.write_feather(table, out)
+    return bytes(out.getvalue())
