@@ -7,7 +7,7 @@ Targets are `mcap`, `trace` (OSI) and `folder` (rosbag2), with none of these giv
 `experiment` (checked and run), `results` (compared, viewed, plotted, reported, run again over it with damaged parts),
 `fit` and `convert`. Every input is made from a seed. A recording is surveyed and read, then its other lists are read
 and its messages copied; on the others commands are called. That is done in a process whose memory is watched and that
-is ended when it takes more than 10 s of computing, 30 s for commands. Good ends: it was read (and what was skipped is
+is ended when it takes more than 30 s of computing. Good ends: it was read (and what was skipped is
 said), or it is refused in single lines. Printed are lines of JSON: each defect with its seed and where the input is
 that shows it, at the end the counts, and how many inputs got past the header: of a recording messages were found, a
 document is of its format.
@@ -36,7 +36,7 @@ from fuzzing.containers import TARGETS, put
 from fuzzing.mcap_model import Model, Piece
 from fuzzing.samples import samples
 
-LONGEST_S, LONGEST_COMMAND_S = 10.0, 30.0
+LONGEST_S = 30.0
 MOST_BYTES = 1_000_000_000
 _ROOM_BYTES = 3 << 30  # of address space beside what is taken at the start
 READ, REFUSED = "read", "refused"
@@ -113,15 +113,18 @@ def _peak_bytes() -> int:
     return 0
 
 
-def _reader(folder: Path, most: int, own: bool, target: str | None) -> Callable[[str, Any], dict[str, Any]]:
-    """What makes the input of a seed, tells of it through a pipe, and says what becomes of it."""
+Made = tuple[Path, str, Callable[[Any], dict[str, Any]]]
+"""An input, what was done to it, and what says what becomes of it, with a pipe to tell that half of it is done."""
+
+
+def _maker(folder: Path, most: int, own: bool, target: str | None) -> Callable[[str], Made]:
+    """What makes the input of a seed."""
     if target in COMMANDS:
         originals = make_originals(folder / "originals", str(target))
 
-        def command(seed: str, pipe: Any) -> dict[str, Any]:
+        def command(seed: str) -> Made:
             case = put_case(originals, seed, folder, str(target))
-            pipe.send({"seed": seed, "done": case.done, "file": str(case.folder)})
-            return outcome_of(case, originals.expected)
+            return case.folder, case.done, lambda pipe: outcome_of(case, originals.expected)
 
         return command
     all_samples = samples(most, own=own)
@@ -130,26 +133,28 @@ def _reader(folder: Path, most: int, own: bool, target: str | None) -> Callable[
         warm.write_bytes(Model([Piece([*sample.schemas, *sample.channels, *sample.messages])]).written())
         outcome(warm)
 
-    def read(seed: str, pipe: Any) -> dict[str, Any]:
+    def recording(seed: str) -> Made:
         path, done = put(all_samples, seed, folder, target)
-        pipe.send({"seed": seed, "done": done, "file": str(path)})
-        return outcome(path, lambda: pipe.send(None))
+        return path, done, lambda pipe: outcome(path, lambda: pipe.send(None))
 
-    return read
+    return recording
 
 
 def _serve(pipe: Any, folder: str, most: int, own: bool, target: str | None) -> None:
     """Make and read the inputs that are asked for, until there are no more."""
-    read = _reader(Path(folder), most, own, target)
+    make = _maker(Path(folder), most, own, target)
     pages = int(Path("/proc/self/statm").read_text().split()[0])
-    room = pages * resource.getpagesize() + _ROOM_BYTES
-    resource.setrlimit(resource.RLIMIT_AS, (room, room))
+    room, anything = pages * resource.getpagesize() + _ROOM_BYTES, resource.getrlimit(resource.RLIMIT_AS)
     pipe.send("ready")
     while (seed := pipe.recv()) is not None:
+        path, done, read = make(seed)
+        pipe.send({"seed": seed, "done": done, "file": str(path)})
+        resource.setrlimit(resource.RLIMIT_AS, (room, anything[1]))
         Path("/proc/self/clear_refs").write_text("5")
         begin = time.process_time()
-        found = read(seed, pipe)
+        found = read(pipe)
         found |= {"seconds": time.process_time() - begin, "bytes": _peak_bytes()}
+        resource.setrlimit(resource.RLIMIT_AS, anything)
         pipe.send(found)
 
 
@@ -158,7 +163,6 @@ class _Worker:
 
     def __init__(self, folder: Path, most: int, own: bool, target: str | None) -> None:
         self._arguments = (str(folder), most, own, target)
-        self._longest_s = LONGEST_COMMAND_S if target in COMMANDS else LONGEST_S
         self._start()
 
     def _start(self) -> None:
@@ -177,7 +181,7 @@ class _Worker:
         """Wait for an answer: as long as it may compute, which on a busy machine is longer."""
         begin, wall = self._computed_s(), time.monotonic()
         while not self._pipe.poll(0.2):
-            if self._computed_s() - begin > self._longest_s or time.monotonic() - wall > 6 * self._longest_s:
+            if self._computed_s() - begin > LONGEST_S or time.monotonic() - wall > 6 * LONGEST_S:
                 return False
         return True
 
@@ -196,8 +200,7 @@ class _Worker:
                     break
                 if (end := self._pipe.recv()) is not None:
                     return about | end
-            found = {"outcome": "defect", "what": f"takes more than {self._longest_s:g} s"}
-            found["seconds"] = self._longest_s
+            found = {"outcome": "defect", "what": f"takes more than {LONGEST_S:g} s", "seconds": LONGEST_S}
         except EOFError:
             found = {"outcome": "defect", "what": "the process died", "seconds": 0.0}
         self.end()

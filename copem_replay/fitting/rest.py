@@ -253,10 +253,10 @@ def fit_list_times(lists: FitLists) -> ListTimesFit:
     """Fit the gaps between lists of the same log."""
     same = np.diff(lists.log) == 0
     gaps_s = np.diff(lists.captured_s)[same]
-    if not len(gaps_s):
-        none = Estimate(float("nan"), why=f"{len(lists.log)} lists")
+    period_s = float(np.median(gaps_s)) if len(gaps_s) else 0.0
+    if not period_s:
+        none = Estimate(float("nan"), why=f"{len(lists.log)} lists{', most of one time' if len(gaps_s) else ''}")
         return ListTimesFit(none, none, none, none)
-    period_s = float(np.median(gaps_s))
     ordinary, long = gaps_s[gaps_s <= LONG * period_s], gaps_s[gaps_s > LONG * period_s]
     n, spread_s = len(gaps_s), float(ordinary.std())
     aside = 1.2533 * 1.96 * spread_s / np.sqrt(len(ordinary))  # of a median

@@ -64,6 +64,11 @@ def test_outages_are_found_again() -> None:
     Outages.model_validate(fit.keys())
 
 
+def test_lists_of_one_time_have_no_period() -> None:
+    fit = fit_list_times(_lists(np.array([0.0, 0.0, 0.0, 0.4])))
+    assert fit.period_s.why == "4 lists, most of one time"
+
+
 def test_no_outage_is_said() -> None:
     fit = fit_list_times(_lists(0.1 * np.arange(100)))
     assert fit.keys() == {}

@@ -97,6 +97,11 @@ def test_argoverse2_from_the_rear_axle_to_the_city(run: Runner) -> None:
         assert f"note: {note}" in found.printed
 
 
+def test_argoverse2_a_quaternion_that_overflows_is_no_turn(run: Runner) -> None:
+    found = run("argoverse2", av2_log(run, [{**BOXES[0], "qw": 1e200}, *BOXES[1:]], POSES))
+    assert len(found.values(found.id_of("car-uuid"), "x_m")) == 1  # of two
+
+
 def test_argoverse2_ego_of_another_size(run: Runner) -> None:
     options = ("--ego-size-m", "5", "2.1", "1.6", "--centre-from-rear-axle-m", "1.5", "0", "0.4")
     found = run("argoverse2", av2_log(run, BOXES, POSES), *options)
@@ -254,6 +259,9 @@ def test_scenarionet_refuses_what_it_does_not_know(run: Runner) -> None:
     assert "track ego: heading: expected 4 steps of up to 1, as `ts` has, found shape (3,)" in line(scenario(ego=short))
     del short["state"]["heading"]
     assert "track ego: expected 'heading' in its state, found position" in line(scenario(ego=short))
+    flat = ego()
+    flat["state"]["velocity"] = np.zeros((4, 1))
+    assert "track ego: velocity: expected 2 or 3 columns, found 1" in line(scenario(ego=flat))
     assert "s.pkl: no object to convert in 4 frames" in line(scenario())
     assert "expected a pickle, found something else" in run.refused("scenarionet", run.file("s.pkl", "no pickle"))
     assert "expected a pickle, found something else" in run.refused("scenarionet", run.file("s.pkl", b""))

@@ -712,10 +712,14 @@ class TestFile:
                 text.replace("\nhit,", "\nhits,"),
                 "expected rows of GT, late, half, hit, never, found GT, late, half, hits",
             ),
+            (text.replace("\nnever,", "\n,"), "found GT, late, half, hit, nan; run the experiment again"),
+            (re.sub(r"(?<=\nhit,)[^,]*", "x", text), "column [a-z_]*: expected numbers, found "),
         ):
             (mine / "summary.csv").write_text(damaged, encoding="utf-8")
             with pytest.raises(InputError, match=said):
                 write_html_report(mine)
+            with pytest.raises(InputError, match=said):
+                write_figure_files(read_results(mine), None, Selection())
 
     def test_nothing_half_written(self, mine: Path, tmp_path: Path) -> None:
         (tmp_path / "file").write_text("a file")

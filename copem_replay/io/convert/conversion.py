@@ -85,9 +85,10 @@ KINDS: Final[dict[str, OsiKind]] = {
 
 
 def rotation_from_quaternion(w: Float, x: Float, y: Float, z: Float) -> Float:
-    """Rotation matrices (N, 3, 3) of quaternions, (N,) each, of any length but 0 (then NaN)."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        w, x, y, z = np.array([w, x, y, z], dtype=np.float64) / np.sqrt(w * w + x * x + y * y + z * z)
+    """Rotation matrices (N, 3, 3) of quaternions, (N,) each, of any length but 0 and more than 1e154 (then NaN)."""
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        length = np.sqrt(w * w + x * x + y * y + z * z)
+        w, x, y, z = np.array([w, x, y, z], dtype=np.float64) / np.where(np.isinf(length), np.nan, length)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],

@@ -141,6 +141,8 @@ def _read_track(track: Any, steps: int, where: str, report: ConversionReport, *,
     velocity = np.full((steps, 2), np.nan)
     if "velocity" in state:
         velocity = _read_array(state, "velocity", steps, 0, where)[:, :2].copy()
+        if velocity.shape[1] != 2:
+            raise InputError(f"{where}: velocity: expected 2 or 3 columns, found 1")
         beside = np.concatenate([[True], ~valid[:-1]]) | np.concatenate([~valid[1:], [True]])
         unknown = valid & beside & ~velocity.any(axis=1)
         report.count("state", "at the ends of tracks with velocity 0: taken as not given", int(unknown.sum()))

@@ -18,7 +18,7 @@ from copem_replay.report.figures.differences import differences_figure, no_diffe
 from copem_replay.report.figures.distances import distances_about, distances_figure
 from copem_replay.report.figures.latency_breakdown import latency_breakdown_figure, no_stages
 from copem_replay.report.figures.selection import Selection, choose_object_and_run
-from copem_replay.report.figures.style import METADATA, render_figure
+from copem_replay.report.figures.style import METADATA, check_summary, render_figure
 from copem_replay.report.figures.sweeps import sweeps_figure
 from copem_replay.report.figures.trade_off import no_trade_off, trade_off_figure
 from copem_replay.results.folder import add_to_made_list, check_unchanged
@@ -145,6 +145,7 @@ def write_figure_files(results: Results, folder: Path | None, selection: Selecti
     removed if they can no longer be made. Raises InputError for a selection that is not among the results, OutputError
     if nothing can be written.
     """
+    check_summary(results)
     choice = choose_object_and_run(results, selection)  # raises before anything is drawn
     selection = replace(selection, log=choice.log, object_id=choice.object_id, run=choice.run)
     folder = results.folder / "figures" if folder is None else folder

@@ -21,8 +21,9 @@ import numpy as np
 import pandas as pd
 
 from copem_replay.core.colours import configuration_colours
-from copem_replay.core.errors import count_noun
+from copem_replay.core.errors import InputError, count_noun
 from copem_replay.metrics.intervals import choose_clusters, describe_absent, describe_clusters, explain_no_clusters
+from copem_replay.results.schema import AGAIN
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -373,6 +374,26 @@ def find_contenders(results: Results, names: Sequence[str] | None = None) -> tup
     """Those of `names` (None: all) that are not the ground truth; all of `names` if there are no others."""
     chosen, upper = results.chosen(names), find_truths(results)
     return tuple(name for name in chosen if name not in upper) or chosen
+
+
+_NUMBERS = ("n", "detected_share", "ttd_median_s", "ttd_rmst_s", "ttd_rmst_horizon_s", "dad_median_m")
+_BRAKING_NUMBERS = ("n_conflict", "pass_share", "pass_share_low", "pass_share_high")
+_BRAKING_TEXTS = ("pass_interval", "pass_interval_over")
+
+
+def check_summary(results: Results) -> None:
+    """Raise InputError unless `summary.csv` has the experiment's configurations, and numbers in what is shown."""
+    braking = results.experiment.braking is not None
+    place, summary = results.folder / "summary.csv", results.summary
+    numbers = _NUMBERS + (_BRAKING_NUMBERS if braking else ())
+    for name in (*numbers, "interval", "interval_over", *(_BRAKING_TEXTS if braking else ())):
+        if name not in summary:
+            raise InputError(f"{place}: expected the column {name}, found none; {AGAIN}")
+        if name in numbers and summary[name].dtype.kind not in "iuf" and summary[name].notna().any():
+            raise InputError(f"{place}: column {name}: expected numbers, found {summary[name].dtype}; {AGAIN}")
+    expected, listed = list(results.experiment.configurations), list(map(str, summary["configuration"]))
+    if listed != expected:
+        raise InputError(f"{place}: expected rows of {', '.join(expected)}, found {', '.join(listed)}; {AGAIN}")
 
 
 def sort_soonest_first(results: Results, names: Sequence[str]) -> tuple[str, ...]:

@@ -17,6 +17,7 @@ from copem_replay.report.figures.selection import pivot_by_run
 from copem_replay.report.figures.style import (
     RANKED_BY,
     Appearance,
+    check_summary,
     choose_appearances,
     explain_no_intervals,
     find_contenders,
@@ -55,12 +56,6 @@ def explain_missing_interval(study: ReportData, rows: pd.DataFrame) -> str:
     if not reasons:
         reasons.append(explain_no_intervals(study.results) or "too few have it")
     return " or ".join(reasons)
-
-
-_COLUMNS = (
-    "detected_share", "interval", "interval_over", "ttd_median_s", "ttd_rmst_s", "ttd_rmst_horizon_s", "dad_median_m",
-)  # fmt: skip
-_BRAKING = ("n_conflict", "pass_share", "pass_share_low", "pass_share_high", "pass_interval", "pass_interval_over")
 
 
 @dataclass(frozen=True)
@@ -113,7 +108,7 @@ def load_study(folder: Path, baseline: str | None = None) -> ReportData:
     None: that of `compare`. Raises InputError: no or damaged results, no such baseline.
     """
     results = read_results(folder, rowless=True)
-    _check_summary(results)
+    check_summary(results)
     names = tuple(results.experiment.configurations)
     if baseline is not None and baseline not in names:
         raise InputError(f"--baseline: {unknown_name_message('configuration', baseline, names)}")
@@ -132,14 +127,3 @@ def load_study(folder: Path, baseline: str | None = None) -> ReportData:
             else compare_folders([results], configurations=ranked, baseline=best, metrics=(RANKED_BY,))
         )
     return ReportData(results, regret.baseline, regret, best, lead)
-
-
-def _check_summary(results: Results) -> None:
-    """Raise InputError if `summary.csv` lacks columns, or has rows of other configurations than the experiment."""
-    place, again = results.folder / "summary.csv", "run the experiment again with --overwrite"
-    needed = _COLUMNS + (_BRAKING if results.experiment.braking is not None else ())
-    if missing := [name for name in needed if name not in results.summary]:
-        raise InputError(f"{place}: expected the column {missing[0]}, found none; {again}")
-    expected, listed = list(results.experiment.configurations), list(results.summary["configuration"])
-    if listed != expected:
-        raise InputError(f"{place}: expected rows of {', '.join(expected)}, found {', '.join(listed)}; {again}")
