@@ -148,6 +148,9 @@ def _report_damage(place: Path) -> Iterator[None]:
     """Raise InputError where Arrow cannot read a table."""
     try:
         yield
+    except KeyError as error:  # of a column that is asked for by its name
+        name = error.args[0].decode() if isinstance(error.args[0], bytes) else error.args[0]
+        raise InputError(f"{place}: expected the column {name}, found none; {AGAIN}") from None
     except (OSError, ValueError) as error:  # what Arrow raises derives from these
         why = " ".join(str(error).split())
         raise InputError(f"{place}: expected a table that can be read, found damage: {why}; {AGAIN}") from None

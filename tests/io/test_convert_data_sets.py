@@ -102,6 +102,11 @@ def test_argoverse2_a_quaternion_that_overflows_is_no_turn(run: Runner) -> None:
     assert len(found.values(found.id_of("car-uuid"), "x_m")) == 1  # of two
 
 
+def test_argoverse2_a_place_that_is_not_finite_is_skipped(run: Runner) -> None:
+    found = run("argoverse2", av2_log(run, [{**BOXES[0], "tx_m": math.inf}, *BOXES[1:]], POSES))
+    assert len(found.values(found.id_of("car-uuid"), "x_m")) == 1  # of two
+
+
 def test_argoverse2_ego_of_another_size(run: Runner) -> None:
     options = ("--ego-size-m", "5", "2.1", "1.6", "--centre-from-rear-axle-m", "1.5", "0", "0.4")
     found = run("argoverse2", av2_log(run, BOXES, POSES), *options)
@@ -684,6 +689,15 @@ def cuboid(val: Any, **more: Any) -> str:
         ),
         (
             labels({}, coordinate_systems={"a": {"parent": "b", "pose_wrt_parent": {"matrix4x4": [1.0] * 16}}}),
+            "a: pose_wrt_parent: expected a rotation and a translation, found another matrix",
+        ),
+        (  # a rotation, and a last row that makes no movement of it
+            labels(
+                {},
+                coordinate_systems={
+                    "a": {"parent": "b", "pose_wrt_parent": {"matrix4x4": [*turned(0, 1, 2, 3)[:-1], 0]}}
+                },
+            ),
             "a: pose_wrt_parent: expected a rotation and a translation, found another matrix",
         ),
         (

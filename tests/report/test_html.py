@@ -712,7 +712,7 @@ class TestFile:
                 text.replace("\nhit,", "\nhits,"),
                 "expected rows of GT, late, half, hit, never, found GT, late, half, hits",
             ),
-            (text.replace("\nnever,", "\n,"), "found GT, late, half, hit, nan; run the experiment again"),
+            (text.replace("\nnever,", "\n,"), "found GT, late, half, hit, ; run the experiment again"),
             (re.sub(r"(?<=\nhit,)[^,]*", "x", text), "column [a-z_]*: expected numbers, found "),
         ):
             (mine / "summary.csv").write_text(damaged, encoding="utf-8")

@@ -238,6 +238,8 @@ def test_a_column_that_is_missing_or_of_another_kind(tmp_path, name):
     assert problem.startswith(f"{folder / name}: column {last}: expected ")
     parquet.write_table(table.drop_columns([last]), folder / name)
     assert problems(folder)[0].startswith(f"{folder / name}: expected the column {last}, found none")
+    parquet.write_table(table.drop_columns(["configuration"]), folder / name)
+    assert problems(folder)[0].startswith(f"{folder / name}: expected the column configuration, found none")
 
 
 def rows_twice(folder: Path) -> None:

@@ -103,7 +103,7 @@ def frames(
                 Box(
                     id=ids[boxes["track_uuid"][k]],
                     kind=KINDS[_KIND.get(category, "other")],
-                    at_m=tuple((R @ ego_t_object[k] + t).tolist()),
+                    at_m=_move(R, ego_t_object[k], t),
                     yaw_rad=_yaw_of_matrix(R @ ego_R_object[k]),
                     size_m=(length, width, height),
                 )
@@ -113,9 +113,16 @@ def frames(
 
 def _make_ego_box(R: Float, t: Float, size_m: tuple[float, float, float], centre_m: tuple[float, float, float]) -> Box:
     """Return the ego vehicle at a pose of its rear axle."""
-    at_m = tuple((R @ np.array(centre_m) + t).tolist())
+    at_m = _move(R, np.array(centre_m), t)
     x, y, z = (-v + 0.0 for v in centre_m)
     return Box(1, KINDS["car"], at_m, _yaw_of_matrix(R), size_m, rear_axle_m=(x, y, z))
+
+
+def _move(R: Float, at_m: Float, t: Float) -> tuple[float, float, float]:
+    """A point turned and moved; not finite where the file's numbers are not."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        x, y, z = (R @ at_m + t).tolist()
+    return x, y, z
 
 
 def _yaw_of_matrix(R: Float) -> float:

@@ -106,8 +106,9 @@ def _read_matrix(pose: Any, where: str) -> Float:
         raise InputError(
             f"{where}: expected matrix4x4, or quaternion and translation, found {', '.join(pose) or 'none'}"
         )
-    turned = matrix[:3, :3]
-    if not np.isfinite(matrix).all() or not np.allclose(turned @ turned.T, np.eye(3), atol=1e-3):
+    turned, last = matrix[:3, :3], [0, 0, 0, 1]
+    moved = np.isfinite(matrix).all() and np.abs(turned).max() < 2 and np.allclose(matrix[3], last)
+    if not moved or not np.allclose(turned @ turned.T, np.eye(3), atol=1e-3):
         raise InputError(f"{where}: expected a rotation and a translation, found another matrix")
     return matrix
 
