@@ -1,11 +1,15 @@
-"""Kill runs at many moments, as `kill -9` does, and look at what is left: `python tools/kill_runs.py --kills 300`.
+"""Kill commands at many moments, as `kill -9` does, and look at what is left: `python tools/kill_runs.py --kills 300`.
+
+    python tools/kill_runs.py fit --kills 50     # one of: run (default), cluster, fit, convert, plot, report
 
 Half of the moments are numbered steps (a file opened, a folder made, a name given or taken where the results go: what
 Python tells its audit hooks of), half random times. After each kill, the results folder is either what it was or what
 it was going to be, and a file of the user's is in it; a page that was made of the old results is there with them and
 gone with them. A run after that gives the same bytes as ever, and leaves nothing beside the folder. The .rrd, whose
 bytes differ from run to run, has to be there. `--two-steps`: as where folders cannot be exchanged; then, for an
-instant, nothing has the folder's name, and the next run puts it back.
+instant, nothing has the folder's name, and the next run puts it back. A fit is such a folder. Of `convert`, `plot` and
+`report` the recording, the folder of figures and the page are what they were or what they were going to be. Of
+`cluster` (`run --cluster local:2`) no process stays longer than a minute.
 """
 
 from __future__ import annotations
@@ -18,6 +22,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -25,6 +30,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 _STEPS = {"open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.link", "os.truncate", "os.scandir"}
 _NOTE, _PAGE = "notes.txt", "page.html"
+COMMANDS = ("run", "cluster", "fit", "convert", "plot", "report")
 Files = dict[str, bytes]
 
 
@@ -47,18 +53,40 @@ class Found:
         return f"{told}; something beside it {self.leftovers}; wrong: {len(self.wrong)}"
 
 
-class Trial:
-    """An experiment in a folder of its own, run by forks of this process, which has loaded what they need."""
+_GONE_S = 60.0
+"""Within this time all processes that a killed command started have ended."""
 
-    def __init__(self, here: Path, experiment: Path, *, two_steps: bool) -> None:
+
+@dataclass
+class Command:
+    """What is killed: its arguments, by 1 and 2 for two outputs that differ, and the file or folder that it writes.
+
+    `keeps`: whether that is a folder of results, in which the user's files stay. `load`: imports and loads what it
+    needs, so that forks need not.
+    """
+
+    arguments: dict[int, list[str]]
+    out: Path
+    keeps: bool
+    load: Callable[[], object]
+    processes: bool = False
+
+
+class Trial:
+    """A command in a folder of its own, called by forks of this process, which has loaded what they need."""
+
+    def __init__(self, here: Path, command: Command, *, two_steps: bool) -> None:
         self.two_steps = two_steps
-        self.here, self.experiment, self.out = here, experiment, here / "out/e"
+        self.here, self.command, self.out = here, command, command.out
         self.expected: dict[int, Files] = {}
+        self.beside: list[str] = []
+        self.last = 0  # the last process, and the number of its group
 
     def forked(self, seed: int, before: Callable[[], None] = lambda: None) -> int:
         """Begin a run; the process that does it."""
         child = os.fork()
         if child:
+            self.last = child
             return child
         try:
             from copem_replay.cli import main as cli
@@ -70,8 +98,8 @@ class Trial:
             for fd in (1, 2):
                 os.dup2(nothing, fd)
             os.chdir(self.here)
-            sys.argv = ["copem-replay", "run", str(self.experiment), "--overwrite", "--seed", str(seed)]
-            sys.argv += ["--out", str(self.out), "--jobs", "1"]
+            sys.argv = ["copem-replay", *self.command.arguments[seed]]
+            os.setpgid(0, 0)
             before()
             os._exit(cli._run_to_exit_code())
         except BaseException:
@@ -80,14 +108,14 @@ class Trial:
     def run(self, seed: int) -> None:
         """A run from beginning to end."""
         code = ended(self.forked(seed))
-        if code != 0:
+        if code not in (0, 1):
             raise SystemExit(f"a run that was not killed ended with {code}")
 
     def steps(self, seed: int) -> int:
         """How many steps a run has."""
         counter = self.here / "steps"
         child = self.forked(seed, lambda: self.kill_at(None, counter))
-        if ended(child) != 0:
+        if ended(child) not in (0, 1):
             raise SystemExit("the run whose steps were counted failed")
         return len(counter.read_bytes())
 
@@ -109,7 +137,9 @@ class Trial:
         sys.addaudithook(hook)
 
     def files(self) -> Files:
-        """What is in the results folder; of an .rrd that it is there."""
+        """What is in the results folder, or the file that is written; of an .rrd that it is there."""
+        if self.out.is_file():
+            return {self.out.name: self.out.read_bytes()}
         paths = [path for path in sorted(self.out.rglob("*")) if path.is_file()]
         return {str(p.relative_to(self.out)): b"" if p.suffix == ".rrd" else p.read_bytes() for p in paths}
 
@@ -117,6 +147,8 @@ class Trial:
         """A file of the user's, and one that was made of the results, as `report` makes it."""
         from copem_replay.results.folder import add_to_made_list
 
+        if not self.command.keeps:
+            return
         (self.out / _NOTE).write_text("mine\n")
         add_to_made_list(self.out, [self.out / _PAGE])
         (self.out / _PAGE).write_text("of the old results\n")
@@ -125,19 +157,22 @@ class Trial:
         """What a killed run left: it is that of one of two seeds (None: there was nothing)."""
         from copem_replay.results.folder import MADE
 
-        found.leftovers += len(os.listdir(self.out.parent)) > self.out.exists() if self.out.parent.exists() else 0
+        self.check_processes(found, what)
+        names = os.listdir(self.out.parent) if self.out.parent.exists() else []
+        found.leftovers += bool(set(names) - {*self.beside, self.out.name})
         before, seed = seeds
         files = self.files()
-        if not self.out.exists() and (before is None or self.two_steps):
+        if not files and (before is None or self.two_steps):
             found.nothing += before is None
             found.gaps += before is not None
             return
-        mine = files.pop(_NOTE, None)
-        if before is not None and mine != b"mine\n":
-            found.wrong.append(f"{what}: {_NOTE} is gone")
-        made = [files.pop(name) for name in (_PAGE, MADE) if name in files]
-        if len(made) != (2 if before is not None and files == self.expected[before] else 0):
-            found.wrong.append(f"{what}: {_PAGE} is beside other results than its own, or gone without them")
+        if self.command.keeps:
+            mine = files.pop(_NOTE, None)
+            if before is not None and mine != b"mine\n":
+                found.wrong.append(f"{what}: {_NOTE} is gone")
+            made = [files.pop(name) for name in (_PAGE, MADE) if name in files]
+            if len(made) != (2 if before is not None and files == self.expected[before] else 0):
+                found.wrong.append(f"{what}: {_PAGE} is beside other results than its own, or gone without them")
         if files == self.expected[seed]:
             found.new += 1
         elif before is not None and files == self.expected[before]:
@@ -150,12 +185,23 @@ class Trial:
         before, seed = seeds
         self.run(seed)
         files = self.files()
-        if files.pop(_NOTE, None) != (None if before is None else b"mine\n"):
+        if files.pop(_NOTE, None) != (None if before is None or not self.command.keeps else b"mine\n"):
             found.wrong.append(f"{what}: {_NOTE} is gone after the next run")
         if files != self.expected[seed]:
             found.wrong.append(f"{what}: the run after it gave other results")
-        if (left := sorted(os.listdir(self.out.parent))) != [self.out.name]:
+        if left := sorted(set(os.listdir(self.out.parent)) - {*self.beside, self.out.name}):
             found.wrong.append(f"{what}: left for good: {left}")
+
+    def check_processes(self, found: Found, what: str) -> None:
+        """Whether all processes of the last command end; those that stay are ended here."""
+        until = time.monotonic() + _GONE_S
+        while left := processes_of(self.last):
+            if time.monotonic() > until:
+                found.wrong.append(f"{what}: {len(left)} processes are left")
+                for number in left:
+                    os.kill(number, signal.SIGKILL)
+                return
+            time.sleep(0.1)
 
 
 def ended(child: int) -> int | None:
@@ -164,8 +210,19 @@ def ended(child: int) -> int | None:
     return None if os.WIFSIGNALED(status) else os.WEXITSTATUS(status)
 
 
-def warmed(path: Path) -> None:
-    """Import and load what a run needs, so that forks need not: all but Rerun's threads, which no fork would have."""
+def processes_of(group: int) -> list[int]:
+    """Processes of a group that have not ended."""
+    numbers = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            state, _, of = path.read_text().rpartition(")")[2].split()[:3]
+            if int(of) == group and state != "Z":
+                numbers.append(int(path.parent.name))
+    return numbers
+
+
+def load_run(path: Path) -> None:
+    """Import and load what a run needs: all but Rerun's threads, which no fork would have."""
     import copem_replay.io.write.mcap  # noqa: F401
     from copem_replay.experiment.file import log_paths, read_experiment_file
     from copem_replay.experiment.validate import find_problems, read_logs
@@ -178,13 +235,105 @@ def warmed(path: Path) -> None:
     run_experiment(experiment, recordings)
 
 
+def run_command(here: Path, experiment: Path, *more: str) -> Command:
+    """`run` of an experiment with two seeds."""
+    both = {}
+    for seed in (1, 2):
+        both[seed] = ["run", str(experiment), "--overwrite", "--seed", str(seed), "--out", str(here / "out/e")]
+        both[seed] += more or ("--jobs", "1")
+    return Command(both, here / "out/e", True, lambda: load_run(experiment), bool(more))
+
+
+def commands_of(here: Path, experiment: Path) -> dict[str, Callable[[], Command]]:
+    """The commands, each of which makes what it works on when it is asked for."""
+    results = here / "results"
+
+    def make_results() -> None:
+        from copem_replay.api.run import run
+
+        run(experiment, jobs=1).save(results)
+
+    def fit() -> Command:
+        make_results()
+        unit = "{on: ego, height_m: 1.8, recorded: {topic: copem/PEM/objects}}"
+        text = f"version: 1\nlogs: [results/replay.mcap]\nunits: {{ego: {unit}}}\n"
+        text += "configurations: {a: {units: [ego]}}\n"
+        (here / "fit.yaml").write_text(text)
+        words = [
+            "fit",
+            str(here / "fit.yaml"),
+            "--unit",
+            "ego",
+            "--folds",
+            "2",
+            "--out",
+            str(here / "out/f"),
+            "--overwrite",
+        ]
+
+        def load() -> None:
+            from copem_replay.api.fit import fit
+            from copem_replay.fitting.page import fit_page
+
+            fit_page(fit(here / "fit.yaml", "ego", folds=2).found)
+
+        return Command({1: words, 2: [*words, "--by", "range"]}, here / "out/f", True, load)
+
+    def convert() -> Command:
+        table = "time_s,id,class,x_m,y_m,yaw_deg,length_m,width_m\n"
+        both = {}
+        for k in (1, 2):
+            rows = "".join(f"{t / 10},{i},car,{t * k},{i},0,4,2\n" for t in range(200) for i in range(5))
+            (here / f"{k}.csv").write_text(table + rows)
+            both[k] = ["convert", "csv", str(here / f"{k}.csv"), "--out", str(here / "out/c.mcap"), "--overwrite"]
+
+        def load() -> None:
+            from copem_replay.io.convert.conversion import convert_source
+
+            convert_source(here / "1.csv", here / "warm.mcap", format="csv")
+
+        return Command(both, here / "out/c.mcap", False, load)
+
+    def plot() -> Command:
+        make_results()
+        words = ["plot", str(results), "--out", str(here / "out/figures"), "--configurations"]
+
+        def load() -> None:
+            from copem_replay.api.plot import write_figures
+
+            write_figures(results, here / "warm")
+
+        return Command({1: [*words, "PEM"], 2: [*words, "PEM,coPEM"]}, here / "out/figures", False, load)
+
+    def report() -> Command:
+        make_results()
+        words = ["report", str(results), "--out", str(here / "out/page.html"), "--baseline"]
+
+        def load() -> None:
+            from copem_replay.api.results import write_report
+
+            write_report(results, here / "warm.html")
+
+        return Command({1: [*words, "PEM"], 2: [*words, "coPEM"]}, here / "out/page.html", False, load)
+
+    return {
+        "run": lambda: run_command(here, experiment),
+        "cluster": lambda: run_command(here, experiment, "--cluster", "local:2"),
+        "fit": fit, "convert": convert, "plot": plot, "report": report,
+    }  # fmt: skip
+
+
 def kill(
-    here: Path, experiment: Path, kills: int, seed: int = 1, *, two_steps: bool = False, progress: bool = False
+    here: Path, command: Command, kills: int, seed: int = 1, *, two_steps: bool = False, progress: bool = False
 ) -> Found:
-    """Kill so many runs: half at steps spread over all there are, half after random times; every tenth a first run."""
-    warmed(experiment)
+    """Kill a command so many times: half at steps spread over all there are, half after random times.
+
+    Every tenth time there is no output yet.
+    """
+    command.load()
+    command.out.parent.mkdir(exist_ok=True)
     rng = random.Random(seed)
-    trial, found = Trial(here, experiment, two_steps=two_steps), Found()
+    trial, found = Trial(here, command, two_steps=two_steps), Found()
     for number in (1, 2):
         trial.run(number)
         trial.expected[number] = trial.files()
@@ -193,6 +342,7 @@ def kill(
     takes_s = time.perf_counter() - begin
     steps = trial.steps(2)
     trial.add_files()
+    trial.beside = os.listdir(trial.out.parent)
     ends = [k * steps // (kills // 2) for k in range(kills // 2 + 1)]
     counted = [rng.randrange(low, max(high, low + 1)) for low, high in pairwise(ends)]
     moments: list[int | float] = [*counted, *(rng.uniform(0, takes_s) for _ in range(kills - len(counted)))]
@@ -200,9 +350,8 @@ def kill(
     there: int | None = 2
     for k, moment in enumerate(moments):
         if k % 10 == 9:
-            for path in sorted(trial.out.rglob("*"), reverse=True):
+            for path in [*sorted(trial.out.rglob("*"), reverse=True), trial.out]:
                 path.rmdir() if path.is_dir() else path.unlink()
-            trial.out.rmdir()
             there = None
         new = 1 if there == 2 else 2
         what = f"kill {k} {'before step' if isinstance(moment, int) else 'after s'} {moment:.6g}"
@@ -228,6 +377,7 @@ def main() -> None:
     from tests.helpers.experiments import changed, drive
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("command", nargs="?", default="run", choices=COMMANDS)
     parser.add_argument("--kills", type=int, default=300)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--two-steps", action="store_true")
@@ -238,8 +388,9 @@ def main() -> None:
         drive(here / "drive.mcap")
         (here / "e.yaml").write_text(changed("show: {run: 0}"))
         begin = time.perf_counter()
+        command = commands_of(here, here / "e.yaml")[arguments.command]()
         found = kill(
-            here, here / "e.yaml", arguments.kills, arguments.seed, two_steps=arguments.two_steps,
+            here, command, arguments.kills, arguments.seed, two_steps=arguments.two_steps,
             progress=arguments.verbose,
         )  # fmt: skip
         print(f"{found}; {time.perf_counter() - begin:.0f} s")

@@ -57,10 +57,13 @@ def line(path: Path) -> str:
     return problem.removeprefix(f"{path}: ")
 
 
-@pytest.mark.long
-@pytest.mark.skipif(
+watched = pytest.mark.skipif(
     not Path("/proc/self/clear_refs").exists(), reason="the memory of a process is watched through /proc"
 )
+
+
+@pytest.mark.long
+@watched
 def test_two_thousand_hostile_files_end_well():
     """Recordings of every format, hit in every way: each is read or refused, none for long or with much memory."""
     found = fuzz.fuzz(2000, 6, most=12, own=True)
@@ -68,6 +71,30 @@ def test_two_thousand_hostile_files_end_well():
     assert found["inputs"] == 2000
     assert found["outcomes"]["read"] > 500  # not all is refused: what was hit is also read
     assert found["outcomes"]["refused"] > 300
+    assert found["past_header"] > 1000
+
+
+@pytest.mark.long
+@watched
+@pytest.mark.parametrize(("target", "inputs"), [("experiment", 60), ("results", 16), ("fit", 20), ("convert", 150)])
+def test_commands_on_what_is_hostile_end_well(target, inputs):
+    """Each ends well or is refused in lines; a run over damaged results gives what it always gives."""
+    found = fuzz.fuzz(inputs, 6, target=target)
+    assert found["defects"] == []
+    assert found["inputs"] == inputs
+    assert found["past_header"] >= inputs / 2
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="processes are found through /proc")
+@pytest.mark.parametrize(("command", "kills"), [("convert", 10), ("fit", 2)])
+def test_killed_commands_leave_the_old_or_the_new(command, kills):
+    """The recording, the fit or the page is whole, and after the next call nothing lies beside it."""
+    tool = [sys.executable, ROOT / "tools/kill_runs.py", command, "--kills", str(kills)]
+    ended = subprocess.run(tool, cwd=ROOT, capture_output=True, text=True, timeout=500)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert f"{kills} kills" in ended.stdout
+    assert "wrong: 0;" in ended.stdout
 
 
 def test_inputs_come_in_every_container(tmp_path):
