@@ -1,10 +1,10 @@
-# make demo | test | bench | check | notebooks | pictures: each sets up .venv on its first call and never again while pyproject and constraints stay.
+# make demo | test | test-random | bench | check | notebooks | pictures: each sets up .venv on its first call and never again while pyproject and constraints stay.
 # Another Python beside it: make test PYTHON=python3.13 VENV=.venv-3.13
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test bench check notebooks pictures clean
+.PHONY: demo test test-random bench check notebooks pictures clean
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit("Python 3.11 or newer is needed, this is " + sys.version.split()[0]) if sys.version_info < (3, 11) else None'
@@ -19,6 +19,13 @@ demo: $(VENV)/.installed
 
 test: $(VENV)/.installed
 	$(BIN)/python -m pytest -q -n 2
+
+# Every night: the tests with drawn examples, with others each time. A failure prints the seed of all (to be given as SEED)
+# and what gives its own example again.
+SEED ?= $(shell date +%s)
+test-random: $(VENV)/.installed
+	@echo "seed $(SEED)"
+	RANDOM_EXAMPLES=1 $(BIN)/python -m pytest -q -n 2 -m hypothesis --hypothesis-seed=$(SEED)
 
 $(VENV)/.peers: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[bench]'

@@ -106,9 +106,10 @@ def outcome(path: Path, looked: Callable[[], None] = lambda: None) -> dict[str, 
     return {"outcome": end, "said": said, "past": past}
 
 
-def _peak_bytes() -> int:
+def _memory_bytes(what: str) -> int:
+    """Resident memory of this process: `VmRSS` now, `VmHWM` its peak."""
     for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith("VmHWM"):
+        if line.startswith(what):
             return int(line.split()[1]) * 1024
     return 0
 
@@ -145,15 +146,16 @@ def _serve(pipe: Any, folder: str, most: int, own: bool, target: str | None) -> 
     make = _maker(Path(folder), most, own, target)
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     room, anything = pages * resource.getpagesize() + _ROOM_BYTES, resource.getrlimit(resource.RLIMIT_AS)
+    at_start = _memory_bytes("VmRSS")
     pipe.send("ready")
     while (seed := pipe.recv()) is not None:
         path, done, read = make(seed)
         pipe.send({"seed": seed, "done": done, "file": str(path)})
         resource.setrlimit(resource.RLIMIT_AS, (room, anything[1]))
         Path("/proc/self/clear_refs").write_text("5")
-        begin = time.process_time()
+        begin, kept = time.process_time(), _memory_bytes("VmRSS") - at_start  # of inputs before, in this long process
         found = read(pipe)
-        found |= {"seconds": time.process_time() - begin, "bytes": _peak_bytes()}
+        found |= {"seconds": time.process_time() - begin, "bytes": _memory_bytes("VmHWM") - max(kept, 0)}
         resource.setrlimit(resource.RLIMIT_AS, anything)
         pipe.send(found)
 

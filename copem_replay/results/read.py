@@ -122,8 +122,9 @@ def log_rows(place: Path, kinds: Mapping[str, str], files: Sequence[Path] = ()) 
         with _report_damage(place):
             file = parquet.ParquetFile(path, read_dictionary=names)
             schema = file.schema_arrow.remove_metadata()
-        if missing := [name for name in kinds if name not in schema.names]:
-            raise InputError(f"{place}: expected the column {missing[0]}, found none; {AGAIN}")
+        for name in kinds:
+            if (found := schema.names.count(name)) != 1:
+                raise InputError(f"{place}: expected the column {name}, found {found or 'none'}; {AGAIN}")
         kinds = dict(kinds) | {name: k for name, k in MAY_HAVE.get(place.name, {}).items() if name in schema.names}
         for name, kind in kinds.items():
             column_type = schema.field(name).type

@@ -188,6 +188,10 @@ def check_format(folder: Path) -> None:
         read_provenance(folder / MARK)
 
 
+_SKIPPED = ("log", "reason")
+"""Keys of each of `logs_skipped`."""
+
+
 def read_provenance(path: Path) -> Provenance:
     """Read `provenance.json`. Raises InputError."""
     try:
@@ -197,6 +201,9 @@ def read_provenance(path: Path) -> Provenance:
         logs = tuple(
             RecordedLog(str(log["log"]), log.get("topic"), str(log["sha256"]), log.get("truth")) for log in data["logs"]
         )
+        notes = [*data.get("notes", []), *(log[name] for log in data.get("logs_skipped", []) for name in _SKIPPED)]
+        if not all(isinstance(note, str) for note in notes):
+            raise ValueError("expected text in notes and logs_skipped")
         measure, braking, gap_s = dict(data["measure"]), data.get("braking"), data.get("max_gap_s")
         used_s, run_shown = float(measure.pop("horizon_used_s")), data.get("run_shown") or {}
         return Provenance(
@@ -213,7 +220,7 @@ def read_provenance(path: Path) -> Provenance:
             run_shown={str(log): int(run) for log, run in run_shown.items() if run is not None},
             data=data,
         )
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         why = f"no {error}" if isinstance(error, KeyError) else " ".join(str(error).split())
         raise InputError(f"{path}: expected the provenance of results, found damage: {why}; {AGAIN}") from None
 

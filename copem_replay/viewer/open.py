@@ -74,7 +74,7 @@ def opening_s(folder: Path, files: Sequence[Path]) -> dict[Path, float]:
                 onset_s = _first_onset_s(first_episodes(rows[rows["run"] == run]), truths)
                 if onset_s is not None:
                     instants_s[path] = max(0.0, onset_s - BEFORE_ONSET_S)
-    except (CopemError, KeyError, TypeError):
+    except (CopemError, KeyError, TypeError, AttributeError, ValueError, OverflowError):
         return {}  # recordings open without readable tables, too
     return instants_s
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -216,6 +217,26 @@ def test_provenance_that_does_not_say_enough(tmp_path, key):
     assert f"no '{key}'" in problem
 
 
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("notes", 3),
+        ("notes", [None]),
+        ("logs_skipped", ["log"]),
+        ("logs_skipped", [{"log": "a"}]),
+        ("logs_skipped", [{"log": "a", "reason": []}]),
+        ("seed", math.inf),
+        ("runs", math.inf),
+    ],
+)
+def test_provenance_with_something_else_in_it(tmp_path, key, value):
+    folder = write_folder(tmp_path / "first", ROWS)
+    said = json.loads((folder / "provenance.json").read_text())
+    (folder / "provenance.json").write_text(json.dumps(said | {key: value}))
+    (problem,) = problems(folder)
+    assert problem.startswith(f"{folder}/provenance.json: expected the provenance of results, found damage: ")
+
+
 def complete(tmp_path: Path) -> Path:
     """A folder with every table."""
     rows = [seen(name, [1, 1, 1, 1], [1, 1, 1, 1]) for name in ("ideal", "late")]
@@ -238,6 +259,9 @@ def test_a_column_that_is_missing_or_of_another_kind(tmp_path, name):
     assert problem.startswith(f"{folder / name}: column {last}: expected ")
     parquet.write_table(table.drop_columns([last]), folder / name)
     assert problems(folder)[0].startswith(f"{folder / name}: expected the column {last}, found none")
+    twice = table.rename_columns([last if k == 0 else other for k, other in enumerate(table.column_names)])
+    parquet.write_table(twice, folder / name)
+    assert problems(folder)[0].startswith(f"{folder / name}: expected the column ")
     parquet.write_table(table.drop_columns(["configuration"]), folder / name)
     assert problems(folder)[0].startswith(f"{folder / name}: expected the column configuration, found none")
 

@@ -456,6 +456,12 @@ class TestRun:
         # What was written is a recording itself: its truth is untouched.
         assert call("info", "one/replay.mcap").code == 0
 
+    def test_the_largest_seed_is_in_the_recording(self, here: Path, call: Call) -> None:
+        (here / "e.yaml").write_text(changed("show: {run: 0}", f"seed: {2**64 - 1}"))
+        ended = call("run", "e.yaml", "--out", "one")
+        assert (ended.code, [line for line in ended.lines if "replay" in line]) == (0, [])
+        assert (here / "one/replay.rrd").is_file()
+
     def test_recordings_of_several_logs(self, here: Path, call: Call) -> None:
         drive(here / "a" / "drive.mcap")
         (here / "e.yaml").write_text(changed("logs: [drive.mcap, a/drive.mcap]", "show: {logs: [all], run: worst}"))
