@@ -424,20 +424,14 @@ def _true_probability(case: Case, couple: DetectionCouple, range_m: float, share
 
 def fitted_pem(detection: DetectionFit, errors: ErrorFit, *, wrong: str | None = None) -> Pem:
     """The model that a fit writes; `wrong`: without what that word names."""
-    tree = detection.yaml_detection()
     couples = [
-        {
-            "when": one.get("when", {}) | error.where.when,
-            "detection": one["detection"],
-            "error": errors.yaml_error(error),
-        }
-        for one in tree["couples"]
-        for error in errors.bins
-        if error.where.when.get("classes")
-        in (None, one.get("when", {}).get("classes", error.where.when.get("classes")))
+        {"when": one.when | error.where.when, "detection": one.model(), "error": errors.error_keys(error)}
+        for one, error in product(detection.couples, errors.bins)
+        if one.classes is None or error.where.of_class in (None, *one.classes)
     ]
-    memory = errors.memory_keys() | tree.get("memory", {})
-    return Pem.model_validate({"couples": couples} | ({"memory": memory} if memory and wrong != "memory" else {}))
+    memory = errors.memory_keys() | detection.memory_keys()
+    keys = {"couples": couples} | ({"memory": memory} if memory and wrong != "memory" else {})
+    return Pem.model_validate(strip_comments(keys))
 
 
 def refuses(pem: Pem, rows: FitRows, lists: FitLists) -> bool:

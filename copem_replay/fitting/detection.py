@@ -19,6 +19,7 @@ from scipy.special import expit, logit
 from copem_replay.core.errors import count_noun
 from copem_replay.core.tracks import CLASSES, Bool, Float, Int
 from copem_replay.core.view_geometry import ViewGeometry
+from copem_replay.core.yaml import CommentedValue
 from copem_replay.fitting.estimate import FEWEST_PASSES, Estimate, Rung, choose_by_bic, choose_rung, held_out_possible
 from copem_replay.fitting.rows import (
     FitLists,
@@ -214,17 +215,18 @@ class DetectionCouple:
         parts += ["azimuth {:g} to {:g}°".format(*self.azimuth_deg)] if self.azimuth_deg else []
         return ", ".join(parts)
 
-    def detection(self) -> dict[str, Any]:
+    def model(self) -> dict[str, Any]:
         """The detection model as the experiment file has it."""
-        values = [[_round_probability(one.value) for one in row] for row in self.probability]
+        values = [
+            [CommentedValue(round(float(np.clip(one.value, _KEEP_OFF, 1 - _KEEP_OFF)), 4), one.words()) for one in row]
+            for row in self.probability
+        ]
         if len(self.range_m) == len(self.visible_share) == 1:
             return {"kind": "constant", "probability": values[0][0]}
-        axes = {"range_m": list(self.range_m), "visible_share": list(self.visible_share)}
-        return {"kind": "table", **{k: v for k, v in axes.items() if len(v) > 1}, "probability": values}
-
-
-def _round_probability(probability: float) -> float:
-    return round(min(max(probability, _KEEP_OFF), 1 - _KEEP_OFF), 4)
+        axes = {"range_m": self.range_m, "visible_share": self.visible_share}
+        words = "nodes: chosen, at quantiles of the rows"
+        nodes = {name: CommentedValue(list(axis), words) for name, axis in axes.items() if len(axis) > 1}
+        return {"kind": "table", **nodes, "probability": values}
 
 
 @dataclass(frozen=True)
@@ -232,16 +234,14 @@ class DetectionFit:
     """A fitted detection model.
 
     `couples`: the first that applies is used. `memory`: `share` and `correlation_s` of what lasts; None: nothing lasts,
-    for the reason `memory_why`. `ladder`: the models that were compared. `covariance (K, K)` of all probabilities,
-    couple by couple, range by range. `rows_per_effective`: how many rows are worth one that is independent. `notes`: a
-    line each. `common`: what lasts is shared by all objects of the unit.
+    for the reason `memory_why`. `ladder`: the models that were compared. `rows_per_effective`: how many rows are worth
+    one that is independent. `notes`: a line each. `common`: what lasts is shared by all objects of the unit.
     """
 
     couples: tuple[DetectionCouple, ...]
     memory: Mapping[str, Estimate] | None
     memory_why: str | None
     ladder: tuple[Rung, ...]
-    covariance: Float
     rows_per_effective: float
     notes: tuple[str, ...]
     common: bool = False
@@ -259,20 +259,17 @@ class DetectionFit:
             out[rows] = model.probability(view.take(rows))
         return out
 
-    def yaml_detection(self) -> dict[str, Any]:
-        """Plain data of a PEM: couples without errors, and the memory of detection."""
-        couples = []
-        for couple in self.couples:
-            when = {"when": couple.when} if couple.when else {}
-            couples.append({**when, "detection": couple.detection()})
+    def memory_keys(self) -> dict[str, list[dict[str, Any]]]:
+        """The memory of detection as the experiment file has it; empty where nothing lasts."""
         if self.memory is None:
-            return {"couples": couples}
-        part: dict[str, Any]
-        tau_s = self.memory["correlation_s"].value
-        lasts = "always" if np.isinf(tau_s) else float(f"{tau_s:.3g}")
-        part = {"share": round(self.memory["share"].value, 3), "correlation_s": lasts}
-        part |= {"of": "unit"} if self.common else {}
-        return {"couples": couples, "memory": {"detection": [part]}}
+            return {}
+        share, tau_s = self.memory["share"], self.memory["correlation_s"]
+        part = {
+            "share": CommentedValue(round(share.value, 3), share.words()),
+            "correlation_s": CommentedValue("always", tau_s.words()) if np.isinf(tau_s.value) else tau_s.written(3),
+        }
+        of_all = {"of": CommentedValue("unit", "all objects of a list: likelier than each")} if self.common else {}
+        return {"detection": [part | of_all]}
 
 
 @dataclass(frozen=True)
@@ -319,8 +316,7 @@ def fit_detection(
     memory, why, tried = _choose_memory(rows, pass_ix, trial.chances(explained), simplest, intervals)
     fit = fit_table(rung.entries, np.ones(int(pass_ix.max()) + 1), trial.worth, monotone=monotone)
     fit = fit if tried is None else replace(fit, worth=tried)
-    values, covariance = estimate_nodes(rung.entries, rung.rows, fit, monotone=monotone, resampled=intervals)
-    grid = np.array(values, dtype=object).reshape(rung.rows.shape)
+    grid = np.array(estimate_nodes(rung.entries, rung.rows, fit), dtype=object).reshape(rung.rows.shape)
     axes = tuple(tuple(axis.tolist()) for axis in rung.axes)
     couples = tuple(
         DetectionCouple(when.get("classes"), axes[0], axes[1], tuple(map(tuple, one)), when.get("azimuth_deg"))
@@ -328,7 +324,7 @@ def fit_detection(
     )
     return DetectionFit(
         couples, None if memory is None else {"share": memory.share, "correlation_s": memory.correlation_s},
-        why, _add_gains(table, memory), covariance, fit.worth, notes, memory is not None and memory.common,
+        why, _add_gains(table, memory), fit.worth, notes, memory is not None and memory.common,
     )  # fmt: skip
 
 

@@ -16,15 +16,13 @@ import numpy as np
 from scipy.special import expit, logit
 
 from copem_replay.core.tracks import Bool, Float, Int
+from copem_replay.core.yaml import CommentedValue
 from copem_replay.fitting.estimate import (
     DROP,
     Bounds,
     Estimate,
-    Note,
-    drop_note,
     maximise_likelihood,
     profile_limits,
-    round_digits,
 )
 
 # Kernels: whitening by a Kalman filter, and correlations between rows.
@@ -174,18 +172,13 @@ class LastingPart:
     share: Estimate
     correlation_s: Estimate | Literal["always"]
 
-    def keys(self, note: Note = drop_note) -> dict[str, Any]:
-        """The keys as they are replayed."""
+    def keys(self) -> dict[str, Any]:
+        """The keys as the experiment file has them."""
         lasts = self.correlation_s
         return {
-            "share": note(round(self.share.value, 3), self.share.words()),
-            "correlation_s": lasts if isinstance(lasts, str) else note(round_digits(lasts.value), lasts.words()),
+            "share": CommentedValue(round(self.share.value, 3), self.share.words()),
+            "correlation_s": lasts if isinstance(lasts, str) else lasts.written(),
         }
-
-    @property
-    def yaml(self) -> dict[str, Any]:
-        """The keys as plain data, without words."""
-        return self.keys()
 
 
 @dataclass(frozen=True)

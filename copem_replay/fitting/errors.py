@@ -14,6 +14,7 @@ from scipy.stats import chi2
 from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import Bool, Float, Int
 from copem_replay.core.view_geometry import ViewGeometry
+from copem_replay.core.yaml import CommentedValue
 from copem_replay.fitting.error_memory import (
     ErrorMemoryFit,
     LastingPart,
@@ -28,11 +29,9 @@ from copem_replay.fitting.estimate import (
     DROP,
     PER_ROW,
     Estimate,
-    Note,
     Rung,
     choose_by_bic,
     choose_rung,
-    drop_note,
     held_out_possible,
     maximise_likelihood,
     profile_limits,
@@ -126,51 +125,50 @@ class ErrorFit:
     untold: Mapping[str, str]
     between_logs: BetweenLogs | None = None
 
-    def yaml_error(self, bin_: ErrorBin) -> dict[str, Any]:
-        """The keys of an error model, as it is replayed."""
+    def error_keys(self, bin_: ErrorBin) -> dict[str, Any]:
+        """An error model as the experiment file has it."""
         xx, xy, yy = (round_digits(one.value) for one in bin_.covariance_m2)
         within = 0.9999 * np.sqrt(xx * yy)  # rounding must not make it singular
+        xy = round_digits(float(np.clip(xy, -within, within)))
         out: dict[str, Any] = {"kind": "gaussian", "frame": self.frame}
         if self.shape.written:
-            out |= {"kind": "student_t", "degrees_of_freedom": round_digits(self.shape.degrees_of_freedom.value, 3)}
-        xy = round_digits(float(np.clip(xy, -within, within)))
-        out |= {"mean_m": [round_digits(one.value) for one in bin_.mean_m], "covariance_m2": [[xx, xy], [xy, yy]]}
-        for name in ("yaw_sigma_deg", "speed_sigma_mps", "size_sigma_m"):
-            if (sigma := getattr(self, name)) is not None:
-                out[name] = round_digits(sigma.value)
-        return out
+            nu = self.shape.degrees_of_freedom
+            words = f"{nu.words()}; {self.shape.words()}"
+            out |= {"kind": "student_t", "degrees_of_freedom": CommentedValue(round_digits(nu.value, 3), words)}
+        first, between, second = (one.words() for one in bin_.covariance_m2)
+        out |= {
+            "mean_m": [one.written() for one in bin_.mean_m],
+            "covariance_m2": [
+                CommentedValue([xx, xy], f"variance {first}; covariance {between}"),
+                CommentedValue([xy, yy], f"variance {second}"),
+            ],
+        }
+        names = ("yaw_sigma_deg", "speed_sigma_mps", "size_sigma_m")
+        return out | {name: sigma.written() for name in names if (sigma := getattr(self, name)) is not None}
 
-    def memory_keys(self, note: Note = drop_note) -> dict[str, list[dict[str, Any]]]:
+    def memory_keys(self) -> dict[str, list[dict[str, Any]]]:
         """The keys of `memory`; a part of all objects of the unit is what differs between logs, and taken off others.
 
         It is taken off what is constant, then off what drifts, for a fit of single objects has it in these.
         """
-        out = {name: [part.keys(note) for part in parts] for name, parts in self.memory.items() if parts}
-        if self.shape.written and "position" in out:
-            kept = gaussian_share(self.shape.degrees_of_freedom.value)
-            out["position"] = [
-                part.keys(note)
-                | {
-                    "share": note(
-                        round(part.share.value / kept, 3), f"{part.share.words()}, of which t keeps {kept:.2g}"
-                    )
-                }
-                for part in self.memory["position"]
-            ]
-        if self.between_logs is None or self.between_logs.untold is not None:
-            return out
-        share = round(self.between_logs.share, 3)
-        left, parts = share, []
-        for part in sorted(self.memory["position"], key=lambda one: one.correlation_s != "always"):
+        out = {name: [part.keys() for part in parts] for name, parts in self.memory.items() if parts}
+        kept = gaussian_share(self.shape.degrees_of_freedom.value) if self.shape.written else 1.0
+        between = None if self.between_logs is None or self.between_logs.untold else self.between_logs
+        left, position = 0.0 if between is None else round(between.share, 3), []
+        for part in sorted(
+            self.memory["position"], key=lambda one: between is not None and one.correlation_s != "always"
+        ):
             taken = min(left, part.share.value)
             left -= taken
-            less = round(part.share.value - taken, 3)
-            if less > 0:
-                words = f"{part.share.words()}; {taken:.3g} of it differs between logs" if taken else part.share.words()
-                parts.append(part.keys(note) | {"share": note(less, words)})
-        words = "between logs: " + " and ".join(f"{one.words()} m" for one in self.between_logs.sigma_m)
-        log_part = {"share": note(share, words), "correlation_s": "always", "of": "unit"}
-        return out | {"position": [*parts, log_part]}
+            words = part.share.words() + (f", of which t keeps {kept:.2g}" if self.shape.written else "")
+            words += f"; {taken:.3g} of it differs between logs" if taken else ""
+            if (less := round(part.share.value / kept - taken, 3)) > 0 or between is None:
+                position.append(part.keys() | {"share": CommentedValue(less, words)})
+        if between is not None:
+            words = "between logs: " + " and ".join(f"{one.words()} m" for one in between.sigma_m)
+            share = CommentedValue(round(between.share, 3), words)
+            position.append({"share": share, "correlation_s": "always", "of": "unit"})
+        return out | ({"position": position} if position else {})
 
 
 def remove_pose(fit: ErrorFit, placed: PoseFit) -> ErrorFit:

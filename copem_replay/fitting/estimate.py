@@ -5,24 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from copem_replay.core.tracks import Float, Int
-from copem_replay.metrics.intervals import draw_resamples
-
-Note = Callable[[Any, str], Any]
-"""Called with a value and words about it: the value as it is written, with the words as a comment."""
-
+from copem_replay.core.yaml import CommentedValue
+from copem_replay.metrics.intervals import figure_variance
 
 PER_ROW = "per row"
 """Metadata of a field with a value for each row of the data, which is not reported as an estimate."""
-
-
-def drop_note(value: Any, words: str) -> Any:
-    """The value without words: a `Note` for plain data."""
-    return value
 
 
 def round_digits(value: float, count: int = 4) -> float:
@@ -70,6 +62,10 @@ class Estimate:
         effective = "" if math.isnan(self.n_effective) else f", effective {self.n_effective:.3g}"
         value, low, high = (f"{one:.{digits}g}" for one in (self.value, self.low, self.high))
         return f"{value} (95 %: {low} … {high}, n {self.n}{effective})"
+
+    def written(self, digits: int = 4) -> CommentedValue:
+        """The value as files have it, with its words as a comment."""
+        return CommentedValue(round_digits(self.value, digits), self.words())
 
 
 # Maximum likelihood over a few numbers, and profile intervals.
@@ -182,6 +178,8 @@ def profile_limits(of: LogLikelihood, best: Float, value: float, k: int, bounds:
 
 FEWEST_PASSES = 4
 """Passes below which none is held out: a standard error of fewer differences says little."""
+PASSES_ALONE = 5
+"""Passes from which on an interval is by passes alone (docs/develop/decisions/0044-how-sure-a-fit-is.md)."""
 
 
 @dataclass(frozen=True)
@@ -210,28 +208,23 @@ def held_out_possible(pass_ix: Int, fold: Int) -> bool:
 
 
 def choose_rung(
-    names: Sequence[str], scores: Float, weights: Float | Int, *, simplest: bool = False, seed: int = 0
+    names: Sequence[str], scores: Float, weights: Float | Int, *, simplest: bool = False
 ) -> tuple[int, tuple[Rung, ...]]:
     """The simplest rung within one standard error of the best, and the table of all; `simplest`: the first in any case.
 
     `names` from the simplest to the richest; `scores (rungs, passes)`: held-out log-likelihood of each pass, summed;
-    `weights (passes,)`: how many lists each has. The standard error is that of the difference to the best, over
-    resamples of whole passes. A rung by which something recorded is impossible (−inf) is below any other.
+    `weights (passes,)`: how many lists each has. The standard error is that of the difference to the best, from the
+    difference without each pass. A rung by which something recorded is impossible (−inf) is below any other.
     """
-    total = weights.sum()
-    score = scores.sum(axis=1) / total
+    score = scores.sum(axis=1) / weights.sum()
     best = int(np.argmax(score))
-    count = draw_resamples([str(k) for k in range(len(weights))], seed)
-    times = count.times / count.times.sum()
-    below, error = np.zeros(len(names)), np.zeros(len(names))
-    for k in range(len(names)):
-        if k == best:
-            continue
-        below[k] = score[best] - score[k]
-        if np.isfinite(below[k]):
-            drawn = count.count @ (scores[best] - scores[k]) / (count.count @ weights)
-            error[k] = np.sqrt(times @ (drawn - times @ drawn) ** 2)
-    return _tabulate_rungs(names, score, below, error, "held out", simplest)
+    with np.errstate(invalid="ignore"):
+        each = scores[best] - scores
+        without = (each.sum(axis=1, keepdims=True) - each) / (weights.sum() - weights)
+        below = score[best] - score
+        variance, _ = figure_variance(below, without, np.asarray(weights, dtype=float))
+    below[best] = 0.0
+    return _tabulate_rungs(names, score, below, np.sqrt(np.nan_to_num(variance)), "held out", simplest)
 
 
 def choose_by_bic(

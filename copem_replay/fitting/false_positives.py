@@ -10,7 +10,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from copem_replay.core.tracks import CLASSES, Bool, Float, Int
-from copem_replay.fitting.estimate import Estimate, Note, drop_note, round_digits
+from copem_replay.core.yaml import CommentedValue
+from copem_replay.fitting.estimate import Estimate
 from copem_replay.fitting.rows import FitLists, FitRows, OtherEntries
 
 # Kernels: a filter over classes that last, and chains of entries from list to list.
@@ -121,12 +122,12 @@ class GhostSort:
     where: dict[str, Any]
     classes: dict[str, float]
 
-    def keys(self, note: Note = drop_note) -> dict[str, Any]:
+    def keys(self) -> dict[str, Any]:
         """One of a PEM's `ghosts`."""
-        lasts_s = 0.0 if np.isnan(self.lasts_s.value) else round_digits(self.lasts_s.value)
+        lasts_s = self.lasts_s
         return {
-            "in_list": note(round_digits(self.in_list.value), self.in_list.words()),
-            "lasts_s": note(lasts_s, self.lasts_s.words()),
+            "in_list": self.in_list.written(),
+            "lasts_s": CommentedValue(0.0, lasts_s.words()) if np.isnan(lasts_s.value) else lasts_s.written(),
             "where": self.where,
             "classes": self.classes,
         }

@@ -20,7 +20,7 @@ from copem_replay.core.yaml import CommentedValue, strip_comments
 from copem_replay.experiment.schema import Experiment
 from copem_replay.fitting.detection import BY, DetectionCouple, DetectionFit, fit_detection, pass_starts
 from copem_replay.fitting.errors import ErrorFit, fit_errors, remove_pose
-from copem_replay.fitting.estimate import PER_ROW, Estimate
+from copem_replay.fitting.estimate import PER_ROW, Estimate, round_digits
 from copem_replay.fitting.gather import (
     LONGEST_S,
     Gathered,
@@ -359,16 +359,6 @@ RUNS = 500
 Tree = dict[str, Any]
 
 
-def round_significant(value: float) -> float:
-    """To six significant digits: no interval tells more."""
-    return float(f"{value:.6g}")
-
-
-def annotate_estimate(estimate: Estimate) -> CommentedValue:
-    """An estimate as a value, with its interval as a comment."""
-    return CommentedValue(round_significant(estimate.value), estimate.words())
-
-
 def build_pem(fit: Fit) -> Tree:
     """The PEM, with the interval of every number as a comment."""
     couples = [
@@ -377,8 +367,8 @@ def build_pem(fit: Fit) -> Tree:
         for of_bin in _list_bins(fit)
         if detection.classes is None or of_bin[1].where.of_class in (None, *detection.classes)
     ]
-    more = fit.parts.rest.pem_keys(CommentedValue)
-    memory = dict(_build_memories(fit)) | more.pop("memory", {})
+    more = fit.parts.rest.pem_keys()
+    memory = fit.parts.detection.memory_keys() | fit.parts.errors.memory_keys() | more.pop("memory", {})
     return {"couples": couples} | ({"memory": memory} if memory else {}) | more
 
 
@@ -393,7 +383,7 @@ def _list_bins(fit: Fit) -> Iterator[tuple[Tree, ErrorBin]]:
         from_m = low_m if from_m == nearest else max(from_m, low_m)
         to_m = high_m if to_m == farthest else min(to_m, high_m)
         if to_m > from_m:
-            yield error_bin.where.when | {"range_m": [round_significant(from_m), round_significant(to_m)]}, error_bin
+            yield error_bin.where.when | {"range_m": [round_digits(from_m, 6), round_digits(to_m, 6)]}, error_bin
 
 
 def _build_couple(fit: Fit, detection: DetectionCouple, of_bin: tuple[Tree, ErrorBin]) -> Tree:
@@ -405,54 +395,10 @@ def _build_couple(fit: Fit, detection: DetectionCouple, of_bin: tuple[Tree, Erro
         when["azimuth_deg"] = list(reach.azimuth_deg)
     return {
         "when": when | detection.when,
-        "detection": _build_table(detection),
-        "error": _build_error(fit.parts.errors, errors),
+        "detection": detection.model(),
+        "error": fit.parts.errors.error_keys(errors),
         "existence": CommentedValue(0.9, "chosen: the lists say nothing of it"),
-    } | fit.parts.rest.couple_keys(CommentedValue)
-
-
-def _build_table(detection: DetectionCouple) -> Tree:
-    """The detection model, with the interval of every probability as a comment."""
-    tree = detection.detection()
-    estimates = detection.probability
-    if tree["kind"] == "constant":
-        return tree | {"probability": CommentedValue(tree["probability"], estimates[0][0].words())}
-    for axis in tree.keys() & {"range_m", "visible_share"}:
-        tree[axis] = CommentedValue(tree[axis], "nodes: chosen, at quantiles of the rows")
-    rows = zip(tree["probability"], estimates, strict=True)
-    tree["probability"] = [
-        [CommentedValue(value, one.words()) for value, one in zip(values, row, strict=True)] for values, row in rows
-    ]
-    return tree
-
-
-def _build_error(errors: ErrorFit, error_bin: ErrorBin) -> Tree:
-    tree: Tree = errors.yaml_error(error_bin)
-    (first, second), (xx, xy, yy) = tree["covariance_m2"], error_bin.covariance_m2
-    tree["covariance_m2"] = [
-        CommentedValue(first, f"variance {xx.words()}; covariance {xy.words()}"),
-        CommentedValue(second, f"variance {yy.words()}"),
-    ]
-    tree["mean_m"] = [
-        CommentedValue(value, mean.words()) for value, mean in zip(tree["mean_m"], error_bin.mean_m, strict=True)
-    ]
-    if "degrees_of_freedom" in tree:
-        nu = errors.shape.degrees_of_freedom
-        tree["degrees_of_freedom"] = CommentedValue(tree["degrees_of_freedom"], f"{nu.words()}; {errors.shape.words()}")
-    for key in tree.keys() & {"yaw_sigma_deg", "speed_sigma_mps", "size_sigma_m"}:
-        tree[key] = CommentedValue(tree[key], getattr(errors, key).words())
-    return tree
-
-
-def _build_memories(fit: Fit) -> Iterator[tuple[str, list[Tree]]]:
-    detection = fit.parts.detection.memory
-    if detection is not None:
-        [part] = fit.parts.detection.yaml_detection()["memory"]["detection"]
-        words = {key: one.words() for key, one in detection.items()} | {
-            "of": "all objects of a list: likelier than each"
-        }
-        yield "detection", [{key: CommentedValue(value, words[key]) for key, value in part.items()}]
-    yield from fit.parts.errors.memory_keys(CommentedValue).items()
+    } | fit.parts.rest.existence.keys()
 
 
 def build_unit(fit: Fit, experiment: Experiment, pem: str) -> Tree:
@@ -463,8 +409,8 @@ def build_unit(fit: Fit, experiment: Experiment, pem: str) -> Tree:
         for key, value in recorded.model_dump(mode="json", by_alias=True, exclude_unset=True).items()
         if key != "recorded"
     }
-    tree |= {"pem": pem, "rate_hz": annotate_estimate(fit.rate_hz)}
-    return tree | fit.parts.rest.unit_keys(CommentedValue)
+    tree |= {"pem": pem, "rate_hz": fit.rate_hz.written(6)}
+    return tree | fit.parts.rest.unit_keys()
 
 
 def build_snippet(fit: Fit, experiment: Experiment) -> Tree:
@@ -480,7 +426,7 @@ def build_experiment(fit: Fit, experiment: Experiment, logs: Sequence[Any]) -> T
     data = experiment.as_written()
     name, other = fit.unit, _find_free_name(f"{fit.unit}_recorded", data["units"])
     pem = _find_free_name(name, data["pems"])
-    late_s = max(round_significant(fit.delay.seconds), 0.0)
+    late_s = max(round_digits(fit.delay.seconds, 6), 0.0)
     stated = {"delay_s": late_s, "covariance_m2": _pool_covariance(fit)}
     recorded = _complete_unit(data["units"][name], stated)
     replayed = fit.held_out or fit.logs
@@ -488,7 +434,7 @@ def build_experiment(fit: Fit, experiment: Experiment, logs: Sequence[Any]) -> T
     entries = [_build_both_settings(entry, name, other, stated) for entry in logs]
     if fit.delay.of_log:
         entries = [
-            _add_delay(entry, other, recorded, round_significant(fit.delay.seconds_of(log)))
+            _add_delay(entry, other, recorded, round_digits(fit.delay.seconds_of(log), 6))
             for entry, log in zip(entries, replayed, strict=True)
         ]
     latency = {"latency_s": {name: late_s}}
@@ -506,8 +452,8 @@ def _pool_covariance(fit: Fit) -> list[list[float]]:
     """The covariance of all errors in easting and northing, for recorded entries that state none."""
     rows = fit.gathered.rows
     finite = np.isfinite(rows.east_m)
-    (ee, en), (_, nn) = np.cov(np.stack([rows.east_m[finite], rows.north_m[finite]])).tolist()
-    return [[round_significant(ee), round_significant(en)], [round_significant(en), round_significant(nn)]]
+    covariance = np.cov(np.stack([rows.east_m[finite], rows.north_m[finite]]))
+    return [[round_digits(one, 6) for one in row] for row in covariance.tolist()]
 
 
 def _find_free_name(name: str, taken: Any) -> str:
@@ -558,7 +504,7 @@ def add_replay_check(fit: Fit, *, seed: int = 0) -> Fit:
     gathered = fit.held or fit.gathered
     pem = Pem.model_validate(strip_comments(build_pem(fit)))
     keys = fit.parts.rest.placed.keys()
-    placed = PoseError.model_validate(keys) if keys else None
+    placed = PoseError.model_validate(strip_comments(keys)) if keys else None
     with_memory = replay_check(pem, gathered.rows, gathered.lists, placed=placed, seed=seed)
     fresh: tuple[StatisticCheck, ...] = ()
     if pem.remembers:

@@ -15,6 +15,7 @@ from copem_replay.core.tracks import CLASSES, Bool, Float, Int, Scene, Tracks
 from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.experiment.schema import Experiment, Unit
+from copem_replay.fitting.estimate import FEWEST_PASSES
 from copem_replay.fitting.rows import FitLists, FitRows, OtherEntries
 from copem_replay.io.recorded_lists import RecordedLists
 from copem_replay.io.recorded_units import assign_truth_ids, read_as_recorded, shift_captures
@@ -149,8 +150,6 @@ LEAST_SHARE = 0.05
 """Share of the rows of a bin that must be matched: fewer are matches with other entries nearby."""
 FOLDS = 5
 """Folds of a cross-validation unless stated otherwise: the usual number. More: slower, larger parts are fitted."""
-FEWEST_PASSES = 4
-"""Passes below which none is held out."""
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Moments of errors: means and covariances by bins of range and visible share, with what passes tell of their spread.
 
 Rows of a pass (one object in one log) hang together, whether or not a memory is written: the mean's interval is that of
-whole passes from FEWEST_PASSES on, with fewer the wider of that and of an autoregression, and a variance counts for no
+whole passes from PASSES_ALONE on, with fewer the wider of that and of an autoregression, and a variance counts for no
 more rows than either the memory or the autoregression leaves.
 """
 
@@ -16,7 +16,7 @@ from scipy.stats import chi2, t
 from copem_replay.core.tracks import CLASSES, Bool, Float, Int
 from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.fitting.error_memory import MemoryShares, ResidualSeries, sum_correlations
-from copem_replay.fitting.estimate import FEWEST_LOGS, PER_ROW, Estimate, pool_logs
+from copem_replay.fitting.estimate import FEWEST_LOGS, PASSES_ALONE, PER_ROW, Estimate, pool_logs
 
 EFFECTIVE_ROWS = 20
 """Independent rows that a bin holds at least: a standard deviation is then known to about 16 %."""
@@ -27,8 +27,6 @@ CLASS_ROWS = 5
 towards those of all so far that a split says nothing."""
 LOGS_WRITTEN = 4
 """Logs from which on a part that is drawn once per log and unit is written."""
-FEWEST_PASSES = 5
-"""Passes from which on the mean's interval is by passes alone (docs/develop/decisions/0044-how-sure-a-fit-is.md)."""
 _WHOLE = 0.95
 """Visible share from which on an object counts as wholly visible: it is 1 only up to rounding and small overlaps."""
 _STRENGTHS = np.geomspace(4, 1e5, 60)
@@ -227,7 +225,7 @@ def mean_half_width(rest: Float, new: Bool, phi: float, variance: float) -> floa
     q = root * _sum_autoregression(phi, w) @ root.T
     freedom = float(np.trace(q) ** 2 / (q * q).sum())
     by_passes = float(t.ppf(0.975, freedom) * np.sqrt((each**2 * scale).sum()) / n)
-    return by_passes if len(w) >= FEWEST_PASSES else max(by_passes, half)
+    return by_passes if len(w) >= PASSES_ALONE else max(by_passes, half)
 
 
 def _shrink_covariances(covariance: Float, freedom: Float) -> tuple[Float, Float]:

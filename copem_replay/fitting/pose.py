@@ -15,7 +15,7 @@ from scipy.stats import chi2, t
 
 from copem_replay.core.tracks import Float, Int
 from copem_replay.fitting.error_memory import LastingPart
-from copem_replay.fitting.estimate import FEWEST_LOGS, Estimate, LogPool, Note, drop_note, pool_logs, round_digits
+from copem_replay.fitting.estimate import FEWEST_LOGS, Estimate, LogPool, pool_logs
 from copem_replay.fitting.rows import FitLists, FitRows
 from copem_replay.io.clock_offset import TimeOffset
 from copem_replay.io.recorded_lists import RecordedLists
@@ -43,15 +43,11 @@ class PoseFit:
     memory: LastingPart | None = None
     untold: str | None = None
 
-    def keys(self, note: Note = drop_note) -> dict[str, Any]:
+    def keys(self) -> dict[str, Any]:
         """A unit's `placed`; empty where no pose is fitted."""
-        if self.untold is not None:
-            return {}
-        out: dict[str, Any] = {}
-        for name in ("position_sigma_m", "yaw_sigma_deg"):
-            if (one := getattr(self, name)) is not None and one.value > 0:
-                out[name] = note(round_digits(one.value), one.words())
-        return out | ({} if self.memory is None else {"memory": [self.memory.keys(note)]})
+        sigmas = {"position_sigma_m": self.position_sigma_m, "yaw_sigma_deg": self.yaw_sigma_deg}
+        out: dict[str, Any] = {name: one.written() for name, one in sigmas.items() if one is not None and one.value > 0}
+        return out | ({} if self.memory is None else {"memory": [self.memory.keys()]})
 
 
 def fit_pose(rows: FitRows, lists: FitLists) -> PoseFit:
@@ -86,14 +82,15 @@ def fit_pose(rows: FitRows, lists: FitLists) -> PoseFit:
     if B < FEWEST_BLOCKS:
         return PoseFit(untold=f"{enough} lists in {B} × {_BLOCK_S:g} s; a pose needs {FEWEST_BLOCKS} such times")
     without = [sums.sum(axis=1) - sums[:, k] for k in range(B)]
-    free, error = _jackknife(_solve_variances(sums.sum(axis=1)), np.array([_solve_variances(one) for one in without]))
+    free, error = _solve_variances(sums.sum(axis=1)), _jackknife(np.array([_solve_variances(one) for one in without]))
     if not (free > t.ppf(_SURE, B - 1) * error).any():
         whole = np.maximum(free, 0)
         most = np.sqrt(np.maximum(whole + 1.96 * error, 0))
         why = f"errors of different objects hang together no more than by chance (pose: < {most[0]:.2g} m, "
         return PoseFit(untold=f"{why}< {np.rad2deg(most[1]):.2g}°, {enough} lists)")
-    whole, error = _jackknife(
-        _solve_nonnegative(sums.sum(axis=1)), np.array([_solve_nonnegative(one) for one in without])
+    whole, error = (
+        _solve_nonnegative(sums.sum(axis=1)),
+        _jackknife(np.array([_solve_nonnegative(one) for one in without])),
     )
     shift, turn = (_estimate_sigma(value, off, enough, B) for value, off in zip(whole, error, strict=True))
     value, low, high = np.rad2deg([turn.value, turn.low, turn.high]).tolist()
@@ -101,11 +98,10 @@ def fit_pose(rows: FitRows, lists: FitLists) -> PoseFit:
     return PoseFit(shift, Estimate(value, low, high, turn.n, turn.n_effective), memory)
 
 
-def _jackknife(whole: Float, each: Float) -> tuple[Float, Float]:
-    """A value (2,) and its standard error, from the values without each block (B, 2)."""
-    B = len(each)
-    error: Float = np.sqrt((B - 1) / B * ((each - each.mean(axis=0)) ** 2).sum(axis=0))
-    return whole, error
+def _jackknife(each: Float) -> Float:
+    """(2,) the standard error of a value, from the values without each block (B, 2)."""
+    error: Float = np.sqrt((len(each) - 1) * each.var(axis=0))
+    return error
 
 
 def _solve_variances(sums: Float) -> Float:
@@ -176,7 +172,7 @@ def _fit_pose_memory(lags: Float, period_s: float, n: int) -> LastingPart | None
 
     whole = fitted(lags.sum(axis=2))
     each = np.array([fitted(lags.sum(axis=2) - lags[:, :, k]) for k in range(B)])
-    error = 1.96 * np.sqrt((B - 1) / B * ((each - each.mean(axis=0)) ** 2).sum(axis=0))
+    error = 1.96 * _jackknife(each)
     if whole[0] - error[0] <= 0:
         return None
     share = Estimate(float(whole[0]), float(whole[0] - error[0]), float(min(whole[0] + error[0], 1.0)), n, B)

@@ -11,9 +11,10 @@ from scipy.special import expit
 from scipy.stats import beta, f
 
 from copem_replay.core.tracks import CLASSES, Float, Int
+from copem_replay.core.yaml import CommentedValue
 from copem_replay.fitting.error_memory import LastingPart, ResidualSeries, sum_correlations
 from copem_replay.fitting.errors import build_series
-from copem_replay.fitting.estimate import Estimate, Note, drop_note, maximise_likelihood, profile_limits, round_digits
+from copem_replay.fitting.estimate import Estimate, maximise_likelihood, profile_limits, round_digits
 from copem_replay.fitting.false_positives import GhostsFit, estimate_duration, fit_ghosts, garwood_interval, log_classes
 from copem_replay.fitting.pose import PoseFit, fit_pose
 from copem_replay.fitting.rows import FitLists, FitRows, OtherEntries
@@ -34,7 +35,7 @@ class ClassesFit:
     memory: tuple[LastingPart, ...] = ()
     untold: str | None = None
 
-    def keys(self, note: Note = drop_note) -> dict[str, Any]:
+    def keys(self) -> dict[str, Any]:
         """A PEM's `classes`; empty where no class is mistaken."""
         rows = {}
         for true, row in self.confusion.items():
@@ -42,7 +43,7 @@ class ClassesFit:
             shares[true] = round(1 - sum(share for name, share in shares.items() if name != true), 4)
             if len(shares) > 1:
                 words = "; ".join(f"{name} {one.words()}" for name, one in row.items())
-                rows[true] = note(shares, words)
+                rows[true] = CommentedValue(shares, words)
         return {"confusion": rows} if rows else {}
 
 
@@ -104,37 +105,34 @@ def _estimate_probability(count: float, n: int, worth: float, kinds: int) -> Est
 
 # Existence: what a unit claims of real objects and of others, and its calibration.
 
-CURVE_BINS = 12
-"""Bins of the calibration curve, with equal numbers of entries."""
 _FEWEST = 8
 """Entries below which no existence is fitted."""
 
 
 @dataclass(frozen=True)
 class ExistenceFit:
-    """Beta shapes (a, b) of matched entries and of others, None where the data do not tell; or one `number` for all.
-
-    `curve`: rows claimed, share of real ones, low, high, n, by bin of the claim; None where the truth is not complete.
-    """
+    """Beta shapes (a, b) of matched entries and of others, None where the data do not tell; or one `number` for all."""
 
     real: tuple[Estimate, Estimate] | None = None
     ghost: tuple[Estimate, Estimate] | None = None
     number: Estimate | None = None
-    curve: Float | None = None
     untold: str | None = None
 
-    def keys(self, note: Note = drop_note) -> Any:
-        """A couple's `existence`; None: nothing is fitted. Ghosts without a fit claim what objects do."""
+    def keys(self) -> dict[str, Any]:
+        """A couple's `existence`; empty where nothing is fitted. Ghosts without a fit claim what objects do."""
         if self.number is not None:
-            return note(round(self.number.value, 4), "the same of every entry")
+            return {"existence": CommentedValue(round(self.number.value, 4), "the same of every entry")}
         if self.real is None:
-            return None
-
-        def shapes(two: tuple[Estimate, Estimate], more: str = "") -> Any:
-            return note([round_digits(one.value) for one in two], more + "; ".join(one.words() for one in two))
-
-        ghost = shapes(self.real, "chosen, as of objects: ") if self.ghost is None else shapes(self.ghost)
-        return {"kind": "scores", "real": shapes(self.real), "ghost": ghost}
+            return {}
+        both = {
+            "real": ("", self.real),
+            "ghost": ("", self.ghost) if self.ghost else ("chosen, as of objects: ", self.real),
+        }
+        shapes = {
+            name: CommentedValue([round_digits(one.value) for one in two], more + "; ".join(one.words() for one in two))
+            for name, (more, two) in both.items()
+        }
+        return {"existence": {"kind": "scores", **shapes}}
 
 
 def fit_existence(real: Float, series_ix: Int, other: Float | None) -> ExistenceFit:
@@ -150,11 +148,10 @@ def fit_existence(real: Float, series_ix: Int, other: Float | None) -> Existence
     ghost = None
     if others is not None and len(others) >= _FEWEST and others.std() > 1e-6:
         ghost = beta_shapes(others, np.arange(len(others)))
-    curve = None if others is None else _calibration_curve(claimed, others)
     real_shapes = beta_shapes(claimed, series_ix)
     if ghost is not None:
         real_shapes = _correct_for_ghosts(claimed, real_shapes, (ghost[0].value, ghost[1].value))
-    return ExistenceFit(real_shapes, ghost, None, curve)
+    return ExistenceFit(real_shapes, ghost)
 
 
 def beta_shapes(values: Float, cluster: Int) -> tuple[Estimate, Estimate]:
@@ -207,19 +204,6 @@ def _solve_shapes(sums: Float) -> tuple[float, float]:
     return float(np.clip(mean * strength, 0.1, 1000)), float(np.clip((1 - mean) * strength, 0.1, 1000))
 
 
-def _calibration_curve(real: Float, others: Float) -> Float:
-    """(5, bins) `ExistenceFit.curve`, with Jeffreys intervals."""
-    claims = np.concatenate([real, others])
-    edges = np.unique(np.quantile(claims, np.linspace(0, 1, CURVE_BINS + 1)))
-    bin_ix = np.clip(np.searchsorted(edges, claims, side="right") - 1, 0, max(len(edges) - 2, 0))
-    rows = []
-    for b in np.unique(bin_ix):
-        in_bin = bin_ix == b
-        n, k = int(in_bin.sum()), int(in_bin[: len(real)].sum())
-        rows.append([claims[in_bin].mean(), k / n, *beta.ppf([0.025, 0.975], k + 0.5, n - k + 0.5), n])
-    return np.array(rows).T
-
-
 # List times: their period, its jitter, and outages.
 
 LONG = 2.5
@@ -241,12 +225,11 @@ class ListTimesFit:
     down_share: Estimate
     lasts_s: Estimate
 
-    def keys(self, note: Note = drop_note) -> dict[str, Any]:
+    def keys(self) -> dict[str, Any]:
         """A unit's `outages`; empty where there are none."""
         if self.down_share.why is not None:
             return {}
-        two = {"down_share": self.down_share, "lasts_s": self.lasts_s}
-        return {name: note(round_digits(one.value), one.words()) for name, one in two.items()}
+        return {"down_share": self.down_share.written(), "lasts_s": self.lasts_s.written()}
 
 
 def fit_list_times(lists: FitLists) -> ListTimesFit:
@@ -301,27 +284,20 @@ class RestFit:
     list_times: ListTimesFit
     untold: dict[str, str]
 
-    def pem_keys(self, note: Note = drop_note) -> dict[str, Any]:
+    def pem_keys(self) -> dict[str, Any]:
         """Keys of a PEM beside its couples: `classes`, `ghosts`, `tracks`, and `memory` of the class."""
-        ids, lasting = self.ids_last_s, [part.keys(note) for part in self.classes.memory]
+        ids, lasting = self.ids_last_s, [part.keys() for part in self.classes.memory]
         out: dict[str, Any] = {
-            "classes": self.classes.keys(note),
-            "ghosts": [sort.keys(note) for sort in self.ghosts.sorts],
-            "tracks": {}
-            if ids is None or ids.why is not None
-            else {"lasts_s": note(round_digits(ids.value), ids.words())},
+            "classes": self.classes.keys(),
+            "ghosts": [sort.keys() for sort in self.ghosts.sorts],
+            "tracks": {} if ids is None or ids.why is not None else {"lasts_s": ids.written()},
             "memory": {"class": lasting} if lasting else {},
         }
         return {key: value for key, value in out.items() if value}
 
-    def couple_keys(self, note: Note = drop_note) -> dict[str, Any]:
-        """Keys of each couple: `existence`."""
-        claimed = self.existence.keys(note)
-        return {} if claimed is None else {"existence": claimed}
-
-    def unit_keys(self, note: Note = drop_note) -> dict[str, Any]:
+    def unit_keys(self) -> dict[str, Any]:
         """Keys of the unit: `placed`, `outages`."""
-        out = {"placed": self.placed.keys(note), "outages": self.list_times.keys(note)}
+        out = {"placed": self.placed.keys(), "outages": self.list_times.keys()}
         return {key: value for key, value in out.items() if value}
 
 

@@ -122,6 +122,12 @@ class NodeWeights:
         result: Float = (self.weight * theta[self.node]).sum(axis=1)
         return result
 
+    def dense(self) -> Float:
+        """(R, K) the weight of every node."""
+        out = np.zeros((len(self.node), int(np.prod(self.shape))))
+        np.add.at(out, (np.arange(len(self.node))[:, None], self.node), self.weight)
+        return out
+
     def pooled(self) -> NodeWeights:
         """These weights in one table that all tables have in common."""
         nodes = self.shape[1] * self.shape[2]

@@ -2,55 +2,29 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numba as nb
 import numpy as np
 from scipy.special import betaincinv, betaln
+from scipy.stats import t
 
 from copem_replay.core.tracks import Bool, Float, Int
-from copem_replay.fitting.estimate import Estimate
+from copem_replay.fitting.estimate import PASSES_ALONE, Estimate
 from copem_replay.fitting.rows import NodeWeights, PooledRows
-from copem_replay.metrics.intervals import DRAWN_FROM, draw_resamples, percentile_limits
 
 # Kernels: EM on the nodes of tables, and monotone regression. Shapes: C pooled rows, K nodes of G tables of I ranges ×
 # J visible shares.
 
 _LEAST = 1e-12
 """Probabilities keep this far from 0 and 1 within EM, where logarithms are taken."""
-
-
-@nb.njit(cache=True, nogil=True)
-def fit_em_many(
-    theta: Float,
-    node: Int,
-    weight: Float,
-    hit: Bool,
-    count: Float,
-    prior: Float,
-    shape: Int,
-    monotone: bool,
-    close: float,
-) -> Float:
-    """(R, K) probabilities of `fit_em`, from one start, for counts (R, C) and priors (R, 2, K)."""
-    out = np.empty((len(count), len(theta)))
-    for r in range(len(count)):
-        out[r] = fit_em(theta, node, weight, hit, count[r], prior[r], shape, monotone, close)[0]
-    return out
+_CLOSE = 1e-7
+"""A step of EM by less is its last."""
 
 
 @nb.njit(cache=True, nogil=True)
 def fit_em(
-    theta: Float,
-    node: Int,
-    weight: Float,
-    hit: Bool,
-    count: Float,
-    prior: Float,
-    shape: Int,
-    monotone: bool,
-    close: float = 1e-7,
+    theta: Float, node: Int, weight: Float, hit: Bool, count: Float, prior: Float, shape: Int, monotone: bool
 ) -> tuple[Float, Float]:
     """Maximum-likelihood probabilities (K,) at the nodes, p = Σ weight · θ, and the hits and misses there (2, K).
 
@@ -67,7 +41,7 @@ def fit_em(
         level = _share_out(one, node, weight, hit, count, prior, counts)
         two = _divide_counts(counts, shape, monotone)
         first, second = one - here, two - 2 * one + here
-        done = np.abs(two - one).max() < close
+        done = np.abs(two - one).max() < _CLOSE
         ahead = np.sqrt((first**2).sum() / max((second**2).sum(), 1e-300))
         here, far = two, here + 2 * ahead * first + ahead**2 * second
         if done:
@@ -169,8 +143,6 @@ def _fit_ascending(value: Float, weight: Float) -> Float:
 
 # Fits of tables.
 
-_DRAWN = 200
-"""Resamples of passes: five beyond each limit of 95 %. More: smoother limits, longer fits."""
 STRENGTHS = (1.0, 2.0, 4.0, 8.0, 16.0)
 """Effective rows that a prior may count as. The least keeps a node off 0 and 1; the most is less than a node has of its
 own, as tables that look alike are not known to be."""
@@ -235,65 +207,33 @@ def _shrink_table(
 
 def fisher_information(placed: NodeWeights, theta: Float, count: Float) -> Float:
     """(K, K) Fisher information on the probabilities at the nodes of `count (C,)` pooled rows."""
-    p = np.clip(placed.chances(theta), 1e-9, 1 - 1e-9)
-    dense = np.zeros((len(p), len(theta)))
-    for m in range(4):
-        np.add.at(dense, (np.arange(len(p)), placed.node[:, m]), placed.weight[:, m])
+    p, dense = np.clip(placed.chances(theta), 1e-9, 1 - 1e-9), placed.dense()
     result: Float = (dense * (count / (p * (1 - p)))[:, None]).T @ dense
     return result
 
 
-def estimate_nodes(
-    entries: PooledRows, rows: NodeWeights, fit: TableFit, *, monotone: bool, resampled: bool = True
-) -> tuple[list[Estimate], Float]:
-    """The probability at each node with its interval, and the covariance (K, K) of all.
+def estimate_nodes(entries: PooledRows, rows: NodeWeights, fit: TableFit) -> list[Estimate]:
+    """The probability at each node with Jeffreys' interval of an effective number of rows.
 
-    The interval is Jeffreys' of the effective number of rows. With enough passes to resample it is on each side the
-    wider of both: resamples show neither what hardly ever happens nor the shrinking.
+    These are the rows that touch the node, or what the information is worth there, over rows per effective row. Where
+    PASSES_ALONE passes touch it there are no more than θ(1 − θ)/V · (t of n − 1 / t of K − 1)² as for shares over logs
+    (`metrics/intervals.py`), V the variance by the scores of whole passes.
     """
     theta, placed = fit.theta, entries.placed
-    passes = entries.count.shape[0]
-    count = np.asarray(entries.count.sum(axis=0))
-    K, inside = len(theta), theta * (1 - theta)
+    inside, dense = theta * (1 - theta), placed.dense()
     strength = fit.strength[-1] if fit.strength else 1.0
-    curve = fisher_information(placed, theta, count / fit.worth) + np.diag(strength / inside)
-    covariance = np.asarray(np.linalg.inv(curve), dtype=np.float64)
-    touched = np.zeros(K, dtype=np.int64)
-    np.add.at(touched, rows.node[rows.weight > 0], 1)
-    effective = np.minimum(inside / np.diag(covariance), touched / fit.worth)
-    low, high = (betaincinv(theta * effective + 0.5, (1 - theta) * effective + 0.5, q) for q in (0.025, 0.975))
-    if passes >= DRAWN_FROM and resampled:
-        drawn = draw_resamples([str(k) for k in range(passes)], 0, _DRAWN)
-        theta_drawn = _fit_resamples(entries, fit, drawn.count.astype(float), monotone)
-        covariance[:] = np.cov(theta_drawn.T)
-        for k in range(K):
-            a, b = percentile_limits(theta_drawn[:, k], drawn)
-            low[k], high[k] = min(low[k], a), max(high[k], b)
-    columns = zip(theta, low, high, touched, effective, strict=True)
-    return [Estimate(float(t), float(a), float(b), int(n), float(e)) for t, a, b, n, e in columns], covariance
-
-
-def _fit_resamples(entries: PooledRows, fit: TableFit, times: Float, monotone: bool) -> Float:
-    """(R, K) probabilities of `fit_table` at the strengths of `fit`; `times (R, passes)`: counts of passes."""
-    count = np.ascontiguousarray(times @ entries.count)
-    total = count.sum(axis=1)
-    theta: Float = ((count @ entries.hit / fit.worth + 0.5) / (total / fit.worth + 1))[:, None]
-    for level, strength in zip(_list_levels(entries.placed), fit.strength, strict=True):
-        K = int(np.prod(level.shape))
-        parent = np.tile(theta, (1, K // theta.shape[1]))
-        prior = fit.worth * strength * np.stack([parent, 1 - parent], axis=1)
-        start = fit.theta if len(fit.theta) == K else fit.theta.reshape(-1, K).mean(axis=0)
-        theta = _fit_each(level, entries.hit, start, monotone, count, prior)
-    return theta
-
-
-def _fit_each(placed: NodeWeights, hit: Bool, start: Float, monotone: bool, count: Float, prior: Float) -> Float:
-    """(R, K) probabilities for counts (R, C) and priors (R, 2, K), from one start, computed in threads."""
-    shape = np.array(placed.shape)
-
-    def fitted(count: Float, prior: Float) -> Float:
-        result: Float = fit_em_many(start, placed.node, placed.weight, hit, count, prior, shape, monotone, 1e-5)
-        return result
-
-    with ThreadPoolExecutor() as threads:
-        return np.concatenate(list(threads.map(fitted, np.array_split(count, 8), np.array_split(prior, 8))))
+    information = fisher_information(placed, theta, np.asarray(entries.count.sum(axis=0)))
+    inverse = np.linalg.inv(information + fit.worth * np.diag(strength / inside))
+    touched = np.bincount(rows.node[rows.weight > 0], minlength=len(theta))
+    effective = np.minimum(inside / np.diag(inverse), touched) / fit.worth
+    p = np.clip(placed.chances(theta), 1e-9, 1 - 1e-9)
+    scores = entries.count @ (dense * ((entries.hit - p) / (p * (1 - p)))[:, None])
+    passes = ((entries.count @ (dense > 0)) > 0).sum(axis=0)
+    several = np.maximum(passes, 2)
+    variance = ((scores @ inverse) ** 2).sum(axis=0) * several / (several - 1)
+    ratio = t.ppf(0.975, np.maximum(touched - 1, 1)) / t.ppf(0.975, several - 1)
+    by_passes = np.where(variance > 0, inside / np.maximum(variance, 1e-300) * ratio**2, np.inf)
+    effective = np.where(passes < PASSES_ALONE, effective, np.maximum(np.minimum(effective, by_passes), 1.0))
+    limits = (betaincinv(theta * effective + 0.5, (1 - theta) * effective + 0.5, q) for q in (0.025, 0.975))
+    columns = (column.tolist() for column in (theta, *limits, touched, effective))
+    return [Estimate(*one) for one in zip(*columns, strict=True)]

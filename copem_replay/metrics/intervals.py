@@ -9,30 +9,22 @@ once objects of one log hang together by `WITHIN_LOG`, nor than the spread betwe
 *Quantile*: all values at which the limits of the share at or below them hold the quantile's level (`limit_quantile`).
 *Nothing drawn*: where no random number is behind a result it is equal in every run, and an interval over runs tells
 nothing (`find_fixed_outcomes`).
-*Resample*: as many clusters as there are, drawn with replacement, for the tables of a fit (`draw_resamples`).
 
 Limits are at 95 %. What they hold, and what not: tools/coverage.py, docs/guide/metrics.md. Functions of arrays take any
-leading axes (…). Letters of the shapes: K clusters, G values, R resamples.
+leading axes (…). Letters of the shapes: K clusters, G values.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
-from itertools import combinations_with_replacement
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from copem_replay.core.errors import count_noun
-from copem_replay.core.random import CounterRng, RandomKey, object_words
 from copem_replay.core.tracks import TRUTH, Float, Int
-
-Counts = NDArray[np.uint32]
 
 FEWEST_LOGS = 3
 """From so many logs on intervals are over logs."""
@@ -269,107 +261,6 @@ def interval_words(kind: str, over: str, number: int | None = None) -> str:
     """What limits are, by the columns `interval` and `interval_over`: `over 8 logs: how far …`."""
     method = {EXACT: "exact binomial limits", JACKKNIFE: "Student's t", INVERTED: "of medians"}.get(kind, kind)
     return f"{method} over {describe_clusters(over, number)}"
-
-
-# Resamples of whole clusters: what fits bound their tables by.
-
-RESAMPLES = 2000
-"""Resamples: the share beyond a 95 % limit is then off by .0035 (one standard error)."""
-DRAWN_FROM = 8
-"""From so many clusters on resamples are drawn: of seven there are 1,716 different ones, of eight 6,435."""
-_CELLS = 4_000_000
-"""Numbers held at a time, 32 MB: the size of blocks, which changes no result."""
-
-
-@dataclass(frozen=True)
-class Resamples:
-    """`count (R, K)`: how often each resample has each cluster; `times (R,)`: how many resamples are like this one."""
-
-    count: Counts
-    times: Int
-
-
-def draw_resamples(names: Sequence[str], seed: int, number: int = RESAMPLES) -> Resamples:
-    """All resamples of the named clusters below `DRAWN_FROM` clusters, else `number` drawn ones."""
-    if len(names) < DRAWN_FROM:
-        return list_resamples(len(names))
-    zeros = np.zeros(len(names), dtype=np.int64)
-    random_key, rng = RandomKey(("",), zeros, object_words(names), zeros), CounterRng(seed, "summary")
-    size = max(1, _CELLS // len(names))
-    blocks = [np.arange(r, min(r + size, number)) for r in range(0, number, size)]
-    count = np.concatenate([count_multiplicities(rng.uniform("bootstrap", random_key, block)) for block in blocks])
-    return Resamples(count, np.ones(number, dtype=np.int64))
-
-
-@cache
-def list_resamples(clusters: int) -> Resamples:
-    """All resamples of K clusters that differ, the order of drawing aside; `times` add up to K^K."""
-    numbers = np.arange(clusters)
-    drawn = np.array(list(combinations_with_replacement(range(clusters), clusters)))
-    count = (drawn[:, :, None] == numbers).sum(axis=1).astype(np.uint32)
-    factorial = np.array([math.factorial(k) for k in range(clusters + 1)])
-    times = factorial[clusters] // factorial[count].prod(axis=1)
-    count.flags.writeable = times.flags.writeable = False  # kept for the next call
-    return Resamples(count, times)
-
-
-def count_multiplicities(uniform: Float) -> Counts:
-    """(R, K) how often each cluster is drawn: of `uniform (R, K)`, between 0 and 1, u draws cluster ⌊u·K⌋."""
-    R, K = uniform.shape
-    drawn = (uniform * K).astype(np.int64) + K * np.arange(R)[:, None]
-    return np.bincount(drawn.ravel(), minlength=uniform.size).reshape(R, K).astype(np.uint32)
-
-
-def percentile_limits(values: Float, resampled: Resamples, *, confidence: float = 0.95) -> tuple[float, float]:
-    """Quantiles of a figure (R,) of each resample, linear between neighbours: (low, high).
-
-    At the levels of a confidence, widened for few clusters (`expand_tail`). A resample that stands for several counts
-    as often.
-
-    Resamples without a figure, NaN, are left out; both limits are NaN where none is left. A limit that is infinite, or
-    NaN between −∞ and ∞, does not exist.
-
-    Source: B. Efron, "Nonparametric standard errors and confidence intervals", Canad. J. Statist. 9 (1981) 139–158
-    (percentile method).
-    """
-    tail = expand_tail(confidence, resampled.count.shape[1])
-    defined = ~np.isnan(values)
-    if not defined.any():
-        return math.nan, math.nan
-    order = np.argsort(values[defined], kind="stable")
-    ranked, until = values[defined][order], np.cumsum(resampled.times[defined][order])
-    low, high = (_weighted_quantile(ranked, until, level) for level in (tail, 1.0 - tail))
-    return low, high
-
-
-def _weighted_quantile(ranked: Float, until: Int, level: float) -> float:
-    """The quantile at `level` of values (R,), ascending; `until (R,)`: how many resamples they stand for up to each."""
-    place = level * (int(until[-1]) - 1)
-    first = math.floor(place)
-    below, above = (
-        float(ranked[np.searchsorted(until, min(k, until[-1] - 1), side="right")]) for k in (first, first + 1)
-    )
-    # Of two infinite neighbours the difference would be NaN.
-    return below if below == above or place == first else below + (above - below) * (place - first)
-
-
-def expand_tail(confidence: float, clusters: int) -> float:
-    """The probability beyond each limit of a percentile interval over `clusters` clusters, at most (1 − confidence)/2.
-
-    A resample of K clusters varies less than K fresh ones would, by √((K − 1)/K), and its quantiles are normal ones
-    where Student's are due: with 5 clusters plain percentiles hold the truth 86 times of 100, not 95. The level is
-    Φ(−t·√(K/(K − 1))), t the two-sided quantile of Student's distribution with K − 1 degrees of freedom. With one
-    cluster nothing varies: the plain level.
-
-    Source: T. C. Hesterberg, "What teachers should know about the bootstrap", Amer. Statist. 69 (2015) 371–386
-    (expanded percentile interval).
-    """
-    from scipy.special import ndtr, stdtrit
-
-    tail = (1.0 - confidence) / 2
-    if clusters == 1:
-        return tail
-    return float(ndtr(stdtrit(clusters - 1, tail) * math.sqrt(clusters / (clusters - 1))))
 
 
 # Outcomes that are equal in every run.

@@ -11,11 +11,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import minimize
+from scipy.stats import beta, t
 
 from copem_replay.core.tracks import CLASSES
+from copem_replay.core.yaml import strip_comments
 from copem_replay.fitting.detection import DetectionFit, build_common_sequences, fit_detection
 from copem_replay.fitting.rows import FitRows, choose_nodes, pool_rows, weigh_nodes
-from copem_replay.fitting.tables import fit_em, fit_table, monotone_tables
+from copem_replay.fitting.tables import estimate_nodes, fit_em, fit_table, monotone_tables
 from copem_replay.perception.pem.condition import find_couples
 from copem_replay.perception.pem.model import Pem
 from tests.helpers.detection_rows import held_uniforms, lists_of, passes, rows_of, view_of
@@ -232,14 +234,14 @@ def test_misses_of_all_objects_at_once_are_the_units() -> None:
         assert fit.common
         held += [fit.memory["share"].low <= 0.8 <= fit.memory["share"].high]
         held += [fit.memory["correlation_s"].low <= 0.8 <= fit.memory["correlation_s"].high]
-        [part] = fit.yaml_detection()["memory"]["detection"]
+        [part] = strip_comments(fit.memory_keys()["detection"])
         assert part["of"] == "unit"
         names = {rung.name: rung.below for rung in fit.ladder}
         assert names["constant + memory"] > 0.05
     assert sum(held) >= 10
     own = fitted(passes(0, 40, 80, flat, (0.8, 0.8)))
     assert not own.common
-    assert "of" not in own.yaml_detection()["memory"]["detection"][0]
+    assert "of" not in own.memory_keys()["detection"][0]
 
 
 def test_few_numbers_of_all_objects_leave_the_probability_open() -> None:
@@ -265,9 +267,15 @@ def test_a_number_of_all_objects_by_hand() -> None:
         assert inside == pytest.approx(expected, abs=0.02)
 
 
+def written(fit: DetectionFit) -> Pem:
+    """The PEM of a fit of detection alone."""
+    couples = [({"when": one.when} if one.when else {}) | {"detection": one.model()} for one in fit.couples]
+    return Pem.model_validate(strip_comments({"couples": couples, "memory": fit.memory_keys()}))
+
+
 def check_replayed(fit: DetectionFit, rows: FitRows) -> None:
     """The PEM that is written says what the fit says."""
-    pem = Pem.model_validate(fit.yaml_detection())
+    pem = written(fit)
     chosen = find_couples(pem.couples, rows.view)
     assert (chosen >= 0).all()
     for c, couple in enumerate(pem.couples):
@@ -281,7 +289,7 @@ def test_what_is_written_is_what_is_fitted(probability: Callable[[Any], np.ndarr
     rows = passes(2, 60, 60, probability, (0.8, 1.0))
     fit = fitted(rows)
     check_replayed(fit, rows)
-    (part,) = Pem.model_validate(fit.yaml_detection()).memory["detection"]
+    (part,) = written(fit).memory["detection"]
     assert fit.memory is not None
     assert part.share == pytest.approx(fit.memory["share"].value, abs=1e-3)
 
@@ -301,7 +309,7 @@ def test_without_a_miss() -> None:
     )
     none = fitted(replace(rows, listed=~rows.listed))
     assert none.memory_why == "no hit in 161 lists"
-    assert none.yaml_detection()["couples"][0]["detection"]["probability"] == pytest.approx(0.5 / 162, abs=1e-4)
+    assert strip_comments(none.couples[0].model())["probability"] == pytest.approx(0.5 / 162, abs=1e-4)
 
 
 def test_few_passes() -> None:
@@ -313,6 +321,22 @@ def test_few_passes() -> None:
     assert fit.rows_per_effective > 3
     _, found = nodes(fit)
     assert all(one.n_effective < one.n / 3 for one in found)
+
+
+def test_an_interval_is_no_narrower_than_whole_passes_tell() -> None:
+    """Ten passes of hits alone and ten of misses: of 1,000 rows that are taken as independent 19 count, by t fewer."""
+    pass_ix, listed = np.repeat(np.arange(20), 50), np.repeat(np.arange(20) % 2 == 0, 50)
+    rows = weigh_nodes((np.zeros(1), np.zeros(1)), (np.zeros(1000), np.zeros(1000)), np.zeros(1000, dtype=int))
+    entries = pool_rows(rows, listed, pass_ix)
+    (one,) = estimate_nodes(entries, rows, fit_table(entries, np.ones(20), 1.0, monotone=True))
+    effective = 19 * (t.ppf(0.975, 999) / t.ppf(0.975, 19)) ** 2
+    assert (one.value, one.n, one.n_effective) == pytest.approx((0.5, 1000, effective), rel=0.003)
+    assert (one.low, one.high) == pytest.approx(
+        beta.ppf([0.025, 0.975], effective / 2 + 0.5, effective / 2 + 0.5), abs=1e-3
+    )
+    alike = pool_rows(rows, np.arange(1000) % 2 == 0, pass_ix)
+    (one,) = estimate_nodes(alike, rows, fit_table(alike, np.ones(20), 1.0, monotone=True))
+    assert one.n_effective == 1000
 
 
 def test_same_numbers_every_time() -> None:

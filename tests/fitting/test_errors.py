@@ -8,6 +8,7 @@ from statsmodels.tsa.statespace.sarimax import SARIMAX
 
 from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import CLASSES
+from copem_replay.core.yaml import strip_comments
 from copem_replay.fitting.error_memory import (
     MemoryShares,
     ResidualSeries,
@@ -162,7 +163,7 @@ def test_heavy_tails_are_said_and_written() -> None:
         nu, [bin_] = fit.shape.degrees_of_freedom, fit.bins
         assert fit.shape.written
         assert "explains" in fit.shape.words()
-        model = StudentT.model_validate(fit.yaml_error(bin_))
+        model = StudentT.model_validate(strip_comments(fit.error_keys(bin_)))
         assert model.degrees_of_freedom == pytest.approx(nu.value, rel=1e-2)
         pairs = ((nu, 3.0), (bin_.covariance_m2[0], 0.16), (bin_.covariance_m2[2], 0.04))
         held += [one.low <= true <= one.high for one, true in pairs]
@@ -172,7 +173,7 @@ def test_heavy_tails_are_said_and_written() -> None:
 def test_a_gaussian_has_no_heavy_tails() -> None:
     fits = [fit_errors(*rows_of(seed, passes=20)) for seed in range(5)]
     assert sum(fit.shape.heavier for fit in fits) <= 1
-    assert fits[0].yaml_error(fits[0].bins[0])["kind"] == "gaussian"
+    assert fits[0].error_keys(fits[0].bins[0])["kind"] == "gaussian"
     assert "no heavier" in fits[0].shape.words()
 
 
@@ -220,13 +221,13 @@ def test_classes_have_errors_of_their_own_where_these_differ() -> None:
 def test_what_is_written_is_what_is_replayed() -> None:
     rows, lists = rows_of(6)
     fit = fit_errors(rows, lists)
-    model = Gaussian.model_validate(fit.yaml_error(fit.bins[0]))
+    model = Gaussian.model_validate(strip_comments(fit.error_keys(fit.bins[0])))
     assert model.covariance_m2[0][0] == pytest.approx(fit.bins[0].covariance_m2[0].value, rel=1e-3)
     assert model.speed_sigma_mps == 0
     assert fit.untold["speed"] == "the lists have no such field"
     flat_m = np.array([np.zeros(len(rows.listed)), np.zeros(len(rows.listed)), np.full(len(rows.listed), np.nan)])
     assert fit_errors(replace(rows, size_m=flat_m), lists).untold["size"] == "the lists have only some of its fields"
-    assert fit.memory_keys()["position"][0]["share"] == pytest.approx(fit.shares.drift, abs=1e-3)
+    assert fit.memory_keys()["position"][0]["share"].value == pytest.approx(fit.shares.drift, abs=1e-3)
 
 
 def test_a_field_that_is_never_filled_is_no_measurement() -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, t
 
+from copem_replay.core.yaml import strip_comments
 from copem_replay.fitting.error_memory import MemoryShares
 from copem_replay.fitting.errors import ErrorFit, build_series, fit_errors
 from copem_replay.fitting.estimate import pool_logs
@@ -80,7 +81,7 @@ def drives(seed: int, logs: int, sigma_m: float) -> tuple[FitRows, FitLists]:
 
 
 def position(fit: ErrorFit) -> list[dict[str, object]]:
-    return fit.memory_keys().get("position", [])
+    return strip_comments(fit.memory_keys()).get("position", [])
 
 
 def test_what_differs_between_logs_is_drawn_once_per_log() -> None:

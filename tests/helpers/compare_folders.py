@@ -9,17 +9,10 @@ from typing import Any
 
 import pyarrow as pa
 from pyarrow import parquet
-from scipy import stats
 
 from tests.oracles import intervals
 
 Row = dict[str, Any]
-
-
-def widened(clusters: int, confidence: float = 0.95) -> list[float]:
-    """Levels of both limits: Student's quantile for a normal one, a resample's spread √((K − 1)/K) of a fresh one's."""
-    t = stats.t.ppf((1 + confidence) / 2, clusters - 1) * (clusters / (clusters - 1)) ** 0.5
-    return [float(stats.norm.sf(t)), float(stats.norm.cdf(t))]
 
 
 def limits_of(

@@ -2,7 +2,6 @@
 
 import itertools
 import math
-from collections import Counter
 
 import numpy as np
 import numpy.typing as npt
@@ -12,26 +11,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binomtest
 
-from copem_replay.core.random import CounterRng, RandomKey, object_words
 from copem_replay.metrics.intervals import (
     MOST_GROUPS,
     absent_share,
     alike_limits,
     describe_absent,
     describe_clusters,
-    draw_resamples,
     exact_limits,
-    expand_tail,
     figure_variance,
     group_clusters,
     limit_figure,
     limit_quantile,
     limit_share,
-    list_resamples,
-    percentile_limits,
 )
 from copem_replay.metrics.summary import format_summary, summarise_rows
-from tests.helpers.compare_folders import widened
 from tests.oracles import intervals as oracle
 
 Array = npt.NDArray[np.float64]
@@ -332,58 +325,3 @@ def test_one_object_has_the_binomial_interval_of_its_runs() -> None:
     expected = binomtest(15, 20).proportion_ci(0.95, method="exact")
     assert (row["detected_share_low"], row["detected_share_high"]) == pytest.approx((expected.low, expected.high))
     assert (row["interval"], row["interval_over"], row["interval_clusters"]) == ("exact", "runs", 20)
-
-
-# ------------------------------------------------------------------------------------ resamples
-
-
-def test_of_few_clusters_every_resample_is_there_as_often_as_it_is_drawn():
-    for clusters in range(1, 6):
-        drawn = Counter(
-            tuple(some.count(k) for k in range(clusters))
-            for some in itertools.product(range(clusters), repeat=clusters)
-        )
-        found = list_resamples(clusters)
-        assert dict(zip(map(tuple, found.count.tolist()), found.times.tolist(), strict=True)) == drawn
-    assert len(list_resamples(7).times) == 1716  # 13 over 7
-    assert list_resamples(7).times.sum() == 7**7
-
-
-def test_seven_clusters_are_worked_out_and_eight_are_drawn():
-    seven, eight = (draw_resamples([f"log{k}" for k in range(K)], 3) for K in (7, 8))
-    assert seven is draw_resamples(list("abcdefg"), 4)  # whatever their names and the seed
-    assert (eight.count.shape, eight.times.sum()) == ((2000, 8), 2000)
-    assert (eight.count.sum(axis=1) == 8).all()
-    assert (draw_resamples([f"log{k}" for k in range(8)], 4).count != eight.count).any()
-
-
-def test_many_clusters_are_drawn_part_by_part_as_well_as_at_once():
-    names = [f"object {k}" for k in range(3000)]  # of which 2000 resamples are more than is held at a time
-    drawn = draw_resamples(names, 5).count
-    assert (drawn.sum(axis=1) == 3000).all()
-    zeros = np.zeros(3000, dtype=np.int64)
-    uniform = CounterRng(5, "summary").uniform(
-        "bootstrap", RandomKey(("",), zeros, object_words(names), zeros), np.arange(1998, 2000)
-    )
-    assert drawn[1998:].tolist() == [np.bincount((u * 3000).astype(int), minlength=3000).tolist() for u in uniform]
-
-
-@given(st.lists(st.integers(-20, 20), min_size=2, max_size=5), st.floats(0.5, 0.99))
-def test_limits_are_those_of_all_resamples_written_out(values: list[int], confidence: float):
-    """A resample that stands for many counts as often: the quantile of K^K figures, linear between neighbours."""
-    every = list_resamples(len(values))
-    means = [sum(some) / len(some) for some in itertools.product(values, repeat=len(values))]
-    found = percentile_limits(every.count @ np.array(values) / len(values), every, confidence=confidence)
-    assert found == pytest.approx(np.quantile(means, widened(len(values), confidence)), abs=1e-9)
-
-
-def test_two_clusters_by_hand():
-    # 0 and 1: the means 0, 1/2 twice, 1; at Φ(−√2 · tan(π/4)) = 0.0786496, of three steps 0.2359488.
-    every = list_resamples(2)
-    low, high = percentile_limits(every.count @ np.array([0.0, 1.0]) / 2, every, confidence=0.5)
-    assert (low, high) == pytest.approx((0.2359488 / 2, 1 - 0.2359488 / 2), abs=1e-7)
-
-
-@pytest.mark.parametrize(("clusters", "tail"), [(1, 0.025), (2, 0.0), (5, 0.00095), (10, 0.00855), (10**6, 0.025)])
-def test_few_clusters_widen_the_tails(clusters, tail):
-    assert expand_tail(0.95, clusters) == pytest.approx(tail, abs=5e-6)
