@@ -375,8 +375,8 @@ def drawn_pairs(case: Case, detection: DetectionFit, errors: ErrorFit) -> Iterat
                 yield "probability", couple.probability[i][j], true
     held = case.pem.get("memory", {}).get("detection")
     if held and detection.memory is not None:
-        yield "detection share", detection.memory["share"], held[0]["share"]
-        yield "detection τ", detection.memory["correlation_s"], held[0]["correlation_s"]
+        yield "detection share", detection.memory.share, held[0]["share"]
+        yield "detection τ", detection.memory.correlation_s, held[0]["correlation_s"]
     for one in errors.bins:
         kind = getattr(one.where, "of_class", None)
         of = [

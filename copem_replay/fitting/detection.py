@@ -12,15 +12,22 @@ from itertools import pairwise, product
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import RectBivariateSpline
-from scipy.optimize import minimize
 from scipy.special import expit, logit
 
 from copem_replay.core.errors import count_noun
 from copem_replay.core.tracks import CLASSES, Bool, Float, Int
 from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.core.yaml import CommentedValue
-from copem_replay.fitting.estimate import FEWEST_PASSES, Estimate, Rung, choose_by_bic, choose_rung, held_out_possible
+from copem_replay.fitting.estimate import (
+    FEWEST_PASSES,
+    Estimate,
+    Rung,
+    choose_by_bic,
+    choose_rung,
+    held_out_possible,
+    maximise_likelihood,
+    profile_limits,
+)
 from copem_replay.fitting.rows import (
     FitLists,
     FitRows,
@@ -43,11 +50,6 @@ LEVELS = 50
 are lost (docs/develop/decisions/0030-fitted-detection.md)."""
 _SHARES = (0.01, 0.999)
 """Bounds of the share that lasts: log-odds have none at 0 and 1."""
-_DROP = 1.9207294
-"""Half of the 95 % quantile of χ² with one degree of freedom."""
-_GRID = 9
-_FINE = 601
-"""Points along each axis of the grid of likelihoods, and of the spline through it."""
 
 
 @dataclass(frozen=True)
@@ -105,34 +107,35 @@ def fit_detection_memory(
     """
     length_s = np.add.reduceat(seen.gap_s, seen.start[:-1]).max()
     period_s = float(np.median(seen.gap_s[seen.gap_s > 0]))
-    bounds = np.array([logit(_SHARES), np.log([period_s / 3, 20 * length_s])])
+    bounds = [tuple(logit(_SHARES).tolist()), tuple(np.log([period_s / 3, 20 * length_s]).tolist())]
 
     def likelihood(at: Float) -> float:
-        share, tau = np.clip(at, bounds[:, 0], bounds[:, 1])
-        return max(float(one.log_probability(expit(share), np.exp(tau)).sum()) for one in (seen, *instead))
+        share, tau_s = expit(at[0]), np.exp(at[1])
+        return max(float(one.log_probability(share, tau_s).sum()) for one in (seen, *instead))
 
+    shortest, longest = bounds[1]
     starts = [
-        np.array([s, t])
-        for s in logit([0.3, 0.7, 0.95])
-        for t in bounds[1, 0] + np.array([0.2, 0.4, 0.6, 0.8]) * np.ptp(bounds[1])
+        np.array([logit(share), shortest + way * (longest - shortest)])
+        for share, way in product((0.3, 0.7, 0.95), (0.2, 0.4, 0.6, 0.8))
     ]
-    first = max(starts, key=likelihood)
-    options = {"xatol": 0.01, "fatol": 0.005, "initial_simplex": first + np.array([[0, 0], [0.5, 0], [0, 0.5]])}
-    optimum = minimize(lambda at: -likelihood(at), first, method="Nelder-Mead", options=options)
-    best = np.clip(optimum.x, bounds[:, 0], bounds[:, 1])
-    limits = _profile_limits(likelihood, best, bounds) if intervals else np.full((2, 2), np.nan)
-    # Where the likelihood does not fall enough within bounds, the limit is the end of the range of values.
-    open_ends = np.abs(limits - bounds) < 1e-6
-    shares = np.where(open_ends[0], [0.0, 1.0], expit(limits[0]))
-    taus = np.where(open_ends[1], [0.0, np.inf], np.exp(limits[1]))
-    share, tau = float(expit(best[0])), float(np.exp(best[1]))
+    best, top = maximise_likelihood(likelihood, [max(starts, key=likelihood)], bounds)
+    share, tau_s = float(expit(best[0])), float(np.exp(best[1]))
     n = len(seen.listed)
-    effective = n / design_effect(share, tau, seen)
-    always = best[1] > bounds[1, 1] - 0.01
+    effective = n / design_effect(share, tau_s, seen)
+
+    def estimate(k: int, value: float, to: Callable[[float], float], ends: tuple[float, float]) -> Estimate:
+        """With its limits, or the `ends` of all values where the likelihood does not fall enough within bounds."""
+        limits = profile_limits(likelihood, best, top, k, bounds) if intervals else (np.nan, np.nan)
+        low, high = (
+            end if limit == bound else float(to(limit))
+            for limit, bound, end in zip(limits, bounds[k], ends, strict=True)
+        )
+        return Estimate(value, low, high, n, effective)
+
     return DetectionMemoryFit(
-        Estimate(share, float(shares[0]), float(shares[1]), n, effective),
-        Estimate(np.inf if always else tau, float(taus[0]), float(taus[1]), n, effective),
-        float(likelihood(best) - seen.log_probability(0.0, 1.0).sum()) / n,
+        estimate(0, share, expit, (0.0, 1.0)),
+        estimate(1, np.inf if best[1] > longest - 0.01 else tau_s, np.exp, (0.0, np.inf)),
+        (top - float(seen.log_probability(0.0, 1.0).sum())) / n,
     )
 
 
@@ -149,26 +152,6 @@ def design_effect(share: float, tau_s: float, seen: Sequences) -> float:
             ahead = same * (ahead + 1)
             total += ahead
     return 1 + 2 * share**2 * total / len(seen.listed)
-
-
-def _profile_limits(likelihood: Callable[[Float], float], best: Float, bounds: Float) -> Float:
-    """(2, 2) low and high limit of each number, by a spline through the likelihood on a grid about its best."""
-    top = likelihood(best)
-    bend = np.array([2 * top - likelihood(best + step) - likelihood(best - step) for step in 0.2 * np.eye(2)]) / 0.04
-    half = np.clip(3 / np.sqrt(np.maximum(bend, 1e-9)), 0.1, 2)[:, None] * [-1.0, 1.0]  # how far the grid reaches
-    for _ in range(6):
-        ends = np.clip(best[:, None] + half, bounds[:, :1], bounds[:, 1:])
-        axes = [np.linspace(low, high, _GRID) for low, high in ends.tolist()]
-        grid = np.array([[likelihood(np.array([s, t])) for t in axes[1]] for s in axes[0]])
-        fine = [np.linspace(low, high, _FINE) for low, high in ends.tolist()]
-        spline = RectBivariateSpline(*axes, grid)(*fine)
-        profiles = [spline.max(axis=1), spline.max(axis=0)]
-        inside = [profile >= max(grid.max(), top) - _DROP for profile in profiles]
-        wide = np.array([[keep[0], keep[-1]] for keep in inside]) & (np.abs(ends - bounds) > 1e-9)
-        if not wide.any():
-            break
-        half = np.where(wide, 2 * half, half)
-    return np.array([[axis[keep][0], axis[keep][-1]] for axis, keep in zip(fine, inside, strict=True)])
 
 
 # Tables of detection.
@@ -233,18 +216,17 @@ class DetectionCouple:
 class DetectionFit:
     """A fitted detection model.
 
-    `couples`: the first that applies is used. `memory`: `share` and `correlation_s` of what lasts; None: nothing lasts,
-    for the reason `memory_why`. `ladder`: the models that were compared. `rows_per_effective`: how many rows are worth
-    one that is independent. `notes`: a line each. `common`: what lasts is shared by all objects of the unit.
+    `couples`: the first that applies is used. `memory`: what lasts; None: nothing, for the reason `memory_why`.
+    `ladder`: the models that were compared. `rows_per_effective`: how many rows are worth one that is independent.
+    `notes`: a line each.
     """
 
     couples: tuple[DetectionCouple, ...]
-    memory: Mapping[str, Estimate] | None
+    memory: DetectionMemoryFit | None
     memory_why: str | None
     ladder: tuple[Rung, ...]
     rows_per_effective: float
     notes: tuple[str, ...]
-    common: bool = False
 
     def probability(self, view: ViewGeometry) -> Float:
         """(P,) the probability that each row is listed, regardless of memory."""
@@ -263,12 +245,14 @@ class DetectionFit:
         """The memory of detection as the experiment file has it; empty where nothing lasts."""
         if self.memory is None:
             return {}
-        share, tau_s = self.memory["share"], self.memory["correlation_s"]
+        share, tau_s = self.memory.share, self.memory.correlation_s
         part = {
             "share": CommentedValue(round(share.value, 3), share.words()),
             "correlation_s": CommentedValue("always", tau_s.words()) if np.isinf(tau_s.value) else tau_s.written(3),
         }
-        of_all = {"of": CommentedValue("unit", "all objects of a list: likelier than each")} if self.common else {}
+        of_all = (
+            {"of": CommentedValue("unit", "all objects of a list: likelier than each")} if self.memory.common else {}
+        )
         return {"detection": [part | of_all]}
 
 
@@ -323,8 +307,7 @@ def fit_detection(
         for when, one in zip(rung.when, grid.tolist(), strict=True)
     )
     return DetectionFit(
-        couples, None if memory is None else {"share": memory.share, "correlation_s": memory.correlation_s},
-        why, _add_gains(table, memory), fit.worth, notes, memory is not None and memory.common,
+        couples, memory, why, _add_gains(table, memory), fit.worth, notes,
     )  # fmt: skip
 
 

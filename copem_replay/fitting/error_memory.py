@@ -7,7 +7,7 @@ asked the mean, are integrated out (REML), so that few series do not look surer 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -235,164 +235,136 @@ def log_likelihood(z: Float, series: ResidualSeries, shares: MemoryShares, *, ce
     return float(total - 0.5 * n * np.log(np.maximum(squares, 1e-300) / n).sum())
 
 
-def refit_error_memory(z: Float, series: ResidualSeries, start: MemoryShares, *, centred: bool) -> MemoryShares:
-    """The shares of greatest likelihood from a start near them, without a choice among models."""
-    z, bounds = np.ascontiguousarray(z), _bound_parameters(series)
-    best, _ = maximise_likelihood(
-        lambda x: log_likelihood(z, series, _unpack_shares(x), centred=centred), [_pack_shares(start)], bounds
-    )
-    return _unpack_shares(best)
-
-
-def fit_error_memory(z: Float, series: ResidualSeries, *, centred: bool, intervals: bool = True) -> ErrorMemoryFit:
-    """The memory of residuals (n, C); without `intervals` it has no parts.
-
-    With many rows those of some series give the start, and decide which models are refused.
-    """
-    n, count = len(z), int(series.new.sum())
-    if n < _FEWEST or n <= count + 2:
-        return ErrorMemoryFit(untold=f"{n} entries in {count} series: no memory can be told")
-    if n > 2 * _ENOUGH:
-        rows = series.some(_ENOUGH)
-        rough = fit_error_memory(
-            z[rows], ResidualSeries(series.gap_s[rows], series.new[rows]), centred=centred, intervals=False
-        )
-        if rough.untold is None and rough.shares.drift > 0:
-            return _polish_fit(np.ascontiguousarray(z), series, rough, centred=centred, intervals=intervals)
-    z, bounds = np.ascontiguousarray(z), _bound_parameters(series)
-
-    def of(shares: MemoryShares) -> float:
-        return log_likelihood(z, series, shares, centred=centred)
-
-    first = [MemoryShares(w, tau_s, c) for w in (0.3, 0.7) for c in (0.05, 0.2) for tau_s in (0.3, 1.0, 3.0)]
-    both, highest = maximise_likelihood(
-        lambda x: of(_unpack_shares(x)), [_pack_shares(one) for one in sorted(first, key=of, reverse=True)[:2]], bounds
-    )
-    shares_of_both = _unpack_shares(both)
-    starts = [
-        (shares_of_both.drift + 0.5 * shares_of_both.constant, both[2]),
-        (shares_of_both.drift + shares_of_both.constant, bounds[2][1] - 3.0),
-    ]
-    drift, of_drift = maximise_likelihood(
-        lambda x: of(_unpack_drift(x)),
-        [(both[0], both[2]), *((logit(np.clip(w, 0.01, 0.99)), tau) for w, tau in starts)],
-        [bounds[0], bounds[2]],
-    )
-    constant, of_constant = maximise_likelihood(
-        lambda x: of(MemoryShares(constant=float(expit(x[0])))), [(0.0,), (-3.0,)], bounds[:1]
-    )
-    likelihoods = {
-        "none": of(MemoryShares()),
-        "constant": of_constant,
-        "drift": of_drift,
-        "both": max(highest, of_drift),
-    }
-    constant_alone = MemoryShares(constant=float(expit(constant[0])))
-    models = {
-        "none": MemoryShares(), "constant": constant_alone, "drift": _unpack_drift(drift), "both": shares_of_both,
-    }  # fmt: skip
-    chosen = next(name for name, allowed in ALLOWED.items() if likelihoods["both"] - likelihoods[name] <= allowed)
-    if chosen == "both" and min(shares_of_both.drift, shares_of_both.constant) < _LEAST:
-        chosen = "drift" if shares_of_both.constant < _LEAST else "constant"
-    fit = ErrorMemoryFit(models[chosen], (), likelihoods)
-    return _add_intervals(fit, of, (both, highest), bounds, (n, count)) if intervals else fit
-
-
-def _polish_fit(
-    z: Float, series: ResidualSeries, rough: ErrorMemoryFit, *, centred: bool, intervals: bool
-) -> ErrorMemoryFit:
-    """The fit to all rows, from that to some of them; models that these refuse stay refused."""
-    bounds, constant = _bound_parameters(series), rough.shares.constant > 0
-
-    def of(shares: MemoryShares) -> float:
-        return log_likelihood(z, series, shares, centred=centred)
-
-    both, highest = maximise_likelihood(lambda x: of(_unpack_shares(x)), [_pack_shares(rough.shares)], bounds)
-    shares, likelihoods = _unpack_shares(both), {"none": of(MemoryShares()), "both": highest}
-    if not constant:
-        start = (logit(shares.drift + 0.5 * shares.constant), both[2])
-        drift, likelihoods["drift"] = maximise_likelihood(
-            lambda x: of(_unpack_drift(x)), [start], [bounds[0], bounds[2]]
-        )
-        shares = _unpack_drift(drift) if highest - likelihoods["drift"] <= ALLOWED["drift"] else shares
-    fit = ErrorMemoryFit(shares, (), likelihoods)
-    return _add_intervals(fit, of, (both, highest), bounds, (len(z), int(series.new.sum()))) if intervals else fit
-
-
-def _bound_parameters(series: ResidualSeries) -> list[tuple[float, float]]:
-    """Bounds of the log-odds of two shares and of ln τ: from a tenth of a gap to twenty times the longest series."""
-    longest_s = float(np.bincount(np.cumsum(series.new) - 1, np.where(series.new, 0.0, series.gap_s)).max())
-    shortest = np.log(max(np.median(series.gap_s[~series.new]) / 10, 1e-3))
-    return [(-_ODDS, _ODDS), (-_ODDS, _ODDS), (shortest, max(np.log(20 * max(longest_s, 1e-3)), shortest + 1))]
-
-
+_FREE = {"none": [], "constant": [1], "drift": [0, 2], "both": [0, 1, 2]}
+"""By model its parameters among the log-odds of the drift, those of the constant in the rest, and ln τ."""
 ALLOWED = {"none": 3.907, "constant": 2.996, "drift": DROP, "both": 0.0}
 """By how much the log-likelihood of a simpler model may be less: half of the 95 % quantile of χ²₃, χ²₂ and χ²₁."""
 
 
-def _unpack_shares(x: Float) -> MemoryShares:
-    """Shares from the log-odds of the drift, those of the constant in the rest, and ln τ."""
-    drift = float(expit(x[0]))
-    return MemoryShares(drift, float(np.exp(x[2])), (1 - drift) * float(expit(x[1])))
+def _unpack_shares(x: Float, swapped: bool = False) -> MemoryShares:
+    """Shares from the parameters; `swapped`: the log-odds of the constant, those of the drift in the rest, and ln τ."""
+    first = float(expit(x[0]))
+    second = (1 - first) * float(expit(x[1]))
+    drift, constant = (second, first) if swapped else (first, second)
+    return MemoryShares(drift, float(np.exp(x[2])), constant)
 
 
-def _unpack_drift(x: Float) -> MemoryShares:
-    """Shares from the log-odds of the drift and ln τ, without a constant."""
-    return MemoryShares(float(expit(x[0])), float(np.exp(x[1])))
-
-
-def _unpack_swapped(x: Float) -> MemoryShares:
-    """Shares from the log-odds of the constant, those of the drift in the rest, and ln τ."""
-    constant = float(expit(x[0]))
-    return MemoryShares((1 - constant) * float(expit(x[1])), float(np.exp(x[2])), constant)
-
-
-def _pack_shares(shares: MemoryShares, *, swapped: bool = False) -> tuple[float, float, float]:
-    """The parameters that `_unpack_shares`, or `_unpack_swapped`, turns into these shares."""
+def _pack_shares(shares: MemoryShares, swapped: bool = False) -> Float:
+    """The parameters that `_unpack_shares` turns into these shares."""
     first, second = (shares.constant, shares.drift) if swapped else (shares.drift, shares.constant)
     first = min(first, 1 - 1e-6)
-    return float(logit(first)), float(logit(min(second / (1 - first), 1.0))), float(np.log(shares.tau_s))
+    return np.array([logit(first), logit(min(second / (1 - first), 1.0)), np.log(shares.tau_s)])
 
 
-def _add_intervals(
-    fit: ErrorMemoryFit,
-    of: Callable[[MemoryShares], float],
-    peak: tuple[Float, float],
-    bounds: Bounds,
-    counted: tuple[int, int],
-) -> ErrorMemoryFit:
-    """The fit with its parts and their profile intervals. `counted`: rows and series."""
-    both, value = peak
+@dataclass(frozen=True)
+class _MemoryTrial:
+    """Likelihoods of residuals (n, C) under memories. `bounds`: of the three parameters."""
+
+    z: Float
+    series: ResidualSeries
+    centred: bool
+    bounds: Bounds
+
+    @classmethod
+    def of(cls, z: Float, series: ResidualSeries, *, centred: bool) -> _MemoryTrial:
+        """The trial, with correlation times from a tenth of a gap to twenty times the longest series."""
+        longest_s = float(np.bincount(np.cumsum(series.new) - 1, np.where(series.new, 0.0, series.gap_s)).max())
+        shortest = np.log(max(np.median(series.gap_s[~series.new]) / 10, 1e-3))
+        ends = (shortest, max(np.log(20 * max(longest_s, 1e-3)), shortest + 1))
+        return cls(np.ascontiguousarray(z), series, centred, [(-_ODDS, _ODDS), (-_ODDS, _ODDS), ends])
+
+    def likelihood(self, shares: MemoryShares) -> float:
+        """The log-likelihood of a memory."""
+        return log_likelihood(self.z, self.series, shares, centred=self.centred)
+
+    def climb(self, model: str, starts: Sequence[Float]) -> tuple[Float, float]:
+        """The likeliest parameters (3,) of a model, −∞ and 0 where it has none, and their likelihood."""
+        free = _FREE[model]
+
+        def fill(x: Float) -> Float:
+            out = np.array([-np.inf, -np.inf, 0.0])
+            out[free] = x
+            return out
+
+        bounds = [self.bounds[k] for k in free]
+        found = maximise_likelihood(
+            lambda x: self.likelihood(_unpack_shares(fill(x))), [x[free] for x in starts], bounds
+        )
+        return fill(found[0]), found[1]
+
+    def limits(self, peak: tuple[Float, float], k: int, swapped: bool = False) -> tuple[float, float]:
+        """The profile interval of parameter k under `both`."""
+        return profile_limits(lambda x: self.likelihood(_unpack_shares(x, swapped)), *peak, k, self.bounds)
+
+
+def refit_error_memory(z: Float, series: ResidualSeries, start: MemoryShares, *, centred: bool) -> MemoryShares:
+    """The shares of greatest likelihood from a start near them, without a choice among models."""
+    return _unpack_shares(_MemoryTrial.of(z, series, centred=centred).climb("both", [_pack_shares(start)])[0])
+
+
+def fit_error_memory(z: Float, series: ResidualSeries, *, centred: bool, intervals: bool = True) -> ErrorMemoryFit:
+    """The memory of residuals (n, C); without `intervals` it has no parts. Of many rows some are the start."""
+    n, count = len(z), int(series.new.sum())
+    if n < _FEWEST or n <= count + 2:
+        return ErrorMemoryFit(untold=f"{n} entries in {count} series: no memory can be told")
+    trial = _MemoryTrial.of(z, series, centred=centred)
+    first = [MemoryShares(w, tau_s, c) for w in (0.3, 0.7) for c in (0.05, 0.2) for tau_s in (0.3, 1.0, 3.0)]
+    if n > 2 * _ENOUGH:
+        rows = series.some(_ENOUGH)
+        few = ResidualSeries(series.gap_s[rows], series.new[rows])
+        rough = fit_error_memory(z[rows], few, centred=centred, intervals=False)
+        first = [rough.shares] if rough.shares.drift > 0 else first
+    best = [_pack_shares(one) for one in sorted(first, key=trial.likelihood, reverse=True)[:2]]
+    both, highest = trial.climb("both", best)
+    at, end = _unpack_shares(both), trial.bounds[2][1]
+    lasts = ((at.drift + 0.5 * at.constant, both[2]), (at.drift + at.constant, end - 3.0))
+    instead = [np.array([logit(np.clip(share, 0.01, 0.99)), 0.0, tau]) for share, tau in lasts]
+    found = {
+        "none": trial.climb("none", [both]),
+        "constant": trial.climb("constant", [np.zeros(3), np.full(3, -3.0)]),
+        "drift": trial.climb("drift", [both, *instead]),
+    }
+    likelihoods = {name: value for name, (_, value) in found.items()}
+    likelihoods["both"] = max(highest, likelihoods["drift"])
+    chosen = next(name for name, allowed in ALLOWED.items() if likelihoods["both"] - likelihoods[name] <= allowed)
+    if chosen == "both" and min(at.drift, at.constant) < _LEAST:
+        chosen = "drift" if at.constant < _LEAST else "constant"
+    shares = at if chosen == "both" else _unpack_shares(found[chosen][0])
+    parts, untold = _estimate_parts(trial, shares, (both, highest), (n, count)) if intervals else ((), None)
+    return ErrorMemoryFit(shares, parts, likelihoods, untold)
+
+
+def _estimate_parts(
+    trial: _MemoryTrial, shares: MemoryShares, peak: tuple[Float, float], counted: tuple[int, int]
+) -> tuple[tuple[LastingPart, ...], str | None]:
+    """The parts with their profile intervals, and what is not told. `counted`: rows and series."""
     n, count = counted
-    shares = fit.shares
 
-    def share_of(at: Float, model: Callable[[Float], MemoryShares], written: float, effective: float) -> Estimate:
-        low, high = profile_limits(lambda x: of(model(x)), at, value, 0, bounds)
-        low, high = (0.0 if low <= -_ODDS else float(expit(low))), (1.0 if high >= _ODDS else float(expit(high)))
-        return Estimate(written, min(low, written), max(high, written), n, effective)
+    def estimate(value: float, limits: tuple[float, float]) -> Estimate:
+        return Estimate(value, min(limits[0], value), max(limits[1], value), n, float(count))
+
+    def bound_share(point: Float, swapped: bool) -> tuple[float, float]:
+        low, high = trial.limits((point, peak[1]), 0, swapped)
+        return (0.0 if low <= -_ODDS else float(expit(low))), (1.0 if high >= _ODDS else float(expit(high)))
 
     if shares.drift == shares.constant == 0:
-        return ErrorMemoryFit(
-            shares, (), fit.log_likelihood, f"no memory in {n} entries of {count} series beyond chance"
-        )
-    parts = []
+        return (), f"no memory in {n} entries of {count} series beyond chance"
+    end, parts = trial.bounds[2][1], list[LastingPart]()
     if shares.drift > 0:
-        low, high = profile_limits(lambda x: of(_unpack_shares(x)), both, value, 2, bounds)
-        low_s, high_s = float(np.exp(low)), float("inf") if high >= bounds[2][1] else float(np.exp(high))
-        share = share_of(both, _unpack_shares, shares.drift, float(count))
-        tau = Estimate(shares.tau_s, min(low_s, shares.tau_s), max(high_s, shares.tau_s), n, float(count))
-        parts.append(LastingPart(share, tau))
-    untold = None
+        low, high = trial.limits(peak, 2)
+        tau = estimate(shares.tau_s, (float(np.exp(low)), float("inf") if high >= end else float(np.exp(high))))
+        parts.append(LastingPart(estimate(shares.drift, bound_share(peak[0], False)), tau))
     if shares.constant > 0:
-        at = np.clip(_pack_shares(_unpack_shares(both), swapped=True), *np.array(bounds).T)
-        share = share_of(at, _unpack_swapped, shares.constant, float(count))
-        parts.append(LastingPart(share, "always"))
-        if shares.drift == 0:
-            start = float(logit(np.clip(shares.constant, 1e-3, 1 - 1e-3)))
-            only = [bounds[0], bounds[2]]
-            best, top = maximise_likelihood(
-                lambda x: of(_unpack_drift(x)), [(start, bounds[2][1]), (start, bounds[2][1] - 3)], only
-            )
-            low, _ = profile_limits(lambda x: of(_unpack_drift(x)), best, top, 1, only)
-            untold = f"τ > {np.exp(low):.2g} s or constant"
-    return ErrorMemoryFit(shares, tuple(parts), fit.log_likelihood, untold)
+        at = np.clip(_pack_shares(_unpack_shares(peak[0]), swapped=True), *np.array(trial.bounds).T)
+        parts.append(LastingPart(estimate(shares.constant, bound_share(at, True)), "always"))
+    if shares.drift > 0 or not parts:
+        return tuple(parts), None
+    start = logit(np.clip(shares.constant, 1e-3, 1 - 1e-3))
+    best, top = trial.climb("drift", [np.array([start, 0.0, tau]) for tau in (end, end - 3)])
+    only = _FREE["drift"]
+
+    def drifting(x: Float) -> float:
+        return trial.likelihood(MemoryShares(float(expit(x[0])), float(np.exp(x[1]))))
+
+    low, _ = profile_limits(drifting, best[only], top, 1, [trial.bounds[k] for k in only])
+    return tuple(parts), f"τ > {np.exp(low):.2g} s or constant"

@@ -13,7 +13,6 @@ from scipy.stats import chi2
 
 from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import Bool, Float, Int
-from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.core.yaml import CommentedValue
 from copem_replay.fitting.error_memory import (
     ErrorMemoryFit,
@@ -202,97 +201,71 @@ def _remove_variance(of: Estimate, pose_m2: float) -> Estimate:
     return replace(of, value=value, low=0.0 if why else low, high=high, why=why)
 
 
-def fit_errors(
-    rows: FitRows, lists: FitLists, *, simplest: bool = False, edges_m: tuple[float, ...] | None = None
-) -> ErrorFit:
-    """Fit the errors of all listed rows. `edges_m`: bounds between bins of range; None: quantiles.
-
-    Raises InputError where too few rows are listed.
-    """
+def fit_errors(rows: FitRows, lists: FitLists, *, simplest: bool = False) -> ErrorFit:
+    """Fit the errors of all listed rows. Raises InputError where too few rows are listed."""
     listed = np.flatnonzero(rows.listed & np.isfinite(rows.along_m) & np.isfinite(rows.across_m))
     if len(listed) < FEWEST:
         raise InputError(f"{len(listed)} entries are of a true object: errors need at least {FEWEST}")
     entries = rows.take(listed)
-    series = build_series(entries)
-    errors = {
-        "line_of_sight": np.column_stack([entries.along_m, entries.across_m]),
-        "absolute": np.column_stack([entries.east_m, entries.north_m]),
-    }
-    everything = np.zeros(len(listed), dtype=np.int64)
-    los_m = errors["line_of_sight"]
+    series, everything = build_series(entries), np.zeros(len(listed), dtype=np.int64)
+    los_m = np.column_stack([entries.along_m, entries.across_m])
     z = fit_moments(los_m, everything, _EVERYWHERE, series, MemoryShares()).standardised(los_m, everything)
     start = fit_error_memory(z, series, centred=True, intervals=False).shares
     worth = float(fit_moments(los_m, everything, _EVERYWHERE, series, start).freedom.min()) / len(listed)
-    candidates = _list_candidates(entries.view, worth, edges_m)
     trial = _ModelTrial(entries, series, worth, simplest)
-    wide = list(candidates.values())[-1]
-    frame_ix, frames = trial.choose({name: (error_m, wide, None) for name, error_m in errors.items()})
-    frame: Frame = ("line_of_sight", "absolute")[frame_ix]
-    error_m = errors[frame]
-    bins_ix, ladder = trial.choose({name: (error_m, bins, None) for name, bins in candidates.items()})
-    name, bins = list(candidates.items())[bins_ix]
+    frame, (error_m, bins, _), memory, ladder, frames = _choose_model(trial, start)
     bin_ix = find_bin(entries.view, bins)
-    memory = _fit_error_memory(error_m, bin_ix, bins, series, start)
-    base = (error_m, bins, memory.shares)
-    _, last = trial.choose({name: (error_m, bins, None), name + _MEMORY: base})
-    by_class: tuple[Rung, ...] = ()
-    if not simplest:
-        bins, memory, by_class = _split_by_class(trial, base, memory, f"{name} and class", last[bool(memory.parts)])
-        bin_ix = find_bin(entries.view, bins)
-    if simplest and memory.parts:
-        memory = ErrorMemoryFit(log_likelihood=memory.log_likelihood, untold="the simplest model was asked for")
-    last = tuple(
-        replace(rung, chosen=k == bool(memory.parts) and not any(one.chosen for one in by_class))
-        for k, rung in enumerate(last)
-    )
     moments = fit_moments(error_m, bin_ix, bins, series, memory.shares)
     between = fit_between_logs(error_m - moments.mean_m[bin_ix], entries.log, series, memory.shares)
     if between is not None:
         moments = replace(moments, half_width_m=np.maximum(moments.half_width_m, between.half_width_m))
     shape = _measure_shape(moments.standardised(error_m, bin_ix), series, memory.shares, between, simplest)
-    estimated = _estimate_bins(bins, moments, shape, error_m, bin_ix)
     spreads, lasting, untold = _fit_spreads(entries, simplest=simplest)
     if memory.untold is not None:
         untold = {"memory.position": memory.untold} | untold
     return ErrorFit(
-        frame, estimated,
-        spreads["yaw"], spreads["speed"], spreads["size"],
-        {"position": memory.parts} | lasting, memory.shares, shape,
-        listed, bin_ix, (*(rung for rung in ladder if not rung.chosen), *last, *by_class), frames, untold, between,
+        frame, _estimate_bins(bins, moments, shape, error_m, bin_ix), spreads["yaw"], spreads["speed"], spreads["size"],
+        {"position": memory.parts} | lasting, memory.shares, shape, listed, bin_ix, ladder, frames, untold, between,
     )  # fmt: skip
 
 
-def _split_by_class(
-    trial: _ModelTrial, base: _Model, memory: ErrorMemoryFit, name: str, rung: Rung
-) -> tuple[tuple[RangeBin, ...], ErrorMemoryFit, tuple[Rung, ...]]:
-    """The bins and their memory, by class if the likelihood rises beyond chance, and a row for the table."""
-    error_m, bins, shares = base
-    split = class_bins(bins, trial.rows.view, trial.worth)
-    if len(split) == len(bins):
-        return bins, memory, ()
-    split_ix = find_bin(trial.rows.view, split)
-    again = _fit_error_memory(error_m, split_ix, split, trial.series, shares or MemoryShares())
-    gain = trial.gain((error_m, split, again.shares), base)
-    needed = float(chi2.ppf(0.95, 5 * (len(split) - len(bins)))) / 2
-    table = _tabulate_split(name, gain, needed, len(error_m), rung)
-    return (split, again, table) if gain > needed else (bins, memory, table)
-
-
-def _tabulate_split(name: str, gain: float, needed: float, n: int, base: Rung) -> tuple[Rung, ...]:
-    """The split by class beside the model without: its gain in likelihood, and whether that is beyond chance."""
-    each = gain / n
-    return (Rung(f"{name}{_MEMORY}", base.score + each, max(-each, 0.0), 0.0, gain > needed, "likelihood"),)
-
-
-def _list_candidates(
-    view: ViewGeometry, worth: float, edges_m: tuple[float, ...] | None
-) -> dict[str, tuple[RangeBin, ...]]:
-    """Bins by name, from one to the finest that the rows allow."""
-    by_range = range_bins(view, worth, edges_m)
-    finer = share_bins(by_range, view, worth)
-    whole = (RangeBin((0.0, by_range[-1].range_m[1])),)
-    candidates = {_ONE: whole} | ({_RANGE: by_range} if len(by_range) > 1 else {})
-    return candidates | ({_SHARE: finer} if len(finer) > len(by_range) else {})
+def _choose_model(
+    trial: _ModelTrial, start: MemoryShares
+) -> tuple[Frame, _Model, ErrorMemoryFit, tuple[Rung, ...], tuple[Rung, ...]]:
+    """The frame, the model in it and its memory, and the tables of models and of frames."""
+    rows, series = trial.rows, trial.series
+    errors: dict[Frame, Float] = {
+        "line_of_sight": np.column_stack([rows.along_m, rows.across_m]),
+        "absolute": np.column_stack([rows.east_m, rows.north_m]),
+    }
+    by_range = range_bins(rows.view, trial.worth)
+    finer = share_bins(by_range, rows.view, trial.worth)
+    candidates: dict[str, tuple[RangeBin, ...]] = {_ONE: (RangeBin((0.0, by_range[-1].range_m[1])),)}
+    candidates |= {
+        name: bins for name, bins, than in ((_RANGE, by_range, 1), (_SHARE, finer, len(by_range))) if len(bins) > than
+    }
+    wide = list(candidates.values())[-1]
+    frame_ix, frames = trial.choose({str(name): (error_m, wide, None) for name, error_m in errors.items()})
+    frame, error_m = list(errors.items())[frame_ix]
+    bins_ix, ladder = trial.choose({name: (error_m, bins, None) for name, bins in candidates.items()})
+    name, bins = list(candidates.items())[bins_ix]
+    memory = _fit_error_memory(error_m, find_bin(rows.view, bins), bins, series, start)
+    model: _Model = (error_m, bins, memory.shares)
+    _, last = trial.choose({name: (error_m, bins, None), name + _MEMORY: model})
+    last = tuple(replace(rung, chosen=k == bool(memory.parts)) for k, rung in enumerate(last))
+    split = class_bins(bins, rows.view, trial.worth)
+    if len(split) > len(bins) and not trial.simplest:
+        again = _fit_error_memory(error_m, find_bin(rows.view, split), split, series, memory.shares)
+        gain = trial.gain((error_m, split, again.shares), model) / len(error_m)
+        better = gain * len(error_m) > float(chi2.ppf(0.95, 5 * (len(split) - len(bins)))) / 2
+        score = last[bool(memory.parts)].score + gain
+        by_class = Rung(f"{name} and class{_MEMORY}", score, max(-gain, 0.0), 0.0, better, "likelihood")
+        last = (*(replace(rung, chosen=rung.chosen and not better) for rung in last), by_class)
+        model, memory = ((error_m, split, again.shares), again) if better else (model, memory)
+    if trial.simplest and memory.parts:
+        memory = ErrorMemoryFit(log_likelihood=memory.log_likelihood, untold="the simplest model was asked for")
+        last = tuple(replace(rung, chosen=k == 0) for k, rung in enumerate(last))
+    return frame, model, memory, (*(rung for rung in ladder if not rung.chosen), *last), frames
 
 
 def _fit_spreads(

@@ -218,10 +218,12 @@ def _fit_sorts(
     classes = _count_classes(entries.class_ix[first])
     out = [GhostSort(in_list(1 - excess, 1.0), lasts_s, field, classes)] if excess < 0.95 else []
     if excess > 0:
-        names, of_objects = _find_neighbours(rows, entries, first[near])
+        count = np.bincount(entries.nearest_class_ix[first[near]], minlength=len(CLASSES))
+        kinds = np.flatnonzero(count >= max(0.1 * count.sum(), 1))
+        of_objects = max(int(np.isin(rows.view.class_ix, kinds).sum()), 1)
         sides_m = np.median(np.concatenate([rows.view.length_m, rows.view.width_m])) / 2
         within_m = max(float(np.quantile(entries.nearest_m[first[near]], 0.9)) - float(sides_m), 0.5)
-        where = {"kind": "beside", "classes": names, "within_m": round(within_m, 1)}
+        where = {"kind": "beside", "classes": [CLASSES[k] for k in kinds], "within_m": round(within_m, 1)}
         out.append(
             GhostSort(in_list(excess, of_objects / L), lasts_s, where, _count_classes(entries.class_ix[first[near]]))
         )
@@ -244,24 +246,6 @@ def _fit_field(entries: _OrderedEntries, first: Int) -> tuple[dict[str, Any], fl
         wrapped = [(np.rad2deg(angle) + 180) % 360 - 180 for angle in (start, start + turn)]
         where["azimuth_deg"] = [round(float(angle), 1) for angle in wrapped]
     return where, turn / 2 * (far_m**2 - near_m**2)
-
-
-def _find_neighbours(rows: FitRows, entries: _OrderedEntries, near: Int) -> tuple[list[str], int]:
-    """Classes of the objects that ghosts are beside, and how many rows have these classes."""
-    order = np.argsort(rows.list, kind="stable")
-    classes = []
-    for e in near:
-        low, high = np.searchsorted(rows.list[order], [entries.list[e], entries.list[e] + 1])
-        if high > low:
-            rows_of_list = order[low:high]
-            apart = np.hypot(
-                rows.state_m[rows_of_list, 0] - entries.east_m[e], rows.state_m[rows_of_list, 1] - entries.north_m[e]
-            )
-            classes.append(int(rows.view.class_ix[rows_of_list[np.argmin(apart)]]))
-    count = np.bincount(np.array(classes, dtype=np.int64), minlength=len(CLASSES))
-    kinds = np.flatnonzero(count >= max(0.1 * count.sum(), 1))
-    of_objects = int(np.isin(rows.view.class_ix, kinds).sum())
-    return [CLASSES[k] for k in kinds] or ["car"], max(of_objects, 1)
 
 
 def _count_classes(class_ix: Int) -> dict[str, float]:

@@ -445,20 +445,18 @@ def _other_columns(
     """Columns (E,) of entries about no true object, with the distance of the nearest true object."""
     tracks = view.found.tracks
     east, north = tracks.x_m[0, other], tracks.y_m[0, other]
-    nearest_m, nearest_listed = np.full(len(other), np.inf), np.zeros(len(other), dtype=bool)
-    order = np.argsort(view.list_ix, kind="stable")
-    bounds = np.searchsorted(view.list_ix[order], np.arange(len(view.captured_s) + 1))
-    for k, f in enumerate(list_ix.tolist()):
-        rows_of_list = order[bounds[f] : bounds[f + 1]]
-        if len(rows_of_list):
-            away_m = np.hypot(rows["x_m"][rows_of_list] - east[k], rows["y_m"][rows_of_list] - north[k])
-            nearest = int(away_m.argmin())
-            nearest_m[k], nearest_listed[k] = away_m[nearest], rows["listed"][rows_of_list[nearest]]
+    places = np.stack([rows["x_m"], rows["y_m"], view.list_ix * _APART_M], axis=1)
+    wanted = np.stack([east, north, list_ix * _APART_M], axis=1)
+    if len(places) and len(wanted):
+        nearest_m, nearest = cKDTree(places).query(wanted)
+    else:
+        nearest_m, nearest = np.full(len(other), np.inf), np.zeros(len(other), dtype=np.int64)
+    nearest_class = view.view.class_ix[view.row][nearest] if len(places) else np.full(len(other), -1)
     dx, dy = east - view.east_m[list_ix], north - view.north_m[list_ix]
     return {
         "list": list_ix.copy(), "log": np.full(len(other), number), "captured_s": view.captured_s[list_ix],
         "east_m": east, "north_m": north, "range_m": np.hypot(dx, dy),
         "azimuth_rad": wrap_angles(np.arctan2(dy, dx) - view.heading_rad[list_ix]),
-        "nearest_m": nearest_m, "nearest_listed": nearest_listed,
+        "nearest_m": np.where(nearest_m < _APART_M / 2, nearest_m, np.inf), "nearest_class_ix": nearest_class,
         **{name: column[other] for name, column in fields.items()},
     }  # fmt: skip

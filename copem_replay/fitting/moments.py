@@ -91,14 +91,12 @@ def _factorise(covariance: Float) -> tuple[Float, Float, Float]:
     return first, below, np.sqrt(np.maximum(covariance[:, 1, 1] - below**2, 1e-12))
 
 
-def range_bins(view: ViewGeometry, worth: float, edges_m: tuple[float, ...] | None = None) -> tuple[RangeBin, ...]:
+def range_bins(view: ViewGeometry, worth: float) -> tuple[RangeBin, ...]:
     """Bins of range with about equal numbers of rows, as many as EFFECTIVE_ROWS allows; `worth`: effective per row."""
     far_m = float(np.ceil(10 * view.range_m.max()) / 10)
-    if edges_m is None:
-        count = int(np.clip(len(view.range_m) * worth / EFFECTIVE_ROWS, 1, MOST_BINS))
-        inner = np.round(np.quantile(view.range_m, np.arange(1, count) / count), 1)
-        edges_m = tuple(float(edge) for edge in inner)
-    inside = [edge for edge in sorted(set(edges_m)) if 0 < edge < far_m]
+    count = int(np.clip(len(view.range_m) * worth / EFFECTIVE_ROWS, 1, MOST_BINS))
+    edges_m = np.unique(np.round(np.quantile(view.range_m, np.arange(1, count) / count), 1)).tolist()
+    inside = [edge for edge in edges_m if 0 < edge < far_m]
     return tuple(RangeBin(pair) for pair in zip([0.0, *inside], [*inside, far_m], strict=True))
 
 
@@ -108,16 +106,12 @@ def share_bins(bins: tuple[RangeBin, ...], view: ViewGeometry, worth: float) -> 
     if len(hidden) * worth < EFFECTIVE_ROWS:
         return bins
     median_share = float(np.round(np.median(hidden), 2))
+    low, bin_ix = view.visible_share <= median_share, find_bin(view, bins)
     out: list[RangeBin] = []
-    bin_ix = find_bin(view, bins)
-    for b, range_bin in enumerate(bins):
-        low = (view.visible_share[bin_ix == b] <= median_share).sum() * worth
-        enough = min(low, (bin_ix == b).sum() * worth - low) >= EFFECTIVE_ROWS
-        out += (
-            [RangeBin(range_bin.range_m, (0.0, median_share)), RangeBin(range_bin.range_m, (median_share, 1.0))]
-            if enough
-            else [range_bin]
-        )
+    for b, one in enumerate(bins):
+        halves = np.bincount(low[bin_ix == b], minlength=2) * worth
+        shares = [(0.0, median_share), (median_share, 1.0)] if halves.min() >= EFFECTIVE_ROWS else [None]
+        out += [replace(one, visible_share=share) for share in shares]
     return tuple(out)
 
 

@@ -79,7 +79,7 @@ class OtherEntries:
     """The entries (E,) about no true object, and duplicates of one: place, time and content.
 
     `list`: index into `FitLists`; `range_m`, `azimuth_rad` from the unit; `nearest_m`: to the centre of the nearest
-    true object (inf: none), `nearest_listed`: whether that object has an entry of its own in this list.
+    true object of the list (inf: none), of class `nearest_class_ix`.
     """
 
     list: Int
@@ -90,7 +90,7 @@ class OtherEntries:
     range_m: Float
     azimuth_rad: Float
     nearest_m: Float
-    nearest_listed: Bool
+    nearest_class_ix: Int
     class_ix: Int
     existence: Float
     track_id: Int

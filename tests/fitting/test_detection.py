@@ -141,7 +141,7 @@ def test_ladder_finds_what_there_is() -> None:
     assert names == ["constant", "range", both, f"{both} + memory", f"{both} + memory of all objects"]
     assert [rung.chosen for rung in fit.ladder] == [False, False, False, True, False]
     assert fit.memory is not None
-    assert fit.memory["share"].value == pytest.approx(0.7, abs=0.1)
+    assert fit.memory.share.value == pytest.approx(0.7, abs=0.1)
     assert fit.memory_why is None
     constant = fitted(passes(0, 60, 80, flat))
     assert constant.ladder[0].chosen
@@ -231,16 +231,17 @@ def test_misses_of_all_objects_at_once_are_the_units() -> None:
     for seed in range(6):
         fit = fitted(together(seed))
         assert fit.memory is not None
-        assert fit.common
-        held += [fit.memory["share"].low <= 0.8 <= fit.memory["share"].high]
-        held += [fit.memory["correlation_s"].low <= 0.8 <= fit.memory["correlation_s"].high]
+        assert fit.memory.common
+        held += [fit.memory.share.low <= 0.8 <= fit.memory.share.high]
+        held += [fit.memory.correlation_s.low <= 0.8 <= fit.memory.correlation_s.high]
         [part] = strip_comments(fit.memory_keys()["detection"])
         assert part["of"] == "unit"
         names = {rung.name: rung.below for rung in fit.ladder}
         assert names["constant + memory"] > 0.05
     assert sum(held) >= 10
     own = fitted(passes(0, 40, 80, flat, (0.8, 0.8)))
-    assert not own.common
+    assert own.memory is not None
+    assert not own.memory.common
     assert "of" not in own.memory_keys()["detection"][0]
 
 
@@ -251,7 +252,7 @@ def test_few_numbers_of_all_objects_leave_the_probability_open() -> None:
         rows, lists = check_fit.drawn_rows(check_fit.CASES["misses of all"], seed)
         memory = fit_detection(rows, lists).memory
         assert memory is not None
-        held.append(memory["share"].low <= 0.7 <= memory["share"].high)
+        held.append(memory.share.low <= 0.7 <= memory.share.high)
     assert sum(held) >= 9
 
 
@@ -291,7 +292,7 @@ def test_what_is_written_is_what_is_fitted(probability: Callable[[Any], np.ndarr
     check_replayed(fit, rows)
     (part,) = written(fit).memory["detection"]
     assert fit.memory is not None
-    assert part.share == pytest.approx(fit.memory["share"].value, abs=1e-3)
+    assert part.share == pytest.approx(fit.memory.share.value, abs=1e-3)
 
 
 def test_without_a_miss() -> None:

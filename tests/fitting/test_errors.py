@@ -139,10 +139,10 @@ def test_memory_is_declined_only_where_white_noise_is_not_refused() -> None:
 
 def test_bins_and_frame_are_chosen_where_they_explain_more() -> None:
     rows, lists = rows_of(5, passes=40, spread=lambda r: (0.1 + 0.02 * r, 0.1 + 0.005 * r), memory=(0.3, 0.3, 0.0))
-    fit = fit_errors(rows, lists, edges_m=(20.0,))
+    fit = fit_errors(rows, lists)
     assert fit.frame == "line_of_sight"
-    near, far = fit.bins
-    assert near.where.when == {"range_m": [0.0, 20.0]}
+    near, *_, far = fit.bins
+    assert near.where.range_m[0] == 0.0
     assert 2 * near.covariance_m2[0].high < far.covariance_m2[0].low
     assert [rung.name for rung in fit.ladder if rung.chosen] == ["by range + memory"]
     assert len(fit_errors(rows, lists, simplest=True).bins) == 1

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from copem_replay.core.errors import InputError
+from copem_replay.core.tracks import CLASSES
 from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.experiment.schema import Experiment
 from copem_replay.fitting.gather import (
@@ -83,7 +84,7 @@ class TestRows:
         other = found.other
         np.testing.assert_allclose(other.captured_s, [0.8, 0.9], atol=1e-6)
         np.testing.assert_allclose(other.nearest_m, [1.5, np.hypot(31.0, 15.0)], atol=1e-6)
-        assert other.nearest_listed.all()
+        assert [CLASSES[k] for k in other.nearest_class_ix] == ["car", "car"]
         assert other.existence[1] == pytest.approx(0.3)
         assert np.isnan(other.existence[0])
         assert not found.crowded

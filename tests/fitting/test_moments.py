@@ -100,7 +100,7 @@ def test_without_memory_a_variance_counts_what_neighbours_share() -> None:
         phi += (1 + 4 * phi) / 100
         least = 100 * (1 - phi**2) / (1 + phi**2)
         assert found.freedom[0, k] == pytest.approx(min(least, 99.0), rel=1e-9)
-    [bin_] = range_bins(view_of(np.full(100, 20.0), np.ones(100)), 1.0, ())
+    bin_ = range_bins(view_of(np.full(100, 20.0), np.ones(100)), 1.0)[0]
     variance = estimate_bin(bin_, found, 0).covariance_m2[0]
     low, high = found.freedom[0, 0] * variance.value / chi2.ppf([0.975, 0.025], found.freedom[0, 0])
     assert (variance.low, variance.high) == pytest.approx((low, high))

@@ -174,7 +174,7 @@ def _ghosts(
     east, north = x[ghost] + rng.normal(0, 0.2, len(ghost)), y[ghost] + rng.normal(0, 0.2, len(ghost))
     other = OtherEntries(
         list_ix, 0 * list_ix, times[list_ix], east, north, np.hypot(east, north), np.arctan2(north, east),
-        np.hypot(east - 20, north), np.ones(len(ghost), dtype=bool), np.full(len(ghost), 0),
+        np.hypot(east - 20, north), np.full(len(ghost), 6), np.full(len(ghost), 0),
         np.full(len(ghost), 0.4), np.full(len(ghost), -1),
     )  # fmt: skip
     m = len(times)

@@ -73,4 +73,4 @@ def rows_of(
 def nothing_else() -> OtherEntries:
     """No other entries."""
     none, whole = np.empty(0), np.empty(0, dtype=np.int64)
-    return OtherEntries(whole, whole, none, none, none, none, none, none, none.astype(bool), whole, none, whole)
+    return OtherEntries(whole, whole, none, none, none, none, none, none, whole, whole, none, whole)

@@ -40,7 +40,7 @@ def fit() -> Iterator[common.Line]:
     fit_detection(rows, lists)
     found, seconds, cpu_s = common.timed(lambda: fit_detection(rows, lists))
     took = {"fit_detection_s": round(seconds, 2), "cpu_s": round(cpu_s, 2)}
-    share = found.memory["share"].value if found.memory else None
+    share = found.memory.share.value if found.memory else None
     yield {**took, "rows": len(rows.listed), "rungs": len(found.ladder), "share": share}
     some = rows.take(rows.pass_ix < 100)
     checked = common.timed(lambda: replay_statistics(Pem.model_validate(PEM), some, lists, runs=500))
