@@ -1,4 +1,4 @@
-"""Hold what `copem-replay fit` estimates against what was put in, three ways.
+"""Hold what `copem-replay fit` estimates against what was put in, four ways.
 
 A known perception error model is replayed on a recording, its lists are written to MCAP, and a copy of that without
 truth ids and without the times of measurement is fitted. Printed: how often each declared number is inside its 95 %
@@ -6,6 +6,7 @@ interval, how wide that is, and what the fitted model gives on another recording
 
     python tools/check_fit.py --seeds 40            # known models, replayed and read back from MCAP
     python tools/check_fit.py rows --seeds 40       # intervals of ten cases, drawn at the rows of a fit
+    python tools/check_fit.py logs --seeds 4000     # numbers over logs, drawn with known variances
     python tools/check_fit.py splits                # a recorded unit by six splits of its trials (../shared/data)
 """
 
@@ -33,7 +34,7 @@ from copem_replay.core.yaml import strip_comments
 from copem_replay.experiment.file import make_plain_source
 from copem_replay.fitting.detection import DetectionCouple, DetectionFit, fit_detection
 from copem_replay.fitting.errors import ErrorFit, fit_errors
-from copem_replay.fitting.estimate import Estimate
+from copem_replay.fitting.estimate import Estimate, pool_logs
 from copem_replay.fitting.fit import FitOptions, ReplayChecks, build_pem, build_unit, fit_unit
 from copem_replay.fitting.replay_check import replay_check, simulate_lists
 from copem_replay.fitting.rows import FitLists, FitRows
@@ -495,6 +496,37 @@ def _coverage_line(name: str, kind: str, held: Sequence[bool]) -> str:
     return f"{name:<21}{kind:<20}{n:>6}{sum(held):>8}{np.mean(held):>7.3f}{least:>7.3f}"
 
 
+# Numbers over logs.
+
+LOGS, TAUS = (3, 4, 8, 20), (0.0, 0.1, 0.3, 1.0)
+"""How many logs there are, and by how much (m) what they tell differs between them."""
+PRECISION = {"equal": (0.3, 0.3), "unequal": (0.1, 0.6), "estimated": (0.1, 0.6)}
+"""Standard deviations (m) of what the logs tell: evenly between these in their logarithm; `estimated`: their squares
+are known by ten degrees of freedom each.
+"""
+
+
+def drawn_logs(logs: int, tau: float, precision: str, seed: int) -> dict[str, tuple[Estimate, float]]:
+    """By kind the estimate and the true number of logs that tell 0 each, but for their variance and τ."""
+    rng = np.random.default_rng([seed, logs])
+    sigma = np.geomspace(*PRECISION[precision], logs)
+    known = rng.chisquare(10, logs) / 10 if precision == "estimated" else 1.0
+    found = pool_logs(tau * rng.normal(size=logs) + sigma * rng.normal(size=logs), known * sigma**2, logs)
+    return {"mean": (found.mean, 0.0), "between": (found.between, tau)}
+
+
+def check_logs(draws: int) -> list[str]:
+    """A line per number of logs, τ, precision and kind: how often the interval holds, and its median width."""
+    lines = [f"{'logs, τ, precision':<21}{'number':<20}{'told':>6}{'inside':>8}{'share':>7}{'least':>7}{'width':>10}"]
+    for logs, tau, precision in product(LOGS, TAUS, PRECISION):
+        found = [drawn_logs(logs, tau, precision, seed) for seed in range(draws)]
+        for kind in found[0]:
+            held = [holds(*one[kind]) for one in found]
+            width = float(np.median([one[kind][0].high - one[kind][0].low for one in found]))
+            lines.append(_coverage_line(f"{logs:>2}, {tau:g} m, {precision}", kind, held) + f"{width:>10.3g}")
+    return lines
+
+
 # A recorded unit by splits of its trials.
 
 SPLITS = (
@@ -534,9 +566,9 @@ def describe_interval(one: Estimate) -> str:
 
 
 def main() -> None:
-    """Print the table of each known model, of the cases that are drawn, or of the splits."""
+    """Print the table of each known model, of the cases that are drawn, of logs, or of the splits."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
-    parser.add_argument("what", nargs="?", choices=["models", "rows", "splits"], default="models")
+    parser.add_argument("what", nargs="?", choices=["models", "rows", "logs", "splits"], default="models")
     parser.add_argument("--seeds", type=int, default=40)
     parser.add_argument(
         "--replays", type=int, default=20, help="of so many seeds of each case the fit is replayed [20]"
@@ -546,6 +578,9 @@ def main() -> None:
     options = parser.parse_args()
     if options.what == "rows":
         print(*check_rows(options.seeds, options.cases, options.replays), sep="\n")
+        return
+    if options.what == "logs":
+        print(*check_logs(options.seeds), sep="\n")
         return
     if options.what == "splits":
         print(*check_splits(ROOT.parent / "shared/data"), sep="\n")

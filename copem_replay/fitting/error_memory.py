@@ -146,8 +146,8 @@ def sum_correlations(decay: Float, new: Bool, bin_ix: Int, bins: int, drift: flo
 
 # Fits of the memory.
 
-_ODDS = 8.0
-"""Log-odds beyond which a share counts as none, or all."""
+_ODDS = (-8.0, 16.0)
+"""Log-odds beyond which a share counts as none, or all: of smooth errors a ten-millionth is new in every list."""
 _LEAST = 1e-3
 """A share below this is a bound that the search has met, and no part of its own."""
 _FEWEST = 12
@@ -271,7 +271,9 @@ class _MemoryTrial:
         longest_s = float(np.bincount(np.cumsum(series.new) - 1, np.where(series.new, 0.0, series.gap_s)).max())
         shortest = np.log(max(np.median(series.gap_s[~series.new]) / 10, 1e-3))
         ends = (shortest, max(np.log(20 * max(longest_s, 1e-3)), shortest + 1))
-        return cls(np.ascontiguousarray(z), series, centred, [(-_ODDS, _ODDS), (-_ODDS, _ODDS), ends])
+        # About the mean of a single series there is no constant.
+        constant = (_ODDS[0], _ODDS[0]) if centred and series.new.sum() == 1 else _ODDS
+        return cls(np.ascontiguousarray(z), series, centred, [_ODDS, constant, ends])
 
     def likelihood(self, shares: MemoryShares) -> float:
         """The log-likelihood of a memory."""
@@ -292,9 +294,13 @@ class _MemoryTrial:
         )
         return fill(found[0]), found[1]
 
-    def limits(self, peak: tuple[Float, float], k: int, swapped: bool = False) -> tuple[float, float]:
-        """The profile interval of parameter k under `both`."""
-        return profile_limits(lambda x: self.likelihood(_unpack_shares(x, swapped)), *peak, k, self.bounds)
+    def limits(self, point: Float, k: int, swapped: bool = False) -> tuple[float, float]:
+        """The profile interval of parameter k under `both`, whose maximum is near a point."""
+
+        def of(x: Float) -> float:
+            return self.likelihood(_unpack_shares(x, swapped))
+
+        return profile_limits(of, *maximise_likelihood(of, [point], self.bounds), k, self.bounds)
 
 
 def refit_error_memory(z: Float, series: ResidualSeries, start: MemoryShares, *, centred: bool) -> MemoryShares:
@@ -330,12 +336,12 @@ def fit_error_memory(z: Float, series: ResidualSeries, *, centred: bool, interva
     if chosen == "both" and min(at.drift, at.constant) < _LEAST:
         chosen = "drift" if at.constant < _LEAST else "constant"
     shares = at if chosen == "both" else _unpack_shares(found[chosen][0])
-    parts, untold = _estimate_parts(trial, shares, (both, highest), (n, count)) if intervals else ((), None)
+    parts, untold = _estimate_parts(trial, shares, both, (n, count)) if intervals else ((), None)
     return ErrorMemoryFit(shares, parts, likelihoods, untold)
 
 
 def _estimate_parts(
-    trial: _MemoryTrial, shares: MemoryShares, peak: tuple[Float, float], counted: tuple[int, int]
+    trial: _MemoryTrial, shares: MemoryShares, both: Float, counted: tuple[int, int]
 ) -> tuple[tuple[LastingPart, ...], str | None]:
     """The parts with their profile intervals, and what is not told. `counted`: rows and series."""
     n, count = counted
@@ -344,19 +350,19 @@ def _estimate_parts(
         return Estimate(value, min(limits[0], value), max(limits[1], value), n, float(count))
 
     def bound_share(point: Float, swapped: bool) -> tuple[float, float]:
-        low, high = trial.limits((point, peak[1]), 0, swapped)
-        return (0.0 if low <= -_ODDS else float(expit(low))), (1.0 if high >= _ODDS else float(expit(high)))
+        low, high = trial.limits(point, 0, swapped)
+        return (0.0 if low <= _ODDS[0] else float(expit(low))), (1.0 if high >= _ODDS[1] else float(expit(high)))
 
     if shares.drift == shares.constant == 0:
         return (), f"no memory in {n} entries of {count} series beyond chance"
     end, parts = trial.bounds[2][1], list[LastingPart]()
     if shares.drift > 0:
-        low, high = trial.limits(peak, 2)
+        low, high = trial.limits(both, 2)
         tau = estimate(shares.tau_s, (float(np.exp(low)), float("inf") if high >= end else float(np.exp(high))))
-        parts.append(LastingPart(estimate(shares.drift, bound_share(peak[0], False)), tau))
+        parts.append(LastingPart(estimate(shares.drift, bound_share(both, False)), tau))
     if shares.constant > 0:
-        at = np.clip(_pack_shares(_unpack_shares(peak[0]), swapped=True), *np.array(trial.bounds).T)
-        parts.append(LastingPart(estimate(shares.constant, bound_share(at, True)), "always"))
+        swapped = _pack_shares(_unpack_shares(both), swapped=True)
+        parts.append(LastingPart(estimate(shares.constant, bound_share(swapped, True)), "always"))
     if shares.drift > 0 or not parts:
         return tuple(parts), None
     start = logit(np.clip(shares.constant, 1e-3, 1 - 1e-3))

@@ -95,7 +95,7 @@ class ErrorShape:
         nu = self.degrees_of_freedom
         return (
             f"tails are heavier than a Gaussian's: Student's t with {nu.value:.3g} degrees of freedom "
-            f"({nu.low:.3g} … {nu.high:.3g}) explains {self.gain:.2g} nats per entry more"
+            f"({nu.shown()[1]}) explains {self.gain:.2g} nats per entry more"
             f"{f', but is not written: {self.untold}' if self.untold else ', and is written'}"
         )
 

@@ -56,12 +56,19 @@ class Estimate:
             return f"not identifiable: {self.why}"
         if self.chosen:
             return "chosen"
-        if self.low == self.high:
-            return f"{self.value:.3g} (the same in all {self.n})"
-        digits = next((k for k in range(3, 10) if f"{self.low:.{k}g}" != f"{self.high:.{k}g}"), 10)
+        value, limits = self.shown()
+        if " … " not in limits:
+            return f"{value} ({limits})"
         effective = "" if math.isnan(self.n_effective) else f", effective {self.n_effective:.3g}"
-        value, low, high = (f"{one:.{digits}g}" for one in (self.value, self.low, self.high))
-        return f"{value} (95 %: {low} … {high}, n {self.n}{effective})"
+        return f"{value} (95 %: {limits}, n {self.n}{effective})"
+
+    def shown(self) -> tuple[str, str]:
+        """The value and its limits with three digits, or as many as tell the limits apart."""
+        if math.isclose(self.low, self.high, rel_tol=1e-9):
+            return f"{self.value:.3g}", f"the same in all {self.n}"
+        digits = next((k for k in range(3, 12) if f"{self.low:.{k}g}" != f"{self.high:.{k}g}"), 3)
+        value, low, high = (f"{one:.{digits}g}".replace("inf", "∞") for one in (self.value, self.low, self.high))
+        return value, f"{low} … {high}"
 
     def written(self, digits: int = 4) -> CommentedValue:
         """The value as files have it, with its words as a comment."""
@@ -266,8 +273,9 @@ def pool_logs(values: Float, variances: Float, n: int) -> LogPool:
     """The mean of values (K,) with variances (K,), and the standard deviation τ of what they are the values of.
 
     τ² by Paule and Mandel, Σ w (y − mean)² = K − 1 with w = 1/(v + τ²); its limits by the Q-profile; the mean's by
-    Student's t with K − 1 degrees of freedom, its variance max(1, q)/Σw with q = Σ w (y − mean)²/(K − 1). `contradict`:
-    scatter within logs alone is refused at five per cent.
+    Student's t with K − 1 degrees of freedom, its variance max(1, q)/Σw with q = Σ w (y − mean)²/(K − 1). Where
+    logs differ less than by chance, no τ would be left: the upper limit takes variances for no larger than the scatter
+    says. `contradict`: scatter within logs alone is refused at five per cent.
 
     Sources: R. C. Paule, J. Mandel, J. Res. NBS 87 (1982) 377–385; W. Viechtbauer, Statist. Med. 26 (2007) 37–52.
     """
@@ -277,21 +285,25 @@ def pool_logs(values: Float, variances: Float, n: int) -> LogPool:
     K = len(values)
     most = (np.ptp(values) + np.sqrt(variances.max())) ** 2 * 1e4
 
-    def scatter(tau_m2: float) -> float:
-        w = 1 / (variances + tau_m2)
+    def scatter(tau_m2: float, within: Float = variances) -> float:
+        w = 1 / (within + tau_m2)
         return float((w * (values - (w @ values) / w.sum()) ** 2).sum())
 
-    def where(level: float) -> float:
-        if scatter(0.0) <= level:
+    def solve(level: float, within: Float = variances) -> float:
+        if scatter(0.0, within) <= level:
             return 0.0
-        return float(brentq(lambda x: scatter(x) - level, 0.0, most)) if scatter(most) < level else float("inf")
+        if scatter(most, within) >= level:
+            return float("inf")
+        return float(brentq(lambda x: scatter(x, within) - level, 0.0, most))
 
-    tau_m2 = where(K - 1)
+    tau_m2, ratio = solve(K - 1), scatter(0.0) / (K - 1)
     w = 1 / (variances + tau_m2)
     mean = float(w @ values / w.sum())
     half = float(t.ppf(0.975, K - 1) * np.sqrt(max(1.0, scatter(tau_m2) / (K - 1)) / w.sum()))
-    low, high = (float(np.sqrt(where(float(chi2.ppf(level, K - 1))))) for level in (0.975, 0.025))
+    above, below = chi2.ppf([0.975, 0.025], K - 1).tolist()
+    limits = solve(above), solve(below, variances * min(ratio, 1.0) if ratio > 0 else variances)
+    tau, low, high = np.sqrt([tau_m2, *limits]).tolist()
     return LogPool(
-        Estimate(mean, mean - half, mean + half, n, K), Estimate(float(np.sqrt(tau_m2)), low, high, n, K),
+        Estimate(mean, mean - half, mean + half, n, K), Estimate(tau, low, high, n, K),
         scatter(0.0) > float(chi2.ppf(0.95, K - 1)),
     )  # fmt: skip

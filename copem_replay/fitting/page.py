@@ -16,7 +16,7 @@ from copem_replay.core.tracks import CLASSES, Float, Int
 from copem_replay.core.yaml import dump_with_comments, dump_yaml
 from copem_replay.experiment.schema import Experiment
 from copem_replay.fitting.diagnostics import FIT_FIGURES
-from copem_replay.fitting.estimate import Estimate, Rung
+from copem_replay.fitting.estimate import Rung
 from copem_replay.fitting.fit import Fit, build_experiment, build_snippet, judge_use, name_estimates, to_plain_data
 from copem_replay.fitting.gather import Gathered
 from copem_replay.fitting.rows import FitLists, FitRows
@@ -84,8 +84,7 @@ def _estimates_table(fit: Fit) -> Html:
         make_tag(
             "tr",
             make_tag("th", allow_breaks(describe_name(fit, name)), scope="row"),
-            make_tag("td", _format_value(one)),
-            make_tag("td", _format_interval(one)),
+            *(make_tag("td", "–" if "nan" in shown else shown.replace("-", "−")) for shown in one.shown()),
             make_tag("td", str(one.n) if one.n else "–"),
             make_tag("td", format_three_digits(one.n_effective) if one.n_effective > 0 else "–"),
             make_tag("td", one.why or ("chosen" if one.chosen else ""), class_="text"),
@@ -94,16 +93,6 @@ def _estimates_table(fit: Fit) -> Html:
     ]
     head = ("number", "estimate", "95 %", "n", "effective n", "not identifiable")
     return make_table(head, rows, caption="Every number with its interval", id_="numbers")
-
-
-def _format_value(one: Estimate) -> str:
-    return "–" if np.isnan(one.value) else format_three_digits(one.value)
-
-
-def _format_interval(one: Estimate) -> str:
-    if np.isnan(one.low) and np.isnan(one.high):
-        return "–"
-    return f"{format_three_digits(one.low)} … {'∞' if np.isinf(one.high) else format_three_digits(one.high)}"
 
 
 def _choice_tables(fit: Fit) -> Html:

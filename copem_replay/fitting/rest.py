@@ -107,6 +107,8 @@ def _estimate_probability(count: float, n: int, worth: float, kinds: int) -> Est
 
 _FEWEST = 8
 """Entries below which no existence is fitted."""
+_SHAPES = (0.1, 1000.0)
+"""Shapes of a Beta that are tried."""
 
 
 @dataclass(frozen=True)
@@ -168,9 +170,14 @@ def beta_shapes(values: Float, cluster: Int) -> tuple[Estimate, Estimate]:
     each = np.log([_solve_shapes(sums.sum(axis=1) - sums[:, g]) for g in range(groups)])
     error = np.sqrt((groups - 1) / groups * ((each - each.mean(axis=0)) ** 2).sum(axis=0))
     factor = np.exp(2.0 * error)
-    return tuple(  # type: ignore[return-value]
-        Estimate(a, float(a / f), float(a * f), len(values), groups) for a, f in zip(shapes, factor, strict=True)
-    )
+    one, two = (
+        Estimate(
+            a, float(a / f), float(a * f), len(values), groups,
+            why=f"the claims hardly vary: {a:g} is the end of what is tried" if a in _SHAPES else None,
+        )
+        for a, f in zip(shapes, factor, strict=True)
+    )  # fmt: skip
+    return one, two
 
 
 def _correct_for_ghosts(
@@ -185,7 +192,7 @@ def _correct_for_ghosts(
         return float(np.log((1 - share) * beta.pdf(values, *np.exp(x[:2])) + share * false + 1e-300).sum())
 
     start = [float(np.log(one.value)) for one in shapes]
-    limits = (float(np.log(0.1)), float(np.log(1000)))
+    limits = (float(np.log(_SHAPES[0])), float(np.log(_SHAPES[1])))
     best, _ = maximise_likelihood(of, [(*start, -6.0), (*start, -3.0)], (limits, limits, (-9.0, 0.0)))
     moved = np.exp(best[:2]) / [one.value for one in shapes]
     one, two = (
@@ -201,7 +208,8 @@ def _solve_shapes(sums: Float) -> tuple[float, float]:
     mean = float(np.clip(first / n, 1e-4, 1 - 1e-4))
     variance = max(float(second / n - (first / n) ** 2), 1e-9)
     strength = max(mean * (1 - mean) / variance - 1, 1e-3)
-    return float(np.clip(mean * strength, 0.1, 1000)), float(np.clip((1 - mean) * strength, 0.1, 1000))
+    one, two = np.clip([mean * strength, (1 - mean) * strength], *_SHAPES).tolist()
+    return one, two
 
 
 # List times: their period, its jitter, and outages.

@@ -93,6 +93,20 @@ def test_what_cannot_be_told_is_said(drawn: dict[str, float], expected: str) -> 
     assert fit.shares.drift == 0
 
 
+@pytest.mark.parametrize("period_s", [3.0, 5.0, 12.0])
+def test_a_single_smooth_series_has_intervals_of_some_width(period_s: float) -> None:
+    """Hardly anything is new in a list, and a constant is in the mean of the only series: no part is told exactly."""
+    at_s = np.arange(160) / 10
+    turn = 2 * np.pi * at_s / period_s
+    z = np.column_stack([np.sin(turn) + 0.3 * np.sin(2.3 * turn + 1), np.cos(1.1 * turn + 0.4) + 0.2 * np.sin(at_s)])
+    series = ResidualSeries(np.where(at_s > 0, 0.1, 0.0), at_s == 0)
+    [part] = fit_error_memory(z, series, centred=True).parts
+    assert not isinstance(part.correlation_s, str)
+    for one in (part.share, part.correlation_s):
+        assert one.low <= one.value <= one.high
+        assert one.high - one.low > 1e-6
+
+
 def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
     held = []
     for seed in range(20):

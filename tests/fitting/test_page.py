@@ -105,6 +105,16 @@ def test_nothing_is_no_number() -> None:
     near = Estimate(0.0315, 0.03149, 0.03151, n=9, n_effective=9.0)
     assert near.words() == "0.0315 (95 %: 0.03149 … 0.03151, n 9, effective 9)"
     assert Estimate(0.9, 0.9, 0.9, n=9, n_effective=9.0).words() == "0.9 (the same in all 9)"
+    rate = Estimate(10.0, 10.0 - 1e-13, 10.0 + 1e-13, n=558, n_effective=float("nan"))
+    assert rate.words() == "10 (the same in all 558)"
+    assert Estimate(3.0, 2.0, float("inf"), n=9, n_effective=1.0).words() == "3 (95 %: 2 … ∞, n 9, effective 1)"
+
+
+def test_no_interval_of_the_page_has_two_equal_ends() -> None:
+    near = replace(_fit(), rate_hz=Estimate(10.0, 9.9999, 10.0001, 479, 479.0))
+    page = fit_page(near)
+    assert ">9.9999 … 10<" in page
+    assert not re.search(r">(\S+) … \1<", page)
 
 
 def test_what_is_missing_is_said() -> None:

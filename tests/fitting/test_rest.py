@@ -147,6 +147,9 @@ def test_existence_of_objects_and_of_others() -> None:
         assert fit.ghost is not None
         held += [_holds(one, true) for one, true in zip((*fit.real, *fit.ghost), (8, 2, 2, 4), strict=True)]
     assert (held >= 17).all()
+    alike = fit_existence(0.9 + 1e-4 * rng.normal(size=400), np.arange(400) % 20, None)
+    assert alike.real is not None
+    assert alike.real[0].words() == "not identifiable: the claims hardly vary: 1000 is the end of what is tried"
     mixed = np.concatenate([rng.beta(8, 2, 4000), rng.beta(2, 4, 60)])  # ghosts matched to an object that was missed
     fit = fit_existence(mixed, np.arange(4060) % 20, rng.beta(2, 4, 500))
     assert fit.real is not None
