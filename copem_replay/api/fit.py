@@ -123,7 +123,8 @@ def fit(
     the check. `folds`: parts of the cross-validation that chooses between models. `truth`: `partial`, if entries may be
     about objects that the truth lacks, or `complete`; None: partial where a list has more of them than true objects are
     within reach. `by`: what detection may depend on. `monotone`: farther and more hidden is never better. `simplest`:
-    the first rung of every ladder. `delay_by`: `log`, each log has a delay of its own.
+    the first rung of every ladder. `delay_by`: `log`, each log has a delay of its own; `class`,
+    each log whose objects are of one class has that of the class.
 
     Raises InputError: no such unit or log, no place, nothing of it near a true object.
 
@@ -159,10 +160,11 @@ def check_fit_options(
     for name in by:
         if name not in ("range", "visible_share", "azimuth", "class"):
             raise InputError(f"--by: expected some of range, visible_share, azimuth, class; found {name!r}")
-    if delay_by not in (None, "log"):
-        raise InputError(f"--delay-by: expected log, found {delay_by}")
+    if delay_by not in (None, "log", "class"):
+        raise InputError(f"--delay-by: expected log or class, found {delay_by}")
     kind: Any = truth
-    return FitOptions(tuple(hold_out), folds, kind, tuple(by), monotone, simplest, delay_by_log=delay_by == "log")
+    late_by: Any = delay_by
+    return FitOptions(tuple(hold_out), folds, kind, tuple(by), monotone, simplest, delay_by=late_by)
 
 
 def read_study_to_fit(source: ExperimentSource, unit: str) -> LoadedStudy:

@@ -34,7 +34,11 @@ def fit(
     ] = False,
     delay_by: Annotated[
         str | None,
-        typer.Option("--delay-by", metavar="KIND", help="log: each log has a delay of its own [one for all]."),
+        typer.Option(
+            "--delay-by",
+            metavar="KIND",
+            help="log: each log has a delay of its own; class: that of its objects' class [one for all].",
+        ),
     ] = None,
     out: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Folder of the fit [out/<experiment>_fit].")

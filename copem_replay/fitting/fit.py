@@ -117,7 +117,7 @@ class FitOptions:
     monotone: bool = True
     simplest: bool = False
     other_gates: bool = True
-    delay_by_log: bool = False
+    delay_by: Literal["log", "class"] | None = None
 
 
 @dataclass(frozen=True)
@@ -250,7 +250,7 @@ def fit_unit(experiment: Experiment, recordings: Sequence[Recording], unit: str,
     fitted, held_out = _split_held_out(recordings, how)
     lists = raw_lists(fitted, experiment, unit)
     declared_s = _declared_delay_s(experiment, unit)
-    delay = unit_delay(list(zip(fitted, lists, strict=True)), declared_s, by_log=how.delay_by_log)
+    delay = unit_delay(list(zip(fitted, lists, strict=True)), declared_s, by=how.delay_by, held_out=held_out)
     views = _view_logs(fitted, experiment, unit, delay)
     gate_m, max_gap_s = experiment.measure.match.gate_m, experiment.max_gap_s
     try:

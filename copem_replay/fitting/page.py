@@ -176,6 +176,8 @@ def describe_name(fit: Fit, name: str) -> str:
         of = "pose of the unit" if words[0] == "placed" else of
         number = f", part {int(words[-2]) + 1}" if words[-2].isdigit() else ""
         return f"memory of {of}{number}: {_LASTING[words[-1]]}"
+    if name.startswith("delay_s."):
+        return f"delay of entries about a {words[1]}, s"
     if name.startswith("classes.confusion."):
         return f"{words[2]} listed as {words[3]}"
     return _WORDS.get(name, " ".join(words).replace("_", " "))
@@ -247,6 +249,8 @@ def pem_text(fit: Fit, experiment: Experiment) -> str:
         f"{count_noun(fit.gathered.number_of_passes, 'pass', 'passes')}; truth {fit.truth}",
         f"delay of its lists: `latency_s: {{{fit.unit}: {fit.delay.seconds:.3g}}}` in a configuration: "
         f"{fit.delay.estimate.words()}",
+        *(f"delay of entries about a {kind}: {one.words()}" for kind, one in fit.delay.of_class.items()),
+        *(["delays by class are not replayed: a replay has one latency for a list"] if fit.delay.of_class else []),
         *(f"{name}: not fitted: {why}" for name, why in rest.untold.items()),
         *([f"errors: {shape.words()}"] if shape.heavier else []),
         *([f"between_logs: not written: {between.untold}"] if between is not None and between.untold else []),
@@ -281,7 +285,8 @@ def describe_estimates(fit: Fit) -> dict[str, Any]:
 
 def list_estimates(fit: Fit) -> list[tuple[str, Any]]:
     """Every estimate by its name."""
-    first = [("delay_s", fit.delay.estimate), ("rate_hz", fit.rate_hz)]
+    first = [("delay_s", fit.delay.estimate), *((f"delay_s.{kind}", one) for kind, one in fit.delay.of_class.items())]
+    first.append(("rate_hz", fit.rate_hz))
     return first + [(name.removeprefix("rest."), one) for name, one in name_estimates(fit.parts)]
 
 

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from scipy.stats import chi2, t
 
-from copem_replay.core.tracks import Float, Int
+from copem_replay.core.tracks import CLASSES, Float, Int
 from copem_replay.fitting.error_memory import LastingPart
 from copem_replay.fitting.estimate import FEWEST_LOGS, Estimate, LogPool, pool_logs
 from copem_replay.fitting.rows import FitLists, FitRows
@@ -192,12 +192,14 @@ _Z = 1.96
 class DelayFit:
     """The delay from capture to stamp of every list that does not state its capture (s). `notes`: a line per log.
 
-    `of_log`: by log what is used in place of that of all (`--delay-by log`).
+    `of_log`: by log what is used in place of that of all (`--delay-by`); `of_class`: by class of object the delay of
+    entries about such objects, where it was asked for.
     """
 
     estimate: Estimate
     notes: tuple[str, ...] = ()
     of_log: Mapping[str, float] = field(default_factory=dict)
+    of_class: Mapping[str, Estimate] = field(default_factory=dict)
 
     @property
     def seconds(self) -> float:
@@ -210,12 +212,13 @@ class DelayFit:
 
 
 def unit_delay(
-    logs: Sequence[tuple[Recording, RecordedLists]], declared_s: float | None, *, by_log: bool = False
-) -> DelayFit:
+    logs: Sequence[tuple[Recording, RecordedLists]], declared_s: float | None, *,
+    by: Literal["log", "class"] | None = None, held_out: Sequence[Recording] = (),
+) -> DelayFit:  # fmt: skip
     """The delay of the lists of all logs, or `declared_s` where they do not tell it; None: none is declared.
 
-    A delay that could also be a shift along the way is used only where none is declared. `by_log`: each log has its
-    own, where it tells one.
+    A delay that could also be a shift along the way is used only where none is declared. `by` log: each log has its
+    own, where it tells one; class: each log whose objects are of one class, `held_out` ones too, has that of the class.
     """
     if all(found.capture_said.all() for _, found in logs):
         late_s = np.concatenate([found.tracks.arrives_s[0] - found.tracks.captured_s for _, found in logs])
@@ -224,8 +227,31 @@ def unit_delay(
         return DelayFit(Estimate(float(middle), float(low), float(high), len(late_s), float(len(late_s))), (note,))
     delays = {recording.scene.log: estimate_delay(found, recording.scene, recording.truth) for recording, found in logs}
     pooled = pool_delays(delays, declared_s)
-    of_log = {log: one.offset_s for log, one in delays.items() if one.untold is None} if by_log else {}
-    return replace(pooled, of_log=of_log)
+    if by == "log":
+        return replace(pooled, of_log={log: one.offset_s for log, one in delays.items() if one.untold is None})
+    of_class = _estimate_by_class(logs) if by == "class" else {}
+    kinds = {one.scene.log: _list_classes(one) for one in (*(one for one, _ in logs), *held_out)}
+    told = {(kind,): one.value for kind, one in of_class.items() if np.isfinite(one.low)}
+    return replace(pooled, of_log={log: told[one] for log, one in kinds.items() if one in told}, of_class=of_class)
+
+
+def _list_classes(recording: Recording) -> tuple[str, ...]:
+    """The classes of a log's true objects."""
+    return tuple(CLASSES[k] for k in np.unique(recording.scene.object_class[recording.truth.object_ix]))
+
+
+def _estimate_by_class(logs: Sequence[tuple[Recording, RecordedLists]]) -> dict[str, Estimate]:
+    """By class the delay of entries about its objects: as that of all, against the truth of this class alone."""
+    out = {}
+    for kind in sorted({kind for recording, _ in logs for kind in _list_classes(recording)}):
+        told = {}
+        for recording, found in logs:
+            truth, scene = recording.truth, recording.scene
+            of_kind = truth.take_tracks(scene.object_class[truth.object_ix] == CLASSES.index(kind))
+            if len(of_kind.object_ix):
+                told[scene.log] = estimate_delay(found, scene, of_kind)
+        out[kind] = pool_delays(told, None).estimate
+    return out
 
 
 def pool_delays(told: Mapping[str, TimeOffset], declared_s: float | None) -> DelayFit:
@@ -254,7 +280,7 @@ def _note_contradiction(told: Mapping[str, TimeOffset]) -> tuple[str, ...]:
     if len(usable) < FEWEST_LOGS or not _pool_offsets(list(usable.values())).contradict:
         return ()
     each = ", ".join(f"{one.offset_s:.3f} s in {log}" for log, one in usable.items())
-    return (f"delays contradict each other beyond chance: {each}; --delay-by log takes each log's own",)
+    return (f"delays contradict each other beyond chance: {each}; --delay-by log or class takes each its own",)
 
 
 def _weigh_delays(told: Sequence[TimeOffset]) -> Estimate:

@@ -168,7 +168,7 @@ class TestDelay:
         found = pool_delays(told, None)
         each = "0.147 s in a, 0.137 s in b, 0.119 s in c, 0.469 s in d"
         assert found.notes[-1] == (
-            f"delays contradict each other beyond chance: {each}; --delay-by log takes each log's own"
+            f"delays contradict each other beyond chance: {each}; --delay-by log or class takes each its own"
         )
         assert found.estimate.low < 0.14 < found.estimate.high
         assert found.estimate.high - found.estimate.low > 0.3  # three degrees of freedom, and one far away

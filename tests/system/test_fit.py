@@ -110,7 +110,7 @@ def test_it_is_replaced_only_when_asked_and_by_the_same_bytes(
         (("--unit", "rsu", "--hold-out", "radar"), "--hold-out: expected a log that is left to fit, found all"),
         (("--unit", "rsu", "--truth", "all"), "--truth: expected partial or complete, found all"),
         (("--unit", "rsu", "--by", "range,colour"), "--by: expected some of range, visible_share, azimuth, class;"),
-        (("--unit", "rsu", "--delay-by", "class"), "--delay-by: expected log, found class"),
+        (("--unit", "rsu", "--delay-by", "colour"), "--delay-by: expected log or class, found colour"),
         (("--unit", "rsu", "--hold-out", "radar", "--folds", "3"), "--folds: expected either folds or logs to hold"),
     ],
 )  # fmt: skip
@@ -203,3 +203,17 @@ def test_a_delay_of_each_log(tmp_path: Path) -> None:
     experiment = cr.load_experiment(folder / "experiment.yaml")
     delays = [entry.units["rsu_recorded"]["recorded"]["delay_s"] for entry in experiment.logs]  # type: ignore[union-attr]
     assert delays == pytest.approx([0.147, 0.137, 0.119, 0.469], abs=1e-3)
+
+
+@pytest.mark.skipif(not (SHARED / "msight_trial14.mcap").exists(), reason="no shared/data beside the project")
+def test_a_delay_of_each_class(tmp_path: Path) -> None:
+    """Three drives have a car, a fourth a pedestrian: each is read at the delay of its class, one is replayed."""
+    logs = [str(SHARED / f"msight_trial{k}.mcap") for k in ("3", "4", "5", "11_ped")]
+    fitted = check_fit.fitted_unit(logs, delay_by="class", simplest=True, hold_out=["msight_trial5"])
+    car, walk = (fitted.estimates[f"delay_s.{kind}"] for kind in ("car", "pedestrian"))
+    assert walk.value == pytest.approx(0.469, abs=1e-3)
+    assert car.low < 0.14 < car.high < walk.low
+    folder = fitted.save(tmp_path / "fit")
+    assert f"delay of entries about a pedestrian: {walk.words()}" in (folder / "pem.yaml").read_text()
+    [held_out] = cr.load_experiment(folder / "experiment.yaml").logs
+    assert held_out.units["rsu_recorded"]["recorded"]["delay_s"] == pytest.approx(car.value, abs=1e-6)  # type: ignore[union-attr]
