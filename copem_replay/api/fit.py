@@ -16,7 +16,6 @@ from copem_replay.io.recording import Recording
 if TYPE_CHECKING:
     from copem_replay.fitting.estimate import Estimate
     from copem_replay.fitting.fit import Fit
-    from copem_replay.results.folder import ResultsPlace
 
 
 _ANY_COVARIANCE_M2 = [[1.0, 0.0], [0.0, 1.0]]
@@ -74,35 +73,16 @@ class FittedPem:
         Raises OutputError: the folder holds something already (`overwrite` replaces a fit), or is not writable; also
         where a page could not be written, and the rest of the fit is there.
         """
+        from copem_replay.fitting.page import fill_fit
         from copem_replay.results.folder import check_inputs, take_place
 
         with take_place(Path(folder), overwrite=overwrite) as place:
             check_inputs(place, [path for recording in self.recordings for path in recording.paths])
-            fill_fit_folder(place, self)
+            fill_fit(place, self.found, self.experiment, self.recordings)
             self.folder = place.shown
         if place.failed:
             raise OutputError(place.failed)
         return place.shown
-
-
-def fill_fit_folder(place: ResultsPlace, fitted: FittedPem) -> None:
-    """Write a fit with its pages into a results place."""
-    from copem_replay.fitting.page import fill_fit
-
-    pages = {"fit.html": _write_page, "places.rrd": _write_places}
-    fill_fit(place, fitted.found, fitted.experiment, fitted.recordings, pages)
-
-
-def _write_page(path: Path, fit: Fit) -> None:
-    from copem_replay.fitting.page import fit_page
-
-    path.write_text(fit_page(fit), encoding="utf-8")
-
-
-def _write_places(path: Path, fit: Fit) -> None:
-    from copem_replay.fitting.page import write_fit_places
-
-    write_fit_places(path, fit.unit, fit.logs, fit.gathered.rows, fit.gathered.lists)
 
 
 def fit(

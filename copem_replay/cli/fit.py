@@ -50,9 +50,9 @@ def fit(
     Every number comes with an interval, or with the reason why the data cannot determine it. The exit code is 1 if the
     fitted model fails its replay check, or a page cannot be written.
     """
-    from copem_replay.api.fit import check_fit_options, fill_fit_folder, fit_study, read_study_to_fit
+    from copem_replay.api.fit import check_fit_options, fit_study, read_study_to_fit
     from copem_replay.experiment.file import read_experiment_file
-    from copem_replay.fitting.page import PEM, table_lines
+    from copem_replay.fitting.page import PEM, fill_fit, table_lines
     from copem_replay.results.folder import EXPERIMENT, check_inputs, take_place
 
     options = check_fit_options(
@@ -64,7 +64,7 @@ def fit(
         study = read_study_to_fit(read_experiment_file(experiment), unit)
         check_inputs(place, [experiment, *(path for recording in study.recordings for path in recording.paths)])
         fitted = fit_study(study, unit, options)
-        fill_fit_folder(place, fitted)
+        fill_fit(place, fitted.found, fitted.experiment, fitted.recordings)
         print_notes([*place.notes, *fitted.notes])
         print_problems(place.failed)
         print_blocks([table_lines(fitted.found)])

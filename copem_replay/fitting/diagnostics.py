@@ -25,10 +25,6 @@ MEMORYLESS: Colour = (204 / 255, 121 / 255, 167 / 255)
 """Colours of the recording, of the fitted model, and of the model without memory, from Okabe and Ito's palette."""
 
 
-def _nothing_missing(fit: Fit) -> str | None:
-    return None
-
-
 @dataclass(frozen=True)
 class FitFigure:
     """A figure. `title`: its heading. `shows`: for readers who cannot see it. `about`: the explanation below it.
@@ -40,7 +36,7 @@ class FitFigure:
     shows: str
     about: str
     draw: Callable[[Fit], Figure]
-    missing: Callable[[Fit], str | None] = _nothing_missing
+    missing: Callable[[Fit], str | None] = lambda fit: None
 
 
 # Calibration: whether as many rows are listed as the fitted model says, near and far.
@@ -71,23 +67,10 @@ def calibration_figure(fit: Fit) -> Figure:
         axes.errorbar(
             at_m, share, bars, fmt="o", color=RECORDED, markersize=5, capsize=2.5, linewidth=1.2, label="recorded"
         )
-        axes.set_xlim(left=0)
-        axes.set_ylim(-0.03, 1.03)
-        axes.set_xlabel("Range (m)")
-        axes.set_ylabel("Share listed")
+        axes.set(xlim=(0, None), ylim=(-0.03, 1.03), xlabel="Range (m)", ylabel="Share listed")
         axes.legend(loc="lower left")
         add_note(figure, [f"{len(p)} rows, worth {len(p) / worth:.0f} independent ones; bars: 95 %"])
     return figure
-
-
-CALIBRATION = FitFigure(
-    "Is the probability of detection right?",
-    "share of rows that are listed over range, with intervals, beside the fitted probability",
-    "Rows (a list and a true object within reach) are put into bins by range. The line is the mean probability that "
-    "the fitted model gives them. Intervals count rows that hang together for less. A point whose bar misses the "
-    "line is a range at which the model is wrong.",
-    calibration_figure,
-)
 
 
 # Ranks: the replay check, the recording among replays of the fitted model.
@@ -116,9 +99,8 @@ def ranks_figure(fit: Fit) -> Figure:
         for k, name in enumerate(names):
             verdict = verdicts.get(name, "") + 4 * "\u00a0"  # room for wider letters in a browser
             axes.text(1.03, k, verdict, transform=axes.get_yaxis_transform(), va="center", fontsize=7.5)
-        axes.set_ylim(len(names) - 0.45, -0.55)
-        axes.set_xlim(-0.02, 1.02)
-        axes.set_xlabel("Rank of the recorded value among replays of the fitted model")
+        words = "Rank of the recorded value among replays of the fitted model"
+        axes.set(ylim=(len(names) - 0.45, -0.55), xlim=(-0.02, 1.02), xlabel=words)
         axes.grid(visible=False, axis="y")
         if both:
             figure.legend(loc="outside upper left", ncols=2)
@@ -134,21 +116,6 @@ def _spread_points(ranked: Float) -> Float:
     step = min(0.035, 0.13 / max((int(nth.max(initial=0)) + 1) // 2, 1))
     aside: Float = np.where(nth % 2 == 1, 1, -1) * ((nth + 1) // 2) * step
     return aside
-
-
-def _explain_no_ranks(fit: Fit) -> str | None:
-    return None if fit.checks is not None and fit.checks.fitted else "nothing was replayed beside what was recorded"
-
-
-RANKS = FitFigure(
-    "Does a replay look like the recording?",
-    "rank of each recorded pass among replays of the fitted model, a strip per statistic",
-    "For each pass the recorded value is ranked among runs of the fitted model: 0 is below all of them, 1 above. Of a "
-    "model that is right, ranks are spread evenly. Ranks in a heap in the middle: the model varies too much; at the "
-    "ends: it is too sure.",
-    ranks_figure,
-    _explain_no_ranks,
-)
 
 
 # Autocorrelation: how long errors last, beside the fitted memory.
@@ -168,23 +135,21 @@ def autocorrelation_figure(fit: Fit) -> Figure:
     far_s = min(max(20 * period_s, 4 * shares.tau_s if shares.drift else 0), 200 * period_s)
     lags = np.unique(np.geomspace(1, max(far_s / period_s, 2), _LAGS).round().astype(np.int64))
     correlations, n = _mean_products(z, series_ix, at_s, lags, period_s)
-    names = ("along", "across") if errors.frame == "line_of_sight" else ("easting", "northing")
     with figure_style():
         figure = new_figure(6.4, 3.6)
         axes = figure.subplots()
         axes.axhline(0, color=FAINT, linewidth=0.8)
         enough = n >= _FEWEST
-        for column, name, colour, mark in zip(correlations.T, names, (RECORDED, FITTED), ("o", "^"), strict=True):
+        for column, name, colour, mark in zip(correlations.T, errors.axes, (RECORDED, FITTED), ("o", "^"), strict=True):
             axes.plot(lags[enough] * period_s, column[enough], mark, color=colour, markersize=4, label=name)
         dense = np.linspace(period_s / 4, lags[-1] * period_s, 300)
         label = f"fitted: {shares.drift:.2f} e^(−Δ/{shares.tau_s:.2g} s)" if shares.drift else "fitted: "
         label += f" + {shares.constant:.2f}" if shares.constant else ("0" if not shares.drift else "")
         axes.plot(dense, shares.drift * np.exp(-dense / shares.tau_s) + shares.constant, color=INK, linewidth=1.8,
                   label=label)  # fmt: skip
-        axes.set_ylim(min(-0.15, float(correlations[enough].min(initial=0)) - 0.05), 1.02)
-        axes.set_xlim(left=0)
+        least = min(-0.15, float(correlations[enough].min(initial=0)) - 0.05)
+        axes.set(ylim=(least, 1.02), xlim=(0, None), ylabel="Correlation of their errors")
         axes.set_xlabel("Time between two entries of an object (s)")
-        axes.set_ylabel("Correlation of their errors")
         axes.legend(loc="upper right")
         untold = errors.untold.get("memory.position")
         add_note(figure, [f"{len(z)} entries in {int(series.new.sum())} series", untold or ""])
@@ -204,17 +169,6 @@ def _mean_products(z: Float, series_ix: Int, at_s: Float, lags: Int, period_s: f
         if n[k]:
             out[k] = (z[close] * z[later[close]]).mean(axis=0)
     return out, n
-
-
-AUTOCORRELATION = FitFigure(
-    "How long do errors last?",
-    "autocorrelation of standardised position errors over time, and the fitted curve",
-    "Points near 1: an entry's error is nearly the same in the next list, and no tracker can average it away. The line "
-    "is the fitted memory: a part that drifts and is forgotten with its correlation time, and a part that stays for as "
-    "long as the object is there. Points that begin below 1 at time 0 leave a rest that is new in every list. Over few "
-    "passes points fall too low at long times, as they are taken about a mean of their own.",
-    autocorrelation_figure,
-)
 
 
 # Error map: whether errors and misses belong to places.
@@ -253,29 +207,12 @@ def error_map_figure(fit: Fit) -> Figure:
             - centre
         )
         axes.plot(*places.T, "^" if len(places) < 5 else ".", color=INK, markersize=8 if len(places) < 5 else 2)
-        bar = figure.colorbar(shown, ax=axes, shrink=0.85, pad=0.02)
-        bar.set_label("Error of the entry (m)")
+        figure.colorbar(shown, ax=axes, shrink=0.85, pad=0.02, label="Error of the entry (m)")
         axes.set_aspect("equal", adjustable="datalim")
-        axes.set_xlabel("East of the middle (m)")
-        axes.set_ylabel("North of the middle (m)")
+        axes.set(xlabel="East of the middle (m)", ylabel="North of the middle (m)")
         thinned = f", of which one in {step} is drawn" if step > 1 else ""
         add_note(figure, [f"{len(rows.log)} rows{thinned}; crosses: missed; triangle (or dots, if it moves): the unit"])
     return figure
-
-
-def _explain_no_map(fit: Fit) -> str | None:
-    return None if fit.gathered.rows.listed.any() else "no entry is of a true object"
-
-
-ERROR_MAP = FitFigure(
-    "Errors over the map",
-    "true places of objects, coloured by the error of their entries, with crosses where they are missed",
-    "Where objects truly are, seen from above. Colours or crosses that gather in one place (a tree, a pole, a crest) "
-    "are not explained by range and visible share: an obstacle may be missing in the experiment, or the truth be "
-    "off there.",
-    error_map_figure,
-    _explain_no_map,
-)
 
 
 # Gaussian: whether position errors are, by quantiles of standardised errors and by the fitted distribution.
@@ -288,14 +225,13 @@ def gaussian_figure(fit: Fit) -> Figure:
     """Left: quantiles over normal ones; right: the share of errors in each twentieth of the fitted distribution."""
     errors = fit.parts.errors
     z, shape = errors.shape.z, errors.shape
-    names = ("along", "across") if errors.frame == "line_of_sight" else ("easting", "northing")
     level = (np.arange(min(_POINTS, len(z))) + 0.5) / min(_POINTS, len(z))
     with figure_style():
         figure = new_figure(8.6, 3.6)
         left, right = figure.subplots(1, 2)
         most = float(max(2.6, np.abs(np.quantile(z, [level[0], level[-1]])).max())) * 1.08
         left.plot([-most, most], [-most, most], color=FAINT, linewidth=1.0, dashes=(4, 2))
-        for column, name, colour, mark in zip(z.T, names, (RECORDED, FITTED), ("o", "^"), strict=True):
+        for column, name, colour, mark in zip(z.T, errors.axes, (RECORDED, FITTED), ("o", "^"), strict=True):
             left.plot(ndtri(level), np.quantile(column, level), mark, color=colour, markersize=3, label=name)
             count = np.histogram(ndtr(column), np.linspace(0, 1, _BARS + 1))[0] / len(column) * _BARS
             right.step(np.linspace(0, 1, _BARS + 1), np.append(count, count[-1]), where="post", color=colour,
@@ -304,34 +240,62 @@ def gaussian_figure(fit: Fit) -> Figure:
         aside = 1.96 * np.sqrt((_BARS - 1) / worth)
         right.axhspan(max(1 - aside, 0), 1 + aside, color=FAINT, alpha=0.15, linewidth=0)
         right.axhline(1.0, color=FAINT, linewidth=1.0, dashes=(4, 2))
-        right.set_ylim(bottom=0)
-        right.set_xlim(0, 1)
-        left.set_xlabel("Quantile of a normal")
-        left.set_ylabel("Standardised error")
-        right.set_xlabel("Probability of a smaller error, as fitted")
-        right.set_ylabel("Errors, relative to even")
+        left.set(xlabel="Quantile of a normal", ylabel="Standardised error")
+        right.set(xlabel="Probability of a smaller error, as fitted", ylabel="Errors, relative to even")
+        right.set(ylim=(0, None), xlim=(0, 1))
         left.legend(loc="upper left")
         add_note(figure, [f"{len(z)} entries; {shape.words()}"])
     return figure
 
 
-GAUSSIAN = FitFigure(
-    "Are the errors Gaussian?",
-    "quantiles of standardised position errors over normal ones, and a histogram of their probabilities",
-    "Errors have the fitted mean taken off and are divided by the fitted spread. On the dashed line (left), and within "
-    "the grey band (right), they are Gaussian. Ends that leave the line are rare large errors, of which the model has "
-    "too few.",
-    gaussian_figure,
-)
-
-
 # All figures.
 
-FIT_FIGURES: dict[str, FitFigure] = {
-    "ranks": RANKS,
-    "calibration": CALIBRATION,
-    "error_map": ERROR_MAP,
-    "autocorrelation": AUTOCORRELATION,
-    "gaussian": GAUSSIAN,
+FIT_FIGURES = {
+    "ranks": FitFigure(
+        "Does a replay look like the recording?",
+        "rank of each recorded pass among replays of the fitted model, a strip per statistic",
+        "For each pass the recorded value is ranked among runs of the fitted model: 0 is below all of them, 1 "
+        "above. Of a model that is right, ranks are spread evenly. Ranks in a heap in the middle: the model "
+        "varies too much; at the ends: it is too sure.",
+        ranks_figure,
+        lambda fit: (
+            None if fit.checks is not None and fit.checks.fitted else "nothing was replayed beside what was recorded"
+        ),
+    ),
+    "calibration": FitFigure(
+        "Is the probability of detection right?",
+        "share of rows that are listed over range, with intervals, beside the fitted probability",
+        "Rows (a list and a true object within reach) are put into bins by range. The line is the mean "
+        "probability that the fitted model gives them. Intervals count rows that hang together for less. A point "
+        "whose bar misses the line is a range at which the model is wrong.",
+        calibration_figure,
+    ),
+    "error_map": FitFigure(
+        "Errors over the map",
+        "true places of objects, coloured by the error of their entries, with crosses where they are missed",
+        "Where objects truly are, seen from above. Colours or crosses that gather in one place (a tree, a pole, a"
+        " crest) are not explained by range and visible share: an obstacle may be missing in the experiment, or "
+        "the truth be off there.",
+        error_map_figure,
+        lambda fit: None if fit.gathered.rows.listed.any() else "no entry is of a true object",
+    ),
+    "autocorrelation": FitFigure(
+        "How long do errors last?",
+        "autocorrelation of standardised position errors over time, and the fitted curve",
+        "Points near 1: an entry's error is nearly the same in the next list, and no tracker can average it away."
+        " The line is the fitted memory: a part that drifts and is forgotten with its correlation time, and a "
+        "part that stays for as long as the object is there. Points that begin below 1 at time 0 leave a rest "
+        "that is new in every list. Over few passes points fall too low at long times, as they are taken about a "
+        "mean of their own.",
+        autocorrelation_figure,
+    ),
+    "gaussian": FitFigure(
+        "Are the errors Gaussian?",
+        "quantiles of standardised position errors over normal ones, and a histogram of their probabilities",
+        "Errors have the fitted mean taken off and are divided by the fitted spread. On the dashed line (left), "
+        "and within the grey band (right), they are Gaussian. Ends that leave the line are rare large errors, of "
+        "which the model has too few.",
+        gaussian_figure,
+    ),
 }
 """Figures by name, in the order of the page: those by which a model is trusted or not."""

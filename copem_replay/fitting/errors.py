@@ -124,6 +124,11 @@ class ErrorFit:
     untold: Mapping[str, str]
     between_logs: BetweenLogs | None = None
 
+    @property
+    def axes(self) -> tuple[str, str]:
+        """The names of the frame's axes."""
+        return ("along", "across") if self.frame == "line_of_sight" else ("east", "north")
+
     def error_keys(self, bin_: ErrorBin) -> dict[str, Any]:
         """An error model as the experiment file has it."""
         xx, xy, yy = (round_digits(one.value) for one in bin_.covariance_m2)

@@ -428,22 +428,24 @@ def build_experiment(fit: Fit, experiment: Experiment, logs: Sequence[Any]) -> T
     pem = _find_free_name(name, data["pems"])
     late_s = max(round_digits(fit.delay.seconds, 6), 0.0)
     stated = {"delay_s": late_s, "covariance_m2": _pool_covariance(fit)}
-    recorded = _complete_unit(data["units"][name], stated)
-    replayed = fit.held_out or fit.logs
-    units = {key: value for key, value in data["units"].items() if key != name}
-    entries = [_build_both_settings(entry, name, other, stated) for entry in logs]
-    if fit.delay.of_log:
-        entries = [
-            _add_delay(entry, other, recorded, round_digits(fit.delay.seconds_of(log), 6))
-            for entry, log in zip(entries, replayed, strict=True)
-        ]
+    lists = _complete_recorded(data["units"][name]["recorded"], stated)
+    units = dict(data["units"])
+    recorded = units.pop(name) | {"recorded": lists}
+    entries = [
+        _build_log_entry(entry, fit, log, (name, other), stated, lists)
+        for entry, log in zip(logs, fit.held_out or fit.logs, strict=True)
+    ]
     latency = {"latency_s": {name: late_s}}
     return {
         **{key: value for key, value in data.items() if key not in ("sweep", "show")},
         "logs": entries,
         "runs": RUNS,
         "pems": data["pems"] | {pem: strip_comments(build_pem(fit))},
-        "units": {name: strip_comments(build_unit(fit, experiment, pem)), other: recorded, **units},
+        "units": {
+            name: strip_comments(build_unit(fit, experiment, pem)),
+            other: recorded,
+            **units,
+        },
         "configurations": {"recorded": {"units": [other]}, "fitted": {"units": [name], **latency}},
     }
 
@@ -462,38 +464,31 @@ def _find_free_name(name: str, taken: Any) -> str:
     return name
 
 
-def _complete_unit(unit: Tree, told: Tree) -> Tree:
-    """A recorded unit with the delay that was found, and a covariance where none is stated."""
-    if unit.get("recorded") is None:
-        return unit
-    stated = {key: value for key, value in unit["recorded"].items() if value is not None}
-    return unit | {"recorded": told | stated | {"delay_s": told["delay_s"]}}
+def _complete_recorded(recorded: Tree, stated: Tree) -> Tree:
+    """The keys of recorded lists with the delay that was found, and a covariance where none is stated."""
+    return (
+        stated | {key: value for key, value in recorded.items() if value is not None} | {"delay_s": stated["delay_s"]}
+    )
 
 
-def _build_both_settings(entry: Any, name: str, other: str, told: Tree) -> Any:
-    """The settings of a log, those of the recorded unit for both the recorded and the fitted one."""
-    settings = entry.get("units") if isinstance(entry, dict) else None
-    if not settings or name not in settings:
+def _build_log_entry(entry: Any, fit: Fit, log: str, names: tuple[str, str], stated: Tree, recorded: Tree) -> Any:
+    """An entry of `logs` with the settings of the unit for the fitted and the recorded one, and with its own delay.
+
+    `names`: of both; `recorded`: the keys of the lists that the experiment has for all logs.
+    """
+    settings = dict(entry) if isinstance(entry, dict) else {"file": entry}
+    units, own_s = dict(settings.get("units") or {}), fit.delay.of_log.get(log)
+    if names[0] not in units and own_s is None:
         return entry
-    unit_settings = settings[name]
-    fitted = (
-        None if unit_settings is None else {key: value for key, value in unit_settings.items() if key != "recorded"}
-    )
-    both = {other: None if unit_settings is None else _complete_unit(unit_settings, told)} | (
-        {name: fitted} if fitted or unit_settings is None else {}
-    )
-    return entry | {"units": {key: value for key, value in settings.items() if key != name} | both}
-
-
-def _add_delay(entry: Any, other: str, recorded: Tree, delay_s: float) -> Tree:
-    """The settings of a log whose recorded lists have a delay of their own."""
-    settings = entry if isinstance(entry, dict) else {"file": entry}
-    units = settings.get("units") or {}
-    if units.get(other, {}) is None:
-        return settings
-    own = units.get(other) or {}
-    topic = (own.get("recorded") or recorded["recorded"]) | {"delay_s": max(delay_s, 0.0)}
-    return settings | {"units": units | {other: own | {"recorded": topic}}}
+    asked = names[0] in units
+    given = units.pop(names[0], {})
+    if given is None:
+        return settings | {"units": units | dict.fromkeys(reversed(names))}
+    stated = stated if own_s is None else stated | {"delay_s": max(round_digits(own_s, 6), 0.0)}
+    lists = given.get("recorded") or (recorded if own_s is not None else None)
+    other = given | ({} if lists is None else {"recorded": _complete_recorded(lists, stated)})
+    fitted = {key: value for key, value in given.items() if key != "recorded"}
+    return settings | {"units": units | {names[1]: other} | ({names[0]: fitted} if asked and fitted else {})}
 
 
 # The replay check.

@@ -22,7 +22,6 @@ from copem_replay.io.recorded_units import assign_truth_ids, read_as_recorded, s
 from copem_replay.io.recording import Recording
 from copem_replay.perception.observation import view_world_from_unit
 from copem_replay.perception.sensor_poses import (
-    UnitPoses,
     collect_solids,
     compute_unit_poses,
     find_carrier,
@@ -52,19 +51,6 @@ class LogView:
     states: Tracks
     row: Int  # (R,) index into `states` and `view`
     view: ViewGeometry
-
-
-@dataclass(frozen=True)
-class _LogParts:
-    """A log before its lists are put in order."""
-
-    scene: Scene
-    truth: Tracks
-    found: RecordedLists
-    of_frame: Int  # (F,) index into `stamps` of each list
-    stamps: Int
-    at: UnitPoses
-    carrier_ix: int
 
 
 def check_unit(experiment: Experiment, name: str) -> Unit:
@@ -114,30 +100,29 @@ def view_log(recording: Recording, found: RecordedLists, experiment: Experiment,
     )[0]
     states, view = view_world_from_unit(world, poses, carrier_ix, shares)
     view = replace(view, class_ix=scene.object_class[states.row_object_ix])
-    return _sort_by_list(_LogParts(scene, truth, found, of_frame, stamps, poses, carrier_ix), states, view)
-
-
-def _sort_by_list(log: _LogParts, states: Tracks, view: ViewGeometry) -> LogView:
-    """The view with rows list by list: lists that are captured at one instant have rows of their own."""
-    order = np.argsort(log.of_frame, kind="stable")
-    order = order[log.at.present[log.of_frame[order]]]
-    place_of = np.full(len(log.of_frame), -1)
+    order = np.argsort(of_frame, kind="stable")
+    order = order[poses.present[of_frame[order]]]
+    place_of = np.full(len(of_frame), -1)
     place_of[order] = np.arange(len(order))
-    instant = log.of_frame[order]
-    # Rows of `states` are numbered by the instants at which the unit is there.
-    present = np.flatnonzero(log.at.present)
-    first = np.searchsorted(instant, present)
-    count = np.searchsorted(instant, present, side="right") - first
-    times = count[states.frame_ix]
-    row = np.repeat(np.arange(len(states.frame_ix)), times)
-    within = np.arange(len(row)) - np.repeat(np.cumsum(times) - times, times)
-    list_ix = first[states.frame_ix[row]] + within
-    ordered = np.lexsort((list_ix, states.row_object_ix[row]))
+    at = of_frame[order]
+    row, list_ix = _repeat_by_list(states, np.flatnonzero(poses.present), at)
     return LogView(
-        log.scene, log.truth, log.found, place_of, (log.stamps[instant] - log.scene.t0_ns) * np.float64(1e-9),
-        log.at.x_m[instant], log.at.y_m[instant], log.at.heading_rad[instant], log.carrier_ix,
-        list_ix[ordered], states, row[ordered], view,
+        scene, truth, found, place_of, (stamps[at] - scene.t0_ns) * np.float64(1e-9), poses.x_m[at], poses.y_m[at],
+        poses.heading_rad[at], carrier_ix, list_ix, states, row, view,
     )  # fmt: skip
+
+
+def _repeat_by_list(states: Tracks, present: Int, instant: Int) -> tuple[Int, Int]:
+    """The row of `states`, and the list, of each row: lists that are captured at one instant have rows of their own.
+
+    `present`: the instants at which the unit is there, by which `states` are numbered; `instant (L,)`: of each list.
+    """
+    first = np.searchsorted(instant, present)
+    times = (np.searchsorted(instant, present, side="right") - first)[states.frame_ix]
+    row = np.repeat(np.arange(len(states.frame_ix)), times)
+    list_ix = first[states.frame_ix[row]] + np.arange(len(row)) - np.repeat(np.cumsum(times) - times, times)
+    ordered = np.lexsort((list_ix, states.row_object_ix[row]))
+    return row[ordered], list_ix[ordered]
 
 
 # Reach, passes within it, and folds of a cross-validation.
@@ -387,7 +372,7 @@ def _match_log(number: int, view: LogView, gates: tuple[float, float], ellipse_m
         "captured_s": view.captured_s[view.list_ix], "listed": listed,
         "apart": apart,
         **errors,
-        **{name: np.where(listed, column[entry], _missing_value(column)) for name, column in fields.items()},
+        **{name: np.where(listed, of[entry], np.nan if of.dtype.kind == "f" else -1) for name, of in fields.items()},
     }  # fmt: skip
     other = np.flatnonzero(within & (object_ix < 0))
     return _MatchedLog(rows, _other_columns(number, view, other, list_of[other], rows, fields), entries)
@@ -400,10 +385,6 @@ def _is_crowded(view: LogView, errors: dict[str, Any], near_m: float) -> Bool:
         return np.zeros(len(places), dtype=bool)
     near: Bool = cKDTree(places).query(places, k=2)[0][:, 1] <= near_m
     return near
-
-
-def _missing_value(column: Any) -> float | int:
-    return np.nan if column.dtype.kind == "f" else -1
 
 
 def _error_columns(view: LogView, found: RecordedLists, entry: Int) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -159,7 +159,7 @@ _LASTING = {"share": "share that lasts", "correlation_s": "correlation time, s"}
 def describe_name(fit: Fit, name: str) -> str:
     """The name of an estimate in words: `errors.bins.0.mean_m.0` is `error, 0 to 30 m: mean along, m`."""
     words, errors = name.split("."), fit.parts.errors
-    axes = ("along", "across") if errors.frame == "line_of_sight" else ("east", "north")
+    axes = errors.axes
     if name.startswith("errors.bins."):
         kinds = {
             "mean_m": [f"mean {axis}, m" for axis in axes],
@@ -186,19 +186,15 @@ def describe_name(fit: Fit, name: str) -> str:
 # The folder: the PEM to paste, the experiment that replays it beside the recording, rows and estimates. It is complete
 # under its name or missing, as a results folder (`results/folder.py`).
 
-PEM, ROWS, ESTIMATES = "pem.yaml", "rows.parquet", "fit.json"
-Page = Callable[[Path, Fit], None]
-"""Writes a file about a fit."""
+PEM, ROWS, ESTIMATES, PAGE, PLACES = "pem.yaml", "rows.parquet", "fit.json", "fit.html", "places.rrd"
 
 
-def fill_fit(
-    place: ResultsPlace, fit: Fit, experiment: Experiment, recordings: Sequence[Recording], pages: Mapping[str, Page]
-) -> None:
-    """Write a fit into a folder that is reserved. `pages`: further files by name. Raises OutputError.
+def fill_fit(place: ResultsPlace, fit: Fit, experiment: Experiment, recordings: Sequence[Recording]) -> None:
+    """Write a fit into a folder that is reserved. Raises OutputError.
 
-    Pages that cannot be written are left out (`place.left_out`).
+    The page and the places are left out where they cannot be written (`place.left_out`).
     """
-    files = sorted([PEM, EXPERIMENT, ROWS, ESTIMATES, MARK, *pages])
+    files = sorted([PEM, EXPERIMENT, ROWS, ESTIMATES, MARK, PAGE, PLACES])
     replayed = [one for one in recordings if one.scene.log in (fit.held_out or fit.logs)]
     provenance = list_versions() | {
         "format": "fit",
@@ -218,9 +214,10 @@ def fill_fit(
         (new / ESTIMATES).write_text(
             _format_json(describe_estimates(fit) | {"provenance": provenance}), encoding="utf-8"
         )
-        for name, page in pages.items():
-            with place.may_fail([name]):
-                page(new / name, fit)
+        with place.may_fail([PAGE]):
+            (new / PAGE).write_text(fit_page(fit), encoding="utf-8")
+        with place.may_fail([PLACES]):
+            write_fit_places(new / PLACES, fit.unit, fit.logs, fit.gathered.rows, fit.gathered.lists)
         files = [name for name in files if name not in place.left_out]
         (new / MARK).write_text(_format_json(provenance | {"files": files}), encoding="utf-8")
         place.finish(files)

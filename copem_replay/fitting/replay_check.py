@@ -40,6 +40,7 @@ STATISTICS = ("first listed, s", "longest run of misses", "share listed", "RMSE,
 _CELLS = 4_000_000
 """Rows × runs that are simulated at once: 100 MB."""
 
+Verdict = Literal["holds", "too sure", "too few passes to tell"]
 Statistics = dict[str, Float]
 """By name (S, passes); NaN where a pass has none, ∞ for the first list of an object that is never listed."""
 
@@ -55,7 +56,7 @@ class StatisticCheck:
     pit: Float
     inside: int
     p: float
-    verdict: Literal["holds", "too sure", "too few passes to tell"]
+    verdict: Verdict
     among: int = 1
 
 
@@ -95,15 +96,6 @@ def remove_memory(pem: Pem) -> Pem:
     """The model with all draws new in every list."""
     couples = tuple(couple.model_copy(update={"memory": None}) for couple in pem.couples)
     return pem.model_copy(update={"couples": couples, "memory": {}})
-
-
-def replay_statistics(
-    pem: Pem, rows: FitRows, lists: FitLists, *, placed: PoseError | None = None, runs: int = RUNS, seed: int = 0
-) -> Statistics:
-    """The statistics (S, passes) of runs of the model."""
-    blocks = _replay_blocks(pem, rows, lists, placed, runs, seed)
-    each = [compute_statistics(*block, rows) for block in blocks]
-    return {name: np.concatenate([one[name] for one in each]) for name in STATISTICS}
 
 
 def _replay_blocks(
@@ -256,11 +248,12 @@ def compare_statistics(recorded: Statistics, runs: Statistics, *, seed: int = 0)
         p = float((surprise >= surprise[0]).mean())
         recorded_pit = pit[0]
         inside = int(((recorded_pit >= 0.025) & (recorded_pit <= 0.975)).sum())
-        too_few = len(recorded_pit) < FEWEST_PASSES
-        verdict: Literal["holds", "too sure", "too few passes to tell"]
-        verdict = "too few passes to tell" if too_few else "holds" if p >= 0.05 else "too sure"
-        checks.append(StatisticCheck(name, recorded_pit, inside, p, verdict))
+        checks.append(StatisticCheck(name, recorded_pit, inside, p, _judge_check(p, len(recorded_pit))))
     return tuple(checks)
+
+
+def _judge_check(p: float, passes: int) -> Verdict:
+    return "too few passes to tell" if passes < FEWEST_PASSES else "holds" if p >= 0.05 else "too sure"
 
 
 # Totals: what no pass tells by itself.
@@ -298,9 +291,7 @@ def compare_totals(totals: Float, passes: int) -> tuple[StatisticCheck, ...]:
         moved = columns[:, spread > 1e-12]
         far = (((moved - moved.mean(axis=0)) / moved.std(axis=0)) ** 2).sum(axis=1)
         p = float((far >= far[0] - 1e-12).mean())
-        verdict: Literal["holds", "too sure", "too few passes to tell"]
-        verdict = "too few passes to tell" if passes < FEWEST_PASSES else "holds" if p >= 0.05 else "too sure"
-        checks.append(StatisticCheck(name, np.array([1 - p]), int(p > 0.05), p, verdict))
+        checks.append(StatisticCheck(name, np.array([1 - p]), int(p > 0.05), p, _judge_check(p, passes)))
     return tuple(checks)
 
 

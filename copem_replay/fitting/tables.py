@@ -152,12 +152,11 @@ own, as tables that look alike are not known to be."""
 class TableFit:
     """Probabilities `theta (K,)` at the nodes, and how they are shrunk.
 
-    The table of all rows is shrunk towards one `constant`, and where there are several tables these towards that of
+    The table of all rows is shrunk towards one constant, and where there are several tables these towards that of
     all, each by a prior of `strength` effective rows, one number for each level. `worth`: rows per effective row.
     """
 
     theta: Float
-    constant: float
     strength: tuple[float, ...]
     worth: float
 
@@ -172,7 +171,7 @@ def fit_table(entries: PooledRows, times: Float, worth: float, *, monotone: bool
         parent = np.resize(theta, int(np.prod(level.shape)))
         theta, prior = _shrink_table(level, entries.hit, count, parent, worth, monotone)
         strength.append(prior)
-    return TableFit(theta if levels else np.array([constant]), float(constant), tuple(strength), worth)
+    return TableFit(theta if levels else np.array([constant]), tuple(strength), worth)
 
 
 def _list_levels(placed: NodeWeights) -> list[NodeWeights]:

@@ -74,7 +74,7 @@ def test_rows_put_together_give_nearly_the_same() -> None:
     assert len(together.hit) < 2000
     assert together.count.sum() == 20_000
     fit = fit_table(together, np.ones(200), 1.0, monotone=False)
-    parent = np.full(9, fit.constant)
+    parent = np.full(9, (rows.listed.sum() + 0.5) / 20_001)
     prior, shape = fit.strength[0] * np.stack([parent, 1 - parent]), np.array(where.shape)
     exact, _ = fit_em(parent, where.node, where.weight, rows.listed, np.ones(20_000), prior, shape, False)
     np.testing.assert_allclose(fit.theta, exact, atol=2e-3)

@@ -19,7 +19,6 @@ from copem_replay.fitting.replay_check import (
     compute_totals,
     remove_memory,
     replay_check,
-    replay_statistics,
     simulate_lists,
 )
 from copem_replay.fitting.rows import FitLists, FitRows
@@ -116,7 +115,7 @@ def test_simulated_as_the_model_says() -> None:
 def test_a_right_model_holds_and_ranks_are_uniform() -> None:
     """Of 40 recordings of 25 passes each, drawn by the model: p is uniform, 95 % of the ranks are inside."""
     pem, rows = pem_of(), passes(0, 25, 40, flat)
-    runs = replay_statistics(pem, rows, lists_of(rows), runs=240, seed=1)
+    runs = compute_statistics(*simulate_lists(pem, rows, lists_of(rows), np.arange(240), 1), rows)
     p, inside = [], []
     for k in range(40):
         others = {name: np.delete(values, k, axis=0) for name, values in runs.items()}

@@ -12,7 +12,7 @@ import numpy as np
 from benches import common
 from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.fitting.detection import fit_detection
-from copem_replay.fitting.replay_check import replay_statistics, simulate_lists
+from copem_replay.fitting.replay_check import replay_check, simulate_lists
 from copem_replay.fitting.rows import FitLists, FitRows
 from copem_replay.perception.pem.model import Pem
 
@@ -43,7 +43,7 @@ def fit() -> Iterator[common.Line]:
     share = found.memory.share.value if found.memory else None
     yield {**took, "rows": len(rows.listed), "rungs": len(found.ladder), "share": share}
     some = rows.take(rows.pass_ix < 100)
-    checked = common.timed(lambda: replay_statistics(Pem.model_validate(PEM), some, lists, runs=500))
+    checked = common.timed(lambda: replay_check(Pem.model_validate(PEM), some, lists, runs=500))
     yield {"fit_replay_check_s": round(checked.seconds, 2), "rows": len(some.listed), "runs": 500}
 
 
