@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Container, Hashable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Literal
 
@@ -177,7 +177,7 @@ def transmit(
         made = made & np.isfinite(delay_s)
     if received is not None:
         arrives_s = np.where(_is_of_units(seen, received), arrives_s, np.inf)
-    return seen.with_values(arrives_s=arrives_s[None])
+    return replace(seen, arrives_s=arrives_s[None])
 
 
 def _check_delays(link: LinkModel, sent: SentLists) -> Float:
@@ -190,7 +190,7 @@ def sample_arrivals(arriving: Tracks, rate_hz: float | None) -> Tracks:
     """The lists, each arriving at the first of the instants k / rate that is not before its arrival, within 1 µs."""
     if rate_hz is None:
         return arriving
-    return arriving.with_values(arrives_s=np.ceil((arriving.arrives_s - SAME_INSTANT_S) * rate_hz) / rate_hz)
+    return replace(arriving, arrives_s=np.ceil((arriving.arrives_s - SAME_INSTANT_S) * rate_hz) / rate_hz)
 
 
 def _is_of_units(seen: Tracks, names: Container[str]) -> Bool:
@@ -217,4 +217,4 @@ def delay_until_ready(seen: Tracks, ready: Mapping[str, LatencyModel], rng: Coun
         )
         [uniform] = rng.uniform("ready", random_key, runs)
         arrives_s[frames] += ask_delays(model, uniform, f"units.{name}.ready")
-    return seen.with_values(arrives_s=arrives_s[None])
+    return replace(seen, arrives_s=arrives_s[None])

@@ -221,21 +221,6 @@ class Tracks:
         """(P,) rows list by list, in each from west to east, and at one place the first object first; of one run."""
         return np.lexsort((self.row_object_ix, self.x_m[0], self.frame_ix))
 
-    def with_values(self, **columns: Any) -> Tracks:
-        """These rows in their lists with other arrivals or values; what has been computed about the rows is kept."""
-        result = replace(self, **columns)
-        vars(result).update({name: vars(self)[name] for name in _OF_ROWS if name in vars(self)})
-        return result
-
-    def take_run(self, s: int) -> Tracks:
-        """One run of (S,), a view of its arrivals and values."""
-        if len(self.valid) == 1:
-            return self
-        for name in _OF_ROWS:  # once for all runs
-            getattr(self, name)
-        columns = {n: a[s : s + 1] for n in _BY_RUN if (a := getattr(self, n)) is not None and len(a) > 1}
-        return self.with_values(**columns)
-
     def take_tracks(self, keep: Bool) -> Tracks:
         """Only the tracks of `keep` (E,). Lists stay: one that held only others is then an empty list."""
         return self if keep.all() else self.take_rows(np.flatnonzero(keep[self.track_ix]))
@@ -340,9 +325,6 @@ def splice_rows(pieces: Sequence[Tracks], *, states: bool = True) -> tuple[Track
 
 VALUES = ("x_m", "y_m", "z_m", "yaw_rad", "vx_mps", "vy_mps", "length_m", "width_m", "height_m")
 UNCERTAINTIES = tuple(f.name for f in fields(Tracks) if f.default is None)
-_BY_RUN = ("arrives_s", "valid", *VALUES, *UNCERTAINTIES)
-_OF_ROWS = ("track_ix", "row_object_ix", "row_unit_ix", "row_captured_s", "by_frame")
-"""Properties of Tracks that depend on neither arrivals nor values."""
 
 
 def append_tracks(tracks: Tracks, others: Tracks) -> Tracks:
@@ -365,14 +347,10 @@ def append_tracks(tracks: Tracks, others: Tracks) -> Tracks:
 
 @dataclass(frozen=True)
 class TimeChunk:
-    """Instants from `from_s` on and before `until_s`, in seconds of the log."""
+    """Instants from `from_s` on and before `until_s`, in seconds of the log; without bounds all of it."""
 
     from_s: float = -np.inf
     until_s: float = np.inf
-
-
-WHOLE = TimeChunk()
-"""The whole of a log."""
 
 
 @dataclass(frozen=True)

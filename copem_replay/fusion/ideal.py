@@ -19,7 +19,7 @@ from copem_replay.communication.arrivals import FusionSchedule, KeptEntries, Sen
 from copem_replay.core.compiled import borrowing
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.random import CounterRng, RandomKey, object_words
-from copem_replay.core.tracks import NO_CAPTURE_NS, UNCERTAINTIES, VALUES, Bool, Float, Int, Scene, Tracks
+from copem_replay.core.tracks import NO_CAPTURE_NS, Bool, Float, Int, Scene, Tracks
 from copem_replay.fusion.covariance import FLATTEST
 
 SMALLEST_VARIANCE = 1e-9
@@ -33,12 +33,10 @@ def fuse_ideal(
     without_object_ix: int = -1,
     instants: FusionSchedule | None = None,
     kept: KeptEntries | None = None,
-    weighed: WeightedRows | None = None,
 ) -> FusedTracks:
     """One fused list per instant of the receiver, as tracks of the one unit `fused`. `instants`: some of the instants.
 
-    `kept`: the entries that `keep_by_object` keeps of units with partial messages; None: there are none. `weighed`:
-    weights of the rows of `received`; None: they are computed.
+    `kept`: the entries that `keep_by_object` keeps of units with partial messages; None: there are none.
 
     `received`: lists with truth ids; arrival times common to all runs. `without_object_ix`: the receiver's own body,
     which it does not list. Frames are the receiver's instants: `arrives_s` is when the list is available,
@@ -52,7 +50,7 @@ def fuse_ideal(
     )
     valid = _any_valid(counts, rows, start)
     out = {name: np.full(valid.shape, np.nan) for name in ("x_m", "y_m", "cov_ee_m2", "cov_en_m2", "cov_nn_m2")}
-    weighed = weighed or WeightedRows.of(received)
+    weighed = WeightedRows.of(received)
     positions = Positions(received.x_m, received.y_m, *weighed.covariances)
     _combine_position(counts, positions, weighed.information, rows, start, Positions(*out.values()))
     spread = _combine_scalars(received, counts, weighed, rows, start, out)
@@ -271,11 +269,6 @@ class WeightedRows(NamedTuple):
         values = [yaw[name] if name in yaw else getattr(received, name) for name in _WEIGHED_BY]
         scalars, weights = _stack_columns(values), _stack_columns([*information, none + 1])
         return cls(floor_covariances(received), PositionInformation(*_inverse_covariances(received)), scalars, weights)
-
-    @staticmethod
-    def alike(tracks: Tracks, other: Tracks) -> bool:
-        """Whether both have equal values and weights: True where their columns are identical arrays, not copies."""
-        return all(getattr(tracks, name) is getattr(other, name) for name in (*VALUES[2:], *UNCERTAINTIES))
 
 
 def _stated_variances(received: Tracks) -> list[Float | None]:

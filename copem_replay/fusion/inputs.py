@@ -7,7 +7,7 @@ is left out, since it knows where it is.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numba as nb
 import numpy as np
@@ -16,34 +16,20 @@ from copem_replay.communication.arrivals import FusionSchedule, KeptEntries, fus
 from copem_replay.core.object_list import COVARIANCES, ENTRY, Entries, Inputs, ObjectLists, join_entries, take_entries
 from copem_replay.core.tracks import CLASSES, VALUES, Bool, Float, Int, Tracks
 from copem_replay.fusion.ideal import floor_covariances
+from copem_replay.perception.perceive import EntryClaims
 
 
-@dataclass(frozen=True)
-class EntryClaims:
-    """Claims of entries beside their states, row by row: (P,), `class_probability (P, C)`."""
-
-    existence: Float
-    class_probability: Float
-    track_id: Int
-
-
-class RowEntries:
-    """Rows (P,) of lists in the runs (S,) as entries; columns that all runs share are filled in once."""
-
-    def __init__(self, seen: Tracks, claims: EntryClaims) -> None:
-        self._columns = {name: getattr(seen, name) for name in VALUES}
-        self._columns |= zip(COVARIANCES, floor_covariances(seen), strict=True)
-        self._template = _make_template(seen, claims, self._columns)
-
-    def lists(self, seen: Tracks, drawn: Float, s: int | None = None, *, without_object_ix: int) -> ObjectLists:
-        """The lists of all runs, or of run s alone, which `seen` and `drawn` are then of. `drawn` orders entries."""
-        start, picked = listed_rows(seen, drawn, without_object_ix=without_object_ix)
-        entries = take_entries(self._template, picked)
-        run = np.repeat(np.arange(len(start)) if s is None else s, start[:, -1] - start[:, 0])
-        for name, values in self._columns.items():
-            if len(values) > 1:
-                entries[name] = values[run, picked]
-        return ObjectLists(start, entries)
+def make_entry_lists(seen: Tracks, claims: EntryClaims, drawn: Float, *, without_object_ix: int) -> ObjectLists:
+    """The lists of the runs (S,) with their rows (P,) as entries, in the order of `drawn (S, P)`."""
+    columns = {name: getattr(seen, name) for name in VALUES}
+    columns |= zip(COVARIANCES, floor_covariances(seen), strict=True)
+    start, picked = listed_rows(seen, drawn, without_object_ix=without_object_ix)
+    entries = take_entries(_make_template(seen, claims, columns), picked)
+    run = np.repeat(np.arange(len(start)), start[:, -1] - start[:, 0])
+    for name, values in columns.items():
+        if len(values) > 1:
+            entries[name] = values[run, picked]
+    return ObjectLists(start, entries)
 
 
 def listed_rows(received: Tracks, drawn: Float, *, without_object_ix: int) -> tuple[Int, Int]:

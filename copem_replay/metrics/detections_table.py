@@ -137,23 +137,23 @@ class DetectionEvents:
     way: Way | None = None
 
 
-def stack_events(blocks: Sequence[Mapping[str, DetectionEvents]]) -> dict[str, DetectionEvents]:
-    """Events by configuration, those of several blocks of runs one after the other."""
+def stack_events(blocks: Sequence[Mapping[str, DetectionEvents]], runs: Sequence[int]) -> dict[str, DetectionEvents]:
+    """Events by configuration, those of several blocks of so many runs one after the other."""
     return (
-        {name: _stack_parts([block[name] for block in blocks]) for name in blocks[0]}
+        {name: _stack_parts([block[name] for block in blocks], runs) for name in blocks[0]}
         if len(blocks) > 1
         else dict(blocks[0])
     )
 
 
-def _stack_parts(parts: Sequence[Any]) -> Any:
+def _stack_parts(parts: Sequence[Any], runs: Sequence[int]) -> Any:
     first: Any = parts[0]
     if isinstance(first, np.ndarray):
-        return np.concatenate(parts)
+        return np.concatenate([np.broadcast_to(p, (n, p.shape[1])) for p, n in zip(parts, runs, strict=True)])
     if hasattr(first, "_fields"):
-        return type(first)(*map(_stack_parts, zip(*parts, strict=True)))
+        return type(first)(*(_stack_parts(columns, runs) for columns in zip(*parts, strict=True)))
     if is_dataclass(first):
-        columns = {f.name: _stack_parts([getattr(part, f.name) for part in parts]) for f in fields(first)}
+        columns = {f.name: _stack_parts([getattr(part, f.name) for part in parts], runs) for f in fields(first)}
         return replace(first, **columns)  # type: ignore[type-var]
     assert all(part == first for part in parts), f"{type(first).__name__} is not of all runs alike"
     return first

@@ -7,9 +7,9 @@ and track id, and the errors of a unit's own pose, of its clock, and outages.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -52,7 +52,7 @@ def perceive(
     valid = _draw_detected(observations, experiment, draws)
     if equipped is not None:
         valid &= equipped[:, tracks.row_unit_ix]
-    seen = tracks.with_values(valid=valid)
+    seen = replace(tracks, valid=valid)
     if states == "true":
         return seen
     return add_states(scene, seen, observations, experiment, None if states == "expected" else draws)
@@ -162,7 +162,7 @@ def _add_errors(
                 per_run("vx_mps")[:, columns_at] += errors.speed_mps * east
                 per_run("vy_mps")[:, columns_at] += errors.speed_mps * north
                 spread["speed_var_m2ps2"][0, columns_at] = errors.speed_var_m2ps2
-    return seen.with_values(**columns, **spread)
+    return replace(seen, **columns, **spread)
 
 
 def _travel_direction(seen: Tracks, speed_mps: Float, columns_at: Any) -> tuple[Float, Float]:
@@ -181,23 +181,27 @@ TRACK_ID_BITS = 52
 """Bits of a track id: numbers in JSON are exact up to 53; of a million ids two are equal with probability 1e-4."""
 
 
-@dataclass(frozen=True)
-class DrawnClaims:
-    """Row by row: existence (P,), class probabilities (P, C) and track ids (P,), −1: none."""
+class EntryClaims(NamedTuple):
+    """Claims of entries beside their states, row by row: track ids are −1 where there are none."""
 
-    existence: Float
-    class_probability: Float
-    track_id: Int
+    existence: Float  # (P,)
+    class_probability: Float  # (P, C)
+    track_id: Int  # (P,)
+
+    def followed_by(self, others: EntryClaims) -> EntryClaims:
+        """The claims of these rows and then of the others."""
+        columns: Any = map(np.concatenate, zip(self, others, strict=True))
+        return EntryClaims(*columns)
 
 
 def draw_claims(
     observations: Observations, setup: PerceptionSetup, draws: UnitDraws, ghost_sort: Int | None = None
-) -> DrawnClaims:
+) -> EntryClaims:
     """The claims of the units about rows (P,) in one run, that of `draws`.
 
     `ghost_sort (P,)`: the rows are ghosts, of these sorts of their PEMs; None: they are objects.
     """
-    claims = DrawnClaims(
+    claims = EntryClaims(
         observations.existence.copy(),
         np.eye(len(CLASSES))[observations.view.class_ix],
         np.full(len(observations.couple_ix), -1),
@@ -374,7 +378,7 @@ def remove_outages(scene: Scene, seen: Tracks, setup: PerceptionSetup, runs: Int
         return seen
     [missing] = down
     arrives_s = np.where(missing, np.inf, seen.arrives_s)
-    return seen.with_values(arrives_s=arrives_s, valid=seen.valid & ~missing[seen.frame_ix])
+    return replace(seen, arrives_s=arrives_s, valid=seen.valid & ~missing[seen.frame_ix])
 
 
 def lists_not_made(scene: Scene, tracks: Tracks, setup: PerceptionSetup, runs: Int) -> Bool | None:

@@ -8,8 +8,7 @@ The recorded output of a stack is a recorded unit that only its configuration he
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -289,37 +288,37 @@ def _replace_members(
     return result
 
 
-# Presence: which units there are in the runs of a block.
+# Groups of runs that are replayed together.
 
 
 @dataclass(frozen=True)
-class Presence:
-    """Which of U units list objects, run by run: `listing (S | 1, U)`; and which send lists: `sending (U,)`.
+class RunGroup:
+    """Runs (S,) of one log that are replayed together; which of U units list objects in each, and which send lists.
 
-    A unit that is only in some runs of a block sends empty lists in the others. That is right where only the entries of
-    lists count. Where the lists themselves count, all runs of a block need the same units: `parts` splits it.
+    A unit that is only in some of the runs sends empty lists in the others. That is right where only the entries of
+    lists count; where lists themselves count, all runs of a group have the same units.
     """
 
-    listing: Bool
-    sending: Bool
+    runs: Int
+    listing: Bool  # (S | 1, U)
+    sending: Bool  # (U,)
 
     @classmethod
-    def same(cls, present: Bool) -> Presence:
-        """Every run with the units that are `present (U,)`."""
-        return cls(present[None], present)
+    def of_all_units(cls, experiment: ExpandedExperiment, runs: Int) -> RunGroup:
+        """Runs (S,) with all units in each."""
+        present = np.ones(len(experiment.named), dtype=bool)
+        return cls(runs, present[None], present)
 
-    @classmethod
-    def of(cls, expanded: ExpandedExperiment, log: str, runs: Int) -> Presence:
-        """Each of the runs (S,) with its own units."""
-        equipped = expanded.equipped(log, runs)
-        present = np.ones(len(expanded.named), dtype=bool)
-        return cls.same(present) if equipped is None else cls(equipped, present)
 
-    def parts(self, runs: Int) -> Iterator[tuple[Int, Presence]]:
-        """The runs (S,) in parts; the runs of a part have the same units."""
-        if len(self.listing) != len(runs):  # one row stands for all
-            yield runs, self
-            return
-        patterns, which = np.unique(self.listing, axis=0, return_inverse=True)
-        for k, present in enumerate(patterns):
-            yield runs[which == k], Presence.same(present)
+def group_runs(experiment: ExpandedExperiment, log: str, runs: Int, *, entries_alone: bool = False) -> list[RunGroup]:
+    """The runs (S,) in groups that have the same lists. `entries_alone`: only the entries of lists count."""
+    everyone = RunGroup.of_all_units(experiment, runs)
+    equipped = experiment.equipped(log, runs)
+    if entries_alone and not experiment.arrivals_differ:
+        return [everyone if equipped is None else replace(everyone, listing=equipped)]
+    patterns, which = everyone.listing, np.zeros(len(runs), dtype=np.int64)
+    if equipped is not None:
+        patterns, which = np.unique(equipped, axis=0, return_inverse=True)
+    if experiment.runs_apart:
+        return [RunGroup(runs[s : s + 1], patterns[k][None], patterns[k]) for s, k in enumerate(which.tolist())]
+    return [RunGroup(runs[which == k], present[None], present) for k, present in enumerate(patterns)]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Self
@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from copem_replay.communication.arrivals import receiver_instants
-from copem_replay.communication.link import sample_arrivals
 from copem_replay.communication.radio import Radio
 from copem_replay.communication.reception import RadioPath, ReceptionModel, ask_reception_probability
 from copem_replay.core.errors import ExperimentError, count_noun
@@ -26,7 +25,6 @@ from copem_replay.core.tracks import (
     CLASSES,
     SAME_INSTANT_S,
     TRUTH,
-    WHOLE,
     Bool,
     Float,
     Scene,
@@ -47,10 +45,9 @@ from copem_replay.perception.config import Carriers
 from copem_replay.perception.observation import interpolate_worlds
 from copem_replay.perception.pem.model import ObjectSidePlace, Pem
 from copem_replay.perception.sensor_poses import UnitPoses
-from copem_replay.pipeline.expansion import ExpandedExperiment
-from copem_replay.pipeline.receiver import perceive_all_units, receive_lists
+from copem_replay.pipeline.expansion import ExpandedExperiment, RunGroup
 from copem_replay.pipeline.sweep import describe_unswept
-from copem_replay.pipeline.world import WorldChunk, asks_for_path
+from copem_replay.pipeline.world import Transmission, asks_for_path
 
 if TYPE_CHECKING:
     from copem_replay.pipeline.prepare import Replay
@@ -86,16 +83,26 @@ def measure_list_rates(replay: Replay, experiment: Experiment) -> dict[str, List
 
     Units that only some runs have count as there in all.
     """
-    world = replay.lists_only(experiment)
-    units, result, seen = world.experiment, dict[str, list[ListRate]](), None
-    differ = units.outages or units.sends or any(ready.fixed_s is None for ready in units.ready.values())
+    units, rates = replay.expanded.with_(experiment), dict[str, list[ListRate]]()
     for run in range(experiment.runs if units.arrivals_differ else 1):
-        one_run = np.array([run])
-        world_of_run = replace(world, on_air=replay.on_air(experiment, one_run))
-        if seen is None or differ:
-            seen = perceive_all_units(world_of_run, one_run, states="true")
-        _add_run(result, world_of_run, seen)
-    return {name: join_list_rates(runs) for name, runs in result.items()}
+        lists = Transmission(replay, experiment, RunGroup.of_all_units(units, np.array([run])))
+        for name in units.configurations:
+            rates.setdefault(name, []).append(_measure_rate(lists, name))
+    return {name: join_list_rates(runs) for name, runs in rates.items()}
+
+
+def _measure_rate(lists: Transmission, name: str) -> ListRate:
+    """The rate of one configuration in one run."""
+    units, end_s = lists.experiment, lists.log.scene.end_s
+    received = lists.received(name)
+    issue_s = receiver_instants(received)
+    issue_s = issue_s[(issue_s >= -SAME_INSTANT_S) & (issue_s <= end_s + SAME_INSTANT_S)]
+    covered_s = float(issue_s[-1] - issue_s[0]) if len(issue_s) > 1 else 0.0
+    links = None
+    if linked := units.linked(name):
+        sent = lists.truth if units.configurations[name].units == TRUTH else lists.lists
+        links = link_times(sent, lists.arriving(name), received, linked, end_s)
+    return ListRate(max(len(issue_s) - 1, 0), covered_s, links)
 
 
 def join_list_rates(times: Iterable[ListRate]) -> ListRate:
@@ -104,22 +111,6 @@ def join_list_rates(times: Iterable[ListRate]) -> ListRate:
     links = [one.links for one in rates if one.links is not None]
     added = sum(links[1:], links[0]) if links else None
     return ListRate(sum(one.intervals for one in rates), sum(one.covered_s for one in rates), added)
-
-
-def _add_run(result: dict[str, list[ListRate]], world: WorldChunk, seen: Tracks) -> None:
-    """Append to `result` the rate of each configuration in one run, whose lists are `seen`."""
-    end_s = world.scene.end_s
-    for name, configuration in world.experiment.configurations.items():
-        arriving = receive_lists(seen, world, name, ticks=False)
-        received = sample_arrivals(arriving, configuration.issue_hz)
-        issue_s = receiver_instants(received)
-        issue_s = issue_s[(issue_s >= -SAME_INSTANT_S) & (issue_s <= end_s + SAME_INSTANT_S)]
-        covered_s = float(issue_s[-1] - issue_s[0]) if len(issue_s) > 1 else 0.0
-        links = None
-        if linked := world.experiment.linked(name):
-            sent = world.truth if configuration.units == TRUTH else seen
-            links = link_times(sent, arriving, received, linked, end_s)
-        result.setdefault(name, []).append(ListRate(max(len(issue_s) - 1, 0), covered_s, links))
 
 
 # Output times: how old the recorded outputs of stacks are when they are available, as the recordings tell.
@@ -581,7 +572,7 @@ class LogFacts:
             tuple(list_oddities(replay, experiment, replay.ever_met)),
             measure_list_rates(replay, experiment),
             sum_output_times([recording], experiment),
-            len((replay.observe(WHOLE) if replay.chunks == (WHOLE,) else replay.measured).tracks.frame_ix),
+            replay.rows_kept,
         )
 
     @classmethod

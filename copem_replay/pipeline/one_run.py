@@ -12,16 +12,17 @@ import pandas as pd
 
 from copem_replay.core.errors import ExperimentError
 from copem_replay.core.fused_tracks import FusedTracks
-from copem_replay.core.tracks import SAME_INSTANT_S, TRUTH, WHOLE, Bool, Float, Int, Tracks
+from copem_replay.core.tracks import SAME_INSTANT_S, TRUTH, Bool, Float, Int, TimeChunk, Tracks
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.onset import select_counted
 from copem_replay.perception.observation import Observations
 from copem_replay.perception.sensor_poses import find_carrier
-from copem_replay.pipeline.expansion import Presence, resolve_for_run
+from copem_replay.pipeline.expansion import RunGroup, group_runs, resolve_for_run
 from copem_replay.pipeline.prepare import ROWS_HELD, Replay, observation_rows, prepare_log
-from copem_replay.pipeline.receiver import Receivers, convert_to_tracks
+from copem_replay.pipeline.receiver import Receivers
 from copem_replay.pipeline.scoring import match_lists
+from copem_replay.pipeline.world import Transmission
 
 if TYPE_CHECKING:
     from copem_replay.pipeline.run import ExperimentResult
@@ -51,46 +52,36 @@ class RunTracks:
             return self._all
         if observation_rows(replay.scene, replay.truth, replay.expanded) > ROWS_HELD:
             raise ExperimentError(f"{replay.scene.log}: too long to be held at once; take a window of it")
-        return replace(self, replay=replace(replay, chunks=(WHOLE,))).whole()
+        return replace(self, replay=replace(replay, chunks=(TimeChunk(),))).whole()
 
     @cached_property
     def _all(self) -> dict[str, FusedTracks]:
         return next(self._compute())
 
     def _compute(self) -> Iterator[dict[str, FusedTracks]]:
-        replay, runs = self.replay, np.array([self.run])
-        [(_, presence)] = Presence.of(replay.expanded, replay.scene.log, runs).parts(runs)
-        receivers = Receivers(runs, presence.sending)
-        for world in replay.worlds(self.experiment, runs, presence):
-            truth_cache = replay.truth_cache_of(world.chunk)
-            result = {}
-            for name, output in receivers.receive(world):
-                if output.fused_tracks is not None:
-                    result[name] = output.fused_tracks
-                else:
-                    matches = match_lists(truth_cache, output, self.experiment.measure)
-                    stated_s = None if output.stated is None else output.told.entries["captured_s"]
-                    result[name] = convert_to_tracks(
-                        output.lists,
-                        0,
-                        matches,
-                        output.received,
-                        output.instants.issue_s,
-                        output.instants.newest,
-                        stated_s,
-                    )
+        replay, measure = self.replay, self.experiment.measure
+        units = replay.expanded.with_(self.experiment)
+        [group] = group_runs(units, replay.scene.log, np.array([self.run]))
+        receivers = Receivers(Transmission(replay, self.experiment, group))
+        for world in receivers.worlds():
+            truth_cache, result = replay.truth_cache_of(world.chunk), {}
+            for name in units.configurations:
+                output = receivers.fuse(world, name)
+                matches = match_lists(truth_cache, output, measure) if output.fused_tracks is None else None
+                [(_, fused_tracks)] = output.tracks_by_run(matches)
                 if output.faults is not None:
-                    result[name] = replace(result[name], faults=output.faults)
-                if linked := world.experiment.linked(name):
-                    result[name] = replace(result[name], by_link=_is_sent_by_link(output.sent, linked, presence))
+                    fused_tracks = replace(fused_tracks, faults=output.faults)
+                if linked := units.linked(name):
+                    fused_tracks = replace(fused_tracks, by_link=_is_sent_by_link(output.sent, linked, group))
+                result[name] = fused_tracks
             yield result
 
 
-def _is_sent_by_link(sent: Tracks, linked: list[str], presence: Presence) -> Bool:
+def _is_sent_by_link(sent: Tracks, linked: list[str], group: RunGroup) -> Bool:
     """(F,) which lists a unit that is there in this run sends by a link."""
     sending = np.array([name in linked for name in sent.units])
     if sent.units != (TRUTH,):
-        sending &= presence.sending
+        sending &= group.sending
     sent_by_link: Bool = sending[sent.frame_unit_ix] & np.isfinite(sent.common_arrives_s)
     return sent_by_link
 

@@ -8,50 +8,40 @@ depends on where the cuts are.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 
-from copem_replay.communication.arrivals import fusion_schedule
 from copem_replay.communication.link import KeptDraws
 from copem_replay.communication.reception import RadioPath
 from copem_replay.core.errors import ExperimentError
-from copem_replay.core.interpolation import AROUND_S, interpolate_at_instants
-from copem_replay.core.tracks import WHOLE, Bool, Float, Int, Scene, TimeChunk, Tracks
+from copem_replay.core.interpolation import AROUND_S, interpolate_at_instants, interpolate_at_stated_instants
+from copem_replay.core.object_list import AGREE
+from copem_replay.core.tracks import CLASSES, Bool, Float, Int, Scene, TimeChunk, Tracks, class_indices, join_tracks
 from copem_replay.experiment.schema import Configuration, Experiment
 from copem_replay.fusion.interface import ListFusion
 from copem_replay.io.recorded_units import RecordedUnits, join_recorded_units
 from copem_replay.io.recording import Recording
-from copem_replay.metrics.accuracy.held import HeldFrames
+from copem_replay.metrics.accuracy.held import HeldFrames, make_held_frames
 from copem_replay.metrics.braking.encounter import EgoPath, Encounter, find_encounters
 from copem_replay.metrics.braking.verdict import find_passing_intervals
+from copem_replay.metrics.config import Measure, MetricsSetup
 from copem_replay.metrics.detection.conflict import keep_episodes_within
-from copem_replay.metrics.episodes import Episodes, find_episodes, first_sights
+from copem_replay.metrics.episodes import (
+    Episodes,
+    Reference,
+    find_episodes,
+    first_sights,
+    locate_reference,
+    measured_objects,
+)
 from copem_replay.perception.observation import KeptShares, Observations, join_observations, observe_objects
 from copem_replay.perception.sensor_poses import SensorPoses, list_instants, place_units
-from copem_replay.pipeline.expansion import ExpandedExperiment, Presence, expand_experiment
-from copem_replay.pipeline.receiver import (
-    StatedCaptures,
-    draw_shown_ghosts,
-    perceive_all_units,
-    receive_lists,
-    state_captures,
-)
-from copem_replay.pipeline.scoring import TruthCache, make_log_frames
-from copem_replay.pipeline.world import (
-    ClaimedRows,
-    OnAir,
-    Perceived,
-    WorldChunk,
-    asks_for_path,
-    claim_rows,
-    find_radio_paths,
-    has_channel,
-    select_sent_objects,
-)
+from copem_replay.pipeline.expansion import ExpandedExperiment, expand_experiment
 
 # Time chunks.
 
@@ -67,11 +57,9 @@ _AFTER = 0.381966
 
 def time_chunks(scene: Scene, truth: Tracks, experiment: ExpandedExperiment) -> tuple[TimeChunk, ...]:
     """A log in time chunks of about as many observation rows each."""
-    if not _can_be_cut(experiment.configurations.values()):
-        return (WHOLE,)
     rows = observation_rows(scene, truth, experiment)
-    if rows <= ROWS_AT_ONCE:
-        return (WHOLE,)
+    if rows <= ROWS_AT_ONCE or not _can_be_cut(experiment.configurations.values()):
+        return (TimeChunk(),)
     _, bounds = truth.by_frame
     pieces = int(-(-rows // ROWS_A_CHUNK))
     frames = np.unique(np.searchsorted(bounds, np.linspace(0, len(truth.frame_ix), pieces + 1)[1:-1]))
@@ -92,60 +80,93 @@ def _can_be_cut(configurations: Iterable[Configuration]) -> bool:
     return all(fusion.resumable for c in configurations if isinstance(fusion := c.fusion, ListFusion))
 
 
-class Reach:
-    """The earliest captures that the receivers need in a time chunk: of lists that arrive, are kept, or looked back to.
+# The truth at the instants of fused lists.
 
-    `received`: by configuration the lists that reach its receiver, whatever is in them. `stated`: the captures that
-    their units state, None where these are true.
-    """
+KEPT = 64
+"""Sets of instants of which the truth is kept. More take more memory, and where arrivals are drawn no set comes again:
+each run has its own. No result depends on it."""
 
-    def __init__(
-        self,
-        experiment: ExpandedExperiment,
-        received: Mapping[str, Tracks],
-        stated: Mapping[str, StatedCaptures | None] | None = None,
-    ) -> None:
-        self._oldest: list[tuple[Float, Float]] = []  # instants, and the oldest capture that each needs
-        self._again: list[tuple[Float, Float]] = []
-        for name, configuration in experiment.configurations.items():
-            lists = received[name]
-            schedule = fusion_schedule(lists, max_age_s=configuration.max_age_s)
-            if not len(schedule.issue_s):
-                continue
-            # The lists that arrive at an instant, and those that are fused beside them.
-            oldest_s = np.minimum.reduceat(lists.captured_s[schedule.arrived], schedule.arrived_start[:-1])
-            used_s = np.where(schedule.newest >= 0, lists.captured_s[schedule.newest], np.inf).min(axis=1)
-            if partial := {
-                n for n, of in experiment.modelled.items() if of.sends is not None and of.sends.partial
-            }:  # entries are kept for max_age_s after a message that leaves them out
-                of_partial = np.array([unit in partial for unit in lists.units], dtype=bool)[lists.frame_unit_ix]
-                way_s = np.where(
-                    of_partial & np.isfinite(lists.common_arrives_s), lists.common_arrives_s - lists.captured_s, 0.0
-                )
-                used_s = np.minimum(used_s, schedule.issue_s - configuration.max_age_s - way_s.max(initial=0.0))
-            self._oldest.append((schedule.issue_s, np.minimum(oldest_s, used_s)))
-            fusion = configuration.fusion
-            if isinstance(fusion, ListFusion) and fusion.looks_back_s > 0:
-                arrives_s, captured_s = lists.common_arrives_s[schedule.arrived], lists.captured_s[schedule.arrived]
-                ahead_s = 0.0
-                if (
-                    stated is not None and (stated_captures := stated[name]) is not None
-                ):  # it looks back in stated captures
-                    captured_s, ahead_s = stated_captures.stated_s[schedule.arrived], stated_captures.ahead_s
-                newest_s = np.maximum.accumulate(captured_s)
-                self._again.append((arrives_s, newest_s - ahead_s - fusion.looks_back_s - AROUND_S))
+T = TypeVar("T")
 
-    def earliest_s(self, chunk: TimeChunk) -> float:
-        """The earliest capture that a time chunk needs."""
-        earliest_s = chunk.from_s
-        for issue_s, oldest_s in self._oldest:
-            first, after = np.searchsorted(issue_s, (chunk.from_s, chunk.until_s))
-            earliest_s = min(earliest_s, float(oldest_s[first:after].min(initial=np.inf)) - AROUND_S)
-        for arrives_s, needed_s in self._again:
-            arrived = int(np.searchsorted(arrives_s, chunk.from_s))
-            if arrived:
-                earliest_s = min(earliest_s, float(needed_s[arrived - 1]))
-        return earliest_s
+
+def _cache_instants(cache: dict[bytes, T], time_s: Float, compute: Callable[[Float], T]) -> T:
+    """What the cache has of these instants, else what `compute` gives, which replaces the oldest entry."""
+    key = time_s.tobytes()
+    value = cache.get(key)
+    if value is None:
+        value = cache[key] = compute(time_s)
+        for oldest in list(cache)[:-KEPT]:
+            cache.pop(oldest, None)
+    return value
+
+
+@dataclass(frozen=True)
+class TruthCache:
+    """One log's truth at the instants of fused lists; configurations with the same instants share it."""
+
+    scene: Scene
+    truth: Tracks
+    experiment: MetricsSetup
+    _worlds: dict[bytes, Tracks] = field(default_factory=dict)
+    _references: dict[bytes, Reference] = field(default_factory=dict)
+
+    def at(self, time_s: Float) -> Tracks:
+        """The truth at instants (K,), ascending."""
+        return _cache_instants(self._worlds, time_s, self._at)
+
+    def between(self, time_s: Float) -> Tracks:
+        """The truth at instants (K,), ascending, which is not kept."""
+        return self._at(time_s)
+
+    def at_stated(self, time_s: Float, captured_s: tuple[Float, Float]) -> Tracks:
+        """The truth at stated instants (K,), ascending; `captured_s`: the earliest and latest true capture of each."""
+        return _cache_instants(self._worlds, np.stack([time_s, *captured_s]), self._at_stated)
+
+    def _at(self, time_s: Float) -> Tracks:
+        return interpolate_at_instants(
+            self._near(time_s), self._stamps(time_s), t0_ns=self.scene.t0_ns, max_gap_s=self.experiment.max_gap_s
+        )
+
+    def _at_stated(self, times_s: Float) -> Tracks:
+        stamps, earliest, latest = self._stamps(times_s)
+        return interpolate_at_stated_instants(
+            self._near(times_s[0]), stamps, (earliest, latest), t0_ns=self.scene.t0_ns,
+            max_gap_s=self.experiment.max_gap_s,
+        )  # fmt: skip
+
+    def _stamps(self, time_s: Float) -> Int:
+        return self.scene.t0_ns + np.rint(time_s * 1e9).astype(np.int64)
+
+    def _near(self, time_s: Float) -> Tracks:
+        """The part of the truth that interpolation at instants (K,) needs."""
+        if not len(time_s):
+            return self.truth
+        gap_s = self.experiment.max_gap_s + AROUND_S
+        return self.truth.captured_between(time_s[0] - gap_s, time_s[-1] + gap_s)
+
+    def reference(self, time_s: Float) -> Reference:
+        """From where distances are measured, at instants (K,)."""
+        return _cache_instants(
+            self._references, time_s, lambda time_s: locate_reference(self.scene, self.truth, self.experiment, time_s)
+        )
+
+    def classes(self, measure: Measure) -> Bool:
+        """(C,) which classes are measured: an entry without a true object is a ghost only if it is of one of these."""
+        measured: Bool = np.zeros(len(CLASSES), dtype=bool)
+        measured[self.scene.object_class[measured_objects(self.scene, measure)]] = True
+        if measure.objects.ids is None and measure.objects.classes is not None:
+            measured[class_indices(measure.objects.classes)] = True
+        # A `vehicle` may be a car; an entry without a class (`other`) may be anything.
+        may_be_measured: Bool = np.array(AGREE[:, measured].any(axis=1))
+        may_be_measured[CLASSES.index("other")] = measured[CLASSES.index("other")]
+        return may_be_measured
+
+    def since_s(self, episodes: Episodes) -> Float:
+        """(M,) when the object of each episode first is in the log."""
+        first = np.full(len(self.scene.object_ids), np.inf)
+        np.minimum.at(first, self.truth.row_object_ix, self.truth.row_captured_s)
+        since: Float = first[episodes.object_ix]
+        return since
 
 
 @dataclass(frozen=True)
@@ -212,13 +233,18 @@ class Replay:
     @cached_property
     def held_frames(self) -> HeldFrames:
         """The frames at which it is measured what receivers hold."""
-        return make_log_frames(self.truth_cache, self.episodes)
+        around = self.truth_cache
+        return make_held_frames(self.truth.captured_s, self.episodes.firsts, around.between, around.reference)
 
     def truth_cache_of(self, chunk: TimeChunk) -> TruthCache:
         """The truth that configurations share: of a whole log it is kept, of a time chunk it is made anew."""
-        if chunk == WHOLE:
-            return self.truth_cache
-        return TruthCache(self.scene, self.truth, self.expanded)
+        whole = chunk == TimeChunk()
+        return self.truth_cache if whole else TruthCache(self.scene, self.truth, self.expanded)
+
+    @cached_property
+    def kept_draws(self) -> KeptDraws:
+        """What links drew for the lists of this log."""
+        return KeptDraws()
 
     @cached_property
     def _shares(self) -> KeptShares:
@@ -227,6 +253,11 @@ class Replay:
     @cached_property
     def _whole(self) -> Observations:
         return observe_objects(self.scene, self.truth, self.expanded, self.placed)
+
+    @cached_property
+    def no_rows(self) -> Observations:
+        """The lists of the modelled units of the whole log, without rows."""
+        return observe_objects(self.scene, self.truth, self.expanded, self.placed, from_s=np.inf)
 
     @cached_property
     def measured(self) -> Observations:
@@ -239,154 +270,64 @@ class Replay:
 
     def observe(self, chunk: TimeChunk, from_s: float | None = None) -> Observations:
         """The observation rows captured in a time chunk, or from `from_s` on. Those of a whole log are kept."""
-        if chunk == WHOLE:
+        if chunk == TimeChunk():
             return self._whole
+        begin_s = chunk.from_s if from_s is None else from_s
         return observe_objects(
-            self.scene,
-            self.truth,
-            self.expanded,
-            self.placed,
-            from_s=chunk.from_s if from_s is None else from_s,
-            until_s=chunk.until_s,
-            kept=self._shares,
-            cut_s=chunk.from_s,
-        )
+            self.scene, self.truth, self.expanded, self.placed, from_s=begin_s, until_s=chunk.until_s,
+            kept=self._shares, cut_s=chunk.from_s,
+        )  # fmt: skip
 
-    def world(self, experiment: Experiment) -> WorldChunk:
-        """The whole log as the units of an experiment perceive it."""
-        units = self.expanded.with_(experiment)
-        return WorldChunk(self.scene, self.truth, self._whole.listable, self.recorded, units, placed=self.placed)
+    def observe_listable(self, chunk: TimeChunk, from_s: float, *, complete: bool) -> Observations:
+        """The rows that can be listed, captured from `from_s` on; of all objects, or only of those with an episode."""
+        if complete:
+            return self.observe(chunk, from_s).listable
+        if len(self.chunks) == 1:
+            return self.measured.listable
+        return self.observe(chunk, from_s).of_objects(self.episodes.object_ix).listable
 
-    def worlds(
-        self,
-        experiment: Experiment,
-        runs: Int,
-        presence: Presence,
-        *,
-        measured_only: bool = False,
-        perceived: Perceived | None = None,
-    ) -> Iterator[WorldChunk]:
-        """The log as units perceive it, chunk by chunk, for runs (S,) that have the same lists.
+    @property
+    def rows_kept(self) -> int:
+        """How many observation rows are kept: all of a log in one time chunk, of others those of measured objects."""
+        kept = self.measured if len(self.chunks) > 1 else self._whole
+        return len(kept.tracks.frame_ix)
 
-        `presence`: which units there are. `measured_only`: of objects with an episode. `perceived`: of a log in one
-        chunk what units list in these and other runs.
-        """
-        sending, equipped = presence.sending, presence.listing
-        if self.chunks == (WHOLE,):
-            on_air = self.on_air(experiment, runs, equipped, perceived)
-            whole = replace(self.world(experiment), on_air=on_air, perceived=perceived)
-            yield replace(whole, observations=self.measured.listable) if measured_only else whole
-            return
-        lists = self.lists_only(experiment, runs[:1], equipped)
-        units, seen = lists.experiment, perceive_all_units(lists, runs[:1], states="true")
-        received = {name: receive_lists(seen, lists, name, sending) for name in units.configurations}
-        stated = None
-        if units.runs_apart:
-            stated = {name: state_captures(self.scene, of, units, int(runs[0])) for name, of in received.items()}
-        reach = Reach(units, received, stated)
-        for chunk in self.chunks:
-            earliest_s = reach.earliest_s(chunk)
-            observations = self.observe(chunk, earliest_s).listable
-            yield WorldChunk(
-                self.scene,
-                self.truth.captured_between(earliest_s, chunk.until_s),
-                observations.of_objects(self.episodes.object_ix) if measured_only else observations,
-                None if self.recorded is None else self.recorded.captured_between(earliest_s, chunk.until_s),
-                units,
-                chunk,
-                self.placed,
-                earliest_s,
-                lists.on_air,
-            )
-
-    def lists_only(self, experiment: Experiment, runs: Int | None = None, equipped: Bool | None = None) -> WorldChunk:
-        """The lists of the whole log without entries. `runs (S,)`: one if arrivals are drawn; None: no draws."""
-        none = np.empty(0, dtype=np.int64)
-        observations = observe_objects(self.scene, self.truth, self.expanded, self.placed, from_s=np.inf)
-        recorded = None if self.recorded is None else self.recorded.captured_between(np.inf, np.inf)
-        units = self.expanded.with_(experiment)
-        on_air = None if runs is None else self.on_air(experiment, runs, equipped)
-        return WorldChunk(self.scene, self.truth.take_rows(none), observations, recorded, units, on_air=on_air)
-
-    def on_air(
-        self, experiment: Experiment, runs: Int, equipped: Bool | None = None, perceived: Perceived | None = None
-    ) -> OnAir | None:
-        """The input of drawn links in one run (1,); None: no link is drawn. `equipped (1, U)`: which units list."""
-        units = self.expanded.with_(experiment)
-        if not units.arrivals_differ:
-            return None
-        if perceived is None:
-            return self._on_air(units, runs, equipped, None)
-        return perceived.on_air(int(runs[0]), lambda: self._on_air(units, runs, equipped, perceived))
-
-    def _on_air(
-        self, units: ExpandedExperiment, runs: Int, equipped: Bool | None, perceived: Perceived | None
-    ) -> OnAir:
-        path = self.paths if asks_for_path(units, self.scene) else None
-        on_air = OnAir(int(runs[0]), path, None, kept=self._drawn)
-        if units.sends:
-            on_air = replace(on_air, sent=select_sent_objects(units, self._listed_in(units, runs, equipped, perceived)))
-        if has_channel(units):
-            on_air = replace(on_air, objects=self._counts(units, runs, equipped, on_air, perceived))
-        return on_air
-
-    @cached_property
-    def _drawn(self) -> KeptDraws:
-        return KeptDraws()
-
-    def _listed_in(
-        self, units: ExpandedExperiment, runs: Int, equipped: Bool | None, perceived: Perceived | None
-    ) -> Iterator[tuple[WorldChunk, Tracks, ClaimedRows]]:
-        """What the modelled units list in one run, chunk by chunk."""
-        for chunk in self.chunks:
-            observations = self.observe(chunk).listable
-            world = WorldChunk(
-                self.scene, self.truth, observations, None, units, chunk, self.placed, chunk.from_s, perceived=perceived
-            )
-            ghosts = draw_shown_ghosts(world, runs)
-            seen = perceive_all_units(world, runs, states="sampled", equipped=equipped, ghosts=ghosts)
-            yield world, seen, claim_rows(world, runs, ghosts)
-
-    def _counts(
-        self, units: ExpandedExperiment, runs: Int, equipped: Bool | None, on_air: OnAir, perceived: Perceived | None
-    ) -> Int:
-        """(F,) how many entries each list of one run has, ghosts among them."""
-        counts = np.zeros(0, dtype=np.int64)
-        for chunk in self.chunks:
-            recorded = None if self.recorded is None else self.recorded.captured_between(chunk.from_s, chunk.until_s)
-            observations = self.observe(chunk).listable
-            world = WorldChunk(
-                self.scene,
-                self.truth,
-                observations,
-                recorded,
-                units,
-                chunk,
-                self.placed,
-                chunk.from_s,
-                on_air,
-                perceived,
-            )
-            seen = perceive_all_units(
-                world, runs, states="true", equipped=equipped, ghosts=draw_shown_ghosts(world, runs)
-            )
-            of_chunk = np.bincount(seen.frame_ix[seen.valid[0]], minlength=len(seen.stamp_ns))
-            counts = of_chunk + counts if len(counts) else of_chunk
-        return counts
+    def add_recorded(self, seen: Tracks, recorded: RecordedUnits | None) -> Tracks:
+        """What modelled units list, and then lists of recorded ones; units are in the experiment's order."""
+        if recorded is None:
+            return seen
+        lists = recorded.tracks
+        lists = replace(lists, valid=np.broadcast_to(lists.valid, (len(seen.valid), len(lists.frame_ix))))
+        both = join_tracks((*seen.units, *lists.units), [seen, lists])
+        # It decides between lists that arrive together.
+        names = tuple(self.expanded.units)
+        place = np.array([names.index(name) for name in both.units])
+        return replace(both, units=names, unit_ix=place[both.unit_ix], frame_unit_ix=place[both.frame_unit_ix])
 
     @cached_property
     def paths(self) -> RadioPath:
-        """The radio path of each list of all units to the ego."""
-        return find_radio_paths(self.rows_of(np.array([self.scene.ego_ix])), self.scene, self.expanded, self._lists)
+        """The radio path of each list (F,) of all units to the ego.
 
-    @property
-    def senders(self) -> np.ndarray:
-        """(F,) the unit of each list of all units, by name."""
-        return np.array(self._lists.units)[self._lists.frame_unit_ix]
+        A list aboard the ego has distance 0, one of a recorded unit NaN, one without an observation of the ego ∞.
+        """
+        expanded, senders = self.expanded, self.senders
+        of_ego, F = self.rows_of(np.array([self.scene.ego_ix])), len(senders)
+        distance_m: Float = np.full(F, np.inf)
+        visible_share: Float = np.zeros(F)
+        distance_m[of_ego.tracks.frame_ix] = of_ego.view.range_m
+        visible_share[of_ego.tracks.frame_ix] = of_ego.view.visible_share
+        ego = self.scene.object_ids[self.scene.ego_ix]
+        is_aboard = np.isin(senders, [name for name, unit in expanded.modelled.items() if unit.on in ("ego", ego)])
+        is_recorded = np.isin(senders, list(expanded.recorded))
+        distance_m[is_aboard], visible_share[is_aboard] = 0.0, 1.0
+        distance_m[is_recorded] = visible_share[is_recorded] = np.nan
+        return RadioPath(distance_m, visible_share)
 
     @cached_property
-    def _lists(self) -> Tracks:
-        return perceive_all_units(self.lists_only(self.expanded.written), np.zeros(1, dtype=np.int64), states="true")
+    def senders(self) -> np.ndarray:
+        """(F,) the unit of each list of all units, by name; the modelled ones' first."""
+        lists = self.add_recorded(self.no_rows.tracks, self.recorded)
+        return np.array(lists.units, dtype=str)[lists.frame_unit_ix]
 
 
 def _find_kept_episodes(

@@ -7,34 +7,32 @@ entry tells is what is stated, as a clock error is an error.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from copem_replay.communication.arrivals import FusionSchedule, KeptEntries, SentEntries, fusion_schedule, keep_entries
-from copem_replay.communication.link import delay_until_ready, sample_arrivals, transmit
+from copem_replay.communication.arrivals import FusionSchedule, SentEntries, fusion_schedule, keep_entries
 from copem_replay.core.compiled import borrowing
 from copem_replay.core.fused_tracks import EntrySources, FusedTracks, find_newest_and_first
+from copem_replay.core.interpolation import AROUND_S
 from copem_replay.core.object_list import COVARIANCES, ENTRY, ObjectLists, TellsOf
-from copem_replay.core.random import CounterRng, RandomKey, object_words
+from copem_replay.core.random import CounterRng, RandomKey
 from copem_replay.core.tracks import (
     NO_CAPTURE_NS,
     SAME_INSTANT_S,
     TRUTH,
     VALUES,
-    WHOLE,
     Bool,
     Float,
     Int,
     Scene,
+    TimeChunk,
     Tracks,
     UnitFaults,
-    append_tracks,
-    join_tracks,
 )
 from copem_replay.experiment.schema import Configuration
 from copem_replay.fusion.ideal import (
@@ -44,16 +42,13 @@ from copem_replay.fusion.ideal import (
     fuse_ideal,
     keep_by_object,
 )
-from copem_replay.fusion.inputs import EntryClaims, RowEntries, add_kept_entries, listed_rows, make_inputs
+from copem_replay.fusion.inputs import add_kept_entries, listed_rows, make_entry_lists, make_inputs
 from copem_replay.fusion.interface import IdealFusion, ListFusion, ask_fusion, ask_resumed_fusion
 from copem_replay.metrics.matching import MATCH, Matches
-from copem_replay.perception.ghosts import GhostRows, draw_ghosts, make_ghost_draws
-from copem_replay.perception.perceive import add_states, clock_errors_s, remove_outages
-from copem_replay.pipeline.world import States, WorldChunk, claim_rows, perceive_modelled
-
-if TYPE_CHECKING:
-    from copem_replay.pipeline.expansion import ExpandedExperiment
-
+from copem_replay.perception.ghosts import GhostRows
+from copem_replay.perception.perceive import EntryClaims, clock_errors_s
+from copem_replay.pipeline.expansion import ExpandedExperiment
+from copem_replay.pipeline.world import States, Transmission, WorldChunk
 
 # Tracks with truth ids ↔ lists without: every fusion is measured, written and shown alike.
 
@@ -116,15 +111,9 @@ def _fill_words(
             start[s, f + 1] = n
 
 
-def convert_to_tracks(
-    lists: ObjectLists, run: int, matches: Matches, received: Tracks, issue_s: Float, newest: Int,
-    stated_s: Float | None = None,
-) -> FusedTracks:  # fmt: skip
-    """The lists of one run as tracks: one of each matched object, one of each identity else, one of each entry else.
-
-    `issue_s (K,)`: the receiver's instants. `newest (K, U)`: the newest list of each unit then, −1: none. `stated_s
-    (N,)`: captures of all entries as the fusion was told of them; None: the true ones.
-    """
+def convert_to_tracks(output: ReceiverOutput, run: int, matches: Matches) -> FusedTracks:
+    """The lists of one run as tracks: one of each matched object, one of each identity else, one of each entry else."""
+    lists, received, issue_s, newest = output.lists, output.received, output.instants.issue_s, output.instants.newest
     first, last = int(lists.start[run, 0]), int(lists.start[run, -1])
     entries = lists.entries[first:last]
     frame = np.repeat(np.arange(len(issue_s)), np.diff(lists.start[run]))
@@ -153,7 +142,7 @@ def convert_to_tracks(
         **{name: entries[name][order][None] for name in (*VALUES, *COVARIANCES)},
     )
     none = np.zeros(len(order) + 1, dtype=np.int64)
-    stated_s = None if stated_s is None else stated_s[first:last][order]
+    stated_s = None if output.stated is None else output.told.entries["captured_s"][first:last][order]
     return FusedTracks(fused, received, none[:0], none, None, entries[order], stated_s=stated_s)
 
 
@@ -252,75 +241,22 @@ class ReceiverOutput:
         assert self.fused_tracks is not None
         return convert_to_lists(self.fused_tracks, self.scene)
 
+    def tracks_by_run(self, matches: Matches | None) -> Iterator[tuple[int, FusedTracks]]:
+        """The fused tracks, and the first of the runs that they are of: of all, or where they have no truth ids of one.
+
+        `matches`: of the fused lists; None: no list is without truth ids.
+        """
+        if self.fused_tracks is not None:
+            yield 0, self.fused_tracks
+            return
+        assert matches is not None
+        for s in range(len(self.lists.start)):
+            yield s, convert_to_tracks(self, s, matches)
+
     @property
     def captures_told_s(self) -> Float:
         """(F,) the captures of the lists that were received, as fusion was told of them."""
         return self.received.captured_s if self.stated is None else self.stated.stated_s
-
-
-def perceive_all_units(
-    world: WorldChunk,
-    runs: Int,
-    *,
-    states: States,
-    equipped: Bool | None = None,
-    ghosts: GhostRows | None = None,
-) -> Tracks:
-    """What every unit lists in the runs (S,), whatever its lists come from. `equipped (S, U)` as in `perceive`.
-
-    One run at a time where lists differ from run to run (outages, a drawn `ready`), or with `ghosts`: rows without an
-    object, which come after those of objects and before those of recorded units.
-    """
-    experiment = world.experiment
-    if world.perceived is not None:
-        seen = world.perceived.seen(world, int(runs[0]), states)
-    else:
-        seen = perceive_modelled(world, runs, states, equipped)
-    if ghosts is not None:
-        drawn = make_ghost_draws(world.scene, ghosts, experiment, int(runs[0]))
-        seen = append_tracks(
-            seen, add_states(world.scene, ghosts.observations.tracks, ghosts.observations, experiment, drawn)
-        )
-    seen = remove_outages(world.scene, seen, experiment, runs)
-    seen = delay_until_ready(seen, experiment.ready, CounterRng(experiment.seed, world.scene.log), runs)
-    if world.on_air is not None and (sent := world.on_air.sent) is not None:
-        words = object_words(world.scene.object_ids)[world.observations.tracks.row_object_ix]
-        seen = sent.of(seen, words if ghosts is None else np.concatenate([words, ghosts.words]))
-    if world.recorded is None:
-        return seen
-    recorded = world.recorded.tracks
-    recorded = replace(recorded, valid=np.broadcast_to(recorded.valid, (len(runs), len(recorded.frame_ix))))
-    both = join_tracks((*seen.units, *recorded.units), [seen, recorded])
-    # In the experiment's order: it decides between lists that arrive together.
-    names = tuple(experiment.units)
-    place = np.array([names.index(name) for name in both.units])
-    return replace(both, units=names, unit_ix=place[both.unit_ix], frame_unit_ix=place[both.frame_unit_ix])
-
-
-def receive_lists(
-    seen: Tracks,
-    world: WorldChunk,
-    name: str,
-    present: Bool | None = None,
-    *,
-    ticks: bool = True,
-) -> Tracks:
-    """What reaches the receiver of the configuration `name`: the lists of its units, late; those of the others never.
-
-    `present (U,)`: which units there are, None: all. Rows are not copied: configurations share them and their draws.
-    `ticks=False`: arrivals as links give them, not at the receiver's next instant (`issue_hz`). Raises InputError where
-    a link of the user's own fails.
-    """
-    experiment, scene, on_air = world.experiment, world.scene, world.on_air
-    configuration, links = experiment.configurations[name], experiment.links_of(name)
-    of_truth = configuration.units == TRUTH
-    lists = world.truth if of_truth else seen
-    air = None if on_air is None else on_air.of(lists, scene, experiment.seed)
-    received = None if of_truth else set(experiment.units_of(configuration))
-    if received is not None and present is not None:
-        received &= {unit for unit, here in zip(seen.units, present, strict=True) if here}
-    arriving = transmit(lists, links, received, air=air)
-    return sample_arrivals(arriving, configuration.issue_hz) if ticks else arriving
 
 
 def has_truth_ids(configuration: Configuration) -> bool:
@@ -329,63 +265,77 @@ def has_truth_ids(configuration: Configuration) -> bool:
     return computed and (configuration.units == TRUTH or isinstance(configuration.fusion, IdealFusion))
 
 
+def states_needed(configuration: Configuration) -> States | None:
+    """What has to be drawn of units' rows for the fused states of a configuration; None, of the truth: nothing."""
+    if configuration.units == TRUTH:
+        return None
+    fusion = configuration.fusion
+    return "expected" if isinstance(fusion, IdealFusion) and fusion.combine == "posterior" else "sampled"
+
+
 class Receivers:
-    """The receivers of all configurations, of the units that are `present (U,)`, and what they remember.
+    """The receivers of the configurations `names`, None: of all, and what they remember.
 
     Time chunks of one log are received one after the other, in order of time.
     """
 
-    def __init__(self, runs: Int, present: Bool | None) -> None:
-        self._runs, self._present = runs, present
-        self._schedules: dict[str, FusionSchedule] = {}
-        self._memory: dict[str, Any] = {}
+    def __init__(self, lists: Transmission, names: Collection[str] | None = None) -> None:
+        self._lists, self._memory = lists, dict[str, Any]()
+        self._told: tuple[WorldChunk, tuple[ObjectLists, Int]] | None = None
+        self._last_fused: tuple[Tracks, bytes, FusedTracks] | None = None
+        self._schedules = {
+            name: fusion_schedule(lists.received(name), max_age_s=configuration.max_age_s)
+            for name, configuration in lists.experiment.configurations.items()
+            if names is None or name in names
+        }
+
+    def worlds(self) -> Iterator[WorldChunk]:
+        """The log as units perceive it, chunk by chunk, each with the earlier captures that the receivers need."""
+        lists, chunks = self._lists, self._lists.log.chunks
+        reach = None
+        if len(chunks) > 1:
+            received = {name: lists.received(name) for name in self._schedules}
+            stated = {name: self._state_captures(of) for name, of in received.items()}
+            reach = Reach(lists.experiment, received, stated)
+        for chunk in chunks:
+            yield lists.world(chunk, chunk.from_s if reach is None else reach.earliest_s(chunk))
 
     def issue_s(self, name: str) -> Float:
-        """(K,) all instants of a configuration's receiver, once `receive` has reached the configuration."""
+        """(K,) all instants of a configuration's receiver."""
         return self._schedules[name].issue_s
 
-    def receive(self, world: WorldChunk) -> Iterator[tuple[str, ReceiverOutput]]:
-        """What each configuration's receiver issues in the runs (S,), in the time chunk.
+    def fuse(self, world: WorldChunk, name: str) -> ReceiverOutput:
+        """What the receiver of a configuration issues in a time chunk, of the lists that reach it.
 
         Raises InputError where a fusion of the user's own fails.
         """
-        shared = _SharedLists(world, self._runs)
-        for name, configuration in world.experiment.configurations.items():
-            yield name, self._receive_configuration(shared, name, configuration)
-
-    def _receive_configuration(self, shared: _SharedLists, name: str, configuration: Configuration) -> ReceiverOutput:
-        world, fusion, of_truth = shared.world, configuration.fusion, configuration.units == TRUTH
-        posterior = isinstance(fusion, IdealFusion) and fusion.combine == "posterior" and not of_truth
-        states: States = "expected" if posterior else "sampled"
-        seen = shared.seen(states)
-        received = receive_lists(seen, world, name, self._present)
-        if name not in self._schedules:
-            self._schedules[name] = fusion_schedule(received, max_age_s=configuration.max_age_s)
-        faults = None if of_truth else _find_faults(world, seen, None if posterior else shared.ghosts)
+        configuration = world.experiment.configurations[name]
+        fusion, states, faults = configuration.fusion, states_needed(configuration), None
+        sent = world.truth if states is None else world.sent(states)
+        if states is not None:
+            faults = _find_faults(world, sent, None if states == "expected" else world.ghosts)
         if isinstance(fusion, IdealFusion) and faults is not None:
             faults = replace(faults, ghosts=faults.ghosts[:0])  # ideal fusion leaves ghosts out
         output = ReceiverOutput(
-            received=received, sent=world.truth if of_truth else seen,
+            received=self._lists.receive(sent, name), sent=sent,
             instants=self._schedules[name].between(world.chunk.from_s, world.chunk.until_s),
-            fused_tracks=None, scene=world.scene, fused=None, whole=world.chunk == WHOLE, faults=faults,
+            fused_tracks=None, scene=world.scene, fused=None, whole=len(world.log.chunks) == 1, faults=faults,
         )  # fmt: skip
         if isinstance(fusion, ListFusion):
-            return self._fuse_lists(shared, name, fusion, output)
-        fused_tracks = self._fuse_by_truth_id(shared, name, states, output)
-        if posterior:
-            fused_tracks = draw_posterior(fused_tracks, world.scene, world.experiment.seed, self._runs)
+            return self._fuse_lists(world, name, fusion, output)
+        fused_tracks = self._fuse_by_truth_id(world, name, output)
+        if states == "expected":
+            fused_tracks = draw_posterior(fused_tracks, world.scene, world.experiment.seed, world.group.runs)
         return replace(output, fused_tracks=fused_tracks)
 
-    def _fuse_lists(
-        self, shared: _SharedLists, name: str, fusion: ListFusion, output: ReceiverOutput
-    ) -> ReceiverOutput:
+    def _fuse_lists(self, world: WorldChunk, name: str, fusion: ListFusion, output: ReceiverOutput) -> ReceiverOutput:
         """Fusion of lists without truth ids, told of the captures that units state."""
-        experiment, received, instants = shared.world.experiment, output.received, output.instants
+        experiment, received, instants = world.experiment, output.received, output.instants
         max_age_s = experiment.configurations[name].max_age_s
-        lists, same = shared.without_truth_ids
-        stated = None
-        if experiment.runs_apart:  # then the block has one run
-            stated = state_captures(shared.world.scene, received, experiment, int(self._runs[0]))
+        if self._told is None or self._told[0] is not world:
+            self._told = world, remove_truth_ids(world)
+        lists, same = self._told[1]
+        stated = self._state_captures(received)
         if stated is not None:
             lists = stated.as_told(lists)
         captured_s = None if stated is None else stated.stated_s
@@ -402,65 +352,37 @@ class Receivers:
             fused = ask_fusion(fusion, inputs, where)
         return replace(output, fused=fused, tells_of=fusion.tells_of, stated=stated)
 
-    def _fuse_by_truth_id(self, shared: _SharedLists, name: str, states: States, output: ReceiverOutput) -> FusedTracks:
-        """Ideal fusion, or the truth itself, at the instants of the configuration."""
-        world, configuration = shared.world, shared.world.experiment.configurations[name]
-        received, instants, of_truth, kept = output.received, output.instants, configuration.units == TRUTH, None
+    def _state_captures(self, received: Tracks) -> StatedCaptures | None:
+        """What a fusion is told of captures, in a group of one run; None: the truth."""
+        experiment, runs = self._lists.experiment, self._lists.group.runs
+        return (
+            state_captures(self._lists.log.scene, received, experiment, int(runs[0])) if experiment.runs_apart else None
+        )
+
+    def _fuse_by_truth_id(self, world: WorldChunk, name: str, output: ReceiverOutput) -> FusedTracks:
+        """Ideal fusion, or the truth itself, at the instants of the configuration.
+
+        Later lists of the same captures, as in a sweep, are fused once.
+        """
+        max_age_s = world.experiment.configurations[name].max_age_s
+        received, instants, kept = output.received, output.instants, None
         partial = _mark_partial(world.experiment, received)
         if partial.any():
-            kept = keep_by_object(received, partial, self._schedules[name], instants, max_age_s=configuration.max_age_s)
-        fused_tracks = shared.fuse_ideal(
-            received, instants, kept, states, of_truth=of_truth, max_age_s=configuration.max_age_s
+            kept = keep_by_object(received, partial, self._schedules[name], instants, max_age_s=max_age_s)
+        parts = (
+            instants.newest,
+            *find_lists_beside_newest(received, instants, kept),
+            *(() if kept is None else [kept.entry]),
         )
-        fused_tracks = fused_tracks.arriving(received, instants.issue_s)
-        if not of_truth and world.recorded is None:
+        captures, last = b"".join(part.tobytes() for part in parts), self._last_fused
+        if last is None or last[0] is not output.sent or last[1] != captures:
+            own, asked = world.scene.ego_ix, instants
+            fused = fuse_ideal(received, max_age_s=max_age_s, without_object_ix=own, instants=asked, kept=kept)
+            self._last_fused = last = output.sent, captures, fused
+        fused_tracks = last[2].arriving(received, instants.issue_s)
+        if output.sent is not world.truth and world.recorded is None:
             fused_tracks = replace(fused_tracks, view=world.observations.view)
         return fused_tracks
-
-
-class _SharedLists:
-    """What the configurations of a time chunk share in the runs (S,); each is made when it is first needed."""
-
-    def __init__(self, world: WorldChunk, runs: Int) -> None:
-        self.world, self._runs = world, runs
-        self.ghosts = draw_shown_ghosts(world, runs)
-        self._seen: dict[States, Tracks] = {}
-        self._last_fused: tuple[tuple[bool, States, bytes, bytes], FusedTracks] | None = None
-
-    def seen(self, states: States) -> Tracks:
-        """What all units list; ghosts only among `sampled` states."""
-        if states not in self._seen:
-            ghosts = self.ghosts if states == "sampled" else None
-            self._seen[states] = perceive_all_units(self.world, self._runs, states=states, ghosts=ghosts)
-        return self._seen[states]
-
-    @cached_property
-    def without_truth_ids(self) -> tuple[ObjectLists, Int]:
-        """What `remove_truth_ids` gives: the units' lists, and which entries a partial unit takes for one object."""
-        return remove_truth_ids(self.world, self.seen("sampled"), self._runs, self.ghosts)
-
-    def fuse_ideal(
-        self, received: Tracks, instants: FusionSchedule, kept: KeptEntries | None, states: States, *,
-        of_truth: bool, max_age_s: float,
-    ) -> FusedTracks:  # fmt: skip
-        """Ideal fusion of what is received: later lists of the same captures, as in a sweep, are fused once."""
-        entries = b"" if kept is None else kept.entry.tobytes()
-        beside = b"".join(part.tobytes() for part in find_lists_beside_newest(received, instants, kept))
-        made_of = (of_truth, states, instants.newest.tobytes(), beside + entries)
-        if self._last_fused is None or self._last_fused[0] != made_of:
-            weighed = None
-            if self.world.perceived is not None and not of_truth:
-                weighed = self.world.perceived.weighed(self.world, states, received)
-            fused_tracks = fuse_ideal(
-                received,
-                max_age_s=max_age_s,
-                without_object_ix=self.world.scene.ego_ix,
-                instants=instants,
-                kept=kept,
-                weighed=weighed,
-            )
-            self._last_fused = made_of, fused_tracks
-        return self._last_fused[1]
 
 
 def _mark_partial(experiment: ExpandedExperiment, received: Tracks) -> Bool:
@@ -469,17 +391,54 @@ def _mark_partial(experiment: ExpandedExperiment, received: Tracks) -> Bool:
     return np.array([unit in partial for unit in received.units], dtype=bool)
 
 
-def draw_shown_ghosts(world: WorldChunk, runs: Int) -> GhostRows | None:
-    """Ghosts of the units, where a block has one run and there is a fusion without truth ids."""
-    if not world.experiment.runs_apart or world.placed is None:
-        return None
-    between_s = world.earliest_s, world.chunk.until_s
-    return draw_ghosts(world.scene, world.observations, world.experiment, world.placed, int(runs[0]), between_s)
+class Reach:
+    """The earliest captures that the receivers need in a time chunk: of lists that arrive, are kept, or looked back to.
 
+    `received`: by configuration the lists that reach its receiver, whatever is in them. `stated`: the captures that
+    their units state, None where these are true.
+    """
 
-def run_receivers(world: WorldChunk, runs: Int, present: Bool | None) -> Iterator[tuple[str, ReceiverOutput]]:
-    """What each configuration's receiver issues in a whole log."""
-    return Receivers(runs, present).receive(world)
+    def __init__(
+        self,
+        experiment: ExpandedExperiment,
+        received: Mapping[str, Tracks],
+        stated: Mapping[str, StatedCaptures | None] | None = None,
+    ) -> None:
+        self._oldest: list[tuple[Float, Float]] = []  # instants, and the oldest capture that each needs
+        self._again: list[tuple[Float, Float]] = []
+        for name, lists in received.items():
+            configuration = experiment.configurations[name]
+            schedule = fusion_schedule(lists, max_age_s=configuration.max_age_s)
+            if not len(schedule.issue_s):
+                continue
+            # The lists that arrive at an instant, and those that are fused beside them.
+            oldest_s = np.minimum.reduceat(lists.captured_s[schedule.arrived], schedule.arrived_start[:-1])
+            used_s = np.where(schedule.newest >= 0, lists.captured_s[schedule.newest], np.inf).min(axis=1)
+            of_partial = _mark_partial(experiment, lists)[lists.frame_unit_ix] & np.isfinite(lists.common_arrives_s)
+            if of_partial.any():  # entries are kept for max_age_s after a message that leaves them out
+                way_s = (lists.common_arrives_s - lists.captured_s)[of_partial].max(initial=0.0)
+                used_s = np.minimum(used_s, schedule.issue_s - configuration.max_age_s - way_s)
+            self._oldest.append((schedule.issue_s, np.minimum(oldest_s, used_s)))
+            fusion = configuration.fusion
+            if isinstance(fusion, ListFusion) and fusion.looks_back_s > 0:
+                arrives_s, captured_s = lists.common_arrives_s[schedule.arrived], lists.captured_s[schedule.arrived]
+                ahead_s = 0.0
+                if stated is not None and (told := stated[name]) is not None:  # it looks back in stated captures
+                    captured_s, ahead_s = told.stated_s[schedule.arrived], told.ahead_s
+                newest_s = np.maximum.accumulate(captured_s)
+                self._again.append((arrives_s, newest_s - ahead_s - fusion.looks_back_s - AROUND_S))
+
+    def earliest_s(self, chunk: TimeChunk) -> float:
+        """The earliest capture that a time chunk needs."""
+        earliest_s = chunk.from_s
+        for issue_s, oldest_s in self._oldest:
+            first, after = np.searchsorted(issue_s, (chunk.from_s, chunk.until_s))
+            earliest_s = min(earliest_s, float(oldest_s[first:after].min(initial=np.inf)) - AROUND_S)
+        for arrives_s, needed_s in self._again:
+            arrived = int(np.searchsorted(arrives_s, chunk.from_s))
+            if arrived:
+                earliest_s = min(earliest_s, float(needed_s[arrived - 1]))
+        return earliest_s
 
 
 def _find_faults(world: WorldChunk, seen: Tracks, ghosts: GhostRows | None) -> UnitFaults | None:
@@ -489,50 +448,28 @@ def _find_faults(world: WorldChunk, seen: Tracks, ghosts: GhostRows | None) -> U
     first = len(world.observations.tracks.frame_ix)
     rows = np.arange(first, first + (0 if ghosts is None else len(ghosts.words)))
     not_made = np.isinf(seen.common_arrives_s)
-    if world.on_air is not None and (sent := world.on_air.sent) is not None:
-        not_made[: len(sent.lists)] &= sent.lists  # a list that is held back is made
+    if world.sending is not None:
+        not_made &= world.sending.lists  # a list that is held back is made
     return UnitFaults(rows, not_made)
 
 
-def remove_truth_ids(
-    world: WorldChunk, seen: Tracks, runs: Int, ghosts: GhostRows | None = None
-) -> tuple[ObjectLists, Int]:
+def remove_truth_ids(world: WorldChunk) -> tuple[ObjectLists, Int]:
     """The units' lists as a real fusion sees them: without truth ids, the entries of each in a random order.
 
     Second, (N,): entries with one number are one object to their unit; empty where no unit sends partial messages.
     """
-    experiment, rng, ego = world.experiment, CounterRng(world.experiment.seed, world.scene.log), world.scene.ego_ix
-    none = np.empty(0, dtype=np.int64)
-    as_perceived = not (experiment.sends or experiment.outages or experiment.draws_claims)
-    if world.perceived is not None and world.recorded is None and as_perceived:
-        s, of_rows, random_key = world.perceived.entries(
-            world, int(runs[0]), lambda every: _make_entry_rows(world, every)
-        )
-        drawn = rng.uniform("order in the list", random_key, runs)
-        return of_rows.lists(seen, drawn, s, without_object_ix=ego), none
-    rows, recorded = claim_rows(world, runs, ghosts), world.recorded
-    words, same = rows.words, rows.same
-    claims = EntryClaims(rows.claims.existence, rows.claims.class_probability, rows.claims.track_id)
+    experiment, seen, recorded = world.experiment, world.sent("sampled"), world.recorded
+    rng, ego = CounterRng(experiment.seed, world.scene.log), world.scene.ego_ix
+    words, (claims, same) = world.words, world.claims
     if recorded is not None:
         words = np.concatenate([words, np.arange(len(recorded.existence), dtype=np.uint64)])
         same = np.concatenate([same, words[len(same) :]])
-        claims = EntryClaims(
-            np.concatenate([claims.existence, recorded.existence]),
-            np.concatenate([claims.class_probability, recorded.class_probability]),
-            np.concatenate([claims.track_id, recorded.track_id]),
-        )
+        claims = claims.followed_by(EntryClaims(recorded.existence, recorded.class_probability, recorded.track_id))
     random_key = RandomKey(seen.units, seen.row_unit_ix, words, seen.stamp_ns[seen.frame_ix])
-    drawn = rng.uniform("order in the list", random_key, runs)
-    lists = RowEntries(seen, claims).lists(seen, drawn, without_object_ix=ego)
+    drawn = rng.uniform("order in the list", random_key, world.group.runs)
+    lists = make_entry_lists(seen, claims, drawn, without_object_ix=ego)
     if not experiment.partial:
-        return lists, none
+        return lists, np.empty(0, dtype=np.int64)
     picked = listed_rows(seen, drawn, without_object_ix=ego)[1]
     pairs = np.stack([seen.row_unit_ix[picked].astype(np.uint64), same[picked]])
     return lists, np.unique(pairs, axis=1, return_inverse=True)[1].ravel()
-
-
-def _make_entry_rows(world: WorldChunk, seen: Tracks) -> tuple[RowEntries, RandomKey]:
-    """Rows as entries, and their random key, where only presence and states are drawn, not claims."""
-    rows = claim_rows(world, np.empty(0, dtype=np.int64), None)
-    claims = EntryClaims(rows.claims.existence, rows.claims.class_probability, rows.claims.track_id)
-    return RowEntries(seen, claims), RandomKey(seen.units, seen.row_unit_ix, rows.words, seen.stamp_ns[seen.frame_ix])

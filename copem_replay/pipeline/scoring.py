@@ -8,113 +8,22 @@ object's first frame, or after its last: it is compared with the state moved the
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, TypeVar
+from dataclasses import dataclass
 
 import numpy as np
 
-from copem_replay.core.interpolation import AROUND_S, interpolate_at_instants, interpolate_at_stated_instants
-from copem_replay.core.object_list import AGREE
-from copem_replay.core.tracks import CLASSES, Bool, Float, Int, Scene, Tracks, class_indices
+from copem_replay.core.tracks import Float, Tracks
+from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.accuracy.aggregator import Aggregator
-from copem_replay.metrics.accuracy.held import HeldAccuracy, HeldErrors, HeldFrames, make_held_frames
+from copem_replay.metrics.accuracy.held import HeldAccuracy, HeldErrors
 from copem_replay.metrics.accuracy.statistics import Accuracy, AccuracySettings, repeat_for_runs
-from copem_replay.metrics.config import AnnotatedArea, Measure, MetricsSetup
+from copem_replay.metrics.config import AnnotatedArea, Measure
 from copem_replay.metrics.detection.by_match import DetectionSteps, FirstMatches, collect_captures
 from copem_replay.metrics.detection.by_truth_id import FirstDetections
-from copem_replay.metrics.episodes import Episodes, Reference, locate_reference, measured_objects
+from copem_replay.metrics.detection.conflict import ConflictDetector
 from copem_replay.metrics.matching import Matches, match_at_both_times, match_entries
-
-if TYPE_CHECKING:
-    from copem_replay.pipeline.receiver import ReceiverOutput
-
-
-KEPT = 64
-"""Sets of instants of which the truth is kept. More take more memory, and where arrivals are drawn no set comes again:
-each run has its own. No result depends on it."""
-
-T = TypeVar("T")
-
-
-def _cache_instants(cache: dict[bytes, T], time_s: Float, compute: Callable[[Float], T]) -> T:
-    """What the cache has of these instants, else what `compute` gives, which replaces the oldest entry."""
-    key = time_s.tobytes()
-    value = cache.get(key)
-    if value is None:
-        value = cache[key] = compute(time_s)
-        for oldest in list(cache)[:-KEPT]:
-            cache.pop(oldest, None)
-    return value
-
-
-@dataclass(frozen=True)
-class TruthCache:
-    """One log's truth at the instants of fused lists; configurations with the same instants share it."""
-
-    scene: Scene
-    truth: Tracks
-    experiment: MetricsSetup
-    _worlds: dict[bytes, Tracks] = field(default_factory=dict)
-    _references: dict[bytes, Reference] = field(default_factory=dict)
-
-    def at(self, time_s: Float) -> Tracks:
-        """The truth at instants (K,), ascending."""
-        return _cache_instants(self._worlds, time_s, self._at)
-
-    def between(self, time_s: Float) -> Tracks:
-        """The truth at instants (K,), ascending, which is not kept."""
-        return self._at(time_s)
-
-    def at_stated(self, time_s: Float, captured_s: tuple[Float, Float]) -> Tracks:
-        """The truth at stated instants (K,), ascending; `captured_s`: the earliest and latest true capture of each."""
-        return _cache_instants(self._worlds, np.stack([time_s, *captured_s]), self._at_stated)
-
-    def _at(self, time_s: Float) -> Tracks:
-        return interpolate_at_instants(
-            self._near(time_s), self._stamps(time_s), t0_ns=self.scene.t0_ns, max_gap_s=self.experiment.max_gap_s
-        )
-
-    def _at_stated(self, times_s: Float) -> Tracks:
-        stamps, earliest, latest = self._stamps(times_s)
-        return interpolate_at_stated_instants(
-            self._near(times_s[0]), stamps, (earliest, latest), t0_ns=self.scene.t0_ns,
-            max_gap_s=self.experiment.max_gap_s,
-        )  # fmt: skip
-
-    def _stamps(self, time_s: Float) -> Int:
-        return self.scene.t0_ns + np.rint(time_s * 1e9).astype(np.int64)
-
-    def _near(self, time_s: Float) -> Tracks:
-        """The part of the truth that interpolation at instants (K,) needs."""
-        if not len(time_s):
-            return self.truth
-        gap_s = self.experiment.max_gap_s + AROUND_S
-        return self.truth.captured_between(time_s[0] - gap_s, time_s[-1] + gap_s)
-
-    def reference(self, time_s: Float) -> Reference:
-        """From where distances are measured, at instants (K,)."""
-        return _cache_instants(
-            self._references, time_s, lambda time_s: locate_reference(self.scene, self.truth, self.experiment, time_s)
-        )
-
-    def classes(self, measure: Measure) -> Bool:
-        """(C,) which classes are measured: an entry without a true object is a ghost only if it is of one of these."""
-        measured: Bool = np.zeros(len(CLASSES), dtype=bool)
-        measured[self.scene.object_class[measured_objects(self.scene, measure)]] = True
-        if measure.objects.ids is None and measure.objects.classes is not None:
-            measured[class_indices(measure.objects.classes)] = True
-        # A `vehicle` may be a car; an entry without a class (`other`) may be anything.
-        may_be_measured: Bool = np.array(AGREE[:, measured].any(axis=1))
-        may_be_measured[CLASSES.index("other")] = measured[CLASSES.index("other")]
-        return may_be_measured
-
-    def since_s(self, episodes: Episodes) -> Float:
-        """(M,) when the object of each episode first is in the log."""
-        first = np.full(len(self.scene.object_ids), np.inf)
-        np.minimum.at(first, self.truth.row_object_ix, self.truth.row_captured_s)
-        since: Float = first[episodes.object_ix]
-        return since
+from copem_replay.pipeline.prepare import Replay, TruthCache
+from copem_replay.pipeline.receiver import ReceiverOutput
 
 
 @dataclass(frozen=True)
@@ -166,21 +75,64 @@ def _list_captures(output: ReceiverOutput) -> Float:
     return captures[used[:-1]]
 
 
-class Scorer:
-    """Measures a configuration's lists, chunk by chunk; `issue_s (K,)`: when those of the whole log are available.
+class Judge:
+    """Measures what the receiver of one configuration issues, chunk by chunk: detection, accuracy and conflicts.
 
-    `frames`: at which it is measured what is held; None: accuracy is not measured. `max_age_s`: of the configuration.
+    `issue_s (K,)`: when its lists of the whole log are available. `matches`: whether its lists are matched.
     """
 
-    def __init__(
-        self, around: TruthCache, episodes: Episodes, output: ReceiverOutput, issue_s: Float, measure: Measure,
-        frames: HeldFrames | None, max_age_s: float,
-    ) -> None:  # fmt: skip
-        self._issue_s, self._measure = issue_s, measure
+    def __init__(self, log: Replay, experiment: Experiment, name: str, issue_s: Float, *, matches: bool) -> None:
+        measure = experiment.measure
+        self._log, self._measure, self._issue_s, self._matches = log, measure, issue_s, matches
+        self._max_age_s = experiment.configurations[name].max_age_s
         self.accuracy_s = 0.0
-        """Seconds that measuring accuracy took, without matching."""
-        runs = len(output.lists.start)
-        self._episodes = episodes
+        """Seconds that measuring accuracy took."""
+        self._known: list[FirstMatches] = []
+        self._aggregator: Aggregator | None = None
+        self._held: HeldErrors | None = None
+        self._conflicts: ConflictDetector | None = None
+        if measure.conflict is not None:
+            self._conflicts = ConflictDetector(
+                log.ego, log.episodes, measure.conflict, confirm=measure.confirm, count_earlier=measure.count_earlier
+            )
+
+    def match(self, around: TruthCache, output: ReceiverOutput) -> tuple[Matches, Matches] | None:
+        """Matches of the lists of a time chunk, whose truth is in `around`; None: they are not asked for.
+
+        At the instants that entries tell of, and for accuracy at those at which their lists are available.
+        """
+        if not self._matches:
+            return None
+        if self._measure.accuracy:
+            began_s = time.perf_counter()
+            both = _match_at_both_times(around, output, self._measure)
+            self.accuracy_s += time.perf_counter() - began_s
+            return both
+        matches = match_lists(around, output, self._measure)
+        return matches, matches
+
+    def measure(self, around: TruthCache, output: ReceiverOutput, both: tuple[Matches, Matches] | None) -> None:
+        """Take in the lists of a time chunk, and what `match` gives of them."""
+        issue_s = output.instants.issue_s
+        if both is not None:
+            lists, (matches, now) = output.lists, both
+            if not self._known:
+                self._begin(around, output)
+            if self._aggregator is not None and self._held is not None:
+                began_s = time.perf_counter()
+                self._aggregator.add(lists, matches, now, around.at(issue_s))
+                self._held.add(lists, matches)
+                self.accuracy_s += time.perf_counter() - began_s
+            for known in self._known:
+                known.add(lists, matches, issue_s)
+        if self._conflicts is not None:
+            for s, fused_tracks in output.tracks_by_run(both and both[0]):
+                self._conflicts.add(fused_tracks, s)
+            self._conflicts.next(issue_s)
+
+    def _begin(self, around: TruthCache, output: ReceiverOutput) -> None:
+        """Begin with the first lists, which have the runs of all."""
+        measure, episodes, runs = self._measure, self._log.episodes, len(output.lists.start)
         captures = collect_captures(output.received, instants=measure.confirm.hits > 1)
         self._known = [
             FirstMatches(
@@ -188,35 +140,24 @@ class Scorer:
             )
             for _, one in episodes.passes
         ]
-        self._aggregator = self._held = None
-        if frames is not None:
-            firsts = episodes.firsts
-            settings, classes = accuracy_settings(measure, around.scene.end_s), around.classes(measure)
-            self._aggregator = Aggregator(
-                issue_s, around.scene, firsts, around.since_s(firsts), around.reference(issue_s), classes,
-                settings=settings, runs=runs,
-            )  # fmt: skip
-            self._held = HeldErrors(
-                frames, issue_s, max_age_s, around.scene, firsts, classes, settings=settings, runs=runs
-            )
+        if not measure.accuracy:
+            return
+        firsts, scene, issue_s = episodes.firsts, around.scene, self._issue_s
+        settings, classes = accuracy_settings(measure, scene.end_s), around.classes(measure)
+        since_s, reference = around.since_s(firsts), around.reference(issue_s)
+        self._aggregator = Aggregator(issue_s, scene, firsts, since_s, reference, classes, settings=settings, runs=runs)
+        self._held = HeldErrors(
+            self._log.held_frames, issue_s, self._max_age_s, scene, firsts, classes, settings=settings, runs=runs
+        )
 
-    def add(self, around: TruthCache, output: ReceiverOutput) -> Matches:
-        """Take in the lists of a time chunk. Returns their matches."""
-        lists, issue_s = output.lists, output.instants.issue_s
-        if self._aggregator is None or self._held is None:
-            matches = match_lists(around, output, self._measure)
-        else:
-            began_s = time.perf_counter()
-            matches, now = _match_at_both_times(around, output, self._measure)
-            self._aggregator.add(lists, matches, now, around.at(issue_s))
-            self._held.add(lists, matches)
-            self.accuracy_s += time.perf_counter() - began_s
-        for known in self._known:
-            known.add(lists, matches, issue_s)
-        return matches
+    def conflict_known_s(self) -> Float | None:
+        """(S | 1, M) when a list first implied a collision, NaN: never; None: it is not asked for."""
+        return None if self._conflicts is None else self._conflicts.result()
 
-    def result(self, runs: int) -> ConfigurationScores:
-        """The scores in this number of runs."""
+    def scores(self, runs: int) -> ConfigurationScores | None:
+        """The scores in this number of runs; None: lists are not matched."""
+        if not self._known:
+            return None
         detections, steps = self._join_known()
         accuracy = None if self._aggregator is None else repeat_for_runs(self._aggregator.result(), runs)
         held = None if self._held is None else self._held.result().repeated(runs)
@@ -226,22 +167,17 @@ class Scorer:
         """The detections of all episodes, and their steps in the order of runs and episodes."""
         results = [known.result() for known in self._known]
         detections = FirstDetections(
-            *(self._episodes.join_passes(columns) for columns in zip(*(one for one, _ in results), strict=True))
+            *(self._log.episodes.join_passes(columns) for columns in zip(*(one for one, _ in results), strict=True))
         )
         if len(results) == 1:
             return detections, results[0][1]
         parts = [
             (steps.run_ix, which[steps.episode_ix], steps.existence, steps.detection_s)
-            for (which, _), (_, steps) in zip(self._episodes.passes, results, strict=True)
+            for (which, _), (_, steps) in zip(self._log.episodes.passes, results, strict=True)
         ]
         run_ix, episode_ix, existence, detection_s = (np.concatenate(column) for column in zip(*parts, strict=True))
         order = np.lexsort((episode_ix, run_ix))
         return detections, DetectionSteps(*(column[order] for column in (run_ix, episode_ix, existence, detection_s)))
-
-
-def make_log_frames(around: TruthCache, episodes: Episodes) -> HeldFrames:
-    """The frames of a log at which it is measured what is held."""
-    return make_held_frames(around.truth.captured_s, episodes.firsts, around.between, around.reference)
 
 
 # What accuracy is measured by: bands of distance, time and existence.

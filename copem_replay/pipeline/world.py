@@ -1,142 +1,253 @@
-"""The world of a time chunk: what units perceive, put on air and send of it, drawn once for all configurations."""
+"""The world in some runs of a log: what units perceive of it, send of that, and when it reaches each receiver."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal
+from functools import cached_property
+from typing import Literal, NamedTuple
 
 import numpy as np
 
-from copem_replay.communication.link import KeptDraws, LinkInput
+from copem_replay.communication.link import LinkInput, delay_until_ready, sample_arrivals, transmit
 from copem_replay.communication.radio import Radio
-from copem_replay.communication.reception import RadioPath
 from copem_replay.communication.sends import LastSent, ListedObjects
 from copem_replay.core.errors import ExperimentError
 from copem_replay.core.lasting import ListStamps
 from copem_replay.core.memory import UnitDraws
 from copem_replay.core.random import CounterRng, RandomKey, Words, object_words, stable_hash
-from copem_replay.core.tracks import CLASSES, TRUTH, WHOLE, Bool, Float, Int, Scene, TimeChunk, Tracks, class_indices
-from copem_replay.fusion.ideal import WeightedRows
-from copem_replay.perception.ghosts import GhostRows, make_ghost_draws
+from copem_replay.core.tracks import (
+    CLASSES,
+    TRUTH,
+    Bool,
+    Float,
+    Int,
+    Scene,
+    TimeChunk,
+    Tracks,
+    append_tracks,
+    class_indices,
+)
+from copem_replay.experiment.schema import Experiment
+from copem_replay.io.recorded_units import RecordedUnits
+from copem_replay.perception.ghosts import GhostRows, draw_ghosts, make_ghost_draws
 from copem_replay.perception.observation import Observations
-from copem_replay.perception.perceive import DrawnClaims, draw_claims, make_draws, perceive
-from copem_replay.pipeline.expansion import ExpandedExperiment
-
-if TYPE_CHECKING:
-    from copem_replay.fusion.inputs import RowEntries
-    from copem_replay.io.recorded_units import RecordedUnits
-    from copem_replay.perception.sensor_poses import SensorPoses
-
-
-# Perceived: what modelled units list in all runs of a block, drawn at once; runs replayed one by one have views.
+from copem_replay.perception.perceive import (
+    EntryClaims,
+    add_states,
+    draw_claims,
+    make_draws,
+    perceive,
+    remove_outages,
+)
+from copem_replay.pipeline.expansion import ExpandedExperiment, RunGroup
+from copem_replay.pipeline.prepare import Replay
 
 States = Literal["true", "expected", "sampled"]
+"""What is drawn of rows: which are listed alone, their mean errors as well, or their errors."""
 
 
-def perceive_modelled(world: WorldChunk, runs: Int, states: States, equipped: Bool | None) -> Tracks:
-    """What the modelled units list in the runs (S,); `equipped (S, U)`: which of all units there are, None: all."""
-    if equipped is not None:
-        equipped = equipped[:, [k for k, unit in enumerate(world.experiment.units.values()) if unit.recorded is None]]
-    return perceive(world.scene, world.observations, world.experiment, runs, states=states, equipped=equipped)
-
-
-class Perceived:
-    """What modelled units list in runs (S,) with the same units, `equipped (1, U)`; drawn when it is first needed."""
-
-    def __init__(self, runs: Int, equipped: Bool | None) -> None:
-        self._number = {run: s for s, run in enumerate(runs.tolist())}
-        self._runs, self._equipped = runs, equipped
-        self._seen: list[tuple[Observations, States, Tracks]] = []
-        self._entries: tuple[Observations, RowEntries, RandomKey] | None = None
-        self._weighed: tuple[Tracks, WeightedRows] | None = None
-        self._on_air: tuple[int, OnAir | None] | None = None
-
-    def seen(self, world: WorldChunk, run: int, states: States) -> Tracks:
-        """What the modelled units list in one of the runs, of the rows of the chunk."""
-        return self._all(world, states).take_run(self._number[run])
-
-    def entries(
-        self, world: WorldChunk, run: int, compute: Callable[[Tracks], tuple[RowEntries, RandomKey]]
-    ) -> tuple[int, RowEntries, RandomKey]:
-        """The index of the run, and rows as entries with their key: `compute` of what all runs list with errors."""
-        if self._entries is None or self._entries[0] is not world.observations:
-            self._entries = world.observations, *compute(self._all(world, "sampled"))
-        return self._number[run], *self._entries[1:]
-
-    def weighed(self, world: WorldChunk, states: States, received: Tracks) -> WeightedRows | None:
-        """The weights of ideal fusion in all runs, if it hears what is listed in all; None: it hears other lists."""
-        listed = self._all(world, states)
-        if not WeightedRows.alike(listed, received):
-            return None
-        if self._weighed is None or self._weighed[0] is not listed:
-            self._weighed = listed, WeightedRows.of(listed)
-        return self._weighed[1]
-
-    def on_air(self, run: int, compute: Callable[[], OnAir | None]) -> OnAir | None:
-        """The input of drawn links in one of the runs, computed once for the calls before the next run."""
-        if self._on_air is None or self._on_air[0] != run:
-            self._on_air = run, compute()
-        return self._on_air[1]
-
-    def _all(self, world: WorldChunk, states: States) -> Tracks:
-        for observations, kind, seen in self._seen:
-            if observations is world.observations and kind == states:
-                return seen
-        seen = perceive_modelled(world, self._runs, states, self._equipped)
-        self._seen.append((world.observations, states, seen))
-        return seen
-
-
-@dataclass(frozen=True)
+@dataclass
 class WorldChunk:
-    """A log, or a time chunk of one, as the units of an experiment have it: what is the same in all runs.
+    """A log, or a time chunk of one, in the runs (S,) of a group, as the units of an experiment have it.
 
-    `truth` at its own frames; `observations`: rows of the modelled units; `recorded`: lists of the recorded ones.
-    Includes earlier captures that the chunk needs, back to `earliest_s`. `placed`: where units are, for their ghosts.
-    `on_air`: the input of drawn links. `perceived`: what units list in all runs of a block that are replayed one by
-    one; None: each call perceives anew.
+    `observations`: rows of the modelled units. Includes earlier captures that the chunk needs, back to `earliest_s`.
+    `complete`: with the rows of all objects and with ghosts, else only of objects with an episode. `sending`: what
+    units send of their lists, set once it is known; None: all. What is drawn is kept for all configurations.
     """
 
-    scene: Scene
-    truth: Tracks
-    observations: Observations
-    recorded: RecordedUnits | None
+    log: Replay
     experiment: ExpandedExperiment
-    chunk: TimeChunk = WHOLE
-    placed: SensorPoses | None = None
+    group: RunGroup
+    chunk: TimeChunk
+    observations: Observations
     earliest_s: float = -np.inf
-    on_air: OnAir | None = None
-    perceived: Perceived | None = None
+    complete: bool = True
+    sending: SentObjects | None = None
+    _listed: dict[States, Tracks] = field(default_factory=dict)
+    _sent: dict[States, Tracks] = field(default_factory=dict)
+
+    @property
+    def scene(self) -> Scene:
+        """The scene of the log."""
+        return self.log.scene
+
+    @cached_property
+    def truth(self) -> Tracks:
+        """The world at its own frames, which the truth lists."""
+        return self.log.truth.captured_between(self.earliest_s, self.chunk.until_s)
+
+    @cached_property
+    def recorded(self) -> RecordedUnits | None:
+        """The lists of the recorded units."""
+        recorded = self.log.recorded
+        return None if recorded is None else recorded.captured_between(self.earliest_s, self.chunk.until_s)
+
+    @cached_property
+    def ghosts(self) -> GhostRows | None:
+        """Ghosts of the units, where the group has one run and there is a fusion without truth ids."""
+        if not self.complete or not self.experiment.runs_apart:
+            return None
+        between_s, run = (self.earliest_s, self.chunk.until_s), int(self.group.runs[0])
+        return draw_ghosts(self.scene, self.observations, self.experiment, self.log.placed, run, between_s)
+
+    def listed(self, states: States) -> Tracks:
+        """What all units list, whatever their lists come from: rows of objects, ghosts, then rows of recorded units.
+
+        Ghosts are left out where states are the expected ones: ideal fusion alone has those.
+        """
+        if states not in self._listed:
+            scene, experiment, runs = self.scene, self.experiment, self.group.runs
+            equipped = self.group.listing
+            modelled = [k for k, unit in enumerate(experiment.units.values()) if unit.recorded is None]
+            there = None if equipped.all() else equipped[:, modelled]
+            seen = perceive(scene, self.observations, experiment, runs, states=states, equipped=there)
+            if states != "expected" and (ghosts := self.ghosts) is not None:
+                drawn, true = make_ghost_draws(scene, ghosts, experiment, int(runs[0])), ghosts.observations.tracks
+                seen = append_tracks(seen, add_states(scene, true, ghosts.observations, experiment, drawn))
+            seen = remove_outages(scene, seen, experiment, runs)
+            seen = delay_until_ready(seen, experiment.ready, CounterRng(experiment.seed, scene.log), runs)
+            self._listed[states] = self.log.add_recorded(seen, self.recorded)
+        return self._listed[states]
+
+    def sent(self, states: States) -> Tracks:
+        """What all units send of what they list."""
+        if self.sending is None:
+            return self.listed(states)
+        if states not in self._sent:
+            self._sent[states] = self.sending.of(self.listed(states), self.words)
+        return self._sent[states]
+
+    def sightings(self, states: States) -> Tracks:
+        """The rows that are listed in the chunk itself, at least those of objects with an episode."""
+        seen, log = self.listed(states), self.log
+        if len(log.chunks) == 1:
+            return seen
+        own = seen.valid.any(axis=0) & (seen.row_captured_s >= self.chunk.from_s)
+        return seen.take_rows(np.flatnonzero(own & np.isin(seen.row_object_ix, log.episodes.object_ix)))
+
+    @cached_property
+    def words(self) -> Words:
+        """The word of the object or ghost of each row, up to those of recorded units."""
+        words = object_words(self.scene.object_ids)[self.observations.tracks.row_object_ix]
+        return words if self.ghosts is None else np.concatenate([words, self.ghosts.words])
+
+    @cached_property
+    def claims(self) -> ClaimedRows:
+        """What the modelled units claim of their rows; the same in all runs where no claim is drawn."""
+        observations, experiment, ghosts = self.observations, self.experiment, self.ghosts
+        existence, class_ix = observations.existence, observations.view.class_ix
+        claims = EntryClaims(existence, np.eye(len(CLASSES))[class_ix], np.full(len(existence), -1))
+        if experiment.runs_apart and experiment.draws_claims:  # else no receiver needs it
+            drawn = make_draws(self.scene, observations, experiment, self.group.runs)
+            claims = draw_claims(observations, experiment, drawn)
+        if ghosts is not None:
+            drawn = make_ghost_draws(self.scene, ghosts, experiment, int(self.group.runs[0]))
+            of_ghosts = draw_claims(ghosts.observations, experiment, drawn, ghosts.sort)
+            claims = claims.followed_by(of_ghosts)
+        # A unit with track ids takes entries of one id for one object.
+        same = np.where(claims.track_id >= 0, claims.track_id.astype(np.uint64), self.words)
+        return ClaimedRows(claims, same)
 
 
-# On air: the input of drawn links: one run's draws, the path to the ego, and the length of lists.
+# Transmission: when what is sent reaches each receiver.
 
 
-@dataclass(frozen=True)
-class OnAir:
-    """The lists (F,) of all units in one run, on air: the path of each to the ego, and how many `objects` it has.
+class Transmission:
+    """The lists (F,) of all units of a log on their way to each receiver, in the runs (S,) of a group.
 
-    Both None where no link asks for them. `sent`: what units send of their lists; None: all. `kept`: draws of links for
-    lists of this log.
+    Where arrivals are drawn the group has one run. `complete`: whether all rows of lists are asked for, else only those
+    of objects with an episode. `states`: what is drawn of them in any case. Raises ExperimentError where a link asks
+    for what is not known.
     """
 
-    run: int
-    path: RadioPath | None
-    objects: Int | None
-    sent: SentObjects | None = None
-    kept: KeptDraws = field(default_factory=KeptDraws)
+    def __init__(
+        self, log: Replay, experiment: Experiment, group: RunGroup, *, complete: bool = True, states: States = "true"
+    ) -> None:
+        self.log, self.experiment, self.group = log, log.expanded.with_(experiment), group
+        self.states: States = "sampled" if self.experiment.sends else states  # what is sent depends on errors
+        self._complete = complete
+        self._whole: WorldChunk | None = None
+        self._path = self._objects = self._sending = None
+        if self.experiment.arrivals_differ:
+            if asks_for_path(self.experiment, log.scene):
+                self._path = log.paths
+            if self.experiment.sends:
+                self._sending = select_sent_objects(self.experiment, self._own_chunks())
+            if has_channel(self.experiment):
+                self._objects = self._count_objects()
+        never = TimeChunk(np.inf, np.inf)
+        self._lists = WorldChunk(log, self.experiment, group, never, log.no_rows, np.inf, False, self._sending)
+        self._arriving: dict[str, Tracks] = {}
 
-    def of(self, lists: Tracks, scene: Scene, seed: int) -> LinkInput:
+    def world(self, chunk: TimeChunk, earliest_s: float) -> WorldChunk:
+        """A time chunk with captures back to `earliest_s`; that of a log in one is kept."""
+        log = self.log
+        if self._whole is None or len(log.chunks) > 1:
+            observations = log.observe_listable(chunk, earliest_s, complete=self._complete)
+            self._whole = WorldChunk(log, self.experiment, self.group, chunk, observations, earliest_s, self._complete)
+        self._whole.sending = self._sending
+        return self._whole
+
+    @property
+    def lists(self) -> Tracks:
+        """The lists of all units as they are sent, without rows."""
+        return self._lists.sent("true")
+
+    @property
+    def truth(self) -> Tracks:
+        """The lists of the truth, without rows."""
+        return self._lists.truth
+
+    def send(self, sightings: Tracks) -> Tracks:
+        """The rows of objects that are sent, of those that are listed."""
+        if self._sending is None:
+            return sightings
+        return self._sending.of(sightings, object_words(self.log.scene.object_ids)[sightings.row_object_ix])
+
+    def arriving(self, name: str) -> Tracks:
+        """The lists that the receiver of a configuration hears, by when links deliver them; those of others never are.
+
+        Raises InputError where a link of the user's own fails.
+        """
+        if name not in self._arriving:
+            experiment, lists, heard = self.experiment, self.lists, None
+            if experiment.configurations[name].units == TRUTH:
+                lists = self.truth
+            else:
+                there = {unit for unit, sends in zip(lists.units, self.group.sending, strict=True) if sends}
+                heard = there.intersection(experiment.units_of(experiment.configurations[name]))
+            air = self._link_input(lists) if experiment.arrivals_differ else None
+            self._arriving[name] = transmit(lists, experiment.links_of(name), heard, air=air)
+        return self._arriving[name]
+
+    def received(self, name: str) -> Tracks:
+        """The lists that the receiver of a configuration hears, by when it takes them in (`issue_hz`)."""
+        return sample_arrivals(self.arriving(name), self.experiment.configurations[name].issue_hz)
+
+    def receive(self, rows: Tracks, name: str) -> Tracks:
+        """Rows in the lists that the receiver of a configuration hears; configurations share them and their draws."""
+        return replace(rows, arrives_s=self.received(name).arrives_s)
+
+    def _own_chunks(self) -> Iterator[WorldChunk]:
+        return (self.world(chunk, chunk.from_s) for chunk in self.log.chunks)
+
+    def _count_objects(self) -> Int:
+        """(F,) how many entries each list of one run has, ghosts among them."""
+        sent = (world.sent(self.states) for world in self._own_chunks())
+        counts: Int = np.sum([np.bincount(s.frame_ix[s.valid[0]], minlength=len(s.stamp_ns)) for s in sent], axis=0)
+        return counts
+
+    def _link_input(self, lists: Tracks) -> LinkInput:
         """The input of links of these lists; the truth's lists have no path and no length."""
-        of_units = lists.units != (TRUTH,)
-        F = len(lists.stamp_ns)
+        scene, of_truth, F = self.log.scene, lists.units == (TRUTH,), len(lists.stamp_ns)
         # The address of a draw: sender, receiver and capture.
         word = object_words([scene.object_ids[scene.ego_ix]])[0] if scene.ego_ix >= 0 else stable_hash("everyone")
         random_key = RandomKey(lists.units, lists.frame_unit_ix, np.full(F, word, dtype=np.uint64), lists.stamp_ns)
         stamps = ListStamps(lists.stamp_ns, lists.frame_unit_ix, np.arange(F))
-        draws = UnitDraws(CounterRng(seed, scene.log), random_key, stamps, np.array([self.run]))
-        return LinkInput(draws, self.path if of_units else None, self.objects if of_units else None, self.kept)
+        draws = UnitDraws(CounterRng(self.experiment.seed, scene.log), random_key, stamps, self.group.runs)
+        path, objects = (None, None) if of_truth else (self._path, self._objects)
+        return LinkInput(draws, path, objects, self.log.kept_draws)
 
 
 def asks_for_path(experiment: ExpandedExperiment, scene: Scene) -> bool:
@@ -171,67 +282,17 @@ def has_channel(experiment: ExpandedExperiment) -> bool:
     return queues
 
 
-def find_radio_paths(of_ego: Observations, scene: Scene, experiment: ExpandedExperiment, lists: Tracks) -> RadioPath:
-    """The path of each list (F,) of all units to the ego. `of_ego`: the ego's observation rows.
-
-    `lists`: those of all units, the modelled ones' first. A list aboard the ego has distance 0, one of a recorded unit
-    NaN, one without an observation of the ego ∞.
-    """
-    F = len(lists.stamp_ns)
-    distance_m: Float = np.full(F, np.inf)
-    visible_share: Float = np.zeros(F)
-    distance_m[of_ego.tracks.frame_ix] = of_ego.view.range_m
-    visible_share[of_ego.tracks.frame_ix] = of_ego.view.visible_share
-    ego = scene.object_ids[scene.ego_ix]
-    aboard = [name for name, unit in experiment.modelled.items() if unit.on in ("ego", ego)]
-    is_aboard = np.array([name in aboard for name in lists.units], dtype=bool)[lists.frame_unit_ix]
-    is_recorded = np.array([name in experiment.recorded for name in lists.units], dtype=bool)[lists.frame_unit_ix]
-    distance_m[is_aboard], visible_share[is_aboard] = 0.0, 1.0
-    distance_m[is_recorded] = visible_share[is_recorded] = np.nan
-    return RadioPath(distance_m, visible_share)
-
-
 # Sends: what units send of what they list in one run, decided list by list over the whole log by what they list
 # themselves, with errors and false positives.
 
 _VRU = class_indices(("vru",))
 
 
-@dataclass(frozen=True)
-class ClaimedRows:
-    """What the modelled units claim of their rows (P,), ghosts last, in one run.
+class ClaimedRows(NamedTuple):
+    """What modelled units claim of rows (P,), ghosts last; `same`: equal where they see one object, no index."""
 
-    `words`: the word of the object or ghost. `same`: equal for rows that the unit takes for one object; no index.
-    """
-
-    words: Words
-    claims: DrawnClaims
+    claims: EntryClaims
     same: Words
-
-
-def claim_rows(world: WorldChunk, runs: Int, ghosts: GhostRows | None) -> ClaimedRows:
-    """The claims of the rows of a time chunk, the same in all runs where no claim is drawn."""
-    observations, experiment = world.observations, world.experiment
-    words = object_words(world.scene.object_ids)[observations.tracks.row_object_ix]
-    claims = DrawnClaims(
-        observations.existence, np.eye(len(CLASSES))[observations.view.class_ix], np.full(len(words), -1)
-    )
-    if experiment.runs_apart and experiment.draws_claims:  # else no receiver needs it
-        claims = draw_claims(observations, experiment, make_draws(world.scene, observations, experiment, runs))
-    same = words
-    if ghosts is not None:
-        drawn = make_ghost_draws(world.scene, ghosts, experiment, int(runs[0]))
-        of_ghosts = draw_claims(ghosts.observations, experiment, drawn, ghosts.sort)
-        claims = DrawnClaims(
-            np.concatenate([claims.existence, of_ghosts.existence]),
-            np.concatenate([claims.class_probability, of_ghosts.class_probability]),
-            np.concatenate([claims.track_id, of_ghosts.track_id]),
-        )
-        words = np.concatenate([words, ghosts.words])
-        same = words
-    # A unit with track ids takes entries of one id for one object.
-    same = np.where(claims.track_id >= 0, claims.track_id.astype(np.uint64), same)
-    return ClaimedRows(words, claims, same)
 
 
 @dataclass(frozen=True)
@@ -243,8 +304,9 @@ class SentObjects:
     keys: Words
 
     def of(self, seen: Tracks, words: Words) -> Tracks:
-        """The rows of the modelled units that are sent; `words (P,)`: the words of their objects."""
-        left_out = self.partial[seen.row_unit_ix] & ~np.isin(_key_rows(seen.frame_ix, words), self.keys)
+        """The rows that are sent; `words`: the words of their objects, up to those of recorded units."""
+        left_out = self.partial[seen.row_unit_ix]
+        left_out[: len(words)] &= ~np.isin(_key_rows(seen.frame_ix[: len(words)], words), self.keys)
         arrives_s = np.where(self.lists, seen.common_arrives_s, np.inf)
         return replace(seen, valid=seen.valid & ~left_out & self.lists[seen.frame_ix], arrives_s=arrives_s[None])
 
@@ -259,23 +321,18 @@ def _mix_bits(numbers: Words) -> Words:
     return result
 
 
-def select_sent_objects(
-    experiment: ExpandedExperiment, chunks: Iterable[tuple[WorldChunk, Tracks, ClaimedRows]]
-) -> SentObjects:
-    """What units send of the lists of one run. `chunks`: what they list, with errors, and claim, chunk after chunk.
-
-    Lists have the same numbers in all chunks.
-    """
-    units = list(experiment.modelled)
+def select_sent_objects(experiment: ExpandedExperiment, chunks: Iterable[WorldChunk]) -> SentObjects:
+    """What units send of the lists of one run, chunk after chunk; lists have the same numbers in all chunks."""
+    units = list(experiment.units)
     last = LastSent([experiment.sends.get(name) for name in units])
     sending = np.array([name in experiment.sends for name in units], dtype=bool)
     partial = np.array([name in experiment.partial for name in units], dtype=bool)
     slots: dict[tuple[int, int], int] = {}
     lists, keys = np.zeros(0, dtype=bool), [np.zeros(0, dtype=np.uint64)]
-    for world, seen, rows in chunks:
+    for world in chunks:
+        chunk, seen, (claims, same) = world.chunk, world.listed("sampled"), world.claims
         if not len(lists):
             lists = np.ones(len(seen.stamp_ns), dtype=bool)
-        chunk = world.chunk
         frames = np.flatnonzero(
             sending[seen.frame_unit_ix] & np.isfinite(seen.common_arrives_s)
             & (seen.captured_s >= chunk.from_s) & (seen.captured_s < chunk.until_s)
@@ -289,18 +346,18 @@ def select_sent_objects(
         start = np.append(0, np.cumsum(valid))[np.append(begin, len(listed))]
         listed = listed[valid]
         pairs, which = np.unique(
-            np.stack([seen.row_unit_ix[listed].astype(np.uint64), rows.same[listed]]), axis=1, return_inverse=True
+            np.stack([seen.row_unit_ix[listed].astype(np.uint64), same[listed]]), axis=1, return_inverse=True
         )
         slot = np.array([slots.setdefault((u, w), len(slots)) for u, w in pairs.T.tolist()], dtype=np.int64)
         sent, included = last.choose(
             ListedObjects(
-                start, seen.frame_unit_ix[frames], seen.captured_s[frames], slot[which.ravel()], rows.words[listed],
-                np.isin(rows.claims.class_probability[listed].argmax(axis=1), _VRU), _sampled_states(seen, listed),
-                rows.claims.existence[listed],
+                start, seen.frame_unit_ix[frames], seen.captured_s[frames], slot[which.ravel()], world.words[listed],
+                np.isin(claims.class_probability[listed].argmax(axis=1), _VRU), _sampled_states(seen, listed),
+                claims.existence[listed],
             )
         )  # fmt: skip
         lists[frames[~sent]] = False
-        keys.append(_key_rows(seen.frame_ix[listed[included]], rows.words[listed[included]]))
+        keys.append(_key_rows(seen.frame_ix[listed[included]], world.words[listed[included]]))
     return SentObjects(lists, partial, np.sort(np.concatenate(keys)))
 
 

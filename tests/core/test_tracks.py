@@ -256,25 +256,3 @@ def test_scene() -> None:
     assert scene.end_s == 2.5
     assert scene.object_number == {"anna": 0, "bert": 1, "carl": 2}
     assert scene.ego_ix == -1
-
-
-def test_a_run_of_several_is_a_view_that_knows_its_rows() -> None:
-    some = tracks({"a": [["anna", "bert"], ["bert"]], "b": [["carl"]]}, runs=3)
-    some = replace(some, arrives_s=some.arrives_s[:1], z_m=some.z_m[:1])
-    one = some.take_run(1)
-    for name in ("valid", *VALUES):
-        whole, alone = getattr(some, name), getattr(one, name)
-        assert np.shares_memory(whole, alone), name
-        np.testing.assert_array_equal(alone, whole if len(whole) == 1 else whole[1:2])
-    assert one.z_m is some.z_m
-    assert one.row_object_ix is some.row_object_ix
-    assert one.take_run(0) is one
-
-
-def test_what_is_known_of_rows_stays_and_what_goes_by_values_does_not() -> None:
-    some = tracks({"a": [["anna", "bert"], ["bert"]]}, runs=1)
-    west, by_frame = some.west_to_east, some.by_frame
-    moved = some.with_values(x_m=-some.x_m)
-    assert moved.by_frame is by_frame
-    assert west.tolist() != moved.west_to_east.tolist()
-    np.testing.assert_array_equal(moved.row_object_ix, replace(moved).row_object_ix)

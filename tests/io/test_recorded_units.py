@@ -20,9 +20,10 @@ from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import read_logs
 from copem_replay.io.recording import Recording
 from copem_replay.pipeline.prepare import prepare_log
-from copem_replay.pipeline.receiver import ReceiverOutput, run_receivers
+from copem_replay.pipeline.receiver import ReceiverOutput
 from copem_replay.pipeline.run import ExperimentResult, run_experiment
 from tests.helpers.recordings import CAR, PEDESTRIAN, SHARED, VEHICLE, Obj, Topic, ns, write_recording
+from tests.helpers.replays import outputs_of
 
 
 def car(x: float | None, y: float = 0.0, *, vx: float = 0.0, kinds: Any = ((VEHICLE, CAR, 1.0),),
@@ -95,7 +96,7 @@ def replayed(path: Path, **changes: Any) -> ExperimentResult:
 
 def told(path: Path, **changes: Any) -> dict[str, ReceiverOutput]:
     plan = plan_of(path, **changes)
-    return dict(run_receivers(prepare_log(read(path, **changes), plan).world(plan), np.arange(2), None))
+    return outputs_of(prepare_log(read(path, **changes), plan), plan, np.arange(2))
 
 
 def figure(result: ExperimentResult, name: str, configuration: str = "union") -> float:

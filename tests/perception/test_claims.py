@@ -26,11 +26,12 @@ from copem_replay.perception.pem.model import (
     TrackIds,
     draw_classes,
 )
-from copem_replay.perception.perceive import DrawnClaims, draw_claims, make_draws
+from copem_replay.perception.perceive import EntryClaims, draw_claims, make_draws
 from copem_replay.pipeline.prepare import Replay, prepare_log
 from copem_replay.pipeline.run import run_experiment
 from tests.helpers import scenes
 from tests.helpers.experiments import changed, source_of
+from tests.helpers.replays import world_of
 from tests.helpers.scenes import SEES_ALL, Thing, experiment, standing
 
 PEDESTRIAN, BICYCLE = CLASSES.index("pedestrian"), CLASSES.index("bicycle")
@@ -55,10 +56,10 @@ def standing_child(until_s: float = 20.0) -> Recording:
     return scenes.recording([Thing("child", "pedestrian", standing(20, 0))], until_s=until_s, ego=None)
 
 
-def claims(plan: Experiment, recording: Recording, runs: int) -> tuple[list[DrawnClaims], Replay]:
+def claims(plan: Experiment, recording: Recording, runs: int) -> tuple[list[EntryClaims], Replay]:
     """By run what a unit says of a child in each of its lists."""
     replay = prepare_log(recording, plan)
-    found = replay.world(plan).observations
+    found = world_of(replay, plan).observations
     by_run = [
         draw_claims(found, replay.expanded, make_draws(replay.scene, found, replay.expanded, np.array([k])))
         for k in range(runs)

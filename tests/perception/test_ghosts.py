@@ -16,12 +16,13 @@ from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import find_problems
 from copem_replay.io.recording import Recording
 from copem_replay.perception.ghosts import GhostRows, draw_ghosts, make_ghost_draws
-from copem_replay.perception.perceive import DrawnClaims, add_states, draw_claims
+from copem_replay.perception.perceive import EntryClaims, add_states, draw_claims
 from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.run import run_experiment
 from copem_replay.pipeline.sweep import list_points
 from tests.helpers import scenes
 from tests.helpers.experiments import changed, source_of
+from tests.helpers.replays import world_of
 from tests.helpers.scenes import SEES_60_M, Thing, driving, experiment, standing
 
 FIELD = {"kind": "field", "range_m": [3, 60], "azimuth_deg": [-60, 60]}
@@ -47,7 +48,7 @@ def scene_of(*things: Thing, until_s: float = 60.0) -> Recording:
 def found(plan: Experiment, recording: Recording, runs: int) -> list[GhostRows]:
     """By run the ghosts in all lists."""
     replay = prepare_log(recording, plan)
-    world = replay.world(plan)
+    world = world_of(replay, plan)
     made = [
         draw_ghosts(replay.scene, world.observations, replay.expanded, replay.placed, k, (-np.inf, np.inf))
         for k in range(runs)
@@ -261,7 +262,7 @@ class TestEachBirthIsAnother:
     RECORDING = scene_of(Thing("t", "truck", driving(10, 0, 1)), Thing("u", "truck", standing(20, -9)), until_s=20.0)
 
     @staticmethod
-    def claimed(rows: GhostRows, run_number: int) -> DrawnClaims:
+    def claimed(rows: GhostRows, run_number: int) -> EntryClaims:
         replay = prepare_log(TestEachBirthIsAnother.RECORDING, TestEachBirthIsAnother.PLAN)
         drawn = make_ghost_draws(replay.scene, rows, replay.expanded, run_number)
         return draw_claims(rows.observations, replay.expanded, drawn, rows.sort)
@@ -291,7 +292,7 @@ class TestEachBirthIsAnother:
 
     def test_they_are_the_same_in_a_part_of_the_log(self) -> None:
         [whole, *_], replay = found(self.PLAN, self.RECORDING, 1), prepare_log(self.RECORDING, self.PLAN)
-        world = replay.world(self.PLAN)
+        world = world_of(replay, self.PLAN)
         part = draw_ghosts(replay.scene, world.observations, replay.expanded, replay.placed, 0, (3.05, 5.05))
         assert part is not None
         captured_s = whole.observations.tracks.row_captured_s

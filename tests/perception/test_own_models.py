@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from copem_replay.core.errors import InputError
-from copem_replay.core.tracks import WHOLE
+from copem_replay.core.tracks import TimeChunk
 from copem_replay.core.view_geometry import Errors, Noise, ViewGeometry
 from copem_replay.fusion.interface import Inbox, StepFusion
 from copem_replay.perception.pem.detection import DetectionModel
@@ -121,7 +121,9 @@ def test_a_detection_model_that_fails_is_named(kind: str, said: str) -> None:
     with pytest.raises(
         InputError, match=rf"^pems\.sure\[0\]\.detection: tests.perception.test_own_models:{kind}: .*{said}"
     ):
-        prepare_log(scenes.oncoming_car(), plan({"kind": f"tests.perception.test_own_models:{kind}"})).observe(WHOLE)
+        prepare_log(scenes.oncoming_car(), plan({"kind": f"tests.perception.test_own_models:{kind}"})).observe(
+            TimeChunk()
+        )
 
 
 def test_an_error_model_that_fails_is_named() -> None:

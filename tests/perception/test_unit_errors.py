@@ -17,10 +17,11 @@ from copem_replay.experiment.validate import find_problems
 from copem_replay.io.recording import Recording
 from copem_replay.perception.perceive import clock_errors_s, lists_not_made
 from copem_replay.pipeline.prepare import Replay, prepare_log
-from copem_replay.pipeline.receiver import StatedCaptures, perceive_all_units
+from copem_replay.pipeline.receiver import StatedCaptures
 from copem_replay.pipeline.run import run_experiment
 from tests.helpers import scenes
 from tests.helpers.experiments import changed, drive, source_of
+from tests.helpers.replays import world_of
 from tests.helpers.scenes import Thing, driving, experiment, standing
 
 EGO = Thing("ego", "car", standing(0, 20))
@@ -43,7 +44,7 @@ def ready(recording: Recording, plan: Experiment) -> Replay:
 def down(plan: Experiment, recording: Recording, runs: int) -> Bool:
     """(S, F) lists of the one unit that are not made."""
     replay = ready(recording, plan)
-    tracks = replay.lists_only(plan).observations.tracks
+    tracks = replay.no_rows.tracks
     found = lists_not_made(replay.scene, tracks, replay.expanded, np.arange(runs))
     assert found is not None
     return found
@@ -73,7 +74,7 @@ class TestOutages:
         replay = ready(alone(10.0), plan)
         [missing] = down(plan, alone(10.0), 1)
         assert 0 < missing.sum() < len(missing)
-        seen = perceive_all_units(replay.world(plan), np.array([0]), states="sampled")
+        seen = world_of(replay, plan).listed("sampled")
         assert (np.isinf(seen.arrives_s[0]) == missing).all()
         assert (seen.valid[0] == ~missing[seen.frame_ix]).all()
 
@@ -253,8 +254,8 @@ class TestPlaced:
         plan = experiment(units={"mast": unit(placed=placed)}, configurations={"PEM": {"units": "all"}})
         recording = scenes.recording([EGO, *(things or [Thing("car", "car", standing(50, 0))])], until_s=until_s)
         replay = ready(recording, plan)
-        world = replay.world(plan)
-        seen = perceive_all_units(world, np.arange(runs), states="sampled")
+        world = world_of(replay, plan, np.arange(runs))
+        seen = world.listed("sampled")
         return seen, world.observations.tracks, replay.scene
 
     def test_one_degree_at_fifty_metres(self) -> None:
@@ -296,7 +297,7 @@ class TestPlaced:
         """At 59 m of 60 m that the unit sees: it lists the car in every run, wherever it takes itself to be."""
         plan = experiment(units={"mast": unit(pem="sure", placed={"position_sigma_m": 5.0})})
         replay = ready(scenes.recording([EGO, Thing("car", "car", standing(59, 0))], until_s=0), plan)
-        assert perceive_all_units(replay.world(plan), np.arange(50), states="sampled").valid.all()
+        assert world_of(replay, plan, np.arange(50)).listed("sampled").valid.all()
 
 
 RECORDED = "  lists: {recorded: {topic: objects}, %s}"

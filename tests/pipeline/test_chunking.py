@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from copem_replay.cli import main as cli
 from copem_replay.core.object_list import Inputs, ObjectLists
-from copem_replay.core.tracks import TRUTH, VALUES, WHOLE, TimeChunk, Tracks
+from copem_replay.core.tracks import TRUTH, VALUES, TimeChunk, Tracks
 from copem_replay.experiment.file import log_paths, read_experiment_file
 from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import find_problems, read_logs
@@ -25,19 +25,19 @@ from copem_replay.fusion.union import Union
 from copem_replay.io.recording import Recording
 from copem_replay.perception.visibility import visible_shares
 from copem_replay.pipeline import prepare as chunking
-from copem_replay.pipeline.expansion import Presence
+from copem_replay.pipeline.expansion import expand_experiment
 from copem_replay.pipeline.one_run import RunTracks
-from copem_replay.pipeline.prepare import Reach, prepare_log
-from copem_replay.pipeline.receiver import perceive_all_units, receive_lists
+from copem_replay.pipeline.prepare import prepare_log
+from copem_replay.pipeline.receiver import Reach, Receivers
 from copem_replay.pipeline.run import ExperimentResult, run_experiment
 from copem_replay.pipeline.tables import AccuracyTables
 from tests.helpers import scenes
 from tests.helpers.recordings import Obj, pedestrian, write_recording
+from tests.helpers.replays import transmitted
 from tests.helpers.scenes import Thing, driving, experiment, standing
 from tests.io import test_recorded_units as test_recorded
 from tests.viewer.test_rrd import rows
 
-ALL = Presence.same(np.ones(1, dtype=bool))
 """There is one unit, and it is there."""
 LOGS = Path(__file__).parents[2] / "logs"
 
@@ -71,7 +71,7 @@ def both_ways(
 
 
 def assert_same(whole: ExperimentResult, pieces: ExperimentResult) -> None:
-    assert [replay.chunks for replay in whole.replays] == [(WHOLE,)] * len(whole.replays)
+    assert [replay.chunks for replay in whole.replays] == [(TimeChunk(),)] * len(whole.replays)
     pd.testing.assert_frame_equal(whole.table, pieces.table, check_exact=True)
     pd.testing.assert_frame_equal(whole.summary, pieces.summary, check_exact=True)
     assert whole.notes == pieces.notes
@@ -251,7 +251,7 @@ def test_a_foreseen_collision_without_accuracy_holds_only_what_is_looked_at() ->
     pd.testing.assert_frame_equal(whole.table, pieces.table, check_exact=True)
     pedestrians = {whole.replays[0].scene.object_number[name] for name in ("crossing", "blinking")}
     for replay in (whole.replays[0], pieces.replays[0]):
-        worlds = list(replay.worlds(plan, np.arange(1), ALL, measured_only=True))
+        worlds = list(Receivers(transmitted(replay, plan, complete=False)).worlds())
         assert {int(k) for world in worlds for k in world.observations.tracks.row_object_ix} == pedestrians
 
 
@@ -270,7 +270,7 @@ def test_a_fusion_that_is_not_resumable_gets_all_at_once() -> None:
     }
     plan = experiment(pems={"sure": NOISY}, configurations=own)
     whole, pieces = both_ways(plan, [traffic()], 50)
-    assert pieces.replays[0].chunks == (WHOLE,)
+    assert pieces.replays[0].chunks == (TimeChunk(),)
     assert_same(whole, pieces)
 
 
@@ -283,7 +283,7 @@ def test_chunks_cover_the_log_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (cuts[0].from_s, cuts[-1].until_s) == (-np.inf, np.inf)
     assert all(one.until_s == after.from_s for one, after in pairwise(cuts))
     rows = [len(replay.observe(time_chunk).tracks.frame_ix) for time_chunk in cuts]
-    assert sum(rows) == len(replay.observe(WHOLE).tracks.frame_ix)
+    assert sum(rows) == len(replay.observe(TimeChunk()).tracks.frame_ix)
     assert max(rows) <= 40
     alone = RunTracks(replay, experiment(), 0).whole()["GT"].fused  # held at once all the same: it is not that long
     assert len(alone.frame_ix) == len(replay.truth.frame_ix) - 91  # but for the ego
@@ -312,7 +312,7 @@ def test_a_log_of_half_a_million_rows_is_cut() -> None:
     assert chunking.observation_rows(log.scene, log.truth, plan) == 540_000
     cuts = chunking.time_chunks(log.scene, log.truth, plan)
     assert [(1000 * k + 999.381966) / 10 for k in range(2)] == pytest.approx([cut.until_s for cut in cuts[:-1]])
-    assert chunking.time_chunks(log.scene, log.truth, experiment(ego="0")) == (WHOLE,)  # 360 000
+    assert chunking.time_chunks(log.scene, log.truth, experiment(ego="0")) == (TimeChunk(),)  # 360 000
 
 
 @pytest.mark.parametrize("rows_at_once", [10**9, 60])
@@ -323,10 +323,10 @@ def test_what_no_run_lists_is_not_held(rows_at_once: int, monkeypatch: pytest.Mo
     near = [{"when": {"range_m": [0, 20]}, "detection": {"kind": "constant", "probability": 0.5}}]
     plan = experiment(pems={"sure": near})
     replay = prepare_log(traffic(), plan)
-    found = replay.observe(WHOLE)
+    found = replay.observe(TimeChunk())
     listed = np.flatnonzero((found.view.range_m >= 0) & (found.view.range_m < 20))
     assert 0 < len(listed) < len(found.view.range_m) / 2
-    held = [set(world.observations.view.range_m.tolist()) for world in replay.worlds(plan, np.arange(1), ALL)]
+    held = [set(world.observations.view.range_m.tolist()) for world in Receivers(transmitted(replay, plan)).worlds()]
     assert set().union(*held) == set(found.view.range_m[listed].tolist())
 
 
@@ -358,7 +358,7 @@ def test_how_far_back_a_chunk_reaches() -> None:
     received = log.truth.captured_between(np.inf, np.inf)  # what is in the lists does not matter
     late = Recording(**{**vars(log), "truth": received}).truth
     late = type(late)(**{**{f: getattr(late, f) for f in late.__dataclass_fields__}, "arrives_s": late.arrives_s + 0.4})
-    reach = Reach(plan, {"ideal": late})
+    reach = Reach(expand_experiment(plan, log.scene), {"ideal": late})
     # From 5.2 s on: the first instant is 5.4 s, at which the list captured at 5 s arrives.
     assert reach.earliest_s(TimeChunk(5.2, 8.0)) == pytest.approx(5.0, abs=0.01)
     assert reach.earliest_s(TimeChunk(5.2, 5.3)) == 5.2  # no instant at all
@@ -367,7 +367,9 @@ def test_how_far_back_a_chunk_reaches() -> None:
     tracker = {"kind": "tracker", "late": "replay", "buffer_s": 2.0}
     replayed = experiment(configurations={"t": {"units": ["ego"], "latency_s": 0.4, "fusion": tracker}})
     # At 5.0 s the newest that has arrived was captured at 4 s: 2 s before that.
-    assert Reach(replayed, {"t": late}).earliest_s(TimeChunk(5.0, 8.0)) == pytest.approx(2.0, abs=0.01)
+    assert Reach(expand_experiment(replayed, log.scene), {"t": late}).earliest_s(TimeChunk(5.0, 8.0)) == pytest.approx(
+        2.0, abs=0.01
+    )
 
 
 def test_a_chunk_reaches_back_to_a_list_that_another_unit_still_goes_by() -> None:
@@ -377,10 +379,8 @@ def test_a_chunk_reaches_back_to_a_list_that_another_unit_still_goes_by() -> Non
         configurations={"ideal": {"units": "all", "latency_s": {"default": 0.2}}},
     )
     replay = prepare_log(traffic(), plan)
-    lists = replay.lists_only(plan)
-    seen = perceive_all_units(lists, np.arange(1), states="true")
-    received = {"ideal": receive_lists(seen, lists, "ideal")}
-    assert Reach(plan, received).earliest_s(TimeChunk(2.85, 3.0)) == pytest.approx(2.0, abs=0.01)
+    received = {"ideal": transmitted(replay, plan).received("ideal")}
+    assert Reach(replay.expanded, received).earliest_s(TimeChunk(2.85, 3.0)) == pytest.approx(2.0, abs=0.01)
 
 
 def test_the_results_folder(

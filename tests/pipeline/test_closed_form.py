@@ -40,9 +40,9 @@ from copem_replay.metrics.summary import summarise_rows
 from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_incidence, quantile_with_never
 from copem_replay.pipeline.closed_form import compute_distributions, exact_table
 from copem_replay.pipeline.prepare import Replay, prepare_log
-from copem_replay.pipeline.receiver import receive_lists
 from copem_replay.pipeline.run import ExperimentResult, run_experiment
 from tests.helpers.experiments import changed, drive, source_of
+from tests.helpers.replays import transmitted
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
 
 ROOT = Path(__file__).parents[2]
@@ -204,7 +204,7 @@ def by_detect(ready: Replay, plan: Experiment, name: str = "all") -> dict[str, T
         valid[:, chance] = outcomes
         weight = np.where(outcomes, probability[chance], 1 - probability[chance]).prod(axis=1)
         found = detect_by_truth_id(
-            receive_lists(replace(tracks, valid=valid), ready.world(plan), name),
+            transmitted(ready, plan).receive(replace(tracks, valid=valid), name),
             ready.episodes,
             confirm=plan.measure.confirm,
             count_earlier=plan.measure.count_earlier,

@@ -20,8 +20,8 @@ from copem_replay.fusion.interface import make_inbox
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.matching import DUPLICATE, GHOST, MATCH, match_entries
 from copem_replay.pipeline.prepare import prepare_log
-from copem_replay.pipeline.receiver import convert_to_tracks, perceive_all_units, remove_truth_ids, run_receivers
-from copem_replay.pipeline.world import WorldChunk
+from copem_replay.pipeline.receiver import convert_to_tracks, remove_truth_ids
+from tests.helpers.replays import outputs_of, world_of
 from tests.helpers.reports import inputs_of, lists_of
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
 
@@ -146,15 +146,10 @@ def pem(covariance_m2: Any = None, **more: Any) -> dict[str, Any]:
     return {"p": [{"detection": {"kind": "constant", "probability": more.pop("probability", 1.0)}, **error, **more}]}
 
 
-def world_of(plan: Experiment, log: Recording) -> WorldChunk:
-    return prepare_log(log, plan).world(plan)
-
-
 def told_in(plan: Experiment, log: Recording, runs: Sequence[int] = (0,)) -> tuple[Tracks, ObjectLists]:
     """What the units list with truth ids, and without."""
-    world = world_of(plan, log)
-    seen = perceive_all_units(world, np.array(runs), states="sampled")
-    return seen, remove_truth_ids(world, seen, np.array(runs))[0]
+    world = world_of(prepare_log(log, plan), plan, runs)
+    return world.sent("sampled"), remove_truth_ids(world)[0]
 
 
 def as_sets(lists: ObjectLists, run: int = 0) -> list[Counter[bytes]]:
@@ -236,11 +231,11 @@ class TestBackToTracks:
         plan = experiment(pems=pems, units=TWO_UNITS, configurations=self.configurations())
         replay = prepare_log(crowd(), plan)
         roles: Counter[int] = Counter()
-        for name, told in run_receivers(replay.world(plan), np.arange(3), None):
-            issue_s, newest = told.instants.issue_s, told.instants.newest
+        for name, told in outputs_of(replay, plan, np.arange(3)).items():
+            issue_s = told.instants.issue_s
             matches = match_entries(told.lists, replay.truth_cache.at(issue_s), replay.scene, gate_m=3.0)
             for s in range(3):
-                fused_tracks = convert_to_tracks(told.lists, s, matches, told.received, issue_s, newest)
+                fused_tracks = convert_to_tracks(told, s, matches)
                 fused, said = fused_tracks.fused, fused_tracks.said
                 assert said is not None
                 assert Counter(map(bytes, said)) == Counter(map(bytes, entries_in(told.lists, s))), name
@@ -261,11 +256,9 @@ class TestBackToTracks:
         """With a gate of nothing all are ghosts: a track of each of the tracker's tracks, of each entry of union."""
         plan = experiment(pems=pem([[1, 0], [0, 1]]), units=TWO_UNITS, configurations=self.configurations())
         replay = prepare_log(crowd(), plan)
-        for name, told in run_receivers(replay.world(plan), np.arange(1), None):
+        for name, told in outputs_of(replay, plan).items():
             matches = match_entries(told.lists, replay.truth_cache.at(told.instants.issue_s), replay.scene, gate_m=1e-6)
-            fused_tracks = convert_to_tracks(
-                told.lists, 0, matches, told.received, told.instants.issue_s, told.instants.newest
-            )
+            fused_tracks = convert_to_tracks(told, 0, matches)
             assert set(fused_tracks.fused.object_ix) == {-1}
             ids = entries_in(told.lists, 0)["track_id"]
             assert len(fused_tracks.fused.object_ix) == (len(set(ids)) if name == "tracker" else len(ids))
@@ -274,7 +267,7 @@ class TestBackToTracks:
     def test_ideal_fusion_is_as_sure_of_its_list_as_it_is(self) -> None:
         log = crowd()
         plan = experiment(pems=pem(probability=0.5), units=TWO_UNITS, configurations=self.configurations())
-        told = dict(run_receivers(world_of(plan, log), np.arange(2), None))["ideal"]
+        told = outputs_of(prepare_log(log, plan), plan, np.arange(2))["ideal"]
         fused_tracks, lists = told.fused_tracks, told.lists
         assert fused_tracks is not None
         assert lists.entries.dtype == ENTRY
@@ -294,8 +287,8 @@ def test_a_belief_of_a_run_without_entries_is_empty() -> None:
     union = {"u": {"units": "all", "fusion": {"kind": "union"}}}
     plan = experiment(pems=pem(probability=0.0), configurations=union, units=TWO_UNITS)
     replay = prepare_log(crowd(), plan)
-    ((_, told),) = run_receivers(replay.world(plan), np.arange(1), None)
+    [told] = outputs_of(replay, plan).values()
     matches = match_entries(told.lists, replay.truth_cache.at(told.instants.issue_s), replay.scene, gate_m=3.0)
-    fused_tracks = convert_to_tracks(told.lists, 0, matches, told.received, told.instants.issue_s, told.instants.newest)
+    fused_tracks = convert_to_tracks(told, 0, matches)
     assert (len(fused_tracks.fused.frame_ix), len(fused_tracks.fused.object_ix)) == (0, 0)
     assert len(fused_tracks.fused.stamp_ns) == 11, "its lists are there, and empty"

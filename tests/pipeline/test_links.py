@@ -21,11 +21,11 @@ from copem_replay.perception.perceive import perceive
 from copem_replay.pipeline import prepare as chunking
 from copem_replay.pipeline import world as perceived
 from copem_replay.pipeline.prepare import prepare_log
-from copem_replay.pipeline.receiver import draw_shown_ghosts, perceive_all_units, receive_lists
 from copem_replay.pipeline.replay import replay_outcomes
 from copem_replay.pipeline.run import ExperimentResult, run_experiment
 from copem_replay.pipeline.sweep import list_points
 from tests.helpers import scenes
+from tests.helpers.replays import transmitted, world_of
 from tests.helpers.scenes import Thing, driving, experiment, standing
 
 GAMMA = {"kind": "gamma", "min_s": 0.02, "mean_s": 0.06, "shape": 2}
@@ -61,9 +61,7 @@ def plan(link: object, **changes: Any) -> Experiment:
 
 def heard_by(experiment: Experiment, name: str = "coop", one: int = 0, recording: Recording | None = None) -> Tracks:
     """What reaches a receiver in one run."""
-    replay, runs = prepare_log(recording or traffic(), experiment), np.array([one])
-    world = replay.lists_only(experiment, runs)
-    return receive_lists(perceive_all_units(world, runs, states="true"), world, name)
+    return transmitted(prepare_log(recording or traffic(), experiment), experiment, [one]).received(name)
 
 
 def assert_same(one: ExperimentResult, other: ExperimentResult) -> None:
@@ -141,7 +139,7 @@ def test_a_run_alone_is_the_same_run(link: str) -> None:
 
 @pytest.mark.parametrize("link", ["v2x", None])
 def test_a_block_perceives_once(monkeypatch: pytest.MonkeyPatch, link: str | None) -> None:
-    """Which objects are listed, and with which errors: of all runs at once, whether arrivals are drawn or not."""
+    """Which objects are listed, and with which errors: of all runs at once, or where arrivals are drawn run by run."""
     some, asked = plan(link), []
     replay = prepare_log(traffic(), some)
     replay_outcomes(replay, some, np.arange(1))  # what is found out once a log
@@ -152,8 +150,9 @@ def test_a_block_perceives_once(monkeypatch: pytest.MonkeyPatch, link: str | Non
 
     monkeypatch.setattr(perceived, "perceive", counted)
     replay_outcomes(replay, some, np.arange(4))
-    # With a queue how many objects lists have goes by the rows of all objects, detection by those of measured ones.
-    assert sorted(asked) == sorted([(4, "sampled"), (4, "true"), *([(4, "true")] if link else [])])
+    # How long lists are on air, detection and fusion go by the same rows; lists without rows have no states.
+    assert [one for one in asked if one[1] != "true"] == ([(1, "sampled")] * 4 if link else [(4, "sampled")])
+    assert len(asked) == (8 if link else 2)
 
 
 def test_what_a_link_drew_is_drawn_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -195,7 +194,7 @@ def test_false_positives_are_in_the_air_too() -> None:
     channel = {"channel": {"kbps": 100}}
     slow = plan("slow", pems={"half": {"couples": couples, "ghosts": [ghosts]}}, links={"slow": channel})
     replay, runs = prepare_log(traffic(), slow), np.array([3])
-    found = draw_shown_ghosts(replay.world(slow), runs)
+    found = world_of(replay, slow, runs).ghosts
     assert found is not None
     received = heard_by(slow, "gnn", one=3)
     g = np.bincount(found.observations.tracks.frame_ix, minlength=len(received.stamp_ns))
@@ -207,7 +206,7 @@ def test_lists_queue_for_as_long_as_they_are_in_their_run() -> None:
     """At 100 kbit/s a list of n objects takes 8 (121 + 35 n) / 100 000 s, and its unit sends ten a second."""
     slow = plan("slow", links={"slow": {"channel": {"kbps": 100}}})
     replay, runs = prepare_log(traffic(), slow), np.array([3])
-    seen = perceive_all_units(replay.world(slow), runs, states="true")
+    seen = world_of(replay, slow, runs).listed("true")
     objects = np.bincount(seen.frame_ix[seen.valid[0]], minlength=len(seen.stamp_ns))
     assert len(np.unique(objects)) > 2
     received = heard_by(slow, one=3)

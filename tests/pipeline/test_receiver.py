@@ -20,9 +20,10 @@ from copem_replay.fusion.interface import ListFusion, ask_fusion
 from copem_replay.io.recording import Recording
 from copem_replay.pipeline import replay as blocks_module
 from copem_replay.pipeline.prepare import prepare_log
-from copem_replay.pipeline.receiver import ReceiverOutput, perceive_all_units, remove_truth_ids, run_receivers
+from copem_replay.pipeline.receiver import ReceiverOutput, remove_truth_ids
 from copem_replay.pipeline.run import ExperimentResult, run_experiment
 from tests.helpers.experiments import changed, drive
+from tests.helpers.replays import outputs_of, world_of
 from tests.helpers.reports import inputs_of
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
 
@@ -102,9 +103,8 @@ class TestWhatDoesNotMatter:
     def test_the_order_of_entries_lists_and_units(self, latency_s: Any) -> None:
         """Told in another order: the same sets. Which unit was first is open where all lists arrive together."""
         plan, runs = noisy(), np.arange(3)
-        world = prepare_log(crowd(), plan).world(plan)
-        seen = perceive_all_units(world, runs, states="sampled")
-        lists = remove_truth_ids(world, seen, runs)[0]
+        world = world_of(prepare_log(crowd(), plan), plan, runs)
+        seen, lists = world.sent("sampled"), remove_truth_ids(world)[0]
         received = transmit(seen, [UnitLinks("link", ConstantLink(latency_s=latency_s))])
         told = make_inputs(received, lists, max_age_s=1.0)
         rng = np.random.default_rng(0)
@@ -124,10 +124,10 @@ class TestWhatDoesNotMatter:
 
     def test_the_other_runs(self) -> None:
         plan = noisy()
-        world = prepare_log(crowd(), plan).world(plan)
-        batch = dict(run_receivers(world, np.arange(5), None))
+        replay = prepare_log(crowd(), plan)
+        batch = outputs_of(replay, plan, np.arange(5))
         for s in (0, 3):
-            for name, alone in run_receivers(world, np.array([s]), None):
+            for name, alone in outputs_of(replay, plan, [s]).items():
                 assert entries_of_run(alone, 0) == entries_of_run(batch[name], s if name != "GT" else 0), name
 
     def test_jobs_and_blocks(self, monkeypatch: pytest.MonkeyPatch) -> None:

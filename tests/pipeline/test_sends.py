@@ -19,9 +19,9 @@ from copem_replay.pipeline import prepare as chunking
 from copem_replay.pipeline.closed_form import check_exact
 from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import prepare_log
-from copem_replay.pipeline.receiver import perceive_all_units
 from copem_replay.pipeline.run import ExperimentResult, run_experiment
 from tests.helpers import scenes
+from tests.helpers.replays import world_of
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, standing
 
 CPM = {"kind": "cpm"}
@@ -51,9 +51,7 @@ def plan(sends: object, fusions: tuple[str, ...] = ("ideal",), mast: Any = None,
 
 def sent(recording: Recording, some: Experiment, one: int = 0) -> Tracks:
     """What units send in one run."""
-    replay, runs = prepare_log(recording, some), np.array([one])
-    world = replace(replay.world(some), on_air=replay.on_air(some, runs))
-    return perceive_all_units(world, runs, states="true")
+    return world_of(prepare_log(recording, some), some, [one]).sent("true")
 
 
 def when(recording: Recording, some: Experiment, name: str) -> list[float]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +15,10 @@ from copem_replay.metrics.detection.by_truth_id import FirstDetections
 from copem_replay.metrics.detections_table import WAY, find_informing_list
 from copem_replay.pipeline import prepare as chunking
 from copem_replay.pipeline.prepare import prepare_log
-from copem_replay.pipeline.receiver import perceive_all_units, receive_lists
 from copem_replay.pipeline.run import run_experiment
 from copem_replay.report.figures.latency_breakdown import mean_stages
 from tests.helpers import scenes
+from tests.helpers.replays import transmitted, world_of
 from tests.helpers.scenes import EGO_UNIT, experiment
 from tests.pipeline import test_recorded_output as recorded_outputs
 from tests.pipeline.test_links import BURSTS, GAMMA, plan, traffic
@@ -97,10 +96,8 @@ def drawn(**changes: Any) -> Experiment:
 
 def plainly(some: Experiment, name: str, one: int) -> dict[str, list[float]]:
     """By object the times of `WAY`, list by list; NaN: none."""
-    replay, runs = prepare_log(traffic(), some), np.array([one])
-    world = replace(replay.world(some), on_air=replay.on_air(some, runs))
-    seen = perceive_all_units(world, runs, states="true")
-    received = receive_lists(seen, world, name)
+    replay = prepare_log(traffic(), some)
+    seen, received = world_of(replay, some, [one]).sent("true"), transmitted(replay, some, [one]).received(name)
     sent_s, arrives_s, captured_s = seen.common_arrives_s, received.common_arrives_s, seen.captured_s
     holds = {
         (int(f), int(o)) for f, o, there in zip(seen.frame_ix, seen.row_object_ix, seen.valid[0], strict=True) if there

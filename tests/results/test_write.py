@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 from pyarrow import parquet
 
 import copem_replay as cr
-from copem_replay.core.tracks import WHOLE
+from copem_replay.core.tracks import TimeChunk
 from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import read_logs
 from copem_replay.io.write.mcap import RUN_RECORD
@@ -359,7 +359,7 @@ def test_blocks_bound_what_is_held_at_once(monkeypatch: pytest.MonkeyPatch) -> N
         measure = {"onset": {"kind": "appears"}, "objects": {"ids": ["a"]}, "accuracy": accuracy}
         many = experiment(runs=100, measure=measure, pems={"sure": NOISY})
         ready = prepare_log(log, many)
-        candidates = ready.observe(WHOLE) if accuracy else ready.measured
+        candidates = ready.observe(TimeChunk()) if accuracy else ready.measured
         rows = len(candidates.tracks.frame_ix)
         assert rows == (62 if accuracy else 31)
         whole = run_experiment(many, [log])

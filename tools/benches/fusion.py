@@ -19,7 +19,7 @@ import numpy as np
 from benches import common
 from copem_replay.communication.arrivals import fusion_schedule
 from copem_replay.core.object_list import COVARIANCES, Inputs, ObjectLists, entries_of
-from copem_replay.core.tracks import CLASSES, Float, Tracks
+from copem_replay.core.tracks import CLASSES, Float, TimeChunk
 from copem_replay.experiment.schema import Experiment
 from copem_replay.fusion.gnn import Gnn
 from copem_replay.fusion.ideal import fuse_ideal
@@ -28,10 +28,11 @@ from copem_replay.fusion.interface import ListFusion
 from copem_replay.fusion.tracker import Tracker
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.gospa import gospa, gospa_pairs
+from copem_replay.pipeline.expansion import RunGroup
 from copem_replay.pipeline.prepare import prepare_log
-from copem_replay.pipeline.receiver import perceive_all_units, receive_lists, remove_truth_ids
+from copem_replay.pipeline.receiver import remove_truth_ids
 from copem_replay.pipeline.replay import cut_blocks
-from copem_replay.pipeline.world import WorldChunk
+from copem_replay.pipeline.world import Transmission
 from tests.oracles import gnn as gnn_oracle
 
 PERIOD_S = 0.1
@@ -79,13 +80,12 @@ def crossing(experiment: Experiment, recording: Recording) -> Iterator[common.Li
     Only the fusion: what units list, and when it arrives, is there before.
     """
     ready = prepare_log(recording, experiment)
-    world = ready.world(experiment)
     cut = cut_blocks(ready, experiment, 2)[:2]
-    seen = [perceive_all_units(world, runs, states="sampled") for runs in cut]
-    told = [remove_truth_ids(world, each, runs)[0] for each, runs in zip(seen, cut, strict=True)]
+    lists = [Transmission(ready, experiment, RunGroup.of_all_units(ready.expanded, runs)) for runs in cut]
+    told = [remove_truth_ids(each.world(TimeChunk(), -np.inf))[0] for each in lists]
     with ThreadPoolExecutor(2) as pool:
-        for name in world.experiment.configurations:
-            parts = [_fusing(world, name, *each) for each in zip(seen, told, strict=True)]
+        for name in experiment.configurations:
+            parts = [_fusing(name, *each) for each in zip(lists, told, strict=True)]
             work = [fused for fused, _ in parts]
             count = parts[0][1] * sum(map(len, cut))
             one = common.best(lambda work=work: list(map(call, work)), 2) / count
@@ -98,9 +98,10 @@ def crossing(experiment: Experiment, recording: Recording) -> Iterator[common.Li
             }
 
 
-def _fusing(world: WorldChunk, name: str, seen: Tracks, told: ObjectLists) -> tuple[Callable[[], object], int]:
+def _fusing(name: str, lists: Transmission, told: ObjectLists) -> tuple[Callable[[], object], int]:
     """Fuses one block of runs as one configuration does; how many lists each run gets."""
-    received = receive_lists(seen, world, name)
+    world = lists.world(TimeChunk(), -np.inf)
+    received = lists.receive(world.sent("sampled"), name)
     configuration = world.experiment.configurations[name]
     age_of_information_s, fusion = configuration.max_age_s, configuration.fusion
     count = len(fusion_schedule(received, max_age_s=age_of_information_s).issue_s)

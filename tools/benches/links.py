@@ -37,7 +37,7 @@ def by_fusion(recording: Recording) -> Iterator[common.Line]:
         ready = [prepare_log(recording, one) for one in plans]
 
         def replayed(experiment: Experiment, replay: Replay) -> None:
-            vars(replay).pop("_drawn", None)  # what links drew is of the call before
+            vars(replay).pop("kept_draws", None)  # what links drew is of the call before
             run_experiment(experiment, [recording], ready=[replay])
 
         constant_s, drawn_s = common.interleaved(

@@ -1,0 +1,32 @@
+"""Single steps of a replay: what units list, what is sent and received, and what receivers issue, in some runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from copem_replay.core.tracks import Int, TimeChunk
+from copem_replay.experiment.schema import Experiment
+from copem_replay.pipeline.expansion import RunGroup
+from copem_replay.pipeline.prepare import Replay
+from copem_replay.pipeline.receiver import ReceiverOutput, Receivers
+from copem_replay.pipeline.world import Transmission, WorldChunk
+
+
+def transmitted(replay: Replay, plan: Experiment, runs: Sequence[int] | Int = (0,), **how: bool) -> Transmission:
+    """The lists of a log on their way, with all units in these runs."""
+    units = replay.expanded.with_(plan)
+    return Transmission(replay, plan, RunGroup.of_all_units(units, np.asarray(runs)), **how)  # type: ignore[arg-type]
+
+
+def world_of(replay: Replay, plan: Experiment, runs: Sequence[int] | Int = (0,)) -> WorldChunk:
+    """A whole log as its units have it in these runs."""
+    return transmitted(replay, plan, runs).world(TimeChunk(), -np.inf)
+
+
+def outputs_of(replay: Replay, plan: Experiment, runs: Sequence[int] | Int = (0,)) -> dict[str, ReceiverOutput]:
+    """By configuration what its receiver issues in the whole log."""
+    lists = transmitted(replay, plan, runs)
+    receivers, world = Receivers(lists), lists.world(TimeChunk(), -np.inf)
+    return {name: receivers.fuse(world, name) for name in plan.configurations}
