@@ -222,14 +222,14 @@ def check_any_counted(study: LoadedStudy, replays: Sequence[Replay] = ()) -> Non
 
     `replays`: the prepared logs; of the others it is known from the survey.
     """
-    from copem_replay.pipeline.notes import check_counted, count_began
+    from copem_replay.metrics.onset import check_counted
 
-    numbers = [count_began(replay.episodes) for replay in replays]
+    numbers = [replay.episodes.count_began() for replay in replays]
     surveys = [recording.survey for recording in study.recordings if recording.survey is not None]
     numbers += [survey.said["facts"]["began"] for survey in surveys if "facts" in survey.said]
     numbers += study.survey.began if study.survey is not None else []
     try:
-        check_counted(numbers, study.experiment)
+        check_counted(numbers, study.experiment.measure.began)
     except ExperimentError as error:
         raise ExperimentError([study.source.at(("measure", "began"), one) for one in error.problems]) from None
 

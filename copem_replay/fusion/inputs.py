@@ -6,7 +6,6 @@ is left out, since it knows where it is.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numba as nb
@@ -24,7 +23,13 @@ def make_entry_lists(seen: Tracks, claims: EntryClaims, drawn: Float, *, without
     columns = {name: getattr(seen, name) for name in VALUES}
     columns |= zip(COVARIANCES, floor_covariances(seen), strict=True)
     start, picked = listed_rows(seen, drawn, without_object_ix=without_object_ix)
-    entries = take_entries(_make_template(seen, claims, columns), picked)
+    rows = np.zeros(len(seen.frame_ix), dtype=ENTRY)
+    for name, values in columns.items():  # those that the runs share
+        if len(values) == 1:
+            rows[name] = values[0]
+    rows["existence"], rows["class_probability"], rows["track_id"] = claims
+    rows["captured_s"], rows["unit_ix"] = seen.row_captured_s, seen.row_unit_ix
+    entries = take_entries(rows, picked)
     run = np.repeat(np.arange(len(start)), start[:, -1] - start[:, 0])
     for name, values in columns.items():
         if len(values) > 1:
@@ -79,18 +84,6 @@ def add_kept_entries(inputs: Inputs, kept: KeptEntries, partial: Bool, max_age_s
         newest=kept.newest,
         keeps_s=np.where(partial, max_age_s, 0.0),
     )
-
-
-def _make_template(received: Tracks, claims: EntryClaims, columns: Mapping[str, Float]) -> Entries:
-    """(P,) entries with all columns that the runs share."""
-    entries = np.zeros(len(received.frame_ix), dtype=ENTRY)
-    for name, values in columns.items():
-        if len(values) == 1:
-            entries[name] = values[0]
-    entries["existence"], entries["class_probability"] = claims.existence, claims.class_probability
-    entries["track_id"] = claims.track_id
-    entries["captured_s"], entries["unit_ix"] = received.row_captured_s, received.row_unit_ix
-    return entries
 
 
 @nb.njit(cache=True, nogil=True)

@@ -22,7 +22,7 @@ from copem_replay.core.errors import ExperimentError
 from copem_replay.core.interpolation import interpolate_states, wrap_angles
 from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int, Scene, Tracks, class_indices
 from copem_replay.metrics.config import Measure, MetricsSetup
-from copem_replay.metrics.onset import APPEARED, CROSSED, LOG_START, OnsetView, evaluate_onset
+from copem_replay.metrics.onset import APPEARED, BEGAN, CROSSED, LOG_START, OnsetView, evaluate_onset
 from copem_replay.metrics.survival import END_REASONS, EndReason
 from copem_replay.perception.config import Carriers
 from copem_replay.perception.observation import Observations
@@ -130,6 +130,10 @@ class Episodes:
         which, first = self.passes[0]
         ends = np.append(which, len(self.object_ix))[1:] - 1
         return replace(first, ended_s=self.ended_s[ends], ended_by=self.ended_by[ends])
+
+    def count_began(self) -> tuple[int, ...]:
+        """How many episodes began in each of the ways `BEGAN`."""
+        return tuple(np.bincount(self.began, minlength=len(BEGAN)).tolist())
 
     def counts_from_s(self, *, count_earlier: bool) -> Float:
         """(M,) captures from here on count: the onset, or with `count_earlier` all after the episode before."""

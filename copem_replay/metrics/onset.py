@@ -24,6 +24,7 @@ from copem_replay.core.components import (
     drop_python_examples,
     wrong_answer_error,
 )
+from copem_replay.core.errors import ExperimentError, count_noun
 from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int, Tracks
 
 if TYPE_CHECKING:
@@ -72,6 +73,32 @@ def select_counted(rows: pd.DataFrame, words: Sequence[str]) -> pd.DataFrame:
     """The rows that count, of a table with the columns `COUNTS_BY`."""
     counted = is_counted(rows, words)
     return rows if counted.all() else rows[counted]
+
+
+# How many episodes of a log began in each of the ways `BEGAN`, as `Episodes.count_began` gives them.
+
+COUNT_ALL = "measure: {began: [log_start, crossed, appeared]}"
+"""The line with which all episodes count."""
+
+
+def count_counted(numbers: Sequence[int], words: Sequence[str]) -> int:
+    """How many of the episodes count by `measure.began`."""
+    return sum(number for word, number in zip(BEGAN, numbers, strict=True) if word in words)
+
+
+def describe_numbers(numbers: Sequence[int]) -> str:
+    """`5 log_start, 2 appeared, 9 crossed`."""
+    return ", ".join(f"{number} {word}" for word, number in zip(BEGAN, numbers, strict=True))
+
+
+def check_counted(by_log: Sequence[Sequence[int]], words: Sequence[str]) -> None:
+    """Raises ExperimentError where objects have an onset, but none counts by `measure.began` in any log."""
+    total = np.sum(by_log, axis=0).tolist() if by_log else []
+    if sum(total) and not count_counted(total, words):
+        raise ExperimentError(
+            f"expected objects that count ({', '.join(words)}), found none: of {count_noun(sum(total), 'object')} with "
+            f"an onset {describe_numbers(total)}; `{COUNT_ALL}` counts all"
+        )
 
 
 class Requires(Enum):

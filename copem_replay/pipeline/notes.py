@@ -18,7 +18,7 @@ import numpy as np
 from copem_replay.communication.arrivals import receiver_instants
 from copem_replay.communication.radio import Radio
 from copem_replay.communication.reception import RadioPath, ReceptionModel, ask_reception_probability
-from copem_replay.core.errors import ExperimentError, count_noun
+from copem_replay.core.errors import count_noun
 from copem_replay.core.interpolation import wrap_angles
 from copem_replay.core.tracks import (
     CLASS_GROUPS,
@@ -38,9 +38,9 @@ from copem_replay.experiment.schema import Experiment, ideal_over, output_unit
 from copem_replay.fusion.interface import IdealFusion
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.detection.conflict import describe_excluded
-from copem_replay.metrics.episodes import AGAIN_AFTER_S, Episodes, measured_objects
+from copem_replay.metrics.episodes import AGAIN_AFTER_S, measured_objects
 from copem_replay.metrics.metric import LinkTimes, OutputTimes, link_times
-from copem_replay.metrics.onset import BEGAN, InRange, Onset
+from copem_replay.metrics.onset import BEGAN, InRange, Onset, count_counted, describe_numbers
 from copem_replay.perception.config import Carriers
 from copem_replay.perception.observation import interpolate_worlds
 from copem_replay.perception.pem.model import ObjectSidePlace, Pem
@@ -459,7 +459,7 @@ def _explain_unmeasured(replay: Replay, experiment: Experiment) -> Iterator[str]
         yield "no rows: no object with an onset matters by `objects.within`"
     elif not len(episodes.object_ix):
         yield f"no rows: no measured object has an onset ({measure.onset.kind})"
-    elif not count_counted(numbers := count_began(episodes), measure.began):
+    elif not count_counted(numbers := episodes.count_began(), measure.began):
         yield f"no object counts: {describe_numbers(numbers)}; `measure.began` has {', '.join(measure.began)}"
     yield from _find_returns(replay)
     if experiment.braking is not None and len(episodes.object_ix) and not replay.encounters:
@@ -485,37 +485,7 @@ def _find_returns(replay: Replay) -> Iterator[str]:
     )
 
 
-# How many episodes began how.
-
-COUNT_ALL = "measure: {began: [log_start, crossed, appeared]}"
-"""The line with which all episodes count."""
-
-
-def count_began(episodes: Episodes) -> tuple[int, ...]:
-    """How many episodes began in each of the ways `BEGAN`."""
-    return tuple(np.bincount(episodes.began, minlength=len(BEGAN)).tolist())
-
-
-def count_counted(numbers: Sequence[int], words: Sequence[str]) -> int:
-    """How many of the episodes, by how they began, count by `measure.began`."""
-    return sum(number for word, number in zip(BEGAN, numbers, strict=True) if word in words)
-
-
-def describe_numbers(numbers: Sequence[int]) -> str:
-    """`5 log_start, 2 appeared, 9 crossed`."""
-    return ", ".join(f"{number} {word}" for word, number in zip(BEGAN, numbers, strict=True))
-
-
-def check_counted(by_log: Sequence[Sequence[int]], experiment: Experiment) -> None:
-    """Raises ExperimentError where objects have an onset, but none counts in any log. `by_log`: as by `count_began`."""
-    total = np.sum(by_log, axis=0).tolist() if by_log else []
-    if sum(total) and not count_counted(total, experiment.measure.began):
-        words = ", ".join(experiment.measure.began)
-        raise ExperimentError(
-            f"expected objects that count ({words}), found none: of {count_noun(sum(total), 'object')} with an onset "
-            f"{describe_numbers(total)}; `{COUNT_ALL}` counts all"
-        )
-
+# How many episodes began how, with other onsets.
 
 RANGES_M = (30.0, 40.0, 50.0)
 """Ranges for which `check` says how many objects begin how: those that studies use."""
@@ -537,7 +507,7 @@ def list_began(ready: Sequence[Replay], experiment: Experiment) -> list[str]:
             measure = alone.measure.model_copy(update={"onset": one})
             measured = alone.model_copy(update={"measure": measure})
             same = one == alone.measure.onset
-            total += count_began(replay.episodes if same else replay.find_episodes_of(measured))
+            total += (replay.episodes if same else replay.find_episodes_of(measured)).count_began()
         chosen = "; chosen" if one == onset and len(asked) > 1 else ""
         lines.append(f"{label}: {describe_numbers(total.tolist())}{chosen}")
     return [f"objects by how they began, {line}" for line in lines]
@@ -567,7 +537,7 @@ class LogFacts:
         """The facts of a prepared log; `experiment`: resolved for it."""
         return cls(
             len(replay.episodes.object_ix),
-            count_began(replay.episodes),
+            replay.episodes.count_began(),
             has_same_instants([replay]),
             tuple(list_oddities(replay, experiment, replay.ever_met)),
             measure_list_rates(replay, experiment),

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from copem_replay.core.errors import ExperimentError
+from copem_replay.core.errors import ExperimentError, count_noun
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import SAME_INSTANT_S, TRUTH, Bool, Float, Int, TimeChunk, Tracks
 from copem_replay.experiment.schema import Experiment
@@ -133,16 +133,10 @@ def _rank_run(rows: pd.DataFrame, horizon_s: float, rank: str) -> tuple[int, str
     ranked = np.sort(total.to_numpy())
     position = {"best": 0, "median": (len(ranked) - 1) // 2, "worst": -1}[rank]
     equal = total.index[total == ranked[position]]
-    over = (_format_count(rows[name].nunique(), what) for name, what in _SUMMED.items())
-    why = f"{rank} of {len(ranked)} by time to detection summed over {' and '.join(over)}"
+    configurations = count_noun(rows["configuration"].nunique(), "configuration")
+    over = f"{configurations} and {count_noun(rows['object_id'].nunique(), 'object')}"
+    why = f"{rank} of {len(ranked)} by time to detection summed over {over}"
     return int(equal[0]), why + (f", the first of {len(equal)} equal" if len(equal) > 1 else "")
-
-
-_SUMMED = {"configuration": "configuration", "object_id": "object"}
-
-
-def _format_count(number: int, what: str) -> str:
-    return f"{number} {what}{'s' if number != 1 else ''}"
 
 
 def select_shown_logs(experiment: Experiment, result: ExperimentResult) -> list[str]:

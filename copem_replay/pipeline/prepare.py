@@ -8,7 +8,7 @@ depends on where the cuts are.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
@@ -22,7 +22,7 @@ from copem_replay.core.errors import ExperimentError
 from copem_replay.core.interpolation import AROUND_S, interpolate_at_instants, interpolate_at_stated_instants
 from copem_replay.core.object_list import AGREE
 from copem_replay.core.tracks import CLASSES, Bool, Float, Int, Scene, TimeChunk, Tracks, class_indices, join_tracks
-from copem_replay.experiment.schema import Configuration, Experiment
+from copem_replay.experiment.schema import Experiment
 from copem_replay.fusion.interface import ListFusion
 from copem_replay.io.recorded_units import RecordedUnits, join_recorded_units
 from copem_replay.io.recording import Recording
@@ -58,7 +58,8 @@ _AFTER = 0.381966
 def time_chunks(scene: Scene, truth: Tracks, experiment: ExpandedExperiment) -> tuple[TimeChunk, ...]:
     """A log in time chunks of about as many observation rows each."""
     rows = observation_rows(scene, truth, experiment)
-    if rows <= ROWS_AT_ONCE or not _can_be_cut(experiment.configurations.values()):
+    fusions = [one.fusion for one in experiment.configurations.values()]
+    if rows <= ROWS_AT_ONCE or not all(one.resumable for one in fusions if isinstance(one, ListFusion)):
         return (TimeChunk(),)
     _, bounds = truth.by_frame
     pieces = int(-(-rows // ROWS_A_CHUNK))
@@ -74,10 +75,6 @@ def observation_rows(scene: Scene, truth: Tracks, experiment: ExpandedExperiment
     """About how many observation rows a log has, with those of the truth, which is perceived like a unit."""
     lists = sum(len(list_instants(scene, truth, unit)) for unit in experiment.modelled.values())
     return len(truth.frame_ix) * (1 + lists / max(len(truth.stamp_ns), 1))
-
-
-def _can_be_cut(configurations: Iterable[Configuration]) -> bool:
-    return all(fusion.resumable for c in configurations if isinstance(fusion := c.fusion, ListFusion))
 
 
 # The truth at the instants of fused lists.

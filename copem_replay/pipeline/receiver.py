@@ -298,6 +298,7 @@ class Receivers:
             stated = {name: self._state_captures(of) for name, of in received.items()}
             reach = Reach(lists.experiment, received, stated)
         for chunk in chunks:
+            self._told = self._last_fused = None  # of the chunk before, which is dropped
             yield lists.world(chunk, chunk.from_s if reach is None else reach.earliest_s(chunk))
 
     def issue_s(self, name: str) -> Float:

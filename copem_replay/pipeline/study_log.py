@@ -30,7 +30,7 @@ from copem_replay.io.open import (
     sha256_of,
 )
 from copem_replay.io.recording import Recording, StoredSurvey, read_whole_recording
-from copem_replay.pipeline.notes import LogFacts, count_began, scene_as_json, scene_from_json
+from copem_replay.pipeline.notes import LogFacts, scene_as_json, scene_from_json
 from copem_replay.pipeline.pieces import (
     PieceCache,
     canonical_json,
@@ -269,5 +269,5 @@ class LogSurvey:
         except ExperimentError as error:
             self.problems += (problem for problem in error.problems if problem not in self.problems)
         self.sizes.append(estimate_size(replay))
-        self.began.append(count_began(replay.episodes))
+        self.began.append(replay.episodes.count_began())
         return drop_content(recording, read)

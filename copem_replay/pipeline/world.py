@@ -182,12 +182,13 @@ class Transmission:
 
     def world(self, chunk: TimeChunk, earliest_s: float) -> WorldChunk:
         """A time chunk with captures back to `earliest_s`; that of a log in one is kept."""
-        log = self.log
-        if self._whole is None or len(log.chunks) > 1:
+        log, world = self.log, self._whole
+        if world is None:
             observations = log.observe_listable(chunk, earliest_s, complete=self._complete)
-            self._whole = WorldChunk(log, self.experiment, self.group, chunk, observations, earliest_s, self._complete)
-        self._whole.sending = self._sending
-        return self._whole
+            world = WorldChunk(log, self.experiment, self.group, chunk, observations, earliest_s, self._complete)
+            self._whole = world if len(log.chunks) == 1 else None
+        world.sending = self._sending
+        return world
 
     @property
     def lists(self) -> Tracks:
@@ -234,7 +235,8 @@ class Transmission:
 
     def _count_objects(self) -> Int:
         """(F,) how many entries each list of one run has, ghosts among them."""
-        sent = (world.sent(self.states) for world in self._own_chunks())
+        states: States = "true" if self.states == "expected" else self.states
+        sent = (world.sent(states) for world in self._own_chunks())
         counts: Int = np.sum([np.bincount(s.frame_ix[s.valid[0]], minlength=len(s.stamp_ns)) for s in sent], axis=0)
         return counts
 
@@ -313,12 +315,8 @@ class SentObjects:
 
 def _key_rows(frame_ix: Int, words: Words) -> Words:
     """(P,) a number for each row: never equal within a list, and practically never between lists."""
-    return words ^ _mix_bits(frame_ix.astype(np.uint64))
-
-
-def _mix_bits(numbers: Words) -> Words:
-    result: Words = numbers * np.uint64(0x9E3779B97F4A7C15)  # an odd factor: one to one
-    return result
+    mixed: Words = frame_ix.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)  # an odd factor: one to one
+    return words ^ mixed
 
 
 def select_sent_objects(experiment: ExpandedExperiment, chunks: Iterable[WorldChunk]) -> SentObjects:
