@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from copem_replay.io.open import File
-    from copem_replay.pipeline.crew import Crew
-    from copem_replay.pipeline.pieces import PieceCache
+    from copem_replay.pipeline.crew import Crew, CrewProgress
+    from copem_replay.pipeline.parts import PartCache
     from copem_replay.pipeline.prepare import Replay
     from copem_replay.results.folder import ResultsPlace
 
@@ -151,10 +151,10 @@ def run(
 
     `experiment`: an Experiment, its keys and values in a dict, or the path of its file. `recordings`: Recordings or
     paths, one or several; None: those the experiment names. `jobs`: workers; None: one per core. The result does not
-    depend on it. `progress(done, total)` is called after each block of runs. `pieces`: a folder or a URL where what
-    was computed is kept, and found by the next run (docs/guide/scale.md). `crew`: an executor of processes on this
-    machine or on others, such as ProcessPoolExecutor or `Client.get_executor()` of Dask, in place of `jobs`; it needs
-    `pieces` that all of them see, and recordings by their paths.
+    depend on it. `progress(done, total)` is called after each block of runs, with a crew after each log. `pieces`: a
+    folder or a URL where what was computed is kept, and found by the next run (docs/guide/scale.md). `crew`: an
+    executor of processes on this machine or on others, such as ProcessPoolExecutor or `Client.get_executor()` of Dask,
+    in place of `jobs`; it needs `pieces` that all of them see, and recordings by their paths.
 
     Raises InputError, before any run, with all problems at once: of the experiment (ExperimentError), of recordings, of
     both together, times without a closed form, runs that no memory holds.
@@ -165,7 +165,7 @@ def run(
     """
     from copem_replay.pipeline.study_log import LogSurvey
 
-    cache = None if pieces is None else open_pieces(str(pieces))
+    cache = None if pieces is None else open_parts(str(pieces))
     if crew is None:
         study = make_study(experiment, recordings, LogSurvey(cache))
     elif cache is None:
@@ -173,25 +173,28 @@ def run(
     else:
         from copem_replay.pipeline.crew import Crew
 
-        show = None if progress is None else lambda p: progress(p.rows_done, p.rows)
+        def show(reached: CrewProgress) -> None:
+            if progress is not None:
+                progress(reached.done if reached.what == "replaying" else 0, reached.total)
+
         workers = Crew(crew, cache, show)
         study = read_with_crew(lambda: make_study(experiment, recordings, LogSurvey(cache), workers), workers)
     return replay_study(study, prepare_study(study)[0], jobs, progress, cache)
 
 
 def read_with_crew(read: Callable[[], LoadedStudy], crew: Crew) -> LoadedStudy:
-    """The study that `read` returns, with all pieces computed; it is read again after a log that killed workers."""
+    """The study that `read` returns, with all parts computed; it is read again after a log that killed workers."""
     check_any_counted(study := read())
     while crew.fill(study.experiment, study.recordings):
         study = read()
     return study
 
 
-def open_pieces(address: str) -> PieceCache:
-    """The pieces kept in a folder, or under a URL. Raises InputError, OutputError."""
-    from copem_replay.pipeline.pieces import PieceCache
+def open_parts(address: str) -> PartCache:
+    """The parts kept in a folder, or under a URL. Raises InputError, OutputError."""
+    from copem_replay.pipeline.parts import PartCache
 
-    return PieceCache(address)
+    return PartCache(address)
 
 
 def replay_study(
@@ -199,13 +202,13 @@ def replay_study(
     ready: Sequence[Replay],
     jobs: int | None,
     progress: Progress | None,
-    pieces: PieceCache | None = None,
+    parts: PartCache | None = None,
 ) -> StudyResult:
     """Replay the prepared logs of a study (`ready`). `progress(done, total)` is called after each block of runs."""
     from copem_replay.pipeline.run import run_experiment
 
     result = run_experiment(
-        study.experiment, study.recordings, jobs=count_workers(jobs), progress=progress, ready=ready, pieces=pieces
+        study.experiment, study.recordings, jobs=count_workers(jobs), progress=progress, ready=ready, parts=parts
     )
     return StudyResult(study.experiment, study.recordings, result)
 

@@ -139,9 +139,9 @@ def read_study(
     survey: LogSurvey | None = None,
     crew: Crew | None = None,
 ) -> LoadedStudy:
-    """Read the recordings of an experiment; a log that the survey knows from its pieces is not read again.
+    """Read the recordings of an experiment; a log that the survey knows from its parts is not read again.
 
-    A crew surveys logs without pieces. The survey also decides which recordings stay in memory.
+    A crew surveys logs without parts. The survey also decides which recordings stay in memory.
 
     Raises InputError with all problems of the experiment and of the recordings.
     """

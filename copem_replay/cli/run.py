@@ -34,11 +34,11 @@ if TYPE_CHECKING:
     from copem_replay.experiment.file import ExperimentSource
     from copem_replay.experiment.schema import Experiment
     from copem_replay.pipeline.crew import Crew
-    from copem_replay.pipeline.pieces import PieceCache
+    from copem_replay.pipeline.parts import PartCache
     from copem_replay.results.folder import ResultsPlace
 
 Pieces: TypeAlias = Annotated[
-    str | None, typer.Option(metavar="FOLDER", help="Keep finished pieces here, and reuse them: a folder or a URL.")
+    str | None, typer.Option(metavar="FOLDER", help="Keep finished parts here, and reuse them: a folder or a URL.")
 ]
 Cluster: TypeAlias = Annotated[
     str | None,
@@ -87,7 +87,7 @@ def run(
     with take_place(out, overwrite=overwrite) as place:
         print_notes(place.notes)
         place.notes.clear()
-        cache = _open_pieces(pieces)
+        cache = _open_parts(pieces)
         study = _read_study(place, experiment, source, skip_unreadable, cache, cluster)
         url = _check_viewer(study.experiment, viewer) if live or viewer is not None else None
         result, advice = _replay_study(study, jobs, cache, threads=cluster is None)
@@ -100,17 +100,17 @@ def run(
     return 1 if study.skipped or place.failed else 0
 
 
-def _open_pieces(pieces: str | None) -> PieceCache | None:
-    from copem_replay.api.run import open_pieces
+def _open_parts(pieces: str | None) -> PartCache | None:
+    from copem_replay.api.run import open_parts
 
-    return None if pieces is None else open_pieces(pieces)
+    return None if pieces is None else open_parts(pieces)
 
 
 def _read_study(
-    place: ResultsPlace, file: Path, source: ExperimentSource, skip_unreadable: bool, cache: PieceCache | None,
+    place: ResultsPlace, file: Path, source: ExperimentSource, skip_unreadable: bool, cache: PartCache | None,
     cluster: str | None,
 ) -> LoadedStudy:  # fmt: skip
-    """The experiment and its recordings; with `cluster` every piece is computed when this returns."""
+    """The experiment and its recordings; with `cluster` every part is computed when this returns."""
     from copem_replay.api.run import read_with_crew
     from copem_replay.api.study import read_study
     from copem_replay.pipeline.study_log import LogSurvey
@@ -127,7 +127,7 @@ def _read_study(
 
 
 def _replay_study(
-    study: LoadedStudy, jobs: int | None, cache: PieceCache | None, *, threads: bool
+    study: LoadedStudy, jobs: int | None, cache: PartCache | None, *, threads: bool
 ) -> tuple[StudyResult, list[str]]:
     """Replay with progress on stderr. Returns the result and, if `threads` do the work, the advice on `--cluster`."""
     from copem_replay.api.run import count_workers, replay_study
@@ -141,7 +141,7 @@ def _replay_study(
 
 
 def _write_results(
-    place: ResultsPlace, study: LoadedStudy, result: StudyResult, advice: list[str], cache: PieceCache | None,
+    place: ResultsPlace, study: LoadedStudy, result: StudyResult, advice: list[str], cache: PartCache | None,
     viewer: str | None,
 ) -> None:  # fmt: skip
     """Fill the results folder, then print notes, problems and the summary."""
@@ -198,31 +198,29 @@ def _check_viewer(experiment: Experiment, url: str | None) -> str:
 
 
 @contextmanager
-def connect_crew(address: str | None, pieces: PieceCache | None) -> Iterator[Crew | None]:
+def connect_crew(address: str | None, parts: PartCache | None) -> Iterator[Crew | None]:
     """The crew at an address; None without an address. Prints what became of its workers, also after an interrupt.
 
-    Raises CopemError: no scheduler at the address, workers of another version, or workers that do not see the pieces.
+    Raises CopemError: no scheduler at the address, workers of another version, or workers that do not see the parts.
     """
-    if address is None or pieces is None:
+    if address is None or parts is None:
         yield None
         return
     from copem_replay.api.run import count_workers
     from copem_replay.pipeline.crew import Crew
-    from copem_replay.pipeline.dask_workers import DaskWorkers
+    from copem_replay.pipeline.dask_workers import connect_workers
 
-    workers = DaskWorkers(address, pieces, count_workers(None))
-    try:
-        with show_crew_progress() as show:
-            crew = Crew(workers, pieces, show)
-            yield crew
-        print_notes(crew.notes)
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(crew.interrupted) from None
-    except SystemExit:  # of a signal
-        print_problems([crew.interrupted])
-        raise
-    finally:
-        workers.close()
+    with connect_workers(address, parts, count_workers(None)) as workers:
+        try:
+            with show_crew_progress() as show:
+                crew = Crew(workers, parts, show)
+                yield crew
+            print_notes(crew.notes)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(crew.interrupted) from None
+        except SystemExit:  # of a signal
+            print_problems([crew.interrupted])
+            raise
 
 
 def advise_cluster(took_s: float, cores: int) -> list[str]:

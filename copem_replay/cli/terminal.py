@@ -218,7 +218,7 @@ def show_crew_progress() -> Iterator[Callable[[CrewProgress], None]]:
 
 
 class CrewProgressLines:
-    """Progress of a crew in lines: `replaying: 412 of 5000 logs, 83 M rows, 9 minutes left, 1 worker lost`."""
+    """Progress of a crew in lines: `replaying: 412 of 5000 logs, 9 minutes left, 1 worker lost`."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock, self._what, self._left = clock, "", _TimeLeft()
@@ -235,21 +235,11 @@ class CrewProgressLines:
         """The progress in one line; the time left is that of this kind of work."""
         if progress.what != self._what:
             self._what, self._left = progress.what, _TimeLeft()
-        parts = [f"{progress.what}: {progress.logs_done} of {count_noun(progress.logs, 'log')}"]
-        if progress.rows_done:
-            parts.append(f"{_round_count(progress.rows_done)} rows")
+        parts = [f"{progress.what}: {progress.done} of {count_noun(progress.total, 'log')}"]
         parts += self._left.words(self._clock(), progress.done, progress.total)
         if progress.lost:
             parts.append(f"{count_noun(progress.lost, 'worker')} lost")
         return ", ".join(parts)
-
-
-def _round_count(count: int) -> str:
-    """A count in three digits or fewer, with k, M or G."""
-    for size, letter in ((10**9, " G"), (10**6, " M"), (10**3, " k")):
-        if count >= size:
-            return f"{count // size}{letter}"
-    return str(count)
 
 
 def format_duration(time_s: float) -> str:

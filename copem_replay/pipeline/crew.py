@@ -1,219 +1,201 @@
-"""The crew: an executor whose workers survey logs and compute pieces, and what happens where workers fail.
+"""The crew: an executor whose workers survey logs and compute parts, and what happens where workers fail.
 
-The command then finds every piece among those that are kept, as it does when it is run again: results are the same
-bytes, whichever worker computes and in whatever order. Tasks: of one log, at most MOST_CELLS or MOST_ROWS each; reading
-a log again costs little, and a worker that dies gives up little. No piece depends on how tasks are cut.
+The command then finds every part among those that are kept, as it does when it is run again: results are the same
+bytes, whichever worker computes and in whatever order. A task is a log with all its missing parts. Text and paths are
+sent, a receipt comes back; rows, recordings and modules are never sent (docs/develop/decisions/0036-crew.md).
 """
 
 from __future__ import annotations
 
 import json
 import os
-from abc import ABC, abstractmethod
+import platform
+import secrets
+import traceback
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from pathlib import Path
+from functools import lru_cache
 
-from copem_replay.core.errors import CopemError, count_noun
+from pydantic import ValidationError
+
+from copem_replay.core.errors import CopemError, ExperimentError, InputError, count_noun
 from copem_replay.core.yaml import Key
 from copem_replay.experiment.drive import apply_settings, resolve_for_log
 from copem_replay.experiment.file import ExperimentSource, place_identity, relocate_settings
 from copem_replay.experiment.schema import Experiment, LogSettings
-from copem_replay.experiment.validate import RefusedLog, log_names, refuse_missing, settings_by_place
+from copem_replay.experiment.validate import RefusedLog, log_names, read_logs, refuse_missing, settings_by_place
 from copem_replay.io.open import Place, first_recording
 from copem_replay.io.recording import Recording
-from copem_replay.pipeline.pieces import PieceCache, recipe_key, split_runs, take_fingerprint, write_recipe
+from copem_replay.pipeline.closed_form import check_exact
+from copem_replay.pipeline.cost import RunCost, peak_bytes
+from copem_replay.pipeline.parts import (
+    PartCache,
+    Store,
+    cut_parts,
+    open_store,
+    part_name,
+    take_fingerprint,
+    write_recipe,
+)
+from copem_replay.pipeline.run import Gatherer
 from copem_replay.pipeline.study_log import StudyLog, survey_key
 from copem_replay.pipeline.sweep import list_points
-from copem_replay.pipeline.worker import LogTask, Receipt, Task, Work, do_task
 
-# Tasks: what a study still needs of its logs.
-
-MOST_CELLS, MOST_ROWS = 50_000_000, 500_000
-"""Row × run cells, and rows, of a task at most, unless one piece has more: some seconds of work."""
-ROWS_AT_ONCE = {False: 250_000, True: 60_000}
-"""Rows in memory of a worker at most, unless one piece has more, without accuracy and with it: up to 500 MB."""
-LEAST_S = 1.0
-"""Seconds below which a task is not cut further: sending it and reading its log would cost as much."""
+# A task, and the worker that does it.
 
 
-def plan_surveys(
-    experiment: Experiment, places: Mapping[Place, Key | None], source: ExperimentSource, pieces: PieceCache
-) -> dict[str, Task]:
-    """Surveys of the logs of which facts are missing, by the identities of their places."""
-    readable = {place_identity(place): place for place in places if refuse_missing(place, None) is None}
-    own_settings = settings_by_place(experiment, source)
-    own_names = {whose: settings.name for whose, (_, settings) in own_settings.items() if settings.name is not None}
-    unnamed = [whose for whose in readable if whose not in own_names]
-    # Names as if all logs can be replayed: else a log that is named after its folder, too, would be surveyed twice.
-    names = own_names | dict(
-        zip(unnamed, log_names([first_recording(readable[whose]) for whose in unnamed]), strict=True)
-    )
-    experiments = [experiment, *(point.experiment for point in list_points(experiment))]
-    surveys = {}
-    for whose, place in readable.items():
-        settings = own_settings[whose][1].model_copy(update={"name": names[whose]}) if whose in own_settings else None
-        resolved = (one if settings is None else apply_settings(one, settings) for one in experiments)
-        if any(pieces.known(survey_key(place, one)) is None for one in resolved):
-            surveys[whose] = Task(_make_log_task(experiment, names[whose], place, settings, pieces.address))
-    return surveys
+@dataclass(frozen=True)
+class Task:
+    """A log as a worker finds it. `experiment`: the study's, with the settings of this log alone, as JSON.
+
+    `sha256`: of its content; empty: it is surveyed, that is read and checked, and its facts are kept.
+    """
+
+    name: str
+    place: Place
+    experiment: str
+    folder: str  # the command's working directory, which paths are relative to
+    parts: str
+    fingerprint: tuple[tuple[str, str], ...]
+    command: str  # parts are listed once for each
+    sha256: str = ""
 
 
-def plan_pieces(experiment: Experiment, logs: Sequence[StudyLog], pieces: PieceCache, threads: int) -> list[Task]:
-    """What has to be computed, log by log so that a worker keeps a log in memory, the largest logs first."""
-    is_kept = pieces.keys()
-    works = {log.name: list(_list_missing_work(log, experiment, is_kept)) for log in logs}
-    whole_s = sum(Task(_NO_LOG, tuple(work)).about_s for work in works.values())
-    most_s = max(whole_s / (4 * threads), LEAST_S)  # few logs then keep many workers busy
-    tasks = []
-    for log in logs:
-        if works[log.name]:
-            entry = next((e for e in experiment.logs if isinstance(e, LogSettings) and e.name == log.name), None)
-            log_task = _make_log_task(experiment, log.name, log.recording.place, entry, pieces.address)
-            tasks += [Task(log_task, part) for part in _cut_into_tasks(works[log.name], most_s)]
-    log_seconds = dict.fromkeys(works, 0.0)
-    for task in tasks:
-        log_seconds[task.log.name] += task.about_s
-    return sorted(tasks, key=lambda task: (-log_seconds[task.log.name], task.log.name, -task.about_s))
+@dataclass(frozen=True)
+class Receipt:
+    """What a worker answers. At most one of `refused`, `problems` and `failure` is set.
+
+    `refused`: why the log cannot be replayed. `problems`: what else is wrong, a line each, at the `key` of the
+    experiment. `failure`: the traceback of an internal error.
+    """
+
+    host: str
+    peak_bytes: int | None = None  # the most memory the worker has had so far, where its system says so
+    refused: tuple[RefusedLog, ...] = ()
+    problems: tuple[str, ...] = ()
+    key: tuple[str, ...] = ()
+    failure: str | None = None
 
 
-def _list_missing_work(log: StudyLog, study: Experiment, is_kept: Callable[[str], bool]) -> Iterator[Work]:
-    for number, experiment in enumerate([study, *(point.experiment for point in list_points(study))]):
-        alone, facts = resolve_for_log(experiment, log.name), log.facts(experiment)
-        without_runs: list[tuple[int, int] | None] = [None] if experiment.measure.exact else []
-        for runs in [*without_runs, *split_runs(alone.runs, facts.episodes)]:
-            keys = {name: recipe_key(write_recipe(alone, name, log.identity, runs)) for name in alone.configurations}
-            names = [name for name, key in keys.items() if not is_kept(key)]
-            count = 1 if runs is None else runs[1] - runs[0]
-            rows = max(facts.episodes * count, 1)
-            step = max(ROWS_AT_ONCE[alone.measure.accuracy] // rows, 1)
-            for k in range(0, len(names), step):
-                part = names[k : k + step]
-                yield Work(number, runs, {n: keys[n] for n in part}, rows * len(part), facts.listable * count)
+def do_task(task: Task) -> Receipt:
+    """Do a task. Errors are in the receipt: no exception has to be sent."""
+    receipt = Receipt(platform.node())
+    try:
+        receipt = _do_task(task, receipt)
+    except CopemError as error:
+        receipt = replace(receipt, problems=error.problems)
+    except ValidationError as error:  # the experiment is valid where the command runs
+        why = error.errors()[0]["msg"]
+        receipt = replace(receipt, problems=(f"worker {receipt.host}: the experiment cannot be read there: {why}",))
+    except Exception:
+        receipt = replace(receipt, failure=traceback.format_exc())
+    return replace(receipt, peak_bytes=peak_bytes())
 
 
-def _cut_into_tasks(works: Sequence[Work], most_s: float) -> Iterator[tuple[Work, ...]]:
-    """Neighbouring work together, up to the size of a task."""
-    batch: list[Work] = []
-    for work in works:
-        task = Task(_NO_LOG, (*batch, work))
-        cells = sum(one.cells for one in task.work)
-        if batch and (cells > MOST_CELLS or task.rows > MOST_ROWS or task.about_s > most_s):
-            yield tuple(batch)
-            batch = []
-        batch.append(work)
-    if batch:
-        yield tuple(batch)
+def _do_task(task: Task, receipt: Receipt) -> Receipt:
+    if other := describe_mismatch(dict(task.fingerprint)):
+        raise InputError(f"worker {receipt.host} {other}: results would not be the same bits")
+    try:
+        os.chdir(task.folder)
+    except OSError:
+        raise InputError(f"{task.folder}: not visible from worker {receipt.host}") from None
+    experiment, parts = Experiment.model_validate(json.loads(task.experiment)), PartCache(task.parts, _open_once(task))
+    recordings, refused = read_logs(resolve_for_log(experiment, task.name), [task.place], None)
+    if refused:
+        return replace(receipt, refused=tuple(refused))
+    recording = replace(recordings[0], scene=replace(recordings[0].scene, log=task.name))
+    first = StudyLog(recording, experiment, parts)
+    points = [(experiment, first)]
+    for point in list_points(experiment):
+        log = first if point.same_units else StudyLog(recording, point.experiment, parts)
+        points.append((point.experiment, log))
+    if not task.sha256:
+        return _survey_log(points, receipt)
+    if first.digests["sha256"] != task.sha256:
+        raise InputError(f"{task.place}: on worker {receipt.host} it has another content than where the command runs")
+    gatherer = Gatherer(1, RunCost(), parts)
+    for experiment, log in points:
+        if experiment.measure.exact:
+            gatherer.exact(log, experiment)
+        for _ in gatherer.each([log], experiment):
+            pass
+    return receipt
 
 
-_NO_LOG = LogTask("", Path(), "", "", "", ())
+def _survey_log(points: Sequence[tuple[Experiment, StudyLog]], receipt: Receipt) -> Receipt:
+    """Keep the facts of a log, at each point of the study."""
+    for experiment, log in points:
+        try:
+            check_exact([log.replay()], experiment)
+        except ExperimentError as error:
+            return replace(receipt, problems=error.problems, key=("measure", "exact"))
+        log.facts(experiment)
+    return receipt
 
 
-def _make_log_task(
-    experiment: Experiment, name: str, place: Place, settings: LogSettings | None, address: str
-) -> LogTask:
-    written = experiment.as_written()
-    del written["logs"]
-    if settings is not None:
-        entry = relocate_settings(settings, place).model_copy(update={"name": name})
-        written["logs"] = [entry.model_dump(mode="json", by_alias=True)]
-    made_by = tuple(sorted(take_fingerprint().items()))
-    return LogTask(name, place, json.dumps(written), os.getcwd(), address, made_by)
+def _open_once(task: Task) -> Store:
+    return _open_store(task.parts, task.folder, task.command)
 
 
-# Workers, and the crew that gives them tasks.
+@lru_cache(maxsize=2)
+def _open_store(address: str, folder: str, command: str) -> Store:  # the address is relative to the folder
+    return open_store(address)
+
+
+def describe_mismatch(expected: Mapping[str, str]) -> str | None:
+    """In what this process differs from a fingerprint: `has numba 0.67.1, expected 0.68.1`; None: in nothing."""
+    own = take_fingerprint()
+    for name, version in expected.items():
+        if own[name] != version:
+            return f"has {name} {_shorten_version(own[name])}, expected {_shorten_version(version)}"
+    return None
+
+
+def _shorten_version(version: str) -> str:
+    """A version whose digest is cut: enough to tell two from one another."""
+    name, _, digest = version.partition(" ")
+    return f"{name} ({digest[:8]})" if len(digest) == 40 else version
+
+
+# The crew that gives workers tasks.
 
 TICK_S = 1.0
 """Seconds between reports of progress while no task ends: the display of time and of lost workers stays alive."""
 
 
 class WorkerDiedError(Exception):
-    """Workers died while they had a task. `alone`: they had no other task of the crew, so this one is the cause."""
+    """Workers died while they had a task."""
 
-    def __init__(self, deaths: int, host: str, *, alone: bool) -> None:
+    def __init__(self, deaths: int, host: str) -> None:
         super().__init__(f"{count_noun(deaths, 'worker')} died, last on {host}")
-        self.deaths, self.host, self.alone = deaths, host, alone
+        self.deaths, self.host = deaths, host
 
 
 class TaskFailedError(RuntimeError):
     """An internal error in a task: where, and the traceback of the worker."""
 
 
-class Workers(Executor, ABC):
-    """An executor that knows its workers. `lost`: how many have died; `again`: how many pieces they gave up."""
-
-    lost = 0
-    again = 0
-
-    @abstractmethod
-    def threads(self) -> int:
-        """How many tasks run at once."""
-
-    def next(self, tasks: deque[Task]) -> Task:
-        """Take out the task to be done next."""
-        return tasks.popleft()
-
-    @abstractmethod
-    def give(self, task: Task) -> Future[Receipt]:
-        """Submit a task."""
-
-    @abstractmethod
-    def come_back(self) -> None:
-        """Wait until tasks can be submitted again. Raises TimeoutError."""
-
-
-class _ExecutorWorkers(Workers):
-    """Any `concurrent.futures` executor: it breaks with its first dead worker."""
-
-    def __init__(self, executor: Executor) -> None:
-        self._executor = executor
-
-    def threads(self) -> int:
-        client = getattr(self._executor, "_client", None)  # Dask's executor
-        if client is not None:
-            return max(sum(map(int, client.nthreads().values())), 1)
-        return int(getattr(self._executor, "_max_workers", None) or os.cpu_count() or 1)
-
-    def give(self, task: Task) -> Future[Receipt]:
-        return self._executor.submit(do_task, task)
-
-    def come_back(self) -> None:
-        raise TimeoutError("crew: its executor has cancelled what it was given")
-
-
 @dataclass(frozen=True)
 class CrewProgress:
-    """How far the crew is. `rows`: of the pieces that were missing; 0 for surveys."""
+    """How far the crew is."""
 
     what: str
-    logs_done: int
-    logs: int
-    rows_done: int = 0
-    rows: int = 0
+    done: int  # logs
+    total: int
     lost: int = 0  # workers
-
-    @property
-    def done(self) -> int:
-        """Rows that are done; of surveys logs."""
-        return self.rows_done if self.rows else self.logs_done
-
-    @property
-    def total(self) -> int:
-        """All rows; of surveys all logs."""
-        return self.rows or self.logs
 
 
 class Crew:
-    """Surveys and computes with an executor whose workers see the same pieces. `tell`: called with the progress."""
+    """Surveys and computes with an executor whose workers see the same parts. `tell`: called with the progress."""
 
     def __init__(
-        self, executor: Executor, pieces: PieceCache, tell: Callable[[CrewProgress], None] | None = None
+        self, executor: Executor, parts: PartCache, tell: Callable[[CrewProgress], None] = lambda _: None
     ) -> None:
-        self._workers = executor if isinstance(executor, Workers) else _ExecutorWorkers(executor)
-        self._pieces, self._tell = pieces, tell
-        self._progress = CrewProgress("", 0, 0)
+        self._executor, self._parts, self._tell = executor, parts, tell
+        self._progress, self._command = CrewProgress("", 0, 0), secrets.token_hex(8)
         self._lost: dict[str, WorkerDiedError] = {}  # logs at which workers died, by their identities
         self.peak_bytes = 0  # the most memory a worker has had, 0 where no system says so
 
@@ -229,20 +211,19 @@ class Crew:
 
         Raises CopemError for what is wrong with the experiment, or with the workers.
         """
-        surveys = plan_surveys(experiment, places, source, self._pieces)
-        whose = {task.log.name: identity for identity, task in surveys.items()}
+        surveys = self._plan_surveys(experiment, places, source)
+        whose = {task.name: identity for identity, task in surveys.items()}
         todo = [task for identity, task in surveys.items() if identity not in self._lost]
         total = len({place_identity(place) for place in places})
         self._progress = CrewProgress("surveying", total - len(todo), total)
         refused: dict[str, list[RefusedLog]] = {}
-        own_settings, problems = settings_by_place(experiment, source), []
-        for task, receipt in self._receive_all(todo):
-            entry, settings = own_settings.get(whose[task.log.name], (None, None))
+        own_settings, problems = settings_by_place(experiment, source), list[str]()
+        for task, receipt in self._do_all(todo):
+            entry, settings = own_settings.get(whose[task.name], (None, None))
             if receipt.refused:
-                refused[whose[task.log.name]] = [log.within(entry, settings) for log in receipt.refused]
+                refused[whose[task.name]] = [log.within(entry, settings) for log in receipt.refused]
             problems += [source.at(receipt.key, line) if receipt.key else line for line in receipt.problems]
-            self._report(logs=1)
-        self._pieces.store.refresh()
+        self._parts.store.refresh()
         if problems:
             raise CopemError(list(dict.fromkeys(problems)))
         for place in places:
@@ -252,41 +233,71 @@ class Crew:
                 ]
         return refused
 
+    def _plan_surveys(
+        self, experiment: Experiment, places: Mapping[Place, Key | None], source: ExperimentSource
+    ) -> dict[str, Task]:
+        """Surveys of the logs of which facts are missing, by the identities of their places."""
+        readable = {place_identity(place): place for place in places if refuse_missing(place, None) is None}
+        own_settings = settings_by_place(experiment, source)
+        own_names = {whose: settings.name for whose, (_, settings) in own_settings.items() if settings.name is not None}
+        unnamed = [whose for whose in readable if whose not in own_names]
+        # Names as if all logs can be replayed: else a log named after its folder, too, would be surveyed twice.
+        names = own_names | dict(
+            zip(unnamed, log_names([first_recording(readable[whose]) for whose in unnamed]), strict=True)
+        )
+        experiments = [experiment, *(point.experiment for point in list_points(experiment))]
+        surveys = {}
+        for whose, place in readable.items():
+            settings = (
+                own_settings[whose][1].model_copy(update={"name": names[whose]}) if whose in own_settings else None
+            )
+            resolved = (one if settings is None else apply_settings(one, settings) for one in experiments)
+            if any(self._parts.known(survey_key(place, one)) is None for one in resolved):
+                surveys[whose] = self._make_task(experiment, names[whose], place, settings)
+        return surveys
+
     def fill(self, experiment: Experiment, recordings: Sequence[Recording]) -> bool:
-        """Have workers compute all missing pieces. Returns whether workers died of logs, which the study leaves out.
+        """Have workers compute all missing parts. Returns whether workers died of logs, which the study leaves out.
 
         Raises CopemError for what is wrong with the workers.
         """
-        logs = [StudyLog(recording, experiment, self._pieces) for recording in recordings]
-        tasks = plan_pieces(experiment, logs, self._pieces, self._workers.threads())
-        left: dict[str, int] = {}
-        for task in tasks:
-            left[task.log.name] = left.get(task.log.name, 0) + 1
-        self._progress = CrewProgress(
-            "replaying", len(logs) - len(left), len(logs), rows=sum(task.rows for task in tasks)
-        )
+        store, tasks, missing = self._parts.store, [], dict[str, list[str]]()
+        store.refresh()
+        for recording in sorted(recordings, key=lambda one: -StudyLog(one, experiment).object_states):
+            log = StudyLog(recording, experiment, self._parts)
+            if names := [name for name in list_parts(log, experiment) if not store.exists(name)]:
+                settings = (one for one in experiment.logs if isinstance(one, LogSettings) and one.name == log.name)
+                task = self._make_task(experiment, log.name, recording.place, next(settings, None))
+                tasks.append(replace(task, sha256=log.digests["sha256"]))
+                missing[log.name] = names
+        self._progress = CrewProgress("replaying", len(recordings) - len(tasks), len(recordings))
         lost_before, computed = len(self._lost), list[str]()
-        for task, receipt in self._receive_all(tasks):
+        for task, receipt in self._do_all(tasks):
             if receipt.problems or receipt.refused:
                 raise CopemError([*receipt.problems, *(log.said(None) for log in receipt.refused)])
-            left[task.log.name] -= 1
-            computed += task.keys
-            self._report(int(left[task.log.name] == 0), task.rows)
-        is_kept = self._pieces.keys()
-        if not all(map(is_kept, computed)):
-            where = self._pieces.store.where
-            raise CopemError(f"{where}: what workers keep there is not seen from here; a shared folder or s3://…")
-        self._pieces.computed += len(computed)
-        self._pieces.found -= len(computed)  # gathering counts them as found
+            computed += missing[task.name]
+        store.refresh()
+        if not all(map(store.exists, computed)):
+            why = "what workers keep there is not seen from here, or their own components are of other files"
+            raise CopemError(f"{store.where}: {why}; a shared folder or s3://…")
+        self._parts.computed += len(computed)
+        self._parts.found -= len(computed)  # gathering counts them as found
         return len(self._lost) > lost_before
+
+    def _make_task(self, experiment: Experiment, name: str, place: Place, settings: LogSettings | None) -> Task:
+        written = experiment.as_written()
+        del written["logs"]
+        if settings is not None:
+            entry = relocate_settings(settings, place).model_copy(update={"name": name})
+            written["logs"] = [entry.model_dump(mode="json", by_alias=True)]
+        made_by = tuple(sorted(take_fingerprint().items()))
+        return Task(name, place, json.dumps(written), os.getcwd(), self._parts.address, made_by, self._command)
 
     @property
     def notes(self) -> list[str]:
         """How many workers died, for the command's notes."""
-        if not self._workers.lost:
-            return []
-        died = "a worker died" if self._workers.lost == 1 else f"{self._workers.lost} workers died"
-        return [f"{died} ({count_noun(self._workers.again, 'piece')} computed again)"]
+        lost = self._progress.lost
+        return [f"{count_noun(lost, 'worker')} died; what was not done was computed again"] if lost else []
 
     @property
     def interrupted(self) -> str:
@@ -295,53 +306,47 @@ class Crew:
 
     @property
     def _so_far(self) -> str:
-        done, logs = (0, 0) if self._progress.what != "replaying" else (self._progress.logs_done, self._progress.logs)
-        return f"{done} of {logs or self._progress.logs} logs are in {self._pieces.store.where}"
+        done = self._progress.done if self._progress.what == "replaying" else 0
+        return f"{done} of {self._progress.total} logs are in {self._parts.store.where}"
 
     def _describe_death(self, error: WorkerDiedError, skip_unreadable: bool) -> str:
         died = f"the worker that replayed it died {error.deaths} times"
         if skip_unreadable:
             return f"{died} (out of memory?)"
-        out, where = "more memory per worker, or --skip-unreadable", self._pieces.store.where
+        out, where = "more memory per worker, or --skip-unreadable", self._parts.store.where
         return f"{died}, last on {error.host} (out of memory?); {out}; what is done stays done in {where}"
 
-    def _report(self, logs: int = 0, rows: int = 0) -> None:
-        """Report that so many more logs and rows are done."""
-        progress = self._progress
-        progress = replace(
-            progress, logs_done=progress.logs_done + logs, rows_done=progress.rows_done + rows, lost=self._workers.lost
-        )
-        self._progress = progress
-        if self._tell is not None:
-            self._tell(self._progress)
+    def _report(self, logs: int = 0) -> None:
+        """Report that so many more logs are done."""
+        lost = getattr(self._executor, "lost", 0)
+        self._progress = replace(self._progress, done=self._progress.done + logs, lost=lost)
+        self._tell(self._progress)
 
-    def _receive_all(self, tasks: Iterable[Task]) -> Iterator[tuple[Task, Receipt]]:
-        """The receipts of tasks as they come. A task at which workers died beside others is tried once more, alone."""
-        waiting, suspects, flying = deque(tasks), deque[Task](), dict[Future[Receipt], Task]()
+    def _do_all(self, tasks: Iterable[Task]) -> Iterator[tuple[Task, Receipt]]:
+        """The receipts of tasks as they come. A task at which workers died is tried once more, alone: it may have died
+        of another.
+        """
+        waiting, suspects, flying = deque(tasks), deque[Task](), dict[Future[Receipt], tuple[Task, bool]]()
         self._report()
         try:
             while waiting or suspects or flying:
-                source, at_once = (waiting, self._workers.threads()) if waiting or flying else (suspects, 1)
+                source, at_once = (waiting, self._count_threads()) if waiting or flying else (suspects, 1)
                 while source and len(flying) < at_once:
-                    task = self._workers.next(source)
-                    if place_identity(task.log.place) not in self._lost:
-                        flying[self._workers.give(task)] = task
+                    task = source.popleft()
+                    if place_identity(task.place) not in self._lost:
+                        flying[self._executor.submit(do_task, task)] = task, at_once == 1
                 finished, _ = wait(flying, TICK_S, FIRST_COMPLETED)
                 self._report()
-                if any(future.cancelled() for future in finished):  # the executor has lost its scheduler
-                    given_up = [future for future in flying if future.cancelled() or not future.done()]
-                    waiting.extendleft(flying.pop(future) for future in given_up)
-                    self._come_back()
-                    continue
                 for future in finished:
-                    task = flying.pop(future)
+                    task, alone = flying.pop(future)
                     try:
-                        yield task, self._receive(future, task)
+                        receipt = self._receive(future, task)
                     except WorkerDiedError as error:
-                        if error.alone:
-                            self._lost[place_identity(task.log.place)] = error
-                        else:
-                            suspects.append(task)
+                        suspects += [] if alone else [task]
+                        self._lost |= {place_identity(task.place): error} if alone else {}
+                        continue
+                    yield task, receipt
+                    self._report(1)
         except TaskFailedError:
             wait(flying)  # running tasks end first
             raise
@@ -349,27 +354,43 @@ class Crew:
             for future in flying:
                 future.cancel()
 
+    def _count_threads(self) -> int:
+        """How many tasks run at once: as many are given, so that none is suspected for its neighbour in a queue."""
+        client = getattr(self._executor, "_client", None)  # Dask's
+        if client is None:
+            return int(getattr(self._executor, "_max_workers", None) or os.cpu_count() or 1)
+        if client.status in ("closing", "closed"):  # its futures might not tell of it
+            raise self._end("the scheduler is gone")
+        with suppress(OSError, RuntimeError):  # futures tell of a lost scheduler
+            return int(max(sum(client.nthreads().values()), 1))
+        return 1
+
     def _receive(self, future: Future[Receipt], task: Task) -> Receipt:
         """The receipt. Raises WorkerDiedError, CopemError, TaskFailedError, and what the executor raises."""
         try:
             receipt = future.result()
         except BrokenExecutor as error:
-            why = f"a worker died, and its executor with it ({type(error).__name__})"
-            raise CopemError(f"crew: {why}; {self._so_far}; the same command goes on") from None
+            raise self._end(f"a worker died, and its executor with it ({type(error).__name__})") from None
+        except CancelledError:
+            raise self._end("the executor has cancelled what it was given: its scheduler is gone") from None
         except Exception as error:
             if type(error).__name__ != "KilledWorker":  # Dask's, which need not be installed
                 raise
             deaths, host = error.allowed_failures + 1, error.last_worker.address  # type: ignore[attr-defined]
-            raise WorkerDiedError(deaths, host, alone=True) from None
+            raise WorkerDiedError(deaths, host.partition("://")[2]) from None
         self.peak_bytes = max(receipt.peak_bytes or 0, self.peak_bytes)
         if receipt.failure is not None:
-            pieces = "".join(f", runs {work.runs}: {', '.join(work.keys)}" for work in task.work)
-            raise TaskFailedError(f"{task.log.place}{pieces}: on worker {receipt.host}:\n{receipt.failure}")
+            raise TaskFailedError(f"{task.place}: on worker {receipt.host}:\n{receipt.failure}")
         return receipt
 
-    def _come_back(self) -> None:
-        """Wait for the executor to come back. Raises CopemError where it does not."""
-        try:
-            self._workers.come_back()
-        except TimeoutError as error:
-            raise CopemError(f"{error}; {self._so_far}; the same command goes on") from None
+    def _end(self, why: str) -> CopemError:
+        return CopemError(f"crew: {why}; {self._so_far}; the same command goes on")
+
+
+def list_parts(log: StudyLog, study: Experiment) -> Iterator[str]:
+    """The names in a store of all parts of a log, at each point of a study."""
+    for experiment in [study, *(point.experiment for point in list_points(study))]:
+        alone = resolve_for_log(experiment, log.name)
+        blocks: list[tuple[int, int] | None] = [None] if experiment.measure.exact else []
+        for runs in [*blocks, *cut_parts(alone.runs, log.object_states)]:
+            yield from (part_name(write_recipe(alone, name, log.identity, runs)) for name in alone.configurations)

@@ -1,7 +1,7 @@
 """Run: an experiment over its logs, from blocks of runs to the tables of a results folder.
 
-Tables are computed in blocks by several workers, or found among the pieces that are kept; then the summary, the sweep
-and the notes are made of all of them.
+Parts are computed by several workers, or found among those that are kept; then the summary, the sweep and the notes are
+made of all of them.
 """
 
 from __future__ import annotations
@@ -9,12 +9,13 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from copy import copy
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pandas as pd
 import pyarrow as pa
@@ -23,7 +24,7 @@ from copem_replay.core.errors import is_url
 from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
-from copem_replay.metrics.accuracy.statistics import AccuracyTotal
+from copem_replay.metrics.accuracy.statistics import AccuracyTotal, join_totals
 from copem_replay.metrics.intervals import find_fixed_outcomes
 from copem_replay.metrics.metric import OutputTimes, OwnSums
 from copem_replay.metrics.onset import select_counted
@@ -31,205 +32,139 @@ from copem_replay.metrics.summary import add_own_sums, own_sums_by_log, settle_h
 from copem_replay.pipeline.closed_form import check_closed_form, exact_table
 from copem_replay.pipeline.cost import RunCost, memory_notes, watch_cost
 from copem_replay.pipeline.notes import ListRate, LogFacts, join_list_rates, study_notes
-from copem_replay.pipeline.pieces import PieceCache, split_runs, write_recipe
+from copem_replay.pipeline.parts import PartCache, cut_parts, write_recipe
 from copem_replay.pipeline.prepare import Replay, prepare_log
 from copem_replay.pipeline.replay import BlockOutcome, cut_blocks, replay_outcomes
 from copem_replay.pipeline.study_log import StudyLog
 from copem_replay.pipeline.sweep import SweepPoint, list_points
 from copem_replay.pipeline.tables import (
+    BATCH_ROWS,
     AccuracyTables,
-    LogTables,
+    PartTables,
     StudyTables,
     accuracy_tables,
-    join_log_tables,
-    log_tables,
+    build_parts,
     tabulate_bands,
-    total_by_log,
+    tabulate_rows,
     total_over_logs,
 )
 
-# Gather: the tables of all logs and runs, computed or found.
+# Gather: the parts of all logs, computed or found.
 
 Progress = Callable[[int, int], None]
 """`progress(done, total)`, called after each block of runs."""
 
-
-_Found = dict[tuple[str, tuple[int, int]], LogTables | None]
-"""Pieces of a log by configuration and range of runs; None: the piece is missing."""
-
 _AT_ONCE = 8
-"""Pieces of object storage that are read at once: one by one would mostly wait. No result depends on it."""
+"""Parts of object storage that are read at once: one by one would mostly wait. No result depends on it."""
 
 
-@dataclass(frozen=True)
-class _Range:
-    """Runs of a log in which some configurations have to be computed."""
+class _Computing(NamedTuple):
+    """A block of runs of a log: its parts that are kept by configuration (None: missing), and what computes these."""
 
     log: StudyLog
-    experiment: Experiment  # of the log, with these configurations
-    runs: tuple[int, int] | None  # None: no more of this log
-    recipes: dict[str, str] = field(default_factory=dict)  # by configuration; empty: nothing is kept
+    runs: tuple[int, int]
+    is_last: bool  # of the log
+    kept: dict[str, PartTables | None]
+    missing: Experiment  # of the log, with the configurations whose parts are missing
+    outcomes: list[Future[list[BlockOutcome]]]
 
 
 class Gatherer:
-    """Computes tables, or finds them, and reports progress. `tables`: how many experiments, sweep points among them."""
+    """Computes parts, or finds them. `advance`: called with the number of runs of a log that are done."""
 
     def __init__(
-        self, jobs: int, progress: Progress | None, tables: int, cost: RunCost, pieces: PieceCache | None
+        self, jobs: int, cost: RunCost, cache: PartCache | None, advance: Callable[[int], None] = lambda _: None
     ) -> None:
-        self._jobs, self._progress, self._tables, self._cost, self._pieces = jobs, progress, tables, cost, pieces
-        self._done = self._runs = 0  # of the runs of all logs, in all tables
-        self._silent = False  # no progress for tables that are read again
+        self._jobs, self._cost, self._cache, self._advance = jobs, cost, cache, advance
 
-    def tables(self, logs: Sequence[StudyLog], experiment: Experiment) -> StudyTables:
-        """The tables of the study, still empty; logs that are added can be read again where pieces are kept."""
-        by_name = {log.name: log for log in logs}
-
-        def again(name: str) -> LogTables:
-            silent = copy(self)
-            silent._silent = True
-            (tables,) = silent.each([by_name[name]], experiment)
-            return tables
-
-        of_logs = {id(alone): alone for alone in (resolve_for_log(experiment, name) for name in by_name)}.values()
-        way = any(alone.has_way(name) for alone in of_logs for name in alone.configurations)
-        return StudyTables(None if self._pieces is None else again, way=way)
-
-    def each(self, logs: Sequence[StudyLog], experiment: Experiment) -> Iterator[LogTables]:
-        """The tables of each log with all its configurations and runs. Only the current log is in memory."""
-        self._runs, found = self._tables * len(logs) * experiment.runs, dict[str, _Found]()
-        keeps_pieces = self._pieces is not None
-        plan = self._plan_missing(logs, experiment, found) if keeps_pieces else self._plan_all(logs, experiment)
-        for of_range, tables in self._compute_ranges(plan):
-            name = of_range.log.name
-            if self._pieces is None:
-                yield tables
-            elif of_range.runs is None:
-                yield join_log_tables(name, [piece for piece in found.pop(name).values() if piece is not None])
-            for configuration, recipe in of_range.recipes.items():
-                assert self._pieces is not None
-                assert of_range.runs is not None
-                way = of_range.experiment.has_way(configuration)
-                piece = self._pieces.write(recipe, tables.of(configuration, way=way))
-                found[name][configuration, of_range.runs] = piece
-
-    def exact(self, log: StudyLog, experiment: Experiment) -> pd.DataFrame:
-        """The rows of `exact.parquet` of a log."""
-        alone = resolve_for_log(experiment, log.name)
-        if self._pieces is None:
-            table = exact_table(log.replay(), alone)
-            log.drop()
-            return table
-        parts = []
-        for name, configuration in alone.configurations.items():
-            recipe = write_recipe(alone, name, log.identity, None)
-            piece = self._pieces.read(recipe, log.name, name)
-            self._pieces.found += piece is not None
-            if piece is None:
-                of_configuration = alone.model_copy(update={"configurations": {name: configuration}})
-                piece = self._pieces.write(recipe, LogTables(log.name, exact_table(log.replay(), of_configuration)))
-            parts.append(piece.rows)
-        log.drop()
-        return pa.concat_tables(
-            [one.replace_schema_metadata(None) for one in parts], promote_options="permissive"
-        ).to_pandas()
-
-    def _plan_all(self, logs: Sequence[StudyLog], experiment: Experiment) -> Iterator[_Range]:
-        """All runs of each log."""
-        for log in logs:
-            log.facts(experiment)  # while the log is in memory
-            yield _Range(log, alone := resolve_for_log(experiment, log.name), (0, alone.runs))
-
-    def _plan_missing(
-        self, logs: Sequence[StudyLog], experiment: Experiment, found: dict[str, _Found]
-    ) -> Iterator[_Range]:
-        """The ranges that have to be computed of each log, then its end; pieces that are kept are put into `found`."""
-        assert self._pieces is not None
-        for log, kept in self._read_ahead(logs, experiment):
-            alone, found[log.name] = resolve_for_log(experiment, log.name), kept
-            if not self._silent:
-                self._pieces.found += sum(piece is not None for piece in kept.values())
-            for runs in dict.fromkeys(runs for _, runs in kept):
-                names = [name for name in alone.configurations if kept[name, runs] is None]
-                if names:
-                    missing = alone.model_copy(update={"configurations": {n: alone.configurations[n] for n in names}})
-                    yield _Range(log, missing, runs, {n: write_recipe(alone, n, log.identity, runs) for n in names})
-                else:
-                    self._advance(runs[1] - runs[0])
-            yield _Range(log, alone, None)
-
-    def _read_ahead(self, logs: Sequence[StudyLog], experiment: Experiment) -> Iterator[tuple[StudyLog, _Found]]:
-        """The kept pieces of each log; those of the next log are read meanwhile."""
-        ahead: tuple[StudyLog, dict[tuple[str, tuple[int, int]], Future[LogTables | None]]] | None = None
-        assert self._pieces is not None
-        with ThreadPoolExecutor(_AT_ONCE if is_url(self._pieces.address) else 1) as pool:
-            try:
-                for log in logs:
-                    reading = {key: pool.submit(*call) for key, call in self._list_reads(log, experiment)}
-                    ahead, current = (log, reading), ahead
-                    if current is not None:
-                        yield current[0], {key: piece.result() for key, piece in current[1].items()}
-                if ahead is not None:
-                    yield ahead[0], {key: piece.result() for key, piece in ahead[1].items()}
-            finally:  # interrupted: what has not begun never does
-                pool.shutdown(cancel_futures=True)
-
-    def _list_reads(self, log: StudyLog, experiment: Experiment) -> Iterator[tuple[tuple[str, tuple[int, int]], Any]]:
-        """By configuration and range of runs the call that reads a piece of a log."""
-        assert self._pieces is not None
-        alone, ranges = (
-            resolve_for_log(experiment, log.name),
-            list(split_runs(experiment.runs, log.facts(experiment).episodes)),
-        )
-        for name in alone.configurations:
-            for runs in ranges:
-                recipe = write_recipe(alone, name, log.identity, runs)
-                yield (name, runs), (self._pieces.read, recipe, log.name, name)
-
-    def _compute_ranges(self, plan: Iterable[_Range]) -> Iterator[tuple[_Range, LogTables]]:
-        """The tables of ranges, one after the other. The next log is read when workers are nearly idle."""
-        pool, began_s = ThreadPoolExecutor(self._jobs), time.perf_counter()
-        waiting: deque[tuple[_Range, list[tuple[int, Future[list[BlockOutcome]]]]]] = deque()
+    def each(self, logs: Sequence[StudyLog], experiment: Experiment) -> Iterator[PartTables]:
+        """The parts of each log, by block of runs, then by configuration. The next log is read when workers are nearly
+        idle; no more than the parts that are computed are in memory.
+        """
+        began_s, waiting = time.perf_counter(), deque[_Computing]()
+        pool, reading = ThreadPoolExecutor(self._jobs), ThreadPoolExecutor(_AT_ONCE)
         try:
-            for of_range in plan:
-                parts = []
-                if of_range.runs is not None:
-                    replay, alone = of_range.log.replay(), of_range.experiment
-                    blocks = cut_blocks(replay, alone, self._jobs, of_range.runs)
-                    parts = [(len(b), pool.submit(replay_outcomes, replay, alone, b)) for b in blocks]
-                waiting.append((of_range, parts))
-                while waiting and (not waiting[0][1] or sum(len(parts) for _, parts in waiting) > self._jobs):
-                    yield self._finish_range(*waiting.popleft())
+            for block in self._begin_blocks(logs, experiment, pool, reading):
+                waiting.append(block)
+                while waiting and (not waiting[0].outcomes or sum(len(w.outcomes) for w in waiting) > self._jobs):
+                    yield from self._finish_block(waiting.popleft())
             while waiting:
-                yield self._finish_range(*waiting.popleft())
+                yield from self._finish_block(waiting.popleft())
         finally:  # interrupted: what has not begun never does
+            reading.shutdown(cancel_futures=True)
             pool.shutdown(cancel_futures=True)
             self._cost.add(time.perf_counter() - began_s, ())
 
-    def _finish_range(
-        self, of_range: _Range, parts: Sequence[tuple[int, Future[list[BlockOutcome]]]]
-    ) -> tuple[_Range, LogTables]:
-        """Wait for the blocks of a range, and return its tables."""
-        outcomes = []
-        for runs, part in parts:
-            outcomes += part.result()
-            self._advance(runs)
-        if of_range.runs is None or self._pieces is None:
-            of_range.log.drop()
-        if of_range.runs is None:
-            return of_range, LogTables(of_range.log.name, pd.DataFrame())
+    def _begin_blocks(
+        self, logs: Sequence[StudyLog], experiment: Experiment, pool: Executor, reading: Executor
+    ) -> Iterator[_Computing]:
+        for log in logs:
+            alone = resolve_for_log(experiment, log.name)
+            log.facts(experiment)  # while the log is in memory
+            blocks = cut_parts(alone.runs, log.object_states)
+            for runs in blocks:
+                kept = self._read_parts(log, alone, runs, reading)
+                names, missing, outcomes = [name for name in kept if kept[name] is None], alone, []
+                if len(names) < len(kept):
+                    missing = alone.model_copy(update={"configurations": {n: alone.configurations[n] for n in names}})
+                if names:
+                    replay, workers = log.replay(), -(-self._jobs // len(blocks))
+                    outcomes = [
+                        pool.submit(replay_outcomes, replay, missing, some)
+                        for some in cut_blocks(replay, missing, workers, runs)
+                    ]
+                yield _Computing(log, runs, runs == blocks[-1], kept, missing, outcomes)
+
+    def _read_parts(
+        self, log: StudyLog, alone: Experiment, runs: tuple[int, int], reading: Executor
+    ) -> dict[str, PartTables | None]:
+        """The parts of a block that are kept, by configuration; None: missing."""
+        cache, names = self._cache, list(alone.configurations)
+        if cache is None:
+            return dict.fromkeys(names)
+
+        def read(name: str) -> PartTables | None:
+            return cache.read(write_recipe(alone, name, log.identity, runs), log.name, name)
+
+        kept = dict(zip(names, (reading.map if is_url(cache.address) else map)(read, names), strict=True))
+        cache.found += sum(part is not None for part in kept.values())
+        return kept
+
+    def _finish_block(self, block: _Computing) -> Iterable[PartTables]:
+        """Wait for the missing parts of a block, keep them, and return all its parts."""
+        log, kept, outcomes = block.log, block.kept, list[BlockOutcome]()
+        for future in block.outcomes:
+            outcomes += (done := future.result())
+            self._advance(sum(len(outcome.runs) for outcome in done))
+        if block.is_last:
+            log.drop()
+        if not outcomes:
+            self._advance(block.runs[1] - block.runs[0])
+            return [part for part in kept.values() if part is not None]
         self._cost.add(0.0, outcomes)
-        names, accuracy = list(of_range.experiment.configurations), of_range.experiment.measure.accuracy
-        return of_range, log_tables(of_range.log.name, outcomes, names, accuracy=accuracy)
+        for part in build_parts(log.name, outcomes, block.missing):
+            kept[part.configuration] = part
+            if self._cache is not None:
+                recipe = write_recipe(block.missing, part.configuration, log.identity, block.runs)
+                self._cache.write(recipe, part)
+        return [part for part in kept.values() if part is not None]
 
-    def _advance(self, runs: int) -> None:
-        self._done += runs
-        if self._progress is not None and not self._silent:
-            self._progress(self._done, self._runs)
-
-
-ROWS_A_BATCH = 100_000
-"""Rows that are counted together, at least: what is done once per batch then costs nothing. No result depends on it."""
+    def exact(self, log: StudyLog, experiment: Experiment) -> pd.DataFrame:
+        """The rows of `exact.parquet` of a log."""
+        alone, cache, rows = resolve_for_log(experiment, log.name), self._cache, list[pa.Table]()
+        for name, configuration in alone.configurations.items():
+            recipe, part = "", None
+            if cache is not None:
+                part = cache.read(recipe := write_recipe(alone, name, log.identity, None), log.name, name)
+                cache.found += part is not None
+            if part is None:
+                only = alone.model_copy(update={"configurations": {name: configuration}})
+                part = PartTables(log.name, name, tabulate_rows(exact_table(log.replay(), only)))
+                if cache is not None:
+                    cache.write(recipe, part)
+            rows.append(part.rows)
+        log.drop()
+        return pa.concat_tables(rows, promote_options="permissive").to_pandas()
 
 
 @dataclass(frozen=True)
@@ -258,11 +193,11 @@ class ExperimentResult:
     @cached_property
     def accuracy(self) -> AccuracyTables | None:
         """The tables of all logs, with `measure: {accuracy: true}`."""
-        return None if self.bands is None else self.accuracy_of(list(self.tables.each()), self.table)
+        return None if self.bands is None else self.accuracy_of(self.tables.parts(), self.table)
 
-    def accuracy_of(self, logs: Sequence[LogTables], rows: pd.DataFrame) -> AccuracyTables:
-        """The accuracy tables of some logs, which have these rows."""
-        return accuracy_tables(logs, rows, same_instants=self.same_instants)
+    def accuracy_of(self, parts: Iterable[PartTables], rows: pd.DataFrame) -> AccuracyTables:
+        """The accuracy tables of some parts, which have these rows."""
+        return accuracy_tables(parts, rows, same_instants=self.same_instants)
 
 
 def run_experiment(
@@ -272,29 +207,36 @@ def run_experiment(
     jobs: int = 1,
     progress: Progress | None = None,
     ready: Sequence[Replay] | None = None,
-    pieces: PieceCache | None = None,
+    parts: PartCache | None = None,
 ) -> ExperimentResult:
     """Replay logs through an experiment. The result does not depend on `jobs`, nor on how runs are cut into blocks.
 
-    `ready`: the logs if they are prepared and checked already. `pieces`: where computed pieces are kept and found.
+    `ready`: the logs if they are prepared and checked already. `parts`: where computed parts are kept and found.
     Raises ExperimentError before any run: exact times without a closed form, or more rows than memory holds.
     """
     with watch_cost() as cost:
-        if ready is None and pieces is None:
+        if ready is None and parts is None:
             read = [recording for recording in recordings if recording.survey is None]
             ready = [prepare_log(recording, resolve_for_log(experiment, recording.scene.log)) for recording in read]
             check_closed_form(ready, experiment)
             memory_notes(ready, experiment)
         by_name = {replay.scene.log: replay for replay in ready or ()}
-        logs = [StudyLog(r, experiment, pieces, by_name.get(r.scene.log)) for r in recordings]
-        gatherer = Gatherer(jobs, progress, 1 + sum(1 for _ in list_points(experiment)), cost, pieces)
-        result = _run_study(experiment, logs, gatherer)
+        logs = [StudyLog(r, experiment, parts, by_name.get(r.scene.log)) for r in recordings]
+        total, done = len(logs) * experiment.runs * (1 + sum(1 for _ in list_points(experiment))), 0
+
+        def advance(runs: int) -> None:
+            nonlocal done
+            done += runs
+            if progress is not None:
+                progress(done, total)
+
+        result = _run_study(experiment, logs, Gatherer(jobs, cost, parts, advance))
     return replace(result, costs=cost.notes())
 
 
 def _run_study(experiment: Experiment, logs: Sequence[StudyLog], gatherer: Gatherer) -> ExperimentResult:
     exact = _compute_exact(logs, experiment, gatherer)
-    sums = _sum_tables(logs, experiment, gatherer)
+    sums = _sum_tables(logs, experiment, gatherer, whole=True)
     facts, counted = [log.facts(experiment) for log in logs], select_counted(sums.tally, experiment.measure.began)
     horizon_s, horizon_notes = settle_horizon(counted, experiment.measure.horizon_s)
     times = _rates_by_configuration(facts, experiment)
@@ -342,43 +284,37 @@ class _StudySums(NamedTuple):
     sums: dict[str, dict[str, OwnSums]]
 
 
-def _sum_tables(logs: Sequence[StudyLog], experiment: Experiment, gatherer: Gatherer) -> _StudySums:
-    """Gather all logs, one after the other."""
-    tables = gatherer.tables(logs, experiment)
-    tallies, totals, sums = (
-        list[pd.DataFrame](),
-        dict[tuple[str, str], AccuracyTotal](),
-        dict[str, dict[str, OwnSums]](),
-    )
-    for batch in _batch_tables(gatherer.each(logs, experiment)):
-        rows = tables.add(batch)
+def _sum_tables(logs: Sequence[StudyLog], experiment: Experiment, gatherer: Gatherer, *, whole: bool) -> _StudySums:
+    """Gather all logs, one after the other. `whole`: the tables are needed, too."""
+    of_logs = {id(alone): alone for alone in (resolve_for_log(experiment, log.name) for log in logs)}.values()
+    tables = StudyTables(way=any(alone.has_way(name) for alone in of_logs for name in alone.configurations))
+    nodes, sums = dict[tuple[str, str], list[tuple[int, AccuracyTotal]]](), dict[str, dict[str, OwnSums]]()
+    tallies, batch, last = list[pd.DataFrame](), list[PartTables](), logs[-1].name
+    for log, parts in groupby(gatherer.each(logs, experiment), key=attrgetter("log")):
+        for part in parts:
+            batch.append(replace(part, beside=None, runs=None))
+            tables.add(part, counted=not whole)
+            if part.total is not None and part.runs is not None:
+                nodes.setdefault((log, part.configuration), []).append((len(part.runs), part.total))
+        if log != last and sum(len(part.rows) for part in batch) < BATCH_ROWS:
+            continue
+        rows = tables.frame(batch)
+        batch.clear()
         tallies.append(tally_rows(rows))
-        totals |= total_by_log(batch)
-        counted = select_counted(rows, experiment.measure.began) if experiment.measure.metrics else rows.iloc[:0]
-        for _, rows_of_log in counted.groupby("log", sort=False):
-            sums = add_own_sums(sums, own_sums_by_log(rows_of_log, experiment.measure.metrics))
+        if experiment.measure.metrics:
+            for _, rows_of_log in select_counted(rows, experiment.measure.began).groupby("log", sort=False):
+                sums = add_own_sums(sums, own_sums_by_log(rows_of_log, experiment.measure.metrics))
+    totals = {key: join_totals(of_log) for key, of_log in nodes.items()}
     return _StudySums(tables, pd.concat(tallies, ignore_index=True), totals, sums)
-
-
-def _batch_tables(each: Iterable[LogTables]) -> Iterator[list[LogTables]]:
-    """Tables of logs in batches of ROWS_A_BATCH rows or more."""
-    batch, rows = list[LogTables](), 0
-    for tables in each:
-        batch.append(tables)
-        rows += len(tables.rows)
-        if rows >= ROWS_A_BATCH:
-            yield batch
-            batch, rows = [], 0
-    if batch:
-        yield batch
 
 
 def _summarise_point(point: SweepPoint, logs: Sequence[StudyLog], gatherer: Gatherer, horizon_s: float) -> pd.DataFrame:
     """The rows of `sweep.csv` of one point: summaries of its configurations, at the horizon of the experiment."""
     experiment = point.experiment
     if not point.same_units:
-        logs = [StudyLog(log.recording, experiment, log.pieces) for log in logs]
-    exact, sums = _compute_exact(logs, experiment, gatherer), _sum_tables(logs, experiment, gatherer)
+        logs = [StudyLog(log.recording, experiment, log.parts) for log in logs]
+    exact = _compute_exact(logs, experiment, gatherer)
+    sums = _sum_tables(logs, experiment, gatherer, whole=False)
     times = _rates_by_configuration([log.facts(experiment) for log in logs], experiment)
     rows, _ = summarise_tally(
         select_counted(sums.tally, experiment.measure.began),

@@ -31,8 +31,8 @@ from copem_replay.io.open import (
 )
 from copem_replay.io.recording import Recording, StoredSurvey, read_whole_recording
 from copem_replay.pipeline.notes import LogFacts, scene_as_json, scene_from_json
-from copem_replay.pipeline.pieces import (
-    PieceCache,
+from copem_replay.pipeline.parts import (
+    PartCache,
     canonical_json,
     file_digests,
     own_components,
@@ -54,7 +54,7 @@ class StudyLog:
 
     recording: Recording
     experiment: Experiment
-    pieces: PieceCache | None = None
+    parts: PartCache | None = None
     ready: Replay | None = None
     _whole: Recording | None = None  # the recording with its truth, until `drop`
     _facts: tuple[Experiment, LogFacts] | None = None  # of the last experiment that was asked for
@@ -83,8 +83,8 @@ class StudyLog:
         survey = self.recording.survey
         if survey is None or (found := read_content_digest(read)) == self.digests["sha256"]:
             return
-        if self.pieces is not None and survey.about:
-            self.pieces.forget(survey.about)
+        if self.parts is not None and survey.about:
+            self.parts.forget(survey.about)
         expected = self.digests["sha256"]
         raise RecordingError(
             f"expected the content that it had when it was read before, SHA-256 {expected[:12]}…, found {found[:12]}…; "
@@ -104,41 +104,47 @@ class StudyLog:
             return {name: self.recording.survey.said[name] for name in ("sha256", "truth")}
         return compute_log_digests(self.recording)
 
+    @property
+    def object_states(self) -> int:
+        """Number of object states of the whole recording."""
+        survey = self.recording.survey
+        return self.recording.object_states if survey is None else int(survey.said["states"])
+
     @cached_property
     def identity(self) -> dict[str, Any]:
-        """What of the log is in the recipes of its pieces: its name, by which draws are addressed, and its content."""
+        """What of the log is in the recipes of its parts: its name, by which draws are addressed, and its content."""
         together = self.recording.together
         ahead_ns = [] if together is None else list(together.ahead_ns)
         named = {"name": self.name, "sha256": self.digests["sha256"], "topic": self.recording.topic}
         return named | {"ahead_ns": ahead_ns}
 
     def facts(self, experiment: Experiment) -> LogFacts:
-        """What the results say of the log beside its rows, in an experiment; kept with the pieces."""
+        """What the results say of the log beside its rows, in an experiment; kept with the parts."""
         if self._facts is None or self._facts[0] is not experiment:
             self._facts = experiment, self._find_facts(resolve_for_log(experiment, self.name))
         return self._facts[1]
 
     def _find_facts(self, alone: Experiment) -> LogFacts:
-        if self.pieces is None:
+        if self.parts is None:
             return LogFacts.of(self.whole(), self.replay(), alone)
         recording, survey = self.recording, self.recording.survey
         seen = None if recording.stamps is None else _drop_paths(recording.stamps)
         about = survey_key(recording.place, alone, seen)
-        kept = survey.said if survey is not None and survey.about == about else self.pieces.known(about)
+        kept = survey.said if survey is not None and survey.about == about else self.parts.known(about)
         if kept is not None and kept["scene"]["log"] == self.name:
             return LogFacts.read(kept["facts"])
         replay = self.replay()
         facts = LogFacts.of(self.whole(), replay, alone)
-        self.pieces.keep(about, self._describe() | {"facts": facts.as_json()})
+        self.parts.keep(about, self._describe() | {"facts": facts.as_json()})
         return facts
 
     def _describe(self) -> dict[str, Any]:
         scene, notes = scene_as_json(self.recording.scene), list(self.recording.notes)
         data = {"scene": scene, "topic": self.recording.topic, "notes": notes, "host": self.recording.host_id}
-        return data | dict(self.digests)
+        return data | dict(self.digests) | {"states": self.object_states}
 
 
-def compute_log_digests(recording: Recording) -> dict[str, str]:
+def compute_log_digests(recording: Recording) -> dict[str, Any]:
     """SHA-256 of the content of a recording that was read, and of its truth."""
     return {"sha256": read_content_digest(recording), "truth": truth_digest(recording.scene, recording.truth)}
 
@@ -154,7 +160,7 @@ def read_content_digest(recording: Recording) -> str:
 
 def drop_content(recording: Recording, read: Callable[[], Recording]) -> Recording:
     """A recording without its truth and its lists, which `read` reads again where they are needed."""
-    survey = StoredSurvey(compute_log_digests(recording), read)
+    survey = StoredSurvey(compute_log_digests(recording) | {"states": recording.object_states}, read)
     return replace(recording, truth=_empty_tracks(), lists={}, around=None, lane_boundaries=(), survey=survey)
 
 
@@ -178,7 +184,7 @@ def survey_key(place: Place, experiment: Experiment, seen: Sequence[Stamp] | Non
 @cache_last_experiment
 def _survey_parts(experiment: Experiment) -> tuple[str, list[Component]]:
     data = {key: value for key, value in experiment.as_written().items() if key not in _NOT_OF_A_SURVEY}
-    of_all = recipe_key(canonical_json({"survey": 3, "fingerprint": take_fingerprint(), "experiment": data}))
+    of_all = recipe_key(canonical_json({"survey": 4, "fingerprint": take_fingerprint(), "experiment": data}))
     return of_all, own_components(experiment)
 
 
@@ -194,14 +200,14 @@ def _drop_paths(files: Stamps) -> list[Stamp]:
 
 
 def recall_log(
-    pieces: PieceCache, place: Place, experiment: Experiment, read: Callable[[], Recording]
+    parts: PartCache, place: Place, experiment: Experiment, read: Callable[[], Recording]
 ) -> Recording | None:
     """A recording by the facts that are kept of it, in an experiment that is resolved for it; None: none are kept."""
     try:
         about = survey_key(place, experiment)
     except RecordingError:  # reading the recording reports it
         return None
-    if (kept := pieces.known(about)) is None:
+    if (kept := parts.known(about)) is None:
         return None
     first = first_recording(place)
     return Recording(
@@ -239,8 +245,8 @@ class LogSurvey:
     `began`: how many of their episodes began how. `problems`: why they have no closed form, where one is asked for.
     """
 
-    def __init__(self, pieces: PieceCache | None = None) -> None:
-        self.pieces = pieces
+    def __init__(self, parts: PartCache | None = None) -> None:
+        self.parts = parts
         self.sizes: list[Size] = []
         self.began: list[tuple[int, ...]] = []
         self.problems: list[str] = []
@@ -248,7 +254,7 @@ class LogSurvey:
 
     def known(self, place: Place, experiment: Experiment, read: Callable[[], Recording]) -> Recording | None:
         """A recording by the facts that are kept of it; None: it has to be read."""
-        return None if self.pieces is None else recall_log(self.pieces, place, experiment, read)
+        return None if self.parts is None else recall_log(self.parts, place, experiment, read)
 
     def kept(self, recording: Recording, experiment: Experiment, read: Callable[[], Recording]) -> Recording:
         """A recording that was read, in the experiment resolved for it: as it is, or without its truth and lists.

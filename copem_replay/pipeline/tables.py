@@ -1,4 +1,4 @@
-"""Tables: what logs give, in the order of configuration, run and object; by log, and of a whole study.
+"""Tables: what logs give, in the order of configuration, run and object: of parts, and of a whole study.
 
 | table | rows |
 |---|---|
@@ -11,21 +11,38 @@
 
 from __future__ import annotations
 
+import json
+import os
+import tempfile
+import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
+from pyarrow import ipc
 
+from copem_replay.core.errors import OutputError
+from copem_replay.core.files import parse_json
 from copem_replay.core.tracks import Bool, Float, Int
-from copem_replay.metrics.accuracy.statistics import Accuracy, AccuracyTotal, join_totals, sum_accuracy
+from copem_replay.metrics.accuracy.statistics import (
+    BAND,
+    EXISTENCE,
+    OBJECT,
+    RUN,
+    Accuracy,
+    AccuracySettings,
+    AccuracyTotal,
+    sum_accuracy,
+)
 from copem_replay.metrics.detections_table import WAY, build_frame, concatenate_columns
 
 if TYPE_CHECKING:
+    from copem_replay.experiment.schema import Experiment
     from copem_replay.pipeline.replay import BlockOutcome
     from copem_replay.pipeline.scoring import ConfigurationScores
 
@@ -82,11 +99,6 @@ def list_accuracies(outcome: BlockOutcome) -> Iterable[tuple[str, ConfigurationS
             yield name, scores, scores.accuracy
 
 
-def total_by_log(logs: Iterable[LogTables]) -> dict[tuple[str, str], AccuracyTotal]:
-    """By log and configuration the sums of accuracy over all runs."""
-    return {(log.log, name): join_totals(nodes) for log in logs for name, nodes in log.totals.items()}
-
-
 def total_over_logs(of_logs: Mapping[tuple[str, str], AccuracyTotal]) -> dict[str, AccuracyTotal]:
     """By configuration the sums over all runs and logs; empty without accuracy."""
     result: dict[str, AccuracyTotal] = {}
@@ -107,11 +119,12 @@ class AccuracyTables:
     thresholds: pa.Table
 
 
-def accuracy_tables(logs: Sequence[LogTables], rows: pd.DataFrame, *, same_instants: bool) -> AccuracyTables:
-    """The tables of accuracy of several logs; `rows`: those of `detections`."""
+def accuracy_tables(parts: Iterable[PartTables], rows: pd.DataFrame, *, same_instants: bool) -> AccuracyTables:
+    """The tables of accuracy of some parts; `rows`: those of `detections`."""
+    parts = list(parts)
     keys = pa.Table.from_pandas(rows[["log", "configuration", "run", "object_id", "episode"]], preserve_index=False)
-    beside = pa.concat_tables([log.beside for log in logs if log.beside is not None])
-    runs = pa.concat_tables([log.runs for log in logs if log.runs is not None])
+    beside = pa.concat_tables([part.beside for part in parts if part.beside is not None])
+    runs = pa.concat_tables([part.runs for part in parts if part.runs is not None])
     per_list = keys
     for name in _BY_LIST:
         per_list = per_list.append_column(name, beside[name])
@@ -178,7 +191,7 @@ def _band_rows(name: str, by: str, edges: Sequence[float], sums: Any, log: str |
     return rows
 
 
-# The tables of one log.
+# The tables of a part.
 
 RUNS = pa.schema(
     [
@@ -205,64 +218,50 @@ _BY_LIST = tuple(name for name in BESIDE.names if name not in ("existence", "ste
 
 
 @dataclass(frozen=True)
-class LogTables:
-    """The tables of one log; `beside` and `runs` are None without accuracy.
+class PartTables:
+    """The tables of a part: of one log in one configuration in a block of runs.
 
     `beside` has the rows of `rows`: the columns of `accuracy.parquet`, and the steps `existence` and `steps_s` of
-    `thresholds.parquet`. `runs` has a row per configuration and run: the columns of `lists.parquet`, and those of
-    `instants.parquet`; null: as in the row before. `totals`: by configuration sums of accuracy, each with the number of
-    neighbouring runs that it is over.
+    `thresholds.parquet`. `runs` has a row per run: the columns of `lists.parquet`, and those of `instants.parquet`;
+    null: as in the row before. `total`: sums of accuracy over the runs. All three are None without accuracy.
     """
 
     log: str
-    rows: pd.DataFrame | pa.Table
+    configuration: str
+    rows: pa.Table
     beside: pa.Table | None = None
     runs: pa.Table | None = None
-    totals: dict[str, list[tuple[int, AccuracyTotal]]] = field(default_factory=dict)
+    total: AccuracyTotal | None = None
 
-    def of(self, configuration: str, *, way: bool) -> LogTables:
-        """The tables of one configuration. `way`: whether it has the columns `WAY`, whatever others have."""
-        assert isinstance(self.rows, pd.DataFrame)
-        of_configuration = (self.rows["configuration"] == configuration).to_numpy()
-        begin, count = int(of_configuration.argmax()) if len(of_configuration) else 0, int(of_configuration.sum())
-        rows, beside, runs = self.rows.iloc[begin : begin + count], self.beside, self.runs
-        return LogTables(
-            self.log,
-            rows if way else rows.drop(columns=list(WAY), errors="ignore"),
-            None if beside is None else beside.slice(begin, count),
-            None if runs is None else runs.filter(np.array(runs["configuration"].to_pylist()) == configuration),
-            {name: nodes for name, nodes in self.totals.items() if name == configuration},
-        )
+    @property
+    def size_bytes(self) -> int:
+        """Bytes of its tables in memory."""
+        return sum(table.nbytes for table in (self.rows, self.beside, self.runs) if table is not None)
 
 
-def log_tables(log: str, outcomes: Sequence[BlockOutcome], names: Sequence[str], *, accuracy: bool) -> LogTables:
-    """The tables of one log from blocks of any of its runs; `names`: its configurations, in order."""
-    columns = add_row_accuracy(*outcomes)
-    counts = [len(one.columns["run"]) // max(len(names), 1) for one in outcomes]  # rows of a configuration
+def build_parts(log: str, outcomes: Sequence[BlockOutcome], experiment: Experiment) -> list[PartTables]:
+    """The part of each configuration, in their order, from blocks of neighbouring runs of one log."""
+    names, columns = list(experiment.configurations), add_row_accuracy(*outcomes)
+    counts = [len(one.columns["run"]) // len(names) for one in outcomes]  # rows of a configuration
     number = np.concatenate([np.repeat(np.arange(len(names)), count) for count in counts])
-    order = np.lexsort((columns["run"], number))
-    totals = {}
-    for name in names:
-        if parts := list(_split_by_runs(outcomes, name)):
-            parts.sort(key=lambda part: part[0])
-            totals[name] = [(sum(len(one.by_run) for _, one in parts), sum_accuracy([one for _, one in parts]))]
-    ordered = build_frame({name: values[order] for name, values in columns.items()})
-    if not accuracy or not names:
-        return LogTables(log, ordered, totals=totals)
-    return LogTables(log, ordered, _build_beside(outcomes).take(pa.array(order)), _build_runs(outcomes, names), totals)
+    parts = []
+    for k, name in enumerate(names):
+        rows = np.flatnonzero(number == k)
+        order = np.argsort(columns["run"][rows], kind="stable")
+        without = () if experiment.has_way(name) else WAY
+        frame = build_frame({n: values[rows[order]] for n, values in columns.items() if n not in without})
+        part = PartTables(log, name, tabulate_rows(frame))
+        if experiment.measure.accuracy:
+            beside, runs = _build_beside(outcomes, name).take(pa.array(order)), _build_runs(outcomes, name)
+            accuracies = [accuracy for _, accuracy in sorted(_split_by_runs(outcomes, name), key=lambda one: one[0])]
+            part = replace(part, beside=beside, runs=runs, total=sum_accuracy(accuracies))
+        parts.append(part)
+    return parts
 
 
-def join_log_tables(log: str, parts: Sequence[LogTables]) -> LogTables:
-    """The tables of one log from those of several configurations and ranges of runs, in this order."""
-    totals: dict[str, list[tuple[int, AccuracyTotal]]] = {}
-    for part in parts:
-        for name, nodes in part.totals.items():
-            totals.setdefault(name, []).extend(nodes)
-    rows = pa.concat_tables([part.rows for part in parts], promote_options="permissive")
-    beside, runs = ([t for part in parts if (t := getattr(part, name)) is not None] for name in ("beside", "runs"))
-    return LogTables(
-        log, rows, pa.concat_tables(beside) if beside else None, pa.concat_tables(runs) if runs else None, totals
-    )
+def tabulate_rows(frame: pd.DataFrame) -> pa.Table:
+    """A frame as Arrow, without what pandas notes of it."""
+    return pa.Table.from_pandas(frame, preserve_index=False).replace_schema_metadata(None)
 
 
 def _split_by_runs(outcomes: Iterable[BlockOutcome], name: str) -> Iterator[tuple[int, Accuracy]]:
@@ -277,29 +276,29 @@ def _split_by_runs(outcomes: Iterable[BlockOutcome], name: str) -> Iterator[tupl
             yield from ((int(run), scores.accuracy.of_run(s)) for s, run in enumerate(outcome.runs))
 
 
-def _build_beside(outcomes: Sequence[BlockOutcome]) -> pa.Table:
-    """`LogTables.beside`, in the order of the outcomes' rows."""
+def _build_beside(outcomes: Sequence[BlockOutcome], name: str) -> pa.Table:
+    """`PartTables.beside` of a configuration, in the order of the outcomes' rows."""
     parts = []
     for outcome in outcomes:
-        runs = len(outcome.runs)
-        for _, scores, accuracy in list_accuracies(outcome):
-            held, assessed = scores.held, outcome.assessed
-            assert held is not None
-            count, existence, steps_s = _count_steps(scores, runs)
-            lists, frames = (np.tile(_spread(of.count, assessed), runs) for of in (accuracy, held))
-            columns = {
-                "first_list": np.tile(_spread(accuracy.first_list, assessed), runs),
-                "error_m": (lists, accuracy.error_m.ravel()),
-                "gospa_m2": (lists, accuracy.gospa.ravel()),
-                "ghosts": _spread(accuracy.by_object["ghosts"], assessed).ravel(),
-                "first_frame": np.tile(_spread(held.first, assessed), runs),
-                "error_held_m": (frames, held.error_m.ravel()),
-                "age_held_s": (frames, held.age_s.ravel()),
-                "gospa_held_m2": (frames, held.gospa.ravel()),
-                "existence": (count, existence),
-                "steps_s": (count, steps_s),
-            }
-            parts.append(columns)
+        scores, assessed, runs = outcome.all_scores[name], outcome.assessed, len(outcome.runs)
+        accuracy, held = scores.accuracy, scores.held
+        assert accuracy is not None
+        assert held is not None
+        count, existence, steps_s = _count_steps(scores, runs)
+        lists, frames = (np.tile(_spread(of.count, assessed), runs) for of in (accuracy, held))
+        columns = {
+            "first_list": np.tile(_spread(accuracy.first_list, assessed), runs),
+            "error_m": (lists, accuracy.error_m.ravel()),
+            "gospa_m2": (lists, accuracy.gospa.ravel()),
+            "ghosts": _spread(accuracy.by_object["ghosts"], assessed).ravel(),
+            "first_frame": np.tile(_spread(held.first, assessed), runs),
+            "error_held_m": (frames, held.error_m.ravel()),
+            "age_held_s": (frames, held.age_s.ravel()),
+            "gospa_held_m2": (frames, held.gospa.ravel()),
+            "existence": (count, existence),
+            "steps_s": (count, steps_s),
+        }
+        parts.append(columns)
     return pa.table({one.name: _join_column(one.type, [part[one.name] for part in parts]) for one in BESIDE})
 
 
@@ -324,125 +323,186 @@ def _count_steps(scores: ConfigurationScores, runs: int) -> tuple[Int, Float, Fl
     return np.tile(count, times), np.tile(steps.existence[order], times), np.tile(steps.detection_s[order], times)
 
 
-def _build_runs(outcomes: Sequence[BlockOutcome], names: Sequence[str]) -> pa.Table:
-    """`LogTables.runs`, in the order of `names` and runs."""
+def _build_runs(outcomes: Sequence[BlockOutcome], name: str) -> pa.Table:
+    """`PartTables.runs` of a configuration, in the order of runs."""
     rows: list[dict[str, Any]] = []
     for outcome in outcomes:
-        for name, scores, accuracy in list_accuracies(outcome):
-            held = scores.held
-            assert held is not None
-            instants: dict[str, Any] = {"available_s": scores.issue_s, "frame_s": held.frame_s}
-            instants["held_list"] = [k if k >= 0 else None for k in held.list_ix.tolist()]
-            for s, run in enumerate(outcome.runs.tolist()):
-                sums = accuracy.by_run[s]
-                rows.append(
-                    {
-                        "log": outcome.log,
-                        "configuration": name,
-                        "run": run,
-                        "lists": int(sums["lists"]),
-                        "minutes": float(sums["time_s"]) / 60,
-                        "ghosts": int(sums["ghosts"]),
-                        "stale_ghosts": int(sums["stale_ghosts"]),
-                        "duplicates": int(sums["duplicates"]),
-                        "existence": list(accuracy.settings.existence_thresholds),
-                        "ghosts_at": accuracy.ghosts_at[s].tolist(),
-                        "without_truth": int(held.without_truth[s]),
-                        **instants,
-                    }
-                )
-    place = {name: k for k, name in enumerate(names)}
-    rows.sort(key=lambda row: (place[row["configuration"]], row["run"]))
-    before: dict[str, Any] = {}
+        scores = outcome.all_scores[name]
+        accuracy, held = scores.accuracy, scores.held
+        assert accuracy is not None
+        assert held is not None
+        instants: dict[str, Any] = {"available_s": scores.issue_s, "frame_s": held.frame_s}
+        instants["held_list"] = [k if k >= 0 else None for k in held.list_ix.tolist()]
+        for s, run in enumerate(outcome.runs.tolist()):
+            sums = accuracy.by_run[s]
+            rows.append(
+                {
+                    "log": outcome.log,
+                    "configuration": name,
+                    "run": run,
+                    "lists": int(sums["lists"]),
+                    "minutes": float(sums["time_s"]) / 60,
+                    "ghosts": int(sums["ghosts"]),
+                    "stale_ghosts": int(sums["stale_ghosts"]),
+                    "duplicates": int(sums["duplicates"]),
+                    "existence": list(accuracy.settings.existence_thresholds),
+                    "ghosts_at": accuracy.ghosts_at[s].tolist(),
+                    "without_truth": int(held.without_truth[s]),
+                    **instants,
+                }
+            )
+    rows.sort(key=lambda row: int(row["run"]))
+    last: Any = None
     for row in rows:  # instants equal to those of the run before are null
-        last, issue_s = before.get(row["configuration"]), row["available_s"]
-        before[row["configuration"]] = issue_s
-        if last is not None and (last is issue_s or np.array_equal(last, issue_s)):
+        issue_s, before = row["available_s"], last
+        last = issue_s
+        if before is not None and (before is issue_s or np.array_equal(before, issue_s)):
             row |= dict.fromkeys(_INSTANTS)
     return pa.Table.from_pylist(rows, RUNS)
 
 
+# Parts as bytes: streams of Arrow, one after the other.
+
+_WHOSE = ("log", "configuration")
+"""Columns that are not in the bytes of a part: a configuration may be renamed."""
+_RECORDS = {"episodes": OBJECT, "runs": RUN, "ghosts_at": np.dtype("i8"), "by_distance": BAND, "by_time": BAND,
+            "by_existence": EXISTENCE}  # fmt: skip
+
+
+def pack_part(part: PartTables, about: str = "") -> bytes:
+    """A part as bytes. `about`: text that `unpack_part` expects."""
+    total = None if part.total is None else _total_as_json(part.total)
+    metadata: dict[bytes, bytes] | None = {b"about": about.encode(), b"total": json.dumps(total).encode()}
+    stream = pa.BufferOutputStream()
+    for table in (part.rows, part.beside, part.runs):
+        if table is not None:
+            table = table.drop_columns([name for name in _WHOSE if name in table.column_names]).combine_chunks()
+            schema = table.schema.with_metadata(metadata)
+            with ipc.new_stream(stream, schema, options=ipc.IpcWriteOptions(compression="zstd")) as writer:
+                writer.write_table(table)
+            metadata = None
+    content: bytes = stream.getvalue().to_pybytes()
+    return content
+
+
+def unpack_part(content: bytes, log: str, configuration: str, about: str = "") -> PartTables:
+    """The part that `pack_part` gave. Raises ValueError, KeyError, TypeError or OSError for other bytes or text."""
+    reader, tables = pa.BufferReader(content), list[pa.Table]()
+    while reader.tell() < reader.size():
+        tables.append(ipc.open_stream(reader).read_all())
+    metadata = tables[0].schema.metadata
+    if metadata[b"about"] != about.encode():
+        raise ValueError("another recipe")
+    total = parse_json(metadata[b"total"])
+    for k in (0, 2)[: len(tables)]:
+        for at, (name, value) in enumerate(zip(_WHOSE, (log, configuration), strict=True)):
+            column = pa.repeat(pa.scalar(value, pa.string()), len(tables[k]))
+            tables[k] = tables[k].replace_schema_metadata(None).add_column(at, name, column)
+    rows, beside, runs = (*tables, None, None)[:3]
+    return PartTables(log, configuration, rows, beside, runs, None if total is None else _total_from_json(total))
+
+
+def _total_as_json(total: AccuracyTotal) -> dict[str, Any]:
+    arrays = {name: np.ascontiguousarray(getattr(total, name)).tobytes().hex() for name in _RECORDS}
+    return (
+        {f.name: getattr(total, f.name) for f in fields(AccuracyTotal)} | {"settings": asdict(total.settings)} | arrays
+    )
+
+
+def _total_from_json(data: dict[str, Any]) -> AccuracyTotal:
+    settings: dict[str, Any] = {n: _lists_to_tuples(v) for n, v in data["settings"].items()}
+    arrays = {name: np.frombuffer(bytes.fromhex(data[name]), dtype=kind) for name, kind in _RECORDS.items()}
+    scalars = {name: arrays[name].reshape(()) for name in ("episodes", "runs")}
+    return AccuracyTotal(**data | {"settings": AccuracySettings(**settings)} | arrays | scalars)
+
+
+def _lists_to_tuples(value: Any) -> Any:
+    return tuple(map(_lists_to_tuples, value)) if isinstance(value, list) else value
+
+
 # The tables of a study.
 
-HELD_BYTES = 1_000_000_000
-"""Bytes of all logs that are held where they can be read again: five million rows without accuracy."""
+HELD_BYTES = 100_000_000
+"""Bytes of parts that are held in memory; further ones are in a temporary file. No result depends on it."""
+BATCH_ROWS, BATCH_BYTES = 100_000, 50_000_000
+"""Rows and bytes that are put together at a time, at least: what is done once per batch then costs nothing."""
 
 
 class StudyTables:
-    """The tables of a study, log by log: all in memory, or, where they are large and kept, those of one log at a time.
+    """The tables of a study, part by part, in memory or in a file without a name, by log, configuration and runs.
 
-    `again`: reads the tables of a log that was added; None: all stay in memory. `way`: whether rows have `WAY`.
+    `way`: whether rows have the columns `WAY`.
     """
 
-    def __init__(self, again: Callable[[str], LogTables] | None = None, *, way: bool = False) -> None:
+    def __init__(self, *, way: bool = False) -> None:
         self.counts: dict[str, int] = {}
         """Rows by log, in the order in which logs are added."""
-        self._again, self._way = again, way
-        self._held: dict[str, LogTables] = {}
-        self._bytes = 0
-        self._schema: pa.Schema | None = None  # of all rows; None: rows are pandas frames
-        self._last: tuple[str, pd.DataFrame] | None = None
+        self._way, self._bytes, self._schema = way, 0, pa.schema([])
+        self._parts: dict[str, dict[str, list[Callable[[], PartTables]]]] = {}
+        self._file: IO[bytes] | None = None
 
-    def add(self, some: Sequence[LogTables]) -> pd.DataFrame:
-        """The tables of more logs. Returns their rows."""
-        for tables in some:
-            self.counts[tables.log] = len(tables.rows)
-            self._held[tables.log] = tables
-            self._bytes += sum(one.nbytes for one in (tables.beside, tables.runs) if one is not None)
-        arrow = [tables.rows for tables in some if isinstance(tables.rows, pa.Table)]
-        if arrow:
-            self._bytes += sum(rows.nbytes for rows in arrow)
-            before = [] if self._schema is None else [self._schema]
-            schemas = [*before, *(rows.schema.remove_metadata() for rows in arrow)]
-            self._schema = pa.unify_schemas(schemas, promote_options="permissive")
-        if self._again is not None and self._bytes > HELD_BYTES:
-            self._held.clear()
-        return self._frame([tables.rows for tables in some])
+    def add(self, part: PartTables, *, counted: bool = False) -> None:
+        """Add a part: after those of earlier runs, and of earlier logs. `counted`: it is not needed any more.
+
+        Raises OutputError: no room on the disk.
+        """
+        self.counts[part.log] = self.counts.get(part.log, 0) + len(part.rows)
+        if self._schema != part.rows.schema:
+            self._schema = pa.unify_schemas([self._schema, part.rows.schema], promote_options="permissive")
+        if counted:
+            return
+        self._bytes += part.size_bytes
+        held = (lambda: part) if self._bytes <= HELD_BYTES else self._store(part)
+        self._parts.setdefault(part.log, {}).setdefault(part.configuration, []).append(held)
+
+    def _store(self, part: PartTables) -> Callable[[], PartTables]:
+        try:
+            if self._file is None:
+                self._file = tempfile.TemporaryFile()  # noqa: SIM115
+                weakref.finalize(self, self._file.close)
+            begin, size = self._file.seek(0, os.SEEK_END), self._file.write(pack_part(part))
+        except OSError as error:
+            place, out = tempfile.gettempdir(), "set TMPDIR to a folder with room"
+            raise OutputError(f"{place}: cannot be written: {error.strerror or error}; {out}") from None
+        file, log, configuration = self._file, part.log, part.configuration
+
+        def read() -> PartTables:
+            file.seek(begin)
+            return unpack_part(file.read(size), log, configuration)
+
+        return read
+
+    def parts(self, log: str | None = None) -> Iterator[PartTables]:
+        """The parts of all logs or of one, by configuration, in order of runs; those in the file are read again."""
+        of_logs = self._parts.values() if log is None else [self._parts.get(log, {})]
+        yield from (part() for of_log in of_logs for parts in of_log.values() for part in parts)
+
+    def batches(self) -> Iterator[tuple[pd.DataFrame, list[PartTables]]]:
+        """Rows of `detections.parquet` with their parts, so many at a time that one batch is in memory."""
+        batch, rows, size = list[PartTables](), 0, 0
+        for part in self.parts():
+            batch.append(part)
+            rows, size = rows + len(part.rows), size + part.size_bytes
+            if rows >= BATCH_ROWS or size >= BATCH_BYTES:
+                yield self.frame(batch), batch
+                batch, rows, size = [], 0, 0
+        if batch:
+            yield self.frame(batch), batch
 
     @cached_property
     def whole(self) -> pd.DataFrame:
         """The rows of `detections.parquet` of all logs."""
-        rows = self._frame([tables.rows for tables in self.each()])
-        self._held = {log: replace(tables, rows=pd.DataFrame()) for log, tables in self._held.items()}
-        return rows
-
-    @property
-    def many(self) -> bool:
-        """Whether tables are read again log by log."""
-        return len(self._held) < len(self.counts)
+        return self.frame(self.parts())
 
     def rows(self, log: str) -> pd.DataFrame:
         """The rows of `detections.parquet` of one log."""
-        if not self.many:
-            return self.whole[self.whole["log"] == log]
-        if self._last is None or self._last[0] != log:
-            self._last = log, self._frame([self._of(log).rows])
-        return self._last[1]
+        return self.frame(self.parts(log))
 
-    def each(self) -> Iterator[LogTables]:
-        """The tables of each log; without rows where `whole` has them."""
-        return map(self._of, self.counts)
-
-    def parts(self) -> Iterator[tuple[pd.DataFrame, Sequence[LogTables]]]:
-        """Rows and their tables in parts, one in memory at a time: all logs at once, or one log each."""
-        if not self.many:
-            yield self.whole, list(self.each())
-        else:
-            yield from ((self._frame([tables.rows]), [tables]) for tables in self.each())
-
-    def _of(self, log: str) -> LogTables:
-        if log in self._held:
-            return self._held[log]
-        assert self._again is not None
-        return self._again(log)
-
-    def _frame(self, rows: Sequence[pd.DataFrame | pa.Table]) -> pd.DataFrame:
-        """The rows of some logs as one frame, with the same columns and types whether computed or read."""
-        if self._schema is None:
-            frame = pd.concat(rows, ignore_index=True).infer_objects()
-        else:
-            tables = [self._schema.empty_table(), *(one.replace_schema_metadata(None) for one in rows)]
-            frame = pa.concat_tables(tables, promote_options="permissive").to_pandas()
+    def frame(self, parts: Iterable[PartTables]) -> pd.DataFrame:
+        """The rows of some parts, with the columns and types that those of all parts have."""
+        frame = pa.concat_tables(
+            [self._schema.empty_table(), *(part.rows for part in parts)], promote_options="permissive"
+        ).to_pandas()
         if "braking_pass" in frame:
             frame["braking_pass"] = pd.array(frame["braking_pass"], dtype="boolean")
         if not self._way:

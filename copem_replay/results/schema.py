@@ -11,8 +11,10 @@ from pathlib import Path
 from typing import Any, Self
 from urllib.parse import quote
 
+import numpy as np
 import pandas as pd
 import pyarrow as pa
+import pyarrow.compute as pc
 from pyarrow import parquet
 
 from copem_replay.core.errors import InputError, RemoteFile
@@ -232,7 +234,9 @@ _LIBRARIES = (
     "scipy", "shapely",
 )  # fmt: skip
 ROWS_A_GROUP = 1 << 17
-"""Rows of a row group of Parquet, at most: comparisons hold a whole group in memory, also where rows hold lists."""
+GROUP_BYTES = 1 << 27
+"""Rows of a row group of Parquet, at most, and about their bytes: it is in memory as a whole, where it is written and
+where it is compared."""
 
 
 def log_entries(logs: Sequence[Any], recordings: Sequence[Recording], folder: Path) -> list[Any]:
@@ -300,15 +304,26 @@ class TableFile:
             self._writer = parquet.ParquetWriter(self._path, arrow.schema, compression="zstd")
         if self._left is not None:
             arrow = pa.concat_tables([self._left, arrow])
-        for k in range(0, whole := len(arrow) // ROWS_A_GROUP * ROWS_A_GROUP, ROWS_A_GROUP):
-            self._write(arrow.slice(k, ROWS_A_GROUP))
-        self._left = arrow.slice(whole)
+        while (count := _count_group_rows(arrow)) <= len(arrow):
+            self._write(arrow.slice(0, count))
+            arrow = arrow.slice(count)
+        self._left = arrow
 
     def _write(self, rows: pa.Table) -> None:
         """Write a row group, as one chunk whatever the chunks of its rows."""
         assert self._writer is not None
         self._writer.write_table(rows.combine_chunks(), row_group_size=ROWS_A_GROUP)
         self._written = True
+
+
+def _count_group_rows(table: pa.Table) -> int:
+    """How many rows of a table are its first row group; one more than there are: no group is complete."""
+    sizes = np.zeros(min(len(table), ROWS_A_GROUP), dtype=np.int64)
+    for column in table.slice(0, ROWS_A_GROUP).columns:
+        if pa.types.is_list(column.type) or pa.types.is_large_list(column.type):
+            lengths = pc.fill_null(pc.list_value_length(column), 0).to_numpy()
+            sizes += lengths * (column.type.value_type.bit_width // 8)
+    return min(int(np.searchsorted(np.cumsum(sizes), GROUP_BYTES)) + 1, ROWS_A_GROUP)
 
 
 # Names in CSV files. A name that begins with `=`, `+`, `-`, `@`, a tab or a line's end gets an apostrophe before it,

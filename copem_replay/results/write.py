@@ -359,33 +359,28 @@ def _escape_name(name: str) -> str:
 def _write_rows(result: ExperimentResult, scratch: Path) -> None:
     """Write the tables of rows, part by part as they are in memory, and the tally."""
     with ExitStack() as open_files:
-        files: dict[str, TableFile] = {}
+        files: dict[str | Path, TableFile] = {}
 
-        def add(name: str, table: Any) -> None:
+        def add(name: str | Path, table: Any) -> None:
             if name not in files:
+                (scratch / name).parent.mkdir(exist_ok=True)
                 files[name] = open_files.enter_context(TableFile(scratch / name))
             files[name].add(table)
 
-        for rows, of_logs in result.tables.parts():
-            if sum(result.tables.counts.values()) <= MANY_ROWS:
-                add("detections.parquet", rows)
-            else:
-                _write_by_log(rows, scratch / "detections.parquet")
+        many = sum(result.tables.counts.values()) > MANY_ROWS
+        for rows, parts in result.tables.batches():
+            for log, of_log in rows.groupby("log", sort=False) if many else [("", rows)]:
+                add("detections.parquet" if not many else table_file(Path("detections.parquet"), str(log)), of_log)
             if result.bands is not None:
-                accuracy = result.accuracy_of(of_logs, rows)
+                accuracy = result.accuracy_of(parts, rows)
                 for name in _ACCURACY:
                     add(f"{name}.parquet", getattr(accuracy, name))
     if len(result.tally) <= MANY_ROWS:
         write_parquet(result.tally, scratch / "tally.parquet")
     else:
-        _write_by_log(result.tally, scratch / "tally.parquet")
-
-
-def _write_by_log(rows: pd.DataFrame, folder: Path) -> None:
-    """Write a file for each log."""
-    folder.mkdir(exist_ok=True)
-    for log, part in rows.groupby("log", sort=False):
-        write_parquet(part, table_file(folder, str(log)))
+        (scratch / "tally.parquet").mkdir()
+        for log, rows in result.tally.groupby("log", sort=False):
+            write_parquet(rows, table_file(scratch / "tally.parquet", str(log)))
 
 
 def write_csv(table: pd.DataFrame, path: Path) -> None:

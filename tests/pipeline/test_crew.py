@@ -6,9 +6,9 @@ import multiprocessing
 import os
 import signal
 import time
-from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +18,17 @@ import pytest
 
 from copem_replay.cli import main as cli
 from copem_replay.core.errors import CopemError, InputError
-from copem_replay.pipeline import dask_workers, worker
+from copem_replay.pipeline import crew as crew_module
+from copem_replay.pipeline import dask_workers
+from copem_replay.pipeline import run as gather
 from copem_replay.pipeline.crew import TaskFailedError
-from copem_replay.pipeline.dask_workers import DaskWorkers
-from copem_replay.pipeline.pieces import PieceCache
-from copem_replay.pipeline.worker import LogTask, Task
+from copem_replay.pipeline.dask_workers import connect_workers
+from copem_replay.pipeline.parts import FolderStore, PartCache
 from tests.cli.test_api import cr
 from tests.helpers.experiments import changed, drive, files
 from tests.helpers.object_storage import Bucket
 from tests.helpers.recordings import Obj, write_recording
-from tests.pipeline.test_pieces import EXACT, FLEET, study
+from tests.pipeline.test_parts import EXACT, FLEET, study
 
 OWN_SETTINGS = "logs: [a.mcap, {file: b.mcap, name: other, units: {mast: null}}]"
 STUDIES = {
@@ -55,25 +56,22 @@ def cluster() -> Iterator[Any]:
 
 
 @pytest.fixture
-def connected(cluster: Any, here: Path) -> Iterator[Callable[..., DaskWorkers]]:
-    """Connects to them, with pieces in a folder."""
-    opened: list[DaskWorkers] = []
+def connected(cluster: Any, here: Path) -> Iterator[Callable[..., Any]]:
+    """Connects to them, with parts in a folder."""
+    with ExitStack() as stack:
 
-    def connect(kept: str = "kept", **keys: float) -> DaskWorkers:
-        opened.append(DaskWorkers(cluster.scheduler_address, PieceCache(kept), 0, **keys))
-        return opened[-1]
+        def connect(kept: str = "kept", **keys: float) -> Any:
+            return stack.enter_context(connect_workers(cluster.scheduler_address, PartCache(kept), 0, **keys))
 
-    yield connect
-    for one in opened:
-        one.close()
+        yield connect
 
 
 def replayed(text: str, out: str, **keys: Any) -> tuple[dict[str, bytes], int, int]:
-    """Files of the results, and how many pieces were computed and found."""
+    """Files of the results, and how many parts were computed and found."""
     Path("e.yaml").write_text(text)
     result = cr.run("e.yaml", **keys)
     result.save(out, overwrite=True)
-    store = result.replayed.logs[0].pieces
+    store = result.replayed.logs[0].parts
     return files(out), *((0, 0) if store is None else (store.computed, store.found))
 
 
@@ -98,13 +96,13 @@ class Shuffled(Executor):
 
 
 @pytest.mark.parametrize("text", STUDIES.values(), ids=STUDIES.keys())
-def test_the_same_bytes_by_threads_and_processes_of_dask(text: str, connected: Callable[..., DaskWorkers]) -> None:
+def test_the_same_bytes_by_threads_and_processes_of_dask(text: str, connected: Callable[..., Any]) -> None:
     plain, _, _ = replayed(text, "plain", jobs=2)
     _, computed, found = replayed(text, "threads", pieces="alone")
     assert found == 0
     assert replayed(text, "dask", pieces="kept", crew=connected()) == (plain, computed, 0)
     assert replayed(text, "again", pieces="kept", crew=connected()) == (plain, 0, computed)
-    for path in sorted(Path("kept/pieces").rglob("*[0-9a-f].parquet"))[::3]:
+    for path in sorted(Path("kept/parts").rglob("*.arrows"))[::3]:
         path.unlink()
     half, more, rest = replayed(text, "half", pieces="kept", crew=Shuffled())
     assert (half, more + rest) == (plain, computed)
@@ -124,39 +122,8 @@ def test_recordings_and_pieces_under_urls_by_a_pool_of_processes(here: Path, buc
     plain, _, _ = replayed(text, "plain")
     with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
         kept = f"{bucket.url}/kept"
-        assert replayed(text, "pool", pieces=kept, crew=pool) == (plain, 2 * 3 * 2, 0)
-        assert replayed(text, "again", pieces=kept, crew=pool) == (plain, 0, 2 * 3 * 2)
-
-
-def test_a_log_is_read_once_to_be_surveyed_and_replayed(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """And again where it was let go of, where its file is another, and where something else of it is to be known."""
-    read, names = worker.read_logs, list[str]()
-    monkeypatch.setattr(worker, "_kept", {})
-    monkeypatch.setattr(worker, "read_logs", lambda *a: [names.extend(map(str, a[1])), read(*a)][1])
-    replayed(study(), "out", pieces="kept", crew=Shuffled())
-    assert sorted(names) == ["a.mcap", "b.mcap"]
-    replayed(study(runs=140), "out", pieces="kept", crew=Shuffled())
-    assert len(names) == 4  # the experiment is another
-    os.utime("a.mcap", ns=(0, 1))
-    replayed(study(runs=140), "out", pieces="kept", crew=Shuffled())
-    assert names[4:] == ["a.mcap"]
-    monkeypatch.setattr(worker, "STATES_HELD", 1)
-    replayed(study(runs=150), "out", pieces="kept", crew=Shuffled())
-    assert len(names) >= 5 + 3  # to be surveyed, then at least the one that was surveyed first
-
-
-def test_a_worker_replays_what_it_has_surveyed(connected: Callable[..., DaskWorkers]) -> None:
-    """As soon as it is idle; what is in memory of no worker, or of a busy one, goes first to one that has nothing."""
-    workers = connected()
-    tasks = deque(Task(LogTask(name, Path(f"{name}.mcap"), "", "", "", ())) for name in "abcde")
-    workers._has = {task.log: f"worker {k % 2}" for k, task in enumerate(tasks)}
-    workers._idle = ["worker 1"]
-    assert [workers.next(tasks).log.name for _ in range(2)] == ["b", "a"]
-    workers._idle = ["worker 1", "worker 2"]
-    assert [workers.next(tasks).log.name for _ in range(3)] == ["d", "c", "e"]
-    replayed(study(), "out", pieces="kept", crew=workers)
-    assert {log.name for log in workers._has} == {*"abcde"}
-    assert len({*workers._has.values()} - {"worker 0", "worker 1"}) > 0
+        assert replayed(text, "pool", pieces=kept, crew=pool) == (plain, 2 * 3, 0)
+        assert replayed(text, "again", pieces=kept, crew=pool) == (plain, 0, 2 * 3)
 
 
 def many(count: int) -> None:
@@ -178,7 +145,7 @@ def at_45_m_and_a_half(kind: str, **keys: Any) -> str:
     return text.replace("{kind: constant, probability: 0.5}", model)
 
 
-def test_the_same_bytes_where_workers_are_killed(connected: Callable[..., DaskWorkers]) -> None:
+def test_the_same_bytes_where_workers_are_killed(connected: Callable[..., Any]) -> None:
     many(10)
     text = study("logs: ['*.mcap']")
     plain, computed, _ = replayed(text, "plain", pieces="alone")
@@ -196,7 +163,7 @@ def test_the_same_bytes_where_workers_are_killed(connected: Callable[..., DaskWo
     assert replayed(text, "again", pieces="kept") == (plain, 0, computed)
 
 
-def test_a_log_that_workers_die_of_is_named_and_the_others_are_done(connected: Callable[..., DaskWorkers]) -> None:
+def test_a_log_that_workers_die_of_is_named_and_the_others_are_done(connected: Callable[..., Any]) -> None:
     text, workers = at_45_m_and_a_half("Deadly"), connected()
     where = r"died 3 times, last on 127.0.0.1:\d+ \(out of memory\?\); more memory per worker, or --skip-unreadable"
     wanted = rf"^at45.mcap: the worker that replayed it {where}; what is done stays done in kept$"
@@ -240,8 +207,8 @@ def test_a_dead_pool_is_said_and_what_is_done_stays(here: Path) -> None:
             replayed(text, "out", pieces="kept", crew=pool)
 
 
-def test_pieces_that_are_kept_elsewhere_are_missed(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(worker, "_open_pieces", lambda address, folder: PieceCache("elsewhere"))
+def test_parts_that_are_kept_elsewhere_are_missed(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(crew_module, "_open_once", lambda task: FolderStore(Path("elsewhere")))
     Path("e.yaml").write_text(study())
     cr.run("e.yaml", pieces="kept", recordings=["a.mcap"])  # so that this log is known
     with (
@@ -251,24 +218,24 @@ def test_pieces_that_are_kept_elsewhere_are_missed(here: Path, monkeypatch: pyte
         replayed(study("seed: 2"), "out", pieces="kept", crew=pool)
 
 
-def test_a_defect_is_told_once_with_its_log_and_pieces(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_defect_is_told_once_with_its_log(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     begun = []
 
     def fail(*given: Any) -> None:
         begun.append(given)
         raise ZeroDivisionError("a defect")
 
-    monkeypatch.setattr(worker, "replay_outcomes", fail)
+    monkeypatch.setattr(gather, "replay_outcomes", fail)
     with ThreadPoolExecutor(1) as pool, pytest.raises(TaskFailedError) as caught:
         replayed(study(), "out", pieces="kept", crew=pool)
     said = str(caught.value)
-    assert said.startswith("a.mcap, runs (0, 64): GT, PEM, coPEM, runs (64, 128)")
-    assert said.count("Traceback") == said.count("ZeroDivisionError: a defect") == 1
+    assert said.startswith("a.mcap: on worker ")
+    assert said.count("ZeroDivisionError: a defect") == 1
     assert len(begun) == 1  # and not tried again
 
 
 def test_workers_that_differ_are_refused(
-    connected: Callable[..., DaskWorkers], monkeypatch: pytest.MonkeyPatch, here: Path
+    connected: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, here: Path
 ) -> None:
     expected = dask_workers.take_fingerprint() | {"numba": "0.1.2"}
     monkeypatch.setattr(dask_workers, "take_fingerprint", lambda: expected)
@@ -277,17 +244,16 @@ def test_workers_that_differ_are_refused(
     )
     with pytest.raises(CopemError, match=words):
         connected()
+    made = [crew_module.take_fingerprint()] * 2  # by the command, for two tasks
     with ThreadPoolExecutor(1) as pool:  # which is asked with its first task
-        monkeypatch.setattr(worker, "take_fingerprint", lambda: expected)
+        monkeypatch.setattr(crew_module, "take_fingerprint", lambda: made.pop(0) if made else expected)
         with pytest.raises(
             CopemError, match=r"^worker \S+ has numba 0.1.2, expected \d\S+: results would not be the same"
         ):
             replayed(study(), "out", pieces="kept", crew=pool)
 
 
-def test_pieces_that_a_worker_does_not_see(
-    connected: Callable[..., DaskWorkers], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_parts_that_a_worker_does_not_see(connected: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
     """As if the folder were on this machine alone: what is written is not where workers look."""
     monkeypatch.setattr(dask_workers, "greet_worker", _blind)
     words = r"^kept: not visible from worker \S+; --pieces with a shared folder or s3://…$"
@@ -318,7 +284,7 @@ def test_addresses(address: str, words: str) -> None:
 
 def test_a_scheduler_that_is_not_there(here: Path) -> None:
     with pytest.raises(CopemError, match=r"^--cluster: tcp://127.0.0.1:1: no scheduler answers there \("):
-        DaskWorkers("tcp://127.0.0.1:1", PieceCache("kept"), 0, wait_s=0.1)
+        ExitStack().enter_context(connect_workers("tcp://127.0.0.1:1", PartCache("kept"), 0, wait_s=0.1))
 
 
 def test_a_scheduler_file_that_is_not_there_and_one_that_comes(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -326,7 +292,7 @@ def test_a_scheduler_file_that_is_not_there_and_one_that_comes(here: Path, monke
         r"^--cluster: s.json: no scheduler answers there \(expected the file of `dask scheduler --scheduler-file`, fo"
     )
     with pytest.raises(CopemError, match=words):
-        DaskWorkers("s.json", PieceCache("kept"), 0, wait_s=0)
+        ExitStack().enter_context(connect_workers("s.json", PartCache("kept"), 0, wait_s=0))
     contents = ["", "{", '{"address": "tcp://127.0.0.1:1"}']
     monkeypatch.setattr(time, "sleep", lambda _: Path("s.json").write_text(contents.pop(0)))
     assert dask_workers._read_address(Path("s.json"), time.monotonic() + 60) == "tcp://127.0.0.1:1"
@@ -357,39 +323,18 @@ def test_certificates_that_are_not_there(
         assert capsys.readouterr().err == said
 
 
-def test_a_client_that_has_closed_itself_gives_up_its_tasks(connected: Callable[..., DaskWorkers]) -> None:
-    """As it does where the scheduler is gone for longer than it looks for it; then there is a new one."""
-    plain, computed, _ = replayed(study(), "plain", pieces="alone")
-    workers, closed = connected(), list[bool]()
+def test_a_client_that_has_closed_itself_is_said(connected: Callable[..., Any]) -> None:
+    """As it does where the scheduler is gone for longer than it looks for it; the same command goes on."""
+    plain, _, _ = replayed(study(), "plain", pieces="alone")
+    workers = connected()
 
     def close(done: int, total: int) -> None:
-        if done and not closed:
-            closed.append(True)
+        if done:
             workers._client.close()
 
-    assert replayed(study(), "dask", pieces="kept", crew=workers, progress=close) == (plain, computed, 0)
-    assert closed
-
-
-def test_a_receipt_that_does_not_come_is_given_up(
-    connected: Callable[..., DaskWorkers], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Dask's client waits without end for a result where it closes in that moment."""
-    import distributed
-
-    plain, computed, _ = replayed(study(), "plain", pieces="alone")
-    workers, late, fetch = connected(), list[bool](), distributed.Future.result
-
-    def fetch_late(future: Any, timeout: float | None = None) -> Any:
-        assert timeout is not None
-        if not late:
-            late.append(True)
-            raise TimeoutError(f"timed out after {timeout} s.")
-        return fetch(future, timeout)
-
-    monkeypatch.setattr(distributed.Future, "result", fetch_late)
-    assert replayed(study(), "dask", pieces="kept", crew=workers) == (plain, computed, 0)
-    assert late
+    with pytest.raises(CopemError, match=r"^crew: the .*gone; [12] of 2 logs are in kept; the same command goes on$"):
+        replayed(study(), "dask", pieces="kept", crew=workers, progress=close)
+    assert replayed(study(), "again", pieces="kept", crew=connected())[0] == plain
 
 
 def test_what_a_crew_needs(here: Path) -> None:

@@ -15,7 +15,7 @@ from copem_replay.pipeline import cost as memory
 from copem_replay.pipeline import study_log as log_survey
 from tests.cli.test_api import cr
 from tests.helpers.experiments import changed, drive
-from tests.pipeline.test_pieces import EXACT, FLEET, replayed, study
+from tests.pipeline.test_parts import EXACT, FLEET, replayed, study
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Recipes: every key of the experiment changes the key of a piece, or is said not to."""
+"""Recipes: every key of the experiment changes the key of a part, or is said not to."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from pydantic import BaseModel
 from copem_replay.core.components import Component
 from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.experiment.schema import Configuration, Experiment
-from copem_replay.pipeline import pieces as module
-from copem_replay.pipeline.pieces import NOT_OF_A_PIECE, canonical_json, recipe_key, write_recipe
+from copem_replay.pipeline import parts as module
+from copem_replay.pipeline.parts import NOT_OF_A_PART, canonical_json, recipe_key, write_recipe
 
 LOG = {"name": "a", "sha256": "0" * 64, "topic": "truth", "ahead_ns": []}
 PEM = {
@@ -90,7 +90,7 @@ OTHERS = ("configurations.another", "units.far", "pems.other", "links.spare")
 UNTOUCHED = {"logs", "runs", "show", "sweep", "measure.began", "measure.horizon_s", "measure.exact", "measure.metrics"}
 
 
-def test_every_key_changes_the_piece_or_is_said_not_to() -> None:
+def test_every_key_changes_the_part_or_is_said_not_to() -> None:
     base, seen = key(experiment()), set()
     for path, changed in variants(experiment()):
         assert isinstance(changed, Experiment)
@@ -113,10 +113,10 @@ def test_every_key_changes_the_piece_or_is_said_not_to() -> None:
         assert (key(changed) == base) == spared, path
         seen.add(path)
     assert len(seen) > 100
-    assert {*UNTOUCHED, "configurations", "units", "pems", "links"} == set(NOT_OF_A_PIECE)
+    assert {*UNTOUCHED, "configurations", "units", "pems", "links"} == set(NOT_OF_A_PART)
 
 
-def test_every_key_of_recorded_lists_changes_the_piece() -> None:
+def test_every_key_of_recorded_lists_changes_the_part() -> None:
     recorded = experiment(units=DATA["units"] | {"mast": {"on": "2", "recorded": {"topic": "/lists"}}})
     keys = {path: key(one) for path, one in variants(recorded) if path.startswith("units.mast.recorded.")}
     assert len(keys) > 3
@@ -166,7 +166,7 @@ def test_no_field_is_left_out_of_what_is_written(model: type[BaseModel]) -> None
             pytest.fail(f"{name}: no value could be written")
 
 
-def test_what_a_piece_is_of() -> None:
+def test_what_a_part_is_of() -> None:
     base = key(experiment())
     assert key(experiment(), runs=(0, 8)) != base
     for name, value in (("name", "b"), ("sha256", "1" * 64), ("topic", "t"), ("ahead_ns", [0, 5])):

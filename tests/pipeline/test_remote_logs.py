@@ -24,7 +24,7 @@ from copem_replay.results.read import reread_log
 from tests.cli.test_api import cr
 from tests.helpers.experiments import changed, drive
 from tests.helpers.object_storage import Bucket
-from tests.pipeline.test_pieces import replayed, study
+from tests.pipeline.test_parts import replayed, study
 
 OF_A_PLACE = {"experiment.yaml", "logs.csv"}
 """What says where the logs lie."""
@@ -106,12 +106,12 @@ def test_another_content_is_read_again(here: Path, drives: Bucket) -> None:
     assert replayed(text, "out")[1:] == (computed // 2, computed // 2)
 
 
-def test_a_damaged_piece_is_computed_again(here: Path, drives: Bucket, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_damaged_part_is_computed_again(here: Path, drives: Bucket, capsys: pytest.CaptureFixture[str]) -> None:
     kept = f"{drives.url}/kept"
     Path("e.yaml").write_text(study(f"logs: ['{drives.url}/drives/b.mcap']", runs=3))
     command = f"copem-replay run e.yaml --overwrite --pieces {kept}"
     assert ran(command, capsys)[1][-1] == f"pieces: 3 computed, 0 found in {kept}"
-    path = next(one for one in drives.fs.find(f"{kept}/pieces") if "sums" not in one)
+    path = drives.fs.find(f"{kept}/parts")[0]
     drives.fs.pipe_file(path, drives.fs.cat_file(path)[:-100])
     damaged, counted = ran(command, capsys)[1]
     assert damaged.startswith(f"note: s3://{path}: damaged, computed again (")

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from copem_replay.core.errors import InputError, OutputError
-from copem_replay.pipeline.pieces import MARK, open_store
+from copem_replay.pipeline.parts import MARK, open_store
 from tests.helpers.object_storage import Bucket
 
 
@@ -25,16 +25,16 @@ def test_what_is_written_is_there_for_every_process_that_has_the_address(
         "s3": f"{bucket.url}/kept/",
     }[kind]
     store = open_store(address)
-    assert store.read("pieces/ab/1.parquet") is None
-    store.write("pieces/ab/1.parquet", b"one")
-    store.write("pieces/ab/1.parquet", b"other")
+    assert store.read("parts/ab/1.arrows") is None
+    store.write("parts/ab/1.arrows", b"one")
+    store.write("parts/ab/1.arrows", b"other")
     store.write("logs/2.json", b"")
-    assert (store.read("pieces/ab/1.parquet"), store.read("logs/2.json")) == (b"other", b"")
+    assert (store.read("parts/ab/1.arrows"), store.read("logs/2.json")) == (b"other", b"")
     assert store.exists("logs/2.json")
     assert not store.exists("logs/3.json")
     other = pickle.loads(pickle.dumps(store))
     other.write("logs/3.json", b"3")
-    assert store.names() - {MARK} == {"pieces/ab/1.parquet", "logs/2.json", "logs/3.json"}
+    assert store.names() - {MARK} == {"parts/ab/1.arrows", "logs/2.json", "logs/3.json"}
     assert store.read("logs/3.json") == b"3"
 
 
@@ -47,15 +47,15 @@ def test_a_process_of_its_own_writes_what_this_one_reads(bucket: Bucket) -> None
     assert store.read("logs/1.json") == b"from elsewhere"
 
 
-def test_one_request_writes_a_piece_and_one_listing_says_what_is_there(bucket: Bucket) -> None:
+def test_one_request_writes_a_part_and_one_listing_says_what_is_there(bucket: Bucket) -> None:
     store = open_store(f"{bucket.url}/kept")
     for k in range(5):
-        store.write(f"pieces/ab/{k}.parquet", bytes(1000))
+        store.write(f"parts/ab/{k}.arrows", bytes(1000))
     before = len(bucket.requests())
     again = open_store(f"{bucket.url}/kept")
-    assert [again.exists(f"pieces/ab/{k}.parquet") for k in range(7)] == [True] * 5 + [False] * 2
-    assert [again.read(f"pieces/cd/{k}.parquet") for k in range(7)] == [None] * 7
-    again.write("pieces/cd/1.parquet", bytes(6_000_000))
+    assert [again.exists(f"parts/ab/{k}.arrows") for k in range(7)] == [True] * 5 + [False] * 2
+    assert [again.read(f"parts/cd/{k}.arrows") for k in range(7)] == [None] * 7
+    again.write("parts/cd/1.arrows", bytes(6_000_000))
     since = bucket.requests()[before:]
     assert [method for method, path in since if "list-type" in path] == ["GET"]
     assert [method for method, path in since if "list-type" not in path] == ["HEAD", "PUT"], "whether it answers"
@@ -99,7 +99,7 @@ def test_what_is_not_installed_is_said_with_what_to_type(absent: str, url: str, 
     code = f"""
 import sys
 sys.modules[{absent!r}] = None
-from copem_replay.pipeline.pieces import open_store
+from copem_replay.pipeline.parts import open_store
 try:
     open_store({url!r})
 except Exception as error:
@@ -112,7 +112,7 @@ except Exception as error:
 def test_fsspec_is_not_loaded_for_what_lies_on_this_machine(tmp_path: Path) -> None:
     code = f"""
 import sys
-from copem_replay.pipeline.pieces import open_store
+from copem_replay.pipeline.parts import open_store
 open_store({str(tmp_path)!r}).write("logs/1.json", b"")
 assert "fsspec" not in sys.modules
 """

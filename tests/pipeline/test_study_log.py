@@ -20,7 +20,7 @@ from copem_replay.experiment import validate
 from copem_replay.io import open as checksum
 from copem_replay.io import recording
 from copem_replay.pipeline import run as gather
-from copem_replay.pipeline import study_log, worker
+from copem_replay.pipeline import study_log
 from copem_replay.pipeline import study_log as log_survey
 from tests.cli.test_api import cr
 from tests.helpers.experiments import changed
@@ -108,8 +108,7 @@ class TestReplaced:
         assert said("old") != said("new")
 
     @REPLACED
-    def test_is_read_again_by_a_worker(self, here: Path, replaced: Change, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(worker, "_kept", {})
+    def test_is_read_again_by_a_worker(self, here: Path, replaced: Change) -> None:
         cr.run("e.yaml", pieces="kept", crew=Shuffled()).save("old")
         replaced(here / "drive.mcap", here / "other.mcap")
         cr.run("e.yaml", pieces="kept", crew=Shuffled()).save("new")
@@ -128,7 +127,7 @@ class TestReplaced:
         old = sha256("drive.mcap")
         replaced(here / "drive.mcap", here / "other.mcap")
         new = sha256("drive.mcap")
-        next(Path("kept/pieces").rglob("*[0-9a-f].parquet")).unlink()  # which has to be computed
+        next(Path("kept/parts").rglob("*.arrows")).unlink()  # which has to be computed
         line = (
             f"drive.mcap: expected the content that it had when it was read before, SHA-256 {old[:12]}…, found "
             f"{new[:12]}…; run the command again, and it is replayed as it is now"

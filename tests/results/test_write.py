@@ -24,7 +24,7 @@ from copem_replay.pipeline import replay as blocks_module
 from copem_replay.pipeline.one_run import select_shown_logs, select_shown_runs
 from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.run import ExperimentResult, run_experiment
-from copem_replay.pipeline.tables import LogTables, StudyTables
+from copem_replay.pipeline.tables import PartTables, StudyTables, tabulate_rows
 from copem_replay.results import write as result_tables
 from copem_replay.results.write import Exporter, RunToExport, write_results
 from copem_replay.viewer.rrd import EXPORTERS
@@ -252,7 +252,8 @@ def made_up(times: list[float | None]) -> ExperimentResult:
 
 def of_one_log(rows: pd.DataFrame) -> StudyTables:
     tables = StudyTables()
-    tables.add([LogTables("scene", rows)])
+    for name, of_configuration in rows.groupby("configuration", sort=False):
+        tables.add(PartTables("scene", str(name), tabulate_rows(of_configuration)))
     return tables
 
 

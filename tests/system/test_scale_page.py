@@ -86,14 +86,14 @@ def typed(text: str, here: Path) -> str:
     return said.read_text()
 
 
-def test_pieces_are_found_again_and_removed(here: Path) -> None:
+def test_parts_are_found_again_and_removed(here: Path) -> None:
     """In Python, too, by executors of both kinds that the page names."""
     assert COMPUTED.format("out") in typed(block("out/study.pieces"), here)
     assert files("out/study") == files("out/plain")
     alone, crewed = in_a_line("cr.run(")
     found = eval(alone, {"cr": cr})
     found.save("out/alone")
-    assert (found.replayed.logs[0].pieces.computed, files("out/alone")) == (0, files("out/plain"))
+    assert (found.replayed.logs[0].parts.computed, files("out/alone")) == (0, files("out/plain"))
     (remove,) = in_a_line("rm -r ")
     typed(remove, here)
     assert not Path("out/study.pieces").exists()

@@ -73,8 +73,8 @@ def go(way: str, folder: str) -> None:
     from copem_replay.api.run import read_with_crew, replay_study
     from copem_replay.api.study import make_study, prepare_study
     from copem_replay.pipeline.crew import Crew
-    from copem_replay.pipeline.dask_workers import DaskWorkers
-    from copem_replay.pipeline.pieces import PieceCache
+    from copem_replay.pipeline.dask_workers import connect_workers
+    from copem_replay.pipeline.parts import PartCache
     from copem_replay.pipeline.study_log import LogSurvey
 
     os.chdir(folder)
@@ -85,14 +85,13 @@ def go(way: str, folder: str) -> None:
         print(time.perf_counter() - began_s, 0, 0, len(result.detections), 0)
         return
     began_s = time.perf_counter()
-    workers = DaskWorkers(way, PieceCache("warm"), 2)
-    warm = Crew(workers, pieces := PieceCache("warm"))  # kernels are loaded in the workers, too
-    read_with_crew(lambda: make_study("e.yaml", ["drive00.mcap", "drive01.mcap"], LogSurvey(pieces), warm), warm)
-    start_s, began_s = time.perf_counter() - began_s, time.perf_counter()
-    hands = Crew(workers, pieces := PieceCache("kept"))
-    study = read_with_crew(lambda: make_study("e.yaml", None, LogSurvey(pieces), hands), hands)
-    computed_s = time.perf_counter() - began_s
-    result = replay_study(study, prepare_study(study)[0], 1, None, pieces)
-    took_s = time.perf_counter() - began_s
-    workers.close()
+    with connect_workers(way, PartCache("warm"), 2) as workers:
+        warm = Crew(workers, parts := PartCache("warm"))  # kernels are loaded in the workers, too
+        read_with_crew(lambda: make_study("e.yaml", ["drive00.mcap", "drive01.mcap"], LogSurvey(parts), warm), warm)
+        start_s, began_s = time.perf_counter() - began_s, time.perf_counter()
+        hands = Crew(workers, parts := PartCache("kept"))
+        study = read_with_crew(lambda: make_study("e.yaml", None, LogSurvey(parts), hands), hands)
+        computed_s = time.perf_counter() - began_s
+        result = replay_study(study, prepare_study(study)[0], 1, None, parts)
+        took_s = time.perf_counter() - began_s
     print(took_s, start_s, hands.peak_bytes / 1e6, len(result.detections), computed_s)

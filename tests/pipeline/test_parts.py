@@ -1,4 +1,4 @@
-"""Pieces: what was computed once is found again, and results with and without them are the same bytes."""
+"""Parts: what was computed once is found again, and results with and without them are the same bytes."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
-from pyarrow import parquet
+from pyarrow import ipc
 
 from copem_replay.core.errors import InputError, OutputError
 from copem_replay.experiment import validate
+from copem_replay.pipeline import parts as parts_module
 from copem_replay.pipeline import tables as study_tables
-from copem_replay.pipeline.pieces import split_runs
-from copem_replay.pipeline.tables import LogTables, StudyTables
+from copem_replay.pipeline.parts import cut_parts
 from copem_replay.results import schema as contents
 from copem_replay.results import write as results_write
 from tests.cli.test_api import cr
@@ -43,11 +43,11 @@ def study(*changes: str, runs: int = 130, gnn: bool = False) -> str:
 
 
 def replayed(text: str, out: str, kept: str | None = "kept") -> tuple[dict[str, bytes], int, int]:
-    """Files of the results, and how many pieces were computed and found."""
+    """Files of the results, and how many parts were computed and found."""
     Path("e.yaml").write_text(text)
     result = cr.run("e.yaml", jobs=2, pieces=kept)
     result.save(out, overwrite=True)
-    store = result.replayed.logs[0].pieces
+    store = result.replayed.logs[0].parts
     counts = (0, 0) if store is None else (store.computed, store.found)
     files = {str(path.relative_to(out)): path.read_bytes() for path in Path(out).rglob("*") if path.is_file()}
     return {name: content for name, content in files.items() if not name.endswith(".rrd")}, *counts
@@ -70,21 +70,22 @@ def test_the_same_bytes_computed_found_and_half_found(text: str, here: Path) -> 
     assert (found, first) == (0, plain)
     again, more, found = replayed(text, "again")
     assert (more, found, again) == (0, computed, plain)
-    for path in sorted(Path("kept/pieces").rglob("*[0-9a-f].parquet"))[::3]:
+    for path in sorted(Path("kept/parts").rglob("*.arrows"))[::3]:
         path.unlink()
     half, more, found = replayed(text, "half")
     assert more > 0
     assert (more + found, half) == (computed, plain)
 
 
-def test_what_is_added_is_computed_and_nothing_else(here: Path) -> None:
-    """Of a log with one object: runs 0 to 64, 128, 256, …; two logs, three configurations."""
+def test_what_is_added_is_computed_and_nothing_else(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """64 runs a part, two logs, three configurations."""
+    monkeypatch.setattr(parts_module, "MOST_RUNS", 64)
     assert replayed(study(), "out")[1:] == (2 * 3 * 3, 0)
     more, computed, found = replayed(study(gnn=True), "out")
     assert (computed, found) == (2 * 3, 18)
     assert more == replayed(study(gnn=True), "fresh", None)[0]
-    raised, computed, found = replayed(study(runs=300), "out")  # the piece that was cut, and one more
-    assert (computed, found) == (2 * 3 * 2, 2 * 3 * 2)
+    raised, computed, found = replayed(study(runs=300), "out")  # the part that was cut, and two more
+    assert (computed, found) == (2 * 3 * 3, 2 * 3 * 2)
     assert raised == replayed(study(runs=300), "fresh", None)[0]
     assert replayed(study(runs=128), "out")[1:] == (0, 2 * 3 * 2)
     assert replayed(study().replace("coPEM:", "renamed:"), "out")[1:] == (0, 18)
@@ -98,13 +99,13 @@ def test_what_is_added_is_computed_and_nothing_else(here: Path) -> None:
     assert replayed(study("ego: '1'"), "out")[2] == 0
 
 
-def test_what_comes_by_a_link_has_columns_that_pieces_of_others_have_not(here: Path) -> None:
+def test_what_comes_by_a_link_has_columns_that_parts_of_others_have_not(here: Path) -> None:
     """Those of the others are the same with and without it beside them."""
     linked = study(LINKS, runs=5).replace("measure:", RADIO)
     beside = replayed(linked, "beside", "kept")
-    of_all = {path.name: path.read_bytes() for path in Path("kept/pieces").rglob("*.parquet")}
+    of_all = {path.name: path.read_bytes() for path in Path("kept/parts").rglob("*.arrows")}
     assert replayed(study(runs=5), "alone", "other")[1:] == (6, 0)
-    alone = {path.name: path.read_bytes() for path in Path("other/pieces").rglob("*.parquet")}
+    alone = {path.name: path.read_bytes() for path in Path("other/parts").rglob("*.arrows")}
     assert alone.items() <= of_all.items()
     assert replayed(linked, "again", "other") == (beside[0], 4, 6)
 
@@ -139,7 +140,7 @@ def test_a_log_that_is_shown_is_read_again_and_no_other(here: Path, monkeypatch:
 def test_what_is_damaged_is_computed_again(here: Path) -> None:
     text = study(runs=5)
     whole, _, _ = replayed(text, "whole")
-    rng, places = np.random.default_rng(1), sorted(Path("kept/pieces").rglob("*.parquet"))
+    rng, places = np.random.default_rng(1), sorted(Path("kept/parts").rglob("*.arrows"))
     for place in places[:2]:
         before = place.read_bytes()
         for at in [*rng.integers(0, len(before), 5).tolist(), None]:
@@ -154,11 +155,11 @@ def test_what_is_damaged_is_computed_again(here: Path) -> None:
             assert again <= 1
             place.write_bytes(before)
     result = cr.run("e.yaml", pieces="kept")
-    assert result.replayed.logs[0].pieces.damaged == []  # type: ignore[union-attr]
+    assert result.replayed.logs[0].parts.damaged == []  # type: ignore[union-attr]
     places[0].write_bytes(b"no Parquet")
-    store = cr.run("e.yaml", pieces="kept").replayed.logs[0].pieces
+    store = cr.run("e.yaml", pieces="kept").replayed.logs[0].parts
     assert store is not None
-    assert re.fullmatch(r"kept/pieces/../[0-9a-f.]+parquet: damaged, computed again \(.*\)", store.damaged[0])
+    assert re.fullmatch(r"kept/parts/../[0-9a-f.]+arrows: damaged, computed again \(.*\)", store.damaged[0])
 
 
 def test_a_record_of_a_log_that_nests_without_end_is_as_none(here: Path) -> None:
@@ -168,63 +169,52 @@ def test_a_record_of_a_log_that_nests_without_end_is_as_none(here: Path) -> None
     for path in records:
         path.write_bytes(b"[" * 100_000)
     again, computed, found = replayed(study(runs=3), "again")
-    assert (computed, found, again) == (0, len(list(Path("kept/pieces").rglob("*[0-9a-f].parquet"))), first)
+    assert (computed, found, again) == (0, len(list(Path("kept/parts").rglob("*.arrows"))), first)
     assert {path: path.read_bytes() for path in Path("kept/logs").iterdir()} == records
 
 
-def sealed(table: pa.Table, metadata: dict[bytes, bytes]) -> bytes:
-    """A table as a piece is kept: with the digest of its file, in which there are zeros in the place of that."""
-    stream = pa.BufferOutputStream()
-    parquet.write_table(table.replace_schema_metadata(metadata | {b"seal": b"seal:" + b"0" * 40}), stream)
-    content = stream.getvalue().to_pybytes()
-    digest = hashlib.blake2b(content, digest_size=20).hexdigest().encode()
-    return content.replace(b"seal:" + b"0" * 40, b"seal:" + digest)
-
-
 @pytest.mark.parametrize("deep", [200, 100_000])
-def test_a_piece_whose_sums_nest_without_end_is_computed_again(here: Path, deep: int) -> None:
-    """One whose seal is right: it was made so."""
+def test_a_part_whose_sums_nest_without_end_is_computed_again(here: Path, deep: int) -> None:
+    """One whose digest is right: it was made so."""
     whole, _, _ = replayed(study(runs=5), "whole")
-    place = min(Path("kept/pieces").rglob("*.sums.parquet"))
-    piece = Path(str(place).replace(".sums", ""))
-    sums = sealed(parquet.read_table(place), {b"sums": b"[" * deep + b"]" * deep})
-    place.write_bytes(sums)
-    table = parquet.read_table(piece)
-    digest = hashlib.blake2b(sums, digest_size=20).hexdigest().encode()
-    piece.write_bytes(sealed(table, {b"recipe": table.schema.metadata[b"recipe"], b"sums": digest}))
-    store = cr.run("e.yaml", pieces="kept").replayed.logs[0].pieces
+    place = min(Path("kept/parts").rglob("*.arrows"))
+    reader = pa.BufferReader(place.read_bytes().partition(b"\n")[2])
+    tables = []
+    while reader.tell() < reader.size():
+        tables.append(ipc.open_stream(reader).read_all())
+    recipe = tables[0].schema.metadata[b"about"]
+    stream = pa.BufferOutputStream()
+    for table in (
+        tables[0].replace_schema_metadata({b"about": recipe, b"total": b"[" * deep + b"]" * deep}),
+        *tables[1:],
+    ):
+        with ipc.new_stream(stream, table.schema) as writer:
+            writer.write_table(table)
+    content = stream.getvalue().to_pybytes()
+    place.write_bytes(hashlib.blake2b(content, digest_size=20).hexdigest().encode() + b"\n" + content)
+    store = cr.run("e.yaml", pieces="kept").replayed.logs[0].parts
     assert store is not None
     (note,) = store.damaged
-    assert note.startswith(f"{piece}: damaged, computed again (")
+    assert note.startswith(f"{place}: damaged, computed again (")
     assert "values within values" in note
     assert replayed(study(runs=5), "again")[0] == whole
 
 
 @pytest.mark.parametrize(
-    ("runs", "episodes", "expected"),
+    ("runs", "states", "expected"),
     [
         (10, 1, [0, 10]),
-        (200, 1, [0, 64, 128, 200]),
-        (1000, 1, [0, 64, 128, 256, 512, 1000]),
-        (1000, 2000, [0, 64, 128, 192, 256, 320, 384, 448, 512, 576, 640, 704, 768, 832, 896, 960, 1000]),
-        (5, 200_000, [0, 1, 2, 3, 4, 5]),
+        (600, 1, [0, 256, 512, 600]),
+        (600, 5000, [0, 128, 256, 384, 512, 600]),  # 209 runs have 2²⁰ states; 128 is the power of two below
+        (5, 300_000, [0, 2, 4, 5]),
+        (3, 10_000_000, [0, 1, 2, 3]),
         (3, 0, [0, 3]),
     ],
 )
-def test_ranges_of_runs(runs: int, episodes: int, expected: list[int]) -> None:
-    found = list(split_runs(runs, episodes))
+def test_runs_of_parts(runs: int, states: int, expected: list[int]) -> None:
+    found = cut_parts(runs, states)
     assert [begin for begin, _ in found] + [runs] == expected
     assert [end for _, end in found] == expected[1:]
-
-
-@pytest.mark.parametrize("episodes", [0, 1, 700, 3000, 130_000])
-def test_more_runs_have_the_same_ranges_but_the_last(episodes: int) -> None:
-    long = list(split_runs(5000, episodes))
-    for runs in (1, 63, 64, 65, 300, 4999):
-        assert list(split_runs(runs, episodes))[:-1] == long[: len(list(split_runs(runs, episodes))) - 1]
-    for begin, end in long[:-1]:
-        assert (end - begin) & (end - begin - 1) == 0
-        assert begin % (end - begin) == 0
 
 
 def test_where_nothing_can_be_kept(here: Path) -> None:
@@ -235,10 +225,10 @@ def test_where_nothing_can_be_kept(here: Path) -> None:
         cr.run("e.yaml", pieces="a.mcap")
 
 
-def test_a_long_log_in_stretches_has_the_pieces_of_each_configuration_alone(
+def test_a_long_log_in_stretches_has_the_parts_of_each_configuration_alone(
     here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Stretches reach back as far as any configuration needs: pieces of one alone are those among others."""
+    """Stretches reach back as far as any configuration needs: parts of one alone are those among others."""
     from copem_replay.pipeline import prepare as chunking
 
     monkeypatch.setattr(chunking, "ROWS_A_CHUNK", 20)
@@ -252,14 +242,15 @@ def test_a_long_log_in_stretches_has_the_pieces_of_each_configuration_alone(
     assert (computed, found, again) == (2, 2 * 3, plain)
 
 
+@pytest.mark.parametrize("kept", [None, "kept"])
 @pytest.mark.parametrize("many", [False, True], ids=["one file", "a file per log"])
 @pytest.mark.parametrize(
     "text", [study(LINKS, gnn=True).replace("measure:", RADIO), study(FLEET, "sweep: {penetration_rate: [0, 0.3]}")]
 )
-def test_rows_of_one_log_are_in_memory_at_a_time(
-    text: str, many: bool, here: Path, monkeypatch: pytest.MonkeyPatch
+def test_few_parts_are_in_memory_at_a_time(
+    text: str, many: bool, kept: str | None, here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where rows are too many they are read again to be written: the same bytes, of row groups, too."""
+    """Where they are too many they wait in a file to be written: the same bytes, of row groups, too."""
     monkeypatch.setattr(contents, "ROWS_A_GROUP", 100)
     if many:
         monkeypatch.setattr(results_write, "MANY_ROWS", 10)
@@ -268,15 +259,24 @@ def test_rows_of_one_log_are_in_memory_at_a_time(
     text = text.replace("logs: [a.mcap, b.mcap]", "logs: ['?.mcap']")
     plain, _, _ = replayed(text, "plain", None)
     assert len([name for name in plain if name.startswith("detections.parquet")]) == (4 if many else 1)
-    monkeypatch.setattr(study_tables, "HELD_BYTES", 100)
-    held: list[int] = []
-    of = StudyTables._of
+    monkeypatch.setattr(parts_module, "MOST_RUNS", 16)
+    for name, value in {"HELD_BYTES": 100, "BATCH_ROWS": 1, "BATCH_BYTES": 1}.items():
+        monkeypatch.setattr(study_tables, name, value)
+    packed, read, most = [], [], [0]
+    pack, unpack = study_tables.pack_part, study_tables.unpack_part
+    monkeypatch.setattr(study_tables, "pack_part", lambda *a: [packed.append(1), pack(*a)][1])
+    monkeypatch.setattr(study_tables, "unpack_part", lambda *a: [read.append(1), unpack(*a)][1])
+    frame = study_tables.StudyTables.frame
 
-    def watched(self: StudyTables, log: str) -> LogTables:
-        held.append(len(self._held))
-        return of(self, log)
+    def watched(self: Any, parts: Any) -> Any:
+        parts = list(parts)
+        most.append(sum(part.beside is not None for part in parts))
+        return frame(self, parts)
 
-    monkeypatch.setattr(StudyTables, "_of", watched)
-    first, computed, _ = replayed(text, "first")
-    assert (first, max(held)) == (plain, 0)
-    assert replayed(text, "again") == (plain, 0, computed)
+    monkeypatch.setattr(study_tables.StudyTables, "frame", watched)
+    first, computed, _ = replayed(text, "first", kept)
+    assert first == plain
+    assert len(packed) == len(read) > 4
+    assert max(most) == 1
+    if kept is not None:
+        assert replayed(text, "again", kept) == (plain, 0, computed)

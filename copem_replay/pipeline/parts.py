@@ -1,13 +1,12 @@
-"""Pieces: what one log gives in one configuration and range of runs is kept, and found again by the key of its recipe.
+"""Parts: what one log gives in one configuration in a block of runs is kept, and found again by the hash of its recipe.
 
-    pieces/ab/<key>.parquet        rows of `detections.parquet`, and what stands beside them; the recipe in the metadata
-    pieces/ab/<key>.sums.parquet   a row per run, sums of accuracy in the metadata; written first
-    logs/<key>.json                the facts of a log, so that it need not be read again
+    parts/ab/<key>.arrows   rows of `detections.parquet`, and what stands beside them, behind a line with their digest
+    logs/<key>.record       the facts of a log, so that it need not be read again, behind such a line
 
-They are in a folder or under a URL. A piece is complete when its `.parquet` exists. Two processes that write the same
-piece write the same bytes. The recipe is all that a piece is made of, as canonical JSON: the log's resolved experiment
-without what cannot change a row, NOT_OF_A_PIECE. That is right as draws have addresses, and as adding a unit, a
-configuration or an object changes no other draw (docs/develop/decisions/0031-pieces.md).
+They are in a folder or under a URL. Two processes that write the same part write the same bytes. The recipe is all that
+a part is made of, as canonical JSON: the log's resolved experiment without what cannot change a row, NOT_OF_A_PART.
+That is right as draws have addresses, and as adding a unit, a configuration or an object changes no other draw
+(docs/develop/decisions/0047-parts.md).
 """
 
 from __future__ import annotations
@@ -19,18 +18,13 @@ import os
 import platform
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, fields
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache, cached_property
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Protocol
 from urllib.parse import urlsplit
 
-import numpy as np
-import pandas as pd
-import pyarrow as pa
-from pyarrow import parquet
 from pydantic import BaseModel
 
 from copem_replay.core.components import Component
@@ -49,15 +43,14 @@ from copem_replay.core.files import parse_json
 from copem_replay.core.waiting import await_server
 from copem_replay.experiment.drive import RecordedLatency, cache_last_experiment
 from copem_replay.experiment.schema import Configuration, Experiment
-from copem_replay.metrics.accuracy.statistics import BAND, EXISTENCE, OBJECT, RUN, AccuracySettings, AccuracyTotal
 from copem_replay.metrics.onset import Requires
-from copem_replay.pipeline.tables import BESIDE, RUNS, LogTables
+from copem_replay.pipeline.tables import PartTables, pack_part, unpack_part
 
 # Stores: bytes by name, in a folder or under a URL. A name is complete or missing. A store is pickled as its address:
 # every process opens its own.
 
 _OPTION = "--pieces: "
-MARK = "pieces.txt"
+MARK = "parts.txt"
 """Written once under a URL: a bucket that is missing, or cannot be written, is found out before any run."""
 
 
@@ -95,7 +88,7 @@ class FolderStore:
     def __init__(self, root: Path) -> None:
         self.root, self.where = root, str(root)
         try:
-            for name in ("pieces", "logs"):
+            for name in ("parts", "logs"):
                 (root / name).mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise OutputError(f"{_OPTION}{root}: cannot be written: {error.strerror or error}") from error
@@ -144,7 +137,7 @@ class BucketStore:
         if urlsplit(url).query:
             raise InputError(f"{_OPTION}{self.where}: expected a URL without a query, names are put behind it")
         if MARK not in self._listed:
-            self.write(MARK, b"pieces of copem-replay\n")
+            self.write(MARK, b"parts of copem-replay\n")
 
     def __getstate__(self) -> dict[str, Any]:
         """The address alone: connections belong to one process."""
@@ -200,12 +193,12 @@ class BucketStore:
 
 # Recipes, and the keys that name them.
 
-NOT_OF_A_PIECE: Mapping[str, str] = {
+NOT_OF_A_PART: Mapping[str, str] = {
     "logs": "which log, and how it is read, is in the recipe itself; other logs are not",
-    "runs": "the range of runs is in the recipe itself",
+    "runs": "the block of runs is in the recipe itself",
     "show": "what is shown is replayed after gathering",
     "sweep": "each of its points is an experiment of its own",
-    "configurations": "only the piece's own, without its name",
+    "configurations": "only the part's own, without its name",
     "units": "only those that the configuration, the onset or the reference of distances goes by",
     "pems": "only those of these units",
     "links": "only those that the configuration sends by",
@@ -261,8 +254,8 @@ def _recipe_parts(experiment: Experiment, name: str) -> tuple[dict[str, Any], li
     units, members = _list_dependencies(experiment, configuration), experiment.units_of(configuration)
     pems = [pem for unit in units if (pem := experiment.units[unit].pem) is not None]
     links = [link for unit in members if isinstance(link := configuration.link_of(unit), str)]
-    of_piece = {
-        "piece": 1,
+    of_part = {
+        "part": 2,
         "fingerprint": take_fingerprint(),
         "configuration": data["configurations"][name] | ({"units": members} if members else {}),
         "units": [(unit, data["units"][unit]) for unit in units],  # in the experiment's order, which decides ties
@@ -274,10 +267,10 @@ def _recipe_parts(experiment: Experiment, name: str) -> tuple[dict[str, Any], li
         experiment.braking, *(experiment.pems[pem] for pem in pems),
         *(experiment.units[unit] for unit in units), *(experiment.links[link] for link in links),
     )  # fmt: skip
-    for key in NOT_OF_A_PIECE:
+    for key in NOT_OF_A_PART:
         within, _, last = key.rpartition(".")
         (data[within] if within else data).pop(last, None)
-    return data | of_piece, own
+    return data | of_part, own
 
 
 def _list_dependencies(experiment: Experiment, configuration: Configuration) -> list[str]:
@@ -316,177 +309,85 @@ def _find_components(value: object) -> Iterator[Component]:
             yield from _find_components(one)
 
 
-# Pieces as files.
+# Parts as files.
 
-ROWS_A_PIECE = 250_000
-"""Rows of a range of runs at most: some MB."""
-FIRST_RUNS = 64
-"""Runs of the first range. More: an experiment of few runs shares fewer pieces with a longer one; no result changes."""
-_BESIDE = "beside:"
-"""Prefix of the columns of `LogTables.beside`."""
-_SEAL, _ZEROS = b"seal:", b"0" * 40
-_WHOSE = ("log", "configuration")
-_RECORDS = {"episodes": OBJECT, "runs": RUN, "ghosts_at": np.dtype("i8"), "by_distance": BAND, "by_time": BAND,
-            "by_existence": EXISTENCE}  # fmt: skip
+STATES_A_PART, MOST_RUNS = 1 << 20, 256
+"""Object states of the runs of a part, and runs, at most: some MB, and seconds of work. More: an experiment of few runs
+shares fewer parts with a longer one, and more memory is needed; no result changes."""
 
 
-def split_runs(runs: int, episodes: int) -> Iterator[tuple[int, int]]:
-    """The ranges of runs that are pieces: 64, 64, 128, … runs up to a power of two, then as many each, the last cut.
+def cut_parts(runs: int, object_states: int) -> list[tuple[int, int]]:
+    """The blocks of runs, from and up to, that are parts: as many each as the log's size says, the last one cut.
 
-    Whole ranges depend only on the log and what is measured in it: more runs find the pieces of fewer.
+    That many is a power of two: sums of accuracy are a tree over runs. More runs find the parts of fewer.
     """
-    most = max(1, ROWS_A_PIECE // max(episodes, 1))
-    most = 1 << most.bit_length() - 1
-    begin, size = 0, min(FIRST_RUNS, most)
-    while begin < runs:
-        yield begin, min(begin + size, runs)
-        begin += size
-        size = min(begin, most)
+    size = 1 << min(max(STATES_A_PART // max(object_states, 1), 1), MOST_RUNS).bit_length() - 1
+    return [(begin, min(begin + size, runs)) for begin in range(0, runs, size)]
 
 
-class PieceCache:
-    """The pieces at an address, a folder or a URL. Raises InputError, OutputError where it cannot be used.
+class PartCache:
+    """The parts at an address, a folder or a URL. Raises InputError, OutputError where it cannot be used.
 
-    `found`, `computed`: how many pieces of a study. `damaged`: a line for each that had to be computed again.
+    `found`, `computed`: how many parts of a study. `damaged`: a line for each that had to be computed again.
     """
 
-    def __init__(self, address: str | Path) -> None:
+    def __init__(self, address: str | Path, store: Store | None = None) -> None:
         self.address = str(address)
-        self.store: Store = open_store(address)
+        self.store = open_store(address) if store is None else store
         self.found = self.computed = 0
         self.damaged: list[str] = []
 
-    def read(self, recipe: str, log: str, configuration: str) -> LogTables | None:
-        """A piece of a log and configuration; None: it is missing or damaged. Raises InputError."""
-        name = piece_name(recipe)
+    def read(self, recipe: str, log: str, configuration: str) -> PartTables | None:
+        """The part of a recipe; None: it is missing or damaged. Raises InputError."""
+        name = part_name(recipe)
         try:
             content = self.store.read(name)
-            return None if content is None else _read_piece(content, self.store, recipe, log, configuration)
-        except (OSError, ValueError, KeyError, TypeError) as error:  # what Arrow raises derives from these
+            return None if content is None else unpack_part(_unseal(content), log, configuration, recipe)
+        except (OSError, ValueError, KeyError, TypeError, IndexError) as error:  # what Arrow raises derives from these
             why = " ".join(str(error).split())[:120]
             self.damaged.append(f"{self.store.where}/{name}: damaged, computed again ({why})")
             return None
 
-    def write(self, recipe: str, piece: LogTables) -> LogTables:
-        """Keep a piece. Returns it as it will be read. Raises OutputError."""
-        assert isinstance(piece.rows, pd.DataFrame)
-        name, rows = piece_name(recipe), pa.Table.from_pandas(piece.rows, preserve_index=False)
-        metadata = {b"recipe": recipe.encode()}
-        table = rows.drop_columns(list(_WHOSE))
-        if piece.beside is not None and piece.runs is not None:
-            totals = canonical_json(
-                [[count, _total_as_json(of)] for nodes in piece.totals.values() for count, of in nodes]
-            )
-            sums = _seal_table(piece.runs.drop_columns(list(_WHOSE)), {b"sums": totals.encode()})
-            self.store.write(_sums_name(name), sums)
-            metadata[b"sums"] = _compute_digest(sums)
-            for column in piece.beside.column_names:
-                table = table.append_column(_BESIDE + column, piece.beside[column])
-        self.store.write(name, _seal_table(table, metadata))
+    def write(self, recipe: str, part: PartTables) -> None:
+        """Keep a part. Raises OutputError."""
+        self.store.write(part_name(recipe), _seal(pack_part(part, recipe)))
         self.computed += 1
-        return LogTables(piece.log, rows, piece.beside, piece.runs, piece.totals)
-
-    def keys(self) -> Callable[[str], bool]:
-        """Whether a piece exists, by its key. Under a URL all names are listed anew, with those of other processes."""
-        self.store.refresh()
-        return lambda key: self.store.exists(_object_name(key))
 
     def known(self, about: str) -> dict[str, Any] | None:
         """The facts of a log, kept under `about`, all that they depend on; None: missing or damaged."""
         try:
-            facts: Any = parse_json(self.store.read(f"logs/{recipe_key(about)}.json") or b"")
-            digest = facts.pop("digest")
-        except (OSError, ValueError, KeyError, AttributeError):
+            facts: Any = parse_json(_unseal(self.store.read(_record_name(about)) or b""))
+        except (OSError, ValueError):
             return None
-        return facts if digest == recipe_key(canonical_json(facts)) else None
+        return facts if isinstance(facts, dict) else None
 
     def keep(self, about: str, said: Mapping[str, Any]) -> None:
         """Keep facts of a log under `about`. Raises OutputError."""
-        text = canonical_json(dict(said) | {"digest": recipe_key(canonical_json(said))})
-        self.store.write(f"logs/{recipe_key(about)}.json", text.encode())
+        self.store.write(_record_name(about), _seal(canonical_json(said).encode()))
 
     def forget(self, about: str) -> None:
         """Remove the facts of a log under `about`. Raises OutputError."""
-        self.store.write(f"logs/{recipe_key(about)}.json", b"")
+        self.store.write(_record_name(about), b"")
 
 
-def piece_name(recipe: str) -> str:
-    """The name of a recipe's piece in a store."""
-    return _object_name(recipe_key(recipe))
+def part_name(recipe: str) -> str:
+    """The name of a recipe's part in a store."""
+    key = recipe_key(recipe)
+    return f"parts/{key[:2]}/{key}.arrows"
 
 
-def _object_name(key: str) -> str:
-    return f"pieces/{key[:2]}/{key}.parquet"
+def _record_name(about: str) -> str:
+    return f"logs/{recipe_key(about)}.record"
 
 
-def _sums_name(name: str) -> str:
-    return name.removesuffix(".parquet") + ".sums.parquet"
+def _seal(content: bytes) -> bytes:
+    """The content behind a line with its digest."""
+    return hashlib.blake2b(content, digest_size=20).hexdigest().encode() + b"\n" + content
 
 
-def _compute_digest(content: bytes) -> bytes:
-    return hashlib.blake2b(content, digest_size=20).hexdigest().encode()
-
-
-def _seal_table(table: pa.Table, metadata: Mapping[bytes, bytes]) -> bytes:
-    """A table as Parquet with its own digest in the metadata: that of the file with zeros in the digest's place."""
-    stream = pa.BufferOutputStream()
-    table = table.replace_schema_metadata({**metadata, _SEAL[:-1]: _SEAL + _ZEROS}).combine_chunks()
-    parquet.write_table(table, stream, compression="zstd")
-    content: bytes = stream.getvalue().to_pybytes()
-    return content.replace(_SEAL + _ZEROS, _SEAL + _compute_digest(content))
-
-
-def _unseal_table(content: bytes) -> pa.Table:
-    """The table of what `_seal_table` gave. Raises ValueError where any bit differs."""
-    begin, _, end = content.partition(_SEAL)
-    if _compute_digest(begin + _SEAL + _ZEROS + end[len(_ZEROS) :]) != end[: len(_ZEROS)]:
+def _unseal(content: bytes) -> bytes:
+    """What `_seal` was given. Raises ValueError where any bit differs."""
+    _, _, sealed = content.partition(b"\n")
+    if _seal(sealed) != content:
         raise ValueError("another content")
-    return parquet.ParquetFile(pa.BufferReader(content)).read(
-        use_threads=False
-    )  # threads cost more time than they save
-
-
-def _read_piece(content: bytes, store: Store, recipe: str, log: str, configuration: str) -> LogTables:
-    """The piece in a file. Raises ValueError, KeyError, TypeError or OSError where it is not as it was written."""
-    table = _unseal_table(content)
-    metadata = table.schema.metadata
-    if metadata[b"recipe"] != recipe.encode():
-        raise ValueError("another recipe")
-    names = [name for name in table.column_names if not name.startswith(_BESIDE)]
-    rows = _piece_columns(table.select(names), log, configuration)
-    if b"sums" not in metadata:
-        return LogTables(log, rows)
-    sums_content = store.read(_sums_name(piece_name(recipe)))
-    if sums_content is None or _compute_digest(sums_content) != metadata[b"sums"]:
-        raise ValueError("other sums")
-    sums = _unseal_table(sums_content)
-    nodes = [(count, _total_from_json(of)) for count, of in parse_json(sums.schema.metadata[b"sums"])]
-    beside = table.select([name for name in table.column_names if name.startswith(_BESIDE)])
-    beside = beside.rename_columns([name.removeprefix(_BESIDE) for name in beside.column_names])
-    runs = _piece_columns(sums.replace_schema_metadata(None), log, configuration).cast(RUNS)
-    beside = beside.replace_schema_metadata(None).cast(BESIDE)  # restores the names of list items
-    return LogTables(log, rows, beside, runs, {configuration: nodes} if nodes else {})
-
-
-def _piece_columns(table: pa.Table, *whose: str) -> pa.Table:
-    for k, (name, value) in enumerate(zip(_WHOSE, whose, strict=True)):
-        table = table.add_column(k, name, pa.repeat(pa.scalar(value, pa.string()), len(table)))
-    return table
-
-
-def _total_as_json(total: AccuracyTotal) -> dict[str, Any]:
-    arrays = {name: np.ascontiguousarray(getattr(total, name)).tobytes().hex() for name in _RECORDS}
-    return (
-        {f.name: getattr(total, f.name) for f in fields(AccuracyTotal)} | {"settings": asdict(total.settings)} | arrays
-    )
-
-
-def _total_from_json(data: dict[str, Any]) -> AccuracyTotal:
-    settings: dict[str, Any] = {n: _lists_to_tuples(v) for n, v in data["settings"].items()}
-    arrays = {name: np.frombuffer(bytes.fromhex(data[name]), dtype=kind) for name, kind in _RECORDS.items()}
-    scalars = {name: arrays[name].reshape(()) for name in ("episodes", "runs")}
-    return AccuracyTotal(**data | {"settings": AccuracySettings(**settings)} | arrays | scalars)
-
-
-def _lists_to_tuples(value: Any) -> Any:
-    return tuple(map(_lists_to_tuples, value)) if isinstance(value, list) else value
+    return sealed
