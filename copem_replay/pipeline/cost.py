@@ -9,7 +9,7 @@ import re
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
@@ -185,6 +185,18 @@ def peak_bytes() -> int | None:
         return peak_wset
     peak: int = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024  # KiB but on macOS
+
+
+def return_memory() -> None:
+    """Give freed memory back to the system, where the C library is asked for that: glibc keeps what threads have freed.
+
+    Measured: 160 of 600 MB after 20 runs of a drive of 5 minutes with 100 objects.
+    """
+    if sys.platform.startswith("linux"):
+        import ctypes
+
+        with suppress(AttributeError):  # another C library than glibc
+            ctypes.CDLL(None).malloc_trim(0)
 
 
 def _read_text(path: str) -> str:

@@ -30,9 +30,9 @@ from copem_replay.metrics.metric import OutputTimes, OwnSums
 from copem_replay.metrics.onset import select_counted
 from copem_replay.metrics.summary import add_own_sums, own_sums_by_log, settle_horizon, summarise_tally, tally_rows
 from copem_replay.pipeline.closed_form import check_closed_form, exact_table
-from copem_replay.pipeline.cost import RunCost, memory_notes, watch_cost
+from copem_replay.pipeline.cost import RunCost, memory_notes, return_memory, watch_cost
 from copem_replay.pipeline.notes import ListRate, LogFacts, join_list_rates, study_notes
-from copem_replay.pipeline.parts import PartCache, cut_parts, write_recipe
+from copem_replay.pipeline.parts import MOST_RUNS, STATES_A_PART, PartCache, cut_parts, write_recipe
 from copem_replay.pipeline.prepare import Replay, prepare_log
 from copem_replay.pipeline.replay import BlockOutcome, cut_blocks, replay_outcomes
 from copem_replay.pipeline.study_log import StudyLog
@@ -142,7 +142,11 @@ class Gatherer:
             self._advance(block.runs[1] - block.runs[0])
             return [part for part in kept.values() if part is not None]
         self._cost.add(0.0, outcomes)
-        for part in build_parts(log.name, outcomes, block.missing):
+        parts = build_parts(log.name, outcomes, block.missing)
+        if log.object_states > STATES_A_PART // MOST_RUNS:  # the part took long enough for it to cost nothing
+            outcomes.clear()
+            return_memory()
+        for part in parts:
             kept[part.configuration] = part
             if self._cache is not None:
                 recipe = write_recipe(block.missing, part.configuration, log.identity, block.runs)

@@ -424,7 +424,7 @@ def _lists_to_tuples(value: Any) -> Any:
 
 HELD_BYTES = 100_000_000
 """Bytes of parts that are held in memory; further ones are in a temporary file. No result depends on it."""
-BATCH_ROWS, BATCH_BYTES = 100_000, 50_000_000
+BATCH_ROWS, BATCH_BYTES = 100_000, 16_000_000
 """Rows and bytes that are put together at a time, at least: what is done once per batch then costs nothing."""
 
 

@@ -234,7 +234,7 @@ _LIBRARIES = (
     "scipy", "shapely",
 )  # fmt: skip
 ROWS_A_GROUP = 1 << 17
-GROUP_BYTES = 1 << 27
+GROUP_BYTES = 1 << 26
 """Rows of a row group of Parquet, at most, and about their bytes: it is in memory as a whole, where it is written and
 where it is compared."""
 

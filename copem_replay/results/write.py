@@ -34,6 +34,7 @@ from copem_replay.io.open import (
 )
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.detections_table import first_episodes
+from copem_replay.pipeline.cost import return_memory
 from copem_replay.pipeline.one_run import ReplayedRun, ShownRun, replay_run, select_shown_logs, select_shown_runs
 from copem_replay.pipeline.run import ExperimentResult, find_log_path
 from copem_replay.pipeline.sweep import resolve_sweep
@@ -375,6 +376,7 @@ def _write_rows(result: ExperimentResult, scratch: Path) -> None:
                 accuracy = result.accuracy_of(parts, rows)
                 for name in _ACCURACY:
                     add(f"{name}.parquet", getattr(accuracy, name))
+    return_memory()
     if len(result.tally) <= MANY_ROWS:
         write_parquet(result.tally, scratch / "tally.parquet")
     else:
