@@ -112,11 +112,22 @@ class StudyResult:
 
         with take_place(Path(folder), overwrite=overwrite) as place:
             check_inputs(place, [path for recording in self.recordings for path in recording.paths])
+            check_own_files(place, self.experiment, self.recordings)
             fill_results_folder(place, self)
             self.folder = place.shown
         if place.failed:
             raise OutputError(place.failed)
         return place.shown
+
+
+def check_own_files(place: ResultsPlace, experiment: Experiment, recordings: Sequence[Recording]) -> None:
+    """Raise OutputError where a file of the user's own has a name that the results will have."""
+    from copem_replay.results.folder import check_names
+    from copem_replay.results.write import MCAP, list_results
+    from copem_replay.viewer.rrd import make_rrd_exporter
+
+    if place.before is not None:
+        check_names(place, list_results(experiment, recordings, [MCAP, make_rrd_exporter(None)]))
 
 
 def fill_results_folder(

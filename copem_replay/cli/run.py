@@ -111,7 +111,7 @@ def _read_study(
     cluster: str | None,
 ) -> LoadedStudy:  # fmt: skip
     """The experiment and its recordings; with `cluster` every part is computed when this returns."""
-    from copem_replay.api.run import read_with_crew
+    from copem_replay.api.run import check_own_files, read_with_crew
     from copem_replay.api.study import read_study
     from copem_replay.pipeline.study_log import LogSurvey
     from copem_replay.results.folder import check_inputs
@@ -121,6 +121,7 @@ def _read_study(
         def read() -> LoadedStudy:
             study = read_study(source, skip_unreadable=skip_unreadable, survey=LogSurvey(cache), crew=crew)
             check_inputs(place, [file, *(path for recording in study.recordings for path in recording.paths)])
+            check_own_files(place, study.experiment, study.recordings)
             return study
 
         return read() if crew is None else read_with_crew(read, crew)

@@ -10,14 +10,13 @@ docs/develop/decisions/0020-results-folder.md.
 from __future__ import annotations
 
 import errno
-import filecmp
 import hashlib
 import json
 import os
 import re
 import stat
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -123,8 +122,7 @@ def _replace_folder(scratch: ScratchFolder, folder: Path, names: Sequence[str]) 
         flush_file(folder.parent)
         return True
     others = {entry.name for entry in os.scandir(folder)}.difference(names)
-    same = {f"{at}/{name}": f"{folder.name}/{name}" for at in (_NEW, OLD) for name in others}
-    scratch.will_hold([f"{at}/{name}" for at in (_NEW, OLD) for name in names], same)
+    scratch.will_hold(f"{at}/{name}" for at in (_NEW, OLD) for name in names)
     try:
         state, here = folder.stat(), Path.cwd()
         if os.path.ismount(folder) or folder in (here, *here.parents) or state.st_uid != new.stat().st_uid:
@@ -271,21 +269,11 @@ class ScratchFolder:
     path: Path
     fd: int
 
-    def will_hold(self, files: Iterable[str], same: Mapping[str, str] | None = None) -> None:
-        """Note what is going to be in it, before it is: so a killed process leaves nothing unknown.
-
-        `files`: names in it that may be removed. `same`: names that may be removed if they are
-        equal to a file beside the scratch folder.
+    def will_hold(self, files: Iterable[str]) -> None:
+        """Note the names of files in it that may be removed, before they are there: so a killed process leaves nothing
+        unknown. Beside these, links to files of the folder that it replaces may be removed.
         """
-        self._write_list({"files": sorted(files), "same": same or {}})
-
-    def add(self, files: Iterable[str] = (), same: Mapping[str, str] | None = None) -> None:
-        """Note more of what is going to be in it."""
-        known, known_same = _read_scratch_list(self.path)
-        self.will_hold(known.union(files), known_same | dict(same or {}))
-
-    def _write_list(self, content: object) -> None:
-        overwrite_file(self.fd, json.dumps(content).encode())
+        overwrite_file(self.fd, json.dumps({"files": sorted(files)}).encode())
 
 
 @contextmanager
@@ -298,7 +286,7 @@ def make_scratch_folder(path: Path, place: Path | None = None) -> Iterator[Scrat
         if IS_WINDOWS:
             os.close(scratch.fd)
         with suppress(OSError):
-            _remove_listed(scratch.path)
+            _remove_listed(scratch.path, path)
         if not IS_WINDOWS:  # locked until all is gone
             os.close(scratch.fd)
 
@@ -341,7 +329,7 @@ def _remove_leftover(left: Path, path: Path) -> list[str]:
         if (left / OLD).is_dir() and not os.path.lexists(path):
             os.rename(left / OLD, path)
             notes.append(f"{path}: put back, as a run was killed that was about to replace it")
-        if _remove_listed(left):
+        if _remove_listed(left, path):
             return [*notes, f"{left}: removed, left by a process that was killed"]
     return [*notes, f"{left}: left by a process that was killed, and not removed: it holds what is not ours"]
 
@@ -364,13 +352,16 @@ def _hold_lock(scratch: Path) -> Iterator[bool]:
             os.close(fd)
 
 
-def _remove_listed(scratch: Path) -> bool:
-    """Remove what the list of a scratch folder names; True where nothing is left. Raises OSError."""
+def _remove_listed(scratch: Path, path: Path | None = None) -> bool:
+    """Remove what the list of a scratch folder names, and links to files in `path`; True where nothing is left.
+
+    Raises OSError.
+    """
     if not os.path.lexists(scratch / MANIFEST):  # killed before it had a list, or about to get one
         with suppress(OSError):
             scratch.rmdir()
         return not scratch.exists()
-    files, same = _read_scratch_list(scratch)
+    files = _read_scratch_list(scratch)
 
     def cleared(folder: Path) -> bool:
         kept = [entry.name for entry in sorted(os.scandir(folder), key=lambda entry: entry.name) if not gone(entry)]
@@ -387,7 +378,7 @@ def _remove_listed(scratch: Path) -> bool:
                 return False
             place.rmdir()
             return True
-        if inside in files or (inside in same and _is_same_file(place, scratch.parent / same[inside])):
+        if inside in files or (path is not None and _is_link(place, path / inside.partition("/")[2])):
             place.unlink()
             return True
         return False
@@ -399,24 +390,17 @@ def _remove_listed(scratch: Path) -> bool:
     return True
 
 
-def _read_scratch_list(scratch: Path) -> tuple[set[str], dict[str, str]]:
-    """The names in the list of a scratch folder, `files` and `same`; empty where it cannot be read."""
+def _read_scratch_list(scratch: Path) -> set[str]:
+    """The names in the list of a scratch folder; none where it cannot be read."""
     try:
-        data = parse_json((scratch / MANIFEST).read_bytes())
-        return set(data["files"]), dict(data["same"])
+        return set(parse_json((scratch / MANIFEST).read_bytes())["files"])
     except (OSError, ValueError, KeyError, TypeError):
-        return set(), {}
+        return set()
 
 
-def _is_same_file(path: Path, other: Path) -> bool:
-    """Whether two names are of one file, of equal links, or of files with equal content."""
-    if not os.path.lexists(other):
-        return False
-    if path.is_symlink() or other.is_symlink():
-        return path.is_symlink() and other.is_symlink() and os.readlink(path) == os.readlink(other)
-    if os.path.samefile(path, other):
-        return True
-    return path.is_file() and other.is_file() and filecmp.cmp(path, other, shallow=False)
+def _is_link(place: Path, other: Path) -> bool:
+    """Whether two names are of one file."""
+    return os.path.lexists(other) and os.path.samestat(os.lstat(place), os.lstat(other))
 
 
 def flush_all(folder: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -114,14 +114,19 @@ def select_shown_runs(experiment: Experiment, result: ExperimentResult, log: str
     which never detected counts as; of equal runs the first is taken. Of a log without rows it is the first run.
     """
     asked = experiment.show.asked() if experiment.show is not None else ()
-    stems = [STEM if k == 0 else f"{STEM}_{one}" for k, one in enumerate(asked)]
     rows = result.tables.rows(log)
     counted = select_counted(rows, experiment.measure.began)
     rows = counted if len(counted) else rows
     return tuple(
         ShownRun(one, "", stem) if isinstance(one, int) else ShownRun(*_rank_run(rows, result.horizon_s, one), stem)
-        for one, stem in zip(asked, stems, strict=True)
+        for one, stem in zip(asked, list_stems(experiment), strict=True)
     )
+
+
+def list_stems(experiment: Experiment) -> list[str]:
+    """The stems of the files of the runs that are shown."""
+    asked = experiment.show.asked() if experiment.show is not None else ()
+    return [STEM if k == 0 else f"{STEM}_{one}" for k, one in enumerate(asked)]
 
 
 def _rank_run(rows: pd.DataFrame, horizon_s: float, rank: str) -> tuple[int, str]:
@@ -141,12 +146,16 @@ def _rank_run(rows: pd.DataFrame, horizon_s: float, rank: str) -> tuple[int, str
 
 def select_shown_logs(experiment: Experiment, result: ExperimentResult) -> list[str]:
     """Names of the logs that are written to MCAP and .rrd."""
-    names = [log.name for log in result.logs] or [replay.scene.log for replay in result.replays]
+    return choose_logs(experiment, [log.name for log in result.logs] or [r.scene.log for r in result.replays])
+
+
+def choose_logs(experiment: Experiment, names: Sequence[str]) -> list[str]:
+    """Those of the names of all logs that are shown."""
     if experiment.show is None or not experiment.show.asked():
         return []
     asked = experiment.show.logs
     if "all" in asked:
-        return names
+        return list(names)
     return [name for k, name in enumerate(names) if name in asked or (k == 0 and "first" in asked)]
 
 

@@ -10,10 +10,9 @@ import errno
 import json
 import os
 import platform
-import shutil
 import stat
 import traceback
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -154,42 +153,28 @@ def list_names(folder: Path, at: str = "") -> Iterator[str]:
             yield from list_names(Path(entry.path), f"{at}{entry.name}/")
 
 
-def keep_file(name: str, old: Path, new: Path, spare: Path) -> str:
-    """Keep the file or folder `name` of `old` in `new`: linked, else copied by way of `spare`. Raises OSError.
-
-    Returns its name there: `name`, or one with `.kept` where `new` has another of that name.
-    """
-    source, target, number = old / name, new / name, 0
-    while os.path.lexists(target) or any(parent.is_file() for parent in _folders_between(target, new)):
-        number += 1
-        first, slash, rest = name.partition("/")
-        target = new / f"{first}.kept{number if number > 1 else ''}{slash}{rest}"
-    name = target.relative_to(new).as_posix()
-    if source.is_dir() and not source.is_symlink():
-        _make_folders(source, target, old)
-        return name
-    _make_folders(source.parent, target.parent, old)
-    try:
-        os.link(source, target, follow_symlinks=False)
-    except OSError:
-        spare.unlink(missing_ok=True)
-        shutil.copy2(source, spare, follow_symlinks=False)
-        os.rename(spare, target)
-    return name
+def _make_folder(folder: Path, old: Path, new: Path) -> None:
+    """Make a folder below `new` and those above it, with the modes of those below `old`. Raises OSError."""
+    if not folder.exists():
+        _make_folder(folder.parent, old, new)
+        folder.mkdir()
+        folder.chmod((old / folder.relative_to(new)).stat().st_mode & 0o777 | 0o700)
 
 
-def _folders_between(path: Path, top: Path) -> Iterator[Path]:
-    yield from (parent for parent in path.parents if parent != top and top in parent.parents)
-
-
-def _make_folders(source: Path, target: Path, top: Path) -> None:
-    """Make `target` with the mode of `source`, and the folders above it up to `top`."""
-    if target.exists():
+def _move_over(name: str, old: Path, new: Path, move: Callable[[Path, Path], None]) -> None:
+    """Link or rename, by `move`, a file or an empty folder of `old` to the same name in `new`. Raises OSError."""
+    source, target = old / name, new / name
+    if os.path.lexists(target):
         return
-    if source != top:
-        _make_folders(source.parent, target.parent, top)
-    target.mkdir()
-    target.chmod(source.stat().st_mode & 0o777 | 0o700)
+    if source.is_dir() and not source.is_symlink():
+        _make_folder(target, old, new)
+        return
+    _make_folder(target.parent, old, new)
+    move(source, target)
+
+
+def _link(source: Path, target: Path) -> None:
+    os.link(source, target, follow_symlinks=False)
 
 
 # The lock: one process at a time writes to a place.
@@ -258,7 +243,7 @@ def _is_still(path: Path, fd: int) -> bool:
 # The place of the results of one run.
 
 EXPERIMENT = "experiment.yaml"
-_NEW, _SPARE = "results", "copy"
+_NEW = "results"
 _OTHERS = "something else came there during the run, and stays"
 _PATH_BYTES = 32_767
 """Length of the longest path where the system does not say it: on Windows, where long paths are enabled."""
@@ -293,7 +278,7 @@ class ResultsPlace:
 
     def will_hold(self, files: Sequence[str]) -> None:
         """Declare the files of the results, before any is written. Raises OSError."""
-        self.scratch.will_hold([_SPARE, *(f"{_NEW}/{name}" for name in files)])
+        self.scratch.will_hold(f"{_NEW}/{name}" for name in files)
 
     @contextmanager
     def may_fail(self, names: Sequence[str]) -> Iterator[None]:
@@ -341,58 +326,43 @@ class ResultsPlace:
         flush_file(self.folder.parent)
 
     def _replace(self, files: Sequence[str]) -> str | None:
-        """Put the new folder in the place of the old one, with the user's own files. Returns why not; None: done."""
+        """Put the new folder in the place of the old one, with the user's own files. Returns why not; None: done.
+
+        They are linked into the new folder before it has its name; where links cannot be made, moved after that.
+        """
         held = list_belongings(self.folder)
-        if held is None:
+        if held is None or find_taken(held.others(files), files):
             return _OTHERS
-        try:
-            kept = self._keep(held, files)
-        except OSError as error:
-            for name in set(held.others(files)) - set(files):
-                with suppress(OSError):
-                    (self.new / name).unlink()
-            return f"not replaced, as {error.filename} can be neither linked nor copied ({error.strerror})"
+        self._list_ours(_NEW, held, files)
+        for name in held.others(files):
+            with suppress(OSError):
+                _move_over(name, self.folder, self.new, _link)
+        flush_all(self.new)
         assert self.before is not None
-        if exchange_folders(self.new, self.folder):
-            if not os.path.samestat(self.new.stat(), self.before):
-                exchange_folders(self.new, self.folder)
-                return _OTHERS
-            old = self.new
-        else:
+        old = self.new
+        if not exchange_folders(self.new, self.folder):
             old = self.scratch.path / OLD
             exchange_in_two_steps(self.new, self.folder, old)
-        self._keep_late(old, held, kept)
+        elif not os.path.samestat(self.new.stat(), self.before):
+            exchange_folders(self.new, self.folder)
+            for name in set(held.others(files)).difference(files):
+                with suppress(OSError):
+                    (self.new / name).unlink()
+            return _OTHERS
+        after = list_belongings(old) or held  # more may have come meanwhile
+        self._list_ours(old.name, after, files)
+        for name in after.others(files):
+            try:
+                _move_over(name, old, self.folder, os.rename)
+            except OSError as error:
+                self.notes.append(f"{self.asked}/{name}: cannot be moved over ({error.strerror}); it is in {old}")
         return None
 
-    def _keep(self, held: FolderFiles, files: Sequence[str]) -> dict[str, str]:
-        """Keep the user's own files in the new folder. Returns their names there by those in the old one."""
-        others = held.others(files)
-        ours = set(held.every) - set(others)
-        removable = [_SPARE, *(f"{_NEW}/{name}" for name in {*files, *ours}), *(f"{OLD}/{name}" for name in ours)]
-        kept: dict[str, str] = {}
-        same: dict[str, str] = {}
-        self.scratch.will_hold(removable, {f"{_NEW}/{name}": f"{self.folder.name}/{name}" for name in others})
-        for name in sorted(others, key=lambda name: name in files):  # those that keep their names first
-            kept[name] = keep_file(name, self.folder, self.new, self.scratch.path / _SPARE)
-            if kept[name] != name:
-                self.notes.append(f"{self.asked}/{name}: kept as {kept[name]}, as the results have one of that name")
-            same |= {f"{at}/{name}": f"{self.folder.name}/{kept[name]}" for at in (_NEW, OLD)}
-            same[f"{_NEW}/{kept[name]}"] = f"{self.folder.name}/{name}"
-        if others:
-            self.scratch.will_hold(removable, same)
-            flush_all(self.new)
-        return kept
-
-    def _keep_late(self, old: Path, held: FolderFiles, kept: dict[str, str]) -> None:
-        """Keep files that came into the old folder during the exchange, except those made of the old results."""
-        made = read_made_names(old)
-        late = [name for name in list_names(old) if name not in held.every]
-        self.scratch.add([f"{old.name}/{name}" for name in made.intersection(late)])
-        for name in late:
-            if name not in made:
-                with suppress(OSError):
-                    kept[name] = keep_file(name, old, self.folder, self.scratch.path / _SPARE)
-                    self.scratch.add(same={f"{old.name}/{name}": f"{self.folder.name}/{kept[name]}"})
+    def _list_ours(self, where: str, held: FolderFiles, files: Sequence[str]) -> None:
+        """List what may be removed of the scratch folder, in which the old results come to lie as `where`."""
+        ours = set(held.every).difference(held.others(files))
+        places = {_NEW, OLD, where}
+        self.scratch.will_hold(f"{at}/{name}" for at in places for name in {*files, *ours})
 
     def _elsewhere(self, why: str) -> None:
         """Give the new folder another name."""
@@ -504,6 +474,21 @@ def check_target(folder: Path, *, overwrite: bool) -> None:
     place = folder.resolve()
     if place.is_mount() or place in (Path.cwd(), *Path.cwd().parents):
         raise OutputError(f"{folder}: cannot be replaced, being in use or a mount point; choose a folder in it")
+
+
+def find_taken(others: Iterable[str], files: Collection[str]) -> list[str]:
+    """The user's own files whose names the results need, themselves or for a folder."""
+    folders = {parent.as_posix() for file in files for parent in Path(file).parents}
+    taken = folders.union(files)
+    return [n for n in others if n in taken or any(parent.as_posix() in files for parent in Path(n).parents)]
+
+
+def check_names(place: ResultsPlace, files: Sequence[str]) -> None:
+    """Raise OutputError, before the replay, where a file of the user's own has a name that the results need."""
+    held = None if place.before is None else list_belongings(place.folder)
+    if held is not None and held.results is not None and (taken := find_taken(held.others(files), files)):
+        out = "move it elsewhere, or choose another folder with --out"
+        raise OutputError(f"{place.asked}/{taken[0]}: the results will have a file of that name; {out}")
 
 
 def _folder_exists(folder: Path) -> bool:

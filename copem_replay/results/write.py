@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -35,10 +35,18 @@ from copem_replay.io.open import (
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.pipeline.cost import return_memory
-from copem_replay.pipeline.one_run import ReplayedRun, ShownRun, replay_run, select_shown_logs, select_shown_runs
+from copem_replay.pipeline.one_run import (
+    ReplayedRun,
+    ShownRun,
+    choose_logs,
+    list_stems,
+    replay_run,
+    select_shown_logs,
+    select_shown_runs,
+)
 from copem_replay.pipeline.run import ExperimentResult, find_log_path
-from copem_replay.pipeline.sweep import resolve_sweep
-from copem_replay.results.folder import EXPERIMENT, MARK, ResultsPlace, check_inputs, take_place
+from copem_replay.pipeline.sweep import list_points, resolve_sweep
+from copem_replay.results.folder import EXPERIMENT, MARK, ResultsPlace, check_inputs, check_names, take_place
 from copem_replay.results.schema import (
     FORMAT,
     MANY_ROWS,
@@ -146,6 +154,7 @@ def write_results(
     """
     with take_place(folder, overwrite=overwrite) as place:
         check_inputs(place, [path for recording in recordings for path in recording.paths])
+        check_names(place, list_results(experiment, recordings, exporters))
         notes = fill_place(place, experiment, recordings, result, exporters=exporters, skipped=skipped)
     if place.failed:
         raise OutputError(place.failed)
@@ -165,7 +174,9 @@ def fill_place(
 
     The place's `folder` and `notes` may change; `failed` has the exporters' files that could not be written.
     """
-    files = _list_files(experiment, recordings, result, exporters)
+    tables = _table_files("detections.parquet", result.tables.counts)
+    tables += _table_files("tally.parquet", dict(result.tally["log"].value_counts(sort=False)))
+    files = list_results(experiment, recordings, exporters, tables)
     try:
         place.will_hold(files)
         _write_files(place, experiment, recordings, result)
@@ -180,20 +191,24 @@ def fill_place(
     return notes
 
 
-def _list_files(
-    experiment: Experiment, recordings: Sequence[Recording], result: ExperimentResult, exporters: Sequence[Exporter]
+def list_results(
+    experiment: Experiment,
+    recordings: Sequence[Recording],
+    exporters: Sequence[Exporter],
+    tables: Iterable[str] = ("detections.parquet", "tally.parquet"),
 ) -> list[str]:
-    """The files that the folder will have, by names relative to it."""
-    files = [EXPERIMENT, MARK, "summary.csv", "logs.csv"]
-    files += _table_files("detections.parquet", result.tables.counts)
-    files += _table_files("tally.parquet", dict(result.tally["log"].value_counts(sort=False)))
-    files += ["exact.parquet"] * (result.exact is not None) + ["sweep.csv"] * (result.sweep is not None)
-    if result.bands is not None:
-        files += [f"{name}.parquet" for name in _ACCURACY] + ["bands.csv"]
-    for log in select_shown_logs(experiment, result):
-        for shown in select_shown_runs(experiment, result, log):
-            stem, shown_count = _run_stem(shown, log, recordings), len(experiment.shown())
-            files += [name for exporter in exporters for name in exporter.files(stem, shown_count)]
+    """The files that the results of an experiment have, by names relative to the folder.
+
+    `tables`: the files of those tables that are a folder where they have many rows.
+    """
+    files = [EXPERIMENT, MARK, "summary.csv", "logs.csv", *tables]
+    files += ["exact.parquet"] * experiment.measure.exact + ["sweep.csv"] * any(True for _ in list_points(experiment))
+    files += [f"{name}.parquet" for name in _ACCURACY if experiment.measure.accuracy]
+    files += ["bands.csv"] * experiment.measure.accuracy
+    for log in choose_logs(experiment, [recording.scene.log for recording in recordings]):
+        for stem in list_stems(experiment):
+            place, shown_count = _place_stem(stem, log, recordings), len(experiment.shown())
+            files += [name for exporter in exporters for name in exporter.files(place, shown_count)]
     return sorted(files)
 
 
@@ -204,9 +219,9 @@ def _table_files(name: str, counts: Mapping[str, int]) -> list[str]:
     return [table_file(Path(name), log).as_posix() for log, count in counts.items() if count]
 
 
-def _run_stem(shown: ShownRun, log: str, recordings: Sequence[Recording]) -> str:
+def _place_stem(stem: str, log: str, recordings: Sequence[Recording]) -> str:
     """The name of a shown run's files, relative to the folder, without suffix."""
-    return shown.stem if len(recordings) == 1 else f"{shown.stem}/{portable_name(log)}"
+    return stem if len(recordings) == 1 else f"{stem}/{portable_name(log)}"
 
 
 def _write_files(
@@ -239,7 +254,7 @@ def _export(
     notes: list[str] = []
     for log in select_shown_logs(experiment, result) if exporters else ():
         for shown in select_shown_runs(experiment, result, log):
-            stem, shown_count = _run_stem(shown, log, recordings), len(experiment.shown())
+            stem, shown_count = _place_stem(shown.stem, log, recordings), len(experiment.shown())
             files = [exporter.files(stem, shown_count) for exporter in exporters]
             with place.may_fail([name for names in files for name in names]):
                 run = _make_run_to_export(log, shown, experiment, recordings, result)

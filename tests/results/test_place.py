@@ -89,40 +89,60 @@ class TestOthers:
         assert again(call).lines == []
         assert set(belongings.list_names(old)) == MINE | set(json.loads(before["provenance.json"])["files"])
         assert (old / "notes.txt").read_text() == "mine\n"
-        assert ((old / "notes.txt").stat().st_ino == inode) is links
+        assert (old / "notes.txt").stat().st_ino == inode  # linked, else moved
         assert os.readlink(old / "link") == "../../drive.mcap"
         assert written(old)["provenance.json"] != before["provenance.json"]
         assert os.listdir(old.parent) == ["e"]
 
-    def test_of_one_name_with_new_results(self, old: Path, call: Call) -> None:
-        """`sweep.csv` of the user's, then a sweep."""
-        (old / "sweep.csv").write_text("mine\n")
-        (old / "sweep.csv.kept").write_text("mine, too\n")
-        (old.parents[1] / "e.yaml").write_text(changed("sweep: {latency_s: [0, 0.2]}"))
-        line = "note: out/e/sweep.csv: kept as sweep.csv.kept2, as the results have one of that name"
-        assert again(call).lines == [line]
-        kept = {p.name: p.read_text() for p in old.glob("sweep.csv.kept*")}
-        assert sorted(kept.values()) == ["mine\n", "mine, too\n"]
-        assert (old / "sweep.csv").read_text().startswith("sweep,value")
+    @pytest.mark.parametrize(("name", "taken"), [("sweep.csv", "sweep.csv"), ("replay.rrd/x", "replay.rrd/x")])
+    def test_of_one_name_with_new_results_is_refused_before_the_replay(
+        self, old: Path, call: Call, monkeypatch: pytest.MonkeyPatch, name: str, taken: str
+    ) -> None:
+        """`sweep.csv` of the user's, then a sweep; a folder of the user's where a run will be shown."""
+        (old / name).parent.mkdir(exist_ok=True)
+        (old / name).write_text("mine\n")
+        before = written(old)
+        (old.parents[1] / "e.yaml").write_text(changed("sweep: {latency_s: [0, 0.2]}", "show: {run: 0}"))
+        monkeypatch.setattr(runs, "run_experiment", raises(errno.EIO))
+        out = "move it elsewhere, or choose another folder with --out"
+        line = f"out/e/{taken}: the results will have a file of that name; {out}"
+        assert again(call) == (2, "", [line])
+        assert written(old) == before
 
-    def test_that_can_be_neither_linked_nor_copied(
+    def test_of_one_name_with_new_results_that_comes_during_the_run(
         self, old: Path, call: Call, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        """The results of hours are not thrown away for it."""
+        replay = runs.run_experiment
 
-        def refused(source: Path, *_: Any, **__: Any) -> None:
-            raise PermissionError(errno.EACCES, "Permission denied", str(source))
+        def meanwhile(*a: Any, **k: Any) -> Any:
+            (old / "sweep.csv").write_text("mine\n")
+            return replay(*a, **k)
 
-        monkeypatch.setattr(os, "link", refused)
-        monkeypatch.setattr(shutil, "copy2", refused)
-        before = written(old)
-        assert again(call).lines == [
-            f"note: out/e: not replaced, as {old}/figures/more/mine.svg can be neither linked nor copied (Permission "
-            f"denied); the results of this run are in {old}-2"
-        ]
-        assert written(old) == before
-        assert json.loads((old.parent / "e-2/provenance.json").read_text())["seed"] == 5
-        assert sorted(os.listdir(old.parent)) == ["e", "e-2"]
+        (old.parents[1] / "e.yaml").write_text(changed("sweep: {latency_s: [0, 0.2]}"))
+        monkeypatch.setattr(runs, "run_experiment", meanwhile)
+        said = f"something else came there during the run, and stays; the results of this run are in {old}-2"
+        assert again(call).lines == [f"note: out/e: {said}"]
+        assert (old / "sweep.csv").read_text() == "mine\n"
+        assert (old.parent / "e-2/sweep.csv").read_text().startswith("sweep,value")
+
+    def test_that_can_be_neither_linked_nor_moved(self, old: Path, call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+        """It is not lost, and it is said where it is."""
+        rename = os.rename
+
+        def refused(source: Path, target: Path) -> None:
+            if Path(source).name == "mine.svg":
+                raise PermissionError(errno.EACCES, "Permission denied", str(source))
+            rename(source, target)
+
+        monkeypatch.setattr(os, "link", raises(errno.EPERM))
+        monkeypatch.setattr(os, "rename", refused)
+        (line,) = again(call).lines
+        (left,) = old.parent.glob(".e.*.tmp")
+        said = f"note: out/e/figures/more/mine.svg: cannot be moved over (Permission denied); it is in {left}/results"
+        assert line == said
+        assert {path.name for path in left.rglob("*.*")} == {"mine.svg", "files.json"}
+        assert (old / "notes.txt").read_text() == "mine\n"
+        assert json.loads((old / "provenance.json").read_text())["seed"] == 5
 
     def test_that_came_while_the_folder_was_exchanged(
         self, old: Path, call: Call, monkeypatch: pytest.MonkeyPatch
@@ -472,11 +492,11 @@ class TestFlushed:
 class TestLeftovers:
     """Of processes that were killed."""
 
-    def left(self, folder: Path, files: list[str], there: list[str], same: dict[str, str] | None = None) -> Path:
+    def left(self, folder: Path, files: list[str], there: list[str]) -> Path:
         """What a killed process leaves: its list, its lock free, and files."""
         path = folder.parent / f".{folder.name}.abcd_123.tmp"
         path.mkdir(parents=True)
-        (path / scratch.MANIFEST).write_text(json.dumps({"files": files, "same": same or {}}))
+        (path / scratch.MANIFEST).write_text(json.dumps({"files": files}))
         for name in there:
             (path / name).parent.mkdir(parents=True, exist_ok=True)
             (path / name).write_text("x")
@@ -506,7 +526,7 @@ class TestLeftovers:
             assert call("run", "e.yaml", "--overwrite").lines == [self.kept(path)]
             assert {p.name for p in (path / "results").iterdir()} == {"thesis.tex", "files.json"}
 
-    @pytest.mark.parametrize("text", [None, "", "{", "[]", '{"files": 3}', '{"files": [[]], "same": {}}'])
+    @pytest.mark.parametrize("text", [None, "", "{", "[]", '{"files": 3}', '{"files": [[]]}'])
     def test_without_a_list_stay_unless_they_are_empty(self, here: Path, call: Call, text: str | None) -> None:
         path = self.left(here / "out/e", [], ["results/summary.csv"])
         if text is None:
@@ -543,24 +563,24 @@ class TestLeftovers:
     @pytest.mark.parametrize("equal", [True, False])
     def test_with_a_file_of_the_users_go_where_it_is_in_the_results(self, old: Path, call: Call, equal: bool) -> None:
         """After the exchange the old folder, with links to what stays, is still there."""
-        path = self.left(old, [], [], {"results/notes.txt": "e/notes.txt"})
+        path = self.left(old, [], [])
         (path / "results").mkdir()
         if equal:
             os.link(old / "notes.txt", path / "results/notes.txt")
         else:
-            (path / "results/notes.txt").write_text("mine!")
+            (path / "results/notes.txt").write_text("mine\n")
         assert again(call).lines == [self.removed(path) if equal else self.kept(path)]
         assert (old / "notes.txt").read_text() == "mine\n"
 
     def test_with_a_link_of_the_users_to_a_folder_go_and_the_folder_stays(
         self, here: Path, old: Path, call: Call
     ) -> None:
-        path = self.left(old, [], [], {"results/theirs": "e/theirs"})
+        path = self.left(old, [], [])
         (here / "theirs").mkdir()
         (here / "theirs/notes.txt").write_text("mine\n")
         (path / "results").mkdir()
-        for link in (old / "theirs", path / "results/theirs"):
-            link.symlink_to(here / "theirs")
+        (old / "theirs").symlink_to(here / "theirs")
+        os.link(old / "theirs", path / "results/theirs", follow_symlinks=False)
         assert again(call).lines == [self.removed(path)]
         assert (here / "theirs/notes.txt").read_text() == "mine\n"
 
