@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -55,23 +55,44 @@ class MetricInputs:
     own: Mapping[str, OwnSums] = field(default_factory=dict)
 
 
+class Compared(NamedTuple):
+    """What the difference to a baseline is: in words, and the figure of the pairs that it is taken of.
+
+    `figure`: values (C,) of the rows that both have (`results/compare/pairing.py`), whose means are compared, or shares
+    where they are true or false; or a name in `FIGURES` of `results/compare/metrics.py`. `files`: that it is made of,
+    beside `detections.parquet`.
+    """
+
+    words: str
+    figure: Callable[[Any], Any] | str
+    files: tuple[str, ...] = ()
+
+
 @dataclass(frozen=True)
 class Metric:
-    """One column of `summary.csv`.
+    """One column of `summary.csv`, one metric of `compare`, or both.
 
     `statistics`: gives the sums; None: the experiment does not ask for this metric, which then has no column. Metrics
     with equal statistics share the function, which is called once. `value`: computes the value from the sums; None: no
     sample. `better`: 1 more, −1 less, 0 neither. `part`: the table that shows the metric on the terminal and in the
-    report; empty: none. `compared`: what its difference to a baseline is; empty: it is not compared.
+    report; empty: none. `header`: of its column in the report, with the unit; empty: made of the name. `compared`:
+    None: it is not compared. `kind`: as of a column of results.
     """
 
     name: str
     statistics: Callable[[MetricInputs], Any]
     value: Callable[[Any], Value]
     better: Literal[-1, 0, 1]
-    help: str
+    help: str = ""
     part: str = ""
-    compared: str = ""
+    header: str = ""
+    compared: Compared | None = None
+    kind: str = "numbers"
+
+
+def compared_metric(name: str, better: Literal[-1, 1], part: str, header: str, compared: Compared) -> Metric:
+    """A metric that `compare` alone has: it is of pairs."""
+    return Metric(name, lambda _: None, lambda _: None, better, "", part, header, compared)
 
 
 def evaluate_metrics(metrics: Iterable[Metric], inputs: MetricInputs) -> dict[str, Value]:

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from operator import attrgetter, itemgetter
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -20,7 +20,7 @@ from copem_replay.core.tracks import Bool, Float
 from copem_replay.metrics.accuracy.metrics import ACCURACY
 from copem_replay.metrics.braking.driver import UNRESOLVED
 from copem_replay.metrics.intervals import EXACT, NOTHING_DRAWN, choose_clusters, exact_limits, limit_share
-from copem_replay.metrics.metric import LINK, OUTPUT, Metric, MetricInputs
+from copem_replay.metrics.metric import LINK, OUTPUT, Compared, Metric, MetricInputs, compared_metric
 from copem_replay.metrics.survival import (
     CENSORED,
     DETECTED,
@@ -275,71 +275,82 @@ def _limit_metrics(
     return (
         row(f"{of}_low", value=attrgetter("low"), help=f"lower limit of {of}, 95 %"),
         row(f"{of}_high", value=attrgetter("high"), help=f"upper limit of {of}, 95 %"),
-        row(f"{prefix}interval", value=attrgetter("kind"), help=f"kind of the limits of {of}, or why there are none"),
-        row(
-            f"{prefix}interval_over",
-            value=attrgetter("over"),
-            help=f"what the limits of {of} are over: logs, objects of one log or runs of one object",
-        ),
-        row(
-            f"{prefix}interval_clusters",
-            value=attrgetter("clusters"),
-            help=f"how many of these the limits of {of} are over",
-        ),
-    )
+        row(f"{prefix}interval", value=attrgetter("kind"), kind="text",
+            help=f"kind of the limits of {of}, or why there are none"),
+        row(f"{prefix}interval_over", value=attrgetter("over"), kind="text",
+            help=f"what the limits of {of} are over: logs, objects of one log or runs of one object"),
+        row(f"{prefix}interval_clusters", value=attrgetter("clusters"),
+            help=f"how many of these the limits of {of} are over"),
+    )  # fmt: skip
 
 
-_DISTANCE = "median distance at detection, centre to centre; never detected ranks below all"
-_PASSES = "share of conflicts that the configured driver avoids when braking after detection, [95 % interval]"
+def _seconds_unknown(rows: Any) -> Float:
+    return compute_unknown_s(rows.detection_s - rows.onset_s, rows.ended_s - rows.onset_s)
+
+
+_MEAN = "mean of min(time to detection, horizon), never detected counting as the horizon"
 
 _DETECTION_METRICS = (
     Metric("n", _return_inputs, lambda of: int(of.rows["runs"].sum()), 0,
-           "rows: runs × measured objects × logs", "summary"),
-    Metric("list_rate_hz", _return_inputs, lambda of: of.list_rate_hz, 0, "fused lists per second", "summary"),
+           "rows: runs × measured objects × logs", "summary", "rows"),
+    Metric("list_rate_hz", _return_inputs, lambda of: of.list_rate_hz, 0, "fused lists per second", "summary",
+           "fused lists per second"),
     Metric("detected_share", estimate_detected_share, lambda of: of.share, 1,
-           "share of the rows that were detected, [95 % interval]", "summary", "share detected"),
+           "share of the rows that were detected, [95 % interval]", "summary", "detected, %",
+           Compared("share detected", attrgetter("detected"))),
     *_limit_metrics("detected_share", estimate_detected_share),
     Metric("ttd_p5_s", summarise_detections, lambda of: of.quantile_s(0.05), -1,
            "time to detection by which 5 % of the rows were detected"),
     Metric("ttd_median_s", summarise_detections, lambda of: of.quantile_s(0.5), -1,
-           "median time to detection", "summary"),
+           "median time to detection", "summary", "median time to detection, s"),
     Metric("ttd_p95_s", summarise_detections, lambda of: of.quantile_s(0.95), -1,
-           "time to detection by which 95 % were detected; a dash: fewer were ever detected", "summary"),
-    Metric("ttd_rmst_s", summarise_detections, lambda of: of.mean_s(), -1,
-           "mean of min(time to detection, horizon), never detected counting as the horizon", "summary",
-           "mean of min(time to detection, horizon), never detected counting as the horizon"),
+           "time to detection by which 95 % were detected; a dash: fewer were ever detected", "summary",
+           "95 % detected by, s"),
+    Metric("ttd_rmst_s", summarise_detections, lambda of: of.mean_s(), -1, _MEAN, "summary",
+           "mean time to detection, s", Compared(_MEAN, "restricted means")),
+    compared_metric("ttd_both_s", -1, "summary", "mean time where both detect, s",
+                    Compared("mean time to detection over the rows that both detect; beside it those that one alone "
+                             "detects", "means where both detect")),
     Metric("ttd_rmst_horizon_s", summarise_detections, lambda of: of.horizon_s, 0, "the horizon of ttd_rmst_s"),
     Metric("unknown_s", measure_unknown, lambda of: of.mean_s, -1,
            "mean seconds from the onset to the detection or the end of the episode; needs no horizon", "summary",
-           "mean seconds unknown, to the detection or the end of the episode"),
+           "mean time unknown, s",
+           Compared("mean seconds unknown, to the detection or the end of the episode", _seconds_unknown)),
     Metric("left_undetected_share", measure_unknown, lambda of: of.left_share, -1,
-           "share of the rows whose object left undetected: never detected", "undetected"),
+           "share of the rows whose object left undetected: never detected", "undetected", "left undetected, %"),
     Metric("open_share", measure_unknown, lambda of: of.open_share, 0,
-           "share of the rows still undetected when the log or the ego ended: censored", "undetected"),
-    Metric("dad_median_m", summarise_detections, lambda of: of.distance_quantile_m(0.5), 1, _DISTANCE, "summary",
-           "median of the differences of distances at detection"),
+           "share of the rows still undetected when the log or the ego ended: censored", "undetected",
+           "undetected at the end, %"),
+    compared_metric("ttd_rmst_s_equal_ghosts", -1, "summary", "mean time at equal false positives, s",
+                    Compared("the same at as many false positives per minute as the baseline has",
+                             "restricted means at equal ghosts", ("lists.parquet", "thresholds.parquet"))),
+    Metric("dad_median_m", summarise_detections, lambda of: of.distance_quantile_m(0.5), 1,
+           "median distance at detection, centre to centre; never detected ranks below all", "summary",
+           "median distance at detection, m",
+           Compared("median of the differences of distances at detection", "distances")),
     Metric("dad_p5_m", summarise_detections, lambda of: of.distance_quantile_m(0.05), 1,
-           "distance at detection that 95 % of the rows exceed", "summary"),
+           "distance at detection that 95 % of the rows exceed", "summary", "95 % detected beyond, m"),
 )  # fmt: skip
 
 _CONFLICT_METRICS = (
     Metric("conflict_detected_share", estimate_foreseen_share, _number_or_none, 1,
-           "share of the rows in which a list implied a collision", "conflict"),
+           "share of the rows in which a list implied a collision", "conflict", "collision foreseen, %"),
     Metric("conflict_ttd_median_s", summarise_conflicts, lambda of: of.quantile_s(0.5), -1,
-           "median time to the first list that implied a collision", "conflict"),
+           "median time to the first list that implied a collision", "conflict", "median time until foreseen, s"),
     Metric("conflict_ttd_p95_s", summarise_conflicts, lambda of: of.quantile_s(0.95), -1,
-           "time by which 95 % of the rows had such a list", "conflict"),
+           "time by which 95 % of the rows had such a list", "conflict", "95 % foreseen by, s"),
     Metric("conflict_ttd_rmst_s", summarise_conflicts, lambda of: of.mean_s(), -1,
-           "mean time to such a list, never counting as the horizon", "conflict"),
+           "mean time to such a list, never counting as the horizon", "conflict", "mean time until foreseen, s"),
     Metric("conflict_dad_median_m", summarise_conflicts, lambda of: of.distance_quantile_m(0.5), 1,
-           "median distance at such a list", "conflict"),
+           "median distance at such a list", "conflict", "median distance when foreseen, m"),
 )  # fmt: skip
 
 _BRAKING_METRICS = (
     Metric("n_conflict", estimate_passed_share, lambda of: of.n, 0,
-           "rows in conflict: without braking the ego would come too near", "braking"),
-    Metric("pass_share", estimate_passed_share, lambda of: of.share, 1, _PASSES,
-           "braking", "share of conflicts that pass"),
+           "rows in conflict: without braking the ego would come too near", "braking", "rows in conflict"),
+    Metric("pass_share", estimate_passed_share, lambda of: of.share, 1,
+           "share of conflicts that the configured driver avoids when braking after detection, [95 % interval]",
+           "braking", "passes, %", Compared("share of conflicts that pass", "passes")),
     *_limit_metrics("pass_share", estimate_passed_share, "pass_"),
 )  # fmt: skip
 
@@ -372,6 +383,7 @@ _EXACT_METRICS = (
         1,
         "pass_share in closed form, the limit for many runs",
         "braking",
+        "passes without a draw, %",
     ),
     Metric(
         "fail_share_exact",
@@ -382,11 +394,18 @@ _EXACT_METRICS = (
     ),
 )
 
-METRICS: tuple[Metric, ...] = (
-    *_DETECTION_METRICS, *_CONFLICT_METRICS, *_BRAKING_METRICS, *ACCURACY, *OUTPUT, *LINK, *_EXACT_METRICS,
-)  # fmt: skip
-"""All built-in metrics, in the order of the columns."""
+_ALL = {
+    "": _DETECTION_METRICS, "conflict": _CONFLICT_METRICS, "braking": _BRAKING_METRICS, "accuracy": ACCURACY,
+    "output": OUTPUT, "link": LINK, "exact": _EXACT_METRICS,
+}  # fmt: skip
+METRICS_OF: dict[str, tuple[Metric, ...]] = {what: tuple(m for m in of if m.help) for what, of in _ALL.items()}
+"""All built-in metrics of the summary, in the order of its columns, by what an experiment asks for; "": always."""
+METRICS: tuple[Metric, ...] = tuple(metric for of in METRICS_OF.values() for metric in of)
 METRIC: dict[str, Metric] = {metric.name: metric for metric in METRICS}
+COMPARED: dict[str, Metric] = {
+    metric.name: metric for what in ("", "accuracy", "braking") for metric in _ALL[what] if metric.compared is not None
+}
+"""The metrics that `compare` holds against a baseline, in its order."""
 
 PARTS = {
     "summary": "When, and how far away",

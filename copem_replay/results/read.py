@@ -35,16 +35,10 @@ from copem_replay.pipeline.study_log import read_content_digest
 from copem_replay.results.folder import MARK, check_unchanged
 from copem_replay.results.schema import (
     AGAIN,
-    BRAKING,
-    CONFLICT,
-    DETECTIONS,
-    EXACT,
-    MAY_HAVE,
-    OPTIONAL,
-    ROWS,
-    TALLY,
-    VERDICTS,
+    COMPARED_FILES,
+    TABLES,
     Provenance,
+    check_columns,
     check_kind,
     check_text,
     read_csv,
@@ -108,9 +102,10 @@ class LogRows:
 
 
 def log_rows(place: Path, kinds: Mapping[str, str], files: Sequence[Path] = ()) -> LogRows:
-    """A table with the place of each log's rows. `files`: those of a table that is a folder.
+    """A table, which has at least columns of these kinds, with the place of each log's rows.
 
-    Raises InputError where the table cannot be read, lacks a column, or has one of another kind.
+    `files`: those of a table that is a folder. Raises InputError where the table cannot be read, lacks a column, or has
+    one of another kind.
     """
     import pyarrow as pa
     from pyarrow import parquet
@@ -122,10 +117,8 @@ def log_rows(place: Path, kinds: Mapping[str, str], files: Sequence[Path] = ()) 
         with _report_damage(place):
             file = parquet.ParquetFile(path, read_dictionary=names)
             schema = file.schema_arrow.remove_metadata()
-        for name in kinds:
-            if (found := schema.names.count(name)) != 1:
-                raise InputError(f"{place}: expected the column {name}, found {found or 'none'}; {AGAIN}")
-        kinds = dict(kinds) | {name: k for name, k in MAY_HAVE.get(place.name, {}).items() if name in schema.names}
+        check_columns(place, kinds, schema.names)
+        kinds = {c.name: c.kind for c in TABLES[place.name].columns if c.name in schema.names}
         for name, kind in kinds.items():
             column_type = schema.field(name).type
             if file.metadata.num_rows or not pa.types.is_null(column_type):  # without rows columns may have no types
@@ -215,13 +208,13 @@ class Results:
     @cached_property
     def table(self) -> pd.DataFrame:
         """`detections.parquet` as a whole, for users; figures take `known` or `each`, which hold less in memory."""
-        return self._frame("detections.parquet", _required_columns(self.experiment))
+        return self._frame("detections.parquet")
 
     @cached_property
     def rows(self) -> LogRows:
         """`detections.parquet` with the place of each log's rows."""
         place = self.folder / "detections.parquet"
-        rows = log_rows(place, self._compared, self._files(place))
+        rows = log_rows(place, self._kinds(place.name, compared=True), self._files(place))
         check_unchanged(self.folder, self.seen)
         return rows
 
@@ -243,7 +236,7 @@ class Results:
     @cached_property
     def tally(self) -> pd.DataFrame:
         """`tally.parquet`."""
-        return self._frame("tally.parquet", (*TALLY, *(("in_conflict", "passed") if self.experiment.braking else ())))
+        return self._frame("tally.parquet")
 
     @cached_property
     def known(self) -> pd.DataFrame:
@@ -251,25 +244,24 @@ class Results:
         tally = self.counted(self.tally[self.tally["event"] == DETECTED])
         if not len(tally) or choose_clusters(tally)[0] != "runs":
             return tally
-        columns = [name for name in TALLY if name not in ("log", "event", "runs")]
+        columns = [name for name in TABLES["tally.parquet"].kinds() if name not in ("log", "event", "runs")]
         (rows,) = self.each(*columns, "run", log=str(tally["log"].iloc[0]))
         return rows.assign(log=tally["log"].iloc[0], runs=1)
 
     @cached_property
     def summary(self) -> pd.DataFrame:
         """`summary.csv`."""
-        return self._frame("summary.csv", ("configuration", "n", "list_rate_hz"))
+        return self._frame("summary.csv")
 
     @cached_property
     def exact(self) -> pd.DataFrame | None:
         """`exact.parquet`; None: there is no such file."""
-        return self._frame("exact.parquet", EXACT) if (self.folder / "exact.parquet").is_file() else None
+        return self._optional("exact.parquet")
 
     @cached_property
     def sweep(self) -> pd.DataFrame | None:
         """`sweep.csv`; None: there is no such file."""
-        columns = ("sweep", "value", "configuration", "list_rate_hz")
-        return self._frame("sweep.csv", columns) if (self.folder / "sweep.csv").is_file() else None
+        return self._optional("sweep.csv")
 
     @property
     def detections(self) -> pd.DataFrame:
@@ -279,13 +271,12 @@ class Results:
     @cached_property
     def accuracy(self) -> pd.DataFrame | None:
         """Position errors and parts of GOSPA, list by list, in the order of `detections`; None: not measured."""
-        return self._frame("accuracy.parquet", ()) if (self.folder / "accuracy.parquet").is_file() else None
+        return self._optional("accuracy.parquet")
 
     @cached_property
     def bands(self) -> pd.DataFrame | None:
         """Accuracy by configuration and by distance, time or existence; None: not measured."""
-        columns = ("configuration", "by", "from", "to")
-        return self._frame("bands.csv", columns) if (self.folder / "bands.csv").is_file() else None
+        return self._optional("bands.csv")
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -296,14 +287,15 @@ class Results:
     @cached_property
     def by_log(self) -> dict[str, LogRows]:
         """By file name the tables that comparisons read, those that exist."""
-        rows = self.rows.only(self._compared)
+        rows = self.rows.only(self._kinds(self.rows.place.name, compared=True))
         if not rows.where:
             raise InputError(f"{self.folder}: nothing can be compared: no measured object has an onset")
         if unknown := set(rows.where) - {log.name for log in self.provenance.logs}:
             raise InputError(f"{rows.place}: expected the logs of provenance.json, found {min(unknown)!r}")
         tables = {rows.place.name: rows}
-        present = {name: kinds for name, kinds in OPTIONAL.items() if (self.folder / name).is_file()}
-        tables |= {name: log_rows(self.folder / name, kinds) for name, kinds in present.items()}
+        for name in (name for name in COMPARED_FILES if (self.folder / name).is_file()):
+            table = log_rows(self.folder / name, self._kinds(name, compared=True))
+            tables[name] = table.only(TABLES[name].kinds("fleet", compared=True))
         check_unchanged(self.folder, self.seen)
         return tables
 
@@ -357,10 +349,10 @@ class Results:
                 raise InputError(f"{self.folder}: configurations: expected some of {', '.join(known)}, found {name!r}")
         return tuple(dict.fromkeys(configurations)) if configurations else known
 
-    @property
-    def _compared(self) -> dict[str, str]:
-        """Columns of `detections.parquet` that comparisons read, and their kinds."""
-        return DETECTIONS | (VERDICTS if self.provenance.braking is not None else {})
+    def _kinds(self, name: str, *, compared: bool = False) -> dict[str, str]:
+        """Kinds of the columns that a file has to have, all or only those that comparisons read."""
+        asked = {"braking": self.provenance.braking, "conflict": self.provenance.measure["conflict"]}
+        return TABLES[name].kinds(*(key for key, of in asked.items() if of is not None), compared=compared)
 
     def _files(self, place: Path) -> list[Path]:
         """The files of a table that is a folder, in the order of the logs; empty: the table is a file."""
@@ -368,7 +360,10 @@ class Results:
             return []
         return [path for log in self.provenance.logs if (path := table_file(place, log.name)).is_file()]
 
-    def _frame(self, name: str, columns: Sequence[str]) -> pd.DataFrame:
+    def _optional(self, name: str) -> pd.DataFrame | None:
+        return self._frame(name) if (self.folder / name).is_file() else None
+
+    def _frame(self, name: str) -> pd.DataFrame:
         def as_frame(place: Path) -> pd.DataFrame:
             from pyarrow import parquet
 
@@ -377,7 +372,7 @@ class Results:
                 split_blocks=True, self_destruct=True
             )  # column by column, so that no column is in memory twice
 
-        table = read_frame(self.folder / name, read_csv if name.endswith(".csv") else as_frame, columns)
+        table = read_frame(self.folder / name, read_csv if name.endswith(".csv") else as_frame, self._kinds(name))
         check_unchanged(self.folder, self.seen)
         return table
 
@@ -417,8 +412,7 @@ def check_complete(results: Results, *, rowless: bool = False) -> Results:
     """The results, with rows checked against the experiment and every other table read. Raises InputError."""
     _check_exists(results.folder, "summary.csv", "tally.parquet")
     experiment, rows = results.experiment, results.rows
-    if missing := [name for name in _required_columns(experiment) if name not in rows.kinds]:
-        raise InputError(f"{rows.place}: expected the column {missing[0]}, found none; {AGAIN}")
+    check_columns(rows.place, results._kinds(rows.place.name), rows.kinds)
     if rows.where or not rowless:
         _check_rows(rows, experiment)
     tally = results.tally[results.tally["event"] == DETECTED]
@@ -437,12 +431,6 @@ def check_complete(results: Results, *, rowless: bool = False) -> Results:
     for name in ("summary", "exact", "sweep"):
         getattr(results, name)
     return results
-
-
-def _required_columns(experiment: Experiment) -> tuple[str, ...]:
-    """Columns that `detections.parquet` has to have."""
-    conflict = experiment.measure.conflict
-    return tuple(ROWS | (BRAKING if experiment.braking else {}) | (CONFLICT if conflict else {}))
 
 
 def _check_rows(rows: LogRows, experiment: Experiment) -> None:

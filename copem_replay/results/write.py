@@ -50,6 +50,7 @@ from copem_replay.results.folder import EXPERIMENT, MARK, ResultsPlace, check_in
 from copem_replay.results.schema import (
     FORMAT,
     MANY_ROWS,
+    TABLES,
     TableFile,
     list_versions,
     log_entries,
@@ -299,8 +300,8 @@ def _logs_table(folder: Path, result: ExperimentResult, skipped: Sequence[tuple[
         }
         for path, why in skipped
     ]
-    columns = {"log": "object", "path": "object", "sha256": "object", "episodes": "Int64", "rows": "Int64",
-               "state": "object", "reason": "object"}  # fmt: skip
+    kinds = TABLES["logs.csv"].kinds()
+    columns = {name: "object" if kind == "text" else "Int64" for name, kind in kinds.items()}
     return pd.DataFrame(rows, columns=list(columns)).astype(columns)
 
 

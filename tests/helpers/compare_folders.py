@@ -10,6 +10,7 @@ from typing import Any
 import pyarrow as pa
 from pyarrow import parquet
 
+from copem_replay.results.schema import TABLES
 from tests.oracles import intervals
 
 Row = dict[str, Any]
@@ -27,61 +28,10 @@ INSTANTS = [0.0, 1.0, 2.0, 3.0]
 """Of the frames of the truth, and of the fused lists of every configuration, unless told otherwise."""
 MAX_AGE_S = 1.0
 
-_DETECTIONS = {
-    "log": pa.string(),
-    "configuration": pa.string(),
-    "run": pa.int64(),
-    "object_id": pa.string(),
-    "episode": pa.int64(),
-    "onset_s": pa.float64(),
-    "began": pa.string(),
-    "detected": pa.bool_(),
-    "detection_s": pa.float64(),
-    "distance_at_detection_m": pa.float64(),
-    "ended_s": pa.float64(),
-    "ended_by": pa.string(),
-}
-_VERDICTS = {"conflict": pa.bool_(), "braking_pass": pa.bool_()}
-_ACCURACY = {
-    "log": pa.string(),
-    "configuration": pa.string(),
-    "run": pa.int64(),
-    "object_id": pa.string(),
-    "episode": pa.int64(),
-    "first_frame": pa.int64(),
-    "error_held_m": pa.list_(pa.float32()),
-    "age_held_s": pa.list_(pa.float32()),
-    "gospa_held_m2": pa.list_(pa.float32()),
-    "ghosts": pa.int64(),
-}
-_LISTS = {
-    "log": pa.string(),
-    "configuration": pa.string(),
-    "run": pa.int64(),
-    "lists": pa.int64(),
-    "minutes": pa.float64(),
-    "ghosts": pa.int64(),
-    "duplicates": pa.int64(),
-    "without_truth": pa.int64(),
-    "existence": pa.list_(pa.float64()),
-    "ghosts_at": pa.list_(pa.int64()),
-}
-_INSTANTS = {
-    "log": pa.string(),
-    "configuration": pa.string(),
-    "available_s": pa.list_(pa.float64()),
-    "frame_s": pa.list_(pa.float64()),
-    "held_list": pa.list_(pa.int64()),
-}
-_THRESHOLDS = {
-    "log": pa.string(),
-    "configuration": pa.string(),
-    "run": pa.int64(),
-    "object_id": pa.string(),
-    "episode": pa.int64(),
-    "existence": pa.float64(),
-    "detection_s": pa.float64(),
-}
+_TYPES = {
+    "text": pa.string(), "whole numbers": pa.int64(), "numbers": pa.float64(), "true or false": pa.bool_(),
+    "lists of numbers": pa.list_(pa.float64()), "lists of whole numbers": pa.list_(pa.int64()),
+}  # fmt: skip
 
 MEASURE = {
     "objects": {"classes": None, "ids": None},
@@ -183,23 +133,24 @@ def write_folder(
     (path / "provenance.json").write_text(json.dumps(said))
     more = "".join(f"{key}: {json.dumps(value)}\n" for key, value in (experiment or {}).items())
     (path / "experiment.yaml").write_text(f"version: 1\nego: {'null' if ego is None else ego}\n{more}")
-    _write(path / "detections.parquet", rows, _DETECTIONS | (_VERDICTS if said["braking"] else {}))
+    _write(path / "detections.parquet", rows, *["braking"] * bool(said["braking"]))
     if any("error_held_m" in r for r in rows):
-        _write(path / "accuracy.parquet", rows, _ACCURACY)
+        _write(path / "accuracy.parquet", rows)
         of = [(log, name) for log in names for name in dict.fromkeys(r["configuration"] for r in rows)]
         issued_s = [list((available_s or {}).get(name, INSTANTS)) for _, name in of]
         instants = [
             {"log": log, "configuration": name, "available_s": a, "frame_s": INSTANTS, "held_list": held_lists(a)}
             for (log, name), a in zip(of, issued_s, strict=True)
         ]
-        _write(path / "instants.parquet", instants, _INSTANTS)
+        _write(path / "instants.parquet", instants)
     if lists:
-        _write(path / "lists.parquet", lists, _LISTS)
+        _write(path / "lists.parquet", lists)
     if steps is not None:
-        _write(path / "thresholds.parquet", steps, _THRESHOLDS)
+        _write(path / "thresholds.parquet", steps)
     return path
 
 
-def _write(path: Path, rows: Sequence[Row], columns: dict[str, pa.DataType]) -> None:
-    table = {name: pa.array([r.get(name) for r in rows], kind) for name, kind in columns.items()}
-    parquet.write_table(pa.table(table), path)
+def _write(path: Path, rows: Sequence[Row], *asked: str) -> None:
+    """The columns that comparisons read."""
+    kinds = TABLES[path.name].kinds(*asked, compared=True)
+    parquet.write_table(pa.table({n: pa.array([r.get(n) for r in rows], _TYPES[k]) for n, k in kinds.items()}), path)

@@ -17,11 +17,10 @@ from copem_replay.core.errors import InputError
 from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.metric import RowMetric
 from copem_replay.metrics.summary import format_summary, summarise_rows
-from copem_replay.metrics.summary_metrics import METRICS, PARTS
+from copem_replay.metrics.summary_metrics import COMPARED, METRICS, PARTS
 from copem_replay.report.html.page import build_page
 from copem_replay.report.html.study import load_study
-from copem_replay.results.compare.metrics import LIKE
-from copem_replay.results.compare.metrics import METRICS as COMPARED
+from copem_replay.results.compare.metrics import FIGURES
 from tests.experiment.test_validate import without_logs
 from tests.helpers import experiments
 from tests.helpers.report_pages import Page, changed, replayed
@@ -166,7 +165,10 @@ def test_every_metric_is_said_once_and_in_the_docs() -> None:
         assert metric.name in said or any(one.fullmatch(metric.name) for one in starred), metric.name
 
 
-def test_what_is_compared_has_words_and_a_better_direction() -> None:
-    compared = {metric.name: metric.better for metric in METRICS if metric.compared}
-    assert {LIKE.get(name, name) for name in COMPARED} == set(compared)
-    assert all(better == compared[LIKE.get(name, name)] != 0 for name, better in COMPARED.items())
+def test_what_is_compared_has_words_a_figure_and_a_better_direction() -> None:
+    for metric in COMPARED.values():
+        assert metric.compared is not None
+        assert metric.better != 0
+        assert metric.compared.words
+        assert metric.header, metric.name
+        assert callable(metric.compared.figure) or metric.compared.figure in FIGURES

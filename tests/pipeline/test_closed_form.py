@@ -18,7 +18,6 @@ from typing import Any
 import mpmath
 import numpy as np
 import pandas as pd
-import pyarrow as pa
 import pytest
 import scipy.stats
 from hypothesis import HealthCheck, assume, given, settings
@@ -41,6 +40,7 @@ from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_i
 from copem_replay.pipeline.closed_form import compute_distributions, exact_table
 from copem_replay.pipeline.prepare import Replay, prepare_log
 from copem_replay.pipeline.run import ExperimentResult, run_experiment
+from copem_replay.results.schema import TABLES
 from tests.helpers.experiments import changed, drive, source_of
 from tests.helpers.replays import transmitted
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
@@ -1017,16 +1017,7 @@ def test_the_file(
     monkeypatch.setattr("sys.argv", ["copem-replay", "run", "e.yaml"])
     assert cli._run_to_exit_code() == 0, capsys.readouterr().err
     table = parquet.read_table(tmp_path / "out" / "e" / "exact.parquet")
-    number, text = pa.float64(), pa.string()
-    columns = {
-        "log": text, "configuration": text, "object_id": text, "object_class": text,
-        "episode": pa.int64(), "onset_s": number, "began": text,
-        "detection_s": number, "probability": number, "incidence": number, "time_to_detection_s": number,
-        "distance_at_detection_m": number, "gap_at_detection_m": number, "ended_s": number, "ended_by": text,
-        "miss_log10": number, "miss_per_logit": number, "miss_log10_half_odds": number,
-    }  # fmt: skip
-    more = {"conflict": pa.bool_(), "pass_probability": number, "fail_probability": number} if braking else {}
-    assert {f.name: f.type for f in table.schema} == columns | more
+    assert {*table.column_names} == {*TABLES["exact.parquet"].kinds(*["braking"] * braking)}
     rows = table.to_pylist()
     # From 1 s on, when the car is 60 m away, to 3 s; the lists of coPEM half a second later.
     assert [sum(r["configuration"] == name for r in rows) for name in ("GT", "PEM", "coPEM")] == [22, 22, 17]

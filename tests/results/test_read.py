@@ -35,7 +35,7 @@ def test_files_are_read_when_they_are_asked_for(folder: Path) -> None:
     assert found.rows_of("a")["detections.parquet"]["detection_s"].to_pylist() == [1.0, 2.0]
     assert found.source.data == {"version": 1, "ego": None}
     with pytest.raises(InputError, match=r"experiment\.yaml:1: logs: missing"):
-        _ = found.table
+        _ = found.experiment
     with pytest.raises(InputError, match=r"found no summary\.csv in it"):
         read_results(folder)
 

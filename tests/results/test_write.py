@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
 import pytest
 from mcap.reader import make_reader
 from pyarrow import parquet
@@ -26,6 +25,7 @@ from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.run import ExperimentResult, run_experiment
 from copem_replay.pipeline.tables import PartTables, StudyTables, tabulate_rows
 from copem_replay.results import write as result_tables
+from copem_replay.results.schema import COMPARED_FILES, TABLES
 from copem_replay.results.write import Exporter, RunToExport, write_results
 from copem_replay.viewer.rrd import EXPORTERS
 from tests.helpers import scenes
@@ -33,55 +33,7 @@ from tests.helpers.experiments import changed, drive
 from tests.helpers.recordings import Obj, write_recording
 from tests.helpers.scenes import experiment
 
-COLUMNS = {
-    "log": pa.string(),
-    "configuration": pa.string(),
-    "run": pa.int64(),
-    "object_id": pa.string(),
-    "object_class": pa.string(),
-    "episode": pa.int64(),
-    "onset_s": pa.float64(),
-    "began": pa.string(),
-    "detected": pa.bool_(),
-    "detection_s": pa.float64(),
-    "captured_s": pa.float64(),
-    "in_sight_s": pa.float64(),
-    "time_to_detection_s": pa.float64(),
-    "distance_at_detection_m": pa.float64(),
-    "gap_at_detection_m": pa.float64(),
-    "ended_s": pa.float64(),
-    "ended_by": pa.string(),
-    "first_unit": pa.string(),
-}
-ACCURACY = {
-    "matched_lists": pa.int64(),
-    "unplaced_lists": pa.int64(),
-    "position_rmse_m": pa.float64(),
-    "position_rmse_captured_m": pa.float64(),
-    "bias_east_m": pa.float64(),
-    "bias_north_m": pa.float64(),
-    "velocity_rmse_mps": pa.float64(),
-    "nees": pa.float64(),
-    "age_of_information_s": pa.float64(),
-    "identity_switches": pa.float64(),
-    "duplicates": pa.int64(),
-    "longest_gap_s": pa.float64(),
-}
-SUMMARY = [
-    "configuration", "n", "list_rate_hz", "detected_share", "detected_share_low", "detected_share_high", "interval",
-    "interval_over", "interval_clusters",
-    "ttd_p5_s", "ttd_median_s", "ttd_p95_s", "ttd_rmst_s", "ttd_rmst_horizon_s", "unknown_s",
-    "left_undetected_share", "open_share", "dad_median_m", "dad_p5_m",
-]  # fmt: skip
-FIGURES = [
-    "position_rmse_m", "position_rmse_captured_m", "bias_east_m", "bias_north_m", "velocity_rmse_mps",
-    "age_of_information_s",
-    "gospa_m", "gospa_localisation_m", "gospa_missed_m", "gospa_false_m", "ospa_m", "false_positives_per_min",
-    "stale_false_positives_per_min", "duplicates_per_min", "nees", "nees_expected", "nees_low", "nees_high",
-    "beyond_gate_share",
-    "existence_ece", "identity_switches", "longest_gap_s",
-]  # fmt: skip
-TABLES = {"accuracy.parquet", "instants.parquet", "lists.parquet", "thresholds.parquet", "bands.csv"}
+OF_ACCURACY = {*COMPARED_FILES, "bands.csv"}
 
 
 def plan(**changes: Any) -> Experiment:
@@ -111,11 +63,11 @@ def test_the_folder_of_several_logs(two_logs: list[Path], tmp_path: Path) -> Non
     names = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
     assert names == {
         "experiment.yaml", "provenance.json", "detections.parquet", "tally.parquet", "logs.csv", "summary.csv",
-        "replay/near/drive.mcap", "replay/near/drive.rrd", "replay/far/drive.mcap", "replay/far/drive.rrd", *TABLES,
+        "replay/near/drive.mcap", "replay/near/drive.rrd", "replay/far/drive.mcap", "replay/far/drive.rrd",
+        *OF_ACCURACY,
     }  # fmt: skip
     table = parquet.read_table(folder / "detections.parquet")
-    assert {f.name: f.type for f in table.schema} == COLUMNS | ACCURACY
-    assert table.column_names == [*COLUMNS, *ACCURACY]
+    assert table.column_names == list(TABLES["detections.parquet"].kinds("accuracy"))
     rows = table.to_pylist()
     assert len(rows) == 2 * 2 * 3, "logs × configurations × runs, one measured object each"
     assert [(r["log"], r["configuration"], r["run"]) for r in rows] == [
@@ -131,7 +83,7 @@ def test_the_folder_of_several_logs(two_logs: list[Path], tmp_path: Path) -> Non
         assert left[name] is None, f"{name}: what does not exist is null"
     with (folder / "summary.csv").open(newline="") as file:
         summary = list(csv.DictReader(file))
-    assert list(summary[0]) == SUMMARY + FIGURES
+    assert list(summary[0]) == list(TABLES["summary.csv"].kinds("accuracy"))
     assert [(s["configuration"], s["n"], s["detected_share"]) for s in summary] == [
         ("GT", "6", "1"),
         ("PEM", "6", "0.5"),
@@ -151,8 +103,8 @@ def test_without_accuracy_nothing_tells_of_it(two_logs: list[Path], tmp_path: Pa
     assert {path.name for path in folder.iterdir()} == {
         "experiment.yaml", "provenance.json", "detections.parquet", "tally.parquet", "logs.csv", "summary.csv",
     }  # fmt: skip
-    assert parquet.read_table(folder / "detections.parquet").column_names == list(COLUMNS)
-    assert list(pd.read_csv(folder / "summary.csv")) == SUMMARY
+    assert parquet.read_table(folder / "detections.parquet").column_names == list(TABLES["detections.parquet"].kinds())
+    assert list(pd.read_csv(folder / "summary.csv")) == list(TABLES["summary.csv"].kinds())
 
 
 NOISY = [

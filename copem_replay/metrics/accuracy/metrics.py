@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from copem_replay.metrics.metric import Metric
+from copem_replay.metrics.metric import Compared, Metric, compared_metric
 
 if TYPE_CHECKING:
     from copem_replay.metrics.accuracy.statistics import AccuracyTotal
@@ -151,35 +151,44 @@ def existence_ece(total: AccuracyTotal) -> float | None:
 
 _TOTAL = attrgetter("accuracy")
 """The statistics of all metrics here; None where the experiment does not ask for accuracy."""
+_HELD = ("accuracy.parquet", "instants.parquet")
 
 ACCURACY = (
     Metric("position_rmse_m", _TOTAL, position_rmse_m, -1,
            "root mean square error of positions against the truth when the list is available", "accuracy",
-           "position error of what is held at the frames of the truth, where both list the object"),
+           "position error (RMSE), m"),
     Metric("position_rmse_captured_m", _TOTAL, position_rmse_captured_m, -1,
-           "the same at the instant the entry tells of", "accuracy"),
+           "the same at the instant the entry tells of", "accuracy", "position error at capture (RMSE), m"),
     Metric("bias_east_m", _TOTAL, bias_east_m, 0, "mean easting error, entry minus truth"),
     Metric("bias_north_m", _TOTAL, bias_north_m, 0, "mean northing error, entry minus truth"),
-    Metric("velocity_rmse_mps", _TOTAL, velocity_rmse_mps, -1, "root mean square error of velocities", "accuracy"),
+    Metric("velocity_rmse_mps", _TOTAL, velocity_rmse_mps, -1, "root mean square error of velocities", "accuracy",
+           "velocity error (RMSE), m/s"),
     Metric("age_of_information_s", _TOTAL, age_of_information_s, -1,
-           "how old entries are: available minus captured, mean", "accuracy"),
+           "how old entries are: available minus captured, mean", "accuracy", "age of information, s"),
+    compared_metric("position_rmse_held_m", -1, "lists", "error of what is held (RMSE), m",
+                    Compared("position error of what is held at the frames of the truth, where both list the object",
+                             "held errors", _HELD)),
     Metric("gospa_m", _TOTAL, gospa_m, -1,
-           "GOSPA of the lists: position errors, misses and false entries in one number", "lists",
-           "GOSPA of what is held at the frames of the truth"),
+           "GOSPA of the lists: position errors, misses and false entries in one number", "lists", "GOSPA, m"),
+    compared_metric("gospa_held_m", -1, "lists", "GOSPA of what is held, m",
+                    Compared("GOSPA of what is held at the frames of the truth", "held GOSPA", _HELD)),
     Metric("gospa_localisation_m", _TOTAL, gospa_localisation_m, -1, "part of GOSPA from position errors of pairs"),
     Metric("gospa_missed_m", _TOTAL, gospa_missed_m, -1, "part of GOSPA from missed objects"),
     Metric("gospa_false_m", _TOTAL, gospa_false_m, -1, "part of GOSPA from false entries"),
     Metric("ospa_m", _TOTAL, ospa_m, -1, "OSPA of the lists, mean"),
     Metric("false_positives_per_min", _TOTAL, false_positives_per_min, -1,
-           "entries at no object, per minute of log", "lists", "entries at no object, per minute"),
+           "entries at no object, per minute of log", "lists", "false positives per minute",
+           Compared("entries at no object, per minute", "ghosts", ("lists.parquet",))),
     Metric("stale_false_positives_per_min", _TOTAL, stale_false_positives_per_min, -1,
-           "false positives that were at an object at the instant they tell of, per minute", "lists"),
+           "false positives that were at an object at the instant they tell of, per minute", "lists",
+           "stale ones of these per minute"),
     Metric("duplicates_per_min", _TOTAL, duplicates_per_min, -1,
            "second entries at an object, per minute of log", "lists"),
     Metric("nees", _TOTAL, mean_nees, 0,
-           "squared error by claimed covariance: more than expected where covariances are too small", "accuracy"),
+           "squared error by claimed covariance: more than expected where covariances are too small", "accuracy",
+           "NEES"),
     Metric("nees_expected", _TOTAL, nees_expected, 0,
-           "nees if covariances are true: 2, minus what the gate cuts off", "accuracy"),
+           "nees if covariances are true: 2, minus what the gate cuts off", "accuracy", "NEES expected"),
     Metric("nees_low", _TOTAL, nees_low, 0, "lower limit of nees if covariances are true, 95 %"),
     Metric("nees_high", _TOTAL, nees_high, 0, "upper limit of nees if covariances are true, 95 %"),
     Metric("beyond_gate_share", _TOTAL, beyond_gate_share, 0,
@@ -190,4 +199,4 @@ ACCURACY = (
     Metric("longest_gap_s", _TOTAL, longest_gap_s, -1,
            "longest time for which an object is unknown after its onset, mean", "lists"),
 )  # fmt: skip
-"""The columns, in their order."""
+"""The metrics, in the order of their columns."""

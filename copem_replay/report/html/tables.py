@@ -16,8 +16,8 @@ import pandas as pd
 from copem_replay.core.errors import count_noun
 from copem_replay.metrics.intervals import NOT_ENOUGH
 from copem_replay.metrics.metric import RowMetric, own_metrics
-from copem_replay.metrics.summary import describe_intervals, format_cell, has_undetected
-from copem_replay.metrics.summary_metrics import METRIC, METRICS, PARTS
+from copem_replay.metrics.summary import SETUP, describe_intervals, format_cell, has_undetected
+from copem_replay.metrics.summary_metrics import COMPARED, METRIC, METRICS, PARTS
 from copem_replay.metrics.survival import EndReason
 from copem_replay.report.figures.differences import excludes_0
 from copem_replay.report.figures.latency_breakdown import STAGES, count_detected, mean_stages_by_configuration
@@ -32,8 +32,6 @@ from copem_replay.report.html.markup import (
     make_table,
     make_tag,
 )
-from copem_replay.results.compare.metrics import LIKE, OF_PAIRS
-from copem_replay.results.compare.metrics import METRICS as COMPARED
 from copem_replay.results.compare.tables import NOTHING, comparison_lines, explain_no_interval, held_cells
 
 if TYPE_CHECKING:
@@ -43,47 +41,12 @@ if TYPE_CHECKING:
 
 # Headers of columns and formats of their values: three significant digits, shares in per cent.
 
-_HEADERS = {
-    "n": "rows",
-    "list_rate_hz": "fused lists per second",
-    "detected_share": "detected, %",
-    "ttd_median_s": "median time to detection, s",
-    "ttd_p95_s": "95 % detected by, s",
-    "ttd_rmst_s": "mean time to detection, s",
-    "ttd_both_s": "mean time where both detect, s",
-    "unknown_s": "mean time unknown, s",
-    "left_undetected_share": "left undetected, %",
-    "open_share": "undetected at the end, %",
-    "ttd_rmst_s_equal_ghosts": "mean time at equal false positives, s",
-    "dad_median_m": "median distance at detection, m",
-    "dad_p5_m": "95 % detected beyond, m",
-    "conflict_detected_share": "collision foreseen, %",
-    "conflict_ttd_median_s": "median time until foreseen, s",
-    "conflict_ttd_p95_s": "95 % foreseen by, s",
-    "conflict_ttd_rmst_s": "mean time until foreseen, s",
-    "conflict_dad_median_m": "median distance when foreseen, m",
-    "n_conflict": "rows in conflict",
-    "pass_share": "passes, %",
-    "pass_share_exact": "passes without a draw, %",
-    "position_rmse_m": "position error (RMSE), m",
-    "position_rmse_captured_m": "position error at capture (RMSE), m",
-    "velocity_rmse_mps": "velocity error (RMSE), m/s",
-    "age_of_information_s": "age of information, s",
-    "nees": "NEES",
-    "nees_expected": "NEES expected",
-    "gospa_m": "GOSPA, m",
-    "position_rmse_held_m": "error of what is held (RMSE), m",
-    "gospa_held_m": "GOSPA of what is held, m",
-    "false_positives_per_min": "false positives per minute",
-    "stale_false_positives_per_min": "stale ones of these per minute",
-    "duplicates_per_min": "duplicates per minute",
-    "longest_gap_s": "longest gap, s",
-}
+_HEADERS = {name: metric.header for name, metric in (METRIC | COMPARED).items() if metric.header}
 _UNITS = {
     "_per_min": " per minute", "_share": ", %", "_mps2": ", m/s²", "_mps": ", m/s", "_deg": ", °", "_hz": ", Hz",
     "_m": ", m", "_s": ", s",
 }  # fmt: skip
-"""Units by ends of names, for columns without an entry in `_HEADERS`."""
+"""Units by ends of names, for columns without a header of their own."""
 FIRST = ("ttd_rmst_s", "ttd_median_s", "ttd_p95_s", "detected_share")
 """First columns of a table, which a narrow screen shows without scrolling."""
 
@@ -140,8 +103,6 @@ def format_signed_difference(name: str, value: float) -> str:
 _INTERVALS = {"detected_share": "interval", "pass_share": "pass_interval"}
 """Columns with limits, and the columns that name their kind of interval."""
 _COUNTS = {"n": ("row", "rows"), "n_conflict": ("row in conflict", "rows in conflict")}
-_ONCE = (*_COUNTS, "list_rate_hz")
-"""Columns that become a sentence below the table if all rows have one value."""
 
 
 @dataclass(frozen=True)
@@ -168,7 +129,7 @@ def summary_tables(study: ReportData) -> Html:
         if part.id == "undetected" and not has_undetected(rows):
             continue
         present = {name: says for name, says in part.columns.items() if name in rows and rows[name].notna().any()}
-        once = [name for name in present if name in _ONCE and rows[name].nunique(dropna=False) == 1]
+        once = [name for name in present if name in SETUP and rows[name].nunique(dropna=False) == 1]
         columns = {name: present[name] for name in sort_columns(list(present)) if name not in once}
         shown = part.id != "braking" or "pass_share" in columns
         if columns and shown:
@@ -260,13 +221,6 @@ def _column_meanings(columns: Iterable[tuple[str, str]], names: Any = column_hea
     return make_tag("dl", *terms)
 
 
-_WORDS = {name: METRIC[LIKE.get(name, name)].compared for name in COMPARED} | OF_PAIRS
-
-
-_LISTS = ("position_rmse_held_m", "gospa_held_m", "false_positives_per_min")
-"""Metrics of lists, whose differences have a table of their own so that both fit on a page."""
-
-
 def regret_table(study: ReportData) -> Html:
     """Each configuration minus the baseline, as in `copem-replay compare`; or why there are no differences."""
     regret = study.regret
@@ -275,11 +229,12 @@ def regret_table(study: ReportData) -> Html:
         return make_tag("p", f"No differences: {reason}.")
     rows = {(row.configuration, row.metric): row for row in regret.overall.itertuples(index=False)}
     metrics = sort_columns([m for m in COMPARED if any((name, m) in rows for name in regret.configurations)])
-    words = [(m, f"{_WORDS[m]}; {'more' if COMPARED[m] > 0 else 'less'} is better") for m in metrics]
+    words = [(m, f"{of.words}; {'more' if COMPARED[m].better > 0 else 'less'} is better") for m in metrics
+             if (of := COMPARED[m].compared)]  # fmt: skip
     tables = []
     for id_, suffix, columns in (
-        ("regret", "", [m for m in metrics if m not in _LISTS]),
-        ("regret-lists", ", of the lists", [m for m in metrics if m in _LISTS]),
+        ("regret", "", [m for m in metrics if COMPARED[m].part != "lists"]),
+        ("regret-lists", ", of the lists", [m for m in metrics if COMPARED[m].part == "lists"]),
     ):
         lines = [
             make_tag(

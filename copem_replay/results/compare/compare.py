@@ -19,6 +19,7 @@ import pandas as pd
 from copem_replay.core.errors import InputError, count_noun
 from copem_replay.core.tracks import SAME_INSTANT_S
 from copem_replay.metrics.intervals import FEWEST_CLUSTERS, FEWEST_LOGS, NOT_ENOUGH, choose_over, explain_no_clusters
+from copem_replay.metrics.summary_metrics import COMPARED
 from copem_replay.results.compare.labels import (
     LabelledConfiguration,
     check_log_names,
@@ -38,7 +39,6 @@ from copem_replay.results.compare.limits import (
     mcnemar_p_value,
 )
 from copem_replay.results.compare.metrics import (
-    METRICS,
     GhostTotals,
     PairSettings,
     Regret,
@@ -55,7 +55,7 @@ from copem_replay.results.compare.pairing import (
     lay_out_configuration,
 )
 from copem_replay.results.read import Results, open_results
-from copem_replay.results.schema import AGAIN, OPTIONAL
+from copem_replay.results.schema import AGAIN, COMPARED_FILES
 
 # The sums of a pair over its logs.
 
@@ -93,7 +93,7 @@ class AllLogs:
 
     def count_better(self, metric: str) -> int:
         """The number of logs whose own difference is for the better."""
-        return sum(METRICS[metric] * difference > 0 for difference in self.differences.get(metric, ()))
+        return sum(COMPARED[metric].better * difference > 0 for difference in self.differences.get(metric, ()))
 
     def regrets(self) -> Iterator[Regret]:
         """The regret of every metric over all logs."""
@@ -136,23 +136,17 @@ def _read_folder(folder: Path | Results) -> Results:
 
 # Notes on a comparison: what is left out, and why.
 
-_NEEDED = {
-    "position_rmse_held_m": {"accuracy.parquet", "instants.parquet"},
-    "gospa_held_m": {"accuracy.parquet", "instants.parquet"},
-    "false_positives_per_min": {"lists.parquet"},
-    "ttd_rmst_s_equal_ghosts": {"lists.parquet", "thresholds.parquet"},
-}
-
 
 def notes_on_folders(folders: Sequence[Results]) -> Iterator[str]:
     """Notes on folders that have other numbers of runs, or lack tables or braking."""
     runs = {str(folder.folder): folder.provenance.runs for folder in folders}
+    of_lists_first = sorted(COMPARED.values(), key=lambda metric: metric.part != "lists")
     if len(set(runs.values())) > 1:
         has = ", ".join(f"{path} {count}" for path, count in runs.items())
         yield f"other numbers of runs ({has}): the first {min(runs.values())} are compared"
     for folder in folders:
-        missing = [name for name in OPTIONAL if name not in folder.by_log]
-        metrics = [metric for metric, files in _NEEDED.items() if files & set(missing)]
+        missing = [name for name in COMPARED_FILES if name not in folder.by_log]
+        metrics = [m.name for m in of_lists_first if m.compared and {*m.compared.files} & {*missing}]
         if metrics:
             yield (
                 f"{folder.folder}: no {', '.join(missing)} (without accuracy, or of "

@@ -23,8 +23,8 @@ other, as between two points of a ROC curve. Intervals keep the thresholds and t
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from functools import reduce
+from dataclasses import dataclass, fields
+from functools import cached_property, reduce
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import Bool, Float, Int
 from copem_replay.metrics.intervals import choose_over
-from copem_replay.metrics.summary_metrics import METRIC, compute_unknown_s
+from copem_replay.metrics.summary_metrics import COMPARED
 from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT
 from copem_replay.results.compare.labels import LabelledConfiguration
 from copem_replay.results.compare.limits import (
@@ -45,6 +45,7 @@ from copem_replay.results.compare.limits import (
 )
 from copem_replay.results.compare.pairing import (
     ConfigurationData,
+    PairedHeldSums,
     PairingGrid,
     StepData,
     configuration_rows,
@@ -206,25 +207,6 @@ def notes_on_equal_ghosts(reasons: Mapping[str, str | None]) -> Iterator[str]:
         yield f"{labels}: no ttd_rmst_s_equal_ghosts: {reason}"
 
 
-LIKE = {
-    "ttd_both_s": "ttd_rmst_s",
-    "ttd_rmst_s_equal_ghosts": "ttd_rmst_s",
-    "position_rmse_held_m": "position_rmse_m",
-    "gospa_held_m": "gospa_m",
-}
-"""Metrics that the summary does not have, and those of it that they are like."""
-OF_PAIRS = {
-    "ttd_both_s": "mean time to detection over the rows that both detect; beside it those that one alone detects",
-    "ttd_rmst_s_equal_ghosts": "the same at as many false positives per minute as the baseline has",
-}
-"""Words of metrics that are not those of the one they are like."""
-METRICS = {name: METRIC[LIKE.get(name, name)].better for name in (
-    "detected_share", "ttd_rmst_s", "ttd_both_s", "unknown_s", "ttd_rmst_s_equal_ghosts", "dad_median_m",
-    "position_rmse_held_m", "gospa_held_m", "false_positives_per_min", "pass_share",
-)}  # fmt: skip
-"""All metrics, and whether more (1) or less (−1) is better."""
-
-
 @dataclass(frozen=True)
 class PairSettings:
     """Parameters of a pair: the horizon, the power of GOSPA, and the operating points of both sides."""
@@ -264,16 +246,16 @@ class HeldCounts:
 
 @dataclass(frozen=True)
 class Regret:
-    """A metric of a pair; `kept`: operating points of the first and the second, for times at equal ghosts.
+    """A metric of a pair; `objects`: by log the number of objects of which both sides have rows.
 
-    `held`: beside figures of what both hold. `objects`: by log the number of objects of which both sides have rows.
+    `kept`: operating points of the first and the second, for times at equal ghosts. `held`: beside what both hold.
     """
 
     metric: str
     figure: PairStatistic
+    objects: tuple[int, ...]
     kept: tuple[OperatingPoint, OperatingPoint] | None = None
     held: HeldCounts | None = None
-    objects: tuple[int, ...] = ()
 
     @property
     def over(self) -> str | None:
@@ -283,13 +265,14 @@ class Regret:
     @staticmethod
     def joined(of_logs: Sequence[Regret]) -> Regret:
         """The same metric over several logs."""
-        figures, counts = (
-            [labelled.figure for labelled in of_logs],
-            [labelled.held for labelled in of_logs if labelled.held is not None],
+        figures, held = [regret.figure for regret in of_logs], [r.held for r in of_logs if r.held is not None]
+        return Regret(
+            of_logs[0].metric,
+            type(figures[0]).joined(figures),
+            tuple(number for regret in of_logs for number in regret.objects),
+            of_logs[0].kept,
+            reduce(HeldCounts.__add__, held) if held else None,
         )
-        held = reduce(HeldCounts.__add__, counts) if counts else None
-        objects = tuple(number for labelled in of_logs for number in labelled.objects)
-        return replace(of_logs[0], figure=type(figures[0]).joined(figures), held=held, objects=objects)
 
 
 @dataclass(frozen=True)
@@ -306,11 +289,22 @@ class _Pair:
     def sides(self) -> tuple[ConfigurationData, ConfigurationData]:
         return self.first, self.second
 
-    @property
-    def runs(self) -> Int:
-        """(C,) the run of each cell."""
-        runs: Int = self.cells % self.grid.runs
-        return runs
+    @cached_property
+    def held(self) -> PairedHeldSums | None:
+        """What both hold; None: a side has no accuracy."""
+        if self.first.accuracy is None or self.second.accuracy is None:
+            return None
+        return pair_held_lists(self.first.accuracy, self.second.accuracy, self.grid, self.cells)
+
+    @cached_property
+    def held_counts(self) -> HeldCounts | None:
+        """What is said beside figures of what both hold."""
+        if self.held is None:
+            return None
+        without_truth = [0 if side.ghosts is None else int(side.ghosts.without_truth.sum()) for side in self.sides]
+        both, pairs = self.held, int(self.held.pairs.sum())
+        frames, without = int(both.frames.sum()), np.array(without_truth)
+        return HeldCounts(frames, pairs, both.only, both.age_s, both.without_list, without)
 
     def items(self, cells: Int, **columns: NDArray[Any]) -> StatisticItems:
         """An item for each of `cells`; −1 − r stands for run r and no object."""
@@ -328,32 +322,51 @@ def compute_regrets(
     setting: PairSettings,
     only: Sequence[str] | None = None,
 ) -> Iterator[Regret]:
-    """The metrics of a log, all or `only` some, for which both sides have the data."""
-    for names, compute in _METRICS.items():
-        there = first.there & second.there if compute in _OF_ALL else first.counted & second.counted
+    """The metrics of a log, all or `only` some, for which both sides have the data.
+
+    Those of lists are over all rows that both sides have, the others over those that count.
+    """
+    pairs = []
+    for there in (first.there & second.there, first.counted & second.counted):
         pair = _Pair(first, second, grid, np.flatnonzero(there), setting)
-        objects = (len(np.unique(grid.object_of(pair.cells))),)
-        if only is None or not set(names).isdisjoint(only):
-            regrets = (regret for regret in compute(pair) if only is None or regret.metric in only)
-            yield from (replace(regret, objects=objects) for regret in regrets)
+        pairs.append((pair, (len(np.unique(grid.object_of(pair.cells))),)))
+    for metric in COMPARED.values():
+        of = metric.compared
+        if of is None or (only is not None and metric.name not in only):
+            continue
+        pair, objects = pairs[0 if metric.part == "lists" else 1]
+        figure = FIGURES[of.figure](pair) if isinstance(of.figure, str) else _means(pair, of.figure)
+        if figure is not None:
+            held = pair.held_counts if FIGURES.get(of.figure) in (_held_errors, _held_gospa) else None
+            kept = pair.setting.kept if FIGURES.get(of.figure) is _means_at_equal_ghosts else None
+            yield Regret(metric.name, figure, objects, kept, held)
 
 
-def _detection_regrets(pair: _Pair) -> Iterator[Regret]:
-    yield Regret(
-        "detected_share", _share_statistic(pair, pair.cells, *(side.detected[pair.cells] for side in pair.sides))
-    )
-    times = [((1.0, side.detection_s),) for side in pair.sides]
-    yield Regret("ttd_rmst_s", _restricted_means(pair, times))
-    yield Regret("ttd_both_s", _both_detected(pair))
-    unknown_s = [
-        compute_unknown_s(side.detection_s - side.onset_s, side.ended_s - side.onset_s)[pair.cells]
-        for side in pair.sides
-    ]
-    sums = np.stack([*unknown_s, np.ones(len(pair.cells))], axis=1)
-    yield Regret("unknown_s", SumStatistic(parts=(pair.items(pair.cells, sums=sums),), of=_divide_mean))
+def _means(pair: _Pair, values: Callable[[ConfigurationData], NDArray[Any]]) -> SumStatistic:
+    """Means of a value of rows; of true and false, shares."""
+    first, second = (values(side)[pair.cells] for side in pair.sides)
+    if first.dtype == bool:
+        return _shares(pair, pair.cells, first, second)
+    sums = np.stack([first, second, np.ones(len(pair.cells))], axis=1)
+    return SumStatistic(parts=(pair.items(pair.cells, sums=sums),), of=_divide_mean)
 
 
-def _both_detected(pair: _Pair) -> SumStatistic:
+def _shares(pair: _Pair, cells: Int, first: Bool, second: Bool) -> SumStatistic:
+    only = np.stack([first & ~second, second & ~first], axis=1).astype(np.int64)
+    sums = np.stack([first, second, np.ones(len(cells))], axis=1)
+    return SumStatistic(parts=(pair.items(cells, only=only, sums=sums),), of=_divide_mean, share=True)
+
+
+def _passes(pair: _Pair) -> SumStatistic | None:
+    """Shares of the rows in conflict that pass."""
+    first, second, cells = pair.first, pair.second, pair.cells
+    if first.conflict is None or second.conflict is None or first.passes is None or second.passes is None:
+        return None
+    judged = cells[first.conflict[cells] & second.conflict[cells]]
+    return _shares(pair, judged, first.passes[judged], second.passes[judged])
+
+
+def _means_where_both_detect(pair: _Pair) -> SumStatistic:
     """Mean times to detection of the cells that both sides detect; `only`: the cells that one side alone does."""
     first, second = (side.detected[pair.cells] for side in pair.sides)
     both = first & second
@@ -364,9 +377,9 @@ def _both_detected(pair: _Pair) -> SumStatistic:
     return SumStatistic(parts=(items,), of=_divide_mean, weighed_by=2)
 
 
-def _equal_ghosts_regrets(pair: _Pair) -> Iterator[Regret]:
+def _means_at_equal_ghosts(pair: _Pair) -> TimeStatistic | None:
     if pair.setting.kept is None:
-        return
+        return None
     times = []
     for side, kept in zip(pair.sides, pair.setting.kept, strict=True):
         parts = ((kept.share, kept.existence), (1.0 - kept.share, kept.above))
@@ -374,7 +387,7 @@ def _equal_ghosts_regrets(pair: _Pair) -> Iterator[Regret]:
         times.append(
             [(share, _detection_times_s(side.steps, limit, len(side.there))) for share, limit in parts if share > 0]
         )
-    yield Regret("ttd_rmst_s_equal_ghosts", _restricted_means(pair, times), pair.setting.kept)
+    return _restricted_means(pair, times)
 
 
 def _detection_times_s(steps: StepData, existence: float, cells: int) -> Float:
@@ -403,40 +416,38 @@ def _time_items(pair: _Pair, side: ConfigurationData, detection_s: Float) -> Sta
     return pair.items(cells, time_s=np.round(time_s, 9), ending=ending)
 
 
-def _distance_regrets(pair: _Pair) -> Iterator[Regret]:
+def _distances(pair: _Pair) -> MedianStatistic:
     first, second = (np.where(side.detected, side.distance_m, -np.inf)[pair.cells] for side in pair.sides)
     placed = ~np.isnan(first + second)  # NaN: detected during a gap of the truth, no distance to rank
-    items = pair.items(pair.cells[placed], first=first[placed], second=second[placed])
-    yield Regret("dad_median_m", MedianStatistic(parts=(items,)))
+    return MedianStatistic(parts=(pair.items(pair.cells[placed], first=first[placed], second=second[placed]),))
 
 
-def _held_regrets(pair: _Pair) -> Iterator[Regret]:
-    """Errors and GOSPA; frames belong to no object, so that their number stays where objects are clusters."""
-    if pair.first.accuracy is None or pair.second.accuracy is None:
-        return
-    both = pair_held_lists(pair.first.accuracy, pair.second.accuracy, pair.grid, pair.cells)
-    without_truth = [0 if side.ghosts is None else int(side.ghosts.without_truth.sum()) for side in pair.sides]
-    counts = HeldCounts(
-        int(both.frames.sum()), int(both.pairs.sum()), both.only, both.age_s, both.without_list, np.array(without_truth)
-    )
+def _held_errors(pair: _Pair) -> SumStatistic | None:
+    if (both := pair.held) is None:
+        return None
     paired = both.pairs > 0
     squares = np.concatenate([both.squared_m2, both.pairs[:, None]], axis=1)[paired]
-    errors = pair.items(pair.cells[paired], n=both.pairs[paired], sums=squares)
-    yield Regret("position_rmse_held_m", SumStatistic(parts=(errors,), of=_make_power_mean(2.0)), held=counts)
+    items = pair.items(pair.cells[paired], n=both.pairs[paired], sums=squares)
+    return SumStatistic(parts=(items,), of=_make_power_mean(2.0))
+
+
+def _held_gospa(pair: _Pair) -> SumStatistic | None:
+    """GOSPA of frames, which belong to no object, so that their number stays where objects are clusters."""
+    if (both := pair.held) is None:
+        return None
     measured = both.measured > 0
     parts = np.concatenate([both.gospa, np.zeros((len(pair.cells), 1))], axis=1)[measured]
     items = _append_run_items(pair, pair.cells[measured], parts, np.outer(both.frames, [0.0, 0.0, 1.0]), both.frames)
-    of_pairs = _make_power_mean(pair.setting.power)
-    yield Regret("gospa_held_m", SumStatistic(parts=(items,), of=of_pairs, weighed_by=2), held=counts)
+    return SumStatistic(parts=(items,), of=_make_power_mean(pair.setting.power), weighed_by=2)
 
 
-def _false_positive_regrets(pair: _Pair) -> Iterator[Regret]:
+def _ghost_rates(pair: _Pair) -> SumStatistic | None:
     """Ghosts per minute; those nearest to no measured object belong to their run only."""
     ghosts, other_ghosts = pair.first.ghosts, pair.second.ghosts
     if ghosts is None or other_ghosts is None:
-        return
-    present = ghosts.there & other_ghosts.there
-    cells, runs = pair.cells[present[pair.runs]], pair.runs[present[pair.runs]]
+        return None
+    present, runs = ghosts.there & other_ghosts.there, pair.cells % pair.grid.runs
+    cells, runs = pair.cells[present[runs]], runs[present[runs]]
     nearest = np.zeros((len(cells), 4))
     rest = np.stack([ghosts.count, other_ghosts.count, ghosts.minutes, other_ghosts.minutes], axis=1).astype(float)
     rest[~present] = 0.0
@@ -445,23 +456,7 @@ def _false_positive_regrets(pair: _Pair) -> Iterator[Regret]:
         nearest[:, k] = accuracy_of_side.ghosts[cells]
         rest[:, k] -= np.bincount(runs, nearest[:, k], minlength=len(rest))
     items = _append_run_items(pair, cells, nearest, rest, present.astype(np.int64))
-    rate = SumStatistic(parts=(items,), by_object=len(accuracy) == 2, of=_divide_rates, weighed_by=2)
-    yield Regret("false_positives_per_min", rate)
-
-
-def _braking_regrets(pair: _Pair) -> Iterator[Regret]:
-    first, second, cells = pair.first, pair.second, pair.cells
-    if first.conflict is not None and second.conflict is not None:
-        assert first.passes is not None
-        assert second.passes is not None
-        judged = cells[first.conflict[cells] & second.conflict[cells]]
-        yield Regret("pass_share", _share_statistic(pair, judged, first.passes[judged], second.passes[judged]))
-
-
-def _share_statistic(pair: _Pair, cells: Int, first: Bool, second: Bool) -> SumStatistic:
-    only = np.stack([first & ~second, second & ~first], axis=1).astype(np.int64)
-    sums = np.stack([first, second, np.ones(len(cells))], axis=1)
-    return SumStatistic(parts=(pair.items(cells, only=only, sums=sums),), of=_divide_mean, share=True)
+    return SumStatistic(parts=(items,), by_object=len(accuracy) == 2, of=_divide_rates, weighed_by=2)
 
 
 def _append_run_items(pair: _Pair, cells: Int, of_cells: Float, of_runs: Float, n: Int) -> StatisticItems:
@@ -487,14 +482,14 @@ def _divide_rates(sums: Float) -> tuple[Float, Float]:
     return sums[..., 0] / sums[..., 2], sums[..., 1] / sums[..., 3]
 
 
-_METRICS = {
-    ("detected_share", "ttd_rmst_s", "ttd_both_s", "unknown_s"): _detection_regrets,
-    ("ttd_rmst_s_equal_ghosts",): _equal_ghosts_regrets,
-    ("dad_median_m",): _distance_regrets,
-    ("position_rmse_held_m", "gospa_held_m"): _held_regrets,
-    ("false_positives_per_min",): _false_positive_regrets,
-    ("pass_share",): _braking_regrets,
+FIGURES: Mapping[Any, Callable[[_Pair], PairStatistic | None]] = {
+    "restricted means": lambda pair: _restricted_means(pair, [((1.0, side.detection_s),) for side in pair.sides]),
+    "means where both detect": _means_where_both_detect,
+    "restricted means at equal ghosts": _means_at_equal_ghosts,
+    "distances": _distances,
+    "held errors": _held_errors,
+    "held GOSPA": _held_gospa,
+    "ghosts": _ghost_rates,
+    "passes": _passes,
 }
-"""By metrics the function that computes them, in the order of a comparison."""
-_OF_ALL = (_held_regrets, _false_positive_regrets)
-"""Functions over all rows that both sides have, not those alone that count."""
+"""Figures of pairs by the names that metrics compared by them give; None: a side has no data."""

@@ -22,7 +22,7 @@ from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int
 from copem_replay.metrics.onset import COUNTS_BY, is_counted
 from copem_replay.metrics.survival import COMPETES
 from copem_replay.results.compare.labels import LabelledConfiguration
-from copem_replay.results.schema import AGAIN, HELD
+from copem_replay.results.schema import AGAIN, TABLES
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -255,10 +255,11 @@ def _accuracy_data(folder: Path, tables: dict[str, pa.Table], cell: Int, grid: P
     rows, place = tables["accuracy.parquet"], folder / "accuracy.parquet"
     if not np.array_equal(grid.cells(rows), cell):
         raise InputError(f"{place}: expected the rows of detections.parquet, found others; {AGAIN}")
-    columns = {name: list_column(rows[name]) for name in HELD}
+    kinds = TABLES["accuracy.parquet"].kinds(compared=True)
+    columns = {name: list_column(rows[name]) for name, kind in kinds.items() if kind == "lists of numbers"}
     length = columns["error_held_m"][0]
     if any(not np.array_equal(length, of) for of, _ in columns.values()):
-        raise InputError(f"{place}: expected {', '.join(HELD)} of equal length, found others; {AGAIN}")
+        raise InputError(f"{place}: expected {', '.join(columns)} of equal length, found others; {AGAIN}")
     frame_s, begins, holds, of_run = _read_frames(folder / "instants.parquet", tables["instants.parquet"], grid)
     first, size = integer_column(rows["first_frame"]), len(grid.episodes) * grid.runs
     kept = cell >= 0

@@ -13,15 +13,15 @@ from copem_replay.core.errors import OutputError, escape_unprintable, wrap_line
 from copem_replay.core.files import atomic_file
 from copem_replay.metrics.intervals import ALL_ALIKE, EXACT, NOTHING_DRAWN, describe_absent, describe_clusters
 from copem_replay.metrics.summary import describe_mean, format_table
-from copem_replay.results.compare.metrics import METRICS
+from copem_replay.metrics.summary_metrics import COMPARED
 from copem_replay.results.folder import add_to_made_list
+from copem_replay.results.schema import TABLES
 
 if TYPE_CHECKING:
     from copem_replay.results.compare.compare import Comparison
 
 
 _SUFFIXES = (".csv", ".md")
-_RESULTS = ("summary.csv", "sweep.csv", "bands.csv")
 NOTHING = 1e-9
 """Differences closer to 0 are 0: far below what any of the metrics resolves."""
 APART = "*"
@@ -58,7 +58,7 @@ def check_out(path: Path) -> None:
     """Raise OutputError where the file's name has another suffix, or is that of a table of results."""
     if path.suffix.lower() not in _SUFFIXES:
         raise OutputError(f"{path}: expected a name that ends with {' or '.join(_SUFFIXES)}, found {path.name}")
-    if path.name in _RESULTS and (path.parent / "provenance.json").exists():
+    if path.name in TABLES and (path.parent / "provenance.json").exists():
         raise OutputError(f"{path}: expected another name, found that of a table of the results in that folder")
 
 
@@ -81,7 +81,7 @@ def write_comparison(comparison: Comparison, path: Path, folders: Sequence[Path]
 
 def _format_cells(comparison: Comparison) -> pd.DataFrame:
     rows = {(row.configuration, row.metric): row for row in comparison.overall.itertuples(index=False)}
-    metrics = [metric for metric in METRICS if any((name, metric) in rows for name in comparison.configurations)]
+    metrics = [metric for metric in COMPARED if any((name, metric) in rows for name in comparison.configurations)]
     columns: dict[str, list[str]] = {"configuration": list(comparison.configurations)}
     for metric in metrics:
         columns[metric] = [_format_cell(rows.get((name, metric))) for name in comparison.configurations]
@@ -164,9 +164,9 @@ def comparison_lines(comparison: Comparison) -> Iterator[str]:
 def _describe_better(comparison: Comparison) -> Iterator[str]:
     """Lines on the configurations that are better than the baseline; metrics with the same ones share a line."""
     metrics: dict[str, list[str]] = {}
-    for metric, better in METRICS.items():
+    for metric, row in COMPARED.items():
         of_metric = comparison.overall[comparison.overall["metric"] == metric]
-        beyond = of_metric["low"] > NOTHING if better > 0 else of_metric["high"] < -NOTHING
+        beyond = of_metric["low"] > NOTHING if row.better > 0 else of_metric["high"] < -NOTHING
         if beyond.any():
             names = ", ".join(map(_name_with_logs, of_metric[beyond].itertuples(index=False)))
             metrics.setdefault(names, []).append(metric)
