@@ -171,10 +171,11 @@ def _write_results(
 
 def _print_baseline(experiment: Experiment) -> None:
     """Print which configuration `compare` and `report` hold the others against."""
+    from copem_replay.pipeline.expansion import find_facts
     from copem_replay.results.compare.labels import find_baseline
 
     if len(names := list(experiment.configurations)) > 1:
-        baseline = find_baseline(experiment.as_written(), names)
+        baseline = find_baseline(find_facts(experiment), names)
         print_line(f"baseline of compare and report: {baseline.name}, {baseline.why}")
 
 

@@ -8,7 +8,7 @@ once objects of one log hang together by `WITHIN_LOG`, nor than the spread betwe
 *Any other figure*: value ± t·√V, from the figure without each cluster (`limit_figure`), at most `MOST_GROUPS` times.
 *Quantile*: all values at which the limits of the share at or below them hold the quantile's level (`limit_quantile`).
 *Nothing drawn*: where no random number is behind a result it is equal in every run, and an interval over runs tells
-nothing (`find_fixed_outcomes`).
+nothing.
 
 Limits are at 95 %. What they hold, and what not: tools/coverage.py, docs/guide/metrics.md. Functions of arrays take any
 leading axes (…). Letters of the shapes: K clusters, G values.
@@ -16,15 +16,11 @@ leading axes (…). Letters of the shapes: K clusters, G values.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
 import pandas as pd
 
 from copem_replay.core.errors import count_noun
-from copem_replay.core.tracks import TRUTH, Float, Int
+from copem_replay.core.tracks import Float, Int
 
 FEWEST_LOGS = 3
 """From so many logs on intervals are over logs."""
@@ -267,62 +263,3 @@ def interval_words(kind: str, over: str, number: int | None = None) -> str:
 
 NOTHING_DRAWN = "nothing drawn"
 """The kind of an interval that does not exist as all runs are equal."""
-
-
-@dataclass(frozen=True)
-class FixedOutcomes:
-    """`lists`: configurations whose lists are equal in every run; `reaction`: whether the driver's delay is."""
-
-    lists: frozenset[str] = frozenset()
-    reaction: bool = False
-
-    def known(self, configuration: str) -> bool:
-        """Whether the configuration's detections are equal in every run."""
-        return configuration in self.lists
-
-    def passes(self, configuration: str) -> bool:
-        """Whether the configuration's verdicts on braking are equal in every run."""
-        return self.reaction and configuration in self.lists
-
-
-def find_fixed_outcomes(experiment: Mapping[str, Any]) -> FixedOutcomes:
-    """The outcomes that are equal in every run of an experiment, given as plain data with every default filled in.
-
-    By kind of unit: lists of the truth and of recorded units are not drawn; those of a unit with a PEM are, and so are
-    its carriers, even where probabilities are 0 or 1. A driver's delay is drawn, except with the `constant` reaction.
-    Missing keys count as drawn.
-    """
-    units = _as_mapping(experiment.get("units"))
-    links = _as_mapping(experiment.get("links"))
-    recorded = {name for name, unit in units.items() if _as_mapping(unit).get("recorded")}
-    lists = set()
-    for name, configuration in _as_mapping(experiment.get("configurations")).items():
-        settings = _as_mapping(configuration)
-        undrawn = _is_undrawn(settings.get("units"), recorded) and not _is_link_random(settings.get("link"), links)
-        if settings.get("recorded") or undrawn:
-            lists.add(str(name))
-    driver = _as_mapping(_as_mapping(experiment.get("braking")).get("driver"))
-    reaction = driver.get("reaction")  # left out: no delay
-    return FixedOutcomes(
-        frozenset(lists), bool(driver) and (not reaction or _as_mapping(reaction).get("kind") == "constant")
-    )
-
-
-def _is_undrawn(units: Any, recorded: set[str]) -> bool:
-    return units == TRUTH or (isinstance(units, list) and set(units) <= recorded)
-
-
-def _is_link_random(link: Any, links: Mapping[str, Any]) -> bool:
-    """Whether a configuration's link, or any of those by unit, delays or loses lists by chance."""
-    by_unit = link.values() if isinstance(link, dict) and "kind" not in link else [link]
-    for unit_link in by_unit:
-        radio = _as_mapping(links.get(unit_link) if isinstance(unit_link, str) else unit_link)
-        latency, reception = _as_mapping(radio.get("latency")), _as_mapping(radio.get("reception"))
-        certain = latency.get("kind") == "constant" and reception == {"kind": "constant", "probability": 1.0}
-        if radio.get("kind") == "radio" and not (certain and not radio.get("channel")):
-            return True
-    return False
-
-
-def _as_mapping(value: Any) -> Mapping[str, Any]:
-    return value if isinstance(value, dict) else {}

@@ -20,7 +20,6 @@ from copem_replay.metrics.accuracy.statistics import AccuracyTotal
 from copem_replay.metrics.intervals import (
     NOT_ENOUGH,
     NOTHING_DRAWN,
-    FixedOutcomes,
     choose_over,
     describe_absent,
     explain_no_clusters,
@@ -182,7 +181,7 @@ def summarise_tally(
     horizon_s: float | None,
     exact: pd.DataFrame | None = None,
     accuracy: Mapping[str, AccuracyTotal] | None = None,
-    fixed: FixedOutcomes | None = None,
+    facts: Mapping[str, Any] | None = None,
     own: Sequence[RowMetric] = (),
     sums: Sums | None = None,
     outputs: Mapping[str, OutputTimes] | None = None,
@@ -191,12 +190,12 @@ def summarise_tally(
 ) -> tuple[pd.DataFrame, list[str]]:
     """The rows of `summary.csv`, and notes about them, from the rows of `tally.parquet`.
 
-    `exact`: the rows of `exact.parquet`. `accuracy`: its sums, by configuration. `fixed`: which outcomes are equal in
-    every run; None: none. `own`: the experiment's own metrics, whose columns come last; `sums`: their sums. `outputs`:
-    ages of recorded outputs, by configuration; `links`: sums over lists on links, by configuration.
-    `conflicts_asked`: whether the experiment measures when lists imply a collision.
+    `exact`: the rows of `exact.parquet`. `accuracy`: its sums, by configuration. `facts`: what configurations are
+    (`find_facts`), of which are read `fixed` and `fixed_verdicts`; None: nothing is known. `own`: the experiment's own
+    metrics, whose columns come last; `sums`: their sums. `outputs`: ages of recorded outputs, by configuration;
+    `links`: sums over lists on links, by configuration. `conflicts_asked`: whether the experiment measures when lists
+    imply a collision.
     """
-    fixed = fixed or FixedOutcomes()
     detections, implying = (tallied[tallied["event"] == event] for event in (DETECTED, CONFLICT))
     detections_of, conflicts_of = _split_by_configuration(detections), _split_by_configuration(implying)
     exact_of = _split_by_configuration(exact) if exact is not None else {}
@@ -208,8 +207,8 @@ def summarise_tally(
             detections_of.get(name, detections.iloc[:0]),
             list_rate_hz[name],
             horizon_s,
-            lists_fixed=fixed.known(name),
-            reaction_fixed=fixed.passes(name),
+            lists_fixed=getattr((facts or {}).get(name), "fixed", False),
+            reaction_fixed=getattr((facts or {}).get(name), "fixed_verdicts", False),
             accuracy=accuracy[name] if accuracy else None,
             exact=exact_of.get(name, exact.iloc[:0]) if exact is not None else None,
             output=(outputs or {}).get(name),

@@ -36,9 +36,8 @@ from copem_replay.metrics.onset import began_texts
 from copem_replay.metrics.survival import end_reason_texts
 from copem_replay.perception.observation import rows_by_unit
 from copem_replay.perception.pem.model import Pem
-from copem_replay.pipeline.expansion import ExpandedExperiment
+from copem_replay.pipeline.expansion import ExpandedExperiment, has_truth_ids
 from copem_replay.pipeline.prepare import Replay
-from copem_replay.pipeline.receiver import has_truth_ids
 from copem_replay.pipeline.sweep import list_points
 
 # Detection that lasts: which units share a held number, and whether that has a closed form.

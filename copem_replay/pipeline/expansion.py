@@ -4,6 +4,8 @@
 carries its unit if its random number is below the share: an object that carries one at 30 % does so at 50 %, too.
 
 The recorded output of a stack is a recorded unit that only its configuration hears, and that is handed on as it is.
+
+What a configuration is, by truth id, fixed, or regretted to which ideal, is decided here once (`find_facts`).
 """
 
 from __future__ import annotations
@@ -20,12 +22,108 @@ from copem_replay.core.errors import ExperimentError
 from copem_replay.core.random import CounterRng, RandomKey, object_words
 from copem_replay.core.tracks import TRUTH, Bool, Float, Int, Scene, class_indices
 from copem_replay.experiment.schema import Configuration, Experiment, Unit, output_unit
-from copem_replay.fusion.interface import ListFusion, PredictedFusion, RecordedFusion
+from copem_replay.fusion.interface import IdealFusion, ListFusion, PredictedFusion, RecordedFusion
 from copem_replay.io.config import RecordedOutput, RecordedTopic
+from copem_replay.metrics.braking.driver import ConstantReaction
 from copem_replay.metrics.config import Braking, Measure
+from copem_replay.metrics.onset import Requires
 from copem_replay.perception.config import Carriers, Obstacle
 from copem_replay.perception.pem.model import Pem
 from copem_replay.perception.visibility import VisibilityModel
+
+# What configurations are.
+
+
+@dataclass(frozen=True)
+class ConfigurationFacts:
+    """What a configuration is, as `provenance.json` has it.
+
+    `truth`: its lists are the truth; `recorded`: they are the output of a stack. `by_truth_id`: objects are detected by
+    truth id, not by match. `fixed`: detections are equal in every run; `fixed_verdicts`: and whether the ego passes.
+    `needs_visibility`: its episodes depend on which body hides which. `ideal`: the ideal fusion of its `ideal_of`: of
+    its inputs, whose lists come alike, or of its units; None: it is ideal itself, or there is none.
+    """
+
+    truth: bool
+    recorded: bool
+    by_truth_id: bool
+    fixed: bool
+    fixed_verdicts: bool
+    needs_visibility: bool
+    ideal: str | None
+    ideal_of: str | None
+
+
+def find_facts(experiment: Experiment) -> dict[str, ConfigurationFacts]:
+    """What each configuration of an experiment is, by name.
+
+    Fixed by kind of unit: lists of the truth and of recorded units are not drawn; those of a unit with a PEM are, and
+    so are its carriers, even where probabilities are 0 or 1. A driver's delay is drawn, except with the `constant`
+    reaction.
+    """
+    driver = None if experiment.braking is None else experiment.braking.driver
+    reaction = getattr(driver, "reaction", None)
+    reacts_alike = driver is not None and (reaction is None or isinstance(reaction, ConstantReaction))
+    in_sight = experiment.measure.onset.requires is not Requires.NOTHING
+    facts = {}
+    for name, configuration in experiment.configurations.items():
+        recorded, fixed = configuration.recorded is not None, _is_fixed(experiment, name, configuration)
+        ideal, ideal_of = _find_ideal(experiment, configuration)
+        facts[name] = ConfigurationFacts(
+            truth=configuration.units == TRUTH,
+            recorded=recorded,
+            by_truth_id=has_truth_ids(configuration) and not experiment.measure.match.always,
+            fixed=fixed,
+            fixed_verdicts=fixed and reacts_alike,
+            needs_visibility=in_sight,
+            ideal=ideal,
+            ideal_of=ideal_of,
+        )
+    return facts
+
+
+def has_truth_ids(configuration: Configuration) -> bool:
+    """Whether a configuration's fused tracks have truth ids: the truth itself, and ideal fusion."""
+    computed = configuration.recorded is None  # not the output of a stack
+    return computed and (configuration.units == TRUTH or isinstance(configuration.fusion, IdealFusion))
+
+
+def _is_fixed(experiment: Experiment, name: str, configuration: Configuration) -> bool:
+    if configuration.recorded is not None:
+        return True
+    drawn = [unit for unit in experiment.units_of(configuration) if unit not in experiment.recorded]
+    return not drawn and not any(of.link.drawn for of in experiment.links_of(name))
+
+
+def _find_ideal(experiment: Experiment, configuration: Configuration) -> tuple[str | None, str | None]:
+    """The ideal fusion of a configuration's units or `inputs`, and which of the two it is of.
+
+    It has the same latency, link and `issue_hz`, if there is one so, else the same units.
+    """
+    if configuration.recorded is None and isinstance(configuration.fusion, IdealFusion):
+        return None, None
+    own, same = _list_inputs(experiment, configuration), {}
+    for name, other in experiment.configurations.items():
+        if other.recorded is None and other.fusion == IdealFusion():
+            inputs = _list_inputs(experiment, other)
+            if own[0] and inputs[0] == own[0]:
+                same[name] = inputs == own
+    alike = next((name for name, is_alike in same.items() if is_alike), None)
+    return alike or next(iter(same), None), None if not same else "units" if alike is None else "inputs"
+
+
+def _list_inputs(experiment: Experiment, configuration: Configuration) -> tuple[frozenset[str], object]:
+    """The units of a configuration, none of the truth; and how their lists come: by unit latency and link, the rate.
+
+    A recorded output has its inputs as they arrived, without latency or link.
+    """
+    recorded = configuration.recorded is not None
+    units = (configuration.inputs or ()) if recorded else experiment.units_of(configuration)
+    come = {unit: (configuration.latency_of(unit), configuration.link_of(unit)) for unit in units}
+    return frozenset(units), (come, configuration.issue_hz)
+
+
+# An experiment over one log.
 
 
 @dataclass(frozen=True)

@@ -259,12 +259,6 @@ class ReceiverOutput:
         return self.received.captured_s if self.stated is None else self.stated.stated_s
 
 
-def has_truth_ids(configuration: Configuration) -> bool:
-    """Whether a configuration's fused tracks have truth ids: the truth itself, and ideal fusion."""
-    computed = configuration.recorded is None  # not the output of a stack
-    return computed and (configuration.units == TRUTH or isinstance(configuration.fusion, IdealFusion))
-
-
 def states_needed(configuration: Configuration) -> States | None:
     """What has to be drawn of units' rows for the fused states of a configuration; None, of the truth: nothing."""
     if configuration.units == TRUTH:

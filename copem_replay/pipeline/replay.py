@@ -28,9 +28,9 @@ from copem_replay.metrics.detections_table import (
     stack_events,
 )
 from copem_replay.metrics.episodes import earliest_sight_s
-from copem_replay.pipeline.expansion import ExpandedExperiment, RunGroup, group_runs
+from copem_replay.pipeline.expansion import ExpandedExperiment, RunGroup, group_runs, has_truth_ids
 from copem_replay.pipeline.prepare import ROWS_A_CHUNK, Replay
-from copem_replay.pipeline.receiver import Receivers, has_truth_ids, states_needed
+from copem_replay.pipeline.receiver import Receivers, states_needed
 from copem_replay.pipeline.scoring import ConfigurationScores, Judge
 from copem_replay.pipeline.world import States, Transmission, has_channel
 

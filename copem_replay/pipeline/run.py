@@ -25,12 +25,12 @@ from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.accuracy.statistics import AccuracyTotal, join_totals
-from copem_replay.metrics.intervals import find_fixed_outcomes
 from copem_replay.metrics.metric import OutputTimes, OwnSums
 from copem_replay.metrics.onset import select_counted
 from copem_replay.metrics.summary import add_own_sums, own_sums_by_log, settle_horizon, summarise_tally, tally_rows
 from copem_replay.pipeline.closed_form import check_closed_form, exact_table
 from copem_replay.pipeline.cost import RunCost, memory_notes, return_memory, watch_cost
+from copem_replay.pipeline.expansion import find_facts
 from copem_replay.pipeline.notes import ListRate, LogFacts, join_list_rates, study_notes
 from copem_replay.pipeline.parts import MOST_RUNS, STATES_A_PART, PartCache, cut_parts, write_recipe
 from copem_replay.pipeline.prepare import Replay, prepare_log
@@ -251,7 +251,7 @@ def _run_study(experiment: Experiment, logs: Sequence[StudyLog], gatherer: Gathe
         horizon_s=horizon_s,
         exact=None if exact is None else select_counted(exact, experiment.measure.began),
         accuracy=total_over_logs(sums.totals),
-        fixed=find_fixed_outcomes(experiment.as_written()),
+        facts=find_facts(experiment),
         own=experiment.measure.metrics,
         sums=sums.sums,
         outputs={name: sum((sums.outputs[name] for sums in facts), OutputTimes()) for name in experiment.outputs},
@@ -327,7 +327,7 @@ def _summarise_point(point: SweepPoint, logs: Sequence[StudyLog], gatherer: Gath
         horizon_s=horizon_s,
         exact=None if exact is None else select_counted(exact, experiment.measure.began),
         accuracy=total_over_logs(sums.totals),
-        fixed=find_fixed_outcomes(experiment.as_written()),
+        facts=find_facts(experiment),
         conflicts_asked=experiment.measure.conflict is not None,
         links={name: one.links for name, one in times.items() if one.links is not None},
     )

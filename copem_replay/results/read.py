@@ -13,13 +13,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
 from copem_replay.core.errors import ExperimentError, InputError, RecordingError, RemoteFile, is_url
-from copem_replay.core.tracks import TRUTH
 from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.experiment.file import ExperimentSource, parse_experiment, read_experiment_file, settings_places
 from copem_replay.experiment.schema import Experiment
@@ -27,7 +26,7 @@ from copem_replay.experiment.validate import read_logs
 from copem_replay.io.open import File, Place, fetch_place, first_recording, read_file_stamps, sha256_of
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.config import Objects
-from copem_replay.metrics.intervals import FixedOutcomes, choose_clusters, find_fixed_outcomes
+from copem_replay.metrics.intervals import choose_clusters
 from copem_replay.metrics.onset import COUNTS_BY, select_counted
 from copem_replay.metrics.summary import DETECTED
 from copem_replay.pipeline.prepare import Replay, prepare_log
@@ -50,6 +49,7 @@ from copem_replay.results.schema import (
 if TYPE_CHECKING:
     import pyarrow as pa
 
+    from copem_replay.pipeline.expansion import ConfigurationFacts
     from copem_replay.results.schema import RecordedLog
 
 
@@ -279,6 +279,11 @@ class Results:
         return self._optional("bands.csv")
 
     @property
+    def facts(self) -> dict[str, ConfigurationFacts]:
+        """What each configuration is."""
+        return self.provenance.facts
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """Notes on the recordings and the runs, a line each."""
         notes = self.provenance.data.get("notes", [])
@@ -290,8 +295,13 @@ class Results:
         rows = self.rows.only(self._kinds(self.rows.place.name, compared=True))
         if not rows.where:
             raise InputError(f"{self.folder}: nothing can be compared: no measured object has an onset")
-        if unknown := set(rows.where) - {log.name for log in self.provenance.logs}:
-            raise InputError(f"{rows.place}: expected the logs of provenance.json, found {min(unknown)!r}")
+        logs = {log.name for log in self.provenance.logs}
+        for what, unknown in (
+            ("logs", set(rows.where) - logs),
+            ("configurations", set(rows.configurations) - self.facts.keys()),
+        ):
+            if unknown:
+                raise InputError(f"{rows.place}: expected the {what} of provenance.json, found {min(unknown)!r}")
         tables = {rows.place.name: rows}
         for name in (name for name in COMPARED_FILES if (self.folder / name).is_file()):
             table = log_rows(self.folder / name, self._kinds(name, compared=True))
@@ -304,31 +314,6 @@ class Results:
         tables = {name: rows.of(log) for name, rows in self.by_log.items() if not names or name in names}
         check_unchanged(self.folder, self.seen)
         return tables
-
-    @cached_property
-    def fixed(self) -> FixedOutcomes:
-        """The outcomes that are equal in every run."""
-        return find_fixed_outcomes(self.source.data)
-
-    @cached_property
-    def by_truth_id(self) -> frozenset[str]:
-        """Configurations that detect by truth id: the truth, and ideal fusion."""
-        if self.provenance.measure["match"].get("always"):
-            return frozenset()
-        return frozenset(name for name, configuration in self._configurations if _knows_ids(configuration))
-
-    @cached_property
-    def truth(self) -> frozenset[str]:
-        """Configurations that are the truth."""
-        return frozenset(name for name, configuration in self._configurations if configuration.get("units") == TRUTH)
-
-    @property
-    def _configurations(self) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Names and plain data of the configurations in `experiment.yaml`."""
-        configurations = self.source.data.get("configurations")
-        for name, configuration in configurations.items() if isinstance(configurations, dict) else ():
-            if isinstance(configuration, dict):
-                yield str(name), configuration
 
     def log_place(self, log: str) -> Place:
         """The place where the recording of a log, or the several that it is made of, are expected."""
@@ -423,11 +408,14 @@ def check_complete(results: Results, *, rowless: bool = False) -> Results:
             f"{results.folder}/tally.parquet: expected the {expected} rows of detections.parquet counted, found "
             f"{found}; {AGAIN}"
         )
-    expected, found = len(results.experiment.logs), len(results.provenance.logs)
-    if expected != found:
-        raise InputError(
-            f"{results.folder}/{MARK}: expected {expected} logs as in experiment.yaml, found {found}; {AGAIN}"
-        )
+    for what, expected, found in (
+        ("logs", len(experiment.logs), len(results.provenance.logs)),
+        ("configurations", len(experiment.configurations), len(experiment.configurations.keys() & results.facts)),
+    ):
+        if expected != found:
+            raise InputError(
+                f"{results.folder}/{MARK}: expected {expected} {what} as in experiment.yaml, found {found}; {AGAIN}"
+            )
     for name in ("summary", "exact", "sweep"):
         getattr(results, name)
     return results
@@ -449,14 +437,6 @@ def _check_rows(rows: LogRows, experiment: Experiment) -> None:
         raise InputError(
             f"{rows.place}: expected as many rows of each configuration, found {min(counts)} to {max(counts)}; {AGAIN}"
         )
-
-
-def _knows_ids(configuration: dict[str, Any]) -> bool:
-    """Whether a configuration detects by truth id, without matches."""
-    fusion = configuration.get("fusion")
-    if configuration.get("recorded"):
-        return False
-    return fusion is None or bool(fusion.get("kind", "ideal") == "ideal")
 
 
 # Logs, read again: figures of single runs need the recording, which a results folder names but does not hold.

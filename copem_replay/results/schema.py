@@ -32,6 +32,7 @@ from copem_replay.io.open import File, first_recording
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.config import Measure
 from copem_replay.metrics.summary_metrics import METRIC, METRICS_OF
+from copem_replay.pipeline.expansion import ConfigurationFacts
 from copem_replay.pipeline.study_log import compute_log_digests
 from copem_replay.results.folder import MARK
 
@@ -288,6 +289,10 @@ _PROVENANCE = (
     Column("measure", "by name",
            "section `measure` with every default, and `horizon_used_s`, the horizon of mean times"),
     Column("braking", "by name", "section `braking` with every default"),
+    Column("configurations", "by name",
+           "what each configuration is: the `truth`, `recorded`, `by_truth_id`, `fixed` (equal in every run) and "
+           "`fixed_verdicts`, `needs_visibility` (of its onset), and its `ideal`, ideal fusion of its inputs or units "
+           "(`ideal_of`)"),
     Column("run_shown", "by name", "by log the number of the run in `replay.mcap`"),
     Column("runs_shown", "by name",
            "by log every run that is written: `file`, `run`, and `run_is`, why it is this one"),
@@ -422,6 +427,7 @@ class Provenance:
     braking: dict[str, Any] | None
     horizon_used_s: float
     run_shown: dict[str, int]  # by log
+    facts: dict[str, ConfigurationFacts]  # by configuration
     data: dict[str, Any]
 
 
@@ -461,6 +467,7 @@ def read_provenance(path: Path) -> Provenance:
             braking=None if braking is None else dict(braking),
             horizon_used_s=used_s,
             run_shown={str(log): int(run) for log, run in run_shown.items() if run is not None},
+            facts={str(name): ConfigurationFacts(**of) for name, of in dict(data["configurations"]).items()},
             data=data,
         )
     except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:

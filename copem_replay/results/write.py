@@ -10,7 +10,7 @@ import json
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,6 +35,7 @@ from copem_replay.io.open import (
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.pipeline.cost import return_memory
+from copem_replay.pipeline.expansion import find_facts
 from copem_replay.pipeline.one_run import (
     ReplayedRun,
     ShownRun,
@@ -359,6 +360,7 @@ def build_provenance(
         "window_s": experiment.window_s,
         "measure": experiment.measure.model_dump(mode="json", by_alias=True) | {"horizon_used_s": result.horizon_s},
         "braking": experiment.braking and experiment.braking.model_dump(mode="json", by_alias=True),
+        "configurations": {name: asdict(of) for name, of in find_facts(experiment).items()},
         "run_shown": {log: runs[0].run for log, runs in shown.items()},
         "runs_shown": {
             log: [{"file": each.stem, "run": each.run, "run_is": each.why or None} for each in runs]

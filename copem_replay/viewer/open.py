@@ -65,7 +65,7 @@ def opening_s(folder: Path, files: Sequence[Path]) -> dict[Path, float]:
     try:
         results = open_results(folder)
         runs = _map_runs(results)
-        truths = [name for name in results.truth if name in results.rows.configurations]
+        truths = [name for name, of in results.facts.items() if of.truth and name in results.rows.configurations]
         for path in files:
             stem = _FURTHER_FILE.sub("", path.relative_to(folder.absolute()).with_suffix("").as_posix())
             if stem in runs:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 from pyarrow import parquet
 
+from copem_replay.experiment.schema import Experiment
+from copem_replay.pipeline.expansion import find_facts
 from copem_replay.results.schema import TABLES
 from tests.oracles import intervals
 
@@ -48,6 +51,11 @@ MEASURE = {
     "gospa": {"cutoff_m": None, "power": 2.0},
     "horizon_used_s": 10.0,
 }
+UNREMARKABLE = dict.fromkeys(
+    ("truth", "recorded", "by_truth_id", "fixed", "fixed_verdicts", "needs_visibility"), False
+) | {"ideal": None, "ideal_of": None}
+"""A configuration of which nothing is known but its rows."""
+LINKS = {"radio": {"latency": 0.1}}
 BRAKING = {"driver": {"kind": "constant_deceleration", "a_max_mps2": 8.0}, "margin_m": 0.5, "brakes_for": "object"}
 
 
@@ -110,11 +118,13 @@ def write_folder(
     ego: str | None = None,
     measure: dict[str, Any] | None = None,
     experiment: dict[str, Any] | None = None,
+    facts: dict[str, dict[str, Any]] | None = None,
     **provenance: Any,
 ) -> Path:
     """A results folder. `logs`: names and contents; `available_s`: by configuration, where not INSTANTS.
 
-    `experiment`: further keys of experiment.yaml.
+    `experiment`: further keys of experiment.yaml; where it has configurations, what they are is found by them. `facts`:
+    by configuration what differs from `UNREMARKABLE`.
     """
     path.mkdir(parents=True)
     names = list(dict.fromkeys(r["log"] for r in rows))
@@ -128,6 +138,14 @@ def write_folder(
         "max_gap_s": 0.5,
         "measure": MEASURE | (measure or {}),
         "braking": None,
+        "configurations": {r["configuration"]: UNREMARKABLE for r in rows},
+    }
+    if "configurations" in (experiment or {}):
+        plan = Experiment.model_validate({"version": 1, "logs": ["a.mcap"], "links": LINKS} | (experiment or {}))
+        said["configurations"] = {name: asdict(of) for name, of in find_facts(plan).items()}
+    in_sight = {"needs_visibility": said["measure"]["onset"]["kind"].startswith("line_of_sight")}
+    said["configurations"] = {
+        name: of | in_sight | (facts or {}).get(name, {}) for name, of in said["configurations"].items()
     }
     said |= provenance
     (path / "provenance.json").write_text(json.dumps(said))

@@ -8,8 +8,9 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from copem_replay.metrics.intervals import find_fixed_outcomes
+from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.summary import format_summary
+from copem_replay.pipeline.expansion import find_facts
 from copem_replay.report.figures.detection_curves import curves_figure
 from copem_replay.report.html.page import build_page
 from copem_replay.report.html.study import load_study
@@ -115,30 +116,49 @@ def test_reports_and_figures_do_without(tmp_path: Path) -> None:
 
 
 TRUTH, RSU, EGO = {"units": "truth"}, {"units": ["rsu"]}, {"units": ["ego", "rsu"]}
-UNITS = {"rsu": {"recorded": {"topic": "rsu"}, "pem": None}, "ego": {"pem": "p", "recorded": None}}
+UNITS = {"rsu": {"recorded": {"topic": "rsu"}}, "ego": {"on": "ego", "pem": "p"}}
+EVERY = {"t": TRUTH, "r": RSU, "e": EGO, "a": {"units": "all"}, "out": {"recorded": {"topic": "o"}}}
+PLAN = {"version": 1, "logs": ["a.mcap"], "units": UNITS}
+DECELERATING = {"kind": "constant_deceleration", "a_max_mps2": 8.0}
+
+
+def driving(reaction: dict[str, Any] | None) -> dict[str, Any]:
+    return {"driver": DECELERATING | ({} if reaction is None else {"reaction": reaction})}
 
 
 @pytest.mark.parametrize(
-    ("experiment", "lists", "reaction"),
+    ("braking", "reacts_alike"),
     [
-        (
-            {"units": UNITS, "configurations": {"t": TRUTH, "r": RSU, "e": EGO, "a": {"units": "all"}}},
-            {"t", "r"},
-            False,
-        ),
-        ({"configurations": {"t": TRUTH, "r": RSU}}, {"t"}, False),
-        ({"braking": {"driver": {"reaction": {"kind": "constant", "delay_s": 1.0}}}}, set(), True),
-        ({"braking": {"driver": {"kind": "own"}}}, set(), True),
-        ({"braking": {"driver": {"reaction": {"kind": "lognormal"}}}}, set(), False),
-        ({"braking": None}, set(), False),
-        ({}, set(), False),
-        ({"units": 3, "configurations": [1], "braking": "x"}, set(), False),
+        (None, False),
+        (driving(None), True),
+        (driving({"kind": "constant", "delay_s": 1.0}), True),
+        (driving({"kind": "lognormal", "median_s": 1.0, "sigma": 0.3}), False),
     ],
 )
 def test_what_is_fixed_goes_by_the_kind_of_units_and_of_the_reaction(
-    experiment: dict[str, Any], lists: set[str], reaction: bool
+    braking: dict[str, Any] | None, reacts_alike: bool
 ) -> None:
-    found = find_fixed_outcomes(experiment)
-    assert (found.lists, found.reaction) == (lists, reaction)
-    assert found.known("t") == ("t" in lists)
-    assert found.passes("t") == (reaction and "t" in lists)
+    facts = find_facts(Experiment.model_validate(PLAN | {"configurations": EVERY, "braking": braking}))
+    assert {name for name, of in facts.items() if of.fixed} == {"t", "r", "out"}
+    assert {name for name, of in facts.items() if of.fixed_verdicts} == ({"t", "r", "out"} if reacts_alike else set())
+
+
+@pytest.mark.parametrize(
+    ("link", "fixed"),
+    [
+        ({"latency": 0.1}, True),
+        ({"latency": {"kind": "gamma", "min_s": 0.02, "mean_s": 0.06, "shape": 2}}, False),
+        ({"latency": 0.1, "reception": {"kind": "constant", "probability": 0.9}}, False),
+    ],
+)
+def test_lists_by_a_link_are_fixed_where_it_draws_nothing(link: dict[str, Any], fixed: bool) -> None:
+    plan = PLAN | {"links": {"radio": link}, "configurations": {"r": RSU | {"link": "radio"}, "t": TRUTH}}
+    facts = find_facts(Experiment.model_validate(plan))
+    assert (facts["r"].fixed, facts["t"].fixed) == (fixed, True)
+
+
+@pytest.mark.parametrize(("onset", "needed"), [("in_range", False), ("line_of_sight", True)])
+def test_an_onset_in_sight_needs_visibility(onset: str, needed: bool) -> None:
+    condition = {"kind": onset} | ({"range_m": 50.0} if onset == "in_range" else {})
+    plan = PLAN | {"configurations": {"t": TRUTH}, "measure": {"onset": condition}}
+    assert find_facts(Experiment.model_validate(plan))["t"].needs_visibility == needed

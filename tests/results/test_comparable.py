@@ -309,6 +309,11 @@ def another_log(folder: Path) -> None:
     changed(folder / "detections.parquet", "log", pa.array(["a", "z"]))
 
 
+def another_configuration(folder: Path) -> None:
+    names = pa.array(["ideal", "z"])
+    changed(folder / "detections.parquet", "configuration", names)
+
+
 DAMAGES = {
     rows_twice: "ideal: expected each log, run and object once, found some twice",
     fewer_rows: "expected the rows of detections.parquet, found others",
@@ -320,6 +325,7 @@ DAMAGES = {
     no_onset: "column onset_s: expected a number in every row, found none in some",
     no_object: "column object_id: expected text in every row, found none in some",
     another_log: "expected the logs of provenance.json, found 'z'",
+    another_configuration: "expected the configurations of provenance.json, found 'z'",
 }
 
 

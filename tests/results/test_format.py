@@ -31,6 +31,24 @@ def test_an_older_format_is_refused(older: Path, read: Callable[[Path], object])
     assert failure.value.problems == (f"{older}: expected results of format 3, found format 1; {again}",)
 
 
+@pytest.mark.parametrize("read", [cr.load_results, cr.compare])
+def test_results_that_do_not_say_what_configurations_are_are_refused(
+    tmp_path: Path, read: Callable[[Path], object]
+) -> None:
+    drive(tmp_path / "drive.mcap")
+    (tmp_path / "e.yaml").write_text(changed())
+    folder = cr.run(tmp_path / "e.yaml").save(tmp_path / "old")
+    said = json.loads((folder / "provenance.json").read_text())
+    facts = said.pop("configurations")
+    assert facts["GT"] == {
+        "truth": True, "recorded": False, "by_truth_id": True, "fixed": True, "fixed_verdicts": False,
+        "needs_visibility": False, "ideal": None, "ideal_of": None,
+    }  # fmt: skip
+    (folder / "provenance.json").write_text(json.dumps(said))
+    with pytest.raises(cr.InputError, match=r"no 'configurations'; run the experiment again with --overwrite$"):
+        read(folder)
+
+
 def test_they_are_replaced_where_that_is_asked_for(older: Path) -> None:
     cr.run(older.parent / "e.yaml").save(older, overwrite=True)
     assert len(cr.load_results(older).summary) == 3

@@ -392,10 +392,7 @@ def test_where_equal_ghosts_say_nothing_there_is_none(tmp_path, per_min, lists, 
 
 def test_of_the_truth_nothing_is_at_equal_ghosts(tmp_path):
     rows = [row("ideal", 0.5, 30.0), row("late", 1.0, 30.0)]
-    folder = write_folder(tmp_path / "study", rows, lists=LISTS, steps=STEPS)
-    (folder / "experiment.yaml").write_text(
-        "version: 1\nconfigurations:\n  ideal: {units: truth}\n  late: {units: all}\n"
-    )
+    folder = write_folder(tmp_path / "study", rows, lists=LISTS, steps=STEPS, facts={"ideal": {"truth": True}})
     comparison = compare_folders([folder], false_positives_per_min=20)
     assert f"late: {NONE}the baseline is the truth, which has no ghosts" in comparison.notes
     assert "ttd_rmst_s_equal_ghosts" not in set(comparison.table["metric"])
@@ -445,9 +442,13 @@ def test_the_same_folder_again_differs_in_nothing(tmp_path):
 @pytest.mark.parametrize(("always", "said"), [(False, 1), (True, 0)])
 def test_who_detects_by_truth_id_is_said(tmp_path, always, said):
     rows = [row(name, 1.0, 30.0) for name in ("ideal", "GT", "gnn")]
-    path = write_folder(tmp_path / "study", rows, measure={"match": {"gate_m": 3.0, "always": always}})
-    fusions = "configurations: {GT: {units: truth}, ideal: {units: all}, gnn: {units: all, fusion: {kind: gnn}}}"
-    (path / "experiment.yaml").write_text(f"version: 1\n{fusions}\n")
+    every = {"units": {"ego": {"on": "ego", "pem": "p"}}, "measure": {"match": {"always": always}}}
+    every["configurations"] = {
+        "GT": {"units": "truth"}, "ideal": {"units": "all"}, "gnn": {"units": "all", "fusion": {"kind": "gnn"}},
+    }  # fmt: skip
+    path = write_folder(
+        tmp_path / "study", rows, measure={"match": {"gate_m": 3.0, "always": always}}, experiment=every
+    )
     notes = [note for note in compare_folders([path]).notes if "by truth id" in note]
     assert (
         notes

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from copem_replay.metrics.intervals import choose_clusters, find_fixed_outcomes
+from copem_replay.metrics.intervals import choose_clusters
 from copem_replay.report.figures.detection_curves import cluster_rows, detection_endings, mean_limits
 from copem_replay.report.figures.style import (
     RANKED_BY,
@@ -71,7 +71,6 @@ def _time_dots(results: Results, names: Sequence[str]) -> tuple[list[Dot], list[
     """A dot per configuration, and sentences on those without an interval."""
     rows = results.summary.set_index("configuration")
     over, cluster = choose_clusters(results.known)
-    fixed = find_fixed_outcomes(results.experiment.as_written())
     dots: list[Dot] = []
     without: dict[str, list[str]] = {}
     for name in names:
@@ -84,7 +83,7 @@ def _time_dots(results: Results, names: Sequence[str]) -> tuple[list[Dot], list[
             continue
         limits = None
         reason = explain_no_intervals(results) if over is None else "every run is the same"
-        if over is not None and not (over == "runs" and fixed.known(name)):
+        if over is not None and not (over == "runs" and results.facts[name].fixed):
             rows_of_name = results.known["configuration"] == name
             of_name = results.known[rows_of_name]
             time_s, ending, runs = detection_endings(of_name)

@@ -23,7 +23,6 @@ from copem_replay.metrics.intervals import (
     NOTHING_DRAWN,
     choose_clusters,
     exact_limits,
-    find_fixed_outcomes,
     group_clusters,
     limit_figure,
     share_variance,
@@ -199,9 +198,7 @@ def build_curves(
 ) -> tuple[str | None, dict[str, DetectionCurve]]:
     """The kind of clusters (None, or `NOTHING_DRAWN`), and the curves, with bands if there are clusters."""
     over, cluster = choose_clusters(results.known)
-    fixed = [
-        name for name in names if over == "runs" and find_fixed_outcomes(results.experiment.as_written()).known(name)
-    ]
+    fixed = [name for name in names if over == "runs" and results.facts[name].fixed]
     over = NOTHING_DRAWN if fixed and len(fixed) == len(names) else over
     curves = {}
     for name in names:

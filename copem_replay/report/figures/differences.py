@@ -50,7 +50,7 @@ def no_differences(results: Results, names: Sequence[str], differences: Comparis
     if not len(results.known):
         return "no object is measured"
     all_names = tuple(results.experiment.configurations)
-    against = find_baseline(results.source.data, all_names).name if differences is None else differences.baseline
+    against = find_baseline(results.facts, all_names).name if differences is None else differences.baseline
     return None if set(names) - {against} else "there is nothing to compare with"
 
 

@@ -32,7 +32,7 @@ import pandas as pd
 from copem_replay.core.tracks import TRUTH, Float
 from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.detections_table import WAY
-from copem_replay.pipeline.receiver import has_truth_ids
+from copem_replay.pipeline.expansion import has_truth_ids
 from copem_replay.report.figures.style import (
     add_note,
     choose_appearances,

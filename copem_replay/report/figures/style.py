@@ -365,9 +365,7 @@ RANKED_BY = "ttd_rmst_s"
 
 def find_truths(results: Results) -> tuple[str, ...]:
     """Configurations of the ground truth, in their order."""
-    return tuple(
-        name for name, configuration in results.experiment.configurations.items() if configuration.units == "truth"
-    )
+    return tuple(name for name, facts in results.facts.items() if facts.truth)
 
 
 def find_contenders(results: Results, names: Sequence[str] | None = None) -> tuple[str, ...]:

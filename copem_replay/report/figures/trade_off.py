@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from copem_replay.core.tracks import Float
-from copem_replay.pipeline.receiver import has_truth_ids
+from copem_replay.pipeline.expansion import has_truth_ids
 from copem_replay.report.figures.style import (
     add_note,
     choose_appearances,

@@ -25,7 +25,6 @@ from copem_replay.report.figures.style import (
 )
 from copem_replay.results.compare import Comparison, compare_folders
 from copem_replay.results.read import Results, read_results
-from copem_replay.results.schema import AGAIN
 
 
 def find_ties(best: str, names: Sequence[str], results: Results) -> tuple[str, ...]:

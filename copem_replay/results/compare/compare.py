@@ -177,7 +177,7 @@ def notes_on_frames(table: pd.DataFrame) -> Iterator[str]:
 
 def note_on_measuring(baseline: LabelledConfiguration, others: Sequence[LabelledConfiguration]) -> Iterator[str]:
     """A note on configurations that detect by truth id while others detect by match."""
-    by_id = [labelled for labelled in (baseline, *others) if labelled.configuration in labelled.results.by_truth_id]
+    by_id = [labelled for labelled in (baseline, *others) if labelled.facts.by_truth_id]
     if by_id and len(by_id) <= len(others):
         yield (
             f"{', '.join(labelled.label for labelled in by_id)}: detected by truth id, the others by match within the "
@@ -247,8 +247,7 @@ def _find_problems(first: Results, other: Results) -> Iterator[str]:
         yield from _describe_mismatch(first, other, "ego", first.source.data.get("ego"), other.source.data.get("ego"))
     for key in _MEASURE:
         yield from _describe_mismatch(first, other, f"measure.{key}", before.measure.get(key), after.measure.get(key))
-    onset = before.measure.get("onset")
-    if isinstance(onset, dict) and str(onset.get("kind")).startswith("line_of_sight"):
+    if any(of.needs_visibility for of in first.facts.values()):
         yield from _describe_mismatch(first, other, "visibility", before.visibility, after.visibility)
     if before.braking is not None and after.braking is not None:
         yield from _describe_mismatch(first, other, "braking", before.braking, after.braking)
@@ -434,10 +433,9 @@ def _settle_ghosts(
     `asked`: whether the user asked for the rate `per_min`; else it is that of the baseline.
     """
     settings, reasons = {}, {}
-    truth = against.configuration in against.results.truth
     for labelled in others:
         both = totals.get(labelled), totals.get(against)
-        why = explain_incomparable(*both, per_min, asked=asked, truth=truth)
+        why = explain_incomparable(*both, per_min, asked=asked, truth=against.facts.truth)
         kept = None if why is not None else find_operating_points(*both, per_min)
         reasons[labelled.label], settings[labelled] = why, replace(setting, kept=kept)
     return settings, reasons
@@ -548,13 +546,6 @@ def _check_same_frames(
         )
 
 
-def _is_fixed(metric: str, *sides: LabelledConfiguration) -> bool:
-    """Whether a metric is equal in every run, on all sides."""
-    if metric == "pass_share":
-        return all(side.results.fixed.passes(side.configuration) for side in sides)
-    return all(side.results.fixed.known(side.configuration) for side in sides)
-
-
 def _make_row(
     regret: Regret,
     values: tuple[float, float, float],
@@ -571,7 +562,9 @@ def _make_row(
         "n": int(figure.items["n"].sum()),
     }
     row["difference"] = _number_or_none(difference)
-    row |= difference_limits(figure, difference, over, names, fixed=_is_fixed(regret.metric, labelled, against))
+    what = "fixed_verdicts" if regret.metric == "pass_share" else "fixed"
+    fixed = all(getattr(side.facts, what) for side in (labelled, against))
+    row |= difference_limits(figure, difference, over, names, fixed=fixed)
     if "only" in figure.items.columns:
         only = figure.items["only"].sum(axis=0)
         row |= {"only_configuration": int(only[0]), "only_baseline": int(only[1])}

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from copem_replay.core.errors import InputError, unknown_name_message
-from copem_replay.core.tracks import TRUTH
 
 if TYPE_CHECKING:
+    from copem_replay.pipeline.expansion import ConfigurationFacts
     from copem_replay.results.read import Results
     from copem_replay.results.schema import RecordedLog
 
@@ -84,10 +84,8 @@ def check_log_names(
 
 
 def _is_same_in_every_run(labelled: LabelledConfiguration) -> bool:
-    fixed = labelled.results.fixed
-    if labelled.results.provenance.braking is not None and not fixed.passes(labelled.configuration):
-        return False
-    return fixed.known(labelled.configuration)
+    with_verdicts = labelled.results.provenance.braking is not None
+    return labelled.facts.fixed_verdicts if with_verdicts else labelled.facts.fixed
 
 
 def notes_on_differences(folders: Sequence[Results], names: Mapping[Results, Mapping[str, str]]) -> Iterator[str]:
@@ -145,7 +143,7 @@ def _rates_by_configuration(results: Results) -> dict[str, float]:
     return {str(name): float(rate) for name, rate in rates.items()}
 
 
-# The baseline where none is asked for, and the ideal of a configuration: ideal fusion of its inputs.
+# The baseline where none is asked for.
 
 IDEAL_NAME = "ideal"
 """A configuration of this name is the baseline where none is asked for."""
@@ -161,82 +159,26 @@ class Baseline(NamedTuple):
     why: str
 
 
-def find_baseline(data: Mapping[str, Any], names: Sequence[str]) -> Baseline:
-    """The baseline among `names`, the configurations of an experiment's plain `data`: one rule for all commands.
+def find_baseline(facts: Mapping[str, ConfigurationFacts], names: Sequence[str]) -> Baseline:
+    """The baseline among `names`, configurations of an experiment: one rule for all commands.
 
-    It is the configuration named `ideal`; else the ideal of the first configuration that fuses otherwise and has one
-    (`find_ideal`); else the first that is not the truth.
+    It is the configuration named `ideal`; else the ideal of the first configuration that fuses otherwise and has one;
+    else the first that is not the truth.
     """
     if IDEAL_NAME in names:
         return Baseline(0, IDEAL_NAME, "by its name")
-    settings_of = _settings_by_name(data)
     for name in names:
-        ideal, alike = find_ideal(data, name) if _is_other_fusion(settings_of.get(name, {})) else (None, False)
-        if ideal in names:
-            of = "inputs" if alike else "units"
-            return Baseline(1, str(ideal), f"ideal fusion of the {of} of {name}")
-    fused = [name for name in names if settings_of.get(name, {}).get("units") != TRUTH]
+        if (ideal := facts[name].ideal) in names:
+            return Baseline(1, str(ideal), f"ideal fusion of the {facts[name].ideal_of} of {name}")
+    fused = [name for name in names if not facts[name].truth]
     return Baseline(2, fused[0], "the first that is not the truth") if fused else Baseline(2, names[0], "the first")
-
-
-def find_ideal(data: Mapping[str, Any], name: str) -> tuple[str | None, bool]:
-    """The ideal of a configuration: ideal fusion of its units or `inputs`; and whether their lists come alike.
-
-    With the same latency, link and `issue_hz` if there is one so, else with the same units; None: there is neither. A
-    recorded output has its inputs as they arrived, without latency or link.
-    """
-    settings_of, every = _settings_by_name(data), _modelled_units(data)
-    settings = settings_of.get(name, {})
-    own = {"units": settings.get("inputs")} if settings.get("recorded") else settings
-    units, arrivals = _list_inputs(own, every)
-    ideals = {other: _list_inputs(labelled, every) for other, labelled in settings_of.items() if _is_ideal(labelled)}
-    same = {other: inputs for other, inputs in ideals.items() if units and inputs[0] == units}
-    alike = next((other for other, inputs in same.items() if inputs[1] == arrivals), None)
-    return alike or next(iter(same), None), alike is not None
-
-
-def _settings_by_name(data: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    configurations = data.get("configurations") or {}
-    return {str(name): settings for name, settings in configurations.items() if isinstance(settings, dict)}
-
-
-def _modelled_units(data: Mapping[str, Any]) -> list[str]:
-    units = data.get("units") or {}
-    return [str(name) for name, unit in units.items() if not (isinstance(unit, dict) and unit.get("recorded"))]
-
-
-def _is_ideal(settings: Mapping[str, Any]) -> bool:
-    fusion, samples = settings.get("fusion") or {}, {"kind": "ideal", "combine": "samples"}
-    return not settings.get("recorded") and samples | fusion == samples
-
-
-def _is_other_fusion(settings: Mapping[str, Any]) -> bool:
-    return bool(settings.get("recorded")) or (settings.get("fusion") or {}).get("kind", "ideal") != "ideal"
-
-
-def _list_inputs(settings: Mapping[str, Any], every: Sequence[str]) -> tuple[frozenset[str], object]:
-    """The units of a configuration, none of the truth; and how their lists come: by unit latency and link, the rate."""
-    units = settings.get("units")
-    names = every if units == "all" else map(str, units) if isinstance(units, list | tuple) else ()
-    latency, link = settings.get("latency_s") or 0.0, settings.get("link")
-
-    def come(unit: str) -> tuple[object, object]:
-        delay_s = latency.get(unit, latency.get("default", 0.0)) if isinstance(latency, dict) else latency
-        own = link.get(unit, link.get("default")) if isinstance(link, dict) and "kind" not in link else link
-        return delay_s, None if own == "none" else own
-
-    inputs = frozenset(names)
-    return inputs, ({unit: come(unit) for unit in inputs}, settings.get("issue_hz"))
 
 
 def notes_on_output_baseline(baseline: LabelledConfiguration, others: Sequence[LabelledConfiguration]) -> Iterator[str]:
     """Notes on recorded outputs whose difference to the baseline is no regret."""
-    for labelled in others:
-        data = labelled.results.source.data
-        if not _settings_by_name(data).get(labelled.configuration, {}).get("recorded"):
-            continue
-        ideal, alike = find_ideal(data, labelled.configuration)
-        if not alike:
+    for labelled in (labelled for labelled in others if labelled.facts.recorded):
+        ideal = labelled.facts.ideal
+        if labelled.facts.ideal_of != "inputs":
             yield f"{labelled.label}: no regret, for it has no `inputs`: only a difference to {baseline.label}"
         elif baseline.configuration != ideal:
             yield f"{labelled.label}: its regret is to {ideal}, ideal fusion of its inputs (--baseline {ideal})"
@@ -252,6 +194,11 @@ class LabelledConfiguration:
     results: Results
     configuration: str
     label: str
+
+    @property
+    def facts(self) -> ConfigurationFacts:
+        """What the configuration is."""
+        return self.results.facts[self.configuration]
 
     def is_meant_by(self, name: str) -> bool:
         """Whether a name stands for it, and perhaps for others."""
@@ -312,7 +259,7 @@ def choose_baseline(known: Sequence[LabelledConfiguration]) -> tuple[LabelledCon
     folders: dict[Results, dict[str, LabelledConfiguration]] = {}
     for labelled in known:
         folders.setdefault(labelled.results, {})[labelled.configuration] = labelled
-    found = [(find_baseline(folder.source.data, list(those)), those) for folder, those in folders.items()]
+    found = [(find_baseline(folder.facts, list(those)), those) for folder, those in folders.items()]
     baseline, those = min(found, key=lambda pair: pair[0].rank)
     return those[baseline.name], baseline.why
 
