@@ -27,7 +27,7 @@ if TYPE_CHECKING:
         read_recordings,
     )
     from copem_replay.api.results import compare, load_results, view, write_report
-    from copem_replay.api.run import StudyResult, fused_tracks, observations, run
+    from copem_replay.api.run import fused_tracks, observations, run
     from copem_replay.api.study import load_experiment
     from copem_replay.communication.latency import LatencyModel
     from copem_replay.communication.link import LinkModel, SentLists
@@ -99,7 +99,6 @@ __all__ = [
     "Scene",
     "SentLists",
     "StepFusion",
-    "StudyResult",
     "Tracks",
     "Unit",
     "ViewGeometry",
@@ -133,7 +132,7 @@ _PLACES = {
     "api.fit": "FittedPem fit",
     "api.recordings": "draft_experiment inspect_recording read_lists read_recording read_recordings",
     "api.results": "compare load_results view write_report",
-    "api.run": "StudyResult fused_tracks observations run",
+    "api.run": "fused_tracks observations run",
     "api.study": "load_experiment",
     "communication.latency": "LatencyModel",
     "communication.link": "LinkModel SentLists",

@@ -26,12 +26,12 @@ Made by `tools/api_reference.py` from the docstrings. Every example runs as a te
 
 Letters of shapes: S runs, P rows (an object in a list), F lists, N objects, U units. Units of measurement end names:
 `_m`, `_s`, `_rad`, `_mps`. AnyExperiment: an Experiment, its keys and values in a dict, or the path of its file.
-AnyRecordings: Recordings or paths, one or several. AnyResults: Results, a saved StudyResult, or the path of a folder.
+AnyRecordings: Recordings or paths, one or several. AnyResults: Results, or the path of a folder.
 What is not on this page is private and may change in any release.
 """
 GROUPS = {
     "Experiments and recordings": "load_experiment read_recordings read_recording inspect_recording draft_experiment",
-    "Runs": "run StudyResult observations fused_tracks FusedTracks read_lists",
+    "Runs": "run observations fused_tracks FusedTracks read_lists",
     "Fits": "fit FittedPem",
     "Results": "load_results Results compare Comparison write_report view",
     "Figures": "plot",

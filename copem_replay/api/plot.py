@@ -7,7 +7,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from copem_replay.api.results import AnyResults, reread_results
+from copem_replay.api.results import AnyResults, take_results
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -26,7 +26,7 @@ def detection_curves(results: AnyResults, *, configurations: Sequence[str] | Non
     """
     from copem_replay.report.figures.detection_curves import curves_figure
 
-    return curves_figure(reread_results(results), configurations=configurations)
+    return curves_figure(take_results(results), configurations=configurations)
 
 
 def distances(results: AnyResults, *, configurations: Sequence[str] | None = None) -> Figure:
@@ -39,7 +39,7 @@ def distances(results: AnyResults, *, configurations: Sequence[str] | None = Non
     """
     from copem_replay.report.figures.distances import distances_figure
 
-    return distances_figure(reread_results(results), configurations=configurations)
+    return distances_figure(take_results(results), configurations=configurations)
 
 
 def single_runs(
@@ -62,7 +62,7 @@ def single_runs(
     from copem_replay.report.figures.selection import Selection
     from copem_replay.report.figures.single_runs import runs_figure
 
-    return runs_figure(reread_results(results), Selection(configurations, log, object_id, run))
+    return runs_figure(take_results(results), Selection(configurations, log, object_id, run))
 
 
 def sweeps(results: AnyResults, *, configurations: Sequence[str] | None = None) -> Figure:
@@ -74,7 +74,7 @@ def sweeps(results: AnyResults, *, configurations: Sequence[str] | None = None) 
     """
     from copem_replay.report.figures.sweeps import sweeps_figure
 
-    return sweeps_figure(reread_results(results), configurations=configurations)
+    return sweeps_figure(take_results(results), configurations=configurations)
 
 
 def write_figures(
@@ -100,4 +100,4 @@ def write_figures(
     from copem_replay.report.figures.selection import Selection
 
     selection = Selection(configurations, log, object_id, run)
-    return write_figure_files(reread_results(results), None if folder is None else Path(folder), selection)
+    return write_figure_files(take_results(results), None if folder is None else Path(folder), selection)

@@ -5,18 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 from copem_replay.core.errors import InputError, OutputError
 from copem_replay.results.compare import Comparison
 from copem_replay.results.read import Results
 
-if TYPE_CHECKING:
-    from copem_replay.api.run import StudyResult
-
-
-AnyResults: TypeAlias = "Results | StudyResult | str | PathLike[str]"
-"""Results that were read, a saved result of `run`, or the path of a results folder."""
+AnyResults: TypeAlias = Results | str | PathLike[str]
+"""Results, of `run` or read from a folder, or the path of a results folder."""
 
 
 def load_results(folder: str | PathLike[str]) -> Results:
@@ -61,7 +57,7 @@ def compare(
 
     all_results = list(results) if isinstance(results, Sequence) and not isinstance(results, str) else [results]
     return compare_folders(
-        [find_results_folder(folder) for folder in all_results],
+        [_results_or_path(folder) for folder in all_results],
         configurations=configurations,
         baseline=baseline,
         false_positives_per_min=false_positives_per_min,
@@ -80,7 +76,7 @@ def write_report(results: AnyResults, file: str | PathLike[str] | None = None, *
     """
     from copem_replay.report import write_html_report
 
-    return write_html_report(find_results_folder(results), None if file is None else Path(file), baseline=baseline)
+    return write_html_report(_results_or_path(results), None if file is None else Path(file), baseline=baseline)
 
 
 def view(results: AnyResults, *, web: bool = False) -> None:
@@ -98,7 +94,7 @@ def view(results: AnyResults, *, web: bool = False) -> None:
     from copem_replay.results.schema import check_format
     from copem_replay.viewer.open import list_rrd_files, open_viewer
 
-    folder = find_results_folder(results)
+    folder = results.require_folder() if isinstance(results, Results) else Path(results)
     files = list_rrd_files(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
@@ -126,15 +122,10 @@ def _serve_recordings(folder: Path, files: Sequence[Path]) -> None:
         return
 
 
-def find_results_folder(results: AnyResults) -> Path:
-    """The folder of results. Raises InputError for results that are not saved."""
-    if isinstance(results, str | PathLike):
-        return Path(results)
-    if results.folder is None:
-        raise InputError("expected results in a folder, found some that are not saved; result.save(folder) does")
-    return results.folder
+def take_results(results: AnyResults) -> Results:
+    """Results as they are, or those of a folder."""
+    return results if isinstance(results, Results) else load_results(results)
 
 
-def reread_results(results: AnyResults) -> Results:
-    """Results as read from their folder; results that were read before are returned as they are."""
-    return results if isinstance(results, Results) else load_results(find_results_folder(results))
+def _results_or_path(results: AnyResults) -> Results | Path:
+    return results if isinstance(results, Results) else Path(results)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,132 +21,27 @@ from copem_replay.api.study import (
     make_study,
     prepare_study,
 )
-from copem_replay.core.errors import InputError, OutputError, count_noun
+from copem_replay.core.errors import InputError
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import CLASSES
 from copem_replay.experiment.drive import resolve_for_log
-from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
-from copem_replay.pipeline.run import ExperimentResult, Progress
+from copem_replay.pipeline.run import Progress
+from copem_replay.results.read import Results, RunTables
 
 if TYPE_CHECKING:
-    import pyarrow as pa
-
-    from copem_replay.io.open import File
     from copem_replay.pipeline.crew import Crew, CrewProgress
     from copem_replay.pipeline.parts import PartCache
     from copem_replay.pipeline.prepare import Replay
-    from copem_replay.results.folder import ResultsPlace
+    from copem_replay.results.write import Exporter
 
 
-@dataclass(repr=False)
-class StudyResult:
-    """What an experiment gave: pandas tables, as a results folder has them.
-
-    `detections`: a row per log, configuration, run and measured object. `summary`: a row per configuration.
-    `exact`, `sweep`, `accuracy`, `bands`: None where the experiment does not ask for them. Times are in seconds (`_s`),
-    distances in metres (`_m`); missing values are null. Source of each column: docs/guide/metrics.md.
-
-    >>> result = cr.run({"version": 1, "configurations": {"GT": {"units": "truth"}}}, "logs/tc016d.mcap")
-    >>> result.detections.shape[0], result.exact is None
-    (7, True)
-    """
-
-    experiment: Experiment
-    recordings: tuple[Recording, ...]
-    replayed: ExperimentResult
-    folder: Path | None = None
-    """The results folder, once they are saved."""
-
-    def __repr__(self) -> str:
-        configurations = count_noun(len(self.experiment.configurations), "configuration")
-        runs, logs = count_noun(self.experiment.runs, "run"), count_noun(len(self.recordings), "recording")
-        return f"StudyResult({configurations}, {runs}, {logs}, {self.folder or 'not saved'})"
-
-    @property
-    def detections(self) -> pd.DataFrame:
-        """When, and how far away, each measured object was detected: log × configuration × run × object."""
-        return self.replayed.table
-
-    @property
-    def summary(self) -> pd.DataFrame:
-        """The metrics of each configuration."""
-        return self.replayed.summary
-
-    @property
-    def exact(self) -> pd.DataFrame | None:
-        """The probability of each time of detection, with `measure: {exact: true}`."""
-        return self.replayed.exact
-
-    @property
-    def sweep(self) -> pd.DataFrame | None:
-        """The summary at each value of the sweep, with `sweep:`."""
-        return self.replayed.sweep
-
-    @property
-    def accuracy(self) -> pd.DataFrame | None:
-        """Position errors and parts of GOSPA, list by list, in the order of `detections`."""
-        return None if self.replayed.accuracy is None else _make_frame(self.replayed.accuracy.accuracy)
-
-    @property
-    def bands(self) -> pd.DataFrame | None:
-        """Accuracy by configuration and by distance, time or existence."""
-        return self.replayed.bands
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What recordings lack, what was corrected, and what can hardly be meant: one line each."""
-        return self.replayed.notes
-
-    def save(self, folder: AnyPath, overwrite: bool = False) -> Path:
-        """Write the results folder, complete or not at all. Returns its path.
-
-        Raises OutputError: the folder holds something already (`overwrite` replaces results), or is not writable; also
-        where a replay could not be written, and all other results are there.
-
-        >>> result.save("out/example", overwrite=True).name
-        'example'
-        """
-        from copem_replay.results.folder import check_inputs, take_place
-
-        with take_place(Path(folder), overwrite=overwrite) as place:
-            check_inputs(place, [path for recording in self.recordings for path in recording.paths])
-            check_own_files(place, self.experiment, self.recordings)
-            fill_results_folder(place, self)
-            self.folder = place.shown
-        if place.failed:
-            raise OutputError(place.failed)
-        return place.shown
-
-
-def check_own_files(place: ResultsPlace, experiment: Experiment, recordings: Sequence[Recording]) -> None:
-    """Raise OutputError where a file of the user's own has a name that the results will have."""
-    from copem_replay.results.folder import check_names
-    from copem_replay.results.write import MCAP, list_results
+def list_exporters(viewer: str | None = None) -> Sequence[Exporter]:
+    """How single runs are written; `viewer`: the address of a Rerun viewer that also gets them."""
+    from copem_replay.results.write import MCAP
     from copem_replay.viewer.rrd import make_rrd_exporter
 
-    if place.before is not None:
-        check_names(place, list_results(experiment, recordings, [MCAP, make_rrd_exporter(None)]))
-
-
-def fill_results_folder(
-    place: ResultsPlace, result: StudyResult, *, skipped: Sequence[tuple[File, str]] = (), viewer: str | None = None
-) -> list[str]:
-    """Write results into a results place. Returns notes, one line each.
-
-    `skipped`: logs that were left out, with reasons. `viewer`: address of a Rerun viewer that also gets the recordings.
-    """
-    from copem_replay.results.write import MCAP, fill_place
-    from copem_replay.viewer.rrd import make_rrd_exporter
-
-    exporters = [MCAP, make_rrd_exporter(viewer)]
-    return fill_place(
-        place, result.experiment, result.recordings, result.replayed, exporters=exporters, skipped=skipped
-    )
-
-
-def _make_frame(table: pa.Table | None) -> pd.DataFrame | None:
-    return None if table is None else table.to_pandas()
+    return [MCAP, make_rrd_exporter(viewer)]
 
 
 def run(
@@ -157,7 +51,7 @@ def run(
     progress: Progress | None = None,
     pieces: AnyPath | None = None,
     crew: Executor | None = None,
-) -> StudyResult:
+) -> Results:
     """Replay recordings through an experiment, and measure.
 
     `experiment`: an Experiment, its keys and values in a dict, or the path of its file. `recordings`: Recordings or
@@ -214,14 +108,14 @@ def replay_study(
     jobs: int | None,
     progress: Progress | None,
     parts: PartCache | None = None,
-) -> StudyResult:
+) -> Results:
     """Replay the prepared logs of a study (`ready`). `progress(done, total)` is called after each block of runs."""
     from copem_replay.pipeline.run import run_experiment
 
     result = run_experiment(
         study.experiment, study.recordings, jobs=count_workers(jobs), progress=progress, ready=ready, parts=parts
     )
-    return StudyResult(study.experiment, study.recordings, result)
+    return Results(RunTables(study.experiment, study.recordings, result), exporters=list_exporters)
 
 
 def count_workers(jobs: int | None) -> int:

@@ -29,13 +29,13 @@ from copem_replay.cli.terminal import (
 from copem_replay.core.errors import InputError
 
 if TYPE_CHECKING:
-    from copem_replay.api.run import StudyResult
     from copem_replay.api.study import LoadedStudy
     from copem_replay.experiment.file import ExperimentSource
     from copem_replay.experiment.schema import Experiment
     from copem_replay.pipeline.crew import Crew
     from copem_replay.pipeline.parts import PartCache
     from copem_replay.results.folder import ResultsPlace
+    from copem_replay.results.read import Results
 
 Pieces: TypeAlias = Annotated[
     str | None, typer.Option(metavar="FOLDER", help="Keep finished parts here, and reuse them: a folder or a URL.")
@@ -111,17 +111,18 @@ def _read_study(
     cluster: str | None,
 ) -> LoadedStudy:  # fmt: skip
     """The experiment and its recordings; with `cluster` every part is computed when this returns."""
-    from copem_replay.api.run import check_own_files, read_with_crew
+    from copem_replay.api.run import list_exporters, read_with_crew
     from copem_replay.api.study import read_study
     from copem_replay.pipeline.study_log import LogSurvey
     from copem_replay.results.folder import check_inputs
+    from copem_replay.results.write import check_own_files
 
     with connect_crew(cluster, cache) as crew:
 
         def read() -> LoadedStudy:
             study = read_study(source, skip_unreadable=skip_unreadable, survey=LogSurvey(cache), crew=crew)
             check_inputs(place, [file, *(path for recording in study.recordings for path in recording.paths)])
-            check_own_files(place, study.experiment, study.recordings)
+            check_own_files(place, study.experiment, study.recordings, list_exporters())
             return study
 
         return read() if crew is None else read_with_crew(read, crew)
@@ -129,7 +130,7 @@ def _read_study(
 
 def _replay_study(
     study: LoadedStudy, jobs: int | None, cache: PartCache | None, *, threads: bool
-) -> tuple[StudyResult, list[str]]:
+) -> tuple[Results, list[str]]:
     """Replay with progress on stderr. Returns the result and, if `threads` do the work, the advice on `--cluster`."""
     from copem_replay.api.run import count_workers, replay_study
     from copem_replay.api.study import prepare_study
@@ -142,27 +143,27 @@ def _replay_study(
 
 
 def _write_results(
-    place: ResultsPlace, study: LoadedStudy, result: StudyResult, advice: list[str], cache: PartCache | None,
+    place: ResultsPlace, study: LoadedStudy, result: Results, advice: list[str], cache: PartCache | None,
     viewer: str | None,
 ) -> None:  # fmt: skip
     """Fill the results folder, then print notes, problems and the summary."""
-    from copem_replay.api.run import fill_results_folder
     from copem_replay.core.tracks import TRUTH
     from copem_replay.metrics.summary import describe_began, format_summary
 
-    notes = fill_results_folder(place, result, skipped=study.skipped, viewer=viewer)
+    notes = result.fill(place, skipped=study.skipped, viewer=viewer)
     if cache is not None:
         print_notes(sorted(cache.damaged))
         print_problems([f"pieces: {cache.computed} computed, {cache.found} found in {cache.store.where}"])
     skipped = [f"{path}: skipped: {reason}" for path, reason in study.skipped]
-    print_notes([*place.notes, *skipped, *notes, *result.replayed.costs, *advice])
+    costs = () if result.replayed is None else result.replayed.costs
+    print_notes([*place.notes, *skipped, *notes, *costs, *advice])
     print_problems(place.failed)
     print(format_summary(result.summary, width_of(sys.stdout)))
-    replayed, configurations = result.replayed, study.experiment.configurations
-    if len(replayed.tally):
+    configurations = study.experiment.configurations
+    if len(result.tally):
         modelled = (name for name, one in configurations.items() if one.units != TRUTH)
         reference, words = next(modelled, next(iter(configurations))), study.experiment.measure.began
-        print_line(describe_began(replayed.tally, reference, replayed.horizon_s, words))
+        print_line(describe_began(result.tally, reference, result.provenance.horizon_used_s, words))
     if result.sweep is not None:
         print_line(f"sweep of {', '.join(dict.fromkeys(result.sweep['sweep']))} in {place.shown / 'sweep.csv'}")
     _print_baseline(study.experiment)

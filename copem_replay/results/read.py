@@ -1,26 +1,42 @@
-"""A results folder, read back: one reader for figures, reports, recordings and comparisons.
+"""Results: what a run gave, in memory or read back from its folder, for figures, reports, recordings and comparisons.
 
 Comparisons read log by log: of a table of any size only the rows of one log are in memory. The place of each log's rows
-is known from a pass over the names alone; they may be in one file or in one for each log, in any order.
+in a folder is known from a pass over the names alone; they may be in one file or in one for each log, in any order.
 """
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
+from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
-from copem_replay.core.errors import ExperimentError, InputError, RecordingError, RemoteFile, is_url
+from copem_replay.core.errors import (
+    ExperimentError,
+    InputError,
+    OutputError,
+    RecordingError,
+    RemoteFile,
+    count_noun,
+    is_url,
+)
 from copem_replay.experiment.drive import resolve_for_log
-from copem_replay.experiment.file import ExperimentSource, parse_experiment, read_experiment_file, settings_places
+from copem_replay.experiment.file import (
+    ExperimentSource,
+    make_plain_source,
+    parse_experiment,
+    read_experiment_file,
+    settings_places,
+)
 from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import read_logs
 from copem_replay.io.open import File, Place, fetch_place, first_recording, read_file_stamps, sha256_of
@@ -31,7 +47,8 @@ from copem_replay.metrics.onset import COUNTS_BY, select_counted
 from copem_replay.metrics.summary import DETECTED
 from copem_replay.pipeline.prepare import Replay, prepare_log
 from copem_replay.pipeline.study_log import read_content_digest
-from copem_replay.results.folder import MARK, check_unchanged
+from copem_replay.pipeline.sweep import resolve_sweep
+from copem_replay.results.folder import EXPERIMENT, MARK, check_inputs, check_unchanged, take_place
 from copem_replay.results.schema import (
     AGAIN,
     COMPARED_FILES,
@@ -40,6 +57,7 @@ from copem_replay.results.schema import (
     check_columns,
     check_kind,
     check_text,
+    parse_provenance,
     read_csv,
     read_frame,
     read_provenance,
@@ -50,39 +68,42 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from copem_replay.pipeline.expansion import ConfigurationFacts
+    from copem_replay.pipeline.run import ExperimentResult
+    from copem_replay.results.folder import ResultsPlace
     from copem_replay.results.schema import RecordedLog
+    from copem_replay.results.write import Exporter
 
 
 @dataclass(frozen=True, eq=False)
 class LogRows:
-    """One table: the kinds of its columns, and the place of each log's rows: file, row group, from, to."""
+    """One table, log by log: the kinds of its columns, rows by log and configuration in the order of both.
+
+    `read`: the named columns of a log's rows, in parts.
+    """
 
     place: Path
     kinds: Mapping[str, str]
-    where: Mapping[str, Sequence[tuple[Path, int, int, int]]]
-    counts: Mapping[tuple[str, str], int]  # rows by log and configuration, in the order of both
+    counts: Mapping[tuple[str, str], int]
     without_rows: pa.Table
-    _last: dict[tuple[Path, int], pa.Table] = field(default_factory=dict)
+    read: Callable[[str, Sequence[str]], list[pa.Table]]
 
     def of(self, log: str) -> pa.Table:
         """A log's rows without the column `log`, text as `string`. Raises InputError where they are damaged."""
         import pyarrow as pa
-        from pyarrow import parquet
 
-        names, parts = [name for name in self.kinds if name != "log"], []
-        for file, k, begin, end in self.where.get(log, ()):
-            if (file, k) not in self._last:
-                self._last.clear()
-                with _report_damage(self.place):
-                    group = parquet.ParquetFile(file).read_row_group(k, names)
-                    self._last[file, k] = group.replace_schema_metadata(None)  # pandas would parse any text in it
-            parts.append(self._last[file, k].slice(begin, end - begin))
+        names = [name for name in self.kinds if name != "log"]
+        parts = self.read(log, names)
         table = pa.concat_tables(parts) if parts else self.without_rows.select(names)
         for k, name in enumerate(names):
             if self.kinds[name] == "text":
                 check_text(self.place, name, table[name])
                 table = table.set_column(k, name, table[name].cast(pa.string()))
         return table
+
+    @property
+    def logs(self) -> tuple[str, ...]:
+        """The logs that have rows, in their order."""
+        return tuple(dict.fromkeys(log for log, _ in self.counts))
 
     @property
     def configurations(self) -> tuple[str, ...]:
@@ -92,26 +113,25 @@ class LogRows:
     def only(self, names: Iterable[str]) -> LogRows:
         """The table with those of the named columns that it has."""
         columns = self.without_rows.column_names
-        return replace(self, kinds={name: self.kinds.get(name, "") for name in names if name in columns}, _last={})
+        return replace(self, kinds={name: self.kinds.get(name, "") for name in names if name in columns})
 
     def renamed(self, to: Mapping[str, str]) -> LogRows:
         """The table with its logs renamed, `to` by the old names."""
-        where = {to.get(log, log): places for log, places in self.where.items()}
         counts = {(to.get(log, log), configuration): n for (log, configuration), n in self.counts.items()}
-        return replace(self, where=where, counts=counts, _last={})
+        before = {to.get(log, log): log for log in self.logs}
+        return replace(self, counts=counts, read=lambda log, names: self.read(before.get(log, log), names))
 
 
 def log_rows(place: Path, kinds: Mapping[str, str], files: Sequence[Path] = ()) -> LogRows:
-    """A table, which has at least columns of these kinds, with the place of each log's rows.
+    """A table in a file, which has at least columns of these kinds. `files`: those of a table that is a folder.
 
-    `files`: those of a table that is a folder. Raises InputError where the table cannot be read, lacks a column, or has
-    one of another kind.
+    Raises InputError where the table cannot be read, lacks a column, or has one of another kind.
     """
     import pyarrow as pa
     from pyarrow import parquet
 
     names, schema = ["log", "configuration"], pa.schema([])
-    where: dict[str, list[tuple[Path, int, int, int]]] = {}
+    where: dict[str, list[tuple[Path, int, int, int]]] = {}  # of each log's rows: file, row group, from, to
     counts: Counter[tuple[str, str]] = Counter()
     for path in files or [place]:
         with _report_damage(place):
@@ -128,13 +148,30 @@ def log_rows(place: Path, kinds: Mapping[str, str], files: Sequence[Path] = ()) 
                 group = file.read_row_group(k, names).unify_dictionaries()
             for name in names:
                 check_text(place, name, group[name])
-            sizes = group.group_by(names, use_threads=False).aggregate([([], "count_all")]).to_pydict()
-            counts.update(
-                dict(zip(zip(sizes["log"], sizes["configuration"], strict=True), sizes["count_all"], strict=True))
-            )
+            counts.update(_count_rows(group))
             for log, begin, end in _find_stretches(group["log"].combine_chunks()):
                 where.setdefault(log, []).append((path, k, begin, end))
-    return LogRows(place, kinds, where, counts, schema.empty_table())
+    last: dict[tuple[object, ...], pa.Table] = {}
+
+    def read(log: str, columns: Sequence[str]) -> list[pa.Table]:
+        parts = []
+        for file, k, begin, end in where.get(log, ()):
+            if (key := (file, k, *columns)) not in last:
+                last.clear()
+                with _report_damage(place):
+                    group = parquet.ParquetFile(file).read_row_group(k, list(columns))
+                    last[key] = group.replace_schema_metadata(None)  # pandas would parse any text in it
+            parts.append(last[key].slice(begin, end - begin))
+        return parts
+
+    return LogRows(place, kinds, counts, schema.empty_table(), read)
+
+
+def _count_rows(table: pa.Table) -> dict[tuple[str, str], int]:
+    """Rows by log and configuration."""
+    keys = ["log", "configuration"]
+    sizes = table.group_by(keys, use_threads=False).aggregate([([], "count_all")]).to_pydict()
+    return dict(zip(zip(sizes["log"], sizes["configuration"], strict=True), sizes["count_all"], strict=True))
 
 
 @contextmanager
@@ -161,40 +198,32 @@ def _find_stretches(names: pa.Array) -> Iterator[tuple[str, int, int]]:
         yield distinct[name_ix[begin]], begin, end
 
 
+# Where tables come from: a folder, or a run that is in memory.
+
 _MAY_BE_FOLDERS = ("detections.parquet", "tally.parquet")
 
 
-@dataclass(frozen=True, eq=False)
-class Results:
-    """A results folder. A file is read when it is first used, which raises InputError where it is damaged, or where
-    other results have taken the place of the folder.
+class FolderTables:
+    """The tables of a results folder, by the names of their files; paths in its experiment are relative to `base`.
 
-    >>> results = cr.load_results("out/tc016d")
-    >>> results.name, results.experiment.runs, results.sweep is None
-    ('tc016d', 500, True)
+    A table is read when it is asked for. Raises InputError where it is damaged, or where other results have taken the
+    place of the folder.
     """
 
-    folder: Path
-    seen: os.stat_result  # the folder when it was opened
-    provenance: Provenance
-
-    @property
-    def name(self) -> str:
-        """The name of the folder, also where it is given as `.`."""
-        return self.folder.resolve().name
+    def __init__(self, place: Path) -> None:
+        self.place, self.base, self._seen = place, place, os.stat(place)
+        self.provenance = read_provenance(place / MARK)
 
     @cached_property
     def source(self) -> ExperimentSource:
         """`experiment.yaml` as plain data."""
+        file = self.place / EXPERIMENT
         try:
-            source = read_experiment_file(self.folder / "experiment.yaml")
+            source = read_experiment_file(file)
         except ExperimentError as error:
-            why = error.problems[0].removeprefix(f"{self.folder / 'experiment.yaml'}:").strip()
-            raise InputError(
-                f"{self.folder / 'experiment.yaml'}: expected the experiment of the results, found damage: {why}; "
-                f"{AGAIN}"
-            ) from None
-        check_unchanged(self.folder, self.seen)
+            why = error.problems[0].removeprefix(f"{file}:").strip()
+            raise InputError(f"{file}: expected the experiment of the results, found damage: {why}; {AGAIN}") from None
+        self.check_unchanged()
         return source
 
     @cached_property
@@ -205,6 +234,229 @@ class Results:
             raise InputError(problems)
         return experiment
 
+    def check_unchanged(self) -> None:
+        """Raise InputError where other results have taken the place of the folder."""
+        check_unchanged(self.place, self._seen)
+
+    def has(self, name: str) -> bool:
+        """Whether there is such a table."""
+        return (self.place / name).is_file() or (name in _MAY_BE_FOLDERS and (self.place / name).is_dir())
+
+    def kinds(self, name: str, *, compared: bool = False) -> dict[str, str]:
+        """Kinds of the columns that a table has to have, all or only those that comparisons read."""
+        asked = {"braking": self.provenance.braking, "conflict": self.provenance.measure["conflict"]}
+        return TABLES[name].kinds(*(key for key, of in asked.items() if of is not None), compared=compared)
+
+    def frame(self, name: str) -> pd.DataFrame:
+        """A whole table."""
+
+        def as_frame(place: Path) -> pd.DataFrame:
+            from pyarrow import parquet
+
+            table = parquet.read_table(self._files(place) or place).replace_schema_metadata(None)
+            return table.to_pandas(
+                split_blocks=True, self_destruct=True
+            )  # column by column, so that no column is in memory twice
+
+        table = read_frame(self.place / name, read_csv if name.endswith(".csv") else as_frame, self.kinds(name))
+        self.check_unchanged()
+        return table
+
+    def rows(self, name: str) -> LogRows:
+        """A table log by log, which has at least the columns that comparisons read."""
+        rows = log_rows(self.place / name, self.kinds(name, compared=True), self._files(self.place / name))
+        self.check_unchanged()
+        return rows
+
+    def _files(self, place: Path) -> list[Path]:
+        """The files of a table that is a folder, in the order of the logs; empty: the table is a file."""
+        if not place.is_dir():
+            return []
+        return [path for log in self.provenance.logs if (path := table_file(place, log.name)).is_file()]
+
+
+_NUMBERS = itertools.count(1)
+
+
+class RunTables:
+    """The tables of a run that is in memory, by the names that their files have. `place`: what it is called."""
+
+    def __init__(self, experiment: Experiment, recordings: tuple[Recording, ...], replayed: ExperimentResult) -> None:
+        self.experiment, self.recordings, self.replayed = experiment, recordings, replayed
+        self.place, self.base = Path(f"run {next(_NUMBERS)}"), Path()
+
+    @cached_property
+    def provenance(self) -> Provenance:
+        """What `provenance.json` says once it is written."""
+        from copem_replay.results.write import build_provenance
+
+        data = build_provenance(self.experiment, self.recordings, self.replayed, (), self.replayed.notes)
+        return parse_provenance(data, self.place)
+
+    @cached_property
+    def source(self) -> ExperimentSource:
+        """The experiment as plain data."""
+        return make_plain_source(resolve_sweep(self.experiment).as_written())
+
+    def check_unchanged(self) -> None:
+        """Nothing can take its place."""
+
+    def has(self, name: str) -> bool:
+        """Whether there is such a table."""
+        return self._table(name) is not None
+
+    def frame(self, name: str) -> pd.DataFrame:
+        """A whole table."""
+        table = self._table(name)
+        return table if isinstance(table, pd.DataFrame) else table.to_pandas()
+
+    def rows(self, name: str) -> LogRows:
+        """A table log by log."""
+        import pyarrow as pa
+        import pyarrow.compute as pc
+
+        table = self._table(name)
+        if isinstance(table, pd.DataFrame):
+            table = pa.Table.from_pandas(table, preserve_index=False)
+        table = table.replace_schema_metadata(None)
+        kinds = {column.name: column.kind for column in TABLES[name].columns if column.name in table.column_names}
+
+        def read(log: str, columns: Sequence[str]) -> list[pa.Table]:
+            return [table.filter(pc.equal(table["log"], log)).select(columns)]
+
+        return LogRows(self.place / name, kinds, _count_rows(table), table.schema.empty_table(), read)
+
+    def _table(self, name: str) -> Any:
+        """A table of pandas or Arrow; None: there is none."""
+        stem = name.partition(".")[0]
+        if name in COMPARED_FILES:
+            return getattr(self.replayed.accuracy, stem, None)
+        return self.replayed.table if stem == "detections" else getattr(self.replayed, stem)
+
+    def recording(self, log: str) -> Recording:
+        """The recording of a log."""
+        return next(of_log for of_log in self.replayed.logs if of_log.name == log).whole()
+
+
+@dataclass(eq=False, repr=False)
+class Results:
+    """What an experiment gave, just computed or read from a folder: pandas tables, as a results folder has them.
+
+    `detections`: a row per log, configuration, run and measured object; of many rows `each` gives those of a log at a
+    time. `summary`: a row per configuration. `exact`, `sweep`, `accuracy`, `bands`: None where the experiment does not
+    ask for them. Times are in seconds (`_s`), distances in metres (`_m`); missing values are null. What columns mean:
+    docs/reference/columns.md. A file of a folder is read when it is first used, which raises InputError where it is
+    damaged, or where other results have taken the place of the folder.
+
+    >>> result = cr.run({"version": 1, "configurations": {"GT": {"units": "truth"}}}, "logs/tc016d.mcap")
+    >>> result.detections.shape[0], result.exact is None
+    (7, True)
+    >>> results = cr.load_results("out/tc016d")
+    >>> results.name, results.experiment.runs, results.sweep is None
+    ('tc016d', 500, True)
+    """
+
+    tables: FolderTables | RunTables
+    folder: Path | None = None
+    """The results folder; None: they are not saved."""
+    exporters: Callable[[str | None], Sequence[Exporter]] | None = None
+    """How single runs are written, by the address of a Rerun viewer that also gets them; None: they are written."""
+
+    def __repr__(self) -> str:
+        logs, runs = count_noun(len(self.provenance.logs), "log"), count_noun(self.provenance.runs, "run")
+        of = count_noun(len(self.facts), "configuration")
+        return f"Results({of}, {runs}, {logs}, {self.folder or 'not saved'})"
+
+    @property
+    def place(self) -> Path:
+        """The folder, or what results that are not saved are called in messages."""
+        return self.folder or self.tables.place
+
+    @property
+    def name(self) -> str:
+        """The name of the folder, also where it is given as `.`."""
+        return self.place.resolve().name
+
+    @property
+    def provenance(self) -> Provenance:
+        """Versions, logs, seed, metric parameters."""
+        return self.tables.provenance
+
+    @property
+    def source(self) -> ExperimentSource:
+        """The experiment as plain data."""
+        return self.tables.source
+
+    @property
+    def experiment(self) -> Experiment:
+        """The experiment, with components of the user's own."""
+        return self.tables.experiment
+
+    @property
+    def recordings(self) -> tuple[Recording, ...]:
+        """The recordings that were replayed; none of results that were read."""
+        return self.tables.recordings if isinstance(self.tables, RunTables) else ()
+
+    @property
+    def replayed(self) -> ExperimentResult | None:
+        """What the pipeline gave; None of results that were read."""
+        return self.tables.replayed if isinstance(self.tables, RunTables) else None
+
+    def check_unchanged(self) -> None:
+        """Raise InputError where other results have taken the place of the folder."""
+        self.tables.check_unchanged()
+
+    def require_folder(self) -> Path:
+        """The results folder. Raises InputError for results that are not saved."""
+        if self.folder is None:
+            raise InputError("expected results in a folder, found some that are not saved; result.save(folder) does")
+        return self.folder
+
+    def save(self, folder: str | PathLike[str], overwrite: bool = False) -> Path:
+        """Write the results folder, complete or not at all. Returns its path.
+
+        Raises OutputError: the folder holds something already (`overwrite` replaces results), or is not writable; also
+        where a replay could not be written, and all other results are there. InputError: they were read from a folder.
+
+        >>> result.save("out/example", overwrite=True).name
+        'example'
+        """
+        from copem_replay.results.write import check_own_files
+
+        exporters = self._list_exporters()
+        with take_place(Path(folder), overwrite=overwrite) as place:
+            check_inputs(place, [path for recording in self.recordings for path in recording.paths])
+            check_own_files(place, self.experiment, self.recordings, exporters)
+            self.fill(place)
+        if place.failed:
+            raise OutputError(place.failed)
+        return place.shown
+
+    def fill(
+        self, place: ResultsPlace, *, skipped: Sequence[tuple[File, str]] = (), viewer: str | None = None
+    ) -> list[str]:
+        """Write the results into a place that is locked. Returns notes, one line each.
+
+        `skipped`: logs that were left out, with reasons. `viewer`: address of a Rerun viewer that also gets the
+        recordings. Raises InputError where the results were read from a folder.
+        """
+        from copem_replay.results.write import fill_place
+
+        exporters = self._list_exporters(viewer)
+        assert self.replayed is not None
+        notes = fill_place(
+            place, self.experiment, self.recordings, self.replayed, exporters=exporters, skipped=skipped
+        )
+        self.folder = place.shown
+        return notes
+
+    def _list_exporters(self, viewer: str | None = None) -> Sequence[Exporter]:
+        if self.replayed is None or self.exporters is None:
+            raise InputError(
+                f"{self.place}: expected results of a run to save, found some that were read from a folder"
+            )
+        return self.exporters(viewer)
+
     @cached_property
     def table(self) -> pd.DataFrame:
         """`detections.parquet` as a whole, for users; figures take `known` or `each`, which hold less in memory."""
@@ -212,19 +464,16 @@ class Results:
 
     @cached_property
     def rows(self) -> LogRows:
-        """`detections.parquet` with the place of each log's rows."""
-        place = self.folder / "detections.parquet"
-        rows = log_rows(place, self._kinds(place.name, compared=True), self._files(place))
-        check_unchanged(self.folder, self.seen)
-        return rows
+        """`detections.parquet`, log by log."""
+        return self.tables.rows("detections.parquet")
 
     def each(self, *columns: str, log: str | None = None, every: bool = False) -> Iterator[pd.DataFrame]:
         """Rows that count, or `every` row, log by log or of one log; with `columns`, none named: all but `log`."""
         columns = columns or tuple(name for name in self.rows.without_rows.column_names if name != "log")
         rows = self.rows.only(dict.fromkeys((*columns, *COUNTS_BY)))
-        for name_of_log in self.rows.where if log is None else [log]:
+        for name_of_log in self.rows.logs if log is None else [log]:
             table = rows.of(name_of_log)
-            check_unchanged(self.folder, self.seen)
+            self.check_unchanged()
             frame = table.to_pandas()
             counted = frame if every else self.counted(frame)
             yield counted[[name for name in columns if name in counted]]
@@ -292,35 +541,31 @@ class Results:
     @cached_property
     def by_log(self) -> dict[str, LogRows]:
         """By file name the tables that comparisons read, those that exist."""
-        rows = self.rows.only(self._kinds(self.rows.place.name, compared=True))
-        if not rows.where:
-            raise InputError(f"{self.folder}: nothing can be compared: no measured object has an onset")
+        rows = self.rows
+        if not rows.counts:
+            raise InputError(f"{self.place}: nothing can be compared: no measured object has an onset")
         logs = {log.name for log in self.provenance.logs}
         for what, unknown in (
-            ("logs", set(rows.where) - logs),
+            ("logs", set(rows.logs) - logs),
             ("configurations", set(rows.configurations) - self.facts.keys()),
         ):
             if unknown:
                 raise InputError(f"{rows.place}: expected the {what} of provenance.json, found {min(unknown)!r}")
-        tables = {rows.place.name: rows}
-        for name in (name for name in COMPARED_FILES if (self.folder / name).is_file()):
-            table = log_rows(self.folder / name, self._kinds(name, compared=True))
-            tables[name] = table.only(TABLES[name].kinds("fleet", compared=True))
-        check_unchanged(self.folder, self.seen)
-        return tables
+        tables = {rows.place.name: rows} | {n: self.tables.rows(n) for n in COMPARED_FILES if self.tables.has(n)}
+        return {name: of.only(TABLES[name].kinds("braking", "fleet", compared=True)) for name, of in tables.items()}
 
     def rows_of(self, log: str, *names: str) -> dict[str, pa.Table]:
         """A log's rows of the named tables, by default of all that comparisons read."""
         tables = {name: rows.of(log) for name, rows in self.by_log.items() if not names or name in names}
-        check_unchanged(self.folder, self.seen)
+        self.check_unchanged()
         return tables
 
     def log_place(self, log: str) -> Place:
         """The place where the recording of a log, or the several that it is made of, are expected."""
         entry = self.experiment.logs[[file.name for file in self.provenance.logs].index(log)]
         if isinstance(entry, str):
-            return RemoteFile(entry) if is_url(entry) else self.folder / entry
-        return settings_places(entry, self.folder)[0]
+            return RemoteFile(entry) if is_url(entry) else self.tables.base / entry
+        return settings_places(entry, self.tables.base)[0]
 
     def log_path(self, log: str) -> File:
         """The file where the recording of a log, or the first of several, is expected."""
@@ -331,35 +576,14 @@ class Results:
         known = tuple(self.experiment.configurations)
         for name in configurations or ():
             if name not in known:
-                raise InputError(f"{self.folder}: configurations: expected some of {', '.join(known)}, found {name!r}")
+                raise InputError(f"{self.place}: configurations: expected some of {', '.join(known)}, found {name!r}")
         return tuple(dict.fromkeys(configurations)) if configurations else known
 
-    def _kinds(self, name: str, *, compared: bool = False) -> dict[str, str]:
-        """Kinds of the columns that a file has to have, all or only those that comparisons read."""
-        asked = {"braking": self.provenance.braking, "conflict": self.provenance.measure["conflict"]}
-        return TABLES[name].kinds(*(key for key, of in asked.items() if of is not None), compared=compared)
-
-    def _files(self, place: Path) -> list[Path]:
-        """The files of a table that is a folder, in the order of the logs; empty: the table is a file."""
-        if not place.is_dir():
-            return []
-        return [path for log in self.provenance.logs if (path := table_file(place, log.name)).is_file()]
-
     def _optional(self, name: str) -> pd.DataFrame | None:
-        return self._frame(name) if (self.folder / name).is_file() else None
+        return self._frame(name) if self.tables.has(name) else None
 
     def _frame(self, name: str) -> pd.DataFrame:
-        def as_frame(place: Path) -> pd.DataFrame:
-            from pyarrow import parquet
-
-            table = parquet.read_table(self._files(place) or place).replace_schema_metadata(None)
-            return table.to_pandas(
-                split_blocks=True, self_destruct=True
-            )  # column by column, so that no column is in memory twice
-
-        table = read_frame(self.folder / name, read_csv if name.endswith(".csv") else as_frame, self._kinds(name))
-        check_unchanged(self.folder, self.seen)
-        return table
+        return self.tables.frame(name)
 
 
 def open_results(folder: Path | str, *more: str) -> Results:
@@ -373,8 +597,7 @@ def open_results(folder: Path | str, *more: str) -> Results:
         found = "a file" if folder.exists() else "no such folder"
         raise InputError(f"{folder}: expected a results folder, found {found}; `copem-replay run` writes one")
     _check_exists(folder, MARK, "experiment.yaml", "detections.parquet", *more)
-    seen = os.stat(folder)
-    return Results(folder, seen, read_provenance(folder / MARK))
+    return Results(FolderTables(folder), folder)
 
 
 def _check_exists(folder: Path, *names: str) -> None:
@@ -395,17 +618,19 @@ def read_results(folder: Path | str, *, rowless: bool = False) -> Results:
 
 def check_complete(results: Results, *, rowless: bool = False) -> Results:
     """The results, with rows checked against the experiment and every other table read. Raises InputError."""
-    _check_exists(results.folder, "summary.csv", "tally.parquet")
+    if isinstance(results.tables, RunTables):
+        return results
+    _check_exists(results.place, "summary.csv", "tally.parquet")
     experiment, rows = results.experiment, results.rows
-    check_columns(rows.place, results._kinds(rows.place.name), rows.kinds)
-    if rows.where or not rowless:
+    check_columns(rows.place, results.tables.kinds(rows.place.name), rows.kinds)
+    if rows.counts or not rowless:
         _check_rows(rows, experiment)
     tally = results.tally[results.tally["event"] == DETECTED]
     counts = tally.groupby(["log", "configuration"])["runs"].sum()
     if counts.to_dict() != rows.counts:
         expected, found = sum(rows.counts.values()), int(counts.sum())
         raise InputError(
-            f"{results.folder}/tally.parquet: expected the {expected} rows of detections.parquet counted, found "
+            f"{results.place}/tally.parquet: expected the {expected} rows of detections.parquet counted, found "
             f"{found}; {AGAIN}"
         )
     for what, expected, found in (
@@ -414,7 +639,7 @@ def check_complete(results: Results, *, rowless: bool = False) -> Results:
     ):
         if expected != found:
             raise InputError(
-                f"{results.folder}/{MARK}: expected {expected} {what} as in experiment.yaml, found {found}; {AGAIN}"
+                f"{results.place}/{MARK}: expected {expected} {what} as in experiment.yaml, found {found}; {AGAIN}"
             )
     for name in ("summary", "exact", "sweep"):
         getattr(results, name)
@@ -426,7 +651,7 @@ def _check_rows(rows: LogRows, experiment: Experiment) -> None:
     unknown = [name for name in rows.configurations if name not in experiment.configurations]
     if unknown:
         raise InputError(f"{rows.place}: expected the configurations of experiment.yaml, found {unknown[0]!r}; {AGAIN}")
-    if not rows.where:
+    if not rows.counts:
         raise InputError(f"{rows.place}: expected rows to draw, found none: no measured object has an onset")
     # A configuration that has none of its units in a log is left out of that log.
     counts = [*rows.counts.values(), *[0] * (set(experiment.configurations) != set(rows.configurations))]
@@ -461,6 +686,8 @@ def reread_recording(results: Results, log: str, experiment: Experiment) -> Reco
 
     Raises RecordingError, one line, where the recording is missing or not the one that was replayed.
     """
+    if isinstance(results.tables, RunTables):
+        return results.tables.recording(log)
     file = next(file for file in results.provenance.logs if file.name == log)
     path, place = results.log_path(log), results.log_place(log)
     try:

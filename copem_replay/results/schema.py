@@ -444,35 +444,38 @@ _SKIPPED = ("log", "reason")
 def read_provenance(path: Path) -> Provenance:
     """Read `provenance.json`. Raises InputError."""
     try:
-        data: Any = parse_json(path.read_text(encoding="utf-8"))
-        if (found := dict(data).get("format", 1)) != FORMAT:
-            raise InputError(f"{path.parent}: expected results of format {FORMAT}, found format {found}; {AGAIN}")
-        logs = tuple(
-            RecordedLog(str(log["log"]), log.get("topic"), str(log["sha256"]), log.get("truth")) for log in data["logs"]
-        )
-        notes = [*data.get("notes", []), *(log[name] for log in data.get("logs_skipped", []) for name in _SKIPPED)]
-        if not all(isinstance(note, str) for note in notes):
-            raise ValueError("expected text in notes and logs_skipped")
-        measure, braking, gap_s = dict(data["measure"]), data.get("braking"), data.get("max_gap_s")
-        used_s, run_shown = float(measure.pop("horizon_used_s")), data.get("run_shown") or {}
-        return Provenance(
-            logs=logs,
-            seed=int(data["seed"]),
-            runs=int(data["runs"]),
-            visibility=data.get("visibility"),
-            max_gap_s=None if gap_s is None else float(gap_s),
-            window_s=data.get("window_s"),
-            # A missing key, from an older version, stands for its default.
-            measure=Measure().model_dump(mode="json", by_alias=True) | measure,
-            braking=None if braking is None else dict(braking),
-            horizon_used_s=used_s,
-            run_shown={str(log): int(run) for log, run in run_shown.items() if run is not None},
-            facts={str(name): ConfigurationFacts(**of) for name, of in dict(data["configurations"]).items()},
-            data=data,
-        )
+        return parse_provenance(parse_json(path.read_text(encoding="utf-8")), path.parent)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         why = f"no {error}" if isinstance(error, KeyError) else " ".join(str(error).split())
         raise InputError(f"{path}: expected the provenance of results, found damage: {why}; {AGAIN}") from None
+
+
+def parse_provenance(data: Any, place: Path) -> Provenance:
+    """What `provenance.json` of the results at a place says. Raises InputError for another format."""
+    if (found := dict(data).get("format", 1)) != FORMAT:
+        raise InputError(f"{place}: expected results of format {FORMAT}, found format {found}; {AGAIN}")
+    notes = [*data.get("notes", []), *(log[name] for log in data.get("logs_skipped", []) for name in _SKIPPED)]
+    if not all(isinstance(note, str) for note in notes):
+        raise ValueError("expected text in notes and logs_skipped")
+    measure, braking, gap_s = dict(data["measure"]), data.get("braking"), data.get("max_gap_s")
+    used_s, run_shown = float(measure.pop("horizon_used_s")), data.get("run_shown") or {}
+    return Provenance(
+        logs=tuple(
+            RecordedLog(str(log["log"]), log.get("topic"), str(log["sha256"]), log.get("truth")) for log in data["logs"]
+        ),
+        seed=int(data["seed"]),
+        runs=int(data["runs"]),
+        visibility=data.get("visibility"),
+        max_gap_s=None if gap_s is None else float(gap_s),
+        window_s=data.get("window_s"),
+        # A missing key, from an older version, stands for its default.
+        measure=Measure().model_dump(mode="json", by_alias=True) | measure,
+        braking=None if braking is None else dict(braking),
+        horizon_used_s=used_s,
+        run_shown={str(log): int(run) for log, run in run_shown.items() if run is not None},
+        facts={str(name): ConfigurationFacts(**of) for name, of in dict(data["configurations"]).items()},
+        data=data,
+    )
 
 
 # Common to all kinds of results: recordings, versions, tables.

@@ -193,6 +193,14 @@ def fill_place(
     return notes
 
 
+def check_own_files(
+    place: ResultsPlace, experiment: Experiment, recordings: Sequence[Recording], exporters: Sequence[Exporter]
+) -> None:
+    """Raise OutputError where a file of the user's own has a name that the results will have."""
+    if place.before is not None:
+        check_names(place, list_results(experiment, recordings, exporters))
+
+
 def list_results(
     experiment: Experiment,
     recordings: Sequence[Recording],

@@ -190,10 +190,8 @@ def _reread_truth(sides: Sequence[_Side], log: str, experiment: Experiment) -> R
     recording = reread_recording(sides[0].results, log, experiment)
     for side in sides:
         if side.one.replay.scene.object_ids != recording.scene.object_ids:
-            first_folder = sides[0].results.folder
-            raise InputError(
-                f"{side.results.folder}: log {log}: expected the objects of {first_folder}: `read` differs"
-            )
+            first_folder = sides[0].results.place
+            raise InputError(f"{side.results.place}: log {log}: expected the objects of {first_folder}: `read` differs")
     return recording
 
 
@@ -218,9 +216,9 @@ def _check_one_recording(used: Sequence[Results]) -> None:
     for results in used[1:]:
         for log in results.provenance.logs:
             if (log.name, log.sha256) not in expected:
-                first_folder = used[0].folder
+                first_folder = used[0].place
                 raise InputError(
-                    f"{results.folder}: log {log.name}: expected the recording of {first_folder}, found another "
+                    f"{results.place}: log {log.name}: expected the recording of {first_folder}, found another "
                     "of the same drive: they cannot be shown together; compare them without --rrd"
                 )
 
@@ -257,7 +255,7 @@ def _replay_side(results: Results, chosen: Sequence[LabelledConfiguration], log:
     )
     if not same:
         raise InputError(
-            f"{results.folder}: log {log}: run {run} comes out otherwise than in detections.parquet: another version "
+            f"{results.place}: log {log}: run {run} comes out otherwise than in detections.parquet: another version "
             "made it; run the experiment again with --overwrite"
         )
     return _Side(results, labels, replayed, first_episodes(rows))
@@ -277,7 +275,7 @@ def _note_other_worlds(sides: Sequence[_Side]) -> list[str]:
     """Notes on settings of the world that differ between folders: only the first folder's are shown."""
     first = sides[0].results
     return [
-        f"{key} differ; those of {first.folder} are shown"
+        f"{key} differ; those of {first.place} are shown"
         for key in ("obstacles", "visibility")
         if any(getattr(side.results.experiment, key) != getattr(first.experiment, key) for side in sides)
     ]

@@ -62,8 +62,8 @@ class TestNames:
         )
         check = [sys.executable, "-m", "mypy", "--config-file", ROOT / "pyproject.toml", tmp_path / "page.py"]
         said = subprocess.run(check, cwd=ROOT, capture_output=True, text=True).stdout
-        assert "-> copem_replay.api.run.StudyResult" in said
-        assert 'has type "StudyResult", variable has type "int"' in said
+        assert "-> copem_replay.results.read.Results" in said
+        assert 'has type "Results", variable has type "int"' in said
         assert 'Module has no attribute "rum"' in said
 
     @pytest.mark.parametrize("code", ["import copem_replay", "import copem_replay; dir(copem_replay)"])
@@ -219,7 +219,7 @@ class TestRun:
         assert refused.value.problems == (said,)
 
     def test_a_result_is_a_line(self, here: Path) -> None:
-        assert repr(cr.run("e.yaml")) == "StudyResult(3 configurations, 4 runs, 1 recording, not saved)"
+        assert repr(cr.run("e.yaml")) == "Results(3 configurations, 4 runs, 1 log, not saved)"
 
     def test_jobs(self, here: Path) -> None:
         with pytest.raises(cr.InputError, match="jobs: expected at least 1, found 0"):
@@ -257,11 +257,6 @@ class TestFusedTracks:
 
 
 class TestFolders:
-    def test_what_is_not_saved_has_no_folder(self, here: Path) -> None:
-        result = cr.run("e.yaml")
-        with pytest.raises(cr.InputError, match=r"result\.save\(folder\) does"):
-            cr.compare(result)
-
     def test_a_result_a_reading_and_a_path_are_the_same(self, here: Path) -> None:
         result = cr.run("e.yaml")
         result.save("out/e")
@@ -280,6 +275,43 @@ class TestFolders:
         monkeypatch.setattr(opening, "open_viewer", lambda folder, files: called.append((folder, files)) or 0)
         cr.view(cr.load_results("out/e"))
         assert called == [(Path("out/e"), [here / "out/e/replay.rrd"])]
+
+    def test_results_in_memory_are_compared_drawn_and_reported_as_those_read_back(self, here: Path) -> None:
+        result = cr.run("e.yaml")
+        compared, words, axes = cr.compare(result), cr.write_report(result, "r.html"), cr.plot.single_runs(result).axes
+        assert result.folder is None
+        folder = cr.run("e.yaml").save("out/e")
+        kept = cr.compare(folder)
+        pd.testing.assert_frame_equal(compared.table, kept.table)
+        assert (compared.baseline, compared.notes) == (kept.baseline, kept.notes)
+        read = cr.load_results(folder)
+        assert len(axes) == len(cr.plot.single_runs(read).axes)
+        for name in ("known", "tally", "bands"):
+            pd.testing.assert_frame_equal(
+                getattr(result, name), getattr(read, name), check_dtype=False, check_exact=False, rtol=1e-8
+            )
+        for log in ("drive",):
+            rows, expected = result.rows_of(log), read.rows_of(log)
+            assert {name: table.column_names for name, table in rows.items()} == {
+                name: table.column_names for name, table in expected.items()
+            }
+            assert all(rows[name].to_pylist() == expected[name].to_pylist() for name in expected)
+        assert words.stat().st_size == pytest.approx(cr.write_report(folder, "s.html").stat().st_size, rel=0.02)
+
+    def test_two_results_in_memory_have_names_of_their_own(self, here: Path) -> None:
+        one, other = cr.run("e.yaml"), cr.run("e.yaml")
+        comparison = cr.compare([one, other], configurations=["PEM"], baseline=f"{one.name}:GT")
+        assert comparison.configurations == (f"{one.name}:PEM", f"{other.name}:PEM")
+        assert comparison.overall["difference"].notna().any()
+
+    def test_what_is_not_in_a_folder_is_said(self, here: Path) -> None:
+        result = cr.run("e.yaml")
+        for call in (cr.view, cr.write_report, cr.plot.write_figures):
+            with pytest.raises(cr.InputError, match=r"found some that are not saved; result\.save\(folder\) does"):
+                call(result)
+        with pytest.raises(cr.InputError, match="expected results of a run to save, found some that were read"):
+            cr.load_results(result.save("out/e")).save("out/again")
+        assert not Path("out/again").exists()
 
 
 class TestRecordings:

@@ -160,7 +160,7 @@ def test_python_of_the_experiment_page_runs(monkeypatch: pytest.MonkeyPatch, tmp
     monkeypatch.chdir(tmp_path)
     namespace: dict[str, Any] = {"__name__": "page"}
     exec(code, namespace)
-    assert isinstance(namespace["result"], cr.StudyResult)
+    assert isinstance(namespace["result"], cr.Results)
     assert len(namespace["result"].detections) == 3000
     assert (tmp_path / "out/python/summary.csv").is_file()
     assert len(namespace["comparison"]) > 0

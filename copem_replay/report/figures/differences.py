@@ -66,7 +66,7 @@ def differences_figure(
 
     names = results.chosen(configurations)
     if (reason := no_differences(results, names, differences)) is not None:
-        raise InputError(f"{results.folder}: no differences: {reason}")
+        raise InputError(f"{results.place}: no differences: {reason}")
     comparison = differences or compare_folders([results], configurations=names, metrics=tuple(_PANELS))
     compared = [name for name in comparison.configurations if name in names]
     drawn = [name for name in compared if name not in find_truths(results)] or compared

@@ -21,7 +21,7 @@ from copem_replay.report.figures.selection import Selection, choose_object_and_r
 from copem_replay.report.figures.style import METADATA, check_summary, render_figure
 from copem_replay.report.figures.sweeps import sweeps_figure
 from copem_replay.report.figures.trade_off import no_trade_off, trade_off_figure
-from copem_replay.results.folder import add_to_made_list, check_unchanged
+from copem_replay.results.folder import add_to_made_list
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -67,7 +67,7 @@ def _no_sweep(results: Results, selection: Selection) -> str | None:
         return ""
     if results.sweep["configuration"].isin(names).any():
         return None
-    return f"{results.folder}/sweep.csv has no rows of {', '.join(names)}"
+    return f"{results.place}/sweep.csv has no rows of {', '.join(names)}"
 
 
 FIGURES: dict[str, FigureKind] = {
@@ -148,7 +148,7 @@ def write_figure_files(results: Results, folder: Path | None, selection: Selecti
     check_summary(results)
     choice = choose_object_and_run(results, selection)  # raises before anything is drawn
     selection = replace(selection, log=choice.log, object_id=choice.object_id, run=choice.run)
-    folder = results.folder / "figures" if folder is None else folder
+    folder = results.require_folder() / "figures" if folder is None else folder
     notes: list[str] = []
     files: list[str] = []
     names = [f"{name}{suffix}" for name in FIGURES for suffix in METADATA]
@@ -163,10 +163,10 @@ def write_figure_files(results: Results, folder: Path | None, selection: Selecti
             except RecordingError as error:
                 notes += [f"no figure of {name}: {problem}" for problem in error.problems]
                 continue
-            check_unchanged(results.folder, results.seen)
+            results.check_unchanged()
             for suffix, data in content.items():
                 (scratch / f"{name}{suffix}").write_bytes(data)
                 files.append(f"{name}{suffix}")
-        check_unchanged(results.folder, results.seen)
-        add_to_made_list(results.folder, [folder / file for file in files])
+        results.check_unchanged()
+        add_to_made_list(results.place, [folder / file for file in files])
     return [folder / file for file in files], notes

@@ -68,7 +68,7 @@ def choose_object_and_run(results: Results, selection: Selection) -> Choice:
             known = known[known[column] == value]
             if not len(known):
                 some = ", ".join(map(str, values[:_NAMED])) + (", …" if len(values) > _NAMED else "")
-                raise InputError(f"{results.folder}: {key}: expected one of {some}; found {value!r}")
+                raise InputError(f"{results.place}: {key}: expected one of {some}; found {value!r}")
     counted = results.counted(known)
     known = counted if len(counted) else known
     asked_names = results.chosen(selection.configurations)
@@ -79,7 +79,7 @@ def choose_object_and_run(results: Results, selection: Selection) -> Choice:
     present_names = tuple(name for name in asked_names if (rows["configuration"] == name).any())
     if not present_names:
         raise InputError(
-            f"{results.folder}: log {log} has none of the units of {', '.join(asked_names)}; choose another log"
+            f"{results.place}: log {log} has none of the units of {', '.join(asked_names)}; choose another log"
         )
     shown = (
         present_names
@@ -100,7 +100,7 @@ def _rows_of_run(results: Results, known: pd.DataFrame, run: int | None) -> pd.D
         parts.append(rows[rows["run"] == wanted_run].assign(log=log))
     of_run = pd.concat(parts)
     if not len(of_run):
-        raise InputError(f"{results.folder}: run: expected 0 to {results.experiment.runs - 1}, found {run}")
+        raise InputError(f"{results.place}: run: expected 0 to {results.experiment.runs - 1}, found {run}")
     return of_run
 
 

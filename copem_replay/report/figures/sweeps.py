@@ -57,12 +57,12 @@ def sweeps_figure(results: Results, *, configurations: Sequence[str] | None = No
     """Shares with 95 % intervals and times to detection over each swept value. Raises InputError without a sweep."""
     sweep = results.sweep
     if sweep is None:
-        raise InputError(f"{results.folder}: expected sweep.csv in it, found none; give the experiment a `sweep:`")
+        raise InputError(f"{results.place}: expected sweep.csv in it, found none; give the experiment a `sweep:`")
     names = results.chosen(configurations) if configurations else tuple(dict.fromkeys(sweep["configuration"]))
     sweep = sweep[sweep["configuration"].isin(names)]
     kinds = list(dict.fromkeys(sweep["sweep"]))
     if not kinds:
-        raise InputError(f"{results.folder}/sweep.csv: expected rows of {', '.join(names)}, found none")
+        raise InputError(f"{results.place}/sweep.csv: expected rows of {', '.join(names)}, found none")
     asked, names = names, _find_differing(sweep, names)
     sweep = sweep[sweep["configuration"].isin(names)]
     rows = [name for name in _ROWS if name == "ttd" or (name in sweep and sweep[name].notna().any())]

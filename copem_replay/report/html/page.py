@@ -40,7 +40,8 @@ from copem_replay.report.html.tables import (
     stage_table,
     summary_tables,
 )
-from copem_replay.results.folder import add_to_made_list, check_unchanged
+from copem_replay.results.folder import add_to_made_list
+from copem_replay.results.read import Results
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -87,20 +88,20 @@ def check_report(path: Path) -> None:
         raise OutputError(f"{path}: expected a name that ends with {' or '.join(_SUFFIXES)}, found {found}")
 
 
-def write_html_report(folder: Path, out: Path | None = None, *, baseline: str | None = None) -> Path:
-    """Write the report of a results folder, by default as `report.html` in it. Returns its path.
+def write_html_report(given: Path | Results, out: Path | None = None, *, baseline: str | None = None) -> Path:
+    """Write the report of results, or of a results folder, by default as `report.html` in it. Returns its path.
 
     An existing report is replaced. Raises InputError if the results cannot be read, OutputError if the file cannot be
     written.
     """
-    path = folder / REPORT if out is None else out
+    path = out or (given.require_folder() if isinstance(given, Results) else given) / REPORT
     check_report(path)
-    study = load_study(folder, baseline)
+    study = load_study(given, baseline)
     html = build_page(study)
     with atomic_file(path) as scratch:
         scratch.write_text(html, encoding="utf-8", newline="\n")
-        check_unchanged(folder, study.results.seen)
-        add_to_made_list(folder, [path])
+        study.results.check_unchanged()
+        add_to_made_list(study.results.place, [path])
     return path
 
 

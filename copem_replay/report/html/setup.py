@@ -37,7 +37,7 @@ def provenance_tables(study: ReportData) -> Html:
     skipped = [f"{log['log']}: {log['reason']}" for log in data.get("logs_skipped", [])]
     notes = [str(note) for note in data.get("notes", [])]
     if study.regret is not None:
-        notes += [note.removeprefix(f"{study.results.folder}: ") for note in study.regret.notes]
+        notes += [note.removeprefix(f"{study.results.place}: ") for note in study.regret.notes]
     keys = ("copem_replay", "python", "seed", "runs", "window_s", "visibility", "max_gap_s")
     parameters = {key: data.get(key) for key in keys}
     measured = {key: data.get(key) for key in ("measure", "braking", "run_shown")}

@@ -102,12 +102,12 @@ class ReportData:
         return self.results.summary.set_index("configuration").loc[name]
 
 
-def load_study(folder: Path, baseline: str | None = None) -> ReportData:
-    """Read a results folder and compare its configurations with a baseline.
+def load_study(given: Path | Results, baseline: str | None = None) -> ReportData:
+    """Compare the configurations of results, or of a results folder, with a baseline.
 
     None: that of `compare`. Raises InputError: no or damaged results, no such baseline.
     """
-    results = read_results(folder, rowless=True)
+    results = given if isinstance(given, Results) else read_results(given, rowless=True)
     check_summary(results)
     names = tuple(results.experiment.configurations)
     if baseline is not None and baseline not in names:

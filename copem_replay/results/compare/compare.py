@@ -111,7 +111,7 @@ def read_folders(given: Sequence[Path | Results]) -> list[Results]:
     problems: list[str] = []
     seen: dict[Path, Path] = {}
     for folder in given:
-        path = folder.folder if isinstance(folder, Results) else folder
+        path = folder.place if isinstance(folder, Results) else folder
         if path.resolve() in seen:
             problems.append(f"{path}: expected each folder once, found it twice ({seen[path.resolve()]})")
             continue
@@ -139,7 +139,7 @@ def _read_folder(folder: Path | Results) -> Results:
 
 def notes_on_folders(folders: Sequence[Results]) -> Iterator[str]:
     """Notes on folders that have other numbers of runs, or lack tables or braking."""
-    runs = {str(folder.folder): folder.provenance.runs for folder in folders}
+    runs = {str(folder.place): folder.provenance.runs for folder in folders}
     of_lists_first = sorted(COMPARED.values(), key=lambda metric: metric.part != "lists")
     if len(set(runs.values())) > 1:
         has = ", ".join(f"{path} {count}" for path, count in runs.items())
@@ -149,12 +149,12 @@ def notes_on_folders(folders: Sequence[Results]) -> Iterator[str]:
         metrics = [m.name for m in of_lists_first if m.compared and {*m.compared.files} & {*missing}]
         if metrics:
             yield (
-                f"{folder.folder}: no {', '.join(missing)} (without accuracy, or of "
+                f"{folder.place}: no {', '.join(missing)} (without accuracy, or of "
                 f"an older version): not compared: {', '.join(metrics)}"
             )
     with_braking = [folder for folder in folders if folder.provenance.braking is not None]
     if with_braking and len(with_braking) < len(folders):
-        without = ", ".join(str(folder.folder) for folder in folders if folder.provenance.braking is None)
+        without = ", ".join(str(folder.place) for folder in folders if folder.provenance.braking is None)
         yield f"{without}: no braking: pass_share is compared only among those that have it"
 
 
@@ -259,7 +259,7 @@ def _find_problems(first: Results, other: Results) -> Iterator[str]:
 def _describe_mismatch(first: Results, other: Results, key: str, expected: object, found: object) -> Iterator[str]:
     if expected != found:
         yield (
-            f"{other.folder}: {key}: expected {_shorten_value(expected)} as in {first.folder}, found "
+            f"{other.place}: {key}: expected {_shorten_value(expected)} as in {first.place}, found "
             f"{_shorten_value(found)}"
         )
 
@@ -278,14 +278,14 @@ def _compare_logs(first: Results, other: Results) -> Iterator[str]:
         other_ones = (
             [f"{', '.join(more)} of {'another truth' if by_truth else 'other content (SHA-256)'}"] if more else []
         )
-        yield f"{other.folder}: expected the logs of {first.folder}, found {' and '.join(lacks + other_ones)}"
+        yield f"{other.place}: expected the logs of {first.place}, found {' and '.join(lacks + other_ones)}"
         return
     if by_truth:
         return
     names, other_names = (sorted(log.name for log in folder.provenance.logs) for folder in (first, other))
     if names != other_names or expected != found:
         yield (
-            f"{other.folder}: expected the logs to be named as in {first.folder}, {', '.join(names)}, found "
+            f"{other.place}: expected the logs to be named as in {first.place}, {', '.join(names)}, found "
             f"{', '.join(other_names)}: draws are by the log's name"
         )
         return
@@ -492,7 +492,7 @@ def _overall_rows(
 
 def _settle_horizon(folders: Sequence[Results]) -> tuple[float, list[str]]:
     """The horizon in seconds, the shortest that any folder has, and a note where they differ."""
-    used_s = {str(folder.folder): folder.provenance.horizon_used_s for folder in folders}
+    used_s = {str(folder.place): folder.provenance.horizon_used_s for folder in folders}
     horizon_s = min(used_s.values())
     if horizon_s == max(used_s.values()):
         return horizon_s, []
@@ -518,8 +518,8 @@ def _check_same_episodes(
         if len(other):
             name = grid.episodes[other[0] // grid.runs][0]
             raise InputError(
-                f"{labelled.results.folder}: log {log}: object {name}: expected {what} {expected[other[0]]:g} as in "
-                f"{against.results.folder}, found {found[other[0]]:g}: not the same ego, recording or units"
+                f"{labelled.results.place}: log {log}: object {name}: expected {what} {expected[other[0]]:g} as in "
+                f"{against.results.place}, found {found[other[0]]:g}: not the same ego, recording or units"
             )
 
 
@@ -541,8 +541,8 @@ def _check_same_frames(
         same = same and np.array_equal(getattr(found, name)[both], getattr(expected, name)[both])
     if not same:
         raise InputError(
-            f"{labelled.results.folder}: log {log}: {labelled.configuration}: expected the frames of "
-            f"{against.configuration} in {against.results.folder}, found others; {AGAIN}"
+            f"{labelled.results.place}: log {log}: {labelled.configuration}: expected the frames of "
+            f"{against.configuration} in {against.results.place}, found others; {AGAIN}"
         )
 
 

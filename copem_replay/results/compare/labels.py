@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -57,9 +58,10 @@ def rename_logs(folders: Sequence[Results]) -> tuple[list[Results], dict[Results
 
 def _replace_log_names(results: Results, to: Mapping[str, str]) -> Results:
     logs = tuple(replace(log, name=to.get(log.name, log.name)) for log in results.provenance.logs)
-    copy = replace(results, provenance=replace(results.provenance, logs=logs))
-    vars(copy)["by_log"] = {name: rows.renamed(to) for name, rows in results.by_log.items()}
-    return copy
+    renamed, tables = copy(results), copy(results.tables)
+    tables.provenance, renamed.tables = replace(results.provenance, logs=logs), tables
+    vars(renamed)["by_log"] = {name: rows.renamed(to) for name, rows in results.by_log.items()}
+    return renamed
 
 
 def check_log_names(
@@ -74,8 +76,8 @@ def check_log_names(
         for log in sorted({*own_names, *theirs}):
             found, expected = own_names.get(log, log), theirs.get(log, log)
             problem = (
-                f"{labelled.results.folder}: log {found}: expected the name {expected} as in "
-                f"{against.results.folder}, for what is drawn depends on it; run it again with "
+                f"{labelled.results.place}: log {found}: expected the name {expected} as in "
+                f"{against.results.place}, for what is drawn depends on it; run it again with "
                 f"`logs: [{{file: …, name: {expected}}}]`"
             )
             problems += [] if found == expected or problem in problems else [problem]
@@ -94,7 +96,7 @@ def notes_on_differences(folders: Sequence[Results], names: Mapping[Results, Map
         differences = list(_describe_differences(folders[0], other, names))
         if differences:
             more = f"; and {len(differences) - _SHOWN} more" if len(differences) > _SHOWN else ""
-            yield f"{other.folder} differs from {folders[0].folder} in {'; '.join(differences[:_SHOWN])}{more}"
+            yield f"{other.place} differs from {folders[0].place} in {'; '.join(differences[:_SHOWN])}{more}"
 
 
 def _describe_differences(first: Results, other: Results, names: Mapping[Results, Mapping[str, str]]) -> Iterator[str]:
@@ -137,7 +139,7 @@ def _format_pair(before: object, after: object) -> str:
 
 
 def _rates_by_configuration(results: Results) -> dict[str, float]:
-    if not (results.folder / "summary.csv").is_file():
+    if not results.tables.has("summary.csv"):
         return {}
     rates = results.summary.set_index("configuration")["list_rate_hz"].dropna()
     return {str(name): float(rate) for name, rate in rates.items()}
@@ -210,7 +212,7 @@ def label_configurations(folders: Sequence[Results]) -> list[LabelledConfigurati
     labelled = [
         LabelledConfiguration(folder, name, name) for folder in folders for name in _configuration_names(folder)
     ]
-    for prefix in (lambda folder: folder.name, lambda folder: str(folder.folder)):
+    for prefix in (lambda folder: folder.name, lambda folder: str(folder.place)):
         times = Counter(labelled.label for labelled in labelled)
         labelled = [
             replace(labelled, label=f"{prefix(labelled.results)}:{labelled.configuration}")

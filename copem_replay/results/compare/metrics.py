@@ -132,7 +132,7 @@ def _add_log(
     size = len(lengths), len(thresholds)
     if not consistent or (existence.reshape(size) != thresholds).any() or (np.diff(thresholds) <= 0).any():
         raise InputError(
-            f"{labelled.results.folder / _FILES[0]}: expected the same ascending existence and as many ghosts_at in "
+            f"{labelled.results.place / _FILES[0]}: expected the same ascending existence and as many ghosts_at in "
             f"all rows, found others; {AGAIN}"
         )
     compared = integer_column(rows["run"], missing=runs) < runs

@@ -169,8 +169,6 @@ class ConfigurationData:
     `counted`: there, and counts for times, shares and distances at detection.
     """
 
-    label: str
-    path: Path
     there: Bool
     counted: Bool
     detected: Bool
@@ -202,7 +200,7 @@ def lay_out_configuration(
     results, rows_of = labelled.results, configuration_rows(labelled, tables)
     rows = rows_of["detections.parquet"]
     cell = grid.cells(rows)
-    place = results.folder / "detections.parquet"
+    place = results.place / "detections.parquet"
     _check_once(place, cell, labelled.configuration)
     detected = flag_column(rows["detected"])
     for name, needed in (("onset_s", True), ("ended_s", True), ("detection_s", detected)):
@@ -211,8 +209,6 @@ def lay_out_configuration(
     braking, began = results.provenance.braking is not None, rows.select([*COUNTS_BY]).to_pandas()
     size = len(grid.episodes) * grid.runs
     return ConfigurationData(
-        label=labelled.label,
-        path=results.folder,
         there=_lay_out(np.ones(len(cell), dtype=bool), cell, size),
         counted=_lay_out(is_counted(began, results.provenance.measure["began"]), cell, size),
         detected=_lay_out(detected, cell, size),
@@ -223,8 +219,8 @@ def lay_out_configuration(
         distance_m=_lay_out(float_column(rows["distance_at_detection_m"]), cell, size),
         conflict=_lay_out(flag_column(rows["conflict"]), cell, size) if braking else None,
         passes=_lay_out(flag_column(rows["braking_pass"]), cell, size) if braking else None,
-        accuracy=_accuracy_data(results.folder, rows_of, cell, grid),
-        ghosts=_false_positive_data(results.folder / "lists.parquet", rows_of, grid, labelled.configuration),
+        accuracy=_accuracy_data(results.place, rows_of, cell, grid),
+        ghosts=_false_positive_data(results.place / "lists.parquet", rows_of, grid, labelled.configuration),
         steps=_step_data(rows_of, grid),
     )
 
