@@ -12,6 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import partial
+from operator import attrgetter
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
@@ -105,6 +106,11 @@ def evaluate_metrics(metrics: Iterable[Metric], inputs: MetricInputs) -> dict[st
         if sums[metric.statistics] is not None:
             row[metric.name] = metric.value(sums[metric.statistics])
     return row
+
+
+def divide_or_none(total: float, number: float) -> float | None:
+    """A mean, or a share; None: of nothing."""
+    return float(total) / float(number) if number > 0 else None
 
 
 OWN = "own"
@@ -244,22 +250,14 @@ def link_times(seen: Tracks, arriving: Tracks, received: Tracks, units: Collecti
     )
 
 
-def _get_link_times(inputs: MetricInputs) -> LinkTimes | None:
-    return inputs.link
-
-
-def _divide_share(part: int, whole: int) -> float | None:
-    return part / whole if whole else None
-
-
-_row = partial(Metric, statistics=_get_link_times, better=-1, part="link")
+_row = partial(Metric, statistics=attrgetter("link"), better=-1, part="link")
 LINK = (
-    _row("lost_share", value=lambda of: _divide_share(of.lost, of.sent),
+    _row("lost_share", value=lambda of: divide_or_none(of.lost, of.sent),
          help="share of the lists sent by a link that it loses"),
     _row("age_of_information_p50_s", value=lambda of: of.age_s(0.5),
          help="age since capture of a unit's newest list that arrived by a link: at most this for 50 % of the time"),
     _row("age_of_information_p95_s", value=lambda of: of.age_s(0.95), help="the same for 95 % of the time"),
-    _row("overtaken_share", value=lambda of: _divide_share(of.overtaken, of.sent - of.lost),
+    _row("overtaken_share", value=lambda of: divide_or_none(of.overtaken, of.sent - of.lost),
          help="share of the arriving lists that come after a newer one of their unit; ideal fusion and trackers still "
               "use them, and all fusions do where messages are partial"),
 )  # fmt: skip
@@ -289,20 +287,14 @@ class OutputTimes:
         return OutputTimes(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(OutputTimes)))
 
 
-def _get_output_times(inputs: MetricInputs) -> OutputTimes | None:
-    return inputs.output
-
-
-def _divide_total(total_s: float, lists: int) -> float | None:
-    return total_s / lists if lists else None
-
+_OF_OUTPUT = attrgetter("output")
 
 OUTPUT = (
-    Metric("output_latency_s", _get_output_times, lambda of: _divide_total(of.latency_s, of.with_latency), -1,
+    Metric("output_latency_s", _OF_OUTPUT, lambda of: divide_or_none(of.latency_s, of.with_latency), -1,
            "a stack's lists: available − the stamp of the state, mean; a dash: not in the messages", "output"),
-    Metric("output_delay_s", _get_output_times, lambda of: _divide_total(of.delay_s, of.with_delay), -1,
+    Metric("output_delay_s", _OF_OUTPUT, lambda of: divide_or_none(of.delay_s, of.with_delay), -1,
            "a stack's lists: that stamp − the instant of the state, by `delay_s` of the experiment", "output"),
-    Metric("input_age_s", _get_output_times, lambda of: _divide_total(of.input_age_s, of.with_input), -1,
+    Metric("input_age_s", _OF_OUTPUT, lambda of: divide_or_none(of.input_age_s, of.with_input), -1,
            "available − the newest capture of an input that had arrived: its age, not a latency", "output"),
 )  # fmt: skip
 """Columns of `summary.csv` where a configuration is recorded."""

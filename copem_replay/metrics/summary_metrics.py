@@ -259,10 +259,6 @@ def exact_verdict_shares(inputs: MetricInputs) -> tuple[float | None, float | No
     return float(weight @ passes / weight.sum()), failed
 
 
-def _return_inputs(inputs: MetricInputs) -> MetricInputs:
-    return inputs
-
-
 def _number_or_none(value: float) -> float | None:
     return None if np.isnan(value) else value
 
@@ -291,9 +287,9 @@ def _seconds_unknown(rows: Any) -> Float:
 _MEAN = "mean of min(time to detection, horizon), never detected counting as the horizon"
 
 _DETECTION_METRICS = (
-    Metric("n", _return_inputs, lambda of: int(of.rows["runs"].sum()), 0,
+    Metric("n", attrgetter("rows"), lambda rows: int(rows["runs"].sum()), 0,
            "rows: runs × measured objects × logs", "summary", "rows"),
-    Metric("list_rate_hz", _return_inputs, lambda of: of.list_rate_hz, 0, "fused lists per second", "summary",
+    Metric("list_rate_hz", lambda of: of, lambda of: of.list_rate_hz, 0, "fused lists per second", "summary",
            "fused lists per second"),
     Metric("detected_share", estimate_detected_share, lambda of: of.share, 1,
            "share of the rows that were detected, [95 % interval]", "summary", "detected, %",

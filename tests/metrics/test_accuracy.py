@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 
 from copem_replay.core.object_list import Entries, ObjectLists
 from copem_replay.core.tracks import CLASSES
-from copem_replay.metrics.accuracy import metrics as accuracy_figures
 from copem_replay.metrics.accuracy.aggregator import Aggregator
 from copem_replay.metrics.accuracy.kernel import expect_gated_nees
 from copem_replay.metrics.accuracy.metrics import ACCURACY
@@ -29,6 +28,7 @@ from copem_replay.metrics.accuracy.statistics import (
 )
 from copem_replay.metrics.gospa import gospa, ospa
 from copem_replay.metrics.matching import Matches, match_at_both_times, match_entries
+from copem_replay.metrics.summary_metrics import METRIC
 from tests.helpers.at_once import assess
 from tests.helpers.reports import between, chunks, entry, lists_of
 from tests.helpers.reports import joined as one_list
@@ -520,9 +520,9 @@ def test_totals_of_logs_add() -> None:
     first = assessed([entry(11)] * 2, places={CAR: standing(10, 0, 2)}, episodes={CAR: (0, 1)})
     other = assessed([entry(12)], [NOTHING], places={CAR: [(10, 0)], OTHER_CAR: [(20, 0)]}, episodes={CAR: (0, 0), 2: (0, 0)})  # fmt: skip # noqa: E501
     both = sum_accuracy([first]) + sum_accuracy([other])
-    assert accuracy_figures.position_rmse_m(both) == pytest.approx(math.sqrt((1 + 1 + 4) / 3))
+    assert METRIC["position_rmse_m"].value(both) == pytest.approx(math.sqrt((1 + 1 + 4) / 3))
     assert (both.rows, both.matched_rows) == (5, 2)
-    assert accuracy_figures.gospa_m(both) == pytest.approx(math.sqrt((1 + 1 + 4 + 3 * 4.5) / 4))
+    assert METRIC["gospa_m"].value(both) == pytest.approx(math.sqrt((1 + 1 + 4 + 3 * 4.5) / 4))
     with pytest.raises(ValueError, match="same settings"):
         sum_accuracy([first]) + sum_accuracy([assessed([entry(1)], places={}, episodes={}, cutoff_m=4.0)])
 

@@ -22,7 +22,7 @@ from copem_replay.experiment.file import log_paths, read_experiment_file
 from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import find_problems, read_logs
 from copem_replay.io.recording import Recording
-from copem_replay.metrics.accuracy.metrics import ACCURACY
+from copem_replay.metrics.summary_metrics import METRICS_OF
 from copem_replay.perception.config import Carriers
 from copem_replay.pipeline.closed_form import exact_table
 from copem_replay.pipeline.prepare import Replay, prepare_log
@@ -31,7 +31,7 @@ from copem_replay.pipeline.sweep import KINDS, SweepPoint, list_points, resolve_
 from tests.helpers.experiments import changed, drive, source_of
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
 
-FIGURES = [metric.name for metric in ACCURACY]
+FIGURES = [metric.name for metric in METRICS_OF["accuracy"]]
 ROOT = Path(__file__).parents[2]
 P = {"p": [{"detection": {"kind": "constant", "probability": 0.2}, "error": {"kind": "gaussian",
             "covariance_m2": [[0.5, 0.0], [0.0, 0.5]]}}]}  # fmt: skip

@@ -8,14 +8,13 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
 from copem_replay.core.errors import count_noun
 from copem_replay.metrics.intervals import NOT_ENOUGH
-from copem_replay.metrics.metric import RowMetric, own_metrics
+from copem_replay.metrics.metric import own_metrics
 from copem_replay.metrics.summary import SETUP, describe_intervals, format_cell, has_undetected
 from copem_replay.metrics.summary_metrics import COMPARED, METRIC, METRICS, PARTS
 from copem_replay.metrics.survival import EndReason
@@ -105,35 +104,21 @@ _INTERVALS = {"detected_share": "interval", "pass_share": "pass_interval"}
 _COUNTS = {"n": ("row", "rows"), "n_conflict": ("row in conflict", "rows in conflict")}
 
 
-@dataclass(frozen=True)
-class SummaryPart:
-    """Columns of `summary.csv` in one table, with their meanings."""
-
-    id: str
-    caption: str
-    columns: dict[str, str]
-
-
-def _list_parts(own: Sequence[RowMetric]) -> list[SummaryPart]:
-    metrics = (*METRICS, *own_metrics(own))
-    return [
-        SummaryPart(id_, caption, {m.name: m.help for m in metrics if m.part == id_}) for id_, caption in PARTS.items()
-    ]
-
-
 def summary_tables(study: ReportData) -> Html:
     """`summary.csv` as several tables, each of which fits on a page."""
     rows = study.results.summary
     parts = []
-    for part in _list_parts(study.results.experiment.measure.metrics):
-        if part.id == "undetected" and not has_undetected(rows):
+    metrics = (*METRICS, *own_metrics(study.results.experiment.measure.metrics))
+    for part in PARTS:
+        if part == "undetected" and not has_undetected(rows):
             continue
-        present = {name: says for name, says in part.columns.items() if name in rows and rows[name].notna().any()}
+        columns_of = {m.name: m.help for m in metrics if m.part == part and m.name in rows}
+        present = {name: says for name, says in columns_of.items() if rows[name].notna().any()}
         once = [name for name in present if name in SETUP and rows[name].nunique(dropna=False) == 1]
         columns = {name: present[name] for name in sort_columns(list(present)) if name not in once}
-        shown = part.id != "braking" or "pass_share" in columns
+        shown = part != "braking" or "pass_share" in columns
         if columns and shown:
-            below = [*_common_values(rows, once), *_interval_sentences(study, part, columns)]
+            below = [*_common_values(rows, once), *_interval_sentences(study, columns)]
             parts += [_summary_table(study, part, columns), *(make_tag("p", line, class_="below") for line in below)]
             parts.append(fold_parts("What the columns mean", _column_meanings(columns.items())))
     return join_html(parts)
@@ -152,14 +137,14 @@ def _common_values(rows: pd.DataFrame, names: Sequence[str]) -> list[str]:
     return [f"{', '.join(values)} for each configuration."] if values else []
 
 
-def _summary_table(study: ReportData, part: SummaryPart, columns: dict[str, str]) -> Html:
+def _summary_table(study: ReportData, part: str, columns: dict[str, str]) -> Html:
     rows = []
     for row in study.results.summary.to_dict("records"):
         cells = [_summary_cell(row, name) for name in columns]
         rows.append(
             make_tag("tr", row_head(study, str(row["configuration"])), *cells, data_row=str(row["configuration"]))
         )
-    return make_table(["configuration", *map(column_header, columns)], rows, caption=part.caption, id_=part.id)
+    return make_table(["configuration", *map(column_header, columns)], rows, caption=PARTS[part], id_=part)
 
 
 def row_head(study: ReportData, name: str) -> Html:
@@ -197,7 +182,7 @@ def full_number(value: Any) -> str | None:
     return f"{value:.9g}" if value is not None and pd.notna(value) else None
 
 
-def _interval_sentences(study: ReportData, part: SummaryPart, columns: Iterable[str]) -> list[str]:
+def _interval_sentences(study: ReportData, columns: Iterable[str]) -> list[str]:
     rows = study.results.summary
     sentences = []
     for column in (name for name in columns if name in _INTERVALS):
