@@ -20,7 +20,6 @@ from numba.core.event import Event, Listener, install_listener
 
 from copem_replay.core.errors import ExperimentError
 from copem_replay.experiment.schema import Experiment
-from copem_replay.pipeline.notes import measure_list_rates
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.replay import BlockOutcome
 
@@ -91,31 +90,25 @@ class _Compiling(Listener):
 
 # Memory.
 
-AT_LEAST_BYTES = {False: (250, 0), True: (400, 16)}
-"""Bytes of a row of `detections.parquet`, and of each list of its object's stay, without accuracy and with it, while
-all tables are put together (measured: a row has 146 and 234; a list two numbers of four bytes; both held twice)."""
-ABOUT_BYTES = {False: (1000, 0), True: (3000, 45)}
-"""Bytes of a row and of each list with all intermediate results and statistics. Measured: by how much the peak of `run`
-without `show` and `sweep` grows from one number of runs to the other, in bytes a row:
-
-| | runs | lists a row | grows by |
-|---|---|---|---|
-| crossing_share.yaml without accuracy | 120, 480 | 0 | 650 |
-| tc016d.yaml | 2000, 10 000 | 76 | 6000 |
-| crossing_share.yaml | 120, 480 | 431 | 23 500 |
-| crossing.yaml | 10, 80 | 979 | 41 200 |
-"""
+AT_LEAST_BYTES = {False: 250, True: 400}
+"""Bytes of a row of `detections.parquet`, without accuracy and with it, while the rows of a log are counted (measured: a
+row has 146 and 234, held twice). What accuracy has list by list waits in a file."""
+ABOUT_BYTES = 1000
+"""Bytes of a row with all intermediate results and statistics (measured: tc016d.yaml with accuracy grows by 600 a row
+from 500 runs to 10,000)."""
+OBSERVED_BYTES = 400
+"""Bytes of a unit's view of a measured object at a frame, whatever the number of runs: about fifty numbers."""
 
 
-Size: TypeAlias = tuple[int, float]
-"""Of one run of a log: rows, and with accuracy about how many lists the stays of these rows have."""
+Size: TypeAlias = tuple[int, int]
+"""Of a log: rows of one run, and views of measured objects by all units."""
 
 
 def estimate_size(replay: Replay) -> Size:
-    """The rows and lists that one run of a log gives."""
-    written = replay.expanded.written
-    lists = _lists_per_run(replay) if written.measure.accuracy else 0.0
-    return len(replay.episodes.object_ix) * len(written.configurations), lists
+    """The rows that one run of a log gives, and how often units look at measured objects."""
+    written, measured = replay.expanded.written, replay.episodes.object_ix
+    states = int(np.isin(replay.truth.row_object_ix, measured).sum())
+    return len(measured) * len(written.configurations), states * len(replay.expanded.modelled)
 
 
 def memory_notes(ready: Sequence[Replay], experiment: Experiment, others: Sequence[Size] = ()) -> list[str]:
@@ -123,31 +116,19 @@ def memory_notes(ready: Sequence[Replay], experiment: Experiment, others: Sequen
 
     `others`: sizes of further logs.
     """
-    accuracy, free = experiment.measure.accuracy, free_bytes()
-    sizes = [*map(estimate_size, ready), *others]
-    rows_a_run, lists_a_run = sum(rows for rows, _ in sizes), sum(lists for _, lists in sizes)
-    about, least = (
-        round(rows_a_run * row[accuracy][0] + lists_a_run * row[accuracy][1]) for row in (ABOUT_BYTES, AT_LEAST_BYTES)
-    )
-    if free is None or about * experiment.runs <= free:
+    sizes, free, runs = [*map(estimate_size, ready), *others], free_bytes(), experiment.runs
+    rows_a_run = sum(rows for rows, _ in sizes)
+    about = rows_a_run * ABOUT_BYTES * runs + max((views for _, views in sizes), default=0) * OBSERVED_BYTES
+    if free is None or about <= free:
         return []
-    few = max(free // about, 1)
-    rows = f"{experiment.runs} runs of {rows_a_run} {'row' if rows_a_run == 1 else 'rows'} each"
-    if least * experiment.runs > free and experiment.runs > 1:
-        size = _format_gb(least * experiment.runs)
-        raise ExperimentError(f"{rows} take at least {size}, and {_format_gb(free)} are free; take {few} or fewer")
-    return [f"{rows} may take {_format_gb(about * experiment.runs)}, and {_format_gb(free)} are free"]
-
-
-def _lists_per_run(replay: Replay) -> float:
-    """About how many lists the stays of a run's rows have: from first frame to end of episode."""
-    truth, episodes = replay.truth, replay.episodes
-    first_s = np.full(len(replay.scene.object_ids), np.inf)
-    np.minimum.at(first_s, truth.row_object_ix, truth.captured_s[truth.frame_ix])
-    stays_s = float((episodes.ended_s - first_s[episodes.object_ix]).sum())
-    once = replay.expanded.written.model_copy(update={"runs": 1})
-    rates = (times.rate_hz or 0.0 for times in measure_list_rates(replay, once).values())
-    return stays_s * sum(rates)
+    rows = f"{runs} runs of {rows_a_run} {'row' if rows_a_run == 1 else 'rows'} each"
+    least = rows_a_run * AT_LEAST_BYTES[experiment.measure.accuracy] * runs
+    if least > free and runs > 1:
+        few = max(free // (rows_a_run * ABOUT_BYTES), 1)
+        raise ExperimentError(
+            f"{rows} take at least {_format_gb(least)}, and {_format_gb(free)} are free; take {few} or fewer"
+        )
+    return [f"{rows} may take {_format_gb(about)}, and {_format_gb(free)} are free"]
 
 
 def free_bytes() -> int | None:

@@ -212,10 +212,10 @@ def with_free(monkeypatch: pytest.MonkeyPatch, free: int | None) -> None:
 
 
 class TestMemory:
-    """One object has an onset: in three configurations three rows a run, of 1000 bytes, or 250 at least.
+    """One object has an onset: in three configurations three rows a run, of 1000 bytes, or 250 at least, 400 with
+    accuracy; and 31 views of 400 bytes by each of two units, whatever the number of runs."""
 
-    With accuracy of 3000, or 400, and of 45, or 16, for each list of the object's stay: of 3 s at 10 Hz.
-    """
+    VIEWS = 31 * 2 * 400
 
     def rows(self, here: Path) -> tuple[Experiment, list[Replay]]:
         experiment, _, ready = made(here, changed("runs: 1000000", "measure: {accuracy: false}"))
@@ -224,13 +224,13 @@ class TestMemory:
 
     def test_enough(self, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         experiment, ready = self.rows(here)
-        for free in (None, 3_000_000_000):
+        for free in (None, 3_000_000_000 + self.VIEWS):
             with_free(monkeypatch, free)
             assert memory.memory_notes(ready, experiment) == []
 
     def test_perhaps_not(self, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         experiment, ready = self.rows(here)
-        for free in (2_999_999_999, 750_000_000):
+        for free in (2_999_999_999 + self.VIEWS, 750_000_000):
             with_free(monkeypatch, free)
             (said,) = memory.memory_notes(ready, experiment)
             assert said == f"1000000 runs of 3 rows each may take 3 GB, and {free / 1e9:.3g} GB are free"
@@ -242,16 +242,16 @@ class TestMemory:
         with pytest.raises(ExperimentError, match=said):
             memory.memory_notes(ready, experiment)
 
-    def test_by_lists(self, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        """3 × (3000 + 30 × 45) bytes a run; with a mast of 20 Hz, in one configuration, of another 30 lists."""
-        twice = "  mast: {at: [12.0, -4.5], height_m: 5.0, pem: onboard, rate_hz: 20}"
-        for change, bytes_a_run in (("seed: 1", 13_050), (twice, 14_400)):
-            experiment, _, ready = made(here, changed("runs: 1000", change))
-            with_free(monkeypatch, 1001 * bytes_a_run)
-            assert memory.memory_notes(ready, experiment) == []
-            with_free(monkeypatch, 999 * bytes_a_run)
-            (said,) = memory.memory_notes(ready, experiment)
-            assert f"may take {bytes_a_run / 1e6:.3g} GB" in said
+    def test_by_units(self, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """3000 masts: 3002 units look at one object at 31 frames, in a single run."""
+        masts = "".join(f"  m{k}: {{at: [{k}, 9], height_m: 5.0, pem: onboard}}\n" for k in range(3000))
+        text = changed("runs: 1").replace("configurations:", f"{masts}configurations:")
+        experiment, _, ready = made(here, text)
+        with_free(monkeypatch, 31 * 3002 * 400)
+        (said,) = memory.memory_notes(ready, experiment)
+        assert said == "1 runs of 3 rows each may take 0.0372 GB, and 0.0372 GB are free"
+        with_free(monkeypatch, 31 * 3002 * 400 + 3000)
+        assert memory.memory_notes(ready, experiment) == []
 
     def test_run_refuses_before_it_begins(self, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         experiment, recordings, _ = made(here, changed("runs: 1000000000"))
