@@ -17,13 +17,7 @@ from scipy.special import expit, logit
 
 from copem_replay.core.tracks import Bool, Float, Int
 from copem_replay.core.yaml import CommentedValue
-from copem_replay.fitting.estimate import (
-    DROP,
-    Bounds,
-    Estimate,
-    maximise_likelihood,
-    profile_limits,
-)
+from copem_replay.fitting.estimate import DROP, Bounds, Estimate, maximise_likelihood, profile_limits
 
 # Kernels: whitening by a Kalman filter, and correlations between rows.
 
@@ -67,53 +61,6 @@ def whiten_columns(values: Float, decay: Float, new: Bool, drift: float, constan
         bb -= gain_b * of_b
         variance[t] = s
     return out, variance
-
-
-@nb.njit(cache=True)
-def sum_whitened_moments(
-    values: Float, decay: Float, new: Bool, drift: float, constant: float
-) -> tuple[Float, Float, float, float]:
-    """Sums of columns v whitened as by `whiten_columns`, for a likelihood: Σ v² (C,), Σ v·1 (C,), Σ 1·1, Σ ln variance.
-
-    `1`: a column of ones, whitened like the others, for the common mean.
-    """
-    n, C = values.shape
-    squares, cross = np.zeros(C), np.zeros(C)
-    state = np.zeros((C + 1, 2))
-    rest = max(1.0 - drift - constant, 1e-9)
-    ones, logs, product = 0.0, 0.0, 1.0
-    aa, ab, bb = drift, 0.0, constant
-    for t in range(n):
-        f = 0.0
-        if new[t]:
-            state[:] = 0.0
-            aa, ab, bb = drift, 0.0, constant
-        else:
-            f = decay[t]
-            aa = f * f * (aa - drift) + drift
-            ab *= f
-        of_a, of_b = aa + ab, ab + bb
-        s = of_a + of_b + rest
-        r = 1.0 / s
-        gain_a, gain_b = of_a * r, of_b * r
-        a, b = state[C, 0] * f, state[C, 1]
-        one = 1.0 - a - b
-        state[C, 0], state[C, 1] = a + gain_a * one, b + gain_b * one
-        ones += one * one * r
-        for k in range(C):
-            a, b = state[k, 0] * f, state[k, 1]
-            innovation = values[t, k] - a - b
-            state[k, 0], state[k, 1] = a + gain_a * innovation, b + gain_b * innovation
-            squares[k] += innovation * innovation * r
-            cross[k] += innovation * one * r
-        aa -= gain_a * of_a
-        ab -= gain_a * of_b
-        bb -= gain_b * of_b
-        product *= s
-        if product < 1e-200 or product > 1e200:  # few logarithms: they take most of the time
-            logs += np.log(product)
-            product = 1.0
-    return squares, cross, ones, logs + np.log(product)
 
 
 @nb.njit(cache=True)
@@ -226,12 +173,13 @@ def whiten_series(values: Float, series: ResidualSeries, shares: MemoryShares) -
 def log_likelihood(z: Float, series: ResidualSeries, shares: MemoryShares, *, centred: bool) -> float:
     """REML of columns (n, C) that share a memory: each with a scale, and if `centred` a mean, of its own."""
     n, C = z.shape
-    squares, cross, ones, logs = sum_whitened_moments(
-        z, series.decay(shares.tau_s), series.new, shares.drift, shares.constant
-    )
-    total = -0.5 * C * logs
+    decay, ones = series.decay(shares.tau_s), np.ones((n, 1))
+    out, variance = whiten_columns(np.hstack([z, ones]), decay, series.new, shares.drift, shares.constant)
+    moments = out.T @ out  # of the columns and, last, of their common mean
+    squares, total = moments.diagonal()[:C], -0.5 * C * float(np.log(variance).sum())
     if centred:
-        squares, n, total = squares - cross**2 / ones, n - 1, total - 0.5 * C * np.log(ones)
+        squares, n = squares - moments[C, :C] ** 2 / moments[C, C], n - 1
+        total -= 0.5 * C * np.log(moments[C, C])
     return float(total - 0.5 * n * np.log(np.maximum(squares, 1e-300) / n).sum())
 
 

@@ -153,14 +153,14 @@ def fit_ghosts(rows: FitRows, lists: FitLists, other: OtherEntries) -> GhostsFit
     if not E:
         most = garwood_interval(0)[1]
         return GhostsFit(untold=f"no ghost in {L} lists (fewer than {60 * most / watched_s:.2g} per minute)")
-    before, order = _chain_entries(lists, other)
-    entries = _OrderedEntries(other, order)
+    begin = np.searchsorted(other.list, np.arange(L + 1))
+    follows = np.where(np.insert(same_log, 0, False), np.arange(L) - 1, -1)
+    before: Int = link_entries(follows, begin, other.east_m, other.north_m, other.track_id, GATE_M)
     ahead = np.zeros(E, dtype=bool)
     ahead[before[before >= 0]] = True
-    lists_of = other.list[order]
-    has_next = np.append(same_log, False)[lists_of]
-    to_next_s = np.append(step_s, 0.0)[lists_of]
-    born = (before < 0) & (np.insert(same_log, 0, False)[lists_of])
+    has_next = np.append(same_log, False)[other.list]
+    to_next_s = np.append(step_s, 0.0)[other.list]
+    born = (before < 0) & (np.insert(same_log, 0, False)[other.list])
     lasts_s = estimate_duration(to_next_s[ahead & has_next], to_next_s[~ahead & has_next], "ghost ends")
     n_born = int(born.sum())
     low, high = garwood_interval(n_born)
@@ -169,32 +169,11 @@ def fit_ghosts(rows: FitRows, lists: FitLists, other: OtherEntries) -> GhostsFit
     if phi < 0.05:
         lasts_s, phi = Estimate(0.0, 0.0, period_s / 3, E, n_born), 0.0
     first = np.flatnonzero(before < 0)
-    return GhostsFit(_fit_sorts(rows, L, entries, first, lasts_s, phi), per_minute)
-
-
-@dataclass(frozen=True)
-class _OrderedEntries:
-    """The columns of the entries, in the order of lists."""
-
-    other: OtherEntries
-    order: Int
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.other, name)[self.order]
-
-
-def _chain_entries(lists: FitLists, other: OtherEntries) -> tuple[Int, Int]:
-    """(E,) which entry each continues, −1: none, in the order of lists; and this order."""
-    order = np.argsort(other.list, kind="stable")
-    begin = np.searchsorted(other.list[order], np.arange(len(lists.log) + 1))
-    follows = np.where(np.insert(np.diff(lists.log) == 0, 0, False), np.arange(len(lists.log)) - 1, -1)
-    east_m, north_m, ids = other.east_m[order], other.north_m[order], other.track_id[order]
-    before: Int = link_entries(follows, begin, east_m, north_m, ids, GATE_M)
-    return before, order
+    return GhostsFit(_fit_sorts(rows, L, other, first, lasts_s, phi), per_minute)
 
 
 def _fit_sorts(
-    rows: FitRows, L: int, entries: _OrderedEntries, first: Int, lasts_s: Estimate, phi: float
+    rows: FitRows, L: int, entries: OtherEntries, first: Int, lasts_s: Estimate, phi: float
 ) -> tuple[GhostSort, ...]:
     """The sorts: a field, and `beside` objects where more are near them than by chance. `first`: where ghosts begin."""
     from scipy.stats import binom
@@ -230,7 +209,7 @@ def _fit_sorts(
     return tuple(out)
 
 
-def _fit_field(entries: _OrderedEntries, first: Int) -> tuple[dict[str, Any], float]:
+def _fit_field(entries: OtherEntries, first: Int) -> tuple[dict[str, Any], float]:
     """Where ghosts begin: an annulus, or a sector of it where a good part of the circle is empty; and its area (m²)."""
     range_m = entries.range_m[first]
     n = len(first)

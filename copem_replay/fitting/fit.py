@@ -35,7 +35,6 @@ from copem_replay.fitting.moments import ErrorBin
 from copem_replay.fitting.pose import DelayFit, unit_delay
 from copem_replay.fitting.replay_check import FEWEST_PASSES, TOTALS, StatisticCheck, remove_memory, replay_check
 from copem_replay.fitting.rest import RestFit, fit_rest
-from copem_replay.fitting.rows import FitLists
 from copem_replay.io.recording import Recording
 from copem_replay.perception.config import PoseError
 from copem_replay.perception.pem.model import Pem
@@ -273,7 +272,7 @@ def fit_unit(experiment: Experiment, recordings: Sequence[Recording], unit: str,
         held = gather_rows(held_views, gate_m=gate_m, max_gap_s=max_gap_s, reach=gathered.reach)
     return Fit(
         unit, tuple(r.scene.log for r in fitted), tuple(r.scene.log for r in held_out), how, truth, delay,
-        estimate_rate(gathered.lists), parts, gathered, held, tuple(find_moved(parts, other_gates)),
+        _invert_period(parts.rest.list_times.period_s), parts, gathered, held, tuple(find_moved(parts, other_gates)),
         (*delay.notes, *_note_data(gathered, truth, how)),
     )  # fmt: skip
 
@@ -326,14 +325,12 @@ def _declared_delay_s(experiment: Experiment, unit: str) -> float | None:
     return recorded.delay_s if recorded is not None and "delay_s" in recorded.model_fields_set else None
 
 
-def estimate_rate(lists: FitLists) -> Estimate:
-    """Lists per second: one over the median time between two."""
-    step_s = np.diff(lists.captured_s)[np.diff(lists.log) == 0]
-    step_s = step_s[step_s > 0]
-    if not len(step_s):
+def _invert_period(period_s: Estimate) -> Estimate:
+    """Lists per second, by the time between two."""
+    if period_s.why is not None:
         return Estimate(1.0, why="one list alone has no rate")
-    low, middle, high = np.quantile(step_s, [0.025, 0.5, 0.975])
-    return Estimate(1 / float(middle), 1 / float(high), 1 / float(low), len(step_s), float("nan"))
+    most = 1 / period_s.low if period_s.low > 0 else math.inf
+    return replace(period_s, value=1 / period_s.value, low=1 / period_s.high, high=most)
 
 
 def _note_data(gathered: Gathered, truth: Truth, how: FitOptions) -> list[str]:
@@ -441,11 +438,7 @@ def build_experiment(fit: Fit, experiment: Experiment, logs: Sequence[Any]) -> T
         "logs": entries,
         "runs": RUNS,
         "pems": data["pems"] | {pem: strip_comments(build_pem(fit))},
-        "units": {
-            name: strip_comments(build_unit(fit, experiment, pem)),
-            other: recorded,
-            **units,
-        },
+        "units": {name: strip_comments(build_unit(fit, experiment, pem)), other: recorded, **units},
         "configurations": {"recorded": {"units": [other]}, "fitted": {"units": [name], **latency}},
     }
 

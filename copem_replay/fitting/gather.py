@@ -359,14 +359,11 @@ def _match_log(number: int, view: LogView, gates: tuple[float, float], ellipse_m
     entry[rows_of_matched] = matched
     errors = _error_columns(view, found, entry)
     far = np.hypot(errors["along_m"] / ellipse_m[0], errors["across_m"] / ellipse_m[1]) > 1
-    if far.any():
-        object_ix[entry[far]] = -1
-        entry[far] = -1
-        errors = _error_columns(view, found, entry)
+    object_ix[entry[far]] = entry[far] = -1
     listed = entry >= 0
     apart = ~_is_crowded(view, errors, min(gate_m, float(ellipse_m.max())))
     for name in ("along_m", "across_m", "east_m", "north_m", "yaw_rad", "speed_mps", "size_m"):
-        errors[name][..., ~apart] = np.nan
+        errors[name][..., ~apart | far] = np.nan
     rows: dict[str, Any] = {
         "list": view.list_ix.copy(), "log": np.full(R, number), "object": row_object,
         "captured_s": view.captured_s[view.list_ix], "listed": listed,
@@ -375,6 +372,7 @@ def _match_log(number: int, view: LogView, gates: tuple[float, float], ellipse_m
         **{name: np.where(listed, of[entry], np.nan if of.dtype.kind == "f" else -1) for name, of in fields.items()},
     }  # fmt: skip
     other = np.flatnonzero(within & (object_ix < 0))
+    other = other[np.argsort(list_of[other], kind="stable")]
     return _MatchedLog(rows, _other_columns(number, view, other, list_of[other], rows, fields), entries)
 
 

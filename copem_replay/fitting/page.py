@@ -95,37 +95,33 @@ def _estimates_table(fit: Fit) -> Html:
     return make_table(head, rows, caption="Every number with its interval", id_="numbers")
 
 
+def _list_ladders(fit: Fit) -> dict[str, Sequence[Rung]]:
+    """The models that were compared, by what they are of."""
+    errors = fit.parts.errors
+    return {"detection": fit.parts.detection.ladder, "errors": errors.ladder, "frame of errors": errors.frames}
+
+
 def _choice_tables(fit: Fit) -> Html:
-    ladders: Sequence[tuple[str, Sequence[Rung]]] = (
-        ("Detection", fit.parts.detection.ladder),
-        ("Position error", fit.parts.errors.ladder),
-        ("Frame of the position error", fit.parts.errors.frames),
-    )
     intro = (
         "Each model is scored on passes it was not fitted to; the simplest within one standard error of the best is "
         "written. Where too few passes are there to hold any out, BIC decides."
     )
     parts: list[Html] = [make_tag("p", intro)]
-    for title, rungs in ladders:
+    for title, rungs in _list_ladders(fit).items():
         rows = [
             make_tag(
                 "tr",
-                make_tag("th", rung.name, scope="row"),
-                make_tag("td", format_three_digits(rung.score)),
-                make_tag("td", _format_below(rung)),
-                make_tag("td", rung.by, class_="text"),
-                make_tag("td", "chosen" if rung.chosen else "", class_="text"),
+                make_tag("th", one.name, scope="row"),
+                make_tag("td", format_three_digits(one.score)),
+                make_tag("td", f"{one.below:.3g} ± {one.below_se:.2g}" if one.below else "–"),
+                make_tag("td", one.by, class_="text"),
+                make_tag("td", "chosen" if one.chosen else "", class_="text"),
             )
-            for rung in rungs
+            for one in rungs
         ]
-        parts.append(make_table(("model", "nats per list", "below the best", "scored by", ""), rows, caption=title))
+        head = ("model", "nats per list", "below the best", "scored by", "")
+        parts.append(make_table(head, rows, caption=title.capitalize()))
     return join_html(parts)
-
-
-def _format_below(rung: Rung) -> str:
-    if rung.below == 0:
-        return "–"
-    return f"{format_three_digits(rung.below)} ± {format_three_digits(rung.below_se)}"
 
 
 def _list_untold(fit: Fit) -> list[str]:
@@ -325,12 +321,9 @@ def _build_rows(gathered: Gathered, logs: Sequence[str], recordings: Sequence[Re
 
 def table_lines(fit: Fit) -> list[str]:
     """The estimates as lines of a table, what is not fitted, and which models were compared."""
-    parts = fit.parts
     lines = [judge_use(fit), *(f"{describe_name(fit, name)}: {one.words()}" for name, one in list_estimates(fit))]
-    untold = {**parts.errors.untold, **parts.rest.untold}
-    lines += [f"{name}: not fitted: {why}" for name, why in untold.items()]
-    ladders = {"detection": parts.detection.ladder, "errors": parts.errors.ladder, "frame": parts.errors.frames}
-    lines += [f"{what}, {rung.words()}" for what, rungs in ladders.items() for rung in rungs]
+    lines += [f"not fitted: {line}" for line in _list_untold(fit)]
+    lines += [f"{what}, {rung.words()}" for what, rungs in _list_ladders(fit).items() for rung in rungs]
     return lines + ([] if fit.checks is None else list(fit.checks.lines()))
 
 
@@ -347,47 +340,42 @@ def write_fit_places(path: Path, unit: str, logs: tuple[str, ...], rows: FitRows
 
     Times are since the start of each log; heights are left out. Raises OutputError.
     """
-    import rerun as rr
-
     ids = "copem_replay_fit", digest_texts(unit, *logs, str(len(rows.log)))
     with file_stream(path, *ids) as rec:
         rec.send_blueprint(_fit_blueprint(logs, rows))
         out = RecordingSink(rec, 0)
         for log, name in enumerate(logs):
-            own, lists_of_log = ["world", plain_part(name)], np.flatnonzero(lists.log == log)
-            rows_of_log = np.flatnonzero(rows.log == log)
-            rows_of_log = rows_of_log[np.argsort(rows.list[rows_of_log], kind="stable")]
-            elapsed_ns = to_nanoseconds(lists.captured_s[lists_of_log])
-            east_m, north_m = rows.state_m.T
-            erring = rows.listed & np.isfinite(rows.east_m)
-            for what, which, colour in (("listed", rows.listed, LISTED), ("missed", ~rows.listed, MISSED)):
-                shown = rows_of_log[which[rows_of_log]]
-                points = rr.Points3D.columns(positions=_flat_positions(east_m[shown], north_m[shown]))
-                out.columns([*own, what], elapsed_ns, points.partition(_count_rows(rows.list[shown], lists_of_log)))
-                look = rr.Points3D.from_fields(colors=[colour], radii=rr.Radius.ui_points(3 if what == "listed" else 4))
-                out.static([*own, what], look)
-            shown = rows_of_log[erring[rows_of_log]]
-            arrows = rr.Arrows3D.columns(
-                origins=_flat_positions(east_m[shown], north_m[shown]),
-                vectors=_flat_positions(rows.east_m[shown], rows.north_m[shown]),
-            )
-            out.columns([*own, "error"], elapsed_ns, arrows.partition(_count_rows(rows.list[shown], lists_of_log)))
-            out.static([*own, "error"], rr.Arrows3D.from_fields(colors=[ERROR], radii=rr.Radius.ui_points(1)))
-            places = rr.Points3D.columns(
-                positions=_flat_positions(lists.east_m[lists_of_log], lists.north_m[lists_of_log])
-            )
-            out.columns([*own, "unit"], elapsed_ns, places.partition(np.ones(len(lists_of_log), dtype=np.int64)))
-            mark = rr.Points3D.from_fields(colors=[UNIT], radii=rr.Radius.ui_points(7), labels=[unit], show_labels=True)
-            out.static([*own, "unit"], mark)
+            mine = np.flatnonzero(rows.log == log)
+            in_order = rows.take(mine[np.argsort(rows.list[mine], kind="stable")])
+            _send_log(out, plain_part(name), unit, in_order, lists, np.flatnonzero(lists.log == log))
+
+
+def _send_log(out: RecordingSink, log: str, unit: str, rows: FitRows, lists: FitLists, own: Int) -> None:
+    """Send what a log has, with rows list by list. `own`: its lists."""
+    import rerun as rr
+
+    elapsed_ns = to_nanoseconds(lists.captured_s[own])
+
+    def send(what: str, columns: Any, list_ix: Int, look: Any) -> None:
+        count = np.bincount(list_ix - own[0], minlength=len(own)) if len(own) else np.zeros(0, dtype=np.int64)
+        out.columns(["world", log, what], elapsed_ns, columns.partition(count))
+        out.static(["world", log, what], look)
+
+    for what, shown, colour, size in (("listed", rows.listed, LISTED, 3), ("missed", ~rows.listed, MISSED, 4)):
+        points = rr.Points3D.columns(positions=_flat_positions(*rows.state_m[shown].T))
+        look = rr.Points3D.from_fields(colors=[colour], radii=rr.Radius.ui_points(size))
+        send(what, points, rows.list[shown], look)
+    erring = rows.take(rows.listed & np.isfinite(rows.east_m))
+    origins, vectors = _flat_positions(*erring.state_m.T), _flat_positions(erring.east_m, erring.north_m)
+    arrows = rr.Arrows3D.columns(origins=origins, vectors=vectors)
+    send("error", arrows, erring.list, rr.Arrows3D.from_fields(colors=[ERROR], radii=rr.Radius.ui_points(1)))
+    places = rr.Points3D.columns(positions=_flat_positions(lists.east_m[own], lists.north_m[own]))
+    mark = rr.Points3D.from_fields(colors=[UNIT], radii=rr.Radius.ui_points(7), labels=[unit], show_labels=True)
+    send("unit", places, own, mark)
 
 
 def _flat_positions(east_m: Float, north_m: Float) -> np.ndarray:
     return stack_float32(east_m, north_m, np.zeros(len(east_m)))
-
-
-def _count_rows(list_ix: Int, lists: Int) -> Int:
-    """(lists,) how many rows each list has."""
-    return np.bincount(list_ix - lists[0], minlength=len(lists)) if len(lists) else np.zeros(0, dtype=np.int64)
 
 
 def _fit_blueprint(logs: tuple[str, ...], rows: FitRows) -> rrb.Blueprint:

@@ -76,7 +76,7 @@ class FitRows:
 
 @dataclass(frozen=True)
 class OtherEntries:
-    """The entries (E,) about no true object, and duplicates of one: place, time and content.
+    """The entries (E,) about no true object, and duplicates of one, list by list: place, time and content.
 
     `list`: index into `FitLists`; `range_m`, `azimuth_rad` from the unit; `nearest_m`: to the centre of the nearest
     true object of the list (inf: none), of class `nearest_class_ix`.
