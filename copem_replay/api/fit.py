@@ -92,7 +92,7 @@ def fit(
     hold_out: Sequence[str] = (),
     folds: int | None = None,
     truth: str | None = None,
-    by: Sequence[str] = ("range", "visible_share", "class", "azimuth"),
+    by: Sequence[str] | None = None,
     monotone: bool = True,
     simplest: bool = False,
     delay_by: str | None = None,
@@ -102,9 +102,9 @@ def fit(
     `unit`: one whose lists are `recorded`, with its place (`at` or `on`). `hold_out`: names of logs that are left for
     the check. `folds`: parts of the cross-validation that chooses between models. `truth`: `partial`, if entries may be
     about objects that the truth lacks, or `complete`; None: partial where a list has more of them than true objects are
-    within reach. `by`: what detection may depend on. `monotone`: farther and more hidden is never better. `simplest`:
-    the first rung of every ladder. `delay_by`: `log`, each log has a delay of its own; `class`,
-    each log whose objects are of one class has that of the class.
+    within reach. `by`: what detection may depend on, of `range`, `visible_share`, `class`, `azimuth`; None: all.
+    `monotone`: farther and more hidden is never better. `simplest`: the first rung of every ladder. `delay_by`: `log`,
+    each log has a delay of its own; `class`, each log whose objects are of one class has that of the class.
 
     Raises InputError: no such unit or log, no place, nothing of it near a true object.
 
@@ -123,12 +123,13 @@ def check_fit_options(
     hold_out: Sequence[str],
     folds: int | None,
     truth: str | None,
-    by: Sequence[str],
+    by: Sequence[str] | None,
     monotone: bool,
     simplest: bool,
     delay_by: str | None = None,
 ) -> Any:
     """FitOptions of these values. Raises InputError for a value that is not allowed."""
+    from copem_replay.fitting.detection import BY
     from copem_replay.fitting.fit import FitOptions
 
     if hold_out and folds is not None:
@@ -137,14 +138,14 @@ def check_fit_options(
         raise InputError(f"--folds: expected at least 2, found {folds}")
     if truth not in (None, "partial", "complete"):
         raise InputError(f"--truth: expected partial or complete, found {truth}")
-    for name in by:
-        if name not in ("range", "visible_share", "azimuth", "class"):
-            raise InputError(f"--by: expected some of range, visible_share, azimuth, class; found {name!r}")
+    by = BY if by is None else tuple(by)
+    if unknown := [name for name in by if name not in BY]:
+        raise InputError(f"--by: expected some of {', '.join(BY)}; found {unknown[0]!r}")
     if delay_by not in (None, "log", "class"):
         raise InputError(f"--delay-by: expected log or class, found {delay_by}")
     kind: Any = truth
     late_by: Any = delay_by
-    return FitOptions(tuple(hold_out), folds, kind, tuple(by), monotone, simplest, delay_by=late_by)
+    return FitOptions(tuple(hold_out), folds, kind, by, monotone, simplest, delay_by=late_by)
 
 
 def read_study_to_fit(source: ExperimentSource, unit: str) -> LoadedStudy:

@@ -26,8 +26,9 @@ def fit(
         typer.Option(metavar="KIND", help="partial: the truth may lack objects of entries; complete: it has all."),
     ] = None,
     by: Annotated[
-        str, typer.Option(metavar="A,B,…", help="What detection may depend on: range, visible_share, azimuth, class.")
-    ] = "range,visible_share",
+        str | None,
+        typer.Option(metavar="A,B,…", help="What detection may depend on: range, visible_share, class, azimuth [all]."),
+    ] = None,
     simplest: Annotated[bool, typer.Option("--simplest", help="Take the simplest of the candidate models.")] = False,
     not_monotone: Annotated[
         bool, typer.Option("--not-monotone", help="Detection may improve with range and occlusion.")
@@ -55,9 +56,7 @@ def fit(
     from copem_replay.fitting.page import PEM, fill_fit, table_lines
     from copem_replay.results.folder import EXPERIMENT, check_inputs, take_place
 
-    options = check_fit_options(
-        hold_out or (), folds, truth, split_names(by) or (), not not_monotone, simplest, delay_by
-    )
+    options = check_fit_options(hold_out or (), folds, truth, split_names(by), not not_monotone, simplest, delay_by)
     with take_place(out or Path("out") / f"{experiment.stem}_fit", overwrite=overwrite) as place:
         print_notes(place.notes)
         place.notes.clear()

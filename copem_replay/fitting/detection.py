@@ -22,9 +22,7 @@ from copem_replay.fitting.estimate import (
     FEWEST_PASSES,
     Estimate,
     Rung,
-    choose_by_bic,
-    choose_rung,
-    held_out_possible,
+    compare_models,
     maximise_likelihood,
     profile_limits,
 )
@@ -367,17 +365,16 @@ class _TableTrial:
 
     def choose(self, ladder: list[_Rung], simplest: bool) -> tuple[int, tuple[Rung, ...]]:
         """The index of the table that is used, from the simplest to the richest, and what each scores."""
-        names, starts = [rung.name for rung in ladder], pass_starts(self.pass_ix)
-        if not held_out_possible(self.pass_ix, self.rows.fold):
-            thetas = [self.fit(rung, np.ones(len(starts) - 1)) for rung in ladder]
-            score = [_log_likelihood(rung, theta).sum() for rung, theta in zip(ladder, thetas, strict=True)]
-            size, n = np.array([len(theta) for theta in thetas]), len(self.pass_ix)
-            return choose_by_bic(names, np.array(score), size, n, n / self.worth, simplest=simplest)
-        fold = self.rows.fold[starts[:-1]]
-        scores = np.zeros((len(ladder), len(fold)))
-        for f, (k, rung) in product(np.unique(fold).tolist(), enumerate(ladder)):
-            scores[k, fold == f] = _log_likelihood(rung, self.fit(rung, (fold != f).astype(float)))[fold == f]
-        return choose_rung(names, scores, np.diff(starts), simplest=simplest)
+        starts = pass_starts(self.pass_ix)
+
+        def score(k: int, held_out: Bool) -> Float:
+            return _log_likelihood(ladder[k], self.fit(ladder[k], (~held_out).astype(float)))
+
+        names, size = [one.name for one in ladder], np.array([np.prod(one.rows.shape) for one in ladder])
+        worth = len(self.pass_ix) / self.worth
+        return compare_models(
+            names, score, self.rows.fold[starts[:-1]], np.diff(starts), size, worth, simplest=simplest
+        )
 
     def fit(self, rung: _Rung, times: Float) -> Float:
         """(K,) probabilities at the nodes; `times (passes,)`: how often each counts."""

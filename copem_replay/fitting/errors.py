@@ -29,9 +29,7 @@ from copem_replay.fitting.estimate import (
     PER_ROW,
     Estimate,
     Rung,
-    choose_by_bic,
-    choose_rung,
-    held_out_possible,
+    compare_models,
     maximise_likelihood,
     profile_limits,
     round_digits,
@@ -327,20 +325,20 @@ class _ModelTrial:
 
     def choose(self, models: Mapping[str, _Model]) -> tuple[int, tuple[Rung, ...]]:
         """The index of the model that is written, from the simplest to the richest, and the table of all."""
-        rows, names = self.rows, list(models)
-        if not held_out_possible(rows.pass_ix, rows.fold):
-            whole = np.ones(len(rows.log), dtype=bool)
-            score = np.array([self._scores(model, whole, whole).sum() for model in models.values()])
-            numbers = np.array([5 * len(bins) + 3 * (memory is not None) for _, bins, memory in models.values()])
-            n = len(rows.log)
-            return choose_by_bic(names, score, numbers, n, n * self.worth, simplest=self.simplest)
-        passes, which = np.unique(rows.pass_ix, return_inverse=True)
-        scores = np.zeros((len(names), len(passes)))
-        for fold in np.unique(rows.fold):
-            held_out = rows.fold == fold
-            for k, model in enumerate(models.values()):
-                scores[k] += np.bincount(which[held_out], self._scores(model, ~held_out, held_out), len(passes))
-        return choose_rung(names, scores, np.bincount(which), simplest=self.simplest)
+        rows = self.rows
+        _, first, which = np.unique(rows.pass_ix, return_index=True, return_inverse=True)
+        each = list(models.values())
+
+        def score(k: int, held_out: Bool) -> Float:
+            of = held_out[which] | (not held_out.any())
+            out: Float = np.bincount(which[of], self._scores(each[k], ~held_out[which], of), len(first))
+            return out
+
+        numbers = np.array([5 * len(bins) + 3 * (memory is not None) for _, bins, memory in each])
+        worth = len(rows.log) * self.worth
+        return compare_models(
+            list(models), score, rows.fold[first], np.bincount(which), numbers, worth, simplest=self.simplest
+        )
 
     def gain(self, model: _Model, base: _Model) -> float:
         """By how much the log-likelihood of all rows is higher under a model than under another, both fitted to all."""

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Literal
 
 import numpy as np
 
-from copem_replay.core.tracks import Float, Int
+from copem_replay.core.tracks import Bool, Float, Int
 from copem_replay.core.yaml import CommentedValue
 from copem_replay.metrics.intervals import figure_variance
 
@@ -212,6 +213,25 @@ class Rung:
 def held_out_possible(pass_ix: Int, fold: Int) -> bool:
     """Whether there are enough passes, in more than one fold."""
     return len(np.unique(pass_ix)) >= FEWEST_PASSES and len(np.unique(fold)) > 1
+
+
+def compare_models(
+    names: Sequence[str], score: Callable[[int, Bool], Float], fold: Int, lists: Int, parameters: Int,
+    n_effective: float, *, simplest: bool,
+) -> tuple[int, tuple[Rung, ...]]:  # fmt: skip
+    """The index of the model that is written, from the simplest to the richest, and the table of all.
+
+    `score(k, held_out)`: log-likelihood of each pass (P,) by model k fitted to those that are not held out. `fold`,
+    `lists (P,)`: of the passes. With too few to hold any out BIC decides, by `parameters` and rows that are worth
+    `n_effective`.
+    """
+    if not held_out_possible(np.arange(len(fold)), fold):
+        whole = np.array([score(k, np.zeros(len(fold), dtype=bool)).sum() for k in range(len(names))])
+        return choose_by_bic(names, whole, parameters, int(lists.sum()), n_effective, simplest=simplest)
+    scores = np.zeros((len(names), len(fold)))
+    for k, f in product(range(len(names)), np.unique(fold)):
+        scores[k, fold == f] = score(k, fold == f)[fold == f]
+    return choose_rung(names, scores, lists, simplest=simplest)
 
 
 def choose_rung(

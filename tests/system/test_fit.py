@@ -109,7 +109,7 @@ def test_it_is_replaced_only_when_asked_and_by_the_same_bytes(
         (("--unit", "rsu", "--hold-out", "x"), "--hold-out x: expected a log of the experiment (radar)"),
         (("--unit", "rsu", "--hold-out", "radar"), "--hold-out: expected a log that is left to fit, found all"),
         (("--unit", "rsu", "--truth", "all"), "--truth: expected partial or complete, found all"),
-        (("--unit", "rsu", "--by", "range,colour"), "--by: expected some of range, visible_share, azimuth, class;"),
+        (("--unit", "rsu", "--by", "range,colour"), "--by: expected some of range, visible_share, class, azimuth;"),
         (("--unit", "rsu", "--delay-by", "colour"), "--delay-by: expected log or class, found colour"),
         (("--unit", "rsu", "--hold-out", "radar", "--folds", "3"), "--folds: expected either folds or logs to hold"),
     ],
