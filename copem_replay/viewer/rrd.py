@@ -293,7 +293,7 @@ def _write_properties(
         log=replay.scene.log,
         run=run,
         run_is=run_is,
-        seed=experiment.seed if experiment.seed < 2**63 else str(experiment.seed),  # Arrow has no larger number
+        seed=str(experiment.seed),  # 64 bits without a sign, too
         visibility=experiment.visibility.label,
         configurations=configurations,
         copem_replay=version("copem-replay"),

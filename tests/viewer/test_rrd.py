@@ -487,7 +487,7 @@ def test_the_summary_says_which_run_and_lists_configurations_side_by_side(made: 
 
 def test_properties(made: Made) -> None:
     own = static(made.path, "/__properties/replay")
-    assert (own["log"], own["run"], own["seed"]) == (["scene"], [3], [7])
+    assert (own["log"], own["run"], own["seed"]) == (["scene"], [3], ["7"])
     assert own["configurations"] == list(CHANGES["configurations"])
     assert own["rerun_sdk"][0].startswith("0.41")
     general = static(made.path, "/__properties")
