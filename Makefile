@@ -1,4 +1,4 @@
-# make demo | test | test-random | bench | check | notebooks | pictures: each sets up .venv on its first call and never again while pyproject and constraints stay.
+# make demo | test | test-random | bench | check | notebooks | pictures: each sets up .venv on its first call and never again while pyproject and requirements stay.
 # Another Python beside it: make test PYTHON=python3.13 VENV=.venv-3.13
 PYTHON ?= python3
 VENV ?= .venv
@@ -6,10 +6,11 @@ BIN := $(VENV)/bin
 
 .PHONY: demo test test-random bench check notebooks pictures clean
 
-$(VENV)/.installed: pyproject.toml constraints.txt
+$(VENV)/.installed: pyproject.toml requirements.txt
 	$(PYTHON) -c 'import sys; sys.exit("Python 3.11 or newer is needed, this is " + sys.version.split()[0]) if sys.version_info < (3, 11) else None'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes --requirement requirements.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
 	touch $@
 
 demo: $(VENV)/.installed
@@ -22,16 +23,12 @@ test: $(VENV)/.installed
 
 # Every night: the tests with drawn examples, with others each time. A failure prints the seed of all (to be given as SEED)
 # and what gives its own example again.
-SEED ?= $(shell date +%s)
+SEED := $(or $(SEED),$(shell date +%s))
 test-random: $(VENV)/.installed
 	@echo "seed $(SEED)"
 	RANDOM_EXAMPLES=1 $(BIN)/python -m pytest -q -n 2 -m hypothesis --hypothesis-seed=$(SEED)
 
-$(VENV)/.peers: $(VENV)/.installed
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[bench]'
-	touch $@
-
-bench: $(VENV)/.peers
+bench: $(VENV)/.installed
 	$(BIN)/python tools/bench.py
 
 check: $(VENV)/.installed

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from pathlib import Path
 
@@ -11,11 +12,32 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).parents[2]
 
 
+def read_pins() -> dict[str, tuple[str, list[str]]]:
+    """Version and hashes by name, of `requirements.txt`."""
+    text = (ROOT / "requirements.txt").read_text(encoding="utf-8")
+    lines = [line for line in text.splitlines() if not line.startswith("#")]
+    entries = "\n".join(lines).replace("\\\n", " ").splitlines()
+    found = [
+        re.fullmatch(r"([\w.-]+)==([^ ;]+)( ; [^-]*?)?((?: +--hash=sha256:[0-9a-f]{64})+)", one) for one in entries
+    ]
+    assert all(found), "a line that is no pin with hashes, such as an index"
+    return {canonicalize_name(one[1]): (one[2], one[4].split()) for one in found if one}
+
+
 def test_every_dependency_has_both_bounds_and_the_pin_is_within() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
-    pins = {canonicalize_name(name): version for name, _, version in (line.partition("==") for line in lines)}
+    pins = read_pins()
     for text in project["dependencies"]:
         needed = Requirement(text)
         assert {one.operator for one in needed.specifier} == {">=", "<"}, text
-        assert needed.specifier.contains(pins[canonicalize_name(needed.name)]), text
+        assert needed.specifier.contains(pins[canonicalize_name(needed.name)][0]), text
+
+
+def test_every_extra_is_pinned_and_what_is_compiled_has_files_for_many_platforms() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    pins = read_pins()
+    for name in ("cluster", "dev", "bench"):
+        for needed in map(Requirement, project["optional-dependencies"][name]):
+            if needed.name != "copem-replay":
+                assert needed.specifier.contains(pins[canonicalize_name(needed.name)][0]), str(needed)
+    assert all(len(pins[name][1]) > 20 for name in ("numpy", "pandas", "pyarrow", "scipy", "shapely"))
