@@ -130,7 +130,9 @@ def autocorrelation_figure(fit: Fit) -> Figure:
     rows, errors = fit.gathered.rows, fit.parts.errors
     shares, z = errors.shares, errors.shape.z
     series = build_series(rows.take(errors.rows))
-    period_s = float(np.median(series.gap_s[~series.new]))
+    gaps_s = series.gap_s[~series.new]
+    gaps_s = gaps_s[gaps_s > 0]  # lists may say one and the same time
+    period_s = float(np.median(gaps_s)) if len(gaps_s) else 1.0  # no pair: no point is drawn
     series_ix, at_s = np.cumsum(series.new) - 1, rows.captured_s[errors.rows]
     far_s = min(max(20 * period_s, 4 * shares.tau_s if shares.drift else 0), 200 * period_s)
     lags = np.unique(np.geomspace(1, max(far_s / period_s, 2), _LAGS).round().astype(np.int64))
@@ -160,7 +162,8 @@ def _mean_products(z: Float, series_ix: Int, at_s: Float, lags: Int, period_s: f
     """(lags, 2) mean products of errors of variance 1 that are `lags` periods apart, ± a half; and how many (lags,)."""
     out, n = np.zeros((len(lags), 2)), np.zeros(len(lags), dtype=np.int64)
     z = z / np.sqrt((z**2).mean(axis=0))
-    key = 2 * (at_s[-1] - at_s[0] + np.ptp(at_s) + 1) * series_ix + at_s  # one axis of time on which series do not meet
+    apart_s = 2 * np.ptp(at_s) + (lags[-1] + 1) * period_s
+    key = apart_s * series_ix + at_s  # one axis of time on which series do not meet
     for k, lag in enumerate(lags):
         later = np.searchsorted(key, key + (lag - 0.5) * period_s)
         later = np.minimum(later, len(key) - 1)

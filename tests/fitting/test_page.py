@@ -159,6 +159,13 @@ def test_correlations_are_within_series_and_at_their_lags() -> None:
     np.testing.assert_allclose(found, [[0.0, -1.0], [-1.0, 1.0]])
 
 
+def test_correlations_of_lists_that_say_one_time_have_no_points() -> None:
+    fit = _fit()
+    rows = replace(fit.gathered.rows, captured_s=np.zeros(len(fit.gathered.rows.log)))
+    [axes] = FIT_FIGURES["autocorrelation"].draw(replace(fit, gathered=replace(fit.gathered, rows=rows))).axes
+    assert [len(line.get_xdata()) for line in axes.lines if line.get_label() in ("along", "across")] == [0, 0]
+
+
 def test_ranks_are_a_point_each() -> None:
     [axes] = ranks_figure(_fit()).axes
     assert [len(line.get_xdata()) for line in axes.lines] == [12, 12]

@@ -378,7 +378,7 @@ def outcome_of(case: Case, expected: dict[str, dict[str, bytes]]) -> dict[str, A
                 return _defect(f"{type(error).__name__} at {Path(where.filename).name}:{where.lineno}", command)
         said += (lines := text.splitlines())
         after = files_of(Path())
-        if code not in (0, 2) and not (code == 1 and command[0] == "fit"):
+        if (code not in (0, 2) and not (code == 1 and command[0] == "fit")) or "internal error" in text:
             return _defect(f"exit code {code}: {' | '.join(lines[-6:])[-400:]}", command)
         if any(not all(c.isprintable() for c in line) for line in lines) or (code == 2 and not lines):
             return _defect(f"not printable lines: {text[-200:]!r}", command)
