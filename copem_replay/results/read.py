@@ -444,9 +444,7 @@ class Results:
 
         exporters = self._list_exporters(viewer)
         assert self.replayed is not None
-        notes = fill_place(
-            place, self.experiment, self.recordings, self.replayed, exporters=exporters, skipped=skipped
-        )
+        notes = fill_place(place, self.experiment, self.recordings, self.replayed, exporters=exporters, skipped=skipped)
         self.folder = place.shown
         return notes
 

@@ -160,7 +160,6 @@ class TestTruth:
         assert SceneUpdate.FromString(messages(folder / "replay.mcap", "copem/truth/scene")[0][1]).entities[0].cubes
         assert not messages(folder / "replay.mcap", "copem/truth/transform")
 
-
     def test_is_left_out_where_it_is_not_to_be_shown(self, tmp_path: Path) -> None:
         drive(tmp_path / "drive.mcap")
         (tmp_path / "e.yaml").write_text(changed("show: {run: 0, truth: false}"))
