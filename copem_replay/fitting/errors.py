@@ -331,8 +331,8 @@ class _ModelTrial:
 
         def score(k: int, held_out: Bool) -> Float:
             of = held_out[which] | (not held_out.any())
-            out: Float = np.bincount(which[of], self._scores(each[k], ~held_out[which], of), len(first))
-            return out
+            rows_of = self._scores(each[k], ~held_out[which], of)
+            return np.bincount(which[of], weights=rows_of, minlength=len(first)).astype(np.float64)
 
         numbers = np.array([5 * len(bins) + 3 * (memory is not None) for _, bins, memory in each])
         worth = len(rows.log) * self.worth
