@@ -382,7 +382,7 @@ _BRAKING_TEXTS = ("pass_interval", "pass_interval_over")
 def check_summary(results: Results) -> None:
     """Raise InputError unless `summary.csv` has the experiment's configurations, and numbers in what is shown."""
     braking = results.experiment.braking is not None
-    place, summary = results.folder / "summary.csv", results.summary
+    place, summary = results.place / "summary.csv", results.summary
     numbers = _NUMBERS + (_BRAKING_NUMBERS if braking else ())
     for name in (*numbers, "interval", "interval_over", *(_BRAKING_TEXTS if braking else ())):
         if name not in summary:
