@@ -91,8 +91,8 @@ class _Compiling(Listener):
 # Memory.
 
 AT_LEAST_BYTES = {False: 250, True: 400}
-"""Bytes of a row of `detections.parquet`, without accuracy and with it, while the rows of a log are counted (measured: a
-row has 146 and 234, held twice). What accuracy has list by list waits in a file."""
+"""Bytes of a row of `detections.parquet`, without accuracy and with it, while the rows of a log are counted (measured:
+a row has 146 and 234, held twice). What accuracy has list by list waits in a file."""
 ABOUT_BYTES = 1000
 """Bytes of a row with all intermediate results and statistics (measured: tc016d.yaml with accuracy grows by 600 a row
 from 500 runs to 10,000)."""

@@ -255,7 +255,7 @@ class TestMemory:
 
     def test_run_refuses_before_it_begins(self, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         experiment, recordings, _ = made(here, changed("runs: 1000000000"))
-        with pytest.raises(ExperimentError, match=r"1000000000 runs of 3 rows each take at least 2\.64e\+03 GB"):
+        with pytest.raises(ExperimentError, match=r"1000000000 runs of 3 rows each take at least 1\.2e\+03 GB"):
             run_experiment(experiment, recordings)
 
     def test_what_is_free(self, monkeypatch: pytest.MonkeyPatch) -> None:

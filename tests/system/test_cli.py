@@ -399,16 +399,16 @@ class TestCheck:
         ended = call(command, "e.yaml")
         assert (ended.code, ended.out) == (2, "")
         (line,) = ended.lines
-        least = r"1000000000 runs of 3 rows each take at least 2\.64e\+03 GB"
+        least = r"1000000000 runs of 3 rows each take at least 1\.2e\+03 GB"
         assert re.fullmatch(rf"e\.yaml:3: runs: {least}, and .* GB are free; take \d+ or fewer", line)
         assert not (here / "out").exists()
 
     def test_runs_that_may_be_too_many_are_said_before(
         self, here: Path, call: Call, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("copem_replay.pipeline.cost.free_bytes", lambda: 50_000)
+        monkeypatch.setattr("copem_replay.pipeline.cost.free_bytes", lambda: 30_000)
         monkeypatch.setattr(gather, "replay_outcomes", raising(OSError(5, "Input/output error")))
-        said = "note: 4 runs of 3 rows each may take 5.22e-05 GB, and 5e-05 GB are free"
+        said = "note: 4 runs of 3 rows each may take 3.68e-05 GB, and 3e-05 GB are free"
         assert call("check", "e.yaml").lines == [said]
         assert call("run", "e.yaml").lines == [said, "copem-replay: Input/output error"]
 

@@ -274,9 +274,10 @@ def test_a_long_recording_is_timed(tmp_path: Path) -> None:
     short, longer, slope = long.grown(tmp_path, minutes=(0.05, 0.1), objects=8)
     assert (short["object_states"], longer["object_states"]) == (240, 480)
     assert all(value > 0 for line in (short, longer, slope) for value in line.values())
-    written = (tmp_path / "city.yaml").read_text()
+    written = (tmp_path / "e.yaml").read_text()
     assert "# Written by `copem-replay init`, as a starting point." in written
-    assert "\nruns: 2 " in written
+    assert "\nruns: 20 " in written
+    assert all(value > 0 for value in long.stayed(tmp_path, 0.02, 3).values())
 
 
 def test_a_crowd_is_timed(tmp_path: Path) -> None:

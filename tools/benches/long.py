@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import subprocess
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -33,20 +32,20 @@ show: null
 """Every object carries a unit that sees as far as anything hides nothing: as many rows as there can be (chosen)."""
 
 
-def grown(folder: Path, minutes: Sequence[float] = (20, 60), objects: int = 100) -> Iterator[common.Line]:
-    """A line for each length, and the slope: how many times as long it takes, per how many times as long it is.
+def drafted(folder: Path, name: str) -> common.Spent:
+    """What the experiment takes that `init` writes for a recording, with its own number of runs."""
+    begun = subprocess.run([*common.TOOL, "init", name], cwd=folder, check=True, capture_output=True, text=True)
+    (folder / "e.yaml").write_text(begun.stdout)
+    return common.spent([*_RUN, "e.yaml"], folder)
 
-    The experiment is the one that `init` writes for the recording, but of two runs.
-    """
+
+def grown(folder: Path, minutes: Sequence[float] = (20, 60), objects: int = 100) -> Iterator[common.Line]:
+    """A line for each length, and the slope: how many times as long it takes, per how many times as long it is."""
     taken: list[tuple[float, int]] = []
     for length in minutes:
         write_osi_trace(long_drive(length, objects), folder / "city.mcap")
-        begun = subprocess.run(
-            [*common.TOOL, "init", "city.mcap"], cwd=folder, check=True, capture_output=True, text=True
-        )
-        (folder / "city.yaml").write_text(re.sub(r"(?m)^runs: \d+", "runs: 2", begun.stdout))
         out = folder / "out"
-        _, seconds, peak_mb = common.spent([*_RUN, "city.yaml"], folder)
+        _, seconds, peak_mb = drafted(folder, "city.mcap")
         taken.append((seconds, peak_mb))
         states = round(length * 600) * objects
         yield {
@@ -61,6 +60,20 @@ def grown(folder: Path, minutes: Sequence[float] = (20, 60), objects: int = 100)
     (first_s, first_mb), (last_s, last_mb) = taken[0], taken[-1]
     times = minutes[-1] / minutes[0]
     yield {"long_slope": round(last_s / first_s / times, 2), "long_memory_slope": round(last_mb / first_mb / times, 2)}
+
+
+def stayed(folder: Path, minutes: float = 60, objects: int = 100) -> common.Line:
+    """What a recording takes in which all objects stay the whole time, at 20 Hz."""
+    common.write_truth(folder / "stay.mcap", common.boxes(round(minutes * 1200), objects))
+    _, seconds, peak_mb = drafted(folder, "stay.mcap")
+    return {"stay_minutes": minutes, "stay_s": round(seconds, 1), "stay_peak_mb": peak_mb}
+
+
+def drawn_often(folder: Path, runs: int = 10_000) -> common.Line:
+    """What many runs of one drive take, with accuracy."""
+    sample = str(common.ROOT / "logs/tc016d.yaml")
+    _, seconds, peak_mb = common.spent([*_RUN, sample, "--runs", str(runs)], folder)
+    return {"often_runs": runs, "often_s": round(seconds, 1), "often_peak_mb": peak_mb}
 
 
 def crowded(folder: Path, frames: int, objects: int) -> common.Line:
@@ -79,9 +92,11 @@ def crowded(folder: Path, frames: int, objects: int) -> common.Line:
 
 
 def long() -> Iterator[common.Line]:
-    """Twenty minutes of recording, and an hour. It takes a quarter of an hour."""
+    """Twenty minutes of recording, and an hour; an hour in which all stay; many runs. It takes an hour."""
     with common.scratch() as folder:
         yield from grown(folder)
+        yield stayed(folder)
+        yield drawn_often(folder)
 
 
 def crowd() -> Iterator[common.Line]:
