@@ -45,7 +45,7 @@ def table_file(table: Path, log: str) -> Path:
     return table / avoid_device_name(f"{quote(log, safe=' ')}.parquet")
 
 
-FORMAT = 3
+FORMAT = 4
 """The format of results folders: raised when columns, files or their meaning change so that readers have to know."""
 
 AGAIN = "run the experiment again with --overwrite"
@@ -454,15 +454,16 @@ def parse_provenance(data: Any, place: Path) -> Provenance:
     """What `provenance.json` of the results at a place says. Raises InputError for another format."""
     if (found := dict(data).get("format", 1)) != FORMAT:
         raise InputError(f"{place}: expected results of format {FORMAT}, found format {found}; {AGAIN}")
+    logs = tuple(
+        RecordedLog(str(log["log"]), log.get("topic"), str(log["sha256"]), log.get("truth")) for log in data["logs"]
+    )
     notes = [*data.get("notes", []), *(log[name] for log in data.get("logs_skipped", []) for name in _SKIPPED)]
     if not all(isinstance(note, str) for note in notes):
         raise ValueError("expected text in notes and logs_skipped")
     measure, braking, gap_s = dict(data["measure"]), data.get("braking"), data.get("max_gap_s")
     used_s, run_shown = float(measure.pop("horizon_used_s")), data.get("run_shown") or {}
     return Provenance(
-        logs=tuple(
-            RecordedLog(str(log["log"]), log.get("topic"), str(log["sha256"]), log.get("truth")) for log in data["logs"]
-        ),
+        logs=logs,
         seed=int(data["seed"]),
         runs=int(data["runs"]),
         visibility=data.get("visibility"),

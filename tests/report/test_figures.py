@@ -42,6 +42,7 @@ from copem_replay.report.figures.single_runs import StoryEvent, last_instant, ru
 from copem_replay.report.figures.style import choose_appearances, format_share, shorten_names
 from copem_replay.report.figures.sweeps import sweeps_figure
 from copem_replay.results.read import Results, read_results
+from copem_replay.results.schema import TABLES
 from copem_replay.results.write import write_results
 from copem_replay.viewer.rrd import EXPORTERS
 from tests.helpers.recordings import Obj, pedestrian, write_recording
@@ -270,7 +271,12 @@ class TestCommand:
             ),
             ("summary.csv", b"a,b\n1,2\n", "/summary.csv: expected the column configuration, found none; run the "),
             ("summary.csv", b"", "/summary.csv: expected a table that can be read, found damage: "),
-            ("summary.csv", b"configuration,n,list_rate_hz\nGT,3,x\n", "/summary.csv: column list_rate_hz: expected "),
+            (
+                "summary.csv",
+                b"configuration,n,list_rate_hz\nGT,3,x\n",
+                "/summary.csv: expected the column detected_share",
+            ),
+            ("sweep.csv", b"sweep,value,configuration\nunits,x,GT\n", "/sweep.csv: column value: expected numbers"),
             ("experiment.yaml", b"version: 1\n", "/experiment.yaml:1: logs: missing"),
             ("sweep.csv", b"sweep,value\nunits,1\n", "/sweep.csv: expected the column configuration, found none; "),
         ],
@@ -573,6 +579,7 @@ class TestCurves:
         rows = [("2", 0.0, 0.5), ("2", 1.0, 0.5), ("3", 1.0, 0.5), ("3", None, 0.5), ("3", 2.0, 0.0)]
         exact = pd.DataFrame(rows, columns=columns).assign(log="drive", configuration="GT", episode=0, began="crossed")
         exact = exact.assign(onset_s=0.0, ended_s=5.0)
+        exact = exact.reindex(columns=[*exact, *TABLES["exact.parquet"].kinds("braking").keys() - {*exact}])
         exact.to_parquet(mine / "exact.parquet")
         figure = curves_figure(read_results(mine), configurations=["GT"])
         x, y = line(figure.axes[0], "exact")
