@@ -130,7 +130,7 @@ def write_folder(
     names = list(dict.fromkeys(r["log"] for r in rows))
     logs = logs or {name: f"content of {name}" for name in names}
     said = {
-        "format": 3,
+        "format": 4,
         "seed": 1,
         "runs": max(r["run"] for r in rows) + 1,
         "logs": [{"log": name, "topic": "ground_truth", "sha256": content} for name, content in logs.items()],

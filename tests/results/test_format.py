@@ -18,7 +18,7 @@ def older(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (place / "e.yaml").write_text(changed("show: {run: 0}"))
     folder = cr.run(place / "e.yaml").save(place / "old")
     said = json.loads((folder / "provenance.json").read_text())
-    assert said.pop("format") == 3
+    assert said.pop("format") == 4
     (folder / "provenance.json").write_text(json.dumps(said))
     return folder
 
@@ -28,7 +28,7 @@ def test_an_older_format_is_refused(older: Path, read: Callable[[Path], object])
     with pytest.raises(cr.InputError) as failure:
         read(older)
     again = "run the experiment again with --overwrite"
-    assert failure.value.problems == (f"{older}: expected results of format 3, found format 1; {again}",)
+    assert failure.value.problems == (f"{older}: expected results of format 4, found format 1; {again}",)
 
 
 @pytest.mark.parametrize("read", [cr.load_results, cr.compare])

@@ -39,7 +39,7 @@ def compare() -> Iterator[common.Line]:
 
 def write(folder: Path, logs: list[str]) -> None:
     """A results folder of so many logs, without accuracy: each object is detected at one of 50 instants, or never."""
-    said = {"format": 3, "seed": 1, "runs": RUNS, "measure": {"horizon_used_s": 10.0}, "braking": None}
+    said = {"format": 4, "seed": 1, "runs": RUNS, "measure": {"horizon_used_s": 10.0}, "braking": None}
     said["logs"] = [{"log": log, "topic": None, "sha256": log} for log in logs]
     (folder / "provenance.json").write_text(json.dumps(said))
     (folder / "experiment.yaml").write_text("version: 1\n")
