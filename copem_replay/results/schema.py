@@ -460,7 +460,10 @@ def parse_provenance(data: Any, place: Path) -> Provenance:
     notes = [*data.get("notes", []), *(log[name] for log in data.get("logs_skipped", []) for name in _SKIPPED)]
     if not all(isinstance(note, str) for note in notes):
         raise ValueError("expected text in notes and logs_skipped")
-    measure, braking, gap_s = dict(data["measure"]), data.get("braking"), data.get("max_gap_s")
+    # A missing key, from an older version, stands for its default.
+    measure = Measure().model_dump(mode="json", by_alias=True) | dict(data["measure"])
+    float(measure["gospa"]["power"])  # which comparisons take as it is
+    braking, gap_s = data.get("braking"), data.get("max_gap_s")
     used_s, run_shown = float(measure.pop("horizon_used_s")), data.get("run_shown") or {}
     return Provenance(
         logs=logs,
@@ -469,8 +472,7 @@ def parse_provenance(data: Any, place: Path) -> Provenance:
         visibility=data.get("visibility"),
         max_gap_s=None if gap_s is None else float(gap_s),
         window_s=data.get("window_s"),
-        # A missing key, from an older version, stands for its default.
-        measure=Measure().model_dump(mode="json", by_alias=True) | measure,
+        measure=measure,
         braking=None if braking is None else dict(braking),
         horizon_used_s=used_s,
         run_shown={str(log): int(run) for log, run in run_shown.items() if run is not None},

@@ -227,6 +227,8 @@ def test_provenance_that_does_not_say_enough(tmp_path, key):
         ("logs_skipped", [{"log": "a", "reason": []}]),
         ("seed", math.inf),
         ("runs", math.inf),
+        ("measure", {"horizon_used_s": 2.0, "gospa": "power"}),
+        ("measure", {"horizon_used_s": 2.0, "gospa": {"power": None}}),
     ],
 )
 def test_provenance_with_something_else_in_it(tmp_path, key, value):

@@ -6,12 +6,14 @@ import json
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from benches import common
+from copem_replay.pipeline.expansion import ConfigurationFacts
 from copem_replay.results.schema import table_file, write_parquet
 
 RUNS, OBJECTS, CONFIGURATIONS = 500, 20, ("ideal", "late", "later")
@@ -40,6 +42,11 @@ def compare() -> Iterator[common.Line]:
 def write(folder: Path, logs: list[str]) -> None:
     """A results folder of so many logs, without accuracy: each object is detected at one of 50 instants, or never."""
     said = {"format": 4, "seed": 1, "runs": RUNS, "measure": {"horizon_used_s": 10.0}, "braking": None}
+    drawn = ConfigurationFacts(
+        truth=False, recorded=False, by_truth_id=True, fixed=False, fixed_verdicts=False, needs_visibility=False,
+        ideal=None, ideal_of=None,
+    )  # fmt: skip
+    said["configurations"] = dict.fromkeys(CONFIGURATIONS, asdict(drawn))
     said["logs"] = [{"log": log, "topic": None, "sha256": log} for log in logs]
     (folder / "provenance.json").write_text(json.dumps(said))
     (folder / "experiment.yaml").write_text("version: 1\n")
