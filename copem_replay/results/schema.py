@@ -360,7 +360,7 @@ def read_frame(path: Path, reader: Callable[[Path], pd.DataFrame], kinds: Mappin
 
 def check_columns(path: Path, expected: Iterable[str], found: Collection[str]) -> None:
     """Raise InputError where a column is missing, or there several times."""
-    counts = Counter(found)
+    counts = Counter(list(found))
     for name in expected:
         if counts[name] != 1:
             raise InputError(f"{path}: expected the column {name}, found {counts[name] or 'none'}; {AGAIN}")
