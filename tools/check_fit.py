@@ -450,7 +450,7 @@ def wrong_fit(case: Case, rows: FitRows, lists: FitLists) -> tuple[DetectionFit,
         rows = replace(rows, view=replace(view, azimuth_rad=0 * view.azimuth_rad))
     if case.wrong == "common":
         rows = replace(rows, list=np.arange(len(rows.list)))
-    detection, errors = fit_detection(rows, lists, intervals=False), fit_errors(rows, lists)
+    detection, errors = fit_detection(rows, intervals=False), fit_errors(rows)
     if case.wrong == "tails":
         errors = replace(errors, shape=replace(errors.shape, heavier=False))
     return detection, errors
@@ -467,7 +467,7 @@ def check_rows(seeds: int, names: Sequence[str], replays: int) -> list[str]:
         case, found, refused, memories = CASES[name], defaultdict(list), np.zeros(2, dtype=int), 0
         for seed in range(seeds):
             rows, lists = drawn_rows(case, seed)
-            detection, errors = fit_detection(rows, lists), fit_errors(rows, lists)
+            detection, errors = fit_detection(rows), fit_errors(rows)
             for kind, estimate, true in drawn_pairs(case, detection, errors):
                 if estimate.why is None:
                     found[kind].append((holds(estimate, true), estimate.high - estimate.low))

@@ -27,7 +27,6 @@ from copem_replay.fitting.estimate import (
     profile_limits,
 )
 from copem_replay.fitting.rows import (
-    FitLists,
     FitRows,
     NodeWeights,
     PooledRows,
@@ -268,7 +267,6 @@ class _Rung:
 
 def fit_detection(
     rows: FitRows,
-    lists: FitLists,
     *,
     monotone: bool = True,
     by: tuple[str, ...] = BY,
@@ -291,9 +289,12 @@ def fit_detection(
     chosen, more = trial.choose(allowed, simplest)
     rung, table = allowed[chosen], _join_rungs(table, more)
     apart, others = trial.choose([rung, *(one for one in splits if one not in allowed)], simplest)
-    notes = _note_rows(rows) + tuple(
+    notes = tuple(
         f"{one.name}: {others[0].below - one.below:+.3g} nats per list, but --by does not name it" for one in others[1:]
     )
+    if rows.listed.all() or not rows.listed.any():
+        none = f"no {'miss' if rows.listed.all() else 'hit'} in {count_noun(len(rows.listed), 'list')}"
+        notes = (f"{none}: intervals of detection take lists as independent, which cannot be told", *notes)
     explained = [rung, *(one for one in splits if one not in allowed)][apart]
     memory, why, tried = _choose_memory(rows, pass_ix, trial.chances(explained), simplest, intervals)
     fit = fit_table(rung.entries, np.ones(int(pass_ix.max()) + 1), trial.worth, monotone=monotone)
@@ -304,9 +305,7 @@ def fit_detection(
         DetectionCouple(when.get("classes"), axes[0], axes[1], tuple(map(tuple, one)), when.get("azimuth_deg"))
         for when, one in zip(rung.when, grid.tolist(), strict=True)
     )
-    return DetectionFit(
-        couples, memory, why, _add_gains(table, memory), fit.worth, notes,
-    )  # fmt: skip
+    return DetectionFit(couples, memory, why, _add_gains(table, memory), fit.worth, notes)
 
 
 def _choose_memory(
@@ -368,7 +367,10 @@ class _TableTrial:
         starts = pass_starts(self.pass_ix)
 
         def score(k: int, held_out: Bool) -> Float:
-            return _log_likelihood(ladder[k], self.fit(ladder[k], (~held_out).astype(float)))
+            entries, theta = ladder[k].entries, self.fit(ladder[k], (~held_out).astype(float))
+            p = entries.placed.chances(theta)
+            result: Float = entries.count @ np.log(np.where(entries.hit, p, 1 - p))  # (passes,)
+            return result
 
         names, size = [one.name for one in ladder], np.array([np.prod(one.rows.shape) for one in ladder])
         worth = len(self.pass_ix) / self.worth
@@ -422,13 +424,6 @@ class _TableTrial:
         return _Rung(name, axes, when, where, pool_rows(where, self.rows.listed, self.pass_ix), split)
 
 
-def _log_likelihood(rung: _Rung, theta: Float) -> Float:
-    """(passes,) log-probability of the hits and misses of each pass."""
-    p = rung.entries.placed.chances(theta)
-    result: Float = rung.entries.count @ np.log(np.where(rung.entries.hit, p, 1 - p))
-    return result
-
-
 def _split_conditions(rows: FitRows, when: list[dict[str, Any]], name: str, least: float) -> list[dict[str, Any]]:
     """Conditions split by class or azimuth where a part has `least` rows; all other rows are one more condition."""
     if name == "class":
@@ -463,10 +458,3 @@ def _rows_per_effective(rows: FitRows, pass_ix: Int, monotone: bool) -> float:
     axes = trial.build_axes(BY)[-1]
     richest = [axes, *trial.build_splits(axes)][-1]
     return count_rows_per_effective(rows.listed - trial.chances(richest), pass_ix)
-
-
-def _note_rows(rows: FitRows) -> tuple[str, ...]:
-    if rows.listed.all() or not rows.listed.any():
-        none = f"no {'miss' if rows.listed.all() else 'hit'} in {count_noun(len(rows.listed), 'list')}"
-        return (f"{none}: intervals of detection take lists as independent, which cannot be told",)
-    return ()

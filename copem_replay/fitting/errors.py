@@ -50,7 +50,7 @@ from copem_replay.fitting.moments import (
     share_bins,
 )
 from copem_replay.fitting.pose import PoseFit
-from copem_replay.fitting.rows import FitLists, FitRows
+from copem_replay.fitting.rows import FitRows
 
 # Fits of errors.
 
@@ -204,7 +204,7 @@ def _remove_variance(of: Estimate, pose_m2: float) -> Estimate:
     return replace(of, value=value, low=0.0 if why else low, high=high, why=why)
 
 
-def fit_errors(rows: FitRows, lists: FitLists, *, simplest: bool = False) -> ErrorFit:
+def fit_errors(rows: FitRows, *, simplest: bool = False) -> ErrorFit:
     """Fit the errors of all listed rows. Raises InputError where too few rows are listed."""
     listed = np.flatnonzero(rows.listed & np.isfinite(rows.along_m) & np.isfinite(rows.across_m))
     if len(listed) < FEWEST:

@@ -301,8 +301,8 @@ def _fit_parts(gathered: Gathered, truth: Truth, how: FitOptions) -> FittedParts
     rows, lists = gathered.rows, gathered.lists
     rest = fit_rest(rows, lists, gathered.other, truth=truth)
     return FittedParts(
-        fit_detection(rows, lists, monotone=how.monotone, by=how.by, simplest=how.simplest),
-        remove_pose(fit_errors(rows, lists, simplest=how.simplest), rest.placed),
+        fit_detection(rows, monotone=how.monotone, by=how.by, simplest=how.simplest),
+        remove_pose(fit_errors(rows, simplest=how.simplest), rest.placed),
         rest,
     )
 
@@ -424,7 +424,12 @@ def build_experiment(fit: Fit, experiment: Experiment, logs: Sequence[Any]) -> T
     name, other = fit.unit, _find_free_name(f"{fit.unit}_recorded", data["units"])
     pem = _find_free_name(name, data["pems"])
     late_s = max(round_digits(fit.delay.seconds, 6), 0.0)
-    stated = {"delay_s": late_s, "covariance_m2": _pool_covariance(fit)}
+    rows = fit.gathered.rows
+    covariance = np.cov(np.stack([rows.east_m, rows.north_m])[:, np.isfinite(rows.east_m)])  # entries may state none
+    stated = {
+        "delay_s": late_s,
+        "covariance_m2": [[round_digits(one, 6) for one in row] for row in covariance.tolist()],
+    }
     lists = _complete_recorded(data["units"][name]["recorded"], stated)
     units = dict(data["units"])
     recorded = units.pop(name) | {"recorded": lists}
@@ -441,14 +446,6 @@ def build_experiment(fit: Fit, experiment: Experiment, logs: Sequence[Any]) -> T
         "units": {name: strip_comments(build_unit(fit, experiment, pem)), other: recorded, **units},
         "configurations": {"recorded": {"units": [other]}, "fitted": {"units": [name], **latency}},
     }
-
-
-def _pool_covariance(fit: Fit) -> list[list[float]]:
-    """The covariance of all errors in easting and northing, for recorded entries that state none."""
-    rows = fit.gathered.rows
-    finite = np.isfinite(rows.east_m)
-    covariance = np.cov(np.stack([rows.east_m[finite], rows.north_m[finite]]))
-    return [[round_digits(one, 6) for one in row] for row in covariance.tolist()]
 
 
 def _find_free_name(name: str, taken: Any) -> str:

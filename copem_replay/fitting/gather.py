@@ -277,7 +277,12 @@ def gather_rows(
     )
     reach = reach or find_reach(view_of_rows, columns["listed"])
     if reach is None:
-        raise NothingMatchedError(_describe_too_few(name, int(entries.sum()), int(columns["listed"].sum()), gate_m))
+        count, matched = count_noun(int(entries.sum()), "entry", "entries"), int(columns["listed"].sum())
+        of_unit, near = f"of unit {name}'s {count}", f"within {gate_m:g} m of a true object"
+        raise NothingMatchedError(
+            f"only {matched} {of_unit} are {near}: too few to fit" if matched
+            else f"nothing {of_unit} is {near} at any delay up to {LONGEST_S:g} s: other frame, or other clock?"
+        )  # fmt: skip
     inside = np.flatnonzero(reach.holds(view_of_rows))
     columns = {key: column[..., inside] for key, column in columns.items()}
     away_m = columns.pop("away_m")
@@ -304,16 +309,6 @@ def _remove_outliers(name: str, values: Float) -> Iterator[str]:
         values[far] = np.nan
         what, count = name.partition("_")[0], count_noun(int(far.sum()), "error")
         yield f"{count} of {what} beyond {_SIGMAS:g} standard deviations (flips, other objects): left out of its spread"
-
-
-def _describe_too_few(name: str, entries: int, matched: int, gate_m: float) -> str:
-    count = count_noun(entries, "entry", "entries")
-    if matched:
-        return f"only {matched} of unit {name}'s {count} are within {gate_m:g} m of a true object: too few to fit"
-    return (
-        f"nothing of unit {name}'s {count} is within {gate_m:g} m of a true object at any delay up to {LONGEST_S:g} s: "
-        "other frame, or other clock?"
-    )
 
 
 @dataclass(frozen=True)
@@ -361,7 +356,9 @@ def _match_log(number: int, view: LogView, gates: tuple[float, float], ellipse_m
     far = np.hypot(errors["along_m"] / ellipse_m[0], errors["across_m"] / ellipse_m[1]) > 1
     object_ix[entry[far]] = entry[far] = -1
     listed = entry >= 0
-    apart = ~_is_crowded(view, errors, min(gate_m, float(ellipse_m.max())))
+    places = np.stack([errors["x_m"], errors["y_m"], view.list_ix * _APART_M], axis=1)
+    # An entry near several true objects of a list may be about either.
+    apart = cKDTree(places).query(places, k=2)[0][:, 1] > min(gate_m, float(ellipse_m.max()))
     for name in ("along_m", "across_m", "east_m", "north_m", "yaw_rad", "speed_mps", "size_m"):
         errors[name][..., ~apart | far] = np.nan
     rows: dict[str, Any] = {
@@ -374,15 +371,6 @@ def _match_log(number: int, view: LogView, gates: tuple[float, float], ellipse_m
     other = np.flatnonzero(within & (object_ix < 0))
     other = other[np.argsort(list_of[other], kind="stable")]
     return _MatchedLog(rows, _other_columns(number, view, other, list_of[other], rows, fields), entries)
-
-
-def _is_crowded(view: LogView, errors: dict[str, Any], near_m: float) -> Bool:
-    """(R,) which true objects have another one within `near_m` in the same list: an entry may be about either."""
-    places = np.stack([errors["x_m"], errors["y_m"], view.list_ix * _APART_M], axis=1)
-    if len(places) < 2:
-        return np.zeros(len(places), dtype=bool)
-    near: Bool = cKDTree(places).query(places, k=2)[0][:, 1] <= near_m
-    return near
 
 
 def _error_columns(view: LogView, found: RecordedLists, entry: Int) -> dict[str, Any]:

@@ -202,9 +202,9 @@ def fill_fit(place: ResultsPlace, fit: Fit, experiment: Experiment, recordings: 
         place.will_hold(files)
         new = place.new
         (new / PEM).write_text(pem_text(fit, experiment), encoding="utf-8")
-        data = build_experiment(
-            fit, experiment, log_entries(_list_settings(experiment, replayed), replayed, place.folder)
-        )
+        names = {recording.scene.log for recording in replayed}
+        settings = [entry for entry in experiment.logs if isinstance(entry, str) or entry.name in names]
+        data = build_experiment(fit, experiment, log_entries(settings, replayed, place.folder))
         (new / EXPERIMENT).write_text(dump_yaml(data), encoding="utf-8")
         write_parquet(rows_table(fit, recordings), new / ROWS)
         (new / ESTIMATES).write_text(
@@ -223,12 +223,6 @@ def fill_fit(place: ResultsPlace, fit: Fit, experiment: Experiment, recordings: 
 
 def _format_json(data: Mapping[str, Any]) -> str:
     return json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-
-
-def _list_settings(experiment: Experiment, recordings: Sequence[Recording]) -> list[Any]:
-    """The entries of `logs` of some recordings."""
-    names = {recording.scene.log for recording in recordings}
-    return [entry for entry in experiment.logs if isinstance(entry, str) or entry.name in names]
 
 
 def pem_text(fit: Fit, experiment: Experiment) -> str:

@@ -71,7 +71,10 @@ def replay_check(
     """
     recorded = compute_statistics(rows.listed[None], rows.along_m[None], rows.across_m[None], rows)
     each, totals = [], list[Float]()
-    for listed, along_m, across_m in _replay_blocks(pem, rows, lists, placed, runs, seed):
+    step = max(1, _CELLS // len(rows.listed))  # runs at a time
+    for first in range(0, runs, step):
+        some = np.arange(first, min(first + step, runs))
+        listed, along_m, across_m = simulate_lists(pem, rows, lists, some, seed, placed)
         if not totals:
             expected = listed.mean(axis=0)
             totals.append(compute_totals(rows.listed[None], rows, expected))
@@ -96,15 +99,6 @@ def remove_memory(pem: Pem) -> Pem:
     """The model with all draws new in every list."""
     couples = tuple(couple.model_copy(update={"memory": None}) for couple in pem.couples)
     return pem.model_copy(update={"couples": couples, "memory": {}})
-
-
-def _replay_blocks(
-    pem: Pem, rows: FitRows, lists: FitLists, placed: PoseError | None, runs: int, seed: int
-) -> Iterator[tuple[Bool, Float, Float]]:
-    """What the model lists in runs, some at a time."""
-    step = max(1, _CELLS // len(rows.listed))
-    for first in range(0, runs, step):
-        yield simulate_lists(pem, rows, lists, np.arange(first, min(first + step, runs)), seed, placed)
 
 
 def simulate_lists(

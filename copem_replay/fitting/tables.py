@@ -165,19 +165,14 @@ def fit_table(entries: PooledRows, times: Float, worth: float, *, monotone: bool
     """Fit to the passes; `times (passes,)`: how often each counts; `worth`: rows per effective row."""
     count = entries.count.T @ times
     constant = (count @ entries.hit / worth + 0.5) / (count.sum() / worth + 1)  # Jeffreys
-    levels = _list_levels(entries.placed)
+    tables, by_range, by_share = (placed := entries.placed).shape
+    levels = [placed.pooled()] * (by_range * by_share > 1) + [placed] * (tables > 1)  # of one node: none
     theta, strength = np.array([constant]), []
     for level in levels:
         parent = np.resize(theta, int(np.prod(level.shape)))
         theta, prior = _shrink_table(level, entries.hit, count, parent, worth, monotone)
         strength.append(prior)
     return TableFit(theta if levels else np.array([constant]), tuple(strength), worth)
-
-
-def _list_levels(placed: NodeWeights) -> list[NodeWeights]:
-    """The levels from the table of all rows to the single tables; empty where a table has one node."""
-    levels = [placed.pooled()] if placed.shape[1] * placed.shape[2] > 1 else []
-    return [*levels, placed] if placed.shape[0] > 1 else levels
 
 
 def _shrink_table(

@@ -20,7 +20,7 @@ from copem_replay.fitting.rows import FitRows, choose_nodes, pool_rows, weigh_no
 from copem_replay.fitting.tables import estimate_nodes, fit_em, fit_table, monotone_tables
 from copem_replay.perception.pem.condition import find_couples
 from copem_replay.perception.pem.model import Pem
-from tests.helpers.detection_rows import held_uniforms, lists_of, passes, rows_of, view_of
+from tests.helpers.detection_rows import held_uniforms, passes, rows_of, view_of
 from tools import check_fit
 
 AXES = np.array([0.0, 20.0, 60.0]), np.array([0.0, 0.5, 1.0])
@@ -36,7 +36,7 @@ def flat(view: Any) -> np.ndarray:
 
 
 def fitted(rows: FitRows, **how: Any) -> DetectionFit:
-    return fit_detection(rows, lists_of(rows), **how)
+    return fit_detection(rows, **how)
 
 
 def nodes(fit: DetectionFit) -> tuple[Any, list[Any]]:
@@ -249,8 +249,8 @@ def test_few_numbers_of_all_objects_leave_the_probability_open() -> None:
     """A number held for 5 s is a few in a drive: given the probability that these show, half of the intervals miss."""
     held = []
     for seed in range(10):
-        rows, lists = check_fit.drawn_rows(check_fit.CASES["misses of all"], seed)
-        memory = fit_detection(rows, lists).memory
+        rows, _ = check_fit.drawn_rows(check_fit.CASES["misses of all"], seed)
+        memory = fit_detection(rows).memory
         assert memory is not None
         held.append(memory.share.low <= 0.7 <= memory.share.high)
     assert sum(held) >= 9

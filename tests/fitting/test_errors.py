@@ -110,8 +110,8 @@ def test_a_single_smooth_series_has_intervals_of_some_width(period_s: float) -> 
 def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
     held = []
     for seed in range(20):
-        rows, lists = rows_of(seed, passes=16, lists_each=60)
-        fit = fit_errors(rows, lists)
+        rows, _ = rows_of(seed, passes=16, lists_each=60)
+        fit = fit_errors(rows)
         [part] = fit.memory["position"]
         assert not isinstance(part.correlation_s, str)
         assert fit.yaw_sigma_deg is not None
@@ -130,7 +130,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
 
 def test_memory_is_declined_only_where_white_noise_is_not_refused() -> None:
     """Three passes drift and one is white: held out memory is no better, and yet errors last."""
-    rows, lists = rows_of(2, passes=4, lists_each=150, memory=(0.9, 4.0, 0.0), mean_m=(0.0, 0.0), folds=4)
+    rows, _ = rows_of(2, passes=4, lists_each=150, memory=(0.9, 4.0, 0.0), mean_m=(0.0, 0.0), folds=4)
     white_m = np.random.default_rng(2).normal(0, 0.6, (2, len(rows.log))) + np.where(rows.listed, 0.0, np.nan)
     along_m, across_m = np.where(rows.pass_ix == 3, white_m, (rows.along_m, rows.across_m))
     cos, sin = np.cos(rows.view.bearing_rad), np.sin(rows.view.bearing_rad)
@@ -138,28 +138,28 @@ def test_memory_is_declined_only_where_white_noise_is_not_refused() -> None:
         rows, along_m=along_m, across_m=across_m,
         east_m=cos * along_m - sin * across_m, north_m=sin * along_m + cos * across_m,
     )  # fmt: skip
-    fit = fit_errors(mixed, lists)
+    fit = fit_errors(mixed)
     without, with_memory = fit.ladder[-2:]
     assert without.score > with_memory.score
     assert with_memory.chosen
     assert fit.memory["position"]
-    simplest = fit_errors(mixed, lists, simplest=True)
+    simplest = fit_errors(mixed, simplest=True)
     assert not simplest.memory["position"]
     for mean in (*fit.bins[0].mean_m, *simplest.bins[0].mean_m):
         assert mean.n_effective < 100
-    white, lists = rows_of(2, passes=4, lists_each=150, memory=(0.0, 1.0, 0.0))
-    assert not fit_errors(white, lists).memory["position"]
+    white, _ = rows_of(2, passes=4, lists_each=150, memory=(0.0, 1.0, 0.0))
+    assert not fit_errors(white).memory["position"]
 
 
 def test_bins_and_frame_are_chosen_where_they_explain_more() -> None:
-    rows, lists = rows_of(5, passes=40, spread=lambda r: (0.1 + 0.02 * r, 0.1 + 0.005 * r), memory=(0.3, 0.3, 0.0))
-    fit = fit_errors(rows, lists)
+    rows, _ = rows_of(5, passes=40, spread=lambda r: (0.1 + 0.02 * r, 0.1 + 0.005 * r), memory=(0.3, 0.3, 0.0))
+    fit = fit_errors(rows)
     assert fit.frame == "line_of_sight"
     near, *_, far = fit.bins
     assert near.where.range_m[0] == 0.0
     assert 2 * near.covariance_m2[0].high < far.covariance_m2[0].low
     assert [rung.name for rung in fit.ladder if rung.chosen] == ["by range + memory"]
-    assert len(fit_errors(rows, lists, simplest=True).bins) == 1
+    assert len(fit_errors(rows, simplest=True).bins) == 1
 
 
 def student(seed: int, nu: float, passes: int = 40) -> tuple[FitRows, FitLists]:
@@ -173,7 +173,7 @@ def test_heavy_tails_are_said_and_written() -> None:
     """Student's t₃: ν and both variances are held; a Gaussian's are off by more than a tenth as often as not."""
     held = np.zeros(3)
     for seed in range(8):
-        fit = fit_errors(*student(seed, 3.0))
+        fit = fit_errors(student(seed, 3.0)[0])
         nu, [bin_] = fit.shape.degrees_of_freedom, fit.bins
         assert fit.shape.written
         assert "explains" in fit.shape.words()
@@ -185,7 +185,7 @@ def test_heavy_tails_are_said_and_written() -> None:
 
 
 def test_a_gaussian_has_no_heavy_tails() -> None:
-    fits = [fit_errors(*rows_of(seed, passes=20)) for seed in range(5)]
+    fits = [fit_errors(rows_of(seed, passes=20)[0]) for seed in range(5)]
     assert sum(fit.shape.heavier for fit in fits) <= 1
     assert fits[0].error_keys(fits[0].bins[0])["kind"] == "gaussian"
     assert "no heavier" in fits[0].shape.words()
@@ -218,8 +218,7 @@ def by_class(spread: float, seed: int = 4) -> FitRows:
 
 def test_classes_have_errors_of_their_own_where_these_differ() -> None:
     """Cars of .16 m² and pedestrians of .01 m² along: pooled neither is held. Alike they stay together."""
-    _, lists = rows_of(4, passes=16, lists_each=60)
-    fit = fit_errors(by_class(0.25), lists)
+    fit = fit_errors(by_class(0.25))
     kinds = {one.where.of_class: one for one in fit.bins}
     assert kinds.keys() == {"car", "pedestrian"}
     for kind, along_m2 in (("car", 0.16), ("pedestrian", 0.01)):
@@ -227,37 +226,37 @@ def test_classes_have_errors_of_their_own_where_these_differ() -> None:
         assert variance.low <= along_m2 <= variance.high
         assert kinds[kind].where.when["classes"] == [kind]
     assert [rung.name for rung in fit.ladder if rung.chosen] == ["one covariance and class + memory"]
-    alike = [fit_errors(by_class(1.0, seed), lists) for seed in range(4, 8)]
+    alike = [fit_errors(by_class(1.0, seed)) for seed in range(4, 8)]
     assert sum(len(one.bins) == 1 for one in alike) >= 3
-    assert len(fit_errors(by_class(0.25), lists, simplest=True).bins) == 1
+    assert len(fit_errors(by_class(0.25), simplest=True).bins) == 1
 
 
 def test_what_is_written_is_what_is_replayed() -> None:
-    rows, lists = rows_of(6)
-    fit = fit_errors(rows, lists)
+    rows, _ = rows_of(6)
+    fit = fit_errors(rows)
     model = Gaussian.model_validate(strip_comments(fit.error_keys(fit.bins[0])))
     assert model.covariance_m2[0][0] == pytest.approx(fit.bins[0].covariance_m2[0].value, rel=1e-3)
     assert model.speed_sigma_mps == 0
     assert fit.untold["speed"] == "the lists have no such field"
     flat_m = np.array([np.zeros(len(rows.listed)), np.zeros(len(rows.listed)), np.full(len(rows.listed), np.nan)])
-    assert fit_errors(replace(rows, size_m=flat_m), lists).untold["size"] == "the lists have only some of its fields"
+    assert fit_errors(replace(rows, size_m=flat_m)).untold["size"] == "the lists have only some of its fields"
     assert fit.memory_keys()["position"][0]["share"].value == pytest.approx(fit.shares.drift, abs=1e-3)
 
 
 def test_a_field_that_is_never_filled_is_no_measurement() -> None:
-    rows, lists = rows_of(9)
-    fit = fit_errors(replace(rows, speed_mps=np.where(rows.listed, 0.0 - rows.view.speed_mps, np.nan)), lists)
+    rows, _ = rows_of(9)
+    fit = fit_errors(replace(rows, speed_mps=np.where(rows.listed, 0.0 - rows.view.speed_mps, np.nan)))
     assert fit.speed_sigma_mps is None
     assert fit.untold["speed"] == "the same in every entry"
     reversed_yaw = np.where(np.arange(len(rows.log)) % 4 == 0, rows.yaw_rad - np.pi, rows.yaw_rad)
-    fit = fit_errors(replace(rows, yaw_rad=reversed_yaw), lists)
+    fit = fit_errors(replace(rows, yaw_rad=reversed_yaw))
     assert fit.yaw_sigma_deg is None
     assert fit.untold["yaw"].endswith("% of the entries point backwards, which no Gaussian does")
 
 
 def test_what_the_pose_explains_is_not_in_the_errors_too() -> None:
-    rows, lists = rows_of(9)
-    fit = fit_errors(rows, lists)
+    rows, _ = rows_of(9)
+    fit = fit_errors(rows)
     assert remove_pose(fit, PoseFit(untold="no pair")) is fit
     placed = PoseFit(Estimate(0.1), Estimate(float(np.rad2deg(0.005))))
     [one], [less] = fit.bins, remove_pose(fit, placed).bins
@@ -274,11 +273,11 @@ def test_what_the_pose_explains_is_not_in_the_errors_too() -> None:
 
 
 def test_few_passes_are_scored_by_bic() -> None:
-    rows, lists = rows_of(7, passes=3)
-    assert {rung.by for rung in fit_errors(rows, lists).ladder} == {"BIC"}
+    rows, _ = rows_of(7, passes=3)
+    assert {rung.by for rung in fit_errors(rows).ladder} == {"BIC"}
 
 
 def test_too_few_entries_are_refused_with_a_reason() -> None:
-    rows, lists = rows_of(8, passes=1, lists_each=20, listed=0.1)
+    rows, _ = rows_of(8, passes=1, lists_each=20, listed=0.1)
     with pytest.raises(InputError, match="errors need at least 8"):
-        fit_errors(rows, lists)
+        fit_errors(rows)

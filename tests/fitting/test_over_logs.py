@@ -94,7 +94,7 @@ def position(fit: ErrorFit) -> list[dict[str, object]]:
 
 
 def test_what_differs_between_logs_is_drawn_once_per_log() -> None:
-    fit = fit_errors(*drives(0, 6, 0.4))
+    fit = fit_errors(drives(0, 6, 0.4)[0])
     between = fit.between_logs
     assert between is not None
     assert between.untold is None
@@ -112,15 +112,15 @@ def test_what_differs_between_logs_is_drawn_once_per_log() -> None:
 
 
 def test_logs_that_do_not_differ_are_said() -> None:
-    fit = fit_errors(*drives(1, 6, 0.0))
+    fit = fit_errors(drives(1, 6, 0.0)[0])
     assert fit.between_logs is not None
     assert fit.between_logs.untold is not None
     assert fit.between_logs.untold.startswith("the means of 6 logs differ no more than chance makes them")
     assert all(part.get("of") is None for part in position(fit))
-    three = fit_errors(*drives(0, 3, 0.4)).between_logs
+    three = fit_errors(drives(0, 3, 0.4)[0]).between_logs
     assert three is not None
     assert three.untold == "3 logs, it is written from 4 on"
-    assert fit_errors(*drives(0, 2, 0.4)).between_logs is None
+    assert fit_errors(drives(0, 2, 0.4)[0]).between_logs is None
 
 
 def test_a_logs_mean_is_as_sure_as_its_memory_leaves_it() -> None:

@@ -40,7 +40,7 @@ def _fit() -> Fit:
     rows, lists = rows_of(3, passes=12, lists_each=40)
     rows = replace(rows, view=replace(rows.view, speed_mps=np.full(len(rows.log), 8.0)))
     parts = FittedParts(
-        fit_detection(rows, lists, intervals=False), fit_errors(rows, lists),
+        fit_detection(rows, intervals=False), fit_errors(rows),
         fit_rest(rows, lists, nothing_else(), truth="partial"),
     )  # fmt: skip
     gathered = Gathered(lists, rows, nothing_else(), FitReach((0.0, 45.0), None), 384, 0.0, False, ())

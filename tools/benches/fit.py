@@ -37,8 +37,8 @@ PEM = {
 def fit() -> Iterator[common.Line]:
     """The full ladder, and the check of a fit by replays."""
     rows, lists = drives()
-    fit_detection(rows, lists)
-    found, seconds, cpu_s = common.timed(lambda: fit_detection(rows, lists))
+    fit_detection(rows)
+    found, seconds, cpu_s = common.timed(lambda: fit_detection(rows))
     took = {"fit_detection_s": round(seconds, 2), "cpu_s": round(cpu_s, 2)}
     share = found.memory.share.value if found.memory else None
     yield {**took, "rows": len(rows.listed), "rungs": len(found.ladder), "share": share}
