@@ -293,7 +293,8 @@ def test_the_frame_of_reference_does_not_matter(given_: Estimates, angle_rad: fl
         turn[:2, :2] = rotation(angle_rad)
     there = all_methods(x @ turn.T + shift_m, turn @ cov @ turn.T)
     for here, elsewhere in zip(all_methods(x, cov), there, strict=True):
-        assert elsewhere[0] == pytest.approx(turn @ here[0] + shift_m, abs=1e-6)
+        # Where covariances differ in late digits only, any weights do, and the mean follows the weights.
+        assert elsewhere[0] == pytest.approx(turn @ here[0] + shift_m, abs=1e-5)
         assert elsewhere[1] == pytest.approx(turn @ here[1] @ turn.T, abs=1e-9 * np.trace(here[1]))
 
 
