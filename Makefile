@@ -1,16 +1,24 @@
-# make demo | test | test-random | bench | check | notebooks | pictures: each sets up .venv on its first call and never again while pyproject and requirements stay.
+# make demo | test | test-random | bench | check | notebooks | pictures: each sets up .venv on its first call and never again
+# while pyproject and requirements stay.
 # Another Python beside it: make test PYTHON=python3.13 VENV=.venv-3.13
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-random bench check notebooks pictures clean
+.PHONY: demo test test-random bench check notebooks pictures requirements clean
+
+# Packages come by hash, through uv where it is there: what runs need, and for all but `demo` the rest.
+INSTALL := $(if $(shell command -v uv),uv pip install --quiet --python $(BIN)/python,$(BIN)/python -m pip install --quiet --disable-pip-version-check)
 
 $(VENV)/.installed: pyproject.toml requirements.txt
 	$(PYTHON) -c 'import sys; sys.exit("Python 3.11 or newer is needed, this is " + sys.version.split()[0]) if sys.version_info < (3, 11) else None'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes --requirement requirements.txt
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
+	$(INSTALL) --require-hashes --requirement requirements.txt
+	$(INSTALL) --no-deps --editable .
+	touch $@
+
+$(VENV)/.rest: $(VENV)/.installed requirements-dev.txt
+	$(INSTALL) --require-hashes --requirement requirements-dev.txt
 	touch $@
 
 demo: $(VENV)/.installed
@@ -18,29 +26,39 @@ demo: $(VENV)/.installed
 	@echo
 	@$(BIN)/python tools/paper.py out/tc016d
 
-test: $(VENV)/.installed
+test: $(VENV)/.rest
 	$(BIN)/python -m pytest -q -n 2
 
 # Every night: the tests with drawn examples, with others each time. A failure prints the seed of all (to be given as SEED)
 # and what gives its own example again.
 SEED := $(or $(SEED),$(shell date +%s))
-test-random: $(VENV)/.installed
+test-random: $(VENV)/.rest
 	@echo "seed $(SEED)"
 	RANDOM_EXAMPLES=1 $(BIN)/python -m pytest -q -n 2 -m hypothesis --hypothesis-seed=$(SEED)
 
-bench: $(VENV)/.installed
+bench: $(VENV)/.rest
 	$(BIN)/python tools/bench.py
 
-check: $(VENV)/.installed
+check: $(VENV)/.rest
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
-notebooks: $(VENV)/.installed
+notebooks: $(VENV)/.rest
 	$(BIN)/python tools/run_notebooks.py
 
-pictures: $(VENV)/.installed
+pictures: $(VENV)/.rest
 	$(BIN)/python tools/pictures.py
+
+# Both files of pins anew, by uv; PINS= takes newer versions.
+PINS := --constraint requirements.txt --constraint requirements-dev.txt
+COMPILE := uv pip compile --quiet pyproject.toml --universal --python-version 3.11 --generate-hashes --no-annotate --no-emit-index-url --no-header
+requirements:
+	$(COMPILE) $(PINS) --output-file requirements.new
+	$(COMPILE) $(PINS) --extra dev --extra bench $$(sed -n 's/^\([A-Za-z0-9._-]*\)==.*/--no-emit-package \1/p' requirements.new) --output-file requirements-dev.new
+	(sed -n '/^#/p' requirements.txt; cat requirements.new) > requirements.made && mv requirements.made requirements.txt
+	(sed -n '/^#/p;/^-r/p' requirements-dev.txt; cat requirements-dev.new) > requirements.made && mv requirements.made requirements-dev.txt
+	rm requirements.new requirements-dev.new
 
 clean:
 	rm -rf .venv .venv-* out build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

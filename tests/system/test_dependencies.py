@@ -12,10 +12,10 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).parents[2]
 
 
-def read_pins() -> dict[str, tuple[str, list[str]]]:
-    """Version and hashes by name, of `requirements.txt`."""
-    text = (ROOT / "requirements.txt").read_text(encoding="utf-8")
-    lines = [line for line in text.splitlines() if not line.startswith("#")]
+def read_pins(file: str) -> dict[str, tuple[str, list[str]]]:
+    """Version and hashes by name, of one of the files of pins."""
+    text = (ROOT / file).read_text(encoding="utf-8")
+    lines = [line for line in text.splitlines() if not line.startswith("#") and line != "-r requirements.txt"]
     entries = "\n".join(lines).replace("\\\n", " ").splitlines()
     found = [
         re.fullmatch(r"([\w.-]+)==([^ ;]+)( ; [^-]*?)?((?: +--hash=sha256:[0-9a-f]{64})+)", one) for one in entries
@@ -24,18 +24,21 @@ def read_pins() -> dict[str, tuple[str, list[str]]]:
     return {canonicalize_name(one[1]): (one[2], one[4].split()) for one in found if one}
 
 
+RUNS, REST = read_pins("requirements.txt"), read_pins("requirements-dev.txt")
+
+
 def test_every_dependency_has_both_bounds_and_the_pin_is_within() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    pins = read_pins()
     for text in project["dependencies"]:
         needed = Requirement(text)
         assert {one.operator for one in needed.specifier} == {">=", "<"}, text
-        assert needed.specifier.contains(pins[canonicalize_name(needed.name)][0]), text
+        assert needed.specifier.contains(RUNS[canonicalize_name(needed.name)][0]), text
 
 
 def test_every_extra_is_pinned_and_what_is_compiled_has_files_for_many_platforms() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    pins = read_pins()
+    assert not RUNS.keys() & REST.keys(), "no package is pinned twice"
+    pins = RUNS | REST
     for name in ("cluster", "dev", "bench"):
         for needed in map(Requirement, project["optional-dependencies"][name]):
             if needed.name != "copem-replay":
