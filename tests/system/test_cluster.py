@@ -46,6 +46,7 @@ def start(here: Path) -> Iterator[Start]:
             subprocess.Popen(
                 [str(BIN / program), *words], cwd=here, env=environment, text=True, start_new_session=True,
                 stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+                preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # ignored in the background
             )
         )  # fmt: skip
         return begun[-1]
@@ -104,7 +105,7 @@ def test_an_interrupt_ends_all_and_says_what_is_done(number: int, code: int, her
     assert len(addresses) >= 2  # of the scheduler and of a worker
     assert {*addresses} == {"0100007F"}  # 127.0.0.1
     os.killpg(command.pid, number)
-    _, said = command.communicate(timeout=180)  # until the last of its processes has closed the pipe
+    _, said = command.communicate(timeout=60)  # until the last of its processes has closed the pipe
     assert command.returncode == code
     assert said == "interrupted; 0 of 6 logs are in out/e.pieces\n"
 
