@@ -132,7 +132,9 @@ _OF_RESULTS: tuple[Command, ...] = (
     ("layout", "out"),
 )
 _FIT: Command = ("fit", "e.yaml", "--unit", "rsu", "--out", "fit")
-_EXACT_DRIVE = _TIMES_ALONE | {"configurations": {"gnn:0.5s": {"units": "all"}}}  # gnn has no exact times
+_EXACT_DRIVE = _TIMES_ALONE | {  # gnn, of the draft, has no exact times
+    "configurations": {"gnn": {"units": "all"}, "alone": {"units": ["ego"]}, "late": {"units": "all", "latency_s": 0.5}}
+}
 _PLACED = {
     "units": {
         "rsu": {
