@@ -1,4 +1,4 @@
-"""Writing ROS 2 messages: CDR, definitions, and fused lists as autoware_perception_msgs/DetectedObjects.
+"""Writing ROS 2 messages: CDR, definitions, fused lists as autoware_perception_msgs/DetectedObjects, and scenes.
 
 `header.stamp` is the instant the list is available, `header.frame_id` the world of the recording. The twist is along
 the object, as in Autoware; a pedestrian is a cylinder whose diameter is the mean of its length and width. An unknown
@@ -7,13 +7,17 @@ covariance is 0 and flagged as absent; of height, roll and pitch it is always 0.
 
 from __future__ import annotations
 
+import math
 import struct
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from copem_replay.core.colours import Rgb
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import CLASSES, Float, Int, Scene
+from copem_replay.io.write.scene import ALPHA, Entity, Pose, Rgba, box_metadata
 
 # CDR, little-endian, each value aligned to its own size.
 
@@ -356,3 +360,128 @@ def _encode_head(existence: float, share: dict[int, float]) -> bytes:
     """A DetectedObject up to its pose, by its label."""
     classes = (struct.pack("<B3xf", label, probability) for label, probability in share.items())
     return struct.pack("<fI", existence, len(share)) + b"".join(classes)
+
+
+# Scenes in ROS 2: foxglove_msgs/SceneUpdate.
+
+_ALL = 1  # SceneEntityDeletion.type
+_FOREVER = bytes(8)  # lifetime
+_UNLOCKED = bytes(4)  # frame_locked, padded to a multiple of 4 bytes
+
+# From the cube's pose to the end of an entity: one cube, no sphere, cylinder, line, triangle, text, model.
+_CUBE = np.dtype([("pose", "<f8", 7), ("size", "<f8", 3), ("color", "<f8", 4), ("none", "<u4", 6)])
+
+
+class Ros2SceneWriter:
+    """Turns the fused lists of one run (values (1, P)) into messages, list by list."""
+
+    def __init__(self, scene: Scene, fused_tracks: FusedTracks, configuration: str, colour: Rgb, frame_id: str) -> None:
+        self._fused, self._listed = fused_tracks.fused, fused_tracks.listed
+        every, which = fused_tracks.names_of(scene)
+        names, kinds = [every[k] for k in which.tolist()], fused_tracks.class_of(scene).tolist()
+        entities = {
+            key: _encode_entity(key[0], box_metadata(*key, configuration), frame_id)
+            for key in dict.fromkeys(zip(names, kinds, strict=True))
+        }
+        self._entity = [entities[key] for key in zip(names, kinds, strict=True)]
+        self._color = (*(c / 255 for c in colour), ALPHA)
+
+    def message(self, frame: int, available_ns: int) -> bytes:
+        """List number `frame` as it became available at `available_ns` of the log's clock."""
+        rows = self._listed(frame)
+        now = encode_time(available_ns)
+        deletion = pad_to_size(now + bytes([_ALL, 0, 0, 0]) + encode_string(""))
+        begin = encode_count(1) + deletion + encode_count(len(rows))
+        cubes = self._cubes(rows)
+        parts = [HEAD, begin]
+        offset = len(begin)
+        for k, row in enumerate(rows):
+            entity = self._entity[row]
+            offset += len(now) + len(entity)
+            parts += (now, entity, bytes(-offset % 8), cubes[k * _CUBE.itemsize : (k + 1) * _CUBE.itemsize])
+            offset = 0  # a cube begins, and so ends, at a multiple of 8 bytes
+        return b"".join(parts)
+
+    def _cubes(self, rows: list[int]) -> bytes:
+        fused = self._fused
+        cubes = np.zeros(len(rows), dtype=_CUBE)
+        for k, name in enumerate(("x_m", "y_m", "z_m")):
+            cubes["pose"][:, k] = getattr(fused, name)[0, rows]
+        half = fused.yaw_rad[0, rows] / 2
+        cubes["pose"][:, 5], cubes["pose"][:, 6] = np.sin(half), np.cos(half)
+        for k, name in enumerate(("length_m", "width_m", "height_m")):
+            cubes["size"][:, k] = getattr(fused, name)[0, rows]
+        cubes["color"] = self._color
+        return cubes.tobytes()
+
+
+def _encode_entity(name: str, metadata: dict[str, str], frame_id: str) -> bytes:
+    """An entity from its frame of reference to the number of its cubes."""
+    texts = [pad_to_size(encode_string(each)) for pair in metadata.items() for each in pair]
+    head = pad_to_size(encode_string(frame_id)) + pad_to_size(encode_string(name)) + _FOREVER + _UNLOCKED
+    return head + encode_count(len(metadata)) + b"".join(texts) + encode_count(0) + encode_count(1)
+
+
+def encode_ros2_scene(entities: Sequence[Entity], time_ns: int, frame_id: str) -> bytes:
+    """A message that deletes all on its topic and draws entities."""
+    out = CdrMessage()
+    out.add("I", 1)
+    out.stamp(time_ns)
+    out.add("B", _ALL)
+    out.text("")
+    out.add("I", len(entities))
+    for each in entities:
+        out.stamp(time_ns)
+        out.text(frame_id)
+        out.text(each.name)
+        out.add("I", 0, 0)  # lifetime
+        out.add("B", 0)  # frame_locked
+        out.add("I", len(each.says))
+        for pair in each.says.items():
+            for text in pair:
+                out.text(text)
+        out.add("I", 0, 0, 0, len(each.ellipses))  # arrows, cubes, spheres, cylinders
+        for ellipse in each.ellipses:
+            _write_pose(out, each.pose)
+            out.add("d", *ellipse.size, 1.0, 1.0, *ellipse.colour)
+        out.add("I", len(each.lines))
+        for line in each.lines:
+            _write_line(out, line.points, line.width, each.pose, line.colour)
+        out.add("I", 0, len(each.texts))  # triangles, texts
+        for words in each.texts:
+            _write_pose(out, words.place(each.pose))
+            out.add("B", 1)  # billboard
+            out.add("d", words.size)
+            out.add("B", 1)  # scale_invariant
+            out.add("d", *words.colour)
+            out.text(words.text)
+        out.add("I", 0)  # models
+    return out.message()
+
+
+def encode_ros2_transform(parent: str, pose: Pose, time_ns: int, child: str) -> bytes:
+    """The pose of the frame `child` in the frame `parent`: foxglove_msgs/FrameTransform."""
+    out = CdrMessage()
+    out.stamp(time_ns)
+    out.text(parent)
+    out.text(child)
+    _write_pose(out, pose)
+    return out.message()
+
+
+def _write_line(
+    out: CdrMessage, points: Sequence[tuple[float, float, float]], width: float, pose: Pose, colour: Rgba
+) -> None:
+    out.add("B", 0)  # LINE_STRIP
+    _write_pose(out, pose)
+    out.add("d", width)
+    out.add("B", 1)  # scale_invariant
+    out.add("I", len(points))
+    for point in points:
+        out.add("d", *point)
+    out.add("d", *colour)
+    out.add("I", 0, 0)  # colors, indices
+
+
+def _write_pose(out: CdrMessage, pose: Pose) -> None:
+    out.add("d", pose.x_m, pose.y_m, pose.z_m, 0.0, 0.0, math.sin(pose.yaw_rad / 2), math.cos(pose.yaw_rad / 2))
