@@ -102,7 +102,8 @@ def _do_task(task: Task, receipt: Receipt) -> Receipt:
         os.chdir(task.folder)
     except OSError:
         raise InputError(f"{task.folder}: not visible from worker {receipt.host}") from None
-    experiment, parts = Experiment.model_validate(json.loads(task.experiment)), PartCache(task.parts, _open_once(task))
+    experiment = Experiment.model_validate(json.loads(task.experiment))
+    parts = PartCache(task.parts, _open_store(task.parts, task.folder, task.command))
     recordings, refused = read_logs(resolve_for_log(experiment, task.name), [task.place], None)
     if refused:
         return replace(receipt, refused=tuple(refused))
@@ -134,10 +135,6 @@ def _survey_log(points: Sequence[tuple[Experiment, StudyLog]], receipt: Receipt)
             return replace(receipt, problems=error.problems, key=("measure", "exact"))
         log.facts(experiment)
     return receipt
-
-
-def _open_once(task: Task) -> Store:
-    return _open_store(task.parts, task.folder, task.command)
 
 
 @lru_cache(maxsize=2)

@@ -208,7 +208,7 @@ def test_a_dead_pool_is_said_and_what_is_done_stays(here: Path) -> None:
 
 
 def test_parts_that_are_kept_elsewhere_are_missed(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(crew_module, "_open_once", lambda task: FolderStore(Path("elsewhere")))
+    monkeypatch.setattr(crew_module, "_open_store", lambda *_: FolderStore(Path("elsewhere")))
     Path("e.yaml").write_text(study())
     cr.run("e.yaml", pieces="kept", recordings=["a.mcap"])  # so that this log is known
     with (
