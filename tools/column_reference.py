@@ -2,14 +2,14 @@
 
 python tools/column_reference.py
 
-Files, columns, kinds and words are those of `copem_replay/results/schema.py`.
+Files, columns, kinds and words are those of `copem_replay/metrics/columns.py`.
 """
 
 from __future__ import annotations
 
 import re
 
-from copem_replay.results.schema import TABLES
+from copem_replay.metrics.columns import COMPARISON, TABLES
 from key_reference import ROOT, unit_of
 
 PAGE = ROOT / "docs/reference/columns.md"
@@ -24,7 +24,7 @@ does not exist; in CSV an empty cell.
 def page() -> str:
     """The whole page."""
     parts = [HEAD]
-    for file, table in TABLES.items():
+    for file, table in (*TABLES.items(), ("compare --out x.csv", COMPARISON)):
         rows = [f"## `{file}`\n", f"{table.words}\n", "| column | type | unit | meaning |", "|---|---|---|---|"]
         for column in table.columns:
             unit = unit_of(re.sub(r"_(low|high|exact)$", "", column.name)) if "number" in column.kind else ""

@@ -91,7 +91,7 @@ def view(results: AnyResults, *, web: bool = False) -> None:
     Traceback (most recent call last):
     copem_replay.core.errors.InputError: out/nowhere: no such folder
     """
-    from copem_replay.results.schema import check_format
+    from copem_replay.results.provenance import check_format
     from copem_replay.viewer.open import list_rrd_files, open_viewer
 
     folder = results.require_folder() if isinstance(results, Results) else Path(results)

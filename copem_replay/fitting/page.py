@@ -25,7 +25,8 @@ from copem_replay.report.figures.style import format_three_digits
 from copem_replay.report.html.markup import Html, allow_breaks, join_html, make_list, make_table, make_tag
 from copem_replay.report.html.page import figure_element, section_links, whole_page
 from copem_replay.results.folder import EXPERIMENT, MARK, ResultsPlace
-from copem_replay.results.schema import describe_logs, list_versions, log_entries, write_parquet
+from copem_replay.results.provenance import describe_logs, list_versions, log_entries
+from copem_replay.results.table_files import write_parquet
 from copem_replay.viewer.sink import (
     ELAPSED,
     GROUND,

@@ -15,7 +15,7 @@ import json
 import os
 import tempfile
 import weakref
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from typing import IO, TYPE_CHECKING, Any
@@ -39,6 +39,7 @@ from copem_replay.metrics.accuracy.statistics import (
     AccuracyTotal,
     sum_accuracy,
 )
+from copem_replay.metrics.columns import TABLES, Column
 from copem_replay.metrics.detections_table import WAY, build_frame, concatenate_columns
 
 if TYPE_CHECKING:
@@ -122,16 +123,16 @@ class AccuracyTables:
 def accuracy_tables(parts: Iterable[PartTables], rows: pd.DataFrame, *, same_instants: bool) -> AccuracyTables:
     """The tables of accuracy of some parts; `rows`: those of `detections`."""
     parts = list(parts)
-    keys = pa.Table.from_pandas(rows[["log", "configuration", "run", "object_id", "episode"]], preserve_index=False)
+    keys = pa.Table.from_pandas(rows[list(_KEYS)], preserve_index=False)
     beside = pa.concat_tables([part.beside for part in parts if part.beside is not None])
     runs = pa.concat_tables([part.runs for part in parts if part.runs is not None])
     per_list = keys
-    for name in _BY_LIST:
-        per_list = per_list.append_column(name, beside[name])
+    for column in _BY_LIST:
+        per_list = per_list.append_column(column.name, beside[column.name])
     lengths = pc.list_value_length(beside["existence"]).to_numpy()
     thresholds = keys.take(pa.array(np.repeat(np.arange(len(lengths)), lengths)))
-    thresholds = thresholds.append_column("existence", pc.list_flatten(beside["existence"]))
-    thresholds = thresholds.append_column("detection_s", pc.list_flatten(beside["steps_s"]))
+    for column in _STEPS:
+        thresholds = thresholds.append_column(column.name, pc.list_flatten(beside[column.name]))
     lists = runs.drop_columns(list(_INSTANTS))
     return AccuracyTables(per_list, _build_instants(runs, same_instants), lists, thresholds)
 
@@ -165,10 +166,7 @@ def tabulate_bands(of_logs: Mapping[tuple[str, str], AccuracyTotal]) -> pd.DataF
                 )  # fmt: skip
     for (log, name), total in of_logs.items():
         rows += _band_rows(name, "time_s", total.settings.time_edges_s, total.by_time, log)
-    columns = ["log", "configuration", "by", "from", "to", "looked", "missed_share", "ghosts", "pairs",
-               "position_rmse_m", "bias_east_m", "bias_north_m", "nees", "nees_expected", "entries", "existence",
-               "with_object_share"]  # fmt: skip
-    return pd.DataFrame(rows, columns=columns)
+    return TABLES["bands.csv"].frame(rows)
 
 
 def _band_rows(name: str, by: str, edges: Sequence[float], sums: Any, log: str | None) -> list[dict[str, Any]]:
@@ -193,35 +191,26 @@ def _band_rows(name: str, by: str, edges: Sequence[float], sums: Any, log: str |
 
 # The tables of a part.
 
-RUNS = pa.schema(
-    [
-        ("log", pa.string()), ("configuration", pa.string()), ("run", pa.int64()), ("lists", pa.int64()),
-        ("minutes", pa.float64()), ("ghosts", pa.int64()), ("stale_ghosts", pa.int64()), ("duplicates", pa.int64()),
-        ("existence", pa.list_(pa.float64())), ("ghosts_at", pa.list_(pa.int64())), ("without_truth", pa.int64()),
-        ("available_s", pa.list_(pa.float64())), ("frame_s", pa.list_(pa.float64())),
-        ("held_list", pa.list_(pa.int64())),
-    ]
-)  # fmt: skip
-_INSTANTS = ("available_s", "frame_s", "held_list")
-"""Columns of `instants`; the others are those of `lists`."""
+_KEYS = ("log", "configuration", "run", "object_id", "episode")
 
-BESIDE = pa.schema(
-    [
-        ("first_list", pa.int64()), ("error_m", pa.large_list(pa.float32())), ("gospa_m2", pa.large_list(pa.float32())),
-        ("ghosts", pa.int64()), ("first_frame", pa.int64()), ("error_held_m", pa.large_list(pa.float32())),
-        ("age_held_s", pa.large_list(pa.float32())), ("gospa_held_m2", pa.large_list(pa.float32())),
-        ("existence", pa.large_list(pa.float64())), ("steps_s", pa.large_list(pa.float64())),
-    ]
-)  # fmt: skip
-_BY_LIST = tuple(name for name in BESIDE.names if name not in ("existence", "steps_s"))
-"""Columns of `accuracy`; the others are those of `thresholds`."""
+
+def _columns_of(name: str, but: Collection[str]) -> list[Column]:
+    return [column for column in TABLES[name].columns if column.name not in but]
+
+
+_LISTS = _columns_of("lists.parquet", ())
+_INSTANTS = tuple(column.name for column in _columns_of("instants.parquet", _KEYS))
+RUNS = pa.schema([(c.name, c.arrow) for c in (*_LISTS, *_columns_of("instants.parquet", _KEYS))])
+_BY_LIST = _columns_of("accuracy.parquet", _KEYS)
+_STEPS = _columns_of("thresholds.parquet", _KEYS)
+BESIDE = pa.schema([*((c.name, c.arrow) for c in _BY_LIST), *((c.name, pa.large_list(c.arrow)) for c in _STEPS)])
 
 
 @dataclass(frozen=True)
 class PartTables:
     """The tables of a part: of one log in one configuration in a block of runs.
 
-    `beside` has the rows of `rows`: the columns of `accuracy.parquet`, and the steps `existence` and `steps_s` of
+    `beside` has the rows of `rows`: the columns of `accuracy.parquet`, and in lists the steps of
     `thresholds.parquet`. `runs` has a row per run: the columns of `lists.parquet`, and those of `instants.parquet`;
     null: as in the row before. `total`: sums of accuracy over the runs. All three are None without accuracy.
     """
@@ -296,7 +285,7 @@ def _build_beside(outcomes: Sequence[BlockOutcome], name: str) -> pa.Table:
             "age_held_s": (frames, held.age_s.ravel()),
             "gospa_held_m2": (frames, held.gospa.ravel()),
             "existence": (count, existence),
-            "steps_s": (count, steps_s),
+            "detection_s": (count, steps_s),
         }
         parts.append(columns)
     return pa.table({one.name: _join_column(one.type, [part[one.name] for part in parts]) for one in BESIDE})

@@ -37,6 +37,7 @@ from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import read_logs
 from copem_replay.io.open import File, Place, fetch_place, first_recording, read_file_stamps, sha256_of
 from copem_replay.io.recording import Recording
+from copem_replay.metrics.columns import COMPARED_FILES, TABLES
 from copem_replay.metrics.config import Objects
 from copem_replay.metrics.intervals import choose_clusters
 from copem_replay.metrics.onset import COUNTS_BY, select_counted
@@ -45,17 +46,16 @@ from copem_replay.pipeline.prepare import Replay, prepare_log
 from copem_replay.pipeline.study_log import read_content_digest
 from copem_replay.pipeline.sweep import resolve_sweep
 from copem_replay.results.folder import EXPERIMENT, MARK, check_inputs, check_unchanged, take_place
-from copem_replay.results.log_rows import LogRows, count_rows, find_stretches, log_rows
-from copem_replay.results.schema import (
+from copem_replay.results.provenance import Provenance, parse_provenance, read_provenance
+from copem_replay.results.table_files import (
     AGAIN,
-    COMPARED_FILES,
-    TABLES,
-    Provenance,
+    LogRows,
     check_columns,
-    parse_provenance,
+    count_rows,
+    find_stretches,
+    log_rows,
     read_csv,
     read_frame,
-    read_provenance,
     table_file,
 )
 
@@ -65,7 +65,7 @@ if TYPE_CHECKING:
     from copem_replay.pipeline.expansion import ConfigurationFacts
     from copem_replay.pipeline.run import ExperimentResult
     from copem_replay.results.folder import ResultsPlace
-    from copem_replay.results.schema import RecordedLog
+    from copem_replay.results.provenance import RecordedLog
     from copem_replay.results.write import Exporter
 
 
@@ -158,7 +158,7 @@ class RunTables:
     @cached_property
     def provenance(self) -> Provenance:
         """What `provenance.json` says once it is written."""
-        from copem_replay.results.write import build_provenance
+        from copem_replay.results.provenance import build_provenance
 
         data = build_provenance(self.experiment, self.recordings, self.replayed, (), self.replayed.notes)
         return parse_provenance(data, self.place)

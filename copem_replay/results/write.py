@@ -10,7 +10,7 @@ import json
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,9 +33,9 @@ from copem_replay.io.open import (
     sha256_of,
 )
 from copem_replay.io.recording import Recording
+from copem_replay.metrics.columns import COMPARED_FILES, TABLES
 from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.pipeline.cost import return_memory
-from copem_replay.pipeline.expansion import find_facts
 from copem_replay.pipeline.one_run import (
     ReplayedRun,
     ShownRun,
@@ -48,18 +48,8 @@ from copem_replay.pipeline.one_run import (
 from copem_replay.pipeline.run import ExperimentResult, find_log_path
 from copem_replay.pipeline.sweep import list_points, resolve_sweep
 from copem_replay.results.folder import EXPERIMENT, MARK, ResultsPlace, check_inputs, check_names, take_place
-from copem_replay.results.schema import (
-    FORMAT,
-    MANY_ROWS,
-    TABLES,
-    TableFile,
-    list_versions,
-    log_entries,
-    quote_formulas,
-    recording_name,
-    table_file,
-    write_parquet,
-)
+from copem_replay.results.provenance import build_provenance, escape_name, log_entries, recording_name
+from copem_replay.results.table_files import MANY_ROWS, TableFile, table_file, write_csv, write_parquet
 from copem_replay.results.truth_scene import draw_truth
 
 if TYPE_CHECKING:
@@ -136,9 +126,6 @@ MCAP = Exporter(".mcap", _write_mcap)
 """The recording with the fused lists added, as MCAP."""
 
 
-_ACCURACY = ("accuracy", "instants", "lists", "thresholds")
-
-
 def write_results(
     folder: Path,
     experiment: Experiment,
@@ -213,7 +200,7 @@ def list_results(
     """
     files = [EXPERIMENT, MARK, "summary.csv", "logs.csv", *tables]
     files += ["exact.parquet"] * experiment.measure.exact + ["sweep.csv"] * any(True for _ in list_points(experiment))
-    files += [f"{name}.parquet" for name in _ACCURACY if experiment.measure.accuracy]
+    files += [name for name in COMPARED_FILES if experiment.measure.accuracy]
     files += ["bands.csv"] * experiment.measure.accuracy
     for log in choose_logs(experiment, [recording.scene.log for recording in recordings]):
         for stem in list_stems(experiment):
@@ -290,7 +277,7 @@ def _logs_table(folder: Path, result: ExperimentResult, skipped: Sequence[tuple[
     rows = [
         {
             "log": log.name,
-            "path": _escape_name(
+            "path": escape_name(
                 " + ".join(recording_name(replayed, folder) for replayed in list_recordings(log.recording.place))
             ),
             "sha256": log.digests["sha256"],
@@ -303,15 +290,13 @@ def _logs_table(folder: Path, result: ExperimentResult, skipped: Sequence[tuple[
     rows += [
         {
             "log": None,
-            "path": _escape_name(recording_name(path, folder)),
+            "path": escape_name(recording_name(path, folder)),
             "state": "skipped",
-            "reason": _escape_name(why),
+            "reason": escape_name(why),
         }
         for path, why in skipped
     ]
-    kinds = TABLES["logs.csv"].kinds()
-    columns = {name: "object" if kind == "text" else "Int64" for name, kind in kinds.items()}
-    return pd.DataFrame(rows, columns=list(columns)).astype(columns)
+    return TABLES["logs.csv"].frame(rows)
 
 
 def _make_run_to_export(
@@ -344,45 +329,6 @@ def _make_run_to_export(
     )
 
 
-def build_provenance(
-    experiment: Experiment,
-    recordings: Sequence[Recording],
-    result: ExperimentResult,
-    skipped: Sequence[tuple[File, str]],
-    notes: Sequence[str],
-) -> dict[str, object]:
-    """The provenance of results: versions, logs, seed, metric parameters; no clock, no host."""
-    shown = {log: select_shown_runs(experiment, result, log) for log in select_shown_logs(experiment, result)}
-    return {
-        "format": FORMAT,
-        **list_versions(),
-        "seed": experiment.seed,
-        "runs": experiment.runs,
-        "logs": [
-            {"log": log.name, "topic": log.recording.topic, **{n: log.digests[n] for n in ("sha256", "truth")}}
-            for log in result.logs
-        ],
-        "logs_skipped": [{"log": _escape_name(path.name), "reason": reason} for path, reason in skipped],
-        "visibility": experiment.visibility.label,
-        "max_gap_s": experiment.max_gap_s,
-        "window_s": experiment.window_s,
-        "measure": experiment.measure.model_dump(mode="json", by_alias=True) | {"horizon_used_s": result.horizon_s},
-        "braking": experiment.braking and experiment.braking.model_dump(mode="json", by_alias=True),
-        "configurations": {name: asdict(of) for name, of in find_facts(experiment).items()},
-        "run_shown": {log: runs[0].run for log, runs in shown.items()},
-        "runs_shown": {
-            log: [{"file": each.stem, "run": each.run, "run_is": each.why or None} for each in runs]
-            for log, runs in shown.items()
-        },
-        "notes": list(notes),
-    }  # fmt: skip
-
-
-def _escape_name(name: str) -> str:
-    """A file's name as text that can be written: bytes that are not UTF-8 escaped."""
-    return name.encode(errors="backslashreplace").decode()
-
-
 def _write_rows(result: ExperimentResult, scratch: Path) -> None:
     """Write the tables of rows, part by part as they are in memory, and the tally."""
     with ExitStack() as open_files:
@@ -400,8 +346,8 @@ def _write_rows(result: ExperimentResult, scratch: Path) -> None:
                 add("detections.parquet" if not many else table_file(Path("detections.parquet"), str(log)), of_log)
             if result.bands is not None:
                 accuracy = result.accuracy_of(parts, rows)
-                for name in _ACCURACY:
-                    add(f"{name}.parquet", getattr(accuracy, name))
+                for name in COMPARED_FILES:
+                    add(name, getattr(accuracy, name.partition(".")[0]))
     return_memory()
     if len(result.tally) <= MANY_ROWS:
         write_parquet(result.tally, scratch / "tally.parquet")
@@ -409,8 +355,3 @@ def _write_rows(result: ExperimentResult, scratch: Path) -> None:
         (scratch / "tally.parquet").mkdir()
         for log, rows in result.tally.groupby("log", sort=False):
             write_parquet(rows, table_file(scratch / "tally.parquet", str(log)))
-
-
-def write_csv(table: pd.DataFrame, path: Path) -> None:
-    """Write a table as CSV: nulls empty, numbers with nine significant digits, names quoted for spreadsheets."""
-    quote_formulas(table).to_csv(path, index=False, float_format="%.9g", lineterminator="\n")

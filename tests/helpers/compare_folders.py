@@ -12,8 +12,8 @@ import pyarrow as pa
 from pyarrow import parquet
 
 from copem_replay.experiment.schema import Experiment
+from copem_replay.metrics.columns import TABLES
 from copem_replay.pipeline.expansion import find_facts
-from copem_replay.results.schema import TABLES
 from tests.oracles import intervals
 
 Row = dict[str, Any]

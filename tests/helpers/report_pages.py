@@ -20,7 +20,7 @@ from copem_replay.experiment.validate import find_problems, read_logs
 from copem_replay.metrics.summary import tally_rows
 from copem_replay.pipeline.run import run_experiment
 from copem_replay.results.read import Results, read_results
-from copem_replay.results.schema import write_parquet
+from copem_replay.results.table_files import write_parquet
 from copem_replay.results.write import write_results
 from copem_replay.viewer.rrd import EXPORTERS
 from tests.helpers.recordings import Obj, pedestrian, write_recording

@@ -34,13 +34,13 @@ from copem_replay.experiment.validate import find_problems, read_logs
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.braking.driver import Reaction
 from copem_replay.metrics.braking.verdict import judge_braking
+from copem_replay.metrics.columns import TABLES
 from copem_replay.metrics.detection.by_truth_id import detect_by_truth_id
 from copem_replay.metrics.summary import summarise_rows
 from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_incidence, quantile_with_never
 from copem_replay.pipeline.closed_form import compute_distributions, exact_table
 from copem_replay.pipeline.prepare import Replay, prepare_log
 from copem_replay.pipeline.run import ExperimentResult, run_experiment
-from copem_replay.results.schema import TABLES
 from tests.helpers.experiments import changed, drive, source_of
 from tests.helpers.replays import transmitted
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing

@@ -30,6 +30,7 @@ from copem_replay.cli import main as cli
 from copem_replay.core.errors import InputError
 from copem_replay.experiment.file import log_paths, read_experiment_file
 from copem_replay.experiment.validate import find_problems, read_logs
+from copem_replay.metrics.columns import TABLES
 from copem_replay.metrics.intervals import choose_clusters
 from copem_replay.metrics.survival import DETECTED, LEFT, cumulative_incidence
 from copem_replay.pipeline.run import run_experiment
@@ -42,7 +43,6 @@ from copem_replay.report.figures.single_runs import StoryEvent, last_instant, ru
 from copem_replay.report.figures.style import choose_appearances, format_share, shorten_names
 from copem_replay.report.figures.sweeps import sweeps_figure
 from copem_replay.results.read import Results, read_results
-from copem_replay.results.schema import TABLES
 from copem_replay.results.write import write_results
 from copem_replay.viewer.rrd import EXPORTERS
 from tests.helpers.recordings import Obj, pedestrian, write_recording

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from pyarrow import compute, parquet
 
 from copem_replay.results.compare import compare_folders
-from copem_replay.results.schema import table_file
+from copem_replay.results.table_files import table_file
 from tests.helpers.compare_folders import BRAKING, Row, ghosts, limits_of, row, step, write_folder
 from tests.oracles import compare as oracle
 from tests.oracles import intervals

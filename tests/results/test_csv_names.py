@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from copem_replay.results.schema import quote_formulas, unquote_names
+from copem_replay.results.table_files import quote_formulas, unquote_names
 
 BEGINNINGS = st.sampled_from(["", "=", "+", "-", "@", "\t", "\r", "\n", "'", "''", "'="])
 

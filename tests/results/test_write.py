@@ -19,13 +19,13 @@ from copem_replay.core.tracks import TimeChunk
 from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import read_logs
 from copem_replay.io.write.mcap import RUN_RECORD
+from copem_replay.metrics.columns import COMPARED_FILES, TABLES
 from copem_replay.pipeline import replay as blocks_module
 from copem_replay.pipeline.one_run import select_shown_logs, select_shown_runs
 from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.run import ExperimentResult, run_experiment
 from copem_replay.pipeline.tables import PartTables, StudyTables, tabulate_rows
 from copem_replay.results import write as result_tables
-from copem_replay.results.schema import COMPARED_FILES, TABLES
 from copem_replay.results.write import Exporter, RunToExport, write_results
 from copem_replay.viewer.rrd import EXPORTERS
 from tests.helpers import scenes

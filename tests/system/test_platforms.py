@@ -11,7 +11,7 @@ import pytest
 
 import copem_replay as cr
 from copem_replay.core.files import portable_name
-from copem_replay.results.schema import table_file
+from copem_replay.results.table_files import table_file
 from copem_replay.viewer.open import list_rrd_files, opening_s
 from tests.helpers.experiments import changed, drive
 

@@ -14,7 +14,7 @@ import pandas as pd
 
 from benches import common
 from copem_replay.pipeline.expansion import ConfigurationFacts
-from copem_replay.results.schema import table_file, write_parquet
+from copem_replay.results.table_files import table_file, write_parquet
 
 RUNS, OBJECTS, CONFIGURATIONS = 500, 20, ("ideal", "late", "later")
 _COMPARE = """

@@ -261,7 +261,7 @@ def _results(made: Originals, place: Path, dice: random.Random) -> Case:
 
 
 def _check_mark(folder: Path) -> None:
-    from copem_replay.results.schema import read_provenance
+    from copem_replay.results.provenance import read_provenance
 
     read_provenance(folder / "provenance.json")
 

@@ -23,7 +23,7 @@ import pandas as pd
 from copem_replay.core.colours import configuration_colours
 from copem_replay.core.errors import InputError, count_noun
 from copem_replay.metrics.intervals import choose_clusters, describe_absent, describe_clusters, explain_no_clusters
-from copem_replay.results.schema import AGAIN
+from copem_replay.results.table_files import AGAIN
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -18,6 +18,7 @@ import pandas as pd
 
 from copem_replay.core.errors import InputError, count_noun
 from copem_replay.core.tracks import SAME_INSTANT_S
+from copem_replay.metrics.columns import COMPARED_FILES, COMPARISON
 from copem_replay.metrics.intervals import FEWEST_CLUSTERS, FEWEST_LOGS, NOT_ENOUGH, choose_over, explain_no_clusters
 from copem_replay.metrics.summary_metrics import COMPARED
 from copem_replay.results.compare.labels import (
@@ -55,7 +56,7 @@ from copem_replay.results.compare.pairing import (
     lay_out_configuration,
 )
 from copem_replay.results.read import Results, open_results
-from copem_replay.results.schema import AGAIN, COMPARED_FILES
+from copem_replay.results.table_files import AGAIN
 
 # The sums of a pair over its logs.
 
@@ -296,48 +297,15 @@ def _compare_logs(first: Results, other: Results) -> Iterator[str]:
 
 ALL = "all"
 """The value of the column `log` for all logs together."""
-COLUMNS = {
-    "log": "object",
-    "configuration": "object",
-    "baseline": "object",
-    "metric": "object",
-    "value": "float64",
-    "baseline_value": "float64",
-    "difference": "float64",
-    "low": "float64",
-    "high": "float64",
-    "interval": "object",
-    "interval_over": "object",
-    "n": "int64",
-    "p_value": "float64",
-    "only_configuration": "Int64",
-    "only_baseline": "Int64",
-    "existence": "float64",
-    "baseline_existence": "float64",
-    "ghosts_kept_per_min": "float64",
-    "baseline_ghosts_kept_per_min": "float64",
-    "clusters": "Int64",
-    "logs_better": "Int64",
-    "hangs_on": "object",
-    "difference_without_it": "float64",
-    "frames": "Int64",
-    "age_s": "float64",
-    "baseline_age_s": "float64",
-    "no_list_share": "float64",
-    "baseline_no_list_share": "float64",
-    "without_truth": "Int64",
-    "baseline_without_truth": "Int64",
-}
-"""Columns of a comparison, and their types in pandas."""
 
 
 @dataclass(frozen=True)
 class Comparison:
     """Differences to a baseline: a row per log (`all`, and each where there are several), configuration and metric.
 
-    Columns of `table` as in COLUMNS, missing where there is none; times are up to `horizon_s`, those at equal ghosts at
-    `false_positives_per_min`. `baseline_why`: why it is the baseline, None if it was asked for. `notes`: what has to be
-    said, a line each.
+    Columns of `table` as in `COMPARISON` (`metrics/columns.py`), missing where there is none; times are up to
+    `horizon_s`, those at equal ghosts at `false_positives_per_min`. `baseline_why`: why it is the baseline, None if it
+    was asked for. `notes`: what has to be said, a line each.
 
     >>> comparison = cr.compare("out/tc016d", baseline="PEM")
     >>> comparison.baseline, comparison.configurations
@@ -389,7 +357,7 @@ def compare_folders(
     setting = PairSettings(horizon_s, float(read[0].provenance.measure["gospa"]["power"]))
     settings, reasons = _settle_ghosts(setting, against, others, totals, false_positives_per_min, asked=not own_rate)
     pairs, rows = _compare_each_log(against, settings, ClusterNames(logs, [], runs), metrics)
-    table = pd.DataFrame(rows, columns=list(COLUMNS)).astype(COLUMNS)
+    table = COMPARISON.frame(rows)
     return Comparison(
         table=table,
         baseline=against.label,

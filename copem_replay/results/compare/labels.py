@@ -17,8 +17,8 @@ from copem_replay.core.errors import InputError, unknown_name_message
 
 if TYPE_CHECKING:
     from copem_replay.pipeline.expansion import ConfigurationFacts
+    from copem_replay.results.provenance import RecordedLog
     from copem_replay.results.read import Results
-    from copem_replay.results.schema import RecordedLog
 
 
 # Logs of one drive.

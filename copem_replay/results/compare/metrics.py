@@ -54,7 +54,7 @@ from copem_replay.results.compare.pairing import (
     list_column,
     pair_held_lists,
 )
-from copem_replay.results.schema import AGAIN
+from copem_replay.results.table_files import AGAIN
 
 if TYPE_CHECKING:
     import pyarrow as pa

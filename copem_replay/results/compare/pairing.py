@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 
 from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int
+from copem_replay.metrics.columns import TABLES
 from copem_replay.metrics.onset import COUNTS_BY, is_counted
 from copem_replay.metrics.survival import COMPETES
 from copem_replay.results.compare.labels import LabelledConfiguration
-from copem_replay.results.schema import AGAIN, TABLES
+from copem_replay.results.table_files import AGAIN
 
 if TYPE_CHECKING:
     import pyarrow as pa

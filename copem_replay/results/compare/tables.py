@@ -11,11 +11,12 @@ import pandas as pd
 
 from copem_replay.core.errors import OutputError, escape_unprintable, wrap_line
 from copem_replay.core.files import atomic_file
+from copem_replay.metrics.columns import TABLES
 from copem_replay.metrics.intervals import ALL_ALIKE, EXACT, NOTHING_DRAWN, describe_absent, describe_clusters
 from copem_replay.metrics.summary import describe_mean, format_table
 from copem_replay.metrics.summary_metrics import COMPARED
 from copem_replay.results.folder import add_to_made_list
-from copem_replay.results.schema import TABLES
+from copem_replay.results.table_files import write_csv
 
 if TYPE_CHECKING:
     from copem_replay.results.compare.compare import Comparison
@@ -67,8 +68,6 @@ def write_comparison(comparison: Comparison, path: Path, folders: Sequence[Path]
 
     `folders`: of the compared results, which list the file if it lies in them.
     """
-    from copem_replay.results.write import write_csv
-
     check_out(path)
     with atomic_file(path) as scratch:
         if path.suffix.lower() == ".csv":

@@ -1,0 +1,192 @@
+"""The provenance of results: what made them, in `provenance.json`, and read back from there.
+
+Versions, logs, seed, metric parameters and what each configuration is; no clock, no host.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from copem_replay.core.errors import InputError, RemoteFile
+from copem_replay.core.files import parse_json
+from copem_replay.experiment.file import relocate_settings
+from copem_replay.experiment.schema import Experiment, LogSettings
+from copem_replay.experiment.validate import resolve_place
+from copem_replay.io.open import File, first_recording
+from copem_replay.io.recording import Recording
+from copem_replay.metrics.config import Measure
+from copem_replay.pipeline.expansion import ConfigurationFacts, find_facts
+from copem_replay.pipeline.one_run import select_shown_logs, select_shown_runs
+from copem_replay.pipeline.run import ExperimentResult
+from copem_replay.pipeline.study_log import compute_log_digests
+from copem_replay.results.folder import MARK
+from copem_replay.results.table_files import AGAIN
+
+FORMAT = 4
+"""The format of results folders: raised when columns, files or their meaning change so that readers have to know."""
+
+_LIBRARIES = (
+    "foxglove-schemas-protobuf", "mcap", "numba", "numpy", "osi-python", "pandas", "protobuf", "pyarrow", "rerun-sdk",
+    "scipy", "shapely",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class RecordedLog:
+    """A recording that was replayed: its name in the tables, the topic of its truth, the SHA-256 of its content.
+
+    `truth`: the SHA-256 of its truth, None in results of older versions.
+    """
+
+    name: str
+    topic: str | None
+    sha256: str
+    truth: str | None = None
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """`provenance.json`. `measure` has every default filled in. `data`: the whole file."""
+
+    logs: tuple[RecordedLog, ...]
+    seed: int
+    runs: int
+    visibility: str | None
+    max_gap_s: float | None
+    window_s: object
+    measure: dict[str, Any]
+    braking: dict[str, Any] | None
+    horizon_used_s: float
+    run_shown: dict[str, int]  # by log
+    facts: dict[str, ConfigurationFacts]  # by configuration
+    data: dict[str, Any]
+
+
+def check_format(folder: Path) -> None:
+    """Raise InputError, one line, where a folder has results of another format; without results nothing is raised."""
+    if (folder / MARK).is_file():
+        read_provenance(folder / MARK)
+
+
+_SKIPPED = ("log", "reason")
+"""Keys of each of `logs_skipped`."""
+
+
+def read_provenance(path: Path) -> Provenance:
+    """Read `provenance.json`. Raises InputError."""
+    try:
+        return parse_provenance(parse_json(path.read_text(encoding="utf-8")), path.parent)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+        why = f"no {error}" if isinstance(error, KeyError) else " ".join(str(error).split())
+        raise InputError(f"{path}: expected the provenance of results, found damage: {why}; {AGAIN}") from None
+
+
+def parse_provenance(data: Any, place: Path) -> Provenance:
+    """What `provenance.json` of the results at a place says. Raises InputError for another format."""
+    if (found := dict(data).get("format", 1)) != FORMAT:
+        raise InputError(f"{place}: expected results of format {FORMAT}, found format {found}; {AGAIN}")
+    logs = tuple(
+        RecordedLog(str(log["log"]), log.get("topic"), str(log["sha256"]), log.get("truth")) for log in data["logs"]
+    )
+    notes = [*data.get("notes", []), *(log[name] for log in data.get("logs_skipped", []) for name in _SKIPPED)]
+    if not all(isinstance(note, str) for note in notes):
+        raise ValueError("expected text in notes and logs_skipped")
+    # A missing key, from an older version, stands for its default.
+    measure = Measure().model_dump(mode="json", by_alias=True) | dict(data["measure"])
+    float(measure["gospa"]["power"])  # which comparisons take as it is
+    braking, gap_s = data.get("braking"), data.get("max_gap_s")
+    used_s, run_shown = float(measure.pop("horizon_used_s")), data.get("run_shown") or {}
+    return Provenance(
+        logs=logs,
+        seed=int(data["seed"]),
+        runs=int(data["runs"]),
+        visibility=data.get("visibility"),
+        max_gap_s=None if gap_s is None else float(gap_s),
+        window_s=data.get("window_s"),
+        measure=measure,
+        braking=None if braking is None else dict(braking),
+        horizon_used_s=used_s,
+        run_shown={str(log): int(run) for log, run in run_shown.items() if run is not None},
+        facts={str(name): ConfigurationFacts(**of) for name, of in dict(data["configurations"]).items()},
+        data=data,
+    )
+
+
+# What is written.
+
+
+def build_provenance(
+    experiment: Experiment,
+    recordings: Sequence[Recording],
+    result: ExperimentResult,
+    skipped: Sequence[tuple[File, str]],
+    notes: Sequence[str],
+) -> dict[str, object]:
+    """The provenance of results: versions, logs, seed, metric parameters; no clock, no host."""
+    shown = {log: select_shown_runs(experiment, result, log) for log in select_shown_logs(experiment, result)}
+    return {
+        "format": FORMAT,
+        **list_versions(),
+        "seed": experiment.seed,
+        "runs": experiment.runs,
+        "logs": [
+            {"log": log.name, "topic": log.recording.topic, **{n: log.digests[n] for n in ("sha256", "truth")}}
+            for log in result.logs
+        ],
+        "logs_skipped": [{"log": escape_name(path.name), "reason": reason} for path, reason in skipped],
+        "visibility": experiment.visibility.label,
+        "max_gap_s": experiment.max_gap_s,
+        "window_s": experiment.window_s,
+        "measure": experiment.measure.model_dump(mode="json", by_alias=True) | {"horizon_used_s": result.horizon_s},
+        "braking": experiment.braking and experiment.braking.model_dump(mode="json", by_alias=True),
+        "configurations": {name: asdict(of) for name, of in find_facts(experiment).items()},
+        "run_shown": {log: runs[0].run for log, runs in shown.items()},
+        "runs_shown": {
+            log: [{"file": each.stem, "run": each.run, "run_is": each.why or None} for each in runs]
+            for log, runs in shown.items()
+        },
+        "notes": list(notes),
+    }  # fmt: skip
+
+
+def escape_name(name: str) -> str:
+    """A file's name as text that can be written: bytes that are not UTF-8 escaped."""
+    return name.encode(errors="backslashreplace").decode()
+
+
+def log_entries(logs: Sequence[Any], recordings: Sequence[Recording], folder: Path) -> list[Any]:
+    """`logs` of the folder's experiment: paths relative to the folder, with settings where logs have them."""
+
+    def called(file: File) -> str:
+        return recording_name(file, folder)
+
+    settings = [entry for entry in logs if isinstance(entry, LogSettings)]
+    if len(settings) < len(recordings):
+        return [called(first_recording(recording.place)) for recording in recordings]
+    moved = (relocate_settings(one, r.place, called) for one, r in zip(settings, recordings, strict=True))
+    return [one.model_dump(mode="json", by_alias=True) for one in moved]
+
+
+def recording_name(file: File, folder: Path) -> str:
+    """The name of a recording in results: its path relative to the folder, or its URL without user and query."""
+    return str(file) if isinstance(file, RemoteFile) else os.path.relpath(resolve_place(file), folder)
+
+
+def list_versions() -> dict[str, object]:
+    """Versions of this project, of Python, and of the libraries that results depend on."""
+    return {
+        "copem_replay": version("copem-replay"),
+        "python": platform.python_version(),
+        "libraries": {name: version(name) for name in _LIBRARIES},
+    }
+
+
+def describe_logs(recordings: Sequence[Recording]) -> list[dict[str, object]]:
+    """Name, topic and content digests of each recording."""
+    return [{"log": r.scene.log, "topic": r.topic, **compute_log_digests(r)} for r in recordings]
