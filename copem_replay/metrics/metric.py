@@ -59,9 +59,9 @@ class MetricInputs:
 class Compared(NamedTuple):
     """What the difference to a baseline is: in words, and the figure of the pairs that it is taken of.
 
-    `figure`: values (C,) of the rows that both have (`results/compare/pairing.py`), whose means are compared, or shares
-    where they are true or false; or a name in `FIGURES` of `results/compare/metrics.py`. `files`: that it is made of,
-    beside `detections.parquet`.
+    `figure`: values (C,) made of columns of the rows that both have (`results/compare/pairing.py`), whose means are
+    compared, or shares where they are true or false; or a name in `FIGURES` of `results/compare/metrics.py`. `files`:
+    that it is made of, beside `detections.parquet`.
     """
 
     words: str

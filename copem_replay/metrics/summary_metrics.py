@@ -281,7 +281,7 @@ def _limit_metrics(
 
 
 def _seconds_unknown(rows: Any) -> Float:
-    return compute_unknown_s(rows.detection_s - rows.onset_s, rows.ended_s - rows.onset_s)
+    return compute_unknown_s(rows["detection_s"] - rows["onset_s"], rows["ended_s"] - rows["onset_s"])
 
 
 _MEAN = "mean of min(time to detection, horizon), never detected counting as the horizon"
@@ -293,7 +293,7 @@ _DETECTION_METRICS = (
            "fused lists per second"),
     Metric("detected_share", estimate_detected_share, lambda of: of.share, 1,
            "share of the rows that were detected, [95 % interval]", "summary", "detected, %",
-           Compared("share detected", attrgetter("detected"))),
+           Compared("share detected", itemgetter("detected"))),
     *_limit_metrics("detected_share", estimate_detected_share),
     Metric("ttd_p5_s", summarise_detections, lambda of: of.quantile_s(0.05), -1,
            "time to detection by which 5 % of the rows were detected"),

@@ -25,8 +25,13 @@ from copem_replay.perception.pem.model import Pem
 from copem_replay.pipeline.one_run import STEM, ReplayedRun, replay_run
 from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.replay import replay_block
-from copem_replay.results.compare.compare import check_comparable, read_folders
-from copem_replay.results.compare.labels import LabelledConfiguration, choose_configurations, label_configurations
+from copem_replay.results.compare.compare import read_folders
+from copem_replay.results.compare.labels import (
+    LabelledConfiguration,
+    check_comparable,
+    choose_configurations,
+    label_configurations,
+)
 from copem_replay.results.folder import add_to_made_list
 from copem_replay.results.read import Results, check_complete, reread_recording
 from copem_replay.viewer.sink import split_into_files

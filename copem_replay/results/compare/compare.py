@@ -6,12 +6,10 @@ Logs are read one by one, so that no rows are kept but their sums.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -23,12 +21,12 @@ from copem_replay.metrics.intervals import FEWEST_CLUSTERS, FEWEST_LOGS, NOT_ENO
 from copem_replay.metrics.summary_metrics import COMPARED
 from copem_replay.results.compare.labels import (
     LabelledConfiguration,
+    check_comparable,
     check_log_names,
     choose_baseline,
     choose_configurations,
     label_configurations,
-    log_keys,
-    logs_match_by_truth,
+    note_on_measuring,
     notes_on_differences,
     notes_on_output_baseline,
     rename_logs,
@@ -50,8 +48,8 @@ from copem_replay.results.compare.metrics import (
     notes_on_equal_ghosts,
 )
 from copem_replay.results.compare.pairing import (
-    ConfigurationData,
     PairingGrid,
+    PairSide,
     build_grid,
     lay_out_configuration,
 )
@@ -73,8 +71,8 @@ class AllLogs:
 
     def add(
         self,
-        first: ConfigurationData,
-        second: ConfigurationData,
+        first: PairSide,
+        second: PairSide,
         regrets: Sequence[Regret],
         *,
         more: bool,
@@ -176,16 +174,6 @@ def notes_on_frames(table: pd.DataFrame) -> Iterator[str]:
         yield f"{where}{', '.join(labels)}: no frame at which an object is measured and both sides have issued a list"
 
 
-def note_on_measuring(baseline: LabelledConfiguration, others: Sequence[LabelledConfiguration]) -> Iterator[str]:
-    """A note on configurations that detect by truth id while others detect by match."""
-    by_id = [labelled for labelled in (baseline, *others) if labelled.facts.by_truth_id]
-    if by_id and len(by_id) <= len(others):
-        yield (
-            f"{', '.join(labelled.label for labelled in by_id)}: detected by truth id, the others by match within the "
-            "gate (`match: {always: true}` matches all alike)"
-        )
-
-
 _FEW_HAVE_IT = (
     f"fewer than {FEWEST_LOGS} logs, {FEWEST_CLUSTERS} objects of one log, or {FEWEST_CLUSTERS} runs of one object "
     "have it, or too few for its limits"
@@ -221,78 +209,6 @@ def notes_on_rows(table: pd.DataFrame, pairs: Iterable[AllLogs], asked: float | 
             f"{', '.join(rows['configuration'])}: all entries make only {rate:.4g} ghosts per minute: "
             "ttd_rmst_s_equal_ghosts is at that rate"
         )
-
-
-# What folders must have in common to be compared.
-
-_MEASURE = ("objects", "onset", "began", "count_earlier", "confirm", "match", "distance_to", "gospa", "annotated")
-"""Keys of `measure` that the compared metrics depend on."""
-
-
-def check_comparable(folders: Sequence[Results]) -> None:
-    """Raise InputError, a line for every reason why a folder cannot be compared with the first."""
-    problems = [problem for other in folders[1:] for problem in _find_problems(folders[0], other)]
-    if problems:
-        raise InputError(problems)
-
-
-def _find_problems(first: Results, other: Results) -> Iterator[str]:
-    before, after = first.provenance, other.provenance
-    other_logs = list(_compare_logs(first, other))
-    if before.window_s == after.window_s:  # else their truths may differ for that reason alone
-        yield from other_logs
-    for key in ("seed", "window_s", "max_gap_s"):
-        yield from _describe_mismatch(first, other, key, getattr(before, key), getattr(after, key))
-    # As written, for the ego that `null` stands for is in the logs.
-    if other_logs or not logs_match_by_truth(first, other):  # equal truths have the same ego
-        yield from _describe_mismatch(first, other, "ego", first.source.data.get("ego"), other.source.data.get("ego"))
-    for key in _MEASURE:
-        yield from _describe_mismatch(first, other, f"measure.{key}", before.measure.get(key), after.measure.get(key))
-    if any(of.needs_visibility for of in first.facts.values()):
-        yield from _describe_mismatch(first, other, "visibility", before.visibility, after.visibility)
-    if before.braking is not None and after.braking is not None:
-        yield from _describe_mismatch(first, other, "braking", before.braking, after.braking)
-        if before.braking.get("brakes_for") == after.braking.get("brakes_for") == "conflict":
-            conflicts = before.measure.get("conflict"), after.measure.get("conflict")
-            yield from _describe_mismatch(first, other, "measure.conflict", *conflicts)
-
-
-def _describe_mismatch(first: Results, other: Results, key: str, expected: object, found: object) -> Iterator[str]:
-    if expected != found:
-        yield (
-            f"{other.place}: {key}: expected {_shorten_value(expected)} as in {first.place}, found "
-            f"{_shorten_value(found)}"
-        )
-
-
-def _shorten_value(value: Any) -> str:
-    return json.dumps(value, ensure_ascii=False)
-
-
-def _compare_logs(first: Results, other: Results) -> Iterator[str]:
-    """Problems of the logs: other drives; where logs match by file only, other names or topics too."""
-    by_truth = logs_match_by_truth(first, other)
-    expected, found = ({key: log.name for key, log in keys.items()} for keys in log_keys(first, other))
-    missing, more = ([a[sha] for sha in a if sha not in b] for a, b in ((expected, found), (found, expected)))
-    if missing or more:
-        lacks = [f"{', '.join(missing)} missing"] if missing else []
-        other_ones = (
-            [f"{', '.join(more)} of {'another truth' if by_truth else 'other content (SHA-256)'}"] if more else []
-        )
-        yield f"{other.place}: expected the logs of {first.place}, found {' and '.join(lacks + other_ones)}"
-        return
-    if by_truth:
-        return
-    names, other_names = (sorted(log.name for log in folder.provenance.logs) for folder in (first, other))
-    if names != other_names or expected != found:
-        yield (
-            f"{other.place}: expected the logs to be named as in {first.place}, {', '.join(names)}, found "
-            f"{', '.join(other_names)}: draws are by the log's name"
-        )
-        return
-    topics, other_topics = ({log.name: log.topic for log in folder.provenance.logs} for folder in (first, other))
-    for name, topic in topics.items():
-        yield from _describe_mismatch(first, other, f"log {name}: topic", topic, other_topics[name])
 
 
 ALL = "all"
@@ -470,9 +386,9 @@ def _settle_horizon(folders: Sequence[Results]) -> tuple[float, list[str]]:
 
 def _check_same_episodes(
     labelled: LabelledConfiguration,
-    first: ConfigurationData,
+    first: PairSide,
     against: LabelledConfiguration,
-    second: ConfigurationData,
+    second: PairSide,
     log: str,
     grid: PairingGrid,
 ) -> None:
@@ -481,7 +397,7 @@ def _check_same_episodes(
         return
     both = first.there & second.there
     for what in ("onset_s", "ended_s"):
-        found, expected = getattr(first, what), getattr(second, what)
+        found, expected = first.rows[what], second.rows[what]
         other = np.flatnonzero(both & (np.abs(found - expected) > SAME_INSTANT_S))
         if len(other):
             name = grid.episodes[other[0] // grid.runs][0]
@@ -493,9 +409,9 @@ def _check_same_episodes(
 
 def _check_same_frames(
     labelled: LabelledConfiguration,
-    first: ConfigurationData,
+    first: PairSide,
     against: LabelledConfiguration,
-    second: ConfigurationData,
+    second: PairSide,
     log: str,
 ) -> None:
     """Raise InputError where what is held is told at other frames, so that its values are no pairs."""

@@ -1,4 +1,4 @@
-"""Labels: names of configurations and logs across results folders, and the choice of the baseline.
+"""Labels: names of configurations and logs across results folders, what these must have in common, and the baseline.
 
 Logs of one drive match by their truth, so that recordings that differ in all else are paired. Random numbers are
 addressed by the log's name: where names differ, only configurations without random draws can be paired.
@@ -145,6 +145,78 @@ def _rates_by_configuration(results: Results) -> dict[str, float]:
     return {str(name): float(rate) for name, rate in rates.items()}
 
 
+# What folders must have in common to be compared.
+
+_MEASURE = ("objects", "onset", "began", "count_earlier", "confirm", "match", "distance_to", "gospa", "annotated")
+"""Keys of `measure` that the compared metrics depend on."""
+
+
+def check_comparable(folders: Sequence[Results]) -> None:
+    """Raise InputError, a line for every reason why a folder cannot be compared with the first."""
+    problems = [problem for other in folders[1:] for problem in _find_problems(folders[0], other)]
+    if problems:
+        raise InputError(problems)
+
+
+def _find_problems(first: Results, other: Results) -> Iterator[str]:
+    before, after = first.provenance, other.provenance
+    other_logs = list(_compare_logs(first, other))
+    if before.window_s == after.window_s:  # else their truths may differ for that reason alone
+        yield from other_logs
+    for key in ("seed", "window_s", "max_gap_s"):
+        yield from _describe_mismatch(first, other, key, getattr(before, key), getattr(after, key))
+    # As written, for the ego that `null` stands for is in the logs.
+    if other_logs or not logs_match_by_truth(first, other):  # equal truths have the same ego
+        yield from _describe_mismatch(first, other, "ego", first.source.data.get("ego"), other.source.data.get("ego"))
+    for key in _MEASURE:
+        yield from _describe_mismatch(first, other, f"measure.{key}", before.measure.get(key), after.measure.get(key))
+    if any(of.needs_visibility for of in first.facts.values()):
+        yield from _describe_mismatch(first, other, "visibility", before.visibility, after.visibility)
+    if before.braking is not None and after.braking is not None:
+        yield from _describe_mismatch(first, other, "braking", before.braking, after.braking)
+        if before.braking.get("brakes_for") == after.braking.get("brakes_for") == "conflict":
+            conflicts = before.measure.get("conflict"), after.measure.get("conflict")
+            yield from _describe_mismatch(first, other, "measure.conflict", *conflicts)
+
+
+def _describe_mismatch(first: Results, other: Results, key: str, expected: object, found: object) -> Iterator[str]:
+    if expected != found:
+        yield (
+            f"{other.place}: {key}: expected {_shorten_value(expected)} as in {first.place}, found "
+            f"{_shorten_value(found)}"
+        )
+
+
+def _shorten_value(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _compare_logs(first: Results, other: Results) -> Iterator[str]:
+    """Problems of the logs: other drives; where logs match by file only, other names or topics too."""
+    by_truth = logs_match_by_truth(first, other)
+    expected, found = ({key: log.name for key, log in keys.items()} for keys in log_keys(first, other))
+    missing, more = ([a[sha] for sha in a if sha not in b] for a, b in ((expected, found), (found, expected)))
+    if missing or more:
+        lacks = [f"{', '.join(missing)} missing"] if missing else []
+        other_ones = (
+            [f"{', '.join(more)} of {'another truth' if by_truth else 'other content (SHA-256)'}"] if more else []
+        )
+        yield f"{other.place}: expected the logs of {first.place}, found {' and '.join(lacks + other_ones)}"
+        return
+    if by_truth:
+        return
+    names, other_names = (sorted(log.name for log in folder.provenance.logs) for folder in (first, other))
+    if names != other_names or expected != found:
+        yield (
+            f"{other.place}: expected the logs to be named as in {first.place}, {', '.join(names)}, found "
+            f"{', '.join(other_names)}: draws are by the log's name"
+        )
+        return
+    topics, other_topics = ({log.name: log.topic for log in folder.provenance.logs} for folder in (first, other))
+    for name, topic in topics.items():
+        yield from _describe_mismatch(first, other, f"log {name}: topic", topic, other_topics[name])
+
+
 # The baseline where none is asked for.
 
 IDEAL_NAME = "ideal"
@@ -184,6 +256,16 @@ def notes_on_output_baseline(baseline: LabelledConfiguration, others: Sequence[L
             yield f"{labelled.label}: no regret, for it has no `inputs`: only a difference to {baseline.label}"
         elif baseline.configuration != ideal:
             yield f"{labelled.label}: its regret is to {ideal}, ideal fusion of its inputs (--baseline {ideal})"
+
+
+def note_on_measuring(baseline: LabelledConfiguration, others: Sequence[LabelledConfiguration]) -> Iterator[str]:
+    """A note on configurations that detect by truth id while others detect by match."""
+    by_id = [labelled for labelled in (baseline, *others) if labelled.facts.by_truth_id]
+    if by_id and len(by_id) <= len(others):
+        yield (
+            f"{', '.join(labelled.label for labelled in by_id)}: detected by truth id, the others by match within the "
+            "gate (`match: {always: true}` matches all alike)"
+        )
 
 
 # Labels, and the configurations that are meant.

@@ -44,10 +44,10 @@ from copem_replay.results.compare.limits import (
     TimeStatistic,
 )
 from copem_replay.results.compare.pairing import (
-    ConfigurationData,
+    Columns,
     PairedHeldSums,
     PairingGrid,
-    StepData,
+    PairSide,
     configuration_rows,
     float_column,
     integer_column,
@@ -279,14 +279,14 @@ class Regret:
 class _Pair:
     """Two sides in a log, and the cells (C,) that both have: all, or those that count."""
 
-    first: ConfigurationData
-    second: ConfigurationData
+    first: PairSide
+    second: PairSide
     grid: PairingGrid
     cells: Int
     setting: PairSettings
 
     @property
-    def sides(self) -> tuple[ConfigurationData, ConfigurationData]:
+    def sides(self) -> tuple[PairSide, PairSide]:
         return self.first, self.second
 
     @cached_property
@@ -301,7 +301,7 @@ class _Pair:
         """What is said beside figures of what both hold."""
         if self.held is None:
             return None
-        without_truth = [0 if side.ghosts is None else int(side.ghosts.without_truth.sum()) for side in self.sides]
+        without_truth = [0 if side.lists is None else int(side.lists["without_truth"].sum()) for side in self.sides]
         both, pairs = self.held, int(self.held.pairs.sum())
         frames, without = int(both.frames.sum()), np.array(without_truth)
         return HeldCounts(frames, pairs, both.only, both.age_s, both.without_list, without)
@@ -316,8 +316,8 @@ class _Pair:
 
 
 def compute_regrets(
-    first: ConfigurationData,
-    second: ConfigurationData,
+    first: PairSide,
+    second: PairSide,
     grid: PairingGrid,
     setting: PairSettings,
     only: Sequence[str] | None = None,
@@ -342,9 +342,9 @@ def compute_regrets(
             yield Regret(metric.name, figure, objects, kept, held)
 
 
-def _means(pair: _Pair, values: Callable[[ConfigurationData], NDArray[Any]]) -> SumStatistic:
+def _means(pair: _Pair, values: Callable[[Columns], NDArray[Any]]) -> SumStatistic:
     """Means of a value of rows; of true and false, shares."""
-    first, second = (values(side)[pair.cells] for side in pair.sides)
+    first, second = (values(side.rows)[pair.cells] for side in pair.sides)
     if first.dtype == bool:
         return _shares(pair, pair.cells, first, second)
     sums = np.stack([first, second, np.ones(len(pair.cells))], axis=1)
@@ -359,18 +359,18 @@ def _shares(pair: _Pair, cells: Int, first: Bool, second: Bool) -> SumStatistic:
 
 def _passes(pair: _Pair) -> SumStatistic | None:
     """Shares of the rows in conflict that pass."""
-    first, second, cells = pair.first, pair.second, pair.cells
-    if first.conflict is None or second.conflict is None or first.passes is None or second.passes is None:
+    first, second, cells = pair.first.rows, pair.second.rows, pair.cells
+    if "conflict" not in first or "conflict" not in second:
         return None
-    judged = cells[first.conflict[cells] & second.conflict[cells]]
-    return _shares(pair, judged, first.passes[judged], second.passes[judged])
+    judged = cells[first["conflict"][cells] & second["conflict"][cells]]
+    return _shares(pair, judged, first["braking_pass"][judged], second["braking_pass"][judged])
 
 
 def _means_where_both_detect(pair: _Pair) -> SumStatistic:
     """Mean times to detection of the cells that both sides detect; `only`: the cells that one side alone does."""
-    first, second = (side.detected[pair.cells] for side in pair.sides)
+    first, second = (side.rows["detected"][pair.cells] for side in pair.sides)
     both = first & second
-    times_s = (side.detection_s[pair.cells] - side.onset_s[pair.cells] for side in pair.sides)
+    times_s = ((side.rows["detection_s"] - side.rows["onset_s"])[pair.cells] for side in pair.sides)
     sums = np.stack([*(np.where(both, time_s, 0.0) for time_s in times_s), both.astype(float)], axis=1)
     only = np.stack([first & ~second, second & ~first], axis=1).astype(np.int64)
     items = pair.items(pair.cells, n=both.astype(np.int64), only=only, sums=sums)
@@ -390,11 +390,11 @@ def _means_at_equal_ghosts(pair: _Pair) -> TimeStatistic | None:
     return _restricted_means(pair, times)
 
 
-def _detection_times_s(steps: StepData, existence: float, cells: int) -> Float:
+def _detection_times_s(steps: Columns, existence: float, cells: int) -> Float:
     """(C,) seconds at which each cell is detected by entries of at least `existence`; NaN: never."""
     detection_s = np.full(cells, np.inf)
-    enough = steps.existence >= existence
-    np.minimum.at(detection_s, steps.cell[enough], steps.detection_s[enough])
+    enough = steps["existence"] >= existence
+    np.minimum.at(detection_s, steps["cell"][enough], steps["detection_s"][enough])
     return np.where(np.isinf(detection_s), np.nan, detection_s)
 
 
@@ -408,16 +408,19 @@ def _restricted_means(pair: _Pair, times: Sequence[Sequence[tuple[float, Float]]
     return TimeStatistic(parts=tuple(parts), shares=tuple(shares), horizon_s=pair.setting.horizon_s)
 
 
-def _time_items(pair: _Pair, side: ConfigurationData, detection_s: Float) -> StatisticItems:
+def _time_items(pair: _Pair, side: PairSide, detection_s: Float) -> StatisticItems:
     """Items of times to detection, rounded to a nanosecond as in the summary."""
     cells, detected = pair.cells, ~np.isnan(detection_s)
-    time_s = np.where(detected, detection_s, side.ended_s[cells]) - side.onset_s[cells]
-    ending = np.where(detected, DETECTED, np.where(side.left[cells], LEFT, CENSORED)).astype(np.int8)
+    time_s = np.where(detected, detection_s, side.rows["ended_s"][cells]) - side.rows["onset_s"][cells]
+    ending = np.where(detected, DETECTED, np.where(side.rows["left"][cells], LEFT, CENSORED)).astype(np.int8)
     return pair.items(cells, time_s=np.round(time_s, 9), ending=ending)
 
 
 def _distances(pair: _Pair) -> MedianStatistic:
-    first, second = (np.where(side.detected, side.distance_m, -np.inf)[pair.cells] for side in pair.sides)
+    first, second = (
+        np.where(side.rows["detected"], side.rows["distance_at_detection_m"], -np.inf)[pair.cells]
+        for side in pair.sides
+    )
     placed = ~np.isnan(first + second)  # NaN: detected during a gap of the truth, no distance to rank
     return MedianStatistic(parts=(pair.items(pair.cells[placed], first=first[placed], second=second[placed]),))
 
@@ -443,13 +446,13 @@ def _held_gospa(pair: _Pair) -> SumStatistic | None:
 
 def _ghost_rates(pair: _Pair) -> SumStatistic | None:
     """Ghosts per minute; those nearest to no measured object belong to their run only."""
-    ghosts, other_ghosts = pair.first.ghosts, pair.second.ghosts
-    if ghosts is None or other_ghosts is None:
+    first, second = pair.first.lists, pair.second.lists
+    if first is None or second is None:
         return None
-    present, runs = ghosts.there & other_ghosts.there, pair.cells % pair.grid.runs
+    present, runs = first["there"] & second["there"], pair.cells % pair.grid.runs
     cells, runs = pair.cells[present[runs]], runs[present[runs]]
     nearest = np.zeros((len(cells), 4))
-    rest = np.stack([ghosts.count, other_ghosts.count, ghosts.minutes, other_ghosts.minutes], axis=1).astype(float)
+    rest = np.stack([side[name] for name in ("ghosts", "minutes") for side in (first, second)], axis=1).astype(float)
     rest[~present] = 0.0
     accuracy = [side.accuracy for side in pair.sides if side.accuracy is not None]
     for k, accuracy_of_side in enumerate(accuracy if len(accuracy) == 2 else ()):
@@ -483,7 +486,9 @@ def _divide_rates(sums: Float) -> tuple[Float, Float]:
 
 
 FIGURES: Mapping[Any, Callable[[_Pair], PairStatistic | None]] = {
-    "restricted means": lambda pair: _restricted_means(pair, [((1.0, side.detection_s),) for side in pair.sides]),
+    "restricted means": lambda pair: _restricted_means(
+        pair, [((1.0, side.rows["detection_s"]),) for side in pair.sides]
+    ),
     "means where both detect": _means_where_both_detect,
     "restricted means at equal ghosts": _means_at_equal_ghosts,
     "distances": _distances,

@@ -12,9 +12,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from copem_replay.core.errors import InputError
@@ -24,9 +26,6 @@ from copem_replay.metrics.onset import COUNTS_BY, is_counted
 from copem_replay.metrics.survival import COMPETES
 from copem_replay.results.compare.labels import LabelledConfiguration
 from copem_replay.results.table_files import AGAIN
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 
 @dataclass(frozen=True)
@@ -54,9 +53,6 @@ class PairingGrid:
 
     def cells(self, table: pa.Table) -> Int:
         """(n,) the cell of each row of a table, −1: a run that is not compared, or an object that is not measured."""
-        import pyarrow as pa
-        import pyarrow.compute as pc
-
         object_ix = integer_column(
             pc.index_in(table["object_id"], value_set=pa.array(self.objects, pa.string())), missing=-1
         )
@@ -87,37 +83,31 @@ def build_grid(log_ix: int, tables: Iterable[pa.Table], runs: int, before: int) 
 
 def integer_column(column: pa.ChunkedArray, *, missing: int = 0) -> Int:
     """(n,) whole numbers, `missing` where null."""
-    import pyarrow as pa
-
     values: Int = column.cast(pa.int64()).fill_null(missing).to_numpy()
     return values
 
 
 def float_column(column: pa.ChunkedArray) -> Float:
     """(n,) numbers, NaN where null."""
-    import pyarrow as pa
-
     values: Float = column.cast(pa.float64()).to_numpy()
     return values
 
 
 def flag_column(column: pa.ChunkedArray) -> Bool:
     """(n,) true or false, null is false."""
-    import pyarrow as pa
-
     values: Bool = column.cast(pa.bool_()).fill_null(False).to_numpy().astype(np.bool_)
     return values
 
 
 def list_column(column: pa.ChunkedArray) -> tuple[Int, Float]:
     """(n,) lengths of lists, 0 where null, and what is in them one after the other, NaN where null."""
-    import pyarrow as pa
-    import pyarrow.compute as pc
-
     length = integer_column(pc.list_value_length(column))
     inner: Float = pc.list_flatten(column).cast(pa.float64()).to_numpy()
     return length, inner
 
+
+_READ = {"true or false": flag_column, "numbers": float_column, "whole numbers": integer_column}
+"""Columns by their kind."""
 
 # One side of a pair: the rows of a configuration in a log, laid out on the grid.
 
@@ -144,86 +134,65 @@ class AccuracyData:
     of_run: Int  # (S,)
 
 
-@dataclass(frozen=True)
-class FalsePositiveData:
-    """Ghosts of a configuration, by run."""
-
-    there: Bool  # (S,)
-    minutes: Float  # (S,)
-    count: Int  # (S,)
-    without_truth: Int  # (S,) held entries whose object has no truth at the frame
+Columns = dict[str, NDArray[Any]]
+"""Columns that comparisons read, by their names in a file of results."""
 
 
 @dataclass(frozen=True)
-class StepData:
-    """Steps (C,): a cell is detected at `detection_s` without entries below any threshold up to `existence`."""
+class PairSide:
+    """One side of a pair in a log: what comparisons read of a configuration, laid out on the grid. None: not written.
 
-    cell: Int
-    existence: Float
-    detection_s: Float
-
-
-@dataclass(frozen=True)
-class ConfigurationData:
-    """A configuration on the grid: columns by cell, without meaning where it is not `there`. None: not written.
-
-    `counted`: there, and counts for times, shares and distances at detection.
+    `rows`: columns of `detections.parquet` by cell, and `left`: never detected, if it was not. They have no meaning
+    where a cell is not `there`. `counted`: there, and counts for times, shares and distances at detection. `lists`:
+    columns of `lists.parquet` by run, and `there`. `steps`: columns (C,) of `thresholds.parquet`, and `cell`: it is
+    detected at `detection_s` without entries below any threshold up to `existence`.
     """
 
     there: Bool
     counted: Bool
-    detected: Bool
-    left: Bool  # never detected, if it was not
-    onset_s: Float
-    ended_s: Float
-    detection_s: Float
-    distance_m: Float
-    conflict: Bool | None
-    passes: Bool | None
+    rows: Columns
     accuracy: AccuracyData | None
-    ghosts: FalsePositiveData | None
-    steps: StepData | None
+    lists: Columns | None
+    steps: Columns | None
 
 
 def configuration_rows(labelled: LabelledConfiguration, tables: dict[str, pa.Table]) -> dict[str, pa.Table]:
     """The rows of a configuration, by table."""
-    import pyarrow.compute as pc
-
     return {
         name: table.filter(pc.equal(table["configuration"], labelled.configuration)) for name, table in tables.items()
     }
 
 
-def lay_out_configuration(
-    labelled: LabelledConfiguration, tables: dict[str, pa.Table], grid: PairingGrid
-) -> ConfigurationData:
+def lay_out_configuration(labelled: LabelledConfiguration, tables: dict[str, pa.Table], grid: PairingGrid) -> PairSide:
     """A configuration's rows of a log on the grid. Raises InputError where tables are damaged or contradictory."""
     results, rows_of = labelled.results, configuration_rows(labelled, tables)
-    rows = rows_of["detections.parquet"]
-    cell = grid.cells(rows)
-    place = results.place / "detections.parquet"
+    rows, place = rows_of["detections.parquet"], results.place / "detections.parquet"
+    cell, size = grid.cells(rows), len(grid.episodes) * grid.runs
     _check_once(place, cell, labelled.configuration)
-    detected = flag_column(rows["detected"])
-    for name, needed in (("onset_s", True), ("ended_s", True), ("detection_s", detected)):
-        if (np.isnan(float_column(rows[name])) & needed).any():
+    columns = _read_columns(place, rows)
+    for name, needed in (("onset_s", True), ("ended_s", True), ("detection_s", columns["detected"])):
+        if (np.isnan(columns[name]) & needed).any():
             raise InputError(f"{place}: column {name}: expected a number in every row, found none in some; {AGAIN}")
-    braking, began = results.provenance.braking is not None, rows.select([*COUNTS_BY]).to_pandas()
-    size = len(grid.episodes) * grid.runs
-    return ConfigurationData(
+    columns["left"] = flag_column(pc.is_in(rows["ended_by"], pa.array(COMPETES)))
+    began = rows.select([*COUNTS_BY]).to_pandas()
+    return PairSide(
         there=_lay_out(np.ones(len(cell), dtype=bool), cell, size),
         counted=_lay_out(is_counted(began, results.provenance.measure["began"]), cell, size),
-        detected=_lay_out(detected, cell, size),
-        left=_lay_out(_is_left(rows), cell, size),
-        onset_s=_lay_out(float_column(rows["onset_s"]), cell, size),
-        ended_s=_lay_out(float_column(rows["ended_s"]), cell, size),
-        detection_s=_lay_out(float_column(rows["detection_s"]), cell, size),
-        distance_m=_lay_out(float_column(rows["distance_at_detection_m"]), cell, size),
-        conflict=_lay_out(flag_column(rows["conflict"]), cell, size) if braking else None,
-        passes=_lay_out(flag_column(rows["braking_pass"]), cell, size) if braking else None,
+        rows={name: _lay_out(values, cell, size) for name, values in columns.items()},
         accuracy=_accuracy_data(results.place, rows_of, cell, grid),
-        ghosts=_false_positive_data(results.place / "lists.parquet", rows_of, grid, labelled.configuration),
-        steps=_step_data(rows_of, grid),
+        lists=_list_columns(results.place / "lists.parquet", rows_of, grid, labelled.configuration),
+        steps=_step_columns(results.place / "thresholds.parquet", rows_of, grid),
     )
+
+
+def _read_columns(place: Path, rows: pa.Table) -> Columns:
+    """(n,) the columns that comparisons read and that are no keys of rows, nor text or lists."""
+    kinds = TABLES[place.name].kinds("braking", compared=True)
+    return {
+        name: _READ[kind](rows[name])
+        for name, kind in kinds.items()
+        if kind in _READ and name not in ("run", "episode") and name in rows.column_names
+    }
 
 
 def _lay_out(values: NDArray[T], cell: Int, size: int) -> NDArray[T]:
@@ -231,13 +200,6 @@ def _lay_out(values: NDArray[T], cell: Int, size: int) -> NDArray[T]:
     out = np.full(size, np.nan if values.dtype.kind == "f" else 0, dtype=values.dtype)
     out[cell[cell >= 0]] = values[cell >= 0]
     return out
-
-
-def _is_left(rows: pa.Table) -> Bool:
-    import pyarrow as pa
-    import pyarrow.compute as pc
-
-    return flag_column(pc.is_in(rows["ended_by"], pa.array(COMPETES)))
 
 
 def _check_once(place: Path, cell: Int, configuration: str) -> None:
@@ -298,29 +260,22 @@ def _read_frames(place: Path, rows: pa.Table, grid: PairingGrid) -> tuple[Float,
     return frame_s, np.append(begins, frames), holds, of_run
 
 
-def _false_positive_data(
-    place: Path, tables: dict[str, pa.Table], grid: PairingGrid, configuration: str
-) -> FalsePositiveData | None:
-    if "lists.parquet" not in tables:
+def _list_columns(place: Path, tables: dict[str, pa.Table], grid: PairingGrid, configuration: str) -> Columns | None:
+    if place.name not in tables:
         return None
-    rows = tables["lists.parquet"]
+    rows = tables[place.name]
     run = grid.runs_of(rows)
     _check_once(place, run, configuration)
-    return FalsePositiveData(
-        there=_lay_out(np.ones(len(run), dtype=bool), run, grid.runs),
-        minutes=_lay_out(float_column(rows["minutes"]), run, grid.runs),
-        count=_lay_out(integer_column(rows["ghosts"]), run, grid.runs),
-        without_truth=_lay_out(integer_column(rows["without_truth"]), run, grid.runs),
-    )
+    columns = _read_columns(place, rows) | {"there": np.ones(len(run), dtype=bool)}
+    return {name: _lay_out(values, run, grid.runs) for name, values in columns.items()}
 
 
-def _step_data(tables: dict[str, pa.Table], grid: PairingGrid) -> StepData | None:
-    if "thresholds.parquet" not in tables:
+def _step_columns(place: Path, tables: dict[str, pa.Table], grid: PairingGrid) -> Columns | None:
+    if place.name not in tables:
         return None
-    rows = tables["thresholds.parquet"]
-    cell = grid.cells(rows)
-    kept = cell >= 0
-    return StepData(cell[kept], float_column(rows["existence"])[kept], float_column(rows["detection_s"])[kept])
+    cell = grid.cells(tables[place.name])
+    columns = _read_columns(place, tables[place.name]) | {"cell": cell}
+    return {name: values[cell >= 0] for name, values in columns.items()}
 
 
 # What two configurations hold, paired frame by frame.
