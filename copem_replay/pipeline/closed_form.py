@@ -36,7 +36,7 @@ from copem_replay.metrics.onset import began_texts
 from copem_replay.metrics.survival import end_reason_texts
 from copem_replay.perception.observation import rows_by_unit
 from copem_replay.perception.pem.model import Pem
-from copem_replay.pipeline.expansion import ExpandedExperiment, has_truth_ids
+from copem_replay.pipeline.expansion import ExpandedExperiment, find_facts
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.sweep import list_points
 
@@ -249,11 +249,12 @@ def exact_table(replay: Replay, experiment: Experiment) -> pd.DataFrame:
 
 def _check_truth_ids(experiment: Experiment) -> None:
     """Raises ExperimentError for a configuration whose probabilities of detection are not known."""
+    facts = find_facts(experiment)
     for name, configuration in experiment.configurations.items():
         recorded = set(experiment.units_of(configuration)) & experiment.recorded.keys()
-        if configuration.recorded is not None:
+        if facts[name].recorded:
             why = "it is recorded, and nothing says how probable its lists were"
-        elif not has_truth_ids(configuration) or experiment.measure.match.always:
+        elif not facts[name].by_truth_id:
             why = "what is matched with the truth depends on sampled errors"
         elif recorded:
             why = f"unit {min(recorded)} is recorded, and nothing says how probable its lists were"

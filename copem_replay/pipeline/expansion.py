@@ -72,7 +72,7 @@ def find_facts(experiment: Experiment) -> dict[str, ConfigurationFacts]:
         facts[name] = ConfigurationFacts(
             truth=configuration.units == TRUTH,
             recorded=recorded,
-            by_truth_id=has_truth_ids(configuration) and not experiment.measure.match.always,
+            by_truth_id=_has_truth_ids(configuration) and not experiment.measure.match.always,
             fixed=fixed,
             fixed_verdicts=fixed and reacts_alike,
             needs_visibility=in_sight,
@@ -82,7 +82,7 @@ def find_facts(experiment: Experiment) -> dict[str, ConfigurationFacts]:
     return facts
 
 
-def has_truth_ids(configuration: Configuration) -> bool:
+def _has_truth_ids(configuration: Configuration) -> bool:
     """Whether a configuration's fused tracks have truth ids: the truth itself, and ideal fusion."""
     computed = configuration.recorded is None  # not the output of a stack
     return computed and (configuration.units == TRUTH or isinstance(configuration.fusion, IdealFusion))
@@ -159,6 +159,11 @@ class ExpandedExperiment:
     def configurations(self) -> dict[str, Configuration]:
         """The configurations, which name these units."""
         return self._expanded.configurations
+
+    @cached_property
+    def facts(self) -> dict[str, ConfigurationFacts]:
+        """What each of the configurations is."""
+        return find_facts(self.written)
 
     def units_of(self, configuration: Configuration) -> tuple[str, ...]:
         """Names of the units of one of these configurations, in order; none for the truth."""

@@ -28,7 +28,7 @@ from copem_replay.metrics.detections_table import (
     stack_events,
 )
 from copem_replay.metrics.episodes import earliest_sight_s
-from copem_replay.pipeline.expansion import ExpandedExperiment, RunGroup, group_runs, has_truth_ids
+from copem_replay.pipeline.expansion import ExpandedExperiment, RunGroup, group_runs
 from copem_replay.pipeline.prepare import ROWS_A_CHUNK, Replay
 from copem_replay.pipeline.receiver import Receivers, states_needed
 from copem_replay.pipeline.scoring import ConfigurationScores, Judge
@@ -88,29 +88,28 @@ def cut_blocks(replay: Replay, experiment: Experiment, jobs: int, runs: tuple[in
         pem.memory_of(c).get("detection") for pem in experiment.pems.values() for c in range(len(pem.couples))
     )
     cell_bytes = LASTING_BYTES if detection_lasts else 1
-    if _needs_lists(experiment) or experiment.measure.conflict is not None or units.sends:
+    if _needs_lists(units) or experiment.measure.conflict is not None or units.sends:
         cell_bytes = STATE_BYTES
-        if not _needs_matches(experiment):
+        if not _needs_matches(units):
             cell_bytes = min(cell_bytes, TRACK_BYTES + STATE_BYTES // max(len(replay.expanded.units), 1))
     at_once = BLOCK_BYTES // (rows * cell_bytes)
     size = max(1, min(at_once, even, small))
     return [np.arange(k, min(k + size, end)) for k in range(begin, end, size)]
 
 
-def _needs_lists(experiment: Experiment) -> bool:
+def _needs_lists(units: ExpandedExperiment) -> bool:
     """Whether anything depends on whole lists, and not only on whether they hold a measured object."""
-    return experiment.measure.accuracy or _needs_matches(experiment)
+    return units.measure.accuracy or _needs_matches(units)
 
 
-def _needs_matches(experiment: Experiment) -> bool:
+def _needs_matches(units: ExpandedExperiment) -> bool:
     """Whether any detection is by match, for which lists are needed even without accuracy."""
-    others = any(not has_truth_ids(configuration) for configuration in experiment.configurations.values())
-    return experiment.measure.match.always or others
+    return not all(of.by_truth_id for of in units.facts.values())
 
 
 def _needs_all_rows(units: ExpandedExperiment) -> bool:
     """Whether rows of all objects are drawn: what units send, and how long it is on air, depends on them, too."""
-    return _needs_lists(units.written) or bool(units.sends) or has_channel(units)
+    return _needs_lists(units) or bool(units.sends) or has_channel(units)
 
 
 def replay_block(replay: Replay, experiment: Experiment, runs: Int) -> pd.DataFrame:
@@ -125,7 +124,7 @@ def replay_outcomes(replay: Replay, experiment: Experiment, runs: Int) -> list[B
     """What one block of runs (S,) gives; in several parts where not all runs have the same lists."""
     began_s, units, measure = time.perf_counter(), replay.expanded.with_(experiment), experiment.measure
     # Which lists there are decides which hits are consecutive.
-    by_entry = measure.confirm.of == 1 and measure.conflict is None and not _needs_lists(experiment)
+    by_entry = measure.confirm.of == 1 and measure.conflict is None and not _needs_lists(units)
     groups = group_runs(units, replay.scene.log, runs, entries_alone=by_entry)
     known = [replay_runs(replay, experiment, group) for group in groups]
     # The table of all runs at once: made for each alone it takes longer than their replay.
@@ -161,7 +160,7 @@ def replay_runs(log: Replay, experiment: Experiment, group: RunGroup) -> GroupOu
     """What every configuration knows of every object, in the runs (S,) of a group, which have the same lists."""
     units, measure = log.expanded.with_(experiment), experiment.measure
     # For detection by truth id alone is drawn which rows are listed; else states as well, for matches of all rows.
-    matched = _needs_lists(experiment)
+    matched = _needs_lists(units)
     fused = list(units.configurations) if matched or measure.conflict is not None else []
     states: States = next(filter(None, (states_needed(units.configurations[name]) for name in fused)), "true")
 
@@ -180,14 +179,13 @@ def replay_runs(log: Replay, experiment: Experiment, group: RunGroup) -> GroupOu
 
     listed = sightings[0] if len(sightings) == 1 else splice_rows(sightings, states=False)[0]
     scores = {name: scores for name, judge in judges.items() if (scores := judge.scores(len(group.runs))) is not None}
-    by_match = {name for name in scores if measure.match.always or not has_truth_ids(units.configurations[name])}
     events = {}
     for name in units.configurations:
-        known = scores[name].detections if name in by_match else None
+        known = scores[name].detections if name in scores and not units.facts[name].by_truth_id else None
         conflict_known_s = judges[name].conflict_known_s() if name in judges else None
         events[name] = replace(find_events(lists, name, listed, known), conflict_known_s=conflict_known_s)
     # Lists that are matched for accuracy alone would not even be fused.
-    for_accuracy = measure.accuracy and not _needs_matches(experiment) and measure.conflict is None
+    for_accuracy = measure.accuracy and not _needs_matches(units) and measure.conflict is None
     accuracy_s = took_s if for_accuracy else sum(judge.accuracy_s for judge in judges.values())
     return GroupOutcome(events, scores, accuracy_s)
 

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from copem_replay.metrics.intervals import choose_clusters
 from copem_replay.metrics.summary import DETECTED, tally_rows
+from copem_replay.pipeline.expansion import find_facts
 from copem_replay.report import write_html_report
 from copem_replay.report.figures import Selection
 from copem_replay.report.figures.detection_curves import build_curve, cluster_rows, detection_endings, mean_limits
@@ -88,7 +89,9 @@ def test_in_sight_in_one_log_alone(several: Path) -> None:
     experiment = read_results(several).experiment
     one = pd.DataFrame({"detected": True, "onset_s": 1.0, "captured_s": [3.0, 4.0], "detection_s": [5.0, 7.0]})
     logs = [one.assign(configuration="half", in_sight_s=sight_s) for sight_s in (2.0, np.nan)]
-    results: Any = SimpleNamespace(experiment=experiment, each=lambda *columns: iter(logs))
+    results: Any = SimpleNamespace(
+        experiment=experiment, facts=find_facts(experiment), each=lambda *columns: iter(logs)
+    )
     expected = {HIDDEN: 1.75, IN_SIGHT: 0.75, TRANSPORT: 2.5, FUSION: 0.0}
     assert mean_stages_by_configuration(results, ["half"]) == {"half": expected}
     assert mean_stages(pd.concat(logs), experiment, "half") == expected

@@ -32,7 +32,7 @@ import pandas as pd
 from copem_replay.core.tracks import TRUTH, Float
 from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.detections_table import WAY
-from copem_replay.pipeline.expansion import has_truth_ids
+from copem_replay.pipeline.expansion import ConfigurationFacts, find_facts
 from copem_replay.report.figures.style import (
     add_note,
     choose_appearances,
@@ -89,7 +89,8 @@ def mean_stages_by_configuration(results: Results, names: Sequence[str]) -> dict
     sums: dict[str, dict[str, float]] = {name: {} for name in names}
     for rows in results.each("configuration", "detected", *_INSTANTS):
         for name, so_far in sums.items():
-            for stage, sum_s in _sum_stages(rows[rows["configuration"] == name], results.experiment, name).items():
+            of_name = rows[rows["configuration"] == name]
+            for stage, sum_s in _sum_stages(of_name, results.experiment, name, results.facts[name]).items():
                 so_far[stage] = so_far.get(stage, 0.0) + sum_s
     return {name: _divide_sums(sum_s) for name, sum_s in sums.items()}
 
@@ -164,7 +165,7 @@ def _add_legend(figure: Figure, stages: Sequence[str]) -> None:
 
 def mean_stages(rows: pd.DataFrame, experiment: Experiment, name: str) -> dict[str, float]:
     """Mean duration (s) of each known stage over rows of a configuration; empty without a detection."""
-    return _divide_sums(_sum_stages(rows, experiment, name))
+    return _divide_sums(_sum_stages(rows, experiment, name, find_facts(experiment)[name]))
 
 
 def _divide_sums(sums: Mapping[str, float]) -> dict[str, float]:
@@ -178,7 +179,7 @@ def _divide_sums(sums: Mapping[str, float]) -> dict[str, float]:
     return {stage: mean_s for stage, mean_s in means.items() if mean_s or stage not in (LISTED, PROCESSING)}
 
 
-def _sum_stages(rows: pd.DataFrame, experiment: Experiment, name: str) -> dict[str, float]:
+def _sum_stages(rows: pd.DataFrame, experiment: Experiment, name: str, facts: ConfigurationFacts) -> dict[str, float]:
     """Sums of the stages (s) over rows, with the number of rows under ""; sums of several logs can be added."""
     rows = rows[rows["detected"].astype(bool) & rows["captured_s"].notna()]
     if not len(rows):
@@ -200,20 +201,19 @@ def _sum_stages(rows: pd.DataFrame, experiment: Experiment, name: str) -> dict[s
         result |= {LISTED: captured_s - listed_s, PROCESSING: sent_s - captured_s}
         result |= {TRANSPORT: arrived_s - sent_s, FUSION: known_s - arrived_s}
     else:
-        result |= _stages_since_capture(known_s - captured_s, experiment, name)
+        result |= _stages_since_capture(known_s - captured_s, experiment, name, facts)
     return {"": float(len(rows))} | {stage: float(values.sum()) for stage, values in result.items()}
 
 
-def _stages_since_capture(delay_s: Float, experiment: Experiment, name: str) -> dict[str, Float]:
-    configuration = experiment.configurations[name]
-    units = experiment.units_of(configuration)
-    by_id = has_truth_ids(configuration) and not experiment.measure.match.always
-    if by_id and experiment.measure.confirm.hits == 1:
+def _stages_since_capture(
+    delay_s: Float, experiment: Experiment, name: str, facts: ConfigurationFacts
+) -> dict[str, Float]:
+    units = experiment.units_of(experiment.configurations[name])
+    if facts.by_truth_id and experiment.measure.confirm.hits == 1:
         return {TRANSPORT: delay_s, FUSION: np.zeros_like(delay_s)}
     latency_s = {experiment.delay_of(name, unit) for unit in units or (TRUTH,)}
     fixed_s = latency_s.pop() if len(latency_s) == 1 else None
-    recorded = configuration.recorded is not None
-    if recorded or fixed_s is None or any(unit in experiment.recorded for unit in units):
+    if facts.recorded or fixed_s is None or any(unit in experiment.recorded for unit in units):
         return {SINCE_CAPTURED: delay_s}
     transport_s = np.minimum(delay_s, fixed_s)
     return {TRANSPORT: transport_s, FUSION: delay_s - transport_s}

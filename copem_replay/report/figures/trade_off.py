@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from copem_replay.core.tracks import Float
-from copem_replay.pipeline.expansion import has_truth_ids
 from copem_replay.report.figures.style import (
     add_note,
     choose_appearances,
@@ -40,8 +39,7 @@ _MARK_PT = 7.0
 
 def no_trade_off(results: Results, names: Sequence[str]) -> str | None:
     """The reason why the figure cannot be drawn, "" if it need not be given; None if it can."""
-    every = results.experiment.configurations
-    if all(has_truth_ids(every[name]) for name in names):
+    if all(results.facts[name].by_truth_id for name in names):
         return ""
     return None if len(_contenders_with_both(results, names)) > 1 else ""
 
