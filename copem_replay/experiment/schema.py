@@ -6,7 +6,7 @@ Units are in the names of keys. References (a unit's `pem`, a configuration's `u
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
@@ -380,34 +380,29 @@ def output_unit(configuration: str) -> str:
     return f"{configuration} (recorded)"
 
 
-def ideal_over(configurations: Mapping[str, Configuration], inputs: Sequence[str]) -> str | None:
-    """The configuration that is ideal fusion of exactly these units, without latency or link; None: there is none."""
-    for name, configuration in configurations.items():
-        alike = (
-            configuration.recorded is None
-            and not isinstance(configuration.units, str)
-            and set(configuration.units) == set(inputs)
-        )
-        if (
-            alike
-            and configuration.fusion == IdealFusion()
-            and configuration.link is None
-            and not configuration.latency_s
-            and configuration.issue_hz is None
-        ):
-            return name
-    return None
+def _is_ideal_of(configuration: Configuration, inputs: Sequence[str]) -> bool:
+    """Whether a configuration is ideal fusion of exactly these units, without latency or link."""
+    return (
+        configuration.recorded is None
+        and not isinstance(configuration.units, str)
+        and set(configuration.units) == set(inputs)
+        and configuration.fusion == IdealFusion()
+        and configuration.link is None
+        and not configuration.latency_s
+        and configuration.issue_hz is None
+    )
 
 
 def _add_ideals(configurations: dict[str, Configuration]) -> dict[str, Configuration]:
     """The configurations, with ideal fusion of the inputs of each recorded output, `<name>:ideal`, where it lacks."""
     result = dict(configurations)
     for name, configuration in configurations.items():
-        if configuration.inputs is None or ideal_over(result, configuration.inputs) is not None:
+        inputs = configuration.inputs
+        if inputs is None or any(_is_ideal_of(one, inputs) for one in result.values()):
             continue
         if f"{name}:ideal" in result:
             raise ValueError(f"{name}:ideal: expected ideal fusion of the inputs of {name}, found another; rename it")
-        result[f"{name}:ideal"] = Configuration(units=configuration.inputs)
+        result[f"{name}:ideal"] = Configuration(units=inputs)
     return result
 
 

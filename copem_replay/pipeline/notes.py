@@ -34,7 +34,7 @@ from copem_replay.core.tracks import (
 )
 from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.experiment.drive import resolve_for_log, settings_notes
-from copem_replay.experiment.schema import Experiment, ideal_over, output_unit
+from copem_replay.experiment.schema import Experiment, output_unit
 from copem_replay.fusion.interface import IdealFusion
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.detection.conflict import describe_excluded
@@ -45,7 +45,7 @@ from copem_replay.perception.config import Carriers
 from copem_replay.perception.observation import interpolate_worlds
 from copem_replay.perception.pem.model import ObjectSidePlace, Pem
 from copem_replay.perception.sensor_poses import UnitPoses
-from copem_replay.pipeline.expansion import ExpandedExperiment, RunGroup
+from copem_replay.pipeline.expansion import ExpandedExperiment, RunGroup, find_facts
 from copem_replay.pipeline.sweep import describe_unswept
 from copem_replay.pipeline.world import Transmission, asks_for_path
 
@@ -156,12 +156,13 @@ def _newest_input_s(recording: Recording, experiment: Experiment, name: str, ins
 
 def notes_on_output_regret(experiment: Experiment) -> Iterator[str]:
     """A note on the baseline of the regret of each recorded output."""
+    facts = find_facts(experiment)
     for name in experiment.outputs:
         inputs = experiment.configurations[name].inputs
         if inputs is None:
             yield f"configuration {name}: no regret, for it has no `inputs`: ideal fusion of what it had is not known"
             continue
-        ideal = ideal_over(experiment.configurations, inputs)
+        ideal = facts[name].ideal
         yield f"configuration {name}: its regret is the difference to {ideal}, ideal fusion of {', '.join(inputs)}"
 
 

@@ -144,11 +144,6 @@ def _rank_run(rows: pd.DataFrame, horizon_s: float, rank: str) -> tuple[int, str
     return int(equal[0]), why + (f", the first of {len(equal)} equal" if len(equal) > 1 else "")
 
 
-def select_shown_logs(experiment: Experiment, result: ExperimentResult) -> list[str]:
-    """Names of the logs that are written to MCAP and .rrd."""
-    return choose_logs(experiment, [log.name for log in result.logs] or [r.scene.log for r in result.replays])
-
-
 def choose_logs(experiment: Experiment, names: Sequence[str]) -> list[str]:
     """Those of the names of all logs that are shown."""
     if experiment.show is None or not experiment.show.asked():

@@ -10,11 +10,10 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import groupby
 from operator import attrgetter
-from pathlib import Path
 from typing import NamedTuple
 
 import pandas as pd
@@ -31,7 +30,7 @@ from copem_replay.metrics.summary import add_own_sums, own_sums_by_log, settle_h
 from copem_replay.pipeline.closed_form import check_closed_form, exact_table
 from copem_replay.pipeline.cost import RunCost, memory_notes, return_memory, watch_cost
 from copem_replay.pipeline.expansion import find_facts
-from copem_replay.pipeline.notes import ListRate, LogFacts, join_list_rates, study_notes
+from copem_replay.pipeline.notes import LogFacts, join_list_rates, study_notes
 from copem_replay.pipeline.parts import MOST_RUNS, STATES_A_PART, PartCache, cut_parts, write_recipe
 from copem_replay.pipeline.prepare import Replay, prepare_log
 from copem_replay.pipeline.replay import BlockOutcome, cut_blocks, replay_outcomes
@@ -178,16 +177,19 @@ class ExperimentResult:
     tables: StudyTables
     summary: pd.DataFrame  # summary.csv
     notes: tuple[str, ...]  # one line each
-    replays: tuple[Replay, ...]  # one per log
+    logs: tuple[StudyLog, ...]
+    facts: tuple[LogFacts, ...]  # a log each
     horizon_s: float
+    tally: pd.DataFrame  # tally.parquet
     exact: pd.DataFrame | None = None  # exact.parquet, with `measure: {exact: true}`
     bands: pd.DataFrame | None = None  # bands.csv, with `measure: {accuracy: true}`
     sweep: pd.DataFrame | None = None  # sweep.csv, with `sweep:`
     costs: tuple[str, ...] = ()  # notes for the terminal alone: no two runs take the same time
-    tally: pd.DataFrame = field(default_factory=pd.DataFrame)  # tally.parquet
-    logs: tuple[StudyLog, ...] = ()
-    facts: tuple[LogFacts, ...] = ()  # a log each
-    same_instants: bool = True  # whether lists have the same instants in all runs
+
+    @property
+    def replays(self) -> tuple[Replay, ...]:
+        """The logs that are prepared and in memory."""
+        return tuple(log.ready for log in self.logs if log.ready is not None)
 
     @property
     def table(self) -> pd.DataFrame:
@@ -201,7 +203,7 @@ class ExperimentResult:
 
     def accuracy_of(self, parts: Iterable[PartTables], rows: pd.DataFrame) -> AccuracyTables:
         """The accuracy tables of some parts, which have these rows."""
-        return accuracy_tables(parts, rows, same_instants=self.same_instants)
+        return accuracy_tables(parts, rows, same_instants=all(of.same_instants for of in self.facts))
 
 
 def run_experiment(
@@ -241,42 +243,26 @@ def run_experiment(
 def _run_study(experiment: Experiment, logs: Sequence[StudyLog], gatherer: Gatherer) -> ExperimentResult:
     exact = _compute_exact(logs, experiment, gatherer)
     sums = _sum_tables(logs, experiment, gatherer, whole=True)
-    facts, counted = [log.facts(experiment) for log in logs], select_counted(sums.tally, experiment.measure.began)
-    horizon_s, horizon_notes = settle_horizon(counted, experiment.measure.horizon_s)
-    times = _rates_by_configuration(facts, experiment)
-    rows, summary_notes = summarise_tally(
-        counted,
-        list(experiment.configurations),
-        {name: one.rate_hz for name, one in times.items()},
-        horizon_s=horizon_s,
-        exact=None if exact is None else select_counted(exact, experiment.measure.began),
-        accuracy=total_over_logs(sums.totals),
-        facts=find_facts(experiment),
-        own=experiment.measure.metrics,
-        sums=sums.sums,
-        outputs={name: sum((sums.outputs[name] for sums in facts), OutputTimes()) for name in experiment.outputs},
-        conflicts_asked=experiment.measure.conflict is not None,
-        links={name: one.links for name, one in times.items() if one.links is not None},
+    horizon_s, horizon_notes = settle_horizon(
+        select_counted(sums.tally, experiment.measure.began), experiment.measure.horizon_s
     )
+    rows, summary_notes = _summarise(logs, experiment, exact, sums, horizon_s)
     swept = [_summarise_point(point, logs, gatherer, horizon_s) for point in list_points(experiment)]
-    recordings = [log.recording for log in logs]
-    notes = study_notes(
-        recordings, {log.name: sums.oddities for log, sums in zip(logs, facts, strict=True)}, experiment
-    )
-    sweep = pd.concat(swept, ignore_index=True) if swept else None
-    accurate = experiment.measure.accuracy and len(experiment.configurations)
-    ready = tuple(log.ready for log in logs if log.ready is not None)
-    result = ExperimentResult(
+    facts = [log.facts(experiment) for log in logs]
+    oddities = {log.name: of.oddities for log, of in zip(logs, facts, strict=True)}
+    notes = study_notes([log.recording for log in logs], oddities, experiment)
+    return ExperimentResult(
         sums.tables,
         rows,
         (*notes, *horizon_notes, *summary_notes),
-        ready,
+        tuple(logs),
+        tuple(facts),
         horizon_s,
-        exact,
-        tabulate_bands(sums.totals) if accurate else None,
+        sums.tally,
+        exact=exact,
+        bands=tabulate_bands(sums.totals) if experiment.measure.accuracy and len(experiment.configurations) else None,
+        sweep=pd.concat(swept, ignore_index=True) if swept else None,
     )
-    alike = all(sums.same_instants for sums in facts)
-    return replace(result, sweep=sweep, tally=sums.tally, logs=tuple(logs), facts=tuple(facts), same_instants=alike)
 
 
 class _StudySums(NamedTuple):
@@ -319,35 +305,35 @@ def _summarise_point(point: SweepPoint, logs: Sequence[StudyLog], gatherer: Gath
         logs = [StudyLog(log.recording, experiment, log.parts) for log in logs]
     exact = _compute_exact(logs, experiment, gatherer)
     sums = _sum_tables(logs, experiment, gatherer, whole=False)
-    times = _rates_by_configuration([log.facts(experiment) for log in logs], experiment)
-    rows, _ = summarise_tally(
-        select_counted(sums.tally, experiment.measure.began),
-        list(experiment.configurations),
-        {name: one.rate_hz for name, one in times.items()},
-        horizon_s=horizon_s,
-        exact=None if exact is None else select_counted(exact, experiment.measure.began),
-        accuracy=total_over_logs(sums.totals),
-        facts=find_facts(experiment),
-        conflicts_asked=experiment.measure.conflict is not None,
-        links={name: one.links for name, one in times.items() if one.links is not None},
-    )
+    rows, _ = _summarise(logs, experiment, exact, sums, horizon_s)
     rows.insert(0, "sweep", point.sweep)
     rows.insert(1, "value", point.value)
     return rows
+
+
+def _summarise(
+    logs: Sequence[StudyLog], experiment: Experiment, exact: pd.DataFrame | None, sums: _StudySums, horizon_s: float
+) -> tuple[pd.DataFrame, list[str]]:
+    """The rows of a summary, and notes about them."""
+    facts, measure, names = [log.facts(experiment) for log in logs], experiment.measure, list(experiment.configurations)
+    times = {name: join_list_rates(of.times[name] for of in facts if name in of.times) for name in names}
+    return summarise_tally(
+        select_counted(sums.tally, measure.began),
+        names,
+        {name: one.rate_hz for name, one in times.items()},
+        horizon_s=horizon_s,
+        exact=None if exact is None else select_counted(exact, measure.began),
+        accuracy=total_over_logs(sums.totals),
+        facts=find_facts(experiment),
+        own=measure.metrics,
+        sums=sums.sums,
+        outputs={name: sum((of.outputs[name] for of in facts), OutputTimes()) for name in experiment.outputs},
+        conflicts_asked=measure.conflict is not None,
+        links={name: one.links for name, one in times.items() if one.links is not None},
+    )
 
 
 def _compute_exact(logs: Sequence[StudyLog], experiment: Experiment, gatherer: Gatherer) -> pd.DataFrame | None:
     if not experiment.measure.exact:
         return None
     return pd.concat([gatherer.exact(log, experiment) for log in logs], ignore_index=True)
-
-
-def _rates_by_configuration(facts: Sequence[LogFacts], experiment: Experiment) -> dict[str, ListRate]:
-    return {
-        name: join_list_rates(of.times[name] for of in facts if name in of.times) for name in experiment.configurations
-    }
-
-
-def find_log_path(recordings: Sequence[Recording], log: str) -> Path:
-    """The path of the recording of a log."""
-    return next(recording.path for recording in recordings if recording.scene.log == log)

@@ -147,10 +147,10 @@ def _explain_unstated(experiment: Experiment, kind: str) -> str:
 
 
 def _reduce_measure(experiment: Experiment) -> Measure:
-    """What sweeps measure: no accuracy; perceived conflicts, which take time, only if the driver brakes for them."""
+    """What sweeps measure: no accuracy, no own metrics; perceived conflicts only if the driver brakes for them."""
     needed = experiment.braking is not None and experiment.braking.brakes_for == "conflict"
     conflict = experiment.measure.conflict if needed else None
-    return experiment.measure.model_copy(update={"conflict": conflict, "accuracy": False})
+    return experiment.measure.model_copy(update={"conflict": conflict, "accuracy": False, "metrics": ()})
 
 
 def _sweep_configurations(

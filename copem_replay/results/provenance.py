@@ -22,7 +22,7 @@ from copem_replay.io.open import File, first_recording
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.config import Measure
 from copem_replay.pipeline.expansion import ConfigurationFacts, find_facts
-from copem_replay.pipeline.one_run import select_shown_logs, select_shown_runs
+from copem_replay.pipeline.one_run import choose_logs, select_shown_runs
 from copem_replay.pipeline.run import ExperimentResult
 from copem_replay.pipeline.study_log import compute_log_digests
 from copem_replay.results.folder import MARK
@@ -129,7 +129,8 @@ def build_provenance(
     notes: Sequence[str],
 ) -> dict[str, object]:
     """The provenance of results: versions, logs, seed, metric parameters; no clock, no host."""
-    shown = {log: select_shown_runs(experiment, result, log) for log in select_shown_logs(experiment, result)}
+    shown_logs = choose_logs(experiment, [log.name for log in result.logs])
+    shown = {log: select_shown_runs(experiment, result, log) for log in shown_logs}
     return {
         "format": FORMAT,
         **list_versions(),

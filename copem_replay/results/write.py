@@ -42,10 +42,9 @@ from copem_replay.pipeline.one_run import (
     choose_logs,
     list_stems,
     replay_run,
-    select_shown_logs,
     select_shown_runs,
 )
-from copem_replay.pipeline.run import ExperimentResult, find_log_path
+from copem_replay.pipeline.run import ExperimentResult
 from copem_replay.pipeline.sweep import list_points, resolve_sweep
 from copem_replay.results.folder import EXPERIMENT, MARK, ResultsPlace, check_inputs, check_names, take_place
 from copem_replay.results.provenance import build_provenance, escape_name, log_entries, recording_name
@@ -143,7 +142,7 @@ def write_results(
     """
     with take_place(folder, overwrite=overwrite) as place:
         check_inputs(place, [path for recording in recordings for path in recording.paths])
-        check_names(place, list_results(experiment, recordings, exporters))
+        check_own_files(place, experiment, recordings, exporters)
         notes = fill_place(place, experiment, recordings, result, exporters=exporters, skipped=skipped)
     if place.failed:
         raise OutputError(place.failed)
@@ -249,12 +248,12 @@ def _export(
 ) -> list[str]:
     """Write the shown runs. Returns notes for the user; files that cannot be written go to the place's `failed`."""
     notes: list[str] = []
-    for log in select_shown_logs(experiment, result) if exporters else ():
+    for log in choose_logs(experiment, [one.name for one in result.logs]) if exporters else ():
         for shown in select_shown_runs(experiment, result, log):
             stem, shown_count = _place_stem(shown.stem, log, recordings), len(experiment.shown())
             files = [exporter.files(stem, shown_count) for exporter in exporters]
             with place.may_fail([name for names in files for name in names]):
-                run = _make_run_to_export(log, shown, experiment, recordings, result)
+                run = _make_run_to_export(log, shown, experiment, result)
                 (place.new / stem).parent.mkdir(parents=True, exist_ok=True)
                 for exporter, names in zip(exporters, files, strict=True):
                     with place.may_fail(names):
@@ -299,9 +298,7 @@ def _logs_table(folder: Path, result: ExperimentResult, skipped: Sequence[tuple[
     return TABLES["logs.csv"].frame(rows)
 
 
-def _make_run_to_export(
-    log: str, shown: ShownRun, experiment: Experiment, recordings: Sequence[Recording], result: ExperimentResult
-) -> RunToExport:
+def _make_run_to_export(log: str, shown: ShownRun, experiment: Experiment, result: ExperimentResult) -> RunToExport:
     """One run of one log, in the configurations that the experiment shows."""
     study_log = next(replayed for replayed in result.logs if replayed.name == log)
     replay, recording = study_log.replay(), study_log.whole()
@@ -311,9 +308,7 @@ def _make_run_to_export(
     rows = result.tables.rows(log)
     manifest = {
         "copem_replay": version("copem-replay"),
-        "experiment": dump_yaml(
-            resolve_sweep(experiment).as_written() | {"logs": [find_log_path(recordings, log).name]}
-        ),
+        "experiment": dump_yaml(resolve_sweep(experiment).as_written() | {"logs": [recording.path.name]}),
         "log": log,
         "run": str(shown.run),
         "run_is": shown.why,

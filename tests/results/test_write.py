@@ -21,7 +21,7 @@ from copem_replay.experiment.validate import read_logs
 from copem_replay.io.write.mcap import RUN_RECORD
 from copem_replay.metrics.columns import COMPARED_FILES, TABLES
 from copem_replay.pipeline import replay as blocks_module
-from copem_replay.pipeline.one_run import select_shown_logs, select_shown_runs
+from copem_replay.pipeline.one_run import choose_logs, select_shown_runs
 from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.run import ExperimentResult, run_experiment
 from copem_replay.pipeline.tables import PartTables, StudyTables, tabulate_rows
@@ -197,9 +197,7 @@ def made_up(times: list[float | None]) -> ExperimentResult:
     """A result of one log with these times to detection, run by run; the horizon is 9 s."""
     of = {"log": "scene", "configuration": "PEM", "object_id": "a", "began": "crossed", "onset_s": 0.0, "ended_s": 10.0}
     table = pd.DataFrame({**of, "run": range(len(times)), "time_to_detection_s": times})
-    return ExperimentResult(
-        of_one_log(table), pd.DataFrame(), (), (prepare_log(scenes.oncoming_car(), experiment()),), 9.0
-    )
+    return ExperimentResult(of_one_log(table), pd.DataFrame(), (), (), (), 9.0, pd.DataFrame())
 
 
 def of_one_log(rows: pd.DataFrame) -> StudyTables:
@@ -226,8 +224,8 @@ def test_which_run_is_shown(times: list[float | None], best: int, median: int, w
         assert (shown.run, shown.stem) == (expected, "replay")
     for nothing in ({"run": None}, None):
         assert select_shown_runs(experiment(show=nothing), result, "scene") == ()
-        assert select_shown_logs(experiment(show=nothing), result) == []
-    assert select_shown_logs(experiment(), result) == ["scene"]
+        assert choose_logs(experiment(show=nothing), ["scene"]) == []
+    assert choose_logs(experiment(), ["scene"]) == ["scene"]
 
 
 def test_several_runs_are_shown_each_as_it_was_asked_for() -> None:
