@@ -120,14 +120,14 @@ def write_lists(
     recording: cr.Recording, pem: Mapping[str, Any], outages: Mapping[str, float], seed: int, out: Path
 ) -> Path:
     """A recording with the lists of a unit of this PEM beside its truth, as if they had been recorded."""
-    from copem_replay.results.write import MCAP, write_results
+    from copem_replay.results.write import MCAP
 
     unit = {"rsu": PLACE | {"pem": "rsu", "outages": dict(outages)}}
     fed = {"fed": {"units": ["rsu"], "latency_s": DELAY_S, "fusion": {"kind": "union"}}}
     result = cr.run(experiment_of(unit, fed, pems={"rsu": dict(pem)}, seed=seed), recording, jobs=1)
     with tempfile.TemporaryDirectory(dir=out.parent) as folder:
         place = Path(folder) / "results"
-        write_results(place, result.experiment, result.recordings, result.replayed, exporters=[MCAP])
+        replace(result, exporters=lambda _: [MCAP]).save(place)
         _without_answers(place / "replay.mcap", out)
     return out
 

@@ -71,20 +71,10 @@ def main() -> None:
 
 def _replay(folder: Path) -> None:
     """`copem-replay run logs/tc016d.yaml`, with the median run shown."""
-    from copem_replay.experiment.file import log_paths, read_experiment_file
-    from copem_replay.experiment.schema import Show
-    from copem_replay.experiment.validate import find_problems, read_logs
-    from copem_replay.pipeline.run import run_experiment
-    from copem_replay.results.write import write_results
-    from copem_replay.viewer.rrd import EXPORTERS
+    import copem_replay as cr
 
-    source = read_experiment_file(ROOT / "logs/tc016d.yaml")
-    experiment, wrong = find_problems(source)
-    if experiment is None or wrong:
-        sys.exit("\n".join(wrong))
-    experiment = experiment.model_copy(update={"show": Show(run="median")})
-    recordings, _ = read_logs(experiment, log_paths(source)[0], source)
-    write_results(folder, experiment, recordings, run_experiment(experiment, recordings), exporters=EXPORTERS)
+    experiment = cr.load_experiment(ROOT / "logs/tc016d.yaml")
+    cr.run(experiment.model_copy(update={"show": experiment.show.model_copy(update={"run": "median"})})).save(folder)
 
 
 def _city(folder: Path) -> float:

@@ -27,7 +27,7 @@ from copem_replay.core.tracks import CLASSES
 from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.io.recording import Recording
 from copem_replay.pipeline.run import Progress
-from copem_replay.results.read import Results, RunTables
+from copem_replay.results.read import Results
 
 if TYPE_CHECKING:
     from copem_replay.pipeline.crew import Crew, CrewProgress
@@ -112,10 +112,10 @@ def replay_study(
     """Replay the prepared logs of a study (`ready`). `progress(done, total)` is called after each block of runs."""
     from copem_replay.pipeline.run import run_experiment
 
-    result = run_experiment(
+    tables = run_experiment(
         study.experiment, study.recordings, jobs=count_workers(jobs), progress=progress, ready=ready, parts=parts
     )
-    return Results(RunTables(study.experiment, study.recordings, result), exporters=list_exporters)
+    return Results(study=tables, exporters=list_exporters)
 
 
 def count_workers(jobs: int | None) -> int:

@@ -155,7 +155,7 @@ def _write_results(
         print_notes(sorted(cache.damaged))
         print_problems([f"pieces: {cache.computed} computed, {cache.found} found in {cache.store.where}"])
     skipped = [f"{path}: skipped: {reason}" for path, reason in study.skipped]
-    costs = () if result.replayed is None else result.replayed.costs
+    costs = () if result.study is None else result.study.costs
     print_notes([*place.notes, *skipped, *notes, *costs, *advice])
     print_problems(place.failed)
     print(format_summary(result.summary, width_of(sys.stdout)))

@@ -25,7 +25,7 @@ from copem_replay.pipeline.scoring import match_lists
 from copem_replay.pipeline.world import Transmission
 
 if TYPE_CHECKING:
-    from copem_replay.pipeline.run import ExperimentResult
+    from copem_replay.pipeline.run import StudyTables
 
 
 @dataclass(frozen=True)
@@ -106,19 +106,20 @@ class ShownRun:
     stem: str
 
 
-def select_shown_runs(experiment: Experiment, result: ExperimentResult, log: str) -> tuple[ShownRun, ...]:
+def select_shown_runs(study: StudyTables, log: str) -> tuple[ShownRun, ...]:
     """The runs of a log that are written to MCAP and .rrd, in the order of the experiment; none with `run: null`.
 
     `median` (of an even number the lower), `worst` and `best` go by the time to detection summed over all
     configurations and the measured objects that count (`measure.began`; all where none does), each up to the horizon,
     which never detected counts as; of equal runs the first is taken. Of a log without rows it is the first run.
     """
+    experiment = study.experiment
     asked = experiment.show.asked() if experiment.show is not None else ()
-    rows = result.tables.rows(log)
+    rows = study.rows(log)
     counted = select_counted(rows, experiment.measure.began)
     rows = counted if len(counted) else rows
     return tuple(
-        ShownRun(one, "", stem) if isinstance(one, int) else ShownRun(*_rank_run(rows, result.horizon_s, one), stem)
+        ShownRun(one, "", stem) if isinstance(one, int) else ShownRun(*_rank_run(rows, study.horizon_s, one), stem)
         for one, stem in zip(asked, list_stems(experiment), strict=True)
     )
 

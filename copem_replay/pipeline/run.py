@@ -6,24 +6,29 @@ made of all of them.
 
 from __future__ import annotations
 
+import os
+import tempfile
 import time
+import weakref
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import groupby
 from operator import attrgetter
-from typing import NamedTuple
+from typing import IO, Any, NamedTuple
 
 import pandas as pd
 import pyarrow as pa
 
-from copem_replay.core.errors import is_url
+from copem_replay.core.errors import OutputError, is_url
 from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.accuracy.statistics import AccuracyTotal, join_totals
+from copem_replay.metrics.columns import COMPARED_FILES
+from copem_replay.metrics.detections_table import WAY
 from copem_replay.metrics.metric import OutputTimes, OwnSums
 from copem_replay.metrics.onset import select_counted
 from copem_replay.metrics.summary import add_own_sums, own_sums_by_log, settle_horizon, summarise_tally, tally_rows
@@ -37,15 +42,14 @@ from copem_replay.pipeline.replay import BlockOutcome, cut_blocks, replay_outcom
 from copem_replay.pipeline.study_log import StudyLog
 from copem_replay.pipeline.sweep import SweepPoint, list_points
 from copem_replay.pipeline.tables import (
-    BATCH_ROWS,
-    AccuracyTables,
     PartTables,
-    StudyTables,
     accuracy_tables,
     build_parts,
+    pack_part,
     tabulate_bands,
     tabulate_rows,
     total_over_logs,
+    unpack_part,
 )
 
 # Gather: the parts of all logs, computed or found.
@@ -170,39 +174,152 @@ class Gatherer:
         return pa.concat_tables(rows, promote_options="permissive").to_pandas()
 
 
-@dataclass(frozen=True)
-class ExperimentResult:
-    """The tables, the summary and the notes of one experiment."""
+# The tables of a study.
 
-    tables: StudyTables
-    summary: pd.DataFrame  # summary.csv
-    notes: tuple[str, ...]  # one line each
+HELD_BYTES = 100_000_000
+"""Bytes of parts that are held in memory; further ones are in a temporary file. No result depends on it."""
+BATCH_ROWS, BATCH_BYTES = 100_000, 16_000_000
+"""Rows and bytes that are put together at a time, at least: what is done once per batch then costs nothing."""
+
+
+@dataclass(eq=False, repr=False)
+class StudyTables:
+    """What a study gives: the tables of its results, and what is said beside them.
+
+    Rows come in part by part, in memory or in a file without a name, by log, configuration and runs; `kept`: they are
+    needed again, not only counted. The other tables and the notes are made of all of them. None: not asked for.
+    """
+
+    experiment: Experiment
     logs: tuple[StudyLog, ...]
-    facts: tuple[LogFacts, ...]  # a log each
-    horizon_s: float
-    tally: pd.DataFrame  # tally.parquet
-    exact: pd.DataFrame | None = None  # exact.parquet, with `measure: {exact: true}`
-    bands: pd.DataFrame | None = None  # bands.csv, with `measure: {accuracy: true}`
-    sweep: pd.DataFrame | None = None  # sweep.csv, with `sweep:`
-    costs: tuple[str, ...] = ()  # notes for the terminal alone: no two runs take the same time
+    kept: bool = True
+    counts: dict[str, int] = field(default_factory=dict)
+    """Rows by log, in the order in which logs are added."""
+    tally: pd.DataFrame = field(default_factory=pd.DataFrame)
+    totals: dict[tuple[str, str], AccuracyTotal] = field(default_factory=dict)
+    """Sums of accuracy over all runs, by log and configuration."""
+    own_sums: dict[str, dict[str, OwnSums]] = field(default_factory=dict)
+    """Sums of own metrics."""
+    exact: pd.DataFrame | None = None
+    horizon_s: float = 0.0
+    summary: pd.DataFrame = field(default_factory=pd.DataFrame)
+    bands: pd.DataFrame | None = None
+    sweep: pd.DataFrame | None = None
+    notes: tuple[str, ...] = ()
+    costs: tuple[str, ...] = ()
+    """Notes for the terminal alone: no two runs take the same time."""
+    _parts: dict[str, dict[str, list[Callable[[], PartTables]]]] = field(default_factory=dict)
+    _bytes: int = 0
+    _schema: pa.Schema = field(default_factory=lambda: pa.schema([]))
+    _file: IO[bytes] | None = None
+
+    @property
+    def recordings(self) -> tuple[Recording, ...]:
+        """The recording of each log."""
+        return tuple(log.recording for log in self.logs)
+
+    @cached_property
+    def facts(self) -> tuple[LogFacts, ...]:
+        """What results say of each log beside its rows."""
+        return tuple(log.facts(self.experiment) for log in self.logs)
 
     @property
     def replays(self) -> tuple[Replay, ...]:
         """The logs that are prepared and in memory."""
         return tuple(log.ready for log in self.logs if log.ready is not None)
 
-    @property
-    def table(self) -> pd.DataFrame:
-        """The rows of `detections.parquet`, of all logs."""
-        return self.tables.whole
+    def find_table(self, name: str) -> Any:
+        """A table of pandas or Arrow by the name of its file; None: there is none."""
+        if name in COMPARED_FILES:
+            return self.accuracy.get(name)
+        return self.table if name == "detections.parquet" else getattr(self, name.partition(".")[0])
+
+    def find_log(self, name: str) -> StudyLog:
+        """A log by its name."""
+        return next(log for log in self.logs if log.name == name)
 
     @cached_property
-    def accuracy(self) -> AccuracyTables | None:
-        """The tables of all logs, with `measure: {accuracy: true}`."""
-        return None if self.bands is None else self.accuracy_of(self.tables.parts(), self.table)
+    def _way(self) -> bool:
+        """Whether rows have the columns `WAY`."""
+        alone = {id(one): one for one in (resolve_for_log(self.experiment, log.name) for log in self.logs)}
+        return any(one.has_way(name) for one in alone.values() for name in one.configurations)
 
-    def accuracy_of(self, parts: Iterable[PartTables], rows: pd.DataFrame) -> AccuracyTables:
-        """The accuracy tables of some parts, which have these rows."""
+    def add(self, part: PartTables) -> None:
+        """Add a part: after those of earlier runs, and of earlier logs.
+
+        Raises OutputError: no room on the disk.
+        """
+        self.counts[part.log] = self.counts.get(part.log, 0) + len(part.rows)
+        if self._schema != part.rows.schema:
+            self._schema = pa.unify_schemas([self._schema, part.rows.schema], promote_options="permissive")
+        if not self.kept:
+            return
+        self._bytes += part.size_bytes
+        held = (lambda: part) if self._bytes <= HELD_BYTES else self._store(part)
+        self._parts.setdefault(part.log, {}).setdefault(part.configuration, []).append(held)
+
+    def _store(self, part: PartTables) -> Callable[[], PartTables]:
+        try:
+            if self._file is None:
+                self._file = tempfile.TemporaryFile()  # noqa: SIM115
+                weakref.finalize(self, self._file.close)
+            begin, size = self._file.seek(0, os.SEEK_END), self._file.write(pack_part(part))
+        except OSError as error:
+            place, out = tempfile.gettempdir(), "set TMPDIR to a folder with room"
+            raise OutputError(f"{place}: cannot be written: {error.strerror or error}; {out}") from None
+        file, log, configuration = self._file, part.log, part.configuration
+
+        def read() -> PartTables:
+            file.seek(begin)
+            return unpack_part(file.read(size), log, configuration)
+
+        return read
+
+    def parts(self, log: str | None = None) -> Iterator[PartTables]:
+        """The parts of all logs or of one, by configuration, in order of runs; those in the file are read again."""
+        of_logs = self._parts.values() if log is None else [self._parts.get(log, {})]
+        yield from (part() for of_log in of_logs for parts in of_log.values() for part in parts)
+
+    def batches(self) -> Iterator[tuple[pd.DataFrame, list[PartTables]]]:
+        """Rows of `detections.parquet` with their parts, so many at a time that one batch is in memory."""
+        batch, rows, size = list[PartTables](), 0, 0
+        for part in self.parts():
+            batch.append(part)
+            rows, size = rows + len(part.rows), size + part.size_bytes
+            if rows >= BATCH_ROWS or size >= BATCH_BYTES:
+                yield self.frame(batch), batch
+                batch, rows, size = [], 0, 0
+        if batch:
+            yield self.frame(batch), batch
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """The rows of `detections.parquet` of all logs."""
+        return self.frame(self.parts())
+
+    def rows(self, log: str) -> pd.DataFrame:
+        """The rows of `detections.parquet` of one log."""
+        return self.frame(self.parts(log))
+
+    def frame(self, parts: Iterable[PartTables]) -> pd.DataFrame:
+        """The rows of some parts, with the columns and types that those of all parts have."""
+        frame = pa.concat_tables(
+            [self._schema.empty_table(), *(part.rows for part in parts)], promote_options="permissive"
+        ).to_pandas()
+        if "braking_pass" in frame:
+            frame["braking_pass"] = pd.array(frame["braking_pass"], dtype="boolean")
+        if not self._way:
+            return frame
+        # Columns that only some configurations have come last, in whatever order tables were added.
+        return frame.reindex(columns=[*(name for name in frame if name not in WAY), *WAY])
+
+    @cached_property
+    def accuracy(self) -> dict[str, pa.Table]:
+        """The tables of accuracy by the names of their files; empty: it is not measured."""
+        return {} if self.bands is None else self.accuracy_of(self.parts(), self.table)
+
+    def accuracy_of(self, parts: Iterable[PartTables], rows: pd.DataFrame) -> dict[str, pa.Table]:
+        """The tables of accuracy of some parts, which have these rows."""
         return accuracy_tables(parts, rows, same_instants=all(of.same_instants for of in self.facts))
 
 
@@ -214,7 +331,7 @@ def run_experiment(
     progress: Progress | None = None,
     ready: Sequence[Replay] | None = None,
     parts: PartCache | None = None,
-) -> ExperimentResult:
+) -> StudyTables:
     """Replay logs through an experiment. The result does not depend on `jobs`, nor on how runs are cut into blocks.
 
     `ready`: the logs if they are prepared and checked already. `parts`: where computed parts are kept and found.
@@ -236,66 +353,49 @@ def run_experiment(
             if progress is not None:
                 progress(done, total)
 
-        result = _run_study(experiment, logs, Gatherer(jobs, cost, parts, advance))
-    return replace(result, costs=cost.notes())
+        study = _run_study(experiment, logs, Gatherer(jobs, cost, parts, advance))
+    study.costs = cost.notes()
+    return study
 
 
-def _run_study(experiment: Experiment, logs: Sequence[StudyLog], gatherer: Gatherer) -> ExperimentResult:
-    exact = _compute_exact(logs, experiment, gatherer)
-    sums = _sum_tables(logs, experiment, gatherer, whole=True)
-    horizon_s, horizon_notes = settle_horizon(
-        select_counted(sums.tally, experiment.measure.began), experiment.measure.horizon_s
-    )
-    rows, summary_notes = _summarise(logs, experiment, exact, sums, horizon_s)
-    swept = [_summarise_point(point, logs, gatherer, horizon_s) for point in list_points(experiment)]
-    facts = [log.facts(experiment) for log in logs]
-    oddities = {log.name: of.oddities for log, of in zip(logs, facts, strict=True)}
-    notes = study_notes([log.recording for log in logs], oddities, experiment)
-    return ExperimentResult(
-        sums.tables,
-        rows,
-        (*notes, *horizon_notes, *summary_notes),
-        tuple(logs),
-        tuple(facts),
-        horizon_s,
-        sums.tally,
-        exact=exact,
-        bands=tabulate_bands(sums.totals) if experiment.measure.accuracy and len(experiment.configurations) else None,
-        sweep=pd.concat(swept, ignore_index=True) if swept else None,
-    )
+def _run_study(experiment: Experiment, logs: Sequence[StudyLog], gatherer: Gatherer) -> StudyTables:
+    study = _gather_study(logs, experiment, gatherer, kept=True)
+    measure = experiment.measure
+    study.horizon_s, horizon_notes = settle_horizon(select_counted(study.tally, measure.began), measure.horizon_s)
+    study.summary, summary_notes = _summarise(study, study.horizon_s)
+    swept = [_summarise_point(point, logs, gatherer, study.horizon_s) for point in list_points(experiment)]
+    study.sweep = pd.concat(swept, ignore_index=True) if swept else None
+    if measure.accuracy and len(experiment.configurations):
+        study.bands = tabulate_bands(study.totals)
+    oddities = {log.name: of.oddities for log, of in zip(logs, study.facts, strict=True)}
+    study.notes = (*study_notes(study.recordings, oddities, experiment), *horizon_notes, *summary_notes)
+    return study
 
 
-class _StudySums(NamedTuple):
-    """The tables of all logs, their tally, sums of accuracy by log and configuration, and sums of own metrics."""
-
-    tables: StudyTables
-    tally: pd.DataFrame
-    totals: dict[tuple[str, str], AccuracyTotal]
-    sums: dict[str, dict[str, OwnSums]]
-
-
-def _sum_tables(logs: Sequence[StudyLog], experiment: Experiment, gatherer: Gatherer, *, whole: bool) -> _StudySums:
-    """Gather all logs, one after the other. `whole`: the tables are needed, too."""
-    of_logs = {id(alone): alone for alone in (resolve_for_log(experiment, log.name) for log in logs)}.values()
-    tables = StudyTables(way=any(alone.has_way(name) for alone in of_logs for name in alone.configurations))
-    nodes, sums = dict[tuple[str, str], list[tuple[int, AccuracyTotal]]](), dict[str, dict[str, OwnSums]]()
+def _gather_study(logs: Sequence[StudyLog], experiment: Experiment, gatherer: Gatherer, *, kept: bool) -> StudyTables:
+    """Gather all logs, one after the other, with their tally and sums. `kept`: rows are needed again."""
+    study, measure = StudyTables(experiment, tuple(logs), kept), experiment.measure
+    if measure.exact:
+        study.exact = pd.concat([gatherer.exact(log, experiment) for log in logs], ignore_index=True)
+    nodes = dict[tuple[str, str], list[tuple[int, AccuracyTotal]]]()
     tallies, batch, last = list[pd.DataFrame](), list[PartTables](), logs[-1].name
     for log, parts in groupby(gatherer.each(logs, experiment), key=attrgetter("log")):
         for part in parts:
             batch.append(replace(part, beside=None, runs=None))
-            tables.add(part, counted=not whole)
+            study.add(part)
             if part.total is not None and part.runs is not None:
                 nodes.setdefault((log, part.configuration), []).append((len(part.runs), part.total))
         if log != last and sum(len(part.rows) for part in batch) < BATCH_ROWS:
             continue
-        rows = tables.frame(batch)
+        rows = study.frame(batch)
         batch.clear()
         tallies.append(tally_rows(rows))
-        if experiment.measure.metrics:
-            for _, rows_of_log in select_counted(rows, experiment.measure.began).groupby("log", sort=False):
-                sums = add_own_sums(sums, own_sums_by_log(rows_of_log, experiment.measure.metrics))
-    totals = {key: join_totals(of_log) for key, of_log in nodes.items()}
-    return _StudySums(tables, pd.concat(tallies, ignore_index=True), totals, sums)
+        if measure.metrics:
+            for _, rows_of_log in select_counted(rows, measure.began).groupby("log", sort=False):
+                study.own_sums = add_own_sums(study.own_sums, own_sums_by_log(rows_of_log, measure.metrics))
+    study.totals = {key: join_totals(of_log) for key, of_log in nodes.items()}
+    study.tally = pd.concat(tallies, ignore_index=True)
+    return study
 
 
 def _summarise_point(point: SweepPoint, logs: Sequence[StudyLog], gatherer: Gatherer, horizon_s: float) -> pd.DataFrame:
@@ -303,37 +403,28 @@ def _summarise_point(point: SweepPoint, logs: Sequence[StudyLog], gatherer: Gath
     experiment = point.experiment
     if not point.same_units:
         logs = [StudyLog(log.recording, experiment, log.parts) for log in logs]
-    exact = _compute_exact(logs, experiment, gatherer)
-    sums = _sum_tables(logs, experiment, gatherer, whole=False)
-    rows, _ = _summarise(logs, experiment, exact, sums, horizon_s)
+    rows, _ = _summarise(_gather_study(logs, experiment, gatherer, kept=False), horizon_s)
     rows.insert(0, "sweep", point.sweep)
     rows.insert(1, "value", point.value)
     return rows
 
 
-def _summarise(
-    logs: Sequence[StudyLog], experiment: Experiment, exact: pd.DataFrame | None, sums: _StudySums, horizon_s: float
-) -> tuple[pd.DataFrame, list[str]]:
+def _summarise(study: StudyTables, horizon_s: float) -> tuple[pd.DataFrame, list[str]]:
     """The rows of a summary, and notes about them."""
-    facts, measure, names = [log.facts(experiment) for log in logs], experiment.measure, list(experiment.configurations)
+    experiment, facts, exact = study.experiment, study.facts, study.exact
+    measure, names = experiment.measure, list(experiment.configurations)
     times = {name: join_list_rates(of.times[name] for of in facts if name in of.times) for name in names}
     return summarise_tally(
-        select_counted(sums.tally, measure.began),
+        select_counted(study.tally, measure.began),
         names,
         {name: one.rate_hz for name, one in times.items()},
         horizon_s=horizon_s,
         exact=None if exact is None else select_counted(exact, measure.began),
-        accuracy=total_over_logs(sums.totals),
+        accuracy=total_over_logs(study.totals),
         facts=find_facts(experiment),
         own=measure.metrics,
-        sums=sums.sums,
+        sums=study.own_sums,
         outputs={name: sum((of.outputs[name] for of in facts), OutputTimes()) for name in experiment.outputs},
         conflicts_asked=measure.conflict is not None,
         links={name: one.links for name, one in times.items() if one.links is not None},
     )
-
-
-def _compute_exact(logs: Sequence[StudyLog], experiment: Experiment, gatherer: Gatherer) -> pd.DataFrame | None:
-    if not experiment.measure.exact:
-        return None
-    return pd.concat([gatherer.exact(log, experiment) for log in logs], ignore_index=True)

@@ -12,13 +12,9 @@
 from __future__ import annotations
 
 import json
-import os
-import tempfile
-import weakref
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
-from functools import cached_property
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -26,7 +22,6 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from pyarrow import ipc
 
-from copem_replay.core.errors import OutputError
 from copem_replay.core.files import parse_json
 from copem_replay.core.tracks import Bool, Float, Int
 from copem_replay.metrics.accuracy.statistics import (
@@ -39,7 +34,7 @@ from copem_replay.metrics.accuracy.statistics import (
     AccuracyTotal,
     sum_accuracy,
 )
-from copem_replay.metrics.columns import TABLES, Column
+from copem_replay.metrics.columns import COMPARED_FILES, TABLES
 from copem_replay.metrics.detections_table import WAY, build_frame, concatenate_columns
 
 if TYPE_CHECKING:
@@ -110,18 +105,11 @@ def total_over_logs(of_logs: Mapping[tuple[str, str], AccuracyTotal]) -> dict[st
     return result
 
 
-@dataclass(frozen=True)
-class AccuracyTables:
-    """The tables of accuracy, in the order of `detections`. `instants` has a row per run where runs differ in them."""
+def accuracy_tables(parts: Iterable[PartTables], rows: pd.DataFrame, *, same_instants: bool) -> dict[str, pa.Table]:
+    """The tables of accuracy of some parts by the names of their files; `rows`: those of `detections.parquet`.
 
-    accuracy: pa.Table
-    instants: pa.Table
-    lists: pa.Table
-    thresholds: pa.Table
-
-
-def accuracy_tables(parts: Iterable[PartTables], rows: pd.DataFrame, *, same_instants: bool) -> AccuracyTables:
-    """The tables of accuracy of some parts; `rows`: those of `detections`."""
+    `same_instants`: whether runs do not differ in their instants, which are then those of the first run.
+    """
     parts = list(parts)
     keys = pa.Table.from_pandas(rows[list(_KEYS)], preserve_index=False)
     beside = pa.concat_tables([part.beside for part in parts if part.beside is not None])
@@ -133,8 +121,8 @@ def accuracy_tables(parts: Iterable[PartTables], rows: pd.DataFrame, *, same_ins
     thresholds = keys.take(pa.array(np.repeat(np.arange(len(lengths)), lengths)))
     for column in _STEPS:
         thresholds = thresholds.append_column(column.name, pc.list_flatten(beside[column.name]))
-    lists = runs.drop_columns(list(_INSTANTS))
-    return AccuracyTables(per_list, _build_instants(runs, same_instants), lists, thresholds)
+    instants, lists = _build_instants(runs, same_instants), runs.drop_columns(_INSTANTS)
+    return dict(zip(COMPARED_FILES, (per_list, instants, lists, thresholds), strict=True))
 
 
 def _build_instants(runs: pa.Table, same: bool) -> pa.Table:
@@ -192,18 +180,12 @@ def _band_rows(name: str, by: str, edges: Sequence[float], sums: Any, log: str |
 # The tables of a part.
 
 _KEYS = ("log", "configuration", "run", "object_id", "episode")
-
-
-def _columns_of(name: str, but: Collection[str]) -> list[Column]:
-    return [column for column in TABLES[name].columns if column.name not in but]
-
-
-_LISTS = _columns_of("lists.parquet", ())
-_INSTANTS = tuple(column.name for column in _columns_of("instants.parquet", _KEYS))
-RUNS = pa.schema([(c.name, c.arrow) for c in (*_LISTS, *_columns_of("instants.parquet", _KEYS))])
-_BY_LIST = _columns_of("accuracy.parquet", _KEYS)
-_STEPS = _columns_of("thresholds.parquet", _KEYS)
-BESIDE = pa.schema([*((c.name, c.arrow) for c in _BY_LIST), *((c.name, pa.large_list(c.arrow)) for c in _STEPS)])
+_BY_LIST, _AT, _, _STEPS = (
+    [column for column in TABLES[name].columns if column.name not in _KEYS] for name in COMPARED_FILES
+)
+_INSTANTS = [column.name for column in _AT]
+_RUNS = pa.schema([(column.name, column.arrow) for column in (*TABLES["lists.parquet"].columns, *_AT)])
+_BESIDE = pa.schema([*((c.name, c.arrow) for c in _BY_LIST), *((c.name, pa.large_list(c.arrow)) for c in _STEPS)])
 
 
 @dataclass(frozen=True)
@@ -288,7 +270,7 @@ def _build_beside(outcomes: Sequence[BlockOutcome], name: str) -> pa.Table:
             "detection_s": (count, steps_s),
         }
         parts.append(columns)
-    return pa.table({one.name: _join_column(one.type, [part[one.name] for part in parts]) for one in BESIDE})
+    return pa.table({one.name: _join_column(one.type, [part[one.name] for part in parts]) for one in _BESIDE})
 
 
 def _join_column(kind: pa.DataType, parts: Sequence[Any]) -> pa.Array:
@@ -347,7 +329,7 @@ def _build_runs(outcomes: Sequence[BlockOutcome], name: str) -> pa.Table:
         last = issue_s
         if before is not None and (before is issue_s or np.array_equal(before, issue_s)):
             row |= dict.fromkeys(_INSTANTS)
-    return pa.Table.from_pylist(rows, RUNS)
+    return pa.Table.from_pylist(rows, _RUNS)
 
 
 # Parts as bytes: streams of Arrow, one after the other.
@@ -407,94 +389,3 @@ def _total_from_json(data: dict[str, Any]) -> AccuracyTotal:
 
 def _lists_to_tuples(value: Any) -> Any:
     return tuple(map(_lists_to_tuples, value)) if isinstance(value, list) else value
-
-
-# The tables of a study.
-
-HELD_BYTES = 100_000_000
-"""Bytes of parts that are held in memory; further ones are in a temporary file. No result depends on it."""
-BATCH_ROWS, BATCH_BYTES = 100_000, 16_000_000
-"""Rows and bytes that are put together at a time, at least: what is done once per batch then costs nothing."""
-
-
-class StudyTables:
-    """The tables of a study, part by part, in memory or in a file without a name, by log, configuration and runs.
-
-    `way`: whether rows have the columns `WAY`.
-    """
-
-    def __init__(self, *, way: bool = False) -> None:
-        self.counts: dict[str, int] = {}
-        """Rows by log, in the order in which logs are added."""
-        self._way, self._bytes, self._schema = way, 0, pa.schema([])
-        self._parts: dict[str, dict[str, list[Callable[[], PartTables]]]] = {}
-        self._file: IO[bytes] | None = None
-
-    def add(self, part: PartTables, *, counted: bool = False) -> None:
-        """Add a part: after those of earlier runs, and of earlier logs. `counted`: it is not needed any more.
-
-        Raises OutputError: no room on the disk.
-        """
-        self.counts[part.log] = self.counts.get(part.log, 0) + len(part.rows)
-        if self._schema != part.rows.schema:
-            self._schema = pa.unify_schemas([self._schema, part.rows.schema], promote_options="permissive")
-        if counted:
-            return
-        self._bytes += part.size_bytes
-        held = (lambda: part) if self._bytes <= HELD_BYTES else self._store(part)
-        self._parts.setdefault(part.log, {}).setdefault(part.configuration, []).append(held)
-
-    def _store(self, part: PartTables) -> Callable[[], PartTables]:
-        try:
-            if self._file is None:
-                self._file = tempfile.TemporaryFile()  # noqa: SIM115
-                weakref.finalize(self, self._file.close)
-            begin, size = self._file.seek(0, os.SEEK_END), self._file.write(pack_part(part))
-        except OSError as error:
-            place, out = tempfile.gettempdir(), "set TMPDIR to a folder with room"
-            raise OutputError(f"{place}: cannot be written: {error.strerror or error}; {out}") from None
-        file, log, configuration = self._file, part.log, part.configuration
-
-        def read() -> PartTables:
-            file.seek(begin)
-            return unpack_part(file.read(size), log, configuration)
-
-        return read
-
-    def parts(self, log: str | None = None) -> Iterator[PartTables]:
-        """The parts of all logs or of one, by configuration, in order of runs; those in the file are read again."""
-        of_logs = self._parts.values() if log is None else [self._parts.get(log, {})]
-        yield from (part() for of_log in of_logs for parts in of_log.values() for part in parts)
-
-    def batches(self) -> Iterator[tuple[pd.DataFrame, list[PartTables]]]:
-        """Rows of `detections.parquet` with their parts, so many at a time that one batch is in memory."""
-        batch, rows, size = list[PartTables](), 0, 0
-        for part in self.parts():
-            batch.append(part)
-            rows, size = rows + len(part.rows), size + part.size_bytes
-            if rows >= BATCH_ROWS or size >= BATCH_BYTES:
-                yield self.frame(batch), batch
-                batch, rows, size = [], 0, 0
-        if batch:
-            yield self.frame(batch), batch
-
-    @cached_property
-    def whole(self) -> pd.DataFrame:
-        """The rows of `detections.parquet` of all logs."""
-        return self.frame(self.parts())
-
-    def rows(self, log: str) -> pd.DataFrame:
-        """The rows of `detections.parquet` of one log."""
-        return self.frame(self.parts(log))
-
-    def frame(self, parts: Iterable[PartTables]) -> pd.DataFrame:
-        """The rows of some parts, with the columns and types that those of all parts have."""
-        frame = pa.concat_tables(
-            [self._schema.empty_table(), *(part.rows for part in parts)], promote_options="permissive"
-        ).to_pandas()
-        if "braking_pass" in frame:
-            frame["braking_pass"] = pd.array(frame["braking_pass"], dtype="boolean")
-        if not self._way:
-            return frame
-        # Columns that only some configurations have come last, in whatever order tables were added.
-        return frame.reindex(columns=[*(name for name in frame if name not in WAY), *WAY])

@@ -16,14 +16,14 @@ from typing import Any
 from copem_replay.core.errors import InputError, RemoteFile
 from copem_replay.core.files import parse_json
 from copem_replay.experiment.file import relocate_settings
-from copem_replay.experiment.schema import Experiment, LogSettings
+from copem_replay.experiment.schema import LogSettings
 from copem_replay.experiment.validate import resolve_place
 from copem_replay.io.open import File, first_recording
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.config import Measure
 from copem_replay.pipeline.expansion import ConfigurationFacts, find_facts
 from copem_replay.pipeline.one_run import choose_logs, select_shown_runs
-from copem_replay.pipeline.run import ExperimentResult
+from copem_replay.pipeline.run import StudyTables
 from copem_replay.pipeline.study_log import compute_log_digests
 from copem_replay.results.folder import MARK
 from copem_replay.results.table_files import AGAIN
@@ -122,15 +122,11 @@ def parse_provenance(data: Any, place: Path) -> Provenance:
 
 
 def build_provenance(
-    experiment: Experiment,
-    recordings: Sequence[Recording],
-    result: ExperimentResult,
-    skipped: Sequence[tuple[File, str]],
-    notes: Sequence[str],
+    study: StudyTables, skipped: Sequence[tuple[File, str]], notes: Sequence[str]
 ) -> dict[str, object]:
     """The provenance of results: versions, logs, seed, metric parameters; no clock, no host."""
-    shown_logs = choose_logs(experiment, [log.name for log in result.logs])
-    shown = {log: select_shown_runs(experiment, result, log) for log in shown_logs}
+    experiment = study.experiment
+    shown = {log: select_shown_runs(study, log) for log in choose_logs(experiment, [log.name for log in study.logs])}
     return {
         "format": FORMAT,
         **list_versions(),
@@ -138,13 +134,13 @@ def build_provenance(
         "runs": experiment.runs,
         "logs": [
             {"log": log.name, "topic": log.recording.topic, **{n: log.digests[n] for n in ("sha256", "truth")}}
-            for log in result.logs
+            for log in study.logs
         ],
         "logs_skipped": [{"log": escape_name(path.name), "reason": reason} for path, reason in skipped],
         "visibility": experiment.visibility.label,
         "max_gap_s": experiment.max_gap_s,
         "window_s": experiment.window_s,
-        "measure": experiment.measure.model_dump(mode="json", by_alias=True) | {"horizon_used_s": result.horizon_s},
+        "measure": experiment.measure.model_dump(mode="json", by_alias=True) | {"horizon_used_s": study.horizon_s},
         "braking": experiment.braking and experiment.braking.model_dump(mode="json", by_alias=True),
         "configurations": {name: asdict(of) for name, of in find_facts(experiment).items()},
         "run_shown": {log: runs[0].run for log, runs in shown.items()},

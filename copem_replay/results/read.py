@@ -1,6 +1,6 @@
 """Results: what a run gave, in memory or read back from its folder, for figures, reports, recordings and comparisons.
 
-Comparisons read log by log (`results/log_rows.py`): of a table of any size only the rows of one log are in memory.
+Comparisons read log by log (`results/table_files.py`): of a table of any size only the rows of one log are in memory.
 """
 
 from __future__ import annotations
@@ -9,10 +9,10 @@ import itertools
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pandas as pd
 
@@ -46,16 +46,16 @@ from copem_replay.pipeline.prepare import Replay, prepare_log
 from copem_replay.pipeline.study_log import read_content_digest
 from copem_replay.pipeline.sweep import resolve_sweep
 from copem_replay.results.folder import EXPERIMENT, MARK, check_inputs, check_unchanged, take_place
-from copem_replay.results.provenance import Provenance, parse_provenance, read_provenance
+from copem_replay.results.provenance import Provenance, build_provenance, parse_provenance, read_provenance
 from copem_replay.results.table_files import (
     AGAIN,
     LogRows,
     check_columns,
-    count_rows,
-    find_stretches,
-    log_rows,
     read_csv,
     read_frame,
+    read_log_rows,
+    read_parquet,
+    slice_log_rows,
     table_file,
 )
 
@@ -63,152 +63,14 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from copem_replay.pipeline.expansion import ConfigurationFacts
-    from copem_replay.pipeline.run import ExperimentResult
+    from copem_replay.pipeline.run import StudyTables
     from copem_replay.results.folder import ResultsPlace
     from copem_replay.results.provenance import RecordedLog
     from copem_replay.results.write import Exporter
 
 
-# Where tables come from: a folder, or a run that is in memory.
-
 _MAY_BE_FOLDERS = ("detections.parquet", "tally.parquet")
-
-
-class FolderTables:
-    """The tables of a results folder, by the names of their files; paths in its experiment are relative to `base`.
-
-    A table is read when it is asked for. Raises InputError where it is damaged, or where other results have taken the
-    place of the folder.
-    """
-
-    def __init__(self, place: Path) -> None:
-        self.place, self.base, self._seen = place, place, os.stat(place)
-        self.provenance = read_provenance(place / MARK)
-
-    @cached_property
-    def source(self) -> ExperimentSource:
-        """`experiment.yaml` as plain data."""
-        file = self.place / EXPERIMENT
-        try:
-            source = read_experiment_file(file)
-        except ExperimentError as error:
-            why = error.problems[0].removeprefix(f"{file}:").strip()
-            raise InputError(f"{file}: expected the experiment of the results, found damage: {why}; {AGAIN}") from None
-        self.check_unchanged()
-        return source
-
-    @cached_property
-    def experiment(self) -> Experiment:
-        """The experiment, with components of the user's own."""
-        experiment, problems = parse_experiment(self.source)
-        if experiment is None or problems:
-            raise InputError(problems)
-        return experiment
-
-    def check_unchanged(self) -> None:
-        """Raise InputError where other results have taken the place of the folder."""
-        check_unchanged(self.place, self._seen)
-
-    def has(self, name: str) -> bool:
-        """Whether there is such a table."""
-        return (self.place / name).is_file() or (name in _MAY_BE_FOLDERS and (self.place / name).is_dir())
-
-    def kinds(self, name: str, *, compared: bool = False) -> dict[str, str]:
-        """Kinds of the columns that a table has to have, all or only those that comparisons read."""
-        asked = {"braking": self.provenance.braking, "conflict": self.provenance.measure["conflict"]}
-        return TABLES[name].kinds(*(key for key, of in asked.items() if of is not None), compared=compared)
-
-    def frame(self, name: str) -> pd.DataFrame:
-        """A whole table."""
-
-        def as_frame(place: Path) -> pd.DataFrame:
-            from pyarrow import parquet
-
-            table = parquet.read_table(self._files(place) or place).replace_schema_metadata(None)
-            # Column by column, so that no column is in memory twice.
-            return table.to_pandas(split_blocks=True, self_destruct=True)
-
-        table = read_frame(self.place / name, read_csv if name.endswith(".csv") else as_frame, self.kinds(name))
-        self.check_unchanged()
-        return table
-
-    def rows(self, name: str) -> LogRows:
-        """A table log by log, which has at least the columns that comparisons read."""
-        rows = log_rows(self.place / name, self.kinds(name, compared=True), self._files(self.place / name))
-        self.check_unchanged()
-        return rows
-
-    def _files(self, place: Path) -> list[Path]:
-        """The files of a table that is a folder, in the order of the logs; empty: the table is a file."""
-        if not place.is_dir():
-            return []
-        return [path for log in self.provenance.logs if (path := table_file(place, log.name)).is_file()]
-
-
 _NUMBERS = itertools.count(1)
-
-
-class RunTables:
-    """The tables of a run that is in memory, by the names that their files have. `place`: what it is called."""
-
-    def __init__(self, experiment: Experiment, recordings: tuple[Recording, ...], replayed: ExperimentResult) -> None:
-        self.experiment, self.recordings, self.replayed = experiment, recordings, replayed
-        self.place, self.base = Path(f"run {next(_NUMBERS)}"), Path()
-
-    @cached_property
-    def provenance(self) -> Provenance:
-        """What `provenance.json` says once it is written."""
-        from copem_replay.results.provenance import build_provenance
-
-        data = build_provenance(self.experiment, self.recordings, self.replayed, (), self.replayed.notes)
-        return parse_provenance(data, self.place)
-
-    @cached_property
-    def source(self) -> ExperimentSource:
-        """The experiment as plain data."""
-        return make_plain_source(resolve_sweep(self.experiment).as_written())
-
-    def check_unchanged(self) -> None:
-        """Nothing can take its place."""
-
-    def has(self, name: str) -> bool:
-        """Whether there is such a table."""
-        return self._table(name) is not None
-
-    def frame(self, name: str) -> pd.DataFrame:
-        """A whole table."""
-        table = self._table(name)
-        return table if isinstance(table, pd.DataFrame) else table.to_pandas()
-
-    def rows(self, name: str) -> LogRows:
-        """A table log by log."""
-        import pyarrow as pa
-
-        table = self._table(name)
-        if isinstance(table, pd.DataFrame):
-            table = pa.Table.from_pandas(table, preserve_index=False)
-        table = table.replace_schema_metadata(None)
-        kinds = {column.name: column.kind for column in TABLES[name].columns if column.name in table.column_names}
-
-        where: dict[str, list[pa.Table]] = {}
-        for log, begin, end in find_stretches(table["log"].combine_chunks()) if len(table) else ():
-            where.setdefault(log, []).append(table.slice(begin, end - begin))
-
-        def read(log: str, columns: Sequence[str]) -> list[pa.Table]:
-            return [rows.select(columns) for rows in where.get(log, ())]
-
-        return LogRows(self.place / name, kinds, count_rows(table), table.schema.empty_table(), read)
-
-    def _table(self, name: str) -> Any:
-        """A table of pandas or Arrow; None: there is none."""
-        stem = name.partition(".")[0]
-        if name in COMPARED_FILES:
-            return getattr(self.replayed.accuracy, stem, None)
-        return self.replayed.table if stem == "detections" else getattr(self.replayed, stem)
-
-    def recording(self, log: str) -> Recording:
-        """The recording of a log."""
-        return next(of_log for of_log in self.replayed.logs if of_log.name == log).whole()
 
 
 @dataclass(eq=False, repr=False)
@@ -229,11 +91,18 @@ class Results:
     ('tc016d', 500, True)
     """
 
-    tables: FolderTables | RunTables
     folder: Path | None = None
     """The results folder; None: they are not saved."""
+    study: StudyTables | None = None
+    """What the pipeline gave; None: they were read."""
     exporters: Callable[[str | None], Sequence[Exporter]] | None = None
     """How single runs are written, by the address of a Rerun viewer that also gets them; None: they are written."""
+
+    def __post_init__(self) -> None:
+        self._called = self.folder or Path(f"run {next(_NUMBERS)}")
+        if self.study is None:
+            self._seen = os.stat(self._called)
+            self.__dict__["provenance"] = read_provenance(self._called / MARK)
 
     def __repr__(self) -> str:
         logs, runs = count_noun(len(self.provenance.logs), "log"), count_noun(self.provenance.runs, "run")
@@ -243,41 +112,85 @@ class Results:
     @property
     def place(self) -> Path:
         """The folder, or what results that are not saved are called in messages."""
-        return self.folder or self.tables.place
+        return self.folder or self._called
 
     @property
     def name(self) -> str:
         """The name of the folder, also where it is given as `.`."""
         return self.place.resolve().name
 
-    @property
+    @cached_property
     def provenance(self) -> Provenance:
         """Versions, logs, seed, metric parameters."""
-        return self.tables.provenance
+        assert self.study is not None
+        return parse_provenance(build_provenance(self.study, (), self.study.notes), self.place)
 
-    @property
+    @cached_property
     def source(self) -> ExperimentSource:
         """The experiment as plain data."""
-        return self.tables.source
+        if self.study is not None:
+            return make_plain_source(resolve_sweep(self.experiment).as_written())
+        file = self.place / EXPERIMENT
+        try:
+            source = read_experiment_file(file)
+        except ExperimentError as error:
+            why = error.problems[0].removeprefix(f"{file}:").strip()
+            raise InputError(f"{file}: expected the experiment of the results, found damage: {why}; {AGAIN}") from None
+        self.check_unchanged()
+        return source
 
-    @property
+    @cached_property
     def experiment(self) -> Experiment:
         """The experiment, with components of the user's own."""
-        return self.tables.experiment
-
-    @property
-    def recordings(self) -> tuple[Recording, ...]:
-        """The recordings that were replayed; none of results that were read."""
-        return self.tables.recordings if isinstance(self.tables, RunTables) else ()
-
-    @property
-    def replayed(self) -> ExperimentResult | None:
-        """What the pipeline gave; None of results that were read."""
-        return self.tables.replayed if isinstance(self.tables, RunTables) else None
+        if self.study is not None:
+            return self.study.experiment
+        experiment, problems = parse_experiment(self.source)
+        if experiment is None or problems:
+            raise InputError(problems)
+        return experiment
 
     def check_unchanged(self) -> None:
         """Raise InputError where other results have taken the place of the folder."""
-        self.tables.check_unchanged()
+        if self.study is None:
+            check_unchanged(self.place, self._seen)
+
+    # Tables, by the names of their files.
+
+    def has(self, name: str) -> bool:
+        """Whether there is a table, by the name of its file."""
+        if self.study is not None:
+            return self.study.find_table(name) is not None
+        return _exists(self.place, name)
+
+    def kinds(self, name: str, *, compared: bool = False) -> dict[str, str]:
+        """Kinds of the columns that a table has to have, all or only those that comparisons read."""
+        asked = {"braking": self.provenance.braking, "conflict": self.provenance.measure["conflict"]}
+        return TABLES[name].kinds(*(key for key, of in asked.items() if of is not None), compared=compared)
+
+    def frame(self, name: str) -> pd.DataFrame:
+        """A whole table, by the name of its file. Raises InputError where it is damaged."""
+        if self.study is not None:
+            found = self.study.find_table(name)
+            return found if isinstance(found, pd.DataFrame) else found.to_pandas()
+        reader = read_csv if name.endswith(".csv") else partial(read_parquet, files=self._files(name))
+        table = read_frame(self.place / name, reader, self.kinds(name))
+        self.check_unchanged()
+        return table
+
+    def log_rows(self, name: str) -> LogRows:
+        """A table log by log, which has at least the columns that comparisons read. Raises InputError."""
+        if self.study is not None:
+            return slice_log_rows(self.place / name, self.study.find_table(name))
+        rows = read_log_rows(self.place / name, self.kinds(name, compared=True), self._files(name))
+        self.check_unchanged()
+        return rows
+
+    def _files(self, name: str) -> list[Path]:
+        """The files of a table that is a folder, in the order of the logs; empty: the table is a file."""
+        if not (self.place / name).is_dir():
+            return []
+        files = (table_file(self.place / name, log.name) for log in self.provenance.logs)
+        return [file for file in files if file.is_file()]
 
     def require_folder(self) -> Path:
         """The results folder. Raises InputError for results that are not saved."""
@@ -296,10 +209,10 @@ class Results:
         """
         from copem_replay.results.write import check_own_files
 
-        exporters = self._list_exporters()
+        study, exporters = self._require_study()
         with take_place(Path(folder), overwrite=overwrite) as place:
-            check_inputs(place, [path for recording in self.recordings for path in recording.paths])
-            check_own_files(place, self.experiment, self.recordings, exporters)
+            check_inputs(place, [path for recording in study.recordings for path in recording.paths])
+            check_own_files(place, study.experiment, study.recordings, exporters(None))
             self.fill(place)
         if place.failed:
             raise OutputError(place.failed)
@@ -315,28 +228,27 @@ class Results:
         """
         from copem_replay.results.write import fill_place
 
-        exporters = self._list_exporters(viewer)
-        assert self.replayed is not None
-        notes = fill_place(place, self.experiment, self.recordings, self.replayed, exporters=exporters, skipped=skipped)
+        study, exporters = self._require_study()
+        notes = fill_place(place, study, exporters=exporters(viewer), skipped=skipped)
         self.folder = place.shown
         return notes
 
-    def _list_exporters(self, viewer: str | None = None) -> Sequence[Exporter]:
-        if self.replayed is None or self.exporters is None:
+    def _require_study(self) -> tuple[StudyTables, Callable[[str | None], Sequence[Exporter]]]:
+        if self.study is None or self.exporters is None:
             raise InputError(
                 f"{self.place}: expected results of a run to save, found some that were read from a folder"
             )
-        return self.exporters(viewer)
+        return self.study, self.exporters
 
     @cached_property
     def table(self) -> pd.DataFrame:
         """`detections.parquet` as a whole, for users; figures take `known` or `each`, which hold less in memory."""
-        return self._frame("detections.parquet")
+        return self.frame("detections.parquet")
 
     @cached_property
     def rows(self) -> LogRows:
         """`detections.parquet`, log by log."""
-        return self.tables.rows("detections.parquet")
+        return self.log_rows("detections.parquet")
 
     def each(self, *columns: str, log: str | None = None, every: bool = False) -> Iterator[pd.DataFrame]:
         """Rows that count, or `every` row, log by log or of one log; with `columns`, none named: all but `log`."""
@@ -356,7 +268,7 @@ class Results:
     @cached_property
     def tally(self) -> pd.DataFrame:
         """`tally.parquet`."""
-        return self._frame("tally.parquet")
+        return self.frame("tally.parquet")
 
     @cached_property
     def known(self) -> pd.DataFrame:
@@ -371,7 +283,7 @@ class Results:
     @cached_property
     def summary(self) -> pd.DataFrame:
         """`summary.csv`."""
-        return self._frame("summary.csv")
+        return self.frame("summary.csv")
 
     @cached_property
     def exact(self) -> pd.DataFrame | None:
@@ -422,7 +334,7 @@ class Results:
         ):
             if unknown:
                 raise InputError(f"{rows.place}: expected the {what} of provenance.json, found {min(unknown)!r}")
-        tables = {rows.place.name: rows} | {n: self.tables.rows(n) for n in COMPARED_FILES if self.tables.has(n)}
+        tables = {rows.place.name: rows} | {n: self.log_rows(n) for n in COMPARED_FILES if self.has(n)}
         return {name: of.only(TABLES[name].kinds("braking", "fleet", compared=True)) for name, of in tables.items()}
 
     def rows_of(self, log: str, *names: str) -> dict[str, pa.Table]:
@@ -433,10 +345,11 @@ class Results:
 
     def log_place(self, log: str) -> Place:
         """The place where the recording of a log, or the several that it is made of, are expected."""
+        base = self.place if self.study is None else Path()
         entry = self.experiment.logs[[file.name for file in self.provenance.logs].index(log)]
         if isinstance(entry, str):
-            return RemoteFile(entry) if is_url(entry) else self.tables.base / entry
-        return settings_places(entry, self.tables.base)[0]
+            return RemoteFile(entry) if is_url(entry) else base / entry
+        return settings_places(entry, base)[0]
 
     def log_path(self, log: str) -> File:
         """The file where the recording of a log, or the first of several, is expected."""
@@ -451,10 +364,7 @@ class Results:
         return tuple(dict.fromkeys(configurations)) if configurations else known
 
     def _optional(self, name: str) -> pd.DataFrame | None:
-        return self._frame(name) if self.tables.has(name) else None
-
-    def _frame(self, name: str) -> pd.DataFrame:
-        return self.tables.frame(name)
+        return self.frame(name) if self.has(name) else None
 
 
 def open_results(folder: Path | str, *more: str) -> Results:
@@ -468,15 +378,16 @@ def open_results(folder: Path | str, *more: str) -> Results:
         found = "a file" if folder.exists() else "no such folder"
         raise InputError(f"{folder}: expected a results folder, found {found}; `copem-replay run` writes one")
     _check_exists(folder, MARK, "experiment.yaml", "detections.parquet", *more)
-    return Results(FolderTables(folder), folder)
+    return Results(folder)
+
+
+def _exists(folder: Path, name: str) -> bool:
+    return (folder / name).is_file() or (name in _MAY_BE_FOLDERS and (folder / name).is_dir())
 
 
 def _check_exists(folder: Path, *names: str) -> None:
-    for name in names:
-        if not (folder / name).is_file() and not (name in _MAY_BE_FOLDERS and (folder / name).is_dir()):
-            raise InputError(
-                f"{folder}: expected a results folder, found no {name} in it; `copem-replay run` writes one"
-            )
+    for name in (name for name in names if not _exists(folder, name)):
+        raise InputError(f"{folder}: expected a results folder, found no {name} in it; `copem-replay run` writes one")
 
 
 def read_results(folder: Path | str, *, rowless: bool = False) -> Results:
@@ -489,11 +400,11 @@ def read_results(folder: Path | str, *, rowless: bool = False) -> Results:
 
 def check_complete(results: Results, *, rowless: bool = False) -> Results:
     """The results, with rows checked against the experiment and every other table read. Raises InputError."""
-    if isinstance(results.tables, RunTables):
+    if results.study is not None:
         return results
     _check_exists(results.place, "summary.csv", "tally.parquet")
     experiment, rows = results.experiment, results.rows
-    check_columns(rows.place, results.tables.kinds(rows.place.name), rows.kinds)
+    check_columns(rows.place, results.kinds(rows.place.name), rows.kinds)
     if rows.counts or not rowless:
         _check_rows(rows, experiment)
     tally = results.tally[results.tally["event"] == DETECTED]
@@ -557,8 +468,8 @@ def reread_recording(results: Results, log: str, experiment: Experiment) -> Reco
 
     Raises RecordingError, one line, where the recording is missing or not the one that was replayed.
     """
-    if isinstance(results.tables, RunTables):
-        return results.tables.recording(log)
+    if results.study is not None:
+        return results.study.find_log(log).whole()
     file = next(file for file in results.provenance.logs if file.name == log)
     path, place = results.log_path(log), results.log_place(log)
     try:

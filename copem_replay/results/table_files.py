@@ -38,6 +38,13 @@ def table_file(table: Path, log: str) -> Path:
 # What is read is checked.
 
 
+def read_parquet(path: Path, files: Sequence[Path] = ()) -> pd.DataFrame:
+    """A table from Parquet. `files`: those of a table that is a folder."""
+    table = parquet.read_table(list(files) or path).replace_schema_metadata(None)
+    # Column by column, so that no column is in memory twice.
+    return table.to_pandas(split_blocks=True, self_destruct=True)
+
+
 def read_frame(path: Path, reader: Callable[[Path], pd.DataFrame], kinds: Mapping[str, str]) -> pd.DataFrame:
     """A table with at least these columns. Raises InputError."""
     try:
@@ -138,7 +145,7 @@ class LogRows:
         return replace(self, counts=counts, read=lambda log, names: self.read(before.get(log, log), names))
 
 
-def log_rows(place: Path, kinds: Mapping[str, str], files: Sequence[Path] = ()) -> LogRows:
+def read_log_rows(place: Path, kinds: Mapping[str, str], files: Sequence[Path] = ()) -> LogRows:
     """A table in a file, which has at least columns of these kinds. `files`: those of a table that is a folder.
 
     Raises InputError where the table cannot be read, lacks a column, or has one of another kind.
@@ -161,8 +168,8 @@ def log_rows(place: Path, kinds: Mapping[str, str], files: Sequence[Path] = ()) 
                 group = file.read_row_group(k, names).unify_dictionaries()
             for name in names:
                 check_text(place, name, group[name])
-            counts.update(count_rows(group))
-            for log, begin, end in find_stretches(group["log"].combine_chunks()):
+            counts.update(_count_rows(group))
+            for log, begin, end in _find_stretches(group["log"].combine_chunks()):
                 where.setdefault(log, []).append((path, k, begin, end))
     last: dict[tuple[object, ...], pa.Table] = {}
 
@@ -180,7 +187,23 @@ def log_rows(place: Path, kinds: Mapping[str, str], files: Sequence[Path] = ()) 
     return LogRows(place, kinds, counts, schema.empty_table(), read)
 
 
-def count_rows(table: pa.Table) -> dict[tuple[str, str], int]:
+def slice_log_rows(place: Path, table: Any) -> LogRows:
+    """A table in memory, of pandas or Arrow, log by log. `place`: what it is called."""
+    if isinstance(table, pd.DataFrame):
+        table = pa.Table.from_pandas(table, preserve_index=False)
+    table = table.replace_schema_metadata(None)
+    kinds = {column.name: column.kind for column in TABLES[place.name].columns if column.name in table.column_names}
+    where: dict[str, list[pa.Table]] = {}
+    for log, begin, end in _find_stretches(table["log"].combine_chunks()) if len(table) else ():
+        where.setdefault(log, []).append(table.slice(begin, end - begin))
+
+    def read(log: str, columns: Sequence[str]) -> list[pa.Table]:
+        return [rows.select(columns) for rows in where.get(log, ())]
+
+    return LogRows(place, kinds, _count_rows(table), table.schema.empty_table(), read)
+
+
+def _count_rows(table: pa.Table) -> dict[tuple[str, str], int]:
     """Rows by log and configuration."""
     keys = ["log", "configuration"]
     sizes = table.group_by(keys, use_threads=False).aggregate([([], "count_all")]).to_pydict()
@@ -200,7 +223,7 @@ def _report_damage(place: Path) -> Iterator[None]:
         raise InputError(f"{place}: expected a table that can be read, found damage: {why}; {AGAIN}") from None
 
 
-def find_stretches(names: pa.Array) -> Iterator[tuple[str, int, int]]:
+def _find_stretches(names: pa.Array) -> Iterator[tuple[str, int, int]]:
     """Stretches of equal names: name, first row, row after the last."""
     column = names if pa.types.is_dictionary(names.type) else names.dictionary_encode()
     name_ix, distinct = column.indices.to_numpy(), column.dictionary.to_pylist()

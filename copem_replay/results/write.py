@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from copem_replay.core.colours import configuration_colours
-from copem_replay.core.errors import OutputError, RecordingError
+from copem_replay.core.errors import RecordingError
 from copem_replay.core.files import portable_name
 from copem_replay.core.yaml import dump_yaml
 from copem_replay.experiment.drive import resolve_for_log
@@ -44,9 +44,9 @@ from copem_replay.pipeline.one_run import (
     replay_run,
     select_shown_runs,
 )
-from copem_replay.pipeline.run import ExperimentResult
+from copem_replay.pipeline.run import StudyTables
 from copem_replay.pipeline.sweep import list_points, resolve_sweep
-from copem_replay.results.folder import EXPERIMENT, MARK, ResultsPlace, check_inputs, check_names, take_place
+from copem_replay.results.folder import EXPERIMENT, MARK, ResultsPlace, check_names
 from copem_replay.results.provenance import build_provenance, escape_name, log_entries, recording_name
 from copem_replay.results.table_files import MANY_ROWS, TableFile, table_file, write_csv, write_parquet
 from copem_replay.results.truth_scene import draw_truth
@@ -125,53 +125,29 @@ MCAP = Exporter(".mcap", _write_mcap)
 """The recording with the fused lists added, as MCAP."""
 
 
-def write_results(
-    folder: Path,
-    experiment: Experiment,
-    recordings: Sequence[Recording],
-    result: ExperimentResult,
-    *,
-    exporters: Sequence[Exporter],
-    skipped: Sequence[tuple[File, str]] = (),
-    overwrite: bool = False,
-) -> list[str]:
-    """Write the results folder. Returns notes for the user. Raises OutputError, also where only exporters failed.
-
-    `exporters`: each writes every shown run (`show` in the experiment) as a file, `MCAP` and `RRD` for instance.
-    `skipped`: recordings that are left out, and why.
-    """
-    with take_place(folder, overwrite=overwrite) as place:
-        check_inputs(place, [path for recording in recordings for path in recording.paths])
-        check_own_files(place, experiment, recordings, exporters)
-        notes = fill_place(place, experiment, recordings, result, exporters=exporters, skipped=skipped)
-    if place.failed:
-        raise OutputError(place.failed)
-    return place.notes + notes
-
-
 def fill_place(
     place: ResultsPlace,
-    experiment: Experiment,
-    recordings: Sequence[Recording],
-    result: ExperimentResult,
+    study: StudyTables,
     *,
     exporters: Sequence[Exporter],
     skipped: Sequence[tuple[File, str]] = (),
 ) -> list[str]:
     """Write results into a place that is locked. Returns notes for the user. Raises OutputError.
 
-    The place's `folder` and `notes` may change; `failed` has the exporters' files that could not be written.
+    `exporters`: each writes every shown run (`show` in the experiment) as a file. `skipped`: recordings that are left
+    out, and why. The place's `folder` and `notes` may change; `failed` has the exporters' files that could not be
+    written.
     """
-    tables = _table_files("detections.parquet", result.tables.counts)
-    tables += _table_files("tally.parquet", dict(result.tally["log"].value_counts(sort=False)))
-    files = list_results(experiment, recordings, exporters, tables)
+    tables = _table_files("detections.parquet", study.counts)
+    tables += _table_files("tally.parquet", dict(study.tally["log"].value_counts(sort=False)))
+    files = list_results(study.experiment, study.recordings, exporters, tables)
     try:
         place.will_hold(files)
-        _write_files(place, experiment, recordings, result)
-        notes = [*result.notes, *_export(place, experiment, recordings, result, exporters)]
+        _write_files(place, study)
+        notes = [*study.notes, *_export(place, study, exporters)]
         files = [name for name in files if name not in place.left_out]
-        write_csv(_logs_table(place.folder, result, skipped), place.new / "logs.csv")
-        provenance = build_provenance(experiment, recordings, result, skipped, notes) | {"files": files}
+        write_csv(_logs_table(place.folder, study, skipped), place.new / "logs.csv")
+        provenance = build_provenance(study, skipped, notes) | {"files": files}
         (place.new / MARK).write_text(json.dumps(provenance, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
         place.finish(files)
     except OSError as error:
@@ -215,51 +191,43 @@ def _table_files(name: str, counts: Mapping[str, int]) -> list[str]:
     return [table_file(Path(name), log).as_posix() for log, count in counts.items() if count]
 
 
-def _place_stem(stem: str, log: str, recordings: Sequence[Recording]) -> str:
+def _place_stem(stem: str, log: str, logs: Sequence[object]) -> str:
     """The name of a shown run's files, relative to the folder, without suffix."""
-    return stem if len(recordings) == 1 else f"{stem}/{portable_name(log)}"
+    return stem if len(logs) == 1 else f"{stem}/{portable_name(log)}"
 
 
-def _write_files(
-    place: ResultsPlace, experiment: Experiment, recordings: Sequence[Recording], result: ExperimentResult
-) -> None:
+def _write_files(place: ResultsPlace, study: StudyTables) -> None:
     """Write the experiment and all tables except `logs.csv`."""
+    experiment = study.experiment
     data, scratch = resolve_sweep(experiment).as_written(), place.new
-    data["logs"] = log_entries(experiment.logs, recordings, place.folder)
+    data["logs"] = log_entries(experiment.logs, study.recordings, place.folder)
     for latency in _find_recorded_latencies(data):
         latency["file"] = os.path.relpath(latency["file"], place.folder)
     (scratch / EXPERIMENT).write_text(dump_yaml(data), encoding="utf-8")
-    _write_rows(result, scratch)
-    write_csv(result.summary, scratch / "summary.csv")
-    if result.exact is not None:
-        write_parquet(result.exact, scratch / "exact.parquet")
-    if result.bands is not None:
-        write_csv(result.bands, scratch / "bands.csv")
-    if result.sweep is not None:
-        write_csv(result.sweep, scratch / "sweep.csv")
+    _write_rows(study, scratch)
+    write_csv(study.summary, scratch / "summary.csv")
+    if study.exact is not None:
+        write_parquet(study.exact, scratch / "exact.parquet")
+    for name, table in (("bands.csv", study.bands), ("sweep.csv", study.sweep)):
+        if table is not None:
+            write_csv(table, scratch / name)
 
 
-def _export(
-    place: ResultsPlace,
-    experiment: Experiment,
-    recordings: Sequence[Recording],
-    result: ExperimentResult,
-    exporters: Sequence[Exporter],
-) -> list[str]:
+def _export(place: ResultsPlace, study: StudyTables, exporters: Sequence[Exporter]) -> list[str]:
     """Write the shown runs. Returns notes for the user; files that cannot be written go to the place's `failed`."""
     notes: list[str] = []
-    for log in choose_logs(experiment, [one.name for one in result.logs]) if exporters else ():
-        for shown in select_shown_runs(experiment, result, log):
-            stem, shown_count = _place_stem(shown.stem, log, recordings), len(experiment.shown())
+    for log in choose_logs(study.experiment, [one.name for one in study.logs]) if exporters else ():
+        for shown in select_shown_runs(study, log):
+            stem, shown_count = _place_stem(shown.stem, log, study.logs), len(study.experiment.shown())
             files = [exporter.files(stem, shown_count) for exporter in exporters]
             with place.may_fail([name for names in files for name in names]):
-                run = _make_run_to_export(log, shown, experiment, result)
+                run = _make_run_to_export(log, shown, study)
                 (place.new / stem).parent.mkdir(parents=True, exist_ok=True)
                 for exporter, names in zip(exporters, files, strict=True):
                     with place.may_fail(names):
                         lines = exporter.write(place.new / f"{stem}{exporter.suffix}", run)
                         notes += [f"{log}: {line}" for line in lines if f"{log}: {line}" not in notes]
-        next(replayed for replayed in result.logs if replayed.name == log).drop()
+        study.find_log(log).drop()
     return notes
 
 
@@ -271,7 +239,7 @@ def _find_recorded_latencies(data: dict[str, Any]) -> list[dict[str, Any]]:
     return [replayed for replayed in latencies if isinstance(replayed, dict) and replayed.get("kind") == "recorded"]
 
 
-def _logs_table(folder: Path, result: ExperimentResult, skipped: Sequence[tuple[File, str]]) -> pd.DataFrame:
+def _logs_table(folder: Path, study: StudyTables, skipped: Sequence[tuple[File, str]]) -> pd.DataFrame:
     """The rows of `logs.csv`: the replayed logs and the skipped recordings."""
     rows = [
         {
@@ -281,10 +249,10 @@ def _logs_table(folder: Path, result: ExperimentResult, skipped: Sequence[tuple[
             ),
             "sha256": log.digests["sha256"],
             "episodes": facts.episodes,
-            "rows": result.tables.counts[log.name],
+            "rows": study.counts[log.name],
             "state": "done",
         }
-        for log, facts in zip(result.logs, result.facts, strict=True)
+        for log, facts in zip(study.logs, study.facts, strict=True)
     ]
     rows += [
         {
@@ -298,14 +266,14 @@ def _logs_table(folder: Path, result: ExperimentResult, skipped: Sequence[tuple[
     return TABLES["logs.csv"].frame(rows)
 
 
-def _make_run_to_export(log: str, shown: ShownRun, experiment: Experiment, result: ExperimentResult) -> RunToExport:
+def _make_run_to_export(log: str, shown: ShownRun, study: StudyTables) -> RunToExport:
     """One run of one log, in the configurations that the experiment shows."""
-    study_log = next(replayed for replayed in result.logs if replayed.name == log)
+    study_log = study.find_log(log)
     replay, recording = study_log.replay(), study_log.whole()
-    experiment = resolve_for_log(experiment, log)
+    experiment = resolve_for_log(study.experiment, log)
     shown_experiment = experiment.model_copy(update={"configurations": experiment.shown()})
     names = list(shown_experiment.configurations)
-    rows = result.tables.rows(log)
+    rows = study.rows(log)
     manifest = {
         "copem_replay": version("copem-replay"),
         "experiment": dump_yaml(resolve_sweep(experiment).as_written() | {"logs": [recording.path.name]}),
@@ -319,12 +287,12 @@ def _make_run_to_export(log: str, shown: ShownRun, experiment: Experiment, resul
         replay_run(recording, shown_experiment, shown.run, replay),
         experiment.configurations,
         first_episodes(rows[(rows["run"] == shown.run) & rows["configuration"].isin(names)]),
-        result.summary[result.summary["configuration"].isin(names)],
+        study.summary[study.summary["configuration"].isin(names)],
         manifest,
     )
 
 
-def _write_rows(result: ExperimentResult, scratch: Path) -> None:
+def _write_rows(study: StudyTables, scratch: Path) -> None:
     """Write the tables of rows, part by part as they are in memory, and the tally."""
     with ExitStack() as open_files:
         files: dict[str | Path, TableFile] = {}
@@ -335,18 +303,17 @@ def _write_rows(result: ExperimentResult, scratch: Path) -> None:
                 files[name] = open_files.enter_context(TableFile(scratch / name))
             files[name].add(table)
 
-        many = sum(result.tables.counts.values()) > MANY_ROWS
-        for rows, parts in result.tables.batches():
+        many = sum(study.counts.values()) > MANY_ROWS
+        for rows, parts in study.batches():
             for log, of_log in rows.groupby("log", sort=False) if many else [("", rows)]:
                 add("detections.parquet" if not many else table_file(Path("detections.parquet"), str(log)), of_log)
-            if result.bands is not None:
-                accuracy = result.accuracy_of(parts, rows)
-                for name in COMPARED_FILES:
-                    add(name, getattr(accuracy, name.partition(".")[0]))
+            if study.bands is not None:
+                for name, table in study.accuracy_of(parts, rows).items():
+                    add(name, table)
     return_memory()
-    if len(result.tally) <= MANY_ROWS:
-        write_parquet(result.tally, scratch / "tally.parquet")
+    if len(study.tally) <= MANY_ROWS:
+        write_parquet(study.tally, scratch / "tally.parquet")
     else:
         (scratch / "tally.parquet").mkdir()
-        for log, rows in result.tally.groupby("log", sort=False):
+        for log, rows in study.tally.groupby("log", sort=False):
             write_parquet(rows, table_file(scratch / "tally.parquet", str(log)))

@@ -21,7 +21,7 @@ from copem_replay.experiment.schema import Experiment
 from copem_replay.perception.observation import Observations
 from copem_replay.pipeline.one_run import share_curves
 from copem_replay.pipeline.prepare import Replay
-from copem_replay.results.write import MCAP, Exporter, RunToExport
+from copem_replay.results.write import Exporter, RunToExport
 from copem_replay.viewer import boxes, curves, lanes, sensors
 from copem_replay.viewer.blueprint import NEAR_BY, RecordingContent, build_blueprint, view_aspect, write_legend_bars
 from copem_replay.viewer.camera import camera_above, camera_following, camera_on_object, write_camera_origin
@@ -329,10 +329,6 @@ def make_rrd_exporter(viewer: str | None) -> Exporter:
 def _list_file_names(stem: str, configurations: int) -> list[str]:
     path = Path(f"{stem}.rrd")
     return [part.path(path).as_posix() for part in split_into_files([str(k) for k in range(configurations)])]
-
-
-EXPORTERS = (MCAP, make_rrd_exporter(None))
-"""Exporters of the files that `copem-replay run` writes of a shown run."""
 
 
 # Fused tracks of a few objects over a whole log of any length: their rows of all time chunks, joined.

@@ -14,7 +14,7 @@ from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import Float
 from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline import prepare as chunking
-from copem_replay.pipeline.run import ExperimentResult, run_experiment
+from copem_replay.pipeline.run import StudyTables, run_experiment
 from copem_replay.pipeline.sweep import describe_unswept, list_points
 from copem_replay.report import write_html_report
 from tests.helpers import scenes
@@ -65,7 +65,7 @@ def linked(link: dict[str, Any], **changes: Any) -> Experiment:
     return experiment(configurations={"PEM": {"units": ["ego"], "link": link}}, **changes)
 
 
-def outcome(plan: Experiment) -> ExperimentResult:
+def outcome(plan: Experiment) -> StudyTables:
     return run_experiment(plan, [scenes.oncoming_car()])
 
 

@@ -1,17 +1,25 @@
-"""Single steps of a replay: what units list, what is sent and received, and what receivers issue, in some runs."""
+"""Single steps of a replay: what units list, what is sent and received, and what receivers issue, in some runs.
+
+The last step: what a study gave, saved.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
+from copem_replay.api.run import list_exporters
 from copem_replay.core.tracks import Int, TimeChunk
 from copem_replay.experiment.schema import Experiment
+from copem_replay.io.recording import Recording
 from copem_replay.pipeline.expansion import RunGroup
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.receiver import ReceiverOutput, Receivers
+from copem_replay.pipeline.run import run_experiment
 from copem_replay.pipeline.world import Transmission, WorldChunk
+from copem_replay.results.read import Results
 
 
 def transmitted(replay: Replay, plan: Experiment, runs: Sequence[int] | Int = (0,), **how: bool) -> Transmission:
@@ -30,3 +38,12 @@ def outputs_of(replay: Replay, plan: Experiment, runs: Sequence[int] | Int = (0,
     lists = transmitted(replay, plan, runs)
     receivers, world = Receivers(lists), lists.world(TimeChunk(), -np.inf)
     return {name: receivers.fuse(world, name) for name in plan.configurations}
+
+
+def save_run(
+    folder: Path, plan: Experiment, recordings: Sequence[Recording], *, replays: bool = True, overwrite: bool = False
+) -> Path:
+    """The results folder of an experiment that is run; `replays`: with the files of the runs that are shown."""
+    exporters = list_exporters if replays else lambda _: ()
+    study = run_experiment(plan, recordings)
+    return Results(study=study, exporters=exporters).save(folder, overwrite=overwrite)

@@ -18,12 +18,10 @@ import pandas as pd
 from copem_replay.experiment.file import log_paths, read_experiment_file
 from copem_replay.experiment.validate import find_problems, read_logs
 from copem_replay.metrics.summary import tally_rows
-from copem_replay.pipeline.run import run_experiment
 from copem_replay.results.read import Results, read_results
 from copem_replay.results.table_files import write_parquet
-from copem_replay.results.write import write_results
-from copem_replay.viewer.rrd import EXPORTERS
 from tests.helpers.recordings import Obj, pedestrian, write_recording
+from tests.helpers.replays import save_run
 
 TEXT = """\
 version: 1
@@ -91,9 +89,7 @@ def replayed(place: Path, text: str = TEXT, *logs: str) -> Path:
     assert experiment is not None, found
     recordings, refused = read_logs(experiment, log_paths(source)[0], source)
     assert not refused + found
-    write_results(
-        place / "results", experiment, recordings, run_experiment(experiment, recordings), exporters=EXPORTERS
-    )
+    save_run(place / "results", experiment, recordings)
     return place / "results"
 
 

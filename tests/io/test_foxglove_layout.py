@@ -16,11 +16,9 @@ from copem_replay.core.errors import InputError
 from copem_replay.experiment.file import log_paths, read_experiment_file
 from copem_replay.experiment.validate import find_problems, read_logs
 from copem_replay.io.write.foxglove_layout import build_layout, split_panels
-from copem_replay.pipeline.run import run_experiment
 from copem_replay.results.folder import read_made_names
-from copem_replay.results.write import write_results
-from copem_replay.viewer.rrd import EXPORTERS
 from tests.helpers import experiments
+from tests.helpers.replays import save_run
 from tests.io.test_write_ros2 import EXPERIMENT, drive
 
 ROOT = Path(__file__).parents[2]
@@ -36,7 +34,7 @@ def replay(tmp_path_factory: pytest.TempPathFactory) -> Path:
     once = experiment.model_copy(update={"runs": 1})
     recordings, _ = read_logs(once, log_paths(source)[0], source)
     folder = tmp_path_factory.mktemp("layout") / "tc016d"
-    write_results(folder, once, recordings, run_experiment(once, recordings), exporters=EXPORTERS)
+    save_run(folder, once, recordings)
     return folder / "replay.mcap"
 
 
@@ -170,7 +168,7 @@ def test_a_replay_of_a_ros_2_recording(tmp_path: Path) -> None:
     experiment, wrong = find_problems(source)
     assert experiment is not None, wrong
     recordings, _ = read_logs(experiment, log_paths(source)[0], source)
-    write_results(tmp_path / "out", experiment, recordings, run_experiment(experiment, recordings), exporters=EXPORTERS)
+    save_run(tmp_path / "out", experiment, recordings)
     layout = build_layout(tmp_path / "out/replay.mcap")
     panels = panels_of(layout, "3D!").values()
     assert [panel["foxglovePanelTitle"] for panel in panels] == ["GT", "PEM", "coPEM", "gnn"]

@@ -21,7 +21,7 @@ from copem_replay.experiment.validate import read_logs
 from copem_replay.io.recording import Recording
 from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.receiver import ReceiverOutput
-from copem_replay.pipeline.run import ExperimentResult, run_experiment
+from copem_replay.pipeline.run import StudyTables, run_experiment
 from tests.helpers.recordings import CAR, PEDESTRIAN, SHARED, VEHICLE, Obj, Topic, ns, write_recording
 from tests.helpers.replays import outputs_of
 
@@ -90,7 +90,7 @@ def refused(path: Path, **changes: Any) -> str:
     return found.reason
 
 
-def replayed(path: Path, **changes: Any) -> ExperimentResult:
+def replayed(path: Path, **changes: Any) -> StudyTables:
     return run_experiment(plan_of(path, **changes), [read(path, **changes)])
 
 
@@ -99,11 +99,11 @@ def told(path: Path, **changes: Any) -> dict[str, ReceiverOutput]:
     return outputs_of(prepare_log(read(path, **changes), plan), plan, np.arange(2))
 
 
-def figure(result: ExperimentResult, name: str, configuration: str = "union") -> float:
+def figure(result: StudyTables, name: str, configuration: str = "union") -> float:
     return float(result.summary.set_index("configuration").loc[configuration, name])
 
 
-def row(result: ExperimentResult, configuration: str) -> pd.Series:
+def row(result: StudyTables, configuration: str) -> pd.Series:
     """Of the other car."""
     return result.table[result.table["object_id"] == "2"].set_index("configuration").loc[configuration]
 

@@ -29,10 +29,8 @@ from copem_replay.io.write.ros2 import LABELS
 from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import Replay, prepare_log
 from copem_replay.pipeline.replay import replay_block
-from copem_replay.pipeline.run import run_experiment
-from copem_replay.results.write import write_results
-from copem_replay.viewer.rrd import EXPORTERS
 from tests.helpers.recordings import SHARED, Obj, ns, write_recording
+from tests.helpers.replays import save_run
 
 TRACKED = """\
 std_msgs/Header header
@@ -404,9 +402,7 @@ def folder_of(path: Path) -> tuple[Recording, Path]:
     experiment, found = find_problems(source)
     assert experiment is not None, found
     recordings = read_logs(experiment, log_paths(source)[0], source)[0]
-    write_results(
-        path.parent / "out", experiment, recordings, run_experiment(experiment, recordings), exporters=EXPORTERS
-    )
+    save_run(path.parent / "out", experiment, recordings)
     return recordings[0], path.parent / "out" / "replay.mcap"
 
 

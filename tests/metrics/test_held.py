@@ -25,9 +25,8 @@ from copem_replay.metrics.accuracy.held import (
 from copem_replay.metrics.accuracy.statistics import AccuracySettings
 from copem_replay.metrics.episodes import Reference
 from copem_replay.metrics.matching import Matches, match_entries
-from copem_replay.pipeline.run import run_experiment
 from copem_replay.results.compare import Comparison, compare_folders
-from copem_replay.results.write import write_results
+from tests.helpers.replays import save_run
 from tests.helpers.reports import between, chunks, entry, lists_of
 from tests.helpers.reports import joined as one_list
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
@@ -262,7 +261,7 @@ def compared(path: Path, things: Sequence[Thing], configurations: dict[str, Any]
         measure={"onset": {"kind": "appears"}, "match": {"gate_m": 3.0}}, **more,
     )  # fmt: skip
     recordings = [replace(log, path=path / "scene.mcap")]
-    write_results(path / "out", plan, recordings, run_experiment(plan, recordings), exporters=())
+    save_run(path / "out", plan, recordings, replays=False)
     return compare_folders([path / "out"], baseline="ideal")
 
 

@@ -84,8 +84,8 @@ class TestOutages:
         result = run_experiment(plan, [alone(10.0)])
         rates = result.summary["list_rate_hz"]
         assert (rates < 9.9).all()
-        assert result.accuracy is not None
-        instants, lists = (table.to_pandas() for table in (result.accuracy.instants, result.accuracy.lists))
+        assert result.accuracy
+        instants, lists = (result.accuracy[name].to_pandas() for name in ("instants.parquet", "lists.parquet"))
         assert instants["run"].tolist() == lists["run"].tolist()  # each run has its own
         assert instants["available_s"].map(len).tolist() == lists["lists"].tolist()
 

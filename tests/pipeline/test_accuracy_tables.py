@@ -6,15 +6,15 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 import pytest
 
 from copem_replay.io.recording import Recording
 from copem_replay.pipeline import replay as blocks_module
 from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import prepare_log
-from copem_replay.pipeline.run import ExperimentResult, run_experiment
+from copem_replay.pipeline.run import StudyTables, run_experiment
 from copem_replay.pipeline.scoring import DISTANCE_EDGES_M, EXISTENCE_THRESHOLDS
-from copem_replay.pipeline.tables import AccuracyTables
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
 
 KEYS = ["log", "configuration", "run", "object_id"]
@@ -49,7 +49,7 @@ def street(name: str, speed_mps: float) -> Recording:
 
 
 @pytest.fixture(scope="module")
-def result() -> ExperimentResult:
+def result() -> StudyTables:
     """Everything that can happen to a list: misses, errors, stale entries, who is looked at from some instant on."""
     plan = experiment(
         runs=5,
@@ -61,17 +61,17 @@ def result() -> ExperimentResult:
     return run_experiment(plan, [street("one", 10), street("two", 25)], jobs=2)
 
 
-def tables(of: ExperimentResult) -> AccuracyTables:
-    assert of.accuracy is not None
+def tables(of: StudyTables) -> dict[str, pa.Table]:
+    assert of.accuracy
     return of.accuracy
 
 
-def rows(of: ExperimentResult, configuration: str, name: str = "accuracy") -> pd.DataFrame:
-    table = of.bands if name == "bands" else getattr(tables(of), name).to_pandas()
+def rows(of: StudyTables, configuration: str, name: str = "accuracy") -> pd.DataFrame:
+    table = of.bands if name == "bands" else tables(of)[f"{name}.parquet"].to_pandas()
     return table[table["configuration"] == configuration]
 
 
-def figures(of: ExperimentResult, configuration: str) -> pd.Series:
+def figures(of: StudyTables, configuration: str) -> pd.Series:
     return of.summary.set_index("configuration").loc[configuration]
 
 
@@ -81,9 +81,9 @@ def values(column: pd.Series) -> Any:
 
 
 class TestTheSame:
-    def test_rows_are_those_of_detections(self, result: ExperimentResult) -> None:
+    def test_rows_are_those_of_detections(self, result: StudyTables) -> None:
         for name in ("accuracy", "detections"):
-            table = result.table if name == "detections" else tables(result).accuracy.to_pandas()  # type: ignore[union-attr]
+            table = result.table if name == "detections" else tables(result)["accuracy.parquet"].to_pandas()
             expected = [
                 (log, c, s, o)
                 for log in ("one", "two")
@@ -93,10 +93,9 @@ class TestTheSame:
             ]
             assert list(table[KEYS].itertuples(index=False, name=None)) == expected
 
-    def test_lists_of_a_stay(self, result: ExperimentResult) -> None:
+    def test_lists_of_a_stay(self, result: StudyTables) -> None:
         """From the first instant the object is in the log, whatever its onset, to the end of the look."""
-        instants = tables(result).instants
-        assert instants is not None
+        instants = tables(result)["instants.parquet"]
         available_s = instants.to_pandas().set_index(["log", "configuration"])["available_s"]
         since_s = {"in": 0.0, "parked": 0.0, "late": 0.7}
         ended_s = result.table["ended_s"]
@@ -113,7 +112,7 @@ class TestTheSame:
                 looked = ~np.isnan(np.asarray(one.gospa_m2, dtype=float))
                 assert (looked == (times_s[first:last] > onset_s - 1e-6)).all()
 
-    def test_errors_and_gospa_are_those_of_the_summary(self, result: ExperimentResult) -> None:
+    def test_errors_and_gospa_are_those_of_the_summary(self, result: StudyTables) -> None:
         for name in NAMES:
             found, table = figures(result, name), rows(result, name)
             error_m = values(table["error_m"])
@@ -129,7 +128,7 @@ class TestTheSame:
             assert np.hypot(np.hypot(*parts[:2]), parts[2]) == pytest.approx(found["gospa_m"])
             assert len(looked) > 100
 
-    def test_columns_of_detections(self, result: ExperimentResult) -> None:
+    def test_columns_of_detections(self, result: StudyTables) -> None:
         for name in NAMES:
             table = result.table[result.table["configuration"] == name]
             errors = [np.asarray(one, dtype=float) for one in rows(result, name)["error_m"]]
@@ -142,7 +141,7 @@ class TestTheSame:
             bias_m = (table["bias_east_m"].fillna(0) * count).sum() / count.sum()
             assert bias_m == pytest.approx(figures(result, name)["bias_east_m"])
 
-    def test_ghosts(self, result: ExperimentResult) -> None:
+    def test_ghosts(self, result: StudyTables) -> None:
         some = 0
         for name in NAMES:
             table, found = rows(result, name, "lists"), figures(result, name)
@@ -163,7 +162,7 @@ class TestTheSame:
             some += table["ghosts"].sum()
         assert some > 100
 
-    def test_thresholds(self, result: ExperimentResult) -> None:
+    def test_thresholds(self, result: StudyTables) -> None:
         """By match, for ideal fusion and the truth too, which are detected by truth id and so at least as soon."""
         for name in NAMES:
             steps = rows(result, name, "thresholds")
@@ -179,7 +178,7 @@ class TestTheSame:
                 assert (np.diff(part["detection_s"]) > 0).all()
         assert len(rows(result, "union", "thresholds")) > rows(result, "union", "thresholds").groupby(KEYS).ngroups
 
-    def test_bands_add_up(self, result: ExperimentResult) -> None:
+    def test_bands_add_up(self, result: StudyTables) -> None:
         for name in NAMES:
             table, of_lists, bands = rows(result, name), rows(result, name, "lists"), rows(result, name, "bands")
             pairs = np.count_nonzero(~np.isnan(values(table["error_m"])))
@@ -209,7 +208,7 @@ class TestWhatIsThere:
         plan = experiment(units={"ego": UNITS["ego"]}, pems=pems(), configurations=configurations("gnn"),
                           measure=APPEARS | {"accuracy": False})  # fmt: skip
         result = run_experiment(plan, [street("one", 10)])
-        assert result.accuracy is None
+        assert not result.accuracy
         assert "position_rmse_m" not in result.summary
         assert "matched_lists" not in result.table
         assert result.table["detected"].all()
@@ -249,8 +248,8 @@ class TestWhatIsThere:
             patch.setattr(blocks_module, "BLOCK_BYTES", 1)
             other = run_experiment(plan, [street("one", 10)], jobs=2)
         pd.testing.assert_frame_equal(result.summary, other.summary, check_exact=True)
-        for name in ("accuracy", "instants", "lists", "thresholds"):
-            assert getattr(tables(result), name).equals(getattr(tables(other), name)), name
+        for name, table in tables(result).items():
+            assert table.equals(tables(other)[name]), name
         pd.testing.assert_frame_equal(result.table, other.table, check_exact=True)
         assert result.bands is not None
         assert result.bands.equals(other.bands)

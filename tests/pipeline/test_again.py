@@ -19,7 +19,7 @@ from copem_replay.metrics.episodes import Episodes, find_episodes
 from copem_replay.metrics.onset import began_texts
 from copem_replay.metrics.survival import end_reason_texts
 from copem_replay.perception.visibility import NO_STATICS
-from copem_replay.pipeline.run import ExperimentResult, run_experiment
+from copem_replay.pipeline.run import StudyTables, run_experiment
 from tests.helpers.experiments import changed, drive
 from tests.helpers.scenes import EGO_UNIT, SEES_60_M, Thing, driving, experiment, recording, standing
 from tests.system.test_cli import Call, call, here
@@ -60,7 +60,7 @@ def episodes_of(log: Recording, *keys: Any, **measure: Any) -> Episodes:
     return find_episodes(log.scene, log.truth, NO_STATICS, plan(*keys, **measure))
 
 
-def of(result: ExperimentResult, configuration: str) -> pd.Series:
+def of(result: StudyTables, configuration: str) -> pd.Series:
     return result.summary.set_index("configuration").loc[configuration]
 
 
@@ -145,13 +145,13 @@ def test_accuracy_is_of_each_object_once() -> None:
     for name in ("position_rmse_m", "gospa_m", "missed_share", "false_positives_per_min", "longest_gap_s"):
         if name in one.summary:
             assert one.summary[name].to_list() == pytest.approx(again.summary[name].to_list(), nan_ok=True), name
-    assert one.accuracy is not None
-    assert again.accuracy is not None
-    lengths = [len(values) for values in again.accuracy.accuracy["error_m"].to_pylist()]
+    assert one.accuracy
+    assert again.accuracy
+    lengths = [len(values) for values in again.accuracy["accuracy.parquet"]["error_m"].to_pylist()]
     later = again.table["episode"].to_numpy() > 0
     assert not np.array(lengths)[later].any()
-    kept = again.accuracy.accuracy.filter(~later).drop_columns(["episode"])
-    assert kept.equals(one.accuracy.accuracy.drop_columns(["episode"]))
+    kept = again.accuracy["accuracy.parquet"].filter(~later).drop_columns(["episode"])
+    assert kept.equals(one.accuracy["accuracy.parquet"].drop_columns(["episode"]))
 
 
 def test_who_was_gone_appears_again() -> None:

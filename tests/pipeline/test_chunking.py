@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -29,8 +30,7 @@ from copem_replay.pipeline.expansion import expand_experiment
 from copem_replay.pipeline.one_run import RunTracks
 from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.receiver import Reach, Receivers
-from copem_replay.pipeline.run import ExperimentResult, run_experiment
-from copem_replay.pipeline.tables import AccuracyTables
+from copem_replay.pipeline.run import StudyTables, run_experiment
 from tests.helpers import scenes
 from tests.helpers.recordings import Obj, pedestrian, write_recording
 from tests.helpers.replays import transmitted
@@ -59,9 +59,7 @@ def shown_in(path: Path) -> dict[str, list[str]]:
     return {entity: sorted(str(sorted(row.items())) for row in rows(path, entity)) for entity in entities}
 
 
-def both_ways(
-    plan: Experiment, recordings: Sequence[Recording], rows_at_once: int
-) -> tuple[ExperimentResult, ExperimentResult]:
+def both_ways(plan: Experiment, recordings: Sequence[Recording], rows_at_once: int) -> tuple[StudyTables, StudyTables]:
     """In one piece, and in time chunks of so many observation rows."""
     whole = run_experiment(plan, recordings)
     with pytest.MonkeyPatch.context() as patch:
@@ -70,7 +68,7 @@ def both_ways(
         return whole, run_experiment(plan, recordings)
 
 
-def assert_same(whole: ExperimentResult, pieces: ExperimentResult) -> None:
+def assert_same(whole: StudyTables, pieces: StudyTables) -> None:
     assert [replay.chunks for replay in whole.replays] == [(TimeChunk(),)] * len(whole.replays)
     pd.testing.assert_frame_equal(whole.table, pieces.table, check_exact=True)
     pd.testing.assert_frame_equal(whole.summary, pieces.summary, check_exact=True)
@@ -78,17 +76,16 @@ def assert_same(whole: ExperimentResult, pieces: ExperimentResult) -> None:
     assert (whole.sweep is None) == (pieces.sweep is None)
     if whole.sweep is not None:
         pd.testing.assert_frame_equal(whole.sweep, pieces.sweep, check_exact=True)
-    assert whole.accuracy is not None
-    assert pieces.accuracy is not None
+    assert whole.accuracy
+    assert pieces.accuracy
     pd.testing.assert_frame_equal(whole.bands, pieces.bands, check_exact=True)
     assert_same_tables(whole.accuracy, pieces.accuracy)
 
 
-def assert_same_tables(whole: AccuracyTables, pieces: AccuracyTables) -> None:
-    for name in ("accuracy", "instants", "lists", "thresholds"):
-        mine, theirs = getattr(whole, name), getattr(pieces, name)
-        assert (mine is None) == (theirs is None)
-        assert mine is None or mine.equals(theirs), name
+def assert_same_tables(whole: dict[str, pa.Table], pieces: dict[str, pa.Table]) -> None:
+    assert whole.keys() == pieces.keys()
+    for name, table in whole.items():
+        assert table.equals(pieces[name]), name
 
 
 @pytest.mark.parametrize(("name", "rows", "configurations"), [("tc016d", 1500, None), ("crossing", 25_000, 9)])

@@ -40,7 +40,7 @@ from copem_replay.metrics.summary import summarise_rows
 from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_incidence, quantile_with_never
 from copem_replay.pipeline.closed_form import compute_distributions, exact_table
 from copem_replay.pipeline.prepare import Replay, prepare_log
-from copem_replay.pipeline.run import ExperimentResult, run_experiment
+from copem_replay.pipeline.run import StudyTables, run_experiment
 from tests.helpers.experiments import changed, drive, source_of
 from tests.helpers.replays import transmitted
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
@@ -742,7 +742,7 @@ def checked(folder: Path, *changes: str) -> list[str]:
 
 
 @cache
-def replayed_file(name: str, **changes: Any) -> ExperimentResult:
+def replayed_file(name: str, **changes: Any) -> StudyTables:
     """An experiment of ours with its exact times and without accuracy; `confirm`: hits and of."""
     source = read_experiment_file(ROOT / "logs" / f"{name}.yaml")
     confirm = changes.get("confirm")
@@ -785,7 +785,7 @@ def farthest(times_s: np.ndarray, part: pd.DataFrame) -> float:
     return float(np.abs(steps - np.cumsum(probability)).max(initial=0.0))
 
 
-def pairs(result: ExperimentResult) -> list[tuple[tuple[str, ...], pd.DataFrame, pd.DataFrame]]:
+def pairs(result: StudyTables) -> list[tuple[tuple[str, ...], pd.DataFrame, pd.DataFrame]]:
     """The runs and the exact rows of each log, configuration and object."""
     assert result.exact is not None
     keys = ["log", "configuration", "object_id"]
@@ -875,7 +875,7 @@ class TestPassing:
             assert row.pass_probability == pytest.approx(share, abs=1 / 500), row.detection_s
 
     @staticmethod
-    def meeting(reaction: dict[str, Any] | None, probability: float = 0.25, **changes: Any) -> ExperimentResult:
+    def meeting(reaction: dict[str, Any] | None, probability: float = 0.25, **changes: Any) -> StudyTables:
         """The ego, 4 m long, drives at 10 m/s towards a pedestrian who stands on its way, his near side at 39.75 m.
 
         It stops in 6.25 m, 0.5 m are to be left: who begins to brake before 3.1 s stays clear.

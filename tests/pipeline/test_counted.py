@@ -19,7 +19,7 @@ from copem_replay.io.recording import Recording
 from copem_replay.metrics.metric import RowMetric
 from copem_replay.metrics.onset import BEGAN
 from copem_replay.metrics.summary import describe_began
-from copem_replay.pipeline.run import ExperimentResult, run_experiment
+from copem_replay.pipeline.run import StudyTables, run_experiment
 from tests.helpers.experiments import changed, drive
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
 from tests.system.test_cli import Call, call, here
@@ -60,11 +60,11 @@ def plan(*began: str, **measure: Any) -> Experiment:
     return experiment(configurations=LATE, measure={"onset": ONSET} | of | measure)
 
 
-def replayed(*began: str, **measure: Any) -> ExperimentResult:
+def replayed(*began: str, **measure: Any) -> StudyTables:
     return run_experiment(plan(*began, **measure), [scene()])
 
 
-def of(result: ExperimentResult, configuration: str) -> pd.Series:
+def of(result: StudyTables, configuration: str) -> pd.Series:
     return result.summary.set_index("configuration").loc[configuration]
 
 

@@ -71,7 +71,7 @@ def replayed(text: str, out: str, **keys: Any) -> tuple[dict[str, bytes], int, i
     Path("e.yaml").write_text(text)
     result = cr.run("e.yaml", **keys)
     result.save(out, overwrite=True)
-    store = result.replayed.logs[0].parts
+    store = result.study.logs[0].parts
     return files(out), *((0, 0) if store is None else (store.computed, store.found))
 
 

@@ -22,7 +22,7 @@ from copem_replay.pipeline import prepare as chunking
 from copem_replay.pipeline import world as perceived
 from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.replay import replay_outcomes
-from copem_replay.pipeline.run import ExperimentResult, run_experiment
+from copem_replay.pipeline.run import StudyTables, run_experiment
 from copem_replay.pipeline.sweep import list_points
 from tests.helpers import scenes
 from tests.helpers.replays import transmitted, world_of
@@ -64,15 +64,15 @@ def heard_by(experiment: Experiment, name: str = "coop", one: int = 0, recording
     return transmitted(prepare_log(recording or traffic(), experiment), experiment, [one]).received(name)
 
 
-def assert_same(one: ExperimentResult, other: ExperimentResult) -> None:
+def assert_same(one: StudyTables, other: StudyTables) -> None:
     columns = [name for name in one.table if name in other.table]  # one may have no link
     assert one.table[columns].equals(other.table[columns])
     columns = [name for name in one.summary if name in other.summary]
     assert one.summary[columns].equals(other.summary[columns])
-    assert one.accuracy is not None
-    assert other.accuracy is not None
-    assert one.accuracy.instants.equals(other.accuracy.instants)
-    assert one.accuracy.lists.equals(other.accuracy.lists)
+    assert one.accuracy
+    assert other.accuracy
+    assert one.accuracy["instants.parquet"].equals(other.accuracy["instants.parquet"])
+    assert one.accuracy["lists.parquet"].equals(other.accuracy["lists.parquet"])
 
 
 def test_a_link_that_is_sure_is_a_latency_to_the_last_bit() -> None:

@@ -15,9 +15,9 @@ from pyarrow import ipc
 from copem_replay.core.errors import InputError, OutputError
 from copem_replay.experiment import validate
 from copem_replay.pipeline import parts as parts_module
-from copem_replay.pipeline import tables as study_tables
+from copem_replay.pipeline import run as study_tables
 from copem_replay.pipeline.parts import cut_parts
-from copem_replay.results import schema as contents
+from copem_replay.results import table_files
 from copem_replay.results import write as results_write
 from tests.cli.test_api import cr
 from tests.helpers.experiments import changed, drive
@@ -47,7 +47,7 @@ def replayed(text: str, out: str, kept: str | None = "kept") -> tuple[dict[str, 
     Path("e.yaml").write_text(text)
     result = cr.run("e.yaml", jobs=2, pieces=kept)
     result.save(out, overwrite=True)
-    store = result.replayed.logs[0].parts
+    store = result.study.logs[0].parts
     counts = (0, 0) if store is None else (store.computed, store.found)
     files = {str(path.relative_to(out)): path.read_bytes() for path in Path(out).rglob("*") if path.is_file()}
     return {name: content for name, content in files.items() if not name.endswith(".rrd")}, *counts
@@ -155,9 +155,9 @@ def test_what_is_damaged_is_computed_again(here: Path) -> None:
             assert again <= 1
             place.write_bytes(before)
     result = cr.run("e.yaml", pieces="kept")
-    assert result.replayed.logs[0].parts.damaged == []  # type: ignore[union-attr]
+    assert result.study.logs[0].parts.damaged == []  # type: ignore[union-attr]
     places[0].write_bytes(b"no Parquet")
-    store = cr.run("e.yaml", pieces="kept").replayed.logs[0].parts
+    store = cr.run("e.yaml", pieces="kept").study.logs[0].parts
     assert store is not None
     assert re.fullmatch(r"kept/parts/../[0-9a-f.]+arrows: damaged, computed again \(.*\)", store.damaged[0])
 
@@ -192,7 +192,7 @@ def test_a_part_whose_sums_nest_without_end_is_computed_again(here: Path, deep: 
             writer.write_table(table)
     content = stream.getvalue().to_pybytes()
     place.write_bytes(hashlib.blake2b(content, digest_size=20).hexdigest().encode() + b"\n" + content)
-    store = cr.run("e.yaml", pieces="kept").replayed.logs[0].parts
+    store = cr.run("e.yaml", pieces="kept").study.logs[0].parts
     assert store is not None
     (note,) = store.damaged
     assert note.startswith(f"{place}: damaged, computed again (")
@@ -251,7 +251,7 @@ def test_few_parts_are_in_memory_at_a_time(
     text: str, many: bool, kept: str | None, here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where they are too many they wait in a file to be written: the same bytes, of row groups, too."""
-    monkeypatch.setattr(contents, "ROWS_A_GROUP", 100)
+    monkeypatch.setattr(table_files, "ROWS_A_GROUP", 100)
     if many:
         monkeypatch.setattr(results_write, "MANY_ROWS", 10)
     for name in "cd":

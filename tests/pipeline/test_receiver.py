@@ -21,7 +21,7 @@ from copem_replay.io.recording import Recording
 from copem_replay.pipeline import replay as blocks_module
 from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.receiver import ReceiverOutput, remove_truth_ids
-from copem_replay.pipeline.run import ExperimentResult, run_experiment
+from copem_replay.pipeline.run import StudyTables, run_experiment
 from tests.helpers.experiments import changed, drive
 from tests.helpers.replays import outputs_of, world_of
 from tests.helpers.reports import inputs_of
@@ -74,11 +74,11 @@ def noisy(**changes: Any) -> Experiment:
     return experiment(**(plan | changes))
 
 
-def of(result: ExperimentResult, configuration: str) -> pd.DataFrame:
+def of(result: StudyTables, configuration: str) -> pd.DataFrame:
     return result.table[result.table["configuration"] == configuration]
 
 
-def figures(result: ExperimentResult, configuration: str) -> pd.Series:
+def figures(result: StudyTables, configuration: str) -> pd.Series:
     return result.summary.set_index("configuration").loc[configuration]
 
 
@@ -140,8 +140,8 @@ class TestWhatDoesNotMatter:
             other = run_experiment(plan, logs, jobs=jobs)
             pd.testing.assert_frame_equal(one.table, other.table, check_exact=True)
             pd.testing.assert_frame_equal(one.summary, other.summary, check_exact=True)
-            for name, table in vars(one.accuracy).items():
-                assert table.equals(getattr(other.accuracy, name)), name
+            for name, table in one.accuracy.items():
+                assert table.equals(other.accuracy[name]), name
 
 
 def entries_of_run(output: ReceiverOutput, s: int) -> tuple[list[int], bytes]:
@@ -160,7 +160,7 @@ FROM_500_MS: dict[str, Any] = {"onset": {"kind": "at", "time_s": 0.5}, "objects"
 ONE_UNIT = {"ego": EGO_UNIT | {"pem": "p"}}
 
 
-def replayed(log: Recording, units: Any = ONE_UNIT, measure: Any = FROM_500_MS, **more: Any) -> ExperimentResult:
+def replayed(log: Recording, units: Any = ONE_UNIT, measure: Any = FROM_500_MS, **more: Any) -> StudyTables:
     plan = {"pems": pems(), "units": units, "configurations": configurations()} | more
     return run_experiment(experiment(measure=measure, **plan), [log])
 

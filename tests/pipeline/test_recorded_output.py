@@ -23,11 +23,10 @@ from copem_replay.io.recording import Recording
 from copem_replay.pipeline import prepare as chunking
 from copem_replay.pipeline.closed_form import check_closed_form
 from copem_replay.pipeline.prepare import prepare_log
-from copem_replay.pipeline.run import ExperimentResult, run_experiment
+from copem_replay.pipeline.run import StudyTables, run_experiment
 from copem_replay.pipeline.sweep import list_points
 from copem_replay.results.compare.compare import compare_folders
-from copem_replay.results.read import read_results
-from copem_replay.results.write import write_results
+from copem_replay.results.read import Results, read_results
 from tests.helpers.recordings import SHARED, Obj, Topic, ns, write_recording
 from tests.io.test_recorded_units import car, list_of
 
@@ -62,17 +61,17 @@ def plan(path: Path, *, inputs: Any = ("rsu",), output: Any = None, **changes: A
     return Experiment.model_validate(data | changes)
 
 
-def replayed(experiment: Experiment) -> tuple[Recording, ExperimentResult]:
+def replayed(experiment: Experiment) -> tuple[Recording, StudyTables]:
     recordings, refused = read_logs(experiment, [Path(experiment.logs[0])], None)
     assert not refused, refused
     return recordings[0], run_experiment(experiment, recordings)
 
 
-def row(result: ExperimentResult, configuration: str = "stack") -> pd.Series:
+def row(result: StudyTables, configuration: str = "stack") -> pd.Series:
     return result.table.set_index(["configuration", "object_id"]).loc[(configuration, "2")]
 
 
-def figures(result: ExperimentResult, configuration: str = "stack") -> pd.Series:
+def figures(result: StudyTables, configuration: str = "stack") -> pd.Series:
     return result.summary.set_index("configuration").loc[configuration]
 
 
@@ -197,7 +196,7 @@ class TestMeasured:
         _, result = replayed(experiment)
         same_as_union(result, "stack")
         assert figures(result)["false_positives_per_min"] == pytest.approx(3 / (0.6 / 60))  # from 0.35 to 0.95 s
-        assert result.accuracy is not None
+        assert result.accuracy
 
     def test_nothing_is_drawn(self, tmp_path: Path) -> None:
         path = drive(tmp_path / "a.mcap", [list_of(0.5, car(30))], [list_of(0.4, car(30))])
@@ -248,7 +247,7 @@ class TestMeasured:
         pd.testing.assert_frame_equal(whole.summary, pieces.summary)
 
 
-def same_as_union(result: ExperimentResult, name: str) -> None:
+def same_as_union(result: StudyTables, name: str) -> None:
     """Rows and figures of a recorded output and of the union of the unit with the same lists."""
     rows = [
         result.table[result.table["configuration"] == one].drop(
@@ -290,9 +289,9 @@ class TestRegret:
         """The stack knows the car .3 s after ideal fusion of its input does; both stay to the end."""
         path = drive(tmp_path / "a.mcap", [list_of(0.7, car(30))], [list_of(0.4, car(30))])
         experiment = plan(path)
-        recording, result = replayed(experiment)
+        _, result = replayed(experiment)
         assert any("its regret is the difference to stack:ideal" in note for note in result.notes)
-        write_results(tmp_path / "out", experiment, [recording], result, exporters=())
+        Results(study=result, exporters=lambda _: ()).save(tmp_path / "out")
         comparison = compare_folders([tmp_path / "out"])
         assert (comparison.baseline, comparison.configurations) == ("stack:ideal", ("stack",))
         found = comparison.overall.set_index("metric")["difference"]
@@ -319,11 +318,11 @@ class TestRegret:
             "stack": plan(path, inputs=None).as_written()["configurations"]["stack"],
         }
         experiment = plan(path, inputs=None, configurations=configurations)
-        recording, result = replayed(experiment)
+        _, result = replayed(experiment)
         assert list(experiment.configurations) == ["GT", "stack"]
         said = "configuration stack: no regret, for it has no `inputs`: ideal fusion of what it had is not known"
         assert said in result.notes
-        write_results(tmp_path / "out", experiment, [recording], result, exporters=())
+        Results(study=result, exporters=lambda _: ()).save(tmp_path / "out")
         chosen = compare_folders([tmp_path / "out"])
         assert (chosen.baseline, chosen.baseline_why) == ("stack", "the first that is not the truth")
         notes = compare_folders([tmp_path / "out"], baseline="GT").notes

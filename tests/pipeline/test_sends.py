@@ -19,7 +19,7 @@ from copem_replay.pipeline import prepare as chunking
 from copem_replay.pipeline.closed_form import check_exact
 from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import prepare_log
-from copem_replay.pipeline.run import ExperimentResult, run_experiment
+from copem_replay.pipeline.run import StudyTables, run_experiment
 from tests.helpers import scenes
 from tests.helpers.replays import world_of
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, standing
@@ -189,12 +189,12 @@ def noisy(sends: object = CPM, **changes: Any) -> tuple[Recording, Experiment]:
     return recorded(*cars), some
 
 
-def assert_same(one: ExperimentResult, other: ExperimentResult) -> None:
+def assert_same(one: StudyTables, other: StudyTables) -> None:
     assert one.table.equals(other.table)
     assert one.summary.equals(other.summary)
-    assert one.accuracy is not None
-    assert other.accuracy is not None
-    assert one.accuracy.lists.equals(other.accuracy.lists)
+    assert one.accuracy
+    assert other.accuracy
+    assert one.accuracy["lists.parquet"].equals(other.accuracy["lists.parquet"])
 
 
 @pytest.mark.parametrize("sends", [CPM, {"kind": "cpm", "interval_s": 0.2, "max_objects": 2}])

@@ -11,16 +11,16 @@ import pytest
 from copem_replay.core.interpolation import interpolate_at_instants
 from copem_replay.io.recording import Recording
 from copem_replay.perception.observation import observe_objects
-from copem_replay.pipeline.run import ExperimentResult, run_experiment
+from copem_replay.pipeline.run import StudyTables, run_experiment
 from tests.helpers import scenes
 from tests.helpers.scenes import EGO_UNIT, Thing, experiment, recording, standing
 
 
-def replayed(log: Recording, **changes: Any) -> ExperimentResult:
+def replayed(log: Recording, **changes: Any) -> StudyTables:
     return run_experiment(experiment(**changes), [log])
 
 
-def row(result: ExperimentResult, configuration: str, object_id: str = "other", run_number: int = 0) -> pd.Series:
+def row(result: StudyTables, configuration: str, object_id: str = "other", run_number: int = 0) -> pd.Series:
     table = result.table
     chosen = table[
         (table["configuration"] == configuration) & (table["object_id"] == object_id) & (table["run"] == run_number)
@@ -29,7 +29,7 @@ def row(result: ExperimentResult, configuration: str, object_id: str = "other", 
     return chosen.iloc[0]
 
 
-def of(result: ExperimentResult, configuration: str) -> pd.Series:
+def of(result: StudyTables, configuration: str) -> pd.Series:
     return result.summary.set_index("configuration").loc[configuration]
 
 

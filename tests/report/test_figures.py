@@ -33,7 +33,6 @@ from copem_replay.experiment.validate import find_problems, read_logs
 from copem_replay.metrics.columns import TABLES
 from copem_replay.metrics.intervals import choose_clusters
 from copem_replay.metrics.survival import DETECTED, LEFT, cumulative_incidence
-from copem_replay.pipeline.run import run_experiment
 from copem_replay.report.figures.detection_curves import RowClusters, curves_figure, incidence_limits
 from copem_replay.report.figures.distances import FAIL, KINDS, NEUTRAL, PASS, Strip, distances_figure
 from copem_replay.report.figures.latency_breakdown import latency_breakdown_figure
@@ -43,9 +42,8 @@ from copem_replay.report.figures.single_runs import StoryEvent, last_instant, ru
 from copem_replay.report.figures.style import choose_appearances, format_share, shorten_names
 from copem_replay.report.figures.sweeps import sweeps_figure
 from copem_replay.results.read import Results, read_results
-from copem_replay.results.write import write_results
-from copem_replay.viewer.rrd import EXPORTERS
 from tests.helpers.recordings import Obj, pedestrian, write_recording
+from tests.helpers.replays import save_run
 from tests.helpers.report_pages import with_rows
 from tests.oracles import intervals as oracle
 
@@ -100,14 +98,7 @@ def replayed(place: Path, text: str = TEXT, name: str = "results") -> Path:
     assert experiment is not None, found
     recordings, refused = read_logs(experiment, log_paths(source)[0], source)
     assert not refused + found
-    write_results(
-        place / name,
-        experiment,
-        recordings,
-        run_experiment(experiment, recordings),
-        exporters=EXPORTERS,
-        overwrite=True,
-    )
+    save_run(place / name, experiment, recordings, overwrite=True)
     return place / name
 
 

@@ -12,9 +12,8 @@ import pandas as pd
 import pytest
 from pyarrow import parquet
 
-from copem_replay.pipeline.run import run_experiment
 from copem_replay.results.compare.compare import compare_folders
-from copem_replay.results.write import write_results
+from tests.helpers.replays import save_run
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
 
 SEES = [{"detection": {"kind": "constant", "probability": 0.8},
@@ -47,7 +46,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     }  # fmt: skip
     recordings = [replace(log, path=path / "scene.mcap")]
     plan = experiment(**more)
-    write_results(path / "out", plan, recordings, run_experiment(plan, recordings), exporters=())
+    save_run(path / "out", plan, recordings, replays=False)
     return path / "out"
 
 

@@ -15,11 +15,10 @@ from copem_replay.core.tracks import Solid
 from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import read_logs
 from copem_replay.io.ground_truth import truth_digest
-from copem_replay.pipeline.run import run_experiment
 from copem_replay.results.compare.compare import Comparison, compare_folders
-from copem_replay.results.write import write_results
 from copem_replay.viewer.side_by_side import write_side_by_side
 from tests.helpers.recordings import Obj, Topic, truth_topic, write_mcap
+from tests.helpers.replays import save_run
 from tests.helpers.scenes import Thing, driving, recording, standing
 from tests.io.test_recorded_units import car, list_of
 
@@ -71,7 +70,7 @@ def results(folder: Path, path: Path, topic: str = "stack", **changes: Any) -> P
     } | changes)  # fmt: skip
     recordings, refused = read_logs(experiment, [path], None)
     assert not refused
-    write_results(folder, experiment, recordings, run_experiment(experiment, recordings), exporters=())
+    save_run(folder, experiment, recordings, replays=False)
     return folder
 
 

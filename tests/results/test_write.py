@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from mcap.reader import make_reader
 from pyarrow import parquet
 
 import copem_replay as cr
+from copem_replay.api.run import list_exporters
 from copem_replay.core.tracks import TimeChunk
 from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import read_logs
@@ -23,14 +23,16 @@ from copem_replay.metrics.columns import COMPARED_FILES, TABLES
 from copem_replay.pipeline import replay as blocks_module
 from copem_replay.pipeline.one_run import choose_logs, select_shown_runs
 from copem_replay.pipeline.prepare import prepare_log
-from copem_replay.pipeline.run import ExperimentResult, run_experiment
-from copem_replay.pipeline.tables import PartTables, StudyTables, tabulate_rows
+from copem_replay.pipeline.run import StudyTables, run_experiment
+from copem_replay.pipeline.study_log import StudyLog
+from copem_replay.pipeline.tables import PartTables, tabulate_rows
 from copem_replay.results import write as result_tables
-from copem_replay.results.write import Exporter, RunToExport, write_results
-from copem_replay.viewer.rrd import EXPORTERS
+from copem_replay.results.read import Results
+from copem_replay.results.write import Exporter, RunToExport
 from tests.helpers import scenes
 from tests.helpers.experiments import changed, drive
 from tests.helpers.recordings import Obj, write_recording
+from tests.helpers.replays import save_run
 from tests.helpers.scenes import experiment
 
 OF_ACCURACY = {*COMPARED_FILES, "bands.csv"}
@@ -57,9 +59,7 @@ def test_the_folder_of_several_logs(two_logs: list[Path], tmp_path: Path) -> Non
     chosen = plan(show={"logs": ["all"], "run": 1}, configurations={"GT": {"units": "truth"}, "PEM": {"units": "all"}})
     recordings, refused = read_logs(chosen, two_logs, None)
     assert not refused
-    result = run_experiment(chosen, recordings)
-    folder = tmp_path / "out"
-    write_results(folder, chosen, recordings, result, exporters=EXPORTERS)
+    folder = save_run(tmp_path / "out", chosen, recordings)
     names = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
     assert names == {
         "experiment.yaml", "provenance.json", "detections.parquet", "tally.parquet", "logs.csv", "summary.csv",
@@ -98,8 +98,7 @@ def test_the_folder_of_several_logs(two_logs: list[Path], tmp_path: Path) -> Non
 def test_without_accuracy_nothing_tells_of_it(two_logs: list[Path], tmp_path: Path) -> None:
     chosen = plan(show=None, measure={"accuracy": False})
     recordings, _ = read_logs(chosen, two_logs, None)
-    folder = tmp_path / "out"
-    write_results(folder, chosen, recordings, run_experiment(chosen, recordings), exporters=EXPORTERS)
+    folder = save_run(tmp_path / "out", chosen, recordings)
     assert {path.name for path in folder.iterdir()} == {
         "experiment.yaml", "provenance.json", "detections.parquet", "tally.parquet", "logs.csv", "summary.csv",
     }  # fmt: skip
@@ -129,7 +128,7 @@ def test_the_files_of_accuracy_say_the_same_as_rows_and_summary(two_logs: list[P
     )  # fmt: skip
     recordings, _ = read_logs(chosen, two_logs, None)
     folder = tmp_path / "out"
-    write_results(folder, chosen, recordings, run_experiment(chosen, recordings, jobs=2), exporters=EXPORTERS)
+    Results(study=run_experiment(chosen, recordings, jobs=2), exporters=list_exporters).save(folder)
 
     def read(name: str) -> list[dict[str, Any]]:
         return parquet.read_table(folder / f"{name}.parquet").to_pylist()
@@ -193,18 +192,12 @@ def test_the_files_of_accuracy_say_the_same_as_rows_and_summary(two_logs: list[P
         assert part["ghosts"].sum() == sum(r["ghosts"] for r in mine)
 
 
-def made_up(times: list[float | None]) -> ExperimentResult:
-    """A result of one log with these times to detection, run by run; the horizon is 9 s."""
-    of = {"log": "scene", "configuration": "PEM", "object_id": "a", "began": "crossed", "onset_s": 0.0, "ended_s": 10.0}
-    table = pd.DataFrame({**of, "run": range(len(times)), "time_to_detection_s": times})
-    return ExperimentResult(of_one_log(table), pd.DataFrame(), (), (), (), 9.0, pd.DataFrame())
-
-
-def of_one_log(rows: pd.DataFrame) -> StudyTables:
-    tables = StudyTables()
+def made_up(rows: pd.DataFrame, plan: Experiment) -> StudyTables:
+    """What a study of one log, `scene`, gives if it has these rows; the horizon is 9 s."""
+    study = StudyTables(plan, (StudyLog(scenes.oncoming_car(), plan),), horizon_s=9.0)
     for name, of_configuration in rows.groupby("configuration", sort=False):
-        tables.add(PartTables("scene", str(name), tabulate_rows(of_configuration)))
-    return tables
+        study.add(PartTables("scene", str(name), tabulate_rows(of_configuration)))
+    return study
 
 
 @pytest.mark.parametrize(
@@ -218,12 +211,13 @@ def of_one_log(rows: pd.DataFrame) -> StudyTables:
     ],
 )
 def test_which_run_is_shown(times: list[float | None], best: int, median: int, worst: int) -> None:
-    result = made_up(times)
+    of = {"log": "scene", "configuration": "PEM", "object_id": "a", "began": "crossed", "onset_s": 0.0, "ended_s": 10.0}
+    rows = pd.DataFrame({**of, "run": range(len(times)), "time_to_detection_s": times})
     for which, expected in (("best", best), ("median", median), ("worst", worst), (0, 0)):
-        (shown,) = select_shown_runs(experiment(show={"run": which}), result, "scene")
+        (shown,) = select_shown_runs(made_up(rows, experiment(show={"run": which})), "scene")
         assert (shown.run, shown.stem) == (expected, "replay")
     for nothing in ({"run": None}, None):
-        assert select_shown_runs(experiment(show=nothing), result, "scene") == ()
+        assert select_shown_runs(made_up(rows, experiment(show=nothing)), "scene") == ()
         assert choose_logs(experiment(show=nothing), ["scene"]) == []
     assert choose_logs(experiment(), ["scene"]) == ["scene"]
 
@@ -246,8 +240,8 @@ def test_several_runs_are_shown_each_as_it_was_asked_for() -> None:
         for k, of_run in enumerate(times)
         for n, (name, one) in enumerate(keys)
     ]
-    result = dataclasses.replace(made_up([]), tables=of_one_log(pd.DataFrame(rows)))
-    shown = select_shown_runs(experiment(show={"run": ["median", "worst", 0, "best"]}, runs=4), result, "scene")
+    table = pd.DataFrame(rows)
+    shown = select_shown_runs(made_up(table, experiment(show={"run": ["median", "worst", 0, "best"]}, runs=4)), "scene")
     over = "of 4 by time to detection summed over 2 configurations and 2 objects, the first of 2 equal"
     assert [(one.run, one.why, one.stem) for one in shown] == [
         (0, f"median {over}", "replay"),
@@ -256,7 +250,7 @@ def test_several_runs_are_shown_each_as_it_was_asked_for() -> None:
         (0, f"best {over}", "replay_best"),
     ]
     # Of a log in which nothing is measured.
-    other = select_shown_runs(experiment(show={"run": ["worst", 3]}, runs=4), result, "other")
+    other = select_shown_runs(made_up(table, experiment(show={"run": ["worst", 3]}, runs=4)), "other")
     assert [(one.run, one.why) for one in other] == [
         (0, "first, not worst, as no measured object has an onset"),
         (3, ""),
@@ -274,7 +268,7 @@ def test_several_runs_of_several_logs(two_logs: list[Path], tmp_path: Path) -> N
     result = run_experiment(chosen, recordings)
     folder = tmp_path / "out"
     for _ in range(2):  # what is there already goes
-        write_results(folder, chosen, recordings, result, exporters=EXPORTERS, overwrite=True)
+        Results(study=result, exporters=list_exporters).save(folder, overwrite=True)
     stems = ["replay", "replay_best", "replay_1"]
     files = {f"{stem}/{log}/drive.{kind}" for stem in stems for log in ("near", "far") for kind in ("mcap", "rrd")}
     assert {p.relative_to(folder).as_posix() for p in folder.rglob("replay*/**/*") if p.is_file()} == files
@@ -336,13 +330,14 @@ def test_what_is_shown_is_written_by_the_exporters_that_are_passed(two_logs: lis
     chosen = plan(show={"logs": ["all"], "run": 1}, configurations={"GT": {"units": "truth"}})
     recordings, _ = read_logs(chosen, two_logs, None)
     result = run_experiment(chosen, recordings)
-    notes = write_results(tmp_path / "own", chosen, recordings, result, exporters=[Exporter(".txt", write)])
+    Results(study=result, exporters=lambda _: [Exporter(".txt", write)]).save(tmp_path / "own")
+    provenance = json.loads((tmp_path / "own/provenance.json").read_text())
     shown = {path.relative_to(tmp_path / "own").as_posix() for path in (tmp_path / "own").rglob("replay/**/*.*")}
     assert shown == {"replay/near/drive.txt", "replay/far/drive.txt"}
     assert {(tmp_path / "own" / name).read_text() for name in shown} == {"1 ['GT']"}
-    assert {"near/drive: half as long as it was", "far/drive: half as long as it was"} <= set(notes)
-    assert shown <= set(json.loads((tmp_path / "own/provenance.json").read_text())["files"])
-    write_results(tmp_path / "none", chosen, recordings, result, exporters=[])
+    assert {"near/drive: half as long as it was", "far/drive: half as long as it was"} <= set(provenance["notes"])
+    assert shown <= set(provenance["files"])
+    Results(study=result, exporters=lambda _: ()).save(tmp_path / "none")
     assert not (tmp_path / "none" / "replay").exists()
 
 

@@ -123,7 +123,7 @@ def test_a_command_that_is_killed_goes_on_with_what_is_missing(here: Path, start
     assert len([*Path("out/e.pieces/parts").glob("*/[!.]*.arrows")]) == 3
     result = cr.run("e.yaml", pieces="out/e.pieces")
     result.save("out/again")
-    parts = result.replayed.logs[0].parts
+    parts = result.study.logs[0].parts
     assert parts is not None
     assert (parts.computed, parts.found) == (18, 3)
     assert files("out/again") == files("out/plain")

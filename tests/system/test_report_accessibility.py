@@ -13,11 +13,9 @@ import pytest
 
 from copem_replay.experiment.file import log_paths, read_experiment_file
 from copem_replay.experiment.validate import find_problems, read_logs
-from copem_replay.pipeline.run import run_experiment
 from copem_replay.report import write_html_report
-from copem_replay.results.write import write_results
-from copem_replay.viewer.rrd import EXPORTERS
 from tests.helpers.browser import Browser, opened_browser
+from tests.helpers.replays import save_run
 from tests.helpers.report_pages import eighteen, replayed
 
 axe = pytest.importorskip("selenium_axe_python", reason="needs selenium-axe-python, which `pip install .[dev]` brings")
@@ -40,7 +38,7 @@ def demo(place: Path) -> Path:
     experiment = experiment.model_copy(update={"runs": 20, "show": experiment.show.model_copy(update={"run": None})})
     recordings, refused = read_logs(experiment, log_paths(source)[0], source)
     assert not refused
-    write_results(place / "demo", experiment, recordings, run_experiment(experiment, recordings), exporters=EXPORTERS)
+    save_run(place / "demo", experiment, recordings)
     return place / "demo"
 
 

@@ -93,7 +93,7 @@ def test_parts_are_found_again_and_removed(here: Path) -> None:
     alone, crewed = in_a_line("cr.run(")
     found = eval(alone, {"cr": cr})
     found.save("out/alone")
-    assert (found.replayed.logs[0].parts.computed, files("out/alone")) == (0, files("out/plain"))
+    assert (found.study.logs[0].parts.computed, files("out/alone")) == (0, files("out/plain"))
     (remove,) = in_a_line("rm -r ")
     typed(remove, here)
     assert not Path("out/study.pieces").exists()

@@ -255,8 +255,8 @@ def test_six_configurations_a_file_and_nothing_dropped() -> None:
 
 
 def test_further_configurations_are_in_further_files(tmp_path: Path) -> None:
+    from copem_replay.api.run import list_exporters
     from copem_replay.viewer import write_rrd
-    from copem_replay.viewer.rrd import EXPORTERS
 
     scene = recording([Thing("ego", "car", standing(0, 0)), Thing("9", "pedestrian", standing(30, 0))], until_s=1.0)
     many = {f"GT{k}": {"units": "truth", "latency_s": k / 10} for k in range(8)}
@@ -264,7 +264,7 @@ def test_further_configurations_are_in_further_files(tmp_path: Path) -> None:
     said = write_rrd(tmp_path / "y.rrd", made.replay, made.given, [made.run_tracks], made.table, SUMMARY, 3)
     assert said == ["y.rrd: GT6, GT7 in y.configurations_7-8.rrd"]
     first, second = tmp_path / "y.rrd", tmp_path / "y.configurations_7-8.rrd"
-    assert [name for kind in EXPORTERS for name in kind.files("y", 8)] == ["y.mcap", first.name, second.name]
+    assert [name for kind in list_exporters() for name in kind.files("y", 8)] == ["y.mcap", first.name, second.name]
     assert "In further files: y.configurations_7-8.rrd." in static(first, "/summary")["TextDocument:text"][0]
     assert [bool(list(chunks(path, "/world/GT5/boxes"))) for path in (first, second)] == [True, False]
     assert [bool(list(chunks(path, "/world/GT6/boxes"))) for path in (first, second)] == [False, True]

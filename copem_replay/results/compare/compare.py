@@ -219,9 +219,9 @@ ALL = "all"
 class Comparison:
     """Differences to a baseline: a row per log (`all`, and each where there are several), configuration and metric.
 
-    Columns of `table` as in `COMPARISON` (`metrics/columns.py`), missing where there is none; times are up to
-    `horizon_s`, those at equal ghosts at `false_positives_per_min`. `baseline_why`: why it is the baseline, None if it
-    was asked for. `notes`: what has to be said, a line each.
+    What the columns of `table` mean: docs/reference/columns.md; null where there is none. Times are up to `horizon_s`,
+    those at equal ghosts at `false_positives_per_min`. `baseline_why`: why it is the baseline, None if it was asked
+    for. `notes`: what has to be said, a line each.
 
     >>> comparison = cr.compare("out/tc016d", baseline="PEM")
     >>> comparison.baseline, comparison.configurations

@@ -58,9 +58,8 @@ def rename_logs(folders: Sequence[Results]) -> tuple[list[Results], dict[Results
 
 def _replace_log_names(results: Results, to: Mapping[str, str]) -> Results:
     logs = tuple(replace(log, name=to.get(log.name, log.name)) for log in results.provenance.logs)
-    renamed, tables = copy(results), copy(results.tables)
-    tables.provenance, renamed.tables = replace(results.provenance, logs=logs), tables
-    vars(renamed)["by_log"] = {name: rows.renamed(to) for name, rows in results.by_log.items()}
+    renamed, by_log = copy(results), {name: rows.renamed(to) for name, rows in results.by_log.items()}
+    vars(renamed).update(provenance=replace(results.provenance, logs=logs), by_log=by_log)
     return renamed
 
 
@@ -139,7 +138,7 @@ def _format_pair(before: object, after: object) -> str:
 
 
 def _rates_by_configuration(results: Results) -> dict[str, float]:
-    if not results.tables.has("summary.csv"):
+    if not results.has("summary.csv"):
         return {}
     rates = results.summary.set_index("configuration")["list_rate_hz"].dropna()
     return {str(name): float(rate) for name, rate in rates.items()}
