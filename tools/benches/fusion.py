@@ -10,10 +10,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from datetime import datetime, timedelta
 from operator import call
 
-import numba as nb
 import numpy as np
 
 from benches import common
@@ -27,7 +25,6 @@ from copem_replay.fusion.inputs import make_inputs
 from copem_replay.fusion.interface import ListFusion
 from copem_replay.fusion.tracker import Tracker
 from copem_replay.io.recording import Recording
-from copem_replay.metrics.gospa import gospa, gospa_pairs
 from copem_replay.pipeline.expansion import RunGroup
 from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.receiver import remove_truth_ids
@@ -37,8 +34,6 @@ from tests.oracles import gnn as gnn_oracle
 
 PERIOD_S = 0.1
 GATE = 0.999
-_VAGUE_M2 = 1e6  # prior of a founding position: as good as none
-MISSING = {"why": "stonesoup is not installed: pip install '.[bench]'"}
 
 
 def scene(objects: int, units: int, count: int, seed: int = 0, common: float = 0.0) -> tuple[Inputs, Float]:
@@ -198,150 +193,10 @@ def _next_to(truth: Float, found: ObjectLists) -> tuple[Float, Float]:
     return np.concatenate(errors), np.concatenate(covariances)
 
 
-# -------------------------------------------------------------------------------------------------------------- a peer
-
-
-def gospa_vs_stonesoup(pairs: int = 200) -> Iterator[common.Line]:
-    """GOSPA of 15 × 15 points, c = 5 m, p = 2, against Stone Soup's, states built before."""
-    try:
-        from stonesoup.metricgenerator.ospametric import GOSPAMetric
-        from stonesoup.types.state import State
-    except ImportError:
-        yield {"gospa_vs_stonesoup": None} | MISSING
-        return
-    rng = np.random.default_rng(0)
-    truth = rng.uniform(0, 10 * math.sqrt(15), (pairs, 15, 2))
-    output = truth + rng.normal(size=truth.shape)
-    output[:, 12:] = rng.uniform(0, 10 * math.sqrt(15), (pairs, 3, 2))  # three are missed, three are about nobody
-    at = datetime(2000, 1, 1)
-    states = [[[State(point, timestamp=at) for point in points] for points in both] for both in (truth, output)]
-    metric = GOSPAMetric(p=2, c=5)
-
-    def theirs() -> list[float]:
-        several = zip(*states, strict=True)
-        return [metric.compute_gospa_metric(said, there)[0].value["distance"] for there, said in several]
-
-    columns = [np.ascontiguousarray(points.transpose(2, 0, 1)) for points in (truth, output)]
-    off = float(np.abs(_gospas(*columns, 5.0, 2.0) - theirs()).max())
-    assert off < 1e-9, f"{off} m apart"
-    seconds = common.best(lambda: _gospas(*columns, 5.0, 2.0), 20)
-    yield {
-        "gospa_vs_stonesoup": round(common.best(theirs, 3) / seconds),
-        "gospa_per_s": round(pairs / seconds),
-        "points": 15,
-        "max_difference_m": off,
-    }
-
-
-@nb.njit(cache=True, nogil=True)
-def _gospas(truth: Float, output: Float, cutoff_m: float, power: float) -> Float:
-    """GOSPA (N,) of each of several pairs of lists, points (2, N, n)."""
-    value_m, partner = np.empty(truth.shape[1]), np.empty(truth.shape[2], np.int64)
-    alone = cutoff_m**power / 2
-    for k in range(len(value_m)):
-        cost, count = gospa_pairs(
-            truth[0, k], truth[1, k], output[0, k], output[1, k], cutoff_m, power, partner
-        )  # fmt: skip
-        cost += alone * (truth.shape[2] + output.shape[2] - 2 * count)
-        value_m[k] = cost ** (1 / power)
-    return value_m
-
-
-def tracker_vs_stonesoup(scenes: int = 3, count: int = 6) -> Iterator[common.Line]:
-    """Tracks of 15 objects, lists of 20 units, against Stone Soup's two-dimensional assignment; and how good they are.
-
-    Both have the same motion model, gate and knowledge of a new track's speed, hear list after list, and forget what
-    was not heard of for long. Their assignments differ in what a pair costs (d, and d² + ln|S|), and ours merges what
-    is one object twice; so tracks are alike, not equal. How good: at the last instant, mean of all scenes.
-    """
-    ours = Tracker(late="predict", gate=GATE, confirm_s=0.0)
-    took: list[tuple[float, float]] = []
-    said: list[tuple[float, ...]] = []
-    for seed in range(scenes):
-        told, truth = scene(15, 20, count, seed)
-        try:
-            feed = _stonesoup(told)
-        except ImportError:
-            yield {"tracker_vs_stonesoup": None} | MISSING
-            return
-        found: list[Float] = []
-        seconds = common.best(lambda told=told: ours.fuse(told), 20)
-        took.append((seconds, common.best(lambda feed=feed, found=found: found.append(feed()), 1)))
-        last = ours.fuse(told).of(0, count - 1)
-        said.append(_quality(truth[-1], np.stack([last["x_m"], last["y_m"]], axis=1)) + _quality(truth[-1], found[-1]))
-    seconds, peer_seconds = np.mean(took, axis=0) / count
-    line: common.Line = {
-        "tracker_vs_stonesoup": round(peer_seconds / seconds),
-        "us_per_instant": round(seconds * 1e6, 1),
-        "stonesoup_us_per_instant": round(peer_seconds * 1e6),
-        "objects": 15,
-        "units": 20,
-    }
-    names = ("tracks", "nearest_rmse_m", "gospa_m")
-    keys = (*names, *(f"stonesoup_{name}" for name in names))
-    yield line | {key: round(float(value), 2) for key, value in zip(keys, np.mean(said, axis=0), strict=True)}
-
-
-def _stonesoup(told: Inputs) -> Callable[[], Float]:
-    """Feeds Stone Soup's tracker all lists, made before, in order: where its tracks (n, 2) are in the end."""
-    from stonesoup.dataassociator.neighbour import GNNWith2DAssignment
-    from stonesoup.deleter.time import UpdateTimeDeleter
-    from stonesoup.hypothesiser.distance import DistanceHypothesiser
-    from stonesoup.initiator.simple import SinglePointMeasurementInitiator
-    from stonesoup.measures import Mahalanobis
-    from stonesoup.models.measurement.linear import LinearGaussian
-    from stonesoup.models.transition.linear import CombinedLinearGaussianTransitionModel, ConstantVelocity
-    from stonesoup.predictor.kalman import KalmanPredictor
-    from stonesoup.tracker.simple import MultiTargetTracker
-    from stonesoup.types.detection import Detection
-    from stonesoup.types.state import GaussianState
-    from stonesoup.updater.kalman import KalmanUpdater
-
-    settings, began = Tracker(), datetime(2000, 1, 1)
-    axis = ConstantVelocity(settings.acceleration_psd_m2ps3)
-    predictor = KalmanPredictor(CombinedLinearGaussianTransitionModel([axis, axis]))
-    model = LinearGaussian(ndim_state=4, mapping=(0, 2), noise_covar=np.eye(2))
-    updater = KalmanUpdater(model)
-    gate = math.sqrt(-2 * math.log1p(-GATE))
-    associator = GNNWith2DAssignment(DistanceHypothesiser(predictor, updater, Mahalanobis(), missed_distance=gate))
-    spread = np.diag([_VAGUE_M2, settings.speed_sigma_mps**2] * 2)
-    prior = GaussianState(np.zeros((4, 1)), spread, timestamp=began)
-    lists = []
-    for f, captured_s in enumerate(told.captured_s.tolist()):
-        at, one = began + timedelta(seconds=captured_s), told.lists.of(0, f)
-        places = np.stack([one["x_m"], one["y_m"]], axis=1)
-        lists.append((at, {Detection(place, timestamp=at, measurement_model=model) for place in places}))
-
-    def feed() -> Float:
-        tracker = MultiTargetTracker(
-            initiator=SinglePointMeasurementInitiator(prior, model),
-            deleter=UpdateTimeDeleter(timedelta(seconds=1)),
-            detector=lists,
-            data_associator=associator,
-            updater=updater,
-        )
-        for _ in tracker:
-            pass
-        return np.array([track.state_vector[[0, 2], 0] for track in tracker.tracks], dtype=float)
-
-    return feed
-
-
-def _quality(truth: Float, found: Float) -> tuple[float, ...]:
-    """How many (m, 2) there are; RMS distance of each truth (n, 2) to the nearest, however many are left; GOSPA."""
-    squared = ((truth[:, None] - found) ** 2).sum(axis=2).min(axis=1)
-    return len(found), math.sqrt(squared.mean()), gospa(truth, found, cutoff_m=5.0, power=2.0).value_m
-
-
 def fusion() -> Iterator[common.Line]:
-    """Fused lists per second on the crossing, and how the time of one grows; see py."""
+    """Fused lists per second on the crossing, and how the time of one grows; peers: `peers.py`."""
     experiment, recordings = common.loaded("crossing")
     yield from crossing(experiment, recordings[0])
+    yield from gnn_vs_numpy()
     yield from gnn_growth()
     yield from combining()
-
-
-def peers() -> Iterator[common.Line]:
-    """Fusion and GOSPA against NumPy and SciPy, and against Stone Soup."""
-    for bench in (gnn_vs_numpy, gospa_vs_stonesoup, tracker_vs_stonesoup):
-        yield from bench()

@@ -317,27 +317,25 @@ def render_figure(figure: Figure, suffixes: Sequence[str] = tuple(METADATA)) -> 
             left, bottom, width, height = (round(float(v), 6) for v in axes.get_position().bounds)
             axes.set_position((left, bottom, width, height))
         for suffix in suffixes:
-            content[suffix] = _save_svg(figure) if suffix == ".svg" else _save_figure(figure, suffix)
+            content[suffix] = _save(figure, suffix)
     return content
 
 
-def _save_figure(figure: Figure, suffix: str) -> bytes:
-    file = BytesIO()
-    figure.savefig(file, format=suffix[1:], metadata=METADATA[suffix])
-    return file.getvalue()
-
-
-def _save_svg(figure: Figure) -> bytes:
-    """The SVG that `savefig` writes, without drawing everything twice as it does."""
+def _save(figure: Figure, suffix: str) -> bytes:
+    """The file that `savefig` writes, without drawing everything twice as it does."""
     import matplotlib
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     canvas, dpi, file = figure.canvas, figure.dpi, BytesIO()
-    figure.dpi = matplotlib.rcParams["savefig.dpi"]  # of pictures in the SVG
-    FigureCanvasSVG(figure).print_svg(file, metadata=METADATA[".svg"])  # type: ignore[no-untyped-call]
+    figure.dpi = matplotlib.rcParams["savefig.dpi"]  # of a PNG, and of pictures in an SVG
+    if suffix == ".svg":
+        FigureCanvasSVG(figure).print_svg(file, metadata=METADATA[suffix])  # type: ignore[no-untyped-call]
+    else:
+        FigureCanvasAgg(figure).print_png(file, metadata=METADATA[suffix])  # type: ignore[no-untyped-call]
     figure.dpi = dpi
     figure.set_canvas(canvas)
-    return _round_coordinates(file.getvalue())
+    return _round_coordinates(file.getvalue()) if suffix == ".svg" else file.getvalue()
 
 
 def lay_out(figure: Figure) -> None:
