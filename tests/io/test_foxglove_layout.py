@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from mcap.reader import make_reader
+from mcap.writer import Writer
 
 import copem_replay as cr
 from copem_replay.cli import main as cli
@@ -15,11 +16,12 @@ from copem_replay.cli.results import layout
 from copem_replay.core.errors import InputError
 from copem_replay.experiment.file import log_paths, read_experiment_file
 from copem_replay.experiment.validate import find_problems, read_logs
-from copem_replay.io.write.foxglove_layout import build_layout, split_panels
+from copem_replay.io.write.foxglove_layout import build_layout, quote_topic, split_panels
 from copem_replay.results.folder import read_made_names
 from tests.helpers import experiments
 from tests.helpers.replays import save_run
 from tests.io.test_write_ros2 import EXPERIMENT, drive
+from tests.oracles import message_path
 
 ROOT = Path(__file__).parents[2]
 KEPT = ROOT / "logs/tc016d.foxglove.json"
@@ -108,14 +110,80 @@ def test_a_panel_for_every_scene(replay: Path) -> None:
         assert (wide, high) == pytest.approx(expected, abs=1e-4)
 
 
-def test_lanes_and_curves_name_what_is_in_the_statuses(replay: Path) -> None:
-    layout = build_layout(replay)
-    (lanes,) = panels_of(layout, "StateTransitions!").values()
-    (curves,) = panels_of(layout, "Plot!").values()
-    asked = [f'copem/{name}/status.objects[:]{{id=="2"}}' for name in NAMES]
-    assert [path["value"] for path in lanes["paths"]] == [f"{path}.status" for path in asked]
-    assert [path["value"] for path in curves["paths"]] == [f"{path}.age_s" for path in asked]
-    assert {path.partition(".objects")[0] for path in asked} <= topics_in(replay)
+def paths_of(layout: dict[str, Any]) -> list[str]:
+    return [path["value"] for kind in ("StateTransitions!", "Plot!") for panel in panels_of(layout, kind).values()
+            for path in panel["paths"]]  # fmt: skip
+
+
+def statuses_in(replay: Path) -> dict[str, list[Any]]:
+    """The messages of the statuses by topic."""
+    found: dict[str, list[Any]] = {}
+    with replay.open("rb") as file:
+        for _, channel, message in make_reader(file).iter_messages():
+            if channel.topic.endswith("/status") and channel.message_encoding == "json":
+                found.setdefault(channel.topic, []).append(json.loads(message.data))
+    return found
+
+
+def test_paths_lead_to_what_is_in_the_statuses(replay: Path) -> None:
+    """By the grammar of the viewers each path names a topic, and in each of its messages one object's value."""
+    layout, statuses = build_layout(replay), statuses_in(replay)
+    paths = paths_of(layout)
+    assert len(paths) == 2 * len(NAMES), "one object, known at different times"
+    for path, name in zip(paths, [*NAMES, *NAMES], strict=True):
+        topic, parts = message_path.parse(path)
+        assert topic == f"copem/{name}/status"
+        values = [message_path.pick(message, parts) for message in statuses[topic]]
+        key = "status" if path.endswith(".status") else "age_s"
+        expected = [[one[key] for one in message["objects"] if one["id"] == "2"] for message in statuses[topic]]
+        assert values == expected
+        assert all(len(value) == 1 for value in values)
+
+
+def test_curves_have_the_colours_of_their_configurations(replay: Path) -> None:
+    (curves,) = panels_of(build_layout(replay, ["coPEM:1s", "PEM"]), "Plot!").values()
+    # Okabe and Ito: orange, sky blue, bluish green, yellow, blue for the first five of the experiment.
+    assert [(path["label"], path["color"]) for path in curves["paths"]] == [("coPEM:1s", "#0072b2"), ("PEM", "#56b4e9")]
+
+
+@pytest.mark.parametrize(
+    ("topic", "quoted"),
+    [("copem/coPEM:0.5s/status", '"copem/coPEM:0.5s/status"'), ('a "b" \\ c', r'"a \"b\" \\ c"')],
+)
+def test_topics_in_quotes(topic: str, quoted: str) -> None:
+    assert quote_topic(topic) == quoted
+    assert message_path.parse(f"{quoted}.objects[:]") == (topic, ["objects", slice(0, None)])
+
+
+def test_a_bare_topic_with_a_colon_is_no_path() -> None:
+    """Why they are quoted: of `copem/coPEM:0s/status.objects` the grammar reads `copem/coPEM` only."""
+    with pytest.raises(ValueError, match="at 11"):
+        message_path.parse("copem/coPEM:0s/status.objects")
+
+
+def test_objects_whose_names_need_care(tmp_path: Path) -> None:
+    """Names in letters of all languages, with quotes and with spaces: each path parses and finds its object."""
+    names = ['say "hi"', "Fußgänger 2", "it's"]
+    statuses = {"objects": [{"id": name, "status": "known", "age_s": 0.1} for name in names]}
+    contents = {"scene": {}, "status": statuses, "detail": {"events": [{"object": name} for name in names]}}
+    with (tmp_path / "replay.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        for kind, content in contents.items():
+            channel = writer.register_channel(f"copem/with radio: 0 %/{kind}", "json", 0)
+            writer.add_message(channel, 10**9, json.dumps(content).encode(), 10**9)
+        writer.finish()
+    layout = build_layout(tmp_path / "replay.mcap")
+    told = []
+    for path in paths_of(layout):
+        topic, parts = message_path.parse(path)
+        assert topic == "copem/with radio: 0 %/status"
+        assert len(message_path.pick(statuses, parts)) == 1
+        told += [part[1] for part in parts if isinstance(part, tuple)]
+    assert sorted(told) == sorted(2 * names)
+    placed = leaves(layout["layout"])
+    assert sorted(panel for panel, *_ in placed) == sorted(layout["configById"])
+    assert [wide for panel, wide, _ in placed if panel.startswith("Plot!")] == pytest.approx([1 / 3] * 3, abs=1e-4)
 
 
 def test_two_compared_are_over_each_other_and_alone(replay: Path) -> None:
@@ -126,7 +194,8 @@ def test_two_compared_are_over_each_other_and_alone(replay: Path) -> None:
     shown = {topic for topic, says in both.items() if says["visible"] and "truth" not in topic}
     assert shown == {f"copem/{name}/{kind}" for name in ("PEM", "coPEM:1s") for kind in ("scene", "uncertainty")}
     (lanes,) = panels_of(layout, "StateTransitions!").values()
-    assert [path["label"] for path in lanes["paths"]] == ["PEM: 2", "coPEM:1s: 2"]
+    assert [path["label"] for path in lanes["paths"]] == ["PEM", "coPEM:1s"]
+    assert lanes["foxglovePanelTitle"] == "2: known"
     with pytest.raises(InputError, match="no configuration is named 'PME'; did you mean PEM"):
         build_layout(replay, ["PME"])
 
@@ -173,4 +242,5 @@ def test_a_replay_of_a_ros_2_recording(tmp_path: Path) -> None:
     panels = panels_of(layout, "3D!").values()
     assert [panel["foxglovePanelTitle"] for panel in panels] == ["GT", "PEM", "coPEM", "gnn"]
     assert {panel["followTf"] for panel in panels} == {"copem_ego"}
-    assert len(panels_of(layout, "StateTransitions!")) == 1
+    objects = {message_path.parse(path)[1][2][1] for path in paths_of(layout)}
+    assert len(objects) == len(panels_of(layout, "StateTransitions!")) == len(panels_of(layout, "Plot!")) == 3

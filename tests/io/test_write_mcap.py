@@ -31,8 +31,8 @@ from copem_replay.io.recorded_lists import read_sensor_data
 from copem_replay.io.recording import read_log
 from copem_replay.io.write import osi as sensor_data
 from copem_replay.io.write.detail import DetailWriter
-from copem_replay.io.write.mcap import OSI_RECORD, RUN_RECORD, atomic_mcap, write_mcap
-from copem_replay.io.write.message_family import find_family
+from copem_replay.io.write.mcap import OSI_RECORD, atomic_mcap, write_mcap
+from copem_replay.io.write.message_family import RUN_RECORD, find_family
 from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import Replay, prepare_log
 from copem_replay.pipeline.replay import replay_block

@@ -23,8 +23,8 @@ from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import find_problems, read_logs
 from copem_replay.io.recorded_lists import read_described_lists
 from copem_replay.io.recording import Recording, read_log
-from copem_replay.io.write.mcap import OSI_RECORD, RUN_RECORD, write_mcap
-from copem_replay.io.write.message_family import OSI, find_family
+from copem_replay.io.write.mcap import OSI_RECORD, write_mcap
+from copem_replay.io.write.message_family import OSI, RUN_RECORD, find_family
 from copem_replay.io.write.ros2 import LABELS
 from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import Replay, prepare_log

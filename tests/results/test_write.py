@@ -18,7 +18,7 @@ from copem_replay.api.run import list_exporters
 from copem_replay.core.tracks import TimeChunk
 from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import read_logs
-from copem_replay.io.write.mcap import RUN_RECORD
+from copem_replay.io.write.message_family import RUN_RECORD
 from copem_replay.metrics.columns import COMPARED_FILES, TABLES
 from copem_replay.pipeline import replay as blocks_module
 from copem_replay.pipeline.one_run import choose_logs, select_shown_runs

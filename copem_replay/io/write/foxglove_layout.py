@@ -1,12 +1,11 @@
 """Layouts for Foxglove and Lichtblick: the scenes of a replay.mcap side by side, or two configurations compared.
 
-Panels of scenes share their camera and follow the ego; under them, lanes show when each object is known, and curves the
-age of its entries.
+Panels of scenes share their camera and follow the ego; under them each object has lanes, which show when it is known,
+and curves of the age of its entries, in the colours of the configurations.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +14,11 @@ from typing import Any
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
+from copem_replay.core.colours import configuration_colours
 from copem_replay.core.errors import InputError, unknown_name_message
 from copem_replay.core.files import parse_json
-from copem_replay.io.write.message_family import EGO_FRAME, MIDDLE_FRAME, TRUTH_TOPICS
+from copem_replay.core.yaml import NotYamlError, parse_yaml
+from copem_replay.io.write.message_family import EGO_FRAME, MIDDLE_FRAME, RUN_RECORD, TRUTH_TOPICS
 
 PREFIX, SUFFIX = "copem/", "/scene"
 EYE = {"perspective": True, "phi": 55, "thetaOffset": 45, "fovy": 45, "near": 0.5, "far": 5000}
@@ -25,7 +26,7 @@ EYE = {"perspective": True, "phi": 55, "thetaOffset": 45, "fovy": 45, "near": 0.
 DISTANCE_M = 60.0
 """Distance of the camera: objects that the ego meets within two seconds are in the picture."""
 TOLD_OBJECTS = 3
-"""Objects with lanes and curves, those known at the most different times; more make the strip too narrow to read."""
+"""Objects with lanes and curves, those known at the most different times; more make their panels too narrow to read."""
 _CDR_TEXT = 8
 """Bytes before the text of a ROS 2 string: the head, and the length."""
 _NEVER_NS = 2**62
@@ -33,9 +34,12 @@ _NEVER_NS = 2**62
 
 @dataclass(frozen=True)
 class ReplayContents:
-    """The content of a replay.mcap: configurations, objects, whether the truth is drawn, and the frame to follow."""
+    """The content of a replay.mcap: configurations, their colours (`#rrggbb`), objects, whether the truth is drawn, and
+    the frame to follow.
+    """
 
     configurations: tuple[str, ...]
+    colours: dict[str, str]
     objects: tuple[str, ...]
     truth: bool
     follow: str | None
@@ -55,6 +59,7 @@ def read_contents(replay: Path) -> ReplayContents:
                 if t.startswith(PREFIX) and t.endswith(SUFFIX) and t != TRUTH_TOPICS[0]
             )
             moves = next((m.data for *_, m in reader.iter_messages(topics=TRUTH_TOPICS[2:])), b"")
+            made = {record.name: record.metadata for record in reader.iter_metadata()}.get(RUN_RECORD, {})
             details = [f"{PREFIX}{name}/detail" for name in names]
             known: dict[str, dict[str, int]] = {}
             for _, channel, message in reader.iter_messages(topics=details) if details else ():
@@ -68,7 +73,19 @@ def read_contents(replay: Path) -> ReplayContents:
     apart = {name: _detection_gap(times, len(names)) for name, times in known.items()}
     objects = sorted(apart, key=lambda name: -apart[name])[:TOLD_OBJECTS]
     follow = next((frame for frame in (EGO_FRAME, MIDDLE_FRAME) if frame.encode() in moves), None)
-    return ReplayContents(names, tuple(objects), TRUTH_TOPICS[1] in topics, follow)
+    return ReplayContents(
+        names, _find_colours(made.get("experiment", ""), names), tuple(objects), TRUTH_TOPICS[1] in topics, follow
+    )
+
+
+def _find_colours(experiment: str, names: Sequence[str]) -> dict[str, str]:
+    """The colour of each configuration, `#rrggbb`, by its place in the experiment that made the replay."""
+    try:
+        every = list(parse_yaml(experiment)[0]["configurations"])
+    except (NotYamlError, TypeError, KeyError):
+        every = []
+    colours = configuration_colours(every if set(names) <= set(every) else names)
+    return {name: "#{:02x}{:02x}{:02x}".format(*colours[name]) for name in names}
 
 
 def _detection_gap(times_ns: dict[str, int], configurations: int) -> int:
@@ -96,37 +113,49 @@ def build_layout(replay: Path, compare: Sequence[str] = ()) -> dict[str, Any]:
     shown = tuple(dict.fromkeys(compare)) or contents.configurations
     groups = [(name,) for name in shown] if not compare else [shown, *((name,) for name in shown)]
     scenes = {f"3D!{k}": _scene_panel(group, contents) for k, group in enumerate(groups)}
-    strip = _knowledge_panels(shown, contents.objects) if contents.objects else {}
+    about = [_knowledge_panels(contents, shown, k) for k in range(len(contents.objects))]
     rows = _arrange_grid(list(scenes))
     return {
-        "configById": {**scenes, **strip},
+        "configById": {**scenes, **{key: panel for panels in about for key, panel in panels.items()}},
         "globalVariables": {},
         "userNodes": {},
         "playbackConfig": {"speed": 1},
-        "layout": _stack_below(rows, split_panels("row", list(strip))) if strip else rows,
+        "layout": _stack_below(rows, about) if about else rows,
     }
 
 
-def _knowledge_panels(configurations: Sequence[str], objects: Sequence[str]) -> dict[str, Any]:
-    """The panels of lanes (when each object is known) and of curves (the age of its entries)."""
-    paths = [
-        (f"{name}: {ident}", f"{PREFIX}{name}/status.objects[:]{{id=={json.dumps(ident)}}}")
-        for ident in objects
-        for name in configurations
+def _knowledge_panels(contents: ReplayContents, shown: Sequence[str], number: int) -> dict[str, Any]:
+    """The panels of one object: lanes (when it is known), and curves (the age of its entries), by configuration."""
+    ident = contents.objects[number]
+    objects = {
+        name: f"{quote_topic(f'{PREFIX}{name}/status')}.objects[:]{{id=={_quote_value(ident)}}}" for name in shown
+    }
+    lanes = [
+        {"value": f"{path}.status", "label": name, "timestampMethod": "receiveTime"} for name, path in objects.items()
     ]
-    lanes = [{"value": f"{path}.status", "label": label, "timestampMethod": "receiveTime"} for label, path in paths]
     curves = [
-        {"value": f"{path}.age_s", "label": label, "enabled": True, "timestampMethod": "receiveTime"}
-        for label, path in paths
-    ]
-    titles = {"StateTransitions!0": "Known, by configuration and object", "Plot!0": "Age of what is listed, s"}
-    panels = {
-        "StateTransitions!0": {"paths": lanes, "isSynced": True},
-        "Plot!0": {"paths": curves, "xAxisVal": "timestamp", "isSynced": True, "showLegend": True,
-                   "legendDisplay": "floating", "showXAxisLabels": True, "showYAxisLabels": True,
-                   "showPlotValuesInLegend": False, "sidebarDimension": 240},
+        {"value": f"{path}.age_s", "label": name, "enabled": True, "timestampMethod": "receiveTime",
+         "color": contents.colours[name]}
+        for name, path in objects.items()
+    ]  # fmt: skip
+    return {
+        f"StateTransitions!{number}": {**_title_settings(f"{ident}: known"), "paths": lanes, "isSynced": True},
+        f"Plot!{number}": {
+            **_title_settings(f"{ident}: age of its entry, s"), "paths": curves, "xAxisVal": "timestamp",
+            "isSynced": True, "showLegend": True, "legendDisplay": "floating", "showXAxisLabels": True,
+            "showYAxisLabels": True, "showPlotValuesInLegend": False, "sidebarDimension": 240,
+        },
     }  # fmt: skip
-    return {key: {**_title_settings(titles[key]), **panel} for key, panel in panels.items()}
+
+
+def quote_topic(topic: str) -> str:
+    """A topic in quotes: message paths of Foxglove and Lichtblick know bare ones of letters and slashes only."""
+    return '"' + topic.replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
+def _quote_value(value: str) -> str:
+    """A value in quotes for the filter of a message path, which knows no escapes: in those that it does not have."""
+    return f"'{value}'" if '"' in value else f'"{value}"'
 
 
 def _title_settings(title: str) -> dict[str, str]:
@@ -154,9 +183,11 @@ def _scene_panel(configurations: Sequence[str], found: ReplayContents) -> dict[s
     }
 
 
-def _stack_below(scenes: Any, told: Any) -> dict[str, Any]:
-    """Lanes and curves in a strip under the scenes."""
-    return {"first": scenes, "second": told, "direction": "column", "splitPercentage": 72}
+def _stack_below(scenes: Any, about: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Lanes and curves in a strip under the scenes, a column per object; of one object they are side by side."""
+    way = "row" if len(about) == 1 else "column"
+    strip = split_panels("row", [split_panels(way, list(panels)) for panels in about])
+    return {"first": scenes, "second": strip, "direction": "column", "splitPercentage": 72 if len(about) == 1 else 58}
 
 
 def _arrange_grid(panels: Sequence[str]) -> Any:

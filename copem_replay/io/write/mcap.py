@@ -34,6 +34,7 @@ from copem_replay.io.write.detail import Event, Statuses
 from copem_replay.io.write.message_family import (
     OSI,
     OSI_CHANNEL,
+    RUN_RECORD,
     TRUTH_TOPICS,
     Catalogue,
     Family,
@@ -49,8 +50,6 @@ from copem_replay.io.write.source import RecordingSource, open_source
 
 OSI_RECORD = "net.asam.osi.trace"
 """The one metadata record of an OSI trace file (OSI 3.8, trace file formats)."""
-RUN_RECORD = "org.copem_replay.run"
-"""The metadata record of this project: what made the file."""
 CHUNK_BYTES = 1 << 20
 """Bytes of a chunk of the file before compression: the default of mcap's writer."""
 ROSBAG_RECORD, ROSBAG_COUNTS = "rosbag2", "serialized_metadata"

@@ -285,6 +285,8 @@ def list_extra_topics(configuration: str) -> list[str]:
     return [f"copem/{configuration}/{kind}" for kind in ("status", "uncertainty")]
 
 
+RUN_RECORD = "org.copem_replay.run"
+"""The metadata record of this project: what made the file."""
 TRUTH_TOPICS = [f"copem/{TRUTH}/{kind}" for kind in ("scene", "static", "transform")]
 """Topics of the truth's scene: moving objects, static ones, the ego's pose."""
 EGO_FRAME, MIDDLE_FRAME = "copem_ego", "copem_middle"
