@@ -49,7 +49,10 @@ if TYPE_CHECKING:
 def add_row_accuracy(*outcomes: BlockOutcome) -> dict[str, Any]:
     """The columns of `detections` with the figures of each row, block after block."""
     parts = [
-        _row_columns(accuracy, outcome.assessed) for outcome in outcomes for _, _, accuracy in list_accuracies(outcome)
+        _row_columns(scores.accuracy, outcome.assessed)
+        for outcome in outcomes
+        for scores in outcome.all_scores.values()
+        if scores.accuracy is not None
     ]
     columns = concatenate_columns([outcome.columns for outcome in outcomes])
     return columns | (concatenate_columns(parts) if parts else {})
@@ -86,13 +89,6 @@ def _row_columns(accuracy: Accuracy, assessed: Bool) -> dict[str, Any]:
         "duplicates": sums["duplicates"],
         "longest_gap_s": np.where(first, sums["longest_gap_s"], np.nan),
     }
-
-
-def list_accuracies(outcome: BlockOutcome) -> Iterable[tuple[str, ConfigurationScores, Accuracy]]:
-    """Name, scores and accuracy of each configuration whose accuracy is measured."""
-    for name, scores in outcome.all_scores.items():
-        if scores.accuracy is not None:
-            yield name, scores, scores.accuracy
 
 
 def total_over_logs(of_logs: Mapping[tuple[str, str], AccuracyTotal]) -> dict[str, AccuracyTotal]:

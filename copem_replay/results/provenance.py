@@ -1,4 +1,4 @@
-"""The provenance of results: what made them, in `provenance.json`, and read back from there.
+"""The provenance of results: what made them, in `provenance.json`, and read back from there; recordings, read again.
 
 Versions, logs, seed, metric parameters and what each configuration is; no clock, no host.
 """
@@ -8,23 +8,24 @@ from __future__ import annotations
 import os
 import platform
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from copem_replay.core.errors import InputError, RemoteFile
+from copem_replay.core.errors import InputError, RecordingError, RemoteFile
 from copem_replay.core.files import parse_json
 from copem_replay.experiment.file import relocate_settings
-from copem_replay.experiment.schema import LogSettings
-from copem_replay.experiment.validate import resolve_place
-from copem_replay.io.open import File, first_recording
+from copem_replay.experiment.schema import Experiment, LogSettings
+from copem_replay.experiment.validate import read_logs, resolve_place
+from copem_replay.io.open import File, Place, fetch_place, first_recording, read_file_stamps, sha256_of
 from copem_replay.io.recording import Recording
+from copem_replay.metrics.columns import TABLES
 from copem_replay.metrics.config import Measure
 from copem_replay.pipeline.expansion import ConfigurationFacts, find_facts
 from copem_replay.pipeline.one_run import choose_logs, select_shown_runs
 from copem_replay.pipeline.run import StudyTables
-from copem_replay.pipeline.study_log import compute_log_digests
+from copem_replay.pipeline.study_log import compute_log_digests, read_content_digest
 from copem_replay.results.folder import MARK
 from copem_replay.results.table_files import AGAIN
 
@@ -49,6 +50,15 @@ class RecordedLog:
     sha256: str
     truth: str | None = None
 
+    def check_same(self, digest: str, path: File) -> None:
+        """Raise RecordingError where a recording is another than the one that was replayed."""
+        if digest != self.sha256:
+            raise RecordingError(
+                f"expected the log that was replayed, SHA-256 {self.sha256[:12]}…, found {digest[:12]}…; "
+                "put that log back, or run the experiment again",
+                path=path,
+            )
+
 
 @dataclass(frozen=True)
 class Provenance:
@@ -66,6 +76,11 @@ class Provenance:
     run_shown: dict[str, int]  # by log
     facts: dict[str, ConfigurationFacts]  # by configuration
     data: dict[str, Any]
+
+    def kinds(self, name: str, *, compared: bool = False) -> dict[str, str]:
+        """Kinds of the columns that a table has to have, all or only those that comparisons read."""
+        asked = {"braking": self.braking, "conflict": self.measure["conflict"]}
+        return TABLES[name].kinds(*(key for key, of in asked.items() if of is not None), compared=compared)
 
 
 def check_format(folder: Path) -> None:
@@ -116,6 +131,26 @@ def parse_provenance(data: Any, place: Path) -> Provenance:
         facts={str(name): ConfigurationFacts(**of) for name, of in dict(data["configurations"]).items()},
         data=data,
     )
+
+
+def reread_recording(log: RecordedLog, place: Place, experiment: Experiment) -> Recording:
+    """A recording that results name, read again as an experiment that is resolved for it has it.
+
+    Raises RecordingError, one line, where the recording is missing or not the one that was replayed.
+    """
+    try:
+        with fetch_place(place) as here:
+            stamps, digest = read_file_stamps(here), sha256_of(here)
+    except InputError as error:
+        raise RecordingError(f"{error}; put the log back to draw its runs") from None
+    log.check_same(digest, first_recording(place))
+    recordings, refused = read_logs(experiment, [place], None)
+    if refused:
+        raise RecordingError([f"{refusal.path}: {refusal.reason}" for refusal in refused])
+    if recordings[0].stamps != stamps:  # a copy of its own, or it has changed since
+        log.check_same(read_content_digest(recordings[0]), first_recording(place))
+    # Draws are addressed by the log's name, which depends on what else was replayed.
+    return replace(recordings[0], scene=replace(recordings[0].scene, log=log.name))
 
 
 # What is written.

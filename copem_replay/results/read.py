@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import os
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from os import PathLike
 from pathlib import Path
@@ -20,7 +20,6 @@ from copem_replay.core.errors import (
     ExperimentError,
     InputError,
     OutputError,
-    RecordingError,
     RemoteFile,
     count_noun,
     is_url,
@@ -34,23 +33,26 @@ from copem_replay.experiment.file import (
     settings_places,
 )
 from copem_replay.experiment.schema import Experiment
-from copem_replay.experiment.validate import read_logs
-from copem_replay.io.open import File, Place, fetch_place, first_recording, read_file_stamps, sha256_of
+from copem_replay.io.open import File, Place
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.columns import COMPARED_FILES, TABLES
-from copem_replay.metrics.config import Objects
 from copem_replay.metrics.intervals import choose_clusters
 from copem_replay.metrics.onset import COUNTS_BY, select_counted
 from copem_replay.metrics.summary import DETECTED
-from copem_replay.pipeline.prepare import Replay, prepare_log
-from copem_replay.pipeline.study_log import read_content_digest
 from copem_replay.pipeline.sweep import resolve_sweep
 from copem_replay.results.folder import EXPERIMENT, MARK, check_inputs, check_unchanged, take_place
-from copem_replay.results.provenance import Provenance, build_provenance, parse_provenance, read_provenance
+from copem_replay.results.provenance import (
+    Provenance,
+    build_provenance,
+    parse_provenance,
+    read_provenance,
+    reread_recording,
+)
 from copem_replay.results.table_files import (
     AGAIN,
     LogRows,
     check_columns,
+    check_configurations,
     read_csv,
     read_frame,
     read_log_rows,
@@ -65,7 +67,6 @@ if TYPE_CHECKING:
     from copem_replay.pipeline.expansion import ConfigurationFacts
     from copem_replay.pipeline.run import StudyTables
     from copem_replay.results.folder import ResultsPlace
-    from copem_replay.results.provenance import RecordedLog
     from copem_replay.results.write import Exporter
 
 
@@ -162,18 +163,13 @@ class Results:
             return self.study.find_table(name) is not None
         return _exists(self.place, name)
 
-    def kinds(self, name: str, *, compared: bool = False) -> dict[str, str]:
-        """Kinds of the columns that a table has to have, all or only those that comparisons read."""
-        asked = {"braking": self.provenance.braking, "conflict": self.provenance.measure["conflict"]}
-        return TABLES[name].kinds(*(key for key, of in asked.items() if of is not None), compared=compared)
-
     def frame(self, name: str) -> pd.DataFrame:
         """A whole table, by the name of its file. Raises InputError where it is damaged."""
         if self.study is not None:
             found = self.study.find_table(name)
             return found if isinstance(found, pd.DataFrame) else found.to_pandas()
         reader = read_csv if name.endswith(".csv") else partial(read_parquet, files=self._files(name))
-        table = read_frame(self.place / name, reader, self.kinds(name))
+        table = read_frame(self.place / name, reader, self.provenance.kinds(name))
         self.check_unchanged()
         return table
 
@@ -181,7 +177,7 @@ class Results:
         """A table log by log, which has at least the columns that comparisons read. Raises InputError."""
         if self.study is not None:
             return slice_log_rows(self.place / name, self.study.find_table(name))
-        rows = read_log_rows(self.place / name, self.kinds(name, compared=True), self._files(name))
+        rows = read_log_rows(self.place / name, self.provenance.kinds(name, compared=True), self._files(name))
         self.check_unchanged()
         return rows
 
@@ -351,9 +347,15 @@ class Results:
             return RemoteFile(entry) if is_url(entry) else base / entry
         return settings_places(entry, base)[0]
 
-    def log_path(self, log: str) -> File:
-        """The file where the recording of a log, or the first of several, is expected."""
-        return first_recording(self.log_place(log))
+    def recording(self, log: str, experiment: Experiment) -> Recording:
+        """The recording of a log, read again as an experiment, this one or one made of it, has it.
+
+        Raises RecordingError, one line, where the recording is missing or not the one that was replayed.
+        """
+        if self.study is not None:
+            return self.study.find_log(log).whole()
+        (recorded,) = (one for one in self.provenance.logs if one.name == log)
+        return reread_recording(recorded, self.log_place(log), resolve_for_log(experiment, log))
 
     def chosen(self, configurations: Sequence[str] | None) -> tuple[str, ...]:
         """The configurations to draw, each once; None: all. Raises InputError for a name that is not there."""
@@ -404,9 +406,9 @@ def check_complete(results: Results, *, rowless: bool = False) -> Results:
         return results
     _check_exists(results.place, "summary.csv", "tally.parquet")
     experiment, rows = results.experiment, results.rows
-    check_columns(rows.place, results.kinds(rows.place.name), rows.kinds)
+    check_columns(rows.place, results.provenance.kinds(rows.place.name), rows.kinds)
     if rows.counts or not rowless:
-        _check_rows(rows, experiment)
+        check_configurations(rows, experiment.configurations)
     tally = results.tally[results.tally["event"] == DETECTED]
     counts = tally.groupby(["log", "configuration"])["runs"].sum()
     if counts.to_dict() != rows.counts:
@@ -426,72 +428,3 @@ def check_complete(results: Results, *, rowless: bool = False) -> Results:
     for name in ("summary", "exact", "sweep"):
         getattr(results, name)
     return results
-
-
-def _check_rows(rows: LogRows, experiment: Experiment) -> None:
-    """Raise InputError where rows are of another experiment or missing, or where there are none."""
-    unknown = [name for name in rows.configurations if name not in experiment.configurations]
-    if unknown:
-        raise InputError(f"{rows.place}: expected the configurations of experiment.yaml, found {unknown[0]!r}; {AGAIN}")
-    if not rows.counts:
-        raise InputError(f"{rows.place}: expected rows to draw, found none: no measured object has an onset")
-    # A configuration that has none of its units in a log is left out of that log.
-    counts = [*rows.counts.values(), *[0] * (set(experiment.configurations) != set(rows.configurations))]
-    counts_of: dict[str, set[int]] = {}
-    for (log, _), count in rows.counts.items():
-        counts_of.setdefault(log, set()).add(count)
-    if 0 in counts or any(len(sizes) > 1 for sizes in counts_of.values()):
-        raise InputError(
-            f"{rows.place}: expected as many rows of each configuration, found {min(counts)} to {max(counts)}; {AGAIN}"
-        )
-
-
-# Logs, read again: figures of single runs need the recording, which a results folder names but does not hold.
-
-
-def reread_log(results: Results, log: str, object_id: str) -> Replay:
-    """One log, prepared again for replay with one measured object only.
-
-    Raises RecordingError, one line, where the recording is missing or not the one that was replayed, or has no ego.
-    """
-    of_log = resolve_for_log(results.experiment, log)
-    measure = of_log.measure.model_copy(update={"objects": Objects(ids=(object_id,))})
-    experiment = of_log.model_copy(update={"measure": measure})
-    recording = reread_recording(results, log, experiment)
-    if recording.scene.ego_ix < 0:
-        raise RecordingError("no ego in this study, whose runs could be drawn", path=recording.path)
-    return prepare_log(recording, experiment)
-
-
-def reread_recording(results: Results, log: str, experiment: Experiment) -> Recording:
-    """The recording of a log of the results, read again as an experiment, theirs or one made of it, has it.
-
-    Raises RecordingError, one line, where the recording is missing or not the one that was replayed.
-    """
-    if results.study is not None:
-        return results.study.find_log(log).whole()
-    file = next(file for file in results.provenance.logs if file.name == log)
-    path, place = results.log_path(log), results.log_place(log)
-    try:
-        with fetch_place(place) as here:
-            stamps, digest = read_file_stamps(here), sha256_of(here)
-    except InputError as error:
-        raise RecordingError(f"{error}; put the log back to draw its runs") from None
-    _check_same_content(digest, file, path)
-    recordings, refused = read_logs(resolve_for_log(experiment, log), [place], None)
-    if refused:
-        raise RecordingError([f"{refusal.path}: {refusal.reason}" for refusal in refused])
-    if recordings[0].stamps != stamps:  # a copy of its own, or it has changed since
-        _check_same_content(read_content_digest(recordings[0]), file, path)
-    # Draws are addressed by the log's name, which depends on what else was replayed.
-    return replace(recordings[0], scene=replace(recordings[0].scene, log=log))
-
-
-def _check_same_content(digest: str, file: RecordedLog, path: File) -> None:
-    """Raise RecordingError where a recording is another than the one that was replayed."""
-    if digest != file.sha256:
-        raise RecordingError(
-            f"expected the log that was replayed, SHA-256 {file.sha256[:12]}…, found {digest[:12]}…; "
-            "put that log back, or run the experiment again",
-            path=path,
-        )

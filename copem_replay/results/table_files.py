@@ -47,11 +47,8 @@ def read_parquet(path: Path, files: Sequence[Path] = ()) -> pd.DataFrame:
 
 def read_frame(path: Path, reader: Callable[[Path], pd.DataFrame], kinds: Mapping[str, str]) -> pd.DataFrame:
     """A table with at least these columns. Raises InputError."""
-    try:
+    with _report_damage(path):
         table = reader(path)
-    except (OSError, ValueError) as error:  # what Arrow and pandas raise derives from these
-        why = " ".join(str(error).split())
-        raise InputError(f"{path}: expected a table that can be read, found damage: {why}; {AGAIN}") from None
     check_columns(path, kinds, table.columns)
     for name in (name for name, kind in kinds.items() if kind in ("numbers", "whole numbers")):
         if table[name].dtype.kind not in "iuf" and table[name].notna().any():
@@ -187,6 +184,24 @@ def read_log_rows(place: Path, kinds: Mapping[str, str], files: Sequence[Path] =
     return LogRows(place, kinds, counts, schema.empty_table(), read)
 
 
+def check_configurations(rows: LogRows, names: Collection[str]) -> None:
+    """Raise InputError where rows are of another experiment or missing, or where there are none."""
+    unknown = [name for name in rows.configurations if name not in names]
+    if unknown:
+        raise InputError(f"{rows.place}: expected the configurations of experiment.yaml, found {unknown[0]!r}; {AGAIN}")
+    if not rows.counts:
+        raise InputError(f"{rows.place}: expected rows to draw, found none: no measured object has an onset")
+    # A configuration that has none of its units in a log is left out of that log.
+    counts = [*rows.counts.values(), *[0] * (set(names) != set(rows.configurations))]
+    counts_of: dict[str, set[int]] = {}
+    for (log, _), count in rows.counts.items():
+        counts_of.setdefault(log, set()).add(count)
+    if 0 in counts or any(len(sizes) > 1 for sizes in counts_of.values()):
+        raise InputError(
+            f"{rows.place}: expected as many rows of each configuration, found {min(counts)} to {max(counts)}; {AGAIN}"
+        )
+
+
 def slice_log_rows(place: Path, table: Any) -> LogRows:
     """A table in memory, of pandas or Arrow, log by log. `place`: what it is called."""
     if isinstance(table, pd.DataFrame):
@@ -212,13 +227,13 @@ def _count_rows(table: pa.Table) -> dict[tuple[str, str], int]:
 
 @contextmanager
 def _report_damage(place: Path) -> Iterator[None]:
-    """Raise InputError where Arrow cannot read a table."""
+    """Raise InputError where Arrow or pandas cannot read a table."""
     try:
         yield
     except KeyError as error:  # of a column that is asked for by its name
         name = error.args[0].decode() if isinstance(error.args[0], bytes) else error.args[0]
         raise InputError(f"{place}: expected the column {name}, found none; {AGAIN}") from None
-    except (OSError, ValueError) as error:  # what Arrow raises derives from these
+    except (OSError, ValueError) as error:  # what Arrow and pandas raise derives from these
         why = " ".join(str(error).split())
         raise InputError(f"{place}: expected a table that can be read, found damage: {why}; {AGAIN}") from None
 

@@ -33,7 +33,7 @@ from copem_replay.results.compare.labels import (
     label_configurations,
 )
 from copem_replay.results.folder import add_to_made_list
-from copem_replay.results.read import Results, check_complete, reread_recording
+from copem_replay.results.read import Results, check_complete
 from copem_replay.viewer.sink import split_into_files
 
 
@@ -192,7 +192,7 @@ def _join_sides(sides: Sequence[_Side], labels: Sequence[str]) -> Experiment:
 
 def _reread_truth(sides: Sequence[_Side], log: str, experiment: Experiment) -> Recording:
     """The first folder's recording. Raises InputError if another folder read other objects from it."""
-    recording = reread_recording(sides[0].results, log, experiment)
+    recording = sides[0].results.recording(log, experiment)
     for side in sides:
         if side.one.replay.scene.object_ids != recording.scene.object_ids:
             first_folder = sides[0].results.place
@@ -247,7 +247,7 @@ def _replay_side(results: Results, chosen: Sequence[LabelledConfiguration], log:
     alone = resolve_for_log(results.experiment, log)
     configurations = {name: configuration for name, configuration in alone.configurations.items() if name in labels}
     experiment = alone.model_copy(update={"configurations": configurations, "sweep": None})
-    replayed = replay_run(reread_recording(results, log, experiment), experiment, run)
+    replayed = replay_run(results.recording(log, experiment), experiment, run)
     (detections,) = results.each(log=log, every=True)
     rows = detections[(detections["run"] == run) & detections["configuration"].isin(list(configurations))].assign(
         log=log

@@ -92,7 +92,7 @@ def test_results_keep_the_settings_and_come_out_the_same_again(folder: Path) -> 
     one, two = (cr.load_results(folder / name) for name in ("one", "two_"))
     assert_frame_equal(one.detections, two.detections)
     assert [log.name for log in one.provenance.logs] == ["drive", "second", "three"]
-    assert [one.log_path(log).resolve().name for log in ("drive", "second")] == ["drive.mcap", "two.mcap"]
+    assert [one.log_place(log).resolve().name for log in ("drive", "second")] == ["drive.mcap", "two.mcap"]
 
 
 def test_log_keeps_the_settings_of_a_recording_that_the_experiment_names(folder: Path) -> None:

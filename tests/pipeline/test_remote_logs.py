@@ -20,7 +20,6 @@ from copem_replay.cli import main as cli
 from copem_replay.core import waiting
 from copem_replay.core.errors import CopemError, RemoteFile, hide_credentials, strip_credentials
 from copem_replay.experiment import validate
-from copem_replay.results.read import reread_log
 from tests.cli.test_api import cr
 from tests.helpers.experiments import changed, drive
 from tests.helpers.object_storage import Bucket
@@ -340,11 +339,11 @@ def test_a_run_is_drawn_from_the_log_where_it_lies(here: Path, drives: Bucket) -
     Path("e.yaml").write_text(changed(f"logs: ['{drives.url}/drives/b.mcap']"))
     cr.run("e.yaml").save("out")
     results = cr.load_results("out")
-    assert reread_log(results, "b", "2").scene.log == "b"
+    assert results.recording("b", results.experiment).scene.log == "b"
     drive(here / "other.mcap", first=7, host=7)
     drives.put(here / "other.mcap", "drives/b.mcap")
     with pytest.raises(cr.RecordingError, match=rf"^{drives.url}/drives/b.mcap: expected the log that was replayed"):
-        reread_log(results, "b", "2")
+        results.recording("b", results.experiment)
 
 
 def test_two_hundred_names_are_replayed_with_few_words_and_found_again_unread(

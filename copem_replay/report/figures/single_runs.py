@@ -13,16 +13,19 @@ from typing import TYPE_CHECKING, Any
 import numba as nb
 import numpy as np
 
+from copem_replay.core.errors import RecordingError
 from copem_replay.core.geometry import box_distance, pose_on_path
 from copem_replay.core.tracks import CLASSES, SAME_INSTANT_S, Float
+from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.braking.driver import Driver
 from copem_replay.metrics.braking.encounter import EgoPath, Encounter
 from copem_replay.metrics.braking.verdict import simulate_braking
+from copem_replay.metrics.config import Objects
 from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.metrics.survival import EndReason
 from copem_replay.pipeline.one_run import BY_EGO, share_curves
-from copem_replay.pipeline.prepare import Replay
+from copem_replay.pipeline.prepare import Replay, prepare_log
 from copem_replay.report.figures.selection import Choice, Selection, choose_object_and_run, describe_left_out
 from copem_replay.report.figures.style import (
     FAINT,
@@ -35,7 +38,6 @@ from copem_replay.report.figures.style import (
     new_figure,
     shorten_names,
 )
-from copem_replay.results.read import reread_log
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -288,7 +290,7 @@ def runs_figure(results: Results, selection: Selection) -> Figure:
     changed.
     """
     choice = choose_object_and_run(results, selection)
-    replay = reread_log(results, choice.log, choice.object_id)
+    replay = _prepare_object(results, choice.log, choice.object_id)
     (rows,) = results.each(log=choice.log, every=True)
     of_run = first_episodes(rows[(rows["object_id"] == choice.object_id) & (rows["run"] == choice.run)])
     of_run = of_run.set_index("configuration", drop=False)
@@ -297,6 +299,17 @@ def runs_figure(results: Results, selection: Selection) -> Figure:
         figure = _draw_stories(results, replay, stories)
         add_note(figure, _note_sentences(results, choice, stories))
     return figure
+
+
+def _prepare_object(results: Results, log: str, object_id: str) -> Replay:
+    """One log, prepared again for replay with one measured object only. Raises RecordingError, also without an ego."""
+    of_log = resolve_for_log(results.experiment, log)
+    measure = of_log.measure.model_copy(update={"objects": Objects(ids=(object_id,))})
+    experiment = of_log.model_copy(update={"measure": measure})
+    recording = results.recording(log, experiment)
+    if recording.scene.ego_ix < 0:
+        raise RecordingError("no ego in this study, whose runs could be drawn", path=recording.path)
+    return prepare_log(recording, experiment)
 
 
 def _draw_stories(results: Results, replay: Replay, stories: Sequence[Story]) -> Figure:

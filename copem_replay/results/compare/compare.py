@@ -16,7 +16,7 @@ import pandas as pd
 
 from copem_replay.core.errors import InputError, count_noun
 from copem_replay.core.tracks import SAME_INSTANT_S
-from copem_replay.metrics.columns import COMPARED_FILES, COMPARISON
+from copem_replay.metrics.columns import COMPARISON
 from copem_replay.metrics.intervals import FEWEST_CLUSTERS, FEWEST_LOGS, NOT_ENOUGH, choose_over, explain_no_clusters
 from copem_replay.metrics.summary_metrics import COMPARED
 from copem_replay.results.compare.labels import (
@@ -28,6 +28,7 @@ from copem_replay.results.compare.labels import (
     label_configurations,
     note_on_measuring,
     notes_on_differences,
+    notes_on_folders,
     notes_on_output_baseline,
     rename_logs,
 )
@@ -134,27 +135,6 @@ def _read_folder(folder: Path | Results) -> Results:
 
 
 # Notes on a comparison: what is left out, and why.
-
-
-def notes_on_folders(folders: Sequence[Results]) -> Iterator[str]:
-    """Notes on folders that have other numbers of runs, or lack tables or braking."""
-    runs = {str(folder.place): folder.provenance.runs for folder in folders}
-    of_lists_first = sorted(COMPARED.values(), key=lambda metric: metric.part != "lists")
-    if len(set(runs.values())) > 1:
-        has = ", ".join(f"{path} {count}" for path, count in runs.items())
-        yield f"other numbers of runs ({has}): the first {min(runs.values())} are compared"
-    for folder in folders:
-        missing = [name for name in COMPARED_FILES if name not in folder.by_log]
-        metrics = [m.name for m in of_lists_first if m.compared and {*m.compared.files} & {*missing}]
-        if metrics:
-            yield (
-                f"{folder.place}: no {', '.join(missing)} (without accuracy, or of "
-                f"an older version): not compared: {', '.join(metrics)}"
-            )
-    with_braking = [folder for folder in folders if folder.provenance.braking is not None]
-    if with_braking and len(with_braking) < len(folders):
-        without = ", ".join(str(folder.place) for folder in folders if folder.provenance.braking is None)
-        yield f"{without}: no braking: pass_share is compared only among those that have it"
 
 
 def notes_on_pairs(baseline: LabelledConfiguration, pairs: Mapping[LabelledConfiguration, AllLogs]) -> Iterator[str]:

@@ -14,6 +14,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from copem_replay.core.errors import InputError, unknown_name_message
+from copem_replay.metrics.columns import COMPARED_FILES
+from copem_replay.metrics.summary_metrics import COMPARED
 
 if TYPE_CHECKING:
     from copem_replay.pipeline.expansion import ConfigurationFacts
@@ -214,6 +216,27 @@ def _compare_logs(first: Results, other: Results) -> Iterator[str]:
     topics, other_topics = ({log.name: log.topic for log in folder.provenance.logs} for folder in (first, other))
     for name, topic in topics.items():
         yield from _describe_mismatch(first, other, f"log {name}: topic", topic, other_topics[name])
+
+
+def notes_on_folders(folders: Sequence[Results]) -> Iterator[str]:
+    """Notes on folders that have other numbers of runs, or lack tables or braking."""
+    runs = {str(folder.place): folder.provenance.runs for folder in folders}
+    of_lists_first = sorted(COMPARED.values(), key=lambda metric: metric.part != "lists")
+    if len(set(runs.values())) > 1:
+        has = ", ".join(f"{path} {count}" for path, count in runs.items())
+        yield f"other numbers of runs ({has}): the first {min(runs.values())} are compared"
+    for folder in folders:
+        missing = [name for name in COMPARED_FILES if name not in folder.by_log]
+        metrics = [m.name for m in of_lists_first if m.compared and {*m.compared.files} & {*missing}]
+        if metrics:
+            yield (
+                f"{folder.place}: no {', '.join(missing)} (without accuracy, or of "
+                f"an older version): not compared: {', '.join(metrics)}"
+            )
+    with_braking = [folder for folder in folders if folder.provenance.braking is not None]
+    if with_braking and len(with_braking) < len(folders):
+        without = ", ".join(str(folder.place) for folder in folders if folder.provenance.braking is None)
+        yield f"{without}: no braking: pass_share is compared only among those that have it"
 
 
 # The baseline where none is asked for.
