@@ -68,9 +68,10 @@ def run(
     >>> result.summary["ttd_median_s"].round(3).tolist()
     [0.0, 0.8, 0.0, 0.5, 1.0, 1.5]
     """
+    from copem_replay.pipeline.parts import PartCache
     from copem_replay.pipeline.study_log import LogSurvey
 
-    cache = None if pieces is None else open_parts(str(pieces))
+    cache = None if pieces is None else PartCache(str(pieces))
     if crew is None:
         study = make_study(experiment, recordings, LogSurvey(cache))
     elif cache is None:
@@ -93,13 +94,6 @@ def read_with_crew(read: Callable[[], LoadedStudy], crew: Crew) -> LoadedStudy:
     while crew.fill(study.experiment, study.recordings):
         study = read()
     return study
-
-
-def open_parts(address: str) -> PartCache:
-    """The parts kept in a folder, or under a URL. Raises InputError, OutputError."""
-    from copem_replay.pipeline.parts import PartCache
-
-    return PartCache(address)
 
 
 def replay_study(

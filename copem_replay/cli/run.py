@@ -75,6 +75,7 @@ def run(
     viewer: Annotated[str | None, typer.Option(metavar="URL", help="Address of that viewer [on this machine].")] = None,
 ) -> int:
     """Replay an experiment, write its results, print the summary."""
+    from copem_replay.pipeline.parts import PartCache
     from copem_replay.results.folder import take_place
 
     source = override_source(experiment, {"ego": ego, "runs": runs, "seed": seed}, log or (), (from_s, to_s))
@@ -87,7 +88,7 @@ def run(
     with take_place(out, overwrite=overwrite) as place:
         print_notes(place.notes)
         place.notes.clear()
-        cache = _open_parts(pieces)
+        cache = None if pieces is None else PartCache(pieces)
         study = _read_study(place, experiment, source, skip_unreadable, cache, cluster)
         url = _check_viewer(study.experiment, viewer) if live or viewer is not None else None
         result, advice = _replay_study(study, jobs, cache, threads=cluster is None)
@@ -98,12 +99,6 @@ def run(
             print_line(f"report in {write_report(place.shown)}")
     _print_next(place.shown)
     return 1 if study.skipped or place.failed else 0
-
-
-def _open_parts(pieces: str | None) -> PartCache | None:
-    from copem_replay.api.run import open_parts
-
-    return None if pieces is None else open_parts(pieces)
 
 
 def _read_study(

@@ -116,15 +116,8 @@ def join_list_rates(times: Iterable[ListRate]) -> ListRate:
 # Output times: how old the recorded outputs of stacks are when they are available, as the recordings tell.
 
 
-def sum_output_times(recordings: Sequence[Recording], experiment: Experiment) -> dict[str, OutputTimes]:
-    """By configuration the sums over all recordings."""
-    return {
-        name: sum((_sum_log_times(recording, experiment, name) for recording in recordings), OutputTimes())
-        for name in experiment.outputs
-    }
-
-
-def _sum_log_times(recording: Recording, experiment: Experiment, name: str) -> OutputTimes:
+def sum_output_times(recording: Recording, experiment: Experiment, name: str) -> OutputTimes:
+    """The sums over the lists of one recorded output that a log has."""
     lists = recording.lists[output_unit(name)]
     available_s, captured_s = lists.tracks.common_arrives_s, lists.tracks.captured_s
     while_it_lasts = (available_s >= -SAME_INSTANT_S) & (available_s <= recording.scene.end_s + SAME_INSTANT_S)
@@ -246,11 +239,6 @@ def _find_unused_memory(experiment: Experiment) -> Iterator[str]:
         for quantity in pem.in_vain():
             what = f"a {quantity} error" if quantity in ("position", "yaw", "speed", "size") else f"{quantity} drawn"
             yield f"pems.{name}.memory.{quantity}: no couple has {what}, nothing to remember"
-
-
-def has_same_instants(ready: Sequence[Replay]) -> bool:
-    """Whether all runs have the same units, and lists at the same instants."""
-    return all(replay.expanded.same_in_all_runs and not replay.expanded.arrivals_differ for replay in ready)
 
 
 def list_oddities(replay: Replay, experiment: Experiment, met: Bool | None = None) -> Iterator[str]:
@@ -521,8 +509,9 @@ def list_began(ready: Sequence[Replay], experiment: Experiment) -> list[str]:
 class LogFacts:
     """What results say of one log in one experiment beside its rows. `times`: as `measure_list_rates` gives them.
 
-    `episodes`: rows of a run and configuration; `began`: how many began in each of the ways `BEGAN`. `listable`:
-    observation rows, by which the time of a run is estimated.
+    `episodes`: rows of a run and configuration; `began`: how many began in each of the ways `BEGAN`. `same_instants`:
+    whether all runs have the same units, and lists at the same instants. `listable`: observation rows, by which the
+    time of a run is estimated.
     """
 
     episodes: int
@@ -539,10 +528,10 @@ class LogFacts:
         return cls(
             len(replay.episodes.object_ix),
             replay.episodes.count_began(),
-            has_same_instants([replay]),
+            replay.expanded.same_in_all_runs and not replay.expanded.arrivals_differ,
             tuple(list_oddities(replay, experiment, replay.ever_met)),
             measure_list_rates(replay, experiment),
-            sum_output_times([recording], experiment),
+            {name: sum_output_times(recording, experiment, name) for name in experiment.outputs},
             replay.rows_kept,
         )
 

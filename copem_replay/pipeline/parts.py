@@ -22,7 +22,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import cache, cached_property
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, TypeAlias
 from urllib.parse import urlsplit
 
 from pydantic import BaseModel
@@ -46,33 +46,12 @@ from copem_replay.experiment.schema import Configuration, Experiment
 from copem_replay.metrics.onset import Requires
 from copem_replay.pipeline.tables import PartTables, pack_part, unpack_part
 
-# Stores: bytes by name, in a folder or under a URL. A name is complete or missing. A store is pickled as its address:
-# every process opens its own.
+# Stores: bytes by name, in a folder or under a URL. A name is complete or missing. `where` is the address of a store
+# without credentials, for messages. A store is pickled as its address: every process opens its own.
 
 _OPTION = "--pieces: "
 MARK = "parts.txt"
 """Written once under a URL: a bucket that is missing, or cannot be written, is found out before any run."""
-
-
-class Store(Protocol):
-    """Bytes by name. `where`: its address without credentials, for messages."""
-
-    where: str
-
-    def exists(self, name: str) -> bool:
-        """Whether there is such a name."""
-
-    def read(self, name: str) -> bytes | None:
-        """The bytes under a name; None: there is no such name. Raises InputError, OSError."""
-
-    def write(self, name: str, content: bytes) -> None:
-        """Keep bytes under a name. Raises OutputError."""
-
-    def names(self) -> set[str]:
-        """All names, listed anew, with those that other processes have written."""
-
-    def refresh(self) -> None:
-        """From now on find what other processes have written."""
 
 
 def open_store(address: str | Path) -> Store:
@@ -120,11 +99,6 @@ class FolderStore:
         except OSError as error:
             raise OutputError(f"{place}: cannot be written: {error.strerror or error}") from error
 
-    def names(self) -> set[str]:
-        """All files but those that are being written."""
-        files = (path for path in self.root.rglob("[!.]*") if path.is_file())
-        return {path.relative_to(self.root).as_posix() for path in files}
-
     def refresh(self) -> None:
         """Nothing to do: files are looked up when they are asked for."""
 
@@ -150,7 +124,12 @@ class BucketStore:
 
     @cached_property
     def _listed(self) -> set[str]:
-        return self.names()
+        fs, path = self._opened
+        with reraise_in_one_line(self.url, what=_OPTION):
+            fs.invalidate_cache()
+            check_answering(self.url, fs, f"{path}/{MARK}")
+            paths = await_server(self.where, lambda _: fs.find(path), works=True)
+        return {name.partition(f"{path}/")[2] for name in paths}
 
     def exists(self, name: str) -> bool:
         """Whether the last listing has the name, or this process has written it since."""
@@ -176,19 +155,12 @@ class BucketStore:
         if "_listed" in self.__dict__:
             self._listed.add(name)
 
-    def names(self) -> set[str]:
-        """The names of all objects, listed anew. Raises InputError."""
-        fs, path = self._opened
-        with reraise_in_one_line(self.url, what=_OPTION):
-            fs.invalidate_cache()
-            check_answering(self.url, fs, f"{path}/{MARK}")
-            paths = await_server(self.where, lambda _: fs.find(path), works=True)
-        self._listed = {name.partition(f"{path}/")[2] for name in paths}
-        return self._listed
-
     def refresh(self) -> None:
-        """List anew."""
-        self.names()
+        """List anew when a name is asked for next, and find what other processes have written."""
+        self.__dict__.pop("_listed", None)
+
+
+Store: TypeAlias = FolderStore | BucketStore
 
 
 # Recipes, and the keys that name them.
