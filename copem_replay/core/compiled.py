@@ -70,7 +70,7 @@ def recompiled_note() -> str | None:
 
 def prepare_cache(package: Path, environment: Mapping[str, str] = os.environ) -> str | None:
     """Provide a place for compiled code, before Numba is imported. Returns a note for the user, or None."""
-    folders = _package_folders(package)
+    folders = [folder for folder, _, files in os.walk(package) if "__init__.py" in files]
     _remove_stale(folders)
     if _is_writable(environment.get(VARIABLE)) or all(_is_writable(f"{folder}/__pycache__") for folder in folders):
         return None
@@ -86,11 +86,6 @@ def prepare_cache(package: Path, environment: Mapping[str, str] = os.environ) ->
         sys.modules["numba"].config.CACHE_DIR = folder
     cached = f"compiled code is cached in {folder}{why}, as neither {package} nor {home} can be written"
     return f"{cached}; {VARIABLE} names another"
-
-
-def _package_folders(package: Path) -> list[str]:
-    """The package, and all packages in it."""
-    return [folder for folder, _, files in os.walk(package) if "__init__.py" in files]
 
 
 def _remove_stale(folders: list[str]) -> None:

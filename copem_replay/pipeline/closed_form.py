@@ -43,11 +43,6 @@ from copem_replay.pipeline.sweep import list_points
 # Detection that lasts: which units share a held number, and whether that has a closed form.
 
 
-def check_lasting(experiment: ExpandedExperiment, name: str, hits: int) -> bool:
-    """Whether detection lasts in a configuration. Raises ExperimentError where that has no closed form."""
-    return bool(_find_processes(experiment, name, hits))
-
-
 def find_lasting_detection(
     replay: Replay, experiment: ExpandedExperiment, name: str, received: Tracks
 ) -> LastingDetection | None:
@@ -276,7 +271,7 @@ def check_exact(ready: Sequence[Replay], experiment: Experiment) -> None:
     for replay in ready:
         units = replay.expanded.with_(resolve_for_log(experiment, replay.scene.log))
         for name in units.configurations:
-            lasts = check_lasting(units, name, hits)
+            lasts = bool(_find_processes(units, name, hits))
             if hits == 1 and not lasts and not units.arrivals_differ:
                 continue
             received, reception = receive_without_loss(replay, units, name, hits)

@@ -256,18 +256,16 @@ class ExpandedExperiment:
     def runs_apart(self) -> bool:
         """Whether runs are replayed one by one, as lists differ in more than the presence and states of their rows."""
         return self.arrivals_differ or any(
-            isinstance(configuration.fusion, ListFusion)
-            and any(self._apart(self.units[name]) for name in self.units_of(configuration))
+            unit.clock is not None or (unit.pem is not None and self.pems[unit.pem].draws_claims)
             for configuration in self.configurations.values()
+            if isinstance(configuration.fusion, ListFusion)
+            for unit in (self.units[name] for name in self.units_of(configuration))
         )
 
     @property
     def draws_claims(self) -> bool:
         """Whether a PEM draws more than states: ghosts, classes, scores or track ids."""
         return any(self.pems[str(unit.pem)].draws_claims for unit in self.modelled.values())
-
-    def _apart(self, unit: Unit) -> bool:
-        return unit.clock is not None or (unit.pem is not None and self.pems[unit.pem].draws_claims)
 
     def with_(self, experiment: Experiment) -> ExpandedExperiment:
         """These units in another experiment, which differs in its configurations or in what is measured.

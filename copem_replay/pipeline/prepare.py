@@ -12,7 +12,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import TypeVar
 
 import numpy as np
 
@@ -83,19 +82,6 @@ KEPT = 64
 """Sets of instants of which the truth is kept. More take more memory, and where arrivals are drawn no set comes again:
 each run has its own. No result depends on it."""
 
-T = TypeVar("T")
-
-
-def _cache_instants(cache: dict[bytes, T], time_s: Float, compute: Callable[[Float], T]) -> T:
-    """What the cache has of these instants, else what `compute` gives, which replaces the oldest entry."""
-    key = time_s.tobytes()
-    value = cache.get(key)
-    if value is None:
-        value = cache[key] = compute(time_s)
-        for oldest in list(cache)[:-KEPT]:
-            cache.pop(oldest, None)
-    return value
-
 
 @dataclass(frozen=True)
 class TruthCache:
@@ -105,24 +91,30 @@ class TruthCache:
     truth: Tracks
     experiment: MetricsSetup
     _worlds: dict[bytes, Tracks] = field(default_factory=dict)
-    _references: dict[bytes, Reference] = field(default_factory=dict)
 
     def at(self, time_s: Float) -> Tracks:
         """The truth at instants (K,), ascending."""
-        return _cache_instants(self._worlds, time_s, self._at)
+        return self._cache(time_s, self.between)
 
     def between(self, time_s: Float) -> Tracks:
         """The truth at instants (K,), ascending, which is not kept."""
-        return self._at(time_s)
-
-    def at_stated(self, time_s: Float, captured_s: tuple[Float, Float]) -> Tracks:
-        """The truth at stated instants (K,), ascending; `captured_s`: the earliest and latest true capture of each."""
-        return _cache_instants(self._worlds, np.stack([time_s, *captured_s]), self._at_stated)
-
-    def _at(self, time_s: Float) -> Tracks:
         return interpolate_at_instants(
             self._near(time_s), self._stamps(time_s), t0_ns=self.scene.t0_ns, max_gap_s=self.experiment.max_gap_s
         )
+
+    def at_stated(self, time_s: Float, captured_s: tuple[Float, Float]) -> Tracks:
+        """The truth at stated instants (K,), ascending; `captured_s`: the earliest and latest true capture of each."""
+        return self._cache(np.stack([time_s, *captured_s]), self._at_stated)
+
+    def _cache(self, time_s: Float, compute: Callable[[Float], Tracks]) -> Tracks:
+        """What is kept of these instants, else what `compute` gives, which replaces the oldest."""
+        key = time_s.tobytes()
+        world = self._worlds.get(key)
+        if world is None:
+            world = self._worlds[key] = compute(time_s)
+            for oldest in list(self._worlds)[:-KEPT]:
+                self._worlds.pop(oldest, None)
+        return world
 
     def _at_stated(self, times_s: Float) -> Tracks:
         stamps, earliest, latest = self._stamps(times_s)
@@ -143,9 +135,7 @@ class TruthCache:
 
     def reference(self, time_s: Float) -> Reference:
         """From where distances are measured, at instants (K,)."""
-        return _cache_instants(
-            self._references, time_s, lambda time_s: locate_reference(self.scene, self.truth, self.experiment, time_s)
-        )
+        return locate_reference(self.scene, self.truth, self.experiment, time_s)
 
     def classes(self, measure: Measure) -> Bool:
         """(C,) which classes are measured: an entry without a true object is a ghost only if it is of one of these."""
@@ -182,6 +172,8 @@ class Replay:
     outside_ix: Int = field(
         default_factory=lambda: np.empty(0, dtype=np.int64)
     )  # (K,) objects that `within` leaves out
+    kept_draws: KeptDraws = field(init=False, default_factory=KeptDraws)  # what links drew for the lists of this log
+    _shares: KeptShares = field(init=False, default_factory=KeptShares)
 
     @cached_property
     def ego(self) -> EgoPath:
@@ -237,15 +229,6 @@ class Replay:
         """The truth that configurations share: of a whole log it is kept, of a time chunk it is made anew."""
         whole = chunk == TimeChunk()
         return self.truth_cache if whole else TruthCache(self.scene, self.truth, self.expanded)
-
-    @cached_property
-    def kept_draws(self) -> KeptDraws:
-        """What links drew for the lists of this log."""
-        return KeptDraws()
-
-    @cached_property
-    def _shares(self) -> KeptShares:
-        return KeptShares()
 
     @cached_property
     def _whole(self) -> Observations:

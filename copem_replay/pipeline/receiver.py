@@ -253,11 +253,6 @@ class ReceiverOutput:
         for s in range(len(self.lists.start)):
             yield s, convert_to_tracks(self, s, matches)
 
-    @property
-    def captures_told_s(self) -> Float:
-        """(F,) the captures of the lists that were received, as fusion was told of them."""
-        return self.received.captured_s if self.stated is None else self.stated.stated_s
-
 
 def states_needed(configuration: Configuration) -> States | None:
     """What has to be drawn of units' rows for the fused states of a configuration; None, of the truth: nothing."""

@@ -66,7 +66,7 @@ def _interpolate_told_world(around: TruthCache, output: ReceiverOutput) -> Track
 
 def _list_captures(output: ReceiverOutput) -> Float:
     """Captures, ascending: all that were received; in a time chunk those about the captures that entries name."""
-    captures: Float = np.unique(output.captures_told_s)
+    captures: Float = np.unique(output.received.captured_s if output.stated is None else output.stated.stated_s)
     if output.whole:
         return captures
     after = np.searchsorted(captures, output.told.entries["captured_s"])

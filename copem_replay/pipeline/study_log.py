@@ -135,13 +135,12 @@ class StudyLog:
             return LogFacts.read(kept["facts"])
         replay = self.replay()
         facts = LogFacts.of(self.whole(), replay, alone)
-        self.parts.keep(about, self._describe() | {"facts": facts.as_json()})
+        said = {
+            "scene": scene_as_json(recording.scene), "topic": recording.topic, "notes": list(recording.notes),
+            "host": recording.host_id, **self.digests, "states": self.object_states, "facts": facts.as_json(),
+        }  # fmt: skip
+        self.parts.keep(about, said)
         return facts
-
-    def _describe(self) -> dict[str, Any]:
-        scene, notes = scene_as_json(self.recording.scene), list(self.recording.notes)
-        data = {"scene": scene, "topic": self.recording.topic, "notes": notes, "host": self.recording.host_id}
-        return data | dict(self.digests) | {"states": self.object_states}
 
 
 def compute_log_digests(recording: Recording) -> dict[str, Any]:

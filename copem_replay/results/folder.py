@@ -15,6 +15,7 @@ import traceback
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -171,10 +172,6 @@ def _move_over(name: str, old: Path, new: Path, move: Callable[[Path, Path], Non
         return
     _make_folder(target.parent, old, new)
     move(source, target)
-
-
-def _link(source: Path, target: Path) -> None:
-    os.link(source, target, follow_symlinks=False)
 
 
 # The lock: one process at a time writes to a place.
@@ -336,7 +333,7 @@ class ResultsPlace:
         self._list_ours(_NEW, held, files)
         for name in held.others(files):
             with suppress(OSError):
-                _move_over(name, self.folder, self.new, _link)
+                _move_over(name, self.folder, self.new, partial(os.link, follow_symlinks=False))
         flush_all(self.new)
         assert self.before is not None
         old = self.new
@@ -406,28 +403,23 @@ def take_place(folder: Path, *, overwrite: bool) -> Iterator[ResultsPlace]:
     check_target(folder, overwrite=overwrite)
     with ExitStack() as stack:
         try:
-            place = _take_place(folder, overwrite, stack)
+            path = folder.resolve()
+            room = (os.pathconf("/", "PC_PATH_MAX") if hasattr(os, "pathconf") else _PATH_BYTES) - _ROOM
+            if len(os.fsencode(path)) > room:
+                raise OutputError(f"{folder}: cannot be written: its whole path has more than {room} bytes")
+            for parent in (missing := [parent for parent in path.parents if not parent.exists()])[::-1]:
+                parent.mkdir(exist_ok=True)
+            stack.callback(_remove_empty, missing)
+            stack.enter_context(lock_folder(path))
+            notes = remove_leftovers(path)
+            check_target(folder, overwrite=overwrite)
+            scratch = stack.enter_context(make_scratch_folder(path))
+            scratch.will_hold([])
+            place = ResultsPlace(path, folder, path, scratch, _stat_folder(path), notes)
+            place.new.mkdir()
         except OSError as error:
             raise OutputError(f"{folder}: cannot be written: {error.strerror or error}") from None
         yield place
-
-
-def _take_place(folder: Path, overwrite: bool, stack: ExitStack) -> ResultsPlace:
-    path = folder.resolve()
-    room = (os.pathconf("/", "PC_PATH_MAX") if hasattr(os, "pathconf") else _PATH_BYTES) - _ROOM
-    if len(os.fsencode(path)) > room:
-        raise OutputError(f"{folder}: cannot be written: its whole path has more than {room} bytes")
-    for parent in (missing := [parent for parent in path.parents if not parent.exists()])[::-1]:
-        parent.mkdir(exist_ok=True)
-    stack.callback(_remove_empty, missing)
-    stack.enter_context(lock_folder(path))
-    notes = remove_leftovers(path)
-    check_target(folder, overwrite=overwrite)
-    scratch = stack.enter_context(make_scratch_folder(path))
-    scratch.will_hold([])
-    place = ResultsPlace(path, folder, path, scratch, _stat_folder(path), notes)
-    place.new.mkdir()
-    return place
 
 
 def _remove_empty(folders: Sequence[Path]) -> None:

@@ -119,16 +119,6 @@ def camera_above(places_m: Float, eye: Camera) -> Camera:
     return Camera(np.round(target - away_m * towards, 1), np.round(target, 1), target)
 
 
-def is_in_picture(eye: Camera, offset_m: Float, aspect: float) -> bool:
-    """Whether a place (3,), relative to the camera's target, is in the picture."""
-    towards = (eye.target_m - eye.place_m) / np.linalg.norm(eye.target_m - eye.place_m)
-    right = np.array([towards[1], -towards[0], 0]) / np.hypot(*towards[:2])
-    depth = float(np.linalg.norm(eye.target_m - eye.place_m) + offset_m @ towards)
-    high = depth * np.tan(EYE_RAD / 2)
-    up = np.cross(right, towards)
-    return bool(depth > 0 and abs(up @ offset_m) <= high and abs(right @ offset_m) <= aspect * high)
-
-
 def write_camera_origin(out: RecordingSink, replay: Replay, eye: Camera) -> None:
     """Write the entity that a camera follows: on the ground at or beside the object, not rotated."""
     import rerun as rr

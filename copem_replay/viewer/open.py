@@ -46,13 +46,11 @@ _FURTHER_FILE = re.compile(r"\.configurations_\d+(-\d+)?$")
 def list_rrd_files(folder: Path) -> list[Path]:
     """Absolute paths of the recordings in a results folder, each once, the first shown run first."""
     place = folder.absolute()  # so that no path looks like an option
-    found = [path for pattern in _PATTERNS for path in sorted(place.glob(pattern), key=_order_key) if path.is_file()]
-    return list(dict.fromkeys(found))
-
-
-def _order_key(path: Path) -> Path:
-    """A recording before its further configurations: `replay.rrd`, then `replay.configurations_7-12.rrd`."""
-    return path.with_suffix("")
+    # A recording comes before its further configurations: `replay.rrd`, then `replay.configurations_7-12.rrd`.
+    found = (
+        path for pattern in _PATTERNS for path in sorted(place.glob(pattern), key=lambda path: path.with_suffix(""))
+    )
+    return list(dict.fromkeys(path for path in found if path.is_file()))
 
 
 def opening_s(folder: Path, files: Sequence[Path]) -> dict[Path, float]:

@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from copem_replay.core.tracks import Float
 from copem_replay.perception.pem.condition import Couple
 from copem_replay.perception.sensor_poses import couple_outlines
 from copem_replay.pipeline.prepare import prepare_log
+from copem_replay.viewer.camera import EYE_RAD, Camera, camera_on_object
 from copem_replay.viewer.line_of_sight import compute_sight
 from copem_replay.viewer.sensors import choose_named_units
 from tests.helpers.scenes import EGO_UNIT, SEES_60_M, SEES_ALL, Thing, driving, experiment, recording, standing
@@ -282,10 +284,18 @@ def test_the_eye_looks_ahead_of_the_ego_and_sees_the_object(tmp_path: Path) -> N
     ]
 
 
+def is_in_picture(eye: Camera, offset_m: Float, aspect: float) -> bool:
+    """Whether a place (3,), relative to the camera's target, is in the picture."""
+    towards = (eye.target_m - eye.place_m) / np.linalg.norm(eye.target_m - eye.place_m)
+    right = np.array([towards[1], -towards[0], 0]) / np.hypot(*towards[:2])
+    depth = float(np.linalg.norm(eye.target_m - eye.place_m) + offset_m @ towards)
+    high = depth * np.tan(EYE_RAD / 2)
+    up = np.cross(right, towards)
+    return bool(depth > 0 and abs(up @ offset_m) <= high and abs(right @ offset_m) <= aspect * high)
+
+
 def test_at_the_start_ego_and_object_are_framed(tmp_path: Path) -> None:
     """A car 30 m away at 0 s, whose onset is when it is 20 m away: a viewer that opens at 0 s shows both."""
-    from copem_replay.viewer.camera import camera_on_object, is_in_picture
-
     scene = recording(
         [Thing("ego", "car", standing(0, 0)), Thing("7", "car", driving(30, 0, -5), yaw_rad=np.pi)], until_s=3.0
     )
