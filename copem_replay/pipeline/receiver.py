@@ -270,7 +270,6 @@ class Receivers:
 
     def __init__(self, lists: Transmission, names: Collection[str] | None = None) -> None:
         self._lists, self._memory = lists, dict[str, Any]()
-        self._told: tuple[WorldChunk, tuple[ObjectLists, Int]] | None = None
         self._last_fused: tuple[Tracks, bytes, FusedTracks] | None = None
         self._schedules = {
             name: fusion_schedule(lists.received(name), max_age_s=configuration.max_age_s)
@@ -287,7 +286,7 @@ class Receivers:
             stated = {name: self._state_captures(of) for name, of in received.items()}
             reach = Reach(lists.experiment, received, stated)
         for chunk in chunks:
-            self._told = self._last_fused = None  # of the chunk before, which is dropped
+            self._last_fused = None  # of the chunk before, which is dropped
             yield lists.world(chunk, chunk.from_s if reach is None else reach.earliest_s(chunk))
 
     def issue_s(self, name: str) -> Float:
@@ -322,9 +321,7 @@ class Receivers:
         """Fusion of lists without truth ids, told of the captures that units state."""
         experiment, received, instants = world.experiment, output.received, output.instants
         max_age_s = experiment.configurations[name].max_age_s
-        if self._told is None or self._told[0] is not world:
-            self._told = world, remove_truth_ids(world)
-        lists, same = self._told[1]
+        lists, same = remove_truth_ids(world)
         stated = self._state_captures(received)
         if stated is not None:
             lists = stated.as_told(lists)

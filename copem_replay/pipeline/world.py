@@ -178,7 +178,6 @@ class Transmission:
                 self._objects = self._count_objects()
         never = TimeChunk(np.inf, np.inf)
         self._lists = WorldChunk(log, self.experiment, group, never, log.no_rows, np.inf, False, self._sending)
-        self._arriving: dict[str, Tracks] = {}
 
     def world(self, chunk: TimeChunk, earliest_s: float) -> WorldChunk:
         """A time chunk with captures back to `earliest_s`; that of a log in one is kept."""
@@ -211,16 +210,14 @@ class Transmission:
 
         Raises InputError where a link of the user's own fails.
         """
-        if name not in self._arriving:
-            experiment, lists, heard = self.experiment, self.lists, None
-            if experiment.configurations[name].units == TRUTH:
-                lists = self.truth
-            else:
-                there = {unit for unit, sends in zip(lists.units, self.group.sending, strict=True) if sends}
-                heard = there.intersection(experiment.units_of(experiment.configurations[name]))
-            air = self._link_input(lists) if experiment.arrivals_differ else None
-            self._arriving[name] = transmit(lists, experiment.links_of(name), heard, air=air)
-        return self._arriving[name]
+        experiment, lists, heard = self.experiment, self.lists, None
+        if experiment.configurations[name].units == TRUTH:
+            lists = self.truth
+        else:
+            there = {unit for unit, sends in zip(lists.units, self.group.sending, strict=True) if sends}
+            heard = there.intersection(experiment.units_of(experiment.configurations[name]))
+        air = self._link_input(lists) if experiment.arrivals_differ else None
+        return transmit(lists, experiment.links_of(name), heard, air=air)
 
     def received(self, name: str) -> Tracks:
         """The lists that the receiver of a configuration hears, by when it takes them in (`issue_hz`)."""
