@@ -12,11 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from copem_replay.metrics.figure_limits import cluster_rows, detection_endings, mean_limits
 from copem_replay.metrics.intervals import choose_clusters
 from copem_replay.metrics.summary import DETECTED, tally_rows
 from copem_replay.report import write_html_report
 from copem_replay.report.figures import Selection
-from copem_replay.report.figures.detection_curves import build_curve, cluster_rows, detection_endings, mean_limits
+from copem_replay.report.figures.detection_curves import build_curve
 from copem_replay.report.figures.latency_breakdown import (
     FUSION,
     HIDDEN,

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from copem_replay.metrics.figure_limits import cluster_rows, detection_endings, mean_limits
 from copem_replay.metrics.intervals import choose_clusters
-from copem_replay.report.figures.detection_curves import cluster_rows, detection_endings, mean_limits
 from copem_replay.report.figures.style import (
     RANKED_BY,
     ROW_IN,
