@@ -337,7 +337,8 @@ def limit_sums(
             [np.bincount(group[clusters.number], column, int(group.max()) + 1) for column in sums.T], axis=1
         )
         without = np.array([float(of(total - one)) for one in by_group])
-    weights: Float = np.bincount(group, clusters.weights) if weighed_by is None else by_group[:, weighed_by]
+    of_objects = np.bincount(group, clusters.weights).astype(np.float64)
+    weights: Float = of_objects if weighed_by is None else by_group[:, weighed_by]
     return _with_limits(value, _limit_unless_alike(value, without, weights, (-math.inf, math.inf), confidence))
 
 

@@ -57,7 +57,9 @@ _EVENT_COLUMNS = {
     },
 }
 """By event the columns of the tally, and their names in `detections.parquet`; null in the row for never."""
-_OBJECT_COLUMNS = ("object_id", "object_class", "episode", "onset_s", "began", "ended_s", "ended_by")
+_OBJECT_COLUMNS = (
+    "object_id", "object_class", "episode", "onset_s", "distance_at_onset_m", "began", "ended_s", "ended_by",
+)  # fmt: skip
 
 
 EPISODE = ("log", "object_id", "episode")

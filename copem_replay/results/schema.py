@@ -11,7 +11,7 @@ import os
 import platform
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Self
@@ -95,6 +95,9 @@ _ONSET = Column("onset_s", "numbers",
                 "when the clock starts, in seconds since the log's start: the first frame at which the onset's "
                 "condition holds while the ego is in the log. An object without onset has no row",
                 compared=True)  # fmt: skip
+_ONSET_RANGE = Column("distance_at_onset_m", "numbers",
+                      "true horizontal distance to the ego at `onset_s`, centre to centre; null when there is none to "
+                      "measure from")  # fmt: skip
 _BEGAN = Column("began", "text",
                 "how the episode began: `log_start`, `appeared` or `crossed`, "
                 "[below](../guide/metrics.md#which-objects-count)", compared=True)  # fmt: skip
@@ -128,7 +131,7 @@ _SUMMARY = (
     *(Column(metric.name, metric.kind, metric.help, when) for when, of in METRICS_OF.items() for metric in of),
 )
 _DETECTIONS = (
-    *_LOG, _RUN, _OBJECT, _CLASS, _EPISODE, _ONSET, _BEGAN,
+    *_LOG, _RUN, _OBJECT, _CLASS, _EPISODE, _ONSET, _ONSET_RANGE, _BEGAN,
     Column("detected", "true or false", "whether the object was detected", compared=True),
     _DETECTION,
     Column("captured_s", "numbers", "newest capture that contributed to that list"),
@@ -180,7 +183,7 @@ _DETECTIONS = (
 _TALLY = (
     *_LOG,
     Column("event", "text", "`detected`, or `conflict`: the first list that implied a collision"),
-    _OBJECT, _CLASS, _EPISODE, _ONSET, _BEGAN, *_ENDED, _DETECTION, _TIME, *_DISTANCES,
+    _OBJECT, _CLASS, _EPISODE, _ONSET, _ONSET_RANGE, _BEGAN, *_ENDED, _DETECTION, _TIME, *_DISTANCES,
     Column("runs", "whole numbers", "in how many runs it is so"),
     Column("in_conflict", "true or false", "whether the ego is in conflict with the object", "braking"),
     Column("passed", "whole numbers", "in how many of these runs the ego passes", "braking"),
@@ -404,13 +407,14 @@ def _is_kind(kind: str, what: pa.DataType) -> bool:
 class RecordedLog:
     """A recording that was replayed: its name in the tables, the topic of its truth, the SHA-256 of its content.
 
-    `truth`: the SHA-256 of its truth, None in results of older versions.
+    `truth`: the SHA-256 of its truth, None in results of older versions. `tags`: by name.
     """
 
     name: str
     topic: str | None
     sha256: str
     truth: str | None = None
+    tags: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -455,7 +459,8 @@ def parse_provenance(data: Any, place: Path) -> Provenance:
     if (found := dict(data).get("format", 1)) != FORMAT:
         raise InputError(f"{place}: expected results of format {FORMAT}, found format {found}; {AGAIN}")
     logs = tuple(
-        RecordedLog(str(log["log"]), log.get("topic"), str(log["sha256"]), log.get("truth")) for log in data["logs"]
+        RecordedLog(str(log["log"]), log.get("topic"), str(log["sha256"]), log.get("truth"), _parse_tags(log))
+        for log in data["logs"]
     )
     notes = [*data.get("notes", []), *(log[name] for log in data.get("logs_skipped", []) for name in _SKIPPED)]
     if not all(isinstance(note, str) for note in notes):
@@ -479,6 +484,13 @@ def parse_provenance(data: Any, place: Path) -> Provenance:
         facts={str(name): ConfigurationFacts(**of) for name, of in dict(data["configurations"]).items()},
         data=data,
     )
+
+
+def _parse_tags(log: Any) -> dict[str, str]:
+    tags = dict(log.get("tags", {}))
+    if not all(isinstance(text, str) for text in (*tags, *tags.values())):
+        raise ValueError(f"expected text in tags of log {log['log']}")
+    return tags
 
 
 # Common to all kinds of results: recordings, versions, tables.

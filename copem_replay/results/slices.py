@@ -1,0 +1,80 @@
+"""Slices of results: their rows in groups, in memory or read back, without a replay.
+
+What an entry is, and what a group has: `metrics/slices.py`. Tables are read log by log; what is kept of them are sums by
+episode.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import pandas as pd
+
+from copem_replay.core.errors import InputError
+from copem_replay.experiment.drive import resolve_for_log
+from copem_replay.metrics.slices import (
+    KEYS,
+    SUMMED_COLUMNS,
+    Group,
+    Slice,
+    SliceSettings,
+    StudyRows,
+    find_range_problem,
+    find_unknown_tag,
+    parse_slices,
+    sum_episodes,
+    sum_lists,
+)
+from copem_replay.pipeline.scoring import accuracy_settings
+
+if TYPE_CHECKING:
+    from copem_replay.results.read import Results
+
+
+def read_slices(results: Results, entries: Sequence[str], where: str = "--by") -> tuple[Slice, ...]:
+    """Entries of `by`, checked against results. `where`: what gave them. Raises InputError, one line."""
+    try:
+        slices = parse_slices(entries)
+    except ValueError as error:
+        raise InputError(f"{where}: {error}") from None
+    tags = {log.name: log.tags for log in results.provenance.logs}
+    onsets = [resolve_for_log(results.experiment, log).measure.onset for log in tags]
+    problems = [*(find_range_problem(onset, slices) for onset in onsets), find_unknown_tag(slices, tags)]
+    for problem in filter(None, problems):
+        raise InputError(f"{where}: {problem}")
+    return slices
+
+
+def read_study_rows(results: Results) -> StudyRows:
+    """The rows of a whole study, from results that were just computed or from a folder; raises InputError for damage.
+
+    `read_study_rows(results).split(by)` gives the groups of an entry, `group.rows.inputs(configuration)` what
+    `evaluate_metrics` computes the figures of a configuration from, with their intervals.
+    """
+    experiment, facts = results.experiment, results.facts
+    measure, provenance = experiment.measure, results.provenance
+    settings = SliceSettings(
+        tuple(experiment.configurations),
+        provenance.horizon_used_s,
+        measure.began,
+        measure.metrics,
+        accuracy_settings(measure, 0.0) if measure.accuracy else None,
+        measure.conflict is not None,
+        frozenset(name for name, of in facts.items() if of.fixed),
+        frozenset(name for name, of in facts.items() if of.fixed_verdicts),
+    )
+    sums = [pd.DataFrame(columns=list(KEYS))]
+    for log in results.rows.logs if measure.accuracy or measure.metrics else ():
+        (rows,) = results.each(*(() if measure.metrics else SUMMED_COLUMNS), log=log, every=True)
+        sums.append(sum_episodes(rows.assign(log=log), measure.metrics, measure.began))
+    lists = sum_lists(results.tables.frame("lists.parquet")) if results.tables.has("lists.parquet") else None
+    tags = {log.name: log.tags for log in provenance.logs}
+    return StudyRows(
+        settings, tags, results.tally, results.exact, pd.concat(sums[1:] or sums, ignore_index=True), lists
+    )
+
+
+def read_groups(results: Results, by: Slice) -> list[Group]:
+    """The groups of one entry; of several, split the same `read_study_rows`, which reads the tables once."""
+    return read_study_rows(results).split(by)
