@@ -333,9 +333,8 @@ def limit_sums(
         if clusters is None:
             return LimitedFigure(value)
         group = clusters.group
-        by_group = np.stack(
-            [np.bincount(group[clusters.number], column, int(group.max()) + 1) for column in sums.T], axis=1
-        )
+        columns = [np.bincount(group[clusters.number], column, int(group.max()) + 1) for column in sums.T]
+        by_group: Float = np.stack(columns, axis=1).astype(np.float64)
         without = np.array([float(of(total - one)) for one in by_group])
     of_objects = np.bincount(group, clusters.weights).astype(np.float64)
     weights: Float = of_objects if weighed_by is None else by_group[:, weighed_by]

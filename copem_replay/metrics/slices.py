@@ -202,8 +202,10 @@ KEYS = ("configuration", *EPISODE)
 """Columns that name an episode in a configuration."""
 
 
-def sum_episodes(rows: pd.DataFrame, own: Sequence[RowMetric], words: Sequence[str]) -> pd.DataFrame:
+def sum_episodes(rows: pd.DataFrame, own: Sequence[RowMetric], words: Sequence[str], *keys: str) -> pd.DataFrame:
     """Sums of accuracy and of own metrics by configuration and episode, over the runs in rows of `detections.parquet`.
+
+    `keys`: further columns to sum by.
 
     Columns: `KEYS`; with accuracy those of `AccuracyTotal.episodes` that rows tell, and how many rows are assessed,
     matched and tracked; for each statistic of an own metric its name and that of the statistic, over the rows that
@@ -216,7 +218,7 @@ def sum_episodes(rows: pd.DataFrame, own: Sequence[RowMetric], words: Sequence[s
         columns[name][counted] = values
     if own:
         columns[_COUNTED] = counted.astype(float)
-    summed = pd.DataFrame(columns, index=rows.index).groupby([rows[name] for name in KEYS], sort=False).sum()
+    summed = pd.DataFrame(columns, index=rows.index).groupby([rows[name] for name in (*KEYS, *keys)], sort=False).sum()
     return summed.reset_index()
 
 

@@ -77,6 +77,21 @@ def tally_rows(rows: pd.DataFrame) -> pd.DataFrame:
     return tallied.iloc[order].reset_index(drop=True)
 
 
+def list_runs(rows: pd.DataFrame) -> pd.DataFrame:
+    """The rows of `detections.parquet` with the columns of the tally, each for its own `run`, event after event."""
+    parts = []
+    for event, of_event in _EVENT_COLUMNS.items():
+        if event != DETECTED and "conflict_detected" not in rows:
+            continue
+        columns = {name: rows[source] for name, source in of_event.items() if source in rows}
+        kept = {name: rows[name] for name in ("log", "configuration", "run", *_OBJECT_COLUMNS) if name in rows}
+        parts.append(pd.DataFrame(kept | columns).assign(event=event, runs=1))
+        if "conflict" in rows:
+            passed = rows["braking_pass"].fillna(False).astype(int)
+            parts[-1] = parts[-1].assign(in_conflict=rows["conflict"].astype(bool), passed=passed)
+    return pd.concat(parts, ignore_index=True)
+
+
 def _tally_event(rows: pd.DataFrame, event: str) -> pd.DataFrame:
     columns = {name: source for name, source in _EVENT_COLUMNS[event].items() if source in rows}
     time_s = rows[columns["time_to_detection_s"]].to_numpy(dtype=float)

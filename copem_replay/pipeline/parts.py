@@ -197,6 +197,7 @@ NOT_OF_A_PART: Mapping[str, str] = {
     "logs": "which log, and how it is read, is in the recipe itself; other logs are not",
     "runs": "the block of runs is in the recipe itself",
     "show": "what is shown is replayed after gathering",
+    "criteria": "rows are judged once they are there",
     "sweep": "each of its points is an experiment of its own",
     "configurations": "only the part's own, without its name",
     "units": "only those that the configuration, the onset or the reference of distances goes by",

@@ -46,8 +46,10 @@ def read_slices(results: Results, entries: Sequence[str], where: str = "--by") -
     return slices
 
 
-def read_study_rows(results: Results) -> StudyRows:
+def read_study_rows(results: Results, *, sums: bool = True) -> StudyRows:
     """The rows of a whole study, from results that were just computed or from a folder; raises InputError for damage.
+
+    Without `sums` no row of a run is read, and there is neither accuracy but that of lists nor an own metric.
 
     `read_study_rows(results).split(by)` gives the groups of an entry, `group.rows.inputs(configuration)` what
     `evaluate_metrics` computes the figures of a configuration from, with their intervals.
@@ -64,14 +66,14 @@ def read_study_rows(results: Results) -> StudyRows:
         frozenset(name for name, of in facts.items() if of.fixed),
         frozenset(name for name, of in facts.items() if of.fixed_verdicts),
     )
-    sums = [pd.DataFrame(columns=list(KEYS))]
-    for log in results.rows.logs if measure.accuracy or measure.metrics else ():
+    summed = [pd.DataFrame(columns=list(KEYS))]
+    for log in results.rows.logs if sums and (measure.accuracy or measure.metrics) else ():
         (rows,) = results.each(*(() if measure.metrics else SUMMED_COLUMNS), log=log, every=True)
-        sums.append(sum_episodes(rows.assign(log=log), measure.metrics, measure.began))
+        summed.append(sum_episodes(rows.assign(log=log), measure.metrics, measure.began))
     lists = sum_lists(results.tables.frame("lists.parquet")) if results.tables.has("lists.parquet") else None
     tags = {log.name: log.tags for log in provenance.logs}
     return StudyRows(
-        settings, tags, results.tally, results.exact, pd.concat(sums[1:] or sums, ignore_index=True), lists
+        settings, tags, results.tally, results.exact, pd.concat(summed[1:] or summed, ignore_index=True), lists
     )
 
 

@@ -8,17 +8,24 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
 from copem_replay.core.errors import InputError, count_noun
 from copem_replay.core.tracks import SAME_INSTANT_S
-from copem_replay.metrics.intervals import FEWEST_CLUSTERS, FEWEST_LOGS, NOT_ENOUGH, choose_over, explain_no_clusters
+from copem_replay.metrics.intervals import (
+    CONFIDENCE,
+    FEWEST_CLUSTERS,
+    FEWEST_LOGS,
+    NOT_ENOUGH,
+    choose_over,
+    explain_no_clusters,
+)
 from copem_replay.metrics.summary_metrics import COMPARED
 from copem_replay.results.compare.labels import (
     LabelledConfiguration,
@@ -57,6 +64,9 @@ from copem_replay.results.compare.pairing import (
 from copem_replay.results.read import Results, open_results
 from copem_replay.results.schema import AGAIN, COMPARED_FILES
 
+if TYPE_CHECKING:
+    import pyarrow as pa
+
 # The sums of a pair over its logs.
 
 
@@ -77,12 +87,14 @@ class AllLogs:
         regrets: Sequence[Regret],
         *,
         more: bool,
+        over_runs: bool = False,
     ) -> None:
-        """Add a log with its regrets. `more`: there are other logs."""
+        """Add a log with its regrets. `more`: there are other logs. `over_runs`: intervals are over runs."""
         self.alone.append((int((first.there & ~second.there).sum()), int((second.there & ~first.there).sum())))
         for regret in regrets:
             # Runs stay apart for a single object: they are the clusters if no log has another.
-            figure = regret.figure.condensed(runs=regret.objects[0] <= 1) if more else regret.figure
+            runs = over_runs or regret.objects[0] <= 1
+            figure = regret.figure.condensed(runs=runs) if more else regret.figure
             self._regrets.setdefault(regret.metric, []).append(replace(regret, figure=figure))
 
     @property
@@ -98,6 +110,36 @@ class AllLogs:
     def regrets(self) -> Iterator[Regret]:
         """The regret of every metric over all logs."""
         return map(Regret.joined, self._regrets.values())
+
+
+@dataclass(frozen=True)
+class PairsAsked:
+    """Of which rows differences are asked, and their intervals. `episodes`: by log the object and episode of each that
+    counts, or all of a log (None); no logs but these; None: all logs. `over_runs`: intervals are over runs of the logs.
+    """
+
+    episodes: Mapping[str, Collection[tuple[str, int]] | None] | None = None
+    over_runs: bool = False
+    confidence: float = CONFIDENCE
+
+    def choose_rows(self, log: str, tables: dict[Results, dict[str, pa.Table]]) -> dict[Results, Any] | None:
+        """The rows of a log that are asked for, by folder and file; None: none are. Ghosts belong to whole logs."""
+        if self.episodes is None or self.episodes.get(log, ()) is None:
+            return tables
+        if not (kept := self.episodes.get(log)):
+            return None
+        index = pd.MultiIndex.from_tuples(sorted(kept))
+
+        def choose(name: str, table: pa.Table) -> pa.Table | None:
+            if "object_id" not in table.column_names:
+                return None if name == "lists.parquet" else table
+            keys = [table["object_id"].to_pylist(), table["episode"].to_pylist()]
+            return table.filter(pa.array(index.get_indexer(pd.MultiIndex.from_arrays(keys)) >= 0))
+
+        import pyarrow as pa
+
+        chosen = {of: {name: choose(name, one) for name, one in files.items()} for of, files in tables.items()}
+        return {of: {name: one for name, one in files.items() if one is not None} for of, files in chosen.items()}
 
 
 # The results folders of a comparison.
@@ -365,6 +407,7 @@ def compare_folders(
     baseline: str | None = None,
     false_positives_per_min: float | None = None,
     metrics: Sequence[str] | None = None,
+    asked: PairsAsked = PairsAsked(),
 ) -> Comparison:
     """Compare configurations (None: all) with a baseline, pair by pair, in some metrics (None: all).
 
@@ -388,7 +431,7 @@ def compare_folders(
     horizon_s, horizon_notes = _settle_horizon(used)
     setting = PairSettings(horizon_s, float(read[0].provenance.measure["gospa"]["power"]))
     settings, reasons = _settle_ghosts(setting, against, others, totals, false_positives_per_min, asked=not own_rate)
-    pairs, rows = _compare_each_log(against, settings, ClusterNames(logs, [], runs), metrics)
+    pairs, rows = _compare_each_log(against, settings, ClusterNames(logs, [], runs), metrics, asked)
     table = pd.DataFrame(rows, columns=list(COLUMNS)).astype(COLUMNS)
     return Comparison(
         table=table,
@@ -446,6 +489,7 @@ def _compare_each_log(
     settings: Mapping[LabelledConfiguration, PairSettings],
     names: ClusterNames,
     metrics: Sequence[str] | None,
+    asked: PairsAsked,
 ) -> tuple[dict[LabelledConfiguration, AllLogs], list[dict[str, object]]]:
     """The sums of each pair over the logs of `names`; rows of all logs, then of each log where there are several.
 
@@ -458,6 +502,9 @@ def _compare_each_log(
             results: results.rows_of(log)
             for results in dict.fromkeys(labelled.results for labelled in (against, *pairs))
         }
+        if (chosen := asked.choose_rows(log, tables)) is None:
+            continue
+        tables = chosen
         detections = (of_folder["detections.parquet"] for of_folder in tables.values())
         grid = build_grid(k, detections, names.runs, len(names.objects))
         names.objects.extend(f"{log}\n{name}" for name in grid.objects)
@@ -467,22 +514,25 @@ def _compare_each_log(
             _check_same_episodes(labelled, first, against, second, log, grid)
             _check_same_frames(labelled, first, against, second, log)
             regrets = list(compute_regrets(first, second, grid, settings[labelled], metrics))
-            pair.add(first, second, regrets, more=len(logs) > 1)
+            pair.add(first, second, regrets, more=len(logs) > 1, over_runs=asked.over_runs)
             for regret in regrets if len(logs) > 1 else ():
                 values = regret.figure.values()
                 pair.differences.setdefault(regret.metric, []).append(values[2])
-                rows.append({"log": log, **_make_row(regret, values, labelled, against, names)})
-    return pairs, [*_overall_rows(against, pairs, names), *rows]
+                rows.append({"log": log, **_make_row(regret, values, labelled, against, names, asked)})
+    return pairs, [*_overall_rows(against, pairs, names, asked), *rows]
 
 
 def _overall_rows(
-    against: LabelledConfiguration, pairs: Mapping[LabelledConfiguration, AllLogs], names: ClusterNames
+    against: LabelledConfiguration,
+    pairs: Mapping[LabelledConfiguration, AllLogs],
+    names: ClusterNames,
+    asked: PairsAsked,
 ) -> Iterator[dict[str, object]]:
     """The rows of all logs. Of intervals over logs: how many logs are better, and on which the difference hangs."""
     for labelled, pair in pairs.items():
         for regret in pair.regrets():
             values = regret.figure.values()
-            row = {"log": ALL, **_make_row(regret, values, labelled, against, names)}
+            row = {"log": ALL, **_make_row(regret, values, labelled, against, names, asked)}
             if row.get("interval_over") == "logs":
                 row["logs_better"] = pair.count_better(regret.metric)
                 if (decisive := find_decisive_log(regret.figure, values[2], names)) is not None:
@@ -552,9 +602,11 @@ def _make_row(
     labelled: LabelledConfiguration,
     against: LabelledConfiguration,
     names: ClusterNames,
+    asked: PairsAsked,
 ) -> dict[str, object]:
     """The row of a regret with its `values`, of one log or all."""
-    figure, over, (value, baseline_value, difference) = regret.figure, regret.over, values
+    figure, (value, baseline_value, difference) = regret.figure, values
+    over = "runs" if asked.over_runs else regret.over
     row: dict[str, object] = {"configuration": labelled.label, "baseline": against.label, "metric": regret.metric}
     row |= {
         "value": _number_or_none(value),
@@ -564,7 +616,7 @@ def _make_row(
     row["difference"] = _number_or_none(difference)
     what = "fixed_verdicts" if regret.metric == "pass_share" else "fixed"
     fixed = all(getattr(side.facts, what) for side in (labelled, against))
-    row |= difference_limits(figure, difference, over, names, fixed=fixed)
+    row |= difference_limits(figure, difference, over, names, fixed=fixed, confidence=asked.confidence)
     if "only" in figure.items.columns:
         only = figure.items["only"].sum(axis=0)
         row |= {"only_configuration": int(only[0]), "only_baseline": int(only[1])}
