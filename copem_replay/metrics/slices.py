@@ -11,7 +11,7 @@ Letters of the shapes: n rows, E episodes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -37,7 +37,7 @@ from copem_replay.metrics.metric import (
 )
 from copem_replay.metrics.onset import BEGAN, COUNTS_BY, is_counted, select_counted
 from copem_replay.metrics.summary import CONFLICT, DETECTED, EPISODE, describe_followed
-from copem_replay.metrics.summary_metrics import METRICS, ShareEstimate, estimate_detected_share
+from copem_replay.metrics.summary_metrics import METRICS, estimate_detected_share
 
 NO_TAG, NO_RANGE = "(no tag)", "(no range)"
 """Groups of episodes whose log has no such tag, or at whose onset there is no place to measure the range from."""
@@ -313,19 +313,20 @@ class StudyRows:
 
     def _total(self, configuration: str, settings: AccuracySettings) -> AccuracyTotal:
         """The sums of accuracy that the rows tell; NaN: those that they do not."""
-        sums = self._of(configuration)(self.sums)
+        names = [*_SUMMED, *_ROWS]
+        sums = dict(zip(names, self._of(configuration)(self.sums)[names].to_numpy().sum(axis=0), strict=True))
         episodes, runs, existence = (
             np.full(shape, np.nan, dtype=[(name, "f8") for name in of.names or ()])
             for of, shape in ((OBJECT, ()), (RUN, ()), (EXISTENCE, 1))
         )
         for name in _SUMMED:
-            episodes[name] = sums[name].sum()
+            episodes[name] = sums[name]
         if self.lists is not None:
             lists = self._of(configuration)(self.lists)
             for name in _OF_LISTS[2:]:
                 runs[name] = lists[name].sum()
             runs["time_s"] = 60 * lists["minutes"].sum()
-        rows, matched, tracked = (int(sums[name].sum()) for name in _ROWS)
+        rows, matched, tracked = (int(sums[name]) for name in _ROWS)
         nothing = np.zeros(0, dtype=np.int64)
         return AccuracyTotal(settings, rows, matched, tracked, episodes, runs, nothing, nothing, nothing, existence)
 
@@ -361,58 +362,65 @@ def summarise_groups(study: StudyRows, slices: Sequence[Slice]) -> pd.DataFrame:
     as long as the horizon. An interval is over logs or objects: over the runs of one object it tells of no group.
     """
     metrics = (*(metric for metric in METRICS if metric.name not in _NOT_OF_GROUPS), *own_metrics(study.settings.own))
-    rows = []
+    rows = list[dict[str, Any]]()
     for by in slices:
         groups = study.split(by)
         whole = replace(study, settings=groups[0].rows.settings) if groups else study
         shares = {name: estimate_detected_share(whole.inputs(name)).share for name in study.settings.configurations}
-        rows += [_summarise_group(group, name, shares[name], metrics) for group in groups for name in shares]
+        for group in groups:
+            rows += _summarise_group(group, shares, metrics)
     return pd.DataFrame(rows)
 
 
-def _summarise_group(group: Group, name: str, share: float | None, metrics: Sequence[Metric]) -> dict[str, Any]:
-    """A row of `summary_by.csv`. `share`: the detected share of all groups."""
-    inputs = group.rows.inputs(name)
-    figures = evaluate_metrics(metrics, inputs)
-    parts = {"detected_share": ("", inputs.rows)}
-    if "pass_share" in figures:
-        parts["pass_share"] = ("pass_", inputs.rows[inputs.rows["in_conflict"]])
-    notes = []
-    for of, (prefix, rows) in parts.items():
-        counts = _count_clusters(rows)
-        if choose_over(*counts) not in ("logs", "objects"):
-            kinds = (f"{prefix}interval", f"{prefix}interval_over", f"{prefix}interval_clusters")
-            figures |= dict.fromkeys((f"{of}_low", f"{of}_high", *kinds))
-            notes += [f"no interval of {of}: {explain_no_clusters(*counts)}"] if len(rows) else []
-    if len(inputs.rows) and (short := describe_followed(inputs.rows, group.rows.settings.horizon_s)) is not None:
-        notes.append(short)
-    logs, objects = _count_clusters(inputs.rows)
-    return {
-        "by": group.by.label,
-        "group": group.label,
-        "configuration": name,
-        "logs": logs,
-        "objects": objects,
-        "apart": _is_apart(estimate_detected_share(inputs), share),
-        "note": "; ".join(notes) or None,
-        **{column: None if value != value else value for column, value in figures.items()},
-    }
+def _summarise_group(
+    group: Group, shares: Mapping[str, float | None], metrics: Sequence[Metric]
+) -> Iterator[dict[str, Any]]:
+    """The rows of `summary_by.csv` of a group. `shares`: by configuration the detected share of all groups."""
+    rows = group.rows.detections
+    short = describe_followed(rows, group.rows.settings.horizon_s) if len(rows) else None
+    for name, share in shares.items():
+        inputs = group.rows.inputs(name)
+        figures = evaluate_metrics(metrics, inputs)
+        logs, objects = _count_clusters(inputs.rows)
+        notes = _leave_out_limits(figures, "detected_share", "", (logs, objects))
+        if "pass_share" in figures:
+            counts = _count_clusters(inputs.rows[inputs.rows["in_conflict"]])
+            notes += _leave_out_limits(figures, "pass_share", "pass_", counts)
+        yield {
+            "by": group.by.label,
+            "group": group.label,
+            "configuration": name,
+            "logs": logs,
+            "objects": objects,
+            "apart": _is_apart(figures, share),
+            "note": "; ".join([*notes, *filter(None, [short])]) or None,
+            **{column: None if value != value else value for column, value in figures.items()},
+        }
 
 
-def _is_apart(estimate: ShareEstimate, share: float | None) -> bool | None:
-    """Whether an interval over logs or objects excludes a share; None: there is none, or the share is that of all or
-    none, which no group can stand out from.
+def _leave_out_limits(figures: dict[str, Any], share: str, prefix: str, counts: tuple[int, int]) -> list[str]:
+    """Leave out limits that are over neither logs nor objects, and say why. `counts`: logs, and objects in them."""
+    if choose_over(*counts) in ("logs", "objects"):
+        return []
+    kinds = (f"{prefix}interval", f"{prefix}interval_over", f"{prefix}interval_clusters")
+    figures |= dict.fromkeys((f"{share}_low", f"{share}_high", *kinds))
+    return [f"no interval of {share}: {explain_no_clusters(*counts)}"] if counts[0] else []
+
+
+def _is_apart(figures: Mapping[str, Any], share: float | None) -> bool | None:
+    """Whether an interval excludes a share; None: there is none, or the share is that of all or none, which no group
+    can stand out from.
     """
-    if estimate.over not in ("logs", "objects") or estimate.low is None or estimate.high is None:
+    low, high = figures["detected_share_low"], figures["detected_share_high"]
+    if low is None or share is None or share in (0.0, 1.0):
         return None
-    if share is None or share in (0.0, 1.0):
-        return None
-    return not estimate.low <= share <= estimate.high
+    return bool(not low <= share <= high)
 
 
 def _count_clusters(rows: pd.DataFrame) -> tuple[int, int]:
     """How many logs, and objects of them, have rows."""
-    return rows["log"].nunique(), rows.groupby(["log", "object_id"], sort=False).ngroups
+    objects = rows[["log", "object_id"]].drop_duplicates()
+    return objects["log"].nunique(), len(objects)
 
 
 def describe_chance(table: pd.DataFrame) -> list[str]:
