@@ -64,6 +64,51 @@ def compare(
     )
 
 
+def judge(
+    results: AnyResults,
+    criteria: Mapping[str, Any] | str | PathLike[str] | None = None,
+    *,
+    before: AnyResults | None = None,
+) -> Verdicts:
+    """Hold criteria against results: met, not met, undecided or not measured, by the intervals of `summary.csv`.
+
+    `criteria`: by name, each with its keys, or the path of a file with the key `criteria`; None: those of the
+    experiment. `before`: results that criteria are `against`.
+
+    Raises InputError: no criteria, names that do not exist, results that are unreadable or not comparable.
+
+    >>> verdicts = cr.judge("out/tc016d", {"known": {"metric": "detected_share", "at_least": 0.9,
+    ...                                              "population": "these_logs", "configurations": ["coPEM:0s"]}})
+    >>> verdicts.passes, verdicts.all[0].verdict
+    (True, 'met')
+    """
+    from copem_replay.experiment.criteria import CriteriaFile, check_criteria, read_criteria
+    from copem_replay.experiment.file import describe_by_key, make_plain_source
+    from copem_replay.results.judge import judge_results
+
+    judged, other = _open_judged(results), None if before is None else _open_judged(before)
+    study = judged.source.data
+    if criteria is None:
+        asked = judged.experiment.criteria
+    elif isinstance(criteria, Mapping):
+        source = make_plain_source({"criteria": criteria})
+        problems = [*check_criteria(source, study)]
+        try:
+            asked = CriteriaFile.model_validate(source.data).criteria
+        except ValidationError as error:
+            shape = describe_by_key(CriteriaFile, error, source.data)
+            problems += [source.at(key, message) for key, message in shape]
+        if problems:
+            raise InputError(problems)
+    else:
+        asked = read_criteria(Path(criteria), study)
+    if not asked:
+        raise InputError(
+            f"{judged.place}: expected criteria, found none in its experiment; give some with --criteria FILE"
+        )
+    return judge_results(judged, asked, other)
+
+
 def write_report(results: AnyResults, file: str | PathLike[str] | None = None, *, baseline: str | None = None) -> Path:
     """Write the report of a results folder as one HTML file that opens offline. Returns its path.
 

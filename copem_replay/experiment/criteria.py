@@ -17,7 +17,7 @@ from copem_replay.core.errors import near_name_hint, unknown_name_message
 from copem_replay.core.tracks import CLASS_GROUPS, TRUTH
 from copem_replay.metrics.figure_limits import JUDGED, PER_MINUTE, SUMMED
 from copem_replay.metrics.intervals import CONFIDENCE
-from copem_replay.metrics.slices import parse_slices
+from copem_replay.metrics.config import parse_slices
 from copem_replay.metrics.summary_metrics import COMPARED, METRICS_OF
 from copem_replay.perception.pem.condition import ClassNames
 

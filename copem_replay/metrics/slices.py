@@ -11,7 +11,7 @@ Letters of the shapes: n rows, E episodes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -19,119 +19,33 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from copem_replay.core.errors import unknown_name_message
+from copem_replay.core.errors import count_noun
 from copem_replay.core.tracks import CLASSES, Bool, Float, Int
 from copem_replay.metrics.accuracy.statistics import EXISTENCE, OBJECT, RUN, AccuracySettings, AccuracyTotal
-from copem_replay.metrics.metric import MetricInputs, OwnSums, RowMetric, own_statistics
-from copem_replay.metrics.onset import BEGAN, COUNTS_BY, InRange, Onset, is_counted, select_counted
-from copem_replay.metrics.summary import CONFLICT, DETECTED, EPISODE
+from copem_replay.metrics.config import BEGAN_BY, CLASS, LOG, RANGE, TAGS, Dimension, Slice
+from copem_replay.metrics.intervals import CONFIDENCE, choose_over, explain_no_clusters
+from copem_replay.metrics.metric import (
+    LINK,
+    OUTPUT,
+    Metric,
+    MetricInputs,
+    OwnSums,
+    RowMetric,
+    evaluate_metrics,
+    own_metrics,
+    own_statistics,
+)
+from copem_replay.metrics.onset import BEGAN, COUNTS_BY, is_counted, select_counted
+from copem_replay.metrics.summary import CONFLICT, DETECTED, EPISODE, describe_followed
+from copem_replay.metrics.summary_metrics import METRICS, estimate_detected_share
 
-# Entries.
-
-LOG, CLASS, BEGAN_BY, RANGE, TAGS = "log", "class", "began", "range_at_onset", "tags."
-RANGE_EDGES_M = (10.0, 20.0, 30.0, 50.0, 75.0, 100.0)
-"""Edges of `range_at_onset` where none are given; nearer and farther objects have groups, too."""
-_EXPECTED = f"{LOG}, {CLASS}, {BEGAN_BY}, {RANGE} or {TAGS}NAME"
 NO_TAG, NO_RANGE = "(no tag)", "(no range)"
 """Groups of episodes whose log has no such tag, or at whose onset there is no place to measure the range from."""
-
-
-@dataclass(frozen=True)
-class Dimension:
-    """What episodes are grouped by. `edges_m`: between the groups of `range_at_onset`."""
-
-    name: str
-    edges_m: tuple[float, ...] = ()
-
-    @property
-    def label(self) -> str:
-        """As it is written in an entry."""
-        own = self.edges_m if self.edges_m != RANGE_EDGES_M else ()
-        return ":".join([self.name, *(f"{edge_m:g}" for edge_m in own)])
-
-    @property
-    def of_logs(self) -> bool:
-        """Whether all episodes of a log are in the same group."""
-        return self.name == LOG or self.name.startswith(TAGS)
-
-
-@dataclass(frozen=True)
-class Slice:
-    """An entry: one dimension, or a cross of several."""
-
-    dimensions: tuple[Dimension, ...]
-
-    @property
-    def label(self) -> str:
-        """As it is written on the command line: `class*tags.weather`."""
-        return "*".join(dimension.label for dimension in self.dimensions)
-
-    @property
-    def of_logs(self) -> bool:
-        """Whether groups are of whole logs."""
-        return all(dimension.of_logs for dimension in self.dimensions)
-
-    def names(self, name: str) -> bool:
-        """Whether it has a dimension of this name."""
-        return any(dimension.name == name for dimension in self.dimensions)
-
-
-def parse_slice(entry: str | Sequence[str]) -> Slice:
-    """An entry of `by`: `class`, `[log, class]`, `log*class`. Raises ValueError with what was expected and found."""
-    words = entry.split("*") if isinstance(entry, str) else list(entry)
-    dimensions = tuple(_parse_dimension(word.strip()) for word in words)
-    names = [dimension.name for dimension in dimensions]
-    if not names:
-        raise ValueError(f"expected {_EXPECTED}, found an empty list")
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f"expected each of a cross once, found {name} {names.count(name)} times")
-    return Slice(dimensions)
-
-
-def parse_slices(entries: Sequence[str | Sequence[str]]) -> tuple[Slice, ...]:
-    """Entries of `by`, each once. Raises ValueError."""
-    slices = tuple(map(parse_slice, entries))
-    labels = [by.label for by in slices]
-    if repeated := [label for label in labels if labels.count(label) > 1]:
-        raise ValueError(f"expected each entry once, found {repeated[0]} {labels.count(repeated[0])} times")
-    return slices
-
-
-def _parse_dimension(word: str) -> Dimension:
-    name, *edges = word.split(":") if word.startswith(RANGE) else [word]
-    if name == RANGE:
-        return Dimension(name, _parse_edges(edges) if edges else RANGE_EDGES_M)
-    if name in (LOG, CLASS, BEGAN_BY) or (name.startswith(TAGS) and len(name) > len(TAGS)):
-        return Dimension(name)
-    message = unknown_name_message("slice", word, (LOG, CLASS, BEGAN_BY, RANGE))
-    raise ValueError(f"{message} (expected {_EXPECTED}; a cross as [log, class] or log*class)")
-
-
-def _parse_edges(edges: Sequence[str]) -> tuple[float, ...]:
-    try:
-        edges_m = tuple(map(float, edges))
-    except ValueError:
-        edges_m = ()
-    if not edges_m or not np.isfinite(edges_m).all() or edges_m[0] <= 0 or (np.diff(edges_m) <= 0).any():
-        raise ValueError(f"{RANGE}: expected ascending edges above 0 in metres, {RANGE}:20:40, found {':'.join(edges)}")
-    return edges_m
-
 
 # Groups.
 
 Tags = Mapping[str, Mapping[str, str]]
 """By log its tags, by name."""
-
-
-def find_range_problem(onset: Onset, slices: Sequence[Slice]) -> str | None:
-    """Why episodes cannot be grouped by their range at this onset; None: they can, or are not asked to be."""
-    if not isinstance(onset, InRange) or not any(by.names(RANGE) for by in slices):
-        return None
-    return (
-        f"{RANGE}: expected an onset that is no range, found in_range: who comes nearer is at {onset.range_m:g} m, and "
-        f"all others began nearer; slice by {BEGAN_BY}, or see bands.csv for accuracy by range at the instant"
-    )
 
 
 def find_unknown_tag(slices: Sequence[Slice], tags: Tags) -> str | None:
@@ -266,6 +180,8 @@ def sum_lists(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 _OF_LISTS = ("lists", "minutes", "ghosts", "stale_ghosts", "duplicates")
+LISTS_COLUMNS = ("log", "configuration", *_OF_LISTS)
+"""Columns of `lists.parquet` that `sum_lists` needs."""
 
 # Rows of a study, or of a group.
 
@@ -399,19 +315,20 @@ class StudyRows:
 
     def _total(self, configuration: str, settings: AccuracySettings) -> AccuracyTotal:
         """The sums of accuracy that the rows tell; NaN: those that they do not."""
-        sums = self._of(configuration)(self.sums)
+        names = [*_SUMMED, *_ROWS]
+        sums = dict(zip(names, self._of(configuration)(self.sums)[names].to_numpy().sum(axis=0), strict=True))
         episodes, runs, existence = (
             np.full(shape, np.nan, dtype=[(name, "f8") for name in of.names or ()])
             for of, shape in ((OBJECT, ()), (RUN, ()), (EXISTENCE, 1))
         )
         for name in _SUMMED:
-            episodes[name] = sums[name].sum()
+            episodes[name] = sums[name]
         if self.lists is not None:
             lists = self._of(configuration)(self.lists)
             for name in _OF_LISTS[2:]:
                 runs[name] = lists[name].sum()
             runs["time_s"] = 60 * lists["minutes"].sum()
-        rows, matched, tracked = (int(sums[name].sum()) for name in _ROWS)
+        rows, matched, tracked = (int(sums[name]) for name in _ROWS)
         nothing = np.zeros(0, dtype=np.int64)
         return AccuracyTotal(settings, rows, matched, tracked, episodes, runs, nothing, nothing, nothing, existence)
 
@@ -428,3 +345,97 @@ class Group:
     def label(self) -> str:
         """The values: `crossing, pedestrian`."""
         return ", ".join(self.values)
+
+
+# Summaries of groups.
+
+_NOT_OF_GROUPS = frozenset(metric.name for metric in (*OUTPUT, *LINK)) | {
+    "list_rate_hz", "gospa_m", "gospa_localisation_m", "gospa_missed_m", "gospa_false_m", "ospa_m", "nees_expected",
+    "nees_low", "nees_high", "beyond_gate_share", "existence_ece",
+}  # fmt: skip
+"""Columns of `summary.csv` that groups do not have: of whole lists, or of sums that no row tells."""
+
+
+def summarise_groups(study: StudyRows, slices: Sequence[Slice]) -> pd.DataFrame:
+    """The rows of `summary_by.csv`: of each entry, group and configuration the columns of `summary.csv`.
+
+    Before them `by`, `group`, `configuration`, `logs` and `objects` that count, `apart` (whether the interval of
+    `detected_share` excludes the share of all groups) and `note`: why there is no interval, or that few episodes last
+    as long as the horizon. An interval is over logs or objects: over the runs of one object it tells of no group.
+    """
+    metrics = (*(metric for metric in METRICS if metric.name not in _NOT_OF_GROUPS), *own_metrics(study.settings.own))
+    rows = list[dict[str, Any]]()
+    for by in slices:
+        groups = study.split(by)
+        whole = replace(study, settings=groups[0].rows.settings) if groups else study
+        shares = {name: estimate_detected_share(whole.inputs(name)).share for name in study.settings.configurations}
+        for group in groups:
+            rows += _summarise_group(group, shares, metrics)
+    return pd.DataFrame(rows)
+
+
+def _summarise_group(
+    group: Group, shares: Mapping[str, float | None], metrics: Sequence[Metric]
+) -> Iterator[dict[str, Any]]:
+    """The rows of `summary_by.csv` of a group. `shares`: by configuration the detected share of all groups."""
+    rows = group.rows.detections
+    short = describe_followed(rows, group.rows.settings.horizon_s) if len(rows) else None
+    for name, share in shares.items():
+        inputs = group.rows.inputs(name)
+        figures = evaluate_metrics(metrics, inputs)
+        logs, objects = _count_clusters(inputs.rows)
+        notes = _leave_out_limits(figures, "detected_share", "", (logs, objects))
+        if "pass_share" in figures:
+            counts = _count_clusters(inputs.rows[inputs.rows["in_conflict"]])
+            notes += _leave_out_limits(figures, "pass_share", "pass_", counts)
+        yield {
+            "by": group.by.label,
+            "group": group.label,
+            "configuration": name,
+            "logs": logs,
+            "objects": objects,
+            "apart": _is_apart(figures, share),
+            "note": "; ".join([*notes, *filter(None, [short])]) or None,
+            **{column: None if value != value else value for column, value in figures.items()},
+        }
+
+
+def _leave_out_limits(figures: dict[str, Any], share: str, prefix: str, counts: tuple[int, int]) -> list[str]:
+    """Leave out limits that are over neither logs nor objects, and say why. `counts`: logs, and objects in them."""
+    if choose_over(*counts) in ("logs", "objects"):
+        return []
+    kinds = (f"{prefix}interval", f"{prefix}interval_over", f"{prefix}interval_clusters")
+    figures |= dict.fromkeys((f"{share}_low", f"{share}_high", *kinds))
+    return [f"no interval of {share}: {explain_no_clusters(*counts)}"] if counts[0] else []
+
+
+def _is_apart(figures: Mapping[str, Any], share: float | None) -> bool | None:
+    """Whether an interval excludes a share; None: there is none, or the share is that of all or none, which no group
+    can stand out from.
+    """
+    low, high = figures["detected_share_low"], figures["detected_share_high"]
+    if low is None or share is None or share in (0.0, 1.0):
+        return None
+    return bool(not low <= share <= high)
+
+
+def _count_clusters(rows: pd.DataFrame) -> tuple[int, int]:
+    """How many logs, and objects of them, have rows."""
+    objects = rows[["log", "object_id"]].drop_duplicates()
+    return objects["log"].nunique(), len(objects)
+
+
+def describe_chance(table: pd.DataFrame) -> list[str]:
+    """A line for each entry in rows of `summary_by.csv`: how many groups were looked at, how many stand out, and how
+    many would by chance.
+    """
+    lines = []
+    for by, rows in table.groupby("by", sort=False):
+        judged = rows["apart"].dropna().astype(bool)
+        groups = count_noun(rows["group"].nunique(), "group")
+        lines.append(
+            f"by {by}: {groups} looked at in {count_noun(rows['configuration'].nunique(), 'configuration')}; of "
+            f"{count_noun(len(judged), 'interval')} of detected_share {int(judged.sum())} exclude the share of all "
+            f"groups, by chance alone at least {(1 - CONFIDENCE) * len(judged):.2g} would"
+        )
+    return lines

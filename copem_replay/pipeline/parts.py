@@ -207,6 +207,7 @@ NOT_OF_A_PART: Mapping[str, str] = {
     "measure.horizon_s": "restricted means are taken of all rows",
     "measure.exact": "closed forms draw nothing",
     "measure.metrics": "own metrics are taken of all rows",
+    "measure.by": "groups are of all rows",
 }
 """Keys of the experiment that are not in a recipe as they are, and why."""
 _LIBRARIES = ("numba", "numpy", "pandas", "pyarrow", "scipy", "shapely")

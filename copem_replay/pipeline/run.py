@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -25,16 +25,27 @@ from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.accuracy.statistics import AccuracyTotal, join_totals
+from copem_replay.metrics.config import parse_slices
 from copem_replay.metrics.metric import OutputTimes, OwnSums
 from copem_replay.metrics.onset import select_counted
+from copem_replay.metrics.slices import (
+    LISTS_COLUMNS,
+    SliceSettings,
+    StudyRows,
+    describe_chance,
+    sum_episodes,
+    sum_lists,
+    summarise_groups,
+)
 from copem_replay.metrics.summary import add_own_sums, own_sums_by_log, settle_horizon, summarise_tally, tally_rows
 from copem_replay.pipeline.closed_form import check_closed_form, exact_table
 from copem_replay.pipeline.cost import RunCost, memory_notes, return_memory, watch_cost
-from copem_replay.pipeline.expansion import find_facts
+from copem_replay.pipeline.expansion import ConfigurationFacts, find_facts
 from copem_replay.pipeline.notes import ListRate, LogFacts, join_list_rates, study_notes
 from copem_replay.pipeline.parts import MOST_RUNS, STATES_A_PART, PartCache, cut_parts, write_recipe
 from copem_replay.pipeline.prepare import Replay, prepare_log
 from copem_replay.pipeline.replay import BlockOutcome, cut_blocks, replay_outcomes
+from copem_replay.pipeline.scoring import accuracy_settings
 from copem_replay.pipeline.study_log import StudyLog
 from copem_replay.pipeline.sweep import SweepPoint, list_points
 from copem_replay.pipeline.tables import (
@@ -183,6 +194,7 @@ class ExperimentResult:
     exact: pd.DataFrame | None = None  # exact.parquet, with `measure: {exact: true}`
     bands: pd.DataFrame | None = None  # bands.csv, with `measure: {accuracy: true}`
     sweep: pd.DataFrame | None = None  # sweep.csv, with `sweep:`
+    summary_by: pd.DataFrame | None = None  # summary_by.csv, with `measure: {by: …}`
     costs: tuple[str, ...] = ()  # notes for the terminal alone: no two runs take the same time
     tally: pd.DataFrame = field(default_factory=pd.DataFrame)  # tally.parquet
     logs: tuple[StudyLog, ...] = ()
@@ -258,6 +270,7 @@ def _run_study(experiment: Experiment, logs: Sequence[StudyLog], gatherer: Gathe
         conflicts_asked=experiment.measure.conflict is not None,
         links={name: one.links for name, one in times.items() if one.links is not None},
     )
+    sliced = _summarise_slices(experiment, logs, sums, exact, horizon_s)
     swept = [_summarise_point(point, logs, gatherer, horizon_s) for point in list_points(experiment)]
     recordings = [log.recording for log in logs]
     notes = study_notes(
@@ -269,23 +282,29 @@ def _run_study(experiment: Experiment, logs: Sequence[StudyLog], gatherer: Gathe
     result = ExperimentResult(
         sums.tables,
         rows,
-        (*notes, *horizon_notes, *summary_notes),
+        (*notes, *horizon_notes, *summary_notes, *(describe_chance(sliced) if sliced is not None else ())),
         ready,
         horizon_s,
         exact,
         tabulate_bands(sums.totals) if accurate else None,
     )
     alike = all(sums.same_instants for sums in facts)
-    return replace(result, sweep=sweep, tally=sums.tally, logs=tuple(logs), facts=tuple(facts), same_instants=alike)
+    result = replace(result, sweep=sweep, summary_by=sliced, tally=sums.tally)
+    return replace(result, logs=tuple(logs), facts=tuple(facts), same_instants=alike)
 
 
 class _StudySums(NamedTuple):
-    """The tables of all logs, their tally, sums of accuracy by log and configuration, and sums of own metrics."""
+    """The tables of all logs, their tally, sums of accuracy by log and configuration, and sums of own metrics.
+
+    `episodes`, `lists`: what slices are made of, in batches; empty where none are asked for.
+    """
 
     tables: StudyTables
     tally: pd.DataFrame
     totals: dict[tuple[str, str], AccuracyTotal]
     sums: dict[str, dict[str, OwnSums]]
+    episodes: list[pd.DataFrame]
+    lists: list[pd.DataFrame]
 
 
 def _sum_tables(logs: Sequence[StudyLog], experiment: Experiment, gatherer: Gatherer, *, whole: bool) -> _StudySums:
@@ -294,22 +313,56 @@ def _sum_tables(logs: Sequence[StudyLog], experiment: Experiment, gatherer: Gath
     tables = StudyTables(way=any(alone.has_way(name) for alone in of_logs for name in alone.configurations))
     nodes, sums = dict[tuple[str, str], list[tuple[int, AccuracyTotal]]](), dict[str, dict[str, OwnSums]]()
     tallies, batch, last = list[pd.DataFrame](), list[PartTables](), logs[-1].name
+    episodes, lists, measure = list[pd.DataFrame](), list[pd.DataFrame](), experiment.measure
     for log, parts in groupby(gatherer.each(logs, experiment), key=attrgetter("log")):
         for part in parts:
             batch.append(replace(part, beside=None, runs=None))
             tables.add(part, counted=not whole)
             if part.total is not None and part.runs is not None:
                 nodes.setdefault((log, part.configuration), []).append((len(part.runs), part.total))
+                lists += [sum_lists(part.runs.select([*LISTS_COLUMNS]).to_pandas())] if measure.by else []
         if log != last and sum(len(part.rows) for part in batch) < BATCH_ROWS:
             continue
         rows = tables.frame(batch)
         batch.clear()
         tallies.append(tally_rows(rows))
-        if experiment.measure.metrics:
-            for _, rows_of_log in select_counted(rows, experiment.measure.began).groupby("log", sort=False):
-                sums = add_own_sums(sums, own_sums_by_log(rows_of_log, experiment.measure.metrics))
+        episodes += [sum_episodes(rows, measure.metrics, measure.began)] if measure.by else []
+        if measure.metrics:
+            for _, rows_of_log in select_counted(rows, measure.began).groupby("log", sort=False):
+                sums = add_own_sums(sums, own_sums_by_log(rows_of_log, measure.metrics))
     totals = {key: join_totals(of_log) for key, of_log in nodes.items()}
-    return _StudySums(tables, pd.concat(tallies, ignore_index=True), totals, sums)
+    return _StudySums(tables, pd.concat(tallies, ignore_index=True), totals, sums, episodes, lists)
+
+
+def _summarise_slices(
+    experiment: Experiment, logs: Sequence[StudyLog], sums: _StudySums, exact: pd.DataFrame | None, horizon_s: float
+) -> pd.DataFrame | None:
+    if not experiment.measure.by:
+        return None
+    study = StudyRows(
+        slice_settings(experiment, find_facts(experiment), horizon_s),
+        {log.name: {} for log in logs},
+        sums.tally,
+        exact,
+        pd.concat(sums.episodes, ignore_index=True),
+        sum_lists(pd.concat(sums.lists)) if sums.lists else None,
+    )
+    return summarise_groups(study, parse_slices(experiment.measure.by))
+
+
+def slice_settings(experiment: Experiment, facts: Mapping[str, ConfigurationFacts], horizon_s: float) -> SliceSettings:
+    """What the figures of groups are computed with."""
+    measure = experiment.measure
+    return SliceSettings(
+        tuple(experiment.configurations),
+        horizon_s,
+        measure.began,
+        measure.metrics,
+        accuracy_settings(measure, 0.0) if measure.accuracy else None,
+        measure.conflict is not None,
+        frozenset(name for name, of in facts.items() if of.fixed),
+        frozenset(name for name, of in facts.items() if of.fixed_verdicts),
+    )
 
 
 def _summarise_point(point: SweepPoint, logs: Sequence[StudyLog], gatherer: Gatherer, horizon_s: float) -> pd.DataFrame:

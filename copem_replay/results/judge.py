@@ -38,7 +38,8 @@ from copem_replay.metrics.intervals import (
     explain_no_clusters,
 )
 from copem_replay.metrics.onset import select_counted
-from copem_replay.metrics.slices import Group, Slice, StudyRows, parse_slice, sum_episodes
+from copem_replay.metrics.config import Slice, parse_slice
+from copem_replay.metrics.slices import Group, StudyRows, sum_episodes
 from copem_replay.metrics.summary import CONFLICT, list_runs
 from copem_replay.results.compare.compare import PairsAsked, compare_folders
 from copem_replay.results.compare.labels import label_configurations
@@ -286,7 +287,8 @@ class _JudgedStudy:
         key = kind, configuration
         if key not in group.made:
             group.made[key] = self._make_figure_rows(group, kind, configuration, of_runs=criterion.of_runs)
-        rows, about = group.made[key]
+        made: tuple[FigureRows | None, JudgedFigure] = group.made[key]
+        rows, about = made
         if rows is None:
             return about
         figure = judged.limit(rows, settings.horizon_s, criterion.confidence, criterion.bound)
@@ -307,7 +309,7 @@ class _JudgedStudy:
         if not len(table):
             return None, replace(_NO_ROW, why="no object is in conflict")
         weight = table["probability" if exact else "runs"].to_numpy(dtype=float)
-        n = int(round(weight.sum()))
+        n = round(float(weight.sum()))
         fixed = study.settings.fixed_verdicts if kind == "braking" else study.settings.fixed
         if of_runs and (exact or configuration in fixed):
             known = LimitedFigure(None, kind=CLOSED_FORM if exact else NOTHING_DRAWN)

@@ -130,6 +130,17 @@ _SUMMARY = (
     _CONFIGURATION,
     *(Column(metric.name, metric.kind, metric.help, when) for when, of in METRICS_OF.items() for metric in of),
 )
+_SUMMARY_BY = (
+    Column("by", "text", "what rows are grouped by, as on the command line: `class`, `log*class`"),
+    Column("group", "text", "the group: its value, of a cross its values"),
+    _CONFIGURATION,
+    Column("logs", "whole numbers", "logs of the group, of the episodes that count"),
+    Column("objects", "whole numbers", "objects of the group, of the episodes that count"),
+    Column("apart", "true or false",
+           "whether the interval of `detected_share` excludes the share of all groups together; null without one, or "
+           "where that share is 0 or 1"),
+    Column("note", "text or null", "why there is no interval; how few episodes last as long as the horizon"),
+)  # fmt: skip
 _DETECTIONS = (
     *_LOG, _RUN, _OBJECT, _CLASS, _EPISODE, _ONSET, _ONSET_RANGE, _BEGAN,
     Column("detected", "true or false", "whether the object was detected", compared=True),
@@ -283,8 +294,8 @@ _PROVENANCE = (
     Column("seed", "whole number", "seed of the experiment"),
     Column("runs", "whole number", "runs of the experiment"),
     Column("logs", "list",
-           "of each log: its name `log`, the `topic` of its truth, the file's `sha256`, and `truth`, the SHA-256 of "
-           "what was read of it"),
+           "of each log: its name `log`, the `topic` of its truth, the file's `sha256`, `truth`, the SHA-256 of what "
+           "was read of it, and its `tags`"),
     Column("logs_skipped", "list", "recordings that were left out: `log` and `reason`"),
     Column("visibility", "text", "how visible shares are worked out"),
     Column("max_gap_s", "number", "longest gap of the truth that is interpolated"),
@@ -313,6 +324,9 @@ TABLES = {
         "One row per value of a sweep and configuration; other columns as in `summary.csv`. "
         "[Definitions](../guide/metrics.md#sweeps).",
         (Column("sweep", "text", "key that is swept"), Column("value", "numbers", "its value"), _CONFIGURATION)),
+    "summary_by.csv": Table(
+        "One row per entry of `measure: {by: …}`, group and configuration; other columns as in `summary.csv`. "
+        "[Definitions](../guide/slices.md).", _SUMMARY_BY),
     "detections.parquet": Table(
         "One row per log, configuration, run and measured object. "
         "[Definitions](../guide/metrics.md#one-row-of-detectionsparquet), those of accuracy "
@@ -342,7 +356,7 @@ COMPARED_FILES = ("accuracy.parquet", "instants.parquet", "lists.parquet", "thre
 
 def read_csv(path: Path) -> pd.DataFrame:
     """A table from CSV: names are text, whatever they look like, and only empty cells are missing."""
-    text = {"configuration": str, "sweep": str}
+    text = {"configuration": str, "sweep": str, "by": str, "group": str}
     table = pd.read_csv(path, dtype=text, na_values=[""], keep_default_na=False)
     return unquote_names(table.fillna({name: "" for name in text if name in table}), [n for n in text if n in table])
 

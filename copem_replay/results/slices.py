@@ -1,7 +1,7 @@
 """Slices of results: their rows in groups, in memory or read back, without a replay.
 
-What an entry is, and what a group has: `metrics/slices.py`. Tables are read log by log; what is kept of them are sums by
-episode.
+What an entry is, and what a group has: `metrics/slices.py`. Tables are read log by log, and only sums
+by episode are kept.
 """
 
 from __future__ import annotations
@@ -13,20 +13,17 @@ import pandas as pd
 
 from copem_replay.core.errors import InputError
 from copem_replay.experiment.drive import resolve_for_log
+from copem_replay.metrics.config import Slice, find_range_problem, parse_slices
 from copem_replay.metrics.slices import (
     KEYS,
     SUMMED_COLUMNS,
     Group,
-    Slice,
-    SliceSettings,
     StudyRows,
-    find_range_problem,
     find_unknown_tag,
-    parse_slices,
     sum_episodes,
     sum_lists,
 )
-from copem_replay.pipeline.scoring import accuracy_settings
+from copem_replay.pipeline.run import slice_settings
 
 if TYPE_CHECKING:
     from copem_replay.results.read import Results
@@ -54,18 +51,9 @@ def read_study_rows(results: Results, *, sums: bool = True) -> StudyRows:
     `read_study_rows(results).split(by)` gives the groups of an entry, `group.rows.inputs(configuration)` what
     `evaluate_metrics` computes the figures of a configuration from, with their intervals.
     """
-    experiment, facts = results.experiment, results.facts
-    measure, provenance = experiment.measure, results.provenance
-    settings = SliceSettings(
-        tuple(experiment.configurations),
-        provenance.horizon_used_s,
-        measure.began,
-        measure.metrics,
-        accuracy_settings(measure, 0.0) if measure.accuracy else None,
-        measure.conflict is not None,
-        frozenset(name for name, of in facts.items() if of.fixed),
-        frozenset(name for name, of in facts.items() if of.fixed_verdicts),
-    )
+    experiment, provenance = results.experiment, results.provenance
+    measure = experiment.measure
+    settings = slice_settings(experiment, results.facts, provenance.horizon_used_s)
     summed = [pd.DataFrame(columns=list(KEYS))]
     for log in results.rows.logs if sums and (measure.accuracy or measure.metrics) else ():
         (rows,) = results.each(*(() if measure.metrics else SUMMED_COLUMNS), log=log, every=True)

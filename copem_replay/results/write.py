@@ -213,6 +213,7 @@ def list_results(
     """
     files = [EXPERIMENT, MARK, "summary.csv", "logs.csv", *tables]
     files += ["exact.parquet"] * experiment.measure.exact + ["sweep.csv"] * any(True for _ in list_points(experiment))
+    files += ["summary_by.csv"] * bool(experiment.measure.by)
     files += [f"{name}.parquet" for name in _ACCURACY if experiment.measure.accuracy]
     files += ["bands.csv"] * experiment.measure.accuracy
     for log in choose_logs(experiment, [recording.scene.log for recording in recordings]):
@@ -245,6 +246,8 @@ def _write_files(
     (scratch / EXPERIMENT).write_text(dump_yaml(data), encoding="utf-8")
     _write_rows(result, scratch)
     write_csv(result.summary, scratch / "summary.csv")
+    if result.summary_by is not None:
+        write_csv(result.summary_by, scratch / "summary_by.csv")
     if result.exact is not None:
         write_parquet(result.exact, scratch / "exact.parquet")
     if result.bands is not None:
