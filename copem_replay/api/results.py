@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from copem_replay.core.errors import InputError, OutputError
 from copem_replay.results.compare import Comparison
 from copem_replay.results.read import Results
+
+if TYPE_CHECKING:
+    from copem_replay.results.verdicts import Verdicts
 
 AnyResults: TypeAlias = Results | str | PathLike[str]
 """Results, of `run` or read from a folder, or the path of a results folder."""
@@ -82,30 +85,21 @@ def judge(
     >>> verdicts.passes, verdicts.all[0].verdict
     (True, 'met')
     """
-    from copem_replay.experiment.criteria import CriteriaFile, check_criteria, read_criteria
-    from copem_replay.experiment.file import describe_by_key, make_plain_source
+    from copem_replay.experiment.criteria import read_criteria
     from copem_replay.results.judge import judge_results
+    from copem_replay.results.read import open_results
 
-    judged, other = _open_judged(results), None if before is None else _open_judged(before)
-    study = judged.source.data
+    judged, other = (
+        given if isinstance(given, Results | None) else open_results(Path(given), "summary.csv", "tally.parquet")
+        for given in (results, before)
+    )
+    assert judged is not None
     if criteria is None:
         asked = judged.experiment.criteria
-    elif isinstance(criteria, Mapping):
-        source = make_plain_source({"criteria": criteria})
-        problems = [*check_criteria(source, study)]
-        try:
-            asked = CriteriaFile.model_validate(source.data).criteria
-        except ValidationError as error:
-            shape = describe_by_key(CriteriaFile, error, source.data)
-            problems += [source.at(key, message) for key, message in shape]
-        if problems:
-            raise InputError(problems)
     else:
-        asked = read_criteria(Path(criteria), study)
+        asked = read_criteria(criteria if isinstance(criteria, Mapping) else Path(criteria), judged.source.data)
     if not asked:
-        raise InputError(
-            f"{judged.place}: expected criteria, found none in its experiment; give some with --criteria FILE"
-        )
+        raise InputError(f"{judged.place}: expected criteria in its experiment, found none; --criteria FILE gives some")
     return judge_results(judged, asked, other)
 
 

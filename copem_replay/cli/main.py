@@ -60,6 +60,7 @@ for command in (
     run.run,
     fit.fit,
     results.compare,
+    results.verdict,
     results.plot,
     results.report,
     results.view,

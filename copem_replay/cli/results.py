@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -15,6 +15,7 @@ from copem_replay.cli.terminal import (
     print_blocks,
     print_line,
     print_notes,
+    print_verdicts,
     split_names,
     tidy_leftovers,
     width_of,
@@ -45,6 +46,10 @@ def compare(
     log: Annotated[
         str | None, typer.Option(metavar="NAME", help="Log in that recording [as in that replay.rrd].")
     ] = None,
+    fail_on: Annotated[
+        list[str] | None,
+        typer.Option(metavar="'METRIC > N'", help="End with 1 where the first folder is shown to be so much worse."),
+    ] = None,
 ) -> int:
     """Compare configurations with a baseline, with intervals.
 
@@ -57,6 +62,7 @@ def compare(
         check_out(out)
     _check_rrd_options(rrd, run, log)
     names = split_names(configurations)
+    conditions = _check_fail_on(fail_on, folders, names, baseline)
     comparison = compare_results(
         folders, configurations=names, baseline=baseline, false_positives_per_min=false_positives_per_min
     )
@@ -70,7 +76,32 @@ def compare(
     if out is not None:
         write_comparison(comparison, out, folders)
     _print_written(out, rrd)
-    return 0
+    return _judge_differences(conditions, folders)
+
+
+def _check_fail_on(
+    conditions: list[str] | None, folders: list[Path], names: list[str] | None, baseline: str | None
+) -> dict[str, dict[str, Any]]:
+    """Criteria of the conditions of `--fail-on`: differences to the second folder, or to the baseline."""
+    if not conditions:
+        return {}
+    from copem_replay.experiment.criteria import BEFORE, parse_fail_on
+
+    if len(folders) != 2 and baseline is None:
+        raise InputError(f"--fail-on: expected two folders, NEW OLD, or --baseline NAME, found {len(folders)}")
+    against = BEFORE if len(folders) == 2 and baseline is None else str(baseline)
+    return parse_fail_on(conditions, against, names)
+
+
+def _judge_differences(criteria: dict[str, dict[str, Any]], folders: list[Path]) -> int:
+    if not criteria:
+        return 0
+    from copem_replay.api.results import judge
+
+    verdicts = judge(folders[0], criteria, before=folders[1] if len(folders) > 1 else None)
+    print_line("")
+    print_verdicts(verdicts)
+    return 0 if verdicts.passes else 1
 
 
 def _check_rrd_options(rrd: Path | None, run: int | None, log: str | None) -> None:
@@ -87,6 +118,44 @@ def _print_written(*files: Path | None) -> None:
         if file is not None:
             tidy_leftovers(file)
             print_line(f"written to {file}")
+
+
+def verdict(
+    folder: ResultsFolder,
+    criteria: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Criteria, a file with this key [those of the experiment].")
+    ] = None,
+    before: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Results of before, for criteria that are against them.")
+    ] = None,
+    junit: Annotated[Path | None, typer.Option(metavar="FILE", help="Also write JUnit XML.")] = None,
+    markdown: Annotated[Path | None, typer.Option(metavar="FILE", help="Also write Markdown; - prints it.")] = None,
+    jsonl: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Name of the JSON lines [FOLDER/verdicts.jsonl].")
+    ] = None,
+) -> int:
+    """Hold criteria against results: met, not met, undecided or not measured.
+
+    Nothing is replayed. Ends with 1 where a criterion does not pass, after all files are written.
+    """
+    from copem_replay.api.results import judge
+    from copem_replay.results.verdicts import FILE, check_verdict_files, verdicts_markdown, write_verdicts
+
+    printed = markdown == Path("-")
+    files = {"jsonl": jsonl or folder / FILE, "junit": junit, "markdown": None if printed else markdown}
+    check_verdict_files(files)
+    verdicts = judge(folder, criteria, before=before)
+    print_notes(verdicts.notes)
+    if printed:
+        print(verdicts_markdown(verdicts), end="")
+    else:
+        print_verdicts(verdicts)
+    for form, path in files.items():
+        if path is not None:
+            tidy_leftovers(write_verdicts(verdicts, path, form))
+            if not printed:
+                print_line(f"{'verdicts' if form == 'jsonl' else form} in {path}")
+    return 0 if verdicts.passes else 1
 
 
 def plot(

@@ -22,6 +22,7 @@ from copem_replay.cli.terminal import (
     print_line,
     print_notes,
     print_problems,
+    print_verdicts,
     show_crew_progress,
     show_progress,
     width_of,
@@ -71,6 +72,9 @@ def run(
     pieces: Pieces = None,
     cluster: Cluster = None,
     report: Annotated[bool, typer.Option("--report", help="Also write report.html.")] = False,
+    label: Annotated[
+        str | None, typer.Option(metavar="TEXT", help="What these results are called in a history.")
+    ] = None,
     live: Annotated[bool, typer.Option("--live", help="Also show the replay in a running Rerun viewer.")] = False,
     viewer: Annotated[str | None, typer.Option(metavar="URL", help="Address of that viewer [on this machine].")] = None,
 ) -> int:
@@ -91,13 +95,36 @@ def run(
         study = _read_study(place, experiment, source, skip_unreadable, cache, cluster)
         url = _check_viewer(study.experiment, viewer) if live or viewer is not None else None
         result, advice = _replay_study(study, jobs, cache, threads=cluster is None)
-        _write_results(place, study, result, advice, cache, url)
+        _write_results(place, study, result, advice, cache, url, label)
+        passes = _judge_results(place.shown, study.experiment)
         if report:
             from copem_replay.api.results import write_report
 
             print_line(f"report in {write_report(place.shown)}")
     _print_next(place.shown)
-    return 1 if study.skipped or place.failed else 0
+    return 1 if study.skipped or place.failed or not passes else 0
+
+
+def _judge_results(folder: Path, experiment: Experiment) -> bool:
+    """Judge the criteria of an experiment, write and print the verdicts; whether all pass. Those that are against
+    results of before are left to `verdict`.
+    """
+    known = list(experiment.configurations)
+    later = [name for name, one in experiment.criteria.items() if one.against and one.find_against("", known)[1]]
+    asked = {name: one.model_dump(exclude_none=True) for name, one in experiment.criteria.items() if name not in later}
+    if later:
+        print_notes([f"criteria {', '.join(later)}: `copem-replay verdict {folder} --before FOLDER` judges them"])
+    if not asked:
+        return True
+    from copem_replay.api.results import judge
+    from copem_replay.results.verdicts import FILE, write_verdicts
+
+    verdicts = judge(folder, asked)
+    write_verdicts(verdicts, folder / FILE)
+    print_notes(verdicts.notes)
+    print_line("")
+    print_verdicts(verdicts)
+    return verdicts.passes
 
 
 def _open_parts(pieces: str | None) -> PartCache | None:
@@ -144,13 +171,13 @@ def _replay_study(
 
 def _write_results(
     place: ResultsPlace, study: LoadedStudy, result: Results, advice: list[str], cache: PartCache | None,
-    viewer: str | None,
+    viewer: str | None, label: str | None,
 ) -> None:  # fmt: skip
     """Fill the results folder, then print notes, problems and the summary."""
     from copem_replay.core.tracks import TRUTH
     from copem_replay.metrics.summary import describe_began, format_summary
 
-    notes = result.fill(place, skipped=study.skipped, viewer=viewer)
+    notes = result.fill(place, skipped=study.skipped, viewer=viewer, label=label)
     if cache is not None:
         print_notes(sorted(cache.damaged))
         print_problems([f"pieces: {cache.computed} computed, {cache.found} found in {cache.store.where}"])

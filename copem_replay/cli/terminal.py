@@ -20,6 +20,7 @@ from copem_replay.core.errors import InputError, count_noun, is_url, local_path,
 
 if TYPE_CHECKING:
     from copem_replay.pipeline.crew import CrewProgress
+    from copem_replay.results.verdicts import Verdicts
 
 
 # Arguments and options of several commands.
@@ -113,6 +114,13 @@ def _fit_line(line: str, width: int | None) -> str:
 def print_notes(lines: Iterable[str]) -> None:
     """Print notes on stderr."""
     print_problems(f"note: {line}" for line in lines)
+
+
+def print_verdicts(verdicts: Verdicts) -> None:
+    """Print verdicts on stdout: the table, what is undecided and why, and how many pass."""
+    from copem_replay.results.verdicts import verdicts_text
+
+    print_blocks([verdicts_text(verdicts, width_of(sys.stdout)).splitlines()])
 
 
 def tidy_leftovers(path: Path, place: Path | None = None) -> None:

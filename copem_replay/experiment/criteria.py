@@ -7,23 +7,23 @@ run: one that does not exist would be a limit that nothing ever breaks.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
 
 from copem_replay.core.components import Frozen, Id, Number
-from copem_replay.core.errors import near_name_hint, unknown_name_message
+from copem_replay.core.errors import ExperimentError, InputError, near_name_hint, unknown_name_message
 from copem_replay.core.tracks import CLASS_GROUPS, TRUTH
+from copem_replay.metrics.config import parse_slices
 from copem_replay.metrics.figure_limits import JUDGED, PER_MINUTE, SUMMED
 from copem_replay.metrics.intervals import CONFIDENCE
-from copem_replay.metrics.config import parse_slices
 from copem_replay.metrics.summary_metrics import COMPARED, METRICS_OF
 from copem_replay.perception.pem.condition import ClassNames
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from copem_replay.core.yaml import Key
     from copem_replay.experiment.file import ExperimentSource
 
@@ -144,24 +144,43 @@ class CriteriaFile(Frozen):
     criteria: Annotated[dict[CriterionName, Criterion], Field(min_length=1)]
 
 
-def read_criteria(path: Path, study: Mapping[str, Any]) -> dict[str, Criterion]:
-    """The criteria of a file with that one key, checked against the plain data of an experiment.
+def read_criteria(given: Path | Mapping[str, Any], study: Mapping[str, Any]) -> dict[str, Criterion]:
+    """Criteria by name, from a file with the one key `criteria` or as plain data, checked against an experiment's data.
 
-    Raises ExperimentError with all problems, a line each with file, line and key.
+    Raises ExperimentError with all problems, a line each, with file, line and key.
     """
-    from copem_replay.core.errors import ExperimentError
-    from copem_replay.experiment.file import describe_by_key, read_experiment_file
+    from copem_replay.experiment.file import describe_by_key, make_plain_source, read_experiment_file
 
-    source = read_experiment_file(path)
+    source = make_plain_source({"criteria": given}) if isinstance(given, Mapping) else read_experiment_file(given)
     problems = [*source.problems, *check_criteria(source, study)]
     try:
-        file = CriteriaFile.model_validate(source.data)
+        criteria = CriteriaFile.model_validate(source.data).criteria
     except ValidationError as error:
-        shape = [source.at(key, message) for key, message in describe_by_key(CriteriaFile, error, source.data)]
-        raise ExperimentError([*problems, *shape]) from None
+        shape = describe_by_key(CriteriaFile, error, source.data)
+        raise ExperimentError([*problems, *(source.at(key, message) for key, message in shape)]) from None
     if problems:
         raise ExperimentError(problems)
-    return dict(file.criteria)
+    return dict(criteria)
+
+
+_FAIL_ON = re.compile(r"\s*(\w+)\s*([<>])=?\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*")
+
+
+def parse_fail_on(conditions: Sequence[str], against: str, names: Sequence[str] | None) -> dict[str, dict[str, Any]]:
+    """Criteria of which these conditions, `ttd_rmst_s > 0.05`, are the refutation: differences to `against`.
+
+    `names`: of the configurations. Raises InputError for a condition of another form.
+    """
+    criteria: dict[str, dict[str, Any]] = {}
+    for condition in conditions:
+        if (found := _FAIL_ON.fullmatch(condition)) is None:
+            example = "such as 'ttd_rmst_s > 0.05'"
+            raise InputError(f"--fail-on: expected a metric and a bound, {example}, found {condition!r}")
+        metric, sign, bound = found.groups()
+        criterion: dict[str, Any] = {"metric": metric, "against": against}
+        criterion["at_most" if sign == ">" else "at_least"] = float(bound)
+        criteria[condition.strip()] = criterion | ({} if names is None else {"configurations": list(names)})
+    return criteria
 
 
 # Names that criteria use.

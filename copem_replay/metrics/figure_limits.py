@@ -26,6 +26,7 @@ from copem_replay.metrics.intervals import (
     EXACT,
     INVERTED,
     JACKKNIFE,
+    alike_run_limits,
     group_clusters,
     limit_figure,
     limit_quantile,
@@ -95,8 +96,8 @@ def cluster_rows(rows: pd.DataFrame, over: str, cluster: pd.Series) -> RowCluste
     return RowClusters(over, list(cluster), list(rows["log"].astype(str) + "\n" + rows["object_id"].astype(str)))
 
 
-def detection_endings(rows: pd.DataFrame) -> tuple[Float, Int, Float]:
-    """Time (n,) from onset to detection or end of the episode, kind of ending (n,) and number of runs (n,).
+def detection_endings(rows: pd.DataFrame) -> tuple[Float, Int]:
+    """Time (n,) from onset to detection or end of the episode, and kind of ending (n,).
 
     `rows`: of `Results.known`, or of the tally.
     """
@@ -104,7 +105,7 @@ def detection_endings(rows: pd.DataFrame) -> tuple[Float, Int, Float]:
     looked_s = (rows["ended_s"] - rows["onset_s"]).to_numpy(dtype=float)
     time_s = np.where(detected, rows["time_to_detection_s"].to_numpy(dtype=float), looked_s)
     ending = np.where(detected, DETECTED, np.where(is_competing(rows["ended_by"]), LEFT, CENSORED))
-    return time_s, ending, rows["runs"].to_numpy()
+    return time_s, ending
 
 
 # Curves and means.
@@ -219,7 +220,7 @@ class FigureRows:
     @cached_property
     def endings(self) -> tuple[Float, Int]:
         """(n,) times, and how they end."""
-        time_s, ending, _ = detection_endings(self.table)
+        time_s, ending = detection_endings(self.table)
         return np.round(time_s, 9), ending
 
     @cached_property
@@ -252,12 +253,25 @@ class FigureRows:
         limits = mean_limits(
             time_s, ending, self.clusters, horizon_s, self.weight, confidence=confidence, least=self.least
         )
-        return _with_limits(value, limits)
+        bounds = min(0.0, float(time_s.min())), horizon_s
+        return _with_limits(value, limits or self._limit_alike_runs(value, bounds, confidence))
 
-    def limit_mean(self, values: Float, confidence: float) -> LimitedFigure:
-        """The mean of values (n,)."""
+    def _limit_alike_runs(
+        self, value: float, bounds: tuple[float, float], confidence: float
+    ) -> tuple[float, float] | None:
+        """Limits of a mean that is the same in all runs; None: clusters are others, whose number tells less."""
+        if self.clusters is None or self.clusters.over != "runs" or len(self.clusters.weights) < 2:
+            return None
+        return alike_run_limits(value, bounds, len(self.clusters.weights), confidence)
+
+    def limit_mean(self, values: Float, most: Float, confidence: float) -> LimitedFigure:
+        """The mean of values (n,), from 0 to `most (n,)`."""
         sums = np.stack([self.weight * values, self.weight], axis=1)
-        return limit_sums(sums, lambda of: of[..., 0] / of[..., 1], self.clusters, confidence)
+        found = limit_sums(sums, lambda of: of[..., 0] / of[..., 1], self.clusters, confidence)
+        if found.kind == ALL_ALIKE and found.value is not None:
+            bounds = 0.0, float(self.weight @ most / self.weight.sum())
+            return _with_limits(found.value, self._limit_alike_runs(found.value, bounds, confidence))
+        return found
 
     @cached_property
     def _quantile_limits(self) -> dict[float, tuple[Float, Float, Float, Int]]:
@@ -374,7 +388,7 @@ def _mean_time(rows: FigureRows, horizon_s: float, confidence: float, _: float) 
 def _mean_unknown(rows: FigureRows, _: float, confidence: float, __: float) -> LimitedFigure:
     length_s = (rows.table["ended_s"] - rows.table["onset_s"]).to_numpy(dtype=float)
     unknown_s = compute_unknown_s(rows.table["time_to_detection_s"].to_numpy(dtype=float), length_s)
-    return rows.limit_mean(unknown_s, confidence)
+    return rows.limit_mean(unknown_s, length_s, confidence)
 
 
 def _left(rows: FigureRows) -> Bool:

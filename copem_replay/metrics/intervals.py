@@ -255,6 +255,17 @@ def limit_figure(
     return np.maximum(value - half, bounds[0]), np.minimum(value + half, bounds[1])
 
 
+def alike_run_limits(
+    value: float, bounds: tuple[float, float], runs: int, confidence: float = CONFIDENCE
+) -> tuple[float, float]:
+    """Bound a mean between `bounds` that is the same in so many independent runs: (low, high).
+
+    In a share of runs at most, by exact limits of none of them, it is another, as far as the bounds allow.
+    """
+    other = float(exact_limits(0.0, float(runs), confidence)[1])
+    return value - other * (value - bounds[0]), value + other * (bounds[1] - value)
+
+
 # Quantiles.
 
 

@@ -22,6 +22,7 @@ from copem_replay.core.components import ask_component
 from copem_replay.core.errors import InputError, count_noun, unknown_name_message
 from copem_replay.core.tracks import Bool, Float
 from copem_replay.experiment.criteria import Criterion, choose_judged
+from copem_replay.metrics.config import Slice, parse_slice
 from copem_replay.metrics.figure_limits import (
     JUDGED,
     PER_MINUTE,
@@ -38,7 +39,6 @@ from copem_replay.metrics.intervals import (
     explain_no_clusters,
 )
 from copem_replay.metrics.onset import select_counted
-from copem_replay.metrics.config import Slice, parse_slice
 from copem_replay.metrics.slices import Group, StudyRows, sum_episodes
 from copem_replay.metrics.summary import CONFLICT, list_runs
 from copem_replay.results.compare.compare import PairsAsked, compare_folders

@@ -306,18 +306,31 @@ class Results:
         return place.shown
 
     def fill(
-        self, place: ResultsPlace, *, skipped: Sequence[tuple[File, str]] = (), viewer: str | None = None
+        self,
+        place: ResultsPlace,
+        *,
+        skipped: Sequence[tuple[File, str]] = (),
+        viewer: str | None = None,
+        label: str | None = None,
     ) -> list[str]:
         """Write the results into a place that is locked. Returns notes, one line each.
 
         `skipped`: logs that were left out, with reasons. `viewer`: address of a Rerun viewer that also gets the
-        recordings. Raises InputError where the results were read from a folder.
+        recordings. `label`: what the results are called in a history. Raises InputError where the results were read from a folder.
         """
         from copem_replay.results.write import fill_place
 
         exporters = self._list_exporters(viewer)
         assert self.replayed is not None
-        notes = fill_place(place, self.experiment, self.recordings, self.replayed, exporters=exporters, skipped=skipped)
+        notes = fill_place(
+            place,
+            self.experiment,
+            self.recordings,
+            self.replayed,
+            exporters=exporters,
+            skipped=skipped,
+            label=label,
+        )
         self.folder = place.shown
         return notes
 

@@ -166,7 +166,11 @@ def verdicts_text(verdicts: Verdicts, width: int | None = None) -> str:
         for verdict in verdicts.all
     ]
     lines = [format_table(pd.DataFrame(rows), width)] if rows else []
-    lines += [f"{v.name}, {v.configuration}: {v.result}: {v.why}" for v in verdicts.all if v.why and v.verdict != MET]
+    reasons: dict[tuple[str, str, str], list[str]] = {}
+    for one in verdicts.all:
+        if one.why and one.verdict != MET:
+            reasons.setdefault((one.name, one.result, one.why), []).append(one.configuration)
+    lines += [f"{name}, {', '.join(of)}: {result}: {why}" for (name, result, why), of in reasons.items()]
     return "\n".join([*lines, verdicts.chance, verdicts.headline])
 
 

@@ -171,6 +171,7 @@ def fill_place(
     *,
     exporters: Sequence[Exporter],
     skipped: Sequence[tuple[File, str]] = (),
+    label: str | None = None,
 ) -> list[str]:
     """Write results into a place that is locked. Returns notes for the user. Raises OutputError.
 
@@ -186,6 +187,7 @@ def fill_place(
         files = [name for name in files if name not in place.left_out]
         write_csv(_logs_table(place.folder, result, skipped), place.new / "logs.csv")
         provenance = build_provenance(experiment, recordings, result, skipped, notes) | {"files": files}
+        provenance |= {"label": label} if label is not None else {}
         (place.new / MARK).write_text(json.dumps(provenance, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
         place.finish(files)
     except OSError as error:

@@ -145,7 +145,7 @@ def test_counts_say_what_rows_say(rows: pd.DataFrame) -> None:
     if banded:
         limits = []
         for of, its in zip((counted, each), clusters, strict=True):
-            time_s, ending, runs = detection_endings(of)
+            (time_s, ending), runs = detection_endings(of), of["runs"].to_numpy()
             assert its is not None
             limits.append(mean_limits(time_s, ending, its, 4.0, runs))
         assert (limits[0] is None) == (limits[1] is None)

@@ -109,7 +109,7 @@ def build_curve(rows: pd.DataFrame, clusters: RowClusters | None) -> DetectionCu
     """The curve of one configuration's rows (n,), with a band over their clusters if there are any."""
     if not len(rows):
         return DetectionCurve(np.empty(0), np.empty(0))
-    time_s, ending, runs = detection_endings(rows)
+    (time_s, ending), runs = detection_endings(rows), rows["runs"].to_numpy()
     times_s, share = cumulative_incidence(time_s, ending, runs.astype(float))
     if clusters is None or not len(times_s):
         return DetectionCurve(times_s, share)
