@@ -97,7 +97,11 @@ def _judge_differences(criteria: dict[str, dict[str, Any]], folders: list[Path])
     if not criteria:
         return 0
     from copem_replay.api.results import judge
+    from copem_replay.results.judge import find_population
+    from copem_replay.results.read import open_results
 
+    population = find_population(open_results(folders[0], "tally.parquet"))
+    criteria = {name: criterion | {"population": population} for name, criterion in criteria.items()}
     verdicts = judge(folders[0], criteria, before=folders[1] if len(folders) > 1 else None)
     print_line("")
     print_verdicts(verdicts)

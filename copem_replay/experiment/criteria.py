@@ -88,7 +88,8 @@ class Criterion(Frozen):
     @field_validator("each")
     @classmethod
     def _sliced(cls, each: Any) -> Any:
-        parse_slices([each])
+        if each is not None:
+            parse_slices([each])
         return each
 
     @field_validator("by")

@@ -295,7 +295,7 @@ class FigureRows:
     def _limit_curve(self, confidence: float) -> tuple[Float, Float, Float, Int]:
         times_s = self.curve[0]
         steps = np.unique(np.linspace(0, len(times_s) - 1, min(len(times_s), _INSTANTS)).astype(int))
-        before = [min(0.0, *times_s[:1]) - 1.0]
+        before = [min([0.0, *times_s[:1]]) - 1.0]
         return times_s, *self._incidence_limits(np.append(before, times_s[steps]), confidence), steps
 
     def _incidence_limits(self, at_s: Sequence[float] | Float, confidence: float) -> tuple[Float, Float]:
@@ -424,7 +424,7 @@ JUDGED = {
     "conflict_ttd_p95_s": JudgedMetric("conflict", _quantile_s(0.95)),
     "conflict_ttd_rmst_s": JudgedMetric("conflict", _mean_time),
     "conflict_dad_median_m": JudgedMetric("conflict", _quantile_m(0.5)),
-    "pass_share": JudgedMetric("braking", _share_of(_column("passed"))),
+    "pass_share": JudgedMetric("braking", lambda rows, _, level, __: rows.limit_share(_column("passed")(rows), level)),
     **{f"{name}_exact": JudgedMetric("exact", limit) for name, limit in _OF_DETECTION.items()},
     "pass_share_exact": JudgedMetric("exact braking", _share_of(_column("pass_probability"))),
     "fail_share_exact": JudgedMetric("exact braking", _share_of(_column("fail_probability"))),

@@ -35,6 +35,7 @@ from copem_replay.metrics.figure_limits import (
 from copem_replay.metrics.intervals import (
     ALL_ALIKE,
     NOTHING_DRAWN,
+    choose_clusters,
     choose_over,
     explain_no_clusters,
 )
@@ -87,6 +88,11 @@ def judge_results(results: Results, criteria: Mapping[str, Criterion], before: R
     return Verdicts(results.name, tuple(verdicts), tuple(notes))
 
 
+def find_population(results: Results) -> str:
+    """Of what population `compare` has intervals: those over the runs of a single object are of these logs."""
+    return "these_logs" if choose_clusters(results.known)[0] == "runs" else "such_traffic"
+
+
 def _make_verdict(name: str, criterion: Criterion, configuration: str, group: str, found: JudgedFigure) -> Verdict:
     figure = found.figure
     word, why = _find_verdict(criterion, found)
@@ -126,7 +132,7 @@ def _find_verdict(criterion: Criterion, found: JudgedFigure) -> tuple[str, str]:
         return NOT_MEASURED, found.why or "no row has a value"
     if figure.kind == ALL_ALIKE:
         good = judge_limits(figure.value, figure.value, bound, direction) == MET
-        why = f"the same in every {_CLUSTER[found.over or 'logs']}, so how it varies is not known"
+        why = "the same throughout, so how it varies is not known"
         return (UNDECIDED if good else NOT_MET), why
     if figure.kind is None or math.isnan(figure.low) or math.isnan(figure.high):
         return NOT_MEASURED, found.why or "no interval"
@@ -137,7 +143,6 @@ def _find_verdict(criterion: Criterion, found: JudgedFigure) -> tuple[str, str]:
     return word, "; ".join([*parts, *filter(None, [found.why])])
 
 
-_CLUSTER = {"logs": "log", "objects": "object", "runs": "run"}
 _MORE = {
     "logs": "more logs would decide ({number} now)",
     "objects": "other drives would decide; {number} objects of one drive now",
@@ -251,7 +256,7 @@ class _JudgedStudy:
         if criterion.objects is not None:
             classes, ids = criterion.objects.expanded(), criterion.objects.ids or ()
             column, wanted = ("object_id", set(ids)) if classes is None else ("object_class", set(classes))
-            kept &= episodes[column].astype(str).isin(wanted).to_numpy(dtype=bool)
+            kept = kept & episodes[column].astype(str).isin(wanted).to_numpy(dtype=bool)
         return kept, chosen
 
     def _find_group(

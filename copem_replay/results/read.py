@@ -316,7 +316,8 @@ class Results:
         """Write the results into a place that is locked. Returns notes, one line each.
 
         `skipped`: logs that were left out, with reasons. `viewer`: address of a Rerun viewer that also gets the
-        recordings. `label`: what the results are called in a history. Raises InputError where the results were read from a folder.
+        recordings. `label`: what the results are called in a history. Raises InputError where the results were read
+        from a folder.
         """
         from copem_replay.results.write import fill_place
 

@@ -137,11 +137,11 @@ class Verdicts:
     @property
     def chance(self) -> str:
         """How many verdicts may be wrong by chance, as each is judged by itself."""
-        wrong = sum((1 - verdict.confidence) / 2 for verdict in self.all if verdict.interval is not None)
-        judged = sum(verdict.interval is not None for verdict in self.all)
+        levels = [verdict.confidence for verdict in self.all if verdict.over is not None and verdict.limits != "–"]
+        wrong = sum((1 - level) / 2 for level in levels)
         return (
-            f"{count_noun(judged, 'verdict')} with an interval, each by itself: were every metric at its bound, about "
-            f"{wrong:.2g} would be met, and as many not met, by chance"
+            f"{count_noun(len(levels), 'verdict')} by an interval, each by itself: were every metric at its bound, "
+            f"about {wrong:.2g} would be met, and as many not met, by chance"
         )
 
 
