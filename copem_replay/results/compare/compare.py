@@ -20,6 +20,7 @@ from copem_replay.core.errors import InputError, count_noun
 from copem_replay.core.tracks import SAME_INSTANT_S
 from copem_replay.metrics.intervals import FEWEST_CLUSTERS, FEWEST_LOGS, NOT_ENOUGH, choose_over, explain_no_clusters
 from copem_replay.metrics.summary_metrics import COMPARED
+from copem_replay.results.compare.groups import EpisodeGroups, without_limits_over_runs
 from copem_replay.results.compare.labels import (
     LabelledConfiguration,
     check_log_names,
@@ -337,7 +338,8 @@ class Comparison:
 
     Columns of `table` as in COLUMNS, missing where there is none; times are up to `horizon_s`, those at equal ghosts at
     `false_positives_per_min`. `baseline_why`: why it is the baseline, None if it was asked for. `notes`: what has to be
-    said, a line each.
+    said, a line each. `groups`: a row per group, configuration and metric, with `by` and `group` in place of the log;
+    None: not asked for.
 
     >>> comparison = cr.compare("out/tc016d", baseline="PEM")
     >>> comparison.baseline, comparison.configurations
@@ -351,6 +353,7 @@ class Comparison:
     horizon_s: float
     false_positives_per_min: float | None
     notes: tuple[str, ...]
+    groups: pd.DataFrame | None = None
 
     @property
     def overall(self) -> pd.DataFrame:
@@ -365,8 +368,11 @@ def compare_folders(
     baseline: str | None = None,
     false_positives_per_min: float | None = None,
     metrics: Sequence[str] | None = None,
+    by: Sequence[str] | None = None,
 ) -> Comparison:
     """Compare configurations (None: all) with a baseline, pair by pair, in some metrics (None: all).
+
+    `by`: entries by which each group is compared for itself, too.
 
     `baseline`: None: the configuration named `ideal`, else the ideal fusion of the same inputs, else the first that is
     not the truth. `false_positives_per_min`: at which times to detection are compared once more; None: as many as the
@@ -388,7 +394,9 @@ def compare_folders(
     horizon_s, horizon_notes = _settle_horizon(used)
     setting = PairSettings(horizon_s, float(read[0].provenance.measure["gospa"]["power"]))
     settings, reasons = _settle_ghosts(setting, against, others, totals, false_positives_per_min, asked=not own_rate)
-    pairs, rows = _compare_each_log(against, settings, ClusterNames(logs, [], runs), metrics)
+    groups = EpisodeGroups(read[0], by or ())
+    names = ClusterNames(logs, [], runs)
+    pairs, rows, of_groups = _compare_each_log(against, settings, names, metrics, groups)
     table = pd.DataFrame(rows, columns=list(COLUMNS)).astype(COLUMNS)
     return Comparison(
         table=table,
@@ -397,6 +405,7 @@ def compare_folders(
         configurations=tuple(labelled.label for labelled in others),
         horizon_s=setting.horizon_s,
         false_positives_per_min=false_positives_per_min,
+        groups=_tabulate_groups(against, of_groups, names, groups) if by else None,
         notes=(
             *notes_on_folders(used),
             *horizon_notes,
@@ -446,12 +455,14 @@ def _compare_each_log(
     settings: Mapping[LabelledConfiguration, PairSettings],
     names: ClusterNames,
     metrics: Sequence[str] | None,
-) -> tuple[dict[LabelledConfiguration, AllLogs], list[dict[str, object]]]:
-    """The sums of each pair over the logs of `names`; rows of all logs, then of each log where there are several.
+    groups: EpisodeGroups,
+) -> tuple[dict[LabelledConfiguration, AllLogs], list[dict[str, object]], GroupPairs]:
+    """The sums of each pair over the logs of `names`; rows of all logs, then of each log where there are several; the
+    sums of each group.
 
     The objects of the logs are appended to `names`.
     """
-    logs, pairs = names.logs, {labelled: AllLogs() for labelled in settings}
+    logs, pairs, of_groups = names.logs, {labelled: AllLogs() for labelled in settings}, GroupPairs()
     rows: list[dict[str, object]] = []
     for k, log in enumerate(logs):
         tables = {
@@ -472,7 +483,29 @@ def _compare_each_log(
                 values = regret.figure.values()
                 pair.differences.setdefault(regret.metric, []).append(values[2])
                 rows.append({"log": log, **_make_row(regret, values, labelled, against, names)})
-    return pairs, [*_overall_rows(against, pairs, names), *rows]
+            for group, kept in groups.select(log, grid):
+                one, other = (groups.restrict(group, kept, side) for side in (first, second))
+                regrets = list(compute_regrets(one, other, grid, settings[labelled], metrics))
+                of_pair = of_groups.setdefault(group, {}).setdefault(labelled, AllLogs())
+                of_pair.add(one, other, regrets, more=len(logs) > 1)
+    return pairs, [*_overall_rows(against, pairs, names), *rows], of_groups
+
+
+GroupPairs = dict[int, dict[LabelledConfiguration, AllLogs]]
+"""Sums of pairs by group."""
+
+
+def _tabulate_groups(
+    against: LabelledConfiguration, of_groups: GroupPairs, names: ClusterNames, groups: EpisodeGroups
+) -> pd.DataFrame:
+    """The rows of `Comparison.groups`."""
+    rows = [
+        {"by": by.label, "group": group, **without_limits_over_runs(row)}
+        for k, (by, group) in enumerate(groups.named)
+        for row in _overall_rows(against, of_groups.get(k, {}), names)
+    ]
+    columns = {"by": "object", "group": "object"} | {n: kind for n, kind in COLUMNS.items() if n != "log"}
+    return pd.DataFrame(rows, columns=list(columns)).astype(columns)
 
 
 def _overall_rows(
