@@ -51,7 +51,7 @@ def slices_figure(
     most_s = max(
         [float(np.nanmax(table.to_numpy())) for table in shown.values() if table.notna().any(axis=None)] or [1]
     )
-    heights = [_ROW_IN * len(table) + 0.55 for table in shown.values()]
+    heights = [_ROW_IN * len(table) + 0.8 for table in shown.values()]
     links = {log.name: f"#drive-{k}" for k, log in enumerate(results.provenance.logs)} if linked else {}
     with figure_style():
         import matplotlib
@@ -59,7 +59,9 @@ def slices_figure(
         colours = matplotlib.colormaps["Blues"]
         longest = max(len(group) for table in shown.values() for group in table.index)
         figure = new_figure(max(4.0, 0.6 + 0.075 * longest + _COLUMN_IN * len(names)), sum(heights) + 0.5)
-        panels = figure.subplots(len(shown), 1, squeeze=False, height_ratios=heights)[:, 0]
+        panels = figure.subplots(
+            len(shown), 1, squeeze=False, height_ratios=[len(table) or 1 for table in shown.values()]
+        )[:, 0]
         for axes, (by, table) in zip(panels, shown.items(), strict=True):
             axes.set_title(f"by {by}", loc="left")
             _draw_cells(axes, table, most_s or 1.0, colours, links if by == "log" else {})

@@ -86,9 +86,11 @@ def _object_table(rows: pd.DataFrame, names: list[str]) -> Html:
     sums = pd.DataFrame({"runs": runs, "known": runs * known, "time_s": np.where(known, runs * time_s, 0.0)})
     of_episode = [rows[name].to_numpy() for name in ("object_id", "episode", "configuration")]
     sums = sums.groupby(of_episode, sort=False).sum()
-    share, mean_s = sums["known"] / sums["runs"], sums["time_s"] / sums["known"].where(sums["known"] > 0)
-    latest = share.groupby(level=[0, 1], sort=False).mean()
-    order = sorted(latest.index, key=lambda of: (latest[of], -np.nan_to_num(mean_s.loc[of].mean())))
+    share = sums["known"] / sums["runs"]
+    mean_s = sums["time_s"] / sums["known"].where(sums["known"] > 0)
+    latest = pd.DataFrame({"share": share, "mean_s": mean_s}).groupby(level=[0, 1], sort=False).mean()
+    order = latest.sort_values(["share", "mean_s"], ascending=[True, False], kind="stable").index
+    found = {of: (float(share[of]), float(mean_s[of])) for of in share.index}
     episodes = rows.drop_duplicates(["object_id", "episode"]).set_index(["object_id", "episode"])
     lines = []
     for of in order:
@@ -98,15 +100,16 @@ def _object_table(rows: pd.DataFrame, names: list[str]) -> Html:
         cells += [
             make_tag("td", format_three_digits(float(episode[name]))) for name in ("onset_s", "distance_at_onset_m")
         ]
-        cells += [make_tag("td", _when_known(share.get((*of, name)), mean_s.get((*of, name)))) for name in names]
+        cells += [make_tag("td", _when_known(found.get((*of, name)))) for name in names]
         lines.append(make_tag("tr", head, *cells))
     return make_table(["object", "class", "onset, s", "range then, m", *names], lines)
 
 
-def _when_known(share: float | None, mean_s: float | None) -> str:
-    """`0.4 s`; where it is not known in every run, `0.4 s in 75 %`."""
-    if share is None:
+def _when_known(found: tuple[float, float] | None) -> str:
+    """`0.4 s`; where it is not known in every run, `0.4 s in 75 %`. `found`: share of the runs, and mean seconds."""
+    if found is None:
         return "–"
-    if not share or mean_s is None:
+    share, mean_s = found
+    if not share:
         return "never"
     return f"{format_three_digits(mean_s)} s" + ("" if share == 1 else f" in {format_per_cent(share)} %")
