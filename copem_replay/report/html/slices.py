@@ -13,8 +13,8 @@ from copem_replay.metrics.slices import describe_chance
 from copem_replay.metrics.summary import EPISODE
 from copem_replay.report.figures.slices import MOST_GROUPS
 from copem_replay.report.figures.style import format_per_cent, format_three_digits
-from copem_replay.report.html.markup import Html, fold_parts, join_html, make_list, make_table, make_tag
-from copem_replay.report.html.tables import column_header, format_value, full_number, interval_markup, row_head
+from copem_replay.report.html.markup import Html, allow_breaks, fold_parts, line_swatch, join_html, make_list, make_table, make_tag
+from copem_replay.report.html.tables import column_header, format_value, full_number, interval_markup
 from copem_replay.results.slices import SHOWN, describe_groups
 
 if TYPE_CHECKING:
@@ -44,10 +44,12 @@ def _group_table(study: ReportData, by: str, rows: pd.DataFrame) -> Html:
     names = [name for name in SHOWN if name in rows and rows[name].notna().any()]
     lines = []
     for row in rows.to_dict("records"):
-        cells = [make_tag("td", str(row["group"]), class_="text"), make_tag("td", str(row["objects"]))]
+        name = str(row["configuration"])
+        of = make_tag("span", line_swatch(study.looks[name]), make_tag("span", allow_breaks(name)), class_="named")
+        cells = [make_tag("td", of, class_="text"), make_tag("td", str(row["objects"]))]
         cells += [_figure_cell(row, name) for name in names]
-        lines.append(make_tag("tr", row_head(study, str(row["configuration"])), *cells))
-    head = ["configuration", by, "objects", *map(column_header, names)]
+        lines.append(make_tag("tr", make_tag("th", allow_breaks(str(row["group"])), scope="row"), *cells))
+    head = [by, "configuration", "objects", *map(column_header, names)]
     return make_table(head, lines, caption=f"By {by}")
 
 
