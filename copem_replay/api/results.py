@@ -41,12 +41,14 @@ def compare(
     configurations: Sequence[str] | None = None,
     baseline: str | None = None,
     false_positives_per_min: float | None = None,
+    by: Sequence[str] | None = None,
 ) -> Comparison:
     """Compare configurations with a baseline, paired by log, object and run, within or across results folders.
 
     `configurations`: only these; None: all. `baseline`: None: the one named `ideal`, else the ideal fusion of the same
     inputs, else the first that is not the truth. `false_positives_per_min`: false positives per minute at which times
-    to detection are compared once more; None: those of the baseline. `table` of the result has a row per log,
+    to detection are compared once more; None: those of the baseline. `by`: entries by which rows are grouped, each
+    group compared for itself, in `groups` of the result: `["class", "log*class"]`. Its `table` has a row per log,
     configuration and metric: `difference` with the limits `low` and `high` of its 95 % interval.
 
     Raises InputError with every reason why the results are unreadable or not comparable.
@@ -64,6 +66,7 @@ def compare(
         configurations=configurations,
         baseline=baseline,
         false_positives_per_min=false_positives_per_min,
+        by=by,
     )
 
 
@@ -103,10 +106,17 @@ def judge(
     return judge_results(judged, asked, other)
 
 
-def write_report(results: AnyResults, file: str | PathLike[str] | None = None, *, baseline: str | None = None) -> Path:
+def write_report(
+    results: AnyResults,
+    file: str | PathLike[str] | None = None,
+    *,
+    baseline: str | None = None,
+    by: Sequence[str] | None = None,
+) -> Path:
     """Write the report of a results folder as one HTML file that opens offline. Returns its path.
 
-    `file`: None: `report.html` in the folder. `baseline`: None: as in `compare`.
+    `file`: None: `report.html` in the folder. `baseline`: None: as in `compare`. `by`: what its tables of groups are
+    by, `["log", "class"]`; None: by what the experiment says (`measure.by`).
 
     Raises InputError where the results are unreadable, OutputError where the file is not writable.
 
@@ -115,7 +125,8 @@ def write_report(results: AnyResults, file: str | PathLike[str] | None = None, *
     """
     from copem_replay.report import write_html_report
 
-    return write_html_report(_results_or_path(results), None if file is None else Path(file), baseline=baseline)
+    path = None if file is None else Path(file)
+    return write_html_report(_results_or_path(results), path, baseline=baseline, by=by)
 
 
 def view(results: AnyResults, *, web: bool = False) -> None:

@@ -11,11 +11,13 @@ import typer
 
 from copem_replay.cli.terminal import (
     Baseline,
+    By,
     ResultsFolder,
     print_blocks,
     print_line,
     print_notes,
     print_verdicts,
+    split_entries,
     split_names,
     tidy_leftovers,
     width_of,
@@ -29,6 +31,7 @@ def compare(
         str | None, typer.Option(metavar="A,B,…", help="Only these, and the baseline [all].")
     ] = None,
     baseline: Baseline = None,
+    by: By = None,
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write everything as .csv, or the table as .md.")
     ] = None,
@@ -64,7 +67,11 @@ def compare(
     names = split_names(configurations)
     conditions = _check_fail_on(fail_on, folders, names, baseline)
     comparison = compare_results(
-        folders, configurations=names, baseline=baseline, false_positives_per_min=false_positives_per_min
+        folders,
+        configurations=names,
+        baseline=baseline,
+        false_positives_per_min=false_positives_per_min,
+        by=split_entries(by),
     )
     notes = list(comparison.notes)
     if rrd is not None:
@@ -73,6 +80,14 @@ def compare(
         notes += write_side_by_side(rrd, folders, configurations=names, baseline=baseline, log=log, run=run)
     print_notes(notes)
     print_blocks([comparison_text(comparison, width_of(sys.stdout)).splitlines()])
+    if by is not None and len(folders) == 1:
+        from copem_replay.results.read import open_results
+        from copem_replay.results.slices import groups_text, summarise_slices
+
+        table = summarise_slices(open_results(folders[0]), split_entries(by))
+        assert table is not None
+        shown = [comparison.baseline, *comparison.configurations]
+        print(f"\n{groups_text(table[table['configuration'].isin(shown)], width_of(sys.stdout))}")
     if out is not None:
         write_comparison(comparison, out, folders)
     _print_written(out, rrd)
@@ -177,6 +192,7 @@ def plot(
     log: Annotated[
         str | None, typer.Option(metavar="NAME", help="Log in the figure of single runs [the first].")
     ] = None,
+    by: By = None,
 ) -> int:
     """Draw the figures of a results folder, as PNG and SVG.
 
@@ -185,7 +201,9 @@ def plot(
     from copem_replay.api.plot import write_figures
 
     names = split_names(configurations)
-    files, notes = write_figures(folder, out, configurations=names, log=log, object_id=object, run=run)
+    files, notes = write_figures(
+        folder, out, configurations=names, log=log, object_id=object, run=run, by=split_entries(by)
+    )
     print_notes(notes)
     figures = out or folder / "figures"
     tidy_leftovers(figures, figures)
@@ -198,6 +216,7 @@ def report(
     folder: ResultsFolder,
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="Name of the file [FOLDER/report.html].")] = None,
     baseline: Baseline = None,
+    by: By = None,
 ) -> int:
     """Write the report of a results folder, as one HTML file.
 
@@ -205,7 +224,7 @@ def report(
     """
     from copem_replay.api.results import write_report
 
-    path = write_report(folder, out, baseline=baseline)
+    path = write_report(folder, out, baseline=baseline, by=split_entries(by))
     tidy_leftovers(path)
     print_line(f"report in {path}")
     return 0

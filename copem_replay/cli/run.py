@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
@@ -14,6 +14,7 @@ import typer
 
 from copem_replay.cli.inspect import override_source
 from copem_replay.cli.terminal import (
+    By,
     Ego,
     ExperimentFile,
     FromS,
@@ -25,11 +26,14 @@ from copem_replay.cli.terminal import (
     print_verdicts,
     show_crew_progress,
     show_progress,
+    split_entries,
     width_of,
 )
 from copem_replay.core.errors import InputError
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from copem_replay.api.study import LoadedStudy
     from copem_replay.experiment.file import ExperimentSource
     from copem_replay.experiment.schema import Experiment
@@ -61,6 +65,7 @@ def run(
     to_s: ToS = None,
     out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="Results folder [out/<experiment>].")] = None,
     runs: Annotated[int | None, typer.Option(metavar="N", min=1, help="Number of runs.")] = None,
+    by: By = None,
     seed: Annotated[int | None, typer.Option(metavar="N", help="Seed of all random numbers.")] = None,
     jobs: Annotated[
         int | None, typer.Option(metavar="N", min=1, max=1024, help="Number of workers [one per core].")
@@ -81,7 +86,9 @@ def run(
     """Replay an experiment, write its results, print the summary."""
     from copem_replay.results.folder import take_place
 
-    source = override_source(experiment, {"ego": ego, "runs": runs, "seed": seed}, log or (), (from_s, to_s))
+    source = override_source(
+        experiment, {"ego": ego, "runs": runs, "seed": seed}, log or (), (from_s, to_s), split_entries(by)
+    )
     out = out or Path("out") / experiment.stem
     if cluster is not None:
         from copem_replay.pipeline.dask_workers import check_address
@@ -96,6 +103,8 @@ def run(
         url = _check_viewer(study.experiment, viewer) if live or viewer is not None else None
         result, advice = _replay_study(study, jobs, cache, threads=cluster is None)
         _write_results(place, study, result, advice, cache, url, label)
+        if by is not None and result.summary_by is not None:
+            _print_groups(result.summary_by, split_entries(by) or ())
         passes = _judge_results(place.shown, study.experiment)
         if report:
             from copem_replay.api.results import write_report
@@ -195,6 +204,15 @@ def _write_results(
         print_line(f"sweep of {', '.join(dict.fromkeys(result.sweep['sweep']))} in {place.shown / 'sweep.csv'}")
     _print_baseline(study.experiment)
     print_line(f"results in {place.shown}")
+
+
+def _print_groups(table: pd.DataFrame, entries: Sequence[str]) -> None:
+    """Print the slices that the command line asks for."""
+    from copem_replay.metrics.config import parse_slice
+    from copem_replay.results.slices import groups_text
+
+    asked = table["by"].isin([parse_slice(entry).label for entry in entries])
+    print(f"\n{groups_text(table[asked], width_of(sys.stdout))}\n")
 
 
 def _print_baseline(experiment: Experiment) -> None:

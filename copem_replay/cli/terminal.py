@@ -73,6 +73,21 @@ Baseline: TypeAlias = Annotated[
 ]
 
 
+By: TypeAlias = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--by",
+        metavar="ENTRY",
+        help="Also by groups: log, class, began, range_at_onset, tags.NAME; a cross is log*class [as in the results].",
+    ),
+]
+
+
+def split_entries(entries: list[str] | None) -> list[str] | None:
+    """The entries of every `--by`, between the commas; None without any."""
+    return None if entries is None else [name for entry in entries for name in split_names(entry) or ()]
+
+
 def split_names(names: str | None) -> list[str] | None:
     """The names between the commas, without spaces around them; None gives None."""
     return None if names is None else [name.strip() for name in names.split(",")]

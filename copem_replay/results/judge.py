@@ -22,7 +22,7 @@ from copem_replay.core.components import ask_component
 from copem_replay.core.errors import InputError, count_noun, unknown_name_message
 from copem_replay.core.tracks import Bool, Float
 from copem_replay.experiment.criteria import Criterion, choose_judged
-from copem_replay.metrics.config import Slice, parse_slice
+from copem_replay.metrics.config import BEGAN_BY, Slice, parse_slice
 from copem_replay.metrics.figure_limits import (
     JUDGED,
     PER_MINUTE,
@@ -165,14 +165,16 @@ def _describe_share(criterion: Criterion, share: tuple[float, float]) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _JudgedGroup:
-    """Rows that a criterion is about. `label`: of the group of a slice, else empty. `fixed` rows: by configuration.
+    """Rows that a criterion is about. `label`: of the group of a slice, else empty.
 
-    `episodes`: by log those that are kept, None: all of them; None: of all logs. `figures`: those already made.
+    `episodes`: by log those that are kept, None: all of them; None: of all logs. `every`: they count however they
+    began. `made`: tables and rows that were made of them.
     """
 
     label: str
     rows: StudyRows
     episodes: Mapping[str, frozenset[tuple[str, int]] | None] | None = None
+    every: bool = False
     made: dict[Any, Any] = field(default_factory=dict)
 
 
@@ -242,7 +244,8 @@ class _JudgedStudy:
         groups = rows.split(by)
         if criterion.by is not None:
             groups = [self._find_group(name, criterion.by, by, study, rows, groups)]
-        return [_JudgedGroup(one.label, one.rows, _list_episodes(one.rows, whole=by.of_logs)) for one in groups]
+        every, whole = by.names(BEGAN_BY), by.of_logs and criterion.objects is None
+        return [_JudgedGroup(one.label, one.rows, _list_episodes(one.rows, whole=whole), every) for one in groups]
 
     def _choose_episodes(self, name: str, criterion: Criterion, episodes: pd.DataFrame) -> tuple[Bool, set[str]]:
         """(E,) which episodes a criterion is about, and the logs. Raises InputError where no log has such a name."""
@@ -439,7 +442,7 @@ class _JudgedStudy:
         baseline = labelled.get((folders[-1], other))
         if baseline is None or not (chosen := [label for label in labels if label != baseline]):
             return pd.DataFrame(columns=["configuration", "metric"])
-        asked = PairsAsked(group.episodes, criterion.of_runs, criterion.confidence)
+        asked = PairsAsked(group.episodes, group.every, criterion.of_runs, criterion.confidence)
         comparison = compare_folders(
             folders, configurations=chosen, baseline=baseline, metrics=metrics, asked=asked
         )  # fmt: skip

@@ -11,7 +11,7 @@ import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -27,6 +27,7 @@ from copem_replay.metrics.intervals import (
     explain_no_clusters,
 )
 from copem_replay.metrics.summary_metrics import COMPARED
+from copem_replay.results.compare.groups import EpisodeGroups, without_limits_over_runs
 from copem_replay.results.compare.labels import (
     LabelledConfiguration,
     check_log_names,
@@ -63,9 +64,6 @@ from copem_replay.results.compare.pairing import (
 )
 from copem_replay.results.read import Results, open_results
 from copem_replay.results.schema import AGAIN, COMPARED_FILES
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 # The sums of a pair over its logs.
 
@@ -115,31 +113,22 @@ class AllLogs:
 @dataclass(frozen=True)
 class PairsAsked:
     """Of which rows differences are asked, and their intervals. `episodes`: by log the object and episode of each that
-    counts, or all of a log (None); no logs but these; None: all logs. `over_runs`: intervals are over runs of the logs.
+    is meant, or all of a log (None); no logs but these; None: all logs. `every`: all of these count, however they
+    began. `over_runs`: intervals are over runs of the logs.
     """
 
     episodes: Mapping[str, Collection[tuple[str, int]] | None] | None = None
+    every: bool = False
     over_runs: bool = False
     confidence: float = CONFIDENCE
 
-    def choose_rows(self, log: str, tables: dict[Results, dict[str, pa.Table]]) -> dict[Results, Any] | None:
-        """The rows of a log that are asked for, by folder and file; None: none are. Ghosts belong to whole logs."""
-        if self.episodes is None or self.episodes.get(log, ()) is None:
-            return tables
-        if not (kept := self.episodes.get(log)):
-            return None
-        index = pd.MultiIndex.from_tuples(sorted(kept))
-
-        def choose(name: str, table: pa.Table) -> pa.Table | None:
-            if "object_id" not in table.column_names:
-                return None if name == "lists.parquet" else table
-            keys = [table["object_id"].to_pylist(), table["episode"].to_pylist()]
-            return table.filter(pa.array(index.get_indexer(pd.MultiIndex.from_arrays(keys)) >= 0))
-
-        import pyarrow as pa
-
-        chosen = {of: {name: choose(name, one) for name, one in files.items()} for of, files in tables.items()}
-        return {of: {name: one for name, one in files.items() if one is not None} for of, files in chosen.items()}
+    def restrict(self, log: str, grid: PairingGrid, side: ConfigurationData) -> ConfigurationData:
+        """A side of a pair with the cells that are asked for alone; ghosts belong to whole logs."""
+        counted = side.there & (side.ended_s - side.onset_s > SAME_INSTANT_S) if self.every else side.counted
+        if self.episodes is None or (kept := self.episodes.get(log, ())) is None:
+            return replace(side, counted=counted)
+        asked = np.repeat(np.array([episode in kept for episode in grid.episodes], dtype=bool), grid.runs)
+        return replace(side, there=side.there & asked, counted=counted & asked, ghosts=None)
 
 
 # The results folders of a comparison.
@@ -379,7 +368,8 @@ class Comparison:
 
     Columns of `table` as in COLUMNS, missing where there is none; times are up to `horizon_s`, those at equal ghosts at
     `false_positives_per_min`. `baseline_why`: why it is the baseline, None if it was asked for. `notes`: what has to be
-    said, a line each.
+    said, a line each. `groups`: a row per group, configuration and metric, with `by` and `group` in place of the log;
+    None: not asked for.
 
     >>> comparison = cr.compare("out/tc016d", baseline="PEM")
     >>> comparison.baseline, comparison.configurations
@@ -393,6 +383,7 @@ class Comparison:
     horizon_s: float
     false_positives_per_min: float | None
     notes: tuple[str, ...]
+    groups: pd.DataFrame | None = None
 
     @property
     def overall(self) -> pd.DataFrame:
@@ -407,9 +398,12 @@ def compare_folders(
     baseline: str | None = None,
     false_positives_per_min: float | None = None,
     metrics: Sequence[str] | None = None,
+    by: Sequence[str] | None = None,
     asked: PairsAsked = PairsAsked(),
 ) -> Comparison:
     """Compare configurations (None: all) with a baseline, pair by pair, in some metrics (None: all).
+
+    `by`: entries by which each group is compared for itself, too.
 
     `baseline`: None: the configuration named `ideal`, else the ideal fusion of the same inputs, else the first that is
     not the truth. `false_positives_per_min`: at which times to detection are compared once more; None: as many as the
@@ -431,7 +425,9 @@ def compare_folders(
     horizon_s, horizon_notes = _settle_horizon(used)
     setting = PairSettings(horizon_s, float(read[0].provenance.measure["gospa"]["power"]))
     settings, reasons = _settle_ghosts(setting, against, others, totals, false_positives_per_min, asked=not own_rate)
-    pairs, rows = _compare_each_log(against, settings, ClusterNames(logs, [], runs), metrics, asked)
+    groups = EpisodeGroups(read[0], by or ())
+    names = ClusterNames(logs, [], runs)
+    pairs, rows, of_groups = _compare_each_log(against, settings, names, metrics, groups, asked)
     table = pd.DataFrame(rows, columns=list(COLUMNS)).astype(COLUMNS)
     return Comparison(
         table=table,
@@ -440,6 +436,7 @@ def compare_folders(
         configurations=tuple(labelled.label for labelled in others),
         horizon_s=setting.horizon_s,
         false_positives_per_min=false_positives_per_min,
+        groups=_tabulate_groups(against, of_groups, names, groups) if by else None,
         notes=(
             *notes_on_folders(used),
             *horizon_notes,
@@ -489,28 +486,27 @@ def _compare_each_log(
     settings: Mapping[LabelledConfiguration, PairSettings],
     names: ClusterNames,
     metrics: Sequence[str] | None,
+    groups: EpisodeGroups,
     asked: PairsAsked,
-) -> tuple[dict[LabelledConfiguration, AllLogs], list[dict[str, object]]]:
-    """The sums of each pair over the logs of `names`; rows of all logs, then of each log where there are several.
+) -> tuple[dict[LabelledConfiguration, AllLogs], list[dict[str, object]], GroupPairs]:
+    """The sums of each pair over the logs of `names`; rows of all logs, then of each log where there are several; the
+    sums of each group.
 
     The objects of the logs are appended to `names`.
     """
-    logs, pairs = names.logs, {labelled: AllLogs() for labelled in settings}
+    logs, pairs, of_groups = names.logs, {labelled: AllLogs() for labelled in settings}, GroupPairs()
     rows: list[dict[str, object]] = []
     for k, log in enumerate(logs):
         tables = {
             results: results.rows_of(log)
             for results in dict.fromkeys(labelled.results for labelled in (against, *pairs))
         }
-        if (chosen := asked.choose_rows(log, tables)) is None:
-            continue
-        tables = chosen
         detections = (of_folder["detections.parquet"] for of_folder in tables.values())
         grid = build_grid(k, detections, names.runs, len(names.objects))
         names.objects.extend(f"{log}\n{name}" for name in grid.objects)
-        second = lay_out_configuration(against, tables[against.results], grid)
+        second = asked.restrict(log, grid, lay_out_configuration(against, tables[against.results], grid))
         for labelled, pair in pairs.items():
-            first = lay_out_configuration(labelled, tables[labelled.results], grid)
+            first = asked.restrict(log, grid, lay_out_configuration(labelled, tables[labelled.results], grid))
             _check_same_episodes(labelled, first, against, second, log, grid)
             _check_same_frames(labelled, first, against, second, log)
             regrets = list(compute_regrets(first, second, grid, settings[labelled], metrics))
@@ -519,14 +515,36 @@ def _compare_each_log(
                 values = regret.figure.values()
                 pair.differences.setdefault(regret.metric, []).append(values[2])
                 rows.append({"log": log, **_make_row(regret, values, labelled, against, names, asked)})
-    return pairs, [*_overall_rows(against, pairs, names, asked), *rows]
+            for group, kept in groups.select(log, grid):
+                one, other = (groups.restrict(group, kept, side) for side in (first, second))
+                regrets = list(compute_regrets(one, other, grid, settings[labelled], metrics))
+                of_pair = of_groups.setdefault(group, {}).setdefault(labelled, AllLogs())
+                of_pair.add(one, other, regrets, more=len(logs) > 1)
+    return pairs, [*_overall_rows(against, pairs, names, asked), *rows], of_groups
+
+
+GroupPairs = dict[int, dict[LabelledConfiguration, AllLogs]]
+"""Sums of pairs by group."""
+
+
+def _tabulate_groups(
+    against: LabelledConfiguration, of_groups: GroupPairs, names: ClusterNames, groups: EpisodeGroups
+) -> pd.DataFrame:
+    """The rows of `Comparison.groups`."""
+    rows = [
+        {"by": by.label, "group": group, **without_limits_over_runs(row)}
+        for k, (by, group) in enumerate(groups.named)
+        for row in _overall_rows(against, of_groups.get(k, {}), names)
+    ]
+    columns = {"by": "object", "group": "object"} | {n: kind for n, kind in COLUMNS.items() if n != "log"}
+    return pd.DataFrame(rows, columns=list(columns)).astype(columns)
 
 
 def _overall_rows(
     against: LabelledConfiguration,
     pairs: Mapping[LabelledConfiguration, AllLogs],
     names: ClusterNames,
-    asked: PairsAsked,
+    asked: PairsAsked = PairsAsked(),
 ) -> Iterator[dict[str, object]]:
     """The rows of all logs. Of intervals over logs: how many logs are better, and on which the difference hangs."""
     for labelled, pair in pairs.items():
