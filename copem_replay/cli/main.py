@@ -61,6 +61,7 @@ for command in (
     fit.fit,
     results.compare,
     results.verdict,
+    results.history,
     results.plot,
     results.report,
     results.view,

@@ -177,6 +177,22 @@ def verdict(
     return 0 if verdicts.passes else 1
 
 
+def history(
+    folders: Annotated[list[Path], typer.Argument(metavar="FOLDER", help="Results folders, the oldest first.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Name of the page.")] = Path("history.html"),
+) -> int:
+    """Write what became of criteria over many results folders, as one HTML file.
+
+    Each criterion is a strip of verdicts, and its figure with its interval.
+    """
+    from copem_replay.api.results import write_history
+
+    path = write_history(folders, out)
+    tidy_leftovers(path)
+    print_line(f"history in {path}")
+    return 0
+
+
 def plot(
     folder: ResultsFolder,
     out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="Folder of the figures [FOLDER/figures].")] = None,

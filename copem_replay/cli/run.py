@@ -118,17 +118,17 @@ def _judge_results(folder: Path, experiment: Experiment) -> bool:
     """Judge the criteria of an experiment, write and print the verdicts; whether all pass. Those that are against
     results of before are left to `verdict`.
     """
-    known = list(experiment.configurations)
-    later = [name for name, one in experiment.criteria.items() if one.against and one.find_against("", known)[1]]
-    asked = {name: one.model_dump(exclude_none=True) for name, one in experiment.criteria.items() if name not in later}
-    if later:
-        print_notes([f"criteria {', '.join(later)}: `copem-replay verdict {folder} --before FOLDER` judges them"])
-    if not asked:
+    if not experiment.criteria:
         return True
-    from copem_replay.api.results import judge
+    from copem_replay.results.judge import judge_own_criteria, list_later
+    from copem_replay.results.read import open_results
     from copem_replay.results.verdicts import FILE, write_verdicts
 
-    verdicts = judge(folder, asked)
+    results = open_results(folder, "summary.csv", "tally.parquet")
+    if later := list_later(results):
+        print_notes([f"criteria {', '.join(later)}: `copem-replay verdict {folder} --before FOLDER` judges them"])
+    if (verdicts := judge_own_criteria(results)) is None:
+        return True
     write_verdicts(verdicts, folder / FILE)
     print_notes(verdicts.notes)
     print_line("")

@@ -88,6 +88,23 @@ def judge_results(results: Results, criteria: Mapping[str, Criterion], before: R
     return Verdicts(results.name, tuple(verdicts), tuple(notes))
 
 
+def list_later(results: Results) -> list[str]:
+    """The criteria of an experiment that are against results of before."""
+    known = list(results.experiment.configurations)
+    return [
+        name
+        for name, one in results.experiment.criteria.items()
+        if one.against is not None and one.find_against("", known)[1]
+    ]
+
+
+def judge_own_criteria(results: Results) -> Verdicts | None:
+    """The verdicts of the experiment's own criteria but those against results of before; None: there are none."""
+    later = list_later(results)
+    criteria = {name: one for name, one in results.experiment.criteria.items() if name not in later}
+    return judge_results(results, criteria) if criteria else None
+
+
 def find_population(results: Results) -> str:
     """Of what population `compare` has intervals: those over the runs of a single object are of these logs."""
     return "these_logs" if choose_clusters(results.known)[0] == "runs" else "such_traffic"

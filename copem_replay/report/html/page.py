@@ -146,6 +146,7 @@ def build_page(study: ReportData) -> str:
     """The whole report as HTML."""
     measured = len(study.results.known) > 0
     sections = [
+        *_verdict_sections(study),
         _Section("differences-of-it", "Differences", _difference_parts(study)),
         *_figure_sections(study, ("trade_off",)),
         _Section(
@@ -175,6 +176,17 @@ def build_page(study: ReportData) -> str:
     return whole_page(
         title, join_html([head, *(make_tag("section", make_tag("h2", s.title), *s.parts, id_=s.id) for s in sections)])
     )
+
+
+def _verdict_sections(study: ReportData) -> list[_Section]:
+    """The section of verdicts: those in the folder, else of the criteria of the experiment; none without criteria."""
+    from copem_replay.report.html.verdicts import verdicts_table
+    from copem_replay.results.judge import judge_own_criteria
+    from copem_replay.results.verdicts import find_verdicts
+
+    folder = study.results.folder
+    verdicts = (find_verdicts(folder) if folder is not None else None) or judge_own_criteria(study.results)
+    return [] if verdicts is None else [_Section("criteria", "Good enough?", [verdicts_table(verdicts)])]
 
 
 def _embed_figure(study: ReportData, name: str) -> Html:
