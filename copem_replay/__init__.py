@@ -26,7 +26,7 @@ if TYPE_CHECKING:
         read_recording,
         read_recordings,
     )
-    from copem_replay.api.results import compare, load_results, view, write_report
+    from copem_replay.api.results import compare, judge, load_results, view, write_history, write_report
     from copem_replay.api.run import fused_tracks, observations, run
     from copem_replay.api.study import load_experiment
     from copem_replay.communication.latency import LatencyModel
@@ -60,6 +60,7 @@ if TYPE_CHECKING:
     from copem_replay.perception.visibility import VisibilityModel
     from copem_replay.results.compare import Comparison
     from copem_replay.results.read import Results
+    from copem_replay.results.verdicts import Verdicts
 
 __all__ = [
     "CLASSES",
@@ -101,6 +102,7 @@ __all__ = [
     "StepFusion",
     "Tracks",
     "Unit",
+    "Verdicts",
     "ViewGeometry",
     "VisibilityModel",
     "check_fusion",
@@ -114,6 +116,7 @@ __all__ = [
     "fused_tracks",
     "gospa",
     "inspect_recording",
+    "judge",
     "load_experiment",
     "load_results",
     "observations",
@@ -124,6 +127,7 @@ __all__ = [
     "read_recordings",
     "run",
     "view",
+    "write_history",
     "write_report",
 ]
 
@@ -131,7 +135,7 @@ _PLACES = {
     "api": "plot",
     "api.fit": "FittedPem fit",
     "api.recordings": "draft_experiment inspect_recording read_lists read_recording read_recordings",
-    "api.results": "compare load_results view write_report",
+    "api.results": "compare judge load_results view write_history write_report",
     "api.run": "fused_tracks observations run",
     "api.study": "load_experiment",
     "communication.latency": "LatencyModel",
@@ -158,6 +162,7 @@ _PLACES = {
     "perception.visibility": "VisibilityModel",
     "results.compare": "Comparison",
     "results.read": "Results",
+    "results.verdicts": "Verdicts",
 }
 """Exported names by the module that defines them."""
 _MODULE = {name: f"{__name__}.{module}" for module, names in _PLACES.items() for name in names.split()}

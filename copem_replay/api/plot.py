@@ -85,10 +85,12 @@ def write_figures(
     log: str | None = None,
     object_id: str | None = None,
     run: int | None = None,
+    by: Sequence[str] | None = None,
 ) -> tuple[list[Path], list[str]]:
     """Write all figures as PNG and SVG. Returns the files, and notes: one line per figure that is left out.
 
-    `folder`: None: `figures` in the results folder. `log`, `object_id`, `run` as in `single_runs`.
+    `folder`: None: `figures` in the results folder. `log`, `object_id`, `run` as in `single_runs`. `by`: what the
+    figure of slices groups rows by, `["log", "class"]`; None: by what the experiment says (`measure.by`).
 
     Raises InputError for what is not among the results, OutputError where a file is not writable.
 
@@ -98,6 +100,8 @@ def write_figures(
     """
     from copem_replay.report.figures.registry import write_figure_files
     from copem_replay.report.figures.selection import Selection
+    from copem_replay.results.slices import summarise_slices
 
-    selection = Selection(configurations, log, object_id, run)
-    return write_figure_files(take_results(results), None if folder is None else Path(folder), selection)
+    read = take_results(results)
+    selection = Selection(configurations, log, object_id, run, sliced=summarise_slices(read, by))
+    return write_figure_files(read, None if folder is None else Path(folder), selection)

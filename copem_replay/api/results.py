@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from copem_replay.core.errors import InputError, OutputError
 from copem_replay.results.compare import Comparison
 from copem_replay.results.read import Results
+
+if TYPE_CHECKING:
+    from copem_replay.results.verdicts import Verdicts
 
 AnyResults: TypeAlias = Results | str | PathLike[str]
 """Results, of `run` or read from a folder, or the path of a results folder."""
@@ -38,12 +41,14 @@ def compare(
     configurations: Sequence[str] | None = None,
     baseline: str | None = None,
     false_positives_per_min: float | None = None,
+    by: Sequence[str] | None = None,
 ) -> Comparison:
     """Compare configurations with a baseline, paired by log, object and run, within or across results folders.
 
     `configurations`: only these; None: all. `baseline`: None: the one named `ideal`, else the ideal fusion of the same
     inputs, else the first that is not the truth. `false_positives_per_min`: false positives per minute at which times
-    to detection are compared once more; None: those of the baseline. `table` of the result has a row per log,
+    to detection are compared once more; None: those of the baseline. `by`: entries by which rows are grouped, each
+    group compared for itself, in `groups` of the result: `["class", "log*class"]`. Its `table` has a row per log,
     configuration and metric: `difference` with the limits `low` and `high` of its 95 % interval.
 
     Raises InputError with every reason why the results are unreadable or not comparable.
@@ -61,13 +66,57 @@ def compare(
         configurations=configurations,
         baseline=baseline,
         false_positives_per_min=false_positives_per_min,
+        by=by,
     )
 
 
-def write_report(results: AnyResults, file: str | PathLike[str] | None = None, *, baseline: str | None = None) -> Path:
+def judge(
+    results: AnyResults,
+    criteria: Mapping[str, Any] | str | PathLike[str] | None = None,
+    *,
+    before: AnyResults | None = None,
+) -> Verdicts:
+    """Hold criteria against results: met, not met, undecided or not measured, by the intervals of `summary.csv`.
+
+    `criteria`: by name, each with its keys, or the path of a file with the key `criteria`; None: those of the
+    experiment. `before`: results that criteria are `against`.
+
+    Raises InputError: no criteria, names that do not exist, results that are unreadable or not comparable.
+
+    >>> verdicts = cr.judge("out/tc016d", {"known": {"metric": "detected_share", "at_least": 0.9,
+    ...                                              "population": "these_logs", "configurations": ["coPEM:0s"]}})
+    >>> verdicts.passes, verdicts.all[0].verdict
+    (True, 'met')
+    """
+    from copem_replay.experiment.criteria import read_criteria
+    from copem_replay.results.judge import judge_results
+    from copem_replay.results.read import open_results
+
+    judged, other = (
+        given if isinstance(given, Results | None) else open_results(Path(given), "summary.csv", "tally.parquet")
+        for given in (results, before)
+    )
+    assert judged is not None
+    if criteria is None:
+        asked = judged.experiment.criteria
+    else:
+        asked = read_criteria(criteria if isinstance(criteria, Mapping) else Path(criteria), judged.source.data)
+    if not asked:
+        raise InputError(f"{judged.place}: expected criteria in its experiment, found none; --criteria FILE gives some")
+    return judge_results(judged, asked, other)
+
+
+def write_report(
+    results: AnyResults,
+    file: str | PathLike[str] | None = None,
+    *,
+    baseline: str | None = None,
+    by: Sequence[str] | None = None,
+) -> Path:
     """Write the report of a results folder as one HTML file that opens offline. Returns its path.
 
-    `file`: None: `report.html` in the folder. `baseline`: None: as in `compare`.
+    `file`: None: `report.html` in the folder. `baseline`: None: as in `compare`. `by`: what its tables of groups are
+    by, `["log", "class"]`; None: by what the experiment says (`measure.by`).
 
     Raises InputError where the results are unreadable, OutputError where the file is not writable.
 
@@ -76,7 +125,24 @@ def write_report(results: AnyResults, file: str | PathLike[str] | None = None, *
     """
     from copem_replay.report import write_html_report
 
-    return write_html_report(_results_or_path(results), None if file is None else Path(file), baseline=baseline)
+    path = None if file is None else Path(file)
+    return write_html_report(_results_or_path(results), path, baseline=baseline, by=by)
+
+
+def write_history(folders: Sequence[str | PathLike[str]], file: str | PathLike[str] = "history.html") -> Path:
+    """Write what became of criteria over many results folders as one HTML file that opens offline. Returns its path.
+
+    `folders`: results folders with their verdicts, the oldest first.
+
+    Raises InputError where a folder has no verdicts or damaged ones, OutputError where the file is not writable.
+
+    >>> cr.write_history([])
+    Traceback (most recent call last):
+    copem_replay.core.errors.InputError: history: expected results folders, found none
+    """
+    from copem_replay.report.html.verdicts import write_history_page
+
+    return write_history_page([Path(folder) for folder in folders], Path(file))
 
 
 def view(results: AnyResults, *, web: bool = False) -> None:

@@ -142,8 +142,12 @@ def override_source(
     changes: Mapping[str, object],
     logs: Sequence[str],
     window_s: tuple[float | None, float | None],
+    by: Sequence[str] | None = None,
 ) -> ExperimentSource:
-    """The experiment file with command-line options in place of its keys; None and empty `logs` leave its values."""
+    """The experiment file with command-line options in place of its keys; None and empty `logs` leave its values.
+
+    `by`: entries of `measure.by` in addition to those of the file.
+    """
     from dataclasses import replace
 
     from copem_replay.experiment.file import drop_settings, read_experiment_file, replace_logs
@@ -157,6 +161,13 @@ def override_source(
         window = written if isinstance(written, list) and len(written) == len(window_s) else [None, None]
         values["window_s"] = [window_s[k] if k in ends else window[k] for k in range(len(window_s))]
         options |= {("window_s",): ", ".join(ends.values())} | {("window_s", k): o for k, o in ends.items()}
+    if by is not None:
+        measure = source.data.get("measure")
+        measure = dict(measure) if isinstance(measure, dict) else {}
+        written = measure.get("by")
+        entries = list(written) if isinstance(written, list) else []
+        values["measure"] = measure | {"by": [*entries, *(entry for entry in by if entry not in entries)]}
+        options |= {("measure", "by", len(entries) + k): "--by" for k in range(len(by))}
     data = drop_settings(source.data, [key for key in ("ego", "window_s") if key in values])
     source = replace(source, data=data | values, options=options)
     return replace_logs(source, logs) if logs else source

@@ -60,6 +60,8 @@ for command in (
     run.run,
     fit.fit,
     results.compare,
+    results.verdict,
+    results.history,
     results.plot,
     results.report,
     results.view,

@@ -5,16 +5,19 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from copem_replay.cli.terminal import (
     Baseline,
+    By,
     ResultsFolder,
     print_blocks,
     print_line,
     print_notes,
+    print_verdicts,
+    split_entries,
     split_names,
     tidy_leftovers,
     width_of,
@@ -28,6 +31,7 @@ def compare(
         str | None, typer.Option(metavar="A,B,…", help="Only these, and the baseline [all].")
     ] = None,
     baseline: Baseline = None,
+    by: By = None,
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write everything as .csv, or the table as .md.")
     ] = None,
@@ -45,6 +49,10 @@ def compare(
     log: Annotated[
         str | None, typer.Option(metavar="NAME", help="Log in that recording [as in that replay.rrd].")
     ] = None,
+    fail_on: Annotated[
+        list[str] | None,
+        typer.Option(metavar="'METRIC > N'", help="End with 1 where the first folder is shown to be so much worse."),
+    ] = None,
 ) -> int:
     """Compare configurations with a baseline, with intervals.
 
@@ -57,8 +65,13 @@ def compare(
         check_out(out)
     _check_rrd_options(rrd, run, log)
     names = split_names(configurations)
+    conditions = _check_fail_on(fail_on, folders, names, baseline)
     comparison = compare_results(
-        folders, configurations=names, baseline=baseline, false_positives_per_min=false_positives_per_min
+        folders,
+        configurations=names,
+        baseline=baseline,
+        false_positives_per_min=false_positives_per_min,
+        by=split_entries(by),
     )
     notes = list(comparison.notes)
     if rrd is not None:
@@ -67,10 +80,47 @@ def compare(
         notes += write_side_by_side(rrd, folders, configurations=names, baseline=baseline, log=log, run=run)
     print_notes(notes)
     print_blocks([comparison_text(comparison, width_of(sys.stdout)).splitlines()])
+    if by is not None and len(folders) == 1:
+        from copem_replay.results.read import open_results
+        from copem_replay.results.slices import groups_text, summarise_slices
+
+        table = summarise_slices(open_results(folders[0]), split_entries(by))
+        assert table is not None
+        shown = [comparison.baseline, *comparison.configurations]
+        print(f"\n{groups_text(table[table['configuration'].isin(shown)], width_of(sys.stdout))}")
     if out is not None:
         write_comparison(comparison, out, folders)
     _print_written(out, rrd)
-    return 0
+    return _judge_differences(conditions, folders)
+
+
+def _check_fail_on(
+    conditions: list[str] | None, folders: list[Path], names: list[str] | None, baseline: str | None
+) -> dict[str, dict[str, Any]]:
+    """Criteria of the conditions of `--fail-on`: differences to the second folder, or to the baseline."""
+    if not conditions:
+        return {}
+    from copem_replay.experiment.criteria import BEFORE, parse_fail_on
+
+    if len(folders) != 2 and baseline is None:
+        raise InputError(f"--fail-on: expected two folders, NEW OLD, or --baseline NAME, found {len(folders)}")
+    against = BEFORE if len(folders) == 2 and baseline is None else str(baseline)
+    return parse_fail_on(conditions, against, names)
+
+
+def _judge_differences(criteria: dict[str, dict[str, Any]], folders: list[Path]) -> int:
+    if not criteria:
+        return 0
+    from copem_replay.api.results import judge
+    from copem_replay.results.judge import find_population
+    from copem_replay.results.read import open_results
+
+    population = find_population(open_results(folders[0], "tally.parquet"))
+    criteria = {name: criterion | {"population": population} for name, criterion in criteria.items()}
+    verdicts = judge(folders[0], criteria, before=folders[1] if len(folders) > 1 else None)
+    print_line("")
+    print_verdicts(verdicts)
+    return 0 if verdicts.passes else 1
 
 
 def _check_rrd_options(rrd: Path | None, run: int | None, log: str | None) -> None:
@@ -89,6 +139,60 @@ def _print_written(*files: Path | None) -> None:
             print_line(f"written to {file}")
 
 
+def verdict(
+    folder: ResultsFolder,
+    criteria: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Criteria, a file with this key [those of the experiment].")
+    ] = None,
+    before: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Results of before, for criteria that are against them.")
+    ] = None,
+    junit: Annotated[Path | None, typer.Option(metavar="FILE", help="Also write JUnit XML.")] = None,
+    markdown: Annotated[Path | None, typer.Option(metavar="FILE", help="Also write Markdown; - prints it.")] = None,
+    jsonl: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Name of the JSON lines [FOLDER/verdicts.jsonl].")
+    ] = None,
+) -> int:
+    """Hold criteria against results: met, not met, undecided or not measured.
+
+    Nothing is replayed. Ends with 1 where a criterion does not pass, after all files are written.
+    """
+    from copem_replay.api.results import judge
+    from copem_replay.results.verdicts import FILE, check_verdict_files, verdicts_markdown, write_verdicts
+
+    printed = markdown == Path("-")
+    files = {"jsonl": jsonl or folder / FILE, "junit": junit, "markdown": None if printed else markdown}
+    check_verdict_files(files)
+    verdicts = judge(folder, criteria, before=before)
+    print_notes(verdicts.notes)
+    if printed:
+        print(verdicts_markdown(verdicts), end="")
+    else:
+        print_verdicts(verdicts)
+    for form, path in files.items():
+        if path is not None:
+            tidy_leftovers(write_verdicts(verdicts, path, form))
+            if not printed:
+                print_line(f"{'verdicts' if form == 'jsonl' else form} in {path}")
+    return 0 if verdicts.passes else 1
+
+
+def history(
+    folders: Annotated[list[Path], typer.Argument(metavar="FOLDER", help="Results folders, the oldest first.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Name of the page.")] = Path("history.html"),
+) -> int:
+    """Write what became of criteria over many results folders, as one HTML file.
+
+    Each criterion is a strip of verdicts, and its figure with its interval.
+    """
+    from copem_replay.api.results import write_history
+
+    path = write_history(folders, out)
+    tidy_leftovers(path)
+    print_line(f"history in {path}")
+    return 0
+
+
 def plot(
     folder: ResultsFolder,
     out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="Folder of the figures [FOLDER/figures].")] = None,
@@ -104,6 +208,7 @@ def plot(
     log: Annotated[
         str | None, typer.Option(metavar="NAME", help="Log in the figure of single runs [the first].")
     ] = None,
+    by: By = None,
 ) -> int:
     """Draw the figures of a results folder, as PNG and SVG.
 
@@ -112,7 +217,9 @@ def plot(
     from copem_replay.api.plot import write_figures
 
     names = split_names(configurations)
-    files, notes = write_figures(folder, out, configurations=names, log=log, object_id=object, run=run)
+    files, notes = write_figures(
+        folder, out, configurations=names, log=log, object_id=object, run=run, by=split_entries(by)
+    )
     print_notes(notes)
     figures = out or folder / "figures"
     tidy_leftovers(figures, figures)
@@ -125,6 +232,7 @@ def report(
     folder: ResultsFolder,
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="Name of the file [FOLDER/report.html].")] = None,
     baseline: Baseline = None,
+    by: By = None,
 ) -> int:
     """Write the report of a results folder, as one HTML file.
 
@@ -132,7 +240,7 @@ def report(
     """
     from copem_replay.api.results import write_report
 
-    path = write_report(folder, out, baseline=baseline)
+    path = write_report(folder, out, baseline=baseline, by=split_entries(by))
     tidy_leftovers(path)
     print_line(f"report in {path}")
     return 0

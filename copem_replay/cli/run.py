@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
@@ -14,6 +14,7 @@ import typer
 
 from copem_replay.cli.inspect import override_source
 from copem_replay.cli.terminal import (
+    By,
     Ego,
     ExperimentFile,
     FromS,
@@ -22,13 +23,17 @@ from copem_replay.cli.terminal import (
     print_line,
     print_notes,
     print_problems,
+    print_verdicts,
     show_crew_progress,
     show_progress,
+    split_entries,
     width_of,
 )
 from copem_replay.core.errors import InputError
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from copem_replay.api.study import LoadedStudy
     from copem_replay.experiment.file import ExperimentSource
     from copem_replay.experiment.schema import Experiment
@@ -60,6 +65,7 @@ def run(
     to_s: ToS = None,
     out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="Results folder [out/<experiment>].")] = None,
     runs: Annotated[int | None, typer.Option(metavar="N", min=1, help="Number of runs.")] = None,
+    by: By = None,
     seed: Annotated[int | None, typer.Option(metavar="N", help="Seed of all random numbers.")] = None,
     jobs: Annotated[
         int | None, typer.Option(metavar="N", min=1, max=1024, help="Number of workers [one per core].")
@@ -71,6 +77,9 @@ def run(
     pieces: Pieces = None,
     cluster: Cluster = None,
     report: Annotated[bool, typer.Option("--report", help="Also write report.html.")] = False,
+    label: Annotated[
+        str | None, typer.Option(metavar="TEXT", help="What these results are called in a history.")
+    ] = None,
     live: Annotated[bool, typer.Option("--live", help="Also show the replay in a running Rerun viewer.")] = False,
     viewer: Annotated[str | None, typer.Option(metavar="URL", help="Address of that viewer [on this machine].")] = None,
 ) -> int:
@@ -78,7 +87,9 @@ def run(
     from copem_replay.pipeline.parts import PartCache
     from copem_replay.results.folder import take_place
 
-    source = override_source(experiment, {"ego": ego, "runs": runs, "seed": seed}, log or (), (from_s, to_s))
+    source = override_source(
+        experiment, {"ego": ego, "runs": runs, "seed": seed}, log or (), (from_s, to_s), split_entries(by)
+    )
     out = out or Path("out") / experiment.stem
     if cluster is not None:
         from copem_replay.pipeline.dask_workers import check_address
@@ -92,13 +103,38 @@ def run(
         study = _read_study(place, experiment, source, skip_unreadable, cache, cluster)
         url = _check_viewer(study.experiment, viewer) if live or viewer is not None else None
         result, advice = _replay_study(study, jobs, cache, threads=cluster is None)
-        _write_results(place, study, result, advice, cache, url)
+        _write_results(place, study, result, advice, cache, url, label)
+        if by is not None and result.summary_by is not None:
+            _print_groups(result.summary_by, split_entries(by) or ())
+        passes = _judge_results(place.shown, study.experiment)
         if report:
             from copem_replay.api.results import write_report
 
             print_line(f"report in {write_report(place.shown)}")
     _print_next(place.shown)
-    return 1 if study.skipped or place.failed else 0
+    return 1 if study.skipped or place.failed or not passes else 0
+
+
+def _judge_results(folder: Path, experiment: Experiment) -> bool:
+    """Judge the criteria of an experiment, write and print the verdicts; whether all pass. Those that are against
+    results of before are left to `verdict`.
+    """
+    if not experiment.criteria:
+        return True
+    from copem_replay.results.judge import judge_own_criteria, list_later
+    from copem_replay.results.read import open_results
+    from copem_replay.results.verdicts import FILE, write_verdicts
+
+    results = open_results(folder, "summary.csv", "tally.parquet")
+    if later := list_later(results):
+        print_notes([f"criteria {', '.join(later)}: `copem-replay verdict {folder} --before FOLDER` judges them"])
+    if (verdicts := judge_own_criteria(results)) is None:
+        return True
+    write_verdicts(verdicts, folder / FILE)
+    print_notes(verdicts.notes)
+    print_line("")
+    print_verdicts(verdicts)
+    return verdicts.passes
 
 
 def _read_study(
@@ -139,13 +175,13 @@ def _replay_study(
 
 def _write_results(
     place: ResultsPlace, study: LoadedStudy, result: Results, advice: list[str], cache: PartCache | None,
-    viewer: str | None,
+    viewer: str | None, label: str | None,
 ) -> None:  # fmt: skip
     """Fill the results folder, then print notes, problems and the summary."""
     from copem_replay.core.tracks import TRUTH
     from copem_replay.metrics.summary import describe_began, format_summary
 
-    notes = result.fill(place, skipped=study.skipped, viewer=viewer)
+    notes = result.fill(place, skipped=study.skipped, viewer=viewer, label=label)
     if cache is not None:
         print_notes(sorted(cache.damaged))
         print_problems([f"pieces: {cache.computed} computed, {cache.found} found in {cache.store.where}"])
@@ -163,6 +199,15 @@ def _write_results(
         print_line(f"sweep of {', '.join(dict.fromkeys(result.sweep['sweep']))} in {place.shown / 'sweep.csv'}")
     _print_baseline(study.experiment)
     print_line(f"results in {place.shown}")
+
+
+def _print_groups(table: pd.DataFrame, entries: Sequence[str]) -> None:
+    """Print the slices that the command line asks for."""
+    from copem_replay.metrics.config import parse_slice
+    from copem_replay.results.slices import groups_text
+
+    asked = table["by"].isin([parse_slice(entry).label for entry in entries])
+    print(f"\n{groups_text(table[asked], width_of(sys.stdout))}\n")
 
 
 def _print_baseline(experiment: Experiment) -> None:

@@ -20,6 +20,7 @@ from copem_replay.core.errors import InputError, count_noun, is_url, local_path,
 
 if TYPE_CHECKING:
     from copem_replay.pipeline.crew import CrewProgress
+    from copem_replay.results.verdicts import Verdicts
 
 
 # Arguments and options of several commands.
@@ -72,6 +73,21 @@ Baseline: TypeAlias = Annotated[
 ]
 
 
+By: TypeAlias = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--by",
+        metavar="ENTRY",
+        help="Also by groups: log, class, began, range_at_onset, tags.NAME; a cross is log*class [as in the results].",
+    ),
+]
+
+
+def split_entries(entries: list[str] | None) -> list[str] | None:
+    """The entries of every `--by`, between the commas; None without any."""
+    return None if entries is None else [name for entry in entries for name in split_names(entry) or ()]
+
+
 def split_names(names: str | None) -> list[str] | None:
     """The names between the commas, without spaces around them; None gives None."""
     return None if names is None else [name.strip() for name in names.split(",")]
@@ -113,6 +129,13 @@ def _fit_line(line: str, width: int | None) -> str:
 def print_notes(lines: Iterable[str]) -> None:
     """Print notes on stderr."""
     print_problems(f"note: {line}" for line in lines)
+
+
+def print_verdicts(verdicts: Verdicts) -> None:
+    """Print verdicts on stdout: the table, what is undecided and why, and how many pass."""
+    from copem_replay.results.verdicts import verdicts_text
+
+    print_blocks([verdicts_text(verdicts, width_of(sys.stdout)).splitlines()])
 
 
 def tidy_leftovers(path: Path, place: Path | None = None) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 from copem_replay.core.errors import unknown_name_message
 from copem_replay.core.tracks import TRUTH
 from copem_replay.core.yaml import Key
+from copem_replay.experiment.criteria import check_criteria
 from copem_replay.experiment.file import ExperimentSource
 from copem_replay.io.ground_truth import MAX_GAP_S
 from copem_replay.metrics.config import LONGEST_CHAIN, onset_requirement
@@ -49,6 +50,7 @@ def check_references(source: ExperimentSource) -> Iterator[str]:
     yield from _check_carried(source, data)
     yield from _check_sweep(source, data, units)
     yield from _check_settings(source, data, units, pems)
+    yield from check_criteria(source, data)
     show, runs = data.get("show"), data.get("runs", 1)
     configurations = _mapping_names(data.get("configurations"))
     shown_names = show.get("configurations") if isinstance(show, dict) else None

@@ -39,6 +39,7 @@ from copem_replay.core.components import (
     error_at_key,
 )
 from copem_replay.core.tracks import TRUTH
+from copem_replay.experiment.criteria import Criterion, CriterionName
 from copem_replay.fusion import FUSIONS
 from copem_replay.fusion.interface import Fusion, IdealFusion
 from copem_replay.io.config import Ego, HowRead, RecordedOutput, RecordedTopic, TruthTopic, WindowOf
@@ -448,6 +449,7 @@ class Experiment(Frozen):
     braking: Braking | None = None
     sweep: Sweep | None = None
     show: Show | None = Show()
+    criteria: dict[CriterionName, Criterion] = Field(default_factory=dict, exclude_if=lambda criteria: not criteria)
 
     @field_validator("configurations", mode="after")
     @classmethod

@@ -74,6 +74,9 @@ _ONSET = Column("onset_s", "numbers",
                 "when the clock starts, in seconds since the log's start: the first frame at which the onset's "
                 "condition holds while the ego is in the log. An object without onset has no row",
                 compared=True)  # fmt: skip
+_ONSET_RANGE = Column("distance_at_onset_m", "numbers",
+                      "true horizontal distance to the ego at `onset_s`, centre to centre; null when there is none to "
+                      "measure from")  # fmt: skip
 _BEGAN = Column("began", "text",
                 "how the episode began: `log_start`, `appeared` or `crossed`, "
                 "[below](../guide/metrics.md#which-objects-count)", compared=True)  # fmt: skip
@@ -106,8 +109,19 @@ _SUMMARY = (
     _CONFIGURATION,
     *(Column(metric.name, metric.kind, metric.help, when) for when, of in METRICS_OF.items() for metric in of),
 )
+_SUMMARY_BY = (
+    Column("by", "text", "what rows are grouped by, as on the command line: `class`, `log*class`"),
+    Column("group", "text", "the group: its value, of a cross its values"),
+    _CONFIGURATION,
+    Column("logs", "whole numbers", "logs of the group, of the episodes that count"),
+    Column("objects", "whole numbers", "objects of the group, of the episodes that count"),
+    Column("apart", "true or false",
+           "whether the interval of `detected_share` excludes the share of all groups together; null without one, or "
+           "where that share is 0 or 1"),
+    Column("note", "text or null", "why there is no interval; how few episodes last as long as the horizon"),
+)  # fmt: skip
 _DETECTIONS = (
-    *_LOG, _RUN, _OBJECT, _CLASS, _EPISODE, _ONSET, _BEGAN,
+    *_LOG, _RUN, _OBJECT, _CLASS, _EPISODE, _ONSET, _ONSET_RANGE, _BEGAN,
     Column("detected", "true or false", "whether the object was detected", compared=True),
     _DETECTION,
     Column("captured_s", "numbers", "newest capture that contributed to that list"),
@@ -159,7 +173,7 @@ _DETECTIONS = (
 _TALLY = (
     *_LOG,
     Column("event", "text", "`detected`, or `conflict`: the first list that implied a collision"),
-    _OBJECT, _CLASS, _EPISODE, _ONSET, _BEGAN, *_ENDED, _DETECTION, _TIME, *_DISTANCES,
+    _OBJECT, _CLASS, _EPISODE, _ONSET, _ONSET_RANGE, _BEGAN, *_ENDED, _DETECTION, _TIME, *_DISTANCES,
     Column("runs", "whole numbers", "in how many runs it is so"),
     Column("in_conflict", "true or false", "whether the ego is in conflict with the object", "braking"),
     Column("passed", "whole numbers", "in how many of these runs the ego passes", "braking"),
@@ -260,8 +274,8 @@ _PROVENANCE = (
     Column("seed", "whole number", "seed of the experiment"),
     Column("runs", "whole number", "runs of the experiment"),
     Column("logs", "list",
-           "of each log: its name `log`, the `topic` of its truth, the file's `sha256`, and `truth`, the SHA-256 of "
-           "what was read of it"),
+           "of each log: its name `log`, the `topic` of its truth, the file's `sha256`, `truth`, the SHA-256 of what "
+           "was read of it, and its `tags`"),
     Column("logs_skipped", "list", "recordings that were left out: `log` and `reason`"),
     Column("visibility", "text", "how visible shares are worked out"),
     Column("max_gap_s", "number", "longest gap of the truth that is interpolated"),
@@ -277,6 +291,7 @@ _PROVENANCE = (
     Column("runs_shown", "by name",
            "by log every run that is written: `file`, `run`, and `run_is`, why it is this one"),
     Column("notes", "list", "what `run` noted"),
+    Column("label", "text", "what the results are called in a history, with `run --label`", "label"),
     Column("files", "list", "names of the files that are the results', which `--overwrite` may replace"),
 )  # fmt: skip
 
@@ -290,6 +305,9 @@ TABLES = {
         "One row per value of a sweep and configuration; other columns as in `summary.csv`. "
         "[Definitions](../guide/metrics.md#sweeps).",
         (Column("sweep", "text", "key that is swept"), Column("value", "numbers", "its value"), _CONFIGURATION)),
+    "summary_by.csv": Table(
+        "One row per entry of `measure: {by: …}`, group and configuration; other columns as in `summary.csv`. "
+        "[Definitions](../guide/slices.md).", _SUMMARY_BY),
     "detections.parquet": Table(
         "One row per log, configuration, run and measured object. "
         "[Definitions](../guide/metrics.md#one-row-of-detectionsparquet), those of accuracy "

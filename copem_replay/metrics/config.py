@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import operator
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 from typing import Annotated, Literal, Protocol, Self
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, model_validator
@@ -162,12 +165,113 @@ BeganWords = Annotated[
 ]
 
 
+# What the summary is sliced by.
+
+LOG, CLASS, BEGAN_BY, RANGE, TAGS = "log", "class", "began", "range_at_onset", "tags."
+RANGE_EDGES_M = (10.0, 20.0, 30.0, 50.0, 75.0, 100.0)
+"""Edges of `range_at_onset` where none are given; nearer and farther objects have groups, too."""
+_EXPECTED = f"{LOG}, {CLASS}, {BEGAN_BY}, {RANGE} or {TAGS}NAME"
+
+
+@dataclass(frozen=True)
+class Dimension:
+    """What episodes are grouped by. `edges_m`: between the groups of `range_at_onset`."""
+
+    name: str
+    edges_m: tuple[float, ...] = ()
+
+    @property
+    def label(self) -> str:
+        """As it is written in an entry."""
+        own = self.edges_m if self.edges_m != RANGE_EDGES_M else ()
+        return ":".join([self.name, *(f"{edge_m:g}" for edge_m in own)])
+
+    @property
+    def of_logs(self) -> bool:
+        """Whether all episodes of a log are in the same group."""
+        return self.name == LOG or self.name.startswith(TAGS)
+
+
+@dataclass(frozen=True)
+class Slice:
+    """An entry: one dimension, or a cross of several."""
+
+    dimensions: tuple[Dimension, ...]
+
+    @property
+    def label(self) -> str:
+        """As it is written on the command line: `class*tags.weather`."""
+        return "*".join(dimension.label for dimension in self.dimensions)
+
+    @property
+    def of_logs(self) -> bool:
+        """Whether groups are of whole logs."""
+        return all(dimension.of_logs for dimension in self.dimensions)
+
+    def names(self, name: str) -> bool:
+        """Whether it has a dimension of this name."""
+        return any(dimension.name == name for dimension in self.dimensions)
+
+
+def parse_slice(entry: str | Sequence[str]) -> Slice:
+    """An entry of `by`: `class`, `[log, class]`, `log*class`. Raises ValueError with what was expected and found."""
+    words = entry.split("*") if isinstance(entry, str) else list(entry)
+    dimensions = tuple(_parse_dimension(word.strip()) for word in words)
+    names = [dimension.name for dimension in dimensions]
+    if not names:
+        raise ValueError(f"expected {_EXPECTED}, found an empty list")
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"expected each of a cross once, found {name} {names.count(name)} times")
+    return Slice(dimensions)
+
+
+def parse_slices(entries: Sequence[str | Sequence[str]]) -> tuple[Slice, ...]:
+    """Entries of `by`, each once. Raises ValueError."""
+    slices = tuple(map(parse_slice, entries))
+    labels = [by.label for by in slices]
+    if repeated := [label for label in labels if labels.count(label) > 1]:
+        raise ValueError(f"expected each entry once, found {repeated[0]} {labels.count(repeated[0])} times")
+    return slices
+
+
+def _parse_dimension(word: str) -> Dimension:
+    name, *edges = word.split(":") if word.startswith(RANGE) else [word]
+    if name == RANGE:
+        return Dimension(name, _parse_edges(edges) if edges else RANGE_EDGES_M)
+    if name in (LOG, CLASS, BEGAN_BY) or (name.startswith(TAGS) and len(name) > len(TAGS)):
+        return Dimension(name)
+    message = unknown_name_message("slice", word, (LOG, CLASS, BEGAN_BY, RANGE))
+    raise ValueError(f"{message} (expected {_EXPECTED}; a cross as [log, class] or log*class)")
+
+
+def _parse_edges(edges: Sequence[str]) -> tuple[float, ...]:
+    try:
+        edges_m = tuple(map(float, edges))
+    except ValueError:
+        edges_m = ()
+    if not edges_m or not all(map(math.isfinite, edges_m)) or any(b <= a for a, b in pairwise((0.0, *edges_m))):
+        raise ValueError(f"{RANGE}: expected ascending edges above 0 in metres, {RANGE}:20:40, found {':'.join(edges)}")
+    return edges_m
+
+
+def _check_entry(value: object) -> object:
+    words = value if isinstance(value, list | tuple) else [value]
+    if all(isinstance(word, str) for word in words):
+        parse_slice(value)  # type: ignore[arg-type]
+    return value
+
+
+SliceEntry = Annotated[str | tuple[str, ...], BeforeValidator(_check_entry)]
+
+
 class Measure(Frozen):
     """What is measured, and from which onset. `began`: which episodes count for times, shares and distances at
     detection, by how they began; everything else is measured of all. `accuracy`: also how far off the fused lists are.
 
     `annotated`: the area in which entries at no true object are ghosts, by default everywhere. `metrics`: your own
-    columns of the summary.
+    columns of the summary. `by`: what the summary is sliced by, once more for each entry: `log`, `class`, `began`,
+    `range_at_onset` (`range_at_onset:20:40`: by edges of your own, in metres), `tags.NAME`; a list is a cross.
 
     >>> measure = cr.Measure(objects={"classes": ["vru"]}, onset={"kind": "in_range", "range_m": 30.0})
     >>> measure.onset.range_m, measure.confirm.hits
@@ -188,6 +292,13 @@ class Measure(Frozen):
     gospa: Gospa = Gospa()
     annotated: AnnotatedArea | None = Field(default=None, exclude_if=_is_none)
     metrics: Annotated[tuple[Annotated[RowMetric, Slot("metric", {})], ...], Field(exclude_if=operator.not_)] = ()
+    by: Annotated[tuple[SliceEntry, ...], Field(exclude_if=operator.not_)] = ()
+
+    @model_validator(mode="after")
+    def _sliced(self) -> Self:
+        if self.by and (problem := find_range_problem(self.onset, parse_slices(self.by))) is not None:
+            raise ValueError(f"by: {problem}")
+        return self
 
     @model_validator(mode="after")
     def _named_once(self) -> Self:
@@ -200,6 +311,16 @@ class Measure(Frozen):
                     raise ValueError(f"metrics: expected a name that no other column has, found {own.name!r}")
                 names.append(own.name)
         return self
+
+
+def find_range_problem(onset: Onset, slices: Sequence[Slice]) -> str | None:
+    """Why episodes cannot be grouped by their range at this onset; None: they can, or are not asked to be."""
+    if not isinstance(onset, InRange) or not any(by.names(RANGE) for by in slices):
+        return None
+    return (
+        f"{RANGE}: expected an onset that is no range, found in_range: who comes nearer is at {onset.range_m:g} m, and "
+        f"all others began nearer; slice by {BEGAN_BY}, or see bands.csv for accuracy by range at the instant"
+    )
 
 
 class Braking(Frozen):

@@ -1,7 +1,7 @@
 """The table of detections: one row per configuration × run × measured object, those never detected included.
 
 time_to_detection_s: from the onset to the instant the list that confirmed the object was available; null when never.
-distance_at_detection_m: true horizontal distance between the centres of object and ego at that instant.
+distance_at_onset_m, distance_at_detection_m: true horizontal distance between the centres of object and ego then.
 gap_at_detection_m: true horizontal distance between the boxes of object and ego at that instant.
 A way of a detection (`Way`): when its list was captured, sent and received.
 Source: Piazzoni et al. 2022 (distance at detection); docs/guide/metrics.md.
@@ -170,9 +170,10 @@ def build_detection_columns(
 ) -> dict[str, Any]:
     """The columns of `detections.parquet` of one log and block of runs, by configuration, run and object."""
     delay_s = _reaction_delays(scene, experiment, episodes, runs)
+    onset_m, _ = measure_distances(scene, truth, experiment, episodes.object_ix, episodes.onset_s)
     parts = []
     for name, event in events.items():
-        columns = _configuration_columns(scene, truth, experiment, episodes, runs, name, event)
+        columns = _configuration_columns(scene, truth, experiment, episodes, runs, name, event, onset_m)
         if delay_s is not None:
             columns |= _braking_columns(experiment, episodes, encounters, delay_s, event)
         if any(other.way is not None for other in events.values()):
@@ -191,8 +192,12 @@ def _configuration_columns(
     runs: Int,
     configuration: str,
     event: DetectionEvents,
+    onset_m: Float,
 ) -> dict[str, Any]:
-    """Columns (S · M,) of one configuration: whether, when and how far away each object is detected."""
+    """Columns (S · M,) of one configuration: whether, when and how far away each object is detected.
+
+    `onset_m (M,)`: distances at the onset.
+    """
     S, M = len(runs), len(episodes.object_ix)
 
     def flat(values: NDArray[T]) -> NDArray[T]:
@@ -211,6 +216,7 @@ def _configuration_columns(
         "object_class": np.array(CLASSES, dtype=object)[scene.object_class[flat(episodes.object_ix)]],
         "episode": flat(episodes.number),
         "onset_s": onset_s,
+        "distance_at_onset_m": flat(onset_m),
         "began": began_texts(flat(episodes.began)),
         "detected": ~np.isnan(detection_s),
         "detection_s": detection_s,

@@ -10,8 +10,8 @@ once objects of one log hang together by `WITHIN_LOG`, nor than the spread betwe
 *Nothing drawn*: where no random number is behind a result it is equal in every run, and an interval over runs tells
 nothing.
 
-Limits are at 95 %. What they hold, and what not: tools/coverage.py, docs/guide/metrics.md. Functions of arrays take any
-leading axes (…). Letters of the shapes: K clusters, G values.
+Limits are at 95 % unless a function is given another `confidence`. What they hold, and what not: tools/coverage.py,
+docs/guide/metrics.md. Functions of arrays take any leading axes (…). Letters of the shapes: K clusters, G values.
 """
 
 from __future__ import annotations
@@ -31,7 +31,6 @@ MOST_GROUPS = 200
 WITHIN_LOG = 0.2
 """Correlation of two objects of a log that few logs cannot refute; on recorded drives .02 to .10."""
 CONFIDENCE = 0.95
-_TAIL = (1.0 - CONFIDENCE) / 2
 _ROUNDING = 1e-9
 """Numbers of trials, and figures, that differ by less differ by rounding only."""
 
@@ -102,32 +101,37 @@ def describe_absent(logs: int) -> str:
 # Shares.
 
 
-def exact_limits(successes: float | Float, n: float | Float) -> tuple[Float, Float]:
+def exact_limits(successes: float | Float, n: float | Float, confidence: float = CONFIDENCE) -> tuple[Float, Float]:
     """Bound the probability of success given `successes` of `n` independent trials exactly: (low, high), shares (…).
 
-    The limits enclose all p with which so few successes, and so many, have a probability of at least .025. Neither
-    number need be whole: the limits are quantiles of beta distributions.
+    The limits enclose all p with which so few successes, and so many, have a probability of at least half of
+    1 − `confidence`. Neither number need be whole: the limits are quantiles of beta distributions.
 
     Source: C. J. Clopper, E. S. Pearson, "The use of confidence or fiducial limits illustrated in the case of the
     binomial", Biometrika 26 (1934) 404–413.
     """
     from scipy.special import betaincinv
 
+    tail = (1.0 - confidence) / 2
     k, n = np.broadcast_arrays(np.asarray(successes, dtype=float), np.asarray(n, dtype=float))
     none, all_of_them = k <= _ROUNDING, n - k <= _ROUNDING
     failures = np.where(all_of_them, 0.0, n - k)
-    low = betaincinv(np.where(none, 1.0, k), failures + 1.0, _TAIL)
-    high = betaincinv(np.where(none, 0.0, k) + 1.0, np.where(all_of_them, 1.0, failures), 1.0 - _TAIL)
+    low = betaincinv(np.where(none, 1.0, k), failures + 1.0, tail)
+    high = betaincinv(np.where(none, 0.0, k) + 1.0, np.where(all_of_them, 1.0, failures), 1.0 - tail)
     return np.where(none, 0.0, low), np.where(all_of_them, 1.0, high)
 
 
 def limit_share(
-    successes: Float | Int, rows: Float | Int, objects: float | Float | Int | None = None
+    successes: Float | Int,
+    rows: Float | Int,
+    objects: float | Float | Int | None = None,
+    confidence: float = CONFIDENCE,
+    within: float = WITHIN_LOG,
 ) -> tuple[Float, Float]:
     """Bound Σ successes / Σ rows over K clusters: (low, high), shares (…).
 
     `successes (…, K)` of `rows (…, K)`; a cluster without rows is none. `objects (…)`: how many the rows are about,
-    None: one in each cluster; rows weigh so that together they are as many.
+    None: one in each cluster; rows weigh so that together they are as many. `within`: as for `spread_share`.
     """
     rows = np.asarray(rows, dtype=float)
     objects = (rows > 0).sum(axis=-1) if objects is None else objects
@@ -135,7 +139,24 @@ def limit_share(
     share = np.sum(successes, axis=-1) / total
     residual = (successes - share[..., None] * rows) * scale[..., None]
     weights = rows * scale[..., None]
-    return spread_share(share, share_variance(residual, weights), weights)
+    return spread_share(share, share_variance(residual, weights), weights, confidence, within)
+
+
+def limit_share_of_runs(
+    share: Float, residual: Float, looks: float, confidence: float = CONFIDENCE
+) -> tuple[Float, Float]:
+    """Bound a share by S independent runs with `looks` rows each: (low, high), shares (…).
+
+    `residual (…, S)`: of each run, successes minus share · looks. A run with one row is a trial. Of several rows the
+    spread of the runs tells how many trials they are worth; where all runs are alike it tells nothing, and rows of a
+    run may be one and the same: a run counts once.
+    """
+    runs = residual.shape[-1]
+    if looks <= 1:
+        return exact_limits(share * runs, float(runs), confidence)
+    weights = np.broadcast_to(float(looks), residual.shape)
+    variance = share_variance(residual, weights)
+    return spread_share(share, variance, weights, confidence, np.where(variance > 0, 0.0, 1.0))
 
 
 def share_variance(residual: Float, weights: Float) -> Float:
@@ -146,25 +167,30 @@ def share_variance(residual: Float, weights: Float) -> Float:
     return np.where(clusters > 1, variance, 0.0)
 
 
-def spread_share(share: Float, variance: Float, weights: Float) -> tuple[Float, Float]:
+def spread_share(
+    share: Float, variance: Float, weights: Float, confidence: float = CONFIDENCE, within: float | Float = WITHIN_LOG
+) -> tuple[Float, Float]:
     """Exact limits (…) of a share with a variance (…) over clusters that have so many objects each, `weights (…, K)`.
 
-    Of n objects, m = Σw²/Σw in an average object's cluster, at most n/(1 + .2·(m − 1)) count; nor more than
-    p(1 − p)/variance, times (t of n − 1 / t of K − 1)² as few clusters show little of how they vary. One at least.
+    Of n objects, m = Σw²/Σw in an average object's cluster, at most n/(1 + `within`·(m − 1)) count, `within` being the
+    correlation in a cluster that its number cannot refute; nor more than p(1 − p)/variance, times
+    (t of n − 1 / t of K − 1)² as few clusters show little of how they vary. One at least.
     """
     from scipy.special import stdtrit
 
+    tail = (1.0 - confidence) / 2
+
     n, clusters = weights.sum(axis=-1), (weights > 0).sum(axis=-1)
-    counted = n / (1.0 + WITHIN_LOG * ((weights**2).sum(axis=-1) / n - 1.0))
+    counted = n / (1.0 + within * ((weights**2).sum(axis=-1) / n - 1.0))
     spread = share * (1.0 - share)
     told = (variance > 0) & (spread > _ROUNDING**2) & (clusters > 1)
-    ratio = stdtrit(np.where(told, n - 1.0, 1.0), _TAIL) / stdtrit(np.where(told, clusters - 1.0, 1.0), _TAIL)
+    ratio = stdtrit(np.where(told, n - 1.0, 1.0), tail) / stdtrit(np.where(told, clusters - 1.0, 1.0), tail)
     by_spread = np.where(told, spread / np.where(told, variance, 1.0) * ratio**2, np.inf)
     effective = np.maximum(np.minimum(counted, by_spread), 1.0)
-    return exact_limits(np.clip(share, 0.0, 1.0) * effective, effective)
+    return exact_limits(np.clip(share, 0.0, 1.0) * effective, effective, confidence)
 
 
-def alike_limits(difference: float, weights: Float) -> tuple[float, float]:
+def alike_limits(difference: float, weights: Float, confidence: float = CONFIDENCE) -> tuple[float, float]:
     """Bound a difference of two shares, −1 … 1, that all clusters have alike: (low, high). `weights (K,)`: objects.
 
     Exact on each side, with n as in `spread_share` without a variance: as if |difference| · n of n objects favoured the
@@ -173,8 +199,8 @@ def alike_limits(difference: float, weights: Float) -> tuple[float, float]:
     """
     size, objects = min(abs(difference), 1.0), np.asarray(weights, dtype=float)
     nothing = np.asarray(0.0)
-    low, high = (float(limit) for limit in spread_share(np.asarray(size), nothing, objects))
-    low -= (1.0 - size) * float(spread_share(nothing, nothing, objects)[1])
+    low, high = (float(limit) for limit in spread_share(np.asarray(size), nothing, objects, confidence))
+    low -= (1.0 - size) * float(spread_share(nothing, nothing, objects, confidence)[1])
     return (low, high) if difference >= 0 else (-high, -low)
 
 
@@ -214,6 +240,7 @@ def limit_figure(
     without: Float,
     weights: Float,
     bounds: tuple[float, float] = (-np.inf, np.inf),
+    confidence: float = CONFIDENCE,
 ) -> tuple[Float, Float]:
     """Bound a figure by Student's t, from the figure without each cluster (…, K): (low, high), (…).
 
@@ -224,8 +251,19 @@ def limit_figure(
 
     value = np.asarray(value, dtype=float)
     variance, df = figure_variance(value, without, np.asarray(weights, dtype=float))
-    half = -stdtrit(df, _TAIL) * np.sqrt(variance)
+    half = -stdtrit(df, (1.0 - confidence) / 2) * np.sqrt(variance)
     return np.maximum(value - half, bounds[0]), np.minimum(value + half, bounds[1])
+
+
+def alike_run_limits(
+    value: float, bounds: tuple[float, float], runs: int, confidence: float = CONFIDENCE
+) -> tuple[float, float]:
+    """Bound a mean between `bounds` that is the same in so many independent runs: (low, high).
+
+    In a share of runs at most, by exact limits of none of them, it is another, as far as the bounds allow.
+    """
+    other = float(exact_limits(0.0, float(runs), confidence)[1])
+    return value - other * (value - bounds[0]), value + other * (bounds[1] - value)
 
 
 # Quantiles.
@@ -241,6 +279,40 @@ def limit_quantile(values: Float, low: Float, high: Float, q: float = 0.5) -> tu
     possible, unsure = np.flatnonzero(high >= q - _ROUNDING), np.flatnonzero(low < q - _ROUNDING)
     ends = np.append(values, np.inf)
     return float(ends[possible[0] if len(possible) else -1]), float(ends[unsure[-1] + 1 if len(unsure) else 0])
+
+
+_VALUES = 2000
+"""Most values at which limits of a quantile are sought: they are then off by at most a two-thousandth of the rows."""
+
+
+def limit_ranked_quantile(
+    values: Float,
+    weight: Float,
+    cluster: Int,
+    clusters: int,
+    objects: float | None,
+    q: float = 0.5,
+    confidence: float = CONFIDENCE,
+) -> tuple[float, float]:
+    """Bound the q-quantile of values (n,), −∞ among them, that weigh `weight (n,)` and are in a `cluster (n,)`.
+
+    `objects`: how many the rows are about, as for `limit_share`; None: clusters are runs.
+    """
+    order = np.argsort(values, kind="stable")
+    ranked = values[order]
+    last_of = np.flatnonzero(np.append(ranked[1:] != ranked[:-1], True))
+    last_of = last_of[np.unique(np.linspace(0, len(last_of) - 1, min(len(last_of), _VALUES)).astype(int))]
+    # Rows of each cluster up to each value; of −∞, where no row needs to be, none.
+    place = np.searchsorted(last_of, np.arange(len(ranked)), side="left") * clusters + cluster[order]
+    until = np.cumsum(np.bincount(place, weight[order], len(last_of) * clusters).reshape(-1, clusters), axis=0)
+    until = np.concatenate([np.zeros((1, clusters)), until])
+    if objects is None:
+        share = until.sum(axis=1) / until[-1].sum()
+        looks = until[-1].sum() / clusters
+        low, high = limit_share_of_runs(share, until - share[:, None] * until[-1], looks, confidence)
+    else:
+        low, high = limit_share(until, np.broadcast_to(until[-1], until.shape), objects, confidence)
+    return limit_quantile(np.append(-np.inf, ranked[last_of]), low, high, q)
 
 
 EXACT = "exact"

@@ -174,23 +174,33 @@ def _check_number(value: Any) -> float | None:
 
 def own_sums(components: Sequence[RowMetric], rows: pd.DataFrame) -> dict[str, OwnSums]:
     """Sums of own metrics, by name, over the rows of `detections.parquet` of one configuration in one log."""
+    return {
+        metric: {name: float(values.sum()) for name, values in of_metric.items()}
+        for metric, of_metric in own_statistics(components, rows).items()
+    }
+
+
+def own_statistics(components: Sequence[RowMetric], rows: pd.DataFrame) -> dict[str, dict[str, Float]]:
+    """The statistics (n,) of own metrics, by name, of the n rows of one configuration in one log; empty without rows.
+
+    Raises InputError where an own metric fails.
+    """
     if not len(rows):
         return {}
     rows = rows.reset_index(drop=True)
     return {
-        own.name: ask_component(own, _own_metric_key(k), partial(_sum_own_metric, own, rows))
+        own.name: ask_component(own, _own_metric_key(k), partial(_check_statistics, own, rows))
         for k, own in enumerate(components)
     }
 
 
-def _sum_own_metric(own: RowMetric, rows: pd.DataFrame) -> OwnSums:
-    sums: OwnSums = {}
+def _check_statistics(own: RowMetric, rows: pd.DataFrame) -> dict[str, Float]:
+    columns: dict[str, Float] = {}
     for name, values in own.statistics(rows).items():
-        column = np.asarray(values, dtype=float)
-        if column.shape != (len(rows),):
-            raise GivenError("statistics", f"{name}: expected shape ({len(rows)},), found {column.shape}")
-        sums[name] = float(column.sum())
-    return sums
+        columns[name] = np.asarray(values, dtype=float)
+        if (found := columns[name].shape) != (len(rows),):
+            raise GivenError("statistics", f"{name}: expected shape ({len(rows)},), found {found}")
+    return columns
 
 
 # Lists on links, for configurations that name one.

@@ -57,7 +57,9 @@ _EVENT_COLUMNS = {
     },
 }
 """By event the columns of the tally, and their names in `detections.parquet`; null in the row for never."""
-_OBJECT_COLUMNS = ("object_id", "object_class", "episode", "onset_s", "began", "ended_s", "ended_by")
+_OBJECT_COLUMNS = (
+    "object_id", "object_class", "episode", "onset_s", "distance_at_onset_m", "began", "ended_s", "ended_by",
+)  # fmt: skip
 
 
 EPISODE = ("log", "object_id", "episode")
@@ -73,6 +75,21 @@ def tally_rows(rows: pd.DataFrame) -> pd.DataFrame:
     tallied = pd.concat(parts, ignore_index=True)
     order = np.lexsort([pd.factorize(tallied[name])[0] for name in ("configuration", "log")])  # stable: events stay
     return tallied.iloc[order].reset_index(drop=True)
+
+
+def list_runs(rows: pd.DataFrame) -> pd.DataFrame:
+    """The rows of `detections.parquet` with the columns of the tally, each for its own `run`, event after event."""
+    parts = []
+    for event, of_event in _EVENT_COLUMNS.items():
+        if event != DETECTED and "conflict_detected" not in rows:
+            continue
+        columns = {name: rows[source] for name, source in of_event.items() if source in rows}
+        kept = {name: rows[name] for name in ("log", "configuration", "run", *_OBJECT_COLUMNS) if name in rows}
+        parts.append(pd.DataFrame(kept | columns).assign(event=event, runs=1))
+        if "conflict" in rows:
+            passed = rows["braking_pass"].fillna(False).astype(int)
+            parts[-1] = parts[-1].assign(in_conflict=rows["conflict"].astype(bool), passed=passed)
+    return pd.concat(parts, ignore_index=True)
 
 
 def _tally_event(rows: pd.DataFrame, event: str) -> pd.DataFrame:
@@ -128,18 +145,34 @@ def settle_horizon(counted: pd.DataFrame, asked_s: float) -> tuple[float, list[s
     `counted`: rows that count, of all logs. It is the longest that enough episodes last, `asked_s` at most: a mean up
     to where hardly anybody is followed would hang on a few long episodes.
     """
+    number, needed, followed, shorter_s = _count_followed(counted, asked_s)
+    if followed >= needed:
+        return asked_s, []
+    words, shorter = _format_followed(number, followed, asked_s), format_cell(shorter_s)
+    return shorter_s, [f"horizon_s: {words}; means are of min(time, {shorter} s), which {needed} of them last"]
+
+
+def describe_followed(counted: pd.DataFrame, horizon_s: float) -> str | None:
+    """How few of the episodes that count last as long as the horizon; None: enough for a restricted mean."""
+    number, needed, followed, _ = _count_followed(counted, horizon_s)
+    return None if followed >= needed else _format_followed(number, followed, horizon_s)
+
+
+def _format_followed(number: int, followed: int, asked_s: float) -> str:
+    share = 100 * followed / number
+    return f"{followed} of {count_noun(number, 'episode')} that count ({share:.3g} %) last {format_cell(asked_s)} s"
+
+
+def _count_followed(counted: pd.DataFrame, asked_s: float) -> tuple[int, int, int, float]:
+    """How many episodes count, how many have to last for a restricted mean, how many last `asked_s`; how long enough
+    of them last.
+    """
     episodes = counted.drop_duplicates([*EPISODE])
     length_s = np.sort(np.round((episodes["ended_s"] - episodes["onset_s"]).to_numpy(dtype=float), 9))[::-1]
     number = len(length_s)
     needed = -(-number // 2) if number < FEWEST_FOLLOWED else max(FEWEST_FOLLOWED, -(-number // 10))
     followed = int((length_s >= asked_s - SAME_INSTANT_S).sum())
-    if followed >= needed:
-        return asked_s, []
-    shorter_s = float(length_s[needed - 1])
-    return shorter_s, [
-        f"horizon_s: {followed} of {count_noun(number, 'episode')} that count ({100 * followed / number:.3g} %) last "
-        f"{asked_s:g} s; means are of min(time, {format_cell(shorter_s)} s), which {needed} of them last"
-    ]
+    return number, needed, followed, float(length_s[needed - 1]) if number else 0.0
 
 
 Sums = Mapping[str, Mapping[str, OwnSums]]

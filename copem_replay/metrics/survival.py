@@ -15,6 +15,7 @@ Letters of the shapes: n rows, M distinct times of detection, K clusters of rows
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
@@ -132,54 +133,90 @@ def restricted_mean(times_s: Float, incidence: Float, horizon_s: float) -> float
     return float(horizon_s - incidence[before] @ lengths_s)
 
 
-def restricted_means_without(
-    time_s: Float, ending: NDArray[np.integer[Any]], weight: Float, cluster: Int, clusters: int, horizon_s: float
-) -> Float:
-    """(K,) restricted means at a horizon without the rows of each cluster, seconds; NaN where no row is left.
+@dataclass(frozen=True)
+class _RestOfClusters:
+    """Rows (n,) without those of each of K clusters, between the times at which rows are censored.
 
-    Rows (n,) as for `cumulative_incidence`, with whole numbers as weights; `cluster (n,)`: 0 … K − 1.
+    Steps are weighted by what the earlier censored rows hand on. Times of censoring are few, one or less per object:
+    between two of them sums over clusters are enough.
     """
-    # Steps are weighted by what the earlier censored rows hand on. Times of censoring are few, one or less per object:
-    # between two of them sums over clusters are enough.
-    censored = ending == CENSORED
-    lost_s = np.unique(time_s[censored])
-    spans = len(lost_s) + 1
-    span = np.searchsorted(lost_s, time_s, side="left")  # censored at the end of it, or all else within it
 
-    def without_each(kept: Bool, of: Float) -> Float:
-        """(K, spans) sums of all rows but those of each cluster."""
-        place = cluster[kept] * spans + span[kept]
-        sums = np.bincount(place, of[kept], minlength=clusters * spans).reshape(clusters, spans)
+    cluster: Int
+    clusters: int
+    span: Int  # (n,) the censoring that comes next: it is the row's own, or the row ends before it
+    total: Float  # (K,) weight of the rows
+    handed: Float  # (K, spans) weight of a row that ends in a span, over its own
+
+    def sums(self, values: Float, part: Int, parts: int) -> Float:
+        """(K, parts) sums of values (n,) by `part (n,)`, of all rows but those of each cluster."""
+        sums = np.bincount(self.cluster * parts + part, values, self.clusters * parts).reshape(self.clusters, parts)
         rest: Float = sums.sum(axis=0) - sums
         return rest
 
-    within = without_each(np.ones(len(weight), dtype=bool), weight)
+
+def _leave_out_clusters(
+    time_s: Float, ending: NDArray[np.integer[Any]], weight: Float, cluster: Int, clusters: int, least: float
+) -> _RestOfClusters:
+    censored = ending == CENSORED
+    lost_s = np.unique(time_s[censored])
+    span = np.searchsorted(lost_s, time_s, side="left")
+    rest = _RestOfClusters(cluster, clusters, span, np.empty(0), np.empty(0))
+    within = rest.sums(weight, span, len(lost_s) + 1)
     total = within.sum(axis=1)
-    lost = without_each(censored, weight)[:, :-1]
+    lost = rest.sums(np.where(censored, weight, 0.0), span, len(lost_s) + 1)[:, :-1]
     remaining = total[:, None] - np.cumsum(within, axis=1)[:, :-1]
-    remains = remaining > 0  # whole numbers
+    remains = remaining >= np.maximum(least * total * (1 - 1e-9), 1e-300)[:, None]
     factors = np.where(remains, 1.0 + lost / np.where(remains, remaining, 1.0), 1.0)
     handed = np.concatenate([np.ones((clusters, 1)), np.cumprod(factors, axis=1)], axis=1)
-    gained = without_each(ending == DETECTED, weight * np.maximum(horizon_s - time_s, 0.0))
+    return replace(rest, total=total, handed=handed)
+
+
+def restricted_means_without(
+    time_s: Float,
+    ending: NDArray[np.integer[Any]],
+    weight: Float,
+    cluster: Int,
+    clusters: int,
+    horizon_s: float,
+    *,
+    least: float = 1e-12,
+) -> Float:
+    """(K,) restricted means at a horizon without the rows of each cluster, seconds; NaN where no row is left.
+
+    Rows (n,) and `least` as for `cumulative_incidence`; `cluster (n,)`: 0 … K − 1.
+    """
+    rest = _leave_out_clusters(time_s, ending, weight, cluster, clusters, least)
+    gain = np.where(ending == DETECTED, weight * np.maximum(horizon_s - time_s, 0.0), 0.0)
+    gained = rest.sums(gain, rest.span, rest.handed.shape[1])
     with np.errstate(divide="ignore", invalid="ignore"):
-        means: Float = horizon_s - (gained * handed).sum(axis=1) / total
-    return means
+        means: Float = horizon_s - (gained * rest.handed).sum(axis=1) / rest.total
+    return np.where(rest.total > 0, means, np.nan)
 
 
 def incidences_without(
-    time_s: Float, ending: NDArray[np.integer[Any]], weight: Float, cluster: Int, clusters: int, at_s: Float
+    time_s: Float,
+    ending: NDArray[np.integer[Any]],
+    weight: Float,
+    cluster: Int,
+    clusters: int,
+    at_s: Float,
+    *,
+    least: float = 1e-12,
 ) -> Float:
-    """(K, G) cumulative incidence at instants (G,) without the rows of each cluster; NaN where no row is left.
+    """(K, G) cumulative incidence at instants (G,), ascending, without the rows of each cluster; NaN: no row is left.
 
-    Rows (n,) as for `cumulative_incidence`; `cluster (n,)`: 0 … K − 1.
+    Rows (n,) and `least` as for `cumulative_incidence`; `cluster (n,)`: 0 … K − 1.
     """
-    shares = np.full((clusters, len(at_s)), np.nan)
-    for k in range(clusters):
-        rest = (cluster != k) & (weight > 0)
-        if rest.any():
-            times_s, incidence = cumulative_incidence(time_s[rest], ending[rest], weight[rest])
-            shares[k] = np.append(0.0, incidence)[np.searchsorted(times_s, at_s, side="right")]
-    return shares
+    rest = _leave_out_clusters(time_s, ending, weight, cluster, clusters, least)
+    # Detections between two instants and two censorings have the same weight handed on.
+    spans, step = rest.handed.shape[1], np.searchsorted(at_s, time_s, side="left")
+    known, part = np.unique(step * spans + rest.span, return_inverse=True)
+    detections = rest.sums(np.where(ending == DETECTED, weight, 0.0), part, len(known))
+    gained = np.cumsum(detections * rest.handed[:, known % spans], axis=1)
+    until = np.searchsorted(known // spans, np.arange(len(at_s)), side="right")
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shares = np.concatenate([np.zeros((clusters, 1)), gained], axis=1)[:, until] / rest.total[:, None]
+    return np.where(rest.total[:, None] > 0, np.minimum(shares, 1.0), np.nan)
 
 
 def quantile_with_never(values: Float, detected: Bool, q: float, weight: Float | None = None) -> float | None:

@@ -169,6 +169,7 @@ NOT_OF_A_PART: Mapping[str, str] = {
     "logs": "which log, and how it is read, is in the recipe itself; other logs are not",
     "runs": "the block of runs is in the recipe itself",
     "show": "what is shown is replayed after gathering",
+    "criteria": "rows are judged once they are there",
     "sweep": "each of its points is an experiment of its own",
     "configurations": "only the part's own, without its name",
     "units": "only those that the configuration, the onset or the reference of distances goes by",
@@ -178,6 +179,7 @@ NOT_OF_A_PART: Mapping[str, str] = {
     "measure.horizon_s": "restricted means are taken of all rows",
     "measure.exact": "closed forms draw nothing",
     "measure.metrics": "own metrics are taken of all rows",
+    "measure.by": "groups are of all rows",
 }
 """Keys of the experiment that are not in a recipe as they are, and why."""
 _LIBRARIES = ("numba", "numpy", "pandas", "pyarrow", "scipy", "shapely")

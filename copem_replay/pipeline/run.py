@@ -11,7 +11,7 @@ import tempfile
 import time
 import weakref
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -28,17 +28,28 @@ from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.accuracy.statistics import AccuracyTotal, join_totals
 from copem_replay.metrics.columns import COMPARED_FILES
+from copem_replay.metrics.config import parse_slices
 from copem_replay.metrics.detections_table import WAY
 from copem_replay.metrics.metric import OutputTimes, OwnSums
 from copem_replay.metrics.onset import select_counted
+from copem_replay.metrics.slices import (
+    LISTS_COLUMNS,
+    SliceSettings,
+    StudyRows,
+    describe_chance,
+    sum_episodes,
+    sum_lists,
+    summarise_groups,
+)
 from copem_replay.metrics.summary import add_own_sums, own_sums_by_log, settle_horizon, summarise_tally, tally_rows
 from copem_replay.pipeline.closed_form import check_closed_form, exact_table
 from copem_replay.pipeline.cost import RunCost, memory_notes, return_memory, watch_cost
-from copem_replay.pipeline.expansion import find_facts
+from copem_replay.pipeline.expansion import ConfigurationFacts, find_facts
 from copem_replay.pipeline.notes import LogFacts, join_list_rates, study_notes
 from copem_replay.pipeline.parts import MOST_RUNS, STATES_A_PART, PartCache, cut_parts, write_recipe
 from copem_replay.pipeline.prepare import Replay, prepare_log
 from copem_replay.pipeline.replay import BlockOutcome, cut_blocks, replay_outcomes
+from copem_replay.pipeline.scoring import accuracy_settings
 from copem_replay.pipeline.study_log import StudyLog
 from copem_replay.pipeline.sweep import SweepPoint, list_points
 from copem_replay.pipeline.tables import (
@@ -200,9 +211,12 @@ class StudyTables:
     """Sums of accuracy over all runs, by log and configuration."""
     own_sums: dict[str, dict[str, OwnSums]] = field(default_factory=dict)
     """Sums of own metrics."""
+    sliced: tuple[pd.DataFrame, pd.DataFrame | None] | None = None
+    """What slices are made of: sums by episode, and of lists; None: not asked for."""
     exact: pd.DataFrame | None = None
     horizon_s: float = 0.0
     summary: pd.DataFrame = field(default_factory=pd.DataFrame)
+    summary_by: pd.DataFrame | None = None
     bands: pd.DataFrame | None = None
     sweep: pd.DataFrame | None = None
     notes: tuple[str, ...] = ()
@@ -363,12 +377,16 @@ def _run_study(experiment: Experiment, logs: Sequence[StudyLog], gatherer: Gathe
     measure = experiment.measure
     study.horizon_s, horizon_notes = settle_horizon(select_counted(study.tally, measure.began), measure.horizon_s)
     study.summary, summary_notes = _summarise(study, study.horizon_s)
+    study.summary_by = sliced = _summarise_slices(study, study.horizon_s)
     swept = [_summarise_point(point, logs, gatherer, study.horizon_s) for point in list_points(experiment)]
     study.sweep = pd.concat(swept, ignore_index=True) if swept else None
     if measure.accuracy and len(experiment.configurations):
         study.bands = tabulate_bands(study.totals)
     oddities = {log.name: of.oddities for log, of in zip(logs, study.facts, strict=True)}
-    study.notes = (*study_notes(study.recordings, oddities, experiment), *horizon_notes, *summary_notes)
+    notes_on_slices = () if sliced is None else describe_chance(sliced)
+    study.notes = (
+        *study_notes(study.recordings, oddities, experiment), *horizon_notes, *summary_notes, *notes_on_slices,
+    )  # fmt: skip
     return study
 
 
@@ -379,23 +397,52 @@ def _gather_study(logs: Sequence[StudyLog], experiment: Experiment, gatherer: Ga
         study.exact = pd.concat([gatherer.exact(log, experiment) for log in logs], ignore_index=True)
     nodes = dict[tuple[str, str], list[tuple[int, AccuracyTotal]]]()
     tallies, batch, last = list[pd.DataFrame](), list[PartTables](), logs[-1].name
+    episodes, lists, sliced = list[pd.DataFrame](), list[pd.DataFrame](), bool(kept and measure.by)
     for log, parts in groupby(gatherer.each(logs, experiment), key=attrgetter("log")):
         for part in parts:
             batch.append(replace(part, beside=None, runs=None))
             study.add(part)
             if part.total is not None and part.runs is not None:
                 nodes.setdefault((log, part.configuration), []).append((len(part.runs), part.total))
+                lists += [sum_lists(part.runs.select([*LISTS_COLUMNS]).to_pandas())] if sliced else []
         if log != last and sum(len(part.rows) for part in batch) < BATCH_ROWS:
             continue
         rows = study.frame(batch)
         batch.clear()
         tallies.append(tally_rows(rows))
+        episodes += [sum_episodes(rows, measure.metrics, measure.began)] if sliced else []
         if measure.metrics:
             for _, rows_of_log in select_counted(rows, measure.began).groupby("log", sort=False):
                 study.own_sums = add_own_sums(study.own_sums, own_sums_by_log(rows_of_log, measure.metrics))
     study.totals = {key: join_totals(of_log) for key, of_log in nodes.items()}
     study.tally = pd.concat(tallies, ignore_index=True)
+    if sliced:
+        study.sliced = pd.concat(episodes, ignore_index=True), sum_lists(pd.concat(lists)) if lists else None
     return study
+
+
+def _summarise_slices(study: StudyTables, horizon_s: float) -> pd.DataFrame | None:
+    if study.sliced is None:
+        return None
+    experiment, (episodes, lists) = study.experiment, study.sliced
+    settings = slice_settings(experiment, find_facts(experiment), horizon_s)
+    rows = StudyRows(settings, {log.name: {} for log in study.logs}, study.tally, study.exact, episodes, lists)
+    return summarise_groups(rows, parse_slices(experiment.measure.by))
+
+
+def slice_settings(experiment: Experiment, facts: Mapping[str, ConfigurationFacts], horizon_s: float) -> SliceSettings:
+    """What the figures of groups are computed with."""
+    measure = experiment.measure
+    return SliceSettings(
+        tuple(experiment.configurations),
+        horizon_s,
+        measure.began,
+        measure.metrics,
+        accuracy_settings(measure, 0.0) if measure.accuracy else None,
+        measure.conflict is not None,
+        frozenset(name for name, of in facts.items() if of.fixed),
+        frozenset(name for name, of in facts.items() if of.fixed_verdicts),
+    )
 
 
 def _summarise_point(point: SweepPoint, logs: Sequence[StudyLog], gatherer: Gatherer, horizon_s: float) -> pd.DataFrame:

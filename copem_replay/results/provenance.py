@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -42,13 +42,14 @@ _LIBRARIES = (
 class RecordedLog:
     """A recording that was replayed: its name in the tables, the topic of its truth, the SHA-256 of its content.
 
-    `truth`: the SHA-256 of its truth, None in results of older versions.
+    `truth`: the SHA-256 of its truth, None in results of older versions. `tags`: by name.
     """
 
     name: str
     topic: str | None
     sha256: str
     truth: str | None = None
+    tags: Mapping[str, str] = field(default_factory=dict)
 
     def check_same(self, digest: str, path: File) -> None:
         """Raise RecordingError where a recording is another than the one that was replayed."""
@@ -107,7 +108,8 @@ def parse_provenance(data: Any, place: Path) -> Provenance:
     if (found := dict(data).get("format", 1)) != FORMAT:
         raise InputError(f"{place}: expected results of format {FORMAT}, found format {found}; {AGAIN}")
     logs = tuple(
-        RecordedLog(str(log["log"]), log.get("topic"), str(log["sha256"]), log.get("truth")) for log in data["logs"]
+        RecordedLog(str(log["log"]), log.get("topic"), str(log["sha256"]), log.get("truth"), _parse_tags(log))
+        for log in data["logs"]
     )
     notes = [*data.get("notes", []), *(log[name] for log in data.get("logs_skipped", []) for name in _SKIPPED)]
     if not all(isinstance(note, str) for note in notes):
@@ -131,6 +133,13 @@ def parse_provenance(data: Any, place: Path) -> Provenance:
         facts={str(name): ConfigurationFacts(**of) for name, of in dict(data["configurations"]).items()},
         data=data,
     )
+
+
+def _parse_tags(log: Any) -> dict[str, str]:
+    tags = dict(log.get("tags", {}))
+    if not all(isinstance(text, str) for text in (*tags, *tags.values())):
+        raise ValueError(f"expected text in tags of log {log['log']}")
+    return tags
 
 
 def reread_recording(log: RecordedLog, place: Place, experiment: Experiment) -> Recording:

@@ -79,10 +79,10 @@ class Results:
     """What an experiment gave, just computed or read from a folder: pandas tables, as a results folder has them.
 
     `detections`: a row per log, configuration, run and measured object; of many rows `each` gives those of a log at a
-    time. `summary`: a row per configuration. `exact`, `sweep`, `accuracy`, `bands`: None where the experiment does not
-    ask for them. Times are in seconds (`_s`), distances in metres (`_m`); missing values are null. What columns mean:
-    docs/reference/columns.md. A file of a folder is read when it is first used, which raises InputError where it is
-    damaged, or where other results have taken the place of the folder.
+    time. `summary`: a row per configuration. `summary_by`, `exact`, `sweep`, `accuracy`, `bands`: None where the
+    experiment does not ask for them. Times are in seconds (`_s`), distances in metres (`_m`); missing values are null.
+    What columns mean: docs/reference/columns.md. A file of a folder is read when it is first used, which raises
+    InputError where it is damaged, or where other results have taken the place of the folder.
 
     >>> result = cr.run({"version": 1, "configurations": {"GT": {"units": "truth"}}}, "logs/tc016d.mcap")
     >>> result.detections.shape[0], result.exact is None
@@ -215,17 +215,23 @@ class Results:
         return place.shown
 
     def fill(
-        self, place: ResultsPlace, *, skipped: Sequence[tuple[File, str]] = (), viewer: str | None = None
+        self,
+        place: ResultsPlace,
+        *,
+        skipped: Sequence[tuple[File, str]] = (),
+        viewer: str | None = None,
+        label: str | None = None,
     ) -> list[str]:
         """Write the results into a place that is locked. Returns notes, one line each.
 
         `skipped`: logs that were left out, with reasons. `viewer`: address of a Rerun viewer that also gets the
-        recordings. Raises InputError where the results were read from a folder.
+        recordings. `label`: what the results are called in a history. Raises InputError where the results were read
+        from a folder.
         """
         from copem_replay.results.write import fill_place
 
         study, exporters = self._require_study()
-        notes = fill_place(place, study, exporters=exporters(viewer), skipped=skipped)
+        notes = fill_place(place, study, exporters=exporters(viewer), skipped=skipped, label=label)
         self.folder = place.shown
         return notes
 
@@ -280,6 +286,11 @@ class Results:
     def summary(self) -> pd.DataFrame:
         """`summary.csv`."""
         return self.frame("summary.csv")
+
+    @cached_property
+    def summary_by(self) -> pd.DataFrame | None:
+        """`summary_by.csv`; None: there is no such file."""
+        return self._optional("summary_by.csv")
 
     @cached_property
     def exact(self) -> pd.DataFrame | None:
@@ -425,6 +436,6 @@ def check_complete(results: Results, *, rowless: bool = False) -> Results:
             raise InputError(
                 f"{results.place}/{MARK}: expected {expected} {what} as in experiment.yaml, found {found}; {AGAIN}"
             )
-    for name in ("summary", "exact", "sweep"):
+    for name in ("summary", "summary_by", "exact", "sweep"):
         getattr(results, name)
     return results

@@ -344,6 +344,6 @@ def _unquote_cell(value: Any) -> Any:
 
 def read_csv(path: Path) -> pd.DataFrame:
     """A table from CSV: names are text, whatever they look like, and only empty cells are missing."""
-    text = {"configuration": str, "sweep": str}
+    text = {"configuration": str, "sweep": str, "by": str, "group": str}
     table = pd.read_csv(path, dtype=text, na_values=[""], keep_default_na=False)
     return unquote_names(table.fillna({name: "" for name in text if name in table}), [n for n in text if n in table])

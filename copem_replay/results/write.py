@@ -131,6 +131,7 @@ def fill_place(
     *,
     exporters: Sequence[Exporter],
     skipped: Sequence[tuple[File, str]] = (),
+    label: str | None = None,
 ) -> list[str]:
     """Write results into a place that is locked. Returns notes for the user. Raises OutputError.
 
@@ -148,6 +149,7 @@ def fill_place(
         files = [name for name in files if name not in place.left_out]
         write_csv(_logs_table(place.folder, study, skipped), place.new / "logs.csv")
         provenance = build_provenance(study, skipped, notes) | {"files": files}
+        provenance |= {"label": label} if label is not None else {}
         (place.new / MARK).write_text(json.dumps(provenance, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
         place.finish(files)
     except OSError as error:
@@ -175,6 +177,7 @@ def list_results(
     """
     files = [EXPERIMENT, MARK, "summary.csv", "logs.csv", *tables]
     files += ["exact.parquet"] * experiment.measure.exact + ["sweep.csv"] * any(True for _ in list_points(experiment))
+    files += ["summary_by.csv"] * bool(experiment.measure.by)
     files += [name for name in COMPARED_FILES if experiment.measure.accuracy]
     files += ["bands.csv"] * experiment.measure.accuracy
     for log in choose_logs(experiment, [recording.scene.log for recording in recordings]):
@@ -208,7 +211,7 @@ def _write_files(place: ResultsPlace, study: StudyTables) -> None:
     write_csv(study.summary, scratch / "summary.csv")
     if study.exact is not None:
         write_parquet(study.exact, scratch / "exact.parquet")
-    for name, table in (("bands.csv", study.bands), ("sweep.csv", study.sweep)):
+    for name, table in (("summary_by.csv", study.summary_by), ("bands.csv", study.bands), ("sweep.csv", study.sweep)):
         if table is not None:
             write_csv(table, scratch / name)
 

@@ -21,10 +21,11 @@ from numpy.typing import NDArray
 
 from copem_replay.core.colours import configuration_colours
 from copem_replay.core.errors import InputError
+from copem_replay.metrics.figure_limits import RowClusters, mean_limits
 from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_incidence, restricted_mean
 from copem_replay.report.figures import FIGURES, Selection
 from copem_replay.report.figures.answer import answer_figure
-from copem_replay.report.figures.detection_curves import RowClusters, curves_figure, mean_limits
+from copem_replay.report.figures.detection_curves import curves_figure
 from copem_replay.report.figures.differences import differences_figure
 from copem_replay.report.figures.selection import choose_object_and_run, find_differing, find_most_telling
 from copem_replay.report.figures.style import (

@@ -31,9 +31,10 @@ from copem_replay.core.errors import InputError
 from copem_replay.experiment.file import log_paths, read_experiment_file
 from copem_replay.experiment.validate import find_problems, read_logs
 from copem_replay.metrics.columns import TABLES
+from copem_replay.metrics.figure_limits import RowClusters, incidence_limits
 from copem_replay.metrics.intervals import choose_clusters
 from copem_replay.metrics.survival import DETECTED, LEFT, cumulative_incidence
-from copem_replay.report.figures.detection_curves import RowClusters, curves_figure, incidence_limits
+from copem_replay.report.figures.detection_curves import curves_figure
 from copem_replay.report.figures.distances import FAIL, KINDS, NEUTRAL, PASS, Strip, distances_figure
 from copem_replay.report.figures.latency_breakdown import latency_breakdown_figure
 from copem_replay.report.figures.registry import write_figure_files

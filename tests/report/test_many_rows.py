@@ -12,12 +12,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from copem_replay.metrics.figure_limits import cluster_rows, detection_endings, mean_limits
 from copem_replay.metrics.intervals import choose_clusters
 from copem_replay.metrics.summary import DETECTED, tally_rows
 from copem_replay.pipeline.expansion import find_facts
 from copem_replay.report import write_html_report
 from copem_replay.report.figures import Selection
-from copem_replay.report.figures.detection_curves import build_curve, cluster_rows, detection_endings, mean_limits
+from copem_replay.report.figures.detection_curves import build_curve
 from copem_replay.report.figures.latency_breakdown import (
     FUSION,
     HIDDEN,
@@ -147,7 +148,7 @@ def test_counts_say_what_rows_say(rows: pd.DataFrame) -> None:
     if banded:
         limits = []
         for of, its in zip((counted, each), clusters, strict=True):
-            time_s, ending, runs = detection_endings(of)
+            (time_s, ending), runs = detection_endings(of), of["runs"].to_numpy()
             assert its is not None
             limits.append(mean_limits(time_s, ending, its, 4.0, runs))
         assert (limits[0] is None) == (limits[1] is None)

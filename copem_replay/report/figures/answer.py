@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from copem_replay.metrics.figure_limits import cluster_rows, detection_endings, mean_limits
 from copem_replay.metrics.intervals import choose_clusters
-from copem_replay.report.figures.detection_curves import cluster_rows, detection_endings, mean_limits
 from copem_replay.report.figures.style import (
     RANKED_BY,
     ROW_IN,
@@ -86,7 +86,7 @@ def _time_dots(results: Results, names: Sequence[str]) -> tuple[list[Dot], list[
         if over is not None and not (over == "runs" and results.facts[name].fixed):
             rows_of_name = results.known["configuration"] == name
             of_name = results.known[rows_of_name]
-            time_s, ending, runs = detection_endings(of_name)
+            (time_s, ending), runs = detection_endings(of_name), of_name["runs"].to_numpy()
             clusters = cluster_rows(of_name, over, cluster[rows_of_name])
             limits = mean_limits(np.round(time_s, 9), ending, clusters, horizon_s, runs)
             reason = f"all {over} alike"

@@ -3,9 +3,7 @@
 The curves are cumulative incidences of detection (Aalen–Johansen, departure competing: `metrics/survival.py`): objects
 that are never detected keep them below 100 %.
 
-Bands are over the clusters of `summary.csv` (`metrics/intervals.py`), and at each instant the limits are those of a
-share: its variance is from the curves without each cluster, as with censoring a curve is no ratio of sums. Letters of
-the shapes: n rows, K clusters, G instants, M steps of a curve.
+Bands are those of `metrics/figure_limits.py`. Letters of the shapes: n rows, M steps of a curve.
 """
 
 from __future__ import annotations
@@ -18,26 +16,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from copem_replay.core.tracks import Float, Int
-from copem_replay.metrics.intervals import (
-    NOTHING_DRAWN,
-    choose_clusters,
-    exact_limits,
-    group_clusters,
-    limit_figure,
-    share_variance,
-    spread_share,
-)
-from copem_replay.metrics.survival import (
-    CENSORED,
-    DETECTED,
-    LEFT,
-    cumulative_incidence,
-    incidences_without,
-    is_competing,
-    restricted_mean,
-    restricted_means_without,
-)
+from copem_replay.core.tracks import Float
+from copem_replay.metrics.figure_limits import RowClusters, cluster_rows, detection_endings, incidence_limits
+from copem_replay.metrics.intervals import NOTHING_DRAWN, choose_clusters
+from copem_replay.metrics.survival import cumulative_incidence
 from copem_replay.report.figures.selection import describe_left_out, find_differing
 from copem_replay.report.figures.style import (
     Appearance,
@@ -58,81 +40,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from copem_replay.results.read import Results
-
-
-# Bands.
-
-_SAME_S = 1e-9
-"""Means this close are equal: times are whole nanoseconds."""
-
-
-@dataclass(frozen=True)
-class RowClusters:
-    """What an interval of rows (n,) is over: each row's `name` (n,), and `object` (n,), the episode it is about."""
-
-    over: str
-    name: Sequence[str]
-    object: Sequence[str]
-
-    @property
-    def number(self) -> Int:
-        """(n,) the cluster of each row, 0 … K − 1 in the order of their names."""
-        number: Int = np.unique(np.asarray(self.name, dtype=str), return_inverse=True)[1]
-        return number
-
-    @property
-    def weights(self) -> Float:
-        """(K,) objects of each cluster; runs count one each."""
-        number = self.number
-        if self.over == "runs":
-            return np.ones(int(number.max()) + 1)
-        pairs = np.unique(np.stack([number, np.unique(np.asarray(self.object), return_inverse=True)[1]]), axis=1)
-        return np.bincount(pairs[0]).astype(float)
-
-
-def cluster_rows(rows: pd.DataFrame, over: str, cluster: pd.Series) -> RowClusters:
-    """The clusters of a configuration's rows (n,), from `choose_clusters`."""
-    return RowClusters(over, list(cluster), list(rows["log"].astype(str) + "\n" + rows["object_id"].astype(str)))
-
-
-def incidence_limits(
-    time_s: Float, ending: Int, clusters: RowClusters, at_s: Float, runs: Int | None = None
-) -> tuple[Float, Float]:
-    """Lower and upper limits (G,) of the cumulative incidence at instants (G,), ascending.
-
-    `time_s` (n,), `ending` (n,) as in `cumulative_incidence`; `runs` (n,): how often each row counts, None: once.
-    """
-    runs = np.ones(len(time_s), dtype=np.int64) if runs is None else runs
-    times_s, incidence = cumulative_incidence(time_s, ending, runs.astype(float))
-    share = np.append(0.0, incidence)[np.searchsorted(times_s, at_s, side="right")]
-    weights = clusters.weights
-    if clusters.over == "runs":
-        return exact_limits(share * len(weights), float(len(weights)))
-    group = group_clusters(len(weights))
-    of_group, row_group = np.bincount(group, weights).astype(float), group[clusters.number]
-    without = incidences_without(time_s, ending, runs.astype(float), row_group, len(of_group), at_s).T
-    residual = (of_group.sum() - of_group) * (share[:, None] - without)
-    variance = share_variance(residual, np.broadcast_to(of_group, residual.shape))
-    return spread_share(share, variance, np.broadcast_to(weights, (len(share), len(weights))))
-
-
-def mean_limits(
-    time_s: Float, ending: Int, clusters: RowClusters, horizon_s: float, runs: Int | None = None
-) -> tuple[float, float] | None:
-    """Limits of the restricted mean of times (n,) at a horizon; None if it is the same without any cluster, or if there
-    are fewer than two. Arguments as in `incidence_limits`.
-    """
-    weight = np.ones(len(time_s)) if runs is None else runs.astype(float)
-    group = group_clusters(len(clusters.weights))
-    weights = np.bincount(group, clusters.weights).astype(float)
-    if len(weights) < 2:
-        return None
-    mean_s = restricted_mean(*cumulative_incidence(time_s, ending, weight), horizon_s)
-    without = restricted_means_without(time_s, ending, weight, group[clusters.number], len(weights), horizon_s)
-    if np.abs(without - mean_s).max() <= _SAME_S:
-        return None
-    low, high = limit_figure(mean_s, without, weights, (min(0.0, float(time_s.min())), horizon_s))
-    return float(low), float(high)
 
 
 # Curves.
@@ -181,18 +88,6 @@ def curves_figure(results: Results, *, configurations: Sequence[str] | None = No
         return figure
 
 
-def detection_endings(rows: pd.DataFrame) -> tuple[Float, Int, Int]:
-    """Time (n,) from onset to detection or end of the episode, kind of ending (n,) and number of runs (n,).
-
-    `rows`: of `Results.known`.
-    """
-    detected = rows["time_to_detection_s"].notna().to_numpy()
-    looked_s = (rows["ended_s"] - rows["onset_s"]).to_numpy(dtype=float)
-    time_s = np.where(detected, rows["time_to_detection_s"].to_numpy(dtype=float), looked_s)
-    ending = np.where(detected, DETECTED, np.where(is_competing(rows["ended_by"]), LEFT, CENSORED))
-    return time_s, ending, rows["runs"].to_numpy()
-
-
 def build_curves(
     results: Results, names: Sequence[str], *, bands: bool = True
 ) -> tuple[str | None, dict[str, DetectionCurve]]:
@@ -214,7 +109,7 @@ def build_curve(rows: pd.DataFrame, clusters: RowClusters | None) -> DetectionCu
     """The curve of one configuration's rows (n,), with a band over their clusters if there are any."""
     if not len(rows):
         return DetectionCurve(np.empty(0), np.empty(0))
-    time_s, ending, runs = detection_endings(rows)
+    (time_s, ending), runs = detection_endings(rows), rows["runs"].to_numpy()
     times_s, share = cumulative_incidence(time_s, ending, runs.astype(float))
     if clusters is None or not len(times_s):
         return DetectionCurve(times_s, share)

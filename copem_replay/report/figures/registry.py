@@ -18,6 +18,7 @@ from copem_replay.report.figures.differences import differences_figure, no_diffe
 from copem_replay.report.figures.distances import distances_about, distances_figure
 from copem_replay.report.figures.latency_breakdown import latency_breakdown_figure, no_stages
 from copem_replay.report.figures.selection import Selection, choose_object_and_run
+from copem_replay.report.figures.slices import slices_figure
 from copem_replay.report.figures.style import METADATA, check_summary, render_figure
 from copem_replay.report.figures.sweeps import sweeps_figure
 from copem_replay.report.figures.trade_off import no_trade_off, trade_off_figure
@@ -120,6 +121,12 @@ FIGURES: dict[str, FigureKind] = {
         "mean duration of the stages from the start of the clock to detection, a bar per configuration",
         lambda results, of: latency_breakdown_figure(results, configurations=of.configurations),
         missing=lambda results, of: no_stages(results, results.chosen(of.configurations)),
+    ),
+    "slices": FigureKind(
+        "Which drive, which class",
+        "mean time to detection by group, a row per group and a column per configuration, darker is later",
+        lambda results, of: slices_figure(results, of.sliced, configurations=of.configurations, linked=of.linked),
+        missing=lambda results, of: "" if of.sliced is None else None,
     ),
     "sweeps": FigureKind(
         "At other values",

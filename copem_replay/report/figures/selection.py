@@ -33,7 +33,8 @@ _NAMED = 12
 class Selection:
     """What figures show. None: all configurations; log, object and run as in `choose_object_and_run`.
 
-    `differences`: to a baseline, computed before; None: to the default baseline.
+    `differences`: to a baseline, computed before; None: to the default baseline. `sliced`: rows of `summary_by.csv`;
+    None: there are none. `linked`: whether groups are links to parts of the page that the figure is on.
     """
 
     configurations: Sequence[str] | None = None
@@ -41,6 +42,8 @@ class Selection:
     object_id: str | None = None
     run: int | None = None
     differences: Comparison | None = None
+    sliced: pd.DataFrame | None = None
+    linked: bool = False
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,7 @@ from copem_replay.report.html.setup import (
     describe_setting,
     provenance_tables,
 )
+from copem_replay.report.html.slices import group_tables
 from copem_replay.report.html.study import ReportData, load_study
 from copem_replay.report.html.tables import (
     baseline_words,
@@ -88,15 +89,17 @@ def check_report(path: Path) -> None:
         raise OutputError(f"{path}: expected a name that ends with {' or '.join(_SUFFIXES)}, found {found}")
 
 
-def write_html_report(given: Path | Results, out: Path | None = None, *, baseline: str | None = None) -> Path:
+def write_html_report(
+    given: Path | Results, out: Path | None = None, *, baseline: str | None = None, by: Sequence[str] | None = None
+) -> Path:
     """Write the report of results, or of a results folder, by default as `report.html` in it. Returns its path.
 
-    An existing report is replaced. Raises InputError if the results cannot be read, OutputError if the file cannot be
-    written.
+    `by`: entries of slices, None: those of the experiment. An existing report is replaced. Raises InputError if the
+    results cannot be read, OutputError if the file cannot be written.
     """
     path = out or (given.require_folder() if isinstance(given, Results) else given) / REPORT
     check_report(path)
-    study = load_study(given, baseline)
+    study = load_study(given, baseline, by)
     html = build_page(study)
     with atomic_file(path) as scratch:
         scratch.write_text(html, encoding="utf-8", newline="\n")
@@ -128,7 +131,7 @@ def figure_element(name: str, figure: Figure, title: str, shows: str) -> Html:
 
 
 _ANSWER, _DIFFERENCES = "answer", "differences"
-_BELOW = {"latency_breakdown": stage_table}
+_BELOW = {"latency_breakdown": stage_table, "slices": group_tables}
 """Elements below figures."""
 
 
@@ -143,6 +146,7 @@ def build_page(study: ReportData) -> str:
     """The whole report as HTML."""
     measured = len(study.results.known) > 0
     sections = [
+        *_verdict_sections(study),
         _Section("differences-of-it", "Differences", _difference_parts(study)),
         *_figure_sections(study, ("trade_off",)),
         _Section(
@@ -174,9 +178,24 @@ def build_page(study: ReportData) -> str:
     )
 
 
+def _verdict_sections(study: ReportData) -> list[_Section]:
+    """The section of verdicts: those in the folder, else of the criteria of the experiment; none without criteria."""
+    from copem_replay.report.html.verdicts import verdicts_table
+    from copem_replay.results.judge import judge_own_criteria
+    from copem_replay.results.verdicts import find_verdicts
+
+    folder = study.results.folder
+    verdicts = (find_verdicts(folder) if folder is not None else None) or judge_own_criteria(study.results)
+    return [] if verdicts is None else [_Section("criteria", "Good enough?", [verdicts_table(verdicts)])]
+
+
 def _embed_figure(study: ReportData, name: str) -> Html:
     kind = FIGURES[name]
-    return figure_element(name, kind.draw(study.results, Selection(differences=study.regret)), kind.title, kind.shows)
+    return figure_element(name, kind.draw(study.results, _select(study)), kind.title, kind.shows)
+
+
+def _select(study: ReportData) -> Selection:
+    return Selection(differences=study.regret, sliced=study.sliced, linked=True)
 
 
 def _difference_parts(study: ReportData) -> list[Html]:
@@ -190,7 +209,7 @@ def _figure_sections(study: ReportData, names: Sequence[str]) -> Iterator[_Secti
     """A section per figure that needs no recording, with the reason in place of a figure that cannot be drawn."""
     for name in names:
         kind = FIGURES[name]
-        reason = "" if kind.needs_recording else kind.missing(study.results, Selection())
+        reason = "" if kind.needs_recording else kind.missing(study.results, _select(study))
         if reason == "" or not len(study.results.known):
             continue
         if reason is not None:

@@ -25,6 +25,7 @@ from copem_replay.report.figures.style import (
 )
 from copem_replay.results.compare import Comparison, compare_folders
 from copem_replay.results.read import Results, read_results
+from copem_replay.results.slices import summarise_slices
 
 
 def find_ties(best: str, names: Sequence[str], results: Results) -> tuple[str, ...]:
@@ -63,7 +64,8 @@ class ReportData:
     """Results with their comparisons.
 
     `baseline`: None if there is nothing to compare; `regret`: the differences to it. `best`: the contender that detects
-    soonest, None if no object is measured; `lead`: the differences of the other contenders to it.
+    soonest, None if no object is measured; `lead`: the differences of the other contenders to it. `sliced`: rows of
+    `summary_by.csv`, None: there are none.
     """
 
     results: Results
@@ -71,6 +73,7 @@ class ReportData:
     regret: Comparison | None
     best: str | None
     lead: Comparison | None
+    sliced: pd.DataFrame | None = None
 
     @property
     def provenance(self) -> Mapping[str, Any]:
@@ -102,10 +105,11 @@ class ReportData:
         return self.results.summary.set_index("configuration").loc[name]
 
 
-def load_study(given: Path | Results, baseline: str | None = None) -> ReportData:
+def load_study(given: Path | Results, baseline: str | None = None, by: Sequence[str] | None = None) -> ReportData:
     """Compare the configurations of results, or of a results folder, with a baseline.
 
-    None: that of `compare`. Raises InputError: no or damaged results, no such baseline.
+    None: that of `compare`. `by`: entries of slices, None: those of the experiment. Raises InputError: no or damaged
+    results, no such baseline.
     """
     results = given if isinstance(given, Results) else read_results(given, rowless=True)
     check_summary(results)
@@ -114,10 +118,11 @@ def load_study(given: Path | Results, baseline: str | None = None) -> ReportData
         raise InputError(f"--baseline: {unknown_name_message('configuration', baseline, names)}")
     if not len(results.known):
         return ReportData(results, None, None, None, None)
+    sliced = summarise_slices(results, by)
     ranked = find_contenders(results)
     best = sort_soonest_first(results, ranked)[0]
     if len(names) < 2:
-        return ReportData(results, None, None, best, None)
+        return ReportData(results, None, None, best, None, sliced)
     regret = compare_folders([results], baseline=baseline)
     lead = None
     if len(ranked) > 1:
@@ -126,4 +131,4 @@ def load_study(given: Path | Results, baseline: str | None = None) -> ReportData
             if best == regret.baseline and ranked == names
             else compare_folders([results], configurations=ranked, baseline=best, metrics=(RANKED_BY,))
         )
-    return ReportData(results, regret.baseline, regret, best, lead)
+    return ReportData(results, regret.baseline, regret, best, lead, sliced)

@@ -7,7 +7,7 @@ Logs are read one by one, so that no rows are kept but their sums.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -17,8 +17,16 @@ import pandas as pd
 from copem_replay.core.errors import InputError, count_noun
 from copem_replay.core.tracks import SAME_INSTANT_S
 from copem_replay.metrics.columns import COMPARISON
-from copem_replay.metrics.intervals import FEWEST_CLUSTERS, FEWEST_LOGS, NOT_ENOUGH, choose_over, explain_no_clusters
+from copem_replay.metrics.intervals import (
+    CONFIDENCE,
+    FEWEST_CLUSTERS,
+    FEWEST_LOGS,
+    NOT_ENOUGH,
+    choose_over,
+    explain_no_clusters,
+)
 from copem_replay.metrics.summary_metrics import COMPARED
+from copem_replay.results.compare.groups import EpisodeGroups, without_limits_over_runs
 from copem_replay.results.compare.labels import (
     LabelledConfiguration,
     check_comparable,
@@ -77,12 +85,14 @@ class AllLogs:
         regrets: Sequence[Regret],
         *,
         more: bool,
+        over_runs: bool = False,
     ) -> None:
-        """Add a log with its regrets. `more`: there are other logs."""
+        """Add a log with its regrets. `more`: there are other logs. `over_runs`: intervals are over runs."""
         self.alone.append((int((first.there & ~second.there).sum()), int((second.there & ~first.there).sum())))
         for regret in regrets:
             # Runs stay apart for a single object: they are the clusters if no log has another.
-            figure = regret.figure.condensed(runs=regret.objects[0] <= 1) if more else regret.figure
+            runs = over_runs or regret.objects[0] <= 1
+            figure = regret.figure.condensed(runs=runs) if more else regret.figure
             self._regrets.setdefault(regret.metric, []).append(replace(regret, figure=figure))
 
     @property
@@ -98,6 +108,29 @@ class AllLogs:
     def regrets(self) -> Iterator[Regret]:
         """The regret of every metric over all logs."""
         return map(Regret.joined, self._regrets.values())
+
+
+@dataclass(frozen=True)
+class PairsAsked:
+    """Of which rows differences are asked, and their intervals. `episodes`: by log the object and episode of each that
+    is meant, or all of a log (None); no logs but these; None: all logs. `every`: all of these count, however they
+    began. `over_runs`: intervals are over runs of the logs.
+    """
+
+    episodes: Mapping[str, Collection[tuple[str, int]] | None] | None = None
+    every: bool = False
+    over_runs: bool = False
+    confidence: float = CONFIDENCE
+
+    def restrict(self, log: str, grid: PairingGrid, side: PairSide) -> PairSide:
+        """A side of a pair with the cells that are asked for alone; ghosts belong to whole logs."""
+        counted = (
+            side.there & (side.rows["ended_s"] - side.rows["onset_s"] > SAME_INSTANT_S) if self.every else side.counted
+        )
+        if self.episodes is None or (kept := self.episodes.get(log, ())) is None:
+            return replace(side, counted=counted)
+        asked = np.repeat(np.array([episode in kept for episode in grid.episodes], dtype=bool), grid.runs)
+        return replace(side, there=side.there & asked, counted=counted & asked, lists=None)
 
 
 # The results folders of a comparison.
@@ -201,7 +234,8 @@ class Comparison:
 
     What the columns of `table` mean: docs/reference/columns.md; null where there is none. Times are up to `horizon_s`,
     those at equal ghosts at `false_positives_per_min`. `baseline_why`: why it is the baseline, None if it was asked
-    for. `notes`: what has to be said, a line each.
+    for. `notes`: what has to be said, a line each. `groups`: a row per group, configuration and metric, with `by` and
+    `group` in place of the log; None: not asked for.
 
     >>> comparison = cr.compare("out/tc016d", baseline="PEM")
     >>> comparison.baseline, comparison.configurations
@@ -215,6 +249,7 @@ class Comparison:
     horizon_s: float
     false_positives_per_min: float | None
     notes: tuple[str, ...]
+    groups: pd.DataFrame | None = None
 
     @property
     def overall(self) -> pd.DataFrame:
@@ -229,8 +264,12 @@ def compare_folders(
     baseline: str | None = None,
     false_positives_per_min: float | None = None,
     metrics: Sequence[str] | None = None,
+    by: Sequence[str] | None = None,
+    asked: PairsAsked = PairsAsked(),
 ) -> Comparison:
     """Compare configurations (None: all) with a baseline, pair by pair, in some metrics (None: all).
+
+    `by`: entries by which each group is compared for itself, too.
 
     `baseline`: None: the configuration named `ideal`, else the ideal fusion of the same inputs, else the first that is
     not the truth. `false_positives_per_min`: at which times to detection are compared once more; None: as many as the
@@ -252,7 +291,9 @@ def compare_folders(
     horizon_s, horizon_notes = _settle_horizon(used)
     setting = PairSettings(horizon_s, float(read[0].provenance.measure["gospa"]["power"]))
     settings, reasons = _settle_ghosts(setting, against, others, totals, false_positives_per_min, asked=not own_rate)
-    pairs, rows = _compare_each_log(against, settings, ClusterNames(logs, [], runs), metrics)
+    groups = EpisodeGroups(read[0], by or ())
+    names = ClusterNames(logs, [], runs)
+    pairs, rows, of_groups = _compare_each_log(against, settings, names, metrics, groups, asked)
     table = COMPARISON.frame(rows)
     return Comparison(
         table=table,
@@ -261,6 +302,7 @@ def compare_folders(
         configurations=tuple(labelled.label for labelled in others),
         horizon_s=setting.horizon_s,
         false_positives_per_min=false_positives_per_min,
+        groups=_tabulate_groups(against, of_groups, names, groups) if by else None,
         notes=(
             *notes_on_folders(used),
             *horizon_notes,
@@ -310,12 +352,15 @@ def _compare_each_log(
     settings: Mapping[LabelledConfiguration, PairSettings],
     names: ClusterNames,
     metrics: Sequence[str] | None,
-) -> tuple[dict[LabelledConfiguration, AllLogs], list[dict[str, object]]]:
-    """The sums of each pair over the logs of `names`; rows of all logs, then of each log where there are several.
+    groups: EpisodeGroups,
+    asked: PairsAsked,
+) -> tuple[dict[LabelledConfiguration, AllLogs], list[dict[str, object]], GroupPairs]:
+    """The sums of each pair over the logs of `names`; rows of all logs, then of each log where there are several; the
+    sums of each group.
 
     The objects of the logs are appended to `names`.
     """
-    logs, pairs = names.logs, {labelled: AllLogs() for labelled in settings}
+    logs, pairs, of_groups = names.logs, {labelled: AllLogs() for labelled in settings}, GroupPairs()
     rows: list[dict[str, object]] = []
     for k, log in enumerate(logs):
         tables = {
@@ -325,28 +370,55 @@ def _compare_each_log(
         detections = (of_folder["detections.parquet"] for of_folder in tables.values())
         grid = build_grid(k, detections, names.runs, len(names.objects))
         names.objects.extend(f"{log}\n{name}" for name in grid.objects)
-        second = lay_out_configuration(against, tables[against.results], grid)
+        second = asked.restrict(log, grid, lay_out_configuration(against, tables[against.results], grid))
         for labelled, pair in pairs.items():
-            first = lay_out_configuration(labelled, tables[labelled.results], grid)
+            first = asked.restrict(log, grid, lay_out_configuration(labelled, tables[labelled.results], grid))
             _check_same_episodes(labelled, first, against, second, log, grid)
             _check_same_frames(labelled, first, against, second, log)
             regrets = list(compute_regrets(first, second, grid, settings[labelled], metrics))
-            pair.add(first, second, regrets, more=len(logs) > 1)
+            pair.add(first, second, regrets, more=len(logs) > 1, over_runs=asked.over_runs)
             for regret in regrets if len(logs) > 1 else ():
                 values = regret.figure.values()
                 pair.differences.setdefault(regret.metric, []).append(values[2])
-                rows.append({"log": log, **_make_row(regret, values, labelled, against, names)})
-    return pairs, [*_overall_rows(against, pairs, names), *rows]
+                rows.append({"log": log, **_make_row(regret, values, labelled, against, names, asked)})
+            for group, kept in groups.select(log, grid):
+                one, other = (groups.restrict(group, kept, side) for side in (first, second))
+                regrets = list(compute_regrets(one, other, grid, settings[labelled], metrics))
+                of_pair = of_groups.setdefault(group, {}).setdefault(labelled, AllLogs())
+                of_pair.add(one, other, regrets, more=len(logs) > 1)
+    return pairs, [*_overall_rows(against, pairs, names, asked), *rows], of_groups
+
+
+GroupPairs = dict[int, dict[LabelledConfiguration, AllLogs]]
+"""Sums of pairs by group."""
+
+
+def _tabulate_groups(
+    against: LabelledConfiguration, of_groups: GroupPairs, names: ClusterNames, groups: EpisodeGroups
+) -> pd.DataFrame:
+    """The rows of `Comparison.groups`."""
+    rows = [
+        {"by": by.label, "group": group, **without_limits_over_runs(row)}
+        for k, (by, group) in enumerate(groups.named)
+        for row in _overall_rows(against, of_groups.get(k, {}), names)
+    ]
+    table = COMPARISON.frame(rows).drop(columns="log")
+    for place, name in enumerate(("by", "group")):
+        table.insert(place, name, pd.Series([row[name] for row in rows], dtype=object))
+    return table
 
 
 def _overall_rows(
-    against: LabelledConfiguration, pairs: Mapping[LabelledConfiguration, AllLogs], names: ClusterNames
+    against: LabelledConfiguration,
+    pairs: Mapping[LabelledConfiguration, AllLogs],
+    names: ClusterNames,
+    asked: PairsAsked = PairsAsked(),
 ) -> Iterator[dict[str, object]]:
     """The rows of all logs. Of intervals over logs: how many logs are better, and on which the difference hangs."""
     for labelled, pair in pairs.items():
         for regret in pair.regrets():
             values = regret.figure.values()
-            row = {"log": ALL, **_make_row(regret, values, labelled, against, names)}
+            row = {"log": ALL, **_make_row(regret, values, labelled, against, names, asked)}
             if row.get("interval_over") == "logs":
                 row["logs_better"] = pair.count_better(regret.metric)
                 if (decisive := find_decisive_log(regret.figure, values[2], names)) is not None:
@@ -416,9 +488,11 @@ def _make_row(
     labelled: LabelledConfiguration,
     against: LabelledConfiguration,
     names: ClusterNames,
+    asked: PairsAsked,
 ) -> dict[str, object]:
     """The row of a regret with its `values`, of one log or all."""
-    figure, over, (value, baseline_value, difference) = regret.figure, regret.over, values
+    figure, (value, baseline_value, difference) = regret.figure, values
+    over = "runs" if asked.over_runs else regret.over
     row: dict[str, object] = {"configuration": labelled.label, "baseline": against.label, "metric": regret.metric}
     row |= {
         "value": _number_or_none(value),
@@ -428,7 +502,7 @@ def _make_row(
     row["difference"] = _number_or_none(difference)
     what = "fixed_verdicts" if regret.metric == "pass_share" else "fixed"
     fixed = all(getattr(side.facts, what) for side in (labelled, against))
-    row |= difference_limits(figure, difference, over, names, fixed=fixed)
+    row |= difference_limits(figure, difference, over, names, fixed=fixed, confidence=asked.confidence)
     if "only" in figure.items.columns:
         only = figure.items["only"].sum(axis=0)
         row |= {"only_configuration": int(only[0]), "only_baseline": int(only[1])}

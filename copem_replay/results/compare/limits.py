@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from copem_replay.core.tracks import Float, Int
 from copem_replay.metrics.intervals import (
     ALL_ALIKE,
+    CONFIDENCE,
     EXACT,
     FEWEST_CLUSTERS,
     FEWEST_LOGS,
@@ -36,11 +37,9 @@ from copem_replay.metrics.intervals import (
     MOST_GROUPS,
     NOTHING_DRAWN,
     alike_limits,
-    exact_limits,
     group_clusters,
     limit_figure,
-    limit_quantile,
-    limit_share,
+    limit_ranked_quantile,
 )
 from copem_replay.metrics.survival import (
     cumulative_incidence,
@@ -211,18 +210,20 @@ class PairStatistic(ABC):
         """The least and the most that the difference can be."""
         return -math.inf, math.inf
 
-    def limits(self, difference: float, clusters: ClusterIndex) -> tuple[str, float, float]:
+    def limits(
+        self, difference: float, clusters: ClusterIndex, confidence: float = CONFIDENCE
+    ) -> tuple[str, float, float]:
         """The kind of the limits, and both; NaN: without some cluster there is no difference, and so no limits."""
         of = clusters.grouped
         without, weights = self.without_each(of), self.weights(of)
         if not np.isfinite(without).all():
             return JACKKNIFE, math.nan, math.nan
         if np.abs(without - difference).max() > _SAME:
-            low, high = limit_figure(difference, without, weights, self.bounds)
+            low, high = limit_figure(difference, without, weights, self.bounds, confidence)
             return JACKKNIFE, float(low), float(high)
         if not self.share:
             return ALL_ALIKE, math.nan, math.nan
-        return EXACT, *alike_limits(difference, self.weights(clusters))
+        return EXACT, *alike_limits(difference, self.weights(clusters), confidence)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -302,24 +303,15 @@ class MedianStatistic(PairStatistic):
         ]
         return np.array(medians)
 
-    def limits(self, difference: float, clusters: ClusterIndex) -> tuple[str, float, float]:
-        """Limits of the share of differences at or below a value, inverted, at `_VALUES` of them at most."""
-        cluster, n, K = clusters.of(self.items), self.items["n"].astype(float), len(clusters.names)
-        order = np.argsort(self.differences, kind="stable")
-        ranked = self.differences[order]
-        last_of = np.flatnonzero(np.append(ranked[1:] != ranked[:-1], True))
-        last_of = last_of[np.unique(np.linspace(0, len(last_of) - 1, min(len(last_of), _VALUES)).astype(int))]
-        # Rows of each cluster up to each value; of −∞, where no row needs to be, none.
-        step = np.searchsorted(last_of, np.arange(len(ranked)), side="left")
-        place = step * K + cluster[order]
-        until = np.cumsum(np.bincount(place, n[order], minlength=len(last_of) * K).reshape(-1, K), axis=0)
-        until = np.concatenate([np.zeros((1, K)), until])
-        if clusters.over == "runs":
-            low, high = exact_limits(until.sum(axis=1), until[-1].sum())
-        else:
-            objects = clusters.count_objects(self.items).sum()
-            low, high = limit_share(until, np.broadcast_to(until[-1], until.shape), objects)
-        least, most = limit_quantile(np.append(-np.inf, ranked[last_of]), low, high)
+    def limits(
+        self, difference: float, clusters: ClusterIndex, confidence: float = CONFIDENCE
+    ) -> tuple[str, float, float]:
+        """Limits of the share of differences at or below a value, inverted."""
+        cluster, n = clusters.of(self.items), self.items["n"].astype(float)
+        objects = None if clusters.over == "runs" else clusters.count_objects(self.items).sum()
+        least, most = limit_ranked_quantile(
+            self.differences, n, cluster, len(clusters.names), objects, confidence=confidence
+        )
         return (ALL_ALIKE, math.nan, math.nan) if most - least <= _SAME else (INVERTED, least, most)
 
 
@@ -372,8 +364,6 @@ def _weighted_median(values: Float, weight: Float) -> float:
 
 _SAME = 1e-9
 """Differences this close are the same: far below what any of the metrics resolves."""
-_VALUES = 2000
-"""Most values at which a median's limits are sought: they are then off by at most a two-thousandth of the rows."""
 
 
 def find_decisive_log(figure: PairStatistic, difference: float, names: ClusterNames) -> tuple[str, float] | None:
@@ -391,7 +381,13 @@ def find_decisive_log(figure: PairStatistic, difference: float, names: ClusterNa
 
 
 def difference_limits(
-    figure: PairStatistic, difference: float, over: str | None, names: ClusterNames, *, fixed: bool
+    figure: PairStatistic,
+    difference: float,
+    over: str | None,
+    names: ClusterNames,
+    *,
+    fixed: bool,
+    confidence: float = CONFIDENCE,
 ) -> dict[str, object]:
     """The columns `low`, `high`, `interval`, `interval_over` and `clusters` of a difference, as far as they exist.
 
@@ -404,7 +400,7 @@ def difference_limits(
     clusters = index_clusters(figure.items, over, names)
     if clusters is None or not (figure.by_object or over != "objects"):
         return {}
-    kind, low, high = figure.limits(difference, clusters)
+    kind, low, high = figure.limits(difference, clusters, confidence)
     if kind == ALL_ALIKE:
         return {"interval": kind}
     if not (math.isfinite(low) or math.isfinite(high)):

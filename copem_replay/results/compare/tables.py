@@ -15,6 +15,7 @@ from copem_replay.metrics.columns import TABLES
 from copem_replay.metrics.intervals import ALL_ALIKE, EXACT, NOTHING_DRAWN, describe_absent, describe_clusters
 from copem_replay.metrics.summary import describe_mean, format_table
 from copem_replay.metrics.summary_metrics import COMPARED
+from copem_replay.results.compare.groups import describe_group_chance
 from copem_replay.results.folder import add_to_made_list
 from copem_replay.results.table_files import write_csv
 
@@ -39,7 +40,28 @@ def comparison_text(comparison: Comparison, width: int | None = None) -> str:
     lines = (part for line in comparison_lines(comparison) for part in wrap_line(line, width))
     held = held_cells(comparison)
     tables = [format_table(held, width)] if len(held) else []
-    return "\n".join([format_table(_format_cells(comparison), width), *lines, *tables])
+    groups = [f"\n{table}" for table in _group_blocks(comparison, width)]
+    return "\n".join([format_table(_format_cells(comparison), width), *lines, *tables, *groups])
+
+
+def _group_blocks(comparison: Comparison, width: int | None) -> Iterator[str]:
+    """A table for each entry by which groups are compared, and how many of its intervals exclude 0."""
+    if comparison.groups is None:
+        return
+    for by, rows in comparison.groups.groupby("by", sort=False):
+        lines = (part for line in describe_group_chance(rows) for part in wrap_line(line, width))
+        yield "\n".join([format_table(_format_groups(str(by), rows), width), *lines])
+
+
+def _format_groups(by: str, rows: pd.DataFrame) -> pd.DataFrame:
+    """The differences of each group and configuration as text; metrics that have none are left out."""
+    names = [name for name in COMPARED if rows.loc[rows["metric"] == name, "difference"].notna().any()]
+    cells: list[dict[str, str]] = []
+    for (group, configuration), of_pair in rows.groupby(["group", "configuration"], sort=False):
+        found = {row.metric: row for row in of_pair.itertuples(index=False)}
+        figures = {name: _format_cell(found.get(name)) for name in names}
+        cells.append({by: str(group), "configuration": str(configuration), **figures})
+    return pd.DataFrame(cells, columns=[by, "configuration", *names])
 
 
 def comparison_markdown(comparison: Comparison) -> str:
@@ -47,6 +69,10 @@ def comparison_markdown(comparison: Comparison) -> str:
     held, notes = held_cells(comparison), (f"note: {note}" for note in comparison.notes)
     lines = [f"- {escape_markdown(line)}" for line in (*comparison_lines(comparison), *notes)]
     beside = ["", *_markdown_rows(held)] if len(held) else []
+    if comparison.groups is not None:
+        for by, rows in comparison.groups.groupby("by", sort=False):
+            chance = (f"- {escape_markdown(line)}" for line in describe_group_chance(rows))
+            beside += ["", *_markdown_rows(_format_groups(str(by), rows)), "", *chance]
     return "\n".join([*_markdown_rows(_format_cells(comparison)), "", *lines, *beside, ""])
 
 
@@ -71,7 +97,8 @@ def write_comparison(comparison: Comparison, path: Path, folders: Sequence[Path]
     check_out(path)
     with atomic_file(path) as scratch:
         if path.suffix.lower() == ".csv":
-            write_csv(comparison.table, scratch)
+            groups = [] if comparison.groups is None else [comparison.groups]
+            write_csv(pd.concat([comparison.table, *groups], ignore_index=True), scratch)
         else:
             scratch.write_text(comparison_markdown(comparison), encoding="utf-8")
         for folder in folders:

@@ -1,0 +1,87 @@
+"""Comparisons of groups: pairs of configurations over the episodes of a group alone (`metrics/slices.py`).
+
+Groups are found in the tally of the first folder, whose logs, objects and episodes all folders have in common. The
+ghosts at equal rates and the horizon are those of all groups. False positives belong to no episode: they are compared
+where groups are of whole logs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+
+from copem_replay.core.errors import count_noun
+from copem_replay.core.tracks import SAME_INSTANT_S, Bool
+from copem_replay.metrics.config import BEGAN_BY, Slice
+from copem_replay.metrics.intervals import CONFIDENCE
+from copem_replay.metrics.slices import number_groups
+from copem_replay.metrics.summary import EPISODE
+from copem_replay.results.slices import read_slices
+
+if TYPE_CHECKING:
+    from copem_replay.results.compare.pairing import PairingGrid, PairSide
+    from copem_replay.results.read import Results
+
+
+class EpisodeGroups:
+    """The groups that entries of `by` make of the episodes of results: of each its entry and its label.
+
+    Raises InputError for an entry that is none.
+    """
+
+    def __init__(self, results: Results, entries: Sequence[str]) -> None:
+        self.slices: tuple[Slice, ...] = read_slices(results, entries)
+        tags = {log.name: log.tags for log in results.provenance.logs}
+        episodes = results.tally.drop_duplicates([*EPISODE])
+        self.named: list[tuple[Slice, str]] = []
+        self._of: dict[tuple[str, str, int], list[int]] = {}
+        keys = list(zip(*(episodes[name].tolist() for name in EPISODE), strict=True))
+        for by in self.slices:
+            number, names = number_groups(episodes, by, tags)
+            for key, k in zip(keys, (number + len(self.named)).tolist(), strict=True):
+                self._of.setdefault(key, []).append(k)
+            self.named += [(by, ", ".join(values)) for values in names]
+
+    def select(self, log: str, grid: PairingGrid) -> Iterator[tuple[int, Bool]]:
+        """The groups that have episodes of a log, by their number, and which cells (N·S,) they have."""
+        of_episodes = [self._of.get((log, *episode), []) for episode in grid.episodes]
+        for k in sorted({k for of in of_episodes for k in of}):
+            yield k, np.repeat([k in of for of in of_episodes], grid.runs)
+
+    def restrict(self, k: int, kept: Bool, side: PairSide) -> PairSide:
+        """A side of a pair with the cells of a group alone; by `began` each group counts its own episodes."""
+        by, counted = self.named[k][0], side.counted
+        if by.names(BEGAN_BY):
+            counted = side.there & (side.rows["ended_s"] - side.rows["onset_s"] > SAME_INSTANT_S)
+        lists = side.lists if by.of_logs else None
+        return replace(side, there=side.there & kept, counted=counted & kept, lists=lists)
+
+
+def without_limits_over_runs(row: dict[str, object]) -> dict[str, object]:
+    """A row of a comparison, without limits over the runs of a single object: they tell of no group."""
+    if row.get("interval_over") in ("logs", "objects"):
+        return row
+    return {name: value for name, value in row.items() if name not in _LIMITS}
+
+
+_LIMITS = ("low", "high", "interval", "interval_over", "clusters")
+
+
+def describe_group_chance(table: pd.DataFrame) -> list[str]:
+    """A line for each entry: how many groups and differences were looked at, how many intervals exclude 0, and how many
+    would by chance.
+    """
+    lines = []
+    for by, rows in table.groupby("by", sort=False):
+        limited = rows[rows["interval_over"].notna()]
+        apart = int(((limited["low"] > 0) | (limited["high"] < 0)).sum())
+        lines.append(
+            f"by {by}: {count_noun(rows['group'].nunique(), 'group')} looked at; of "
+            f"{count_noun(len(limited), 'interval')} {apart} exclude 0, by chance alone at least "
+            f"{(1 - CONFIDENCE) * len(limited):.2g} would"
+        )
+    return lines

@@ -1,0 +1,520 @@
+"""Judging: criteria held against results by the intervals that `summary.csv` and `compare` print. Nothing is replayed.
+
+A criterion asked of *such traffic* is judged over drives, or over the objects of a single one, as those intervals are;
+one asked of *these logs* over the runs: what is random about these very recordings is the draws. Where nothing is
+drawn, or a figure is exact, it is known. Rows are those of the tally; of runs, of accuracy and of own metrics they are
+read log by log.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from copem_replay.core.components import ask_component
+from copem_replay.core.errors import InputError, count_noun, unknown_name_message
+from copem_replay.core.tracks import Bool, Float
+from copem_replay.experiment.criteria import Criterion, choose_judged
+from copem_replay.metrics.config import BEGAN_BY, Slice, parse_slice
+from copem_replay.metrics.figure_limits import (
+    JUDGED,
+    PER_MINUTE,
+    SUMMED,
+    FigureRows,
+    LimitedFigure,
+    RowClusters,
+    limit_sums,
+)
+from copem_replay.metrics.intervals import (
+    ALL_ALIKE,
+    NOTHING_DRAWN,
+    choose_clusters,
+    choose_over,
+    explain_no_clusters,
+)
+from copem_replay.metrics.onset import select_counted
+from copem_replay.metrics.slices import Group, StudyRows, sum_episodes
+from copem_replay.metrics.summary import CONFLICT, list_runs
+from copem_replay.results.compare.compare import PairsAsked, compare_folders
+from copem_replay.results.compare.labels import label_configurations
+from copem_replay.results.read import Results
+from copem_replay.results.slices import read_slices, read_study_rows
+from copem_replay.results.verdicts import MET, NOT_MEASURED, NOT_MET, UNDECIDED, Verdict, Verdicts, judge_limits
+
+CLOSED_FORM = "closed form"
+"""The kind of an interval of what is computed without a draw: of these logs it is known."""
+FEWEST_RUNS = 30
+"""Over fewer runs there is no interval of what several objects give."""
+
+
+@dataclass(frozen=True)
+class JudgedFigure:
+    """A figure with its limits and what these are over: `clusters` of `over`, of `n` rows; `why` there are none."""
+
+    figure: LimitedFigure
+    over: str | None = None
+    clusters: int | None = None
+    n: int = 0
+    why: str = ""
+
+
+_NO_ROW = JudgedFigure(LimitedFigure(None), why="no row")
+
+
+def judge_results(results: Results, criteria: Mapping[str, Criterion], before: Results | None = None) -> Verdicts:
+    """The verdicts of criteria, in their order, by configuration and group.
+
+    `before`: results that criteria are `against`. Raises InputError where a name does not exist in the results, where
+    `before` is missing, or where it cannot be compared.
+    """
+    study = _JudgedStudy(results, before, criteria)
+    verdicts: list[Verdict] = []
+    notes: list[str] = []
+    for name, criterion in criteria.items():
+        groups = study.find_groups(name, criterion)
+        if criterion.each is not None:
+            notes.append(f"{name}: {count_noun(len(groups), 'group')} of {study.slice_of(name, criterion).label}")
+        for configuration in choose_judged(criterion, results.experiment.configurations):
+            for group in groups:
+                found = study.measure(name, criterion, configuration, group)
+                verdicts.append(_make_verdict(name, criterion, configuration, group.label, found))
+    return Verdicts(results.name, tuple(verdicts), tuple(notes))
+
+
+def list_later(results: Results) -> list[str]:
+    """The criteria of an experiment that are against results of before."""
+    known = list(results.experiment.configurations)
+    return [
+        name
+        for name, one in results.experiment.criteria.items()
+        if one.against is not None and one.find_against("", known)[1]
+    ]
+
+
+def judge_own_criteria(results: Results) -> Verdicts | None:
+    """The verdicts of the experiment's own criteria but those against results of before; None: there are none."""
+    later = list_later(results)
+    criteria = {name: one for name, one in results.experiment.criteria.items() if name not in later}
+    return judge_results(results, criteria) if criteria else None
+
+
+def find_population(results: Results) -> str:
+    """Of what population `compare` has intervals: those over the runs of a single object are of these logs."""
+    return "these_logs" if choose_clusters(results.known)[0] == "runs" else "such_traffic"
+
+
+def _make_verdict(name: str, criterion: Criterion, configuration: str, group: str, found: JudgedFigure) -> Verdict:
+    figure = found.figure
+    word, why = _find_verdict(criterion, found)
+    passes = word == MET or (word == UNDECIDED and criterion.passes_unless_refuted)
+    other, of_before = criterion.find_against(configuration, (criterion.against or "",))
+    return Verdict(
+        criterion=name,
+        configuration=configuration,
+        group=group,
+        metric=criterion.metric,
+        against=criterion.against and (f"{other}@before" if of_before else other),
+        direction=criterion.direction,
+        bound=criterion.bound,
+        confidence=criterion.confidence,
+        population=criterion.population,
+        estimate=_finite(figure.value),
+        low=_finite(figure.low),
+        high=_finite(figure.high),
+        interval=figure.kind,
+        over=found.over,
+        clusters=found.clusters,
+        n=found.n,
+        verdict=word,
+        passes=passes or (word == NOT_MEASURED and criterion.if_absent == "pass"),
+        why=why,
+    )
+
+
+def _finite(value: float | None) -> float | None:
+    return None if value is None or not math.isfinite(value) else float(value)
+
+
+def _find_verdict(criterion: Criterion, found: JudgedFigure) -> tuple[str, str]:
+    """The word, and why."""
+    figure, bound, direction = found.figure, criterion.bound, criterion.direction
+    if figure.value is None:
+        return NOT_MEASURED, found.why or "no row has a value"
+    if figure.kind == ALL_ALIKE:
+        good = judge_limits(figure.value, figure.value, bound, direction) == MET
+        why = "the same throughout, so how it varies is not known"
+        return (UNDECIDED if good else NOT_MET), why
+    if figure.kind is None or math.isnan(figure.low) or math.isnan(figure.high):
+        return NOT_MEASURED, found.why or "no interval"
+    word = judge_limits(figure.low, figure.high, bound, direction)
+    parts = [] if figure.share is None else [_describe_share(criterion, figure.share)]
+    if word == UNDECIDED:
+        parts.append(_MORE[found.over or "logs"].format(number=found.clusters))
+    return word, "; ".join([*parts, *filter(None, [found.why])])
+
+
+_MORE = {
+    "logs": "more logs would decide ({number} now)",
+    "objects": "other drives would decide; {number} objects of one drive now",
+    "runs": "more runs would decide ({number} now)",
+}
+_LEVELS = {"p5": 0.05, "median": 0.5, "p95": 0.95}
+
+
+def _describe_share(criterion: Criterion, share: tuple[float, float]) -> str:
+    """What is known of the share that a quantile is held by: `93.1 … 97 % known by 0.5 s, 95 % wanted`."""
+    level = next(_LEVELS[part] for part in criterion.metric.split("_") if part in _LEVELS)
+    limits = f"{100 * share[0]:.3g} … {100 * share[1]:.3g} %"
+    if "dad" in criterion.metric:
+        return f"{limits} known at {criterion.bound:g} m or farther, {100 * (1 - level):g} % wanted"
+    return f"{limits} known by {criterion.bound:g} s, {100 * level:g} % wanted"
+
+
+# What is judged: rows of a study or of some of its episodes.
+
+
+@dataclass(frozen=True, eq=False)
+class _JudgedGroup:
+    """Rows that a criterion is about. `label`: of the group of a slice, else empty.
+
+    `episodes`: by log those that are kept, None: all of them; None: of all logs. `every`: they count however they
+    began. `made`: tables and rows that were made of them.
+    """
+
+    label: str
+    rows: StudyRows
+    episodes: Mapping[str, frozenset[tuple[str, int]] | None] | None = None
+    every: bool = False
+    made: dict[Any, Any] = field(default_factory=dict)
+
+
+class _JudgedStudy:
+    """Results with their rows, each read once, and the pairs that criteria are against."""
+
+    def __init__(self, results: Results, before: Results | None, criteria: Mapping[str, Criterion]) -> None:
+        self.results, self.before, self.criteria = results, before, criteria
+        self._groups: dict[Any, list[_JudgedGroup]] = {}
+        self._pairs: dict[Any, pd.DataFrame] = {}
+
+    @property
+    def _of_rows(self) -> bool:
+        """Whether a criterion needs more than the tally has."""
+        known = (*JUDGED, *PER_MINUTE)
+        return any(one.against is None and one.metric not in known for one in self.criteria.values())
+
+    @cached_property
+    def traffic(self) -> StudyRows:
+        """The rows of all runs together."""
+        return read_study_rows(self.results, sums=self._of_rows)
+
+    @cached_property
+    def runs(self) -> StudyRows:
+        """The rows run by run, those of the tally with a column `run`."""
+        tables, sums = [], []
+        own = self.traffic.settings.own
+        for log in self.results.rows.logs:
+            (rows,) = self.results.each(log=log, every=True)
+            rows = rows.assign(log=log)
+            tables.append(list_runs(rows))
+            if self._of_rows:
+                sums.append(sum_episodes(rows, own, self.traffic.settings.words, "run"))
+        tally = pd.concat(tables, ignore_index=True) if tables else self.traffic.tally
+        lists = self.traffic.lists
+        if lists is not None:
+            lists = self.results.frame("lists.parquet")
+        summed = pd.concat(sums, ignore_index=True) if sums else self.traffic.sums
+        return replace(self.traffic, tally=tally, sums=summed, lists=lists)
+
+    # Which rows.
+
+    def slice_of(self, name: str, criterion: Criterion) -> Slice:
+        """The slice that a criterion names. Raises InputError where it cannot be of these results."""
+        entry: Any = criterion.each if criterion.by is None else list(criterion.by)
+        (by,) = read_slices(self.results, [parse_slice(entry).label], f"criteria.{name}")
+        return by
+
+    def find_groups(self, name: str, criterion: Criterion) -> list[_JudgedGroup]:
+        """The rows that a criterion is about, in groups where it says `each`."""
+        narrowed = criterion.model_dump_json(include={"objects", "logs", "by", "each", "population"})
+        if narrowed not in self._groups:
+            self._groups[narrowed] = self._make_groups(name, criterion)
+        return self._groups[narrowed]
+
+    def _make_groups(self, name: str, criterion: Criterion) -> list[_JudgedGroup]:
+        study = self.runs if criterion.of_runs else self.traffic
+        episodes = study.episodes
+        kept, logs = self._choose_episodes(name, criterion, episodes)
+        rows = study
+        if criterion.objects is not None or criterion.logs is not None:
+            rows = study.select(kept, None if criterion.objects is not None else logs)
+        if criterion.by is None and criterion.each is None:
+            whole = rows is study
+            return [_JudgedGroup("", rows, None if whole else _list_episodes(rows, whole=criterion.objects is None))]
+        by = self.slice_of(name, criterion)
+        groups = rows.split(by)
+        if criterion.by is not None:
+            groups = [self._find_group(name, criterion.by, by, study, rows, groups)]
+        every, whole = by.names(BEGAN_BY), by.of_logs and criterion.objects is None
+        return [_JudgedGroup(one.label, one.rows, _list_episodes(one.rows, whole=whole), every) for one in groups]
+
+    def _choose_episodes(self, name: str, criterion: Criterion, episodes: pd.DataFrame) -> tuple[Bool, set[str]]:
+        """(E,) which episodes a criterion is about, and the logs. Raises InputError where no log has such a name."""
+        logs = [log.name for log in self.results.provenance.logs]
+        patterns = criterion.logs or ("*",)
+        for k, pattern in enumerate(patterns):
+            if not any(fnmatchcase(log, pattern) for log in logs):
+                raise InputError(f"criteria.{name}.logs[{k}]: {unknown_name_message('log', pattern, logs)}")
+        chosen = {log for log in logs if any(fnmatchcase(log, pattern) for pattern in patterns)}
+        kept = episodes["log"].isin(chosen).to_numpy(dtype=bool)
+        if criterion.objects is not None:
+            classes, ids = criterion.objects.expanded(), criterion.objects.ids or ()
+            column, wanted = ("object_id", set(ids)) if classes is None else ("object_class", set(classes))
+            kept = kept & episodes[column].astype(str).isin(wanted).to_numpy(dtype=bool)
+        return kept, chosen
+
+    def _find_group(
+        self, name: str, asked: Mapping[str, str], by: Slice, study: StudyRows, rows: StudyRows, groups: Sequence[Group]
+    ) -> Group:
+        """The group that `by` names, without rows where the chosen rows have none of it."""
+        values = tuple(map(str, asked.values()))
+        if found := [one for one in groups if one.values == values]:
+            return found[0]
+        for k, (key, value) in enumerate(asked.items()):
+            known = sorted({one.values[k] for one in study.split(by)})
+            if value not in known and not key.startswith(("class", "began")):
+                raise InputError(f"criteria.{name}.by.{key}: {unknown_name_message('group', value, known)}")
+        nothing = rows.select(np.zeros(len(rows.episodes), dtype=bool))
+        return Group(by, values, nothing)
+
+    # Figures.
+
+    def measure(self, name: str, criterion: Criterion, configuration: str, group: _JudgedGroup) -> JudgedFigure:
+        """The figure of a configuration with its limits."""
+        if criterion.against is not None:
+            return self._measure_difference(name, criterion, configuration, group)
+        metric = criterion.metric
+        if metric in JUDGED:
+            return self._measure_rows(criterion, configuration, group)
+        if metric in PER_MINUTE:
+            return self._measure_lists(criterion, configuration, group)
+        return self._measure_sums(criterion, configuration, group)
+
+    def _measure_rows(self, criterion: Criterion, configuration: str, group: _JudgedGroup) -> JudgedFigure:
+        judged, settings = JUDGED[criterion.metric], group.rows.settings
+        kind = judged.rows
+        key = kind, configuration
+        if key not in group.made:
+            group.made[key] = self._make_figure_rows(group, kind, configuration, of_runs=criterion.of_runs)
+        made: tuple[FigureRows | None, JudgedFigure] = group.made[key]
+        rows, about = made
+        if rows is None:
+            return about
+        figure = judged.limit(rows, settings.horizon_s, criterion.confidence, criterion.bound)
+        if about.figure.kind is not None and figure.value is not None:  # it is known
+            figure = LimitedFigure(figure.value, figure.value, figure.value, about.figure.kind)
+        return replace(about, figure=figure)
+
+    def _make_figure_rows(
+        self, group: _JudgedGroup, kind: str, configuration: str, *, of_runs: bool
+    ) -> tuple[FigureRows | None, JudgedFigure]:
+        """The rows of a kind with their clusters; without rows None. What is known beforehand of their figures."""
+        study, exact = group.rows, kind.startswith("exact")
+        table = self._split_table(group, "exact" if exact else kind).get(configuration)
+        if table is None or not len(table):
+            return None, _NO_ROW
+        if kind.endswith("braking"):
+            table = table[table["conflict" if exact else "in_conflict"]]
+        if not len(table):
+            return None, replace(_NO_ROW, why="no object is in conflict")
+        weight = table["probability" if exact else "runs"].to_numpy(dtype=float)
+        n = round(float(weight.sum()))
+        fixed = study.settings.fixed_verdicts if kind == "braking" else study.settings.fixed
+        if of_runs and (exact or configuration in fixed):
+            known = LimitedFigure(None, kind=CLOSED_FORM if exact else NOTHING_DRAWN)
+            return FigureRows(table, weight, None), JudgedFigure(known, n=n)
+        clusters, why = find_clusters(table, of_runs=of_runs)
+        runs = float(self.results.provenance.runs)
+        least = 1.0 / max(n * runs, 1.0) if exact else 1e-12
+        about = JudgedFigure(LimitedFigure(None), n=n, why=why)
+        if clusters is not None:
+            about = replace(about, over=clusters.over, clusters=len(clusters.weights))
+        return FigureRows(table, weight, clusters, least), about
+
+    def _split_table(self, group: _JudgedGroup, kind: str) -> dict[str, pd.DataFrame]:
+        """By configuration the rows of a group that count."""
+        study = group.rows
+        name = "detected" if kind == "braking" else kind
+        if name not in group.made:
+            if name == "exact":
+                assert study.exact is not None
+                table = select_counted(study.exact, study.settings.words)
+                table = table[table["probability"] > 0]
+            elif name == "conflict":
+                table = study.counted[study.counted["event"] == CONFLICT]
+            else:
+                table = study.detections
+            group.made[name] = {str(one): part for one, part in table.groupby("configuration", sort=False)}
+        split: dict[str, pd.DataFrame] = group.made[name]
+        return split
+
+    def _measure_sums(self, criterion: Criterion, configuration: str, group: _JudgedGroup) -> JudgedFigure:
+        """A metric of accuracy, or an own one, from sums by episode."""
+        metric, sums = criterion.metric, group.rows.sums
+        own = {one.name: one for one in group.rows.settings.own}
+        names = [name for name in sums if name.startswith(f"{metric} ")]
+        ratio = SUMMED.get(metric)
+        over = "counted_rows" if ratio is None else ratio.over
+        columns = names if ratio is None else [ratio.sum, ratio.over]
+        if over not in sums:
+            return replace(_NO_ROW, why="accuracy is not measured")
+        sums = sums[(sums["configuration"] == configuration) & (sums[over] > 0)]
+        if not len(sums):
+            return replace(_NO_ROW, why="no row has it")
+
+        def of_own(totals: Float) -> float:
+            given = {name.partition(" ")[2]: float(total) for name, total in zip(names, totals, strict=True)}
+            value = ask_component(own[metric], f"measure.metrics ({metric})", lambda: own[metric].value(given))
+            return math.nan if value is None else float(value)
+
+        of = of_own if ratio is None else ratio.value_of
+        return self._limit_sums(criterion, configuration, sums, columns, of)
+
+    def _limit_sums(
+        self,
+        criterion: Criterion,
+        configuration: str,
+        rows: pd.DataFrame,
+        columns: Sequence[str],
+        of: Any,
+        weighed_by: int | None = None,
+    ) -> JudgedFigure:
+        clusters, why = None, ""
+        fixed = criterion.of_runs and configuration in self.traffic.settings.fixed
+        if not fixed:
+            clusters, why = find_clusters(rows, of_runs=criterion.of_runs)
+        values = rows[list(columns)].to_numpy(dtype=float)
+        figure = limit_sums(values, of, clusters, criterion.confidence, weighed_by)
+        if fixed and figure.value is not None:
+            figure = LimitedFigure(figure.value, figure.value, figure.value, NOTHING_DRAWN)
+        if clusters is None:
+            return JudgedFigure(figure, n=len(rows), why=why)
+        return JudgedFigure(figure, clusters.over, len(clusters.weights), len(rows), why)
+
+    def _measure_lists(self, criterion: Criterion, configuration: str, group: _JudgedGroup) -> JudgedFigure:
+        """False entries per minute, which belong to whole logs."""
+        lists = group.rows.lists
+        if lists is None:
+            why = "accuracy is not measured" if self.traffic.lists is None else "false entries belong to whole logs"
+            return replace(_NO_ROW, why=why)
+        lists = lists[lists["configuration"] == configuration].assign(object_id="")
+        if not len(lists):
+            return _NO_ROW
+        columns = (PER_MINUTE[criterion.metric], "minutes")
+        return self._limit_sums(criterion, configuration, lists, columns, lambda of: of[..., 0] / of[..., 1], 1)
+
+    # Differences.
+
+    def _measure_difference(
+        self, name: str, criterion: Criterion, configuration: str, group: _JudgedGroup
+    ) -> JudgedFigure:
+        """The difference to another configuration, of these results or of those before, pair by pair."""
+        known = list(self.results.experiment.configurations)
+        other, of_before = criterion.find_against(configuration, known)
+        if of_before and self.before is None:
+            raise InputError(f"criteria.{name}.against: {criterion.against}: give the folder with --before")
+        if of_before and self.before is not None and other not in self.before.facts:
+            hint = unknown_name_message("configuration", other, self.before.facts)
+            raise InputError(f"criteria.{name}.against: {self.before.place}: {hint}")
+        key = id(group), other, of_before, criterion.of_runs, criterion.confidence
+        if (table := self._pairs.get(key)) is None:
+            table = self._pairs[key] = self._compare(criterion, other, group, of_before=of_before)
+        rows = table[(table["configuration"] == configuration) & (table["metric"] == criterion.metric)]
+        if not len(rows):
+            return replace(_NO_ROW, why="nothing that both sides have")
+        return _difference_of(rows.iloc[0], of_runs=criterion.of_runs)
+
+    def _compare(self, criterion: Criterion, other: str, group: _JudgedGroup, *, of_before: bool) -> pd.DataFrame:
+        """The overall rows of a comparison with a configuration, in all metrics that are asked of this group.
+
+        The column `configuration` has names, not labels.
+        """
+        alike = [
+            one for one in self.criteria.values()
+            if one.against is not None
+            and (one.of_runs, one.confidence) == (criterion.of_runs, criterion.confidence)
+        ]  # fmt: skip
+        metrics = sorted({one.metric for one in alike})
+        folders = [self.results, *([self.before] if of_before and self.before is not None else [])]
+        labelled = {(one.results, one.configuration): one.label for one in label_configurations(folders)}
+        configurations = self.results.experiment.configurations
+        names = dict.fromkeys(name for one in alike for name in choose_judged(one, configurations))
+        labels = {labelled[self.results, name]: name for name in names if (self.results, name) in labelled}
+        baseline = labelled.get((folders[-1], other))
+        if baseline is None or not (chosen := [label for label in labels if label != baseline]):
+            return pd.DataFrame(columns=["configuration", "metric"])
+        asked = PairsAsked(group.episodes, group.every, criterion.of_runs, criterion.confidence)
+        comparison = compare_folders(
+            folders, configurations=chosen, baseline=baseline, metrics=metrics, asked=asked
+        )  # fmt: skip
+        return comparison.overall.assign(configuration=comparison.overall["configuration"].map(labels))
+
+
+def _difference_of(row: pd.Series, *, of_runs: bool) -> JudgedFigure:
+    n = int(row["n"])
+    if pd.isna(row["difference"]):
+        return replace(_NO_ROW, n=n, why="no pair has it")
+    value, kind = float(row["difference"]), None if pd.isna(row["interval"]) else str(row["interval"])
+    over = None if pd.isna(row["interval_over"]) else str(row["interval_over"])
+    if kind == NOTHING_DRAWN and of_runs:
+        return JudgedFigure(LimitedFigure(value, value, value, kind), n=n)
+    if over == "runs" and not of_runs:
+        return JudgedFigure(LimitedFigure(value), n=n, why=_ONE_OBJECT)
+    if kind == ALL_ALIKE:
+        return JudgedFigure(LimitedFigure(value, kind=kind), "runs" if of_runs else None, n=n)
+    if kind is None or kind == NOTHING_DRAWN:
+        return JudgedFigure(LimitedFigure(value), n=n, why=_TOO_FEW)
+    low = -math.inf if pd.isna(row["low"]) else float(row["low"])
+    high = math.inf if pd.isna(row["high"]) else float(row["high"])
+    return JudgedFigure(LimitedFigure(value, low, high, kind), over, int(row["clusters"]), n)
+
+
+_ONE_OBJECT = "one object tells nothing of other traffic; `population: these_logs` asks about this recording"
+_TOO_FEW = "too few logs, objects of one log, or runs have it for an interval"
+
+
+def _list_episodes(rows: StudyRows, *, whole: bool) -> dict[str, frozenset[tuple[str, int]] | None]:
+    """By log the episodes of rows; None: the `whole` of it."""
+    kept: dict[str, frozenset[tuple[str, int]] | None] = {}
+    for log, of_log in rows.episodes.groupby("log", sort=False):
+        pairs = zip(of_log["object_id"].astype(str), of_log["episode"].astype(int), strict=True)
+        kept[str(log)] = None if whole else frozenset(pairs)
+    return kept
+
+
+def find_clusters(table: pd.DataFrame, *, of_runs: bool) -> tuple[RowClusters | None, str]:
+    """What an interval of rows is over, or why there is none; `of_runs`: the runs, else as `choose_over` has it."""
+    log_ix, logs = pd.factorize(table["log"])
+    object_ix, objects = pd.factorize(table["object_id"])
+    episode = log_ix * max(len(objects), 1) + object_ix
+    number = len(pd.unique(episode))
+    if of_runs:
+        runs = table["run"].nunique()
+        if runs < FEWEST_RUNS and (number > 1 or runs < 2):
+            return None, f"{count_noun(runs, 'run')}, fewer than {FEWEST_RUNS}: `runs: {FEWEST_RUNS}` or more"
+        return RowClusters("runs", table["run"].to_numpy(), episode), ""
+    over = choose_over(len(logs), number)
+    if over is None:
+        return None, f"{explain_no_clusters(len(logs), number)}; {_RATHER}"
+    if over == "runs":
+        return None, _ONE_OBJECT
+    return RowClusters(over, table["log" if over == "logs" else "object_id"].to_numpy(), episode), ""
+
+
+_RATHER = "more runs do not tell how drives differ; `population: these_logs` asks about these recordings"

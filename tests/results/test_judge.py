@@ -1,0 +1,283 @@
+"""Judging: verdicts by the intervals that the summary, the curves and `compare` print; and what they may never do."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import binomtest
+
+import copem_replay as cr
+from copem_replay.metrics.figure_limits import JUDGED, PER_MINUTE, SUMMED, FigureRows, RowClusters
+from copem_replay.metrics.intervals import limit_share_of_runs
+from copem_replay.results.compare import compare_folders
+from copem_replay.results.read import Results, read_results
+from copem_replay.results.verdicts import (
+    MET,
+    NOT_MEASURED,
+    NOT_MET,
+    UNDECIDED,
+    Verdict,
+    Verdicts,
+    judge_limits,
+    verdicts_jsonl,
+)
+from tests.helpers.report_pages import changed, replayed
+
+LOGS = "logs: [drive.mcap]"
+
+
+@pytest.fixture(scope="module")
+def several(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three logs, of two objects each, six runs."""
+    logs = [f"drive{k}.mcap" for k in range(3)]
+    return replayed(tmp_path_factory.mktemp("several"), changed((LOGS, f"logs: [{', '.join(logs)}]")), *logs)
+
+
+def judged(folder: Path | Results, *, before: Path | None = None, **criterion: Any) -> dict[str, Verdict]:
+    """Verdicts of one criterion, by configuration and group."""
+    verdicts = cr.judge(folder, {"it": criterion}, before=before).all
+    return {f"{one.configuration}/{one.group}" if one.group else one.configuration: one for one in verdicts}
+
+
+# ------------------------------------------------------------------------------------ as printed elsewhere
+
+
+def measured(summary: pd.DataFrame) -> list[str]:
+    return [name for name in (*JUDGED, *SUMMED, *PER_MINUTE) if name in summary]
+
+
+def test_every_figure_is_that_of_the_summary(several: Path) -> None:
+    summary = read_results(several).summary.set_index("configuration")
+    names = measured(summary)
+    assert len(names) > 20
+    for name in names:
+        for configuration, verdict in judged(several, metric=name, at_most=1.0).items():
+            expected = summary.loc[configuration, name]
+            if pd.isna(expected):
+                assert verdict.estimate is None, name
+            else:
+                assert verdict.estimate == pytest.approx(float(expected), abs=1e-9), (name, configuration)
+
+
+@pytest.mark.parametrize("share", ["detected_share", "pass_share"])
+def test_limits_of_shares_are_those_of_the_summary(several: Path, share: str) -> None:
+    summary = read_results(several).summary.set_index("configuration")
+    for configuration, verdict in judged(several, metric=share, at_least=0.5).items():
+        low, high = (float(summary.loc[configuration, f"{share}_{end}"]) for end in ("low", "high"))
+        assert (verdict.low, verdict.high) == pytest.approx((low, high), abs=1e-8)
+        assert (verdict.over, verdict.clusters) == ("logs", 3)
+        assert verdict.verdict == (MET if low >= 0.5 else NOT_MET if high < 0.5 else UNDECIDED)
+
+
+@pytest.mark.parametrize("metric", ["ttd_rmst_s", "detected_share", "dad_median_m", "position_rmse_held_m"])
+def test_differences_are_those_of_compare(several: Path, metric: str) -> None:
+    table = compare_folders([several], baseline="half").overall
+    table = table[table["metric"] == metric].set_index("configuration")
+    found = judged(several, metric=metric, at_most=0.0, against="half")
+    assert found
+    for configuration, verdict in found.items():
+        row = table.loc[configuration]
+        numbers = [None if pd.isna(row[name]) else float(row[name]) for name in ("difference", "low", "high")]
+        assert [verdict.estimate, verdict.low, verdict.high] == numbers
+
+
+def test_a_group_is_judged_by_its_rows_alone(several: Path) -> None:
+    results = read_results(several)
+    for configuration in ("half",):
+        found = judged(several, metric="detected_share", at_least=0.5, each="log", population="these_logs")
+        for log in results.rows.logs:
+            tally = results.counted(results.tally[results.tally["event"] == "detected"])
+            rows = tally[(tally["configuration"] == configuration) & (tally["log"] == log)]
+            known = rows["time_to_detection_s"].notna()
+            expected = rows.loc[known, "runs"].sum() / rows["runs"].sum()
+            assert found[f"{configuration}/{log}"].estimate == pytest.approx(expected)
+            alone = judged(several, metric="detected_share", at_least=0.5, logs=[log], population="these_logs")
+            assert alone[configuration].estimate == pytest.approx(expected)
+            of_log = judged(several, metric="detected_share", at_least=0.5, by={"log": log}, population="these_logs")
+            assert of_log[f"{configuration}/{log}"].low == alone[configuration].low
+
+
+# ------------------------------------------------------------------------------------- point-blank cases
+
+
+def test_no_row_is_never_0_and_never_100(several: Path) -> None:
+    for metric in ("detected_share", "ttd_p95_s", "unknown_s", "position_rmse_m", "pass_share"):
+        for bound in ({"at_most": 0.0}, {"at_least": 1.0}, {"at_least": 0.0}):
+            for one in judged(several, metric=metric, objects={"classes": ["bus"]}, **bound).values():
+                assert (one.verdict, one.passes, one.estimate) == (NOT_MEASURED, False, None)
+    absent = judged(several, metric="detected_share", at_least=0.5, by={"class": "bus"}, if_absent="pass")
+    assert {(one.verdict, one.passes) for one in absent.values()} == {(NOT_MEASURED, True)}
+
+
+def test_two_logs_decide_nothing_of_such_traffic(several: Path) -> None:
+    for one in judged(several, metric="detected_share", at_least=0.0, logs=["drive[01]"]).values():
+        assert one.verdict == NOT_MEASURED
+        assert "2 logs, fewer than 3" in one.why
+
+
+def test_few_runs_of_several_objects_decide_nothing(several: Path) -> None:
+    for one in judged(several, metric="detected_share", at_least=0.0, population="these_logs").values():
+        expected = NOT_MEASURED if one.interval is None else MET
+        assert one.verdict == expected
+        assert "6 runs, fewer than 30" in one.why or one.interval == "nothing drawn"
+
+
+def test_identical_results_are_not_refuted(several: Path, tmp_path: Path) -> None:
+    logs = [f"drive{k}.mcap" for k in range(3)]
+    again = replayed(tmp_path, changed((LOGS, f"logs: [{', '.join(logs)}]")), *logs)
+    for metric in ("ttd_rmst_s", "detected_share", "unknown_s"):  # of six objects a median has no limits
+        found = judged(again, before=several, metric=metric, at_most=0.0, against="before")
+        assert found
+        assert {name: (one.passes, one.estimate) for name, one in found.items()} == dict.fromkeys(found, (True, 0.0))
+
+
+def test_the_same_twice(several: Path) -> None:
+    criteria = {"a": {"metric": "ttd_p95_s", "at_most": 1.0}, "b": {"metric": "unknown_s", "at_most": 1.0}}
+    assert verdicts_jsonl(cr.judge(several, criteria)) == verdicts_jsonl(cr.judge(several, criteria))
+
+
+UNKNOWN = {
+    "a column of summary.csv, found ttd_p96_s; did you mean ttd_p95_s?": {"metric": "ttd_p96_s"},
+    "configurations[0]: expected names of configurations, found halff": {"configurations": ["halff"]},
+    "against: half@before: give the folder with --before": {"against": "half@before"},
+    "criteria.it.logs[0]: no log is named 'drive9*'": {"logs": ["drive9*"]},
+    "tags.weather: expected a tag that some log has": {"by": {"tags.weather": "rain"}},
+    "criteria.it.by.log: no group is named 'drive9'": {"by": {"log": "drive9"}},
+}
+
+
+@pytest.mark.parametrize("says", UNKNOWN)
+def test_what_does_not_exist_is_said(several: Path, says: str) -> None:
+    with pytest.raises(cr.InputError) as caught:
+        cr.judge(several, {"it": {"metric": "unknown_s", "at_most": 1.0} | UNKNOWN[says]})
+    assert says in str(caught.value)
+
+
+# ------------------------------------------------------------------------------------------- by hand
+
+
+def rows_of(times_s: list[float | None], clusters: list[str], over: str = "logs") -> FigureRows:
+    """Rows of one run each, onset 0, looked at for 10 s; None: the object left."""
+    table = pd.DataFrame(
+        {
+            "time_to_detection_s": pd.Series(times_s, dtype=float),
+            "onset_s": 0.0,
+            "ended_s": 10.0,
+            "ended_by": "object_left",
+            "distance_at_detection_m": [math.nan if t is None else 100.0 - 10.0 * t for t in times_s],
+        }
+    )
+    objects = [0] * len(times_s) if over == "runs" else list(range(len(times_s)))
+    return FigureRows(table, np.ones(len(table)), RowClusters(over, clusters, objects))
+
+
+def test_a_share_over_runs_of_one_object_is_that_of_clopper_and_pearson() -> None:
+    rows = rows_of([1.0] * 18 + [None, None], [str(k) for k in range(20)], "runs")
+    found = rows.limit_share(rows.known.astype(float), 0.9)
+    expected = binomtest(18, 20).proportion_ci(0.9, "exact")
+    assert (found.low, found.high) == pytest.approx((expected.low, expected.high), abs=1e-9)
+
+
+def test_runs_that_are_alike_count_once_each() -> None:
+    low, high = limit_share_of_runs(np.asarray(1.0), np.zeros(40), 5)
+    expected = binomtest(40, 40).proportion_ci(0.95, "exact")
+    assert (float(low), float(high)) == pytest.approx((expected.low, expected.high), abs=1e-9)
+
+
+def test_runs_of_many_objects_are_worth_what_their_spread_says() -> None:
+    """40 runs of 10 objects, of which each 9 or all are known: 950 trials by Σ(y − p)², far more than 40."""
+    successes = np.array([9.0, 10.0] * 20)
+    share = 0.95
+    low, high = limit_share_of_runs(np.asarray(share), successes - share * 10, 10)
+    variance = 40 / 39 * (0.05**2) / 40  # of the mean of 40 runs, all 0.05 away
+    ratio = 1.9659 / 2.0227  # t of 399 degrees of freedom over that of 39
+    n = min(400.0, share * (1 - share) / variance * ratio**2)
+    assert n == 400.0
+    expected = binomtest(380, 400).proportion_ci(0.95, "exact")
+    assert (float(low), float(high)) == pytest.approx((expected.low, expected.high), abs=1e-9)
+
+
+def test_a_quantile_is_judged_as_a_share() -> None:
+    """12 logs of an object each: 11 known within 1 s. Exact limits of 11 of 12: .615 … .998; 95 % are not shown."""
+    rows = rows_of([0.5] * 6 + [1.0] * 5 + [4.0], [f"{k:02}" for k in range(12)])
+    p95 = rows.limit_time_quantile(0.95, 0.95, 1.0)
+    assert p95.value == 4.0
+    assert p95.share is not None
+    # The spread of logs that are all or nothing leaves 12 − 1 of 12 trials.
+    assert p95.share[0] < 0.95 < p95.share[1]
+    assert judge_limits(p95.low, p95.high, 1.0, "at_most") == UNDECIDED
+    assert (p95.low, p95.high) == (1.0, math.inf)
+    median = rows.limit_time_quantile(0.5, 0.95, 1.0)
+    assert (median.value, judge_limits(median.low, median.high, 1.0, "at_most")) == (0.5, MET)
+    never = rows_of([None] * 12, [f"{k:02}" for k in range(12)]).limit_time_quantile(0.5, 0.95, 1.0)
+    assert (never.value, judge_limits(never.low, never.high, 1.0, "at_most")) == (math.inf, NOT_MET)
+
+
+# ------------------------------------------------------------------------------------------ properties
+
+limits = st.tuples(st.floats(-1e6, 1e6) | st.just(-math.inf), st.floats(-1e6, 1e6) | st.just(math.inf)).map(sorted)
+_RANK = {NOT_MET: 0, UNDECIDED: 1, MET: 2}
+
+
+@given(limits, st.floats(-1e6, 1e6), st.floats(0.0, 1e6))
+def test_a_bound_that_moves_in_the_good_direction_never_worsens(of: list[float], bound: float, more: float) -> None:
+    for direction, moved in (("at_most", bound + more), ("at_least", bound - more)):
+        assert _RANK[judge_limits(*of, moved, direction)] >= _RANK[judge_limits(*of, bound, direction)]
+
+
+@given(limits, st.floats(-1e6, 1e6))
+def test_at_most_is_at_least_of_the_negative(of: list[float], bound: float) -> None:
+    assert judge_limits(*of, bound, "at_most") == judge_limits(-of[1], -of[0], -bound, "at_least")
+
+
+@given(limits, st.floats(-1e6, 1e6))
+def test_what_is_met_is_not_unmet_the_other_way_round(of: list[float], bound: float) -> None:
+    both = {judge_limits(*of, bound, "at_most"), judge_limits(*of, bound, "at_least")}
+    if both == {MET}:  # the interval is the bound itself
+        assert of[1] - of[0] <= 3e-9
+    assert both != {NOT_MET}
+
+
+drawn = st.lists(
+    st.tuples(st.integers(0, 3), st.one_of(st.none(), st.integers(0, 20))), min_size=6, max_size=30
+).filter(lambda rows: len({log for log, _ in rows}) >= 3)
+
+
+@given(drawn, st.sampled_from([0.05, 0.5, 0.95]), st.integers(0, 9))
+def test_a_quantile_is_within_its_limits_and_these_say_what_the_share_says(
+    rows: list[tuple[int, int | None]], q: float, half_s: int
+) -> None:
+    times_s = [None if t is None else t / 2 for _, t in rows]
+    figures = rows_of(times_s, [f"log {log}" for log, _ in rows])
+    found = figures.limit_time_quantile(q, 0.95, half_s / 2)
+    assert found.value is not None
+    assert found.low <= found.value <= found.high
+    assert found.share is not None
+    verdict = judge_limits(found.low, found.high, half_s / 2, "at_most")
+    if verdict == MET:
+        assert found.share[0] >= q - 1e-9
+    if verdict == NOT_MET:
+        assert found.share[1] < q
+    distance = figures.limit_distance_quantile(q, 0.95, 50.0)
+    assert distance.value is not None
+    assert distance.low <= distance.value <= distance.high
+
+
+@given(drawn, st.floats(0.6, 0.99))
+def test_less_confidence_is_narrower(rows: list[tuple[int, int | None]], confidence: float) -> None:
+    figures = rows_of([None if t is None else t / 2 for _, t in rows], [f"log {log}" for log, _ in rows])
+    known = figures.known.astype(float)
+    wide, narrow = (figures.limit_share(known, level) for level in (0.995, confidence))
+    assert wide.low <= narrow.low + 1e-12
+    assert narrow.high <= wide.high + 1e-12
+
+
+def test_no_verdict_passes_where_one_does_not() -> None:
+    assert Verdicts("none", ()).passes
