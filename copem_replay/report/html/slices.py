@@ -13,7 +13,16 @@ from copem_replay.metrics.slices import describe_chance
 from copem_replay.metrics.summary import EPISODE
 from copem_replay.report.figures.slices import MOST_GROUPS
 from copem_replay.report.figures.style import format_per_cent, format_three_digits
-from copem_replay.report.html.markup import Html, allow_breaks, fold_parts, line_swatch, join_html, make_list, make_table, make_tag
+from copem_replay.report.html.markup import (
+    Html,
+    allow_breaks,
+    fold_parts,
+    join_html,
+    line_swatch,
+    make_list,
+    make_table,
+    make_tag,
+)
 from copem_replay.report.html.tables import column_header, format_value, full_number, interval_markup
 from copem_replay.results.slices import SHOWN, describe_groups
 
