@@ -341,7 +341,7 @@ def _summarise_slices(
         return None
     study = StudyRows(
         slice_settings(experiment, find_facts(experiment), horizon_s),
-        {log.name: {} for log in logs},
+        {log.name: log.recording.scene.tags for log in logs},
         sums.tally,
         exact,
         pd.concat(sums.episodes, ignore_index=True),
