@@ -23,8 +23,8 @@ from copem_replay.results.verdicts import (
     NOT_MEASURED,
     NOT_MET,
     UNDECIDED,
+    Judgement,
     Verdict,
-    Verdicts,
     judge_limits,
     verdicts_jsonl,
 )
@@ -41,7 +41,7 @@ def several(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def judged(folder: Path | Results, *, before: Path | None = None, **criterion: Any) -> dict[str, Verdict]:
-    """Verdicts of one criterion, by configuration and group."""
+    """Judgement of one criterion, by configuration and group."""
     verdicts = cr.judge(folder, {"it": criterion}, before=before).all
     return {f"{one.configuration}/{one.group}" if one.group else one.configuration: one for one in verdicts}
 
@@ -295,4 +295,4 @@ def test_verdicts_over_runs_are_seldom_wrong_at_the_bound(looks: int, together: 
 
 
 def test_no_verdict_passes_where_one_does_not() -> None:
-    assert Verdicts("none", ()).passes
+    assert Judgement("none", ()).passes
