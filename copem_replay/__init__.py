@@ -60,7 +60,7 @@ if TYPE_CHECKING:
     from copem_replay.perception.visibility import VisibilityModel
     from copem_replay.results.compare import Comparison
     from copem_replay.results.read import Results
-    from copem_replay.results.verdicts import Verdicts
+    from copem_replay.results.verdicts import Judgement
 
 __all__ = [
     "CLASSES",
@@ -82,6 +82,7 @@ __all__ = [
     "Inbox",
     "InputError",
     "Inputs",
+    "Judgement",
     "LatencyModel",
     "LinkModel",
     "ListFusion",
@@ -102,7 +103,6 @@ __all__ = [
     "StepFusion",
     "Tracks",
     "Unit",
-    "Verdicts",
     "ViewGeometry",
     "VisibilityModel",
     "check_fusion",
@@ -162,7 +162,7 @@ _PLACES = {
     "perception.visibility": "VisibilityModel",
     "results.compare": "Comparison",
     "results.read": "Results",
-    "results.verdicts": "Verdicts",
+    "results.verdicts": "Judgement",
 }
 """Exported names by the module that defines them."""
 _MODULE = {name: f"{__name__}.{module}" for module, names in _PLACES.items() for name in names.split()}

@@ -11,9 +11,9 @@ import sys
 from benches import commands, compare, crew, fit, fusion, links, long, memory, peers, reading, replay, writing
 
 BENCHES = (
-    commands.pieces, compare.compare, crew.crew, replay.visibility, memory.memory, fit.fit, replay.paper,
-    reading.reading, writing.writing, commands.commands, commands.reports, fusion.fusion, peers.peers, links.links,
-    long.crowd, long.long,
+    commands.pieces, compare.compare, compare.verdict, crew.crew, replay.visibility, memory.memory, fit.fit,
+    replay.paper, reading.reading, writing.writing, commands.commands, commands.reports, fusion.fusion, peers.peers,
+    links.links, long.crowd, long.long,
 )  # fmt: skip
 """All there are, in the order in which they run; each is called without arguments, by its name."""
 

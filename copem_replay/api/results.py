@@ -12,7 +12,7 @@ from copem_replay.results.compare import Comparison
 from copem_replay.results.read import Results
 
 if TYPE_CHECKING:
-    from copem_replay.results.verdicts import Verdicts
+    from copem_replay.results.verdicts import Judgement
 
 AnyResults: TypeAlias = Results | str | PathLike[str]
 """Results, of `run` or read from a folder, or the path of a results folder."""
@@ -75,7 +75,7 @@ def judge(
     criteria: Mapping[str, Any] | str | PathLike[str] | None = None,
     *,
     before: AnyResults | None = None,
-) -> Verdicts:
+) -> Judgement:
     """Hold criteria against results: met, not met, undecided or not measured, by the intervals of `summary.csv`.
 
     `criteria`: by name, each with its keys, or the path of a file with the key `criteria`; None: those of the
@@ -88,7 +88,7 @@ def judge(
     >>> verdicts.passes, verdicts.all[0].verdict
     (True, 'met')
     """
-    from copem_replay.experiment.criteria import read_criteria
+    from copem_replay.experiment.cross_references import read_criteria
     from copem_replay.results.judge import judge_results
     from copem_replay.results.read import open_results
 
@@ -140,7 +140,7 @@ def write_history(folders: Sequence[str | PathLike[str]], file: str | PathLike[s
     Traceback (most recent call last):
     copem_replay.core.errors.InputError: history: expected results folders, found none
     """
-    from copem_replay.report.html.verdicts import write_history_page
+    from copem_replay.report.html.history import write_history_page
 
     return write_history_page([Path(folder) for folder in folders], Path(file))
 

@@ -20,7 +20,7 @@ from copem_replay.core.errors import InputError, count_noun, is_url, local_path,
 
 if TYPE_CHECKING:
     from copem_replay.pipeline.crew import CrewProgress
-    from copem_replay.results.verdicts import Verdicts
+    from copem_replay.results.verdicts import Judgement
 
 
 # Arguments and options of several commands.
@@ -131,7 +131,7 @@ def print_notes(lines: Iterable[str]) -> None:
     print_problems(f"note: {line}" for line in lines)
 
 
-def print_verdicts(verdicts: Verdicts) -> None:
+def print_verdicts(verdicts: Judgement) -> None:
     """Print verdicts on stdout: the table, what is undecided and why, and how many pass."""
     from copem_replay.results.verdicts import verdicts_text
 

@@ -133,6 +133,21 @@ def _id_as_text(value: object) -> object:
     return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
 
+def _tag_as_text(value: object) -> object:
+    """Tags may be numbers, or true and false: `2` is `"2"`, `true` is `"true"`."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:g}" if isinstance(value, int | float) else value
+
+
+TagText = Annotated[
+    str,
+    BeforeValidator(_tag_as_text),
+    Field(min_length=1, max_length=100),
+    WithJsonSchema({"type": ["string", "number", "boolean"]}),
+]
+"""What a drive is tagged with under a name, as text."""
+
 Id = Annotated[str, BeforeValidator(_id_as_text), WithJsonSchema({"type": ["string", "integer"]})]
 
 Pair = tuple[Number, Number]

@@ -15,8 +15,8 @@ list shows), *arrives* (when the receiver has it), *now*.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -88,7 +88,8 @@ class Scene:
 
     `moving` is False for stationary objects (they hide others; they are measured only when named).
     `solids` are stationary objects with an outline of their own: they hide, and are no objects.
-    `ego_ix` is −1 where the log has no ego vehicle, or none was chosen.
+    `ego_ix` is −1 where the log has no ego vehicle, or none was chosen. `tags`: what the recording, or the experiment,
+    says of the drive, by name.
 
     >>> scene = cr.read_recording("logs/tc016d.mcap").scene
     >>> scene.object_ids[scene.ego_ix], cr.CLASSES[scene.object_class[scene.ego_ix]], scene.end_s
@@ -104,6 +105,7 @@ class Scene:
     ego_ix: int = -1
     ego_sized: bool = True  # False: the size of the ego is not known, nor are gaps to it
     solids: tuple[Solid, ...] = ()
+    tags: Mapping[str, str] = field(default_factory=dict)
 
     @cached_property
     def object_number(self) -> dict[str, int]:

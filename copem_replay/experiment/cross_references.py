@@ -5,17 +5,22 @@ The file's plain data is checked, so that a problem of shape elsewhere does not 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
-from copem_replay.core.errors import unknown_name_message
-from copem_replay.core.tracks import TRUTH
+from pydantic import ValidationError
+
+from copem_replay.core.errors import ExperimentError, near_name_hint, unknown_name_message
+from copem_replay.core.tracks import CLASSES, TRUTH
 from copem_replay.core.yaml import Key
-from copem_replay.experiment.criteria import check_criteria
-from copem_replay.experiment.file import ExperimentSource
+from copem_replay.experiment.criteria import BEFORE, CriteriaFile, Criterion
+from copem_replay.experiment.file import ExperimentSource, describe_by_key, make_plain_source, read_experiment_file
 from copem_replay.io.ground_truth import MAX_GAP_S
-from copem_replay.metrics.config import LONGEST_CHAIN, onset_requirement
-from copem_replay.metrics.onset import Requires
+from copem_replay.metrics.config import BEGAN_BY, CLASS, LONGEST_CHAIN, onset_requirement
+from copem_replay.metrics.figure_limits import JUDGED, PER_MINUTE, SUMMED
+from copem_replay.metrics.onset import BEGAN, Requires
+from copem_replay.metrics.summary_metrics import COMPARED, METRICS_OF
 
 NO_EGO = "none"
 """The value of `ego: none`: the study has no ego."""
@@ -372,3 +377,106 @@ def _mapping_names(mapping: object) -> list[str]:
 
 def _is_name(value: object) -> bool:
     return isinstance(value, str | int) and not isinstance(value, bool)
+
+
+# Names that criteria use.
+
+_ASKED: dict[str, tuple[Callable[[Mapping[str, Any]], bool], str]] = {
+    "braking": (lambda data: data.get("braking") is not None, "`braking: {driver: …}`"),
+    "conflict": (lambda data: _measure_data(data).get("conflict") is not None, "`measure: {conflict: {}}`"),
+    "accuracy": (lambda data: _measure_data(data).get("accuracy", True) is not False, "`measure: {accuracy: true}`"),
+    "exact": (lambda data: _measure_data(data).get("exact") is True, "`measure: {exact: true}`"),
+}
+"""What an experiment has to ask for so that there is a metric: whether it does, and the key that would."""
+
+
+def _measure_data(data: Mapping[str, Any]) -> Mapping[str, Any]:
+    measure = data.get("measure")
+    return measure if isinstance(measure, Mapping) else {}
+
+
+def _own_metric_names(study: Mapping[str, Any]) -> list[str]:
+    own = _measure_data(study).get("metrics")
+    return [str(one.get("name")) for one in own if isinstance(one, dict)] if isinstance(own, list | tuple) else []
+
+
+def check_criteria(source: ExperimentSource, study: Mapping[str, Any]) -> Iterator[str]:
+    """A line for every metric and configuration that criteria name and the experiment `study`, plain data, has not."""
+    criteria = source.data.get("criteria")
+    configurations = study.get("configurations")
+    known = [str(name) for name in configurations] if isinstance(configurations, Mapping) else []
+    for name, criterion in criteria.items() if isinstance(criteria, Mapping) else ():
+        if not isinstance(criterion, Mapping):
+            continue
+        key: Key = ("criteria", name)
+        metric, against = criterion.get("metric"), criterion.get("against")
+        if isinstance(metric, str) and (problem := _find_metric_problem(metric, against is not None, study)):
+            yield source.at((*key, "metric"), problem)
+        named = criterion.get("configurations")
+        for k, one in enumerate(named if isinstance(named, list | tuple) else ()):
+            if isinstance(one, str | int) and str(one) not in known:
+                yield source.at((*key, "configurations", k), _unknown_configuration(one, known))
+        yield from _check_group(source, (*key, "by"), criterion.get("by"))
+        if isinstance(against, str | int) and str(against) not in known:
+            other, _, where = str(against).rpartition("@")
+            if where != BEFORE or (other and "@" not in str(against)):
+                hint = f"; of the results given by --before: {against}@{BEFORE}, or {BEFORE} for the same name"
+                yield source.at((*key, "against"), _unknown_configuration(against, known) + hint)
+
+
+def _check_group(source: ExperimentSource, key: Key, by: object) -> Iterator[str]:
+    """A line for each class and way to begin that does not exist."""
+    for name, what, known in ((CLASS, "class", CLASSES), (BEGAN_BY, "way to begin", BEGAN)):
+        value = by.get(name) if isinstance(by, Mapping) else None
+        if isinstance(value, str) and value not in known:
+            yield source.at((*key, name), unknown_name_message(what, value, known))
+
+
+def _unknown_configuration(name: object, known: Sequence[str]) -> str:
+    return f"expected names of configurations, found {name}: {unknown_name_message('configuration', name, known)}"
+
+
+def _find_metric_problem(metric: str, paired: bool, study: Mapping[str, Any]) -> str | None:
+    """Why a metric cannot be held against a bound; None: it can. `paired`: it is a difference."""
+    own, of = _own_metric_names(study), {name.name: what for what, names in METRICS_OF.items() for name in names}
+    if metric not in of and metric not in own and metric not in COMPARED:
+        hint = near_name_hint(metric, [*of, *own, *COMPARED]) or "; `copem-replay schema` lists them"
+        return f"expected a column of summary.csv, found {metric}{hint}"
+    if paired and metric not in COMPARED:
+        listed = ", ".join(COMPARED)
+        return f"expected a metric that `compare` pairs, as there is `against`, found {metric}; there are {listed}"
+    judged = (*JUDGED, *SUMMED, *PER_MINUTE, *own)
+    if not paired and metric not in judged:
+        if metric in COMPARED:
+            return f"{metric} is a difference of two configurations; say `against: <configuration>`"
+        return f"expected a metric that has an interval over logs or runs, found {metric}{_judged_instead(metric)}"
+    needs = [of.get(metric, "")] + ["braking"] * (metric in JUDGED and "braking" in JUDGED[metric].rows)
+    if metric in COMPARED and COMPARED[metric].compared and (COMPARED[metric].compared or (0, 0, ()))[2]:
+        needs.append("accuracy")
+    for what in needs:
+        if what in _ASKED and not _ASKED[what][0](study):
+            return f"expected a metric that the experiment measures, found {metric}; {_ASKED[what][1]} would"
+    return None
+
+
+def _judged_instead(metric: str) -> str:
+    if f"{metric.removesuffix('_m')}_held_m" in COMPARED:
+        return f"; with `against`, {metric.removesuffix('_m')}_held_m has one"
+    return f"; there are {', '.join(name for name in (*JUDGED, *SUMMED, *PER_MINUTE) if not name.endswith('_exact'))}"
+
+
+def read_criteria(given: Path | Mapping[str, Any], study: Mapping[str, Any]) -> dict[str, Criterion]:
+    """Criteria by name, from a file with the one key `criteria` or as plain data, checked against an experiment's data.
+
+    Raises ExperimentError with all problems, a line each, with file, line and key.
+    """
+    source = make_plain_source({"criteria": given}) if isinstance(given, Mapping) else read_experiment_file(given)
+    problems = [*source.problems, *check_criteria(source, study)]
+    try:
+        criteria = CriteriaFile.model_validate(source.data).criteria
+    except ValidationError as error:
+        shape = describe_by_key(CriteriaFile, error, source.data)
+        raise ExperimentError([*problems, *(source.at(key, message) for key, message in shape)]) from None
+    if problems:
+        raise ExperimentError(problems)
+    return dict(criteria)

@@ -75,6 +75,8 @@ def apply_settings(experiment: Experiment, settings: LogSettings) -> Experiment:
     changed |= {key: value for key in ("read", "obstacles") if (value := getattr(settings, key)) is not None}
     units = _apply_units(experiment, settings)
     changed |= {"units": units, "configurations": _keep_configurations(experiment, units)}
+    if settings.tags:
+        changed["tags"] = experiment.tags | settings.tags
     if settings.measure:
         changed["measure"] = _apply_measure(experiment.measure, settings.measure)
     return experiment.model_copy(update=changed | {"logs": ()})

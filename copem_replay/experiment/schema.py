@@ -35,6 +35,7 @@ from copem_replay.core.components import (
     Positive,
     Share,
     Slot,
+    TagText,
     drop_python_examples,
     error_at_key,
 )
@@ -331,7 +332,8 @@ class LogSettings(Frozen):
 
     `file`: a path, wildcards allowed. `name`: name of the log, by default that of its file. In `units` and `measure`
     single keys are replaced; a unit that is `null` is absent from the log. `together`, instead of `file`: several
-    recordings of one drive; `clock_offset_s`: how far the clock of each is ahead of the first one's.
+    recordings of one drive; `clock_offset_s`: how far the clock of each is ahead of the first one's. `tags`: what the
+    drive is to be found by, in addition to those in the recording: `{weather: rain, site: A}`.
     """
 
     file: Annotated[str, Field(min_length=1)] | None = None
@@ -344,6 +346,7 @@ class LogSettings(Frozen):
     obstacles: tuple[Obstacle, ...] | None = None
     read: HowRead | None = None
     measure: dict[str, Any] = Field(default_factory=dict)
+    tags: dict[Id, TagText] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _one_place(self) -> Self:
@@ -422,7 +425,8 @@ class Experiment(Frozen):
     """An experiment file.
 
     `logs`: paths or URLs, or mappings with settings for one log. `window_s`: the part of each log that is read,
-    [from, to] in log time since the first message of its truth.
+    [from, to] in log time since the first message of its truth. `tags`: those of all logs, to slice the summary by
+    (`measure.by`) and for conditions of PEMs; a log may have others.
 
     >>> experiment = cr.Experiment(version=1, runs=20, configurations={"GT": cr.Configuration(units="truth")})
     >>> experiment.model_copy(update={"runs": 50}).runs, experiment.seed
@@ -435,6 +439,7 @@ class Experiment(Frozen):
     logs: Annotated[tuple[LogEntry, ...], Field(min_length=1)] = ()
     read: HowRead = TruthTopic()
     ego: Ego | None = None
+    tags: dict[Id, TagText] = Field(default_factory=dict, exclude_if=lambda tags: not tags)
     window_s: WindowOf | None = None
     max_gap_s: Positive = 0.5
     runs: Count = 1

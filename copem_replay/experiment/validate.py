@@ -16,8 +16,10 @@ from copem_replay.core.errors import (
     RecordingError,
     RemoteFile,
     escape_unprintable,
+    near_name_hint,
     unknown_name_message,
 )
+from copem_replay.core.tracks import Scene
 from copem_replay.core.yaml import Key
 from copem_replay.experiment.cross_references import NO_EGO, check_references
 from copem_replay.experiment.drive import SettingsError, apply_settings, resolve_for_log
@@ -49,6 +51,7 @@ from copem_replay.io.open import (
 )
 from copem_replay.io.recorded_units import read_recorded_output, read_recorded_unit
 from copem_replay.io.recording import Recording, moving_ids, read_log
+from copem_replay.metrics.config import parse_slices
 from copem_replay.metrics.onset import Requires
 from copem_replay.perception.config import Carriers
 from copem_replay.perception.sensor_poses import find_enclosing_solid
@@ -374,10 +377,27 @@ def _read_local_recording(experiment: Experiment, place: Local) -> tuple[Recordi
         check_files_unchanged(recording.stamps or ())
     except RecordingError as error:
         return None, [RefusedLog(path, line) for line in error.within(path)]
-    recording = replace(recording, lists=lists, notes=tuple(notes))
+    scene = replace(recording.scene, tags={**recording.scene.tags, **experiment.tags})
+    recording = replace(recording, scene=scene, lists=lists, notes=tuple(notes))
     return recording, wrong + [
         RefusedLog(path, reason, where) for where, reason in check_against_log(experiment, recording, known=bool(wrong))
     ]
+
+
+def _check_tags(experiment: Experiment, scenes: Sequence[Scene], at: Callable[[Key, str], str]) -> Iterator[str]:
+    """Tags that the summary is sliced by, or that a PEM asks for, and no log has."""
+    known = {name for scene in scenes for name in scene.tags}
+    asked: list[tuple[Key, str]] = [
+        (("measure", "by", k), name) for k, by in enumerate(parse_slices(experiment.measure.by)) for name in by.tags
+    ]
+    for pem, of in experiment.pems.items():
+        asked += [
+            (("pems", pem, k, "when", "tags"), n) for k, one in enumerate(of.couples) for n in one.when.tags or ()
+        ]
+    for key, name in asked if scenes else ():
+        if name not in known:
+            has = f"there are {', '.join(sorted(known))}" if known else "`logs: [{file: …, tags: {…}}]` gives tags"
+            yield at(key, f"no log has the tag {name!r}{near_name_hint(name, known)}; {has}")
 
 
 def check_across_logs(
@@ -400,6 +420,7 @@ def check_across_logs(
             if "objects" in settings.measure and wanted not in scene.object_number:
                 of_id: Key = ("logs", entry, "measure", "objects", "ids", n)
                 yield at(of_id, f"no object {wanted!r} in the log; there are {moving_ids(scene)}")
+    yield from _check_tags(experiment, scenes, at)
     everywhere = bind_logs(experiment, recordings, source)
     kept = [resolve_for_log(everywhere, scene.log).configurations for scene in scenes]
     for name in experiment.configurations if scenes else ():

@@ -12,13 +12,13 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Iterator, Mapping, Set
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, Any
 
 import zstandard
 from mcap.exceptions import EndOfFile
-from mcap.records import Message
+from mcap.records import Message, Metadata
 from mcap.stream_reader import CRCValidationError
 from mcap.summary import Summary
 
@@ -30,6 +30,7 @@ from copem_replay.io.containers.mcap_records import (
     RecordsFromStart,
     drop_traceback,
     read_by_log_time,
+    read_metadata,
     read_summary,
 )
 from copem_replay.io.decoded_size import DecodeAllowance, OversizeError
@@ -103,6 +104,8 @@ def _describe_content(path: Path, start: bytes) -> str:
 
 # The log of an MCAP file.
 
+TAGS = "tags"
+"""The metadata record of a file that says what the drive is: names and values."""
 _READ_AT_ONCE = 1 << 16
 """Bytes of the buffer of a file: a call of Python for as many takes no time beside reading them."""
 
@@ -133,6 +136,7 @@ class Log:
     end_ns: int = ALWAYS[1]  # log time of the last message
     notes: tuple[str, ...] = ()
     window: Window | None = None  # the log time that is read, None: all
+    tags: Mapping[str, str] = field(default_factory=dict)  # of the metadata record `TAGS`
 
     def within(self, window: Window | None) -> Log:
         """The log restricted to a window; None: the whole recording."""
@@ -228,7 +232,8 @@ def open_mcap(path: Path) -> Log:
             if summary is not None and _index_is_sound(summary):
                 start_ns = min((c.message_start_time for c in summary.chunk_indexes), default=0)
                 end_ns = max((c.message_end_time for c in summary.chunk_indexes), default=0)
-                return Log(path, _make_channels(summary), indexed=True, start_ns=start_ns, end_ns=end_ns)
+                tags = read_metadata(file, summary, TAGS)
+                return Log(path, _make_channels(summary), indexed=True, start_ns=start_ns, end_ns=end_ns, tags=tags)
         except DAMAGE as error:
             return open_from_start(path, error)
     return open_from_start(path)
@@ -241,13 +246,15 @@ def open_from_start(path: Path, index_error: BaseException | None = None, promis
     Raises RecordingError: the file is damaged and no message can be read.
     """
     counts: Counter[int] = Counter()
-    start_ns, end_ns = 1 << 64, 0
+    start_ns, end_ns, tags = 1 << 64, 0, dict[str, str]()
     with open_file(path) as file:
         stream = RecordsFromStart(file)
         for record in stream:
             if isinstance(record, Message):
                 counts[record.channel_id] += 1
                 start_ns, end_ns = min(start_ns, record.log_time), max(end_ns, record.log_time)
+            elif isinstance(record, Metadata) and record.name == TAGS:
+                tags |= record.metadata
     expected = {c.number: c.messages for c in promised}
     channels = tuple(
         _make_channel(number, channel, stream.schemas.get(channel.schema_id), counts[number], expected.get(number))
@@ -273,6 +280,7 @@ def open_from_start(path: Path, index_error: BaseException | None = None, promis
         start_ns=start_ns,
         end_ns=end_ns,
         notes=(UNPROTECTED,) if stream.unprotected else (),
+        tags=tags,
     )
 
 

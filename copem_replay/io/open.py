@@ -249,6 +249,7 @@ def join_logs(place: DriveRecordings, logs: Sequence[Log]) -> JoinedLog:
         notes=tuple(f"{log.path.name}: {note}" for log in logs for note in log.notes),
         place=place,
         parts=tuple(parts),
+        tags={name: value for log in reversed(logs) for name, value in log.tags.items()},
     )
 
 

@@ -170,7 +170,7 @@ def _read(
     window_lines = window_notes(window_s)
     notes = [*([damage] if damage else []), *window_lines, *log.notes, *ignored, *notes, *host_notes, *ego_notes]
     sized = around is None or around.ego is None or (asked is not None and asked.size_m is not None)
-    scene = replace(scene, ego_ix=ego_ix, ego_sized=sized)
+    scene = replace(scene, ego_ix=ego_ix, ego_sized=sized, tags=dict(log.tags))
     all_notes = tuple(escape_unprintable(note) for note in notes)
     encoding = next(c.encoding for c in log.channels if c.topic == topic and c.messages)
     return Recording(

@@ -208,6 +208,12 @@ class Slice:
         """Whether groups are of whole logs."""
         return all(dimension.of_logs for dimension in self.dimensions)
 
+    @property
+    def tags(self) -> tuple[str, ...]:
+        """The names of the tags that it groups by."""
+        names = (dimension.name for dimension in self.dimensions)
+        return tuple(name.removeprefix(TAGS) for name in names if name.startswith(TAGS))
+
     def names(self, name: str) -> bool:
         """Whether it has a dimension of this name."""
         return any(dimension.name == name for dimension in self.dimensions)

@@ -51,10 +51,9 @@ Tags = Mapping[str, Mapping[str, str]]
 def find_unknown_tag(slices: Sequence[Slice], tags: Tags) -> str | None:
     """A line on the first tag that no log has; None: there is none."""
     known = sorted({name for of_log in tags.values() for name in of_log})
-    for name in (d.name.removeprefix(TAGS) for by in slices for d in by.dimensions if d.name.startswith(TAGS)):
-        if name not in known:
-            has = f"tags are {', '.join(known)}" if known else "logs have no tags"
-            return f"{TAGS}{name}: expected a tag that some log has, found none; {has}"
+    for name in (name for by in slices for name in by.tags if name not in known):
+        has = f"tags are {', '.join(known)}" if known else "logs have no tags"
+        return f"{TAGS}{name}: expected a tag that some log has, found none; {has}"
     return None
 
 
@@ -432,10 +431,12 @@ def describe_chance(table: pd.DataFrame) -> list[str]:
     lines = []
     for by, rows in table.groupby("by", sort=False):
         judged = rows["apart"].dropna().astype(bool)
-        groups = count_noun(rows["group"].nunique(), "group")
-        lines.append(
-            f"by {by}: {groups} looked at in {count_noun(rows['configuration'].nunique(), 'configuration')}; of "
-            f"{count_noun(len(judged), 'interval')} of detected_share {int(judged.sum())} exclude the share of all "
-            f"groups, by chance alone at least {(1 - CONFIDENCE) * len(judged):.2g} would"
-        )
+        line = f"by {by}: {count_noun(rows['group'].nunique(), 'group')} looked at in "
+        line += count_noun(rows["configuration"].nunique(), "configuration")
+        if len(judged):
+            line += (
+                f"; of {count_noun(len(judged), 'interval')} of detected_share {int(judged.sum())} exclude the share "
+                f"of all groups, by chance alone at least {(1 - CONFIDENCE) * len(judged):.2g} would"
+            )
+        lines.append(line)
     return lines

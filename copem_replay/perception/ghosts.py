@@ -108,7 +108,7 @@ def draw_ghosts(
                 if len(born.ghost):
                     couples = setup.pems[str(unit.pem)].couples
                     tracks, view = _place_ghosts(rng, observations.tracks, lists, (n, sort), runs, born)
-                    couple_ix = np.maximum(find_couples(couples, view), 0)
+                    couple_ix = np.maximum(find_couples(couples, view, scene.tags), 0)
                     sure = np.ones(len(couple_ix))
                     rows = Observations(tracks, view, couple_ix, sure, sure)
                     pieces.append(GhostRows(rows, born.words[born.ghost], np.full(len(sure), n)))

@@ -5,7 +5,7 @@ Nothing here depends on the run, on a model's parameters or on a configuration: 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
 from itertools import pairwise
@@ -149,7 +149,7 @@ def observe_objects(
     tracks = join_tracks(tuple(experiment.modelled), [piece[0] for piece in ordered])
     view = ViewGeometry.joined([nothing, *(piece[1] for piece in ordered)])
     view = replace(view, class_ix=scene.object_class[tracks.row_object_ix])
-    return Observations(tracks, view, *_assess_rows(tracks, view, experiment))
+    return Observations(tracks, view, *_assess_rows(tracks, view, experiment, scene.tags))
 
 
 def interpolate_worlds(
@@ -215,14 +215,16 @@ def compute_view(
     )
 
 
-def _assess_rows(tracks: Tracks, view: ViewGeometry, experiment: PerceptionSetup) -> tuple[Int, Float, Float]:
+def _assess_rows(
+    tracks: Tracks, view: ViewGeometry, experiment: PerceptionSetup, tags: Mapping[str, str]
+) -> tuple[Int, Float, Float]:
     """Of each row (P,) the couple of its unit's PEM that applies, its probability, and the existence it claims."""
     couple_ix = np.full(len(tracks.frame_ix), -1)
     probability, existence = np.zeros(len(tracks.frame_ix)), np.zeros(len(tracks.frame_ix))
     for unit, rows in zip(experiment.modelled.values(), rows_by_unit(tracks), strict=True):
         seen = view.take(rows)
         pem = experiment.pems[str(unit.pem)].couples
-        couple_ix[rows] = find_couples(pem, seen)
+        couple_ix[rows] = find_couples(pem, seen, tags)
         for c, couple in enumerate(pem):
             of_couple = rows[couple_ix[rows] == c]
             if len(of_couple):

@@ -372,6 +372,7 @@ def _meets(pem: Pem, scene: Scene, world: Tracks, poses: UnitPoses, carrier_ix: 
         return False
     rows = order[bounds[lists[0]] : bounds[lists[-1] + 1]]
     conditions = [couple.when.model_copy(update={"visible_share": None}) for couple in pem.couples]
+    conditions = [condition for condition in conditions if condition.applies_to(scene.tags)]
     for examined in (rows[::_SAMPLE], rows):
         frame = world.frame_ix[examined]
         kept = poses.present[frame] & (world.row_object_ix[examined] != carrier_ix)

@@ -241,6 +241,8 @@ def _recipe_parts(experiment: Experiment, name: str) -> tuple[dict[str, Any], li
         experiment.braking, *(experiment.pems[pem] for pem in pems),
         *(experiment.units[unit] for unit in units), *(experiment.links[link] for link in links),
     )  # fmt: skip
+    if not any(couple.when.tags for pem in pems for couple in experiment.pems[pem].couples):
+        data.pop("tags", None)
     for key in NOT_OF_A_PART:
         within, _, last = key.rpartition(".")
         (data[within] if within else data).pop(last, None)

@@ -426,7 +426,8 @@ def _summarise_slices(study: StudyTables, horizon_s: float) -> pd.DataFrame | No
         return None
     experiment, (episodes, lists) = study.experiment, study.sliced
     settings = slice_settings(experiment, find_facts(experiment), horizon_s)
-    rows = StudyRows(settings, {log.name: {} for log in study.logs}, study.tally, study.exact, episodes, lists)
+    tags = {log.name: log.recording.scene.tags for log in study.logs}
+    rows = StudyRows(settings, tags, study.tally, study.exact, episodes, lists)
     return summarise_groups(rows, parse_slices(experiment.measure.by))
 
 

@@ -46,7 +46,7 @@ from copem_replay.results.compare.compare import PairsAsked, compare_folders
 from copem_replay.results.compare.labels import label_configurations
 from copem_replay.results.read import Results
 from copem_replay.results.slices import read_slices, read_study_rows
-from copem_replay.results.verdicts import MET, NOT_MEASURED, NOT_MET, UNDECIDED, Verdict, Verdicts, judge_limits
+from copem_replay.results.verdicts import MET, NOT_MEASURED, NOT_MET, UNDECIDED, Judgement, Verdict, judge_limits
 
 CLOSED_FORM = "closed form"
 """The kind of an interval of what is computed without a draw: of these logs it is known."""
@@ -68,7 +68,7 @@ class JudgedFigure:
 _NO_ROW = JudgedFigure(LimitedFigure(None), why="no row")
 
 
-def judge_results(results: Results, criteria: Mapping[str, Criterion], before: Results | None = None) -> Verdicts:
+def judge_results(results: Results, criteria: Mapping[str, Criterion], before: Results | None = None) -> Judgement:
     """The verdicts of criteria, in their order, by configuration and group.
 
     `before`: results that criteria are `against`. Raises InputError where a name does not exist in the results, where
@@ -85,7 +85,7 @@ def judge_results(results: Results, criteria: Mapping[str, Criterion], before: R
             for group in groups:
                 found = study.measure(name, criterion, configuration, group)
                 verdicts.append(_make_verdict(name, criterion, configuration, group.label, found))
-    return Verdicts(results.name, tuple(verdicts), tuple(notes))
+    return Judgement(results.name, tuple(verdicts), tuple(notes))
 
 
 def list_later(results: Results) -> list[str]:
@@ -98,7 +98,7 @@ def list_later(results: Results) -> list[str]:
     ]
 
 
-def judge_own_criteria(results: Results) -> Verdicts | None:
+def judge_own_criteria(results: Results) -> Judgement | None:
     """The verdicts of the experiment's own criteria but those against results of before; None: there are none."""
     later = list_later(results)
     criteria = {name: one for name, one in results.experiment.criteria.items() if name not in later}

@@ -178,6 +178,7 @@ def build_provenance(
         "runs": experiment.runs,
         "logs": [
             {"log": log.name, "topic": log.recording.topic, **{n: log.digests[n] for n in ("sha256", "truth")}}
+            | ({"tags": dict(log.recording.scene.tags)} if log.recording.scene.tags else {})
             for log in study.logs
         ],
         "logs_skipped": [{"log": escape_name(path.name), "reason": reason} for path, reason in skipped],

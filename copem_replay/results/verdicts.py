@@ -1,4 +1,4 @@
-"""Verdicts: whether criteria are met, as text, JSON lines, JUnit XML and Markdown, and read back from JSON lines.
+"""Judgement: whether criteria are met, as text, JSON lines, JUnit XML and Markdown, and read back from JSON lines.
 
 *Met*: the whole interval is on the good side of the bound; *not met*: all of it is on the other; *undecided*: the bound
 is in it; *not measured*: there is no row, or no interval. Files have no clock and no host: equal results, equal bytes.
@@ -100,7 +100,7 @@ class Verdict:
 
 
 @dataclass(frozen=True)
-class Verdicts:
+class Judgement:
     """The verdicts of criteria on results. `place`: their name in messages. `notes`: what else has to be said.
 
     >>> verdicts = cr.judge("out/tc016d", {"known": {"metric": "detected_share", "at_least": 0.9}})
@@ -148,7 +148,7 @@ class Verdicts:
 # As text, and as files.
 
 
-def verdicts_text(verdicts: Verdicts, width: int | None = None) -> str:
+def verdicts_text(verdicts: Judgement, width: int | None = None) -> str:
     """The verdicts for a terminal of so many characters a line; None: lines of any length."""
     grouped = any(verdict.group for verdict in verdicts.all)
     levels = {verdict.confidence for verdict in verdicts.all}
@@ -174,7 +174,7 @@ def verdicts_text(verdicts: Verdicts, width: int | None = None) -> str:
     return "\n".join([*lines, verdicts.chance, verdicts.headline])
 
 
-def verdicts_markdown(verdicts: Verdicts) -> str:
+def verdicts_markdown(verdicts: Judgement) -> str:
     """The verdicts as a table in Markdown, for the summary page of a job."""
     head = ("criterion", "configuration", "bound", "found", "interval", "verdict", "")
     lines = [f"### {escape_markdown(verdicts.place)}: {verdicts.headline}", ""]
@@ -186,7 +186,7 @@ def verdicts_markdown(verdicts: Verdicts) -> str:
     return "\n".join([*lines, "", f"{escape_markdown(verdicts.chance)}.", ""])
 
 
-def verdicts_junit(verdicts: Verdicts) -> str:
+def verdicts_junit(verdicts: Judgement) -> str:
     """The verdicts as JUnit XML: a test case for each, in a suite named as the results are.
 
     Not met is a failure; undecided a failure of that type, or skipped where it passes; not measured an error, or
@@ -224,7 +224,7 @@ def _junit_tag(verdict: Verdict) -> str:
     return "error" if verdict.verdict == NOT_MEASURED else "failure"
 
 
-def verdicts_jsonl(verdicts: Verdicts) -> str:
+def verdicts_jsonl(verdicts: Judgement) -> str:
     """The verdicts as JSON lines; the last one has the total, and a digest of the lines before it."""
     lines = [json.dumps(asdict(verdict), ensure_ascii=False) for verdict in verdicts.all]
     total = {
@@ -240,7 +240,7 @@ def _digest_lines(lines: Iterable[str]) -> str:
     return hashlib.sha256("".join(f"{line}\n" for line in lines).encode()).hexdigest()
 
 
-FORMS: dict[str, Callable[[Verdicts], str]] = {
+FORMS: dict[str, Callable[[Judgement], str]] = {
     "jsonl": verdicts_jsonl,
     "junit": verdicts_junit,
     "markdown": verdicts_markdown,
@@ -255,7 +255,7 @@ def check_verdict_files(files: Mapping[str, Path | None]) -> None:
             raise OutputError(f"--{form}: expected a name for a file, found the folder {path}")
 
 
-def write_verdicts(verdicts: Verdicts, path: Path, form: str = "jsonl") -> Path:
+def write_verdicts(verdicts: Judgement, path: Path, form: str = "jsonl") -> Path:
     """Write verdicts as a file, complete or not at all; an existing one is replaced. Raises OutputError."""
     with atomic_file(path) as scratch:
         scratch.write_text(FORMS[form](verdicts), encoding="utf-8", newline="\n")
@@ -268,7 +268,7 @@ def write_verdicts(verdicts: Verdicts, path: Path, form: str = "jsonl") -> Path:
 # Read back.
 
 
-def read_verdicts(path: Path) -> Verdicts:
+def read_verdicts(path: Path) -> Judgement:
     """The verdicts of a file in JSON lines. Raises InputError, one line, where it is not as it was written."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -277,7 +277,7 @@ def read_verdicts(path: Path) -> Verdicts:
         raise InputError(f"{path}: expected verdicts, found none that can be read: {why}") from None
     try:
         *rows, last = [parse_json(line) for line in lines]
-        verdicts = Verdicts(path.parent.name, tuple(_parse_verdict(k, row) for k, row in enumerate(rows, start=1)))
+        verdicts = Judgement(path.parent.name, tuple(_parse_verdict(k, row) for k, row in enumerate(rows, start=1)))
         total = {"verdicts": len(rows), **verdicts.count(), "passes": verdicts.passes}
         found = dict(last["total"])
         digest = found.pop("sha256")
@@ -321,7 +321,7 @@ def _parse_verdict(number: int, row: Any) -> Verdict:
     return verdict
 
 
-def find_verdicts(folder: Path) -> Verdicts | None:
+def find_verdicts(folder: Path) -> Judgement | None:
     """The verdicts in a results folder; None: there are none. Raises InputError where they are damaged."""
     return read_verdicts(folder / FILE) if (folder / FILE).is_file() else None
 

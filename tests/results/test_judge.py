@@ -23,8 +23,8 @@ from copem_replay.results.verdicts import (
     NOT_MEASURED,
     NOT_MET,
     UNDECIDED,
+    Judgement,
     Verdict,
-    Verdicts,
     judge_limits,
     verdicts_jsonl,
 )
@@ -41,7 +41,7 @@ def several(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def judged(folder: Path | Results, *, before: Path | None = None, **criterion: Any) -> dict[str, Verdict]:
-    """Verdicts of one criterion, by configuration and group."""
+    """Judgement of one criterion, by configuration and group."""
     verdicts = cr.judge(folder, {"it": criterion}, before=before).all
     return {f"{one.configuration}/{one.group}" if one.group else one.configuration: one for one in verdicts}
 
@@ -279,5 +279,20 @@ def test_less_confidence_is_narrower(rows: list[tuple[int, int | None]], confide
     assert narrow.high <= wide.high + 1e-12
 
 
+@pytest.mark.parametrize("looks", [1, 5, 40])
+@pytest.mark.parametrize("together", [False, True])
+def test_verdicts_over_runs_are_seldom_wrong_at_the_bound(looks: int, together: bool) -> None:
+    """2,000 studies of 60 runs at a share of .9: rows of a run are independent, or one and the same."""
+    rng = np.random.default_rng([looks, together])
+    studies, runs = 2000, 60
+    known = rng.random((studies, runs, 1 if together else looks)) < 0.9
+    successes = np.broadcast_to(known, (studies, runs, looks)).sum(axis=-1).astype(float)
+    share = successes.mean(axis=-1) / looks
+    low, high = limit_share_of_runs(share, successes - (share * looks)[:, None], looks)
+    wrong = max((low > 0.9).mean(), (high < 0.9).mean())
+    assert wrong <= 0.035 + 3 * math.sqrt(0.035 * 0.965 / studies)
+    assert (high - low).mean() < (0.2 if looks == 1 or together else 0.2 / math.sqrt(looks / 1.5))
+
+
 def test_no_verdict_passes_where_one_does_not() -> None:
-    assert Verdicts("none", ()).passes
+    assert Judgement("none", ()).passes

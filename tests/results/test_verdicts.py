@@ -1,4 +1,4 @@
-"""Verdicts as files: JSON lines and back, JUnit XML as others read it, Markdown; tampered ones are refused by name."""
+"""Judgement as files: JSON lines and back, JUnit XML as others read it, Markdown; tampered ones are refused by name."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from copem_replay.results.verdicts import (
     NOT_MET,
     UNDECIDED,
     WORDS,
+    Judgement,
     Verdict,
-    Verdicts,
     find_verdicts,
     judge_limits,
     read_verdicts,
@@ -52,7 +52,7 @@ def verdict(word: str, *, passes: bool | None = None, **given: Any) -> Verdict:
     return Verdict(**columns | given)
 
 
-ALL = Verdicts(
+ALL = Judgement(
     "out",
     (
         *(verdict(word, criterion=f"is {word}") for word in WORDS),
@@ -75,7 +75,7 @@ some = st.lists(
 @given(some)
 def test_what_is_written_is_read(tmp_path_factory: pytest.TempPathFactory, of: list[Verdict]) -> None:
     folder = tmp_path_factory.mktemp("folder")
-    written = Verdicts(folder.name, tuple(of))
+    written = Judgement(folder.name, tuple(of))
     write_verdicts(written, folder / FILE)
     assert find_verdicts(folder) == written
     assert (folder / FILE).read_text() == verdicts_jsonl(written)
@@ -150,7 +150,7 @@ def test_junit_is_read_as_it_is_meant() -> None:
 
 @given(some)
 def test_counts_of_junit_are_right_and_its_schema_holds(of: list[Verdict]) -> None:
-    verdicts = Verdicts("out", tuple(of))
+    verdicts = Judgement("out", tuple(of))
     xml = verdicts_junit(verdicts)
     xmlschema.XMLSchema(str(XSD)).validate(io.StringIO(xml))
     (suite,) = JUnitXml.fromstring(xml.encode())
@@ -165,7 +165,7 @@ def test_counts_of_junit_are_right_and_its_schema_holds(of: list[Verdict]) -> No
 
 @given(some)
 def test_a_row_of_markdown_for_each(of: list[Verdict]) -> None:
-    html = MarkdownIt("commonmark").enable("table").render(verdicts_markdown(Verdicts("out", tuple(of))))
+    html = MarkdownIt("commonmark").enable("table").render(verdicts_markdown(Judgement("out", tuple(of))))
     assert html.count("<tr>") == 1 + len(of)
     assert html.count("<strong>") == sum(not one.passes for one in of)
 

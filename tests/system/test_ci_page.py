@@ -15,7 +15,8 @@ from junitparser import JUnitXml
 
 from copem_replay.cli import main as cli
 from copem_replay.core.yaml import parse_yaml
-from copem_replay.experiment.criteria import CriteriaFile, read_criteria
+from copem_replay.experiment.criteria import CriteriaFile
+from copem_replay.experiment.cross_references import read_criteria
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs/guide/ci.md").read_text(encoding="utf-8")

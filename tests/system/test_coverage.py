@@ -77,10 +77,21 @@ def test_no_row_of_a_short_table_is_below_its_gate(tool: ModuleType) -> None:
 
 def test_a_row_below_its_gate_fails(tool: ModuleType) -> None:
     low, high = np.zeros(100), np.where(np.arange(100) < 80, 2.0, 0.5)
-    row = tool.describe_row(low, high, 1.0, 0.0, 0.93)
+    alike = (np.full(100, -1.0), np.ones(100))
+
+    def row_of(gate: float | None, **held: bool) -> dict[str, object]:
+        return tool.describe_row((low, high), alike, 1.0, gate, **({"judged": False, "symmetric": False} | held))
+
+    row = row_of(0.93)
     assert (row["coverage"], row["width"], row["fails"]) == (0.8, pytest.approx(1.7), True)
-    assert not tool.describe_row(low, high, 1.0, 0.0, 0.85)["fails"]  # .85 − 2 · .0357
-    assert not tool.describe_row(low, high, 1.0, 0.0, None)["fails"]
+    assert not row_of(0.85)["fails"]  # .85 − 2 · .0357
+    assert not row_of(None)["fails"]
+    # Of 100 verdicts 20 are met though the truth is beyond the bound by a hair: more than .035 + 3 · .0184.
+    assert (row["wrong"], row["wrong, difference"]) == (0.2, 0.0)
+    assert row_of(None, judged=True)["fails"]
+    assert not row_of(None, symmetric=True)["fails"]
+    shifted = tool.describe_row(alike, (low - 3.0, high - 3.0), 0.0, None, judged=True, symmetric=True)
+    assert (shifted["wrong"], shifted["wrong, difference"], shifted["fails"]) == (0.0, 1.0, True)
 
 
 def test_it_is_not_taken_for_the_package_of_that_name() -> None:
@@ -93,6 +104,7 @@ def test_it_prints_its_tables_and_tells_by_its_exit_code() -> None:
     asked = ["--studies", "60", "--logs", "4", "--objects", "5"]
     printed = subprocess.run([sys.executable, str(PATH), *asked], capture_output=True, text=True)
     lines = printed.stdout.splitlines()
-    assert lines[0].split() == ["kind", "design", "objects", "sizes", "logs", "coverage", "width", "false", "*", "gate"]
-    (verdict,) = (line for line in lines if "below their gate" in line)
+    head = "kind design objects sizes logs coverage width false * wrong wrong, difference gate"
+    assert lines[0].split() == head.split()
+    (verdict,) = (line for line in lines if "beyond a gate" in line)
     assert printed.returncode == int(not verdict.startswith("0 of "))

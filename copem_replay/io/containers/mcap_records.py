@@ -298,6 +298,16 @@ def _parse_summary(section: bytes) -> Summary:
     return summary
 
 
+def read_metadata(file: IO[bytes], summary: Summary, name: str) -> dict[str, str]:
+    """The metadata records of a name, later ones over earlier ones; empty without any. Raises DAMAGE."""
+    found: dict[str, str] = {}
+    for index in summary.metadata_indexes:
+        if index.name == name:
+            record = parse_record(Opcode.METADATA, read_record_at(file, index.offset, Opcode.METADATA))
+            found |= record.metadata if isinstance(record, Metadata) else {}
+    return found
+
+
 def read_by_log_time(file: IO[bytes], summary: Summary, spans: Mapping[int, Span]) -> Iterator[Message]:
     """Messages of some channels in order of log time, of equal ones as in the file. Raises DAMAGE.
 

@@ -242,6 +242,7 @@ def _join_bag_files(folder: Path, logs: Sequence[Log], lost: Sequence[str], note
         end_ns=max(log.end_ns for log in logs),
         notes=tuple(dict.fromkeys([*notes, *of_files])),
         parts=tuple(parts),
+        tags={name: value for log in reversed(logs) for name, value in log.tags.items()},
         lost=tuple(lost),
     )
 

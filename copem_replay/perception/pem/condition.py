@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError, ValidationError
 
-from copem_replay.core.components import Either, Flag, Frozen, NotNegative, Number, Share, Slot
+from copem_replay.core.components import Either, Flag, Frozen, Id, NotNegative, Number, Share, Slot, TagText
 from copem_replay.core.memory import Memory
 from copem_replay.core.tracks import CLASS_GROUPS, CLASSES, Bool, Float, Int, class_indices
 from copem_replay.core.view_geometry import ViewGeometry
@@ -142,15 +142,20 @@ ClassNames = Annotated[tuple[ClassName, ...], Field(min_length=1)]
 
 
 class Condition(Frozen):
-    """When a couple applies. All given keys must hold; bounds are included."""
+    """When a couple applies. All given keys must hold; bounds are included. `tags`: those that the log has."""
 
     range_m: Annotated[tuple[NotNegative, NotNegative], AfterValidator(check_ascending)] | None = None
     azimuth_deg: Annotated[tuple[Number, Number], AfterValidator(check_one_turn)] | None = None
     classes: ClassNames | None = None
     visible_share: Annotated[tuple[Share, Share], AfterValidator(check_ascending)] | None = None
+    tags: Annotated[dict[Id, TagText] | None, Field(exclude_if=lambda tags: tags is None)] = None
+
+    def applies_to(self, tags: Mapping[str, str]) -> bool:
+        """Whether a log with these tags has all that are asked for."""
+        return all(tags.get(name) == value for name, value in (self.tags or {}).items())
 
     def holds(self, view: ViewGeometry) -> Bool:
-        """(P,) where the condition holds."""
+        """(P,) where the condition holds, whatever the tags of the log."""
         result = np.ones(len(view.range_m), dtype=bool)
         if self.range_m is not None:
             result &= _is_within(view.range_m, *self.range_m)
@@ -197,9 +202,13 @@ class Couple(Frozen):
         return None if names is None else frozenset(map(noise_quantity, names))
 
 
-def find_couples(couples: tuple[Couple, ...], view: ViewGeometry) -> Int:
-    """(P,) index of the couple that applies to each row, −1 where none does (then it is not detected)."""
+def find_couples(couples: tuple[Couple, ...], view: ViewGeometry, tags: Mapping[str, str] | None = None) -> Int:
+    """(P,) index of the couple that applies to each row, −1 where none does (then it is not detected).
+
+    `tags`: those of the log.
+    """
     couple_ix = np.full(len(view.range_m), -1)
     for k, couple in enumerate(couples):
-        couple_ix[(couple_ix < 0) & couple.when.holds(view)] = k
+        if couple.when.applies_to(tags or {}):
+            couple_ix[(couple_ix < 0) & couple.when.holds(view)] = k
     return couple_ix

@@ -40,6 +40,7 @@ from copem_replay.report.html.tables import (
     regret_table,
     stage_table,
     summary_tables,
+    verdicts_table,
 )
 from copem_replay.results.folder import add_to_made_list
 from copem_replay.results.read import Results
@@ -180,7 +181,6 @@ def build_page(study: ReportData) -> str:
 
 def _verdict_sections(study: ReportData) -> list[_Section]:
     """The section of verdicts: those in the folder, else of the criteria of the experiment; none without criteria."""
-    from copem_replay.report.html.verdicts import verdicts_table
     from copem_replay.results.judge import judge_own_criteria
     from copem_replay.results.verdicts import find_verdicts
 

@@ -32,6 +32,7 @@ from copem_replay.report.html.markup import (
     make_tag,
 )
 from copem_replay.results.compare.tables import NOTHING, comparison_lines, explain_no_interval, held_cells
+from copem_replay.results.verdicts import MET, NOT_MEASURED, NOT_MET, UNDECIDED, Judgement, Verdict
 
 if TYPE_CHECKING:
     from copem_replay.report.html.study import ReportData
@@ -436,3 +437,40 @@ def _stages_table(
         rows.append(make_tag("tr", row_head(study, name), counted, *cells, data_row=name))
     head = ["configuration", "known", *stages, "sum"]
     return make_table(head, rows, caption="Mean duration of the stages, in seconds", id_="stages")
+
+
+# Verdicts of criteria.
+
+VERDICT_SIGNS = {MET: "✓", NOT_MET: "✗", UNDECIDED: "?", NOT_MEASURED: "–"}
+"""What tells verdicts apart beside their colour."""
+
+
+def verdict_mark(verdict: Verdict | None) -> Html:
+    """A square with the sign of a verdict."""
+    if verdict is None:
+        return make_tag("span", " ", class_="mark absent", title="not judged")
+    kind = verdict.verdict.replace(" ", "-")
+    words = f"{verdict.result}: {verdict.found} {verdict.limits}"
+    return make_tag(
+        "span", VERDICT_SIGNS[verdict.verdict], class_=f"mark {kind}", title=words, aria_label=words, role="img"
+    )
+
+
+def verdicts_table(verdicts: Judgement) -> Html:
+    """The table of a report: a row per verdict; below it how many pass."""
+    head = ["criterion", "configuration", "bound", "found", "verdict", "why"]
+    rows = [
+        make_tag(
+            "tr",
+            make_tag("th", one.name, scope="row"),
+            make_tag("td", allow_breaks(one.configuration), class_="text"),
+            make_tag("td", allow_breaks(one.asked), class_="text"),
+            make_tag("td", one.found, " ", make_tag("span", one.limits, class_="interval")),
+            make_tag("td", verdict_mark(one), " ", make_tag("span" if one.passes else "b", one.result), class_="text"),
+            make_tag("td", one.why, class_="text long"),
+        )
+        for one in verdicts.all
+    ]
+    below = [make_tag("p", f"{text}.", class_="below") for text in (verdicts.chance, *verdicts.notes)]
+    headline = make_tag("p", f"{verdicts.headline}.", class_="lead")
+    return join_html([headline, make_table(head, rows, id_="verdicts"), *below])

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import copem_replay as cr
-from copem_replay.report.html.verdicts import draw_strip, find_turns
+from copem_replay.report.html.history import draw_strip, find_turns
 from copem_replay.results.verdicts import FILE, MET, NOT_MET, UNDECIDED, WORDS, write_verdicts
 from tests.helpers.report_pages import changed, replayed
 from tests.results.test_verdicts import verdict

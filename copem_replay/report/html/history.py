@@ -1,8 +1,8 @@
-"""Verdicts on pages: the table of a report, and the history of many results folders as one page that opens offline.
+"""History: what became of criteria over many results folders, as one page that opens offline.
 
-A history has a row for each criterion, configuration and group: a strip with the verdict of each folder, the figure
-with its interval over the folders beside the bound, and the first folder at which the verdict turned. Folders stand in
-the order in which they are given.
+There is a row for each criterion, configuration and group: a strip with the verdict of each folder, the figure with its
+interval over the folders beside the bound, and the first folder at which the verdict turned. Folders stand in the order
+in which they are given.
 """
 
 from __future__ import annotations
@@ -21,52 +21,16 @@ from copem_replay.metrics.summary import format_cell
 from copem_replay.metrics.summary_metrics import COMPARED
 from copem_replay.report.html.markup import Html, allow_breaks, fold_parts, join_html, make_list, make_table, make_tag
 from copem_replay.report.html.page import REPORT, check_report, section_links, whole_page
+from copem_replay.report.html.tables import VERDICT_SIGNS, verdict_mark
 from copem_replay.results.compare import compare_folders
 from copem_replay.results.compare.labels import label_configurations
 from copem_replay.results.read import Results, open_results
 from copem_replay.results.verdicts import (
     FILE,
-    MET,
-    NOT_MEASURED,
-    NOT_MET,
-    UNDECIDED,
+    Judgement,
     Verdict,
-    Verdicts,
     find_verdicts,
 )
-
-_SIGNS = {MET: "✓", NOT_MET: "✗", UNDECIDED: "?", NOT_MEASURED: "–"}
-"""What tells verdicts apart beside their colour."""
-
-
-def verdict_mark(verdict: Verdict | None) -> Html:
-    """A square with the sign of a verdict, dashed where it does not pass for another reason than that it is not met."""
-    if verdict is None:
-        return make_tag("span", " ", class_="mark absent", title="not judged")
-    kind = verdict.verdict.replace(" ", "-")
-    words = f"{verdict.result}: {verdict.found} {verdict.limits}"
-    return make_tag("span", _SIGNS[verdict.verdict], class_=f"mark {kind}", title=words, aria_label=words, role="img")
-
-
-def verdicts_table(verdicts: Verdicts) -> Html:
-    """The table of a report: a row per verdict; below it how many pass."""
-    head = ["criterion", "configuration", "bound", "found", "verdict", "why"]
-    rows = [
-        make_tag(
-            "tr",
-            make_tag("th", one.name, scope="row"),
-            make_tag("td", allow_breaks(one.configuration), class_="text"),
-            make_tag("td", allow_breaks(one.asked), class_="text"),
-            make_tag("td", one.found, " ", make_tag("span", one.limits, class_="interval")),
-            make_tag("td", verdict_mark(one), " ", make_tag("span" if one.passes else "b", one.result), class_="text"),
-            make_tag("td", one.why, class_="text long"),
-        )
-        for one in verdicts.all
-    ]
-    below = [make_tag("p", f"{text}.", class_="below") for text in (verdicts.chance, *verdicts.notes)]
-    headline = make_tag("p", f"{verdicts.headline}.", class_="lead")
-    return join_html([headline, make_table(head, rows, id_="verdicts"), *below])
-
 
 # The history.
 
@@ -76,7 +40,7 @@ class JudgedFolder:
     """A results folder of a history: its verdicts, its label, and where its report is seen from the page."""
 
     results: Results
-    verdicts: Verdicts
+    verdicts: Judgement
     label: str
     report: str | None
 
@@ -204,7 +168,7 @@ def _criteria_table(folders: Sequence[JudgedFolder], rows: dict[_Key, list[Verdi
             )
         )
     head = ["criterion", "configuration", "bound", "verdicts", "figure", "newest", "first turned"]
-    key = ", ".join(f"{sign} {word}" for word, sign in _SIGNS.items())
+    key = ", ".join(f"{sign} {word}" for word, sign in VERDICT_SIGNS.items())
     says = f"{key}; empty: not judged. The line is the bound, bars are the intervals, an open ring has none."
     return join_html([make_table(head, lines, id_="strips"), make_tag("p", says, class_="below")])
 
@@ -250,7 +214,7 @@ def _folders_table(folders: Sequence[JudgedFolder]) -> Html:
     for k, folder in enumerate(folders):
         provenance = folder.results.provenance
         counts = folder.verdicts.count()
-        cells = [str(counts[word]) for word in _SIGNS]
+        cells = [str(counts[word]) for word in VERDICT_SIGNS]
         cells += [str(provenance.runs), str(len(provenance.logs)), str(provenance.data.get("copem_replay", "–"))]
         lines.append(
             make_tag(
@@ -261,7 +225,7 @@ def _folders_table(folders: Sequence[JudgedFolder]) -> Html:
                 *(make_tag("td", cell) for cell in cells),
             )
         )
-    head = ["", "folder", "", *_SIGNS, "runs", "logs", "version"]
+    head = ["", "folder", "", *VERDICT_SIGNS, "runs", "logs", "version"]
     said = "A name leads to the report where the folder has one (`copem-replay report FOLDER`)."
     return join_html([make_table(head, lines, id_="all-folders"), make_tag("p", said, class_="below")])
 
