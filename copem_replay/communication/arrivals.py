@@ -11,9 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 
+from copem_replay.core.compiled import kernel
 from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int, Tracks
 
 
@@ -173,7 +173,7 @@ class _PartialLists(NamedTuple):
     outdated_s: Float
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _keep_newest(
     issue_s: Float, arrived: Int, arrived_start: Int, before: int, given: Int, lists: _PartialLists, frame: Int,
     same: Int, units: Int,

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, NamedTuple, Self
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from copem_replay.core.compiled import kernel
 from copem_replay.core.components import Count, Frozen
 from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int
 
@@ -83,7 +83,7 @@ class LastSent:
         return sent, included
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _choose_objects(
     listed: ListedObjects,
     interval_s: Float,
@@ -130,7 +130,7 @@ def _choose_objects(
                 objects[listed.slot[r], 1:] = listed.state[r]
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _keep_most(listed: ListedObjects, differences: Float, first: int, after: int, most: int, included: Bool) -> None:
     """Of the rows `first` … `after` − 1 that are `included`, keep the `most` that are worth most, in place.
 

@@ -25,27 +25,30 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
+def kernel(function: Function) -> Function:
+    """The function, compiled at its first call: kept in the cache, and without Python's global lock."""
+    return _compile(function)
+
+
 def borrowing(function: Function) -> Function:
-    """`nb.njit` for functions that make no array and return none: their arguments outlive them."""
-    return _compile(function, counts_references=False)
+    """`kernel` for functions that make no array and return none: their arguments outlive them."""
+    return _compile(function, _nrt=False)
 
 
 def making(function: Function) -> Function:
-    """`nb.njit` for functions that make arrays and are called by borrowing ones."""
-    return _compile(function, counts_references=True)
+    """`kernel` for functions that make arrays and are called by borrowing ones."""
+    return _compile(function, _nrt=True)
 
 
-def _compile(function: Function, *, counts_references: bool) -> Function:
-    import numba  # by kernels alone: the place of the cache is prepared before, and `--help` needs no Numba
+def _compile(function: Function, **options: bool) -> Function:
+    from copem_replay.core.callees import Kernel  # by kernels alone: the place of the cache is prepared before
 
-    njit: Any = numba.njit  # whose stubs leave the option out
-    compiled: Function = njit(cache=True, nogil=True, _nrt=counts_references)(function)
-    return compiled
+    return cast("Function", Kernel(function, {"nogil": True, **options}))
 
 
 VARIABLE = "NUMBA_CACHE_DIR"

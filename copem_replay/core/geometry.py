@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
-from copem_replay.core.compiled import borrowing
+from copem_replay.core.compiled import borrowing, kernel
 from copem_replay.core.tracks import Bool, Float, Int
 
 _TOUCH_M = 1e-9
@@ -109,7 +109,7 @@ def corner_travel(path: Float, size: Float) -> float:
     return most
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def find_smallest_distances(
     along: Float, path: Float, size: Float, other: Float, other_size: Float, near: Float, touch: Float
 ) -> None:
@@ -234,7 +234,7 @@ _MOST_CORNERS = 20
 there were: 4, 6, 9, 13, 19."""
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def rotated_iou(
     x0: float, y0: float, yaw0: float, l0: float, w0: float,
     x1: float, y1: float, yaw1: float, l1: float, w1: float,
@@ -257,7 +257,7 @@ def rotated_iou(
     return float(both / (area0 + area1 - both))
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _intersection_area(
     dx: float, dy: float, yaw: float, length: float, width: float, by_yaw: float, by_length: float, by_width: float
 ) -> float:
@@ -284,7 +284,7 @@ def _intersection_area(
     return float(max(twice / 2, 0.0))
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _clip_polygon(polygon: Float, count: int, axis: int, side: float, reach: float, out: Float) -> int:
     """What of a polygon lies where side · coordinate ≤ reach; how many corners that has."""
     kept = 0

@@ -20,6 +20,7 @@ from typing import Literal
 import numba as nb
 import numpy as np
 
+from copem_replay.core.compiled import kernel
 from copem_replay.core.random import CounterRng, RandomKey, Words, normal_quantile, philox4x32, stable_hash
 from copem_replay.core.tracks import Bool, Float, Int
 
@@ -312,7 +313,7 @@ _AT_ONCE = 4
 """Renewals of a cell that are drawn in advance; a cell has 1 to 2 on average."""
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _advance_renewal(
     key: np.uint64,
     word: np.uint64,
@@ -333,7 +334,7 @@ def _advance_renewal(
         number, value = number + 1, v
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _find_last_renewal(
     key: np.uint64, word: np.uint64, run: np.uint64, cell: int, tau_ns: float, shift: int
 ) -> tuple[int, float]:
@@ -440,7 +441,7 @@ def fill_held_rows(
                     row[p] = row[p] if where[s, p] else 0.0
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def fill_correlated_rows(
     key: Words,
     word: Words,
@@ -519,7 +520,7 @@ def fill_correlated_rows(
             out[s, p] = value
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def list_births(
     key: Words,
     word: Words,

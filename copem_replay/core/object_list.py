@@ -11,11 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from copem_replay.core.compiled import borrowing
+from copem_replay.core.compiled import borrowing, kernel
 from copem_replay.core.tracks import CLASS_GROUPS, CLASSES, Bool, Float, Int
 
 ENTRY = np.dtype(
@@ -161,7 +160,7 @@ def most_probable_class(probability: Float) -> int:
     return best if probability[best] > 0 else _OTHER
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def most_probable_classes(probability: Float) -> Int:
     """(N,) `most_probable_class` of each row of `probability (N, C)`."""
     best = np.empty(len(probability), np.int64)

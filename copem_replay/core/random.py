@@ -22,6 +22,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from copem_replay.core.compiled import kernel
 from copem_replay.core.tracks import Bool, Float, Int
 
 Words = NDArray[np.uint64]
@@ -122,14 +123,14 @@ def _unit_interval(key: np.uint64, word: np.uint64, stamp: np.uint64, run: np.ui
     return (np.float64(bits) + 0.5) * _UNIT
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _draw_uniform(key: Words, word: Words, stamp: Words, runs: Words, out: Float) -> None:
     for s in range(out.shape[0]):
         for p in range(out.shape[1]):
             out[s, p] = _unit_interval(key[p], word[p], stamp[p], runs[s])
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _draw_bernoulli(key: Words, word: Words, stamp: Words, runs: Words, probability: Float, out: Bool) -> None:
     for s in range(out.shape[0]):
         for p in range(out.shape[1]):
@@ -180,7 +181,7 @@ def _central_quantile(q: float) -> float:
     return q * num / (den * r + 1.0)
 
 
-@nb.njit(cache=True)
+@kernel
 def normal_quantile(u: float) -> float:
     """Inverse of the standard normal distribution, u in (0, 1); relative error about 1e-16.
 

@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-import numba as nb
 import numpy as np
 from scipy.special import expit, logit
 
+from copem_replay.core.compiled import kernel
 from copem_replay.core.tracks import Bool, Float, Int
 from copem_replay.core.yaml import CommentedValue
 from copem_replay.fitting.estimate import DROP, Bounds, Estimate, maximise_likelihood, profile_limits
@@ -22,7 +22,7 @@ from copem_replay.fitting.estimate import DROP, Bounds, Estimate, maximise_likel
 # Kernels: whitening by a Kalman filter, and correlations between rows.
 
 
-@nb.njit(cache=True)
+@kernel
 def whiten_columns(values: Float, decay: Float, new: Bool, drift: float, constant: float) -> tuple[Float, Float]:
     """Columns (n, K) freed of their memory, (n, K), and the variance of each row given those before it, (n,).
 
@@ -63,7 +63,7 @@ def whiten_columns(values: Float, decay: Float, new: Bool, drift: float, constan
     return out, variance
 
 
-@nb.njit(cache=True)
+@kernel
 def sum_correlations(decay: Float, new: Bool, bin_ix: Int, bins: int, drift: float, constant: float) -> Float:
     """(2, B) Σ ρ and Σ ρ² over all pairs of rows of a bin, a row with itself as 1.
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numba as nb
 import numpy as np
 from scipy.stats import chi2
 
+from copem_replay.core.compiled import kernel
 from copem_replay.core.tracks import CLASSES, Bool, Float, Int
 from copem_replay.core.yaml import CommentedValue
 from copem_replay.fitting.estimate import Estimate
@@ -17,7 +17,7 @@ from copem_replay.fitting.rows import FitLists, FitRows, OtherEntries
 # Kernels: a filter over classes that last, and chains of entries from list to list.
 
 
-@nb.njit(cache=True)
+@kernel
 def log_classes(shares: Float, listed: Int, decay: Float, new: Bool, share: float) -> float:
     """Logarithm of the probability of listed classes (n,), by probabilities (n, C) that are the same within a series.
 
@@ -38,7 +38,7 @@ def log_classes(shares: Float, listed: Int, decay: Float, new: Bool, share: floa
     return total
 
 
-@nb.njit(cache=True)
+@kernel
 def link_entries(follows: Int, begin: Int, x_m: Float, y_m: Float, ids: Int, gate_m: float) -> Int:
     """(E,) the entry of the list before that each continues, −1: none. First by id, then the nearest within a gate.
 

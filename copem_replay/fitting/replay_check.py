@@ -17,9 +17,9 @@ from functools import partial
 from itertools import pairwise
 from typing import Literal
 
-import numba as nb
 import numpy as np
 
+from copem_replay.core.compiled import kernel
 from copem_replay.core.lasting import ListStamps, drop_unshared
 from copem_replay.core.memory import Parts, UnitDraws
 from copem_replay.core.random import CounterRng, RandomKey, object_words
@@ -183,7 +183,7 @@ def compute_statistics(listed: Bool, along_m: Float, across_m: Float, rows: FitR
     return dict(zip(STATISTICS, out, strict=True))
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _fill_statistics(listed: Bool, along: Float, across: Float, at: Float, start: Int, out: Float) -> None:
     for s in range(listed.shape[0]):
         for k in range(len(start) - 1):

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numba as nb
 import numpy as np
 
 from copem_replay.communication.arrivals import FusionSchedule, KeptEntries, fusion_schedule
+from copem_replay.core.compiled import kernel
 from copem_replay.core.object_list import COVARIANCES, ENTRY, Entries, Inputs, ObjectLists, join_entries, take_entries
 from copem_replay.core.tracks import CLASSES, VALUES, Bool, Float, Int, Tracks
 from copem_replay.fusion.ideal import floor_covariances
@@ -86,7 +86,7 @@ def add_kept_entries(inputs: Inputs, kept: KeptEntries, partial: Bool, max_age_s
     )
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _pick_rows(valid: Bool, drawn: Float, order: Int, bounds: Int, start: Int, picked: Int) -> None:
     """Fill `start (S, F + 1)` and `picked (N,)` with the valid rows, list by list, ordered by `drawn`."""
     n = 0
@@ -122,7 +122,7 @@ def view_as_numbers(entries: Entries) -> Float:
     return values
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def order_by_content(start: Int, content: Float) -> Int:
     """Indices of the entries (N,), list by list, in order of their content, place first."""
     rows = np.arange(start[-1])
@@ -131,7 +131,7 @@ def order_by_content(start: Int, content: Float) -> Int:
     return rows
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def sort_rows(values: Float, order: Int) -> None:
     """Sort `order`, indices of rows of `values (N, V)`, by the first column, then the second …; in place, stably."""
     n = len(order)
@@ -165,7 +165,7 @@ def sort_rows(values: Float, order: Int) -> None:
         block *= 2
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def compare_rows(values: Float, a: int, b: int) -> int:
     """−1, 0 or 1: row a comes before row b, equals it, or comes after it."""
     for v in range(values.shape[1]):

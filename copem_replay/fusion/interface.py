@@ -9,9 +9,9 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, get_args
 
-import numba as nb
 import numpy as np
 
+from copem_replay.core.compiled import kernel
 from copem_replay.core.components import Component, GivenError, ask_component, wrong_answer_error
 from copem_replay.core.object_list import COVARIANCES, ENTRY, Entries, Inputs, ObjectLists, TellsOf
 from copem_replay.core.tracks import SAME_INSTANT_S, VALUES, Bool, Float, Int
@@ -247,7 +247,7 @@ def _has_arrived(answer: ObjectLists, inputs: Inputs) -> Bool:
     return arrived
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _mark_arrived(
     start: Int, entry_s: Float, issue_s: Float, captured_s: Float, first_s: Float, tolerance_s: float, arrived: Bool
 ) -> None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any, ClassVar, Literal
 
-import numba as nb
 import numpy as np
 
+from copem_replay.core.compiled import kernel
 from copem_replay.core.components import Positive, Share
 from copem_replay.core.geometry import rotated_iou
 from copem_replay.core.object_list import AGREE, Entries, Inputs, ObjectLists, most_probable_classes
@@ -81,7 +81,7 @@ def _order_entries(entries: Entries, bounds: Int, inputs: Inputs) -> Int:
     return order
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _suppress_overlapping(
     entries: Entries, place: Float, kind: Int, order: Int, start: Int, rows: Int, agree: Bool, by_iou: bool, iou: float
 ) -> tuple[Int, Int]:
@@ -111,7 +111,7 @@ def _suppress_overlapping(
     return kept_start, kept[:n].copy()
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _iou_of_entries(a: Any, b: Any) -> float:
     share: float = rotated_iou(
         a.x_m, a.y_m, a.yaw_rad, a.length_m, a.width_m, b.x_m, b.y_m, b.yaw_rad, b.length_m, b.width_m

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import ClassVar, Literal
 
-import numba as nb
 import numpy as np
 
+from copem_replay.core.compiled import kernel
 from copem_replay.core.components import Share
 from copem_replay.core.object_list import Entries, Inputs, ObjectLists, join_entries, take_entries
 from copem_replay.core.tracks import Bool, Int
@@ -66,7 +66,7 @@ def join_runs(runs: Sequence[tuple[Int, Entries]], instants: int) -> ObjectLists
     return ObjectLists(start, join_entries([entries for _, entries in runs]))
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def gather_newest_rows(bounds: Int, newest: Int, counts: Bool) -> tuple[Int, Int]:
     """Where the rows of each instant begin, (K + 1,), and (R,) the rows of its newest lists that count.
 

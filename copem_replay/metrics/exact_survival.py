@@ -20,9 +20,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba as nb
 import numpy as np
 
+from copem_replay.core.compiled import kernel
 from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int
 
 # Where detection lasts: the probability of a sequence of lists with and without the object, by a filter.
@@ -136,7 +136,7 @@ class Sequences:
         return out
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _filter_sequences(
     start: Int, listed: Float, held: Bool, log_same: Float, share: Float, edge_start: Int, edges: Float, out: Float
 ) -> None:
@@ -146,7 +146,7 @@ def _filter_sequences(
         _filter_sequence(listed[a:b], held[a:b], log_same[a:b], share[a:b], cells, out[a:b])
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _filter_sequence(listed: Float, held: Bool, log_same: Float, share: Float, edges: Float, out: Float) -> None:
     """Fill `out (P,)` as `log_sequence` has it. `edges`: the density of U is constant between them, 0 … 1.
 
@@ -319,7 +319,7 @@ def _weigh_by_presence(step: Float, share: float) -> Float:
     return np.where(detected < 0.5, np.log1p(-np.minimum(detected, 0.5)), np.log(absent + present * np.exp(step)))
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _run_chain(step: Float, listed: Float, without: Int, hits: int, of: int, probability: Float) -> tuple[float, float]:
     """A Markov chain whose state is which of the last `of` − 1 captures hold the object.
 
@@ -357,7 +357,7 @@ def _run_chain(step: Float, listed: Float, without: Int, hits: int, of: int, pro
     return rest, rest_slope
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _advance_chain(
     mass: Float, slope: Float, held: Int, hits: int, miss: float, miss_slope: float, hit: float, hit_slope: float
 ) -> tuple[Float, Float]:
@@ -376,7 +376,7 @@ def _advance_chain(
     return new, new_slope
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _add_logs(a: float, a_slope: float, b: float, b_slope: float) -> tuple[float, float]:
     """ln(eᵃ + eᵇ), and its derivative from those of a and b."""
     if b == -np.inf:

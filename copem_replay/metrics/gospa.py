@@ -22,7 +22,7 @@ import numba as nb
 import numpy as np
 
 from copem_replay.core.assignment import assign_pairs
-from copem_replay.core.compiled import making
+from copem_replay.core.compiled import kernel, making
 from copem_replay.core.tracks import Float, Int
 
 
@@ -130,7 +130,7 @@ def gospas_m(truth: Float, starts: Int, estimates: Float, begins: Int, cutoff_m:
     return value_m
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _sum_gospa(
     tx: Float, ty: Float, starts: Int, bx: Float, by: Float, begins: Int,
     cutoff_m: float, power: float, unit: float, total: Float,

@@ -26,11 +26,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from copem_replay.core.compiled import borrowing
+from copem_replay.core.compiled import borrowing, kernel
 from copem_replay.core.object_list import AGREE, Entries, ObjectLists, TellsOf, most_probable_class
 from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int, Scene, Tracks
 
@@ -123,7 +122,7 @@ def most_probable_entry_class(entries: Entries, i: int) -> int:
     return most_probable_class(entries[i].class_probability)
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _match_lists(
     start: Int,
     entries: Entries,

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import numba as nb
 import numpy as np
 
+from copem_replay.core.compiled import kernel
 from copem_replay.core.tracks import Bool, Float, Int
 
 Work = tuple[Float, Float, Float, Float, Float, Float, Float]
@@ -100,7 +101,7 @@ _MAX_PIECES = 512
 """Azimuth pieces per view: 60 bodies in front of one target need about 250."""
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def compute_shares(
     f0: int, f1: int, boxes: Boxes, obstacles: Statics, places: Observers, flat: bool, out: Float, blocker: Int
 ) -> None:
@@ -218,7 +219,7 @@ def compute_shares(
                         blocker[u, first + t] = first + near[i] if near[i] < n else -2 - of[near[i]].owner
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _hidden_by_one(t: int, near: Int, count: int, of: Any, oz: float, flat: bool) -> bool:
     # Whether one body surely hides all of target t, by bounds alone: what `_visible_share` gives, in far less time.
     nearest, farthest = of[t].distance_m - of[t].radius_m, of[t].distance_m + of[t].radius_m
@@ -256,7 +257,7 @@ def _contains(polygon: Float, size: int, px: float, py: float, depth_m: float) -
     return True
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _are_separated(a: Float, na: int, b: Float, nb_: int) -> bool:
     # Whether some edge of a has all of b on its outer side (or touching it).
     for k in range(na):
@@ -273,7 +274,7 @@ def _are_separated(a: Float, na: int, b: Float, nb_: int) -> bool:
     return False
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _drop_overlapping_boxes(t: int, near: Int, count: int, xy: Float, of: Any) -> int:
     # A box that overlaps the target's footprint does not hide it: a rider's overlaps that of the bicycle.
     kept = 0
@@ -296,7 +297,7 @@ def _may_meet(of: Any, a: int, b: int) -> bool:
     return bool(dx * dx + dy * dy < reach * reach)
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _make_workspace(most: int, widest: int) -> Work:
     return (
         np.empty((most + 1, widest, 2)),  # corners in the frame of the view: observer at 0, target along +x
@@ -336,7 +337,7 @@ def _crossing_distances(
     return hit and enter < leave and leave > 0.0, enter, nx, ny, fx, fy
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _insert_sorted(values: Float, count: int, value: float) -> int:
     # Keeps values[:count] ascending.
     k = count
@@ -347,7 +348,7 @@ def _insert_sorted(values: Float, count: int, value: float) -> int:
     return count + 1
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _insert_crossings(a: Float, na: int, b: Float, nb_: int, lo: float, hi: float, breaks: Float, count: int) -> int:
     # The azimuths between lo and hi at which an edge of a crosses one of b go to the ascending breaks[:count].
     for k in range(na):
@@ -381,7 +382,7 @@ def _equal_at(
     return float(min(max(angle, a), b))
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _visible_share(
     t: int, near: Int, count: int, xy: Float, of: Any, eye_m: tuple[float, float, float], flat: bool, work: Work
 ) -> float:
@@ -476,7 +477,7 @@ def _find_covering_bodies(
     return active
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _split_azimuths(
     active: int, begin: Float, end: Float, tx: float, ty: float, z0: float, z1: float, a: float, b: float, splits: Float
 ) -> int:

@@ -76,7 +76,7 @@ def watch_cost() -> Iterator[RunCost]:
     cost.total_s, cost.compiled = time.perf_counter() - began, compiling.happened
 
 
-class _Compiling(Listener):
+class _Compiling(Listener):  # type: ignore[misc]  # Numba has no types
     """Whether any kernel was compiled; kernels read from Numba's cache do not count."""
 
     happened = False

@@ -1,4 +1,4 @@
-"""Where compiled code is cached when neither the package nor the user's cache can be written."""
+"""Where compiled code is cached when neither package nor user's cache can be written; kernels that call others."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import copem_replay
-from copem_replay.core.compiled import prepare_cache
+from copem_replay.core.compiled import kernel, making, prepare_cache
 from tests.helpers.experiments import TEXT, drive
 from tests.system.test_cli import Call, call, raising
 
@@ -210,3 +211,72 @@ def test_cached_code_that_cannot_be_used_is_compiled_again(tmp_path: Path) -> No
         ), name
         assert note.endswith("): compiled again")
     assert "No module named 'no_such_module'" in found[4][2]
+
+
+@pytest.fixture
+def empty_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("numba.config.CACHE_DIR", str(tmp_path))
+
+
+def _compile_events(work: Callable[[], object]) -> list[str]:
+    """The kernels that are compiled by `work`, in the order in which they are done."""
+    from numba.core.event import install_recorder
+
+    with install_recorder("numba:compile") as recorder:
+        work()
+    names = [event.data["dispatcher"].py_func.__name__ for _, event in recorder.buffer if event.is_end]
+    return [name for name in names if name in ("_count", "_count_twice")]
+
+
+@pytest.mark.usefixtures("empty_cache")
+def test_a_callee_is_compiled_once_whatever_literals_it_is_called_with() -> None:
+    @kernel
+    def _count(start: int, step: bool) -> int:
+        return start + 1 if step else start
+
+    @kernel
+    def _count_twice(times: int) -> int:
+        n = 0
+        for _ in range(times):
+            n = _count(n, True)
+        return _count(n, False) + _count(5, True)
+
+    assert _compile_events(lambda: _count_twice(3)) == ["_count", "_count_twice"]
+    assert _count_twice(3) == 3 + 6
+
+
+@pytest.mark.usefixtures("empty_cache")
+def test_python_may_call_what_kernels_call() -> None:
+    """By code of its own: what its callers have is theirs."""
+
+    @making
+    def _count(values: np.ndarray) -> np.ndarray:
+        return values + 1
+
+    @kernel
+    def _count_twice(values: np.ndarray) -> np.ndarray:
+        return _count(_count(values))
+
+    assert _count_twice(np.array([1, 5])).tolist() == [3, 7]
+    assert _compile_events(lambda: _count(np.array([1, 5]))) == ["_count"]
+    assert _count(np.array([1, 5])).tolist() == [2, 6]
+    assert _count(values=np.array([0.5])).tolist() == [1.5]
+
+
+@pytest.mark.usefixtures("empty_cache")
+def test_an_error_in_a_callee_reaches_python() -> None:
+    @kernel
+    def _count(k: int) -> float:
+        if k < 0:
+            raise ValueError("expected a number of at least 0")
+        return 1 / k
+
+    @kernel
+    def _count_twice(k: int) -> float:
+        return 2 * _count(k)
+
+    assert _count_twice(4) == 0.5
+    with pytest.raises(ValueError, match="of at least 0"):
+        _count_twice(-1)
+    with pytest.raises(ZeroDivisionError):
+        _count_twice(0)

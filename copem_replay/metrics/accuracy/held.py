@@ -24,11 +24,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from copem_replay.core.compiled import borrowing
+from copem_replay.core.compiled import borrowing, kernel
 from copem_replay.core.geometry import is_in_area
 from copem_replay.core.object_list import Entries, ObjectLists
 from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int, Scene, Tracks
@@ -206,7 +205,7 @@ class _FrameScratch(NamedTuple):
     present: Bool  # (M,) whether the truth has it
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _measure_frames(
     start: Int, entries: Entries, about: EntryMatches, number: Int, first: int, time_s: Float, truth: TruthByList,
     episodes: _EpisodeFrames, reference: tuple[Float, Float, Bool], asked: AccuracyParameters, out: _HeldColumns,

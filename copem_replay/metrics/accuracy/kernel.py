@@ -12,11 +12,10 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from copem_replay.core.compiled import borrowing
+from copem_replay.core.compiled import borrowing, kernel
 from copem_replay.core.geometry import is_in_area
 from copem_replay.core.object_list import Entries
 from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int
@@ -187,14 +186,14 @@ class Estimates(NamedTuple):
     paired: Bool
 
 
-@nb.njit(cache=True)
+@kernel
 def make_targets(most: int) -> Targets:
     """Room for so many objects."""
     whole, real = np.empty((3, most), dtype=np.int64), np.empty((5, most))
     return Targets(whole[0], whole[1], real[0], real[1], whole[2], real[2], real[3], real[4])
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def add_up(
     start: Int, entries: Entries, about: EntryMatches, now: EntryMatches, issue_s: Float, world: TruthByList,
     stays: EpisodeLists, reference_x_m: Float, reference_y_m: Float, present: Bool, asked: AccuracyParameters,

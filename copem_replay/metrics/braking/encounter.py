@@ -15,10 +15,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba as nb
 import numpy as np
 
-from copem_replay.core.compiled import borrowing
+from copem_replay.core.compiled import borrowing, kernel
 from copem_replay.core.geometry import box_distance, corner_travel, find_smallest_distances, pose_on_path
 from copem_replay.core.interpolation import interpolate_states
 from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int, Scene, Tracks
@@ -107,7 +106,7 @@ def _project_on_path(x_m: Float, y_m: Float, vertex: Int, path: Float) -> Float:
     return result
 
 
-@nb.njit(cache=True)
+@kernel
 def _choose_vertices(x_m: Float, y_m: Float, yaw_rad: Float, stride_m: float, reversal_m: float) -> tuple[Int, bool]:
     """Indices (V,) of the places that make the path, and whether it ends in reverse.
 

@@ -15,10 +15,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from copem_replay.core.compiled import kernel
 from copem_replay.core.object_list import Entries, ObjectLists
 from copem_replay.core.tracks import SAME_INSTANT_S, Float, Int, Tracks
 from copem_replay.metrics.config import Confirm
@@ -51,7 +51,7 @@ class EpisodeWindows(NamedTuple):
     until_s: Float  # (M,)
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def find_existence_levels(
     lists: MatchedLists, stays: EpisodeWindows, source: Int, group: Int, hits: int, of: int, best: Float,
     held: NDArray[Any], level: Float,
@@ -120,7 +120,7 @@ def find_existence_levels(
     return carried[:kept].copy()
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _sort_by_episode(
     s: int, lists: MatchedLists, stays: EpisodeWindows, episode: Int, first: Int, row: Int, number: Int
 ) -> None:
@@ -153,7 +153,7 @@ def _sort_by_episode(
     first[0] = 0
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _is_preferred(entries: Entries, role: NDArray[np.int8], i: int, j: int) -> bool:
     # Of two entries about one object: the match, the higher existence, the newer capture, the first unit's.
     one, other = entries[i], entries[j]
@@ -166,7 +166,7 @@ def _is_preferred(entries: Entries, role: NDArray[np.int8], i: int, j: int) -> b
     return bool(one.unit_ix < other.unit_ix)
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _find_confirming_existence(existence: Float, capture: int, hits: int, of: int, group: Int, held: Float) -> float:
     # The highest existence with which `hits` of `of` consecutive captures of a group, this one among them, hold the
     # object.

@@ -12,10 +12,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-import numba as nb
 import numpy as np
 
 from copem_replay.communication.arrivals import first_newer_arrival_s
+from copem_replay.core.compiled import kernel
 from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int, Tracks
 from copem_replay.metrics.config import Confirm
 
@@ -147,7 +147,7 @@ def _group_by_episode(received: Tracks, episodes: Episodes) -> tuple[Int, Int]:
     return rows, np.searchsorted(episode[rows], np.arange(len(episodes.object_ix) + 1))
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _cluster_captures(captured_s: Float, unit_ix: Int, last_of: Int, reach_s: float, order: Int, out: Int) -> None:
     current, first = -1, -np.inf
     for k in order:
@@ -175,7 +175,7 @@ class _EpisodeRows(NamedTuple):
     until_s: Float
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _find_first(
     rows: _ListedRows, units_in_place: Int, stays: _EpisodeRows, hits: int, of: int, out: FirstDetections
 ) -> None:
@@ -224,7 +224,7 @@ def _find_first(
                 break
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _is_confirmed(marks: Int, token: int, instant: int, hits: int, of: int, group: Int) -> bool:
     # Whether `hits` of `of` consecutive instants of one group, this instant among them, hold the object.
     for start in range(instant - of + 1, instant + 1):

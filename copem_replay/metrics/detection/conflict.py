@@ -14,9 +14,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-import numba as nb
 import numpy as np
 
+from copem_replay.core.compiled import kernel
 from copem_replay.core.errors import ExperimentError
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.geometry import are_in_area, polygon_corners, pose_on_path
@@ -111,7 +111,7 @@ def build_corridors(ego: EgoPath, now_s: Float, conflict: Conflict) -> tuple[Flo
     return pieces, bounds
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _cover_corridor(path: Float, along: Float, ahead: Float, bounds: Int, size: Float, pieces: Float) -> None:
     """Each piece has the ego's pose halfway along it, and reaches as far as the path does along the piece."""
     for k in range(len(along)):
@@ -145,7 +145,7 @@ class _Boxes(NamedTuple):
     width_m: Float
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _mark_conflicts(
     valid: Bool, boxes: _Boxes, frame_ix: Int, pieces: Float, bounds: Int, horizon_s: float, out: Bool
 ) -> None:
@@ -162,7 +162,7 @@ def _mark_conflicts(
                     break
 
 
-@nb.njit(cache=True)
+@kernel
 def will_enter(
     x: float, y: float, yaw: float, vx: float, vy: float, length: float, width: float, piece: Float, horizon_s: float
 ) -> bool:

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import numba as nb
 import numpy as np
 
+from copem_replay.core.compiled import kernel
 from copem_replay.core.geometry import box_distance, pose_on_path
 from copem_replay.core.tracks import CLASSES, SAME_INSTANT_S, Float
 from copem_replay.experiment.schema import Experiment
@@ -151,7 +151,7 @@ def _gaps_along(encounter: Encounter, along_m: Float, time_s: Float) -> Float:
     return _box_gaps(along_m, encounter.path, encounter.size_m, poses, encounter.other_size_m)
 
 
-@nb.njit(cache=True)
+@kernel
 def _box_gaps(along: Float, path: Float, size: Float, other: Float, other_size: Float) -> Float:
     """Box distance (T,) of the ego at places (T,) of its path to the other at poses (3, T); NaN while one is absent."""
     result = np.full(len(along), np.nan)

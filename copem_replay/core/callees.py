@@ -1,0 +1,77 @@
+"""Compiled functions that call each other: of what is called, Numba makes no machine code of its own.
+
+Numba compiles every function by itself, down to machine code and with the wrapper by which Python calls it, and then
+links it, optimised, into each function that calls it, where all is optimised and turned into machine code once more.
+In a chain of six functions the innermost goes through that six times. And a variable that starts as a literal (`n = 0`
+before a loop) has a callee compiled twice: for the literal, and for any number.
+
+Here a function has two sides. The one that Python calls is Numba's own. The one that compiled functions call is typed
+and lowered, for numbers and not for literals, and linked into the caller as it is: optimised there, once, and kept in
+the cache as part of it. The operations are the same, and so are the results, to the last bit.
+
+docs/develop/decisions/0052-code-of-callees.md
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from types import SimpleNamespace
+from typing import Any
+
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler
+from numba.core.registry import CPUDispatcher
+from numba.core.types.misc import unliteral
+
+_NO_WRAPPERS = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+
+
+class Kernel(CPUDispatcher):  # type: ignore[misc]  # Numba has no types
+    """A compiled function that Python and compiled functions may call. `options`: those of `nb.njit`."""
+
+    def __init__(self, function: Callable[..., Any], options: Mapping[str, Any]) -> None:
+        options = {"nopython": True, "boundscheck": None, **options}
+        super().__init__(function, targetoptions={**options, "no_cfunc_wrapper": True})
+        self.callee = _Callee(function, targetoptions={**options, **_NO_WRAPPERS}, pipeline_class=_CalleeCompiler)
+        self.enable_caching()
+
+    def get_call_template(self, args: tuple[Any, ...], kws: Mapping[str, Any]) -> Any:
+        """What a caller has to know of the function to be called."""
+        return self.callee.get_call_template(args, kws)
+
+    def get_overload(self, sig: Any) -> Any:
+        """What a caller calls."""
+        return self.callee.get_overload(sig)
+
+
+class _Callee(CPUDispatcher):  # type: ignore[misc]
+    def get_call_template(self, args: tuple[Any, ...], kws: Mapping[str, Any]) -> Any:
+        named = {name: unliteral(kind) for name, kind in kws.items()}
+        return super().get_call_template(tuple(unliteral(kind) for kind in args), named)
+
+
+class _CalleeCompiler(Compiler):  # type: ignore[misc]
+    def _compile_core(self) -> Any:
+        state = self.state
+        state.library = _CalleeLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
+        return super()._compile_core()
+
+
+class _CalleeLibrary(JITCodeLibrary):  # type: ignore[misc]
+    # The code of a callee and of all that it calls, to be linked into its callers.
+
+    def finalize(self) -> None:
+        for library in dict.fromkeys(self._linking_libraries):
+            self._reload_init.update(library._reload_init)
+            self._final_module.link_in(library._get_module_for_linking(), preserve=True)
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+    def get_pointer_to_function(self, name: str) -> int:
+        self._ensure_finalized()
+        return 0  # none
+
+    @property
+    def codegen(self) -> Any:
+        # Numba puts the environment of a function into its machine code, to no use in nopython mode.
+        return SimpleNamespace(set_env=lambda name, environment: None)
