@@ -12,8 +12,8 @@ from benches import commands, compare, compiling, crew, fit, fusion, links, long
 
 BENCHES = (
     compiling.compile, commands.pieces, compare.compare, crew.crew, replay.visibility, memory.memory, fit.fit,
-    replay.paper, reading.reading, writing.writing, commands.commands, commands.reports, fusion.fusion, fusion.peers, links.links,
-    long.crowd, long.long,
+    replay.paper, reading.reading, writing.writing, commands.commands, commands.reports, fusion.fusion, fusion.peers,
+    links.links, long.crowd, long.long,
 )  # fmt: skip
 """All there are, in the order in which they run; each is called without arguments, by its name."""
 
