@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, TextIO, TypeAlias, TypeVar
 
 import typer
 
+from copem_replay.core.compiled import compiling
 from copem_replay.core.errors import InputError, count_noun, is_url, local_path, strip_credentials, wrap_line
 
 if TYPE_CHECKING:
@@ -173,27 +174,47 @@ def show_progress(what: str, work: Callable[[Progress], T]) -> T:
     if sys.stderr is None or not sys.stderr.isatty():
         return work(ProgressLines(what))
     from rich.console import Console
-    from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, Task, TextColumn
     from rich.progress import Progress as Bar
+    from rich.text import Text
 
-    words = "{task.description}", "left"
-    columns = (TextColumn(words[0]), BarColumn(), TaskProgressColumn(), TimeRemainingColumn(), TextColumn(words[1]))
-    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
+    class Words(TextColumn):
+        """The words of the last report, or that something is compiled now."""
+
+        def render(self, task: Task) -> Text:
+            return Text(f"{what}: {COMPILING}") if compiling.running else super().render(task)
+
+    lines, console = ProgressLines(what), Console(stderr=True)
+    with Bar(BarColumn(), Words("{task.description}"), console=console, transient=True) as bar:
         task = bar.add_task(what, total=None)
-        return work(lambda done, total: bar.update(task, completed=done, total=total))
+
+        def show(done: int, total: int) -> None:
+            bar.update(task, completed=done, total=total, description=lines.words(done, total))
+
+        return work(show)
+
+
+COMPILING = "compiling (once)"
+"""Stands in place of the time left while code is compiled, which is then in the cache."""
 
 
 class _TimeLeft:
     """How long the rest takes, by how long what was done since the first report took.
 
-    What comes before the first report is no measure of the rest: kernels are compiled in it, and logs are read.
+    What comes before the first report is no measure of the rest: logs are read in it. Nor is what comes before the last
+    kernel was compiled.
     """
 
     def __init__(self) -> None:
         self._first: tuple[float, int] | None = None
+        self._begun = compiling.begun
 
     def words(self, now_s: float, done: int, total: int) -> list[str]:
         """`4 minutes left`, as a list; empty where nothing is known of it, or nothing is left."""
+        if compiling.begun != self._begun:
+            self._begun, self._first = compiling.begun, None
+        if compiling.running and done < total:
+            return [COMPILING]
         if done and self._first is None:
             self._first = now_s, done
         if self._first is None or not self._first[1] < done < total:
@@ -211,12 +232,14 @@ class ProgressLines:
 
     def __call__(self, done: int, total: int) -> None:
         """Print a line if the last one is at least `EVERY_S` old."""
-        now_s = self._clock()
-        left = self._left.words(now_s, done, total)
-        if now_s - self._printed_s < EVERY_S or not 0 < done < total:
-            return
-        self._printed_s = now_s
-        print_problems([", ".join([f"{self._what}: {100 * done // total} %", *left])])
+        words = self.words(done, total)
+        if self._clock() - self._printed_s >= EVERY_S and 0 < done < total:
+            self._printed_s = self._clock()
+            print_problems([words])
+
+    def words(self, done: int, total: int) -> str:
+        """The progress in one line."""
+        return ", ".join([f"{self._what}: {100 * done // total} %", *self._left.words(self._clock(), done, total)])
 
 
 @contextmanager

@@ -20,8 +20,11 @@ from typing import Any
 
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
+from numba.core.event import Event, Listener, register
 from numba.core.registry import CPUDispatcher
 from numba.core.types.misc import unliteral
+
+from copem_replay.core.compiled import compiling
 
 _NO_WRAPPERS = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
@@ -75,3 +78,17 @@ class _CalleeLibrary(JITCodeLibrary):  # type: ignore[misc]
     def codegen(self) -> Any:
         # Numba puts the environment of a function into its machine code, to no use in nopython mode.
         return SimpleNamespace(set_env=lambda name, environment: None)
+
+
+class _Watch(Listener):  # type: ignore[misc]
+    # Numba compiles under one lock: there is one count.
+
+    def on_start(self, event: Event) -> None:
+        compiling.begun += 1
+        compiling.running += 1
+
+    def on_end(self, event: Event) -> None:
+        compiling.running -= 1
+
+
+register("numba:compile", _Watch())

@@ -23,6 +23,7 @@ import stat
 import sys
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -49,6 +50,18 @@ def _compile(function: Function, **options: bool) -> Function:
     from copem_replay.core.callees import Kernel  # by kernels alone: the place of the cache is prepared before
 
     return cast("Function", Kernel(function, {"nogil": True, **options}))
+
+
+@dataclass
+class Compiling:
+    """Kernels that were not in the cache: how many this process has begun to compile, how many it compiles now."""
+
+    begun: int = 0
+    running: int = 0
+
+
+compiling = Compiling()
+"""Of this process, kept by `core/callees.py`."""
 
 
 VARIABLE = "NUMBA_CACHE_DIR"

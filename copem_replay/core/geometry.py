@@ -54,10 +54,23 @@ def box_distance(ax: float, ay: float, ayaw: float, al: float, aw: float,
 
 
 @borrowing
+def count_below(values: Float, value: float) -> int:
+    """How many of ascending numbers are below a value, of NaN all: what `np.searchsorted` gives, compiled sooner."""
+    first, left = 0, len(values)
+    while left > 0:
+        half = left // 2
+        if values[first + half] >= value:
+            left = half
+        else:
+            first, left = first + half + 1, left - half - 1
+    return first
+
+
+@borrowing
 def pose_on_path(path: Float, s: float) -> tuple[float, float, float]:
     """Pose at arc length `s` of a path (V, 4): s, x, y, yaw by vertex. Beyond its ends it goes straight on."""
     n = len(path)
-    k = min(max(int(np.searchsorted(path[:, 0], s)) - 1, 0), n - 2)
+    k = min(max(count_below(path[:, 0], s) - 1, 0), n - 2)
     f = (s - path[k, 0]) / (path[k + 1, 0] - path[k, 0])
     turn = min(max(f, 0.0), 1.0)
     return (

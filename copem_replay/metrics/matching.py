@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from copem_replay.core.compiled import borrowing, kernel
+from copem_replay.core.geometry import count_below
 from copem_replay.core.object_list import AGREE, Entries, ObjectLists, TellsOf, most_probable_class
 from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int, Scene, Tracks
 
@@ -181,7 +182,7 @@ def _find_frames(entries: Entries, first: int, frame_s: Float, out: Int) -> None
     for j in range(len(out)):
         captured_s = entries[first + j].captured_s
         if last >= 0 and frame_s[f] != captured_s:  # entries of one list were mostly captured together
-            f = min(np.searchsorted(frame_s, captured_s), last)
+            f = min(count_below(frame_s, captured_s), last)
             if f > 0 and captured_s - frame_s[f - 1] < frame_s[f] - captured_s:
                 f -= 1
         out[j] = f if last >= 0 and abs(frame_s[f] - captured_s) <= SAME_INSTANT_S else -1

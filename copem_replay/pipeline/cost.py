@@ -16,8 +16,8 @@ from typing import TypeAlias
 
 import numpy as np
 import psutil
-from numba.core.event import Event, Listener, install_listener
 
+from copem_replay.core.compiled import compiling
 from copem_replay.core.errors import ExperimentError
 from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.prepare import Replay
@@ -70,22 +70,9 @@ class RunCost:
 @contextmanager
 def watch_cost() -> Iterator[RunCost]:
     """The cost of the `with` block; `total_s` and `compiled` are set at its end."""
-    cost, began, compiling = RunCost(), time.perf_counter(), _Compiling()
-    with install_listener("numba:compile", compiling):
-        yield cost
-    cost.total_s, cost.compiled = time.perf_counter() - began, compiling.happened
-
-
-class _Compiling(Listener):  # type: ignore[misc]  # Numba has no types
-    """Whether any kernel was compiled; kernels read from Numba's cache do not count."""
-
-    happened = False
-
-    def on_start(self, event: Event) -> None:
-        self.happened = True
-
-    def on_end(self, event: Event) -> None:
-        pass
+    cost, began, begun = RunCost(), time.perf_counter(), compiling.begun
+    yield cost
+    cost.total_s, cost.compiled = time.perf_counter() - began, compiling.begun > begun
 
 
 # Memory.

@@ -17,6 +17,7 @@ import pytest
 import copem_replay as cr
 from copem_replay.cli import main as cli
 from copem_replay.cli.terminal import ProgressLines, format_duration, show_progress
+from copem_replay.core.compiled import compiling
 from copem_replay.core.errors import wrap_line
 from copem_replay.metrics.summary import format_summary, format_table
 from tests.helpers.experiments import changed, drive
@@ -233,9 +234,34 @@ class TestProgress:
         monkeypatch.setenv("COLUMNS", "80")
         show_progress("replaying", lambda progress: progress(3, 4))
         shown = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", screen.getvalue())
-        assert "replaying" in shown
-        assert "75%" in shown
-        assert "left" in shown
+        assert "replaying: 75 %" in shown
+        assert "left" not in shown, "nothing is known of it"
+
+    def test_on_a_terminal_it_says_that_it_compiles(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """From when it begins, with no report."""
+        screen = Terminal()
+        monkeypatch.setattr(sys, "stderr", screen)
+        monkeypatch.setenv("TERM", "xterm")
+        monkeypatch.setenv("COLUMNS", "80")
+        monkeypatch.setattr(compiling, "running", 1)
+        show_progress("replaying", lambda progress: None)
+        assert "replaying: compiling (once)" in screen.getvalue()
+
+    def test_what_is_compiled_is_no_measure_of_the_rest(
+        self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        """Blocks take 10 s each; while the fourth is computed, something is compiled for 90 s."""
+        now_s = 0.0
+        lines = ProgressLines("replaying", lambda: now_s)
+        said = []
+        for reported_s, done in ((10.0, 1), (20.0, 2), (70.0, 3), (120.0, 4), (130.0, 5), (140.0, 6)):
+            now_s = reported_s
+            if done == 3:
+                monkeypatch.setattr(compiling, "begun", compiling.begun + 1)
+            monkeypatch.setattr(compiling, "running", int(done == 3))
+            lines(done, 20)
+            said += capsys.readouterr().err.splitlines()
+        assert said == ["replaying: 15 %, compiling (once)", "replaying: 25 %, 2 minutes left"]  # 15 blocks
 
     @pytest.mark.parametrize(
         ("time_s", "said"),

@@ -2,12 +2,13 @@
 
 import math
 
+import numpy as np
 import pytest
 import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from copem_replay.core.geometry import rotated_iou
+from copem_replay.core.geometry import count_below, rotated_iou
 
 Box = tuple[float, float, float, float, float]
 """x, y, yaw, length, width."""
@@ -129,3 +130,10 @@ def test_shifted_along_itself_what_is_left_is_the_rest_of_its_length(
     shifted = (shift * math.cos(yaw), shift * math.sin(yaw), yaw, length, width)
     expected = left / (2 * length - left)
     assert rotated_iou(0.0, 0.0, yaw, length, width, *shifted) == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize("value", [-1.0, 0.0, 0.5, 2.0, 2.5, 7.0, 9.0, np.nan, np.inf])
+def test_numbers_below_a_value_are_counted(value: float) -> None:
+    """As NumPy does, in columns and rows; nothing is below a value where there is nothing."""
+    for values in (np.array([0.0, 2.0, 2.0, 2.0, 7.0]), np.array([[0.0, 9.0], [3.0, 9.0]])[:, 0], np.empty(0)):
+        assert count_below(values, value) == np.searchsorted(values, value)

@@ -519,5 +519,7 @@ def find_nearest_target(x_m: float, y_m: float, targets: Targets, wanted: int) -
 @borrowing
 def _find_band(edges: Float, value: float) -> int:
     # The band that holds the value, its lower edge included, its upper one not; −1: none.
-    band = int(np.searchsorted(edges, value, side="right")) - 1
+    band = -1
+    while band < len(edges) - 1 and not value < edges[band + 1]:
+        band += 1
     return band if band < len(edges) - 1 else -1

@@ -18,7 +18,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from copem_replay.core.compiled import borrowing, kernel
-from copem_replay.core.geometry import box_distance, corner_travel, find_smallest_distances, pose_on_path
+from copem_replay.core.geometry import (
+    box_distance,
+    corner_travel,
+    count_below,
+    find_smallest_distances,
+    pose_on_path,
+)
 from copem_replay.core.interpolation import interpolate_states
 from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int, Scene, Tracks
 from copem_replay.metrics.config import MetricsSetup
@@ -197,7 +203,7 @@ def find_required_deceleration(
     the one that brings the ego to the end of a stretch by then and the one that brings it to its beginning.
     """
     for r in range(len(out)):
-        first = int(np.searchsorted(time_s, begin_s[r]))
+        first = count_below(time_s, begin_s[r])
         a, ruled_out = 0.0, True
         while ruled_out and a < np.inf:
             ruled_out = False

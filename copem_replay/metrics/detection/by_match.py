@@ -109,7 +109,8 @@ def find_existence_levels(
                     best[s, m] = level[standing] = reached
             if kept + n > len(carried):
                 grown = np.empty(2 * (kept + n), HELD)
-                grown[:kept] = carried[:kept]
+                for c in range(kept):
+                    grown[c] = carried[c]
                 carried = grown
             for c in used[:n]:
                 if holds[c] > best[s, m]:
@@ -175,10 +176,13 @@ def _find_confirming_existence(existence: Float, capture: int, hits: int, of: in
         n = 0
         for q in range(first, min(first + of, len(existence))):
             if group[q] == group[capture] and existence[q] > -np.inf:
-                held[n] = existence[q]
+                place = n
+                while place > 0 and held[place - 1] > existence[q]:  # ascending
+                    held[place] = held[place - 1]
+                    place -= 1
+                held[place] = existence[q]
                 n += 1
         if n >= hits:
-            held[:n].sort()
             highest = max(highest, held[n - hits])
     return highest
 
