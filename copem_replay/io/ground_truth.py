@@ -241,14 +241,14 @@ def _order_messages(columns: DecodedObjects, notes: list[str]) -> tuple[Int, Int
 def _find_usable(values: Float, kept: Bool, notes: list[str]) -> Bool:
     """(P,) which of the rows `kept` so far have a position, a yaw and a size; `notes` gets the others."""
     usable = kept.copy()
-    place, size = values[:, _X : _Z + 1], values[:, _LENGTH : _WIDTH + 1]
+    place, size = values.T[_X : _Z + 1], values.T[_LENGTH : _WIDTH + 1]
     with np.errstate(invalid="ignore"):
         defects = {
-            "without a position, or with one that is no number": ~np.isfinite(place).all(axis=1),
-            f"farther than {FARTHEST_M:g} m from the origin": (np.abs(place) > FARTHEST_M).any(axis=1),
+            "without a position, or with one that is no number": ~np.isfinite(place).all(axis=0),
+            f"farther than {FARTHEST_M:g} m from the origin": (np.abs(place) > FARTHEST_M).any(axis=0),
             "whose yaw is no number": ~np.isfinite(values[:, _YAW]),
             f"whose length or width is not between 0 and {LONGEST_M:g} m": ~((size > 0.0) & (size <= LONGEST_M)).all(
-                axis=1
+                axis=0
             ),
             f"whose height is negative, above {LONGEST_M:g} m or no number": ~(
                 (values[:, _HEIGHT] >= 0.0) & (values[:, _HEIGHT] <= LONGEST_M)

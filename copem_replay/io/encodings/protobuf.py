@@ -10,14 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.message import DecodeError, EncodeError
 from numba import njit
 
-from copem_replay.core.tracks import Int
+from copem_replay.core.tracks import Bool, Int
 from copem_replay.io.decoded_size import MESSAGE_LIMIT_BYTES, check_decoded_bytes
 from copem_replay.io.encodings.columns import (
     COLUMN_BYTES,
@@ -39,10 +39,10 @@ from copem_replay.io.encodings.columns import (
 VARINT, FIXED64, BYTES, GROUP, END_GROUP, FIXED32 = range(6)
 """Wire types."""
 MESSAGE = 6
-"""Besides the wire types, in the table of fields: bytes (or a group) that are a message to step into."""
+"""Besides the wire types, in the table of fields: bytes that are a message to step into, as groups are."""
 NUMBER, WHAT, COLUMN, LEVEL, INTO = range(5)
-"""Columns of the table of fields: the field's number, its wire type or MESSAGE, its column or −1, the level of a
-repeated field or −1, the kind of message inside or −1."""
+"""Columns of the table of fields: the field's number, its wire type or MESSAGE, its column or −1 (of a message: where
+is said whether it is there), the level of a repeated field or −1, the kind of message inside or −1."""
 DEEPEST = 32
 """Messages within messages, at most; no path leads deeper."""
 
@@ -118,8 +118,9 @@ def walk_protobuf(  # type: ignore[no-untyped-def]
 
     Message m is `data[bounds[m]:bounds[m + 1]]`. A message of kind n has `fields[node_first[n]:node_first[n + 1]]` and
     is of level `node_level[n]`; where it is present, its columns `blank[blank_first[n]:blank_first[n + 1]]` are 0 or
-    empty unless it states another value. The value of column c in row r of its level goes to `bits[first[c] + r]`, with
-    `said` and, of a text, `lengths`. `parent[l, r]` is the parent of row r of level l; level 0 is the message.
+    empty, as all are before, unless it states another value. The value of column c in row r of its level goes to
+    `bits[first[c] + r]`, with `said` and, of a text, `lengths`. `parent[l, r]` is the parent of row r of level l; level
+    0 is the message.
     """
     rows = np.zeros(len(room), dtype=np.int64)
     ends = np.zeros(DEEPEST, dtype=np.int64)
@@ -137,8 +138,7 @@ def walk_protobuf(  # type: ignore[no-untyped-def]
                 row = rows[node_level[node]] - 1
                 if row < room[node_level[node]]:
                     for k in range(blank_first[node], blank_first[node + 1]):
-                        place = first[blank[k]] + row
-                        bits[place], lengths[place], said[place] = 0, 0, True
+                        said[first[blank[k]] + row] = True
             if offset >= end:
                 offset, depth = end, depth - 1
                 continue
@@ -148,7 +148,14 @@ def walk_protobuf(  # type: ignore[no-untyped-def]
                 break
             if wire == END_GROUP:  # of the one that was stepped into
                 continue
-            after = _skip_value(data, offset, end, wire)
+            begin = offset
+            if wire == BYTES:
+                size, begin = _read_varint(data, offset, end)
+                after = end + 1 if begin > end or size > np.uint64(end - begin) else begin + np.int64(size)
+            elif wire == FIXED64:
+                after = offset + 8
+            else:
+                after = _skip_value(data, offset, end, wire)
             if after > end:
                 break
             found = -1
@@ -160,11 +167,12 @@ def walk_protobuf(  # type: ignore[no-untyped-def]
                 offset = after
                 continue
             what, column, level, into = fields[found, 1], fields[found, 2], fields[found, 3], fields[found, 4]
-            begin = _read_varint(data, offset, end)[1] if wire == BYTES else offset
-            if what == MESSAGE:
-                if (wire != BYTES and wire != GROUP) or depth + 1 == DEEPEST:
+            if what in (MESSAGE, GROUP):
+                if wire != (GROUP if what == GROUP else BYTES) or depth + 1 == DEEPEST:
                     offset = after
                     continue
+                if column >= 0 and rows[node_level[node]] <= room[node_level[node]]:
+                    said[first[column] + rows[node_level[node]] - 1] = True
                 if level >= 0:
                     if rows[level] < room[level]:
                         parent[level, rows[level]] = rows[node_level[node]] - 1
@@ -181,8 +189,10 @@ def walk_protobuf(  # type: ignore[no-untyped-def]
                         next_at = begin + (8 if what == FIXED64 else 4)
                     if next_at > after or (wire != what and begin == after):
                         break
-                    if what in (FIXED64, FIXED32):
-                        value = _read_fixed(data, begin, next_at - begin)
+                    if what == FIXED64:
+                        value = _read_fixed(data, begin, 8)
+                    elif what == FIXED32:
+                        value = _read_fixed(data, begin, 4)
                     of = node_level[node]
                     if level >= 0:
                         of = level
@@ -191,7 +201,9 @@ def walk_protobuf(  # type: ignore[no-untyped-def]
                         rows[level] += 1
                     if rows[of] - 1 < room[of]:
                         place = first[column] + rows[of] - 1
-                        bits[place], lengths[place], said[place] = value, after - begin, True
+                        bits[place], said[place] = value, True
+                        if what == BYTES:
+                            lengths[place] = after - begin
                     begin = next_at
                     if begin >= after:
                         break
@@ -350,36 +362,33 @@ class ProtobufDefinition(Definition):
         """The columns of messages. Raises KeyError for a path that is not offered; OversizeError."""
         numbers, texts = tuple(numbers), tuple(texts)
         wanted = self._known((*numbers, *texts))
-        levels = list_levels(wanted)
-        table = _FieldTable(self._root, wanted, levels)
+        table = FieldTable(self._root, wanted)
         columns = [RawColumn(table.kinds[path]) for path in wanted]
-        level_ix = np.array([levels.index(list_level(path)) for path in wanted], dtype=np.int64)
-        rows = np.zeros(len(levels), dtype=np.int64)
-        parents: list[list[Int]] = [[] for _ in levels]
+        rows = np.zeros(len(table.levels), dtype=np.int64)
+        parents: list[list[Int]] = [[] for _ in table.levels]
         decoded = np.zeros(len(payloads), dtype=bool)
         for batch in split_batches(payloads):
-            whole = [self._canonical(payload) for payload in payloads[batch]]
+            whole = [self._canonical(payload, table.closed) for payload in payloads[batch]]
             good = batch.start + np.flatnonzero([p is not None for p in whole])
             decoded[good] = True
-            data = b"".join(p for p in whole if p is not None)
-            bounds = np.cumsum([0, *(len(p) for p in whole if p is not None)], dtype=np.int64)
-            batch_rows, taken, parent = _walk_messages(data, bounds, table, level_ix, len(levels))
-            for k, name in enumerate(levels):
-                of = parent[k, : batch_rows[k]]
-                parents[k].append(of + rows[levels.index(parent_level(name))] if name else good[of])
-            for column, (bits, lengths, said) in zip(columns, taken, strict=True):
-                column.add(data, bits, lengths, said)
-            rows += batch_rows
+            walked = walk_messages([p for p in whole if p is not None], table)
+            for k, name in enumerate(table.levels):
+                of = walked.parent[k, : walked.rows[k]]
+                parents[k].append(of + rows[table.levels.index(parent_level(name))] if name else good[of])
+            for column, taken in zip(columns, walked.columns, strict=True):
+                column.add(walked.data, *taken)
+            rows += walked.rows
 
-        by_level = {name: join_arrays(parents[k], np.int64) for k, name in enumerate(levels)}
+        by_level = {name: join_arrays(parents[k], np.int64) for k, name in enumerate(table.levels)}
         return shred_columns(by_level, dict(zip(wanted, columns, strict=True)), numbers, texts, decoded)
 
-    def _canonical(self, payload: bytes) -> bytes | None:
-        """The message with every field once and as its schema has it; None: no message. Raises OversizeError."""
+    def _canonical(self, payload: bytes, closed: Mapping[int, Int]) -> bytes | None:
+        """The message with every known field once; None: no message. Raises OversizeError."""
         self._size.check(payload)
         try:
             message = self._parse(payload)
-            message.DiscardUnknownFields()
+            if closed:
+                message.DiscardUnknownFields()
             written: bytes = message.SerializePartialToString()
         except (DecodeError, EncodeError, RecursionError, ValueError):
             return None
@@ -404,71 +413,96 @@ class ProtobufDefinition(Definition):
             level = below
 
 
-class _FieldTable:
-    """The fields that lead to `wanted` paths, for the walk, by the kind of message they are in."""
+class FieldTable:
+    """The fields that lead to `wanted` paths, for the walk, by the kind of message they are in.
 
-    def __init__(self, root: Any, wanted: Sequence[str], levels: Sequence[str]) -> None:
+    A path may name a message that is not repeated: whether it is there. `levels`: all that lead to the paths, the outer
+    ones first. `closed`: numbers of an enumeration by column, where Google's parser takes others as unknown fields.
+    """
+
+    def __init__(self, root: Any, wanted: Sequence[str]) -> None:
         self.kinds: dict[str, ValueKind] = {}
-        self._level = {name: k for k, name in enumerate(levels)}
+        self.closed: dict[int, Int] = {}
+        self.levels = list_levels(wanted)
+        self.level_ix = np.array([self.levels.index(list_level(path)) for path in wanted], dtype=np.int64)
         nodes: list[tuple[Any, str]] = [(root, "")]
-        node_of = {"": 0}
+        node_of, entries = {"": 0}, dict[str, list[int]]()
         fields: list[list[list[int]]] = [[]]
         blank: list[list[int]] = [[]]
         for column, path in enumerate(wanted):
             node, here = 0, ""
-            parts = path.split(".")
-            for part in parts[:-1]:
+            for part in path.split("."):
                 here = f"{here}.{part}" if here else part
                 field = nodes[node][0].fields_by_name[part.removesuffix("[]")]
+                level = self.levels.index(here) if field.is_repeated else -1
+                if field.message_type is None:
+                    fields[node].append([field.number, _TYPES[field.type][0], column, level, -1])
+                    if not field.is_repeated and not field.has_presence:
+                        blank[node].append(column)
+                    continue
                 if here not in node_of:
-                    node_of[here] = len(nodes)
+                    what = GROUP if field.type == FieldDescriptor.TYPE_GROUP else MESSAGE
+                    node_of[here], entries[here] = len(nodes), [field.number, what, -1, level, len(nodes)]
                     nodes.append((field.message_type, here))
+                    fields[node].append(entries[here])
                     fields.append([])
                     blank.append([])
-                    level = self._level[here] if field.is_repeated else -1
-                    fields[node].append([field.number, MESSAGE, -1, level, node_of[here]])
                 node = node_of[here]
-            field = nodes[node][0].fields_by_name[parts[-1].removesuffix("[]")]
-            wire, how = _TYPES[field.type]
-            level = self._level[path] if field.is_repeated else -1
-            fields[node].append([field.number, wire, column, level, -1])
-            if not field.is_repeated and not field.has_presence:
-                blank[node].append(column)
-            self.kinds[path] = ValueKind(how, _enum_names(field) if field.enum_type is not None else {})
+            if field.message_type is not None:
+                entries[path][COLUMN] = column
+                continue
+            self.kinds[path] = ValueKind(_TYPES[field.type][1], _enum_names(field) if field.enum_type else {})
+            if field.enum_type is not None and field.enum_type.is_closed:
+                self.closed[column] = np.array(sorted(_enum_names(field)), dtype=np.int32)
         self.fields = np.array([row for rows in fields for row in rows], dtype=np.int64).reshape(-1, 5)
         self.node_first = np.cumsum([0, *map(len, fields)], dtype=np.int64)
-        self.node_level = np.array([self._level[list_level(path)] for _, path in nodes], dtype=np.int64)
+        self.node_level = np.array([self.levels.index(list_level(path)) for _, path in nodes], dtype=np.int64)
         self.blank = np.array([column for columns in blank for column in columns], dtype=np.int64)
         self.blank_first = np.cumsum([0, *map(len, blank)], dtype=np.int64)
+
+    def has_unknown_names(self, walked: WalkedMessages) -> bool:
+        """Whether a value is none of its closed enumeration: a field that is unknown to Google's parser."""
+        for column, known in self.closed.items():
+            bits, _, there = walked.columns[column]
+            if not np.isin(np.unique(bits[there]).astype(np.uint32).view(np.int32), known).all():
+                return True
+        return False
 
 
 def _enum_names(field: Any) -> dict[int, str]:
     return {v.number: v.name for v in field.enum_type.values}
 
 
-def _walk_messages(
-    data: bytes, bounds: Int, table: _FieldTable, level_ix: Int, levels: int
-) -> tuple[Int, list[tuple[Any, Int, Any]], Int]:
-    """Number of rows of each level; bits, lengths and presence of each column's values; parents (levels, most rows)."""
+class WalkedMessages(NamedTuple):
+    """What the walk takes of messages that lie one after the other in `data`; L levels, C columns."""
+
+    data: bytes
+    rows: Int  # (L,) number of rows of each level
+    columns: list[tuple[Any, Int, Bool]]  # C: bits of numbers or places of texts, lengths of texts, whether it is there
+    parent: Int  # (L, most rows) the row of the level above, of level 0 the message
+
+
+def walk_messages(payloads: Sequence[bytes], table: FieldTable, rows: Int | None = None) -> WalkedMessages:
+    """The columns of messages that Google's parser has written. Raises OversizeError.
+
+    `rows` (L,): number of rows of each level; None: they are counted first, as long as the walk itself takes.
+    """
+    data, levels = b"".join(payloads), len(table.levels)
+    bounds = np.cumsum([0, *map(len, payloads)], dtype=np.int64)
     octets = np.frombuffer(data, dtype=np.uint8)
     plan = (table.fields, table.node_first, table.node_level, table.blank, table.blank_first)
-    first = np.zeros(len(level_ix) + 1, dtype=np.int64)
+    first = np.zeros(len(table.level_ix) + 1, dtype=np.int64)
 
-    def walk(room: Int, size: int, most: int) -> tuple[Int, Any, Int, Any, Int]:
-        bits, lengths = np.empty(size, dtype=np.uint64), np.empty(size, dtype=np.int64)
+    def walk(room: Int, size: int, most: int) -> tuple[Int, Any, Int, Bool, Int]:
+        bits, lengths = np.zeros(size, dtype=np.uint64), np.zeros(size, dtype=np.int64)
         said, parent = np.zeros(size, dtype=bool), np.empty((levels, most), dtype=np.int64)
-        return (
-            walk_protobuf(octets, bounds, *plan, first, room, bits, lengths, said, parent),
-            bits,
-            lengths,
-            said,
-            parent,
-        )
+        rows = walk_protobuf(octets, bounds, *plan, first, room, bits, lengths, said, parent)
+        return rows, bits, lengths, said, parent
 
-    rows = walk(np.zeros(levels, dtype=np.int64), 0, 0)[0]
-    np.cumsum(rows[level_ix], out=first[1:])
+    if rows is None:
+        rows = walk(np.zeros(levels, dtype=np.int64), 0, 0)[0]
+    np.cumsum(rows[table.level_ix], out=first[1:])
     check_decoded_bytes(COLUMN_BYTES * int(first[-1]) + 8 * levels * int(rows.max(initial=0)))
     _, bits, lengths, said, parent = walk(rows, int(first[-1]), int(rows.max(initial=0)))
-    lengths[~said], bits[~said] = 0, 0
     parts = [slice(*ends) for ends in pairwise(first.tolist())]
-    return rows, [(bits[p], lengths[p], said[p]) for p in parts], parent
+    return WalkedMessages(data, rows, [(bits[p], lengths[p], said[p]) for p in parts], parent)

@@ -9,19 +9,23 @@ from __future__ import annotations
 
 import itertools
 import math
+import sys
 from array import array
-from collections import Counter
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from google.protobuf.message import DecodeError
+from numpy.typing import NDArray
 
 from copem_replay.core.errors import count_noun
-from copem_replay.core.tracks import CLASSES, VALUES, Float, Solid
+from copem_replay.core.tracks import CLASSES, VALUES, Bool, Float, Int, Solid
 from copem_replay.io.channel import LAST_NS
-from copem_replay.io.decoded_size import check_objects
+from copem_replay.io.decoded_size import MOST_OBJECTS, STATE_BYTES, DecodeAllowance, check_objects
 from copem_replay.io.ground_truth import FARTHEST_M, DecodedObjects
+
+if TYPE_CHECKING:
+    from copem_replay.io.encodings.protobuf import WalkedMessages
 
 GROUND_TRUTH = "osi3.GroundTruth"
 SENSOR_VIEW = "osi3.SensorView"
@@ -90,27 +94,98 @@ def _osi_size(message_class: Any) -> Any:
     return ProtobufSize(message_class.DESCRIPTOR)
 
 
-class GroundTruthDecoder:
-    """Collects messages of one topic: `add` each payload, then take `columns`."""
+BATCH_BYTES = 4_000_000
+"""Bytes of ground truth whose moving objects are decoded at once by the compiled walk: for less it is not loaded."""
+_PLAIN_BATCHES = 10
+"""Batches that are decoded object by object where Numba is not loaded: importing it takes as long."""
+
+
+_Place = tuple[int, int, int]
+"""Of a note: the message, whether the object is stationary, its place in the list."""
+_WITHOUT_ID = ("object state", "without an id: skipped")
+_WITHOUT_YAW = ("object state", "without orientation: yaw 0 taken")
+
+# Of a moving object: what has to be there; what is read as bits, the fields in the order of VALUES first.
+_MARKS = ("id", "base.position", "base.orientation", "base.velocity")
+_VALUE_FIELDS = (
+    *(f"base.{name}" for name in ("position.x", "position.y", "position.z", "orientation.yaw")),
+    *(f"base.{name}" for name in ("velocity.x", "velocity.y")),
+    *(f"base.dimension.{name}" for name in ("length", "width", "height")),
+)
+_FIELDS = (*_VALUE_FIELDS, "id.value", "type", "vehicle_classification.type")
+_KINDS = np.array([_CLASS_OF_TYPE.get(k, OTHER) for k in range(max(_CLASS_OF_TYPE) + 2)], dtype=np.int8)
+_VEHICLES = np.array([_CLASS_OF_VEHICLE.get(k, VEHICLE) for k in range(max(_CLASS_OF_VEHICLE) + 2)], dtype=np.int8)
+"""The class by number; the last is that of all higher ones."""
+
+
+class _ObjectRows:
+    """Rows of objects message by message, of moving or of stationary ones."""
 
     def __init__(self) -> None:
+        self.of_message = array("q")  # number of rows of each message
+        self.object_ix, self.class_ix, self.values = array("q"), array("b"), array("d")
+        self.blocks: list[tuple[Int, Int, NDArray[np.int8], Float]] = []  # the same of messages after these
+
+    @property
+    def number(self) -> int:
+        """Number of rows."""
+        return len(self.object_ix) + sum(len(object_ix) for _, object_ix, *_ in self.blocks)
+
+    def columns(self) -> tuple[Int, Int, NDArray[np.int8], Float]:
+        """All rows: of each message their number, then columns (P,) and (P, len(VALUES))."""
+        first = (
+            np.array(self.of_message, dtype=np.int64),
+            np.array(self.object_ix, dtype=np.int64),
+            np.array(self.class_ix, dtype=np.int8),
+            np.array(self.values, dtype=np.float64).reshape(-1, len(VALUES)),
+        )
+        if not self.blocks:
+            return first
+        blocks = [first, *self.blocks] if self.of_message else self.blocks
+        of_message, object_ix, class_ix, values = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
+        return of_message, object_ix, class_ix, values
+
+
+def _join_rows(moving: _ObjectRows, stationary: _ObjectRows) -> dict[str, Any]:
+    """The columns of both, moving objects first in each message."""
+    names = ("rows", "object_ix", "class_ix", "values")
+    columns: tuple[Any, ...] = moving.columns()
+    if stationary.number:
+        beside = stationary.columns()
+        of_rows = [np.repeat(np.arange(len(rows)), rows) for rows, *_ in (columns, beside)]
+        order = np.argsort(np.concatenate(of_rows), kind="stable")
+        pairs: Any = zip(columns[1:], beside[1:], strict=True)
+        columns = (columns[0] + beside[0], *(np.concatenate(pair)[order] for pair in pairs))
+    return dict(zip(names, columns, strict=True))
+
+
+class GroundTruthDecoder:
+    """Collects messages of one topic: `add` each payload, then take `columns`.
+
+    `allowance`: memory that all of them may take. Fields of objects are read one by one, which costs most, or, where
+    there are many, by the compiled walk through the messages as Google's parser writes them: the same rows and notes.
+    """
+
+    def __init__(self, allowance: DecodeAllowance) -> None:
         # Imported here: 0.03 s that `--help` need not pay.
         from osi3.osi_groundtruth_pb2 import GroundTruth
         from osi3.osi_sensorview_pb2 import SensorView
 
         self._message_of = {GROUND_TRUTH: GroundTruth, SENSOR_VIEW: SensorView}
+        self._allowance = allowance
         self._stamp_ns = array("q")
         self._stamped = array("b")
-        self._rows = array("q")
         self._hosts: list[str] = []
         self._moving_number: dict[int, int] = {}  # OSI id → number of the object
         self._stationary_number: dict[int, int] = {}
-        self._object_ix = array("q")
-        self._class_ix = array("b")
-        self._values = array("d")
+        self._moving, self._stationary = _ObjectRows(), _ObjectRows()
+        self._waiting: list[tuple[int, bytes]] = []  # moving objects that are still to be added, and of which message
+        self._waiting_bytes, self._waiting_objects, self._batches, self._walk = 0, 0, 0, False
         self._lane_boundaries: list[Float] = []
         self._solids: dict[int, Solid | None] = {}  # of stationary objects by OSI id; None: a box
-        self._notes: Counter[tuple[str, str]] = Counter()  # what is counted, and what is the matter with it
+        # What is counted and what is the matter with it: how many, and where the first is.
+        self._notes: dict[tuple[str, str], tuple[int, _Place]] = {}
+        self._messages = 0
 
     def add(self, payload: bytes, *, schema: str, log_time_ns: int, ahead_ns: int = 0) -> None:
         """Add a message of `schema`, one of `TRUTH_SCHEMAS`; one that cannot be decoded is skipped with a note.
@@ -118,16 +193,17 @@ class GroundTruthDecoder:
         `ahead_ns`: how far the clock of its stamp is ahead of that of the log times. Raises OversizeError.
         """
         message_class = self._message_of[schema]
+        self._messages += 1
         check_osi(message_class, payload)
         try:
             message = message_class.FromString(payload)
         except DecodeError:
-            self._notes["message", "cannot be decoded: skipped"] += 1
+            self._note("message", "cannot be decoded: skipped", (self._messages, 0, 0))
             return
         truth = message
         if schema == SENSOR_VIEW:
             if not message.HasField("global_ground_truth"):
-                self._notes["message", "without global_ground_truth: skipped"] += 1
+                self._note("message", "without global_ground_truth: skipped", (self._messages, 0, 0))
                 return
             truth = message.global_ground_truth
         stamped = next((m for m in (message, truth) if m.HasField("timestamp")), None)
@@ -136,43 +212,36 @@ class GroundTruthDecoder:
         else:
             seconds, nanos = divmod(log_time_ns, 1_000_000_000)
         if abs(seconds) > _LAST_SECOND:
-            self._notes["message", "with an impossible time stamp: skipped"] += 1
+            self._note("message", "with an impossible time stamp: skipped", (self._messages, 0, 0))
             return
         self._stamp_ns.append(seconds * 1_000_000_000 + nanos - (0 if stamped is None else ahead_ns))
         self._stamped.append(stamped is not None)
         self._add_host(message, truth)
         if not self._lane_boundaries and len(truth.lane_boundary):  # the lanes of one message are those of all
             self._add_lanes(truth.lane_boundary)
-        before = len(self._object_ix)
         check_objects(len(truth.moving_object) + len(truth.stationary_object))
-        self._add_moving(truth.moving_object)
         self._add_stationary(truth.stationary_object)
-        self._rows.append(len(self._object_ix) - before)
-
-    @property
-    def states(self) -> int:
-        """Number of object states of all messages that were added."""
-        return len(self._object_ix)
+        self._allowance.spend(0, self._stationary.of_message[-1])
+        self._wait(truth)
 
     def columns(self) -> DecodedObjects:
-        """The columns of all messages that were added."""
+        """The columns of all messages that were added. Raises OversizeError."""
+        self._add_waiting()
         ids, moving = self._names()
         solids = tuple(solid for solid in self._solids.values() if solid is not None)
+        notes = {key: number for key, (number, _) in sorted(self._notes.items(), key=lambda item: item[1][1])}
         if solids:
-            self._notes["stationary object", "with a base_polygon: hides as that prism, and is no object"] = len(solids)
+            notes["stationary object", "with a base_polygon: hides as that prism, and is no object"] = len(solids)
         return DecodedObjects(
             stamp_ns=np.array(self._stamp_ns, dtype=np.int64),
             stamped=np.array(self._stamped, dtype=bool),
-            rows=np.array(self._rows, dtype=np.int64),
             object_ids=ids,
             moving=np.array(moving, dtype=bool),
-            object_ix=np.array(self._object_ix, dtype=np.int64),
-            class_ix=np.array(self._class_ix, dtype=np.int8),
-            values=np.array(self._values, dtype=np.float64).reshape(-1, len(VALUES)),
+            **_join_rows(self._moving, self._stationary),
             lane_boundaries=tuple(self._lane_boundaries),
             solids=solids,
             hosts=tuple(self._hosts),
-            notes=tuple(f"{count_noun(number, noun)} {what}" for (noun, what), number in self._notes.items()),
+            notes=tuple(f"{count_noun(number, noun)} {what}" for (noun, what), number in notes.items()),
         )
 
     def _add_host(self, message: Any, truth: Any) -> None:
@@ -182,15 +251,81 @@ class GroundTruthDecoder:
                 self._hosts.append(str(source.host_vehicle_id.value))
                 return
 
-    def _add_moving(self, objects: Any) -> None:
+    def _wait(self, truth: Any) -> None:
+        """Keep the moving objects of a message; add those that wait where they are many."""
+        self._waiting_objects += len(truth.moving_object)
+        self._waiting.append((self._messages, truth.SerializePartialToString()))
+        self._waiting_bytes += len(self._waiting[-1][1])
+        if self._waiting_bytes > BATCH_BYTES or self._waiting_objects > MOST_OBJECTS:
+            self._walk = self._walk or "numba" in sys.modules or self._batches >= _PLAIN_BATCHES
+            self._add_waiting()
+
+    def _add_waiting(self) -> None:
+        before = self._moving.number
+        if self._walk:
+            self._walk_moving()
+        else:
+            for message, content in self._waiting:
+                self._add_moving(message, self._message_of[GROUND_TRUTH].FromString(content).moving_object)
+        self._batches += 1
+        self._waiting, self._waiting_bytes, self._waiting_objects = [], 0, 0
+        self._allowance.spend(STATE_BYTES * (self._moving.number - before), -1)
+
+    def _walk_moving(self) -> None:
+        """As `_add_moving`, for all messages that wait."""
+        walked = self._walk_waiting()
+        bits = {path: taken[0] for path, taken in zip((*_MARKS, *_FIELDS), walked.columns, strict=True)}
+        named, placed, turned, moved = (there for *_, there in walked.columns[: len(_MARKS)])
+        values = np.array([bits[path].view(np.float64) for path in _VALUE_FIELDS]).T  # columns lie together
+        values[~placed & (values[:, 0] == 0.0) & (values[:, 1] == 0.0), 0] = _NAN
+        values[~moved & (values[:, 4] == 0.0) & (values[:, 5] == 0.0), 4:6] = _NAN
+        of_message = walked.parent[1, : walked.rows[1]]
+        self._note_rows(of_message, ~named, _WITHOUT_ID)
+        self._note_rows(of_message, named & ~turned & (values[:, 3] == 0.0), _WITHOUT_YAW)
+        kind, vehicle = (bits[path].astype(np.uint32) for path in ("type", "vehicle_classification.type"))
+        of_vehicle = _VEHICLES[np.minimum(vehicle, len(_VEHICLES) - 1)]
+        class_ix = np.where(kind == _IS_VEHICLE, of_vehicle, _KINDS[np.minimum(kind, len(_KINDS) - 1)])
+        rows = slice(None) if named.all() else np.flatnonzero(named)
+        ids, which = np.unique(bits["id.value"][rows], return_inverse=True)
+        number_of = self._moving_number
+        numbers = [number_of[k] if k in number_of else self._next_number(number_of, k) for k in ids.tolist()]
+        per_message = np.bincount(of_message[rows], minlength=len(self._waiting))
+        object_ix = np.array(numbers, dtype=np.int64)[which]
+        self._moving.blocks.append((per_message, object_ix, class_ix[rows], values[rows]))
+
+    def _walk_waiting(self) -> WalkedMessages:
+        """The columns of the moving objects that wait."""
+        from copem_replay.io.encodings.protobuf import FieldTable, walk_messages
+
+        truth_class = self._message_of[GROUND_TRUTH]
+        table = FieldTable(truth_class.DESCRIPTOR, [f"moving_object[].{path}" for path in (*_MARKS, *_FIELDS)])
+        payloads = [content for _, content in self._waiting]
+        rows = np.array([len(payloads), self._waiting_objects])
+        walked = walk_messages(payloads, table, rows)
+        if not table.has_unknown_names(walked):
+            return walked
+        messages = [truth_class.FromString(content) for content in payloads]
+        for message in messages:
+            message.DiscardUnknownFields()  # such a one may hide one that is known
+        return walk_messages([message.SerializePartialToString() for message in messages], table, rows)
+
+    def _note_rows(self, of_message: Int, rows: Bool, note: tuple[str, str]) -> None:
+        """Count a note for some rows (P,) of the messages that wait; `of_message` (P,): their numbers among these."""
+        found = np.flatnonzero(rows)
+        if len(found):
+            first = of_message[found[0]]
+            place = int(found[0] - np.searchsorted(of_message, first))
+            self._note(*note, (self._waiting[first][0], 0, place), len(found))
+
+    def _add_moving(self, message: int, objects: Any) -> None:
         """Add a row for each. Reading fields costs most: each is read once, its presence only where it is 0."""
-        number_of, next_number = self._moving_number, self._next_number
-        add_object, add_class = self._object_ix.append, self._class_ix.append
-        add_values, notes = self._values.extend, self._notes
-        for moving in objects:
+        number_of, next_number, before = self._moving_number, self._next_number, len(self._moving.object_ix)
+        add_object, add_class = self._moving.object_ix.append, self._moving.class_ix.append
+        add_values = self._moving.values.extend
+        for k, moving in enumerate(objects):
             ident = moving.id.value
             if ident == 0 and not moving.HasField("id"):
-                notes["object state", "without an id: skipped"] += 1
+                self._note(*_WITHOUT_ID, (message, 0, k))
                 continue
             base = moving.base
             position, size, velocity = base.position, base.dimension, base.velocity
@@ -199,7 +334,7 @@ class GroundTruthDecoder:
             if x == 0.0 and y == 0.0 and not base.HasField("position"):
                 x = _NAN
             if yaw == 0.0 and not base.HasField("orientation"):
-                notes["object state", "without orientation: yaw 0 taken"] += 1
+                self._note(*_WITHOUT_YAW, (message, 0, k))
             if vx == 0.0 and vy == 0.0 and not base.HasField("velocity"):
                 vx = vy = _NAN
             kind = moving.type
@@ -211,18 +346,20 @@ class GroundTruthDecoder:
             number = number_of.get(ident)
             add_object(next_number(number_of, ident) if number is None else number)
             add_values((x, y, z, yaw, vx, vy, size.length, size.width, size.height))
+        self._moving.of_message.append(len(self._moving.object_ix) - before)
 
     def _add_stationary(self, objects: Any) -> None:
         """Add a row of class `other`, at rest, for each; none for those with a base polygon, which become solids."""
-        number_of, notes = self._stationary_number, self._notes
-        for stationary in objects:
+        number_of, rows, before = self._stationary_number, self._stationary, len(self._stationary.object_ix)
+        for k, stationary in enumerate(objects):
+            at = (self._messages, 1, k)
             ident = stationary.id.value
             if ident == 0 and not stationary.HasField("id"):
-                notes["object state", "without an id: skipped"] += 1
+                self._note(*_WITHOUT_ID, at)
                 continue
             base = stationary.base
             if ident not in self._solids:
-                self._solids[ident] = self._solid(ident, base)
+                self._solids[ident] = self._solid(ident, base, at)
             if self._solids[ident] is not None:
                 continue
             position, size, yaw = base.position, base.dimension, base.orientation.yaw
@@ -230,13 +367,19 @@ class GroundTruthDecoder:
             if x == 0.0 and y == 0.0 and not base.HasField("position"):
                 x = _NAN
             if yaw == 0.0 and not base.HasField("orientation"):
-                notes["object state", "without orientation: yaw 0 taken"] += 1
+                self._note(*_WITHOUT_YAW, at)
             number = number_of.get(ident)
-            self._object_ix.append(self._next_number(number_of, ident) if number is None else number)
-            self._class_ix.append(OTHER)
-            self._values.extend((x, y, position.z, yaw, 0.0, 0.0, size.length, size.width, size.height))
+            rows.object_ix.append(self._next_number(number_of, ident) if number is None else number)
+            rows.class_ix.append(OTHER)
+            rows.values.extend((x, y, position.z, yaw, 0.0, 0.0, size.length, size.width, size.height))
+        rows.of_message.append(len(rows.object_ix) - before)
 
-    def _solid(self, ident: int, base: Any) -> Solid | None:
+    def _note(self, noun: str, what: str, at: _Place, number: int = 1) -> None:
+        """Count a note; `at`: the message, whether the object is stationary, its place in the list."""
+        before, first = self._notes.get((noun, what), (0, at))
+        self._notes[noun, what] = before + number, min(first, at)
+
+    def _solid(self, ident: int, base: Any, at: _Place) -> Solid | None:
         """The prism over an object's base polygon, as high as its box; None: no base polygon, or no simple one."""
         if not base.base_polygon:
             return None
@@ -251,7 +394,7 @@ class GroundTruthDecoder:
         somewhere = all(abs(value) <= FARTHEST_M for value in (*itertools.chain(*corners), position.z))
         outline = shapely.Polygon(corners) if somewhere and 3 <= len(corners) <= _MOST_CORNERS else None
         if outline is None or not outline.is_valid or not outline.area > 0.0:
-            self._notes["stationary object", "whose base_polygon is no simple polygon: its box taken"] += 1
+            self._note("stationary object", "whose base_polygon is no simple polygon: its box taken", at)
             return None
         if not 0.0 < height_m <= FARTHEST_M:  # a note tells of it when its box is assembled
             return None
