@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import itertools
 import json
 import math
 import os
@@ -16,7 +18,10 @@ import numpy as np
 import pandas as pd
 import pytest
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from hypothesis import given
+from hypothesis import strategies as st
 from mcap.reader import make_reader
+from mcap.records import Message
 from mcap.writer import Writer
 from osi3.osi_sensordata_pb2 import SensorData
 
@@ -31,7 +36,7 @@ from copem_replay.io.recorded_lists import read_sensor_data
 from copem_replay.io.recording import read_log
 from copem_replay.io.write import osi as sensor_data
 from copem_replay.io.write.detail import DetailWriter
-from copem_replay.io.write.mcap import OSI_RECORD, RUN_RECORD, atomic_mcap, write_mcap
+from copem_replay.io.write.mcap import OSI_RECORD, RUN_RECORD, BatchWriter, atomic_mcap, write_mcap
 from copem_replay.io.write.message_family import find_family
 from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import Replay, prepare_log
@@ -477,6 +482,45 @@ def test_nothing_is_left_when_writing_fails(written: Written, tmp_path: Path) ->
         written.write(tmp_path / "file" / "out.mcap")
 
 
+SIZES = st.one_of(st.integers(0, 30), st.sampled_from([968, 969, 970, 4000]))  # 1000 bytes with the head are no chunk
+MESSAGES = st.lists(
+    st.builds(
+        lambda channel, log_ns, size, publish_ns, sequence: Message(
+            channel, log_ns, bytes(k % 251 for k in range(size)), publish_ns, sequence
+        ),
+        st.integers(1, 3), st.integers(0, 2**64 - 1), SIZES, st.integers(0, 2**64 - 1), st.integers(0, 2**32 - 1),
+    ),
+    max_size=12,
+)  # fmt: skip
+
+
+@given(st.lists(MESSAGES, max_size=4))
+def test_messages_at_once_are_written_as_one_by_one(batches: list[list[Message]]) -> None:
+    """The bytes of mcap's own writer; its reader finds the messages by the index, and checksums hold."""
+
+    def written(at_once: bool) -> bytes:
+        out = io.BytesIO()
+        writer = BatchWriter(out, chunk_size=1000, enable_data_crcs=True)
+        writer.start()
+        schema = writer.register_schema("s", "jsonschema", b"{}")
+        for topic in ("a", "b", "c"):
+            writer.register_channel(topic, "json", schema)
+        for batch in batches:
+            if at_once:
+                writer.add_messages(batch)
+            else:
+                for m in batch:
+                    writer.add_message(m.channel_id, m.log_time, m.data, m.publish_time, m.sequence)
+        writer.finish()
+        return out.getvalue()
+
+    content = written(at_once=True)
+    assert content == written(at_once=False)
+    reader = make_reader(io.BytesIO(content), validate_crcs=True)
+    found = [m for *_, m in reader.iter_messages()]
+    assert found == sorted(itertools.chain(*batches), key=lambda m: m.log_time)
+
+
 KILLED = """
 import sys
 sys.path.insert(0, {tests!r})
@@ -484,16 +528,17 @@ from pathlib import Path
 import copem_replay.io.write.mcap as write
 from tests.io.test_write_mcap import Written
 folder = Path({folder!r})
-original = write.Writer.add_message
+original = write.BatchWriter.add_messages
 count = 0
-def slowly(self, *args, **kwargs):
+def slowly(self, messages):
     global count
-    count += 1
-    if count == {stop}:
-        print("now", flush=True)
-        sys.stdin.read()
-    return original(self, *args, **kwargs)
-write.Writer.add_message = slowly
+    for message in messages:
+        count += 1
+        if count == {stop}:
+            print("now", flush=True)
+            sys.stdin.read()
+        original(self, [message])
+write.BatchWriter.add_messages = slowly
 Written(folder)
 """
 

@@ -14,7 +14,6 @@ detections table has it: from `detection_s` on, while the newest list holds it.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -96,10 +95,20 @@ class Statuses:
         available_s = (available_ns - self._t0_ns) * 1e-9
         ages_s = np.fmax(0.0, available_s[frame] - self._fused_tracks.captured_s[0, rows])
         every = np.full((len(available_ns), self._count + 1), np.nan)  # a column for each object, the last for none
-        every[frame, number[rows]] = [round(age_s, 6) if math.isfinite(age_s) else age_s for age_s in ages_s.tolist()]
+        every[frame, number[rows]] = _round_to_us(ages_s)
         age_s = every[:, self._objects]
         is_known = available_ns[:, None] >= self._known_ns - SAME_INSTANT_NS
         return np.where(np.isnan(age_s), 0, np.where(is_known, 2, 1)), np.where(np.isfinite(age_s), age_s, np.nan)
+
+
+def _round_to_us(time_s: Float) -> Float:
+    """Times (N,) with six decimals, as `round` gives them."""
+    us = time_s * 1e6
+    rounded: Float = np.rint(us) / 1e6
+    with np.errstate(invalid="ignore"):  # some are not finite
+        unsure = np.flatnonzero(np.abs(us - np.floor(us) - 0.5) <= 1e-3 + 1e-15 * us)  # the product may be off
+    rounded[unsure] = [round(time, 6) for time in time_s[unsure].tolist()]
+    return rounded
 
 
 class StatusWriter:

@@ -12,6 +12,8 @@ A given input gives the same bytes each time; the file appears under its name wh
 from __future__ import annotations
 
 import heapq
+import struct
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -21,7 +23,10 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from mcap.records import Message
+from mcap._chunk_builder import ChunkBuilder
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import Message, MessageIndex, Statistics
 from mcap.writer import Writer
 
 from copem_replay.core.colours import Rgb, configuration_colours
@@ -104,8 +109,8 @@ def write_mcap(
         chunks = chain([begun], map(streams_of, rest))
         added, later_ns = _shift_to_zero(_merge_by_time([chain.from_iterable(map(_merge_by_time, chunks)), *shown]))
         _add_records(writer, original, opened.osi, {**manifest, **{f"unit.{k}": unit for unit, k in numbers.items()}})
-        for m in _encode_ahead(_merge_by_time([messages, added])):
-            writer.add_message(m.channel_id, m.log_time, m.data, m.publish_time, m.sequence)
+        for encoded in _encode_ahead(_merge_by_time([messages, added])):
+            writer.add_messages(encoded)
     return list(_note_differences(path, original, ours, later_ns))
 
 
@@ -187,13 +192,13 @@ def _merge_by_time(streams: Sequence[Iterator[Message]]) -> Iterator[Message]:
     return heapq.merge(*streams, key=lambda m: m.log_time)
 
 
-def _encode_ahead(messages: Iterator[Message]) -> Iterator[Message]:
-    """The messages, encoded in a thread one chunk of the file ahead: compiled code and compression share no lock."""
+def _encode_ahead(messages: Iterator[Message]) -> Iterator[list[Message]]:
+    """The messages, many at once, encoded in a thread one chunk ahead: compiled code and compression share no lock."""
     with ThreadPoolExecutor(1) as thread:
         following = thread.submit(_next_messages, messages)
         while encoded := following.result():
             following = thread.submit(_next_messages, messages)
-            yield from encoded
+            yield encoded
 
 
 def _next_messages(messages: Iterator[Message]) -> list[Message]:
@@ -257,10 +262,82 @@ def _parse_release(text: str) -> tuple[int, ...]:
 
 
 @contextmanager
-def atomic_mcap(path: Path, *, profile: str) -> Iterator[Writer]:
+def atomic_mcap(path: Path, *, profile: str) -> Iterator[BatchWriter]:
     """A writer whose file gets its name when it is complete; an error before that leaves no file."""
     with atomic_file(path) as scratch, scratch.open("wb") as file:
-        writer = Writer(file, enable_data_crcs=True)
+        writer = BatchWriter(file, enable_data_crcs=True)
         writer.start(profile=profile, library="copem_replay")
         yield writer
         writer.finish()  # type: ignore[no-untyped-call]
+
+
+class BatchWriter(Writer):
+    """The writer of `mcap`, which takes many messages at once, too: in a twentieth of the time, with the same bytes.
+
+    It fills the chunk that the writer has begun, by names that are the writer's own: of `mcap` 1.6.
+    """
+
+    def add_messages(self, messages: Iterable[Message]) -> None:
+        """Add messages as `add_message` does one by one."""
+        whole: list[Message] = []
+        offset, most = self._chunk.count, vars(self)["_Writer__chunk_size"]
+        for message in messages:
+            whole.append(message)
+            offset += _MESSAGE_HEAD.size + len(message.data)
+            if offset > most:
+                self._fill_chunk(whole)
+                whole, offset = [], 0
+        if whole:
+            self._fill_chunk(whole)
+
+    @property
+    def _chunk(self) -> ChunkBuilder:
+        chunk: ChunkBuilder = vars(self)["_Writer__chunk_builder"]
+        return chunk
+
+    def _fill_chunk(self, messages: Sequence[Message]) -> None:
+        """Add messages of which all but the last fit into the chunk."""
+        chunk, parts = self._chunk, list[bytes]()
+        offset = chunk.count
+        for m in messages:
+            index = chunk.message_indices.get(m.channel_id)
+            if index is None:
+                index = chunk.message_indices[m.channel_id] = _ChannelIndex(m.channel_id, [])
+            index.records.append((m.log_time, offset))
+            size = _MESSAGE_HEAD.size + len(m.data)
+            head = (Opcode.MESSAGE, size - _RECORD_HEAD, m.channel_id, m.sequence, m.log_time, m.publish_time)
+            parts += (_MESSAGE_HEAD.pack(*head), m.data)
+            offset += size
+        chunk.record_writer.write(b"".join(parts))
+        times_ns = [m.log_time for m in messages]
+        for one, count in ((chunk, chunk.num_messages), (self._counted, self._counted.message_count)):
+            one.message_start_time = min([*times_ns, one.message_start_time] if count else times_ns)
+            one.message_end_time = max(*times_ns, one.message_end_time)
+        chunk.num_messages += len(messages)
+        self._counted.message_count += len(messages)
+        for channel, number in Counter(m.channel_id for m in messages).items():
+            self._counted.channel_message_counts[channel] += number
+        vars(Writer)["_Writer__maybe_finalize_chunk"](self)
+
+    @property
+    def _counted(self) -> Statistics:
+        counted: Statistics = vars(self)["_Writer__statistics"]
+        return counted
+
+
+class _ChannelIndex(MessageIndex):
+    """Where the messages of a channel are in a chunk, written at once."""
+
+    def write(self, stream: RecordBuilder) -> None:
+        """Write the record."""
+        stream.start_record(Opcode.MESSAGE_INDEX)
+        stream.write2(self.channel_id)
+        stream.write4(16 * len(self.records))
+        stream.write(np.array(self.records, dtype="<u8").tobytes())
+        stream.finish_record()  # type: ignore[no-untyped-call]
+
+
+_MESSAGE_HEAD = struct.Struct("<BQHIQQ")
+"""A message up to its data: the kind and size of the record, channel, sequence, two times in ns."""
+_RECORD_HEAD = 9
+"""Bytes of the kind and size of a record."""
