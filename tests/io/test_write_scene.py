@@ -236,13 +236,14 @@ def test_moving_entities_are_the_messages_of_each_frame_alone() -> None:
         ))
     )  # fmt: skip
     frames = [[0], [], [1, 2, 3], [4]]
-    expected = []
+    expected, expected_ros2 = [], []
     for at_ns, rows in zip(moving.time_ns.tolist(), frames, strict=True):
         columns = moving.x_m, moving.y_m, moving.z_m, moving.yaw_rad
         drawn = [looks[look_ix[r]].placed(Pose(*(float(column[r]) for column in columns))) for r in rows]
         expected.append(foxglove_scene.encode_scene(drawn, at_ns, "map"))
-        assert moving.entities(len(expected) - 1) == drawn
+        expected_ros2.append(foxglove_scene_ros2.encode_ros2_scene(drawn, at_ns, "map"))
     assert list(encode_moving(moving, "map")) == expected
+    assert list(foxglove_scene_ros2.encode_ros2_moving(moving, "map")) == expected_ros2
 
 
 def test_both_families_place_a_frame_alike() -> None:

@@ -60,6 +60,7 @@ from copem_replay.io.write.ros2 import (
     CdrMessage,
     DetectedObjectsWriter,
     Ros2SceneWriter,
+    encode_ros2_moving,
     encode_ros2_scene,
     encode_ros2_transform,
     encode_string,
@@ -393,10 +394,8 @@ class _Ros2Family:
         schemas = zip(TRUTH_TOPICS, (self._schemas[1], self._schemas[1], moves), strict=True)
         scene, static, ego = (self._channel(topic, schema) for topic, schema in schemas)
         placed = partial(encode_ros2_transform, self._frame_id)
-        return TruthWriter(scene, static, ego, self.drawn, self._moving, placed)
-
-    def _moving(self, moving: MovingEntities) -> Iterator[bytes]:
-        return (self.drawn(moving.entities(frame), at_ns) for frame, at_ns in enumerate(moving.time_ns.tolist()))
+        moving = partial(encode_ros2_moving, frame_id=self._frame_id)
+        return TruthWriter(scene, static, ego, self.drawn, moving, placed)
 
     def drawn(self, entities: Sequence[Entity], time_ns: int) -> bytes:
         return encode_ros2_scene(entities, time_ns, self._frame_id)

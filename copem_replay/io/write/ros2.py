@@ -9,21 +9,34 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from copem_replay.core.colours import Rgb
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import CLASSES, Float, Int, Scene
-from copem_replay.io.write.scene import ALPHA, Entity, Pose, Rgba, box_metadata
+from copem_replay.io.encodings.column_bytes import (
+    RowGroups,
+    RowTexts,
+    TextPool,
+    encode_records,
+    expand_ranges,
+    put_pieces,
+    split_into_blocks,
+    start_offsets,
+)
+from copem_replay.io.write.scene import ALPHA, Entity, MovingEntities, Pose, Rgba, box_metadata
 
 # CDR, little-endian, each value aligned to its own size.
 
 HEAD = b"\0\1\0\0"
 """The begin of every message; alignment counts from its end."""
 _FIRST_S, _LAST_S = -(2**31), 2**31 - 1
+_POSE_BYTES = 56
 
 
 def encode_time(time_ns: int) -> bytes:
@@ -51,8 +64,11 @@ def pad_to_size(data: bytes, size: int = 4) -> bytes:
 class CdrMessage:
     """A message that grows field by field, each aligned to its own size."""
 
-    def __init__(self) -> None:
-        self._body = bytearray()
+    def __init__(self, before: int = 0) -> None:
+        """`before`: bytes of the message that lie before, of which alignment counts."""
+        self._body, self._before = bytearray(before), before
+        self.poses: list[int] = []
+        """Where poses begin, from `before` on."""
 
     def add(self, kind: str, *values: float) -> None:
         """Add numbers of a format of `struct`: `B`, `I`, `i` or `d`."""
@@ -67,9 +83,19 @@ class CdrMessage:
         """Add a time."""
         self._body += bytes(-len(self._body) % 4) + encode_time(time_ns)
 
+    def pose(self, pose: Pose) -> None:
+        """Add a pose."""
+        turn = 0.0, 0.0, math.sin(pose.yaw_rad / 2), math.cos(pose.yaw_rad / 2)
+        self.add("d", pose.x_m, pose.y_m, pose.z_m, *turn)
+        self.poses.append(len(self._body) - _POSE_BYTES - self._before)
+
+    def content(self) -> bytes:
+        """What was added, without a head."""
+        return bytes(self._body[self._before :])
+
     def message(self) -> bytes:
         """The whole message, with its head."""
-        return HEAD + bytes(self._body)
+        return HEAD + self.content()
 
 
 # Definitions of the written messages as in MCAP (`ros2msg`): a type, then all types in it. Sources: the packages' own
@@ -431,32 +457,122 @@ def encode_ros2_scene(entities: Sequence[Entity], time_ns: int, frame_id: str) -
     out.text("")
     out.add("I", len(entities))
     for each in entities:
-        out.stamp(time_ns)
-        out.text(frame_id)
-        out.text(each.name)
-        out.add("I", 0, 0)  # lifetime
-        out.add("B", 0)  # frame_locked
-        out.add("I", len(each.says))
-        for pair in each.says.items():
-            for text in pair:
-                out.text(text)
-        out.add("I", 0, 0, 0, len(each.ellipses))  # arrows, cubes, spheres, cylinders
-        for ellipse in each.ellipses:
-            _write_pose(out, each.pose)
-            out.add("d", *ellipse.size, 1.0, 1.0, *ellipse.colour)
-        out.add("I", len(each.lines))
-        for line in each.lines:
-            _write_line(out, line.points, line.width, each.pose, line.colour)
-        out.add("I", 0, len(each.texts))  # triangles, texts
-        for words in each.texts:
-            _write_pose(out, words.place(each.pose))
-            out.add("B", 1)  # billboard
-            out.add("d", words.size)
-            out.add("B", 1)  # scale_invariant
-            out.add("d", *words.colour)
-            out.text(words.text)
-        out.add("I", 0)  # models
+        _write_entity(out, each, time_ns, frame_id)
     return out.message()
+
+
+def _write_entity(out: CdrMessage, each: Entity, time_ns: int, frame_id: str) -> None:
+    """Add an entity. It ends at a multiple of 4 bytes, and so the next begins."""
+    out.stamp(time_ns)
+    out.text(frame_id)
+    out.text(each.name)
+    out.add("I", 0, 0)  # lifetime
+    out.add("B", 0)  # frame_locked
+    out.add("I", len(each.says))
+    for pair in each.says.items():
+        for text in pair:
+            out.text(text)
+    out.add("I", 0, 0, 0, len(each.ellipses))  # arrows, cubes, spheres, cylinders
+    for ellipse in each.ellipses:
+        out.pose(each.pose)
+        out.add("d", *ellipse.size, 1.0, 1.0, *ellipse.colour)
+    out.add("I", len(each.lines))
+    for line in each.lines:
+        _write_line(out, line.points, line.width, each.pose, line.colour)
+    out.add("I", 0, len(each.texts))  # triangles, texts
+    for words in each.texts:
+        out.pose(words.place(each.pose))
+        out.add("B", 1)  # billboard
+        out.add("d", words.size)
+        out.add("B", 1)  # scale_invariant
+        out.add("d", *words.colour)
+        out.text(words.text)
+    out.add("I", 0)  # models
+
+
+def encode_ros2_moving(moving: MovingEntities, frame_id: str) -> Iterator[bytes]:
+    """A message for each frame, as `encode_ros2_scene` gives it, many at once."""
+    looks = _EncodedLooks(moving.looks, frame_id)
+    for first, last in split_into_blocks(moving.start):
+        bounds, time_ns = moving.start[first : last + 1], moving.time_ns[first:last]
+        start, frames = bounds - bounds[0], last - first
+        head = np.tile(np.frombuffer(_SCENE_HEAD, dtype=np.uint8), (frames, 1))
+        stamps = _encode_times(time_ns)
+        head[:, 8:16], head[:, 28:32] = stamps, np.diff(start).astype("<u4")[:, None].view(np.uint8)
+        heads = TextPool(head.tobytes(), np.arange(frames) * len(_SCENE_HEAD), np.full(frames, len(_SCENE_HEAD)))
+        entities = looks.placed(moving, slice(bounds[0], bounds[-1]), start, np.repeat(stamps, np.diff(start), axis=0))
+        yield from encode_records([heads.at(np.arange(frames)), RowGroups(start, [entities])], frames)
+
+
+_SCENE_HEAD = HEAD + encode_count(1) + bytes(8) + pad_to_size(bytes([_ALL, 0, 0, 0]) + encode_string("")) + bytes(4)
+"""A message up to its entities, without its instant and their number."""
+
+
+def _encode_times(time_ns: Int) -> NDArray[np.uint8]:
+    """(F, 8) `encode_time` of each instant."""
+    seconds, nanoseconds = np.divmod(time_ns, 1_000_000_000)
+    pairs = np.stack([np.clip(seconds, _FIRST_S, _LAST_S), nanoseconds], axis=1).astype("<i4")
+    return pairs.view(np.uint8)
+
+
+class _EncodedLooks:
+    """What entities look like, encoded once for either alignment at which they may begin; then only poses differ."""
+
+    def __init__(self, looks: Sequence[Entity], frame_id: str) -> None:
+        self._looks, self._frame_id = looks, frame_id
+        self._number: dict[tuple[int, int], int] = {}  # of what is encoded, by look and the place of its begin modulo 8
+        self._encoded: list[bytes] = []
+        self._poses: list[list[tuple[int, bool, tuple[float, ...]]]] = []  # place, whether it turns, heights above
+
+    def placed(self, moving: MovingEntities, rows: slice, start: Int, stamps: NDArray[np.uint8]) -> _PlacedPieces:
+        """The entities of some rows (P,) of frames `start` (F + 1,)."""
+        look, which = moving.look_ix[rows].tolist(), list[int]()
+        for first, last in pairwise(start.tolist()):
+            begin = len(_SCENE_HEAD) - len(HEAD)
+            for k in range(first, last):
+                which.append(self._encode(look[k], begin % 8))
+                begin += len(self._encoded[which[-1]])
+        pieces = np.array(which, dtype=np.int64)
+        begin_of = start_offsets(np.array([len(poses) for poses in self._poses], dtype=np.int64))
+        _, pose = expand_ranges(begin_of, pieces)
+        row = np.repeat(np.arange(len(pieces)), np.diff(begin_of)[pieces])
+        every = [pose for poses in self._poses for pose in poses]
+        x, y, z, yaw = (getattr(moving, name)[rows][row] for name in ("x_m", "y_m", "z_m", "yaw_rad"))
+        for step in range(max((len(above) for *_, above in every), default=0)):
+            up = np.array([above[step] if step < len(above) else np.nan for *_, above in every])[pose]
+            z = np.where(np.isnan(up), z, z + up)
+        half = np.where(np.array([turns for _, turns, _ in every], dtype=bool)[pose], yaw, 0.0) / 2
+        zero = np.zeros(len(x))
+        columns = np.stack([x, y, z, zero, zero, np.sin(half), np.cos(half)], axis=1).astype("<f8")
+        place = np.array([at for at, *_ in every], dtype=np.int64)[pose]
+        changes = ((np.arange(len(pieces)), np.zeros_like(pieces), stamps), (row, place, columns.view(np.uint8)))
+        return _PlacedPieces(TextPool.of(self._encoded).at(pieces), changes)
+
+    def _encode(self, look: int, begin: int) -> int:
+        """The number of an encoded look."""
+        if (look, begin) not in self._number:
+            out, entity = CdrMessage(begin), self._looks[look]
+            _write_entity(out, entity, 0, self._frame_id)
+            turning = len(entity.ellipses) + len(entity.lines)
+            heights = [*[()] * turning, *(text.above_m for text in entity.texts)]
+            self._poses.append([(at, k < turning, heights[k]) for k, at in enumerate(out.poses)])
+            self._number[look, begin] = len(self._encoded)
+            self._encoded.append(out.content())
+        return self._number[look, begin]
+
+
+class _PlacedPieces:
+    """A part that has a text in each row, with changes: of which rows, from which place in their texts, the bytes."""
+
+    def __init__(self, texts: RowTexts, changes: Sequence[tuple[Int, Int, NDArray[np.uint8]]]) -> None:
+        self._texts, self._changes, self.sizes = texts, changes, texts.sizes
+
+    def put(self, out: NDArray[np.uint8], offset: Int) -> None:
+        """Put the bytes of every row at its place in `out`, `offset` (N,)."""
+        self._texts.put(out, offset)
+        for row, place, content in self._changes:
+            count, size = content.shape
+            put_pieces(out, offset[row] + place, content.ravel(), np.arange(count) * size, np.full(count, size))
 
 
 def encode_ros2_transform(parent: str, pose: Pose, time_ns: int, child: str) -> bytes:
@@ -465,7 +581,7 @@ def encode_ros2_transform(parent: str, pose: Pose, time_ns: int, child: str) -> 
     out.stamp(time_ns)
     out.text(parent)
     out.text(child)
-    _write_pose(out, pose)
+    out.pose(pose)
     return out.message()
 
 
@@ -473,7 +589,7 @@ def _write_line(
     out: CdrMessage, points: Sequence[tuple[float, float, float]], width: float, pose: Pose, colour: Rgba
 ) -> None:
     out.add("B", 0)  # LINE_STRIP
-    _write_pose(out, pose)
+    out.pose(pose)
     out.add("d", width)
     out.add("B", 1)  # scale_invariant
     out.add("I", len(points))
@@ -481,7 +597,3 @@ def _write_line(
         out.add("d", *point)
     out.add("d", *colour)
     out.add("I", 0, 0)  # colors, indices
-
-
-def _write_pose(out: CdrMessage, pose: Pose) -> None:
-    out.add("d", pose.x_m, pose.y_m, pose.z_m, 0.0, 0.0, math.sin(pose.yaw_rad / 2), math.cos(pose.yaw_rad / 2))

@@ -110,12 +110,6 @@ class MovingEntities:
     z_m: Float
     yaw_rad: Float
 
-    def entities(self, frame: int) -> list[Entity]:
-        """The entities of one frame."""
-        rows = slice(self.start[frame], self.start[frame + 1])
-        columns = (getattr(self, name)[rows].tolist() for name in ("look_ix", "x_m", "y_m", "z_m", "yaw_rad"))
-        return [self.looks[look].placed(Pose(*pose)) for look, *pose in zip(*columns, strict=True)]
-
 
 @dataclass(frozen=True)
 class TruthScene:
