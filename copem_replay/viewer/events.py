@@ -352,12 +352,12 @@ def mark_curves(
     if not curves:
         return
     entity = entity_names(replay.scene)[replay.scene.object_number[name]]
-    episodes = table[table["object_id"] == name]
-    marks = [(BY_EGO, episodes["onset_s"].head(1), ONSET, rr.components.MarkerShape.Diamond)]
+    episodes = table_rows(table[table["object_id"] == name])
+    marks = [(BY_EGO, [episode.onset_s for episode in episodes[:1]], ONSET, rr.components.MarkerShape.Diamond)]
     for configuration, colour in colours.items():
-        detections = episodes[(episodes["configuration"] == configuration) & episodes["detected"]]
+        found = [episode for episode in episodes if episode.configuration == configuration and episode.detected]
         curve = BY_EGO if _has_only_ego(replay, experiment, configuration) else BY_ANY
-        marks.append((curve, detections["detection_s"], colour, rr.components.MarkerShape.Circle))
+        marks.append((curve, [episode.detection_s for episode in found], colour, rr.components.MarkerShape.Circle))
     rows: list[tuple[int, float, Rgb, Any]] = []
     for curve, time_s, colour, shape in marks:
         known_ns, heights = _sample_curve(curves.get(curve, curves[BY_ANY]), to_nanoseconds(time_s))

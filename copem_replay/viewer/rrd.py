@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from importlib.metadata import version
 from itertools import chain
 from pathlib import Path
@@ -52,6 +53,7 @@ from copem_replay.viewer.sink import (
     split_into_files,
 )
 from copem_replay.viewer.status import (
+    EpisodeClocks,
     compute_status,
     read_episode_clocks,
     write_hiding_lines,
@@ -124,6 +126,12 @@ class _RecordingFile:
     content: RecordingContent
     colours: dict[str, Rgb]
     last_gospa: dict[str, tuple[Int, Float]] = field(default_factory=dict)
+
+    @cached_property
+    def clocks(self) -> dict[str, EpisodeClocks]:
+        """The clocks of all objects, by configuration."""
+        scene, table = self.content.replay.scene, self.content.table
+        return {name: read_episode_clocks(scene, table, name) for name in self.colours}
 
 
 def _measured_indices(replay: Replay, experiment: Experiment, table: pd.DataFrame) -> list[int]:
@@ -241,7 +249,7 @@ def _write_fused(file: _RecordingFile, run_tracks: Mapping[str, FusedTracks]) ->
             file.last_gospa[name] = curves.write_gospa(
                 out, content.replay, content.experiment, name, run_tracks[name], colour, before
             )
-            since_ns = read_episode_clocks(content.replay.scene, content.table, name).known_ns
+            since_ns = file.clocks[name].known_ns
             curves.write_known_count(out, content.replay, name, run_tracks[name].fused, colour, since_ns)
 
 
@@ -249,17 +257,17 @@ def _write_knowledge(file: _RecordingFile, run_tracks: Mapping[str, FusedTracks]
     """Write status, reasons and position errors. `run_tracks`: of the shown objects, over the whole log."""
     out, content = file.out, file.content
     replay, experiment, scene = content.replay, content.experiment, content.replay.scene
-    statuses, clocks = {}, {}
+    statuses = {}
     for name, colour in file.colours.items():
-        fused_tracks, clock = run_tracks[name], read_episode_clocks(scene, content.table, name)
-        statuses[name], clocks[name] = compute_status(replay, experiment, name, fused_tracks, sight, clock), clock
+        fused_tracks, clock = run_tracks[name], file.clocks[name]
+        statuses[name] = compute_status(replay, experiment, name, fused_tracks, sight, clock)
         write_status_words(out, name, replay, experiment, sight, statuses[name], clock)
         write_hiding_lines(out, name, sight, statuses[name])
         detections = content.table[(content.table["configuration"] == name) & content.table["detected"]]
         first_unit = dict(zip(detections["object_id"].map(scene.object_number), detections["first_unit"], strict=True))
         write_listing_lines(out, name, replay, experiment, fused_tracks, sight, colour, first_unit)
         curves.write_position_errors(out, replay, experiment, name, fused_tracks.fused, content.objects, colour)
-    lanes.write_lanes(out, scene, experiment, sight, statuses, file.colours, clocks, content.axes_s)
+    lanes.write_lanes(out, scene, experiment, sight, statuses, file.colours, file.clocks, content.axes_s)
 
 
 def _write_shares(file: _RecordingFile, observed: Observations) -> None:

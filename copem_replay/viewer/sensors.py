@@ -22,7 +22,7 @@ from copem_replay.perception.sensor_poses import (
     unit_ground,
 )
 from copem_replay.pipeline.prepare import Replay
-from copem_replay.viewer.sink import EGO, FIELD, RecordingSink, stack_float32, upright_quaternions
+from copem_replay.viewer.sink import EGO, FIELD, RecordingSink, stack_float32
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -122,6 +122,12 @@ def _locate_recorded_unit(replay: Replay, experiment: Experiment, unit: Unit, ti
     return place
 
 
+def _upright_quaternions(yaw_rad: Float) -> np.ndarray:
+    """Quaternions xyzw (K, 4) of rotations about the vertical."""
+    zero = np.zeros(len(yaw_rad))
+    return stack_float32(zero, zero, np.sin(yaw_rad / 2), np.cos(yaw_rad / 2))
+
+
 def _write_field(
     out: RecordingSink,
     name: str,
@@ -141,7 +147,7 @@ def _write_field(
     path, rows = ["world", "fields", name], np.flatnonzero(poses.present)
     place, turn = (
         stack_float32(poses.x_m[rows], poses.y_m[rows], poses.z_m[rows]),
-        upright_quaternions(poses.heading_rad[rows]),
+        _upright_quaternions(poses.heading_rad[rows]),
     )
     if unit.at is not None:
         out.static(path, rr.Transform3D.from_fields(translation=place[0], quaternion=turn[0]))

@@ -344,10 +344,15 @@ def stack_float32(*columns: Float) -> np.ndarray:
     return np.stack(columns, axis=-1).astype(np.float32)
 
 
-def upright_quaternions(yaw_rad: Float) -> np.ndarray:
-    """Quaternions xyzw (K, 4) of rotations about the vertical."""
-    zero = np.zeros(len(yaw_rad))
-    return stack_float32(zero, zero, np.sin(yaw_rad / 2), np.cos(yaw_rad / 2))
+def upright_turns(yaw_rad: Float) -> pa.Array:
+    """Rotations (K,) about the vertical, by axis and angle: in the file the axis takes next to nothing."""
+    import rerun as rr
+
+    kind = rr.encodings.RotationAxisAngleBatch._ARROW_DATATYPE
+    up = np.zeros((len(yaw_rad), 3), dtype=np.float32)
+    up[:, 2] = 1.0
+    axis = pa.FixedSizeListArray.from_arrays(pa.array(up.ravel()), type=kind.field("axis").type)
+    return pa.StructArray.from_arrays([axis, pa.array(yaw_rad.astype(np.float32))], fields=list(kind))
 
 
 # Selection: which configurations a file holds, and which objects words, lines, lanes and plots are about.

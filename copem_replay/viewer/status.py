@@ -80,12 +80,12 @@ class EpisodeClocks:
 
 def read_episode_clocks(scene: Scene, table: pd.DataFrame, configuration: str) -> EpisodeClocks:
     """The clocks of all objects in a configuration; `table`: rows of one log and run."""
-    detections = table[(table["configuration"] == configuration) & table["detected"]]
-    times = (table, "onset_s"), (detections, "detection_s"), (table, "ended_s")
+    numbers = table["object_id"].map(scene.object_number).to_numpy(dtype=np.int64)
+    detected = ((table["configuration"] == configuration) & table["detected"]).to_numpy()
     clocks = []
-    for part, name in times:
+    for name, rows in (("onset_s", slice(None)), ("detection_s", detected), ("ended_s", slice(None))):
         times_ns = np.full(len(scene.object_ids) + 1, NEVER_NS)
-        times_ns[part["object_id"].map(scene.object_number).to_numpy(dtype=np.int64)] = to_nanoseconds(part[name])
+        times_ns[numbers[rows]] = to_nanoseconds(table[name].to_numpy()[rows])
         clocks.append(times_ns)
     return EpisodeClocks(*clocks)
 

@@ -144,6 +144,13 @@ def float32(*columns: Any) -> list[list[float]]:
     return np.stack(columns, axis=-1).astype(np.float32).tolist()
 
 
+def turns(row: dict[str, Any], archetype: str) -> list[float]:
+    """Angles about the vertical, rad."""
+    found = row[f"{archetype}:rotation_axis_angles"]
+    assert all(turn["axis"] == [0, 0, 1] for turn in found)
+    return [turn["angle"] for turn in found]
+
+
 def kinds_of_boxes(path: Path) -> dict[int, Any]:
     context = static(path, "/")["AnnotationContext:context"][0]
     return {info["class_id"]: info["class_description"]["info"] for info in context}
@@ -168,8 +175,7 @@ def test_boxes_are_those_of_the_arrays(made: Made, name: str) -> None:
         )
         assert row["Boxes3D:centers"] == float32(x, y, z)
         assert row["Boxes3D:half_sizes"] == float32(long / 2, wide / 2, high / 2)
-        zero = np.zeros(len(mine))
-        assert row["Boxes3D:quaternions"] == float32(zero, zero, np.sin(yaw / 2), np.cos(yaw / 2))
+        assert turns(row, "Boxes3D") == yaw.astype(np.float32).tolist()
         objects = tracks.row_object_ix[mine]
         kinds = [CLASSES[k] for k in scene.object_class[objects]]
         assert [named[k] for k in row["Boxes3D:class_ids"]] == [
@@ -215,13 +221,14 @@ def test_the_older_the_paler(made: Made) -> None:
 def test_ellipses_are_two_sigma(made: Made) -> None:
     alone = at(made.path, "/world/PEM/covariance", 4.0)
     assert alone["Ellipsoids3D:half_sizes"] == [pytest.approx([4, 2, 0.01])] * 2
-    assert alone["Ellipsoids3D:quaternions"] == [[0, 0, 0, 1]] * 2
+    assert turns(alone, "Ellipsoids3D") == [0, 0]
     boxes = at(made.path, "/world/PEM/boxes", 4.0)["Boxes3D:centers"]
-    assert [x for x, _, _ in alone["Ellipsoids3D:centers"]] == [x for x, _, _ in boxes]
+    assert [x for x, _, _ in alone["Ellipsoids3D:centers"]] == pytest.approx([x for x, _, _ in boxes], abs=0.004)
+    assert all(float(value * 128).is_integer() for place in alone["Ellipsoids3D:centers"] for value in place)
     assert [z for _, _, z in alone["Ellipsoids3D:centers"]] == pytest.approx([0, 0])
     tilted = at(made.path, "/world/pole/covariance", 1.0)
     assert tilted["Ellipsoids3D:half_sizes"][0] == pytest.approx([4, 2, 0.01])
-    assert tilted["Ellipsoids3D:quaternions"][0] == pytest.approx([0, 0, np.sin(np.pi / 8), np.cos(np.pi / 8)])
+    assert turns(tilted, "Ellipsoids3D")[0] == pytest.approx(np.pi / 4)
     assert not list(chunks(made.path, "/world/GT/covariance"))
 
 

@@ -492,7 +492,7 @@ def _write_entity(out: CdrMessage, each: Entity, time_ns: int, frame_id: str) ->
 
 def encode_ros2_moving(moving: MovingEntities, frame_id: str) -> Iterator[bytes]:
     """A message for each frame, as `encode_ros2_scene` gives it, many at once."""
-    looks = _EncodedLooks(moving.looks, frame_id)
+    looks = _CdrLooks(moving.looks, frame_id)
     for first, last in split_into_blocks(moving.start):
         bounds, time_ns = moving.start[first : last + 1], moving.time_ns[first:last]
         start, frames = bounds - bounds[0], last - first
@@ -515,7 +515,7 @@ def _encode_times(time_ns: Int) -> NDArray[np.uint8]:
     return pairs.view(np.uint8)
 
 
-class _EncodedLooks:
+class _CdrLooks:
     """What entities look like, encoded once for either alignment at which they may begin; then only poses differ."""
 
     def __init__(self, looks: Sequence[Entity], frame_id: str) -> None:
