@@ -135,8 +135,8 @@ class FusedOnce:
             return None
         later_s, instants_s = other_s[arrive] - one_s[arrive], np.unique(one_s[arrive])
         # Neither does rounding decide which two arrive together.
-        apart = [np.searchsorted(instants_s, instants_s + SAME_INSTANT_S + side * 1e-9) for side in (-1, 1)]
-        alike = np.ptp(later_s) < 1e-10 and np.array_equal(*apart)
+        before, after = (np.searchsorted(instants_s, instants_s + SAME_INSTANT_S + side_s) for side_s in (-1e-9, 1e-9))
+        alike = np.ptp(later_s) < 1e-10 and np.array_equal(before, after)
         return self._lists if alike else None
 
 
