@@ -1,6 +1,9 @@
 """Benchmarks, one JSON line each. Ratios are taken within one run: trust them, not the absolute figures.
 
 python tools/bench.py [name …]
+
+Each section runs in a process of its own, one after the other, and ends with a line of what it took: of the processor,
+of the clock, and the most memory.
 """
 
 from __future__ import annotations
@@ -10,6 +13,7 @@ import sys
 
 from benches import (
     commands,
+    common,
     compare,
     compiling,
     crew,
@@ -21,26 +25,33 @@ from benches import (
     peers,
     reading,
     replay,
+    scaling,
     writing,
-)
+)  # fmt: skip
 
 BENCHES = (
     compiling.compile, commands.pieces, compare.compare, compare.verdict, crew.crew, replay.visibility, memory.memory,
     fit.fit, replay.paper, reading.reading, writing.writing, commands.commands, commands.reports, fusion.fusion,
-    peers.peers,
-    links.links, long.crowd, long.long,
+    peers.peers, links.links, scaling.scaling, long.crowd, long.long,
 )  # fmt: skip
 """All there are, in the order in which they run; each is called without arguments, by its name."""
+ALONE = "--alone"
+"""Before a name: the section runs in this process."""
 
 
 def main(names: list[str]) -> None:
     known = {bench.__name__: bench for bench in BENCHES}
-    if unknown := [name for name in names if name not in known]:
+    alone = names[:1] == [ALONE]
+    if unknown := [name for name in names[alone:] if name not in known]:
         raise SystemExit(f"expected some of {', '.join(known)}; found {', '.join(unknown)}")
-    for name, bench in known.items():
+    if alone:
+        for line in known[names[1]]():
+            print(json.dumps(line), flush=True)
+        return
+    for name in known:
         if not names or name in names:
-            for line in bench():
-                print(json.dumps(line), flush=True)
+            took = common.spent((ALONE, name), command=(sys.executable, __file__), stdout=None)
+            print(json.dumps({"section": name} | common.as_line(took)), flush=True)
 
 
 if __name__ == "__main__":

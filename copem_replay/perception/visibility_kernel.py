@@ -21,10 +21,8 @@ from typing import Any, NamedTuple
 import numba as nb
 import numpy as np
 
-from copem_replay.core.compiled import kernel
+from copem_replay.core.compiled import borrowing, kernel
 from copem_replay.core.tracks import Bool, Float, Int
-
-Work = tuple[Float, Float, Float, Float, Float, Float, Float]
 
 
 class Boxes(NamedTuple):
@@ -67,6 +65,10 @@ class FaceColumns(NamedTuple):
 
     a: float
     b: float
+    cos_a: float
+    sin_a: float
+    cos_b: float
+    sin_b: float
     ux: float
     uy: float
     face: float  # distance along (ux, uy)
@@ -81,10 +83,15 @@ BODY = np.dtype(
         ("size", np.int64), ("owner", np.int64), ("x_m", np.float64), ("y_m", np.float64), ("radius_m", np.float64),
         ("bottom_m", np.float64), ("top_m", np.float64),
         ("bearing", np.float64), ("distance_m", np.float64), ("lo", np.float64), ("hi", np.float64),
+        ("near_m", np.float64), ("far_m", np.float64), ("lowest", np.float64), ("highest", np.float64),
+        ("from_slope", np.float64), ("to_slope", np.float64), ("begins_m", np.float64),
+        ("hides", np.bool_), ("inside", np.bool_), ("over", np.bool_),
     ]
 )  # fmt: skip
 """A body: how many corners it has; the obstacle it is a part of, −1: none; middle, radius and height. From one
-observer: bearing and distance of the middle, and the extent in azimuth about it."""
+observer: bearing and distance of the middle, the extent in azimuth about it, the distances of the outline's nearest and
+farthest point, the slopes between which all of it is, and those between which it covers at every azimuth of its extent;
+whether it can hide others, whether the observer is within its outline, and then over or under it."""
 
 _CORNERS = 4
 """Corners of a target."""
@@ -95,10 +102,42 @@ _ON_TOP_M = 0.01
 _SURELY = 1e-6
 """A body that surely hides all of another exceeds it by this, in rad, m and slope: far above rounding. Larger: slower,
 no result changes."""
+_BESIDE_M = 1e-3
+"""From a body nearer than this azimuths are too unsure to tell what it misses; above it rounding is far below
+`_SURELY`."""
 _STEEP = 1e6
 """Height (m) at the target's face of a slope that stands for straight down or straight up: beyond any target."""
+_APART = 1e-9
+"""Slopes that differ by this at both ends of a piece, to the one or the other side, do not cross: above rounding. For
+larger ones: this part of them."""
 _MAX_PIECES = 512
 """Azimuth pieces per view: 60 bodies in front of one target need about 250."""
+_MOST_SECTORS = 256
+"""Sectors of azimuth by which bodies are found. No result depends on it."""
+_WORD = 64
+"""Bodies in a word of the index."""
+_LOWEST_BIT = 0x03F79D71B4CB0A89
+"""De Bruijn's sequence: times a power of two, its top six bits tell which power. No two windows of six are equal."""
+_PLACE_OF = np.zeros(_WORD, dtype=np.int64)
+_PLACE_OF[[(_LOWEST_BIT << place & 2**64 - 1) >> 58 for place in range(_WORD)]] = np.arange(_WORD)
+
+
+class _Index(NamedTuple):
+    # The bodies that may hide something, by how near they are and by sectors of azimuth.
+    order: Int  # (B,) nearer ones first; those with the same depth in any order
+    depth: Int  # (B,) of each, from 0 on
+    ends: Int  # (B + 1,) where each depth ends in `order`
+    bits: Int  # (sectors, words) a bit for each place in `order` whose body reaches into the sector
+    half_m: Float  # (1,) half of the depths are for what is nearer
+
+
+class _Found(NamedTuple):
+    # The bodies that may hide the target at hand, and what is known of them.
+    near: Int
+    span: Float  # (B, 2) azimuths about the target's bearing, outside which a body surely hides nothing
+    covered: Float  # (B, 2) azimuths, ascending and apart, between which a body surely hides all of the target
+    kept: Int  # those of `near` that matter elsewhere, ascending, and their spans
+    kept_span: Float
 
 
 @kernel
@@ -110,139 +149,315 @@ def compute_shares(
     `blocker (U, P)`, unless empty, becomes the row of the body that alone would hide most of each row, −1 where none
     hides any of it, −2 − k for the obstacle k.
     """
-    bounds, corners, bottom, top, object_ix = boxes
-    static_xy, static_start, static_body, static_bottom, static_top = obstacles
-    observer_m, present, carrier_ix = places
-    # Bodies of one list: the boxes first, then the static parts. Everything below is relative to the observer.
-    n_static = len(static_body)
-    most = n_static
+    # Bodies of one list: the boxes first, then the static parts. Everything is relative to the observer.
+    most, widest = 0, boxes.corners_m.shape[1]
     for f in range(f0, f1):
-        most = max(most, bounds[f + 1] - bounds[f] + n_static)
-    widest = 4
-    for g in range(n_static):
-        widest = max(widest, static_start[g + 1] - static_start[g])
-    xy = np.empty((most, widest, 2))
-    of = np.empty(most, BODY)
-    hides, inside, over = np.empty(most, dtype=np.bool_), np.empty(most, dtype=np.bool_), np.empty(most, dtype=np.bool_)
-    near, alone = np.empty(most, dtype=np.int64), np.empty(1, dtype=np.int64)
+        most = max(most, boxes.bounds[f + 1] - boxes.bounds[f])
+    most += len(obstacles.body)
+    for g in range(len(obstacles.body)):
+        widest = max(widest, obstacles.start[g + 1] - obstacles.start[g])
+    xy, of = np.empty((most, widest, 2)), np.empty(most, BODY)
+    index = _Index(
+        np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most + 1, np.int64),
+        np.empty((_MOST_SECTORS, most // _WORD + 1), np.int64), np.empty(1),
+    )  # fmt: skip
+    found = _Found(
+        np.empty(most, np.int64), np.empty((most, 2)), np.empty((most + 1, 2)), np.empty(most, np.int64),
+        np.empty((most, 2)),
+    )  # fmt: skip
     work = _make_workspace(most, widest)
-
     for f in range(f0, f1):
-        first = bounds[f]
-        n = bounds[f + 1] - first
-        bodies = n + n_static
-        for b in range(bodies):
-            if b < n:
-                of[b].size, of[b].owner = 4, -1
-                of[b].bottom_m, of[b].top_m = bottom[first + b], top[first + b]
-                for k in range(4):
-                    xy[b, k, 0], xy[b, k, 1] = corners[first + b, k, 0], corners[first + b, k, 1]
-            else:
-                g = b - n
-                of[b].size, of[b].owner = static_start[g + 1] - static_start[g], static_body[g]
-                of[b].bottom_m, of[b].top_m = static_bottom[g], static_top[g]
-                for k in range(of[b].size):
-                    v = static_start[g] + k
-                    xy[b, k, 0], xy[b, k, 1] = static_xy[v, 0], static_xy[v, 1]
-            mx = my = r2 = 0.0
-            for k in range(of[b].size):
-                mx += xy[b, k, 0] / of[b].size
-                my += xy[b, k, 1] / of[b].size
-            for k in range(of[b].size):
-                r2 = max(r2, (xy[b, k, 0] - mx) ** 2 + (xy[b, k, 1] - my) ** 2)
-            of[b].x_m, of[b].y_m, of[b].radius_m = mx, my, np.sqrt(r2)
-
-        for u in range(present.shape[0]):
-            if not present[u, f]:
-                continue
-            ox, oy, oz = observer_m[u, f, 0], observer_m[u, f, 1], observer_m[u, f, 2]
-            for b in range(bodies):
-                # A unit that touches a box is in it: some logs hold the mast, too. A unit that touches an obstacle is
-                # in front of it: some cameras are fixed to walls, or stand on roofs.
-                dx, dy = of[b].x_m - ox, of[b].y_m - oy
-                of[b].bearing, of[b].distance_m = np.arctan2(dy, dx), np.sqrt(dx * dx + dy * dy)
-                inside[b] = of[b].distance_m <= of[b].radius_m + _SURELY and _contains(
-                    xy[b], of[b].size, ox, oy, 0.0 if b < n else _OVERLAP_M
-                )
-                apart = _ON_TOP_M if b < n else -_OVERLAP_M
-                over[b] = not flat and inside[b] and (oz > of[b].top_m + apart or oz < of[b].bottom_m - apart)
-                hides[b] = over[b] or not inside[b]
-                if b < n and object_ix[first + b] == carrier_ix[u]:
-                    hides[b] = False
-                of[b].lo = of[b].hi = 0.0
-                if over[b]:
-                    of[b].lo, of[b].hi = -np.pi, np.pi
-                elif hides[b]:
-                    for k in range(of[b].size):
-                        vx, vy = xy[b, k, 0] - ox, xy[b, k, 1] - oy
-                        angle = np.arctan2(dx * vy - dy * vx, dx * vx + dy * vy)
-                        of[b].lo, of[b].hi = min(of[b].lo, angle), max(of[b].hi, angle)
-            for b in range(n, bodies):  # a unit inside one part of an obstacle is inside the obstacle
-                if inside[b] and not over[b]:
-                    for c in range(n, bodies):
-                        if of[c].owner == of[b].owner:
-                            hides[c] = False
-            for t in range(n):
-                if object_ix[first + t] == carrier_ix[u]:
-                    continue
-                if inside[t]:
-                    out[u, first + t] = 1.0
-                    continue
-                count = 0
-                for b in range(bodies):
-                    if b == t or not hides[b] or of[b].distance_m - of[b].radius_m > of[t].distance_m + of[t].radius_m:
+        first = boxes.bounds[f]
+        n = boxes.bounds[f + 1] - first
+        _gather_bodies(first, n, boxes, obstacles, xy, of)
+        bodies = of[: n + len(obstacles.body)]
+        for u in range(places.present.shape[0]):
+            if places.present[u, f]:
+                eye_m = (places.place_m[u, f, 0], places.place_m[u, f, 1], places.place_m[u, f, 2])
+                mine = places.carrier_ix[u]
+                _look_at_bodies(eye_m, n, boxes.object_ix[first : first + n], mine, flat, xy, bodies, work.azimuth)
+                _index_bodies(bodies, index)
+                for t in range(n):
+                    if boxes.object_ix[first + t] == mine:
                         continue
-                    turn = of[b].bearing - of[t].bearing
-                    turn -= 2 * np.pi * np.rint(turn / (2 * np.pi))
-                    if (
-                        (turn + of[b].lo < of[t].hi and turn + of[b].hi > of[t].lo)
-                        or turn + of[b].hi - 2 * np.pi > of[t].lo
-                        or turn + of[b].lo + 2 * np.pi < of[t].hi
-                    ):
-                        near[count] = b
-                        count += 1
-                count = _drop_overlapping_boxes(t, near, count, xy, of)
-                if count == 0:
-                    out[u, first + t] = 1.0
-                elif _hidden_by_one(t, near, count, of, oz, flat):
-                    out[u, first + t] = 0.0
-                else:
-                    out[u, first + t] = _visible_share(t, near, count, xy, of, (ox, oy, oz), flat, work)
-                if blocker.shape[0] == 0:
-                    continue
-                least = 1.0 - 1e-9
-                for i in range(count):
-                    alone[0] = near[i]
-                    left = _visible_share(t, alone, 1, xy, of, (ox, oy, oz), flat, work)
-                    if left < least:
-                        least = left
-                        blocker[u, first + t] = first + near[i] if near[i] < n else -2 - of[near[i]].owner
+                    if bodies[t].inside:
+                        out[u, first + t] = 1.0
+                        continue
+                    alone = len(blocker) > 0
+                    share, b = _view_target(t, alone, xy, bodies, eye_m, flat, index, found, work)
+                    out[u, first + t] = share
+                    if alone:
+                        blocker[u, first + t] = -1 if b < 0 else first + b if b < n else -2 - bodies[b].owner
 
 
-@kernel
-def _hidden_by_one(t: int, near: Int, count: int, of: Any, oz: float, flat: bool) -> bool:
-    # Whether one body surely hides all of target t, by bounds alone: what `_visible_share` gives, in far less time.
-    nearest, farthest = of[t].distance_m - of[t].radius_m, of[t].distance_m + of[t].radius_m
-    z0, z1 = of[t].bottom_m - oz, of[t].top_m - oz
-    lowest = z0 / nearest if z0 < 0.0 else z0 / farthest  # slopes between which the target is
-    highest = z1 / nearest if z1 > 0.0 else z1 / farthest
+@borrowing
+def _gather_bodies(first: int, n: int, boxes: Boxes, obstacles: Statics, xy: Float, of: Any) -> None:
+    # Out: the bodies of one list.
+    for b in range(n + len(obstacles.body)):
+        if b < n:
+            of[b].size, of[b].owner = 4, -1
+            of[b].bottom_m, of[b].top_m = boxes.bottom_m[first + b], boxes.top_m[first + b]
+            for k in range(4):
+                xy[b, k, 0], xy[b, k, 1] = boxes.corners_m[first + b, k, 0], boxes.corners_m[first + b, k, 1]
+        else:
+            g = b - n
+            of[b].size, of[b].owner = obstacles.start[g + 1] - obstacles.start[g], obstacles.body[g]
+            of[b].bottom_m, of[b].top_m = obstacles.bottom_m[g], obstacles.top_m[g]
+            for k in range(of[b].size):
+                v = obstacles.start[g] + k
+                xy[b, k, 0], xy[b, k, 1] = obstacles.xy_m[v, 0], obstacles.xy_m[v, 1]
+        mx = my = r2 = 0.0
+        for k in range(of[b].size):
+            mx += xy[b, k, 0] / of[b].size
+            my += xy[b, k, 1] / of[b].size
+        for k in range(of[b].size):
+            r2 = max(r2, (xy[b, k, 0] - mx) ** 2 + (xy[b, k, 1] - my) ** 2)
+        of[b].x_m, of[b].y_m, of[b].radius_m = mx, my, np.sqrt(r2)
+
+
+@borrowing
+def _look_at_bodies(
+    eye_m: tuple[float, float, float], n: int, object_ix: Int, mine: int, flat: bool, xy: Float, of: Any, azimuth: Float
+) -> None:
+    # Out: what of the bodies depends on the observer. The first n are boxes; `mine`: the object that carries the unit.
+    ox, oy, oz = eye_m
+    for b in range(len(of)):
+        # A unit that touches a box is in it: some logs hold the mast, too. A unit that touches an obstacle is
+        # in front of it: some cameras are fixed to walls, or stand on roofs.
+        body = of[b]
+        dx, dy = body.x_m - ox, body.y_m - oy
+        body.bearing, body.distance_m = np.arctan2(dy, dx), np.sqrt(dx * dx + dy * dy)
+        body.inside = body.distance_m <= body.radius_m + _SURELY and _contains(
+            xy[b], body.size, ox, oy, 0.0 if b < n else _OVERLAP_M
+        )
+        apart = _ON_TOP_M if b < n else -_OVERLAP_M
+        body.over = not flat and body.inside and (oz > body.top_m + apart or oz < body.bottom_m - apart)
+        body.hides = (body.over or not body.inside) and not (b < n and object_ix[b] == mine)
+        body.lo = body.hi = 0.0
+        if body.over:
+            body.lo, body.hi = -np.pi, np.pi
+        elif body.hides:
+            for k in range(body.size):
+                vx, vy = xy[b, k, 0] - ox, xy[b, k, 1] - oy
+                angle = np.arctan2(dx * vy - dy * vx, dx * vx + dy * vy)
+                body.lo, body.hi, azimuth[b, k] = min(body.lo, angle), max(body.hi, angle), angle
+        _bound_slopes(xy[b], eye_m, flat, body)
+    for b in range(n, len(of)):  # a unit inside one part of an obstacle is inside the obstacle
+        if of[b].inside and not of[b].over:
+            for c in range(n, len(of)):
+                if of[c].owner == of[b].owner:
+                    of[c].hides = False
+
+
+@borrowing
+def _bound_slopes(polygon: Float, eye_m: tuple[float, float, float], flat: bool, body: Any) -> None:
+    # Out: distances and slopes of a body. One too near to be sure of is infinitely far: it surely hides nothing.
+    near_m2, far_m2, short = np.inf, 0.0, False
+    for k in range(body.size):
+        m = k + 1 if k + 1 < body.size else 0
+        ax, ay = polygon[k, 0] - eye_m[0], polygon[k, 1] - eye_m[1]
+        ex, ey = polygon[m, 0] - polygon[k, 0], polygon[m, 1] - polygon[k, 1]
+        along, length2 = -(ax * ex + ay * ey), ex * ex + ey * ey
+        short |= length2 < _BESIDE_M * _BESIDE_M
+        if along >= length2:  # nearest at the next corner
+            along = 0.0
+        part = along / length2 if along > 0.0 else 0.0
+        px, py = ax + part * ex, ay + part * ey
+        near_m2, far_m2 = min(near_m2, px * px + py * py), max(far_m2, ax * ax + ay * ay)
+    near_m, far_m = np.sqrt(near_m2), np.sqrt(far_m2)
+    body.near_m, body.far_m = near_m, far_m
+    if near_m <= _BESIDE_M or short or body.inside:
+        body.near_m, body.far_m = 0.0, np.inf
+        return
+    bottom, top = body.bottom_m - eye_m[2], body.top_m - eye_m[2]
+    body.lowest = bottom / near_m if bottom < 0.0 else bottom / far_m
+    body.highest = top / near_m if top > 0.0 else top / far_m
+    body.from_slope = -np.inf if flat else bottom / far_m if bottom < 0.0 else bottom / near_m
+    body.to_slope = np.inf if flat else top / far_m if top > 0.0 else top / near_m
+
+
+# What may hide a target: bodies by depth and by sectors of azimuth.
+
+
+@borrowing
+def _index_bodies(of: Any, index: _Index) -> None:
+    # Out: the bodies that may hide something.
+    bodies, total_m = len(of), 1.0
+    for b in range(bodies):
+        of[b].begins_m = of[b].distance_m - of[b].radius_m
+        total_m += of[b].distance_m
+    index.half_m[0] = total_m / bodies
+    index.ends[: bodies + 1] = 0
+    for b in range(bodies):
+        index.depth[b] = _find_depth(of[b].begins_m, bodies, index)
+        index.ends[index.depth[b] + 1] += 1
+    for depth in range(bodies):
+        index.ends[depth + 1] += index.ends[depth]
+    sectors, words = min(_MOST_SECTORS, 4 * bodies), bodies // _WORD + 1
+    index.bits[:sectors, :words] = 0
+    for b in range(bodies):
+        place = index.ends[index.depth[b]]
+        index.ends[index.depth[b]] += 1
+        index.order[place] = b
+        if of[b].hides:
+            first, last = _find_sectors(of[b], sectors)
+            for k in range(first, last + 1):
+                index.bits[k if k < sectors else k - sectors, place // _WORD] |= 1 << (place % _WORD)
+
+
+@nb.njit(inline="always")
+def _find_depth(begins_m: float, bodies: int, index: _Index) -> int:
+    # What begins farther away has no smaller depth, 0 … bodies − 1; half of the depths are for what is nearer.
+    return int(max(begins_m, 0.0) / (max(begins_m, 0.0) + index.half_m[0]) * bodies)
+
+
+@nb.njit(inline="always")
+def _find_sectors(body: Any, sectors: int) -> tuple[int, int]:
+    # The first and the last sector that a body reaches into, counted on beyond a full round.
+    if body.over:
+        return 0, sectors - 1
+    first = int(np.floor((body.bearing + body.lo - _SURELY) * sectors / (2 * np.pi)))
+    last = int(np.floor((body.bearing + body.hi + _SURELY) * sectors / (2 * np.pi)))
+    round_ = first % sectors - first
+    return first + round_, min(last, first + sectors - 1) + round_
+
+
+@borrowing
+def _find_near_bodies(t: int, all_: bool, xy: Float, of: Any, index: _Index, found: _Found) -> tuple[int, int]:
+    # Out: the bodies that may hide a part of target t, and azimuths that are covered. Returns the numbers of both.
+    # Unless `all_` are asked for, it ends where all azimuths are covered.
+    sectors, bodies = min(_MOST_SECTORS, 4 * len(of)), len(of)
+    first, last = _find_sectors(of[t], sectors)
+    reach_m, lo, hi = of[t].distance_m + of[t].radius_m, of[t].lo, of[t].hi
+    words = index.ends[min(_find_depth(reach_m, bodies, index) + 1, bodies - 1)] // _WORD + 1  # nothing beyond
+    count = n_covered = 0
+    for w in range(words):
+        left = 0
+        for k in range(first, last + 1):
+            left |= index.bits[k if k < sectors else k - sectors, w]
+        while left != 0:
+            b = index.order[w * _WORD + _PLACE_OF[((left & -left) * _LOWEST_BIT >> 58) & 63]]
+            left &= left - 1
+            if b == t or of[b].begins_m > reach_m:
+                continue
+            turn = of[b].bearing - of[t].bearing
+            turn -= 2 * np.pi * np.rint(turn / (2 * np.pi))
+            ahead = turn + of[b].lo < hi and turn + of[b].hi > lo
+            left_round, right_round = turn + of[b].hi - 2 * np.pi > lo, turn + of[b].lo + 2 * np.pi < hi
+            if not (ahead or left_round or right_round):
+                continue
+            since, until = -np.inf, np.inf
+            if of[b].near_m > 0.0 and ahead + left_round + right_round == 1:
+                turn += 2 * np.pi if right_round else -2 * np.pi if left_round else 0.0
+                since, until = turn + of[b].lo, turn + of[b].hi
+            if since > -np.inf and _surely_covers(of[b], of[t]):
+                n_covered = _cover_azimuths(since, until, n_covered, found.covered)
+                if not all_ and _covers_all(lo, hi, found.covered[:n_covered]):
+                    return count, n_covered
+            elif _overlaps_target(b, t, xy, of):
+                continue
+            found.near[count], found.span[count, 0], found.span[count, 1] = b, since, until
+            count += 1
+    return count, n_covered
+
+
+@nb.njit(inline="always")
+def _overlaps_target(b: int, t: int, xy: Float, of: Any) -> bool:
+    # A box that overlaps the target's footprint does not hide it: a rider's overlaps that of the bicycle.
+    return (
+        of[b].owner < 0
+        and _may_meet(of, b, t)
+        and not _are_separated(xy[t], of[t].size, xy[b], of[b].size)
+        and not _are_separated(xy[b], of[b].size, xy[t], of[t].size)
+    )
+
+
+@nb.njit(inline="always")
+def _surely_covers(body: Any, target: Any) -> bool:
+    # Whether a body hides all of a target at every azimuth of its extent, by bounds alone.
+    return bool(
+        body.far_m + 2 * _SURELY < target.near_m
+        and body.from_slope + _SURELY < target.lowest
+        and body.to_slope - _SURELY > target.highest
+    )
+
+
+@nb.njit(inline="always")
+def _cover_azimuths(since: float, until: float, n: int, covered: Float) -> int:
+    # Adds an interval to those that are covered[:n]; those that overlap surely become one. Returns their number.
+    k = 0
+    while k < n and covered[k, 1] < since + 2 * _SURELY:
+        k += 1
+    m = k
+    while m < n and covered[m, 0] + 2 * _SURELY <= until:
+        since, until = min(since, covered[m, 0]), max(until, covered[m, 1])
+        m += 1
+    if m == k:  # room for one more
+        for j in range(n, k, -1):
+            covered[j, 0], covered[j, 1] = covered[j - 1, 0], covered[j - 1, 1]
+    else:
+        for j in range(m, n):
+            covered[k + 1 + j - m, 0], covered[k + 1 + j - m, 1] = covered[j, 0], covered[j, 1]
+    covered[k, 0], covered[k, 1] = since, until
+    return n + 1 - (m - k)
+
+
+@nb.njit(inline="always")
+def _covers_all(lo: float, hi: float, covered: Float) -> bool:
+    found = False
+    for k in range(len(covered)):
+        found |= covered[k, 0] + _SURELY < lo and covered[k, 1] - _SURELY > hi
+    return found
+
+
+@borrowing
+def _keep_what_matters(t: int, count: int, covered: Float, of: Any, found: _Found) -> int:
+    # Out: the bodies that may hide a part of target t at an azimuth that is not covered. Returns their number.
+    kept = 0
     for i in range(count):
-        b = near[i]
-        begins, ends = of[b].distance_m - of[b].radius_m, of[b].distance_m + of[b].radius_m
-        if begins <= _SURELY or ends + _SURELY >= nearest:
+        since, until = found.span[i, 0], found.span[i, 1]
+        lo, hi = max(since - _SURELY, of[t].lo), min(until + _SURELY, of[t].hi)
+        matters = True
+        for k in range(len(covered)):
+            if lo >= covered[k, 0] + 2 * _SURELY and hi <= covered[k, 1] - 2 * _SURELY:
+                matters = False
+        if not matters:
             continue
-        turn = of[b].bearing - of[t].bearing
-        turn -= 2 * np.pi * np.rint(turn / (2 * np.pi))
-        if turn + of[b].lo + _SURELY >= of[t].lo or turn + of[b].hi - _SURELY <= of[t].hi:
-            continue
-        if flat:
-            return True
-        bottom, top = of[b].bottom_m - oz, of[b].top_m - oz
-        from_slope = bottom / ends if bottom < 0.0 else bottom / begins
-        to_slope = top / ends if top > 0.0 else top / begins
-        if from_slope + _SURELY < lowest and to_slope - _SURELY > highest:
-            return True
-    return False
+        j = kept
+        while j > 0 and found.kept[j - 1] > found.near[i]:
+            found.kept[j], found.kept_span[j, 0] = found.kept[j - 1], found.kept_span[j - 1, 0]
+            found.kept_span[j, 1] = found.kept_span[j - 1, 1]
+            j -= 1
+        found.kept[j], found.kept_span[j, 0], found.kept_span[j, 1] = found.near[i], since, until
+        kept += 1
+    return kept
+
+
+@borrowing
+def _view_target(
+    t: int, alone: bool, xy: Float, of: Any, eye_m: tuple[float, float, float], flat: bool, index: _Index,
+    found: _Found, work: _Work,
+) -> tuple[float, int]:  # fmt: skip
+    # The share of target t that is visible; and the body that `alone` hides most of it, −1: none hides any of it.
+    count, n_covered = _find_near_bodies(t, alone, xy, of, index, found)
+    share, least, most = 1.0, 1.0 - 1e-9, -1
+    if _covers_all(of[t].lo, of[t].hi, found.covered[:n_covered]):
+        share = 0.0
+        if not alone:
+            return share, most
+    # At first all bodies at once, then each, which is compiled once.
+    for which in range(-1 if count > 0 and share > 0.0 else 0, count if alone else 0):
+        covered = found.covered[: n_covered if which < 0 else 0]
+        kept = _keep_what_matters(t, count, covered, of, found) if which <= 0 else count
+        first, after = (0, kept) if which < 0 else (which, which + 1)
+        left = _visible_share(
+            t, found.kept[first:after], found.kept_span[first:after], covered, xy, of, eye_m, flat, work
+        )
+        if which < 0:
+            share = left
+        elif left < least:
+            least, most = left, found.kept[which]
+    return share, most
 
 
 @nb.njit(inline="always")
@@ -274,67 +489,78 @@ def _are_separated(a: Float, na: int, b: Float, nb_: int) -> bool:
     return False
 
 
-@kernel
-def _drop_overlapping_boxes(t: int, near: Int, count: int, xy: Float, of: Any) -> int:
-    # A box that overlaps the target's footprint does not hide it: a rider's overlaps that of the bicycle.
-    kept = 0
-    for i in range(count):
-        b = near[i]
-        if (
-            of[b].owner >= 0
-            or not _may_meet(of, b, t)
-            or _are_separated(xy[t], of[t].size, xy[b], of[b].size)
-            or _are_separated(xy[b], of[b].size, xy[t], of[t].size)
-        ):
-            near[kept] = b
-            kept += 1
-    return kept
-
-
 @nb.njit(inline="always")
 def _may_meet(of: Any, a: int, b: int) -> bool:
     dx, dy, reach = of[a].x_m - of[b].x_m, of[a].y_m - of[b].y_m, of[a].radius_m + of[b].radius_m
     return bool(dx * dx + dy * dy < reach * reach)
 
 
+class _Work(NamedTuple):
+    # Of the target at hand and the bodies in front of it, the target last.
+    azimuth: Float  # (B, corners) of the corners of each body of the list, about its bearing
+    corner: Float  # (B, corners, 2) in the frame of the view: observer at 0, target along +x
+    edge: (
+        Float  # (B, corners, 4) of each edge its direction, how far it is from the observer times its length, 1 / that
+    )
+    ahead: Int  # the bodies that may cover a part of it
+    breaks: Float  # azimuths of corners, and of edges that cross
+    slope: (
+        Float  # (4, B) at which each active body begins and ends to cover, as g·u: x, y of the one, x, y of the other
+    )
+    slope_at: (
+        Float  # (2, 2 B) these slopes at both ends of a piece: where the first body begins, ends, the next begins …
+    )
+    sorted: Float  # (2, 2 B + 2) these, and the ends of the column, ascending at a
+    splits: Float  # azimuths where two slopes are equal
+    interval: Float  # (2, B) of each active body in one column
+    low: Float  # covered intervals of one column that do not begin at its bottom
+    high: Float
+
+
 @kernel
-def _make_workspace(most: int, widest: int) -> Work:
-    return (
-        np.empty((most + 1, widest, 2)),  # corners in the frame of the view: observer at 0, target along +x
-        np.empty((1 + _CORNERS) * most * widest + widest + 2),  # azimuths of corners, and of edges that cross
-        np.empty((most, 2)), np.empty((most, 2)),  # slopes at which each active body begins and ends to cover, as g·u
-        np.empty(_MAX_PIECES),  # azimuths where two slopes are equal
-        np.empty(most), np.empty(most),  # covered intervals of one column
+def _make_workspace(most: int, widest: int) -> _Work:
+    return _Work(
+        np.empty((most, widest)), np.empty((most + 1, widest, 2)), np.empty((most + 1, widest, 4)),
+        np.empty(most, np.int64),
+        np.empty((1 + _CORNERS) * most * widest + widest + 2), np.empty((4, most)), np.empty((2, 2 * most)),
+        np.empty((2, 2 * most + 2)), np.empty(_MAX_PIECES), np.empty((2, most)), np.empty(most), np.empty(most),
     )  # fmt: skip
 
 
 @nb.njit(inline="always")
-def _crossing_distances(
-    polygon: Float, size: int, ux: float, uy: float
-) -> tuple[bool, float, float, float, float, float]:
-    # Inverse distances of entry and exit along u, as vectors g with 1/d = g·u; hit is False where the ray misses.
-    enter, leave = -np.inf, np.inf
-    nx = ny = fx = fy = 0.0
-    hit = True
+def _measure_edges(polygon: Float, size: int, edge: Float) -> None:
     for k in range(size):
         m = k + 1 if k + 1 < size else 0
         ax, ay = polygon[k, 0], polygon[k, 1]
         ex, ey = polygon[m, 0] - ax, polygon[m, 1] - ay
         offset = ey * ax - ex * ay  # outward normal (ey, −ex) times a point of the edge
-        speed = ey * ux - ex * uy
         # Zero where the observer stands in line with the edge: then it is not the face that is seen.
-        nearness = 1.0 / offset if offset != 0.0 else 0.0
+        edge[k, 0], edge[k, 1], edge[k, 2], edge[k, 3] = ex, ey, offset, 1.0 / offset if offset != 0.0 else 0.0
+
+
+@borrowing
+def _crossing_distances(edge: Float, size: int, ux: float, uy: float) -> tuple[bool, float, float, float, float, float]:
+    # Inverse distances of entry and exit along u, as vectors g with 1/d = g·u; hit is False where the ray misses.
+    enter, leave = -np.inf, np.inf
+    front = back = -1
+    hit = True
+    for k in range(size):
+        speed = edge[k, 1] * ux - edge[k, 0] * uy
         if speed < 0.0:
-            d = offset / speed
+            d = edge[k, 2] / speed
             if d > enter:
-                enter, nx, ny = d, ey * nearness, -ex * nearness
+                enter, front = d, k
         elif speed > 0.0:
-            d = offset / speed
+            d = edge[k, 2] / speed
             if d < leave:
-                leave, fx, fy = d, ey * nearness, -ex * nearness
-        elif offset < 0.0:
+                leave, back = d, k
+        elif edge[k, 2] < 0.0:
             hit = False
-    return hit and enter < leave and leave > 0.0, enter, nx, ny, fx, fy
+    if not (hit and enter < leave and leave > 0.0):
+        return False, enter, 0.0, 0.0, 0.0, 0.0
+    nx, ny = (edge[front, 1] * edge[front, 3], -edge[front, 0] * edge[front, 3]) if front >= 0 else (0.0, 0.0)
+    fx, fy = (edge[back, 1] * edge[back, 3], -edge[back, 0] * edge[back, 3]) if back >= 0 else (0.0, 0.0)
+    return True, enter, nx, ny, fx, fy
 
 
 @kernel
@@ -384,43 +610,42 @@ def _equal_at(
 
 @kernel
 def _visible_share(
-    t: int, near: Int, count: int, xy: Float, of: Any, eye_m: tuple[float, float, float], flat: bool, work: Work
-) -> float:
-    # The share of target t that the bodies near[:count] leave visible: the open azimuths, column by column.
-    local, breaks, begin, end, splits, low, high = work
-    ox, oy, oz = eye_m
-    bearing, lo, hi = of[t].bearing, of[t].lo, of[t].hi
-    cos, sin = np.cos(bearing), np.sin(bearing)
-    n_breaks = _insert_sorted(breaks, 0, lo)
-    n_breaks = _insert_sorted(breaks, n_breaks, hi)
+    t: int, near: Int, span: Float, covered: Float, xy: Float, of: Any, eye_m: tuple[float, float, float], flat: bool,
+    work: _Work,
+) -> float:  # fmt: skip
+    # The share of target t that the bodies `near` leave visible: the open azimuths, column by column.
+    breaks, splits, count = work.breaks, work.splits, len(near)
+    lo, hi, oz = of[t].lo, of[t].hi, eye_m[2]
+    breaks[0], breaks[1], n_breaks = lo, hi, 2
     for i in range(count + 1):  # the target last
         b = near[i] if i < count else t
-        for k in range(of[b].size):
-            dx, dy = xy[b, k, 0] - ox, xy[b, k, 1] - oy
-            vx, vy = cos * dx + sin * dy, cos * dy - sin * dx
-            local[i, k, 0], local[i, k, 1] = vx, vy
-            angle = np.arctan2(vy, vx)
-            if lo < angle < hi:
-                n_breaks = _insert_sorted(breaks, n_breaks, angle)
+        turn = span[i, 0] - of[b].lo if i < count else -np.inf
+        n_breaks = _place_corners(i, b, turn, xy[b], of, t, eye_m, n_breaks, work)
     for i in range(count):
         if of[near[i]].owner >= 0 and _may_meet(of, near[i], t):
-            n_breaks = _insert_crossings(local[i], of[near[i]].size, local[count], of[t].size, lo, hi, breaks, n_breaks)
+            n_breaks = _insert_crossings(
+                work.corner[i], of[near[i]].size, work.corner[count], of[t].size, lo, hi, breaks, n_breaks
+            )
+    n_ahead = _find_bodies_ahead(t, near, span, of, flat, work.ahead)
+    cos_b, sin_b, at_b = 0.0, 0.0, np.nan
     z0, z1 = of[t].bottom_m - oz, of[t].top_m - oz
     seen = 0.0
     for piece in range(n_breaks - 1):
         a, b = breaks[piece], breaks[piece + 1]
-        if b - a < 1e-12:
+        if b - a < 1e-12 or _is_covered((a + b) / 2, covered):
             continue
         ux, uy = np.cos((a + b) / 2), np.sin((a + b) / 2)
-        hit, face, tx, ty, _fx, _fy = _crossing_distances(local[count], of[t].size, ux, uy)
+        hit, face, tx, ty, _fx, _fy = _crossing_distances(work.edge[count], of[t].size, ux, uy)
         if not hit:  # rounding at a grazing corner
             continue
-        columns = FaceColumns(a, b, ux, uy, face, tx, ty, z0, z1)
-        active = _find_covering_bodies(near, count, local, of, oz, columns, flat, begin, end)
+        cos_a, sin_a = (cos_b, sin_b) if a == at_b else (np.cos(a), np.sin(a))
+        cos_b, sin_b, at_b = np.cos(b), np.sin(b), b
+        columns = FaceColumns(a, b, cos_a, sin_a, cos_b, sin_b, ux, uy, face, tx, ty, z0, z1)
+        active = _find_covering_bodies(near, work.ahead[:n_ahead], span, of, oz, columns, flat, work)
         if active == 0:
             seen += b - a
         elif active > 0:
-            n_splits = _split_azimuths(active, begin, end, tx, ty, z0, z1, a, b, splits)
+            n_splits = _split_azimuths(active, columns, work)
             for k in range(n_splits - 1):
                 width = splits[k + 1] - splits[k]
                 if width < 1e-12:
@@ -428,26 +653,78 @@ def _visible_share(
                 for g in range(3):
                     theta = splits[k] + width * (0.5 + (g - 1) * 0.3872983346207417)  # √0.15: Gauss–Legendre
                     weight = (8.0 if g == 1 else 5.0) / 18.0
-                    seen += width * weight * _open_share(active, begin, end, tx, ty, z0, z1, theta, low, high)
+                    seen += width * weight * _open_share(active, columns, theta, work)
     return float(min(max(seen / (hi - lo), 0.0), 1.0))
 
 
 @nb.njit(inline="always")
+def _place_corners(
+    i: int, b: int, turn: float, polygon: Float, of: Any, t: int, eye_m: tuple[float, float, float], count: int,
+    work: _Work,
+) -> int:  # fmt: skip
+    # Out: the corners and edges of body b, as the i-th in the frame of target t; those within the extent of the target
+    # go to the breaks. `turn`: of the body's bearing from the target's, −∞: unsure. Returns the number of breaks.
+    corner, lo, hi = work.corner, of[t].lo, of[t].hi
+    cos, sin = np.cos(of[t].bearing), np.sin(of[t].bearing)
+    for k in range(of[b].size):
+        dx, dy = polygon[k, 0] - eye_m[0], polygon[k, 1] - eye_m[1]
+        vx, vy = cos * dx + sin * dy, cos * dy - sin * dx
+        corner[i, k, 0], corner[i, k, 1] = vx, vy
+        if turn == -np.inf or lo - _SURELY < turn + work.azimuth[b, k] < hi + _SURELY:
+            angle = np.arctan2(vy, vx)
+            if lo < angle < hi:
+                count = _insert_sorted(work.breaks, count, angle)
+    _measure_edges(corner[i], of[b].size, work.edge[i])
+    return count
+
+
+@nb.njit(inline="always")
+def _find_bodies_ahead(t: int, near: Int, span: Float, of: Any, flat: bool, ahead: Int) -> int:
+    # Out: the places of bodies that may cover a part of target t, neither surely beyond it nor surely below or above
+    # what can be seen of it. Returns their number.
+    n = 0
+    for i in range(len(near)):
+        body = of[near[i]]
+        if (
+            span[i, 0] > -np.inf
+            and of[t].near_m > 0.0
+            and (
+                body.near_m > of[t].far_m + 2 * _SURELY
+                or (not flat and (body.highest + _SURELY < of[t].lowest or body.lowest - _SURELY > of[t].highest))
+            )
+        ):
+            continue
+        ahead[n] = i
+        n += 1
+    return n
+
+
+@nb.njit(inline="always")
+def _is_covered(angle: float, covered: Float) -> bool:
+    found = False
+    for k in range(len(covered)):
+        found |= covered[k, 0] + _SURELY <= angle <= covered[k, 1] - _SURELY
+    return found
+
+
+@nb.njit(inline="always")
 def _find_covering_bodies(
-    near: Int, count: int, local: Float, of: Any, oz: float, columns: FaceColumns, flat: bool, begin: Float, end: Float
+    near: Int, ahead: Int, span: Float, of: Any, oz: float, columns: FaceColumns, flat: bool, work: _Work
 ) -> int:
-    # Bodies that cover a part of the columns between the azimuths a and b: how many, their slopes in begin and end.
+    # Bodies that cover a part of the columns between the azimuths a and b: how many, their slopes in `work.slope`.
     # −1 where one of them covers all of it. Linear in u: what holds at both ends holds throughout.
-    a, b, ux, uy, face, tx, ty, z0, z1 = columns
-    cos_a, sin_a, cos_b, sin_b = np.cos(a), np.sin(a), np.cos(b), np.sin(b)
+    a, b, cos_a, sin_a, cos_b, sin_b, ux, uy, face, tx, ty, z0, z1 = columns
     tx0, ty0, tx1, ty1 = z0 * tx, z0 * ty, z1 * tx, z1 * ty
     active = 0
-    for i in range(count):
+    middle = (a + b) / 2
+    for i in ahead:
+        if middle < span[i, 0] - _SURELY or middle > span[i, 1] + _SURELY:
+            continue
         body = near[i]
-        hit, enter, nx, ny, fx, fy = _crossing_distances(local[i], of[body].size, ux, uy)
+        of_obstacle = of[body].owner >= 0
+        hit, enter, nx, ny, fx, fy = _crossing_distances(work.edge[i], of[body].size, ux, uy)
         if not hit or enter >= face:
             continue
-        of_obstacle = of[body].owner >= 0
         if of_obstacle and enter + _OVERLAP_M >= face:  # in line with the target's face: not before it
             continue
         if flat:
@@ -472,33 +749,38 @@ def _find_covering_bodies(
         under = (ex - tx0) * cos_a + (ey - ty0) * sin_a <= 0 and (ex - tx0) * cos_b + (ey - ty0) * sin_b <= 0
         over = (bx - tx1) * cos_a + (by - ty1) * sin_a >= 0 and (bx - tx1) * cos_b + (by - ty1) * sin_b >= 0
         if not (under or over):
-            begin[active, 0], begin[active, 1], end[active, 0], end[active, 1] = bx, by, ex, ey
+            slope, slope_at = work.slope, work.slope_at
+            slope[0, active], slope[1, active], slope[2, active], slope[3, active] = bx, by, ex, ey
+            slope_at[0, 2 * active], slope_at[1, 2 * active] = bx * cos_a + by * sin_a, bx * cos_b + by * sin_b
+            slope_at[0, 2 * active + 1], slope_at[1, 2 * active + 1] = ex * cos_a + ey * sin_a, ex * cos_b + ey * sin_b
             active += 1
     return active
 
 
-@kernel
-def _split_azimuths(
-    active: int, begin: Float, end: Float, tx: float, ty: float, z0: float, z1: float, a: float, b: float, splits: Float
-) -> int:
+@borrowing
+def _split_azimuths(active: int, columns: FaceColumns, work: _Work) -> int:
     # The azimuths from a to b between which no slope crosses another, nor an end of the column; how many.
-    cos_a, sin_a, cos_b, sin_b = np.cos(a), np.sin(a), np.cos(b), np.sin(b)
-    n_splits = _insert_sorted(splits, 0, a)
-    n_splits = _insert_sorted(splits, n_splits, b)
+    a, b, tx, ty = columns.a, columns.b, columns.tx, columns.ty
+    slope, splits = work.slope, work.splits
+    cos_a, sin_a, cos_b, sin_b = columns.cos_a, columns.sin_a, columns.cos_b, columns.sin_b
+    splits[0], splits[1], n_splits = a, b, 2
+    largest = 1.0 + (abs(columns.z0) + abs(columns.z1)) * (abs(tx) + abs(ty))
+    for i in range(active):
+        for k in range(4):
+            largest = max(largest, abs(slope[k, i]))
+    if _crosses_none(2 * active, columns, _APART * largest, work):
+        return n_splits
     for i in range(active):
         for edge in range(2):
-            gx = begin[i, 0] if edge == 0 else end[i, 0]
-            gy = begin[i, 1] if edge == 0 else end[i, 1]
+            gx, gy = slope[2 * edge, i], slope[2 * edge + 1, i]
             for other in range(-2, 2 * active):
                 if other < 0:
-                    z = z0 if other == -2 else z1
+                    z = columns.z0 if other == -2 else columns.z1
                     hx, hy = z * tx, z * ty
                 elif other // 2 <= i:
                     continue
-                elif other % 2 == 0:
-                    hx, hy = begin[other // 2, 0], begin[other // 2, 1]
                 else:
-                    hx, hy = end[other // 2, 0], end[other // 2, 1]
+                    hx, hy = slope[2 * (other % 2), other // 2], slope[2 * (other % 2) + 1, other // 2]
                 angle = _equal_at(gx - hx, gy - hy, a, b, cos_a, sin_a, cos_b, sin_b)
                 if angle > a and n_splits < _MAX_PIECES:
                     n_splits = _insert_sorted(splits, n_splits, angle)
@@ -506,18 +788,48 @@ def _split_azimuths(
 
 
 @nb.njit(inline="always")
-def _open_share(
-    active: int, begin: Float, end: Float, tx: float, ty: float, z0: float, z1: float, theta: float,
-    low: Float, high: Float,
-) -> float:  # fmt: skip
+def _crosses_none(count: int, columns: FaceColumns, least: float, work: _Work) -> bool:
+    # Whether the slopes and the ends of the column surely have the same order at both azimuths, none nearer to the next
+    # than `least`: then none crosses another, which mostly is so.
+    face_a = columns.tx * columns.cos_a + columns.ty * columns.sin_a
+    face_b = columns.tx * columns.cos_b + columns.ty * columns.sin_b
+    low, high, n = work.sorted[0], work.sorted[1], 0
+    for k in range(-2, count):
+        z = columns.z0 if k == -2 else columns.z1
+        at_a, at_b = (work.slope_at[0, k], work.slope_at[1, k]) if k >= 0 else (z * face_a, z * face_b)
+        j = n
+        while j > 0 and low[j - 1] > at_a:
+            low[j], high[j] = low[j - 1], high[j - 1]
+            j -= 1
+        low[j], high[j] = at_a, at_b
+        n += 1
+        if (j > 0 and high[j - 1] + least > at_b) or (j + 1 < n and at_b + least > high[j + 1]):
+            return False
+    apart = True
+    for k in range(1, n):
+        apart &= low[k - 1] + least <= low[k]
+    return apart
+
+
+@nb.njit(inline="always")
+def _open_share(active: int, columns: FaceColumns, theta: float, work: _Work) -> float:
     # The share of the column at one azimuth that is not covered: 1 less the union of the bodies' intervals.
+    slope, low, high, z0, height = work.slope, work.low, work.high, columns.z0, columns.z1 - columns.z0
     ux, uy = np.cos(theta), np.sin(theta)
-    inverse = tx * ux + ty * uy
+    inverse = columns.tx * ux + columns.ty * uy
+    for i in range(active):  # apart from what follows, so that it is compiled to work on several at once
+        work.interval[0, i] = ((slope[0, i] * ux + slope[1, i] * uy) / inverse - z0) / height
+        work.interval[1, i] = ((slope[2, i] * ux + slope[3, i] * uy) / inverse - z0) / height
+    left, reach = 1.0, 0.0
     n_covered = 0
     for i in range(active):
-        first = max(((begin[i, 0] * ux + begin[i, 1] * uy) / inverse - z0) / (z1 - z0), 0.0)
-        last = min(((end[i, 0] * ux + end[i, 1] * uy) / inverse - z0) / (z1 - z0), 1.0)
+        first, last = max(work.interval[0, i], 0.0), min(work.interval[1, i], 1.0)
         if last <= first:
+            continue
+        if first == 0.0:  # before all others
+            if last > reach:
+                left -= last - reach
+                reach = last
             continue
         j = n_covered
         while j > 0 and low[j - 1] > first:
@@ -525,7 +837,6 @@ def _open_share(
             j -= 1
         low[j], high[j] = first, last
         n_covered += 1
-    left, reach = 1.0, 0.0
     for i in range(n_covered):
         if high[i] > reach:
             left -= high[i] - max(low[i], reach)

@@ -111,6 +111,35 @@ def _fill_words(
             start[s, f + 1] = n
 
 
+@dataclass(frozen=True)
+class FusedOnce:
+    """What ideal fusion made of lists of the same captures, which configurations with other latencies share."""
+
+    sent: Tracks
+    captures: bytes
+    fused_tracks: FusedTracks
+
+    @cached_property
+    def _lists(self) -> ObjectLists:
+        assert self.fused_tracks.scene is not None
+        return convert_to_lists(self.fused_tracks, self.fused_tracks.scene)
+
+    def lists_arriving(self, received: Tracks) -> ObjectLists | None:
+        """These as lists without truth ids, for lists received at other times; None: an entry's first unit may differ.
+
+        Which list of two arrived first stays the same where all are later by one latency.
+        """
+        one_s, other_s = self.fused_tracks.received.common_arrives_s, received.common_arrives_s
+        arrive = np.isfinite(one_s)
+        if not np.array_equal(arrive, np.isfinite(other_s)) or not arrive.any():
+            return None
+        later_s, instants_s = other_s[arrive] - one_s[arrive], np.unique(one_s[arrive])
+        # Neither does rounding decide which two arrive together.
+        before, after = (np.searchsorted(instants_s, instants_s + SAME_INSTANT_S + side_s) for side_s in (-1e-9, 1e-9))
+        alike = np.ptp(later_s) < 1e-10 and np.array_equal(before, after)
+        return self._lists if alike else None
+
+
 def convert_to_tracks(output: ReceiverOutput, run: int, matches: Matches) -> FusedTracks:
     """The lists of one run as tracks: one of each matched object, one of each identity else, one of each entry else."""
     lists, received, issue_s, newest = output.lists, output.received, output.instants.issue_s, output.instants.newest
@@ -213,8 +242,8 @@ class ReceiverOutput:
     `received`: the lists that reach it; `sent`: these before links delay or lose them. `fused_tracks`: of ideal fusion
     and the truth, which have truth ids, else None. `fused`: what another fusion gave, else None; one run where all runs
     agree. `tells_of`: of which instant entries tell. `whole`: the instants are those of the whole log, not of a time
-    chunk. `stated`: the captures that a fusion is told of, in one run; None: the true ones. `faults`: ghosts and lists
-    that outages leave out, in one run; None: units have neither.
+    chunk. `fused_once`: what `fused_tracks` are of. `stated`: the captures that a fusion is told of, in one run; None:
+    the true ones. `faults`: ghosts and lists that outages leave out, in one run; None: units have neither.
     """
 
     received: Tracks
@@ -227,6 +256,7 @@ class ReceiverOutput:
     whole: bool = True
     stated: StatedCaptures | None = None
     faults: UnitFaults | None = None
+    fused_once: FusedOnce | None = None
 
     @cached_property
     def lists(self) -> ObjectLists:
@@ -239,7 +269,8 @@ class ReceiverOutput:
         if self.fused is not None:
             return self.fused
         assert self.fused_tracks is not None
-        return convert_to_lists(self.fused_tracks, self.scene)
+        shared = None if self.fused_once is None else self.fused_once.lists_arriving(self.received)
+        return convert_to_lists(self.fused_tracks, self.scene) if shared is None else shared
 
     def tracks_by_run(self, matches: Matches | None) -> Iterator[tuple[int, FusedTracks]]:
         """The fused tracks, and the first of the runs that they are of: of all, or where they have no truth ids of one.
@@ -270,7 +301,7 @@ class Receivers:
 
     def __init__(self, lists: Transmission, names: Collection[str] | None = None) -> None:
         self._lists, self._memory = lists, dict[str, Any]()
-        self._last_fused: tuple[Tracks, bytes, FusedTracks] | None = None
+        self._last_fused: FusedOnce | None = None
         self._schedules = {
             name: fusion_schedule(lists.received(name), max_age_s=configuration.max_age_s)
             for name, configuration in lists.experiment.configurations.items()
@@ -312,10 +343,11 @@ class Receivers:
         )  # fmt: skip
         if isinstance(fusion, ListFusion):
             return self._fuse_lists(world, name, fusion, output)
-        fused_tracks = self._fuse_by_truth_id(world, name, output)
+        fused_tracks, fused_once = self._fuse_by_truth_id(world, name, output)
         if states == "expected":
             fused_tracks = draw_posterior(fused_tracks, world.scene, world.experiment.seed, world.group.runs)
-        return replace(output, fused_tracks=fused_tracks)
+            return replace(output, fused_tracks=fused_tracks)
+        return replace(output, fused_tracks=fused_tracks, fused_once=fused_once)
 
     def _fuse_lists(self, world: WorldChunk, name: str, fusion: ListFusion, output: ReceiverOutput) -> ReceiverOutput:
         """Fusion of lists without truth ids, told of the captures that units state."""
@@ -346,7 +378,7 @@ class Receivers:
             state_captures(self._lists.log.scene, received, experiment, int(runs[0])) if experiment.runs_apart else None
         )
 
-    def _fuse_by_truth_id(self, world: WorldChunk, name: str, output: ReceiverOutput) -> FusedTracks:
+    def _fuse_by_truth_id(self, world: WorldChunk, name: str, output: ReceiverOutput) -> tuple[FusedTracks, FusedOnce]:
         """Ideal fusion, or the truth itself, at the instants of the configuration.
 
         Later lists of the same captures, as in a sweep, are fused once.
@@ -362,14 +394,14 @@ class Receivers:
             *(() if kept is None else [kept.entry]),
         )
         captures, last = b"".join(part.tobytes() for part in parts), self._last_fused
-        if last is None or last[0] is not output.sent or last[1] != captures:
+        if last is None or last.sent is not output.sent or last.captures != captures:
             own, asked = world.scene.ego_ix, instants
             fused = fuse_ideal(received, max_age_s=max_age_s, without_object_ix=own, instants=asked, kept=kept)
-            self._last_fused = last = output.sent, captures, fused
-        fused_tracks = last[2].arriving(received, instants.issue_s)
+            self._last_fused = last = FusedOnce(output.sent, captures, replace(fused, scene=world.scene))
+        fused_tracks = last.fused_tracks.arriving(received, instants.issue_s)
         if output.sent is not world.truth and world.recorded is None:
             fused_tracks = replace(fused_tracks, view=world.observations.view)
-        return fused_tracks
+        return fused_tracks, last
 
 
 def _mark_partial(experiment: ExpandedExperiment, received: Tracks) -> Bool:

@@ -102,6 +102,76 @@ def test_random_scenes_agree_with_the_oracle(seed: int, height_m: float) -> None
         )
 
 
+def agree_with_the_oracle(
+    boxes: Sequence[tuple[float, ...]], observer: Sequence[float], targets: Sequence[int], static: Sequence[dict] = ()
+) -> np.ndarray:
+    """Some boxes (x, y, yaw, length, width, bottom, top) are seen as by the oracle; gives their `surface` shares."""
+    footprints = [rectangle(x, y, length, width, yaw) for x, y, yaw, length, width, _, _ in boxes]
+    walls = make_statics(
+        [wall["polygon"] for wall in static],
+        [wall["z0"] for wall in static],
+        [wall["z1"] - wall["z0"] for wall in static],
+    )
+    flat, surface = (shares(one_list(boxes), observer, walls, flat=each) for each in (True, False))
+    for k in targets:
+        others = [j for j in range(len(boxes)) if j != k]
+        solids = [prism(wall) for wall in static]
+        assert flat[k] == pytest.approx(
+            flat_share(observer[:2], footprints[k], [footprints[j] for j in others], [each[0] for each in solids]),
+            abs=1e-6,
+        ), f"flat, {k}"
+        prisms = [(footprints[j], *boxes[j][5:]) for j in [k, *others]]
+        assert surface[k] == pytest.approx(
+            surface_share(observer, prisms[0], prisms[1:], azimuths=1500, solids=solids), abs=ERROR
+        ), f"surface, {k}"
+    return surface[list(targets)]
+
+
+KINDS = ((4.5, 1.9, 1.5), (10.0, 2.5, 3.5), (0.5, 0.5, 1.8))
+
+
+@pytest.mark.parametrize(("seed", "height_m"), [(0, 1.8), (1, 5.0), (2, 5.0), (3, 12.0)])
+def test_hundreds_in_a_disc_agree_with_the_oracle(seed: int, height_m: float) -> None:
+    """Many hide one: most are hidden by several together, some stand in one another, the unit is among them."""
+    rng, count = np.random.default_rng(seed), 400
+    radius, angle = 70 * np.sqrt(rng.uniform(0.01, 1, count)), rng.uniform(-np.pi, np.pi, count)
+    sizes = [KINDS[k] for k in rng.choice(3, count, p=[0.5, 0.1, 0.4])]
+    yaw = rng.uniform(-np.pi, np.pi, count)
+    boxes = [
+        (r * math.cos(a), r * math.sin(a), turn, length, width, 0.0, height)
+        for r, a, turn, (length, width, height) in zip(radius, angle, yaw, sizes, strict=True)
+    ]
+    found = agree_with_the_oracle(boxes, (0.3, 0.2, height_m), range(0, count, 8))
+    assert (found == 0).any()
+    assert ((found > 0.01) & (found < 0.99)).any()
+
+
+def test_rows_and_rings_round_a_unit_agree_with_the_oracle() -> None:
+    """Touching boxes in two closed rings, and pairs at the same bearings beyond, where azimuths begin again, too."""
+    boxes: list[tuple[float, ...]] = []
+    for radius_m, top_m in ((6.0, 1.2), (9.0, 1.5)):
+        count = 24
+        width_m = 2 * (radius_m - 0.5) * math.tan(math.pi / count)  # neighbours touch at their inner corners
+        for k in range(count):
+            a = -math.pi + 2 * math.pi * k / count
+            boxes.append((radius_m * math.cos(a), radius_m * math.sin(a), a, 1.0, width_m, 0.0, top_m))
+    for k in range(60):
+        a = -math.pi + 2 * math.pi * k / 60
+        for radius_m, top_m in ((20.0, 1.0 + k % 3), (23.0, 2.5), (26.0, 3.5)):
+            boxes.append((radius_m * math.cos(a), radius_m * math.sin(a), a, 2.0, 1.0 + k % 2, 0.0, top_m))
+    wall = {"polygon": rectangle(-14.0, 0.0, 0.3, 6.0), "z0": 0.0, "z1": 2.2}
+    for height_m in (1.6, 4.0):
+        found = agree_with_the_oracle(boxes, (0.0, 0.0, height_m), range(0, len(boxes), 5), [wall])
+        assert np.ptp(found) > 0.5
+
+
+def test_a_parking_lot_agrees_with_the_oracle() -> None:
+    """Rows of equal boxes that touch: equal slopes, corners at the same azimuths, seen along a row and from aside."""
+    boxes = [(5.0 * i, 2.0 * j, 0.0, 5.0, 2.0, 0.0, 1.5) for i in range(12) for j in range(-8, 9)]
+    for observer in ((-7.5, 0.0, 1.8), (-7.5, 1.0, 3.0), (-2.5 - 1e-3, 0.0, 6.0), (70.0, 0.0, 4.0)):
+        agree_with_the_oracle(boxes, observer, range(0, len(boxes), 11))
+
+
 @pytest.mark.skipif(not DATA.is_dir(), reason="shared/data with recordings is not beside the project")
 @pytest.mark.parametrize("name", ["nuscenes_scene0061", "av2_3b3570b4"])
 def test_a_recording_agrees_with_the_oracle(name: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -142,6 +143,32 @@ class TestWhatDoesNotMatter:
             pd.testing.assert_frame_equal(one.summary, other.summary, check_exact=True)
             for name, table in one.accuracy.items():
                 assert table.equals(other.accuracy[name]), name
+
+    def test_lists_of_the_same_captures_are_made_once_for_all_latencies(self) -> None:
+        names = {"at once": {}, "later": {"latency_s": 0.25}, "latest": {"latency_s": 1 / 3}}
+        each = {name: {"units": "all"} | more for name, more in names.items()}
+        log = crowd()
+        plan = noisy(configurations=each)
+        together = outputs_of(prepare_log(log, plan), plan, runs=(0, 1, 2))
+        assert together["later"].lists is together["at once"].lists
+        assert together["latest"].lists is together["at once"].lists
+        for name, configuration in each.items():
+            alone = noisy(configurations={name: configuration})
+            lists = outputs_of(prepare_log(log, alone), alone, runs=(0, 1, 2))[name].lists
+            assert lists.start.tobytes() == together[name].lists.start.tobytes()
+            assert lists.entries.tobytes() == together[name].lists.entries.tobytes()
+
+    def test_entries_whose_first_list_may_be_another_are_not_shared(self) -> None:
+        plan = noisy(configurations={"ideal": {"units": "all"}})
+        output = outputs_of(prepare_log(crowd(), plan), plan)["ideal"]
+        once, received = output.fused_once, output.received
+        assert once is not None
+        later = replace(received, arrives_s=received.arrives_s + 0.5)
+        assert once.lists_arriving(later) is output.lists
+        for of_mast in (received.frame_unit_ix == 1, np.arange(len(received.stamp_ns)) == 4):
+            assert once.lists_arriving(replace(received, arrives_s=received.arrives_s + 0.01 * of_mast)) is None
+            lost = np.where(of_mast, np.inf, received.arrives_s)
+            assert once.lists_arriving(replace(received, arrives_s=lost)) is None
 
 
 def entries_of_run(output: ReceiverOutput, s: int) -> tuple[list[int], bytes]:

@@ -28,7 +28,7 @@ import calibrate_tc016d  # noqa: E402
 import lidar_visibility  # noqa: E402
 import make_logs  # noqa: E402
 import paper  # noqa: E402
-from benches import common, fit, fusion, long, memory, reading  # noqa: E402
+from benches import common, fit, fusion, long, memory, reading, scaling  # noqa: E402
 
 
 def test_rank_correlation_and_area_under_the_curve_by_hand() -> None:
@@ -38,6 +38,32 @@ def test_rank_correlation_and_area_under_the_curve_by_hand() -> None:
     # Of the pairs (positive, negative): .9 > .1, .9 > .5, .5 > .1, .5 = .5: 3.5 of 4
     score, positive = np.array([0.9, 0.5, 0.5, 0.1]), np.array([True, True, False, False])
     assert lidar_visibility.auc(score, positive) == pytest.approx(3.5 / 4)
+
+
+def test_exponents_by_hand() -> None:
+    assert scaling.exponent((10, 20, 40), (3.0, 7.0, 12.0)) == pytest.approx(1)
+    assert scaling.exponent((60, 600), (0.5, 50.0)) == pytest.approx(2)
+
+
+def test_bench_of_scaling_grows_one_thing_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[scaling.Size] = []
+
+    def spent_on(size: scaling.Size, _folder: Path) -> common.Spent:
+        asked.append(size)
+        return common.Spent(1.0 + 0.01 * size.objects, 2.0, 100 + size.objects)
+
+    monkeypatch.setattr(scaling, "spent_on", spent_on)
+    *lines, exponents = scaling.grown("objects", common.Spent(1.0, 1.0, 100), tmp_path)
+    assert [line["objects"] for line in lines] == [size.objects for size in asked] == list(scaling.SIZES["objects"])
+    assert len({(size.runs, size.units, size.configurations, size.frames) for size in asked}) == 1
+    assert (exponents["cpu_exponent"], exponents["seconds_exponent"], exponents["peak_exponent"]) == (1, 0, 1)
+
+
+def test_the_experiment_of_scaling_runs(tmp_path: Path) -> None:
+    few = scaling.Size(runs=2, units=2, objects=4, configurations=2, frames=4)
+    assert scaling.spent_on(few, tmp_path).peak_mb > 0
+    summary = pd.read_csv(tmp_path / "out" / "summary.csv")
+    assert set(summary["configuration"]) == {"c0", "c1"}
 
 
 def test_bench_of_memory_remembers_all_that_the_crossing_draws(monkeypatch: pytest.MonkeyPatch) -> None:

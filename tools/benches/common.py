@@ -9,6 +9,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
@@ -63,16 +64,29 @@ class Spent(NamedTuple):
     peak_mb: int
 
 
-def spent(arguments: Sequence[str], folder: Path | None = None) -> Spent:
-    """By a command of the project, in a folder. Raises CalledProcessError where it fails."""
-    began, null = time.perf_counter(), subprocess.DEVNULL
-    command = [*TOOL, *arguments]
-    process = subprocess.Popen(command, cwd=folder, stdout=null, stderr=null)
+def spent(
+    arguments: Sequence[str],
+    folder: Path | None = None,
+    *,
+    command: Sequence[str] = TOOL,
+    stdout: int | None = subprocess.DEVNULL,
+) -> Spent:
+    """By a command, of the project unless another is named, in a folder. Raises CalledProcessError where it fails.
+
+    `stdout` None: what it prints is printed. Processes that it waits for count, of memory the largest alone.
+    """
+    began, whole = time.perf_counter(), [*command, *arguments]
+    process = subprocess.Popen(whole, cwd=folder, stdout=stdout, stderr=subprocess.DEVNULL if stdout else None)
     _, status, used = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
     if status:
-        raise subprocess.CalledProcessError(process.returncode, command)
+        raise subprocess.CalledProcessError(process.returncode, whole)
     return Spent(used.ru_utime + used.ru_stime, time.perf_counter() - began, used.ru_maxrss // 1024)
+
+
+def as_line(took: Spent) -> Line:
+    """Rounded, for a line of a benchmark."""
+    return {"cpu_s": round(took.cpu_s, 2), "seconds": round(took.seconds, 2), "peak_mb": took.peak_mb}
 
 
 # ----------------------------------------------------------------------------------------------------------- recordings
@@ -100,6 +114,12 @@ def boxes(frames: int, count: int) -> cr.Tracks:
         z_m=rows(height) / 2, yaw_rad=rows(heading), vx_mps=zero, vy_mps=zero, length_m=rows(length),
         width_m=rows(width), height_m=rows(height),
     )  # fmt: skip
+
+
+def spread_boxes(frames: int, count: int) -> cr.Tracks:
+    """As `boxes`, in a disc that grows with their number: as many are around each as of 60 in 60 m."""
+    world, wider = boxes(frames, count), float(np.sqrt(count / 60))
+    return replace(world, x_m=world.x_m * wider, y_m=world.y_m * wider)
 
 
 def write_truth(path: Path, world: cr.Tracks) -> None:

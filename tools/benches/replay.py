@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
@@ -15,16 +16,26 @@ from copem_replay.pipeline.run import run_experiment
 
 
 def visibility() -> Iterator[common.Line]:
-    """Views per second at 1200 lists × 60 boxes × 21 units."""
-    frames, count, units = 1200, 60, 21
-    world, rng = common.boxes(frames, count), np.random.default_rng(1)
-    place = np.empty((units, frames, 3))
-    place[..., :2] = rng.uniform(-60, 60, (units, 1, 2))
-    place[..., 2] = rng.choice([1.8, 5.0], (units, 1))
-    observers = Observers(place, np.ones((units, frames), dtype=bool), np.full(units, -1))
+    """Views per processor second from 21 units: 60, 250 and 1,000 boxes in a disc of 60 m, and as dense as 60 in it.
+
+    Exponents: of the time of a list, over the number of boxes.
+    """
+    rng, units, counts = np.random.default_rng(1), 21, (60, 250, 1000)
+    place_m = np.column_stack([rng.uniform(-60, 60, (units, 2)), rng.choice([1.8, 5.0], units)])
     for model in (Flat(), Surface()):
-        seconds = common.best(lambda model=model: visible_shares(world, NO_STATICS, observers, model), 3)
-        yield {f"visibility_{model.kind}_views_per_s": round(units * frames * count / seconds)}
+        for scene, boxes in (("in_60_m", common.boxes), ("as_dense", common.spread_boxes)):
+            rates = []
+            for count in counts:
+                frames = 12_000 // count
+                wider = np.array([np.sqrt(count / 60)] * 2 + [1]) if boxes is common.spread_boxes else 1.0
+                places = np.repeat((place_m * wider)[:, None], frames, axis=1)
+                observers = Observers(places, np.ones((units, frames), dtype=bool), np.full(units, -1))
+                call = partial(visible_shares, boxes(frames, count), NO_STATICS, observers, model)
+                [seconds] = common.interleaved([call], 3)
+                rates.append(units * frames * count / seconds)
+            line = {f"views_per_cpu_s_{count}": round(rate) for count, rate in zip(counts, rates, strict=True)}
+            steeper = np.log(rates[0] / rates[-1]) / np.log(counts[-1] / counts[0])
+            yield {"visibility": model.kind, "boxes": scene} | line | {"exponent": round(1 + steeper, 2)}
 
 
 def paper() -> Iterator[common.Line]:
