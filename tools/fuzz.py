@@ -40,6 +40,7 @@ LONGEST_S = 30.0
 MOST_BYTES = 1_000_000_000
 _ROOM_BYTES = 3 << 30  # of address space beside what is taken at the start
 READ, REFUSED = "read", "refused"
+_IN_MEMORY = Path("/dev/shm")  # nothing waits for a disk
 
 
 def outcome(path: Path, looked: Callable[[], None] = lambda: None) -> dict[str, Any]:
@@ -228,7 +229,7 @@ def fuzz(
     counts, past, worst_s, worst_bytes = Counter[str](), 0, (0.0, ""), (0, "")
     defects: list[dict[str, Any]] = []
     until = time.monotonic() + 60 * minutes
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(dir=_IN_MEMORY if _IN_MEMORY.is_dir() else None) as folder:
         worker = _Worker(Path(folder), most, own, target)
         for name in seeds(seed, inputs):
             if time.monotonic() > until:
