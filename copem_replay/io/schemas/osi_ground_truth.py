@@ -155,7 +155,7 @@ class GroundTruthDecoder:
         return len(self._object_ix)
 
     def columns(self) -> DecodedObjects:
-        """The columns of all messages that were added."""
+        """The columns of all messages that were added: the rows are those here, without a copy; none can be added."""
         ids, moving = self._names()
         solids = tuple(solid for solid in self._solids.values() if solid is not None)
         if solids:
@@ -166,9 +166,9 @@ class GroundTruthDecoder:
             rows=np.array(self._rows, dtype=np.int64),
             object_ids=ids,
             moving=np.array(moving, dtype=bool),
-            object_ix=np.array(self._object_ix, dtype=np.int64),
-            class_ix=np.array(self._class_ix, dtype=np.int8),
-            values=np.array(self._values, dtype=np.float64).reshape(-1, len(VALUES)),
+            object_ix=np.asarray(self._object_ix, dtype=np.int64),
+            class_ix=np.asarray(self._class_ix, dtype=np.int8),
+            values=np.asarray(self._values, dtype=np.float64).reshape(-1, len(VALUES)),
             lane_boundaries=tuple(self._lane_boundaries),
             solids=solids,
             hosts=tuple(self._hosts),
