@@ -39,7 +39,9 @@ from fuzzing.samples import samples
 LONGEST_S = 30.0
 MOST_BYTES = 1_000_000_000
 _ROOM_BYTES = 3 << 30  # of address space beside what is taken at the start
+_MOST_CALLS = 600  # of commands in a process: writers of Rerun leave threads, whose stacks are address space
 READ, REFUSED = "read", "refused"
+_IN_MEMORY = Path("/dev/shm")  # nothing waits for a disk
 
 
 def outcome(path: Path, looked: Callable[[], None] = lambda: None) -> dict[str, Any]:
@@ -179,6 +181,10 @@ class _Worker:
         self._process.kill()
         self._process.join()
 
+    def start_again(self) -> None:
+        self.end()
+        self._start()
+
     def _answers(self) -> bool:
         """Wait for an answer: as long as it may compute, which on a busy machine is longer."""
         begin, wall = self._computed_s(), time.monotonic()
@@ -205,8 +211,7 @@ class _Worker:
             found = {"outcome": "defect", "what": f"takes more than {LONGEST_S:g} s", "seconds": LONGEST_S}
         except EOFError:
             found = {"outcome": "defect", "what": "the process died", "seconds": 0.0}
-        self.end()
-        self._start()
+        self.start_again()
         return about | {"bytes": 0} | found
 
 
@@ -228,11 +233,13 @@ def fuzz(
     counts, past, worst_s, worst_bytes = Counter[str](), 0, (0.0, ""), (0, "")
     defects: list[dict[str, Any]] = []
     until = time.monotonic() + 60 * minutes
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(dir=_IN_MEMORY if _IN_MEMORY.is_dir() else None) as folder:
         worker = _Worker(Path(folder), most, own, target)
-        for name in seeds(seed, inputs):
+        for k, name in enumerate(seeds(seed, inputs), 1):
             if time.monotonic() > until:
                 break
+            if target in COMMANDS and k % _MOST_CALLS == 0:
+                worker.start_again()
             found = worker.read(name)
             if found["outcome"] != "defect" and found["bytes"] > MOST_BYTES:
                 found |= {"outcome": "defect", "what": f"takes {found['bytes'] / 1e6:.0f} MB"}

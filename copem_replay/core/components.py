@@ -123,7 +123,8 @@ NotNegative = Annotated[float, Field(strict=True, ge=0, le=_LARGEST)]
 Latency = Annotated[float, Field(strict=True, ge=0, le=86_400)]
 """Seconds, a day at most: more is a mistake, and a stamp in nanoseconds has an end."""
 Share = Annotated[float, Field(strict=True, ge=0, le=1)]
-Count = Annotated[int, Field(strict=True, ge=1, le=10**9)]
+MOST_RUNS = 10**9
+Count = Annotated[int, Field(strict=True, ge=1, le=MOST_RUNS)]
 Flag = Annotated[bool, Field(strict=True)]
 """True or false; `yes` is text."""
 

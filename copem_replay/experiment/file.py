@@ -457,7 +457,11 @@ def place_identity(place: Place) -> str:
     """A text that identifies a recording, or several as one, whatever path or link leads there."""
     if isinstance(place, RemoteFile):
         return place.url
-    return os.path.realpath(place) if isinstance(place, Path) else "\n".join(map(os.path.realpath, place.paths))
+    paths = [place] if isinstance(place, Path) else place.paths
+    try:
+        return "\n".join(map(os.path.realpath, paths))
+    except UnicodeEncodeError:  # half a character: no file has such a name
+        return "\n".join(map(str, paths))
 
 
 def source_folder(source: ExperimentSource) -> Path:

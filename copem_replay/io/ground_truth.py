@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +45,7 @@ class DecodedObjects:
 # Corrections of velocities and heights. Rows are those of the truth (P,), track by track (`start (E + 1,)`). Each
 # function returns new columns and a note for everything that it changed.
 
+_ROWS_AT_ONCE = 1 << 18
 MAX_GAP_S = 0.5
 """No difference is taken across a longer gap: the default of an experiment's `max_gap_s`."""
 MOVING_MPS = 0.5
@@ -78,29 +80,43 @@ def correct_velocities(
     if it is not given, above `FASTEST_MPS`, or exactly 0 although the way to every neighbour is faster than
     `MOVING_MPS`. Objects not `moving` keep their velocities.
     """
+    vx, vy, counts = vx_mps.copy(), vy_mps.copy(), np.zeros(4, dtype=np.int64)
+    firsts = np.searchsorted(start, np.arange(0, len(time_s), _ROWS_AT_ONCE)).tolist()
+    for first, last in pairwise(sorted({*firsts, len(start) - 1})):  # some tracks at a time: no column is there often
+        here = slice(start[first], start[last])
+        columns = (column[here] for column in (time_s, x_m, y_m, vx_mps, vy_mps))
+        begin = start[first : last + 1] - start[first]
+        vx[here], vy[here], of_tracks = _derive_velocities(begin, moving[here], *columns)
+        counts += of_tracks
+    unset, frozen, too_fast, lone = counts.tolist()
+    notes = [
+        f"velocity of {count_noun(number, 'object state')} {what}: derived from the positions"
+        for number, what in (
+            (unset, "is not given"),
+            (frozen, "is 0 though the object moves"),
+            (too_fast, f"exceeds {FASTEST_MPS:g} m/s"),
+        )
+        if number
+    ]
+    if lone:
+        notes.append(f"velocity of {count_noun(lone, 'object state')} cannot be derived (no neighbour): 0 taken")
+    return vx, vy, notes
+
+
+def _derive_velocities(
+    start: Int, moving: Bool, time_s: Float, x_m: Float, y_m: Float, vx_mps: Float, vy_mps: Float
+) -> tuple[Float, Float, Int]:
+    """Velocities of some tracks (P,), and how many are not given, 0, too fast, and without a neighbour."""
     before, after = _find_neighbours(start, time_s)
     dx, dy, apart_s = (a[after] - a[before] for a in (x_m, y_m, time_s))
     with_both = np.maximum(apart_s, np.finfo(float).tiny)  # lone rows: 0 / tiny = 0
-    derived_x, derived_y = dx / with_both, dy / with_both
-
     speed = np.hypot(vx_mps, vy_mps)
     unset = moving & np.isnan(speed)
     too_fast = moving & (speed > FASTEST_MPS)
     frozen = moving & (speed == 0.0) & _is_moving(before, after, time_s, x_m, y_m)
     derive = unset | too_fast | frozen
-    notes = [
-        f"velocity of {count_noun(int(rows.sum()), 'object state')} {what}: derived from the positions"
-        for rows, what in (
-            (unset, "is not given"),
-            (frozen, "is 0 though the object moves"),
-            (too_fast, f"exceeds {FASTEST_MPS:g} m/s"),
-        )
-        if rows.any()
-    ]
-    if (lone := int((derive & (before == after)).sum())) > 0:
-        notes.append(f"velocity of {count_noun(lone, 'object state')} cannot be derived (no neighbour): 0 taken")
-    vx, vy = np.where(derive, derived_x, vx_mps), np.where(derive, derived_y, vy_mps)
-    return vx, vy, notes
+    counts = np.array([rows.sum() for rows in (unset, frozen, too_fast, derive & (before == after))])
+    return np.where(derive, dx / with_both, vx_mps), np.where(derive, dy / with_both, vy_mps), counts
 
 
 def correct_heights(
@@ -120,8 +136,9 @@ def correct_heights(
     if len(np.unique(object_ix[moving])) >= 3 and (of_moving == width_m[moving]).all():
         notes.append("the height of every moving object equals its width, a known defect of exporters")
     low = height < _LEAST_M[object_class]
-    if low.any():
-        notes.append(f"height implausible or missing: {_count_by_class(object_ix, object_class, low)}")
+    if not low.any():
+        return z, height, notes
+    notes.append(f"height implausible or missing: {_count_by_class(object_ix, object_class, low)}")
     typical = _TYPICAL_M[object_class]
     return (
         np.where(low, z + (typical - height) / 2.0, z),
@@ -199,7 +216,8 @@ def assemble_truth(
         object_class=object_class,
         moving=columns.moving[first_seen],
     )
-    tracks = _build_tracks(scene, stamp_ns, frame[row], object_ix, columns.values[row], notes)
+    column = {name: columns.values[row, k] for k, name in enumerate(VALUES)}
+    tracks = _build_tracks(scene, stamp_ns, frame[row], object_ix, column, notes)
     return (
         replace(scene, solids=_stand_solids_on_ground(columns.solids, columns.values[row, _Z], tracks.z_m)),
         tracks,
@@ -293,13 +311,14 @@ def _most_frequent_class(object_ix: Int, class_ix: NDArray[np.int8], notes: list
     return majority
 
 
-def _build_tracks(scene: Scene, stamp_ns: Int, frame: Int, object_ix: Int, values: Float, notes: list[str]) -> Tracks:
+def _build_tracks(
+    scene: Scene, stamp_ns: Int, frame: Int, object_ix: Int, column: dict[str, Float], notes: list[str]
+) -> Tracks:
     """The truth of rows that are in order of tracks, velocities and heights corrected; `notes` gets the corrections."""
     number = len(scene.object_ids)
     start = np.concatenate([[0], np.cumsum(np.bincount(object_ix, minlength=number))])
     captured_s = ((stamp_ns - scene.t0_ns) * 1e-9).astype(np.float64)
     moving, class_ix = scene.moving[object_ix], scene.object_class[object_ix].astype(np.int64)
-    column: dict[str, Float] = dict(zip(VALUES, values.T, strict=True))
     x, y = column["x_m"], column["y_m"]
     vx, vy, corrections = correct_velocities(start, captured_s[frame], x, y, column["vx_mps"], column["vy_mps"], moving)
     notes += corrections
@@ -325,15 +344,17 @@ def _build_tracks(scene: Scene, stamp_ns: Int, frame: Int, object_ix: Int, value
         frame_unit_ix=np.zeros(len(stamp_ns), dtype=np.int64),
         arrives_s=captured_s[None],
         valid=np.ones((1, len(frame)), dtype=bool),
-        **{name: np.ascontiguousarray(a)[None] for name, a in column.items()},
+        **{name: values[None] for name, values in column.items()},
     )
 
 
 def _wrap_exceeding(yaw_rad: Float) -> Float:
     """Angles in (−π, π]; those that are there already keep their bits."""
-    wrapped = np.pi - np.mod(np.pi - yaw_rad, 2.0 * np.pi)
-    wrapped = np.where(wrapped <= -np.pi, np.pi, wrapped)  # mod may round up to 2π
-    return np.where((yaw_rad > -np.pi) & (yaw_rad <= np.pi), yaw_rad, wrapped)
+    exceeding = ~((yaw_rad > -np.pi) & (yaw_rad <= np.pi))
+    wrapped = np.pi - np.mod(np.pi - yaw_rad[exceeding], 2.0 * np.pi)
+    angles = yaw_rad.copy()
+    angles[exceeding] = np.where(wrapped <= -np.pi, np.pi, wrapped)  # mod may round up to 2π
+    return angles
 
 
 # Identity: two recordings with one digest are of one drive.

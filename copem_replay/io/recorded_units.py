@@ -107,6 +107,7 @@ def _changing_ids(lists: RecordedLists, object_ix: Int, scene: Scene) -> Iterato
         )
 
 
+@np.errstate(over="ignore", invalid="ignore")  # a position may be any number
 def backwards_share(lists: RecordedLists) -> float | None:
     """Share of the entries of moving tracks whose velocity points against their motion; None: nothing moves."""
     tracks = lists.tracks

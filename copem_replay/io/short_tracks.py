@@ -188,6 +188,8 @@ def _smooth_points(entries: ListPoints, window_s: float, gap_s: float) -> ShortT
             for power in range(3):
                 right[axis_ix, power] += away * t**power
     normal = np.array([[sums[i + j] for j in range(3)] for i in range(3)]).transpose(2, 0, 1)
+    curved = np.linalg.det(normal) != 0  # no parabola goes through entries of one time alone
+    kept, normal, right = kept[curved], normal[curved], right[:, :, curved]
     solved = np.linalg.solve(normal, right.transpose(2, 1, 0)) if len(kept) else np.empty((0, 3, 2))
     x_m, y_m = entries.x_m[kept] + solved[:, 0, 0], entries.y_m[kept] + solved[:, 0, 1]
     return ShortTracks(time_s[kept], track[kept], x_m, y_m, solved[:, 1].T, gap_s, entries)

@@ -13,6 +13,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from copem_replay.core.components import MOST_RUNS
 from copem_replay.core.errors import InputError, RecordingError, RemoteFile
 from copem_replay.core.files import parse_json
 from copem_replay.experiment.file import relocate_settings
@@ -116,9 +117,11 @@ def parse_provenance(data: Any, place: Path) -> Provenance:
         raise ValueError("expected text in notes and logs_skipped")
     # A missing key, from an older version, stands for its default.
     measure = Measure().model_dump(mode="json", by_alias=True) | dict(data["measure"])
-    float(measure["gospa"]["power"])  # which comparisons take as it is
     braking, gap_s = data.get("braking"), data.get("max_gap_s")
     used_s, run_shown = float(measure.pop("horizon_used_s")), data.get("run_shown") or {}
+    Measure.model_validate(measure)
+    if not 1 <= int(data["runs"]) <= MOST_RUNS:
+        raise ValueError(f"expected 1 to {MOST_RUNS} runs, found {data['runs']}")
     return Provenance(
         logs=logs,
         seed=int(data["seed"]),

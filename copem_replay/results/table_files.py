@@ -154,8 +154,9 @@ def read_log_rows(place: Path, kinds: Mapping[str, str], files: Sequence[Path] =
         with _report_damage(place):
             file = parquet.ParquetFile(path, read_dictionary=names)
             schema = file.schema_arrow.remove_metadata()
-        check_columns(place, kinds, schema.names)
-        kinds = {c.name: c.kind for c in TABLES[place.name].columns if c.name in schema.names}
+        known = {c.name: c.kind for c in TABLES[place.name].columns if c.name in schema.names}
+        check_columns(place, {**kinds, **known}, schema.names)
+        kinds = known
         for name, kind in kinds.items():
             column_type = schema.field(name).type
             if file.metadata.num_rows or not pa.types.is_null(column_type):  # without rows columns may have no types

@@ -16,6 +16,7 @@ import sys
 import time
 import urllib.error
 import urllib.request
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -111,7 +112,8 @@ def read_identities(files: Sequence[Path]) -> dict[Path, RecordingIdentity]:
     identities = {}
     for path in files:
         try:
-            (entry,) = RrdReader(str(path)).recordings()
+            with warnings.catch_warnings(action="ignore"):  # a file was cut off: it has no identity
+                (entry,) = RrdReader(str(path)).recordings()
         except (OSError, RuntimeError, ValueError):
             continue
         identities[path] = RecordingIdentity(entry.application_id, entry.recording_id)

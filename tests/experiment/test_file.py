@@ -26,6 +26,7 @@ from copem_replay.experiment.file import (
     describe_by_key,
     log_paths,
     parse_experiment,
+    place_identity,
     read_experiment_file,
 )
 from copem_replay.experiment.schema import Experiment
@@ -308,6 +309,9 @@ class TestStrangeYaml:
     def test_half_a_character(self, tmp_path: Path) -> None:
         """It can be written in YAML, and nowhere else."""
         assert problems(tmp_path, TEXT + 'ego: "\\ud83d"\n') == ["19: ego: half a character (a surrogate)"]
+
+    def test_a_path_of_half_a_character_is_itself(self) -> None:
+        assert place_identity(Path("\ud83d")) == "\ud83d"
 
     @pytest.mark.parametrize("tag", ["int", "float", "bool", "null", "timestamp"])
     def test_tag_that_does_not_fit_its_text(self, tmp_path: Path, tag: str) -> None:

@@ -229,6 +229,18 @@ def test_what_has_no_scene_is_refused(tmp_path: Path) -> None:
         build_layout(tmp_path / "text.mcap")
 
 
+def test_a_damaged_replay_is_refused(replay: Path, tmp_path: Path) -> None:
+    damaged, data = tmp_path / "damaged.mcap", bytearray(replay.read_bytes())
+    damaged.write_bytes(data[:5])
+    with pytest.raises(InputError, match=r"damaged.mcap: cannot be read"):
+        build_layout(damaged)
+    chunk = data.index(b"zstd")  # the compression of the first one, behind which its data begin
+    data[chunk + 20 : chunk + 40] = bytes(20)
+    damaged.write_bytes(data)
+    with pytest.raises(InputError, match=r"damaged.mcap: cannot be read: decompression error"):
+        build_layout(damaged)
+
+
 def test_a_replay_of_a_ros_2_recording(tmp_path: Path) -> None:
     """Scenes in CDR, in the frame of reference of the recording."""
     drive(tmp_path / "drive.mcap", "square")

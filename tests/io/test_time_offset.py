@@ -177,6 +177,16 @@ class TestFollowed:
         expected = 9.0 + 2.0 * np.cos(tracks.time_s / 2.0) * 0.9
         assert np.abs(tracks.velocity[0] - expected).max() < 0.4
 
+    def test_what_is_listed_many_times_at_one_time_has_no_velocity(self) -> None:
+        """One object at 3 m/s in eleven lists; another nine times in the sixth of them, and nowhere else."""
+        time_s = np.append(np.arange(11) * 0.1, np.full(9, 0.5))
+        list_ix = np.append(np.arange(11), np.full(9, 5))
+        order = np.argsort(list_ix, kind="stable")
+        points = ListPoints(time_s, list_ix, 3.0 * time_s, np.zeros(20), np.append(np.zeros(11, int), np.ones(9, int)))
+        tracks = short_tracks(points.take(order))
+        assert tracks.time_s == pytest.approx([0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8])
+        assert tracks.velocity[0] == pytest.approx([3.0] * 7)
+
 
 def test_the_tool_lists_with_misses_and_errors() -> None:
     from copem_replay.io.recording import read_log

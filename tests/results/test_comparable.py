@@ -229,6 +229,9 @@ def test_provenance_that_does_not_say_enough(tmp_path, key):
         ("runs", math.inf),
         ("measure", {"horizon_used_s": 2.0, "gospa": "power"}),
         ("measure", {"horizon_used_s": 2.0, "gospa": {"power": None}}),
+        ("measure", {"horizon_used_s": 2.0, "began": 255}),
+        ("runs", 0),
+        ("runs", 2**64),
     ],
 )
 def test_provenance_with_something_else_in_it(tmp_path, key, value):
@@ -248,6 +251,15 @@ def complete(tmp_path: Path) -> Path:
 def changed(path: Path, name: str, values: Any) -> None:
     table = parquet.read_table(path)
     parquet.write_table(table.set_column(table.column_names.index(name), name, values), path)
+
+
+def test_a_column_that_no_comparison_reads_and_that_is_there_twice(tmp_path):
+    path = complete(tmp_path) / "detections.parquet"
+    table = parquet.read_table(path)
+    column = pa.nulls(len(table), pa.float64())
+    parquet.write_table(table.append_column("bias_east_m", column).append_column("bias_east_m", column), path)
+    (problem,) = problems(path.parent)
+    assert problem.startswith(f"{path}: expected the column bias_east_m, found 2; ")
 
 
 @pytest.mark.parametrize("name", FILES)

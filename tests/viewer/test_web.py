@@ -11,6 +11,7 @@ import sys
 import threading
 import urllib.error
 import urllib.request
+import warnings
 from collections.abc import Iterator
 from http.client import HTTPConnection, HTTPMessage
 from pathlib import Path
@@ -96,6 +97,11 @@ class TestOpening:
         assert len({identity.recording for identity in found.values()}) == 2
         (tmp_path / "x.rrd").write_bytes(b"no recording")
         assert read_identities([tmp_path / "x.rrd"]) == {}
+
+    def test_a_recording_that_was_cut_off_has_none(self, results: Path, tmp_path: Path) -> None:
+        (tmp_path / "cut.rrd").write_bytes((results / "replay.rrd").read_bytes()[:-100])
+        with warnings.catch_warnings(action="error"):
+            assert read_identities([tmp_path / "cut.rrd"]) == {}
 
 
 class TestRequest:

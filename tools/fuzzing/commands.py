@@ -19,6 +19,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass, field, replace
+from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from types import SimpleNamespace
@@ -117,6 +118,7 @@ def make_originals(folder: Path, target: str) -> Originals:
     sys.path.insert(0, str(ROOT))
     from tests.helpers.experiments import changed, drive
 
+    _with_one_parser()
     made = Originals(folder)
     shutil.rmtree(folder, ignore_errors=True)  # of a process that had to be ended
     folder.mkdir(parents=True)
@@ -125,7 +127,7 @@ def make_originals(folder: Path, target: str) -> Originals:
         _write_data_sets(folder)
         return made
     drive(Path("drive.mcap"))
-    texts = {"plain": changed(_SHOWN), "measured": changed(_SHOWN, _MEASURED, _BRAKING), "rich": _RICH}
+    texts = {"plain": changed("show: null"), "measured": changed(_SHOWN, _MEASURED, _BRAKING), "rich": _RICH}
     for name, text in texts.items():
         Path(f"{name}.yaml").write_text(text)
     if target == "fit":
@@ -139,7 +141,8 @@ def make_originals(folder: Path, target: str) -> Originals:
     for name in texts:
         _sound("run", f"{name}.yaml", "--out", name, "--jobs", "1", "--pieces", "pieces")
         made.expected[name] = files_of(Path(name))
-        for command in ("compare", "plot", "report", "layout", "view") if target == "results" else ():
+        shown = ("layout", "view") if name in _SHOWN_ONES else ()
+        for command in ("compare", "plot", "report", *shown) if target == "results" else ():
             _sound(command, name)
     return made
 
@@ -150,6 +153,15 @@ def _only(sample: Sample, topics: set[bytes]) -> Sample:
     assert len(channels) == len(topics)
     numbers = {channel.id for channel in channels}
     return replace(sample, channels=channels, messages=[m for m in sample.messages if m.channel in numbers])
+
+
+def _with_one_parser() -> None:
+    """The tree of commands and options is made once, not for every call, of which it would be a third."""
+    from copem_replay.cli import main as cli
+
+    if not isinstance(cli.typer, SimpleNamespace):
+        once = SimpleNamespace(get_command=cache(cli.typer.main.get_command))
+        cli.typer = SimpleNamespace(**{**vars(cli.typer), "main": once})  # type: ignore[assignment]
 
 
 def _without_viewer() -> None:
@@ -234,21 +246,20 @@ def _check_keys(path: Path) -> None:
 
 
 _HIT = (("provenance.json", 25), ("experiment.yaml", 20), ("made.jsonl", 10))
+_SHOWN_ONES = ("measured", "rich")
+"""Results with replays, which take most of the time of a run: the third ones have none."""
 _REST = 10
 """How often each other file of a results folder is hit, beside those."""
 
 
 def _results(made: Originals, place: Path, dice: random.Random) -> Case:
-    name = dice.choice(("plain", "measured", "rich"))
+    word = dice.choices(("compare", "view", "layout", "run", "report", "plot"), (42, 20, 15, 15, 5, 3))[0]
+    name = dice.choice(_SHOWN_ONES if word in ("view", "layout") else ("plain", *_SHOWN_ONES))
+    command, done = [word, name], [name]
     shutil.copytree(made.folder / name, place / name)
     for beside in ("drive.mcap", f"{name}.yaml"):
         shutil.copy(made.folder / beside, place)
-    command = dice.choices(
-        (["compare", name], ["view", name], ["layout", name], ["run"], ["report", name], ["plot", name]),
-        (40, 15, 10, 20, 8, 7),
-    )[0]
-    done = [name]
-    if command == ["run"]:
+    if word == "run":
         command = ["run", f"{name}.yaml", "--out", name, "--jobs", "1", "--overwrite", "--pieces", "pieces"]
         shutil.copytree(made.folder / "pieces", place / "pieces")
         for path in dice.sample(pieces := _files(place / "pieces"), dice.choice((0, 1, 3, len(pieces)))):

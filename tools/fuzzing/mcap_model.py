@@ -193,9 +193,9 @@ def model_of(sample: Sample, dice: random.Random, most: tuple[int, ...] = (5, 10
     """A sound file of so many messages of a sample, in chunks of some size and compression."""
     import copy
 
-    schemas, channels, messages = copy.deepcopy((sample.schemas, sample.channels, sample.messages))
-    first = dice.randrange(max(1, len(messages) // 2))
-    messages = messages[first : first + dice.choice(most)]
+    first = dice.randrange(max(1, len(sample.messages) // 2))
+    some = sample.messages[first : first + dice.choice(most)]
+    schemas, channels, messages = copy.deepcopy((sample.schemas, sample.channels, some))
     size = dice.choice((3, 10, 100))
     groups = [messages[k : k + size] for k in range(0, len(messages), size)] or [[]]
     compression = dice.choice(("zstd", "zstd", "lz4", ""))

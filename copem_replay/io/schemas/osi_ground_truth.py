@@ -134,10 +134,10 @@ class _ObjectRows:
     def columns(self) -> tuple[Int, Int, NDArray[np.int8], Float]:
         """All rows: of each message their number, then columns (P,) and (P, len(VALUES))."""
         first = (
-            np.array(self.of_message, dtype=np.int64),
-            np.array(self.object_ix, dtype=np.int64),
-            np.array(self.class_ix, dtype=np.int8),
-            np.array(self.values, dtype=np.float64).reshape(-1, len(VALUES)),
+            np.asarray(self.of_message, dtype=np.int64),  # without a copy
+            np.asarray(self.object_ix, dtype=np.int64),
+            np.asarray(self.class_ix, dtype=np.int8),
+            np.asarray(self.values, dtype=np.float64).reshape(-1, len(VALUES)),
         )
         if not self.blocks:
             return first
@@ -225,7 +225,7 @@ class GroundTruthDecoder:
         self._wait(truth)
 
     def columns(self) -> DecodedObjects:
-        """The columns of all messages that were added. Raises OversizeError."""
+        """The columns of all messages that were added; none can be added after. Raises OversizeError."""
         self._add_waiting()
         ids, moving = self._names()
         solids = tuple(solid for solid in self._solids.values() if solid is not None)

@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
 from copem_replay.core.colours import configuration_colours
 from copem_replay.core.errors import InputError, unknown_name_message
 from copem_replay.core.files import parse_json
 from copem_replay.core.yaml import NotYamlError, parse_yaml
+from copem_replay.io.containers.mcap_records import DAMAGE
 from copem_replay.io.write.message_family import EGO_FRAME, MIDDLE_FRAME, RUN_RECORD, TRUTH_TOPICS
 
 PREFIX, SUFFIX = "copem/", "/scene"
@@ -66,7 +66,7 @@ def read_contents(replay: Path) -> ReplayContents:
                 text = message.data if channel.message_encoding == "json" else message.data[_CDR_TEXT:-1]
                 for event in parse_json(text)["events"]:
                     known.setdefault(str(event["object"]), {})[channel.topic] = message.log_time
-    except (OSError, McapError, ValueError, KeyError, TypeError) as error:
+    except (*DAMAGE, TypeError) as error:
         raise InputError(f"{replay}: cannot be read: {' '.join(str(error).split())}") from None
     if not names:
         raise InputError(f"{replay}: expected topics {PREFIX}<configuration>{SUFFIX}, as in a replay.mcap, found none")
