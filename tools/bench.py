@@ -8,11 +8,12 @@ from __future__ import annotations
 import json
 import sys
 
-from benches import commands, compare, crew, fit, fusion, links, long, memory, reading, replay, writing
+from benches import commands, compare, crew, fit, fusion, links, long, memory, reading, replay, slices, writing
 
 BENCHES = (
-    commands.pieces, compare.compare, compare.verdict, crew.crew, replay.visibility, memory.memory, fit.fit,
-    replay.paper, reading.reading, writing.writing, commands.commands, commands.reports, fusion.fusion, fusion.peers, links.links,
+    commands.pieces, compare.compare, compare.verdict, slices.slices, crew.crew, replay.visibility, memory.memory,
+    fit.fit, replay.paper, reading.reading, writing.writing, commands.commands, commands.reports, fusion.fusion,
+    fusion.peers, links.links,
     long.crowd, long.long,
 )  # fmt: skip
 """All there are, in the order in which they run; each is called without arguments, by its name."""
