@@ -110,10 +110,14 @@ def check(
     from copem_replay.api.study import prepare_study, read_study
 
     study = read_study(override_source(experiment, {"ego": ego}, log or (), (from_s, to_s)))
+    from copem_replay.experiment.criteria import note_undecidable
+    from copem_replay.metrics.onset import count_counted
     from copem_replay.pipeline.notes import list_began, list_notes
 
     replays, warnings = prepare_study(study)
-    print_notes([*list_notes(study.recordings, replays, study.experiment, replayed=False), *warnings])
+    counted = [count_counted(one.episodes.count_began(), study.experiment.measure.began) for one in replays]
+    undecided = note_undecidable(study.experiment.criteria, counted)
+    print_notes([*list_notes(study.recordings, replays, study.experiment, replayed=False), *warnings, *undecided])
     for line in list_began(replays, study.experiment):
         print_line(line)
     print_line(f"{experiment}: no problem found; logs: {', '.join(r.scene.log for r in study.recordings)}")

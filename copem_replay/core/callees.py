@@ -15,6 +15,7 @@ docs/develop/decisions/0052-code-of-callees.md
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -23,8 +24,6 @@ from numba.core.compiler import Compiler
 from numba.core.event import Event, Listener, register
 from numba.core.registry import CPUDispatcher
 from numba.core.types.misc import unliteral
-
-from copem_replay.core.compiled import compiling
 
 _NO_WRAPPERS = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
@@ -80,15 +79,19 @@ class _CalleeLibrary(JITCodeLibrary):  # type: ignore[misc]
         return SimpleNamespace(set_env=lambda name, environment: None)
 
 
+@cache
+def watch_compiling(count: Any) -> None:
+    """Count, from now on, what is compiled (`Compiling`): Numba compiles under one lock, so there is one count."""
+    register("numba:compile", _Watch(count))
+
+
 class _Watch(Listener):  # type: ignore[misc]
-    # Numba compiles under one lock: there is one count.
+    def __init__(self, count: Any) -> None:
+        self._count = count
 
     def on_start(self, event: Event) -> None:
-        compiling.begun += 1
-        compiling.running += 1
+        self._count.begun += 1
+        self._count.running += 1
 
     def on_end(self, event: Event) -> None:
-        compiling.running -= 1
-
-
-register("numba:compile", _Watch())
+        self._count.running -= 1

@@ -47,12 +47,14 @@ def making(function: Function) -> Function:
 
 
 def _compile(function: Function, **options: bool) -> Function:
-    from copem_replay.core.callees import Kernel  # by kernels alone: the place of the cache is prepared before
+    # By kernels alone: the place of the cache is prepared before.
+    from copem_replay.core.callees import Kernel, watch_compiling
 
+    watch_compiling(compiling)
     return cast("Function", Kernel(function, {"nogil": True, **options}))
 
 
-@dataclass
+@dataclass(eq=False)
 class Compiling:
     """Kernels that were not in the cache: how many this process has begun to compile, how many it compiles now."""
 

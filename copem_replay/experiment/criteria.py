@@ -8,7 +8,7 @@ run: one that does not exist would be a limit that nothing ever breaks.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
@@ -17,7 +17,7 @@ from copem_replay.core.components import Frozen, Id, Number
 from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import CLASS_GROUPS, TRUTH
 from copem_replay.metrics.config import parse_slices
-from copem_replay.metrics.intervals import CONFIDENCE
+from copem_replay.metrics.intervals import CONFIDENCE, choose_over, explain_no_clusters
 from copem_replay.perception.pem.condition import ClassNames
 
 BEFORE = "before"
@@ -156,6 +156,17 @@ def parse_fail_on(conditions: Sequence[str], against: str, names: Sequence[str] 
         criterion["at_most" if sign == ">" else "at_least"] = float(bound)
         criteria[condition.strip()] = criterion | ({} if names is None else {"configurations": list(names)})
     return criteria
+
+
+def note_undecidable(criteria: Mapping[str, Criterion], counted: Sequence[int]) -> Iterator[str]:
+    """A note on criteria that no number of runs decides. `counted`: by log how many episodes count."""
+    asked = [name for name, one in criteria.items() if not one.of_runs]
+    logs = sum(number > 0 for number in counted)
+    if asked and choose_over(logs, sum(counted)) not in ("logs", "objects"):
+        yield (
+            f"criteria {', '.join(asked)}: such traffic is not measured by {explain_no_clusters(logs, sum(counted))}, "
+            "whatever the runs; `population: these_logs` asks about these recordings"
+        )
 
 
 def choose_judged(criterion: Criterion, configurations: Mapping[str, Any]) -> list[str]:

@@ -6,6 +6,7 @@ import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
 from typing import Protocol
@@ -433,6 +434,10 @@ def check_across_logs(
             yield at(key, f"no object {wanted!r} in any log; the first has {moving_ids(scenes[0])}")
         elif all(scene.object_number[wanted] == scene.ego_ix for scene in scenes_with_it):
             yield at(key, f"{wanted!r} is the ego vehicle, which is not measured")
+    for name, criterion in experiment.criteria.items():
+        for k, pattern in enumerate(criterion.logs or () if names else ()):
+            if not any(fnmatchcase(log, pattern) for log in names):
+                yield at(("criteria", name, "logs", k), unknown_name_message("log", pattern, names))
     for k, wanted in enumerate(experiment.show.logs if experiment.show else ()):
         if names and wanted not in ("first", "all", *names):
             yield at(("show", "logs", k), unknown_name_message("log", wanted, ["first", "all", *names]))

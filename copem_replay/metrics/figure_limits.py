@@ -337,8 +337,11 @@ def limit_sums(
     clusters: RowClusters | None,
     confidence: float,
     weighed_by: int | None = None,
+    least: float = -math.inf,
 ) -> LimitedFigure:
-    """A figure `of` sums (…, m) over rows, from `sums (n, m)`; `weighed_by`: the sum that it averages over."""
+    """A figure `of` sums (…, m) over rows, from `sums (n, m)`; `weighed_by`: the sum that it averages over; `least`:
+    the least that it can be.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         total = sums.sum(axis=0)
         value = float(of(total))
@@ -352,7 +355,7 @@ def limit_sums(
         without = np.array([float(of(total - one)) for one in by_group])
     of_objects = np.bincount(group, clusters.weights).astype(np.float64)
     weights: Float = of_objects if weighed_by is None else by_group[:, weighed_by]
-    return _with_limits(value, _limit_unless_alike(value, without, weights, (-math.inf, math.inf), confidence))
+    return _with_limits(value, _limit_unless_alike(value, without, weights, (least, math.inf), confidence))
 
 
 # Metrics of the summary that are held against bounds.
@@ -438,6 +441,11 @@ class SummedMetric(NamedTuple):
     sum: str
     over: str
     root: bool = False
+
+    @property
+    def least(self) -> float:
+        """The least that it can be: a bias has a sign."""
+        return -math.inf if self.sum.endswith(("east_m", "north_m")) else 0.0
 
     def value_of(self, sums: Float) -> Any:
         """The metric of both sums (…, 2)."""

@@ -175,6 +175,7 @@ NOT_OF_A_PART: Mapping[str, str] = {
     "units": "only those that the configuration, the onset or the reference of distances goes by",
     "pems": "only those of these units",
     "links": "only those that the configuration sends by",
+    "tags": "only where a PEM asks for some",
     "measure.began": "rows that do not count are replayed, too",
     "measure.horizon_s": "restricted means are taken of all rows",
     "measure.exact": "closed forms draw nothing",
@@ -236,13 +237,13 @@ def _recipe_parts(experiment: Experiment, name: str) -> tuple[dict[str, Any], li
         "pems": {pem: data["pems"][pem] for pem in pems},
         "links": {link: data["links"][link] for link in links},
     }
+    if any(couple.when.tags for pem in pems for couple in experiment.pems[pem].couples):
+        of_part["tags"] = experiment.tags
     own = own_components(
         configuration, experiment.visibility, experiment.measure.model_copy(update={"metrics": ()}),
         experiment.braking, *(experiment.pems[pem] for pem in pems),
         *(experiment.units[unit] for unit in units), *(experiment.links[link] for link in links),
     )  # fmt: skip
-    if not any(couple.when.tags for pem in pems for couple in experiment.pems[pem].couples):
-        data.pop("tags", None)
     for key in NOT_OF_A_PART:
         within, _, last = key.rpartition(".")
         (data[within] if within else data).pop(last, None)

@@ -384,7 +384,9 @@ class _JudgedStudy:
             return math.nan if value is None else float(value)
 
         of = of_own if ratio is None else ratio.value_of
-        return self._limit_sums(criterion, configuration, sums, columns, of)
+        return self._limit_sums(
+            criterion, configuration, sums, columns, of, least=-math.inf if ratio is None else ratio.least
+        )
 
     def _limit_sums(
         self,
@@ -394,13 +396,14 @@ class _JudgedStudy:
         columns: Sequence[str],
         of: Any,
         weighed_by: int | None = None,
+        least: float = 0.0,
     ) -> JudgedFigure:
         clusters, why = None, ""
         fixed = criterion.of_runs and configuration in self.traffic.settings.fixed
         if not fixed:
             clusters, why = find_clusters(rows, of_runs=criterion.of_runs)
         values = rows[list(columns)].to_numpy(dtype=float)
-        figure = limit_sums(values, of, clusters, criterion.confidence, weighed_by)
+        figure = limit_sums(values, of, clusters, criterion.confidence, weighed_by, least)
         if fixed and figure.value is not None:
             figure = LimitedFigure(figure.value, figure.value, figure.value, NOTHING_DRAWN)
         if clusters is None:

@@ -9,7 +9,7 @@ import pytest
 
 import copem_replay as cr
 from copem_replay.core.errors import ExperimentError, InputError
-from copem_replay.experiment.criteria import Criterion, choose_judged, parse_fail_on
+from copem_replay.experiment.criteria import Criterion, choose_judged, note_undecidable, parse_fail_on
 from copem_replay.experiment.cross_references import read_criteria
 from copem_replay.experiment.schema import Configuration
 from copem_replay.metrics.figure_limits import JUDGED, PER_MINUTE, SUMMED
@@ -102,6 +102,17 @@ def test_a_bound_has_to_be_shown_and_a_difference_refuted() -> None:
     difference = Criterion(metric="unknown_s", at_most=0.1, against="gnn")
     assert difference.passes_unless_refuted
     assert not difference.model_copy(update={"passes_when": "shown"}).passes_unless_refuted
+
+
+def test_what_no_number_of_runs_decides_is_noted() -> None:
+    asked = {"a": Criterion(metric="unknown_s", at_most=1), "b": Criterion(metric="unknown_s", at_most=1)}
+    (note,) = note_undecidable(asked, [4])
+    assert note.startswith("criteria a, b: such traffic is not measured by 4 objects of one drive, fewer than 5")
+    assert "by 2 logs, fewer than 3" in next(note_undecidable(asked, [9, 0, 9]))
+    for counted in ([5], [1, 1, 1]):
+        assert not list(note_undecidable(asked, counted))
+    of_runs = {"a": Criterion(metric="unknown_s", at_most=1, population="these_logs")}
+    assert not list(note_undecidable(of_runs, [1]))
 
 
 def test_conditions_of_fail_on() -> None:

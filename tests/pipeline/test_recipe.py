@@ -87,7 +87,10 @@ def inner(value: Any, at: str) -> Iterator[tuple[str, Any]]:
 
 
 OTHERS = ("configurations.another", "units.far", "pems.other", "links.spare")
-UNTOUCHED = {"logs", "runs", "show", "sweep", "measure.began", "measure.horizon_s", "measure.exact", "measure.metrics"}
+UNTOUCHED = {
+    "logs", "runs", "show", "sweep", "tags", "measure.began", "measure.horizon_s", "measure.exact", "measure.metrics",
+    "measure.by",
+}  # fmt: skip
 
 
 def test_every_key_changes_the_part_or_is_said_not_to() -> None:
@@ -114,6 +117,13 @@ def test_every_key_changes_the_part_or_is_said_not_to() -> None:
         seen.add(path)
     assert len(seen) > 100
     assert {*UNTOUCHED, "configurations", "units", "pems", "links"} == set(NOT_OF_A_PART)
+
+
+def test_tags_change_the_parts_of_a_pem_that_asks_for_some() -> None:
+    asks = {"p": [PEM["couples"][0] | {"when": {"tags": {"weather": "rain"}}}], "other": PEM}
+    wet, dry = (experiment(pems=asks, tags={"weather": weather}) for weather in ("rain", "dry"))
+    assert key(wet) != key(dry)
+    assert key(wet, "another") == key(dry, "another")
 
 
 def test_every_key_of_recorded_lists_changes_the_part() -> None:

@@ -42,6 +42,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     data = YAML(typ="safe", pure=True).load((ROOT / "logs/tc016d.yaml").read_text(encoding="utf-8")) | CHANGES
     data["units"]["fleet"] = FLEET
     data["measure"]["conflict"] = {"horizon_s": 3.0}
+    data["measure"]["by"] = ["class"]
     data["units"]["ego"]["ready"] = 0.0  # so lists have a way that is told
     return cr.run(data).save(tmp_path_factory.mktemp("results") / "out")
 
@@ -70,12 +71,13 @@ def test_files_have_the_columns_of_the_schema_in_their_order(folder: Path) -> No
             c.name: c.kind.removesuffix(" or null") for c in table.columns if c.when not in ABSENT.get(name, ())
         }
         found = written(folder / name)
-        if name == "sweep.csv":  # the others are those of the summary
+        if name in ("sweep.csv", "summary_by.csv"):  # the others are those of the summary
             found = {column: of for column, of in found.items() if column not in METRIC}
         assert list(found) == list(expected), name
         if name.endswith(".csv"):  # a column of nothing but nulls is one of numbers there
             expected = {column: of.replace("whole ", "") for column, of in expected.items()}
             found |= {"reason": "text"} if name == "logs.csv" else {}
+            found |= {"apart": "true or false", "note": "text"} if name == "summary_by.csv" else {}
         assert found == expected, name
 
 

@@ -117,7 +117,7 @@ def history_page(folders: Sequence[JudgedFolder]) -> str:
     head = make_tag(
         "header",
         make_tag("h1", "What became of the criteria?"),
-        make_tag("p", f"{count_noun(len(rows), 'criterion', 'criteria')} in {count_noun(len(folders), 'folder')}, the "
+        make_tag("p", f"{count_noun(len(rows), 'verdict')} of each of {count_noun(len(folders), 'folder')}, the "
                  "newest last, in the order in which they were given.", class_="question"),
         make_list(said),
         section_links((id_, title) for id_, title, _ in sections),

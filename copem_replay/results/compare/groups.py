@@ -34,13 +34,14 @@ class EpisodeGroups:
     """
 
     def __init__(self, results: Results, entries: Sequence[str]) -> None:
-        self.slices: tuple[Slice, ...] = read_slices(results, entries)
-        tags = {log.name: log.tags for log in results.provenance.logs}
-        episodes = results.tally.drop_duplicates([*EPISODE])
         self.named: list[tuple[Slice, str]] = []
         self._of: dict[tuple[str, str, int], list[int]] = {}
+        if not entries:
+            return
+        tags = {log.name: log.tags for log in results.provenance.logs}
+        episodes = results.tally.drop_duplicates([*EPISODE])
         keys = list(zip(*(episodes[name].tolist() for name in EPISODE), strict=True))
-        for by in self.slices:
+        for by in read_slices(results, entries):
             number, names = number_groups(episodes, by, tags)
             for key, k in zip(keys, (number + len(self.named)).tolist(), strict=True):
                 self._of.setdefault(key, []).append(k)
