@@ -24,8 +24,6 @@ from numba.core.event import Event, Listener, register
 from numba.core.registry import CPUDispatcher
 from numba.core.types.misc import unliteral
 
-from copem_replay.core.compiled import compiling
-
 _NO_WRAPPERS = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 
@@ -80,15 +78,17 @@ class _CalleeLibrary(JITCodeLibrary):  # type: ignore[misc]
         return SimpleNamespace(set_env=lambda name, environment: None)
 
 
+def watch_compiling(tell: Callable[[int], None]) -> None:
+    """From now on call `tell` with 1 when Numba begins to compile a function, with −1 at its end."""
+    register("numba:compile", _Watch(tell))
+
+
 class _Watch(Listener):  # type: ignore[misc]
-    # Numba compiles under one lock: there is one count.
+    def __init__(self, tell: Callable[[int], None]) -> None:
+        self._tell = tell
 
     def on_start(self, event: Event) -> None:
-        compiling.begun += 1
-        compiling.running += 1
+        self._tell(1)
 
     def on_end(self, event: Event) -> None:
-        compiling.running -= 1
-
-
-register("numba:compile", _Watch())
+        self._tell(-1)

@@ -47,9 +47,16 @@ def making(function: Function) -> Function:
 
 
 def _compile(function: Function, **options: bool) -> Function:
-    from copem_replay.core.callees import Kernel  # by kernels alone: the place of the cache is prepared before
+    return cast("Function", _kernel_class()(function, {"nogil": True, **options}))
 
-    return cast("Function", Kernel(function, {"nogil": True, **options}))
+
+@cache
+def _kernel_class() -> Any:
+    # Imported by kernels alone: the place of the cache is prepared before.
+    from copem_replay.core.callees import Kernel, watch_compiling
+
+    watch_compiling(compiling.count)
+    return Kernel
 
 
 @dataclass
@@ -59,9 +66,14 @@ class Compiling:
     begun: int = 0
     running: int = 0
 
+    def count(self, step: int) -> None:
+        """1: one begins, −1: it ends. Numba compiles under one lock."""
+        self.running += step
+        self.begun += step > 0
+
 
 compiling = Compiling()
-"""Of this process, kept by `core/callees.py`."""
+"""Of this process."""
 
 
 VARIABLE = "NUMBA_CACHE_DIR"
