@@ -15,7 +15,6 @@ docs/develop/decisions/0052-code-of-callees.md
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -79,19 +78,17 @@ class _CalleeLibrary(JITCodeLibrary):  # type: ignore[misc]
         return SimpleNamespace(set_env=lambda name, environment: None)
 
 
-@cache
-def watch_compiling(count: Any) -> None:
-    """Count, from now on, what is compiled (`Compiling`): Numba compiles under one lock, so there is one count."""
-    register("numba:compile", _Watch(count))
+def watch_compiling(tell: Callable[[int], None]) -> None:
+    """From now on call `tell` with 1 when Numba begins to compile a function, with −1 at its end."""
+    register("numba:compile", _Watch(tell))
 
 
 class _Watch(Listener):  # type: ignore[misc]
-    def __init__(self, count: Any) -> None:
-        self._count = count
+    def __init__(self, tell: Callable[[int], None]) -> None:
+        self._tell = tell
 
     def on_start(self, event: Event) -> None:
-        self._count.begun += 1
-        self._count.running += 1
+        self._tell(1)
 
     def on_end(self, event: Event) -> None:
-        self._count.running -= 1
+        self._tell(-1)

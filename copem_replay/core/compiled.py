@@ -47,23 +47,33 @@ def making(function: Function) -> Function:
 
 
 def _compile(function: Function, **options: bool) -> Function:
-    # By kernels alone: the place of the cache is prepared before.
+    return cast("Function", _kernel_class()(function, {"nogil": True, **options}))
+
+
+@cache
+def _kernel_class() -> Any:
+    # Imported by kernels alone: the place of the cache is prepared before.
     from copem_replay.core.callees import Kernel, watch_compiling
 
-    watch_compiling(compiling)
-    return cast("Function", Kernel(function, {"nogil": True, **options}))
+    watch_compiling(compiling.count)
+    return Kernel
 
 
-@dataclass(eq=False)
+@dataclass
 class Compiling:
     """Kernels that were not in the cache: how many this process has begun to compile, how many it compiles now."""
 
     begun: int = 0
     running: int = 0
 
+    def count(self, step: int) -> None:
+        """1: one begins, −1: it ends. Numba compiles under one lock."""
+        self.running += step
+        self.begun += step > 0
+
 
 compiling = Compiling()
-"""Of this process, kept by `core/callees.py`."""
+"""Of this process."""
 
 
 VARIABLE = "NUMBA_CACHE_DIR"
@@ -88,7 +98,7 @@ def recompiled_note() -> str | None:
 
 def prepare_cache(package: Path, environment: Mapping[str, str] = os.environ) -> str | None:
     """Provide a place for compiled code, before Numba is imported. Returns a note for the user, or None."""
-    folders = [folder for folder, _, files in os.walk(package) if "__init__.py" in files]
+    folders = _package_folders(package)
     _remove_stale(folders)
     if _is_writable(environment.get(VARIABLE)) or all(_is_writable(f"{folder}/__pycache__") for folder in folders):
         return None
@@ -104,6 +114,11 @@ def prepare_cache(package: Path, environment: Mapping[str, str] = os.environ) ->
         sys.modules["numba"].config.CACHE_DIR = folder
     cached = f"compiled code is cached in {folder}{why}, as neither {package} nor {home} can be written"
     return f"{cached}; {VARIABLE} names another"
+
+
+def _package_folders(package: Path) -> list[str]:
+    """The package, and all packages in it."""
+    return [folder for folder, _, files in os.walk(package) if "__init__.py" in files]
 
 
 def _remove_stale(folders: list[str]) -> None:

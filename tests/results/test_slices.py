@@ -59,7 +59,8 @@ def changed(folder: Path, old: str, new: str) -> cr.Results:
 
 
 FIGURES = ("n", "detected_share", "detected_share_low", "detected_share_high", "ttd_median_s", "ttd_rmst_s",
-           "unknown_s", "dad_median_m", "position_rmse_m", "position_rmse_captured_m", "bias_east_m", "velocity_rmse_mps", "nees",
+           "unknown_s", "dad_median_m", "position_rmse_m", "position_rmse_captured_m", "bias_east_m",
+           "velocity_rmse_mps", "nees",
            "age_of_information_s", "longest_gap_s")  # fmt: skip
 
 
