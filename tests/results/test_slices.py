@@ -58,10 +58,11 @@ def changed(folder: Path, old: str, new: str) -> cr.Results:
     return cr.run(path)
 
 
-FIGURES = ("n", "detected_share", "detected_share_low", "detected_share_high", "ttd_median_s", "ttd_rmst_s",
-           "unknown_s", "dad_median_m", "position_rmse_m", "position_rmse_captured_m", "bias_east_m",
-           "velocity_rmse_mps", "nees",
-           "age_of_information_s", "longest_gap_s")  # fmt: skip
+FIGURES = (
+    "n", "detected_share", "detected_share_low", "detected_share_high", "ttd_median_s", "ttd_rmst_s", "unknown_s",
+    "dad_median_m", "position_rmse_m", "position_rmse_captured_m", "bias_east_m", "velocity_rmse_mps", "nees",
+    "age_of_information_s", "longest_gap_s",
+)  # fmt: skip
 
 
 def equal(found: pd.DataFrame, expected: pd.DataFrame, names: tuple[str, ...]) -> None:
