@@ -291,8 +291,8 @@ _PROVENANCE = (
     Column("runs_shown", "by name",
            "by log every run that is written: `file`, `run`, and `run_is`, why it is this one"),
     Column("notes", "list", "what `run` noted"),
-    Column("label", "text", "what the results are called in a history, with `run --label`", "label"),
     Column("files", "list", "names of the files that are the results', which `--overwrite` may replace"),
+    Column("label", "text", "what the results are called in a history, with `run --label`", "label"),
 )  # fmt: skip
 
 _FAR_OFF = "[Definitions](../guide/metrics.md#how-far-off)"

@@ -18,7 +18,7 @@ from xml.etree import ElementTree
 
 import pandas as pd
 
-from copem_replay.core.errors import InputError, OutputError, count_noun
+from copem_replay.core.errors import InputError, OutputError, count_noun, escape_unprintable
 from copem_replay.core.files import atomic_file, parse_json
 from copem_replay.metrics.summary import format_cell, format_table
 from copem_replay.results.compare.tables import escape_markdown
@@ -202,11 +202,13 @@ def verdicts_junit(verdicts: Judgement) -> str:
         "time": "0",
     }
     root = ElementTree.Element("testsuites", {"name": "copem-replay", **numbers})
-    suite = ElementTree.SubElement(root, "testsuite", {"name": verdicts.place, **numbers})
+    suite = ElementTree.SubElement(root, "testsuite", {"name": escape_unprintable(verdicts.place), **numbers})
     for verdict in verdicts.all:
-        about = {"name": verdict.name, "classname": verdict.configuration, "time": "0"}
+        names = {"name": verdict.name, "classname": verdict.configuration}
+        about = {key: escape_unprintable(name) for key, name in names.items()} | {"time": "0"}
         case = ElementTree.SubElement(suite, "testcase", about)
         says = f"{verdict.asked}: found {verdict.found} {verdict.limits}; {verdict.why}".rstrip("; ")
+        says = escape_unprintable(says)
         if tag := tags[id(verdict)]:
             kind = {} if tag == "skipped" else {"type": verdict.verdict}
             ElementTree.SubElement(case, tag, {"message": f"{verdict.verdict}: {says}", **kind})
@@ -271,7 +273,7 @@ def write_verdicts(verdicts: Judgement, path: Path, form: str = "jsonl") -> Path
 def read_verdicts(path: Path) -> Judgement:
     """The verdicts of a file in JSON lines. Raises InputError, one line, where it is not as it was written."""
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8").removesuffix("\n").split("\n")  # names may have other ends of lines
     except (OSError, UnicodeDecodeError) as error:
         why = getattr(error, "strerror", None) or "no text in UTF-8"
         raise InputError(f"{path}: expected verdicts, found none that can be read: {why}") from None

@@ -123,6 +123,14 @@ def test_tampered_ones_are_refused_by_name(tmp_path: Path, how: str) -> None:
     assert len(str(caught.value).splitlines()) == 1
 
 
+def test_names_with_ends_of_lines_and_controls_are_one_name(tmp_path: Path) -> None:
+    """Groups are named after drives, whose files may be called anything."""
+    of = Judgement("a\x01b", (verdict(MET, group="one\u2028two\x85three\x01"),))
+    assert read_verdicts(write_verdicts(of, tmp_path / FILE)).all == of.all
+    (suite,) = JUnitXml.fromstring(verdicts_junit(of).encode())
+    assert (suite.name, [case.name for case in suite]) == ("a\\x01b", ["known soon: one\\u2028two\\x85three\\x01"])
+
+
 # ------------------------------------------------------------------------------------------- JUnit
 
 

@@ -31,8 +31,9 @@ CHANGES: dict[str, Any] = {
     "window_s": [0.0, 8.0],
 }
 FLEET = {"on": {"classes": ["truck"], "penetration_rate": 0.5}, "pem": "onboard"}  # so runs differ in their instants
-ABSENT = {"summary.csv": {"output", "link"}}
-"""By file what is there `when` a configuration has what none has here: the output of a stack, links."""
+ABSENT = {"summary.csv": {"output", "link"}, "provenance.json": {"label"}}
+"""By file what is there `when` a configuration has what none has here, the output of a stack, links; or `run` a label.
+"""
 JSON = {str: "text", int: "whole number", float: "number", dict: "by name", list: "list"}
 
 
