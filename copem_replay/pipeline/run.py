@@ -36,7 +36,6 @@ from copem_replay.metrics.slices import (
     LISTS_COLUMNS,
     SliceSettings,
     StudyRows,
-    describe_chance,
     sum_episodes,
     sum_lists,
     summarise_groups,
@@ -377,16 +376,13 @@ def _run_study(experiment: Experiment, logs: Sequence[StudyLog], gatherer: Gathe
     measure = experiment.measure
     study.horizon_s, horizon_notes = settle_horizon(select_counted(study.tally, measure.began), measure.horizon_s)
     study.summary, summary_notes = _summarise(study, study.horizon_s)
-    study.summary_by = sliced = _summarise_slices(study, study.horizon_s)
+    study.summary_by = _summarise_slices(study, study.horizon_s)
     swept = [_summarise_point(point, logs, gatherer, study.horizon_s) for point in list_points(experiment)]
     study.sweep = pd.concat(swept, ignore_index=True) if swept else None
     if measure.accuracy and len(experiment.configurations):
         study.bands = tabulate_bands(study.totals)
     oddities = {log.name: of.oddities for log, of in zip(logs, study.facts, strict=True)}
-    notes_on_slices = () if sliced is None else describe_chance(sliced)
-    study.notes = (
-        *study_notes(study.recordings, oddities, experiment), *horizon_notes, *summary_notes, *notes_on_slices,
-    )  # fmt: skip
+    study.notes = (*study_notes(study.recordings, oddities, experiment), *horizon_notes, *summary_notes)
     return study
 
 
