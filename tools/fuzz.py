@@ -186,12 +186,15 @@ class _Worker:
         self._start()
 
     def _answers(self) -> bool:
-        """Wait for an answer: as long as it may compute, which on a busy machine is longer."""
-        begin, wall = self._computed_s(), time.monotonic()
+        """Wait for an answer: as long as it may compute, or do nothing. While it waits for a processor no time passes."""
+        begin, wall = self._computed_s(), time.monotonic() - self._queued_s()
         while not self._pipe.poll(0.2):
-            if self._computed_s() - begin > LONGEST_S or time.monotonic() - wall > 6 * LONGEST_S:
+            if self._computed_s() - begin > LONGEST_S or time.monotonic() - self._queued_s() - wall > 2 * LONGEST_S:
                 return False
         return True
+
+    def _queued_s(self) -> float:
+        return int(Path(f"/proc/{self._process.pid}/schedstat").read_text().split()[1]) / 1e9
 
     def _computed_s(self) -> float:
         fields = Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()

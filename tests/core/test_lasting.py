@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -113,7 +113,6 @@ def both(tau_s: float, random_key: RandomKey, lists: ListStamps, runs: Int = RUN
     pick=st.lists(st.booleans(), min_size=60, max_size=60),
     order=st.randoms(use_true_random=False),
 )
-@settings(max_examples=40, deadline=None)
 def test_rows_asked_for_in_any_way_have_the_same_bits(
     tau_s: float, rate_hz: float, pick: list[bool], order: Any
 ) -> None:

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from copem_replay.core.errors import InputError
@@ -85,7 +85,6 @@ def in_chunks(fusion: ListFusion, told: Inputs, places: list[tuple[int, int]], l
     return join_chunks(parts)
 
 
-@settings(max_examples=120)
 @given(st.integers(0, len(FUSIONS) - 1), st.integers(0, len(WORLDS) - 1), st.lists(st.floats(0, 1), max_size=8))
 def test_chunks_give_the_lists_of_one_go_to_the_last_bit(which: int, number: int, cuts: list[float]) -> None:
     fusion, told, expected = FUSIONS[which], world(number), at_once(which, number)

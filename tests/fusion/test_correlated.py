@@ -282,7 +282,7 @@ def test_of_two_cross_covariance_is_bar_shaloms_and_campos(given_: tuple[Array, 
     assert pytest.approx(A - K @ (A - C).T, rel=1e-6, abs=1e-9) == P
 
 
-@settings(max_examples=25)
+@settings(max_examples=25)  # for each the oracle searches for the least trace
 @given(pairs, st.floats(0, 3))
 def test_covariance_union_covers_both_and_no_trace_is_less(given_: tuple[Array, Array], scale: float):
     (a, b), (A, B) = given_

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -532,7 +532,6 @@ def weighed(pairs: list[tuple[float, float]]) -> float:
     return sum(value / variance for value, variance in pairs) / sum(1 / variance for _, variance in pairs)
 
 
-@settings(max_examples=150, deadline=None)
 @given(units_lists(), st.sampled_from([TICK, 3 * TICK, 100 * TICK]), st.sampled_from([-1, 0, 2]))
 def test_against_the_words(
     world: tuple[dict[str, list[tuple[int, dict[int, Says]]]], dict[str, int]], max_age: int, own: int

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 from scipy.optimize import minimize_scalar
@@ -111,7 +111,6 @@ def plain_split(
     return x + K @ (z - H @ x), after, after - own
 
 
-@settings(max_examples=60)
 @given(st.integers(0, 2**32 - 1), st.floats(0.05, 1.0), st.floats(0.1, 0.9), st.sampled_from([1.0, 3.0]))
 def test_the_update_is_the_one_written_out(seed: int, share: float, of_track: float, grown: float):
     rng = np.random.default_rng(seed)

@@ -286,7 +286,7 @@ def check(definition: CdrDefinition, made: list[dict[str, Any]], found: Shredded
 
 
 @given(definitions(), st.booleans(), st.data())
-@settings(max_examples=150, suppress_health_check=[HealthCheck.too_slow])
+@settings(suppress_health_check=[HealthCheck.too_slow])
 def test_what_was_serialised_is_found(made: Made, little: bool, data: st.DataObject) -> None:
     definition = defined(made.text)
     payloads = [serialised(made.text, m, little=little) for m in made.messages]
@@ -302,7 +302,7 @@ def test_what_was_serialised_is_found(made: Made, little: bool, data: st.DataObj
 
 
 @given(definitions(), st.data())
-@settings(max_examples=100, suppress_health_check=[HealthCheck.too_slow])
+@settings(suppress_health_check=[HealthCheck.too_slow])
 def test_damaged_messages_are_told_and_the_others_unharmed(made: Made, data: st.DataObject) -> None:
     definition = defined(made.text)
     payloads = [serialised(made.text, m) for m in made.messages]

@@ -409,7 +409,6 @@ THING = st.fixed_dictionaries(
 
 
 @given(st.lists(st.lists(THING, max_size=3), min_size=1, max_size=3))
-@settings(max_examples=100)
 def test_the_same_content_gives_the_same_columns(content: Sequence[list[dict[str, Any]]]) -> None:
     messages = [{"t": k, "things": things} for k, things in enumerate(content)]
     fields = "string name\nfloat64 x\nfloat32 f\nint64 n\nbool yes\nfloat64[] v"

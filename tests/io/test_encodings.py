@@ -101,7 +101,6 @@ PATHS = [p for p in every.offers() if p.count(".") < 4]
 
 
 @given(st.lists(st.lists(ALL, max_size=2), max_size=3), st.lists(st.sampled_from(PATHS), min_size=1, max_size=12))
-@settings(max_examples=150, deadline=None)
 def test_protobuf_of_every_type(contents: list[list[dict[str, Any]]], paths: list[str]) -> None:
     """Messages one after the other are one message, with what the parser makes of it."""
     payloads = [b"".join(message(every, c).SerializeToString() for c in several) for several in contents]
@@ -109,7 +108,6 @@ def test_protobuf_of_every_type(contents: list[list[dict[str, Any]]], paths: lis
 
 
 @given(ALL, st.data())
-@settings(max_examples=150, deadline=None)
 def test_protobuf_that_was_hit(content: dict[str, Any], data: st.DataObject) -> None:
     payload = bytearray(message(every, content).SerializeToString())
     for _ in range(data.draw(st.integers(0, 3))):

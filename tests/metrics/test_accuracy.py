@@ -240,7 +240,7 @@ def test_the_gate_cuts_the_mean_and_the_spread_of_true_covariances() -> None:
     assert (high - low) / 2 / 1.96 == pytest.approx(nees.std() / math.sqrt(len(nees)), rel=0.03)
 
 
-@settings(max_examples=60)
+@settings(max_examples=60)  # each integrates over a plane by quadrature
 @given(st.floats(-9, 4), st.floats(0, 4), st.sampled_from([0.3, 3.0, 50.0]))
 @example(4.0, 0.5, 0.3)  # next to nothing is within
 def test_what_is_expected_within_the_gate_as_integrals_have_it(large: float, less: float, gate_m: float) -> None:
@@ -696,7 +696,6 @@ def assert_equal_totals(found: AccuracyTotal, expected: AccuracyTotal) -> None:
         assert (got.dtype, got.shape, got.tobytes()) == (want.dtype, want.shape, want.tobytes()), column
 
 
-@settings(max_examples=60)
 @given(st.integers(0, 2**32 - 1))
 def test_sums_as_the_sentences_have_them(seed: int) -> None:
     made = Scenery(seed)
@@ -709,7 +708,6 @@ def test_sums_as_the_sentences_have_them(seed: int) -> None:
     assert_same(found, expected, exactly=False)
 
 
-@settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1))
 def test_runs_by_themselves_are_those_of_all_and_the_order_of_entries_does_not_matter(seed: int) -> None:
     made = Scenery(seed)
@@ -724,7 +722,6 @@ def test_runs_by_themselves_are_those_of_all_and_the_order_of_entries_does_not_m
     assert_same(made.of(shuffled, made.matched(shuffled)), whole, exactly=False)
 
 
-@settings(max_examples=60)
 @given(st.integers(0, 2**32 - 1), st.lists(st.floats(0, 1), max_size=6))
 def test_chunks_add_up_to_the_whole_to_the_last_bit(seed: int, cuts: list[float]) -> None:
     made = Scenery(seed)
@@ -800,7 +797,6 @@ def test_runs_add_up_as_the_leaves_of_a_tree(runs: int, step: int) -> None:
     assert_equal_totals(join_totals(pieces), whole)
 
 
-@settings(max_examples=25)
 @given(st.integers(0, 2**32 - 1))
 def test_parts_of_objects_add_up_to_gospa(seed: int) -> None:
     rng = np.random.default_rng(seed)

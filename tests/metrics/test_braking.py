@@ -49,7 +49,9 @@ from copem_replay.pipeline.run import run_experiment
 from tests.helpers.scenes import EGO_UNIT, SEES_ALL, Thing, driving, experiment, recording, standing
 from tests.oracles.braking import Motion, corners, outcome
 
-SOME = settings(max_examples=60, suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much])
+SOME = settings(
+    max_examples=60, suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much]
+)  # an example prepares a log and judges it
 BRAKES_8 = {"kind": "constant_deceleration", "a_max_mps2": 8.0}
 NEVER = math.inf
 COLUMNS = ["brake_s", "braking_pass", "min_distance_m", "impact_s", "impact_speed_mps", "required_deceleration_mps2"]
@@ -611,7 +613,7 @@ def agree(case: Case, driver: ConstantDeceleration, margin_m: float, brake_s: Fl
 
 
 @pytest.mark.long
-@settings(SOME, max_examples=100)
+@settings(SOME, max_examples=100)  # each judges a log several times
 @given(
     case=cases(),
     a_max=st.floats(1, 10),
@@ -654,7 +656,7 @@ def test_named_encounters_as_the_oracle_says() -> None:
     angle=st.floats(-math.pi, math.pi),
     shift=st.tuples(st.floats(-1e4, 1e4), st.floats(-1e4, 1e4)) | st.just((691_607.0, 5_335_000.0)),
 )
-@settings(SOME, max_examples=30)
+@settings(SOME, max_examples=30)  # each judges a log several times
 def test_verdicts_do_not_depend_on_where_the_world_is(case: Case, angle: float, shift: tuple[float, float]) -> None:
     """Turned and shifted, also to where a UTM grid has Munich, all is as before."""
     log, driver = case.log(), ConstantDeceleration(a_max_mps2=6.0)
@@ -712,7 +714,7 @@ def test_instants_to_begin_at() -> None:
     assert find_passing_intervals(encounter, ConstantDeceleration(a_max_mps2=2.0), 0.5).shape == (0, 2)
 
 
-@settings(SOME, max_examples=25)
+@settings(SOME, max_examples=25)  # each judges a log several times
 @given(case=cases(), a_max=st.floats(2, 10), build_up_s=st.sampled_from([0.0, 0.6]), seed=st.integers(0, 2**32 - 1))
 def test_passing_is_what_is_judged(case: Case, a_max: float, build_up_s: float, seed: int) -> None:
     driver = ConstantDeceleration(a_max_mps2=a_max, build_up_s=build_up_s)
@@ -760,7 +762,7 @@ DECADES = st.floats(-300, -0.01)
 """Of a probability: where on the way from 1 to 10⁻³⁰⁰."""
 
 
-@settings(SOME, max_examples=60)
+@settings(SOME, max_examples=200)
 @given(shape=st.floats(0.01, 500), mean_s=st.floats(0.01, 10), decades=DECADES)
 def test_survival_of_gamma_to_the_far_tail(shape: float, mean_s: float, decades: float) -> None:
     """P(D > d) < e^(shape − x) (x / shape)^shape beyond the mean: some d at which it is about 10^decades."""
@@ -772,7 +774,7 @@ def test_survival_of_gamma_to_the_far_tail(shape: float, mean_s: float, decades:
     assert found == pytest.approx(float(expected), rel=1e-10, abs=1e-305)
 
 
-@settings(SOME, max_examples=60)
+@settings(SOME, max_examples=200)
 @given(median_s=st.floats(0.01, 10), sigma=st.floats(0.01, 10), deviations=st.floats(-5, 37))
 def test_survival_of_lognormal_to_the_far_tail(median_s: float, sigma: float, deviations: float) -> None:
     delay_s = median_s * math.exp(sigma * deviations)
@@ -819,7 +821,7 @@ def test_probability_to_fail_between_and_before_what_passes() -> None:
     assert fail_probability(between_s[:0], known_s, gamma).tolist() == [1] * 5
 
 
-@settings(SOME, max_examples=60)
+@settings(SOME, max_examples=200)
 @given(
     reaction=st.one_of(
         st.builds(ConstantReaction, delay_s=st.floats(0, 3)),
@@ -850,7 +852,7 @@ def test_probability_to_pass_with_two_intervals() -> None:
     assert found[0] == pytest.approx(law.cdf(0.3) + law.cdf(1.325) - law.cdf(0.85), abs=1e-3)
 
 
-@settings(SOME, max_examples=40)
+@settings(SOME, max_examples=40)  # each judges a log several times
 @given(
     case=cases(),
     a_max=st.floats(0.5, 12),

@@ -41,7 +41,9 @@ from tests.helpers.experiments import changed, source_of
 from tests.helpers.recordings import Obj, pedestrian, write_recording
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
 
-SOME = settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+SOME = settings(
+    max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)  # an example replays a log
 COLUMNS = [
     "conflict_detected",
     "conflict_detection_s",
@@ -336,7 +338,7 @@ class TestOracle:
         assert will_enter(0.0, y_m, 0.0, 0.0, 0.0, 4.0, 2.0, np.array([0.0, 0.0, 0.0, 4.0, 2.0]), 3.0) is expected
 
     @given(drawn=logs(), horizon_s=st.floats(0.1, 4), margin_m=st.floats(0, 1.5))
-    @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+    @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])  # an example replays a log
     def test_corridor_is_what_the_ego_sweeps(self, drawn: Drawn, horizon_s: float, margin_m: float) -> None:
         ready = prepare_log(drawn.log, plan())
         now_s = np.array([-0.1, 0.0, 0.33, 1.2, 2.0, 2.95, 3.0, 3.1])
@@ -598,7 +600,7 @@ class TestOtherWays:
         assert found["GT", 0, "near"] == pytest.approx(1.3)
 
     @given(angle=st.floats(-math.pi, math.pi), x_m=st.floats(-1e5, 1e5), y_m=st.floats(-1e5, 1e5))
-    @settings(max_examples=15, deadline=None)
+    @settings(max_examples=15, deadline=None)  # an example replays a log
     def test_wherever_the_scene_is(self, angle: float, x_m: float, y_m: float) -> None:
         def placed(of: Motion) -> Motion:
             def at(t: float) -> tuple[float, float]:
@@ -869,7 +871,7 @@ class TestOnset:
         onset=st.integers(0, 12),
         count_earlier=st.booleans(),
     )
-    @settings(max_examples=60, deadline=None)
+    @settings(max_examples=60, deadline=None)  # an example replays a log
     def test_hits_of_the_last_lists(
         self, says: list[str], hits: int, more: int, onset: int, count_earlier: bool
     ) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from copem_replay.core.tracks import Tracks
@@ -199,7 +199,6 @@ class HeldScenery(Scenery):
         return errors.result()
 
 
-@settings(max_examples=100)
 @given(st.integers(0, 2**32 - 1))
 def test_what_is_held_is_as_the_sentences_have_it(seed: int) -> None:
     made = HeldScenery(seed)
@@ -219,7 +218,6 @@ def test_what_is_held_is_as_the_sentences_have_it(seed: int) -> None:
         assert got == pytest.approx(values, rel=1e-4, abs=1e-5)
 
 
-@settings(max_examples=60)
 @given(st.integers(0, 2**32 - 1), st.lists(st.floats(0, 1), max_size=6))
 def test_chunks_hold_what_the_whole_holds_to_the_last_bit(seed: int, cuts: list[float]) -> None:
     made = HeldScenery(seed)

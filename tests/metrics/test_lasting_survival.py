@@ -78,7 +78,7 @@ def brute(p: Float, held: Any, gap_s: Float, share: float, tau_s: float) -> Any:
     tau_s=st.sampled_from([0.01, 0.7, 300.0, math.inf]),
     data=st.data(),
 )
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=120, deadline=None)  # each counts all ways with 60 digits
 def test_against_all_ways_to_60_digits(p: list[float], share: float, tau_s: float, data: Any) -> None:
     held = data.draw(st.lists(st.booleans(), min_size=len(p), max_size=len(p)))
     gap = np.array(

@@ -17,7 +17,7 @@ from mpmath import mp, mpf
 
 from copem_replay.metrics.exact_survival import FirstKnown, first_confirmed, first_known
 
-SOME = settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+SOME = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 DIGITS = 450
 
 # ------------------------------------------------------------------------------------- the oracle, in 450 digits

@@ -238,7 +238,7 @@ def test_own_models_remember_without_knowing() -> None:
     ),
     low=st.floats(0, 1), more=st.floats(0, 1), kind=st.sampled_from(["constant", "table", "visible_share"]),
 )  # fmt: skip
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25, deadline=None)  # each perceives twenty runs twice
 def test_a_higher_probability_only_adds_detections(part: dict[str, Any], low: float, more: float, kind: str) -> None:
     log = two_standing(1.0)
     high = low + (1 - low) * more

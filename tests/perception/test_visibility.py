@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from copem_replay.core.tracks import Tracks
@@ -380,7 +380,6 @@ def test_a_person_who_steps_from_behind_a_corner() -> None:
 
 
 @given(turn=st.floats(-np.pi, np.pi), scale=st.floats(0.5, 3), east=st.floats(-1e5, 1e5), seed=st.integers(0, 99))
-@settings(max_examples=60, deadline=None)
 def test_turning_scaling_and_moving_the_world_changes_nothing(
     turn: float, scale: float, east: float, seed: int
 ) -> None:

@@ -163,7 +163,9 @@ def plans(draw: st.DrawFn) -> Experiment:
 
 
 @given(plan=plans(), rows=st.integers(40, 700))
-@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(
+    max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)  # each replays a log twice and compares all
 def test_whatever_is_replayed(plan: Experiment, rows: int) -> None:
     whole, pieces = both_ways(plan, [traffic()], rows)
     assert len(pieces.replays[0].chunks) > 1

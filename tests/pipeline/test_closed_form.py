@@ -46,7 +46,9 @@ from tests.helpers.replays import transmitted
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
 
 ROOT = Path(__file__).parents[2]
-SOME = settings(max_examples=80, suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much])
+SOME = settings(
+    max_examples=80, suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much]
+)  # an example replays a log
 NEVER = None
 Times = dict[int | None, float]
 """How probable each time of the first detection is, in milliseconds since the log's start; None: never."""
@@ -1112,7 +1114,7 @@ class TestSummary:
         row = run_experiment(masts(1), [one, three]).summary.iloc[0]
         assert row["detected_share_exact"] == pytest.approx((3 / 4 + 3 * (1 - 0.5**21)) / 4)
 
-    @settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow])
+    @settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow])  # an example replays a log
     @given(st.data())
     def test_probabilities_are_shares_of_rows(self, data: st.DataObject) -> None:
         """Sixteenths of looks count like so many rows: exact columns are those of a table that repeats them."""

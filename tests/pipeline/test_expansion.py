@@ -41,7 +41,7 @@ from tests.helpers.recordings import Obj, pedestrian, write_recording
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
 from tests.pipeline.test_closed_form import band, farthest, in_closed_form, same, sure_to
 
-FEW = settings(max_examples=25, suppress_health_check=[HealthCheck.too_slow])
+FEW = settings(max_examples=25, suppress_health_check=[HealthCheck.too_slow])  # an example replays a log
 RISK = 1e-6
 EGO = {"on": "ego", "pem": "p"}
 MEASURE: dict[str, Any] = {"objects": {"classes": ["pedestrian"]}, "onset": {"kind": "appears"}}
@@ -213,7 +213,7 @@ class TestExpansion:
 
 
 class TestShare:
-    @settings(max_examples=50)
+    @settings(max_examples=50)  # an example replays a log
     @given(st.floats(0, 1), st.floats(0, 1), st.integers(-3, 3))
     def test_who_does_at_a_share_does_at_a_larger_one(self, a: float, b: float, seed: int) -> None:
         scene = street().scene

@@ -85,7 +85,7 @@ def sent(draw: st.DrawFn) -> tuple[list[list[SentList]], int]:
     return [[SentList(*one, draw(held)) for one in common] for _ in range(2)], units
 
 
-@settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.too_slow])  # an example replays a log
 @given(sent(), st.sampled_from([None, 10, 70, 200]), st.sampled_from([30, 200, 1000]), st.integers(0, 40))
 def test_states_and_detections_are_those_of_the_oracle(
     drawn: tuple[list[list[SentList]], int], tick: int | None, max_age: int, onset: int
@@ -307,7 +307,9 @@ def links(draw: st.DrawFn) -> dict[str, Any]:
     return link
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True)
+@settings(
+    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True
+)  # an example replays a log
 @given(
     links(), st.sampled_from([None, 0.7, 2, 4]), st.integers(1, 3), st.sampled_from([(1, 1), (2, 3)]),
     st.sampled_from([None, "cpm"]), st.sampled_from([0.3, 1.0]), st.integers(0, 99),

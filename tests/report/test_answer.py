@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
@@ -139,7 +139,6 @@ class TestAnswer:
 
 class TestMeanLimits:
     @given(st.data())
-    @settings(max_examples=60, deadline=None)
     def test_they_come_of_the_means_without_each_log(self, data: st.DataObject) -> None:
         """Of four logs, each left out row by row; some rows are censored."""
         count = data.draw(st.integers(4, 14))
@@ -251,7 +250,6 @@ class TestEighteen:
 
 class TestWhichObject:
     @given(st.data())
-    @settings(max_examples=80, deadline=None)
     def test_the_same_as_in_the_viewer(self, data: st.DataObject) -> None:
         """Of one log: the one object that the viewer would choose."""
         objects, names = data.draw(st.integers(1, 5)), ("GT", "A", "B")

@@ -20,7 +20,7 @@ import matplotlib
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -502,7 +502,6 @@ class TestDistances:
         assert drawn.all()
 
     @given(st.lists(st.tuples(st.integers(0, 8), st.integers(0, 2)), min_size=1, max_size=40), st.integers(0, 40))
-    @settings(max_examples=80, deadline=None)
     def test_points_find_their_places_log_by_log(self, points: list[tuple[int, int]], cut: int) -> None:
         """However the rows are cut, as if all were there: of a bin those of a kind in their order, evenly."""
         distance_m, kind = np.array([one / 8 for one, _ in points]), np.array([one for _, one in points])

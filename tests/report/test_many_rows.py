@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from copem_replay.metrics.figure_limits import cluster_rows, detection_endings, mean_limits
@@ -131,7 +131,6 @@ def tables(draw: st.DrawFn) -> pd.DataFrame:
 
 
 @given(tables())
-@settings(max_examples=60, deadline=None)
 def test_counts_say_what_rows_say(rows: pd.DataFrame) -> None:
     """The same curve to the last bit, the same bands, limits of the mean, and objects that are missed."""
     found = tally_rows(rows)

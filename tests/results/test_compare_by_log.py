@@ -82,7 +82,7 @@ def one(rnd: Random, name: str, run: int, of: Row, present: list[bool]) -> Row:
 seeds, log_counts = st.integers(0, 2**32 - 1), st.sampled_from([1, 2, 3, 5])
 
 
-@settings(max_examples=25)
+@settings(max_examples=25)  # each writes folders and compares them
 @given(seeds, log_counts)
 def test_figures_are_those_of_pairs_one_by_one(seed, count):
     given_study = study(seed, count)
@@ -125,7 +125,7 @@ def test_figures_are_those_of_pairs_one_by_one(seed, count):
         is_as("false_positives_per_min", oracle.ghosts_per_min(both, "late", "ideal"), minutes)
 
 
-@settings(max_examples=8)
+@settings(max_examples=8)  # each writes folders and compares them
 @given(seeds, st.sampled_from([3, 5]))
 def test_intervals_leave_out_whole_logs(seed, count):
     given_study = study(seed, count, fewest=2)
@@ -163,7 +163,7 @@ def test_intervals_leave_out_whole_logs(seed, count):
                 assert pd.isna(row["hangs_on"])
 
 
-@settings(max_examples=6)
+@settings(max_examples=6)  # each writes folders and compares them
 @given(seeds)
 def test_more_runs_do_not_narrow_intervals_over_logs(seed):
     """The same again as further runs, as often: no limit moves."""
@@ -184,7 +184,7 @@ def test_more_runs_do_not_narrow_intervals_over_logs(seed):
         assert found == pytest.approx(one.loc[over_logs, name].astype(float).to_numpy(), abs=1e-9, nan_ok=True)
 
 
-@settings(max_examples=10)
+@settings(max_examples=10)  # each writes folders and compares them
 @given(seeds)
 def test_limits_of_medians_are_those_of_shares_inverted(seed):
     rnd = Random(seed)
@@ -210,7 +210,7 @@ def test_limits_of_medians_are_those_of_shares_inverted(seed):
         assert (of_median["interval"], of_median["interval_over"]) == ("inverted", "logs")
 
 
-@settings(max_examples=15)
+@settings(max_examples=15)  # each writes folders and compares them
 @given(seeds, log_counts)
 def test_files_folders_and_orders_are_alike(seed, count):
     """Rows of logs among each other, of small row groups, or in a file for each log."""
@@ -236,7 +236,7 @@ def test_files_folders_and_orders_are_alike(seed, count):
         assert other.notes == whole.notes
 
 
-@settings(max_examples=15)
+@settings(max_examples=15)  # each writes folders and compares them
 @given(seeds)
 def test_runs_told_as_logs_give_the_same_over_all(seed):
     """What one log says in several runs several logs say in one run each."""

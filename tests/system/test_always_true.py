@@ -17,7 +17,7 @@ from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.run import run_experiment
 from tests.helpers.scenes import Thing, driving, experiment, recording
 
-MANY = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+MANY = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])  # each replays a log
 
 
 @st.composite
@@ -174,7 +174,7 @@ def test_the_truth_detects_at_the_first_list_from_the_onset_on(log: Recording, o
 
 
 @given(log=logs())
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10, deadline=None)  # each replays a log
 def test_the_truth_is_believed_without_error(log: Recording) -> None:
     plan = experiment(configurations={"GT": {"units": "truth"}})
     ready = prepare_log(log, plan)
@@ -210,7 +210,7 @@ def test_identical_units_divide_the_variance(count: int) -> None:
 
 
 @given(log=logs(), latency=latencies)
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15, deadline=None)  # each replays a log
 def test_no_list_before_the_first_capture_plus_latency(log: Recording, latency: float) -> None:
     plan = experiment(
         pems=PEMS, units=units(None, None), configurations={"all": {"units": "all", "latency_s": latency}}

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from copem_replay.core.colours import TRUTH, configuration_colours
@@ -210,7 +210,6 @@ def test_no_lane_of_the_city_says_known_before_the_table(city: Made) -> None:
 
 
 @given(st.lists(st.tuples(st.integers(1, 12), st.integers(1, len(STATUSES) - 1)), min_size=1, max_size=30))
-@settings(max_examples=150, deadline=None)
 def test_steady_lanes_begin_known_where_it_begins(runs: list[tuple[int, int]]) -> None:
     """Tenths of a second each status lasts: spans are long, or the first of all, or the first known."""
     lasts, what = np.array([r for r, _ in runs]), np.array([s for _, s in runs])
