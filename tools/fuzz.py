@@ -186,7 +186,7 @@ class _Worker:
         self._start()
 
     def _answers(self) -> bool:
-        """Wait for an answer: as long as it may compute, or do nothing. While it waits for a processor no time passes."""
+        """Wait for an answer: as long as it may compute, or do nothing; waiting for a processor takes no time."""
         begin, wall = self._computed_s(), time.monotonic() - self._queued_s()
         while not self._pipe.poll(0.2):
             if self._computed_s() - begin > LONGEST_S or time.monotonic() - self._queued_s() - wall > 2 * LONGEST_S:

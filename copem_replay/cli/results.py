@@ -153,7 +153,7 @@ def verdict(
         Path | None, typer.Option(metavar="FILE", help="Name of the JSON lines [FOLDER/verdicts.jsonl].")
     ] = None,
 ) -> int:
-    """Hold criteria against results: met, not met, undecided or not measured.
+    """Judge results by criteria; exit code 1 if one does not pass.
 
     Nothing is replayed. Ends with 1 where a criterion does not pass, after all files are written.
     """
@@ -181,7 +181,7 @@ def history(
     folders: Annotated[list[Path], typer.Argument(metavar="FOLDER", help="Results folders, the oldest first.")],
     out: Annotated[Path, typer.Option(metavar="FILE", help="Name of the page.")] = Path("history.html"),
 ) -> int:
-    """Write what became of criteria over many results folders, as one HTML file.
+    """Write the verdicts of many results folders, as one HTML file.
 
     Each criterion is a strip of verdicts, and its figure with its interval.
     """

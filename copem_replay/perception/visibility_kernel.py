@@ -283,6 +283,8 @@ def _bound_slopes(polygon: Float, eye_m: tuple[float, float, float], flat: bool,
 def _index_bodies(of: Any, index: _Index) -> None:
     # Out: the bodies that may hide something.
     bodies, total_m = len(of), 1.0
+    if bodies == 0:
+        return
     for b in range(bodies):
         of[b].begins_m = of[b].distance_m - of[b].radius_m
         total_m += of[b].distance_m

@@ -13,6 +13,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
+
 from copem_replay.core.components import MOST_RUNS
 from copem_replay.core.errors import InputError, RecordingError, RemoteFile
 from copem_replay.core.files import parse_json
@@ -119,7 +121,7 @@ def parse_provenance(data: Any, place: Path) -> Provenance:
     measure = Measure().model_dump(mode="json", by_alias=True) | dict(data["measure"])
     braking, gap_s = data.get("braking"), data.get("max_gap_s")
     used_s, run_shown = float(measure.pop("horizon_used_s")), data.get("run_shown") or {}
-    Measure.model_validate(measure)
+    _check_measure(measure)
     if not 1 <= int(data["runs"]) <= MOST_RUNS:
         raise ValueError(f"expected 1 to {MOST_RUNS} runs, found {data['runs']}")
     return Provenance(
@@ -136,6 +138,16 @@ def parse_provenance(data: Any, place: Path) -> Provenance:
         facts={str(name): ConfigurationFacts(**of) for name, of in dict(data["configurations"]).items()},
         data=data,
     )
+
+
+def _check_measure(measure: dict[str, Any]) -> None:
+    """Raise ValueError where a key of `measure` has a value that no experiment gives it; unknown keys may be there."""
+    try:
+        Measure.model_validate(measure)
+    except ValidationError as error:
+        for wrong in error.errors(include_url=False, include_context=False):
+            if wrong["type"] != "extra_forbidden":
+                raise ValueError(f"measure.{'.'.join(map(str, wrong['loc']))}: {wrong['msg']}") from None
 
 
 def _parse_tags(log: Any) -> dict[str, str]:

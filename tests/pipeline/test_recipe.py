@@ -88,8 +88,8 @@ def inner(value: Any, at: str) -> Iterator[tuple[str, Any]]:
 
 OTHERS = ("configurations.another", "units.far", "pems.other", "links.spare")
 UNTOUCHED = {
-    "logs", "runs", "show", "sweep", "tags", "measure.began", "measure.horizon_s", "measure.exact", "measure.metrics",
-    "measure.by",
+    "logs", "runs", "show", "criteria", "sweep", "tags", "measure.began", "measure.horizon_s", "measure.exact",
+    "measure.metrics", "measure.by",
 }  # fmt: skip
 
 

@@ -197,8 +197,9 @@ def test_benchmarks_of_the_page(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     monkeypatch.syspath_prepend(ROOT / "tools")
     bench, common, compare = (importlib.import_module(n) for n in ("bench", "benches.common", "benches.compare"))
     monkeypatch.setattr(compare, "RUNS", 5)
-    monkeypatch.setattr(common, "spent", lambda command: common.Spent(1.0, 2.0, 3))
+    monkeypatch.setattr(common, "spent", lambda *command, **how: common.Spent(1.0, 2.0, 3))
     monkeypatch.setenv("COPEM_REPLAY_DATA", "nowhere")
-    bench.main([command.split()[-1] for command in in_a_line("python tools/bench.py ")])
+    for command in in_a_line("python tools/bench.py "):
+        bench.main(["--alone", command.split()[-1]])
     printed = {key for line in capsys.readouterr().out.splitlines() for key in json.loads(line)}
     assert printed >= {"pieces_overhead", "resume_cpu_s", "compare_peak_ratio", "crew"}

@@ -28,7 +28,7 @@ import calibrate_tc016d  # noqa: E402
 import lidar_visibility  # noqa: E402
 import make_logs  # noqa: E402
 import paper  # noqa: E402
-from benches import common, fit, fusion, long, memory, reading, scaling  # noqa: E402
+from benches import common, fit, fusion, long, memory, peers, reading, scaling  # noqa: E402
 
 
 def test_rank_correlation_and_area_under_the_curve_by_hand() -> None:
@@ -136,7 +136,7 @@ def test_benchmarks_print_json_lines(
 ) -> None:
     """How fast does not matter here: each is called once."""
     monkeypatch.setattr(common, "best", lambda work, times=5: common.timed(work).seconds)
-    bench.main([name])
+    bench.main(["--alone", name])
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     printed = {key for line in lines for key in line}
     assert keys <= printed
@@ -149,7 +149,7 @@ def test_benchmarks_print_json_lines(
 
 
 def test_a_benchmark_that_there_is_not() -> None:
-    with pytest.raises(SystemExit, match=r"^expected some of pieces, .*; found writting$"):
+    with pytest.raises(SystemExit, match=r"^expected some of compile, pieces, .*; found writting$"):
         bench.main(["paper", "writting"])
 
 
@@ -219,13 +219,19 @@ def test_stone_soup_is_a_peer_where_it_is_installed(once: None) -> None:
         assert line[f"{who}nearest_rmse_m"] < line[f"{who}gospa_m"]
 
 
-def test_without_stone_soup_a_line_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in [name for name in sys.modules if name.partition(".")[0] == "stonesoup"]:
+def test_without_peers_lines_say_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    libraries = {"gospa_vs_stonesoup": "stonesoup", "tracker_vs_stonesoup": "stonesoup",
+                 "tracker_vs_norfair": "norfair", "tracker_vs_filterpy": "filterpy",
+                 "matches_vs_motmetrics": "motmetrics", "matches_vs_trackeval": "trackeval"}  # fmt: skip
+    for name in [name for name in sys.modules if name.partition(".")[0] in libraries.values()]:
         monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, "stonesoup", None)
-    why = "stonesoup is not installed: pip install '.[bench]'"
-    assert list(fusion.gospa_vs_stonesoup()) == [{"gospa_vs_stonesoup": None, "why": why}]
-    assert list(fusion.tracker_vs_stonesoup()) == [{"tracker_vs_stonesoup": None, "why": why}]
+    for library in libraries.values():
+        monkeypatch.setitem(sys.modules, library, None)
+    found = {name: line for line in peers.peers() for name in libraries if name in line}
+    assert list(found) == list(libraries)
+    for name, line in found.items():
+        assert line[name] is None
+        assert "is not installed: see tools/benches/peers.py" in line["why"]
 
 
 def test_paper_counts_and_what_stands_beside_them() -> None:
