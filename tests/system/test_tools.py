@@ -208,11 +208,10 @@ def test_only_equal_results_are_raced(once: None, monkeypatch: pytest.MonkeyPatc
 def test_stone_soup_is_a_peer_where_it_is_installed(once: None) -> None:
     """GOSPA is equal; tracks are alike: about as many as objects, and near them."""
     pytest.importorskip("stonesoup")
-    (line,) = fusion.gospa_vs_stonesoup(5)
+    (line,) = peers.gospa_vs_stonesoup(5)
     assert line["gospa_vs_stonesoup"] > 0
     assert line["max_difference_m"] < 1e-9
-    (line,) = fusion.tracker_vs_stonesoup(1, 3)
-    assert line["tracker_vs_stonesoup"] > 0
+    (line,) = peers.tracker_vs_stonesoup(1, 3)  # how many times faster: not here, a first call compiles
     for who in ("", "stonesoup_"):
         assert 14 <= line[f"{who}tracks"] <= 20
         assert 0 < line[f"{who}nearest_rmse_m"] < 1
