@@ -1,0 +1,340 @@
+"""Causes: where the time goes until an object is known, cause by cause, on the same draws.
+
+A replay without any cause of lateness knows every object at its onset wherever there is a unit. Causes come back one by one, in
+the order in which they act (a chain); what is added is the share of each, so that shares sum to the mean time unknown. Beside it stands what
+would be gained if only that cause were gone, which does not sum. Definitions: docs/guide/why.md.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Container, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, reduce
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+
+from copem_replay.communication.latency import ConstantLatency
+from copem_replay.communication.link import ConstantLink, LinkModel
+from copem_replay.communication.radio import Radio
+from copem_replay.communication.reception import ConstantReception
+from copem_replay.core.errors import ExperimentError, unknown_name_message
+from copem_replay.core.tracks import TRUTH, Float, Tracks
+from copem_replay.core.view_geometry import ViewGeometry
+from copem_replay.experiment.schema import Configuration, Experiment
+from copem_replay.fusion.interface import IdealFusion
+from copem_replay.io.recording import Recording
+from copem_replay.metrics.config import Confirm
+from copem_replay.metrics.onset import select_counted
+from copem_replay.metrics.summary_metrics import compute_unknown_s
+from copem_replay.perception.pem.condition import Couple
+from copem_replay.perception.pem.detection import DetectionModel
+from copem_replay.perception.pem.model import Pem
+from copem_replay.perception.visibility import Observers, Statics, VisibilityModel
+from copem_replay.pipeline.prepare import Replay, prepare_log
+from copem_replay.pipeline.replay import cut_blocks, replay_block
+from copem_replay.pipeline.world import asks_for_path
+
+# What it is that is gone: an experiment of one configuration, without a cause.
+
+
+class _Clear(VisibilityModel):
+    """Nothing hides anything."""
+
+    kind: Literal["clear"] = "clear"
+
+    def shares(self, world: Tracks, static: Statics, observers: Observers) -> Float:
+        return np.ones((len(observers.carrier_ix), len(world.frame_ix)))
+
+
+class _Sure(DetectionModel):
+    """Listed wherever a model lists with any probability: where it never does is a limit of the sensor, and stays."""
+
+    kind: Literal["sure"] = "sure"
+    of: DetectionModel
+
+    def probability(self, view: ViewGeometry) -> Float:
+        return (self.of.probability(view) > 0).astype(float)
+
+
+def _change_units(experiment: Experiment, **values: Any) -> Experiment:
+    changed = {name: unit.model_copy(update=values) for name, unit in experiment.units.items()}
+    return experiment.model_copy(update={"units": changed})
+
+
+def _change_pems(experiment: Experiment, change: Callable[[Pem], Pem]) -> Experiment:
+    return experiment.model_copy(update={"pems": {name: change(pem) for name, pem in experiment.pems.items()}})
+
+
+def _change_couples(change: Callable[[Couple], Couple]) -> Callable[[Pem], Pem]:
+    return lambda pem: pem.model_copy(update={"couples": tuple(map(change, pem.couples))})
+
+
+def _change_links(experiment: Experiment, change: Callable[[Radio], Radio]) -> Experiment:
+    """The links of the configuration, named or its own, those of the user's own as they are."""
+
+    def changed(link: LinkModel) -> LinkModel:
+        return change(link) if isinstance(link, Radio) else link
+
+    links = {name: changed(link) for name, link in experiment.links.items()}
+    (name, one), *_ = experiment.configurations.items()
+    own = changed(one.link) if isinstance(one.link, LinkModel) else one.link
+    configurations = {name: one.model_copy(update={"link": own})}
+    return experiment.model_copy(update={"links": links, "configurations": configurations})
+
+
+def _change_configuration(experiment: Experiment, **values: Any) -> Experiment:
+    (name, one), *_ = experiment.configurations.items()
+    return experiment.model_copy(update={"configurations": {name: one.model_copy(update=values)}})
+
+
+def _change_measure(experiment: Experiment, **values: Any) -> Experiment:
+    return experiment.model_copy(update={"measure": experiment.measure.model_copy(update=values)})
+
+
+def _show_all(experiment: Experiment) -> Experiment:
+    return experiment.model_copy(update={"visibility": _Clear()})
+
+
+def _list_all_frames(experiment: Experiment) -> Experiment:
+    return _change_units(experiment, rate_hz=None, phase_s=0.0)
+
+
+def _widen(pem: Pem) -> Pem:
+    # Conditions that are dropped in place would let the first couple take what is of later ones: copies follow all.
+    wider = []
+    for couple in pem.couples:
+        if couple.when.range_m is None and couple.when.azimuth_deg is None:
+            continue
+        when = couple.when.model_copy(update={"range_m": None, "azimuth_deg": None})
+        wider.append(couple.model_copy(update={"when": when}))
+    return pem.model_copy(update={"couples": (*pem.couples, *wider)}) if wider else pem
+
+
+def _list_whatever_shows(couple: Couple) -> Couple:
+    return couple.model_copy(update={"detection": _Sure(of=couple.detection)})
+
+
+def _without_detection(memory: Any) -> Any:
+    return None if memory is None else {name: parts for name, parts in memory.items() if name != "detection"}
+
+
+def _forget(pem: Pem) -> Pem:
+    couples = [one.model_copy(update={"memory": _without_detection(one.memory)}) for one in pem.couples]
+    return pem.model_copy(update={"couples": tuple(couples), "memory": _without_detection(pem.memory)})
+
+
+def _send_at_once(experiment: Experiment) -> Experiment:
+    def change(link: Radio) -> Radio:
+        memory = {name: parts for name, parts in link.memory.items() if name != "latency"}
+        return link.model_copy(update={"latency": ConstantLatency(), "memory": memory})
+
+    return _change_configuration(_change_links(experiment, change), latency_s=0.0)
+
+
+def _lose_nothing(experiment: Experiment) -> Experiment:
+    def change(link: Radio) -> Radio:
+        memory = {name: parts for name, parts in link.memory.items() if name == "latency"}
+        return link.model_copy(update={"reception": ConstantReception(), "memory": memory})
+
+    return _change_links(experiment, change)
+
+
+def _fuse_ideally(experiment: Experiment) -> Experiment:
+    match = experiment.measure.match.model_copy(update={"always": False})
+    return _change_measure(_change_configuration(experiment, fusion=IdealFusion()), match=match)
+
+
+@dataclass(frozen=True)
+class Cause:
+    """Something that makes an object known later; `remove`: an experiment without it, of one configuration."""
+
+    name: str
+    group: str
+    words: str
+    remove: Callable[[Experiment], Experiment]
+
+
+CAUSES = (
+    Cause("hidden", "line of sight", "hidden by other bodies", _show_all),
+    Cause("rate", "unit", "between two lists of a unit", _list_all_frames),
+    Cause("outages", "unit", "outages of units", lambda e: _change_units(e, outages=None)),
+    Cause("range", "sensor", "out of range or view", lambda e: _change_pems(e, _widen)),
+    Cause("missed", "sensor", "in sight, and missed", lambda e: _change_pems(e, _change_couples(_list_whatever_shows))),
+    Cause("memory", "sensor", "missed in list after list", lambda e: _change_pems(e, _forget)),
+    Cause("processing", "unit", "processing of units", lambda e: _change_units(e, ready=None)),
+    Cause("sends", "radio", "left out by the sending rule", lambda e: _change_units(e, sends=None)),
+    Cause("queue", "radio", "waiting for the channel", lambda e: _change_links(e, lambda link: link.model_copy(update={"channel": None}))),
+    Cause("latency", "radio", "latency", _send_at_once),
+    Cause("loss", "radio", "lists lost", _lose_nothing),
+    Cause("ticks", "fusion", "waiting for the next fused list", lambda e: _change_configuration(e, issue_hz=None)),
+    Cause("fusion", "fusion", "fusion: association and its own confirmation", _fuse_ideally),
+    Cause("confirmation", "fusion", "confirmation by several lists", lambda e: _change_measure(e, confirm=Confirm())),
+    Cause("pose", "unit", "errors of pose and clock", lambda e: _change_units(e, placed=None, clock=None)),
+    Cause("ghosts", "fusion", "ghosts", lambda e: _change_pems(e, lambda pem: pem.model_copy(update={"ghosts": ()}))),
+)  # fmt: skip
+"""The causes in the order in which they act."""
+NO_UNIT = "no unit there"
+"""What is left without any cause: there is no unit, or it does not list its own carrier."""
+_OF_RECORDED = ("latency", "loss", "queue", "ticks", "fusion", "confirmation")
+"""Causes of a configuration with recorded units: what these would list otherwise is not known."""
+
+
+# The question: of one configuration, over the logs.
+
+
+def select_configuration(experiment: Experiment, name: str) -> Experiment:
+    """The experiment with one configuration, its units and nothing that a time of detection does not need.
+
+    Raises ExperimentError: there is none of this name, or it is the truth, a stack's recorded output, or its times may
+    begin before the onset.
+    """
+    if name not in experiment.configurations:
+        raise ExperimentError(unknown_name_message("configuration", name, experiment.configurations))
+    one = experiment.configurations[name]
+    if one.units == TRUTH or one.recorded is not None:
+        what = "is the truth, which is never late" if one.recorded is None else "is recorded: what made it is not known"
+        raise ExperimentError(f"configuration {name}: {what}; choose one with units")
+    if experiment.measure.count_earlier:
+        raise ExperimentError("measure.count_earlier: times may be negative then, which no cause explains; leave it out")
+    measure = {"accuracy": False, "exact": False, "by": (), "metrics": (), "conflict": None}
+    only = {
+        "configurations": {name: one}, "sweep": None, "show": None, "criteria": {}, "braking": None,
+        "measure": experiment.measure.model_copy(update=measure | {"distance_to": "ego"}),
+        "units": {unit: experiment.units[unit] for unit in experiment.units_of(one)},
+    }  # fmt: skip
+    pems, links = {unit.pem for unit in only["units"].values()}, {one.link_of(unit) for unit in only["units"] if isinstance(one.link_of(unit), str)}
+    used = {"pems": _keep(experiment.pems, pems), "links": _keep(experiment.links, links)}
+    return experiment.model_copy(update=only | used)
+
+
+def _keep(named: Mapping[str, Any], names: Container[str | None]) -> dict[str, Any]:
+    return {name: one for name, one in named.items() if name in names}
+
+
+def list_causes(experiment: Experiment) -> list[Cause]:
+    """The causes that act in an experiment of one configuration: without each of them it is another experiment.
+
+    Raises ExperimentError for a link of the user's own, whose latency and losses cannot be told apart.
+    """
+    (name, one), *_ = experiment.configurations.items()
+    for unit in experiment.units_of(one):
+        link = one.link_of(unit)
+        model = experiment.links[link] if isinstance(link, str) else link
+        if model is not None and not isinstance(model, Radio | ConstantLink):
+            kind = f"{type(model).__module__}:{type(model).__qualname__}"
+            raise ExperimentError(f"configuration {name}: {kind} is a link whose latency and losses are not told apart")
+    acting = [cause for cause in CAUSES if cause.remove(experiment) != experiment]
+    return [cause for cause in acting if cause.name in _OF_RECORDED] if experiment.recorded else acting
+
+
+# Replays on the same draws: units, seed and log keep their names, by which draws are addressed.
+
+
+class Counterfactuals:
+    """The time unknown of one configuration of one log, in replays without some causes.
+
+    Onsets and episodes are those of the experiment as it is, and so is the geometry of the radio: bodies that hide nothing from sensors are
+    still between a unit and the ego.
+    """
+
+    def __init__(self, recording: Recording, experiment: Experiment, name: str) -> None:
+        self._recording, self.only = recording, select_configuration(experiment, name)
+        self._whole = prepare_log(recording, experiment)
+        self._found: dict[str, Float] = {}
+
+    @cached_property
+    def rows(self) -> pd.DataFrame:
+        """The rows that count, as they are: log, run, object, `unknown_s` and what else `detections.parquet` has."""
+        return self._replay(self.only)
+
+    def unknown_s(self, gone: Sequence[Cause]) -> Float:
+        """(n,) seconds unknown of the rows that count without some causes; each replay is made once."""
+        experiment = reduce(lambda one, cause: cause.remove(one), gone, self.only)
+        key = experiment.model_dump_json()
+        if key not in self._found:
+            rows = self._replay(experiment)
+            same = rows[["run", "object_id", "onset_s"]].reset_index(drop=True)
+            if not same.equals(self.rows[["run", "object_id", "onset_s"]].reset_index(drop=True)):
+                raise AssertionError("expected the same episodes in every replay")
+            self._found[key] = rows["unknown_s"].to_numpy(dtype=float)
+        return self._found[key]
+
+    def _replay(self, experiment: Experiment) -> pd.DataFrame:
+        replay = self._prepare(experiment)
+        blocks = [replay_block(replay, experiment, runs) for runs in cut_blocks(replay, experiment, 1)]
+        rows = select_counted(pd.concat(blocks, ignore_index=True), experiment.measure.began)
+        length_s = (rows["ended_s"] - rows["onset_s"]).to_numpy(dtype=float)
+        time_s = rows["time_to_detection_s"].to_numpy(dtype=float)
+        return rows.assign(unknown_s=compute_unknown_s(time_s, length_s))
+
+    def _prepare(self, experiment: Experiment) -> Replay:
+        as_it_is = experiment.model_copy(update={"visibility": self.only.visibility})
+        replay = prepare_log(self._recording, as_it_is)
+        replay = replace(replay, episodes=self._whole.episodes, outside_ix=self._whole.outside_ix)
+        if experiment.visibility == self.only.visibility:
+            return replay
+        clear = replace(replay, expanded=replay.expanded.with_(experiment))
+        if asks_for_path(replay.expanded, replay.scene):
+            clear.__dict__["paths"] = replay.paths
+        return clear
+
+
+@dataclass(frozen=True)
+class CauseShares:
+    """Seconds of rows (n,) by cause: `added_s` in the chain, `gained_s` if only this cause were gone (None: left out)."""
+
+    cause: Cause | None  # None: no unit there
+    added_s: Float
+    gained_s: Float | None
+
+
+def share_lateness(replays: Counterfactuals) -> list[CauseShares]:
+    """What each acting cause adds to the time unknown of every row; the rows of `added_s` sum to it."""
+    causes = list_causes(replays.only)
+    known = replays.unknown_s(causes)
+    shares = [CauseShares(None, known, None)]
+    whole = replays.unknown_s(())
+    for k, cause in enumerate(causes):
+        later = replays.unknown_s(causes[k + 1 :])
+        gained_s = whole - replays.unknown_s([cause])
+        shares.append(CauseShares(cause, later - known, gained_s))
+        known = later
+    return shares
+
+
+def tabulate_causes(of_logs: Sequence[tuple[Counterfactuals, list[CauseShares]]]) -> pd.DataFrame:
+    """The rows of `why.csv`: of each cause the mean seconds over the rows of all logs, in the chain's order.
+
+    `error_s`: the standard error of `added_s` over the runs, of these recordings.
+    """
+    rows = pd.concat([replays.rows for replays, _ in of_logs], ignore_index=True)
+    names = dict.fromkeys(name_cause(one) for _, shares in of_logs for one in shares)
+    order = [NO_UNIT, *(cause.name for cause in CAUSES)]
+    table = []
+    for name in sorted(names, key=order.index):
+        found = [_find(shares, name) for _, shares in of_logs]
+        counts = [len(replays.rows) for replays, _ in of_logs]
+        added = np.concatenate([np.zeros(n) if one is None else one.added_s for one, n in zip(found, counts, strict=True)])
+        gains = [one.gained_s if one else np.zeros(n) for one, n in zip(found, counts, strict=True)]
+        cause = next(one.cause for one in found if one is not None)
+        by_run = pd.Series(added).groupby(rows["run"].to_numpy()).mean()
+        table.append({
+            "cause": name, "group": NO_UNIT if cause is None else cause.group,
+            "added_s": added.mean(),
+            "error_s": by_run.std(ddof=1) / math.sqrt(len(by_run)) if len(by_run) > 1 else math.nan,
+            "gained_s": math.nan if any(gain is None for gain in gains) else np.concatenate(gains).mean(),
+            "later_share": float((added < -1e-9).mean()),
+        })  # fmt: skip
+    return pd.DataFrame(table)
+
+
+def name_cause(share: CauseShares) -> str:
+    """The name of what a share is of."""
+    return NO_UNIT if share.cause is None else share.cause.name
+
+
+def _find(shares: Sequence[CauseShares], name: str) -> CauseShares | None:
+    return next((one for one in shares if name_cause(one) == name), None)
