@@ -246,6 +246,11 @@ class Counterfactuals:
         self._found: dict[str, Float] = {}
 
     @cached_property
+    def replay(self) -> Replay:
+        """The log as it is, made ready."""
+        return self._prepare(self.only)
+
+    @cached_property
     def rows(self) -> pd.DataFrame:
         """The rows that count, as they are: log, run, object, `unknown_s` and what else `detections.parquet` has."""
         return self._replay(self.only)
@@ -263,7 +268,7 @@ class Counterfactuals:
         return self._found[key]
 
     def _replay(self, experiment: Experiment) -> pd.DataFrame:
-        replay = self._prepare(experiment)
+        replay = self.replay if experiment is self.only else self._prepare(experiment)
         blocks = [replay_block(replay, experiment, runs) for runs in cut_blocks(replay, experiment, 1)]
         rows = select_counted(pd.concat(blocks, ignore_index=True), experiment.measure.began)
         length_s = (rows["ended_s"] - rows["onset_s"]).to_numpy(dtype=float)
