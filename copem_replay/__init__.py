@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from copem_replay.api.results import compare, judge, load_results, view, write_history, write_report
     from copem_replay.api.run import fused_tracks, observations, run
     from copem_replay.api.study import load_experiment
+    from copem_replay.api.why import Explanation, why
     from copem_replay.communication.latency import LatencyModel
     from copem_replay.communication.link import LinkModel, SentLists
     from copem_replay.communication.reception import RadioPath, ReceptionModel

@@ -1,8 +1,9 @@
 """Causes: where the time goes until an object is known, cause by cause, on the same draws.
 
-A replay without any cause of lateness knows every object at its onset wherever there is a unit. Causes come back one by one, in
-the order in which they act (a chain); what is added is the share of each, so that shares sum to the mean time unknown. Beside it stands what
-would be gained if only that cause were gone, which does not sum. Definitions: docs/guide/why.md.
+A replay without any cause of lateness knows every object at its onset wherever there is a unit. Causes come back one by
+one, in the order in which they act (a chain); what is added is the share of each, so that shares sum to the mean time
+unknown. Beside it stands what would be gained if only that cause were gone, which does not sum. Definitions:
+docs/guide/why.md.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from copem_replay.communication.reception import ConstantReception
 from copem_replay.core.errors import ExperimentError, unknown_name_message
 from copem_replay.core.tracks import TRUTH, Float, Tracks
 from copem_replay.core.view_geometry import ViewGeometry
-from copem_replay.experiment.schema import Configuration, Experiment
+from copem_replay.experiment.schema import Experiment
 from copem_replay.fusion.interface import IdealFusion
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.config import Confirm
@@ -64,11 +65,13 @@ def _change_units(experiment: Experiment, **values: Any) -> Experiment:
     return experiment.model_copy(update={"units": changed})
 
 
-def _change_pems(experiment: Experiment, change: Callable[[Pem], Pem]) -> Experiment:
+def change_pems(experiment: Experiment, change: Callable[[Pem], Pem]) -> Experiment:
+    """The experiment with all its PEMs changed."""
     return experiment.model_copy(update={"pems": {name: change(pem) for name, pem in experiment.pems.items()}})
 
 
-def _change_couples(change: Callable[[Couple], Couple]) -> Callable[[Pem], Pem]:
+def change_couples(change: Callable[[Couple], Couple]) -> Callable[[Pem], Pem]:
+    """A change of PEMs that changes all their couples."""
     return lambda pem: pem.model_copy(update={"couples": tuple(map(change, pem.couples))})
 
 
@@ -142,6 +145,10 @@ def _lose_nothing(experiment: Experiment) -> Experiment:
     return _change_links(experiment, change)
 
 
+def _widen_channel(experiment: Experiment) -> Experiment:
+    return _change_links(experiment, lambda link: link.model_copy(update={"channel": None}))
+
+
 def _fuse_ideally(experiment: Experiment) -> Experiment:
     match = experiment.measure.match.model_copy(update={"always": False})
     return _change_measure(_change_configuration(experiment, fusion=IdealFusion()), match=match)
@@ -161,19 +168,19 @@ CAUSES = (
     Cause("hidden", "line of sight", "hidden by other bodies", _show_all),
     Cause("rate", "unit", "between two lists of a unit", _list_all_frames),
     Cause("outages", "unit", "outages of units", lambda e: _change_units(e, outages=None)),
-    Cause("range", "sensor", "out of range or view", lambda e: _change_pems(e, _widen)),
-    Cause("missed", "sensor", "in sight, and missed", lambda e: _change_pems(e, _change_couples(_list_whatever_shows))),
-    Cause("memory", "sensor", "missed in list after list", lambda e: _change_pems(e, _forget)),
+    Cause("range", "sensor", "out of range or view", lambda e: change_pems(e, _widen)),
+    Cause("missed", "sensor", "in sight, and missed", lambda e: change_pems(e, change_couples(_list_whatever_shows))),
+    Cause("memory", "sensor", "missed in list after list", lambda e: change_pems(e, _forget)),
     Cause("processing", "unit", "processing of units", lambda e: _change_units(e, ready=None)),
     Cause("sends", "radio", "left out by the sending rule", lambda e: _change_units(e, sends=None)),
-    Cause("queue", "radio", "waiting for the channel", lambda e: _change_links(e, lambda link: link.model_copy(update={"channel": None}))),
+    Cause("queue", "radio", "waiting for the channel", _widen_channel),
     Cause("latency", "radio", "latency", _send_at_once),
     Cause("loss", "radio", "lists lost", _lose_nothing),
     Cause("ticks", "fusion", "waiting for the next fused list", lambda e: _change_configuration(e, issue_hz=None)),
     Cause("fusion", "fusion", "fusion: association and its own confirmation", _fuse_ideally),
     Cause("confirmation", "fusion", "confirmation by several lists", lambda e: _change_measure(e, confirm=Confirm())),
     Cause("pose", "unit", "errors of pose and clock", lambda e: _change_units(e, placed=None, clock=None)),
-    Cause("ghosts", "fusion", "ghosts", lambda e: _change_pems(e, lambda pem: pem.model_copy(update={"ghosts": ()}))),
+    Cause("ghosts", "fusion", "ghosts", lambda e: change_pems(e, lambda pem: pem.model_copy(update={"ghosts": ()}))),
 )  # fmt: skip
 """The causes in the order in which they act."""
 NO_UNIT = "no unit there"
@@ -198,19 +205,27 @@ def select_configuration(experiment: Experiment, name: str) -> Experiment:
         what = "is the truth, which is never late" if one.recorded is None else "is recorded: what made it is not known"
         raise ExperimentError(f"configuration {name}: {what}; choose one with units")
     if experiment.measure.count_earlier:
-        raise ExperimentError("measure.count_earlier: times may be negative then, which no cause explains; leave it out")
-    measure = {"accuracy": False, "exact": False, "by": (), "metrics": (), "conflict": None}
+        raise ExperimentError(
+            "measure.count_earlier: times may be negative then, which no cause explains; leave it out"
+        )
+    units = {unit: experiment.units[unit] for unit in experiment.units_of(one)}
+    links = [one.link_of(unit) for unit in units]
     only = {
-        "configurations": {name: one}, "sweep": None, "show": None, "criteria": {}, "braking": None,
-        "measure": experiment.measure.model_copy(update=measure | {"distance_to": "ego"}),
-        "units": {unit: experiment.units[unit] for unit in experiment.units_of(one)},
+        "configurations": {name: one}, "units": units,
+        "pems": _keep(experiment.pems, {unit.pem for unit in units.values()}),
+        "links": _keep(experiment.links, {link for link in links if isinstance(link, str)}),
     }  # fmt: skip
-    pems, links = {unit.pem for unit in only["units"].values()}, {one.link_of(unit) for unit in only["units"] if isinstance(one.link_of(unit), str)}
-    used = {"pems": _keep(experiment.pems, pems), "links": _keep(experiment.links, links)}
-    return experiment.model_copy(update=only | used)
+    return measure_times_only(experiment.model_copy(update=only))
 
 
-def _keep(named: Mapping[str, Any], names: Container[str | None]) -> dict[str, Any]:
+def measure_times_only(experiment: Experiment) -> Experiment:
+    """The experiment with nothing that a time of detection does not need."""
+    nothing: dict[str, Any] = {"sweep": None, "show": None, "criteria": {}, "braking": None}
+    measure = {"accuracy": False, "exact": False, "by": (), "metrics": (), "conflict": None, "distance_to": "ego"}
+    return experiment.model_copy(update=nothing | {"measure": experiment.measure.model_copy(update=measure)})
+
+
+def _keep(named: Mapping[str, Any], names: Container[Any]) -> dict[str, Any]:
     return {name: one for name, one in named.items() if name in names}
 
 
@@ -233,11 +248,19 @@ def list_causes(experiment: Experiment) -> list[Cause]:
 # Replays on the same draws: units, seed and log keep their names, by which draws are addressed.
 
 
+def replay_rows(replay: Replay, experiment: Experiment) -> pd.DataFrame:
+    """The rows that count, of all runs, with `unknown_s` beside the columns of `detections.parquet`."""
+    blocks = [replay_block(replay, experiment, runs) for runs in cut_blocks(replay, experiment, 1)]
+    rows = select_counted(pd.concat(blocks, ignore_index=True), experiment.measure.began)
+    length_s = (rows["ended_s"] - rows["onset_s"]).to_numpy(dtype=float)
+    return rows.assign(unknown_s=compute_unknown_s(rows["time_to_detection_s"].to_numpy(dtype=float), length_s))
+
+
 class Counterfactuals:
     """The time unknown of one configuration of one log, in replays without some causes.
 
-    Onsets and episodes are those of the experiment as it is, and so is the geometry of the radio: bodies that hide nothing from sensors are
-    still between a unit and the ego.
+    Onsets and episodes are those of the experiment as it is, and so is the geometry of the radio: bodies that hide
+    nothing from sensors are still between a unit and the ego.
     """
 
     def __init__(self, recording: Recording, experiment: Experiment, name: str) -> None:
@@ -269,11 +292,7 @@ class Counterfactuals:
 
     def _replay(self, experiment: Experiment) -> pd.DataFrame:
         replay = self.replay if experiment is self.only else self._prepare(experiment)
-        blocks = [replay_block(replay, experiment, runs) for runs in cut_blocks(replay, experiment, 1)]
-        rows = select_counted(pd.concat(blocks, ignore_index=True), experiment.measure.began)
-        length_s = (rows["ended_s"] - rows["onset_s"]).to_numpy(dtype=float)
-        time_s = rows["time_to_detection_s"].to_numpy(dtype=float)
-        return rows.assign(unknown_s=compute_unknown_s(time_s, length_s))
+        return replay_rows(replay, experiment)
 
     def _prepare(self, experiment: Experiment) -> Replay:
         as_it_is = experiment.model_copy(update={"visibility": self.only.visibility})
@@ -289,7 +308,7 @@ class Counterfactuals:
 
 @dataclass(frozen=True)
 class CauseShares:
-    """Seconds of rows (n,) by cause: `added_s` in the chain, `gained_s` if only this cause were gone (None: left out)."""
+    """Seconds of rows (n,) of a cause: `added_s` in the chain, `gained_s` if only it were gone (None: it cannot be)."""
 
     cause: Cause | None  # None: no unit there
     added_s: Float
@@ -322,15 +341,18 @@ def tabulate_causes(of_logs: Sequence[tuple[Counterfactuals, list[CauseShares]]]
     for name in sorted(names, key=order.index):
         found = [_find(shares, name) for _, shares in of_logs]
         counts = [len(replays.rows) for replays, _ in of_logs]
-        added = np.concatenate([np.zeros(n) if one is None else one.added_s for one, n in zip(found, counts, strict=True)])
-        gains = [one.gained_s if one else np.zeros(n) for one, n in zip(found, counts, strict=True)]
+        added = np.concatenate(
+            [np.zeros(n) if one is None else one.added_s for one, n in zip(found, counts, strict=True)]
+        )
+        gains = [np.zeros(n) if one is None else one.gained_s for one, n in zip(found, counts, strict=True)]
+        known = [gain for gain in gains if gain is not None]
         cause = next(one.cause for one in found if one is not None)
         by_run = pd.Series(added).groupby(rows["run"].to_numpy()).mean()
         table.append({
             "cause": name, "group": NO_UNIT if cause is None else cause.group,
             "added_s": added.mean(),
             "error_s": by_run.std(ddof=1) / math.sqrt(len(by_run)) if len(by_run) > 1 else math.nan,
-            "gained_s": math.nan if any(gain is None for gain in gains) else np.concatenate(gains).mean(),
+            "gained_s": np.concatenate(known).mean() if len(known) == len(gains) else math.nan,
             "later_share": float((added < -1e-9).mean()),
         })  # fmt: skip
     return pd.DataFrame(table)

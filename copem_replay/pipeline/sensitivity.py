@@ -1,8 +1,9 @@
 """Sensitivity: how much the answer hangs on the perception error models, configuration by configuration.
 
-The study is replayed with the odds p / (1 − p) of every detection halved and doubled, with memory of detection that lasts twice as long, and
-with errors 1.5 times as large where a fusion goes by them. A change of order of two configurations counts where both differences, as
-it is and as it is varied, are beyond two standard errors of the pairs of runs. p = 0 and p = 1 do not move by odds. docs/guide/why.md
+The study is replayed with the odds p / (1 − p) of every detection halved and doubled, with memory of detection that
+lasts twice as long, and with errors 1.5 times as large where a fusion goes by them. A change of order of two
+configurations counts where both differences, as it is and as it is varied, are beyond two standard errors of the pairs
+of runs. p = 0 and p = 1 do not move by odds. docs/guide/why.md
 """
 
 from __future__ import annotations
@@ -23,15 +24,13 @@ from copem_replay.core.view_geometry import Errors, Noise, ViewGeometry
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.exact_survival import scale_odds
-from copem_replay.metrics.onset import select_counted
-from copem_replay.metrics.summary_metrics import compute_unknown_s
 from copem_replay.perception.pem.condition import Couple
 from copem_replay.perception.pem.detection import DetectionModel
 from copem_replay.perception.pem.error import ErrorModel
 from copem_replay.perception.pem.model import Pem
+from copem_replay.pipeline.causes import change_couples, change_pems, measure_times_only, replay_rows
 from copem_replay.pipeline.expansion import find_facts
 from copem_replay.pipeline.prepare import prepare_log
-from copem_replay.pipeline.replay import cut_blocks, replay_block
 
 AS_IT_IS = "as it is"
 _BEYOND = 2.0
@@ -64,18 +63,11 @@ class _WiderErrors(ErrorModel):
         return replace(errors, **wider)
 
 
-def _change_couples(experiment: Experiment, change: Callable[[Couple], Couple]) -> Experiment:
-    def changed(pem: Pem) -> Pem:
-        return pem.model_copy(update={"couples": tuple(map(change, pem.couples))})
-
-    return experiment.model_copy(update={"pems": {name: changed(pem) for name, pem in experiment.pems.items()}})
-
-
 def _scale_odds(odds: float) -> Callable[[Experiment], Experiment]:
     def change(couple: Couple) -> Couple:
         return couple.model_copy(update={"detection": _ScaledOdds(of=couple.detection, odds=odds)})
 
-    return lambda experiment: _change_couples(experiment, change)
+    return lambda experiment: change_pems(experiment, change_couples(change))
 
 
 def _widen_errors(experiment: Experiment) -> Experiment:
@@ -86,7 +78,7 @@ def _widen_errors(experiment: Experiment) -> Experiment:
         wider = None if couple.error is None else _WiderErrors(of=couple.error, factor=1.5)
         return couple.model_copy(update={"error": wider})
 
-    return _change_couples(experiment, change)
+    return change_pems(experiment, change_couples(change))
 
 
 def _remember_longer(experiment: Experiment) -> Experiment:
@@ -94,7 +86,9 @@ def _remember_longer(experiment: Experiment) -> Experiment:
         if memory is None or "detection" not in memory:
             return memory
         parts = [
-            part if isinstance(part.correlation_s, str) else part.model_copy(update={"correlation_s": 2 * part.correlation_s})
+            part
+            if isinstance(part.correlation_s, str)
+            else part.model_copy(update={"correlation_s": 2 * part.correlation_s})
             for part in memory["detection"]
         ]
         return {**memory, "detection": tuple(parts)}
@@ -103,7 +97,7 @@ def _remember_longer(experiment: Experiment) -> Experiment:
         couples = [couple.model_copy(update={"memory": longer(couple.memory)}) for couple in pem.couples]
         return pem.model_copy(update={"couples": tuple(couples), "memory": longer(pem.memory)})
 
-    return experiment.model_copy(update={"pems": {name: changed(pem) for name, pem in experiment.pems.items()}})
+    return change_pems(experiment, changed)
 
 
 VARIATIONS: dict[str, Callable[[Experiment], Experiment]] = {
@@ -137,30 +131,26 @@ def _select_modelled(experiment: Experiment) -> Experiment:
         if one.recorded is None and one.units != TRUTH and not set(experiment.units_of(one)) & set(experiment.recorded)
     }
     if len(configurations) < 2:
-        raise ExperimentError("sensitivity: expected two configurations with modelled units, found fewer: there is no order")
-    measure = {"accuracy": False, "exact": False, "by": (), "metrics": (), "conflict": None}
-    nothing = {"sweep": None, "show": None, "criteria": {}, "braking": None}
-    return experiment.model_copy(
-        update=nothing | {"configurations": configurations, "measure": experiment.measure.model_copy(update=measure)}
-    )
+        raise ExperimentError(
+            "sensitivity: expected two configurations with modelled units, found fewer: there is no order"
+        )
+    return measure_times_only(experiment.model_copy(update={"configurations": configurations}))
 
 
 def _replay(recording: Recording, experiment: Experiment) -> pd.DataFrame:
-    replay = prepare_log(recording, experiment)
-    blocks = [replay_block(replay, experiment, runs) for runs in cut_blocks(replay, experiment, 1)]
-    rows = select_counted(pd.concat(blocks, ignore_index=True), experiment.measure.began)
-    length_s = (rows["ended_s"] - rows["onset_s"]).to_numpy(dtype=float)
-    unknown_s = compute_unknown_s(rows["time_to_detection_s"].to_numpy(dtype=float), length_s)
-    return rows[["configuration", "run"]].assign(unknown_s=unknown_s)
+    return replay_rows(prepare_log(recording, experiment), experiment)[["configuration", "run", "unknown_s"]]
 
 
 def compare_orders(varied: pd.DataFrame) -> pd.DataFrame:
     """Of each variation the pairs of configurations whose order is another, with both differences and their errors.
 
-    Rows: variation, better, worse (as it is), `difference_s`, `error_s` as it is, `varied_s`, `varied_error_s`, and `beyond`: both beyond two
-    standard errors over the runs. A difference without an error (one run) is never beyond.
+    Rows: variation, better, worse (as it is), `difference_s`, `error_s` as it is, `varied_s`, `varied_error_s`, and
+    `beyond`: both beyond two standard errors over the runs. A difference without an error (one run) is never beyond.
     """
-    by_run = {name: of.pivot(index="run", columns="configuration", values="unknown_s") for name, of in varied.groupby("variation")}
+    by_run = {
+        name: of.pivot(index="run", columns="configuration", values="unknown_s")
+        for name, of in varied.groupby("variation")
+    }
     base, rows = by_run.pop(AS_IT_IS), []
     for variation, table in by_run.items():
         for one, other in combinations(base.columns, 2):
@@ -190,7 +180,7 @@ def describe_orders(varied: pd.DataFrame, orders: pd.DataFrame) -> list[str]:
         of = orders[orders["variation"] == variation]
         sure = of[of["beyond"]]
         kept = f"{variation}: the order of {pairs - len(sure)} of {pairs} pairs stays"
-        unsure = f" ({len(of) - len(sure)} differ by less than chance)" if len(of) > len(sure) else ""
+        unsure = f" ({len(of) - len(sure)} more change places within chance)" if len(of) > len(sure) else ""
         told = [f"{row.better} falls behind {row.worse}" for row in sure.itertuples()]
         lines.append(kept + unsure + (f"; {', '.join(told)}" if told else ""))
     return lines

@@ -1,8 +1,9 @@
 """Triage: late episodes of a configuration in groups that have one story, ranked by the seconds that they cost.
 
-An episode is late where its object is unknown for more than a second. Its cause is the one that adds most in the chain (`pipeline/causes.py`);
-a group is a drive, a cause, and what hides the object, or else on which side of the ego it is. An episode is late by structure where it
-stays late although nothing in sight is missed, else by chance. Definitions: docs/guide/why.md.
+An episode is late where its object is unknown for more than a second. Its cause is the one that adds most in the chain
+(`pipeline/causes.py`); a group is a drive, a cause, and what hides the object, or else on which side of the ego it is.
+An episode is late by structure where it stays late although nothing in sight is missed, else by chance. Definitions:
+docs/guide/why.md.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from copem_replay.pipeline.causes import CAUSES, CauseShares, Counterfactuals, n
 from copem_replay.pipeline.prepare import Replay
 
 LATE_S = 1.0
-"""An episode that is unknown for longer is late: four fifths of all seconds are in these, on fourteen recorded drives."""
+"""An episode that is unknown for longer is late: on fourteen recorded drives, four fifths of all seconds."""
 _MOST_LATE = 0.05
 """Episodes that are late in a larger share of the runs are in the groups."""
 _SENSED = ("hidden", "rate", "outages", "range", "missed", "memory")
@@ -31,8 +32,8 @@ EPISODE = ["log", "object_id", "episode"]
 def tabulate_episodes(replays: Counterfactuals, shares: Sequence[CauseShares], late_s: float = LATE_S) -> pd.DataFrame:
     """A row for each episode of a log: the means over runs of its seconds, in all and by cause, and what became of it.
 
-    `late_share`, `never_share`: of the runs; `structural_share`: late although nothing is missed; `hopeless_share`: not known in time even
-    if every list of every unit held it. `cause`: the one that adds most.
+    `late_share`, `never_share`: of the runs; `structural_share`: late although nothing is missed; `hopeless_share`: not
+    known in time even if every list of every unit held it. `cause`: the one that adds most.
     """
     rows, gone = replays.rows, [one.cause for one in shares if one.cause is not None]
     unknown_s, length_s = rows["unknown_s"].to_numpy(), (rows["ended_s"] - rows["onset_s"]).to_numpy(dtype=float)
@@ -74,8 +75,8 @@ def group_late_episodes(
 
 
 COLUMNS = [
-    "log", "cause", "where", "episodes", "objects", "lost_s", "never_share", "structural_share", "example", "example_class",
-    "example_onset_s",
+    "log", "cause", "where", "episodes", "objects", "lost_s", "never_share", "structural_share", "example",
+    "example_class", "example_onset_s",
 ]  # fmt: skip
 
 
@@ -151,7 +152,7 @@ def describe_cause(name: str) -> str:
 
 
 def describe_episode(episode: pd.Series) -> str:
-    """One sentence on why an object is late: `1.9 s late: 1.2 hidden by bus 12, .5 latency`; parts below .05 s are left out."""
+    """Why an object is late: `1.9 s late: 1.2 hidden by bus 12, 0.5 latency`; parts below .05 s are left out."""
     parts = []
     for cause in CAUSES:
         added_s = float(episode.get(f"added {cause.name}", 0.0))

@@ -1,11 +1,13 @@
-"""Worth of units: how many seconds each unit spares, fairly shared, beside what it spares alone and what is lost without it.
+"""Worth of units: how many seconds each unit spares, as a fair share, alone, and by what is lost without it.
 
-The value of a set of units is the mean time unknown that it spares (`unknown_s`, docs/guide/metrics.md). Shares are Shapley's: the mean of what a
-unit adds, over all orders in which units may come. The ego's own unit is given, as a world without any unit decides nothing.
+The value of a set of units is the mean time unknown that it spares (`unknown_s`, docs/guide/metrics.md). Shares are
+Shapley's: the mean of what a unit adds, over all orders in which units may come. The ego's own unit is given, as a
+world without any unit decides nothing.
 
-Where units are independent, a set knows an object later than t with the product of the probabilities of its units, and Shapley's sum is an
-integral of a polynomial, which Gauss and Legendre's ⌈n/2⌉ nodes give exactly (Owen's multilinear extension): no set is replayed. Elsewhere all
-sets are, on the same draws, up to eight units. Definitions: docs/guide/why.md.
+Where units are independent, a set knows an object later than t with the product of the probabilities of its units, and
+Shapley's sum is an integral of a polynomial, which Gauss and Legendre's ⌈n/2⌉ nodes give exactly (Owen's multilinear
+extension): no set is replayed. Elsewhere all sets are, on the same draws, up to eight units. Definitions:
+docs/guide/why.md.
 """
 
 from __future__ import annotations
@@ -19,24 +21,22 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from copem_replay.core.errors import ExperimentError, count_noun, unknown_name_message
+from copem_replay.core.errors import ExperimentError, unknown_name_message
 from copem_replay.core.tracks import Float
-from copem_replay.experiment.schema import Configuration, Experiment
+from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.onset import select_counted
-from copem_replay.metrics.summary_metrics import compute_unknown_s
-from copem_replay.pipeline.causes import select_configuration
+from copem_replay.pipeline.causes import replay_rows, select_configuration
 from copem_replay.pipeline.closed_form import exact_table
 from copem_replay.pipeline.expansion import find_facts
-from copem_replay.pipeline.prepare import Replay, prepare_log
-from copem_replay.pipeline.replay import cut_blocks, replay_block
+from copem_replay.pipeline.prepare import prepare_log
 
 MOST_UNITS = 8
 """Units of which all sets are replayed: 255 configurations."""
 
 
 class UnitCurves(NamedTuple):
-    """Of one episode the probabilities `unknown (U, K)` that each unit does not know it, in spans of `length_s (K,)`."""
+    """Of one episode the probability `unknown (U, K)` that each unit does not know it, in spans of `length_s (K,)`."""
 
     length_s: Float
     unknown: Float
@@ -71,8 +71,9 @@ def compute_unit_worths(
 ) -> UnitWorths:
     """The worth of the units of a configuration, of its rows in all logs, each with the experiment of the log.
 
-    `units`: only these are asked about, the others are given; None: all but the one aboard the ego. Raises ExperimentError for a unit that the
-    configuration has not, and for more than `MOST_UNITS` where times have no closed form.
+    `units`: only these are asked about, the others are given; None: all but the one aboard the ego. Raises
+    ExperimentError for a unit that the configuration has not, and for more than `MOST_UNITS` where times have no closed
+    form.
     """
     only = [(recording, select_configuration(experiment, name)) for recording, experiment in logs]
     first = only[0][1]
@@ -82,7 +83,9 @@ def compute_unit_worths(
             raise ExperimentError(f"configuration {name}: {unknown_name_message('unit', unit, members)}")
     asked = tuple(units or (unit for unit in members if first.units[unit].on != "ego"))
     if not asked:
-        raise ExperimentError(f"configuration {name}: expected a unit beside the ego's, found {', '.join(members)} alone")
+        raise ExperimentError(
+            f"configuration {name}: expected a unit beside the ego's, found {', '.join(members)} alone"
+        )
     given = tuple(unit for unit in members if unit not in asked)
     if all(_is_product(experiment, name) for _, experiment in only):
         try:
@@ -159,7 +162,13 @@ def share_by_curves(units: Sequence[str], curves: Sequence[UnitCurves]) -> UnitW
     alone_s, count = (1 - q) @ length_s, len(curves)
     given_s, all_s = length_s.sum(), q.prod(axis=0) @ length_s
     return UnitWorths(
-        tuple(units), share_s / count, alone_s / count, left_out_s / count, given_s / count, all_s / count, by_curves=True
+        tuple(units),
+        share_s / count,
+        alone_s / count,
+        left_out_s / count,
+        given_s / count,
+        all_s / count,
+        by_curves=True,
     )
 
 
@@ -179,20 +188,14 @@ def _replay_sets(
             if units:
                 configurations[str(number)] = experiment.configurations[name].model_copy(update={"units": units})
         several = experiment.model_copy(update={"configurations": configurations})
-        replay = prepare_log(recording, several)
-        for runs in cut_blocks(replay, several, 1):
-            rows = select_counted(replay_block(replay, several, runs), several.measure.began)
-            length_s = (rows["ended_s"] - rows["onset_s"]).to_numpy(dtype=float)
-            rows = rows.assign(
-                unknown_s=compute_unknown_s(rows["time_to_detection_s"].to_numpy(dtype=float), length_s), length_s=length_s
-            )
-            for number, of_set in rows.groupby("configuration", sort=False):
-                total_s[sets[int(str(number))]] += of_set["unknown_s"].sum()
-                count[sets[int(str(number))]] += len(of_set)
-            if not given:  # nothing is ever known without a unit
-                of_one = rows[rows["configuration"] == "1"]
-                total_s[frozenset()] += of_one["length_s"].sum()
-                count[frozenset()] += len(of_one)
+        rows = replay_rows(prepare_log(recording, several), several)
+        for number, of_set in rows.groupby("configuration", sort=False):
+            total_s[sets[int(str(number))]] += of_set["unknown_s"].sum()
+            count[sets[int(str(number))]] += len(of_set)
+        if not given:  # nothing is ever known without a unit
+            of_one = rows[rows["configuration"] == "1"]
+            total_s[frozenset()] += (of_one["ended_s"] - of_one["onset_s"]).sum()
+            count[frozenset()] += len(of_one)
     return {some: total_s[some] / count[some] for some in sets}
 
 
