@@ -78,6 +78,7 @@ __all__ = [
     "Errors",
     "Experiment",
     "ExperimentError",
+    "Explanation",
     "FittedPem",
     "FusedTracks",
     "Inbox",
@@ -128,6 +129,7 @@ __all__ = [
     "read_recordings",
     "run",
     "view",
+    "why",
     "write_history",
     "write_report",
 ]
@@ -139,6 +141,7 @@ _PLACES = {
     "api.results": "compare judge load_results view write_history write_report",
     "api.run": "fused_tracks observations run",
     "api.study": "load_experiment",
+    "api.why": "Explanation why",
     "communication.latency": "LatencyModel",
     "communication.link": "LinkModel SentLists",
     "communication.reception": "RadioPath ReceptionModel",

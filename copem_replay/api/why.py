@@ -71,6 +71,8 @@ class Explanation:
         if self.triage is not None:
             for name, of in self.triage.groupby("configuration", sort=False):
                 yield _describe_groups(str(name), of)
+            if not len(self.triage):
+                yield ["no object is unknown for more than 1 s in one run of twenty or more"]
         if self.sensitivity is not None and self.orders is not None:
             from copem_replay.pipeline.sensitivity import describe_orders
 
@@ -167,8 +169,7 @@ def _explain_configuration(
         yield from attempt("causes", lambda: tabulate_causes(shares))
     if "triage" in parts:
         groups = [group_late_episodes(replays, of)[0] for replays, of in shares]
-        if groups := [of for of in groups if len(of)]:
-            yield "triage", rank_groups(pd.concat(groups, ignore_index=True))
+        yield "triage", rank_groups(pd.concat([of for of in groups if len(of)] or groups[:1], ignore_index=True))
     if "units" in parts:
         yield from attempt("units", lambda: compute_unit_worths(logs, name, units).table)
 

@@ -19,7 +19,7 @@ try:  # an interrupt during the imports, too, ends without a traceback
 
     import typer
 
-    from copem_replay.cli import convert, fit, inspect, results, run, why
+    from copem_replay.cli import convert, fit, inspect, results, run
     from copem_replay.cli.terminal import print_problems
     from copem_replay.core.compiled import cache_note, recompiled_note
     from copem_replay.core.errors import CopemError, InputError
@@ -60,7 +60,7 @@ for command in (
     run.run,
     fit.fit,
     results.compare,
-    why.why,
+    run.why,
     results.verdict,
     results.history,
     results.plot,
