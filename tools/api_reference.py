@@ -31,9 +31,9 @@ What is not on this page is private and may change in any release.
 """
 GROUPS = {
     "Experiments and recordings": "load_experiment read_recordings read_recording inspect_recording draft_experiment",
-    "Runs": "run observations fused_tracks FusedTracks read_lists",
+    "Runs": "run observations fused_tracks FusedTracks read_lists why Explanation",
     "Fits": "fit FittedPem",
-    "Results": "load_results Results compare Comparison judge Judgement write_report write_history view why Explanation",
+    "Results": "load_results Results compare Comparison judge Judgement write_report write_history view",
     "Figures": "plot",
     "Keys of an experiment": "Experiment Unit Configuration Measure Onset",
     "Data": "Recording Scene Tracks ObjectLists Inputs Inbox entries_of ViewGeometry Errors CLASSES",
