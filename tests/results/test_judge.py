@@ -147,6 +147,14 @@ def test_objects_and_logs_together_are_the_objects_of_these_logs(several: Path) 
         assert judged(several, **asked, **narrowed)["half"].n == rows
 
 
+def test_what_is_the_same_in_all_logs_may_be_refuted_and_is_never_shown(several: Path) -> None:
+    """In three equal logs all are known half a second after the onset: how logs differ is not seen."""
+    for bound, word in ((0.6, UNDECIDED), (0.4, NOT_MET)):
+        one = judged(several, metric="unknown_s", at_most=bound, configurations=["late"])["late"]
+        assert one.estimate == pytest.approx(0.5)
+        assert (one.verdict, one.passes, one.why) == (word, False, "the same throughout, so how it varies is not known")
+
+
 def test_identical_results_are_not_refuted(several: Path, tmp_path: Path) -> None:
     logs = [f"drive{k}.mcap" for k in range(3)]
     again = replayed(tmp_path, changed((LOGS, f"logs: [{', '.join(logs)}]")), *logs)
