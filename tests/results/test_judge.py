@@ -17,6 +17,7 @@ import copem_replay as cr
 from copem_replay.metrics.figure_limits import JUDGED, PER_MINUTE, SUMMED, FigureRows, RowClusters
 from copem_replay.metrics.intervals import limit_share_of_runs
 from copem_replay.results.compare import compare_folders
+from copem_replay.results.judge import find_clusters
 from copem_replay.results.read import Results, read_results
 from copem_replay.results.verdicts import (
     MET,
@@ -129,6 +130,31 @@ def test_few_runs_of_several_objects_decide_nothing(several: Path) -> None:
         assert "6 runs, fewer than 30" in one.why or one.interval == "nothing drawn"
 
 
+def test_criteria_that_differ_in_their_population_alone_are_judged_each_by_its_own(several: Path) -> None:
+    asked: dict[str, Any] = {"metric": "detected_share", "at_least": 0.5, "configurations": ["half"]}
+    of_runs = {"runs": asked | {"population": "these_logs"}}
+    for criteria in ({"traffic": asked} | of_runs, of_runs | {"traffic": asked}):
+        found = {one.criterion: one for one in cr.judge(several, criteria).all}
+        assert (found["traffic"].over, found["traffic"].clusters) == ("logs", 3)
+        assert (found["runs"].over, found["runs"].why) == (None, "6 runs, fewer than 30: `runs: 30` or more")
+
+
+def test_objects_and_logs_together_are_the_objects_of_these_logs(several: Path) -> None:
+    """Six runs: of one of two objects in one of three logs 6 rows, of both 12, of one in all logs 18."""
+    asked: dict[str, Any] = {"metric": "detected_share", "at_least": 0.5, "configurations": ["half"]}
+    one, here = {"objects": {"ids": ["2"]}}, {"logs": ["drive1"]}
+    for narrowed, rows in ((one | here, 6), (here, 12), (one, 18), ({}, 36)):
+        assert judged(several, **asked, **narrowed)["half"].n == rows
+
+
+def test_what_is_the_same_in_all_logs_may_be_refuted_and_is_never_shown(several: Path) -> None:
+    """In three equal logs all are known half a second after the onset: how logs differ is not seen."""
+    for bound, word in ((0.6, UNDECIDED), (0.4, NOT_MET)):
+        one = judged(several, metric="unknown_s", at_most=bound, configurations=["late"])["late"]
+        assert one.estimate == pytest.approx(0.5)
+        assert (one.verdict, one.passes, one.why) == (word, False, "the same throughout, so how it varies is not known")
+
+
 def test_identical_results_are_not_refuted(several: Path, tmp_path: Path) -> None:
     logs = [f"drive{k}.mcap" for k in range(3)]
     again = replayed(tmp_path, changed((LOGS, f"logs: [{', '.join(logs)}]")), *logs)
@@ -218,6 +244,36 @@ def test_a_quantile_is_judged_as_a_share() -> None:
     assert (median.value, judge_limits(median.low, median.high, 1.0, "at_most")) == (0.5, MET)
     never = rows_of([None] * 12, [f"{k:02}" for k in range(12)]).limit_time_quantile(0.5, 0.95, 1.0)
     assert (never.value, judge_limits(never.low, never.high, 1.0, "at_most")) == (math.inf, NOT_MET)
+
+
+@pytest.mark.parametrize(
+    ("runs", "objects", "why"),
+    [
+        (29, 2, "29 runs, fewer than 30: `runs: 30` or more"), (30, 2, ""), (2, 1, ""),
+        (1, 1, "1 run, fewer than 30: `runs: 30` or more"),
+    ],
+)  # fmt: skip
+def test_thirty_runs_of_several_objects_or_two_of_one_have_an_interval(runs: int, objects: int, why: str) -> None:
+    pairs = [(run, str(one)) for run in range(runs) for one in range(objects)]
+    table = pd.DataFrame(pairs, columns=["run", "object_id"]).assign(log="drive")
+    clusters, said = find_clusters(table, of_runs=True)
+    assert said == why
+    assert (clusters is None) == bool(why)
+    if clusters is not None:
+        assert (clusters.over, len(clusters.weights), clusters.looks) == ("runs", runs, objects)
+
+
+def test_who_is_known_at_the_very_bound_is_known_by_it() -> None:
+    """12 logs of an object each: 11 known after 1 s, 90 m away, one after 4 s, 60 m away."""
+    rows = rows_of([1.0] * 11 + [4.0], [f"{k:02}" for k in range(12)])
+    share = rows.limit_share(np.array([1.0] * 11 + [0.0]), 0.95)
+    for within, bound in ((rows.limit_time_quantile, 1.0), (rows.limit_distance_quantile, 90.0)):
+        found = within(0.5, 0.95, bound)
+        assert found.value == bound
+        assert found.share == pytest.approx((share.low, share.high), abs=1e-9)
+    nobody = rows.limit_distance_quantile(0.5, 0.95, 90.0 + 1e-6).share
+    assert nobody is not None
+    assert nobody[0] == 0.0
 
 
 # ------------------------------------------------------------------------------------------ properties

@@ -192,3 +192,20 @@ def test_never_is_said_of_a_quantile_that_is_not_reached() -> None:
     one = verdict(NOT_MET, estimate=None)
     assert (one.found, one.limits) == ("never", "[0.6, –]")
     assert judge_limits(0.6, math.inf, 0.5, "at_most") == NOT_MET
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "word"),
+    [
+        (0.1, 0.5, MET),
+        (0.1, 0.5 + 5e-10, MET),  # times are whole nanoseconds: it is the bound
+        (0.1, 0.5 + 2e-9, UNDECIDED),
+        (0.5, 0.5, MET),
+        (0.5, 0.6, UNDECIDED),
+        (0.5 + 5e-10, 0.6, UNDECIDED),
+        (0.5 + 2e-9, 0.6, NOT_MET),
+    ],
+)
+def test_a_limit_at_the_bound_keeps_it(low: float, high: float, word: str) -> None:
+    assert judge_limits(low, high, 0.5, "at_most") == word
+    assert judge_limits(1 - high, 1 - low, 0.5, "at_least") == word
