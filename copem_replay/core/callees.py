@@ -36,6 +36,10 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]  # Numba has no types
         self.callee = _Callee(function, targetoptions={**options, **_NO_WRAPPERS}, pipeline_class=_CalleeCompiler)
         self.enable_caching()
 
+    def compile(self, sig: Any) -> Any:
+        """What Python calls, for arguments of these types."""
+        return _call_in_room(super().compile, sig)
+
     def get_call_template(self, args: tuple[Any, ...], kws: Mapping[str, Any]) -> Any:
         """What a caller has to know of the function to be called."""
         return self.callee.get_call_template(args, kws)
@@ -43,6 +47,16 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]  # Numba has no types
     def get_overload(self, sig: Any) -> Any:
         """What a caller calls."""
         return self.callee.get_overload(sig)
+
+
+def _call_in_room(function: Callable[[Any], Any], argument: Any) -> Any:
+    # Python has frames in pieces of 16 KiB, and gives a piece back as soon as the one frame in it ends. Where calls go
+    # to and fro over the end of a piece, which compiling does a million times, each asks the system for memory.
+    return function(argument)
+
+
+# A frame as deep as this gets a piece of 1 MiB, the rest of which is for the frames of what it calls.
+_call_in_room.__code__ = _call_in_room.__code__.replace(co_stacksize=70_000)
 
 
 class _Callee(CPUDispatcher):  # type: ignore[misc]
