@@ -15,13 +15,17 @@ docs/develop/decisions/0052-code-of-callees.md
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
+from numba import types
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
 from numba.core.event import Event, Listener, register
 from numba.core.registry import CPUDispatcher
+from numba.core.targetconfig import TargetConfig
+from numba.core.types.functions import BaseFunction
 from numba.core.types.misc import unliteral
 
 _NO_WRAPPERS = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
@@ -90,6 +94,49 @@ class _CalleeLibrary(JITCodeLibrary):  # type: ignore[misc]
     def codegen(self) -> Any:
         # Numba puts the environment of a function into its machine code, to no use in nopython mode.
         return SimpleNamespace(set_env=lambda name, environment: None)
+
+
+# What an operator makes of which types, Numba asks anew at each place in each function. Most implementations refuse,
+# and each refusal is looked up by the whole configuration of the compiler. Here it is asked once.
+
+
+def _resolve_once(resolve: Callable[..., Any]) -> Callable[..., Any]:
+    """`BaseFunction.get_call_type`, asked once for the same plain types.
+
+    What overloads a function in Python depends on options of compiling, too, and is asked for each time.
+    """
+    known: dict[Any, Any] = {}
+
+    def resolve_once(self: Any, context: Any, args: tuple[Any, ...], kws: Mapping[str, Any]) -> Any:
+        if kws or not all(isinstance(kind, _PLAIN) for kind in args):
+            return resolve(self, context, args, kws)
+        key = self, context, tuple(args)
+        if key not in known:
+            signature = resolve(self, context, args, kws)
+            if signature is None or self.get_impl_key(signature) != self.typing_key:
+                return signature
+            known[key] = signature
+        return known[key]
+
+    return resolve_once
+
+
+_PLAIN = types.Number, types.Boolean, types.Array, types.Record, types.BaseTuple, types.SliceType
+
+
+@cache
+def _defaults_of(options: type) -> dict[str, Any]:
+    return {name: option.default for name, option in options.options.items()}
+
+
+def _compare(self: Any, other: object) -> Any:
+    return self is other or (self.values() == other.values() if isinstance(other, TargetConfig) else NotImplemented)
+
+
+BaseFunction.get_call_type = _resolve_once(BaseFunction.get_call_type)
+TargetConfig.values = lambda self: _defaults_of(type(self)) | self._values
+TargetConfig.__hash__ = lambda self: hash(type(self))
+TargetConfig.__eq__ = _compare
 
 
 def watch_compiling(tell: Callable[[int], None]) -> None:
