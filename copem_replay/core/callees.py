@@ -25,8 +25,9 @@ from numba.core.compiler import Compiler
 from numba.core.event import Event, Listener, register
 from numba.core.registry import CPUDispatcher
 from numba.core.targetconfig import TargetConfig
+from numba.core.types.containers import BaseTuple
 from numba.core.types.functions import BaseFunction
-from numba.core.types.misc import unliteral
+from numba.core.types.misc import SliceType, unliteral
 
 _NO_WRAPPERS = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
@@ -42,7 +43,7 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]  # Numba has no types
 
     def compile(self, sig: Any) -> Any:
         """What Python calls, for arguments of these types."""
-        return _call_in_room(super().compile, sig)
+        return call_in_room(super().compile, sig)
 
     def get_call_template(self, args: tuple[Any, ...], kws: Mapping[str, Any]) -> Any:
         """What a caller has to know of the function to be called."""
@@ -53,14 +54,17 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]  # Numba has no types
         return self.callee.get_overload(sig)
 
 
-def _call_in_room(function: Callable[[Any], Any], argument: Any) -> Any:
-    # Python has frames in pieces of 16 KiB, and gives a piece back as soon as the one frame in it ends. Where calls go
-    # to and fro over the end of a piece, which compiling does a million times, each asks the system for memory.
+def call_in_room(function: Callable[[Any], Any], argument: Any) -> Any:
+    """What the function returns, called with half a MiB for Python's frames in one piece.
+
+    Python has frames in pieces of 16 KiB, and gives a piece back as soon as the first frame in it ends. Where calls go
+    to and fro over the end of a piece, which compiling does a million times, each asks the system for memory.
+    """
     return function(argument)
 
 
-# A frame as deep as this gets a piece of 1 MiB, the rest of which is for the frames of what it calls.
-_call_in_room.__code__ = _call_in_room.__code__.replace(co_stacksize=70_000)
+# A frame as deep as this (never filled) gets a piece of 1 MiB, the rest of which is for the frames of what it calls.
+call_in_room.__code__ = call_in_room.__code__.replace(co_stacksize=70_000)
 
 
 class _Callee(CPUDispatcher):  # type: ignore[misc]
@@ -121,11 +125,11 @@ def _resolve_once(resolve: Callable[..., Any]) -> Callable[..., Any]:
     return resolve_once
 
 
-_PLAIN = types.Number, types.Boolean, types.Array, types.Record, types.BaseTuple, types.SliceType
+_PLAIN = types.Number, types.Boolean, types.Array, types.Record, BaseTuple, SliceType
 
 
 @cache
-def _defaults_of(options: type) -> dict[str, Any]:
+def _defaults_of(options: Any) -> dict[str, Any]:
     return {name: option.default for name, option in options.options.items()}
 
 
@@ -133,10 +137,15 @@ def _compare(self: Any, other: object) -> Any:
     return self is other or (self.values() == other.values() if isinstance(other, TargetConfig) else NotImplemented)
 
 
-BaseFunction.get_call_type = _resolve_once(BaseFunction.get_call_type)
-TargetConfig.values = lambda self: _defaults_of(type(self)) | self._values
-TargetConfig.__hash__ = lambda self: hash(type(self))
+def _tell_values(self: Any) -> dict[str, Any]:
+    kind: Any = type(self)
+    return {**_defaults_of(kind), **self._values}
+
+
+BaseFunction.get_call_type = _resolve_once(BaseFunction.get_call_type)  # type: ignore[method-assign]
+TargetConfig.values = _tell_values
 TargetConfig.__eq__ = _compare
+TargetConfig.__hash__ = lambda self: hash(type(self))
 
 
 def watch_compiling(tell: Callable[[int], None]) -> None:
