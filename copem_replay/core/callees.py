@@ -15,14 +15,19 @@ docs/develop/decisions/0052-code-of-callees.md
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
+from numba import types
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
 from numba.core.event import Event, Listener, register
 from numba.core.registry import CPUDispatcher
-from numba.core.types.misc import unliteral
+from numba.core.targetconfig import TargetConfig
+from numba.core.types.containers import BaseTuple
+from numba.core.types.functions import BaseFunction
+from numba.core.types.misc import SliceType, unliteral
 
 _NO_WRAPPERS = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
@@ -36,6 +41,10 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]  # Numba has no types
         self.callee = _Callee(function, targetoptions={**options, **_NO_WRAPPERS}, pipeline_class=_CalleeCompiler)
         self.enable_caching()
 
+    def compile(self, sig: Any) -> Any:
+        """What Python calls, for arguments of these types."""
+        return call_in_room(super().compile, sig)
+
     def get_call_template(self, args: tuple[Any, ...], kws: Mapping[str, Any]) -> Any:
         """What a caller has to know of the function to be called."""
         return self.callee.get_call_template(args, kws)
@@ -43,6 +52,19 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]  # Numba has no types
     def get_overload(self, sig: Any) -> Any:
         """What a caller calls."""
         return self.callee.get_overload(sig)
+
+
+def call_in_room(function: Callable[[Any], Any], argument: Any) -> Any:
+    """What the function returns, called with half a MiB for Python's frames in one piece.
+
+    Python has frames in pieces of 16 KiB, and gives a piece back as soon as the first frame in it ends. Where calls go
+    to and fro over the end of a piece, which compiling does a million times, each asks the system for memory.
+    """
+    return function(argument)
+
+
+# A frame as deep as this (never filled) gets a piece of 1 MiB, the rest of which is for the frames of what it calls.
+call_in_room.__code__ = call_in_room.__code__.replace(co_stacksize=70_000)
 
 
 class _Callee(CPUDispatcher):  # type: ignore[misc]
@@ -76,6 +98,54 @@ class _CalleeLibrary(JITCodeLibrary):  # type: ignore[misc]
     def codegen(self) -> Any:
         # Numba puts the environment of a function into its machine code, to no use in nopython mode.
         return SimpleNamespace(set_env=lambda name, environment: None)
+
+
+# What an operator makes of which types, Numba asks anew at each place in each function. Most implementations refuse,
+# and each refusal is looked up by the whole configuration of the compiler. Here it is asked once.
+
+
+def _resolve_once(resolve: Callable[..., Any]) -> Callable[..., Any]:
+    """`BaseFunction.get_call_type`, asked once for the same plain types.
+
+    What overloads a function in Python depends on options of compiling, too, and is asked for each time.
+    """
+    known: dict[Any, Any] = {}
+
+    def resolve_once(self: Any, context: Any, args: tuple[Any, ...], kws: Mapping[str, Any]) -> Any:
+        if kws or not all(isinstance(kind, _PLAIN) for kind in args):
+            return resolve(self, context, args, kws)
+        key = self, context, tuple(args)
+        if key not in known:
+            signature = resolve(self, context, args, kws)
+            if signature is None or self.get_impl_key(signature) != self.typing_key:
+                return signature
+            known[key] = signature
+        return known[key]
+
+    return resolve_once
+
+
+_PLAIN = types.Number, types.Boolean, types.Array, types.Record, BaseTuple, SliceType
+
+
+@cache
+def _defaults_of(options: Any) -> dict[str, Any]:
+    return {name: option.default for name, option in options.options.items()}
+
+
+def _compare(self: Any, other: object) -> Any:
+    return self is other or (self.values() == other.values() if isinstance(other, TargetConfig) else NotImplemented)
+
+
+def _tell_values(self: Any) -> dict[str, Any]:
+    kind: Any = type(self)
+    return {**_defaults_of(kind), **self._values}
+
+
+BaseFunction.get_call_type = _resolve_once(BaseFunction.get_call_type)  # type: ignore[method-assign]
+TargetConfig.values = _tell_values
+TargetConfig.__eq__ = _compare
+TargetConfig.__hash__ = lambda self: hash(type(self))
 
 
 def watch_compiling(tell: Callable[[int], None]) -> None:

@@ -280,3 +280,38 @@ def test_an_error_in_a_callee_reaches_python() -> None:
         _count_twice(-1)
     with pytest.raises(ZeroDivisionError):
         _count_twice(0)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="memory is counted by thread")
+def test_calls_in_room_ask_for_no_memory_at_any_depth() -> None:
+    """Without room, there is a depth at which each of the thousand calls asks the system for memory."""
+    import resource
+
+    from copem_replay.core.callees import call_in_room
+
+    def call_often(_: int) -> int:
+        before = resource.getrusage(resource.RUSAGE_THREAD).ru_minflt
+        for _ in range(1000):
+            max((1, 2), key=lambda number: number)
+        return resource.getrusage(resource.RUSAGE_THREAD).ru_minflt - before
+
+    def count_most(call: Callable[[int], int]) -> int:
+        most, code = 0, call_often.__code__
+        for words in range(8, 2100, 4):  # a frame of a piece and a half
+            call_often.__code__ = code.replace(co_stacksize=words)
+            most = max(most, call(0))
+        return most
+
+    assert count_most(lambda _: call_in_room(call_often, 0)) < 500
+
+
+def test_configurations_are_equal_where_all_options_are() -> None:
+    """Numba keeps what it compiled by them."""
+    from numba.core.compiler import Flags
+
+    plain, said, other = Flags(), Flags(), Flags()
+    said.nrt, other.nrt = plain.nrt, not plain.nrt
+    assert plain == said != other
+    assert hash(plain) == hash(said)
+    assert (plain.values(), other.values()) == (said.values(), {**said.values(), "nrt": other.nrt})
+    assert plain != 1
