@@ -160,7 +160,7 @@ def observations(experiment: AnyExperiment, recording: Recording | AnyPath) -> p
 
     study = make_study(experiment, recording)
     replay = prepare_log(study.recordings[0], resolve_for_log(study.experiment, study.recordings[0].scene.log))
-    observed, episodes = replay.measured, replay.episodes.firsts
+    observed, episodes = replay.rows_of(replay.episodes.object_ix), replay.episodes.firsts
     tracks, scene = observed.tracks, replay.scene
     onset_s = pd.Series(episodes.onset_s, index=episodes.object_ix).reindex(tracks.row_object_ix).to_numpy()
     return pd.DataFrame(

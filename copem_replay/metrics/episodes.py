@@ -33,7 +33,7 @@ from copem_replay.perception.sensor_poses import (
     offset_places,
     unit_ground,
 )
-from copem_replay.perception.visibility import Statics, visible_shares
+from copem_replay.perception.visibility import Asked, Statics, visible_shares
 
 
 @dataclass(frozen=True)
@@ -123,6 +123,21 @@ class Episodes:
             return parts[0]
         order = np.argsort(np.concatenate([which for which, _ in self.passes]))
         return np.concatenate(parts, axis=-1)[..., order]
+
+    def number_rows(self, tracks: Tracks) -> Int:
+        """(P,) the episode during which each row was captured; −1: none."""
+        numbers, captured_s = np.full(len(tracks.frame_ix), -1), tracks.row_captured_s
+        of_object = np.empty(int(max(self.object_ix.max(initial=-1), tracks.object_ix.max(initial=-1))) + 1, np.int64)
+        for which, one in self.passes:
+            of_object[:] = -1
+            of_object[one.object_ix] = which
+            number = of_object[tracks.row_object_ix]
+            rows = np.flatnonzero(number >= 0)
+            number, at_s = number[rows], captured_s[rows]
+            during = at_s >= self.onset_s[number] - SAME_INSTANT_S
+            during &= at_s <= self.ended_s[number] + SAME_INSTANT_S
+            numbers[rows[during]] = number[during]
+        return numbers
 
     @property
     def firsts(self) -> Episodes:
@@ -290,6 +305,8 @@ def _find_best_share(
 ) -> Float:
     """(P,) the largest visible share any unit (of the ego) has of each row of the truth; 0 where there is none.
 
+    Of objects that are not measured it is 0.
+
     Units that only some runs have do not count: an onset is the same in all of them.
     """
     ego_carriers = {"ego", scene.object_ids[scene.ego_ix]} if scene.ego_ix >= 0 else set()
@@ -301,11 +318,13 @@ def _find_best_share(
     if not units:
         return np.zeros(len(truth.frame_ix))
     places = [compute_unit_poses(scene, u, truth, unit_ground(truth, n, u)) for n, u in units.items()]
+    measured = np.isin(truth.row_object_ix, measured_objects(scene, experiment.measure))
     shares = visible_shares(
         truth,
         static,
         make_observers(places, np.array([find_carrier(scene, u) for u in units.values()])),
         experiment.visibility,
+        Asked(np.tile(measured, (len(units), 1)), np.full(len(measured), -1)),
     )
     best: Float = np.max(np.where(np.isnan(shares), 0.0, shares), axis=0)
     return best
@@ -313,19 +332,10 @@ def _find_best_share(
 
 def first_sights(observations: Observations, episodes: Episodes) -> Float:
     """(U, M) capture of each modelled unit's first list of an episode that has the object in sight; inf: none."""
-    return episodes.join_passes([_first_sights(observations, one) for _, one in episodes.passes])
-
-
-def _first_sights(observations: Observations, episodes: Episodes) -> Float:
-    tracks = observations.tracks
-    episode_of = np.full(int(max(episodes.object_ix.max(initial=-1), tracks.object_ix.max(initial=-1))) + 1, -1)
-    episode_of[episodes.object_ix] = np.arange(len(episodes.object_ix))
-    episode, captured_s = episode_of[tracks.row_object_ix], tracks.row_captured_s
+    tracks, episode = observations.tracks, episodes.number_rows(observations.tracks)
     rows = np.flatnonzero((episode >= 0) & (observations.view.visible_share > 0))
-    during = captured_s[rows] >= episodes.onset_s[episode[rows]] - SAME_INSTANT_S
-    rows = rows[during & (captured_s[rows] <= episodes.ended_s[episode[rows]] + SAME_INSTANT_S)]
     first_s = np.full((len(tracks.units), len(episodes.object_ix)), np.inf)
-    np.minimum.at(first_s, (tracks.row_unit_ix[rows], episode[rows]), captured_s[rows])
+    np.minimum.at(first_s, (tracks.row_unit_ix[rows], episode[rows]), tracks.row_captured_s[rows])
     return first_s
 
 

@@ -22,6 +22,7 @@ from pydantic_core import PydanticKnownError
 from copem_replay.core.components import Component, Slot, ask_component, wrong_answer_error
 from copem_replay.core.errors import is_own
 from copem_replay.core.tracks import Float, Int, Tracks
+from copem_replay.perception.visibility_kernel import Asked as Asked
 from copem_replay.perception.visibility_kernel import Boxes, compute_shares
 from copem_replay.perception.visibility_kernel import Observers as Observers
 from copem_replay.perception.visibility_kernel import Statics as Statics
@@ -89,20 +90,20 @@ class VisibilityModel(Component, ABC):
 
 
 class _BuiltInModel(VisibilityModel):
-    """Base of the built-in models: their shares are NaN where the unit is absent, and for its carrier."""
+    """Base of the built-in models: NaN where the unit is absent, for its carrier, and where no share is asked for."""
 
     flat: ClassVar[bool]
 
-    def shares(self, world: Tracks, static: Statics, observers: Observers) -> Float:
+    def shares(self, world: Tracks, static: Statics, observers: Observers, asked: Asked | None = None) -> Float:
         order, _bounds = world.by_frame
-        seen, _blocker = _compute_views(world, static, observers, flat=self.flat, blockers=False)
+        seen, _blocker = _compute_views(world, static, observers, asked, flat=self.flat, blockers=False)
         shares = np.empty_like(seen)
         shares[:, order] = seen
         return shares
 
     def hidden_by(self, world: Tracks, static: Statics, observers: Observers) -> Int:
         order, _bounds = world.by_frame
-        _seen, listed = _compute_views(world, static, observers, flat=self.flat, blockers=True)
+        _seen, listed = _compute_views(world, static, observers, None, flat=self.flat, blockers=True)
         blocker = np.empty_like(listed)
         blocker[:, order] = np.where(listed >= 0, order[listed], listed) if len(order) else listed
         return blocker
@@ -156,17 +157,20 @@ Visibility = Annotated[
 """`visibility:` of an experiment: a plain word, or a model of the user's own, `{kind: package.module:Class}`."""
 
 
-def visible_shares(world: Tracks, static: Statics, observers: Observers, model: VisibilityModel) -> Float:
+def visible_shares(
+    world: Tracks, static: Statics, observers: Observers, model: VisibilityModel, asked: Asked | None = None
+) -> Float:
     """Visible share of every row of the world from every unit: (U, P); NaN where the unit is absent or the carrier.
 
-    Raises InputError where a model of the user's own fails, or gives no shares.
+    `asked`: those to compute, the others may be NaN; None: all. A model of the user's own gives all. Raises InputError
+    where one fails, or gives no shares.
     """
     expected = (len(observers.carrier_ix), len(world.frame_ix))
     if not expected[1]:  # a model is not asked about no rows
         return np.zeros(expected)
+    if isinstance(model, _BuiltInModel) and not is_own(type(model)):
+        return model.shares(world, static, observers, asked)
     shares = ask_component(model, "visibility", lambda: np.asarray(model.shares(world, static, observers), dtype=float))
-    if not is_own(type(model)):
-        return shares
     if shares.shape != expected:
         raise wrong_answer_error(
             model, "visibility", f"shares: expected shape {expected}, found {shares.shape}", "shares"
@@ -197,9 +201,9 @@ def find_blockers(world: Tracks, static: Statics, observers: Observers, model: V
 
 
 def _compute_views(
-    world: Tracks, static: Statics, observers: Observers, *, flat: bool, blockers: bool
+    world: Tracks, static: Statics, observers: Observers, asked: Asked | None, *, flat: bool, blockers: bool
 ) -> tuple[Float, Int]:
-    """Shares and blockers (U, P), rows list by list; blockers empty unless asked for."""
+    """Shares and blockers (U, P), rows list by list; blockers empty unless wanted."""
     order, bounds = world.by_frame
     n_units, n_frames = observers.present.shape
     out = np.full((n_units, len(order)), np.nan)
@@ -210,6 +214,9 @@ def _compute_views(
     boxes = Boxes(bounds, box_corners(world)[order], z - half, z + half, world.row_object_ix[order])
     place_m, present = np.ascontiguousarray(observers.place_m), np.ascontiguousarray(observers.present)
     places = Observers(place_m, present, observers.carrier_ix)
+    if asked is None:
+        asked = Asked(np.ones(out.shape, dtype=bool), np.full(len(order), -1))
+    wanted = Asked(asked.always[:, order], asked.stretch[order])
     threads = min(8, os.cpu_count() or 1)
     pieces = max(1, min(4 * threads, n_units * len(order) // _ROWS_PER_THREAD, n_frames))
     # Cuts with about as many rows each, so that threads end together.
@@ -218,7 +225,7 @@ def _compute_views(
     with ThreadPoolExecutor(threads) as pool:
         list(
             pool.map(
-                lambda k: compute_shares(edges[k], edges[k + 1], boxes, static, places, flat, out, blocker),
+                lambda k: compute_shares(edges[k], edges[k + 1], boxes, static, places, wanted, flat, out, blocker),
                 range(pieces),
             )
         )

@@ -60,6 +60,17 @@ class Observers(NamedTuple):
     carrier_ix: Int
 
 
+class Asked(NamedTuple):
+    """Which views are asked for, by unit and row of a world.
+
+    `always (U, P)`: in any case. `stretch (P,)`: besides, of the rows with the same number from 0 on, each unit's up to
+    the first that shows; where later ones are known, too, depends on how the work is cut.
+    """
+
+    always: Bool
+    stretch: Int
+
+
 class FaceColumns(NamedTuple):
     """Columns of a target's face between two azimuths `a` and `b`, (ux, uy) half way between them."""
 
@@ -142,9 +153,10 @@ class _Found(NamedTuple):
 
 @kernel
 def compute_shares(
-    f0: int, f1: int, boxes: Boxes, obstacles: Statics, places: Observers, flat: bool, out: Float, blocker: Int
-) -> None:
-    """Visible shares `out (U, P)` of the lists f0 … f1 − 1.
+    f0: int, f1: int, boxes: Boxes, obstacles: Statics, places: Observers, asked: Asked, flat: bool, out: Float,
+    blocker: Int,
+) -> None:  # fmt: skip
+    """Visible shares `out (U, P)` of the lists f0 … f1 − 1, where they are `asked` for.
 
     `blocker (U, P)`, unless empty, becomes the row of the body that alone would hide most of each row, −1 where none
     hides any of it, −2 − k for the obstacle k.
@@ -166,28 +178,44 @@ def compute_shares(
         np.empty((most, 2)),
     )  # fmt: skip
     work = _make_workspace(most, widest)
+    shown = np.zeros((len(places.carrier_ix), asked.stretch.max() + 1), np.bool_)  # of each stretch from each unit
     for f in range(f0, f1):
         first = boxes.bounds[f]
         n = boxes.bounds[f + 1] - first
         _gather_bodies(first, n, boxes, obstacles, xy, of)
         bodies = of[: n + len(obstacles.body)]
         for u in range(places.present.shape[0]):
-            if places.present[u, f]:
+            if places.present[u, f] and _find_next(0, u, first, n, asked, shown) < n:
                 eye_m = (places.place_m[u, f, 0], places.place_m[u, f, 1], places.place_m[u, f, 2])
                 mine = places.carrier_ix[u]
                 _look_at_bodies(eye_m, n, boxes.object_ix[first : first + n], mine, flat, xy, bodies, work.azimuth)
                 _index_bodies(bodies, index)
-                for t in range(n):
+                t = -1
+                while True:
+                    t = _find_next(t + 1, u, first, n, asked, shown)
+                    if t >= n:
+                        break
                     if boxes.object_ix[first + t] == mine:
                         continue
-                    if bodies[t].inside:
-                        out[u, first + t] = 1.0
-                        continue
-                    alone = len(blocker) > 0
-                    share, b = _view_target(t, alone, xy, bodies, eye_m, flat, index, found, work)
+                    share, b, alone = 1.0, -1, len(blocker) > 0
+                    if not bodies[t].inside:
+                        share, b = _view_target(t, alone, xy, bodies, eye_m, flat, index, found, work)
+                        if alone:
+                            blocker[u, first + t] = -1 if b < 0 else first + b if b < n else -2 - bodies[b].owner
                     out[u, first + t] = share
-                    if alone:
-                        blocker[u, first + t] = -1 if b < 0 else first + b if b < n else -2 - bodies[b].owner
+                    if share > 0.0 and asked.stretch[first + t] >= 0:
+                        shown[u, asked.stretch[first + t]] = True
+
+
+@nb.njit(inline="always")
+def _find_next(t: int, u: int, first: int, n: int, asked: Asked, shown: Bool) -> int:
+    # The first target from t on that is asked for; n: none.
+    while t < n:
+        stretch = asked.stretch[first + t]
+        if asked.always[u, first + t] or (stretch >= 0 and not shown[u, stretch]):
+            break
+        t += 1
+    return t
 
 
 @borrowing

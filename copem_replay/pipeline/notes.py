@@ -43,6 +43,7 @@ from copem_replay.metrics.metric import LinkTimes, OutputTimes, link_times
 from copem_replay.metrics.onset import BEGAN, InRange, Onset, count_counted, describe_numbers
 from copem_replay.perception.config import Carriers
 from copem_replay.perception.observation import interpolate_worlds
+from copem_replay.perception.pem.condition import may_apply
 from copem_replay.perception.pem.model import ObjectSidePlace, Pem
 from copem_replay.perception.sensor_poses import UnitPoses
 from copem_replay.pipeline.expansion import ExpandedExperiment, RunGroup, find_facts
@@ -371,8 +372,6 @@ def _meets(pem: Pem, scene: Scene, world: Tracks, poses: UnitPoses, carrier_ix: 
     if not len(lists):
         return False
     rows = order[bounds[lists[0]] : bounds[lists[-1] + 1]]
-    conditions = [couple.when.model_copy(update={"visible_share": None}) for couple in pem.couples]
-    conditions = [condition for condition in conditions if condition.applies_to(scene.tags)]
     for examined in (rows[::_SAMPLE], rows):
         frame = world.frame_ix[examined]
         kept = poses.present[frame] & (world.row_object_ix[examined] != carrier_ix)
@@ -383,7 +382,7 @@ def _meets(pem: Pem, scene: Scene, world: Tracks, poses: UnitPoses, carrier_ix: 
             np.hypot(dx_m, dy_m), wrap_angles(bearing_rad - poses.heading_rad[frame]), bearing_rad, none,
             scene.object_class[world.row_object_ix[examined]], none, none, none, none, none,
         )  # fmt: skip
-        if any(bool(condition.holds(view).any()) for condition in conditions):
+        if may_apply(pem.couples, view, scene.tags).any():
             return True
     return False
 

@@ -232,7 +232,7 @@ class Replay:
 
     @cached_property
     def _whole(self) -> Observations:
-        return observe_objects(self.scene, self.truth, self.expanded, self.placed)
+        return observe_objects(self.scene, self.truth, self.expanded, self.placed, stretches=self.episodes.number_rows)
 
     @cached_property
     def no_rows(self) -> Observations:
@@ -241,21 +241,34 @@ class Replay:
 
     @cached_property
     def measured(self) -> Observations:
-        """The observation rows of objects that have an episode."""
-        return self.rows_of(self.episodes.object_ix)
+        """The observation rows of objects that have an episode, without visible shares that nothing draws from."""
+        return self._observe_objects(self.episodes.object_ix)
 
-    def rows_of(self, object_ix: Int) -> Observations:
-        """The observation rows of some objects."""
+    def _observe_objects(self, object_ix: Int) -> Observations:
         return join_observations([self.observe(chunk).of_objects(object_ix) for chunk in self.chunks])
 
+    def rows_of(self, object_ix: Int) -> Observations:
+        """The observation rows of some objects, with all visible shares, which are computed anew."""
+        pieces = [
+            observe_objects(
+                self.scene, self.truth, self.expanded, self.placed, from_s=chunk.from_s, until_s=chunk.until_s,
+                only_ix=object_ix,
+            )
+            for chunk in self.chunks
+        ]  # fmt: skip
+        return join_observations(pieces)
+
     def observe(self, chunk: TimeChunk, from_s: float | None = None) -> Observations:
-        """The observation rows captured in a time chunk, or from `from_s` on. Those of a whole log are kept."""
+        """The observation rows captured in a time chunk, or from `from_s` on. Those of a whole log are kept.
+
+        Visible shares are there where a couple may apply, of the ego, and of each episode up to the first sight.
+        """
         if chunk == TimeChunk():
             return self._whole
         begin_s = chunk.from_s if from_s is None else from_s
         return observe_objects(
             self.scene, self.truth, self.expanded, self.placed, from_s=begin_s, until_s=chunk.until_s,
-            kept=self._shares, cut_s=chunk.from_s,
+            kept=self._shares, cut_s=chunk.from_s, stretches=self.episodes.number_rows,
         )  # fmt: skip
 
     def observe_listable(self, chunk: TimeChunk, from_s: float, *, complete: bool) -> Observations:
@@ -291,7 +304,7 @@ class Replay:
         A list aboard the ego has distance 0, one of a recorded unit NaN, one without an observation of the ego ∞.
         """
         expanded, senders = self.expanded, self.senders
-        of_ego, F = self.rows_of(np.array([self.scene.ego_ix])), len(senders)
+        of_ego, F = self._observe_objects(np.array([self.scene.ego_ix])), len(senders)
         distance_m: Float = np.full(F, np.inf)
         visible_share: Float = np.zeros(F)
         distance_m[of_ego.tracks.frame_ix] = of_ego.view.range_m

@@ -21,7 +21,7 @@ from copem_replay.perception.sensor_poses import (
     make_observers,
     unit_ground,
 )
-from copem_replay.perception.visibility import VisibilityModel, find_blockers, visible_shares
+from copem_replay.perception.visibility import Asked, VisibilityModel, find_blockers, visible_shares
 from copem_replay.pipeline.prepare import ROWS_A_CHUNK, Replay
 from copem_replay.viewer.sink import stack_float32
 
@@ -107,12 +107,13 @@ def _compute_part(
         if unit.recorded is not None:
             continue
         poses = _unit_poses(replay, name, unit, world)
-        share = _visible_shares(replay, experiment, unit, poses, world, rows, known_shares[u, frame, column])
         view = _make_view_geometry(poses, world, rows, scene.object_class[world.row_object_ix[rows]])
         pem = experiment.pems[str(unit.pem)].couples
         in_field = _fits_any_couple(pem, view, "range_m", "azimuth_deg", "classes")
         sight.place_m[u, part] = np.stack([poses.x_m, poses.y_m, poses.z_m], axis=-1)
         sight.in_range[u, frame, column] = _fits_any_couple(pem, view, "range_m")
+        known = np.where(in_field, known_shares[u, frame, column], 0.0)
+        share = _visible_shares(replay, experiment, unit, poses, world, rows, known)
         sight.share[u, frame, column] = np.where(in_field, share, np.nan)
         _find_hiders(replay, experiment, unit, poses, sight, u, part, centres)
 
@@ -137,7 +138,10 @@ def _visible_shares(
         return known_shares
     watching = make_observers([poses], np.array([on]))
     near, rows = _keep_near_lines(world, poses, rows, lacks, experiment.visibility)
-    [share] = visible_shares(near, replay.placed.static, watching, experiment.visibility)
+    asked = np.zeros((1, len(near.frame_ix)), dtype=bool)
+    asked[0, rows[lacks]] = True
+    nowhere = np.full(len(near.frame_ix), -1)
+    [share] = visible_shares(near, replay.placed.static, watching, experiment.visibility, Asked(asked, nowhere))
     return np.where(lacks, share[rows], known_shares)
 
 

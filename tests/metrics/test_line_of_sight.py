@@ -13,9 +13,12 @@ import pytest
 
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import read_log
-from copem_replay.metrics.episodes import earliest_sight_s
+from copem_replay.metrics.episodes import earliest_sight_s, first_sights
+from copem_replay.perception.observation import observe_objects
+from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.run import run_experiment
 from tests.helpers.recordings import Obj, pedestrian, write_recording
+from tests.helpers.scenes import Thing, driving, experiment, recording
 
 EXPERIMENT = {
     "version": 1,
@@ -97,3 +100,34 @@ def test_only_units_that_are_there_in_a_run_have_it_in_sight() -> None:
     assert of("c", None) == [[nan, nan]]
     assert of("rsu", None) == [[nan, nan]], "recorded units don't tell what they had in sight"
     assert of("GT", equipped) == [[nan, nan]]
+
+
+def test_what_nothing_reads_is_not_computed_and_nothing_else_changes() -> None:
+    """Against the same with all shares: what is listed, first sights, and the rows of single objects."""
+    turn = np.random.default_rng(5)
+    things = [Thing("ego", "car", driving(0, 0, 3, 0))]
+    for k in range(40):
+        x, y, vx, vy = turn.normal(0, [25, 25, 5, 5])
+        things.append(Thing(str(k), "car" if k % 3 else "pedestrian", driving(x, y, vx, vy), yaw_rad=float(k)))
+    pole = {"at": [9, 9], "height_m": 3.0, "ground_z_m": 0.0, "rate_hz": 5, "phase_s": 0.05, "pem": "ahead"}
+    when = {"range_m": [0, 30], "azimuth_deg": [-60, 60], "visible_share": [0.2, 1.0]}
+    ahead = [{"when": when, "detection": {"kind": "visible_share"}, "existence": "visible_share"}]
+    log = recording(things, until_s=3.0)
+    onset = {"kind": "in_range", "range_m": 25, "again_after_s": 0.5}
+    units = {"ego": {"on": "ego", "height_m": 1.8, "pem": "ahead"}, "pole": pole}
+    replay = prepare_log(log, experiment(pems={"ahead": ahead}, units=units, measure={"onset": onset}))
+    found = replay.observe(replay.chunks[0])
+    every = observe_objects(replay.scene, replay.truth, replay.expanded, replay.placed)
+    for name in ("couple_ix", "probability", "existence"):
+        assert np.array_equal(getattr(found, name), getattr(every, name)), name
+    assert np.array_equal(replay.first_sights_s, first_sights(every, replay.episodes))
+    assert np.isfinite(replay.first_sights_s).sum() > 20
+    known = ~np.isnan(found.view.visible_share)
+    assert np.array_equal(found.view.visible_share[known], every.view.visible_share[known])
+    assert 0.1 < known.mean() < 0.7
+    assert known[found.tracks.row_object_ix == replay.scene.ego_ix].all(), "links ask how much of the ego shows"
+    some = np.array([2, 7, 11])
+    asked, them = replay.rows_of(some), every.of_objects(some)
+    assert np.array_equal(asked.view.visible_share, them.view.visible_share)
+    assert np.array_equal(asked.tracks.row_object_ix, them.tracks.row_object_ix)
+    assert np.array_equal(asked.probability, them.probability)

@@ -212,3 +212,12 @@ def find_couples(couples: tuple[Couple, ...], view: ViewGeometry, tags: Mapping[
         if couple.when.applies_to(tags or {}):
             couple_ix[(couple_ix < 0) & couple.when.holds(view)] = k
     return couple_ix
+
+
+def may_apply(couples: tuple[Couple, ...], view: ViewGeometry, tags: Mapping[str, str]) -> Bool:
+    """(P,) where a couple applies at some visible share: that of the view is not read."""
+    result = np.zeros(len(view.range_m), dtype=bool)
+    for condition in (couple.when for couple in couples):
+        if condition.applies_to(tags):
+            result |= condition.model_copy(update={"visible_share": None}).holds(view)
+    return result

@@ -374,7 +374,7 @@ def _draw_courses(
 
 def _draw_share(axes: Axes, story: Story, results: Results, replay: Replay, look: Appearance) -> None:
     """Draw the visible share from the ego's units, list by list, along the recorded course."""
-    curve = share_curves(replay, replay.measured, story.object_ix).get(BY_EGO)
+    curve = share_curves(replay, replay.rows_of(np.array([story.object_ix])), story.object_ix).get(BY_EGO)
     if curve is None:
         axes.text(0.5, 0.5, "the ego carries no unit", transform=axes.transAxes, ha="center", va="center", color=FAINT)
         return
