@@ -20,6 +20,7 @@ import pandas as pd
 from copem_replay.core.colours import configuration_colours
 from copem_replay.core.errors import RecordingError
 from copem_replay.core.files import portable_name
+from copem_replay.core.tracks import TRUTH
 from copem_replay.core.yaml import dump_yaml
 from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.experiment.schema import Experiment
@@ -115,7 +116,7 @@ def _write_mcap(path: Path, run: RunToExport) -> list[str]:
             find_family(recording),
             recording.window,
             draw_truth(run.replayed, run.table) if show is None or show.truth else None,
-            configuration_colours(run.every),
+            configuration_colours(run.every, truths={name for name, of in run.every.items() if of.units == TRUTH}),
         )
         check_files_unchanged(stamps)
     return notes

@@ -91,7 +91,7 @@ def write_rrd(
     later_chunks = iter(run_tracks)
     first = next(later_chunks)
     parts = split_into_files(list(first), baseline)
-    colours = configuration_colours(experiment.configurations)  # by place, so equal in all files of the experiment
+    truths = {name for name, asked in experiment.configurations.items() if asked.units == TRUTH}
     collector = TrackCollector(_measured_indices(replay, experiment, table))
     objects = collector.object_ix.tolist()
     with ExitStack() as stack:
@@ -103,6 +103,7 @@ def write_rrd(
             # The viewer takes two files of one identity for one recording.
             ids = f"copem_replay:{appearance}", digest_texts(*identity)
             out = stack.enter_context(_open_streams(part.path(path), ids, replay.scene.t0_ns, viewer))
+            colours = configuration_colours(experiment.configurations, truths=truths, selected=part.configurations)
             files.append(_RecordingFile(out, content, {name: colours[name] for name in part.configurations}))
             _begin_file(files[-1], panels, summary, run, run_is, [p.path(path).name for p in parts if p != part])
         if baseline is not None:  # of all objects at once: such a log is not long

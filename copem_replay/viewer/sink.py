@@ -75,7 +75,7 @@ STATUS: dict[int, Rgb] = {
     OUT: (52, 60, 80),
     UNLISTED: (88, 76, 54),
     HIDDEN: (152, 126, 82),
-    VISIBLE: (106, 112, 122),
+    VISIBLE: (95, 100, 109),
     LOST: (208, 192, 158),
     CAPTURED: (118, 140, 192),
     UNMATCHED: (190, 202, 228),

@@ -20,7 +20,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from copem_replay.core.colours import configuration_colours
 from copem_replay.core.errors import OutputError
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import CLASSES, TimeChunk
@@ -624,12 +623,6 @@ def test_of_many_objects_those_that_tell_configurations_apart_are_shown() -> Non
     assert choose_telling_objects(episodes[episodes["configuration"] == "GT"], ["GT"], 2) == ["a", "b"], (
         "nothing but the truth"
     )
-
-
-def test_colours_do_not_repeat() -> None:
-    colours = configuration_colours([str(k) for k in range(28)])
-    assert len(set(colours.values())) == 28
-    assert all(0 <= c <= 255 for colour in colours.values() for c in colour)
 
 
 def test_a_disk_that_is_full_is_an_error_and_leaves_nothing(made: Made, tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ from copem_replay.viewer import write_rrd
 from copem_replay.viewer.curves import break_lines, running_median
 from copem_replay.viewer.lanes import STEADY_S, smooth_status
 from copem_replay.viewer.sink import KNOWN, STATUSES
+from tests.helpers.report_pages import named
 from tests.oracles.colour import apart_for_a_deuteranope, contrast
 from tests.viewer.test_rrd import SUMMARY, Made
 from tests.viewer.test_status import lane
@@ -71,7 +72,7 @@ def test_words_and_lines_stand_out_from_the_ground() -> None:
     assert [name for name, colour in words.items() if contrast(colour, plate) < 3] == []
     lines = {
         "truth": TRUTH, "standing": palette.STANDING, "lane": palette.LANE, "field": palette.FIELD,
-        "onset": palette.ONSET, "difference": palette.DIFFERENCE, **configuration_colours(map(str, range(28))),
+        "onset": palette.ONSET, "difference": palette.DIFFERENCE, **configuration_colours(map(str, range(8))),
     }  # fmt: skip
     assert [name for name, colour in lines.items() if contrast(colour, palette.GROUND) < 3] == []
 
@@ -83,7 +84,7 @@ def test_statuses_stay_apart_for_deuteranopes() -> None:
         (a, b) for a, b in combinations(all_of_them, 2) if apart_for_a_deuteranope(all_of_them[a], all_of_them[b]) < 15
     ]
     assert near == []
-    for colour in configuration_colours(map(str, range(28))).values():
+    for colour in configuration_colours(map(str, range(8))).values():
         half = palette.status_colour(KNOWN - 1, colour)
         assert apart_for_a_deuteranope(half, colour) >= 15, "listed and known"
     # The oracle: black and white are 100 apart, a colour 0 from itself; red and green of one luminance hardly.
@@ -93,15 +94,17 @@ def test_statuses_stay_apart_for_deuteranopes() -> None:
 
 
 def test_marks_of_differences_use_no_colour_of_a_configuration() -> None:
-    assert palette.DIFFERENCE not in configuration_colours(map(str, range(28))).values()
+    assert palette.DIFFERENCE not in configuration_colours(map(str, range(8))).values()
 
 
 def test_a_configuration_has_one_colour_everywhere(city: Made) -> None:
     """In boxes, lanes, lines, curves, the legend and the figures of the report."""
     from copem_replay.report.figures.style import choose_appearances
 
-    every = configuration_colours(city.given.configurations)
-    figures = {name: tuple(round(255 * c) for c in one.colour) for name, one in choose_appearances(list(every)).items()}
+    truths = [name for name, asked in city.given.configurations.items() if asked.units == "truth"]
+    every = configuration_colours(city.given.configurations, truths=truths)
+    looks = choose_appearances(named(list(every), truths))
+    figures = {name: tuple(round(255 * c) for c in one.dark) for name, one in looks.items()}
     assert figures == every
     number = {name: r << 16 | g << 8 | b for name, (r, g, b) in every.items()}
     found = defaultdict(set)
