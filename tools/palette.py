@@ -5,7 +5,7 @@ contrast to every ground, and keeps away from the greys. Simulated annealing ove
 any two, plainly seen and by a deuteranope, then for one hue within a family, other hues in other families, the same
 hue in both themes, and strong colours. `tests/core/test_colours.py` holds the result against plain formulas.
 
-Sources: OKLab, B. Ottosson, "A perceptual color space for image processing" (2020); of the rest `tests/oracles/colour.py`.
+Sources: OKLab, B. Ottosson, "A perceptual color space for image processing" (2020); rest: `tests/oracles/colour.py`.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from copem_replay.core.colours import MOST_COLOURS, REST, TRUTH, Theme  # noqa: E402
-from tests.oracles.colour import DEUTERANOPE, WHITE, XYZ, contrast  # noqa: E402
+from copem_replay.core.colours import MOST_COLOURS, REST, TRUTH, Theme
+from tests.oracles.colour import DEUTERANOPE, WHITE, XYZ, contrast
 
 GROUNDS: dict[Theme, tuple[tuple[int, int, int], ...]] = {
     "light": ((255, 255, 255), (250, 250, 250)),
