@@ -201,7 +201,7 @@ def test_colours_tell_ego_standing_and_configurations_apart(made: Made) -> None:
     ego, car, walker, bin = (kinds[k] for k in at(made.path, "/world/truth/boxes", 0)["Boxes3D:class_ids"])
     assert (ego["label"], bin["label"]) == ("ego car", "bin other")
     assert len({ego["color"], car["color"], bin["color"]}) == 3
-    assert car["color"] >> 8 == walker["color"] >> 8 == 0x969696, "the truth is grey"
+    assert car["color"] >> 8 == walker["color"] >> 8 == 0x919191, "the truth is grey"
     assert bin["color"] < car["color"] < ego["color"], "stationary: darker"
     colours = [at(made.path, f"/world/{n}/boxes", 4.0)["Boxes3D:colors"][0] >> 8 for n in ("GT", "PEM", "pole")]
     assert len(set(colours)) == 3
