@@ -61,7 +61,8 @@ LANE: Rgb = (104, 104, 114)
 """Boundaries of lanes: visible, but less than everything else."""
 FIELD: Rgb = (150, 146, 118)
 """Outlines of fields of view."""
-ONSET: Rgb = (255, 255, 255)
+ONSET: tuple[Rgb, Rgb] = ((255, 255, 255), (0, 0, 0))
+"""Halves of the mark of the onset in lanes, whose ground is that of the theme; elsewhere the first."""
 HIDES: Rgb = (255, 110, 95)
 """Lines to what hides an object."""
 NOTICED: Rgb = (255, 255, 255)
