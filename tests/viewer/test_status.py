@@ -339,6 +339,44 @@ def test_an_entry_that_no_object_is_matched_with(tmp_path: Path) -> None:
     assert lane(made.path, "2 pedestrian", 1) == [(0.0, "on its way from ego"), (0.3, "unmatched")]
 
 
+def test_false_entries_are_crossed_and_counted(tmp_path: Path) -> None:
+    """The same pedestrian, listed 10 m off: no entry of gnn is matched with him."""
+    scene = recording([Thing("ego", "car", standing(0, 0)), Thing("2", "pedestrian", standing(20, 0))], until_s=0.5)
+    wrong = {"kind": "gaussian", "covariance_m2": [[0.01, 0.0], [0.0, 0.01]], "mean_m": [10.0, 0.0]}
+    made = make(
+        tmp_path / "replay.rrd", scene, measure=PERSON,
+        pems={"sure": [{"detection": {"kind": "constant", "probability": 1.0}, "error": wrong}]},
+        configurations={name: {"units": ["ego"], "fusion": {"kind": name}} for name in ("ideal", "gnn")},
+    )  # fmt: skip
+    assert not rows(made.path, "/world/ideal/false")
+    assert {tuple(row["Boxes3D:centers"]) for row in rows(made.path, "/world/gnn/boxes")} == {()}
+    drawn, fused = rows(made.path, "/world/gnn/false"), made.run_tracks["gnn"].fused
+    assert len(drawn) == 6
+    for frame, row in enumerate(drawn):
+        [entry] = np.flatnonzero((fused.frame_ix == frame) & fused.valid[0])
+        ends = np.array([line.tolist() for line in lines(row)])
+        assert ends.shape == (14, 2, 3), "three dashes a side, two lines across"
+        middle = [fused.x_m[0, entry], fused.y_m[0, entry], fused.z_m[0, entry] + fused.height_m[0, entry] / 2]
+        assert ends[12:].mean(axis=1).tolist() == [pytest.approx(middle, abs=1e-5)] * 2
+        across = np.linalg.norm(ends[12:, 1] - ends[12:, 0], axis=1)
+        diagonal_m = np.hypot(fused.length_m[0, entry], fused.width_m[0, entry])
+        assert across.tolist() == [pytest.approx(diagonal_m, abs=1e-5)] * 2
+        around_m = np.linalg.norm(ends[:12, 1] - ends[:12, 0], axis=1).sum()
+        half_m = fused.length_m[0, entry] + fused.width_m[0, entry]
+        assert around_m == pytest.approx(0.6 * 2 * half_m, abs=1e-5), "three fifths of the outline"
+    assert titles(made.path) >= {"gnn · 0 of 1 known · 1 false", "ideal · 1 of 1 known"}
+
+
+def titles(path: Path) -> set[str]:
+    from rerun.chunk import RrdReader
+
+    reader = RrdReader(path)
+    [blueprint] = reader.blueprints()
+    batches = [chunk.to_record_batch() for chunk in reader.stream(store=blueprint)]
+    column = "ViewBlueprint:display_name"
+    return {batch.column(column)[0].as_py()[0] for batch in batches if column in batch.schema.names}
+
+
 def test_a_list_that_never_arrives_is_lost(hiding: Made) -> None:
     from dataclasses import replace
 
