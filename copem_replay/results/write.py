@@ -20,6 +20,7 @@ import pandas as pd
 from copem_replay.core.colours import configuration_colours
 from copem_replay.core.errors import RecordingError
 from copem_replay.core.files import portable_name
+from copem_replay.core.tracks import TRUTH
 from copem_replay.core.yaml import dump_yaml
 from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.experiment.schema import Experiment
@@ -80,7 +81,7 @@ class RunToExport:
 class Exporter:
     """A kind of file. `suffix`: with the dot. `write`: writes the file and returns notes for the user.
 
-    `names`: gives the files for a stem and a number of configurations, where there may be several.
+    `names`: gives the files for a stem and a number of configurations besides the truth, where there may be several.
 
     `write` raises OutputError where the file cannot be written, and RecordingError where the recording cannot be read:
     the results are then without it, and say so.
@@ -115,7 +116,7 @@ def _write_mcap(path: Path, run: RunToExport) -> list[str]:
             find_family(recording),
             recording.window,
             draw_truth(run.replayed, run.table) if show is None or show.truth else None,
-            configuration_colours(run.every),
+            configuration_colours(run.every, truths={name for name, of in run.every.items() if of.units == TRUTH}),
         )
         check_files_unchanged(stamps)
     return notes
@@ -182,9 +183,15 @@ def list_results(
     files += ["bands.csv"] * experiment.measure.accuracy
     for log in choose_logs(experiment, [recording.scene.log for recording in recordings]):
         for stem in list_stems(experiment):
-            place, shown_count = _place_stem(stem, log, recordings), len(experiment.shown())
+            place, shown_count = _place_stem(stem, log, recordings), _count_with_views(experiment)
             files += [name for exporter in exporters for name in exporter.files(place, shown_count)]
     return sorted(files)
+
+
+def _count_with_views(experiment: Experiment) -> int:
+    """How many of the shown configurations have views of their own: all but the truth, unless it is alone."""
+    shown = experiment.shown()
+    return sum(configuration.units != TRUTH for configuration in shown.values()) or len(shown)
 
 
 def _table_files(name: str, counts: Mapping[str, int]) -> list[str]:
@@ -221,7 +228,7 @@ def _export(place: ResultsPlace, study: StudyTables, exporters: Sequence[Exporte
     notes: list[str] = []
     for log in choose_logs(study.experiment, [one.name for one in study.logs]) if exporters else ():
         for shown in select_shown_runs(study, log):
-            stem, shown_count = _place_stem(shown.stem, log, study.logs), len(study.experiment.shown())
+            stem, shown_count = _place_stem(shown.stem, log, study.logs), _count_with_views(study.experiment)
             files = [exporter.files(stem, shown_count) for exporter in exporters]
             with place.may_fail([name for names in files for name in names]):
                 run = _make_run_to_export(log, shown, study)

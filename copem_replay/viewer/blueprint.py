@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,6 +22,7 @@ from copem_replay.viewer.sink import (
     GROUND,
     HIDES,
     NOTICED,
+    SHOWN_OBJECTS,
     RecordingSink,
     configuration_part,
     digest_texts,
@@ -76,8 +77,9 @@ def write_legend_bars(out: RecordingSink, colours: Mapping[str, Rgb]) -> None:
 
 SMALL = 3
 """Most views beside each other: a view narrower than 400 points is too small."""
-NEAR_BY = 4
-"""Most objects with views that follow them: each view takes some kilobytes of the file."""
+NEAR_BY = SHOWN_OBJECTS
+"""Most objects with views that follow them: each of those shown."""
+SHARE_TITLE = "Visible share (white: ego, grey: any, x: out of view)"
 BESIDE = 4
 """Objects with lanes on one page: the lanes of six configurations fit into a height of 720 points."""
 BESIDE_LISTS = 2
@@ -92,7 +94,7 @@ class RecordingContent:
 
     `episodes`: rows of the table by object; `axes_s`: first and last second of each object's axis.
     Camera `eye` follows the ego, if there is one, `eyes` the objects; `above` looks at the units, of which `named` have
-    names. `lists`: lists that units send by a link, by configuration.
+    names. `lists`: lists that units send by a link, by configuration. `false`: how many false entries each one had.
     """
 
     replay: Replay
@@ -108,6 +110,7 @@ class RecordingContent:
     named: Sequence[str]
     lists: Mapping[str, Sequence[UnitLists]]
     baseline: str | None = None
+    false: Mapping[str, int] = field(default_factory=dict)
 
     def id_of(self, object_ix: int) -> str:
         """Id of an object as drawn, with its class."""
@@ -116,6 +119,13 @@ class RecordingContent:
     def axis(self, object_ix: int) -> rrb.TimeAxis:
         """The time axis of an object's lanes and curves."""
         return make_time_axis(*self.axes_s[object_ix])
+
+    def title(self, configuration: str, suffix: str = "") -> str:
+        """The title of a view: “bursty · 18 of 24 known · 3 false”, over the run; `suffix`: after the name."""
+        rows = self.table[self.table["configuration"] == configuration]
+        false = self.false.get(configuration, 0)
+        known = [f"{rows['detected'].sum()} of {len(rows)} known"] if len(rows) else []
+        return " · ".join([configuration + suffix, *known, *([f"{false} false"] if false else [])])
 
     def under(self, object_ix: int) -> list[str]:
         """Entities of the lanes of lists under those of an object."""
@@ -189,11 +199,12 @@ def reasons_page(content: RecordingContent) -> rrb.Container:
             for name, title in _last_and_first(content, k)
         ]
         origin = make_entity_path("plots", "visible_share", entity_names(content.replay.scene)[k])
-        share = _curves_view(
-            origin, "Visible share (white: ego, grey: any unit)", content.axis(k), values=(-0.05, 1.05)
-        )
+        share = _curves_view(origin, SHARE_TITLE, content.axis(k), values=(-0.05, 1.05))
         lower_row = rrb.Horizontal(lanes_view(content, k), share, column_shares=[3, 2])
-        pages.append(rrb.Vertical(rrb.Horizontal(*views), lower_row, row_shares=[3, 2], name=content.id_of(k)))
+        first_s, last_s = content.axes_s[k]
+        name = f"{short_ids(content.replay.scene)[k]} · {first_s:.1f}–{last_s:.1f} s"
+        rows = [3, 2] if len(content.configurations) <= MANY else [1, 1]
+        pages.append(rrb.Vertical(rrb.Horizontal(*views), lower_row, row_shares=rows, name=name))
     return rrb.Tabs(*pages, name="Why not earlier")
 
 
@@ -293,7 +304,9 @@ def tracks_views(content: RecordingContent, title_suffix: str = "") -> list[rrb.
     """A view of the fused tracks per configuration, from the ego's side."""
     marks = len(content.objects) == 1
     return [
-        world_view(content, name, name + title_suffix, content.eye, units=content.received(name), marks=marks)
+        world_view(
+            content, name, content.title(name, title_suffix), content.eye, units=content.received(name), marks=marks
+        )
         for name in content.configurations
     ]
 
@@ -377,7 +390,7 @@ def _curves_view(
     )
 
 
-LAYOUT = 4
+LAYOUT = 5
 """Version of the blueprint, raised with every change: a viewer prefers the one it has kept for an application id."""
 ALL_VIEWS = 3.1
 """Width by height of all views together: they have three fifths of a 16:9 window's height, less its bars."""
@@ -428,6 +441,7 @@ def build_blueprint(content: RecordingContent) -> tuple[rrb.Blueprint, str]:
         onset_ns,
         end_ns,
         content.baseline,
+        [content.title(name) for name in content.configurations],
         *([under] if any(under := [content.under(k) for k in content.objects]) else []),
     )
     return blueprint, digest_texts(repr(parts))

@@ -9,7 +9,7 @@ import numpy as np
 
 from copem_replay.core.colours import TRUTH, Rgb
 from copem_replay.core.fused_tracks import FusedTracks
-from copem_replay.core.tracks import CLASSES, Float, Int, Scene, Tracks
+from copem_replay.core.tracks import CLASSES, Bool, Float, Int, Scene, Tracks
 from copem_replay.perception.sensor_poses import SensorPoses
 from copem_replay.viewer.sink import (
     EGO,
@@ -180,10 +180,80 @@ def write_fused_boxes(
         step = np.clip(np.rint(age_of_information_s / STEP_S), 0, len(ALPHAS) - 1).astype(np.int64)
         return {"class_ids": kind[rows], "colors": shades[step]}
 
-    _write_boxes(out, [*path, "boxes"], tracks, more)
+    _write_boxes(out, [*path, "boxes"], tracks, more, tracks.valid[0] & (object_ix >= 0))
     solid = rr.components.FillMode.TransparentFillMajorWireframe
     out.static([*path, "boxes"], rr.Boxes3D.from_fields(radii=0.04, fill_mode=solid, show_labels=False))
     _write_covariance(out, [*path, "covariance"], tracks, colour)
+
+
+class FalseEntries:
+    """Draws entries about no object as dashed outlines with a cross over their boxes, and counts them.
+
+    An entry that the fusion follows counts once, whenever it is about no object; of those without an identity, as many
+    count as are in one list.
+    """
+
+    def __init__(self, out: RecordingSink, path: list[str], colour: Rgb) -> None:
+        self._out, self._path, self._colour = out, [*path, "false"], colour
+        self._tracks: set[int] = set()
+        self._at_once = 0
+        self._shown = False
+
+    @property
+    def count(self) -> int:
+        """How many there were so far."""
+        return len(self._tracks) + self._at_once
+
+    def add(self, fused_tracks: FusedTracks) -> None:
+        """Write those of the next time chunk. A list without any has an empty row, if one before had some."""
+        import rerun as rr
+
+        tracks = fused_tracks.fused
+        false = tracks.valid[0] & (tracks.row_object_ix < 0)
+        if not false.any() and not self._shown:
+            return
+        self._count(fused_tracks, np.flatnonzero(false))
+        for rows, counts, available_ns in slice_by_frame(tracks, false):
+            strips = rr.LineStrips3D.columns(strips=_dashed_crosses(tracks, rows).reshape(-1, 2, 3))
+            self._out.columns(self._path, available_ns, strips.partition(counts * _LINES))
+        if not self._shown:
+            self._out.static(
+                self._path, rr.LineStrips3D.from_fields(colors=[self._colour], radii=rr.Radius.ui_points(0.9))
+            )
+        self._shown = True
+
+    def _count(self, fused_tracks: FusedTracks, rows: Int) -> None:
+        said = fused_tracks.said
+        track_id = np.full(len(rows), -1) if said is None else said["track_id"][rows]
+        self._tracks.update(np.unique(track_id[track_id >= 0]).tolist())
+        frames = fused_tracks.fused.frame_ix[rows[track_id < 0]]
+        self._at_once = max(self._at_once, int(np.bincount(frames).max(initial=0)))
+
+
+_DASHES = np.array([(0.0, 0.2), (0.4, 0.6), (0.8, 1.0)])
+"""Where a side is drawn, as shares of its length: it begins and ends with a dash, so that corners are closed."""
+_LINES = 4 * len(_DASHES) + 2
+"""Lines of a false entry: dashes of four sides, and two of the cross."""
+
+
+def _dashed_crosses(tracks: Tracks, rows: Int) -> np.ndarray:
+    """(R, `_LINES`, 2, 3) ends of the lines of false entries, at the height of their tops."""
+    along = np.array([1.0, -1.0, -1.0, 1.0]) * tracks.length_m[0, rows, None] / 2
+    across = np.array([1.0, 1.0, -1.0, -1.0]) * tracks.width_m[0, rows, None] / 2
+    cos, sin = np.cos(tracks.yaw_rad[0, rows, None]), np.sin(tracks.yaw_rad[0, rows, None])
+    top_m = np.broadcast_to((tracks.z_m[0, rows] + tracks.height_m[0, rows] / 2)[:, None], along.shape)
+    corner = np.stack(
+        [
+            tracks.x_m[0, rows, None] + cos * along - sin * across,
+            tracks.y_m[0, rows, None] + sin * along + cos * across,
+            top_m,
+        ],
+        axis=-1,
+    )  # (R, 4, 3)
+    side = np.roll(corner, -1, axis=1) - corner
+    dashes = corner[:, :, None, None] + side[:, :, None, None] * _DASHES[..., None]  # (R, 4, 3, 2, 3)
+    cross = corner[:, [[0, 2], [1, 3]]]
+    return np.concatenate([dashes.reshape(len(rows), -1, 2, 3), cross], axis=1).astype(np.float32)
 
 
 def _pack_rgba(colour: tuple[int, int, int, int]) -> int:
@@ -191,11 +261,16 @@ def _pack_rgba(colour: tuple[int, int, int, int]) -> int:
     return red << 24 | green << 16 | blue << 8 | alpha
 
 
-def _write_boxes(out: RecordingSink, path: list[str], tracks: Tracks, more: Callable[[Int], dict[str, Any]]) -> None:
-    """Write the boxes of `tracks`, each list from the instant it is available. `more`: further columns of rows."""
+def _write_boxes(
+    out: RecordingSink, path: list[str], tracks: Tracks, more: Callable[[Int], dict[str, Any]], kept: Bool | None = None
+) -> None:
+    """Write the boxes of `tracks`, each list from the instant it is available.
+
+    `more`: further columns of rows. `kept` (P,): which are drawn, None: all.
+    """
     import rerun as rr
 
-    for rows, counts, available_ns in slice_by_frame(tracks, tracks.valid[0]):
+    for rows, counts, available_ns in slice_by_frame(tracks, tracks.valid[0] if kept is None else kept):
         columns = rr.Boxes3D.columns(
             centers=stack_float32(tracks.x_m[0, rows], tracks.y_m[0, rows], tracks.z_m[0, rows]),
             half_sizes=stack_float32(tracks.length_m[0, rows], tracks.width_m[0, rows], tracks.height_m[0, rows]) / 2,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -19,6 +19,10 @@ FARTHEST_BESIDE_M = 16.0
 AROUND_UNIT_M = 40.0
 """Radius in view around a fixed unit from which distances are measured: all of long paths would be too small."""
 EYES = ("world", "eyes")
+BESIDE_ASPECT = 1.7
+"""Width by height of two views beside each other, at least."""
+TOGETHER_M = 60.0
+"""Farthest unit that is in one picture with what it sees: from farther away people are a few pixels."""
 TURNED_RAD, DOWN_RAD = np.deg2rad((65.0, 65.0))
 """Direction of view, right of the ego's heading and down: from so high few words overlap."""
 ABOVE_RAD = np.deg2rad(75.0)
@@ -106,6 +110,25 @@ def camera_following(replay: Replay, experiment: Experiment, table: pd.DataFrame
     away_m = float(np.clip(np.hypot(*(own - np.append(target, 0))[:2]) if has_ego else 0.0, *CLOSE_M))
     path = (*EYES, entity_names(scene)[object_ix])
     return Camera(np.round(-away_m * towards, 1), np.zeros(3), np.nan_to_num(target), object_ix, path=path)
+
+
+def include_places(eye: Camera, places_m: Float) -> Camera:
+    """A camera that looks between its object and the places (3, K) around it, from where all of them are seen.
+
+    `places_m`: relative to the object. Places farther away than `TOGETHER_M` are left out.
+    """
+    near = places_m[:, np.hypot(*places_m[:2]) <= TOGETHER_M]
+    if not near.size:
+        return eye
+    both = np.concatenate([np.zeros((3, 1)), near], axis=1)
+    middle = (both.min(axis=1) + both.max(axis=1)) / 2
+    back = eye.place_m / np.linalg.norm(eye.place_m)
+    right = np.array([-back[1], back[0], 0.0]) / np.hypot(*back[:2])
+    off, tall = both - middle[:, None], np.tan(EYE_RAD / 2)
+    beside, above = np.abs(right @ off) / (BESIDE_ASPECT * tall), np.abs(np.cross(back, right) @ off) / tall
+    needed_m = (np.maximum(beside, above) + MARGIN_M / tall + back @ off).max()
+    away_m = max(CLOSE_M[0], float(needed_m))
+    return replace(eye, place_m=np.round(middle + away_m * back, 1), target_m=np.round(middle, 1))
 
 
 def camera_above(places_m: Float, eye: Camera) -> Camera:

@@ -51,15 +51,25 @@ LISTS_AT_ONCE = 2_000
 
 NO_LIST = np.empty(0, dtype=np.int64), np.empty(0)
 """`before` of the first time chunk in `write_gospa`."""
+HATCH_S, HATCH_SIZE = 0.1, 3.5
+"""Crosses of the visible share outside the field of view: one per tenth of a second, and its size in points."""
 _LOOKS = {BY_EGO: (EGO, 2.0), BY_ANY: (TRUTH, 1.0)}
 
 
-def write_visible_share(out: RecordingSink, name: str, curves: Mapping[str, Curve]) -> None:
-    """Write the visible shares of one object; `name`: its part of entity paths."""
+def write_visible_share(out: RecordingSink, name: str, curves: Mapping[str, Curve], inside: Mapping[str, Bool]) -> None:
+    """Write the visible shares of one object; `name`: its part of entity paths.
+
+    `inside`: by curve (K,), whether the object is in a field of view of its units. A line where it is, crosses where it
+    is not: what could be seen of it then is not looked at.
+    """
     import rerun as rr
 
     for units, curve in curves.items():
-        line = break_lines(curve.elapsed_ns, curve.share[:, None])
+        looked_at = np.where(inside[units], curve.share, np.nan)
+        _write_outside(
+            out, ["plots", "visible_share", name, f"{plain_part(units)}_outside"], units, curve, inside[units]
+        )
+        line = break_lines(curve.elapsed_ns, looked_at[:, None])
         share = np.full(len(line.counts), np.nan)
         share[line.counts > 0] = line.values
         has_value = ~np.isnan(share)
@@ -74,6 +84,20 @@ def write_visible_share(out: RecordingSink, name: str, curves: Mapping[str, Curv
         out.columns(path, instants, values)
         colour, width = _LOOKS[units]
         out.static(path, rr.SeriesLines(names=units, colors=colour, widths=width))
+
+
+def _write_outside(out: RecordingSink, path: list[str], units: str, curve: Curve, inside: Bool) -> None:
+    """Write a cross every `HATCH_S` where an object is outside all fields of view."""
+    import rerun as rr
+
+    at = np.flatnonzero(~inside & ~np.isnan(curve.share))
+    if not len(at):
+        return
+    step = curve.elapsed_ns[at] // round(HATCH_S * 1e9)
+    at = at[np.append(True, step[1:] != step[:-1])]
+    out.columns(path, curve.elapsed_ns[at], rr.Scalars.columns(scalars=curve.share[at]))
+    cross, names = rr.components.MarkerShape.Cross, f"{units}, outside the field of view"
+    out.static(path, rr.SeriesPoints(colors=_LOOKS[units][0], markers=cross, marker_sizes=HATCH_SIZE, names=names))
 
 
 def write_position_errors(

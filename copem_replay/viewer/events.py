@@ -227,7 +227,7 @@ def mark_onsets(
         part,
         "onset_s",
         texts,
-        ONSET,
+        ONSET[0],
         up=-1,
     )
 
@@ -353,7 +353,7 @@ def mark_curves(
         return
     entity = entity_names(replay.scene)[replay.scene.object_number[name]]
     episodes = table_rows(table[table["object_id"] == name])
-    marks = [(BY_EGO, [episode.onset_s for episode in episodes[:1]], ONSET, rr.components.MarkerShape.Diamond)]
+    marks = [(BY_EGO, [episode.onset_s for episode in episodes[:1]], ONSET[0], rr.components.MarkerShape.Diamond)]
     for configuration, colour in colours.items():
         found = [episode for episode in episodes if episode.configuration == configuration and episode.detected]
         curve = BY_EGO if _has_only_ego(replay, experiment, configuration) else BY_ANY

@@ -1,8 +1,10 @@
 """Lanes: the status of each shown object in each configuration over time, and lost, late and overtaken lists of units.
 
 An entity per object and configuration, such as `lanes/6_pedestrian/2_PEM`; the number is the configuration's place in
-the file. Changes too short to follow are left out, but known begins exactly at `detection_s`. A white mark ends at the
-onset. A lane is empty while the object is absent.
+the file. What holds when the object's axis begins is told after the configuration's name, “PEM: out of view”. Changes
+too short to follow are left out, but known begins exactly at `detection_s`, with how long after the onset, “0.60 s
+known”. A mark ends at the onset, white and black, so that it stands out in any theme. A lane is empty while the object
+is absent.
 
 An entity per configuration and unit, such as `lists/2_bursts/rsu1`, under the lanes of the objects, shows lists sent by
 a link, if one did not come in time; events say it in words.
@@ -49,9 +51,12 @@ if TYPE_CHECKING:
 
 STEADY_S = 0.4
 """Shorter spans become part of those around them: their words could not be read."""
-MARK = 1 / 80
-"""Length of the mark that ends at the onset, as a share of the axis: just wide enough to be visible."""
-ONSET_IS = "onset"
+MARK = 1 / 40
+"""Length of the mark that ends at the onset, as a share of the axis: just wide enough for both halves."""
+FLAG = 6
+"""Length of words such as “0.60 s known”, as a multiple of the mark's."""
+ONSET_IS = ("onset", "onset of the object")
+"""The two halves of the mark."""
 _STEADY_NS = round(STEADY_S * 1e9)
 
 
@@ -82,10 +87,14 @@ def write_lanes(
                 continue
             spans = smooth_status(status.elapsed_ns, status.status[:, m])
             texts = [_span_text(ids, units, sight, status, m, span) for span in spans]
-            tints = [status_colour(span.status, colours[name]) if span.status else ONSET for span in spans]
-            style = {text: tint for text, tint in zip(texts, tints, strict=True) if text} | {ONSET_IS: ONSET}
             begins = status.elapsed_ns[[span.first for span in spans]]
-            elapsed, texts = _insert_onset(begins, texts, int(clocks[name].onset_ns[k]), mark_ns)
+            onset_ns = int(clocks[name].onset_ns[k])
+            _add_flag(begins, texts, int(clocks[name].known_ns[k]), onset_ns, FLAG * mark_ns)
+            tints = [status_colour(span.status, colours[name]) if span.status else ONSET[0] for span in spans]
+            style = {text: tint for text, tint in zip(texts, tints, strict=True) if text}
+            style |= dict(zip(ONSET_IS, ONSET, strict=True))
+            elapsed, texts = _insert_onset(begins, texts, onset_ns, mark_ns)
+            style |= _add_name(elapsed, texts, name, to_nanoseconds(axes[k][0]), style)
             path = lane_path(scene, k, place, name)
             labels = [text for text in texts if text is not None]  # the row is empty while the object is absent
             states = rr.StateChange.columns(state=pa.array(labels, pa.string()))
@@ -133,6 +142,33 @@ def _span_text(
     return lane_text(span.status, units[by], body_name(ids, sight.solids, what))
 
 
+def _add_flag(begins: Int, texts: list[str | None], known_ns: int, onset_ns: int, room_ns: int) -> None:
+    """Say how long after the onset the object is first known, where that begins: “0.60 s known”.
+
+    Where that lasts for less than `room_ns`, too short for words, what follows says it, too.
+    """
+    for k in np.flatnonzero(begins == known_ns)[:1].tolist():
+        texts[k] = flag = f"{(known_ns - onset_ns) / 1e9:.2f} s {texts[k]}"
+        if k + 1 < len(texts) and texts[k + 1] is not None and begins[k + 1] - known_ns < room_ns:
+            texts[k + 1] = f"{flag}, then {texts[k + 1]}"
+
+
+def _add_name(
+    begins: Int, texts: list[str | None], name: str, first_ns: int, style: Mapping[str, Rgb]
+) -> dict[str, Rgb]:
+    """Put the configuration's name before the first text on the axis: the viewer's own titles of lanes are paths.
+
+    Returns what `style` lacks, the colour of that text.
+    """
+    current = max(int(np.searchsorted(begins, first_ns, side="right")) - 1, 0)
+    told = next((k for k in range(current, len(texts)) if texts[k] is not None), None)
+    text = None if told is None else texts[told]
+    if told is None or text is None:
+        return {}
+    texts[told] = named = f"{name}: {text}"
+    return {named: style[text]}
+
+
 def _insert_onset(
     elapsed_ns: Int, texts: Sequence[str | None], onset_ns: int, mark_ns: int
 ) -> tuple[Int, list[str | None]]:
@@ -141,8 +177,10 @@ def _insert_onset(
     if not elapsed_ns[0] <= begin:
         return elapsed_ns, list(texts)
     before, after = int(np.searchsorted(elapsed_ns, begin)), int(np.searchsorted(elapsed_ns, onset_ns, side="right"))
-    instants = np.concatenate([elapsed_ns[:before], [begin, onset_ns], elapsed_ns[after:]])
-    return instants, [*texts[:before], ONSET_IS, texts[after - 1], *texts[after:]]
+    marked = [begin, begin + mark_ns // 2, onset_ns]
+    return np.concatenate([elapsed_ns[:before], marked, elapsed_ns[after:]]), [
+        *texts[:before], *ONSET_IS, texts[after - 1], *texts[after:]
+    ]  # fmt: skip
 
 
 # Lists that units send by a link, in the shown run: lost, late or overtaken.

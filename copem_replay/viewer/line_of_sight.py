@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from copem_replay.core.errors import is_own
 from copem_replay.core.interpolation import AROUND_S, interpolate_at_instants, wrap_angles
-from copem_replay.core.tracks import Bool, Float, Int, Solid, Tracks
+from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int, Solid, Tracks
 from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.experiment.schema import Experiment, Unit
 from copem_replay.perception.observation import Observations
@@ -22,6 +22,7 @@ from copem_replay.perception.sensor_poses import (
     unit_ground,
 )
 from copem_replay.perception.visibility import Asked, VisibilityModel, find_blockers, visible_shares
+from copem_replay.pipeline.one_run import BY_ANY, BY_EGO, Curve
 from copem_replay.pipeline.prepare import ROWS_A_CHUNK, Replay
 from copem_replay.viewer.sink import stack_float32
 
@@ -74,6 +75,21 @@ def compute_sight(
     for first in range(0, len(stamps), at_once):
         _compute_part(replay, experiment, sight, known_shares, slice(first, first + at_once), centres)
     return sight
+
+
+def find_looked_at(replay: Replay, sight: Sight, object_ix: int, curves: Mapping[str, Curve]) -> dict[str, Bool]:
+    """(K,) by curve of the visible share, whether an object is in a field of view of the curve's units then."""
+    experiment, m = replay.expanded, int(np.flatnonzero(sight.object_ix == object_ix)[0])
+    numbers = {name: u for u, name in enumerate(experiment.units)}
+    ego = replay.scene.ego_ix
+    own = [numbers[name] for name, unit in experiment.modelled.items() if ego == find_carrier(replay.scene, unit) >= 0]
+    by_name = {BY_EGO: own, BY_ANY: [numbers[name] for name in experiment.modelled]}
+    looked = {}
+    for name, curve in curves.items():
+        frame = np.searchsorted(sight.elapsed_ns, curve.elapsed_ns + SAME_INSTANT_NS, side="right") - 1
+        seen = np.asarray((~np.isnan(sight.share[by_name[name], :, m])).any(axis=0))
+        looked[name] = seen[np.maximum(frame, 0)] & (frame >= 0)
+    return looked
 
 
 def _known_shares(sight: Sight, experiment: Experiment, observed: Observations | None, t0_ns: int) -> Float:

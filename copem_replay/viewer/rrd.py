@@ -25,7 +25,13 @@ from copem_replay.pipeline.prepare import Replay
 from copem_replay.results.write import Exporter, RunToExport
 from copem_replay.viewer import boxes, curves, lanes, sensors
 from copem_replay.viewer.blueprint import NEAR_BY, RecordingContent, build_blueprint, view_aspect, write_legend_bars
-from copem_replay.viewer.camera import camera_above, camera_following, camera_on_object, write_camera_origin
+from copem_replay.viewer.camera import (
+    camera_above,
+    camera_following,
+    camera_on_object,
+    include_places,
+    write_camera_origin,
+)
 from copem_replay.viewer.curves import write_differences
 from copem_replay.viewer.events import (
     mark_curves,
@@ -38,7 +44,7 @@ from copem_replay.viewer.events import (
     write_summary_text,
 )
 from copem_replay.viewer.lanes import UnitLists, find_linked_lists, write_list_fates, write_list_lanes
-from copem_replay.viewer.line_of_sight import Sight, compute_sight
+from copem_replay.viewer.line_of_sight import Sight, compute_sight, find_looked_at
 from copem_replay.viewer.sensors import FaultsShown, choose_named_units
 from copem_replay.viewer.sink import (
     RecordingPart,
@@ -80,8 +86,9 @@ def write_rrd(
 ) -> list[str]:
     """Write one run of one log to a file and, with an address, to a viewer. Returns notes. Raises OutputError.
 
-    More than six configurations go into several files, such as `replay.configurations_7-12.rrd`. Colours depend on the
-    places of all of the experiment's configurations, also of those that are not written.
+    More than six configurations go into several files, such as `replay.configurations_7-12.rrd`; the ground truth is
+    none of them, unless it is alone or compared. Colours depend on all of the experiment's configurations, also on
+    those that are not written.
 
     `run_tracks`: by time chunk, the receiver's fused tracks of each configuration in this run, with a frame per issued
     list (one unit, values (1, P)). `table`: the rows of `detections.parquet` of this log and run. `summary`: over all
@@ -90,9 +97,11 @@ def write_rrd(
     """
     later_chunks = iter(run_tracks)
     first = next(later_chunks)
-    parts = split_into_files(list(first), baseline)
-    colours = configuration_colours(experiment.configurations)  # by place, so equal in all files of the experiment
-    collector = TrackCollector(_measured_indices(replay, experiment, table))
+    truths = [name for name, asked in experiment.configurations.items() if asked.units == TRUTH]
+    # The truth is in every view, so it needs none of its own; configurations that are compared were chosen.
+    beside = [name for name in first if name not in truths] if baseline is None else []
+    parts = split_into_files(beside or list(first), baseline)
+    collector = TrackCollector(_measured_indices(replay, table, truths))
     objects = collector.object_ix.tolist()
     with ExitStack() as stack:
         files = []
@@ -103,6 +112,7 @@ def write_rrd(
             # The viewer takes two files of one identity for one recording.
             ids = f"copem_replay:{appearance}", digest_texts(*identity)
             out = stack.enter_context(_open_streams(part.path(path), ids, replay.scene.t0_ns, viewer))
+            colours = configuration_colours(experiment.configurations, truths=truths, selected=part.configurations)
             files.append(_RecordingFile(out, content, {name: colours[name] for name in part.configurations}))
             _begin_file(files[-1], panels, summary, run, run_is, [p.path(path).name for p in parts if p != part])
         if baseline is not None:  # of all objects at once: such a log is not long
@@ -112,6 +122,8 @@ def write_rrd(
         chunks = chain(iter([first]), later_chunks)
         del first  # so that only one chunk is held at a time
         _write_chunks(files, chunks, replay, experiment, collector)
+        for file in files:
+            _send_layout(file)
     return list(_list_notes(path, parts, [file.out.live for file in files]))
 
 
@@ -119,13 +131,14 @@ def write_rrd(
 class _RecordingFile:
     """One of the files: its streams, its content, and the colours of its configurations, in order.
 
-    `last_gospa`: by configuration, the last point of its curve in the time chunks so far.
+    By configuration, in the time chunks so far: `last_gospa` the last point of its curve, `false` its false entries.
     """
 
     out: RecordingSink
     content: RecordingContent
     colours: dict[str, Rgb]
     last_gospa: dict[str, tuple[Int, Float]] = field(default_factory=dict)
+    false: dict[str, boxes.FalseEntries] = field(default_factory=dict)
 
     @cached_property
     def clocks(self) -> dict[str, EpisodeClocks]:
@@ -134,9 +147,8 @@ class _RecordingFile:
         return {name: read_episode_clocks(scene, table, name) for name in self.colours}
 
 
-def _measured_indices(replay: Replay, experiment: Experiment, table: pd.DataFrame) -> list[int]:
+def _measured_indices(replay: Replay, table: pd.DataFrame, truths: Sequence[str]) -> list[int]:
     """Indices of the objects that words, lanes and curves are about; all files have the same ones."""
-    truths = [name for name, asked in experiment.configurations.items() if asked.units == TRUTH]
     return [replay.scene.object_number[name] for name in choose_measured_objects(table, truths)]
 
 
@@ -151,9 +163,12 @@ def _build_content(
     }
     aspect = view_aspect(len(configurations))
     eye = camera_on_object(replay, experiment, table, shown[0] if len(shown) else None, aspect)
-    eyes = [camera_following(replay, experiment, table, k) for k in shown[:NEAR_BY]]
     scene = replay.scene
     episodes = {k: table[table["object_id"] == scene.object_ids[k]] for k in shown}
+    eyes = [
+        include_places(camera_following(replay, experiment, table, k), sensors.watching_places(replay, episodes[k]))
+        for k in shown[:NEAR_BY]
+    ]
     onset_s = float(episodes[shown[0]]["onset_s"].iloc[0]) if len(shown) else 0.0
     axes_s = {k: axis_s(rows, scene.end_s) for k, rows in episodes.items()}
     named_units = choose_named_units(replay, experiment, eye.at_m, onset_s)
@@ -185,15 +200,13 @@ def _open_streams(path: Path, ids: tuple[str, str], t0_ns: int, viewer: str | No
 def _begin_file(
     file: _RecordingFile, panels: rrb.Blueprint, summary: pd.DataFrame, run: int, run_is: str, further: Sequence[str]
 ) -> None:
-    """Write the layout and everything that does not depend on fused tracks.
-
-    The layout is made active, so that no viewer replaces it by a guess.
-    """
+    """Write everything that does not depend on fused tracks; a running viewer gets the layout, too."""
     import rerun as rr
 
     out, content = file.out, file.content
     replay, experiment, scene = content.replay, content.experiment, content.replay.scene
-    out.send(lambda rec: rec.send_blueprint(panels, make_active=True))
+    if out.live is not None:
+        out.live.send(lambda rec: rec.send_blueprint(panels, make_active=True))
     for eye in (content.eye, *content.eyes):
         write_camera_origin(out, replay, eye)
     _write_properties(out, replay, experiment, list(content.configurations), run, run_is)
@@ -219,6 +232,13 @@ def _begin_file(
         curves.write_known_count(out, replay, "truth", replay.truth)
 
 
+def _send_layout(file: _RecordingFile) -> None:
+    """Write the layout, whose titles count false entries; active, so that no viewer replaces it by a guess."""
+    counts = {name: false.count for name, false in file.false.items()}
+    panels, _ = build_blueprint(replace(file.content, false=counts))
+    file.out.send(lambda rec: rec.send_blueprint(panels, make_active=True))
+
+
 def _write_chunks(
     files: Sequence[_RecordingFile], chunks: Iterable[Mapping[str, FusedTracks]], replay: Replay,
     experiment: Experiment, collector: TrackCollector,
@@ -234,16 +254,16 @@ def _write_chunks(
     sight = compute_sight(replay, experiment, collector.object_ix.tolist(), observed)
     for file in files:
         _write_knowledge(file, fused_tracks, sight)
-        _write_shares(file, observed)
+        _write_shares(file, observed, sight)
 
 
 def _write_fused(file: _RecordingFile, run_tracks: Mapping[str, FusedTracks]) -> None:
     """Write boxes, GOSPA and number of known objects of each configuration in a time chunk."""
     out, content = file.out, file.content
     for name, colour in file.colours.items():
-        boxes.write_fused_boxes(
-            out, ["world", configuration_part(name)], content.replay.scene, run_tracks[name], colour
-        )
+        path = ["world", configuration_part(name)]
+        boxes.write_fused_boxes(out, path, content.replay.scene, run_tracks[name], colour)
+        file.false.setdefault(name, boxes.FalseEntries(out, path, colour)).add(run_tracks[name])
         if len(content.replay.episodes.object_ix):
             before = file.last_gospa.get(name, curves.NO_LIST)
             file.last_gospa[name] = curves.write_gospa(
@@ -270,13 +290,13 @@ def _write_knowledge(file: _RecordingFile, run_tracks: Mapping[str, FusedTracks]
     lanes.write_lanes(out, scene, experiment, sight, statuses, file.colours, file.clocks, content.axes_s)
 
 
-def _write_shares(file: _RecordingFile, observed: Observations) -> None:
+def _write_shares(file: _RecordingFile, observed: Observations, sight: Sight) -> None:
     """Write the visible share of each shown object, with marks."""
     out, content = file.out, file.content
     names = entity_names(content.replay.scene)
     for k in content.objects:
         shares = share_curves(content.replay, observed, k)
-        curves.write_visible_share(out, names[k], shares)
+        curves.write_visible_share(out, names[k], shares, find_looked_at(content.replay, sight, k, shares))
         object_id = content.replay.scene.object_ids[k]
         mark_curves(out, content.replay, content.experiment, content.table, object_id, shares, file.colours)
 

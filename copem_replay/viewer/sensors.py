@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 
 from copem_replay.core.colours import Rgb
 from copem_replay.core.fused_tracks import FusedTracks
@@ -87,6 +88,31 @@ def choose_named_units(replay: Replay, experiment: Experiment, at_m: Float, time
         if len(chosen) < NAMED_UNITS and np.hypot(*(place[name] - at_m)[:2]) <= NAMED_WITHIN_M and all(apart):
             chosen[name] = place[name]
     return chosen
+
+
+def watching_places(replay: Replay, episodes: pd.DataFrame) -> Float:
+    """(3, K) places of the units that first listed an object, relative to it, at its onset and detections.
+
+    `episodes`: rows of one object and run. Of the ego, which may not have listed it, the place at the onset.
+    """
+    told = [(name, time_s) for name, time_s in zip(episodes["first_unit"], episodes["detection_s"], strict=True)]
+    onset_s, k = float(episodes["onset_s"].iloc[0]), replay.scene.object_number[episodes["object_id"].iloc[0]]
+    own = [name for name, unit in replay.expanded.modelled.items() if unit.on == "ego"]
+    asked = [(name, onset_s) for name in (*own[:1], *(name for name, _ in told))] + told
+    places = []
+    for name, time_s in dict.fromkeys(asked):
+        if name not in replay.expanded.modelled or np.isnan(time_s):
+            continue
+        poses, stamp = replay.placed.poses[name], replay.scene.t0_ns + round(time_s * 1e9)
+        row = int(np.searchsorted(replay.placed.stamps_ns[name], stamp, side="right")) - 1
+        states, there = interpolate_states(
+            replay.truth, np.array([k]), np.array([time_s]), t0_ns=replay.scene.t0_ns,
+            max_gap_s=replay.expanded.max_gap_s,
+        )  # fmt: skip
+        if row >= 0 and poses.present[row] and there[0]:
+            unit_m = np.array([poses.x_m[row], poses.y_m[row], poses.z_m[row]])
+            places.append(unit_m - [float(states[axis][0]) for axis in ("x_m", "y_m", "z_m")])
+    return np.array(places).reshape(-1, 3).T
 
 
 def unit_places(replay: Replay, experiment: Experiment, lists: Tracks) -> Float:

@@ -61,7 +61,8 @@ LANE: Rgb = (104, 104, 114)
 """Boundaries of lanes: visible, but less than everything else."""
 FIELD: Rgb = (150, 146, 118)
 """Outlines of fields of view."""
-ONSET: Rgb = (255, 255, 255)
+ONSET: tuple[Rgb, Rgb] = ((255, 255, 255), (0, 0, 0))
+"""Halves of the mark of the onset in lanes, whose ground is that of the theme; elsewhere the first."""
 HIDES: Rgb = (255, 110, 95)
 """Lines to what hides an object."""
 NOTICED: Rgb = (255, 255, 255)
@@ -75,7 +76,7 @@ STATUS: dict[int, Rgb] = {
     OUT: (52, 60, 80),
     UNLISTED: (88, 76, 54),
     HIDDEN: (152, 126, 82),
-    VISIBLE: (106, 112, 122),
+    VISIBLE: (95, 100, 109),
     LOST: (208, 192, 158),
     CAPTURED: (118, 140, 192),
     UNMATCHED: (190, 202, 228),

@@ -365,7 +365,7 @@ def lane_text(status: int, unit: str, hider: str) -> str:
         return "not listed yet" if unit == TRUTH else f"seen by {unit}, not listed"
     if status == CAPTURED:
         return f"on its way from {unit}"
-    return "listed, captured before the onset" if status == EARLY else STATUSES[status]
+    return "listed early" if status == EARLY else STATUSES[status]
 
 
 # Words over the shown objects, lines to hiding bodies, lines of sight of the units that listed objects first.

@@ -9,9 +9,12 @@ from __future__ import annotations
 
 import re
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pandas as pd
 
@@ -174,3 +177,9 @@ class Page(HTMLParser):
     def lines(self) -> list[str]:
         """What the top says, a sentence or paragraph a line."""
         return [re.sub(r"\s+", " ", line).strip() for line in self.head.splitlines() if line.strip()]
+
+
+def named(configurations: list[str], truths: Sequence[str] = ()) -> Any:
+    """What results say of the names of their configurations."""
+    facts = {name: SimpleNamespace(truth=name in truths) for name in configurations}
+    return SimpleNamespace(experiment=SimpleNamespace(configurations=facts), facts=facts)

@@ -13,6 +13,7 @@ from mcap.writer import Writer
 import copem_replay as cr
 from copem_replay.cli import main as cli
 from copem_replay.cli.results import layout
+from copem_replay.core.colours import configuration_colours
 from copem_replay.core.errors import InputError
 from copem_replay.experiment.file import log_paths, read_experiment_file
 from copem_replay.experiment.validate import find_problems, read_logs
@@ -142,8 +143,10 @@ def test_paths_lead_to_what_is_in_the_statuses(replay: Path) -> None:
 
 def test_curves_have_the_colours_of_their_configurations(replay: Path) -> None:
     (curves,) = panels_of(build_layout(replay, ["coPEM:1s", "PEM"]), "Plot!").values()
-    # Okabe and Ito: orange, sky blue, bluish green, yellow, blue for the first five of the experiment.
-    assert [(path["label"], path["color"]) for path in curves["paths"]] == [("coPEM:1s", "#0072b2"), ("PEM", "#56b4e9")]
+    every = configuration_colours(NAMES, truths=["GT"])
+    hexed = {name: "#" + bytes(colour).hex() for name, colour in every.items()}
+    shown = [(path["label"], path["color"]) for path in curves["paths"]]
+    assert shown == [(name, hexed[name]) for name in ("coPEM:1s", "PEM")]
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,7 @@ from copem_replay.report.figures.style import (
     render_figure,
 )
 from copem_replay.report.figures.trade_off import trade_off_figure
-from copem_replay.report.html.markup import INK, PAPER, dark_greys, replace_greys
+from copem_replay.report.html.markup import INK, PAPER, line_swatch, page_colours, replace_colours, replace_greys
 from copem_replay.report.html.page import build_page as report_page
 from copem_replay.report.html.study import load_study
 from copem_replay.report.html.tables import (
@@ -54,7 +54,7 @@ from copem_replay.report.html.tables import (
 from copem_replay.results.compare import compare_folders
 from copem_replay.results.read import Results, read_results
 from copem_replay.viewer.sink import choose_telling_objects
-from tests.helpers.report_pages import ALONE, ONE, changed, eighteen, replayed, with_rows
+from tests.helpers.report_pages import ALONE, ONE, changed, eighteen, named, replayed, with_rows
 from tests.oracles import intervals as oracle
 
 
@@ -280,16 +280,28 @@ class TestWhichObject:
 
 class TestLooks:
     def test_colours_are_those_of_the_recording(self) -> None:
-        names = [f"c{k}" for k in range(21)]
-        colours = configuration_colours(names)
-        for name, look in choose_appearances(names).items():
-            assert tuple(round(255 * channel) for channel in look.colour) == colours[name]
+        """On a dark page; paper has its own, by the same names."""
+        names = ["GT", "PEM", *(f"coPEM:{k}s" for k in range(19))]
+        on = {theme: configuration_colours(names, truths=["GT"], theme=theme) for theme in ("light", "dark")}
+        for name, look in choose_appearances(named(names, truths=["GT"])).items():
+            assert tuple(round(255 * channel) for channel in look.colour) == on["light"][name]
+            assert tuple(round(255 * channel) for channel in look.dark) == on["dark"][name]
+
+    def test_the_truth_is_a_grey_line_of_a_pixel(self) -> None:
+        look = choose_appearances(named(["PEM", "GT"], truths=["GT"]))["GT"]
+        assert look.colour == look.dark == (145 / 255,) * 3
+        assert look.line()["linewidth"] == 0.75
+        assert look.line()["linestyle"] == "-"
+
+    def test_variants_of_a_family_have_markers_of_their_own(self) -> None:
+        looks = choose_appearances(named(["PEM", "coPEM:0s", "coPEM:1s", "masts"]))
+        assert [look.marker for look in looks.values()] == ["o", "o", "s", "o"]
 
     def test_lines_are_seen_on_white_and_on_a_dark_page(self) -> None:
-        """WCAG 2.1, 1.4.11: 3 to 1, by the colour itself or by its outline."""
-        for look in choose_appearances([f"c{k}" for k in range(21)]).values():
-            for paper in (WHITE, DARK):
-                assert max(contrast_ratio(look.colour, paper), contrast_ratio(look.edge, paper)) >= 3, look
+        """WCAG 2.1, 1.4.11: 3 to 1."""
+        for look in choose_appearances(named([f"c{k}" for k in range(21)])).values():
+            assert contrast_ratio(look.colour, WHITE) >= 3, look
+            assert contrast_ratio(look.dark, DARK) >= 3, look
 
     def test_contrast(self) -> None:
         assert contrast_ratio((0.0, 0.0, 0.0), WHITE) == pytest.approx(21)
@@ -330,16 +342,30 @@ def test_headers_have_units_also_of_own_metrics() -> None:
     assert sort_columns(["n", "detected_share", "ttd_rmst_s"]) == ["ttd_rmst_s", "detected_share", "n"]
 
 
+def test_a_configuration_has_its_other_colour_on_a_dark_page() -> None:
+    """In figures and swatches, by the same variable; other colours and texts stay."""
+    looks = choose_appearances(named(["PEM"]))
+    [(light, dark)] = [
+        [bytes(round(255 * c) for c in one).hex() for one in (look.colour, look.dark)] for look in looks.values()
+    ]
+    page = replace_colours(f'<path style="fill: #{light}; stroke: #123456"/>#{light}', looks.values())
+    assert page == f'<path style="fill: var(--c-{light}-{dark}); stroke: #123456"/>#{light}'
+    assert f"var(--c-{light}-{dark})" in line_swatch(looks["PEM"])
+    on_paper, on_dark = page_colours(page).splitlines()
+    assert on_paper == f":root{{--c-{light}-{dark}:#{light};}}"
+    assert f":root{{--c-{light}-{dark}:#{dark};}}" in on_dark
+
+
 def test_greys_turn_over_and_colours_stay() -> None:
     """Black becomes the ink of the dark page, white its paper, a grey lies as far between them."""
     page = replace_greys('<path style="fill: #ffffff; stroke: #000000"/><path style="fill: #808080; stroke: #0072b2"/>')
     assert "#0072b2" in page
     assert re.findall(r"#[0-9a-f]{6}", page) == ["#0072b2"]
-    light, dark = dark_greys(page).splitlines()
+    light, dark = page_colours(page).splitlines()
     assert light == ":root{--g-00:#000000;--g-80:#808080;--g-ff:#ffffff;}"
     expected = ":root{--g-00:#e8e8e8;--g-80:#818181;--g-ff:#1b1b1b;}"
     assert dark == f"@media screen and (prefers-color-scheme: dark){{{expected}}}"
-    assert dark_greys("<p>no figure</p>") == ""
+    assert page_colours("<p>no figure</p>") == ""
 
 
 def test_the_page_has_the_dark_paper_that_greys_go_by() -> None:

@@ -45,7 +45,7 @@ from copem_replay.report.figures.sweeps import sweeps_figure
 from copem_replay.results.read import Results, read_results
 from tests.helpers.recordings import Obj, pedestrian, write_recording
 from tests.helpers.replays import save_run
-from tests.helpers.report_pages import with_rows
+from tests.helpers.report_pages import named, with_rows
 from tests.oracles import intervals as oracle
 
 TEXT = """\
@@ -731,7 +731,7 @@ class TestWords:
         assert labels == ["GT", "$a$_{<&>}", "near", "_試", "never"]
 
     def test_looks_differ(self) -> None:
-        looks = choose_appearances([f"c{k}" for k in range(9)])
+        looks = choose_appearances(named([f"c{k}" for k in range(9)]))
         assert len({(look.dashes, look.colour) for look in looks.values()}) == 9
         assert len({look.dashes for look in list(looks.values())[:7]}) == 7
         # The first line is the widest.

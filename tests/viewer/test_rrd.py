@@ -20,7 +20,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from copem_replay.core.colours import configuration_colours
 from copem_replay.core.errors import OutputError
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import CLASSES, TimeChunk
@@ -101,6 +100,18 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
     return make(tmp_path_factory.mktemp("show") / "not yet" / "there" / "replay.rrd", approaching(), **CHANGES)
 
 
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    """Nothing but the truth: then it has views of its own."""
+    truths = {name: asked for name, asked in CHANGES["configurations"].items() if asked["units"] == "truth"}
+    path = tmp_path_factory.mktemp("alone") / "replay.rrd"
+    return make(path, approaching(), **CHANGES | {"configurations": truths})
+
+
+BESIDE = ["PEM", "pole", "none"]
+"""Configurations that are not the truth."""
+
+
 # ------------------------------------------------------------------------------- reading back
 
 
@@ -160,7 +171,8 @@ def kinds_of_boxes(path: Path) -> dict[int, Any]:
 
 
 @pytest.mark.parametrize("name", ["truth", *CHANGES["configurations"]])
-def test_boxes_are_those_of_the_arrays(made: Made, name: str) -> None:
+def test_boxes_are_those_of_the_arrays(made: Made, alone: Made, name: str) -> None:
+    made = alone if name in alone.run_tracks else made
     tracks = made.replay.truth if name == "truth" else made.run_tracks[name].fused
     entity = f"/world/{name}/boxes".replace(" ", "\\ ")
     found = rows(made.path, entity)
@@ -183,18 +195,18 @@ def test_boxes_are_those_of_the_arrays(made: Made, name: str) -> None:
         ]
 
 
-def test_what_lists_hold_and_when(made: Made) -> None:
+def test_what_lists_hold_and_when(made: Made, alone: Made) -> None:
     assert [80.0, 0.0, 0.75] in at(made.path, "/world/truth/boxes", 2.0)["Boxes3D:centers"]
     # From the ego: the bin, 31 m away, always, and once the car.
     assert [len(row["Boxes3D:centers"]) for row in rows(made.path, "/world/PEM/boxes")] == [1] * 40 + [2] + [1] * 10
     # Lists without objects are there, and empty; they end where the carrier leaves.
     assert [row["Boxes3D:centers"] for row in rows(made.path, "/world/none/boxes")] == [[]] * 41
     # Half a second late: nothing before, and then what was half a second before.
-    late = rows(made.path, "/world/GT\\ late/boxes")
+    late = rows(alone.path, "/world/GT\\ late/boxes")
     assert late[0][ELAPSED] == 500_000_000
-    assert [80.0, 0.0, 0.75] in at(made.path, "/world/GT\\ late/boxes", 2.5)["Boxes3D:centers"]
-    assert len(at(made.path, "/world/GT\\ late/boxes", 4.5)["Boxes3D:centers"]) == 3
-    assert len(at(made.path, "/world/GT\\ late/boxes", 4.6)["Boxes3D:centers"]) == 2
+    assert [80.0, 0.0, 0.75] in at(alone.path, "/world/GT\\ late/boxes", 2.5)["Boxes3D:centers"]
+    assert len(at(alone.path, "/world/GT\\ late/boxes", 4.5)["Boxes3D:centers"]) == 3
+    assert len(at(alone.path, "/world/GT\\ late/boxes", 4.6)["Boxes3D:centers"]) == 2
 
 
 def test_colours_tell_ego_standing_and_configurations_apart(made: Made) -> None:
@@ -202,15 +214,16 @@ def test_colours_tell_ego_standing_and_configurations_apart(made: Made) -> None:
     ego, car, walker, bin = (kinds[k] for k in at(made.path, "/world/truth/boxes", 0)["Boxes3D:class_ids"])
     assert (ego["label"], bin["label"]) == ("ego car", "bin other")
     assert len({ego["color"], car["color"], bin["color"]}) == 3
-    assert car["color"] >> 8 == walker["color"] >> 8 == 0x969696, "the truth is grey"
+    assert car["color"] >> 8 == walker["color"] >> 8 == 0x919191, "the truth is grey"
     assert bin["color"] < car["color"] < ego["color"], "stationary: darker"
-    colours = [at(made.path, f"/world/{n}/boxes", 4.0)["Boxes3D:colors"][0] >> 8 for n in ("GT", "PEM", "pole")]
-    assert len(set(colours)) == 3
+    colours = [at(made.path, f"/world/{n}/boxes", 4.0)["Boxes3D:colors"][0] >> 8 for n in ("PEM", "pole")]
+    assert len({*colours, 0x919191}) == 3
 
 
-def test_the_older_the_paler(made: Made) -> None:
+def test_the_older_the_paler(made: Made, alone: Made) -> None:
     def opaque(name: str, elapsed_s: float) -> set[int]:
-        return {colour & 0xFF for colour in at(made.path, f"/world/{name}/boxes", elapsed_s)["Boxes3D:colors"]}
+        path = alone.path if name.startswith("GT") else made.path
+        return {colour & 0xFF for colour in at(path, f"/world/{name}/boxes", elapsed_s)["Boxes3D:colors"]}
 
     assert opaque("GT", 3.0) == {220}
     assert opaque("GT\\ late", 3.0) == {120}, "half a second: two and a half steps, to even"
@@ -229,7 +242,23 @@ def test_ellipses_are_two_sigma(made: Made) -> None:
     tilted = at(made.path, "/world/pole/covariance", 1.0)
     assert tilted["Ellipsoids3D:half_sizes"][0] == pytest.approx([4, 2, 0.01])
     assert turns(tilted, "Ellipsoids3D")[0] == pytest.approx(np.pi / 4)
-    assert not list(chunks(made.path, "/world/GT/covariance"))
+
+
+def test_exact_positions_have_no_ellipses(alone: Made) -> None:
+    assert list(chunks(alone.path, "/world/GT/boxes"))
+    assert not list(chunks(alone.path, "/world/GT/covariance"))
+
+
+def test_the_truth_has_nothing_of_its_own_beside_others(made: Made, alone: Made) -> None:
+    """Its outlines are in every view; as the baseline of differences, or alone, it is one like any other."""
+    from rerun.chunk import RrdReader
+
+    def of_truth(path: Path) -> set[str]:
+        return {c.entity_path for c in RrdReader(path).stream() if "GT" in c.entity_path}
+
+    assert of_truth(made.path) == set()
+    assert "/world/GT/boxes" in of_truth(alone.path)
+    assert not any("| GT" in text for text in static(made.path, "/difference")["TextDocument:text"])
 
 
 # ------------------------------------------------------------------------------- units, obstacles
@@ -273,9 +302,10 @@ def test_what_hides_from_below_the_ground_is_drawn_from_the_ground(tmp_path: Pat
 # ------------------------------------------------------------------------------- plots, words
 
 
-def test_errors_are_those_of_the_instant_a_list_is_available(made: Made) -> None:
+def test_errors_are_those_of_the_instant_a_list_is_available(made: Made, alone: Made) -> None:
     def error(name: str) -> list[dict[str, Any]]:
-        return rows(made.path, f"/plots/position_error/7_car/{name}".replace(" ", "\\ "))
+        path = alone.path if name.startswith("GT") else made.path
+        return rows(path, f"/plots/position_error/7_car/{name}".replace(" ", "\\ "))
 
     # Quartiles of a second around every quarter of one; ten lists a second.
     exact = error("GT")
@@ -397,17 +427,26 @@ def test_visible_shares_of_the_ego_and_of_the_best(tmp_path: Path) -> None:
         ],
         until_s=3.0,
     )
-    made = make(tmp_path / "x.rrd", scene, units={"ego": EGO_UNIT, "pole": CHANGES["units"]["pole"] | {"at": [70, 8]}})
+    pole = CHANGES["units"]["pole"] | {"at": [70, 8]}
+    made = make(tmp_path / "x.rrd", scene, units={"ego": EGO_UNIT | {"pem": "all"}, "pole": pole})
     own, best = (rows(made.path, f"/plots/visible_share/9_pedestrian/{name}") for name in ("ego", "any_unit"))
     # Only where a line bends: its ends, and the gap.
     assert [row["Scalars:scalars"] for row in own] == [[0.0], [0.0], [], [0.0], [0.0]]
     assert [row["Scalars:scalars"] for row in best] == [[1.0], [1.0], [], [1.0], [1.0]]
     assert (best[0][ELAPSED], best[-1][ELAPSED]) == (0, 3_000_000_000)
+    assert not rows(made.path, "/plots/visible_share/9_pedestrian/ego_outside")
+    # From 60 m it does not look at all, whatever could be seen: crosses, ten a second, and no line.
+    far = make(tmp_path / "far.rrd", scene, units={"ego": EGO_UNIT, "pole": pole}).path
+    crosses = rows(far, "/plots/visible_share/9_pedestrian/ego_outside")
+    assert not rows(far, "/plots/visible_share/9_pedestrian/ego")
+    assert [row["Scalars:scalars"] for row in crosses] == [[0.0]] * 22
+    assert np.diff([row[ELAPSED] for row in crosses[:10]]).tolist() == [100_000_000] * 9
+    assert not rows(far, "/plots/visible_share/9_pedestrian/any_unit_outside")
 
 
-def test_events_in_words(made: Made) -> None:
+def test_events_in_words(made: Made, alone: Made) -> None:
     def told(name: str) -> list[tuple[float, str, str]]:
-        found = rows(made.path, f"/events/{name}")
+        found = rows(alone.path if name == "GT" else made.path, f"/events/{name}")
         return [(row[ELAPSED] * 1e-9, row["TextLog:level"][0], row["TextLog:text"][0]) for row in found]
 
     found = rows(made.path, "/events/onsets")
@@ -445,8 +484,6 @@ def test_what_becomes_of_a_conflict_is_told(made: Made, tmp_path: Path) -> None:
         "",
         "| configuration | known after | at | verdict | closest | by |",
         "| --- | ---: | ---: | ---: | ---: | ---: |",
-        "| GT | 0.00 s | 80.0 m | pass | 9.0 m | truth |",
-        "| GT late | 0.50 s | 75.0 m | pass | 8.0 m | truth |",
         "| PEM | 2.00 s | 60.0 m | **fail** at 4.0 m/s | 0.0 m | ego |",
         "| pole | 0.00 s | 80.0 m | **fail** | 0.2 m | pole |",
         "| none | never | – | **fail** at 10.0 m/s | 0.0 m | – |",
@@ -469,11 +506,11 @@ def test_up_to_three_marks_have_lines(tmp_path: Path, many: int, lines: bool) ->
     assert bool(rows(path, "/world/PEM/marks/from/line")) == lines
 
 
-def test_detected_before_the_onset_and_where_nobody_knows(made: Made, tmp_path: Path) -> None:
-    table = made.table[made.table["detected"]].head(1).assign(
+def test_detected_before_the_onset_and_where_nobody_knows(alone: Made, tmp_path: Path) -> None:
+    table = alone.table[alone.table["detected"]].head(1).assign(
         detection_s=0.5, onset_s=1.0, time_to_detection_s=-0.5, distance_at_detection_m=np.nan
     )  # fmt: skip
-    made.write(tmp_path / "x.rrd", table=table)
+    alone.write(tmp_path / "x.rrd", table=table)
     found = rows(tmp_path / "x.rrd", "/events/GT")
     assert [row["TextLog:text"] for row in found] == [["GT: 7 car detected by truth 0.50 s before the onset"]]
 
@@ -495,7 +532,7 @@ def test_the_summary_says_which_run_and_lists_configurations_side_by_side(made: 
 def test_properties(made: Made) -> None:
     own = static(made.path, "/__properties/replay")
     assert (own["log"], own["run"], own["seed"]) == (["scene"], [3], ["7"])
-    assert own["configurations"] == list(CHANGES["configurations"])
+    assert own["configurations"] == BESIDE
     assert own["rerun_sdk"][0].startswith("0.41")
     general = static(made.path, "/__properties")
     assert general["RecordingInfo:name"] == ["scene: run 3"]
@@ -518,7 +555,7 @@ def test_a_blueprint_inside_and_one_name_per_layout(made: Made, tmp_path: Path) 
         if "ViewBlueprint:display_name" in b.schema.names
     ]
     assert set(names) >= {
-        *CHANGES["configurations"], "7 car, onset 2.0 s", "9 pedestrian, onset 0.0 s", "What difference it made",
+        "PEM · 1 of 2 known", "pole · 2 of 2 known", "none · 0 of 2 known", "7 car, onset 2.0 s", "9 pedestrian, onset 0.0 s", "What difference it made",
         "7 car: position error, m", "GOSPA of all measured objects, m", "Measured objects known (grey: there are)",
         "Events", "Legend",
         "Summary of all runs", "PEM: 9 pedestrian never known", "pole: 7 car known 0.00 s after its onset",
@@ -528,7 +565,18 @@ def test_a_blueprint_inside_and_one_name_per_layout(made: Made, tmp_path: Path) 
         for b in batches
         if "ContainerBlueprint:display_name" in b.schema.names
     ]
-    asked = {"Overview", "Who knew when", "Why not earlier", "What each believes", "How far off", "Units", "In words"}
+    assert "GT" not in " ".join(names)
+    asked = {
+        "7 · 1.5–4.5 s",
+        "9 · 0.0–2.0 s",
+        "Overview",
+        "Who knew when",
+        "Why not earlier",
+        "What each believes",
+        "How far off",
+        "Units",
+        "In words",
+    }
     assert set(pages) >= asked
     fewer = {name: made.run_tracks[name] for name in ("GT", "PEM")}
     made.write(tmp_path / "x.rrd", run_tracks=fewer)
@@ -624,12 +672,6 @@ def test_of_many_objects_those_that_tell_configurations_apart_are_shown() -> Non
     assert choose_telling_objects(episodes[episodes["configuration"] == "GT"], ["GT"], 2) == ["a", "b"], (
         "nothing but the truth"
     )
-
-
-def test_colours_do_not_repeat() -> None:
-    colours = configuration_colours([str(k) for k in range(28)])
-    assert len(set(colours.values())) == 28
-    assert all(0 <= c <= 255 for colour in colours.values() for c in colour)
 
 
 def test_a_disk_that_is_full_is_an_error_and_leaves_nothing(made: Made, tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ from copem_replay.viewer import write_rrd
 from copem_replay.viewer.curves import break_lines, running_median
 from copem_replay.viewer.lanes import STEADY_S, smooth_status
 from copem_replay.viewer.sink import KNOWN, STATUSES
+from tests.helpers.report_pages import named
 from tests.oracles.colour import apart_for_a_deuteranope, contrast
 from tests.viewer.test_rrd import SUMMARY, Made
 from tests.viewer.test_status import lane
@@ -63,6 +64,8 @@ def city(tmp_path_factory: pytest.TempPathFactory) -> Made:
 
 
 def test_words_and_lines_stand_out_from_the_ground() -> None:
+    assert max(contrast(half, palette.GROUND) for half in palette.ONSET) >= 3
+    assert max(contrast(half, (255, 255, 255)) for half in palette.ONSET) >= 3, "lanes have the ground of the theme"
     words = {"known": palette.NOTICED, "waiting": palette.WAITING, "hidden": palette.BEHIND, "ego": palette.EGO}
     assert {name: contrast(colour, palette.GROUND) >= 4.5 for name, colour in words.items()} == dict.fromkeys(
         words, True
@@ -71,19 +74,19 @@ def test_words_and_lines_stand_out_from_the_ground() -> None:
     assert [name for name, colour in words.items() if contrast(colour, plate) < 3] == []
     lines = {
         "truth": TRUTH, "standing": palette.STANDING, "lane": palette.LANE, "field": palette.FIELD,
-        "onset": palette.ONSET, "difference": palette.DIFFERENCE, **configuration_colours(map(str, range(28))),
+        "onset": palette.ONSET[0], "difference": palette.DIFFERENCE, **configuration_colours(map(str, range(8))),
     }  # fmt: skip
     assert [name for name, colour in lines.items() if contrast(colour, palette.GROUND) < 3] == []
 
 
 def test_statuses_stay_apart_for_deuteranopes() -> None:
     neutral = {STATUSES[k]: colour for k, colour in palette.STATUS.items()}
-    all_of_them = neutral | {"onset": palette.ONSET, "truth": TRUTH, "ground": palette.GROUND}
+    all_of_them = neutral | {"onset": palette.ONSET[0], "truth": TRUTH, "ground": palette.GROUND}
     near = [
         (a, b) for a, b in combinations(all_of_them, 2) if apart_for_a_deuteranope(all_of_them[a], all_of_them[b]) < 15
     ]
     assert near == []
-    for colour in configuration_colours(map(str, range(28))).values():
+    for colour in configuration_colours(map(str, range(8))).values():
         half = palette.status_colour(KNOWN - 1, colour)
         assert apart_for_a_deuteranope(half, colour) >= 15, "listed and known"
     # The oracle: black and white are 100 apart, a colour 0 from itself; red and green of one luminance hardly.
@@ -93,15 +96,18 @@ def test_statuses_stay_apart_for_deuteranopes() -> None:
 
 
 def test_marks_of_differences_use_no_colour_of_a_configuration() -> None:
-    assert palette.DIFFERENCE not in configuration_colours(map(str, range(28))).values()
+    assert palette.DIFFERENCE not in configuration_colours(map(str, range(8))).values()
 
 
 def test_a_configuration_has_one_colour_everywhere(city: Made) -> None:
     """In boxes, lanes, lines, curves, the legend and the figures of the report."""
     from copem_replay.report.figures.style import choose_appearances
 
-    every = configuration_colours(city.given.configurations)
-    figures = {name: tuple(round(255 * c) for c in one.colour) for name, one in choose_appearances(list(every)).items()}
+    truths = [name for name, asked in city.given.configurations.items() if asked.units == "truth"]
+    every = configuration_colours(city.given.configurations, truths=truths)
+    beside = [name for name in every if name not in truths]
+    looks = choose_appearances(named(list(every), truths))
+    figures = {name: tuple(round(255 * c) for c in one.dark) for name, one in looks.items()}
     assert figures == every
     number = {name: r << 16 | g << 8 | b for name, (r, g, b) in every.items()}
     found = defaultdict(set)
@@ -116,13 +122,14 @@ def test_a_configuration_has_one_colour_everywhere(city: Made) -> None:
                 found[name] |= {colour >> 8 for colour in batch.column("SeriesLines:colors").to_pylist()[0]}
         if entity == "/legend/bars":
             bars = [colour >> 8 for colour in batch.column("LineStrips2D:colors").to_pylist()[0]]
-            assert bars[: len(every)] == list(number.values())
+            assert bars[: len(beside)] == [number[name] for name in beside]
         if entity.startswith("/lanes/") and batch.schema.names and "StateConfiguration:values" in batch.schema.names:
             of = dict(zip(batch.column("StateConfiguration:values").to_pylist()[0],
                           batch.column("StateConfiguration:colors").to_pylist()[0], strict=True))  # fmt: skip
             place = int(entity.rsplit("/", 1)[-1].split("_")[0]) - 1
-            assert of.get("known", number[list(every)[place]] << 8) >> 8 == number[list(every)[place]]
-    assert found == {name: {value} for name, value in number.items()}
+            known = {colour >> 8 for text, colour in of.items() if text.endswith("known")}
+            assert known <= {number[beside[place]]}
+    assert found == {name: {number[name]} for name in beside}
 
 
 def test_every_ground_is_dark(city: Made) -> None:
@@ -185,7 +192,7 @@ def test_at_most_six_labels_a_view(city: Made) -> None:
 
 def test_paths_of_lanes_and_plots_need_no_escapes(city: Made) -> None:
     paths = {entity for entity, _ in batches(city.path) if entity.startswith("/lanes/")}
-    assert len(paths) == 6 * 5
+    assert len(paths) == 6 * 4
     assert not any("\\" in path or "[" in path for path in paths)
     assert {path.split("/")[2].split("_")[1] for path in paths} <= {"car", "pedestrian"}
 
@@ -199,7 +206,8 @@ def test_no_lane_of_the_city_says_known_before_the_table(city: Made) -> None:
     shown = {entity.split("/")[2].split("_")[0] for entity, _ in batches(city.path) if entity.startswith("/lanes/")}
     assert len(shown) == 6
     held = 0
-    for c, name in enumerate(city.given.configurations):
+    beside = [name for name, asked in city.given.configurations.items() if asked.units != "truth"]
+    for c, name in enumerate(beside):
         for who in shown:
             kind = table.loc[(name, who), "object_class"]
             known = [time_s for time_s, said in lane(city.path, f"{who} {kind}", c) if said == "known"]

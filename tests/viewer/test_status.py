@@ -5,6 +5,7 @@ Mostly an ego that stands at the origin and looks east, and pedestrians who are 
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -35,12 +36,13 @@ def labels(path: Path, configuration: str, elapsed_s: float) -> list[str]:
 
 
 def lane(path: Path, who: str, number: int) -> list[tuple[float, str | None]]:
-    """When a configuration's lane changes, and to what; None: it says nothing."""
+    """When a configuration's lane changes, and to what; None: it says nothing. Without its name and without times."""
     from rerun.chunk import RrdReader
 
     begin = f"/lanes/{who.replace(' ', '_')}/{number + 1}_"
     [entity] = {chunk.entity_path for chunk in RrdReader(path).stream() if chunk.entity_path.startswith(begin)}
-    return [(row["elapsed"] / 1e9, (row["StateChange:state"] or [None])[0]) for row in rows(path, entity)]
+    said = [(row["elapsed"] / 1e9, (row["StateChange:state"] or [None])[0]) for row in rows(path, entity)]
+    return [(when, text and re.sub(r"^(.*: )?(-?[0-9.]+ s )?", "", text)) for when, text in said]
 
 
 # ------------------------------------------------------------------------------- hidden, out of view
@@ -76,7 +78,7 @@ def test_a_solid_of_the_log_is_told_by_its_name(tmp_path: Path) -> None:
     made = make(tmp_path / "x.rrd", scene, obstacles=[away], measure=PERSON, pems={"sure": seen})
     assert told(made.path, "PEM", 0.2) == ["4 hidden from ego by object 9 (share 0.00)"]
     assert labels(made.path, "PEM", 0.2) == ["4 behind object 9"]
-    assert lane(made.path, "4 pedestrian", 1) == [(0, "behind object 9 (from ego)")]
+    assert lane(made.path, "4 pedestrian", 0) == [(0, "behind object 9 (from ego)")]
 
 
 def test_who_is_hidden_and_by_whom(hiding: Made) -> None:
@@ -107,20 +109,32 @@ def test_the_labels_are_short(hiding: Made) -> None:
 
 
 def test_lanes_tell_when_a_configuration_knew(hiding: Made) -> None:
-    assert lane(hiding.path, "2 pedestrian", 0) == [(0, "known"), (1.6, None)]
-    assert lane(hiding.path, "2 pedestrian", 1) == [(0, "behind 3 (from ego)"), (1.0, "known"), (1.6, None)]
-    assert lane(hiding.path, "4 pedestrian", 1) == [(0, "behind obstacle 0 (from ego)")]
-    assert lane(hiding.path, "4 pedestrian", 2) == [(0, "known")]
+    assert lane(hiding.path, "2 pedestrian", 0) == [(0, "behind 3 (from ego)"), (1.0, "known"), (1.6, None)]
+    assert lane(hiding.path, "4 pedestrian", 0) == [(0, "behind obstacle 0 (from ego)")]
+    assert lane(hiding.path, "4 pedestrian", 1) == [(0, "known")]
 
     def colour_of(name: str) -> dict[str, int]:
         style = static(hiding.path, f"/lanes/2_pedestrian/{name}")
         return dict(zip(style["StateConfiguration:values"], style["StateConfiguration:colors"], strict=True))
 
-    names = ("1_GT", "2_PEM", "3_both")
-    known = [colour_of(name)["known"] >> 8 for name in names]
-    boxes = [at(hiding.path, f"/world/{name}/boxes", 1.2)["Boxes3D:colors"][0] >> 8 for name in ("GT", "PEM", "both")]
+    names = {"1_PEM": "1.00 s known", "2_both": "both: 0.00 s known"}
+    known = [colour_of(name)[text] >> 8 for name, text in names.items()]
+    boxes = [at(hiding.path, f"/world/{name}/boxes", 1.2)["Boxes3D:colors"][0] >> 8 for name in ("PEM", "both")]
     assert known == boxes
-    assert len({colour_of(name)["onset"] for name in names}) == 1
+    # One half of the mark stands out from the ground of any theme.
+    halves = {(colour_of(name)["onset"] >> 8, colour_of(name)["onset of the object"] >> 8) for name in names}
+    assert halves == {(0xFFFFFF, 0)}
+
+
+def test_lanes_say_whose_they_are_and_how_soon(hiding: Made) -> None:
+    """The name before what holds where the axis begins, the time where the object is first known."""
+
+    def said(entity: str) -> list[str | None]:
+        return [(row["StateChange:state"] or [None])[0] for row in rows(hiding.path, f"/lanes/{entity}")]
+
+    assert said("2_pedestrian/1_PEM") == ["PEM: behind 3 (from ego)", "1.00 s known", None]
+    assert said("2_pedestrian/2_both") == ["both: 0.00 s known", None]
+    assert said("4_pedestrian/1_PEM") == ["PEM: behind obstacle 0 (from ego)"]
 
 
 def test_lines_from_units_to_what_they_listed(hiding: Made) -> None:
@@ -149,7 +163,6 @@ def test_the_words_say_how_much_is_seen(tmp_path: Path) -> None:
     )  # fmt: skip
     # From 2 m over 1.5 m at 14.9 m: 1 m up at 29.75 m, give or take the wall's thickness: 0.8 m of 1.8 m are seen.
     assert told(made.path, "PEM", 0.0) == ["9 hidden from ego by obstacle 0 (share 0.44)"]
-    assert told(made.path, "GT", 0.0) == ["9 known"]
 
 
 def test_out_of_range_beside_the_field_and_seen_but_not_listed(tmp_path: Path) -> None:
@@ -165,7 +178,7 @@ def test_out_of_range_beside_the_field_and_seen_but_not_listed(tmp_path: Path) -
     blind = [SECTOR[0] | {"detection": {"kind": "constant", "probability": 0.0}}]
     made = make(tmp_path / "x.rrd", scene, pems={"sure": blind}, measure=PERSON)
     assert told(made.path, "PEM", 0.5) == ["6 out of range", "7 outside fields of view", "8 seen by ego, not listed"]
-    assert [lane(made.path, f"{k} pedestrian", 1) for k in (6, 7, 8)] == [
+    assert [lane(made.path, f"{k} pedestrian", 0) for k in (6, 7, 8)] == [
         [(0, "out of view")],
         [(0, "out of view")],
         [(0, "seen by ego, not listed")],
@@ -223,14 +236,15 @@ def test_gospa_is_of_the_measured_objects(tmp_path: Path) -> None:
         ],
         until_s=1.0,
     )
-    made = make(
-        tmp_path / "x.rrd", scene, obstacles=[WALL], measure=PERSON,
-        pems={"sure": [{"when": {"visible_share": [0.5, 1]}, "detection": {"kind": "constant", "probability": 1.0}}]},
-        configurations=EGO_ONLY | {"late": {"units": "truth", "latency_s": 0.5}},
-    )  # fmt: skip
+    near = [{"when": {"visible_share": [0.5, 1]}, "detection": {"kind": "constant", "probability": 1.0}}]
+    alike: dict[str, Any] = {"obstacles": [WALL], "measure": PERSON, "pems": {"sure": near}}
+    truths = {"GT": {"units": "truth"}, "late": {"units": "truth", "latency_s": 0.5}}
+    make(tmp_path / "x.rrd", scene, **alike, configurations={"PEM": {"units": ["ego"]}})
+    make(tmp_path / "truths.rrd", scene, **alike, configurations=truths)
 
     def values(name: str) -> list[float]:
-        return [row["Scalars:scalars"][0] for row in rows(made.path, f"/plots/gospa/{name}")]
+        path = tmp_path / ("truths.rrd" if name in truths else "x.rrd")
+        return [row["Scalars:scalars"][0] for row in rows(path, f"/plots/gospa/{name}")]
 
     assert values("GT") == [0.0] * 11
     assert values("PEM") == pytest.approx([np.sqrt(4.5)] * 11)
@@ -285,7 +299,7 @@ def test_long_ids_are_shortened_where_they_are_drawn(tmp_path: Path) -> None:
         until_s=1.0,
     )
     made = make(tmp_path / "x.rrd", scene, measure=PERSON, configurations=EGO_ONLY)
-    assert told(made.path, "GT", 0.5) == ["8d2f0c5e-a known", "8d2f0c5e-b known"]
+    assert told(made.path, "PEM", 0.5) == ["8d2f0c5e-a known", "8d2f0c5e-b known"]
     assert lane(made.path, "8d2f0c5e-a pedestrian", 0) == [(0, "known")]
 
 
@@ -323,6 +337,44 @@ def test_an_entry_that_no_object_is_matched_with(tmp_path: Path) -> None:
         assert told(made.path, "ideal", now_s) == ["2 known, 0.3 s old"]
     assert told(made.path, "gnn", 0.05) == ["2 listed by ego, arrives in 0.3 s"]
     assert lane(made.path, "2 pedestrian", 1) == [(0.0, "on its way from ego"), (0.3, "unmatched")]
+
+
+def test_false_entries_are_crossed_and_counted(tmp_path: Path) -> None:
+    """The same pedestrian, listed 10 m off: no entry of gnn is matched with him."""
+    scene = recording([Thing("ego", "car", standing(0, 0)), Thing("2", "pedestrian", standing(20, 0))], until_s=0.5)
+    wrong = {"kind": "gaussian", "covariance_m2": [[0.01, 0.0], [0.0, 0.01]], "mean_m": [10.0, 0.0]}
+    made = make(
+        tmp_path / "replay.rrd", scene, measure=PERSON,
+        pems={"sure": [{"detection": {"kind": "constant", "probability": 1.0}, "error": wrong}]},
+        configurations={name: {"units": ["ego"], "fusion": {"kind": name}} for name in ("ideal", "gnn")},
+    )  # fmt: skip
+    assert not rows(made.path, "/world/ideal/false")
+    assert {tuple(row["Boxes3D:centers"]) for row in rows(made.path, "/world/gnn/boxes")} == {()}
+    drawn, fused = rows(made.path, "/world/gnn/false"), made.run_tracks["gnn"].fused
+    assert len(drawn) == 6
+    for frame, row in enumerate(drawn):
+        [entry] = np.flatnonzero((fused.frame_ix == frame) & fused.valid[0])
+        ends = np.array([line.tolist() for line in lines(row)])
+        assert ends.shape == (14, 2, 3), "three dashes a side, two lines across"
+        middle = [fused.x_m[0, entry], fused.y_m[0, entry], fused.z_m[0, entry] + fused.height_m[0, entry] / 2]
+        assert ends[12:].mean(axis=1).tolist() == [pytest.approx(middle, abs=1e-5)] * 2
+        across = np.linalg.norm(ends[12:, 1] - ends[12:, 0], axis=1)
+        diagonal_m = np.hypot(fused.length_m[0, entry], fused.width_m[0, entry])
+        assert across.tolist() == [pytest.approx(diagonal_m, abs=1e-5)] * 2
+        around_m = np.linalg.norm(ends[:12, 1] - ends[:12, 0], axis=1).sum()
+        half_m = fused.length_m[0, entry] + fused.width_m[0, entry]
+        assert around_m == pytest.approx(0.6 * 2 * half_m, abs=1e-5), "three fifths of the outline"
+    assert titles(made.path) >= {"gnn · 0 of 1 known · 1 false", "ideal · 1 of 1 known"}
+
+
+def titles(path: Path) -> set[str]:
+    from rerun.chunk import RrdReader
+
+    reader = RrdReader(path)
+    [blueprint] = reader.blueprints()
+    batches = [chunk.to_record_batch() for chunk in reader.stream(store=blueprint)]
+    column = "ViewBlueprint:display_name"
+    return {batch.column(column)[0].as_py()[0] for batch in batches if column in batch.schema.names}
 
 
 def test_a_list_that_never_arrives_is_lost(hiding: Made) -> None:

@@ -16,6 +16,7 @@ from mcap.reader import make_reader
 from copem_replay.core.colours import configuration_colours
 from copem_replay.core.errors import InputError, unknown_name_message
 from copem_replay.core.files import parse_json
+from copem_replay.core.tracks import TRUTH
 from copem_replay.core.yaml import NotYamlError, parse_yaml
 from copem_replay.io.containers.mcap_records import DAMAGE
 from copem_replay.io.write.message_family import EGO_FRAME, MIDDLE_FRAME, RUN_RECORD, TRUTH_TOPICS
@@ -79,12 +80,13 @@ def read_contents(replay: Path) -> ReplayContents:
 
 
 def _find_colours(experiment: str, names: Sequence[str]) -> dict[str, str]:
-    """The colour of each configuration, `#rrggbb`, by its place in the experiment that made the replay."""
+    """The colour of each configuration, `#rrggbb`, by the experiment that made the replay."""
     try:
-        every = list(parse_yaml(experiment)[0]["configurations"])
-    except (NotYamlError, TypeError, KeyError):
-        every = []
-    colours = configuration_colours(every if set(names) <= set(every) else names)
+        asked = dict(parse_yaml(experiment)[0]["configurations"])
+        truths = {name for name, keys in asked.items() if keys.get("units") == TRUTH}
+    except (NotYamlError, AttributeError, TypeError, ValueError, KeyError):
+        asked, truths = {}, set()
+    colours = configuration_colours(asked if set(names) <= set(asked) else names, truths=truths)
     return {name: "#{:02x}{:02x}{:02x}".format(*colours[name]) for name in names}
 
 

@@ -78,7 +78,8 @@ def write_mcap(
     `run_tracks`: time chunk by time chunk, the fused tracks by configuration; values (1, P). `table`: the rows of the
     detections table of this log and run. `manifest`: what made the file, kept as a metadata record. `family`: of the
     messages, None: OSI's. `window`: the log time of `source` that was read, None: all. `truth`: drawn beside the lists
-    unless it is None or a configuration has the name of its topics. `colours`: by configuration, None: by their order.
+    unless it is None or a configuration has the name of its topics. `colours`: by
+    configuration, None: those of an experiment with no others.
 
     MCAP has no times before 0. If a list or a frame of the truth is earlier, all added messages are logged later by the
     same time, so that the first of them is at 0; stamps in messages stay by the log's clock.

@@ -51,7 +51,7 @@ def answer_figure(results: Results, *, configurations: Sequence[str] | None = No
     with figure_style():
         figure = new_figure(8.0, 1.0 + ROW_IN * len(names) + 0.15 * bool(upper))
         panels = figure.subplots(1, 1 + bool(share), squeeze=False, width_ratios=[1.5, 1.0] if share else None)[0]
-        looks = choose_appearances(tuple(results.experiment.configurations))
+        looks = choose_appearances(results, configurations)
         draw_rows(panels[0], list(zip(names, times, strict=True)), looks, named=True)
         panels[0].set_xlabel("Mean time to detection (s)")
         _draw_truth_line(panels[0], {name: float(rows.loc[name, RANKED_BY]) for name in upper}, " s")
@@ -132,7 +132,7 @@ def _draw_truth_line(axes: Axes, values: dict[str, float], unit: str) -> None:
     """Draw the ground truth as dashed lines with their values: an upper bound, not ranked."""
     for name, value in values.items():
         if not np.isnan(value):
-            axes.axvline(value, color="0.45", linewidth=1.2, linestyle=(0, (4, 2)), zorder=1, label=name)
+            axes.axvline(value, color="0.45", linewidth=0.75, linestyle=(0, (4, 2)), zorder=1, label=name)
     shown = ", ".join(
         f"{short} {format_three_digits(values[name])}{unit}" for name, short in shorten_names(list(values)).items()
     )

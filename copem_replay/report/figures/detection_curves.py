@@ -83,7 +83,7 @@ def curves_figure(results: Results, *, configurations: Sequence[str] | None = No
     counted = None if results.exact is None else results.counted(results.exact)
     exact = {} if counted is None else {name: exact_curve(counted, name) for name in names}
     with figure_style():
-        figure = _draw_curves(results, curves, exact)
+        figure = _draw_curves(curves, exact, choose_appearances(results, configurations))
         _add_caption(figure, results, names, over, curves, bool(exact), describe_left_out(chosen, names))
         return figure
 
@@ -132,8 +132,9 @@ def exact_curve(exact: pd.DataFrame, name: str) -> DetectionCurve:
     return DetectionCurve(times_s, np.cumsum(mass) / max(rows.groupby(["log", "object_id", "episode"]).ngroups, 1))
 
 
-def _draw_curves(results: Results, curves: dict[str, DetectionCurve], exact: dict[str, DetectionCurve]) -> Figure:
-    looks = choose_appearances(tuple(results.experiment.configurations))
+def _draw_curves(
+    curves: dict[str, DetectionCurve], exact: dict[str, DetectionCurve], looks: dict[str, Appearance]
+) -> Figure:
     short = shorten_names(list(curves))
     begin_s, end_s = choose_time_limits([*curves.values(), *exact.values()])
     figure = new_figure(8.0, 4.5)
@@ -174,7 +175,7 @@ def _draw_band(axes: Axes, curve: DetectionCurve, name: str, look: Appearance, b
         x, low, high, step="post", color=look.colour, alpha=0.2, linewidth=0, zorder=1, label=f"band of {name}"
     )
     for limit in (low, high):
-        axes.step(x, limit, where="post", color=look.edge, linewidth=0.5, alpha=0.7, zorder=1.1)
+        axes.step(x, limit, where="post", color=look.colour, linewidth=0.5, alpha=0.7, zorder=1.1)
 
 
 def choose_time_limits(curves: Sequence[DetectionCurve]) -> tuple[float, float]:

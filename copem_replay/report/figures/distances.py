@@ -141,7 +141,7 @@ def distances_figure(results: Results, *, configurations: Sequence[str] | None =
     with figure_style():
         figure = new_figure(1.6 + 4.4 * len(events) + 0.6, 1.5 + 0.5 * len(names))
         panels = figure.subplots(1, len(events), sharex=True, sharey=True, squeeze=False)[0]
-        looks = choose_appearances(tuple(results.experiment.configurations))
+        looks = choose_appearances(results, configurations)
         for axes, event in zip(panels, events, strict=True):
             panel_strips = {name: (strips[event, name], points[event, name]) for name in names}
             _draw_panel(axes, event, panel_strips, looks, int(detections["runs"].sum()), top_m)
@@ -245,12 +245,6 @@ def _draw_points(
             continue
         position = points.distance_m[chosen], (place - _HALF * points.across)[chosen]
         drawn: dict[str, Any] = {"linewidths": 0.8 if verdict == FAIL else 0, "rasterized": count > _MANY} | marker
-        if (
-            marker is in_colour and look.edge != look.colour
-        ):  # around all points together, since they lie close to each other
-            outline = {"color": look.edge, "s": (size**0.5 + 1.2) ** 2, "label": "_outline"}
-            axes.scatter(*position, zorder=1.9, **(drawn | outline))
-            drawn["alpha"] = 1.0
         if verdict == FAIL and drawn["rasterized"]:  # a picture stays black on a dark page
             halo = {"color": "white", "linewidths": 2.4, "label": "_halo", "zorder": 1.95}
             axes.scatter(*position, **(drawn | halo))

@@ -313,8 +313,8 @@ def _prepare_object(results: Results, log: str, object_id: str) -> Replay:
 
 
 def _draw_stories(results: Results, replay: Replay, stories: Sequence[Story]) -> Figure:
-    looks = choose_appearances(tuple(results.experiment.configurations))
-    names = shorten_names([story.configuration for story in stories])
+    shown = [story.configuration for story in stories]
+    looks, names = choose_appearances(results, shown), shorten_names(shown)
     begin_s, end_s = _choose_limits(stories)
     steps = max(len(story.events) for story in stories)
     figure = new_figure(0.75 + (_WIDTH_IN + 0.12) * len(stories), 3 * _HEIGHT_IN + steps * STEP_IN + 1.35)

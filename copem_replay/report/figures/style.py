@@ -1,8 +1,8 @@
 """Style of figures: one colour, dash, width and marker per configuration in every figure; notes, numbers, files, rows.
 
-Colours come from `core/colours.py`; a colour with little contrast to white or to a dark page has an outline. Dashes and
-markers distinguish configurations in grey, too. Lines get thinner from one configuration to the next, so that
-coinciding curves look like stripes.
+Colours come from `core/colours.py`, for paper and for a dark page. Dashes distinguish configurations in grey, too, and
+markers the variants of a family. Lines get thinner from one configuration to the next, so that coinciding curves look
+like stripes. The ground truth is a grey line of a pixel.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import pandas as pd
 
-from copem_replay.core.colours import configuration_colours
+from copem_replay.core.colours import Rgb, configuration_colours, group_families
 from copem_replay.core.errors import InputError, count_noun
 from copem_replay.metrics.intervals import choose_clusters, describe_absent, describe_clusters, explain_no_clusters
 from copem_replay.results.table_files import AGAIN
@@ -52,8 +52,8 @@ _MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 _WIDEST_PT, _THINNEST_PT = 4.4, 1.5
 _PALE = 0.4
 """Share of a colour in its pale version: clearly paler, but still that colour."""
-_NEEDS_OUTLINE = 3.0
-"""Contrast with the paper, white or dark, below which a colour gets an outline. Source: WCAG 2.1, 1.4.11."""
+_TRUTH_PT = 0.75
+"""Width of lines of the ground truth: a pixel."""
 WHITE: Colour = (1.0, 1.0, 1.0)
 DARK: Colour = (27 / 255, 27 / 255, 27 / 255)
 """Paper of a file, and of the report on a dark screen."""
@@ -82,10 +82,10 @@ _STYLE: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Appearance:
-    """Line and marker of one configuration. `edge`: colour of outlines, `colour` itself if it needs none."""
+    """Line and marker of one configuration. `dark`: its colour on a dark page."""
 
     colour: Colour
-    edge: Colour
+    dark: Colour
     dashes: tuple[float, ...]  # on and off in line widths; empty: solid
     marker: str
     width_pt: float
@@ -94,47 +94,43 @@ class Appearance:
     def pale(self) -> Appearance:
         """The appearance mixed with white. Transparency would show the lines and outlines below."""
         return replace(
-            self, colour=_mix_colours(self.colour, WHITE, 1 - _PALE), edge=_mix_colours(self.edge, WHITE, 1 - _PALE)
+            self, colour=_mix_colours(self.colour, WHITE, 1 - _PALE), dark=_mix_colours(self.dark, DARK, 1 - _PALE)
         )
 
     def line(self, width_pt: float | None = None) -> dict[str, Any]:
         """Arguments of a matplotlib line."""
-        from matplotlib import patheffects
-
         width = width_pt or self.width_pt
         # matplotlib scales dashes with the width: those of thick lines would not repeat within a step.
         dashes = tuple(length * 1.6 / width for length in self.dashes)
         drawn: dict[str, Any] = {"color": self.colour, "linewidth": width, "solid_capstyle": "butt"}
         drawn["linestyle"] = (0, dashes) if dashes else "-"
-        if self.edge != self.colour:
-            outline = patheffects.Stroke(linewidth=width + 1.2, foreground=self.edge)
-            drawn["path_effects"] = [outline, patheffects.Normal()]
         return drawn
 
 
-def choose_appearances(configurations: Sequence[str]) -> dict[str, Appearance]:
-    """The appearance of each configuration of an experiment; figures of some of them pass all, too."""
-    count = len(configurations)
+def choose_appearances(results: Results, selected: Sequence[str] | None = None) -> dict[str, Appearance]:
+    """The appearance of each configuration of results. `selected`: which have colours, if they are too many."""
+    names = tuple(dict.fromkeys([*results.experiment.configurations, *(selected or ())]))
+    truths = find_truths(results)
+    light, dark = (
+        configuration_colours(names, truths=truths, selected=selected, theme=theme) for theme in ("light", "dark")
+    )
+    variant = {name: k for family in group_families(names).values() for k, name in enumerate(family)}
     result = {}
-    for k, (name, rgb) in enumerate(configuration_colours(configurations).items()):
-        red, green, blue = (channel / 255 for channel in rgb)
-        edge = _outline_colour((red, green, blue))
-        width = _WIDEST_PT + (_THINNEST_PT - _WIDEST_PT) * k / max(count - 1, 1)
+    for k, name in enumerate(names):
+        width = _WIDEST_PT + (_THINNEST_PT - _WIDEST_PT) * k / max(len(names) - 1, 1)
         result[name] = Appearance(
-            (red, green, blue),
-            edge,
-            _DASHES[k % len(_DASHES)],
-            _MARKERS[k % len(_MARKERS)],
-            width,
+            _scale_channels(light[name]),
+            _scale_channels(dark[name]),
+            () if name in truths else _DASHES[k % len(_DASHES)],
+            _MARKERS[variant[name] % len(_MARKERS)],
+            _TRUTH_PT if name in truths else width,
         )
     return result
 
 
-def _outline_colour(colour: Colour) -> Colour:
-    """A darker colour if the contrast to white is low, a lighter one if that to dark paper is, else the colour."""
-    if contrast_ratio(colour, WHITE) < _NEEDS_OUTLINE:
-        return _mix_colours(colour, (0.0, 0.0, 0.0), 0.45)
-    return _mix_colours(colour, WHITE, 0.45) if contrast_ratio(colour, DARK) < _NEEDS_OUTLINE else colour
+def _scale_channels(colour: Rgb) -> Colour:
+    red, green, blue = (channel / 255 for channel in colour)
+    return red, green, blue
 
 
 def _mix_colours(colour: Colour, other: Colour, share: float) -> Colour:
@@ -450,10 +446,8 @@ def _draw_row(axes: Axes, row: int, dot: Dot, look: Appearance, name: str) -> No
         return
     limits = dot.low is not None and dot.high is not None
     if dot.low is not None and dot.high is not None:
-        if look.edge != look.colour:
-            axes.plot([dot.low, dot.high], [row, row], color=look.edge, linewidth=3.6, zorder=2, label="_outline")
         axes.plot([dot.low, dot.high], [row, row], color=look.colour, linewidth=2.4, zorder=2.1, label=f"of {name}")
     axes.scatter(
         [dot.value], [row], s=_DOT, marker=look.marker, zorder=3, label=name, linewidths=1.0 if limits else 1.6,
-        facecolor=look.colour if limits else "white", edgecolor=look.edge, clip_on=False,
+        facecolor=look.colour if limits else "white", edgecolor=look.colour, clip_on=False,
     )  # fmt: skip

@@ -66,7 +66,7 @@ def sweeps_figure(results: Results, *, configurations: Sequence[str] | None = No
     asked, names = names, _find_differing(sweep, names)
     sweep = sweep[sweep["configuration"].isin(names)]
     rows = [name for name in _ROWS if name == "ttd" or (name in sweep and sweep[name].notna().any())]
-    looks = choose_appearances(tuple(dict.fromkeys([*results.experiment.configurations, *names])))
+    looks = choose_appearances(results, configurations)
     with figure_style():
         figure = new_figure(2.2 + 2.35 * len(kinds), 1.0 + 1.75 * len(rows))
         panels = figure.subplots(len(rows), len(kinds), sharex="col", sharey="row", squeeze=False)
@@ -131,13 +131,13 @@ def _draw_series(axes: Axes, rows: pd.DataFrame, quantity: str, name: str, look:
         )
         for limit in (low, high):  # with lines, since bands overlap
             shown = np.where(limited & (limit < _BEYOND_S), limit, np.nan)
-            axes.plot(value, shown, color=look.edge, linewidth=0.5, label="_limit")
+            axes.plot(value, shown, color=look.colour, linewidth=0.5, label="_limit")
         beside = np.concatenate([[False], limited[:-1]]) | np.concatenate([limited[1:], [False]])
         alone = limited & ~beside  # a point between two without limits has no band
-        axes.vlines(value[alone], low[alone], high[alone], color=look.edge, linewidth=1)
+        axes.vlines(value[alone], low[alone], high[alone], color=look.colour, linewidth=1)
     line = look.line(max(look.width_pt * 0.6, 1.2))
     axes.plot(
-        value, middle, marker=look.marker, markersize=4.5, markeredgecolor=look.edge, label=name, zorder=2.5, **line
+        value, middle, marker=look.marker, markersize=4.5, markeredgecolor=look.colour, label=name, zorder=2.5, **line
     )
     exact = _read_column(rows, "ttd_median_s_exact" if quantity == "ttd" else f"{quantity}_exact")
     if not np.isnan(exact).all():

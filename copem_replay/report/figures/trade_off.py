@@ -59,7 +59,7 @@ def trade_off_figure(results: Results, *, configurations: Sequence[str] | None =
     names = _contenders_with_both(results, asked)
     rows = results.summary.set_index("configuration")
     error_m, rate = (rows.loc[names, key].to_numpy(dtype=float) for key in (_ERROR, _FALSE))
-    looks, short = choose_appearances(tuple(results.experiment.configurations)), shorten_names(names)
+    looks, short = choose_appearances(results, configurations), shorten_names(names)
     with figure_style():
         figure = new_figure(_WIDE_IN, _HIGH_IN + 0.06 * max(len(names) - 8, 0))
         axes = figure.subplots()
@@ -69,7 +69,7 @@ def trade_off_figure(results: Results, *, configurations: Sequence[str] | None =
             with mark_configuration(list(looks).index(name), axes):
                 axes.scatter(
                     [error_m[k]], [rate[k]], s=_MARK_PT**2, marker=look.marker, facecolor=look.colour, zorder=3,
-                    edgecolor=look.edge, label=name, clip_on=False,
+                    label=name, clip_on=False,
                 )  # fmt: skip
         axes.set_xlabel("Position error, RMSE (m)")
         axes.set_ylabel("False positives per minute")

@@ -68,9 +68,8 @@ _PX = 1.25
 
 
 def css_colour(colour: Colour) -> str:
-    """A colour in CSS, `rgb(…)`."""
-    red, green, blue = (round(255 * channel) for channel in colour)
-    return f"rgb({red},{green},{blue})"
+    """A colour in CSS, `#rrggbb`."""
+    return "#" + bytes(round(255 * channel) for channel in colour).hex()
 
 
 def _dash_array(look: Appearance, width_px: float) -> str:
@@ -84,20 +83,30 @@ def line_swatch(look: Appearance) -> Html:
     width = look.width_pt * _PX
     dash = _dash_array(look, width) or None
 
-    def line(colour: Colour, wide: float) -> Html:
-        return make_tag(
-            "line",
-            x1="1", y1="7", x2="43", y2="7", stroke=css_colour(colour), stroke_width=f"{wide:.2f}",
-            stroke_dasharray=dash,
-        )  # fmt: skip
+    line = make_tag(
+        "line",
+        x1="1", y1="7", x2="43", y2="7", stroke=f"var({_variable(look)})", stroke_width=f"{width:.2f}",
+        stroke_dasharray=dash,
+    )  # fmt: skip
+    return make_tag("svg", line, class_="swatch", viewBox="0 0 44 14", aria_hidden="true")
 
-    edge = [line(look.edge, width + 1.8)] if look.edge != look.colour else []
-    return make_tag("svg", *edge, line(look.colour, width), class_="swatch", viewBox="0 0 44 14", aria_hidden="true")
+
+def _variable(look: Appearance) -> str:
+    """The variable of the page that is a configuration's colour; its name tells both colours."""
+    return f"--c-{css_colour(look.colour)[1:]}-{css_colour(look.dark)[1:]}"
+
+
+def replace_colours(svg: str, looks: Iterable[Appearance]) -> str:
+    """Colours of configurations in styles and attributes as variables; `page_colours` sets them."""
+    variables = {css_colour(look.colour): _variable(look) for look in looks}
+    return _COLOUR.sub(lambda found: f"var({variables[found[0]]})" if found[0] in variables else found[0], svg)
 
 
 # Greys of figures become variables of the page, from ink for black to paper for white, so that a dark page inverts
-# them. Colours stay: a configuration has one colour.
+# them.
 
+_COLOUR = re.compile(r"(?<=[: \"])#[0-9a-f]{6}\b")
+_OWN = re.compile(r"var\((--c-([0-9a-f]{6})-([0-9a-f]{6}))\)")
 _GREY = re.compile(r"(?<=[: \"])#([0-9a-f]{2})\1\1\b")
 _USED = re.compile(r"var\(--g-([0-9a-f]{2})\)")
 INK, PAPER = (232, 232, 232), (27, 27, 27)
@@ -109,14 +118,15 @@ def replace_greys(svg: str) -> str:
     return _GREY.sub(r"var(--g-\1)", svg)
 
 
-def dark_greys(html: str) -> str:
-    """CSS that sets the variables of a page, for light paper and dark screens."""
+def page_colours(html: str) -> str:
+    """CSS that sets the variables of a page's greys and configurations, for light paper and dark screens."""
     levels = sorted({int(level, 16) for level in _USED.findall(html)})
-    light = "".join(f"--g-{k:02x}:#{k:02x}{k:02x}{k:02x};" for k in levels)
-    dark = "".join(f"--g-{k:02x}:{_invert_grey(k)};" for k in levels)
-    if not levels:
+    own = sorted(set(_OWN.findall(html)))
+    light = [f"--g-{k:02x}:#{k:02x}{k:02x}{k:02x};" for k in levels] + [f"{name}:#{one};" for name, one, _ in own]
+    dark = [f"--g-{k:02x}:{_invert_grey(k)};" for k in levels] + [f"{name}:#{other};" for name, _, other in own]
+    if not light:
         return ""
-    return f":root{{{light}}}\n@media screen and (prefers-color-scheme: dark){{:root{{{dark}}}}}\n"
+    return f":root{{{''.join(light)}}}\n@media screen and (prefers-color-scheme: dark){{:root{{{''.join(dark)}}}}}\n"
 
 
 def _invert_grey(level: int) -> str:

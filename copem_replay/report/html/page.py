@@ -13,16 +13,17 @@ from copem_replay.core.errors import OutputError
 from copem_replay.core.files import atomic_file
 from copem_replay.report.figures.registry import FIGURES
 from copem_replay.report.figures.selection import Selection
-from copem_replay.report.figures.style import render_figure
+from copem_replay.report.figures.style import Appearance, render_figure
 from copem_replay.report.html.conclusions import write_details, write_lead
 from copem_replay.report.html.markup import (
     Html,
-    dark_greys,
     escape_text,
     join_html,
     line_swatch,
     make_list,
     make_tag,
+    page_colours,
+    replace_colours,
     replace_greys,
 )
 from copem_replay.report.html.setup import (
@@ -70,7 +71,7 @@ def whole_page(title: str, body: Html) -> str:
             f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">',
             '<meta name="color-scheme" content="light dark">',
             '<link rel="icon" href="data:,">',
-            f"<title>{escape_text(title)}</title>\n<style>\n{style}{dark_greys(body)}</style>\n</head>\n<body>\n<main>",
+            f"<title>{escape_text(title)}</title>\n<style>\n{style}{page_colours(body)}</style>\n</head>\n<body>\n<main>",
             body,
             f"</main>\n<script>\n{script}</script>\n</body>\n</html>\n",
         ]
@@ -122,11 +123,15 @@ def _enlarge(size: re.Match[str]) -> str:
     return f'{size[1]}style="width: {_LARGER * float(size[2]):.0f}pt"'
 
 
-def figure_element(name: str, figure: Figure, title: str, shows: str) -> Html:
-    """A figure as an element of a page, scrolled where there is no room; `shows`: text for screen readers."""
+def figure_element(name: str, figure: Figure, title: str, shows: str, looks: Iterable[Appearance] = ()) -> Html:
+    """A figure as an element of a page, scrolled where there is no room.
+
+    `shows`: text for screen readers. `looks`: of configurations, whose colours are others on a dark page.
+    """
     svg = render_figure(figure, (".svg",))[".svg"].decode("utf-8")
     svg = _NOT_DRAWN.sub("", svg[svg.index("<svg ") :])  # comments repeat texts of users without escapes
-    svg = replace_greys(_SIZE.sub(_enlarge, _IDS.sub(f"{name}-", svg), count=1))
+    svg = _SIZE.sub(_enlarge, _IDS.sub(f"{name}-", svg), count=1)
+    svg = replace_greys(replace_colours(svg, looks))
     plot = make_tag("div", Html(svg), id_=name, class_="plot", role="img", aria_label=shows)
     return make_tag("div", plot, class_="scroll figure", tabindex="0", role="region", aria_label=title)
 
@@ -191,7 +196,8 @@ def _verdict_sections(study: ReportData) -> list[_Section]:
 
 def _embed_figure(study: ReportData, name: str) -> Html:
     kind = FIGURES[name]
-    return figure_element(name, kind.draw(study.results, _select(study)), kind.title, kind.shows)
+    drawn = kind.draw(study.results, _select(study))
+    return figure_element(name, drawn, kind.title, kind.shows, study.looks.values())
 
 
 def _select(study: ReportData) -> Selection:

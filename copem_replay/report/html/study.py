@@ -93,7 +93,7 @@ class ReportData:
     @property
     def looks(self) -> dict[str, Appearance]:
         """How each configuration is drawn."""
-        return choose_appearances(self.names)
+        return choose_appearances(self.results)
 
     @cached_property
     def as_soon(self) -> tuple[str, ...]:
