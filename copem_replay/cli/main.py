@@ -63,6 +63,7 @@ for command in (
     results.verdict,
     results.history,
     results.plot,
+    results.film,
     results.report,
     results.view,
     results.layout,
