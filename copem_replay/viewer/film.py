@@ -1,9 +1,10 @@
 """A film of one object in one run, as a GIF for slides: what each configuration believes, side by side.
 
-A plan for each configuration: true objects in grey outlines, the ego dark, the configuration's fused tracks in its colour,
-lanes and obstacles pale. Its title says in the words of the viewer whether the object is known, or why it is not; a red
-line leads from the unit that sees most of a hidden object to what hides it. Below, a bar per configuration grows while
-the object is known. The plan is turned so that the ego drove to the right at the onset, and follows the object.
+A plan for each configuration: true objects as grey outlines, the ego dark, fused tracks in the configuration's
+colour, units as dots, lanes and obstacles pale. Its title says in the words of the viewer whether the object is known,
+or why it is not; a red line leads from the unit that sees most of a hidden object to what hides it. Below, a bar per
+configuration grows while the object is known. A plan follows the object; its longer side is how the ego drove at the
+onset.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from copem_replay.core.errors import InputError
 from copem_replay.core.files import atomic_file
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.interpolation import interpolate_states
-from copem_replay.core.tracks import CLASSES, SAME_INSTANT_NS, Bool, Float, Int
+from copem_replay.core.tracks import CLASSES, SAME_INSTANT_NS, TRUTH, Bool, Float, Int
 from copem_replay.perception.visibility import rectangle_corners
 from copem_replay.pipeline.one_run import ReplayedRun
 from copem_replay.results.folder import add_to_made_list
@@ -46,9 +47,13 @@ LASTS_S, BEFORE_S, FRAMES_PER_S = 10.0, 2.0, 10
 MOST_PLANS = 6
 """Configurations side by side; more are too small for a slide."""
 _SIZE_IN, _DPI = (9.6, 5.4), 100
-_NEAREST_M, _FARTHEST_M = 20.0, 45.0
-"""Limits of half the height of a plan: of a narrower one nothing else is seen, of a wider one no pedestrian."""
-_INK, _GREY, _LANE, _WALL, _HIDES = "0.15", "0.5", "0.8", "0.88", "#c8321e"
+_NEAREST_M, _FARTHEST_M = 18.0, 40.0
+"""Limits of half the longer side of a plan: in a shorter one nothing else is seen, in a longer one no pedestrian."""
+_MARGIN_M = 5.0
+"""Room around the object and the ego at the onset."""
+_INSIDE = 0.75
+"""How far from the middle of a plan the object is at most, by half a side."""
+_INK, _GREY, _LANE, _WALL, _HIDES = "0.15", "0.5", "0.75", "0.88", "#c8321e"
 _LONGEST_NAME = 40
 
 
@@ -61,6 +66,7 @@ class _Knowledge:
     list_ix: Int  # (T,)
     known: Bool  # (T,)
     words: Sequence[str]  # T
+    units_m: Float  # (T, U, 2) its units; NaN: absent
     hiding_m: Float  # (T, 2, 2) from the unit to what hides the object; NaN: nothing
 
 
@@ -111,6 +117,19 @@ def draw_film(
     return path
 
 
+def _arrange_plans(plans: int) -> tuple[int, int, Float]:
+    """Rows and columns of plans, and the sides (2,) of each by the longer one."""
+    columns = plans if plans <= 3 else math.ceil(plans / 2)
+    rows = math.ceil(plans / columns)
+    sides_in = np.array([_SIZE_IN[0] / columns, (0.84 * _SIZE_IN[1] - _bars_in(plans)) / rows - 0.4 * (rows > 1)])
+    return rows, columns, sides_in / sides_in.max()
+
+
+def _bars_in(plans: int) -> float:
+    """Height of the bars below the plans, inches."""
+    return 0.55 + 0.17 * plans
+
+
 def choose_instants(onset_s: float, end_s: float) -> Float:
     """The instants (T,) of a film of a log that ends at `end_s`: from two seconds before the onset, ten seconds long.
 
@@ -138,15 +157,17 @@ def _prepare_plot(replayed: ReplayedRun, table: pd.DataFrame, object_id: str, co
     centre_m = np.stack([states["x_m"], states["y_m"]], axis=-1).reshape(*grid, 2)
     corners_m = rectangle_corners(*(states[name] for name in ("x_m", "y_m", "yaw_rad", "length_m", "width_m")))
     corners_m[~present] = np.nan
-    yaw_rad, apart_m = 0.0, np.zeros(0)
+    *_, sides = _arrange_plans(len(configurations))
+    yaw_rad, apart_m = 0.0, np.zeros(2)
     if scene.ego_ix >= 0:
         at_onset = int(np.argmin(np.abs(time_s - onset_s)))
         yaw_rad = float(np.nan_to_num(states["yaw_rad"].reshape(grid)[at_onset, scene.ego_ix]))
-        apart_m = np.linalg.norm(centre_m[:, object_ix] - centre_m[:, scene.ego_ix], axis=-1)
-        apart_m = apart_m[np.isfinite(apart_m) & (time_s <= onset_s + BEFORE_S)]
+        apart_m = np.nan_to_num(centre_m[at_onset, scene.ego_ix] - centre_m[at_onset, object_ix])
+    yaw_rad -= math.pi / 2 if sides[1] > sides[0] else 0.0
     turn = np.array([[math.cos(yaw_rad), math.sin(yaw_rad)], [-math.sin(yaw_rad), math.cos(yaw_rad)]])
-    half_m = float(np.clip(apart_m.max(initial=0.0) / 1.5, _NEAREST_M, _FARTHEST_M))
-    followed_m = _hold_ends(centre_m[:, object_ix] @ turn.T)
+    half_m = float(np.clip(((np.abs(turn @ apart_m) / 2 + _MARGIN_M) / sides).max(), _NEAREST_M, _FARTHEST_M))
+    beside_m = np.clip(turn @ apart_m / 2, -_INSIDE * half_m * sides, _INSIDE * half_m * sides)
+    followed_m = _hold_ends(centre_m[:, object_ix] @ turn.T) + beside_m
     knowledge = _collect_knowledge(replayed, table, object_ix, configurations, time_s)
     bodies_m = corners_m.reshape(*grid, 4, 2) @ turn.T
     return _Plot(replayed, object_ix, onset_s, time_s, turn, half_m, followed_m, bodies_m, knowledge)
@@ -180,9 +201,20 @@ def _collect_knowledge(
             np.searchsorted(elapsed_ns(tracks.fused), time_ns + SAME_INSTANT_NS, side="right") - 1,
             status == KNOWN,
             _choose_words(replayed, sight, statuses, clock, rows, status),
+            _find_units(replayed, name, sight, statuses.frame[rows]),
             _find_hiding_lines(sight, statuses, rows, status),
         )
     return found
+
+
+def _find_units(replayed: ReplayedRun, name: str, sight: Sight, frame: Int) -> Float:
+    """(T, U, 2) places of the units of a configuration at frames (T,) of the sight; NaN before the first."""
+    experiment = replayed.experiment
+    asked = experiment.configurations[name]
+    heard = [] if asked.units == TRUTH else experiment.units_of(asked)
+    units = [u for u, unit in enumerate(experiment.units) if unit in heard]
+    places_m = sight.place_m[units][:, np.maximum(frame, 0), :2].transpose(1, 0, 2)
+    return np.where((frame >= 0)[:, None, None], places_m, np.nan)
 
 
 def _choose_words(
@@ -206,7 +238,7 @@ def _choose_words(
 
 
 def _find_hiding_lines(sight: Sight, statuses: Status, rows: Int, status: Int) -> Float:
-    """(T, 2, 2) from the unit that sees most of a hidden object to the body that hides it; NaN where it is not hidden."""
+    """(T, 2, 2) from the unit that sees most of a hidden object to the body that hides it; NaN: it is not hidden."""
     lines = np.full((len(rows), 2, 2), np.nan)
     hidden = np.flatnonzero(status == HIDDEN)
     unit, frame = statuses.unit_ix[rows[hidden], 0], statuses.frame[rows[hidden]]
@@ -238,11 +270,10 @@ def _new_figure() -> Figure:
 def _draw_frames(figure: Figure, plot: _Plot) -> Iterator[None]:
     """Draw frame after frame into the figure."""
     names = list(plot.knowledge)
-    columns = len(names) if len(names) <= 3 else math.ceil(len(names) / 2)
-    rows, bars_in = math.ceil(len(names) / columns), 0.55 + 0.17 * len(names)
-    bottom = bars_in / _SIZE_IN[1]
+    rows, columns, _ = _arrange_plans(len(names))
+    bottom = _bars_in(len(names)) / _SIZE_IN[1]
     grid = figure.add_gridspec(
-        rows, columns, left=0.012, right=0.988, top=0.84, bottom=bottom, wspace=0.03, hspace=0.34 if rows > 1 else 0
+        rows, columns, left=0.012, right=0.988, top=0.84, bottom=bottom, wspace=0.03, hspace=0.36 if rows > 1 else 0
     )
     panels = [_Panel(figure.add_subplot(grid[k // columns, k % columns]), plot, name) for k, name in enumerate(names)]
     title = figure.text(0.5, 0.975, "", ha="center", va="top", fontsize=12, color=_INK)
@@ -271,7 +302,8 @@ class _Panel:
         for spine in axes.spines.values():
             spine.set_color(_LANE)
         box = axes.get_position()
-        self._half_m = plot.half_m * box.width * _SIZE_IN[0] / (box.height * _SIZE_IN[1]), plot.half_m
+        sides_in = np.array([box.width * _SIZE_IN[0], box.height * _SIZE_IN[1]])
+        self._half_m = plot.half_m * sides_in / sides_in.max()
         replay = plot.replayed.replay
         static = replay.placed.static
         walls = [plot.place(part) for part in np.split(static.xy_m, static.start[1:-1])] if len(static.body) else []
@@ -287,8 +319,13 @@ class _Panel:
         (self._hiding,) = axes.plot([], [], color=_HIDES, linewidth=1.2, zorder=3)
         (self._ring,) = axes.plot([], [], "o", markersize=20, markerfacecolor="none", zorder=4)
         shown = name if len(name) <= _LONGEST_NAME else f"{name[: _LONGEST_NAME - 1]}…"
-        axes.text(0.0, 1.115, shown, transform=axes.transAxes, weight="bold", color=_INK, fontsize=10)
-        self._word = axes.text(0.0, 1.025, "", transform=axes.transAxes, fontsize=9.5)
+        (self._units,) = axes.plot([], [], "o", markersize=3, color=_INK, zorder=3)
+        corner = {"xy": (0, 1), "xycoords": "axes fraction", "textcoords": "offset points"}
+        axes.annotate(shown, xytext=(0, 17), weight="bold", color=_INK, fontsize=10, **corner)
+        self._word = axes.annotate("", xytext=(0, 4), fontsize=9.5, **corner)
+        scale = 10.0 / (2 * self._half_m[0])
+        axes.plot([0.97 - scale, 0.97], [0.04, 0.04], transform=axes.transAxes, color=_GREY, linewidth=1.5)
+        axes.text(0.97 - scale / 2, 0.055, "10 m", transform=axes.transAxes, ha="center", fontsize=7, color=_GREY)
 
     def show(self, frame: int) -> None:
         """Draw a frame."""
@@ -302,11 +339,12 @@ class _Panel:
         self._ego.set_verts(list(bodies[ego_ix : ego_ix + 1][there[ego_ix : ego_ix + 1]]) if ego_ix >= 0 else [])
         self._fused.set_verts(list(self._fused_boxes(frame)))
         self._hiding.set_data(*plot.place(knowledge.hiding_m[frame]).T)
-        self._ring.set_data([x], [y])
-        known = bool(knowledge.known[frame])
-        self._ring.set_markeredgecolor(_INK if known else _HIDES)
+        self._ring.set_data(*bodies[plot.object_ix].mean(axis=0)[:, None])
+        self._units.set_data(*plot.place(knowledge.units_m[frame]).T)
+        colour = _HIDES if plot.time_s[frame] > plot.onset_s - 1e-6 and not knowledge.known[frame] else _INK
+        self._ring.set_markeredgecolor(colour)
         self._word.set_text(knowledge.words[frame])
-        self._word.set_color(_INK if known else _HIDES)
+        self._word.set_color(colour)
 
     def _fused_boxes(self, frame: int) -> Float:
         """Corners (K, 4, 2) of what the configuration's newest list holds."""
