@@ -93,8 +93,8 @@ def check_film(path: Path, configurations: Sequence[str] | None) -> None:
     """Raises InputError for a name that is no GIF, and for more configurations than fit."""
     if path.suffix.lower() != ".gif":
         raise InputError(f"{path}: expected a name that ends with .gif")
-    if len(set(configurations or ())) > MOST_PLANS:
-        raise InputError(f"configurations: expected at most {MOST_PLANS} in a film, found {len(set(configurations))}")
+    if (asked := len(set(configurations or ()))) > MOST_PLANS:
+        raise InputError(f"configurations: expected at most {MOST_PLANS} in a film, found {asked}")
 
 
 def draw_film(
@@ -320,7 +320,7 @@ class _Panel:
         (self._ring,) = axes.plot([], [], "o", markersize=20, markerfacecolor="none", zorder=4)
         shown = name if len(name) <= _LONGEST_NAME else f"{name[: _LONGEST_NAME - 1]}…"
         (self._units,) = axes.plot([], [], "o", markersize=3, color=_INK, zorder=3)
-        corner = {"xy": (0, 1), "xycoords": "axes fraction", "textcoords": "offset points"}
+        corner: dict[str, Any] = {"xy": (0, 1), "xycoords": "axes fraction", "textcoords": "offset points"}
         axes.annotate(shown, xytext=(0, 17), weight="bold", color=_INK, fontsize=10, **corner)
         self._word = axes.annotate("", xytext=(0, 4), fontsize=9.5, **corner)
         scale = 10.0 / (2 * self._half_m[0])
@@ -371,10 +371,9 @@ class _KnownBars:
             axes.spines[side].set_visible(False)
         axes.axvline(0.0, color=_INK, linewidth=1.0, linestyle=(0, (2, 2)))
         self._cursor = axes.axvline(self._since_s[0], color=_INK, linewidth=1.0)
-        self._bars = [
-            axes.add_collection(PolyCollection([], facecolor=of.colour, edgecolor="none"), autolim=False)
-            for of in plot.knowledge.values()
-        ]
+        self._bars = [PolyCollection([], facecolor=of.colour, edgecolor="none") for of in plot.knowledge.values()]
+        for bar in self._bars:
+            axes.add_collection(bar, autolim=False)
 
     def show(self, frame: int) -> None:
         """Draw the bars up to a frame."""

@@ -207,6 +207,7 @@ class TestMade:
         commands = [
             ["plot", "out/e"],
             ["plot", "out/e", "--out", "out/e/more figures", "--configurations", "GT,PEM"],
+            ["film", "out/e", "--configurations", "PEM"],
             ["report", "out/e"],
             ["report", "out/e", "--out", "out/e/pages/second.html", "--baseline", "PEM"],
             ["layout", "out/e"],
@@ -222,7 +223,7 @@ class TestMade:
         assert {
             f"figures/{name}.{kind}" for name in ("answer", "differences", "sweeps") for kind in ("png", "svg")
         } <= made
-        assert {"report.html", "pages/second.html", "replay.foxglove.json", "wide.json"} <= made
+        assert {"film.gif", "report.html", "pages/second.html", "replay.foxglove.json", "wide.json"} <= made
         assert {"c.csv", "c.md", "beside.rrd", "beside.configurations_7.rrd", "more figures/curves.svg"} <= made
         (folder / "figures/mine.svg").write_text("<svg/>")
         (folder / "notes.txt").write_text("mine\n")
