@@ -133,9 +133,10 @@ def _bars_in(plans: int) -> float:
 def choose_instants(onset_s: float, end_s: float) -> Float:
     """The instants (T,) of a film of a log that ends at `end_s`: from two seconds before the onset, ten seconds long.
 
-    Near the end of the log it begins earlier, and in a shorter log it is shorter.
+    Near the end of the log it begins earlier, and in a shorter log it is shorter. The onset is one of the instants.
     """
     begin_s = max(0.0, min(onset_s - BEFORE_S, end_s - LASTS_S))
+    begin_s = onset_s - math.floor((onset_s - begin_s) * FRAMES_PER_S + 1e-6) / FRAMES_PER_S
     count = math.floor(min(LASTS_S, end_s - begin_s) * FRAMES_PER_S + 1e-6)
     return begin_s + np.arange(max(count, 1)) / FRAMES_PER_S
 
@@ -229,7 +230,7 @@ def _choose_words(
     )
     after_s = (known_ns - onset_ns) * 1e-9 if NEVER_NS not in (known_ns, onset_ns) else 0.0
     told = {
-        ABSENT: "not in the log",
+        ABSENT: "absent",
         KNOWN: f"known {after_s:.2f} s after the onset" if after_s > 0 else "known at once",
     }
     name = short_ids(scene)[object_ix]

@@ -60,7 +60,7 @@ def coloured(picture: np.ndarray, colour: tuple[int, int, int]) -> np.ndarray:
 @pytest.mark.parametrize(
     ("onset_s", "end_s", "first_s", "last_s", "count"),
     [(12.0, 60.0, 10.0, 19.9, 100), (1.0, 60.0, 0.0, 9.9, 100), (57.0, 60.0, 50.0, 59.9, 100), (3.0, 8.0, 0.0, 7.9, 80),
-     (0.0, 0.0, 0.0, 0.0, 1)],
+     (0.0, 0.0, 0.0, 0.0, 1), (3.26, 8.0, 0.06, 7.86, 79)],
 )  # fmt: skip
 def test_ten_seconds_from_two_before_the_onset(
     onset_s: float, end_s: float, first_s: float, last_s: float, count: int
