@@ -315,7 +315,7 @@ class TestMade:
         assert os.listdir(old.parent) == ["e"]
 
     @pytest.mark.parametrize(
-        "command", [["plot"], ["report"], ["compare", "--baseline", "PEM", "--out", "out/e/c.csv"]]
+        "command", [["plot"], ["film"], ["report"], ["compare", "--baseline", "PEM", "--out", "out/e/c.csv"]]
     )
     def test_a_file_is_listed_before_it_is_there(
         self, here: Path, call: Call, monkeypatch: pytest.MonkeyPatch, command: list[str]

@@ -253,7 +253,7 @@ _REST = 10
 
 
 def _results(made: Originals, place: Path, dice: random.Random) -> Case:
-    word = dice.choices(("compare", "view", "layout", "run", "report", "plot"), (42, 20, 15, 15, 5, 3))[0]
+    word = dice.choices(("compare", "view", "layout", "run", "report", "plot", "film"), (42, 20, 15, 15, 5, 3, 1))[0]
     name = dice.choice(_SHOWN_ONES if word in ("view", "layout") else ("plain", *_SHOWN_ONES))
     command, done = [word, name], [name]
     shutil.copytree(made.folder / name, place / name)
