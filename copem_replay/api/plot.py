@@ -130,6 +130,7 @@ def write_film(
     >>> cr.plot.write_film("out/tc016d", "film.gif", configurations=["PEM", "coPEM:0s"]).name
     'film.gif'
     """
+    from copem_replay.core.colours import configuration_colours
     from copem_replay.experiment.drive import resolve_for_log
     from copem_replay.metrics.detections_table import first_episodes
     from copem_replay.pipeline.one_run import replay_run
@@ -145,4 +146,6 @@ def write_film(
     recording = read.recording(choice.log, read.experiment)
     replayed = replay_run(recording, resolve_for_log(read.experiment, choice.log), choice.run)
     read.check_unchanged()
-    return draw_film(path, replayed, table, choice.object_id, choice.configurations, read.place)
+    every = configuration_colours(read.experiment.configurations)
+    colours = {name: every[name] for name in choice.configurations}
+    return draw_film(path, replayed, table, choice.object_id, colours, read.place)

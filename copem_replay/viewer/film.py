@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from copem_replay.core.colours import configuration_colours
+from copem_replay.core.colours import Rgb
 from copem_replay.core.errors import InputError
 from copem_replay.core.files import atomic_file
 from copem_replay.core.fused_tracks import FusedTracks
@@ -98,15 +98,16 @@ def check_film(path: Path, configurations: Sequence[str] | None) -> None:
 
 
 def draw_film(
-    path: Path, replayed: ReplayedRun, table: pd.DataFrame, object_id: str, configurations: Sequence[str], folder: Path
+    path: Path, replayed: ReplayedRun, table: pd.DataFrame, object_id: str, colours: Mapping[str, Rgb], folder: Path
 ) -> Path:
     """Write the film of an object, and return its path. Raises OutputError, ExperimentError where the log is too long.
 
-    `table`: the first episodes in its log and run; `folder`: that of the results, which lists what is made of them.
+    `table`: the first episodes in its log and run; `colours`: those of the configurations that are shown; `folder`:
+    that of the results, which lists what is made of them.
     """
     from matplotlib.animation import PillowWriter
 
-    plot = _prepare_plot(replayed, table, object_id, configurations)
+    plot = _prepare_plot(replayed, table, object_id, colours)
     with _plain_style(), atomic_file(path) as scratch:
         figure = _new_figure()
         writer = PillowWriter(fps=FRAMES_PER_S)
@@ -144,7 +145,7 @@ def choose_instants(onset_s: float, end_s: float) -> Float:
 # What the film shows.
 
 
-def _prepare_plot(replayed: ReplayedRun, table: pd.DataFrame, object_id: str, configurations: Sequence[str]) -> _Plot:
+def _prepare_plot(replayed: ReplayedRun, table: pd.DataFrame, object_id: str, colours: Mapping[str, Rgb]) -> _Plot:
     replay, experiment = replayed.replay, replayed.experiment
     scene, object_ix = replay.scene, replay.scene.object_number[object_id]
     onset_s = float(table.loc[table["object_id"] == object_id, "onset_s"].iloc[0])
@@ -158,7 +159,7 @@ def _prepare_plot(replayed: ReplayedRun, table: pd.DataFrame, object_id: str, co
     centre_m = np.stack([states["x_m"], states["y_m"]], axis=-1).reshape(*grid, 2)
     corners_m = rectangle_corners(*(states[name] for name in ("x_m", "y_m", "yaw_rad", "length_m", "width_m")))
     corners_m[~present] = np.nan
-    *_, sides = _arrange_plans(len(configurations))
+    *_, sides = _arrange_plans(len(colours))
     yaw_rad, apart_m = 0.0, np.zeros(2)
     if scene.ego_ix >= 0:
         at_onset = int(np.argmin(np.abs(time_s - onset_s)))
@@ -169,7 +170,7 @@ def _prepare_plot(replayed: ReplayedRun, table: pd.DataFrame, object_id: str, co
     half_m = float(np.clip(((np.abs(turn @ apart_m) / 2 + _MARGIN_M) / sides).max(), _NEAREST_M, _FARTHEST_M))
     beside_m = np.clip(turn @ apart_m / 2, -_INSIDE * half_m * sides, _INSIDE * half_m * sides)
     followed_m = _hold_ends(centre_m[:, object_ix] @ turn.T) + beside_m
-    knowledge = _collect_knowledge(replayed, table, object_ix, configurations, time_s)
+    knowledge = _collect_knowledge(replayed, table, object_ix, colours, time_s)
     bodies_m = corners_m.reshape(*grid, 4, 2) @ turn.T
     return _Plot(replayed, object_ix, onset_s, time_s, turn, half_m, followed_m, bodies_m, knowledge)
 
@@ -184,38 +185,43 @@ def _hold_ends(places_m: Float) -> Float:
 
 
 def _collect_knowledge(
-    replayed: ReplayedRun, table: pd.DataFrame, object_ix: int, configurations: Sequence[str], time_s: Float
+    replayed: ReplayedRun, table: pd.DataFrame, object_ix: int, colours: Mapping[str, Rgb], time_s: Float
 ) -> dict[str, _Knowledge]:
     replay, experiment = replayed.replay, replayed.experiment
     sight = compute_sight(replay, experiment, [object_ix], replay.rows_of(np.array([object_ix])))
-    run_tracks, colours = replayed.run_tracks.whole(), configuration_colours(experiment.configurations)
+    run_tracks = replayed.run_tracks.whole()
     time_ns, found = to_nanoseconds(time_s), {}
-    for name in configurations:
+    for name, colour in colours.items():
         clock, tracks = read_episode_clocks(replay.scene, table, name), run_tracks[name]
         statuses = compute_status(replay, experiment, name, tracks, sight, clock)
         rows = np.searchsorted(statuses.elapsed_ns, time_ns + SAME_INSTANT_NS, side="right") - 1
         status = np.where(rows >= 0, statuses.status[rows, 0], ABSENT)
-        red, green, blue = (channel / 255 for channel in colours[name])
+        red, green, blue = (channel / 255 for channel in colour)
         found[name] = _Knowledge(
             (red, green, blue),
             tracks,
             np.searchsorted(elapsed_ns(tracks.fused), time_ns + SAME_INSTANT_NS, side="right") - 1,
             status == KNOWN,
             _choose_words(replayed, sight, statuses, clock, rows, status),
-            _find_units(replayed, name, sight, statuses.frame[rows]),
+            _find_units(replayed, name, replay.scene.t0_ns + time_ns),
             _find_hiding_lines(sight, statuses, rows, status),
         )
     return found
 
 
-def _find_units(replayed: ReplayedRun, name: str, sight: Sight, frame: Int) -> Float:
-    """(T, U, 2) places of the units of a configuration at frames (T,) of the sight; NaN before the first."""
-    experiment = replayed.experiment
+def _find_units(replayed: ReplayedRun, name: str, stamps_ns: Int) -> Float:
+    """(T, U, 2) places of the units of a configuration, as of their newest lists; NaN: no list yet, or absent."""
+    experiment, placed = replayed.experiment, replayed.replay.placed
     asked = experiment.configurations[name]
     heard = [] if asked.units == TRUTH else experiment.units_of(asked)
-    units = [u for u, unit in enumerate(experiment.units) if unit in heard]
-    places_m = sight.place_m[units][:, np.maximum(frame, 0), :2].transpose(1, 0, 2)
-    return np.where((frame >= 0)[:, None, None], places_m, np.nan)
+    units = [unit for unit in heard if len(placed.stamps_ns.get(unit, ()))]
+    places_m = np.full((len(stamps_ns), len(units), 2), np.nan)
+    for u, unit in enumerate(units):
+        newest = np.searchsorted(placed.stamps_ns[unit], stamps_ns, side="right") - 1
+        there = (newest >= 0) & placed.poses[unit].present[newest]
+        for axis, column in enumerate((placed.poses[unit].x_m, placed.poses[unit].y_m)):
+            places_m[there, u, axis] = column[newest[there]]
+    return places_m
 
 
 def _choose_words(
