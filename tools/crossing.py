@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from copem_replay.io.write.osi import NANOS_PER_SECOND, OsiTrace
-from make_logs import SOURCE, Body, ground_truth
+from make_logs import SOURCE, Body, Boundary, Edge, ground_truth
 from make_logs import Kind as Vehicle
 
 RATE_HZ, FRAMES, EGO = 10, 601, 1
@@ -24,6 +24,8 @@ RATE_HZ, FRAMES, EGO = 10, 601, 1
 EDGE_M = 120.0  # lines begin and end this far from the centre
 LANE_M, CYCLE_LANE_M = 1.75, 4.6  # from the middle of the road to the middle of the lane
 STOP_LINE_M, KERB_M = 12.0, 6.2  # from the centre: where vehicles wait, where pedestrians wait
+LINE_M, CORNER_M = 3.4, 2.8  # from the middle of the road to the line beside the cycle lane; the radius of kerbs
+CROSSWALK_M = (8.4, 11.6)  # from the centre
 EAST, NORTH, WEST, SOUTH = 0, 90, 180, -90  # which way one comes driving or walking, degrees
 
 Spans = tuple[tuple[float, float], ...]  # from … to, seconds
@@ -206,6 +208,22 @@ def street_furniture() -> list[Body]:
     return [shelter, column, hedge, kiosk, *(Body(100 + k, (0.3, 0.3, 6.0), at_m) for k, at_m in enumerate(masts_m))]
 
 
+def road() -> list[Boundary]:
+    """Return lines and kerbs of the four arms, their crosswalks, and the bay of the parked van."""
+    corner_m, angles = KERB_M + CORNER_M, np.radians(np.arange(0, 91, 15))
+    arc = [(corner_m - CORNER_M * math.cos(a), corner_m - CORNER_M * math.sin(a)) for a in angles]
+    bay_m = [(42.0, KERB_M), (43.5, 7.9), (52.5, 7.9), (54.0, KERB_M)]
+    lines: list[Boundary] = []
+    for quarter in range(4):  # the arm to the east and its corner in the northeast, then all are turned to the left
+        lines.append((Edge.TYPE_SOLID_LINE, [(EDGE_M, 0.0), (STOP_LINE_M, 0.0)]))
+        lines += [(Edge.TYPE_DASHED_LINE, [(EDGE_M, y), (STOP_LINE_M, y)]) for y in (LINE_M, -LINE_M)]
+        lines += [(Edge.TYPE_DASHED_LINE, [(x, -KERB_M), (x, KERB_M)]) for x in CROSSWALK_M]
+        bay = bay_m if quarter == 2 else []  # is turned twice: in the southwest
+        lines.append((Edge.TYPE_CURB, [(KERB_M, EDGE_M), *arc, *bay, (EDGE_M, KERB_M)]))
+        lines = [(kind, [(round(-y, 3) + 0.0, round(x, 3) + 0.0) for x, y in points]) for kind, points in lines]
+    return lines
+
+
 # How they move -----------------------------------------------------------------------------------------------
 
 HARDEST_MPS2, YIELD_S = 4.5, 5.0  # hardest braking; how far one looks ahead before a turn
@@ -298,5 +316,5 @@ def crossing() -> OsiTrace:
         source=SOURCE,
         description="A busy signalised crossing: an ego vehicle that turns left, pedestrians and cyclists half hidden.",
         topics={"ground_truth": "osi3.GroundTruth, 10 Hz: all road users and the street furniture"},
-        messages=(("ground_truth", ground_truth(t, moving, still, host_id=EGO)) for t, moving in frames()),
+        messages=(("ground_truth", ground_truth(t, moving, still, EGO, road())) for t, moving in frames()),
     )

@@ -4,13 +4,13 @@
     python tools/fuzz.py results --inputs 20000
 
 Targets are `mcap`, `trace` (OSI) and `folder` (rosbag2), with none of these given eight of ten inputs are MCAP; and
-`experiment` (checked and run), `results` (compared, viewed, plotted, reported, run again over it with damaged parts),
-`fit` and `convert`. Every input is made from a seed. A recording is surveyed and read, then its other lists are read
-and its messages copied; on the others commands are called. That is done in a process whose memory is watched and that
-is ended when it takes more than 30 s of computing. Good ends: it was read (and what was skipped is
-said), or it is refused in single lines. Printed are lines of JSON: each defect with its seed and where the input is
-that shows it, at the end the counts, and how many inputs got past the header: of a recording messages were found, a
-document is of its format.
+`experiment` (checked and run), `results` (compared, viewed, plotted, filmed, reported, run again over it with damaged
+parts), `fit` and `convert`. Every input is made from a seed. A recording is surveyed and read, then its other lists
+are read and its messages copied; on the others commands are called. That is done in a process whose memory is watched
+and that is ended when it takes more than 30 s of computing. Good ends: it was read (and what was skipped is said), or
+it is refused in single lines. Printed are lines of JSON: each defect with its seed and where the input is that shows
+it, at the end the counts, and how many inputs got past the header: of a recording messages were found, a document is
+of its format.
 """
 
 from __future__ import annotations

@@ -19,11 +19,13 @@ from pathlib import Path
 from typing import Any, Final
 
 from osi3.osi_groundtruth_pb2 import GroundTruth
+from osi3.osi_lane_pb2 import LaneBoundary
 from osi3.osi_object_pb2 import MovingObject, StationaryObject
 
 from copem_replay.io.write.osi import NANOS_PER_SECOND, OsiTrace, empty_ground_truth, write_osi_trace
 
 Kind = MovingObject.VehicleClassification
+Edge = LaneBoundary.Classification
 SOURCE: Final = "synthetic (tools/make_logs.py)"
 
 
@@ -97,11 +99,24 @@ def stationary_object(body: Body) -> StationaryObject:
     return osi
 
 
-def ground_truth(stamp_ns: int, moving: list[Body], stationary: list[Body], host_id: int) -> GroundTruth:
-    """Return all bodies at one instant."""
+Boundary = tuple[int, list[tuple[float, float]]]
+"""Of a lane: its kind, an `Edge`, and its points on the ground, m."""
+FIRST_BOUNDARY_ID: Final = 200
+
+
+def ground_truth(
+    stamp_ns: int, moving: list[Body], stationary: list[Body], host_id: int, road: list[Boundary]
+) -> GroundTruth:
+    """Return all bodies at one instant, and in the first message the road, which stays."""
     osi = empty_ground_truth(stamp_ns, host_id)
     osi.moving_object.extend(moving_object(body, stamp_ns / NANOS_PER_SECOND) for body in moving)
     osi.stationary_object.extend(stationary_object(body) for body in stationary)
+    for number, (kind, points_m) in enumerate(road if stamp_ns == 0 else ()):
+        boundary = osi.lane_boundary.add()
+        boundary.id.value, boundary.classification.type = FIRST_BOUNDARY_ID + number, kind
+        for x, y in points_m:
+            place = boundary.boundary_line.add().position
+            place.x, place.y, place.z = x, y, 0.0
     return osi
 
 
@@ -142,6 +157,19 @@ def tc016d_bodies(truck_edge_m: float = TC016D_TRUCK_EDGE_M) -> tuple[list[Body]
     return moving, [shelter]
 
 
+def tc016d_road() -> list[Boundary]:
+    """Return a street of two lanes with parking on the right, and the crosswalk before the truck."""
+    begin_m, end_m = -90.0, 110.0
+    along = [
+        (Edge.TYPE_CURB, 5.25),
+        (Edge.TYPE_DASHED_LINE, 1.75),
+        (Edge.TYPE_DASHED_LINE, -1.9),
+        (Edge.TYPE_CURB, -4.9),
+    ]
+    lanes = [(kind, [(begin_m, y), (end_m, y)]) for kind, y in along]
+    return lanes + [(Edge.TYPE_DASHED_LINE, [(x, -4.9), (x, 5.25)]) for x in (-0.6, 3.0)]
+
+
 def tc016d_units() -> list[dict[str, Any]]:
     """Return twenty roadside units on masts, ten on either side, which face the crossing point (0, 0).
 
@@ -167,7 +195,7 @@ def tc016d(truck_edge_m: float = TC016D_TRUCK_EDGE_M) -> OsiTrace:
         source=SOURCE,
         description="A parked truck hides a pedestrian who starts to cross 20 m ahead of the ego vehicle.",
         topics={"ground_truth": "osi3.GroundTruth, 10 Hz: all road users and the bus shelter"},
-        messages=(("ground_truth", ground_truth(t, moving, stationary, host_id=1)) for t in stamps_ns),
+        messages=(("ground_truth", ground_truth(t, moving, stationary, 1, tc016d_road())) for t in stamps_ns),
     )
 
 

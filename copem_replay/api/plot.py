@@ -1,4 +1,6 @@
-"""Figures of results, as matplotlib Figures: `cr.plot.detection_curves(results)`. `write_figures` makes the files."""
+"""Figures of results, as matplotlib Figures: `cr.plot.detection_curves(results)`. `write_figures` makes the files,
+`write_film` a film.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-__all__ = ["detection_curves", "distances", "single_runs", "sweeps", "write_figures"]
+__all__ = ["detection_curves", "distances", "single_runs", "sweeps", "write_figures", "write_film"]
 
 
 def detection_curves(results: AnyResults, *, configurations: Sequence[str] | None = None) -> Figure:
@@ -105,3 +107,45 @@ def write_figures(
     read = take_results(results)
     selection = Selection(configurations, log, object_id, run, sliced=summarise_slices(read, by))
     return write_figure_files(read, None if folder is None else Path(folder), selection)
+
+
+def write_film(
+    results: AnyResults,
+    file: str | PathLike[str] | None = None,
+    *,
+    configurations: Sequence[str] | None = None,
+    log: str | None = None,
+    object_id: str | None = None,
+    run: int | None = None,
+) -> Path:
+    """Write ten seconds of one object in one run as a GIF, and return its path.
+
+    A plan for each of up to six configurations shows what it believes, and says whether the object is known, or why
+    not. `file`: None: `film.gif` in the results folder. `configurations`: None: four, from worst to best. `log`,
+    `object_id`, `run` as in `single_runs`. The recording is replayed again.
+
+    Raises InputError for what is not among the results and for more configurations, RecordingError where the recording
+    is gone or has changed, OutputError where the file is not writable.
+
+    >>> cr.plot.write_film("out/tc016d", "film.gif", configurations=["PEM", "coPEM:0s"]).name
+    'film.gif'
+    """
+    from copem_replay.core.colours import configuration_colours
+    from copem_replay.experiment.drive import resolve_for_log
+    from copem_replay.metrics.detections_table import first_episodes
+    from copem_replay.pipeline.one_run import replay_run
+    from copem_replay.report.figures.selection import Selection, choose_object_and_run
+    from copem_replay.viewer.film import check_film, draw_film
+
+    read = take_results(results)
+    path = read.require_folder() / "film.gif" if file is None else Path(file)
+    check_film(path, configurations)
+    choice = choose_object_and_run(read, Selection(configurations, log, object_id, run))
+    (rows,) = read.each(log=choice.log, every=True)
+    table = first_episodes(rows[rows["run"] == choice.run])
+    recording = read.recording(choice.log, read.experiment)
+    replayed = replay_run(recording, resolve_for_log(read.experiment, choice.log), choice.run)
+    read.check_unchanged()
+    every = configuration_colours(read.experiment.configurations)
+    colours = {name: every[name] for name in choice.configurations}
+    return draw_film(path, replayed, table, choice.object_id, colours, read.place)

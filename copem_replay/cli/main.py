@@ -64,6 +64,7 @@ for command in (
     results.verdict,
     results.history,
     results.plot,
+    results.film,
     results.report,
     results.view,
     results.layout,

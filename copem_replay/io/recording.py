@@ -11,6 +11,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -322,6 +323,9 @@ def _decode_topic(log: Log, topic: str) -> DecodedObjects:
             decoder.add(
                 payload, schema=channels[number].schema, log_time_ns=log_time_ns, ahead_ns=channels[number].ahead_ns
             )
+        if log.window is not None:  # simulators write the road in the first message alone
+            for number, _, payload in islice(log.within(None).payloads(frozenset(channels)), 1):
+                decoder.add_road(payload, channels[number].schema)
         return decoder.columns()
     except OversizeError as error:
         raise RecordingError(str(error), path=log.path, topic=topic) from None

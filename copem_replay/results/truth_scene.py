@@ -20,6 +20,7 @@ BODY: Rgba = (0.62, 0.62, 0.62, 1.0)
 UNIT: Rgba = (0.85, 0.85, 0.85, 1.0)
 FIELD: Rgba = (0.45, 0.45, 0.38, 1.0)
 STATIC: Rgba = (0.4, 0.4, 0.4, 1.0)
+LANE: Rgba = (0.35, 0.35, 0.4, 1.0)
 """Greys: the truth is thin and neutral, so that the colours of configurations stand out."""
 NAMED_OBJECTS = 6
 """Measured objects with a name, at most: those that configurations detect at the most different times."""
@@ -31,7 +32,7 @@ _MARK_M, _ABOVE_M = 0.5, 0.05
 def draw_truth(replayed: ReplayedRun, table: pd.DataFrame) -> TruthScene:
     """The truth of a run; `table`: the rows of `detections.parquet` of its log and run."""
     replay, modelled = replayed.replay, replayed.experiment.modelled
-    static = list(_draw_obstacles(replayed))
+    static = [*_draw_obstacles(replayed), *_draw_lanes(replayed)]
     for name, unit in modelled.items():
         if unit.at is not None and len(replay.placed.stamps_ns[name]):
             poses = replay.placed.poses[name]
@@ -135,6 +136,12 @@ def _draw_unit(replayed: ReplayedRun, name: str, *, field: bool) -> Entity:
             lines.append(Line([(x, y, down_m) for x, y in border.tolist()], FIELD))
     mark = Ellipse((_MARK_M, _MARK_M, _MARK_M / 2), UNIT)
     return Entity(f"unit {name}", {"unit": name}, lines, [Text(name, UNIT, above_m=(_MARK_M,))], [mark])
+
+
+def _draw_lanes(replayed: ReplayedRun) -> Iterator[Entity]:
+    """The boundaries of all lanes as one entity, if the log has any."""
+    if boundaries := replayed.replay.lane_boundaries:
+        yield Entity("lanes", lines=[Line([(x, y, z) for x, y, z in line.tolist()], LANE, 1.0) for line in boundaries])
 
 
 def _draw_obstacles(replayed: ReplayedRun) -> Iterator[Entity]:

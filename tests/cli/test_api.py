@@ -306,7 +306,7 @@ class TestFolders:
 
     def test_what_is_not_in_a_folder_is_said(self, here: Path) -> None:
         result = cr.run("e.yaml")
-        for call in (cr.view, cr.write_report, cr.plot.write_figures):
+        for call in (cr.view, cr.write_report, cr.plot.write_figures, cr.plot.write_film):
             with pytest.raises(cr.InputError, match=r"found some that are not saved; result\.save\(folder\) does"):
                 call(result)
         with pytest.raises(cr.InputError, match="expected results of a run to save, found some that were read"):

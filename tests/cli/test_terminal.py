@@ -33,8 +33,8 @@ configurations:
   gnn: {units: all, latency_s: {ego: 0, default: 0.3}, fusion: {kind: gnn}}
   a fusion of two units, with a long name: {units: all, latency_s: 1.0, fusion: {kind: gnn}}
 """
-COMMANDS = ("", "info", "init", "check", "run", "fit", "compare", "why", "verdict", "history", "plot", "report", "view",
-            "layout", "schema", "samples", "convert")  # fmt: skip
+COMMANDS = ("", "info", "init", "check", "run", "fit", "compare", "why", "verdict", "history", "plot", "film",
+            "report", "view", "layout", "schema", "samples", "convert")  # fmt: skip
 FORMATS = ("argoverse2", "scenarionet", "openlabel", "commonroad", "sumo", "csv")
 
 

@@ -832,8 +832,11 @@ def test_the_same_drive_as_ros_2_and_as_osi():
     np.testing.assert_allclose(*speeds, atol=1e-3)
 
 
-def test_boundaries_of_lanes(tmp_path: Path) -> None:
-    """Of the first message that has some; lines of fewer than two points, and points that are nowhere, are none."""
+Lines = dict[int, list[list[tuple[float, float, float]]]]
+
+
+def road_log(path: Path, lines: Lines) -> Path:
+    """Three messages with a car; `lines` by message."""
     messages = []
     for k in range(3):
         truth = GroundTruth()
@@ -841,13 +844,31 @@ def test_boundaries_of_lanes(tmp_path: Path) -> None:
         one = truth.moving_object.add(type=2)
         one.id.value, one.base.position.x, one.base.dimension.length = 1, 1.0 * k, 4.0
         one.base.dimension.width, one.base.dimension.height = 2.0, 1.5
-        places = {1: [[(0, 2, 0), (50, 2, 0), (90, 3, 0.5)], [(0, -2, 0)], [(0, 9, 0), (math.nan, 9, 0), (5, 9, 0)]]}
-        for line in places.get(k, [[(7, 7, 0), (8, 8, 0)]] if k == 2 else []):
+        for line in lines.get(k, []):
             boundary = truth.lane_boundary.add()
             for x, y, z in line:
                 point = boundary.boundary_line.add().position
                 point.x, point.y, point.z = x, y, z
         messages.append((k * 10**8, truth.SerializeToString()))
-    write_mcap(tmp_path / "a.mcap", [Topic("truth", "osi3.GroundTruth", messages)])
-    lines = read_log(tmp_path / "a.mcap", name="a").lane_boundaries
+    write_mcap(path, [Topic("truth", "osi3.GroundTruth", messages)])
+    return path
+
+
+def test_boundaries_of_lanes(tmp_path: Path) -> None:
+    """Of the first message that has some; lines of fewer than two points, and points that are nowhere, are none."""
+    first = [[(0, 2, 0), (50, 2, 0), (90, 3, 0.5)], [(0, -2, 0)], [(0, 9, 0), (math.nan, 9, 0), (5, 9, 0)]]
+    log = road_log(tmp_path / "a.mcap", {1: first, 2: [[(7, 7, 0), (8, 8, 0)]]})
+    lines = read_log(log, name="a").lane_boundaries
     assert [line.tolist() for line in lines] == [[[0, 2, 0], [50, 2, 0], [90, 3, 0.5]], [[0, 9, 0], [5, 9, 0]]]
+
+
+@pytest.mark.parametrize(
+    ("later", "read"), [({}, [[0, 2, 0], [50, 2, 0]]), ({2: [[(7, 7, 0), (8, 8, 0)]]}, [[7, 7, 0], [8, 8, 0]])]
+)
+def test_a_window_has_the_road_of_the_first_message_unless_it_has_its_own(
+    tmp_path: Path, later: Lines, read: list[list[float]]
+) -> None:
+    log = road_log(tmp_path / "a.mcap", {0: [[(0, 2, 0), (50, 2, 0)]], **later})
+    recording = read_log(log, name="a", window_s=(0.1, None))
+    assert [line.tolist() for line in recording.lane_boundaries] == [read]
+    assert len(recording.truth.stamp_ns) == 2

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.reader import make_reader
 
 import copem_replay as cr
+from copem_replay.io.recording import read_log
 from copem_replay.io.write import ros2 as foxglove_scene_ros2
 from copem_replay.io.write import scene as foxglove_scene
 from copem_replay.io.write.detail import KNOWN, LISTED, NOT_LISTED
@@ -131,6 +133,17 @@ class TestTruth:
         assert {round(point.z, 2) for point in field.points} == {-4.95}, "on the ground under it"
         top = found["obstacle 0:0"].lines[1]
         assert {(point.x, point.y) for point in top.points} == {(10, 10), (20, 10), (20, 20)}
+
+    def test_lanes_are_one_entity_of_what_does_not_move(self, tmp_path: Path) -> None:
+        drive(tmp_path / "drive.mcap")
+        (tmp_path / "e.yaml").write_text(changed("show: {run: 0}"))
+        boundaries = [[[0.0, 2, 0], [50, 2, 0]], [[0.0, -2, 0], [50, -2, 0], [60, -3, 0.5]]]
+        recording = read_log(tmp_path / "drive.mcap", name="drive")
+        recording = replace(recording, lane_boundaries=tuple(map(np.array, boundaries)))
+        folder = cr.run(tmp_path / "e.yaml", recording).save(tmp_path / "r")
+        ((_, data),) = messages(folder / "replay.mcap", "copem/truth/static")
+        (lanes,) = (e for e in SceneUpdate.FromString(data).entities if e.id == "lanes")
+        assert [[[point.x, point.y, point.z] for point in line.points] for line in lanes.lines] == boundaries
 
     def test_the_frame_to_follow_is_the_ego(self, results: Path) -> None:
         found = [

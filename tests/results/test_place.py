@@ -207,6 +207,7 @@ class TestMade:
         commands = [
             ["plot", "out/e"],
             ["plot", "out/e", "--out", "out/e/more figures", "--configurations", "GT,PEM"],
+            ["film", "out/e", "--configurations", "PEM"],
             ["report", "out/e"],
             ["report", "out/e", "--out", "out/e/pages/second.html", "--baseline", "PEM"],
             ["layout", "out/e"],
@@ -222,7 +223,7 @@ class TestMade:
         assert {
             f"figures/{name}.{kind}" for name in ("answer", "differences", "sweeps") for kind in ("png", "svg")
         } <= made
-        assert {"report.html", "pages/second.html", "replay.foxglove.json", "wide.json"} <= made
+        assert {"film.gif", "report.html", "pages/second.html", "replay.foxglove.json", "wide.json"} <= made
         assert {"c.csv", "c.md", "beside.rrd", "beside.configurations_7.rrd", "more figures/curves.svg"} <= made
         (folder / "figures/mine.svg").write_text("<svg/>")
         (folder / "notes.txt").write_text("mine\n")
@@ -314,7 +315,7 @@ class TestMade:
         assert os.listdir(old.parent) == ["e"]
 
     @pytest.mark.parametrize(
-        "command", [["plot"], ["report"], ["compare", "--baseline", "PEM", "--out", "out/e/c.csv"]]
+        "command", [["plot"], ["film"], ["report"], ["compare", "--baseline", "PEM", "--out", "out/e/c.csv"]]
     )
     def test_a_file_is_listed_before_it_is_there(
         self, here: Path, call: Call, monkeypatch: pytest.MonkeyPatch, command: list[str]

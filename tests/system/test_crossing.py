@@ -18,9 +18,10 @@ import pytest
 import shapely
 from mcap.reader import make_reader
 from osi3.osi_groundtruth_pb2 import GroundTruth
+from osi3.osi_lane_pb2 import LaneBoundary
 from osi3.osi_object_pb2 import MovingObject
 from ruamel.yaml import YAML
-from shapely import LineString, Polygon, affinity
+from shapely import LineString, Point, Polygon, affinity
 
 import copem_replay as cr
 from copem_replay.experiment.file import log_paths, read_experiment_file
@@ -156,6 +157,30 @@ def test_who_is_there(scenes: list[Scene]) -> None:
     assert min(len(scene) for scene in scenes) >= 20
     for one, other in pairwise(scenes):
         assert all(one[key].size_m == other[key].size_m for key in one.keys() & other.keys())
+
+
+def test_the_road_is_in_the_first_message(messages: list[GroundTruth], scenes: list[Scene], furniture: Scene) -> None:
+    """No kerb runs through a vehicle or through what stands, and crosswalks join kerbs. Who crosses at a crosswalk is
+    between its lines.
+    """
+    assert not any(message.lane_boundary for message in messages[1:])
+    lines: dict[int, list[LineString]] = {}
+    for osi in messages[0].lane_boundary:
+        points = [(point.position.x, point.position.y) for point in osi.boundary_line]
+        lines.setdefault(osi.classification.type, []).append(LineString(points))
+    kerbs = shapely.union_all(lines[LaneBoundary.Classification.TYPE_CURB])
+    across = [line for line in lines[LaneBoundary.Classification.TYPE_DASHED_LINE] if line.length == 12.4]
+    assert (len(lines[LaneBoundary.Classification.TYPE_CURB]), len(across)) == (4, 8)
+    assert all(kerbs.distance(Point(end)) < 0.2 for line in across for end in line.coords)
+    crosswalks = shapely.union_all([one.union(other).envelope for one in across for other in across
+                                    if one.distance(other) == pytest.approx(3.2)])  # fmt: skip
+    walkers = range(40, 51)
+    for scene in [*scenes[::5], furniture]:
+        for key, state in scene.items():
+            if state.kind != "pedestrian":
+                assert kerbs.disjoint(state.footprint), key
+            elif key in walkers and min(abs(state.x_m), abs(state.y_m)) < 6:
+                assert crosswalks.contains(state.footprint), key
 
 
 def test_the_ego_is_the_host_from_begin_to_end(messages: list[GroundTruth], stays: dict[int, list[int]]) -> None:

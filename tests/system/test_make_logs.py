@@ -22,6 +22,7 @@ import shapely
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from mcap.reader import make_reader
 from osi3.osi_groundtruth_pb2 import GroundTruth
+from osi3.osi_lane_pb2 import LaneBoundary
 from osi3.osi_object_pb2 import MovingObject
 from osi3.osi_sensordata_pb2 import SensorData
 from ruamel.yaml import YAML
@@ -200,6 +201,25 @@ def test_who_is_there(messages: list[GroundTruth]) -> None:
             assert osi.base.position.z == dimension.height / 2
             if key in sizes_m:
                 assert (dimension.length, dimension.width, dimension.height) == sizes_m[key]
+
+
+def test_the_road_is_in_the_first_message(messages: list[GroundTruth], scenes: list[Scene]) -> None:
+    """Kerbs have all traffic between them and the shelter outside; he walks along the crosswalk, clear of the truck."""
+    lines = [
+        (osi.classification.type, LineString([(p.position.x, p.position.y) for p in osi.boundary_line]))
+        for osi in messages[0].lane_boundary
+    ]
+    assert not any(message.lane_boundary for message in messages[1:])
+    one, other = (line for kind, line in lines if kind == LaneBoundary.Classification.TYPE_CURB)
+    street = Polygon([*one.coords, *reversed(other.coords)])
+    west, east = sorted((line for _, line in lines if line.bounds[0] == line.bounds[2]), key=lambda line: line.bounds)
+    crosswalk = Polygon([*west.coords, *reversed(east.coords)])
+    assert [line.length for line in (west, east)] == pytest.approx([other.distance(one)] * 2)
+    for scene in scenes:
+        assert street.disjoint(scene[SHELTER].footprint)
+        assert all(street.contains(scene[key].footprint) for key in range(1, 8) if abs(scene[key].x_m) < 80)
+        assert crosswalk.contains(scene[PEDESTRIAN].footprint)
+        assert crosswalk.disjoint(scene[TRUCK].footprint)
 
 
 def test_the_ego_drives_straight_on_at_10_mps(scenes: list[Scene]) -> None:

@@ -11,6 +11,7 @@ import itertools
 import math
 import sys
 from array import array
+from contextlib import suppress
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -224,6 +225,14 @@ class GroundTruthDecoder:
         self._allowance.spend(0, self._stationary.of_message[-1])
         self._wait(truth)
 
+    def add_road(self, payload: bytes, schema: str) -> None:
+        """Take the lanes of a message that is not read otherwise, where none has had any. Raises OversizeError."""
+        if not self._lane_boundaries:
+            check_osi(self._message_of[schema], payload)
+            with suppress(DecodeError):
+                message = self._message_of[schema].FromString(payload)
+                self._add_lanes((message.global_ground_truth if schema == SENSOR_VIEW else message).lane_boundary)
+
     def columns(self) -> DecodedObjects:
         """The columns of all messages that were added; none can be added after. Raises OversizeError."""
         self._add_waiting()
@@ -252,8 +261,11 @@ class GroundTruthDecoder:
                 return
 
     def _wait(self, truth: Any) -> None:
-        """Keep the moving objects of a message; add those that wait where they are many."""
+        """Keep the moving objects of a message, no map; add those that wait where they are many."""
         self._waiting_objects += len(truth.moving_object)
+        for field, _ in truth.ListFields():
+            if field.name != "moving_object":
+                truth.ClearField(field.name)
         self._waiting.append((self._messages, truth.SerializePartialToString()))
         self._waiting_bytes += len(self._waiting[-1][1])
         if self._waiting_bytes > BATCH_BYTES or self._waiting_objects > MOST_OBJECTS:
