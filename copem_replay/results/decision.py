@@ -18,8 +18,7 @@ import pandas as pd
 from copem_replay.experiment.schema import Experiment
 from copem_replay.results.compare import Comparison, compare_folders
 from copem_replay.results.compare.tables import NOTHING
-from copem_replay.results.judge import judge_own_criteria
-from copem_replay.results.verdicts import NOT_MET, Judgement, find_verdicts
+from copem_replay.results.verdicts import NOT_MET, Judgement
 
 if TYPE_CHECKING:
     from copem_replay.results.read import Results
@@ -64,12 +63,6 @@ def decide(results: Results, comparison: Comparison | None = None, verdicts: Jud
         comparison = comparison or compare_folders([results], metrics=DECIDED_BY)
         found = decide_compared(comparison, results.experiment)
     return found if verdicts is None else Decision(describe_verdicts(verdicts), found.best)
-
-
-def find_own_verdicts(results: Results) -> Judgement | None:
-    """The verdicts in the folder of the results, else of the criteria of their experiment; None: no criteria."""
-    found = None if results.folder is None else find_verdicts(results.folder)
-    return found or judge_own_criteria(results)
 
 
 def describe_verdicts(verdicts: Judgement) -> str:

@@ -637,7 +637,7 @@ class TestSweeps:
             ("rate_hz", 2.0, "late", 2.0, 0.4, 0.3, 0.5, 0.2, None, None, None, None, None),
         ]
         columns = ["sweep", "value", "configuration", "list_rate_hz", "detected_share", "detected_share_low",
-                   "detected_share_high", "ttd_p5_s", "ttd_median_s", "ttd_p95_s", "pass_share", "pass_share_low",
+                   "detected_share_high", "ttd_p5_s", "ttd_rmst_s", "ttd_p95_s", "pass_share", "pass_share_low",
                    "pass_share_high"]  # fmt: skip
         table = pd.DataFrame(rows, columns=columns).assign(
             n=6, interval="exact", interval_over="runs", interval_clusters=6

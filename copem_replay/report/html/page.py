@@ -181,11 +181,7 @@ def build_page(study: ReportData) -> str:
 
 def _verdict_sections(study: ReportData) -> list[_Section]:
     """The section of verdicts: those in the folder, else of the criteria of the experiment; none without criteria."""
-    from copem_replay.results.judge import judge_own_criteria
-    from copem_replay.results.verdicts import find_verdicts
-
-    folder = study.results.folder
-    verdicts = (find_verdicts(folder) if folder is not None else None) or judge_own_criteria(study.results)
+    verdicts = study.verdicts
     return [] if verdicts is None else [_Section("criteria", "Good enough?", [verdicts_table(verdicts)])]
 
 
