@@ -9,7 +9,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from copem_replay.core.errors import OutputError
+from copem_replay.core.errors import OutputError, RecordingError
 from copem_replay.core.files import atomic_file
 from copem_replay.report.figures.registry import FIGURES
 from copem_replay.report.figures.selection import Selection
@@ -132,6 +132,8 @@ def figure_element(name: str, figure: Figure, title: str, shows: str) -> Html:
 
 
 _ANSWER, _DIFFERENCES = "answer", "differences"
+_ALONE = ("runs",)
+"""Figures that `plot` draws alone: stories show single runs here."""
 _BELOW = {"latency_breakdown": stage_table, "slices": group_tables}
 """Elements below figures."""
 
@@ -202,10 +204,10 @@ def _difference_parts(study: ReportData) -> list[Html]:
 
 
 def _figure_sections(study: ReportData, names: Sequence[str]) -> Iterator[_Section]:
-    """A section per figure that needs no recording, with the reason in place of a figure that cannot be drawn."""
+    """A section per figure, with the reason in place of one that cannot be drawn."""
     for name in names:
         kind = FIGURES[name]
-        reason = "" if kind.needs_recording else kind.missing(study.results, _select(study))
+        reason = "" if name in _ALONE else kind.missing(study.results, _select(study))
         if reason == "" or not len(study.results.known):
             continue
         if reason is not None:
@@ -213,7 +215,11 @@ def _figure_sections(study: ReportData, names: Sequence[str]) -> Iterator[_Secti
             continue
         about = [make_tag("p", line) for line in kind.about(study.results)]
         below = [_BELOW[name](study)] if name in _BELOW else []
-        yield _Section(f"section-{name}", kind.title, [*about, _embed_figure(study, name), *below])
+        try:
+            figure = _embed_figure(study, name)
+        except RecordingError as error:
+            figure = make_tag("p", f"No figure: {error.problems[0]}.")
+        yield _Section(f"section-{name}", kind.title, [*about, figure, *below])
 
 
 def _configuration_key(study: ReportData) -> Html:
