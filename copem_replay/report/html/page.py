@@ -32,6 +32,7 @@ from copem_replay.report.html.setup import (
     provenance_tables,
 )
 from copem_replay.report.html.slices import group_tables
+from copem_replay.report.html.stories import story_parts
 from copem_replay.report.html.study import ReportData, load_study
 from copem_replay.report.html.tables import (
     baseline_words,
@@ -151,7 +152,8 @@ def build_page(study: ReportData) -> str:
     sections = [
         *_verdict_sections(study),
         _Section("differences-of-it", "Differences", _difference_parts(study)),
-        *_figure_sections(study, ("trade_off",)),
+        *([_Section("stories", "Stories of single objects", story_parts(study))] if measured else []),
+        *_figure_sections(study, ("late_paths", "trade_off")),
         _Section(
             "configurations-of-it",
             "What is compared",
@@ -161,7 +163,7 @@ def build_page(study: ReportData) -> str:
     ]
     if measured:
         sections += _figure_sections(
-            study, [name for name in FIGURES if name not in (_ANSWER, _DIFFERENCES, "trade_off")]
+            study, [name for name in FIGURES if name not in (_ANSWER, _DIFFERENCES, "late_paths", "trade_off")]
         )
         sections.append(_Section("missed", "Never detected", [never_detected(study), exact_misses(study)]))
     sections.append(_Section("provenance", "Where this comes from", [provenance_tables(study)]))
