@@ -289,12 +289,16 @@ def view(
     web: Annotated[
         bool, typer.Option("--web", help="Serve viewer and recordings on 127.0.0.1, for a browser, until interrupted.")
     ] = False,
+    object: Annotated[
+        str | None, typer.Option(metavar="ID", help="Open at the onset of this object [at the first onset].")
+    ] = None,
+    log: Annotated[str | None, typer.Option(metavar="NAME", help="Log of that object [any].")] = None,
 ) -> int:
     """Open the recordings of a results folder in the viewer.
 
-    Each opens half a second before the first onset.
+    Each opens half a second before the first onset, or that of an object.
     """
     from copem_replay.api.results import view as view_results
 
-    view_results(folder, web=web)
+    view_results(folder, web=web, object_id=object, log=log)
     return 0

@@ -173,8 +173,13 @@ def _draw_ground(axes: Axes, drive: Drive, box: tuple[float, float, float, float
     axes.set_aspect("equal", adjustable="box")
     axes.set_xlim(*box[:2])
     axes.set_ylim(*box[2:])
-    axes.grid(color="0.9", linewidth=0.4)
-    axes.tick_params(labelsize=7)
+    axes.set_xticks([])
+    axes.set_yticks([])
+    axes.spines[:].set(visible=True, color="0.75")
+    long_m = next(size for size in (50, 20, 10, 5) if size <= (box[1] - box[0]) / 3 or size == 5)
+    at_m = box[0] + 0.04 * (box[1] - box[0]), box[2] + 0.05 * (box[3] - box[2])
+    axes.plot([at_m[0], at_m[0] + long_m], [at_m[1]] * 2, color=INK, linewidth=2, solid_capstyle="butt", label="_scale")
+    axes.annotate(f"{long_m} m", at_m, (0, 3), textcoords="offset points", fontsize=7.5, color=INK)
     axes.add_collection(PolyCollection(list(drive.outlines()), facecolor="0.8", edgecolor="0.6", linewidth=0.6))
     if drive.scene.ego_ix >= 0:
         axes.plot(
@@ -222,7 +227,7 @@ def _note_sentences(
         f"; ✕: never known in {100 * NEVER_FROM:.0f} % of the {runs} runs or more" if runs > 1 else "; ✕: never known"
     )
     return [
-        f"{which}: {count_noun(rows['object_id'].nunique(), 'measured object')}, north is up, metres",
+        f"{which}: {count_noun(rows['object_id'].nunique(), 'measured object')}, north is up",
         "Grey: before the onset; thick: unknown since the onset; thin: afterwards, in the colour of the time that it "
         f"took; darker is later{never}",
         *(["Dashed: the way of the ego"] if drive.scene.ego_ix >= 0 else []),

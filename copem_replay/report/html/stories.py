@@ -126,10 +126,27 @@ class ObjectStory:
         """When a configuration knows it; when its episode ends, if it never does."""
         return float(row["detection_s"] if row["detected"] else row["ended_s"])
 
+    @property
+    def blind(self) -> Any:
+        """The row of the configuration whose units have it in sight last, or know it last."""
+        return self.rows.loc[self.rows.apply(self.hidden_s, axis=1).iloc[::-1].idxmax()]
+
+    def hidden_s(self, row: Any) -> float:
+        """For how long after the onset a configuration has it in no list in sight, at most until one that counts."""
+        seen_s = float(row["in_sight_s"])
+        if not self.drive.experiment.units_of(self.drive.experiment.configurations[row["configuration"]]):
+            return 0.0  # what units of a recorded output see is not known
+        listed_s = float(row["captured_s"]) if row["detected"] else self.known_s(row)
+        return (
+            max(float(np.fmin(seen_s, listed_s)) - self.onset_s, 0.0)
+            if seen_s == seen_s or not row["detected"]
+            else 0.0
+        )
+
     def blind_unit(self) -> str | None:
-        """The unit from which the last configuration should have seen it: the ego's, else its first one."""
+        """The unit from which that configuration should have seen it: a carried one, else its first one."""
         experiment = self.drive.experiment
-        names = experiment.units_of(experiment.configurations[self.last["configuration"]])
+        names = experiment.units_of(experiment.configurations[self.blind["configuration"]])
         modelled = [name for name in names if name in experiment.modelled]
         own = [name for name in modelled if find_carrier(self.drive.scene, experiment.modelled[name]) >= 0]
         return next(iter([*own, *modelled]), None)
@@ -180,50 +197,53 @@ def unit_pose(drive: Drive, name: str, unit: Unit, world: Tracks) -> UnitPoses:
 
 
 def explain_story(story: ObjectStory, hider: tuple[str, int] | None) -> str:
-    """Why the last configuration knows an object late, and how the first one knows it, in one sentence."""
-    first, last = story.first, story.last
-    parts = [*_explain_last(story, last, hider)]
+    """What hid an object, why the last configuration knows it late, and how the first one knows it, in one sentence."""
+    first, last, hidden_s = story.first, story.last, story.hidden_s(story.blind)
+    parts = []
+    if hidden_s > SAME_INSTANT_S:
+        name = str(story.blind["configuration"])
+        where = (
+            f"Hidden from {story.blind_unit()} behind {hider[0]}" if hider else f"Out of sight of the units of {name}"
+        )
+        until = _format_time(hidden_s) if story.blind["detected"] or story.blind["in_sight_s"] > 0 else "the end"
+        parts.append(f"{where} until {until}")
+        if hider and story.rows["detected"].any() and name not in (first["configuration"], last["configuration"]):
+            parts[0] += f", so {name} {_tell_known(story.blind)}"
+    if not story.rows["detected"].any():
+        return (
+            "; ".join([*parts, "no configuration ever knows it" if parts else "No configuration ever knows it"]) + "."
+        )
+    parts.append(f"{last['configuration']} {_tell_known(last)}{_tell_captured(last, story)}")
     if last["unknown_s"] - first["unknown_s"] > SAME_INSTANT_S:
         parts.append(f"{first['configuration']} {_tell_known(first)}{_tell_captured(first, story)}")
-    told = "; ".join(parts)
-    return f"{told[:1].upper()}{told[1:]}."
-
-
-def _explain_last(story: ObjectStory, row: Any, hider: tuple[str, int] | None) -> Iterator[str]:
-    name, onset_s, unit = str(row["configuration"]), story.onset_s, story.blind_unit()
-    sight_s, told = float(row["in_sight_s"]), False
-    if unit is not None and not sight_s <= onset_s + SAME_INSTANT_S:
-        where = f"hidden from {unit} behind {hider[0]}" if hider else f"out of sight of the units of {name}"
-        told = True
-        if np.isnan(sight_s):
-            yield f"{where} at the onset, and in no list of {name} in sight"
-        else:
-            yield f"{where} until {_format_time(sight_s - onset_s)}"
-    if not row["detected"]:
-        yield f"{name} never knows it"
-        return
-    seen_s = onset_s if np.isnan(sight_s) else max(sight_s, onset_s)
-    listed_s = float(row.get("listed_s", np.nan))
-    if not np.isnan(listed_s) and row["captured_s"] - listed_s > SAME_INSTANT_S and listed_s >= onset_s:
-        since, last = _format_time(listed_s - onset_s), _format_time(row["captured_s"] - onset_s)
-        yield f"lists that have it from {since} on are lost, late or held back until that of {last}"
-    elif not told and row["captured_s"] - seen_s > SAME_INSTANT_S:
-        yield f"in sight, but in no list that counts until {_format_time(row['captured_s'] - onset_s)}"
-    yield f"{name} {_tell_known(row)}{_tell_captured(row, story)}"
+    return "; ".join(parts) + "."
 
 
 def _tell_known(row: Any) -> str:
+    if not row["detected"]:
+        return "never knows it"
     return (
         f"knows it after {_format_time(row['unknown_s'])}" if row["unknown_s"] > SAME_INSTANT_S else "knows it at once"
     )
 
 
 def _tell_captured(row: Any, story: ObjectStory) -> str:
-    """By which unit's list, and how long that took to come."""
+    """By which unit's list, what became of lists before it, and how long it took to come."""
+    if not row["detected"]:
+        return "" if np.isnan(row["in_sight_s"]) else f", though {_tell_sight(story, row['in_sight_s'])}"
     unit, took_s = row.get("first_unit"), row["detection_s"] - row["captured_s"]
-    by = f" by {unit}" if isinstance(unit, str) and unit else ""
-    late = f", whose list takes {_format_time(took_s)}" if took_s > SAME_INSTANT_S else ""
-    return by + (late if by else late.replace("whose list", "by a list that"))
+    told = f" by {unit}" if isinstance(unit, str) and unit else ""
+    listed_s, since_s = float(row.get("listed_s", np.nan)), max(float(row["in_sight_s"]), story.onset_s)
+    if row["captured_s"] - listed_s > SAME_INSTANT_S and listed_s >= story.onset_s:
+        told += f" (lists from {_format_time(listed_s - story.onset_s)} on were lost, late or held back)"
+    elif row["captured_s"] - since_s > SAME_INSTANT_S:
+        told += f" ({_tell_sight(story, since_s)}, but in no list that counts)"
+    return told + (f", whose list takes {_format_time(took_s)}" if took_s > SAME_INSTANT_S and told else "")
+
+
+def _tell_sight(story: ObjectStory, since_s: float) -> str:
+    after_s = max(since_s - story.onset_s, 0.0)
+    return f"in sight from {_format_time(after_s)} on" if after_s > SAME_INSTANT_S else "in sight from the onset on"
 
 
 def _format_time(time_s: float) -> str:
@@ -238,10 +258,12 @@ _LANES_TOP, _LANE_LEFT = 250, 150
 _OBJECT, _HIDER = "#c2410c", "#7a1fa2"
 _SPAN_M, _NEAR_M = 30.0, 60.0
 """Least width of a plan, and from how far away the ego and units are in it."""
+_MARGIN_M = 6.0
+"""Bodies whose middle is so far outside a plan may still reach into it."""
 
 
 def _story_element(story: ObjectStory, why: str, log: str | None) -> Html:
-    hider = None if story.last["in_sight_s"] <= story.onset_s + SAME_INSTANT_S else find_hider(story)
+    hider = find_hider(story) if story.hidden_s(story.blind) > SAME_INSTANT_S else None
     said = explain_story(story, hider)
     title = make_tag("h3", f"{story.name}: {why}")
     shown = log is None or log in story.study.results.provenance.run_shown
@@ -272,12 +294,14 @@ class _View:
 
 def _draw_plans(story: ObjectStory, hider: tuple[str, int] | None) -> Iterator[Html]:
     first, last = story.first, story.last
-    instants = [
-        (story.onset_s, f"onset, {story.onset_s:.2f} s", None),
-        (story.known_s(first), f"{_format_time(first['unknown_s'])}: {first['configuration']} first", first),
-        (story.known_s(last), f"{_format_time(last['unknown_s'])}: {last['configuration']} "
-         f"{'last' if last['detected'] else 'never'}", last),
-    ]  # fmt: skip
+    known = f"{first['configuration']} first", f"{last['configuration']} {'last' if last['detected'] else 'never'}"
+    if not story.rows["detected"].any():  # halfway, and at its end
+        first = first.copy()
+        first["ended_s"], first["unknown_s"] = (story.onset_s + last["ended_s"]) / 2, first["unknown_s"] / 2
+        known = "not known", "never known"
+    told = [(row, f"{_format_time(row['unknown_s'])}: {word}") for row, word in zip((first, last), known, strict=True)]
+    instants = [(story.onset_s, f"onset, {story.onset_s:.2f} s", None)]
+    instants += [(story.known_s(row), title, row) for row, title in told]
     worlds = [world_at(story.drive, time_s) for time_s, _, _ in instants]
     box = _choose_box(story, worlds, hider)
     for k, ((_, title, row), world) in enumerate(zip(instants, worlds, strict=True)):
@@ -326,10 +350,16 @@ def _draw_plan(
     looks = {number: (_OBJECT, _OBJECT), scene.ego_ix: ("#4d4d4d", "#262626")}
     if hider is not None and hider[1] >= 0:
         looks[hider[1]] = ("#d9d9d9", _HIDER)
-    for k, corners in zip(world.row_object_ix.tolist(), box_corners(world), strict=True):
-        fill, stroke = looks.get(k, ("#d9d9d9", "#8c8c8c"))
-        width = "3" if k == number else "2" if k in looks else "1"
-        yield make_tag("polygon", points=view.points(corners), fill=fill, stroke=stroke, stroke_width=width)
+    corners_m, half_m = box_corners(world), np.array([_PLAN_W, _PLAN_H]) / view.scale / 2
+    middle_m = np.array([view.west_m, view.north_m]) + half_m * [1, -1]
+    near = (np.abs(corners_m.mean(axis=1) - middle_m) <= half_m + _MARGIN_M).all(axis=1)
+    others = corners_m[near & ~np.isin(world.row_object_ix, list(looks))]
+    bodies = "".join(f"M{view.points(corners)}z" for corners in others)
+    yield make_tag("path", d=bodies, fill="#d9d9d9", stroke="#8c8c8c")
+    for k, (fill, stroke) in looks.items():
+        for corners in corners_m[world.row_object_ix == k]:
+            width = "3" if k == number else "2"
+            yield make_tag("polygon", points=view.points(corners), fill=fill, stroke=stroke, stroke_width=width)
     yield from _draw_units(story, world, view, row)
     labels = {number: story.object_id, scene.ego_ix: "ego", **({hider[1]: hider[0]} if hider else {})}
     for k, label in labels.items():
@@ -347,7 +377,7 @@ def _draw_units(story: ObjectStory, world: Tracks, view: _View, row: Any) -> Ite
     target = _places(world, drive.scene.object_number[story.object_id])
     if not isinstance(name, str) or name not in drive.experiment.modelled or not len(target):
         return
-    if row is None and story.last["in_sight_s"] <= story.onset_s + SAME_INSTANT_S:
+    if row is None and story.hidden_s(story.blind) <= SAME_INSTANT_S:
         return
     if row is not None and not row["detected"]:
         return
@@ -388,9 +418,8 @@ def _draw_lane(story: ObjectStory, row: Any, y: float, height: float, scale: flo
     stages = (
         [row["in_sight_s"], row["captured_s"], known_s] if row["detected"] else [row["in_sight_s"], known_s, known_s]
     )
+    stages[0] = story.onset_s + story.hidden_s(row)
     ends = np.fmin(np.maximum.accumulate(np.nan_to_num(np.array(stages, dtype=float), nan=story.onset_s)), known_s)
-    if np.isnan(row["in_sight_s"]) and not row["detected"]:
-        ends[0] = known_s
     begin_s, common = story.onset_s, {"y": f"{y:.1f}", "height": f"{height:.1f}"}
     yield make_tag(
         "text", name[:22], x=f"{_LANE_LEFT - 6}", y=f"{y + height - 2:.1f}", class_="label", text_anchor="end"
