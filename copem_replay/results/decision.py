@@ -210,7 +210,7 @@ def _tell_latencies(
         return None  # not in the order of latencies: each has to be named
     cooperates = units > set(experiment.units_of(experiment.configurations[baseline]))
     what, none = ("cooperation", f"{baseline} alone") if cooperates else (names[0].partition(":")[0], baseline)
-    parts = []
+    parts: list[str] = []
     for word, says in ((BETTER, "{what} helps"), (ALIKE, "no difference to {none} is shown")):
         if word in judged:
             last = [name for name in names if words[name] == word][-1]

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+import copem_replay as cr
 from copem_replay.report.figures import FIGURES, Selection
 from copem_replay.report.figures.paths import late_paths_figure, measure_unknown
 from copem_replay.report.html.page import build_page
@@ -19,8 +20,7 @@ from copem_replay.report.html.stories import choose_stories, story_parts
 from copem_replay.report.html.study import load_study
 from copem_replay.results.read import Results, read_results
 from tests.helpers.recordings import Obj, pedestrian, write_recording
-from tests.helpers.report_pages import ONE, Page, changed, replayed, with_rows
-from tests.helpers.replays import save_experiment
+from tests.helpers.report_pages import ALONE, ONE, Page, changed, replayed, with_rows
 
 MAST = (
     ("  eye: {", "  mast: {at: [30.0, 20.0], height_m: 5.0, pem: sure}\n  eye: {"),
@@ -65,16 +65,16 @@ class TestChoice:
 
 @pytest.fixture(scope="module")
 def hidden(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A lorry (9), 10 m long, stands between the lane of the ego and the pedestrian (3) 30 m aside; a mast is beside."""
+    """A lorry (9), 40 m long, stands between the lane of the ego and the pedestrian (3) aside; a mast is behind it."""
     place = tmp_path_factory.mktemp("hidden")
-    lorry = Obj(id=9, x=15.0, y=12.0, length=40.0, width=2.5, height=4.0)
-    frames = [
-        (0.1 * k, [Obj(id=1, x=1.0 * k, vx=10.0), pedestrian(3, 20.0, 25.0), lorry]) for k in range(51)
-    ]
+    lorry = Obj(id=9, x=15.0, y=12.0, z=2.0, length=40.0, width=2.5, height=4.0)
+    frames = [(0.1 * k, [Obj(id=1, x=1.0 * k, vx=10.0), pedestrian(3, 20.0, 25.0), lorry]) for k in range(51)]
     write_recording(place / "drive.mcap", frames, host=1)
-    text = changed(("measure: {onset", "measure: {objects: {ids: [3]}, onset"), *MAST)
-    text = text.replace("sure: [{detection: {kind: constant, probability: 1.0}}]", "sure: [{detection: {kind: visible_share}}]")
-    return save_experiment(place, text)
+    text = changed(("measure: {onset", "measure: {objects: {ids: [3]}, onset"), *MAST, *ALONE[2:])
+    sure = "sure: [{detection: {kind: %s}}]"
+    text = text.replace(sure % "constant, probability: 1.0", sure % "visible_share")
+    (place / "e.yaml").write_text(text)
+    return cr.run(place / "e.yaml", jobs=1).save(place / "results")
 
 
 def test_a_story_names_what_hides_and_who_listed_it(hidden: Path) -> None:
@@ -98,11 +98,12 @@ def test_stories_are_in_the_report_and_without_the_recording_the_reason(tmp_path
     assert len(re.findall(r"No (?:plans|figure): .*drive\.mcap", page.words)) == 2
 
 
-class TestLatePaths:
-    @pytest.fixture(scope="class")
-    def results(self, tmp_path_factory: pytest.TempPathFactory) -> Results:
-        return read_results(replayed(tmp_path_factory.mktemp("late"), changed()))
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
+    return read_results(replayed(tmp_path_factory.mktemp("late"), changed()))
 
+
+class TestLatePaths:
     def test_unknown_is_over_all_runs_and_of_never_until_its_end(self, results: Results, tmp_path: Path) -> None:
         """Six runs, of which two never know it: (4 × 1 + 2 × 4.5) / 6."""
         table = results.table.copy()
