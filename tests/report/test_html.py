@@ -590,12 +590,12 @@ class TestWaterfall:
         folder = replayed(tmp_path, changed(("time_s: 0.5}}", "time_s: 0.5}, count_earlier: true}")))
         found = Page(build_page(load_study(folder)))
         assert "No figure: with count_earlier" in found.words
-        assert found.plots == ["answer", "differences", "curves", "distances"]
+        assert found.plots == ["answer", "differences", "late_paths", "curves", "distances"]
 
 
 class TestFigures:
-    def test_each_that_needs_no_recording(self, read: Page, tmp_path: Path) -> None:
-        assert read.plots == ["answer", "differences", "curves", "distances", "latency_breakdown"]
+    def test_each_that_the_report_has(self, read: Page, tmp_path: Path) -> None:
+        assert read.plots == ["answer", "differences", "late_paths", "curves", "distances", "latency_breakdown"]
         text = changed(ONE, *ALONE[2:]) + "sweep: {latency_s: [0, 0.5], rate_hz: [2, 10]}\n"
         assert Page(build_page(load_study(replayed(tmp_path, text)))).plots == [*read.plots, "sweeps"]
 
@@ -667,6 +667,7 @@ class TestFile:
         assert (mine / "report.html").read_text(encoding="utf-8") == html
         other = tmp_path / "elsewhere" / "other"
         shutil.copytree(mine, other)
+        shutil.copy(mine.parent / "drive.mcap", other.parent)
         (other / "report.html").unlink()
         deep = write_html_report(other, tmp_path / "new" / "deep.htm")
         assert deep.read_bytes() == (mine / "report.html").read_bytes()
@@ -754,9 +755,14 @@ class TestCommands:
         assert (refused.code, len(refused.lines)) == (2, 1)
         assert not (out / "report.html").exists()
         ended = call("run", experiment, "--out", out, "--report", "--overwrite")
-        assert (ended.code, ended.out[-2:]) == (
+        assert (ended.code, ended.out[-4:]) == (
             0,
-            [f"report in {out / 'report.html'}", f"next: copem-replay report {out}"],
+            [
+                f"report in {out / 'report.html'}",
+                f"next: copem-replay report {out}",
+                "",
+                Page((out / "report.html").read_text(encoding="utf-8")).lines()[2],
+            ],
         )
         first = (out / "report.html").read_bytes()
         assert call("report", out).out == [f"report in {out / 'report.html'}"]
