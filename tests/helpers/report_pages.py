@@ -153,6 +153,8 @@ class Page(HTMLParser):
         if found.get("class") == "plot":
             self.plots.append(found.get("id") or "")
             self._plot = self._open.index("div", len(self._open) - 1)
+        if found.get("class") == "story":
+            self._plot = len(self._open) - 1
 
     def handle_endtag(self, tag: str) -> None:
         assert self._open.pop() == tag, "elements are nested"

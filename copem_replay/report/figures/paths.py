@@ -113,6 +113,8 @@ _TALLEST, _FLATTEST = 1.25, 0.3
 _MARGIN_M = 5.0
 _GROUND = (0.992, 0.99, 0.985)
 """Ground of the panels, no grey: it stays light on a dark page, as the colours of paths need it."""
+_SHADES = 24
+"""Shades of the scale: so few are shapes in an SVG, more would be a picture."""
 NEVER_FROM = 0.5
 """Share of runs from which on an object counts as never known."""
 
@@ -196,6 +198,7 @@ def _draw_ground(axes: Axes, drive: Drive, box: tuple[float, float, float, float
 
 def _draw_paths(axes: Axes, drive: Drive, rows: pd.DataFrame, most_s: float) -> Any:
     """Draw the paths of the episodes of one configuration, the latest on top. Returns what has the colours."""
+    from matplotlib import colormaps
     from matplotlib.collections import LineCollection
     from matplotlib.colors import Normalize
 
@@ -210,7 +213,11 @@ def _draw_paths(axes: Axes, drive: Drive, rows: pd.DataFrame, most_s: float) -> 
         if row.never_share >= NEVER_FROM:
             never.append(at_m[(time_s <= row.ended_s) & ~np.isnan(at_m[:, 0])][-1:])
     axes.add_collection(LineCollection(before, colors="0.72", linewidths=1.0, zorder=1.6))
-    coloured: dict[str, Any] = {"cmap": "cividis_r", "norm": Normalize(0, most_s), "array": np.array(times_s)}
+    coloured: dict[str, Any] = {
+        "cmap": colormaps["cividis_r"].resampled(_SHADES),
+        "norm": Normalize(0, most_s),
+        "array": np.array(times_s),
+    }
     axes.add_collection(LineCollection(after, linewidths=0.9, zorder=1.8, **coloured))
     drawn = axes.add_collection(LineCollection(unknown, linewidths=3.0, zorder=2.0, capstyle="round", **coloured))
     if never:

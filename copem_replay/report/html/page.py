@@ -220,7 +220,7 @@ def _figure_sections(study: ReportData, names: Sequence[str]) -> Iterator[_Secti
         try:
             figure = _embed_figure(study, name)
         except RecordingError as error:
-            figure = make_tag("p", f"No figure: {error.problems[0]}.")
+            figure = make_tag("p", f"No figure: a recording is not there as it was: {error.reasons[0]}.")
         yield _Section(f"section-{name}", kind.title, [*about, figure, *below])
 
 

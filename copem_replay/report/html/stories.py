@@ -30,6 +30,7 @@ from copem_replay.perception.sensor_poses import (
 from copem_replay.perception.visibility import box_corners, find_blockers
 from copem_replay.report.figures.paths import Drive, find_latest_log, read_drive
 from copem_replay.report.figures.selection import pick_evenly
+from copem_replay.report.figures.style import shorten_names
 from copem_replay.report.html.markup import Html, css_colour, make_tag, replace_greys
 from copem_replay.report.html.study import ReportData
 
@@ -51,7 +52,7 @@ def story_parts(study: ReportData) -> list[Html]:
     try:
         drive = read_drive(study.results, log)
     except RecordingError as error:
-        return [make_tag("p", f"No plans: {error.problems[0]}.")]
+        return [make_tag("p", f"No plans: the recording of {log} is not there as it was: {error.reasons[0]}.")]
     stories = [ObjectStory(study, drive, rows[rows["object_id"] == name]) for name in chosen]
     several = len(study.results.provenance.logs) > 1
     said = f"Run {run} of {log}, the longest unknown first, then those on which configurations differ most."
@@ -111,6 +112,11 @@ class ObjectStory:
     def onset_s(self) -> float:
         """The onset, in seconds since the log's start."""
         return float(self.rows["onset_s"].iloc[0])
+
+    @property
+    def short(self) -> dict[str, str]:
+        """Short names of the configurations."""
+        return shorten_names([str(name) for name in self.rows["configuration"]])
 
     @property
     def first(self) -> Any:
@@ -294,7 +300,11 @@ class _View:
 
 def _draw_plans(story: ObjectStory, hider: tuple[str, int] | None) -> Iterator[Html]:
     first, last = story.first, story.last
-    known = f"{first['configuration']} first", f"{last['configuration']} {'last' if last['detected'] else 'never'}"
+    short = story.short
+    known = (
+        f"{short[first['configuration']]} first",
+        f"{short[last['configuration']]} {'last' if last['detected'] else 'never'}",
+    )
     if not story.rows["detected"].any():  # halfway, and at its end
         first = first.copy()
         first["ended_s"], first["unknown_s"] = (story.onset_s + last["ended_s"]) / 2, first["unknown_s"] / 2
@@ -307,7 +317,7 @@ def _draw_plans(story: ObjectStory, hider: tuple[str, int] | None) -> Iterator[H
     for k, ((_, title, row), world) in enumerate(zip(instants, worlds, strict=True)):
         left = k * (_PLAN_W + _GAP)
         view = _View(box[0], box[1], _PLAN_W / box[2], left)
-        yield make_tag("text", title[:46], x=f"{left}", y="12", class_="title")
+        yield make_tag("text", title, x=f"{left}", y="12", class_="title")
         frame = {"x": f"{left}", "y": f"{_TOP}", "width": f"{_PLAN_W}", "height": f"{_PLAN_H}"}
         yield make_tag(
             "svg", *_draw_plan(story, world, view, row, hider), viewBox=f"{left} {_TOP} {_PLAN_W} {_PLAN_H}", **frame
@@ -422,7 +432,7 @@ def _draw_lane(story: ObjectStory, row: Any, y: float, height: float, scale: flo
     ends = np.fmin(np.maximum.accumulate(np.nan_to_num(np.array(stages, dtype=float), nan=story.onset_s)), known_s)
     begin_s, common = story.onset_s, {"y": f"{y:.1f}", "height": f"{height:.1f}"}
     yield make_tag(
-        "text", name[:22], x=f"{_LANE_LEFT - 6}", y=f"{y + height - 2:.1f}", class_="label", text_anchor="end"
+        "text", story.short[name], x=f"{_LANE_LEFT - 6}", y=f"{y + height - 2:.1f}", class_="label", text_anchor="end"
     )
     for end_s, shade in zip(ends.tolist(), _SHADES.values(), strict=True):
         if end_s > begin_s:
