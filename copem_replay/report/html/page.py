@@ -33,7 +33,7 @@ from copem_replay.report.html.setup import (
 )
 from copem_replay.report.html.slices import group_tables
 from copem_replay.report.html.stories import story_parts
-from copem_replay.report.html.study import ReportData, load_study
+from copem_replay.report.html.study import NO_RECORDING, ReportData, load_study
 from copem_replay.report.html.tables import (
     baseline_words,
     exact_misses,
@@ -219,8 +219,8 @@ def _figure_sections(study: ReportData, names: Sequence[str]) -> Iterator[_Secti
         below = [_BELOW[name](study)] if name in _BELOW else []
         try:
             figure = _embed_figure(study, name)
-        except RecordingError as error:
-            figure = make_tag("p", f"No figure: a recording is not there as it was: {error.reasons[0]}.")
+        except RecordingError:
+            figure = make_tag("p", f"No figure: {NO_RECORDING}.")
         yield _Section(f"section-{name}", kind.title, [*about, figure, *below])
 
 

@@ -32,7 +32,7 @@ from copem_replay.report.figures.paths import Drive, find_latest_log, read_drive
 from copem_replay.report.figures.selection import pick_evenly
 from copem_replay.report.figures.style import shorten_names
 from copem_replay.report.html.markup import Html, css_colour, make_tag, replace_greys
-from copem_replay.report.html.study import ReportData
+from copem_replay.report.html.study import NO_RECORDING, ReportData
 
 MOST_STORIES = 6
 """Half of them the latest objects, half those on which configurations differ most."""
@@ -51,8 +51,8 @@ def story_parts(study: ReportData) -> list[Html]:
         return [make_tag("p", f"Every configuration knows every object of {log} at its onset (run {run}).")]
     try:
         drive = read_drive(study.results, log)
-    except RecordingError as error:
-        return [make_tag("p", f"No plans: the recording of {log} is not there as it was: {error.reasons[0]}.")]
+    except RecordingError:
+        return [make_tag("p", f"No plans of {log}: {NO_RECORDING}.")]
     stories = [ObjectStory(study, drive, rows[rows["object_id"] == name]) for name in chosen]
     several = len(study.results.provenance.logs) > 1
     said = f"Run {run} of {log}, the longest unknown first, then those on which configurations differ most."

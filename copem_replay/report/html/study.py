@@ -61,6 +61,10 @@ def explain_missing_interval(study: ReportData, rows: pd.DataFrame) -> str:
     return " or ".join(reasons)
 
 
+NO_RECORDING = "the recording is not there as it was; copem-replay plot says more"
+"""Why a page lacks what needs a recording: without a path, for a page is the same wherever its folder lies."""
+
+
 @dataclass(frozen=True)
 class ReportData:
     """Results with their comparisons.
