@@ -145,20 +145,23 @@ def write_history(folders: Sequence[str | PathLike[str]], file: str | PathLike[s
     return write_history_page([Path(folder) for folder in folders], Path(file))
 
 
-def view(results: AnyResults, *, web: bool = False) -> None:
+def view(results: AnyResults, *, web: bool = False, object_id: str | None = None, log: str | None = None) -> None:
     """Open the recordings of a results folder in the Rerun viewer, just before the first onset, and wait until it ends.
+
+    `object_id`: only recordings with this measured object, just before its onset; `log`: only those of this log.
 
     `web`: serve viewer and recordings on a free port of 127.0.0.1 instead, print the address, and go on until
     interrupted (Ctrl-C).
 
-    Raises InputError: no such folder, or no `replay.rrd` in it; OutputError where the viewer does not open.
+    Raises InputError: no such folder, no `replay.rrd` in it, or none of it with the object; OutputError where the
+    viewer does not open.
 
     >>> cr.view("out/nowhere")
     Traceback (most recent call last):
     copem_replay.core.errors.InputError: out/nowhere: no such folder
     """
     from copem_replay.results.provenance import check_format
-    from copem_replay.viewer.open import list_rrd_files, open_viewer
+    from copem_replay.viewer.open import Sought, list_rrd_files, open_viewer, opening_s
 
     folder = results.require_folder() if isinstance(results, Results) else Path(results)
     files = list_rrd_files(folder)
@@ -167,21 +170,29 @@ def view(results: AnyResults, *, web: bool = False) -> None:
     check_format(folder)
     if not files:
         raise InputError(f"{folder}: no replay.rrd in this folder; `show: {{run: 0}}` in an experiment writes one")
+    if log is not None and object_id is None:
+        raise InputError("--log: expected --object ID with it, found none")
+    instants_s = opening_s(folder, files, None if object_id is None else Sought(object_id, log))
+    if object_id is not None:
+        files = [file for file in files if file in instants_s]
+        if not files:
+            where = "" if log is None else f" of log {log}"
+            raise InputError(f"{folder}: no recording{where} has the measured object {object_id!r}")
     if web:
-        _serve_recordings(folder, files)
-    elif code := open_viewer(folder, files):
+        _serve_recordings(folder, files, instants_s)
+    elif code := open_viewer(files, instants_s):
         raise OutputError(
             f"{folder}: the Rerun viewer could not be opened (it ended with {code}); without a display, "
             f"copem-replay view {folder} --web serves it for a browser"
         )
 
 
-def _serve_recordings(folder: Path, files: Sequence[Path]) -> None:
+def _serve_recordings(folder: Path, files: Sequence[Path], instants_s: Mapping[Path, float]) -> None:
     """Serve recordings for a browser until interrupted."""
     from copem_replay.viewer.open import serve_recordings
 
     try:
-        with serve_recordings(folder, files) as server:
+        with serve_recordings(folder, files, instants_s) as server:
             print(f"viewer at {server.url} (Ctrl-C ends it)", flush=True)
             server.serve_forever()
     except KeyboardInterrupt:  # the intended end

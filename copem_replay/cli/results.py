@@ -13,9 +13,11 @@ from copem_replay.cli.terminal import (
     Baseline,
     By,
     ResultsFolder,
+    print_answer,
     print_blocks,
     print_line,
     print_notes,
+    print_table,
     print_verdicts,
     split_entries,
     split_names,
@@ -60,6 +62,8 @@ def compare(
     """
     from copem_replay.api.results import compare as compare_results
     from copem_replay.results.compare import check_out, comparison_text, write_comparison
+    from copem_replay.results.decision import decide_compared
+    from copem_replay.results.read import open_results
 
     if out is not None:
         check_out(out)
@@ -79,9 +83,9 @@ def compare(
 
         notes += write_side_by_side(rrd, folders, configurations=names, baseline=baseline, log=log, run=run)
     print_notes(notes)
-    print_blocks([comparison_text(comparison, width_of(sys.stdout)).splitlines()])
+    decision = decide_compared(comparison, open_results(folders[0]).experiment if len(folders) == 1 else None)
+    print_table(comparison_text(comparison, width_of(sys.stdout)), decision.best)
     if by is not None and len(folders) == 1:
-        from copem_replay.results.read import open_results
         from copem_replay.results.slices import groups_text, summarise_slices
 
         table = summarise_slices(open_results(folders[0]), split_entries(by))
@@ -91,7 +95,9 @@ def compare(
     if out is not None:
         write_comparison(comparison, out, folders)
     _print_written(out, rrd)
-    return _judge_differences(conditions, folders)
+    code = _judge_differences(conditions, folders)
+    print_answer(decision.sentence)
+    return code
 
 
 def _check_fail_on(
@@ -306,12 +312,16 @@ def view(
     web: Annotated[
         bool, typer.Option("--web", help="Serve viewer and recordings on 127.0.0.1, for a browser, until interrupted.")
     ] = False,
+    object: Annotated[
+        str | None, typer.Option(metavar="ID", help="Open at the onset of this object [at the first onset].")
+    ] = None,
+    log: Annotated[str | None, typer.Option(metavar="NAME", help="Log of that object [any].")] = None,
 ) -> int:
     """Open the recordings of a results folder in the viewer.
 
-    Each opens half a second before the first onset.
+    Each opens half a second before the first onset, or that of an object.
     """
     from copem_replay.api.results import view as view_results
 
-    view_results(folder, web=web)
+    view_results(folder, web=web, object_id=object, log=log)
     return 0

@@ -20,10 +20,12 @@ from copem_replay.cli.terminal import (
     FromS,
     Logs,
     ToS,
+    print_answer,
     print_blocks,
     print_line,
     print_notes,
     print_problems,
+    print_table,
     print_verdicts,
     show_crew_progress,
     show_progress,
@@ -42,8 +44,10 @@ if TYPE_CHECKING:
     from copem_replay.experiment.schema import Experiment
     from copem_replay.pipeline.crew import Crew
     from copem_replay.pipeline.parts import PartCache
+    from copem_replay.results.decision import Decision
     from copem_replay.results.folder import ResultsPlace
     from copem_replay.results.read import Results
+    from copem_replay.results.verdicts import Judgement
 
 Pieces: TypeAlias = Annotated[
     str | None, typer.Option(metavar="FOLDER", help="Keep finished parts here, and reuse them: a folder or a URL.")
@@ -88,6 +92,7 @@ def run(
 ) -> int:
     """Replay an experiment, write its results, print the summary."""
     from copem_replay.pipeline.parts import PartCache
+    from copem_replay.results.decision import describe_verdicts
     from copem_replay.results.folder import take_place
 
     source = override_source(
@@ -106,24 +111,25 @@ def run(
         study = _read_study(place, experiment, source, skip_unreadable, cache, cluster)
         url = _check_viewer(study.experiment, viewer) if live or viewer is not None else None
         result, advice = _replay_study(study, jobs, cache, threads=cluster is None)
-        _write_results(place, study, result, advice, cache, url, label)
+        decision = _write_results(place, study, result, advice, cache, url, label)
         if by is not None and result.summary_by is not None:
             _print_groups(result.summary_by, split_entries(by) or ())
-        passes = _judge_results(place.shown, study.experiment)
+        verdicts = _judge_results(place.shown, study.experiment)
         if report:
             from copem_replay.api.results import write_report
 
             print_line(f"report in {write_report(place.shown)}")
     _print_next(place.shown)
-    return 1 if study.skipped or place.failed or not passes else 0
+    print_answer(decision.sentence if verdicts is None else describe_verdicts(verdicts))
+    return 1 if study.skipped or place.failed or not (verdicts is None or verdicts.passes) else 0
 
 
-def _judge_results(folder: Path, experiment: Experiment) -> bool:
-    """Judge the criteria of an experiment, write and print the verdicts; whether all pass. Those that are against
+def _judge_results(folder: Path, experiment: Experiment) -> Judgement | None:
+    """Judge the criteria of an experiment, write and print the verdicts; None: there are none. Those that are against
     results of before are left to `verdict`.
     """
     if not experiment.criteria:
-        return True
+        return None
     from copem_replay.results.judge import judge_own_criteria, list_later
     from copem_replay.results.read import open_results
     from copem_replay.results.verdicts import FILE, write_verdicts
@@ -132,12 +138,12 @@ def _judge_results(folder: Path, experiment: Experiment) -> bool:
     if later := list_later(results):
         print_notes([f"criteria {', '.join(later)}: `copem-replay verdict {folder} --before FOLDER` judges them"])
     if (verdicts := judge_own_criteria(results)) is None:
-        return True
+        return None
     write_verdicts(verdicts, folder / FILE)
     print_notes(verdicts.notes)
     print_line("")
     print_verdicts(verdicts)
-    return verdicts.passes
+    return verdicts
 
 
 def _read_study(
@@ -179,10 +185,11 @@ def _replay_study(
 def _write_results(
     place: ResultsPlace, study: LoadedStudy, result: Results, advice: list[str], cache: PartCache | None,
     viewer: str | None, label: str | None,
-) -> None:  # fmt: skip
-    """Fill the results folder, then print notes, problems and the summary."""
+) -> Decision:  # fmt: skip
+    """Fill the results folder, then print notes, problems and the summary. Returns what is decided."""
     from copem_replay.core.tracks import TRUTH
     from copem_replay.metrics.summary import describe_began, format_summary
+    from copem_replay.results.decision import decide
 
     notes = result.fill(place, skipped=study.skipped, viewer=viewer, label=label)
     if cache is not None:
@@ -192,7 +199,8 @@ def _write_results(
     costs = () if result.study is None else result.study.costs
     print_notes([*place.notes, *skipped, *notes, *costs, *advice])
     print_problems(place.failed)
-    print(format_summary(result.summary, width_of(sys.stdout)))
+    decision = decide(result)
+    print_table(format_summary(result.summary, width_of(sys.stdout)), decision.best)
     configurations = study.experiment.configurations
     if len(result.tally):
         modelled = (name for name, one in configurations.items() if one.units != TRUTH)
@@ -202,6 +210,7 @@ def _write_results(
         print_line(f"sweep of {', '.join(dict.fromkeys(result.sweep['sweep']))} in {place.shown / 'sweep.csv'}")
     _print_baseline(study.experiment)
     print_line(f"results in {place.shown}")
+    return decision
 
 
 def _print_groups(table: pd.DataFrame, entries: Sequence[str]) -> None:

@@ -9,7 +9,7 @@ import shutil
 import sys
 import time
 import unicodedata
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TextIO, TypeAlias, TypeVar
@@ -114,6 +114,19 @@ def print_blocks(blocks: Iterable[Sequence[str]]) -> None:
     """Print blocks of lines on stdout, with an empty line between blocks."""
     width = width_of(sys.stdout)
     print("\n\n".join("\n".join(_fit_line(line, width) for line in block) for block in blocks))
+
+
+def print_table(text: str, bold: Collection[str] = ()) -> None:
+    """Print the text of tables on stdout; in a terminal, rows of the configurations in `bold` are bold."""
+    width = width_of(sys.stdout)
+    for line in text.split("\n"):
+        fitted = _fit_line(line, width)
+        print(f"\x1b[1m{fitted}\x1b[0m" if width is not None and line.split("  ")[0] in bold else fitted)
+
+
+def print_answer(sentence: str) -> None:
+    """Print the answer, the last paragraph of a command."""
+    print_blocks([["", sentence]])
 
 
 def print_problems(lines: Iterable[str]) -> None:

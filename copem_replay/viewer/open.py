@@ -54,11 +54,19 @@ def list_rrd_files(folder: Path) -> list[Path]:
     return list(dict.fromkeys(path for path in found if path.is_file()))
 
 
-def opening_s(folder: Path, files: Sequence[Path]) -> dict[Path, float]:
+@dataclass(frozen=True)
+class Sought:
+    """An object that recordings open at, and its log; None: of any log."""
+
+    object_id: str
+    log: str | None = None
+
+
+def opening_s(folder: Path, files: Sequence[Path], sought: Sought | None = None) -> dict[Path, float]:
     """The instant at which each recording opens, in seconds since its log starts.
 
-    Half a second before the earliest onset among the objects of interest. A recording of no known run, or without an
-    onset, is left out: it opens at its beginning.
+    Half a second before the earliest onset among the objects of interest, or before that of the object `sought`. A
+    recording of no known run, or without an onset, is left out: it opens at its beginning.
     """
     instants_s = {}
     try:
@@ -70,7 +78,8 @@ def opening_s(folder: Path, files: Sequence[Path]) -> dict[Path, float]:
             if stem in runs:
                 log, run = runs[stem]
                 (rows,) = results.each(log=log, every=True)
-                onset_s = _first_onset_s(first_episodes(rows[rows["run"] == run]), truths)
+                of_run = first_episodes(rows[rows["run"] == run])
+                onset_s = _first_onset_s(of_run, truths) if sought is None else _onset_of(of_run, log, sought)
                 if onset_s is not None:
                     instants_s[path] = max(0.0, onset_s - BEFORE_ONSET_S)
     except (CopemError, KeyError, TypeError, AttributeError, ValueError, OverflowError):
@@ -87,6 +96,12 @@ def _map_runs(results: Results) -> dict[str, tuple[str, int]]:
         for log, runs in shown.items()
         for shown_run in runs
     }
+
+
+def _onset_of(table: pd.DataFrame, log: str, sought: Sought) -> float | None:
+    """The onset (s) of the object sought; None: it is not in this log."""
+    onset_s = table.loc[(table["object_id"] == sought.object_id) & (sought.log in (None, log)), "onset_s"]
+    return float(onset_s.min()) if len(onset_s) else None
 
 
 def _first_onset_s(table: pd.DataFrame, truths: Sequence[str]) -> float | None:
@@ -120,9 +135,8 @@ def read_identities(files: Sequence[Path]) -> dict[Path, RecordingIdentity]:
     return identities
 
 
-def open_viewer(folder: Path, files: Sequence[Path]) -> int:
-    """Open recordings in the viewer on this machine, and wait until it ends. Returns its exit code."""
-    instants_s = opening_s(folder, files)
+def open_viewer(files: Sequence[Path], instants_s: Mapping[Path, float]) -> int:
+    """Open recordings in the viewer on this machine, at their instants, and wait for its end. Returns its exit code."""
     identities = read_identities(list(instants_s))
     port = find_free_port()
     # `-m rerun` is there in every environment with rerun-sdk, whatever the PATH. The viewer shows what it opened last.
@@ -247,13 +261,16 @@ class ViewerSite:
     recordings: Mapping[str, Path]
 
 
-def serve_recordings(folder: Path, files: Sequence[Path]) -> Server:
+def serve_recordings(folder: Path, files: Sequence[Path], instants_s: Mapping[Path, float] | None = None) -> Server:
     """A server, on a free port of 127.0.0.1, of the web viewer with the recordings of a results folder open in it.
+
+    `instants_s`: at which each opens; None: as `opening_s` has them.
 
     The caller closes it. Raises OutputError if the files of the viewer cannot be had.
     """
     by_name = {path.relative_to(folder.absolute()).as_posix(): path for path in files}
-    instants_s, identities = opening_s(folder, files), read_identities(files)
+    instants_s = opening_s(folder, files) if instants_s is None else instants_s
+    identities = read_identities(files)
     requests = [set_time(identities[path], at_s) for path, at_s in instants_s.items() if path in identities]
     assets = viewer_files()
     last_shown = list(reversed(by_name))  # the viewer shows what it opened last

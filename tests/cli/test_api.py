@@ -271,10 +271,18 @@ class TestFolders:
 
     def test_view_opens_the_recordings(self, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         cr.run("shown.yaml").save("out/e")
-        called: list[tuple[Path, list[Path]]] = []
-        monkeypatch.setattr(opening, "open_viewer", lambda folder, files: called.append((folder, files)) or 0)
-        cr.view(cr.load_results("out/e"))
-        assert called == [(Path("out/e"), [here / "out/e/replay.rrd"])]
+        called: list[tuple[list[Path], dict[Path, float]]] = []
+        monkeypatch.setattr(opening, "open_viewer", lambda files, at_s: called.append((files, at_s)) or 0)
+        results, file = cr.load_results("out/e"), here / "out/e/replay.rrd"
+        cr.view(results)
+        row = results.detections.iloc[0]
+        cr.view(results, object_id=str(row["object_id"]), log=str(row["log"]))
+        at_s = {file: pytest.approx(max(float(row["onset_s"]) - 0.5, 0.0))}
+        assert called == [([file], at_s)] * 2
+        with pytest.raises(cr.InputError, match=r"^out/e: no recording of log nowhere has the measured object '2'$"):
+            cr.view("out/e", object_id="2", log="nowhere")
+        with pytest.raises(cr.InputError, match=r"^--log: expected --object ID with it, found none$"):
+            cr.view("out/e", log="nowhere")
 
     def test_results_in_memory_are_compared_drawn_and_reported_as_those_read_back(self, here: Path) -> None:
         result = cr.run("e.yaml")

@@ -156,6 +156,8 @@ class Page(HTMLParser):
         if found.get("class") == "plot":
             self.plots.append(found.get("id") or "")
             self._plot = self._open.index("div", len(self._open) - 1)
+        if found.get("class") == "story":
+            self._plot = len(self._open) - 1
 
     def handle_endtag(self, tag: str) -> None:
         assert self._open.pop() == tag, "elements are nested"
@@ -163,7 +165,7 @@ class Page(HTMLParser):
             self._plot = None
         if tag in ("td", "th"):
             self.rows[self._table][-1].append(self._cell.text)
-        if tag in ("p", "li", "h1", "h2", "h3"):
+        if tag in ("p", "li", "h1", "h2", "h3", "summary"):
             self.words += "\n"
         if tag == "header":
             self.head = self.words[self._header :]

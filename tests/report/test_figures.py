@@ -70,8 +70,8 @@ braking: {driver: {kind: constant_deceleration, a_max_mps2: 8.0, reaction: {kind
 show: null
 """
 TWO = "measure: {objects: {ids: [2]}, onset: {kind: at, time_s: 0.5}}"
-NAMES = ("answer", "differences", "runs", "curves", "distances", "latency_breakdown")
-WITHOUT_RUNS = tuple(name for name in NAMES if name != "runs")
+NAMES = ("answer", "differences", "runs", "curves", "late_paths", "distances", "latency_breakdown")
+WITHOUT_LOG = tuple(name for name in NAMES if name not in ("runs", "late_paths"))
 
 
 def drive(path: Path) -> Path:
@@ -218,14 +218,14 @@ class TestCommand:
         damage(mine.parent / "drive.mcap")
         ended = call(mine)
         assert ended.code == 0
-        (text,) = ended.lines
-        assert text.startswith("note: no figure of runs: ")
-        assert said in text
+        for text, name in zip(ended.lines, ("runs", "late_paths"), strict=True):
+            assert text.startswith(f"note: no figure of {name}: ")
+            assert said in text
         # Nor does an old one stay, of a log that is no more.
         assert [Path(out).name for out in ended.out] == [
-            f"{name}.{kind}" for name in WITHOUT_RUNS for kind in ("png", "svg")
+            f"{name}.{kind}" for name in WITHOUT_LOG for kind in ("png", "svg")
         ]
-        assert {p.stem for p in (mine / "figures").iterdir()} == set(WITHOUT_RUNS)
+        assert {p.stem for p in (mine / "figures").iterdir()} == set(WITHOUT_LOG)
 
     @pytest.mark.parametrize(
         ("options", "said"),
@@ -637,7 +637,7 @@ class TestSweeps:
             ("rate_hz", 2.0, "late", 2.0, 0.4, 0.3, 0.5, 0.2, None, None, None, None, None),
         ]
         columns = ["sweep", "value", "configuration", "list_rate_hz", "detected_share", "detected_share_low",
-                   "detected_share_high", "ttd_p5_s", "ttd_median_s", "ttd_p95_s", "pass_share", "pass_share_low",
+                   "detected_share_high", "ttd_p5_s", "ttd_rmst_s", "ttd_p95_s", "pass_share", "pass_share_low",
                    "pass_share_high"]  # fmt: skip
         table = pd.DataFrame(rows, columns=columns).assign(
             n=6, interval="exact", interval_over="runs", interval_clusters=6
@@ -684,7 +684,7 @@ class TestSweeps:
         ended = call(swept.folder)
         assert [Path(out).name for out in ended.out[-2:]] == ["sweeps.png", "sweeps.svg"]
         ended = call(swept.folder, "--configurations", "never")
-        assert (ended.code, len(ended.out)) == (0, 10)
+        assert (ended.code, len(ended.out)) == (0, 12)
         assert ended.lines == [
             "note: no figure of latency_breakdown: nothing was detected",
             f"note: no figure of sweeps: {swept.folder}/sweep.csv has no rows of never",

@@ -238,12 +238,16 @@ class TestWords:
         lines = lines_of(made)
         mean_s = float(summary_rows(made)["half"]["ttd_rmst_s"])
         assert lines[2] == (
+            "Nothing is shown to be better than late (100 % of conflicts pass); no difference shown: half 100 %; "
+            "worse: hit and never 0 %."
+        )
+        assert lines[3] == (
             f"half detects soonest, after {mean_s:.3g} s on average (an object that is never detected counts as "
             "4.5 s), sooner than the other 3."
         )
         difference = 0.5 - mean_s
-        assert lines[3].startswith(f"Later, the interval of the difference excluding 0: late (+{difference:.3g} s [")
-        assert lines[3].index("hit (") < lines[3].index("never (")
+        assert lines[4].startswith(f"Later, the interval of the difference excluding 0: late (+{difference:.3g} s [")
+        assert lines[4].index("hit (") < lines[4].index("never (")
         assert "The same figures pick the winner, which flatters it a little." in lines
         assert "never never detects any object." in lines
         assert any(
@@ -256,12 +260,14 @@ class TestWords:
     def test_without_intervals_it_says_so(self, tmp_path: Path) -> None:
         lines = lines_of(replayed(tmp_path, changed()))
         assert re.fullmatch(
-            r"No interval: 2 objects of one drive, fewer than 5\. half has the shortest mean time, \S+ s "
+            r"half has the shortest mean time, \S+ s "
             r"\(an object that is never detected counts as 4\.5 s\)\.",
-            lines[2],
+            lines[3],
         )
-        assert lines[3].startswith("Later, without an interval: late (+")
-        assert "[" not in lines[3]
+        assert lines[4].startswith("Later, without an interval: late (+")
+        assert "[" not in lines[4]
+        assert lines[2].endswith(", on these objects alone: there is no interval.")
+        assert "No interval: 2 objects of one drive, fewer than 5." in lines
         assert any(line.startswith("There are no intervals: 2 objects of one drive, fewer than 5. ") for line in lines)
         assert not any("excluding 0" in line for line in lines)
 
@@ -276,8 +282,8 @@ class TestWords:
         lines = whole.lines()
         assert int(rows["half"]["n"]) == int(rows["late"]["n"]) / 2
         assert float(rows["half"]["ttd_rmst_s"]) < float(rows["late"]["ttd_rmst_s"])
-        assert "late has the shortest mean time" in lines[2]
-        assert lines[3].startswith("half is ranked last: some logs lack the units, and means and shares are over")
+        assert "late has the shortest mean time" in lines[3]
+        assert any(line.startswith("half is ranked last: some logs lack the units, and means and") for line in lines)
         assert any(line.startswith("Sooner by pairs, without an interval: half (−") for line in lines)
         assert not any(line.startswith("Later") and "half" in line for line in lines)
         results = read_results(folder)
@@ -295,23 +301,25 @@ class TestWords:
     def test_who_is_alike_is_no_winner(self, tmp_path: Path) -> None:
         text = changed(ONE, ("  hit: {units: [ego], latency_s: 1.8}", "  hit: {units: [weak]}"), *ALONE[:2], ALONE[3])
         lines = lines_of(replayed(tmp_path, text))
-        assert re.match(r"(No interval.*\. )?half and hit detect at the same times: after ", lines[2])
-        assert not any("No difference" in line or "includes 0" in line for line in lines)
+        assert re.match(r"half and hit detect at the same times: after ", lines[3])
+        assert lines[2].startswith("No difference to half (an object is known after ")
+        assert not any("No difference" in line or "includes 0" in line for line in lines[3:])
         assert "The same figures pick the winners, which flatters them a little." not in lines, "no loser"
 
     def test_who_knows_at_once_ties(self, tmp_path: Path) -> None:
         """Of units that surely see both objects at the onset none is the first; of two objects there is no interval."""
         second = ("  hit: {units: [ego], latency_s: 1.8}", "  second: {units: [ego]}")
         lines = lines_of(replayed(tmp_path, changed(("  half: {units: [weak]}", "  half: {units: [ego]}"), second)))
-        few = "No interval: 2 objects of one drive, fewer than 5. "
-        assert lines[2] == few + "half and second detect every object at its onset. The other 2 are below."
-        assert re.match(r"Later, without an interval: late \(\+0\.5 s\), never \(\+4\.5 s\)\.", lines[3])
+        few = "No interval: 2 objects of one drive, fewer than 5."
+        assert few in lines
+        assert lines[3] == "half and second detect every object at its onset. The other 2 are below."
+        assert re.match(r"Later, without an interval: late \(\+0\.5 s\), never \(\+4\.5 s\)\.", lines[4])
         assert not any("shortest" in line or "soonest" in line for line in lines)
         three = ("  late: {units: [ego], latency_s: 0.5}", "  late: {units: [ego]}")
         text = changed(("  half: {units: [weak]}", "  half: {units: [ego]}"), second, three, ALONE[3])
         lines = lines_of(replayed(tmp_path / "all", text))
-        assert lines[2] == few + "late, half and second detect every object at its onset."
-        assert not lines[3].startswith("Later")
+        assert lines[3] == "late, half and second detect every object at its onset."
+        assert not lines[4].startswith("Later")
 
     def test_the_same_mean_at_other_times_is_a_tie_too(self, tmp_path: Path) -> None:
         """One unit sees only the one object, the other only the other: at once and never, whichever it is."""
@@ -325,9 +333,9 @@ class TestWords:
             ("  hit: {units: [ego], latency_s: 1.8}", "  hit: {units: [near]}"), ALONE[1], ALONE[3],
         )  # fmt: skip
         lines = lines_of(replayed(tmp_path, text))
-        assert lines[2] == (
-            "No interval: 2 objects of one drive, fewer than 5. hit and half have the same mean time, 0.05 s (an "
-            "object that is never detected counts as 0.1 s), though they do not always detect at the same time."
+        assert lines[3] == (
+            "hit and half have the same mean time, 0.05 s (an object that is never detected counts as 0.1 s), "
+            "though they do not always detect at the same time."
         )
 
     def test_of_equal_lists_none_is_the_best(self, tmp_path: Path) -> None:
@@ -346,9 +354,9 @@ class TestWords:
         other = ("  eye: {", "  other: {on: ego, height_m: 1.8, pem: half}\n  eye: {")
         hit = ("  hit: {units: [ego], latency_s: 1.8}", "  hit: {units: [other]}")
         lines = lines_of(replayed(tmp_path, changed(ONE, other, hit, *ALONE[:2], ALONE[3])))
-        assert re.search(r", but the interval of its difference to (hit|half) includes 0\.$", lines[2])
-        assert re.match(r"No difference to it is shown, the interval including 0: (hit|half) \(\+0\.\d+ s \[", lines[3])
-        assert lines[3].endswith("]). That does not show that there is none.")
+        assert re.search(r", but the interval of its difference to (hit|half) includes 0\.$", lines[3])
+        assert re.match(r"No difference to it is shown, the interval including 0: (hit|half) \(\+0\.\d+ s \[", lines[4])
+        assert lines[4].endswith("]). That does not show that there is none.")
 
     @pytest.mark.parametrize(
         ("low", "high", "includes"),
@@ -386,7 +394,7 @@ class TestWords:
         assert re.fullmatch(
             r"hit and again detect at the same times: after \S+ s on average\. The interval of their difference to the "
             r"other includes 0\.",
-            lines[2],
+            lines[3],
         )
         assert re.search(r'half \(<span class="tight">\+\S+ s \[−\S+, \S+\]</span>\)', html), "no line breaks within"
 
@@ -395,14 +403,16 @@ class TestWords:
         found = Page(build_page(load_study(folder)))
         lines = found.lines()
         assert "with the one configuration of perception units" in lines[1]
-        assert lines[2].endswith("There is nothing to compare it with: it is the only configuration.")
+        assert lines[2].startswith("half: an object is known after ")
+        assert lines[2].endswith(" of conflicts pass; there is nothing to compare it with.")
+        assert lines[3].endswith("There is nothing to compare it with: it is the only configuration.")
         assert "No differences: there is one configuration only." in found.words
         assert "regret" not in found.tables
         assert list(found.tables["summary"]) == ["half"]
 
     def test_beside_the_truth_alone_nobody_competes(self, tmp_path: Path) -> None:
         folder = replayed(tmp_path, changed(ONE, *ALONE[1:]))
-        assert lines_of(folder)[2].endswith("There is nothing to compare it with: only the ground truth is beside it.")
+        assert lines_of(folder)[3].endswith("There is nothing to compare it with: only the ground truth is beside it.")
         study = load_study(folder)
         assert (study.baseline, study.best, study.lead) == ("half", "half", None)
         assert study.regret is not None
@@ -580,12 +590,12 @@ class TestWaterfall:
         folder = replayed(tmp_path, changed(("time_s: 0.5}}", "time_s: 0.5}, count_earlier: true}")))
         found = Page(build_page(load_study(folder)))
         assert "No figure: with count_earlier" in found.words
-        assert found.plots == ["answer", "differences", "curves", "distances"]
+        assert found.plots == ["answer", "differences", "late_paths", "curves", "distances"]
 
 
 class TestFigures:
-    def test_each_that_needs_no_recording(self, read: Page, tmp_path: Path) -> None:
-        assert read.plots == ["answer", "differences", "curves", "distances", "latency_breakdown"]
+    def test_each_that_the_report_has(self, read: Page, tmp_path: Path) -> None:
+        assert read.plots == ["answer", "differences", "late_paths", "curves", "distances", "latency_breakdown"]
         text = changed(ONE, *ALONE[2:]) + "sweep: {latency_s: [0, 0.5], rate_hz: [2, 10]}\n"
         assert Page(build_page(load_study(replayed(tmp_path, text)))).plots == [*read.plots, "sweeps"]
 
@@ -657,6 +667,7 @@ class TestFile:
         assert (mine / "report.html").read_text(encoding="utf-8") == html
         other = tmp_path / "elsewhere" / "other"
         shutil.copytree(mine, other)
+        shutil.copy(mine.parent / "drive.mcap", other.parent)
         (other / "report.html").unlink()
         deep = write_html_report(other, tmp_path / "new" / "deep.htm")
         assert deep.read_bytes() == (mine / "report.html").read_bytes()
@@ -744,9 +755,14 @@ class TestCommands:
         assert (refused.code, len(refused.lines)) == (2, 1)
         assert not (out / "report.html").exists()
         ended = call("run", experiment, "--out", out, "--report", "--overwrite")
-        assert (ended.code, ended.out[-2:]) == (
+        assert (ended.code, ended.out[-4:]) == (
             0,
-            [f"report in {out / 'report.html'}", f"next: copem-replay report {out}"],
+            [
+                f"report in {out / 'report.html'}",
+                f"next: copem-replay report {out}",
+                "",
+                Page((out / "report.html").read_text(encoding="utf-8")).lines()[2],
+            ],
         )
         first = (out / "report.html").read_bytes()
         assert call("report", out).out == [f"report in {out / 'report.html'}"]

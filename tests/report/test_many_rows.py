@@ -63,7 +63,7 @@ def test_neither_holds_all_rows(several: Path, tmp_path: Path, monkeypatch: pyte
     assert write_html_report(several, tmp_path / "r.html").exists()
     files, notes = write_figure_files(read_results(several), tmp_path / "figures", Selection())
     assert ({path.stem for path in files}, notes) == (
-        {"answer", "differences", "runs", "curves", "distances", "latency_breakdown"}, []
+        {"answer", "differences", "runs", "curves", "late_paths", "distances", "latency_breakdown"}, []
     )  # fmt: skip
     # Of each log five configurations × six runs × two objects.
     assert set(most) == {60}

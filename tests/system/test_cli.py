@@ -172,7 +172,7 @@ class TestInstalled:
         assert done.stderr == ""
         assert done.stdout.splitlines()[0].startswith("configuration  detected_share  95 %")
         assert [line.split()[0] for line in done.stdout.splitlines()[1:4]] == ["GT", "PEM", "coPEM"]
-        assert done.stdout.endswith("results in out/e\nnext: copem-replay report out/e\n")
+        assert re.search(r"\nresults in out/e\nnext: copem-replay report out/e\n\n[A-Z].*\.\n$", done.stdout)
         assert table(here / "out" / "e").shape[0] == 12
 
     def test_wrong_input(self, here: Path) -> None:
@@ -436,7 +436,7 @@ class TestRun:
         ended = call("run", "e.yaml")
         assert ended.code == 0
         assert ended.lines == []
-        assert ended.out.endswith("results in out/e\nnext: copem-replay report out/e\n")
+        assert re.search(r"\nresults in out/e\nnext: copem-replay report out/e\n\n[A-Z].*\.\n$", ended.out)
         assert sorted(written(here / "out" / "e")) == [
             "accuracy.parquet", "bands.csv", "detections.parquet", "experiment.yaml", "instants.parquet",
             "lists.parquet", "logs.csv", "provenance.json", "summary.csv", "tally.parquet", "thresholds.parquet",

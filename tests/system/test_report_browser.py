@@ -63,6 +63,7 @@ def test_every_figure_is_drawn_and_nothing_goes_wrong(opened: Browser, report: P
     assert [one["id"] for one in found] == [
         "answer",
         "differences",
+        "late_paths",
         "curves",
         "distances",
         "latency_breakdown",

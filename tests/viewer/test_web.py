@@ -26,6 +26,7 @@ from copem_replay.viewer.open import (
     TYPES,
     RecordingIdentity,
     Server,
+    Sought,
     ViewerSite,
     list_rrd_files,
     opening_page,
@@ -87,6 +88,13 @@ class TestOpening:
             "replay/drive.rrd",
         ]
         assert opening_s(folder, files) == {path: pytest.approx(0.5) for path in files}
+
+    def test_at_an_object(self, results: Path) -> None:
+        """Its onset is at 1 s, as that of all others; of an object that is nowhere there is no instant."""
+        files = list_rrd_files(results)
+        assert opening_s(results, files, Sought("2")) == {path: pytest.approx(0.5) for path in files}
+        assert opening_s(results, files, Sought("2", "elsewhere")) == {}
+        assert opening_s(results, files, Sought("none")) == {}
 
     def test_a_recording_without_results_beside_it_opens_at_its_beginning(self, results: Path, tmp_path: Path) -> None:
         (tmp_path / "replay.rrd").write_bytes((results / "replay.rrd").read_bytes())

@@ -17,6 +17,7 @@ from copem_replay.report.figures.detection_curves import curves_figure
 from copem_replay.report.figures.differences import differences_figure, no_differences
 from copem_replay.report.figures.distances import distances_about, distances_figure
 from copem_replay.report.figures.latency_breakdown import latency_breakdown_figure, no_stages
+from copem_replay.report.figures.paths import late_paths_figure, no_late_paths
 from copem_replay.report.figures.selection import Selection, choose_object_and_run
 from copem_replay.report.figures.slices import slices_figure
 from copem_replay.report.figures.style import METADATA, check_summary, render_figure
@@ -109,6 +110,13 @@ FIGURES: dict[str, FigureKind] = {
             "leave the scene undetected count as never detected and keep the curve below 100 %. Where lines coincide, "
             "the thinner ones are on top.",
         ),
+    ),
+    "late_paths": FigureKind(
+        "Where it is late",
+        "the path of every measured object, coloured by how long it stays unknown, a panel per configuration",
+        late_paths_figure,
+        missing=lambda results, of: no_late_paths(results, results.chosen(of.configurations)),
+        needs_recording=True,
     ),
     "distances": FigureKind(
         "How far away",

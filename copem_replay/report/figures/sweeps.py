@@ -49,7 +49,7 @@ AXES = {
 _ROWS = {
     "pass_share": "Share that passes",
     "detected_share": "Share detected",
-    "ttd": "Time to detection (s)\nmedian, 5 % to 95 %",
+    "ttd": "Time to detection (s)\nmean, 5 % to 95 %",
 }
 
 
@@ -118,7 +118,7 @@ def _draw_series(axes: Axes, rows: pd.DataFrame, quantity: str, name: str, look:
     """Draw one configuration in one panel: a line with markers, and its band."""
     value = rows["value"].to_numpy(dtype=float)
     if quantity == "ttd":
-        middle, low, high = (_read_column(rows, f"ttd_{q}_s") for q in ("median", "p5", "p95"))
+        middle, low, high = (_read_column(rows, f"ttd_{q}_s") for q in ("rmst", "p5", "p95"))
         # With a known fifth percentile, a missing 95th is among the never detected: beyond every axis.
         high = np.where(np.isnan(high) & ~np.isnan(low), np.inf, high)
     else:
@@ -139,13 +139,13 @@ def _draw_series(axes: Axes, rows: pd.DataFrame, quantity: str, name: str, look:
     axes.plot(
         value, middle, marker=look.marker, markersize=4.5, markeredgecolor=look.colour, label=name, zorder=2.5, **line
     )
-    exact = _read_column(rows, "ttd_median_s_exact" if quantity == "ttd" else f"{quantity}_exact")
+    exact = _read_column(rows, "ttd_rmst_s_exact" if quantity == "ttd" else f"{quantity}_exact")
     if not np.isnan(exact).all():
         axes.plot(value, exact, color="black", linewidth=0.7, linestyle=(0, (5, 3)), label="exact", zorder=3)
 
 
 def _any_exact(sweep: pd.DataFrame) -> bool:
-    names = ("pass_share_exact", "detected_share_exact", "ttd_median_s_exact")
+    names = ("pass_share_exact", "detected_share_exact", "ttd_rmst_s_exact")
     return any(bool(sweep[name].notna().any()) for name in names if name in sweep)
 
 

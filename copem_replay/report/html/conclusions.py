@@ -1,4 +1,4 @@
-"""The answer in words: which configuration detects soonest, by how much, how certain that is, and its limits."""
+"""The answer in words: the decision, differences to the best, what varies most, and, folded, how sure that is."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from operator import itemgetter
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from copem_replay.core.errors import count_noun
@@ -19,29 +20,35 @@ from copem_replay.report.figures.style import (
     format_per_cent,
     format_three_digits,
 )
-from copem_replay.report.html.markup import Html, escape_text, join_html, make_list, make_tag
+from copem_replay.report.html.markup import Html, escape_text, fold_parts, join_html, make_list, make_tag
 from copem_replay.report.html.setup import join_names, shorten_list
 from copem_replay.report.html.study import ReportData, detects_at_onset, explain_missing_interval
 from copem_replay.report.html.tables import format_signed_difference
 from copem_replay.results.compare import Comparison
 from copem_replay.results.compare.tables import NOTHING, describe_gain
+from copem_replay.results.decision import MATTERS_S, decide
 
 _INTERVAL = re.compile(r"(?:[^\s(]+ (?:s|%|percentage points) )?\[[^\[\]<]*\]")
 
 
 def write_lead(study: ReportData) -> Html:
-    """The answer in one or two sentences."""
-    if study.best is None:
-        return make_tag("p", "There is no answer: no measured object has an onset.", class_="lead")
-    return make_tag("p", next(_detail_sentences(study)), class_="lead")
+    """The decision, in one sentence."""
+    return make_tag("p", decide(study.results, study.regret, study.verdicts).sentence, class_="lead")
 
 
 def write_details(study: ReportData) -> Html:
-    """All other sentences, the most important ones first."""
+    """Differences to the best with intervals, what varies most; caveats below, folded."""
     if study.best is None:
         return make_list(str(note) for note in study.provenance.get("notes", []))
-    _, *others = _detail_sentences(study)
-    return make_list(map(_prevent_breaks, others))
+    caveats = [*_caveat_sentences(study)]
+    return join_html(
+        [
+            make_list(map(_prevent_breaks, _detail_sentences(study))),
+            fold_parts(
+                f"How sure this is: {count_noun(len(caveats), 'remark')}", make_list(map(_prevent_breaks, caveats))
+            ),
+        ]
+    )
 
 
 def _prevent_breaks(sentence: str) -> Html:
@@ -53,16 +60,22 @@ def _detail_sentences(study: ReportData) -> Iterator[str]:
     rows = study.results.summary.set_index("configuration")
     contenders = study.contenders
     share = rows["detected_share"].astype(float)
-    if (share[list(study.names)] == 0).all():
-        yield "No configuration detects any measured object in any run."
-    elif (share[list(contenders)] == 0).all():
-        yield "Only the ground truth holds the measured objects: no configuration detects any of them in any run."
-    else:
+    if share[list(contenders)].any():
         yield _soonest_sentence(study)
-        yield from _elsewhere_sentences(study)
         yield from _other_sentences(study)
         yield from _detected_sentences(study, share)
     yield from _pass_sentences(study)
+    yield from _variation_sentences(study)
+
+
+def _caveat_sentences(study: ReportData) -> Iterator[str]:
+    """On what the answer is over, and what it leaves out."""
+    if study.lead is not None:
+        later, _, _, unsure = _split_by_difference(study.lead)
+        yield from _missing_sentences(study, unsure)
+        if len(later) and len(study.contenders) > 2:
+            yield f"The same figures pick the winner{'s' * (len(study.as_soon) > 1)}, which flatters it a little."
+    yield from _elsewhere_sentences(study)
     yield from _truth_sentences(study)
     yield from _certainty_sentences(study)
     yield from _left_out_sentences(study)
@@ -81,7 +94,7 @@ def _soonest_sentence(study: ReportData) -> Html:
     tied = study.as_soon
     if len(tied) == 1:
         return _first_sentence(study, name, mean_s, counted_as)
-    _, alike, sooner, unsure = _split_by_difference(study.lead)
+    _, alike, sooner, _ = _split_by_difference(study.lead)
     when = "every object at its onset"
     if not detects_at_onset(study):
         when = f"at the same times: after {format_three_digits(mean_s)} s on average{counted_as}"
@@ -92,7 +105,7 @@ def _soonest_sentence(study: ReportData) -> Html:
     if undecided:
         to = others if undecided == not_tied else f"{undecided} of {others}"
         below = f" The interval of their difference to {to} includes 0."
-    return join_html([_missing_sentence(study, unsure), make_tag("b", join_names(tied)), f" detect {when}.{below}"])
+    return join_html([make_tag("b", join_names(tied)), f" detect {when}.{below}"])
 
 
 def _elsewhere_sentences(study: ReportData) -> Iterator[str]:
@@ -104,10 +117,10 @@ def _elsewhere_sentences(study: ReportData) -> Iterator[str]:
         )
 
 
-def _missing_sentence(study: ReportData, unsure: pd.DataFrame) -> str:
-    """That differences have no interval, and why; it stands before the differences."""
+def _missing_sentences(study: ReportData, unsure: pd.DataFrame) -> Iterator[str]:
+    """That differences have no interval, and why."""
     if not len(unsure):
-        return ""
+        return
     assert study.lead is not None
     tied = study.as_soon
     all_tied = all(rows["configuration"].isin(tied).all() for rows in _split_by_difference(study.lead)[:3])
@@ -117,7 +130,7 @@ def _missing_sentence(study: ReportData, unsure: pd.DataFrame) -> str:
         if all_tied
         else f" of the difference to {join_names(list((apart if len(apart) else unsure)['configuration']))}"
     )
-    return f"No interval{of_names}: {explain_missing_interval(study, unsure)}. "
+    yield f"No interval{of_names}: {explain_missing_interval(study, unsure)}."
 
 
 def _first_sentence(study: ReportData, name: Html, mean_s: float, counted_as: str) -> Html:
@@ -125,12 +138,21 @@ def _first_sentence(study: ReportData, name: Html, mean_s: float, counted_as: st
     assert study.lead is not None
     later, alike, sooner, unsure = _split_by_difference(study.lead)
     undecided, others = len(alike) + len(sooner), len(study.lead.configurations)
-    before = _missing_sentence(study, unsure)
     level = list(unsure.loc[unsure["difference"].abs() <= NOTHING, "configuration"])
     if level:
         names = make_tag("b", join_names([str(study.best), *level]))
         mean = f" have the same mean time, {format_three_digits(mean_s)} s{counted_as},"
-        return join_html([before, names, f"{mean} though they do not always detect at the same time."])
+        return join_html([names, f"{mean} though they do not always detect at the same time."])
+    near = _metric_rows(study.lead, RANKED_BY).query("abs(difference) < @MATTERS_S")["configuration"]
+    if len(near):
+        names = make_tag("b", join_names([str(study.best), *near]))
+        return join_html(
+            [
+                names,
+                f" detect soonest, after {format_three_digits(mean_s)} s on average{counted_as}: differences below "
+                f"{MATTERS_S:g} s name no winner.",
+            ]
+        )
     rivals = f"the other {others}" if others > 1 else study.lead.configurations[0]
     has, sure = f" has the shortest mean time, {format_three_digits(mean_s)} s", ""
     if len(later) == others:
@@ -138,7 +160,7 @@ def _first_sentence(study: ReportData, name: Html, mean_s: float, counted_as: st
     elif undecided:
         to = f"{undecided} of {rivals}" if undecided < others else rivals
         sure = f", but the interval of its difference to {to} includes 0"
-    return join_html([before, name, f"{has}{counted_as}{sure}."])
+    return join_html([name, f"{has}{counted_as}{sure}."])
 
 
 def _split_by_difference(lead: Comparison) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame, pd.DataFrame]:
@@ -176,12 +198,6 @@ def _other_sentences(study: ReportData) -> Iterator[str]:
     ):
         if len(rows):
             yield f"{word}, without an interval: {_list_differences(rows)}."
-    if len(later) and len(study.contenders) > 2:
-        single = len(tied) == 1
-        yield (
-            f"The same figures pick the {'winner, which flatters it' if single else 'winners, which flatters them'} a "
-            "little."
-        )
 
 
 def _list_differences(rows: pd.DataFrame) -> str:
@@ -264,6 +280,28 @@ def _truth_sentences(study: ReportData) -> Iterator[str]:
     truth = [name for name in study.names if name not in study.contenders]
     if truth:
         yield f"{join_names(truth)} {'is' if len(truth) == 1 else 'are'} the ground truth: the upper bound, not ranked."
+
+
+def _variation_sentences(study: ReportData) -> Iterator[str]:
+    """Which of object, configuration and run moves times most: standard deviations of means, up to the horizon."""
+    rows = study.results.known
+    rows = rows[rows["configuration"].isin(study.contenders)]
+    horizon_s = study.results.provenance.horizon_used_s
+    time_s, weight = rows["time_to_detection_s"].fillna(horizon_s).clip(upper=horizon_s), rows["runs"]
+    episode = rows.groupby(["log", "object_id", "episode"], sort=False).ngroup()
+    mean_s = float(np.average(time_s, weights=weight))
+    means_s = {
+        what: (time_s * weight).groupby(key).transform("sum") / weight.groupby(key).transform("sum")
+        for what, key in (("object", episode), ("configuration", rows["configuration"]))
+    }
+    pairs = [episode, rows["configuration"]]
+    of_pair = (time_s * weight).groupby(pairs).transform("sum") / weight.groupby(pairs).transform("sum")
+    apart = {what: means - mean_s for what, means in means_s.items()} | {"run": time_s - of_pair}
+    sd_s = {what: float(np.sqrt(np.average(of**2, weights=weight))) for what, of in apart.items()}
+    shown = [(what, value) for what, value in sorted(sd_s.items(), key=itemgetter(1), reverse=True) if value >= 0.005]
+    if shown:
+        words = (f"from {what} to {what} by {format_three_digits(round(value, 2))} s" for what, value in shown)
+        yield f"Times vary most {', then '.join(words)} (standard deviations of means)."
 
 
 def _certainty_sentences(study: ReportData) -> Iterator[str]:

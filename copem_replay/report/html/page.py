@@ -9,7 +9,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from copem_replay.core.errors import OutputError
+from copem_replay.core.errors import OutputError, RecordingError
 from copem_replay.core.files import atomic_file
 from copem_replay.report.figures.registry import FIGURES
 from copem_replay.report.figures.selection import Selection
@@ -33,7 +33,8 @@ from copem_replay.report.html.setup import (
     provenance_tables,
 )
 from copem_replay.report.html.slices import group_tables
-from copem_replay.report.html.study import ReportData, load_study
+from copem_replay.report.html.stories import story_parts
+from copem_replay.report.html.study import NO_RECORDING, ReportData, load_study
 from copem_replay.report.html.tables import (
     baseline_words,
     exact_misses,
@@ -137,6 +138,8 @@ def figure_element(name: str, figure: Figure, title: str, shows: str, looks: Ite
 
 
 _ANSWER, _DIFFERENCES = "answer", "differences"
+_ALONE = ("runs",)
+"""Figures that `plot` draws alone: stories show single runs here."""
 _BELOW = {"latency_breakdown": stage_table, "slices": group_tables}
 """Elements below figures."""
 
@@ -154,7 +157,8 @@ def build_page(study: ReportData) -> str:
     sections = [
         *_verdict_sections(study),
         _Section("differences-of-it", "Differences", _difference_parts(study)),
-        *_figure_sections(study, ("trade_off",)),
+        *([_Section("stories", "Stories of single objects", story_parts(study))] if measured else []),
+        *_figure_sections(study, ("late_paths", "trade_off")),
         _Section(
             "configurations-of-it",
             "What is compared",
@@ -164,7 +168,7 @@ def build_page(study: ReportData) -> str:
     ]
     if measured:
         sections += _figure_sections(
-            study, [name for name in FIGURES if name not in (_ANSWER, _DIFFERENCES, "trade_off")]
+            study, [name for name in FIGURES if name not in (_ANSWER, _DIFFERENCES, "late_paths", "trade_off")]
         )
         sections.append(_Section("missed", "Never detected", [never_detected(study), exact_misses(study)]))
     sections.append(_Section("provenance", "Where this comes from", [provenance_tables(study)]))
@@ -186,11 +190,7 @@ def build_page(study: ReportData) -> str:
 
 def _verdict_sections(study: ReportData) -> list[_Section]:
     """The section of verdicts: those in the folder, else of the criteria of the experiment; none without criteria."""
-    from copem_replay.results.judge import judge_own_criteria
-    from copem_replay.results.verdicts import find_verdicts
-
-    folder = study.results.folder
-    verdicts = (find_verdicts(folder) if folder is not None else None) or judge_own_criteria(study.results)
+    verdicts = study.verdicts
     return [] if verdicts is None else [_Section("criteria", "Good enough?", [verdicts_table(verdicts)])]
 
 
@@ -212,10 +212,10 @@ def _difference_parts(study: ReportData) -> list[Html]:
 
 
 def _figure_sections(study: ReportData, names: Sequence[str]) -> Iterator[_Section]:
-    """A section per figure that needs no recording, with the reason in place of a figure that cannot be drawn."""
+    """A section per figure, with the reason in place of one that cannot be drawn."""
     for name in names:
         kind = FIGURES[name]
-        reason = "" if kind.needs_recording else kind.missing(study.results, _select(study))
+        reason = "" if name in _ALONE else kind.missing(study.results, _select(study))
         if reason == "" or not len(study.results.known):
             continue
         if reason is not None:
@@ -223,7 +223,11 @@ def _figure_sections(study: ReportData, names: Sequence[str]) -> Iterator[_Secti
             continue
         about = [make_tag("p", line) for line in kind.about(study.results)]
         below = [_BELOW[name](study)] if name in _BELOW else []
-        yield _Section(f"section-{name}", kind.title, [*about, _embed_figure(study, name), *below])
+        try:
+            figure = _embed_figure(study, name)
+        except RecordingError:
+            figure = make_tag("p", f"No figure: {NO_RECORDING}.")
+        yield _Section(f"section-{name}", kind.title, [*about, figure, *below])
 
 
 def _configuration_key(study: ReportData) -> Html:

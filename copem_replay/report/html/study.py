@@ -24,8 +24,10 @@ from copem_replay.report.figures.style import (
     sort_soonest_first,
 )
 from copem_replay.results.compare import Comparison, compare_folders
+from copem_replay.results.judge import judge_own_criteria
 from copem_replay.results.read import Results, read_results
 from copem_replay.results.slices import summarise_slices
+from copem_replay.results.verdicts import Judgement, find_verdicts
 
 
 def find_ties(best: str, names: Sequence[str], results: Results) -> tuple[str, ...]:
@@ -57,6 +59,10 @@ def explain_missing_interval(study: ReportData, rows: pd.DataFrame) -> str:
     if not reasons:
         reasons.append(explain_no_intervals(study.results) or "too few have it")
     return " or ".join(reasons)
+
+
+NO_RECORDING = "the recording is not there as it was; copem-replay plot says more"
+"""Why a page lacks what needs a recording: without a path, for a page is the same wherever its folder lies."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +105,12 @@ class ReportData:
     def as_soon(self) -> tuple[str, ...]:
         """The best, and all contenders that detect the same objects at the same times in the same runs."""
         return find_ties(str(self.best), self.contenders, self.results)
+
+    @cached_property
+    def verdicts(self) -> Judgement | None:
+        """The verdicts in the folder, else of the criteria of the experiment; None: no criteria."""
+        folder = self.results.folder
+        return (None if folder is None else find_verdicts(folder)) or judge_own_criteria(self.results)
 
     def of(self, name: str) -> pd.Series:
         """The row of `summary.csv` of a configuration."""

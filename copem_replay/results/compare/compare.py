@@ -235,7 +235,7 @@ class Comparison:
     What the columns of `table` mean: docs/reference/columns.md; null where there is none. Times are up to `horizon_s`,
     those at equal ghosts at `false_positives_per_min`. `baseline_why`: why it is the baseline, None if it was asked
     for. `notes`: what has to be said, a line each. `groups`: a row per group, configuration and metric, with `by` and
-    `group` in place of the log; None: not asked for.
+    `group` in place of the log; None: not asked for. `truths`: labels of the ground truth.
 
     >>> comparison = cr.compare("out/tc016d", baseline="PEM")
     >>> comparison.baseline, comparison.configurations
@@ -250,6 +250,7 @@ class Comparison:
     false_positives_per_min: float | None
     notes: tuple[str, ...]
     groups: pd.DataFrame | None = None
+    truths: tuple[str, ...] = ()
 
     @property
     def overall(self) -> pd.DataFrame:
@@ -303,6 +304,7 @@ def compare_folders(
         horizon_s=setting.horizon_s,
         false_positives_per_min=false_positives_per_min,
         groups=_tabulate_groups(against, of_groups, names, groups) if by else None,
+        truths=tuple(labelled.label for labelled in (against, *others) if labelled.facts.truth),
         notes=(
             *notes_on_folders(used),
             *horizon_notes,

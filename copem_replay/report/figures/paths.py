@@ -1,0 +1,243 @@
+"""Figure of where it is late: the path of every measured object, coloured by how long it stays unknown.
+
+A panel per configuration, all of one drive, that on which objects stay unknown longest. It needs the recording.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import pandas as pd
+
+from copem_replay.core.errors import RecordingError, RemoteFile, count_noun
+from copem_replay.core.tracks import Float, Scene, Tracks
+from copem_replay.experiment.drive import resolve_for_log
+from copem_replay.experiment.schema import Experiment
+from copem_replay.metrics.summary import EPISODE
+from copem_replay.report.figures.selection import Selection, describe_left_out, find_differing
+from copem_replay.report.figures.style import (
+    FAINT,
+    INK,
+    add_note,
+    figure_style,
+    find_contenders,
+    find_truths,
+    new_figure,
+    shorten_names,
+    sort_soonest_first,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from copem_replay.results.read import Results
+
+
+# A drive as plans need it.
+
+
+@dataclass(frozen=True)
+class Drive:
+    """The truth of one log, and what stands in it."""
+
+    log: str
+    experiment: Experiment
+    scene: Scene
+    truth: Tracks
+
+    def path(self, object_ix: int) -> tuple[Float, Float]:
+        """Instants (K,) in seconds since the log's start, and places (K, 2) in metres, of an object; NaN in gaps."""
+        rows = np.flatnonzero((self.truth.row_object_ix == object_ix) & self.truth.valid[0])
+        time_s, at_m = self.truth.row_captured_s[rows], np.stack([self.truth.x_m[0, rows], self.truth.y_m[0, rows]], 1)
+        gaps = np.flatnonzero(np.diff(time_s) > self.experiment.max_gap_s) + 1
+        return np.insert(time_s, gaps, time_s[gaps - 1]), np.insert(at_m, gaps, np.nan, axis=0)
+
+    def outlines(self) -> Iterator[Float]:
+        """Corners (K, 2) of what stands there and hides: obstacles of the experiment, solids of the log."""
+        yield from (np.array(one.polygon_m) for one in self.experiment.obstacles)
+        yield from (np.array(solid.corners_m) for solid in self.scene.solids)
+
+    def fixed_units(self) -> dict[str, tuple[float, float]]:
+        """Places of the units that stand."""
+        return {name: unit.at for name, unit in self.experiment.modelled.items() if unit.at is not None}
+
+
+_LAST: WeakKeyDictionary[Results, Drive] = WeakKeyDictionary()
+"""The drive that was read last, for the next figure of it."""
+
+
+def read_drive(results: Results, log: str) -> Drive:
+    """A drive of the results. Raises RecordingError where its recording is missing, another one, or elsewhere."""
+    if (last := _LAST.get(results)) is not None and last.log == log:
+        return last
+    place = results.log_place(log)
+    if isinstance(place, RemoteFile):
+        raise RecordingError("plans need the recording on this machine", path=place)
+    experiment = resolve_for_log(results.experiment, log)
+    recording = results.recording(log, experiment)
+    drive = _LAST[results] = Drive(log, experiment, recording.scene, recording.truth)
+    return drive
+
+
+def find_latest_log(results: Results) -> str:
+    """The log whose objects stay unknown longest on average, over all contenders."""
+    rows = measure_unknown(results, find_contenders(results))
+    return str(rows["unknown_s"].groupby(rows["log"], sort=False).mean().idxmax())
+
+
+def measure_unknown(results: Results, names: Sequence[str]) -> pd.DataFrame:
+    """A row per configuration and episode: mean `unknown_s` over runs, of never until its end; `never_share`."""
+    rows = results.known
+    rows = rows[rows["configuration"].isin(list(names))]
+    never = rows["time_to_detection_s"].isna()
+    unknown_s = rows["time_to_detection_s"].fillna(rows["ended_s"] - rows["onset_s"]).clip(lower=0.0)
+    weighed = rows[["configuration", *EPISODE, "onset_s", "ended_s", "runs"]].assign(
+        unknown_s=unknown_s * rows["runs"], never_share=never * rows["runs"]
+    )
+    sums = weighed.groupby(["configuration", *EPISODE, "onset_s", "ended_s"], sort=False, as_index=False).sum()
+    return sums.assign(unknown_s=sums["unknown_s"] / sums["runs"], never_share=sums["never_share"] / sums["runs"])
+
+
+# The figure.
+
+_WIDTH_IN = 9.6
+_COLUMNS = 3
+_TALLEST, _FLATTEST = 1.25, 0.3
+"""Limits of a panel's height by its width."""
+_MARGIN_M = 5.0
+_GROUND = (0.992, 0.99, 0.985)
+"""Ground of the panels, no grey: it stays light on a dark page, as the colours of paths need it."""
+_SHADES = 24
+"""Shades of the scale: so few are shapes in an SVG, more would be a picture."""
+NEVER_FROM = 0.5
+"""Share of runs from which on an object counts as never known."""
+
+
+def late_paths_figure(results: Results, selection: Selection) -> Figure:
+    """Every path of the measured objects of a drive: grey before the onset, then coloured by the seconds unknown.
+
+    A panel per configuration, the soonest first. Raises RecordingError where the recording is missing.
+    """
+    asked = sort_soonest_first(results, find_contenders(results, selection.configurations))
+    names = [name for name in asked if name in find_differing(results, asked)]
+    drive = read_drive(results, selection.log or find_latest_log(results))
+    rows = measure_unknown(results, names)
+    rows = rows[rows["log"] == drive.log]
+    most_s = max(float(rows["unknown_s"].max()) if len(rows) else 0.0, 0.1)
+    box = _find_box(drive, rows)
+    columns = min(len(names), _COLUMNS)
+    lines = math.ceil(len(names) / columns)
+    tall = min(max((box[3] - box[2]) / (box[1] - box[0]), _FLATTEST), _TALLEST)
+    with figure_style():
+        width_in = _WIDTH_IN / _COLUMNS * max(columns, 2)
+        figure = new_figure(width_in, lines * (tall * (width_in - 1) / columns + 0.35) + 0.8)
+        panels = figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False)
+        short = shorten_names(names)
+        for axes in panels.flat[len(names) :]:
+            axes.set_axis_off()
+        for axes, name in zip(panels.flat, names, strict=False):
+            axes.set_title(short[name], loc="left")
+            _draw_ground(axes, drive, box)
+            drawn = _draw_paths(axes, drive, rows[rows["configuration"] == name], most_s)
+        bar = figure.colorbar(drawn, ax=panels, aspect=30, pad=0.01, fraction=0.04)
+        bar.set_label("Seconds unknown (mean over runs)")
+        add_note(figure, _note_sentences(results, drive, rows, names, asked))
+    return figure
+
+
+def no_late_paths(results: Results, names: Sequence[str]) -> str | None:
+    """The reason why there is no such figure: of the truth alone nothing is late; None: there is one."""
+    return None if set(names) - set(find_truths(results)) and len(results.known) else ""
+
+
+def _find_box(drive: Drive, rows: pd.DataFrame) -> tuple[float, float, float, float]:
+    """West, east, south and north end of the paths, with a margin."""
+    numbers = {drive.scene.object_number[name] for name in rows["object_id"]}
+    at_m = np.concatenate([drive.path(k)[1] for k in sorted(numbers)])
+    low, high = np.nanmin(at_m, axis=0), np.nanmax(at_m, axis=0)
+    least_m = 0.3 * max(float((high - low).max()), 20.0)  # of a straight way, too, the surroundings are seen
+    half, middle = np.maximum(high - low, least_m) / 2 + _MARGIN_M, (high + low) / 2
+    (west, south), (east, north) = (middle - half).tolist(), (middle + half).tolist()
+    return west, east, south, north
+
+
+def _draw_ground(axes: Axes, drive: Drive, box: tuple[float, float, float, float]) -> None:
+    """Draw what stands there, the way of the ego, and the places of units."""
+    from matplotlib.collections import PolyCollection
+
+    axes.set_facecolor(_GROUND)
+    axes.set_aspect("equal", adjustable="box")
+    axes.set_xlim(*box[:2])
+    axes.set_ylim(*box[2:])
+    axes.set_xticks([])
+    axes.set_yticks([])
+    axes.spines[:].set(visible=True, color="0.75")
+    long_m = next(size for size in (50, 20, 10, 5) if size <= (box[1] - box[0]) / 3 or size == 5)
+    at_m = box[0] + 0.04 * (box[1] - box[0]), box[2] + 0.05 * (box[3] - box[2])
+    axes.plot([at_m[0], at_m[0] + long_m], [at_m[1]] * 2, color=INK, linewidth=2, solid_capstyle="butt", label="_scale")
+    axes.annotate(f"{long_m} m", at_m, (0, 3), textcoords="offset points", fontsize=7.5, color=INK)
+    axes.add_collection(PolyCollection(list(drive.outlines()), facecolor="0.8", edgecolor="0.6", linewidth=0.6))
+    if drive.scene.ego_ix >= 0:
+        axes.plot(
+            *drive.path(drive.scene.ego_ix)[1].T,
+            color=FAINT,
+            linewidth=1.0,
+            linestyle=(0, (5, 3)),
+            label="ego",
+            zorder=1.5,
+        )
+    units = list(drive.fixed_units().values())
+    axes.plot([x for x, _ in units], [y for _, y in units], "^", color=INK, markersize=5, label="units", zorder=3)
+
+
+def _draw_paths(axes: Axes, drive: Drive, rows: pd.DataFrame, most_s: float) -> Any:
+    """Draw the paths of the episodes of one configuration, the latest on top. Returns what has the colours."""
+    from matplotlib import colormaps
+    from matplotlib.collections import LineCollection
+    from matplotlib.colors import Normalize
+
+    before, unknown, after, times_s, never = [], [], [], [], []
+    for row in rows.sort_values("unknown_s", kind="stable").itertuples(index=False):
+        time_s, at_m = drive.path(drive.scene.object_number[row.object_id])
+        known_s = row.onset_s + row.unknown_s
+        before.append(at_m[time_s <= row.onset_s])
+        unknown.append(at_m[(time_s >= row.onset_s) & (time_s <= max(known_s, row.onset_s + 0.2))])
+        after.append(at_m[(time_s >= known_s) & (time_s <= row.ended_s)])
+        times_s.append(row.unknown_s)
+        if row.never_share >= NEVER_FROM:
+            never.append(at_m[(time_s <= row.ended_s) & ~np.isnan(at_m[:, 0])][-1:])
+    axes.add_collection(LineCollection(before, colors="0.72", linewidths=1.0, zorder=1.6))
+    coloured: dict[str, Any] = {
+        "cmap": colormaps["cividis_r"].resampled(_SHADES),
+        "norm": Normalize(0, most_s),
+        "array": np.array(times_s),
+    }
+    axes.add_collection(LineCollection(after, linewidths=0.9, zorder=1.8, **coloured))
+    drawn = axes.add_collection(LineCollection(unknown, linewidths=3.0, zorder=2.0, capstyle="round", **coloured))
+    if never:
+        axes.plot(*np.concatenate(never).T, "X", color="#b3261e", markersize=6, label="never", zorder=3)
+    return drawn
+
+
+def _note_sentences(
+    results: Results, drive: Drive, rows: pd.DataFrame, names: Sequence[str], asked: Sequence[str]
+) -> list[str]:
+    logs, runs = len(results.provenance.logs), results.experiment.runs
+    which = f"{drive.log}, the drive of {logs} on which objects stay unknown longest" if logs > 1 else drive.log
+    never = (
+        f"; ✕: never known in {100 * NEVER_FROM:.0f} % of the {runs} runs or more" if runs > 1 else "; ✕: never known"
+    )
+    return [
+        f"{which}: {count_noun(rows['object_id'].nunique(), 'measured object')}, north is up",
+        "Grey: before the onset; thick: unknown since the onset; thin: afterwards, in the colour of the time that it "
+        f"took; darker is later{never}",
+        *(["Dashed: the way of the ego"] if drive.scene.ego_ix >= 0 else []),
+        *(["Triangles: fixed units"] if drive.fixed_units() else []),
+        describe_left_out(asked, names),
+    ]

@@ -1,0 +1,244 @@
+"""Decision: what results say, in one sentence for those who decide; the report begins with it, the terminal ends so.
+
+With criteria the sentence is their verdicts. Else it is by the share of conflicts that pass, where it differs, else by
+the mean time to detection: who is better than the baseline, who is worse, of whom no difference is shown. A difference
+is named if its 95 % interval excludes 0 and it is as large as `MATTERS_S`, or visible in whole per cents.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from operator import itemgetter
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+
+from copem_replay.experiment.schema import Experiment
+from copem_replay.results.compare import Comparison, compare_folders
+from copem_replay.results.compare.tables import NOTHING
+from copem_replay.results.verdicts import NOT_MET, Judgement
+
+if TYPE_CHECKING:
+    from copem_replay.results.read import Results
+
+
+MATTERS_S = 0.05
+"""Smaller differences of mean times name no winner: half of the time between two lists at 10 Hz."""
+MATTERS_SHARE = 0.005
+"""Smaller differences of shares name no winner: half of a per cent."""
+Values = dict[str, float]
+"""Values of the metric that decides, by configuration."""
+DECIDED_BY = ("ttd_rmst_s", "pass_share")
+"""Metrics that a decision is about."""
+_NAMED = 4
+"""Most configurations that are named with their figures: more make a sentence hard to read."""
+BETTER, ALIKE, WORSE = "better", "alike", "worse"
+
+
+@dataclass(frozen=True)
+class Decision:
+    """One sentence, and the configurations with the best figure; several, if their difference does not matter."""
+
+    sentence: str
+    best: tuple[str, ...] = ()
+
+
+def decide(results: Results, comparison: Comparison | None = None, verdicts: Judgement | None = None) -> Decision:
+    """The decision on results. `comparison`: to their baseline, with `DECIDED_BY`; None: it is made here.
+
+    `verdicts`: of criteria, which are the sentence where there are any.
+    """
+    if not len(results.known):
+        return Decision("There is no answer: no measured object has an onset.")
+    names = [name for name, facts in results.facts.items() if not facts.truth] or list(results.facts)
+    share = results.summary.set_index("configuration")["detected_share"]
+    if not share[names].any():
+        others = "" if len(names) == len(results.facts) else " (only the ground truth has them)"
+        found = Decision(f"No configuration detects any measured object in any run{others}.")
+    elif len(names) == 1:
+        found = _describe_alone(results, names[0])
+    else:
+        comparison = comparison or compare_folders([results], metrics=DECIDED_BY)
+        found = decide_compared(comparison, results.experiment)
+    return found if verdicts is None else Decision(describe_verdicts(verdicts), found.best)
+
+
+def describe_verdicts(verdicts: Judgement) -> str:
+    """Whether results are good enough, by all criteria; of those that do not pass the first is named."""
+    number, failing = len(verdicts.all), [one for one in verdicts.all if not one.passes]
+    if not failing:
+        return "Good enough: the one verdict passes." if number == 1 else f"Good enough: all {number} verdicts pass."
+    refuted = [one for one in failing if one.verdict == NOT_MET]
+    worst = (refuted or failing)[0]
+    head = "Not good enough" if refuted else "Not shown to be good enough"
+    more = f", and {len(failing) - 1} more" if len(failing) > 1 else ""
+    return (
+        f"{head}: {len(failing)} of {number} verdicts do{'es' * (len(failing) == 1)} not pass: {worst.name} with "
+        f"{worst.configuration} is {worst.verdict} (asked: {worst.asked}, found: {worst.found}){more}."
+    )
+
+
+def _describe_alone(results: Results, name: str) -> Decision:
+    row = results.summary.set_index("configuration").loc[name]
+    figures = [_Scale(metric).say(float(row[metric])) for metric in DECIDED_BY if pd.notna(row.get(metric))]
+    return Decision(f"{name}: {', and '.join(figures)}; there is nothing to compare it with.", (name,))
+
+
+# Of several configurations.
+
+
+@dataclass(frozen=True)
+class _Scale:
+    """A metric that decides: how its values are said, and which differences matter."""
+
+    metric: str
+
+    @property
+    def is_share(self) -> bool:
+        return self.metric == "pass_share"
+
+    def matters(self, difference: float) -> bool:
+        return abs(difference) >= (MATTERS_SHARE if self.is_share else MATTERS_S)
+
+    def gain(self, difference: float) -> float:
+        """A difference whose sign is that of the gain."""
+        return difference if self.is_share else -difference
+
+    def number(self, value: float) -> str:
+        """`85 %`, `0.73 s`; 0 and 100 % only for none and all."""
+        if not self.is_share:
+            return f"{value + 0.0:.2f}".rstrip("0").rstrip(".").replace("-", "−") + " s"
+        return f"{100 * value:.0f} %" if 0.005 <= value < 0.995 or value in (0, 1) else _format_edge(value)
+
+    def say(self, value: float) -> str:
+        """`85 % of conflicts pass`, `an object is known after 0.73 s on average`."""
+        number = self.number(value)
+        return f"{number} of conflicts pass" if self.is_share else f"an object is known after {number} on average"
+
+
+def _format_edge(share: float) -> str:
+    if 0.0005 <= share < 0.9995:
+        return f"{100 * share:.1f} %"
+    return "< 0.1 %" if share < 0.5 else "> 99.9 %"
+
+
+def decide_compared(comparison: Comparison, experiment: Experiment | None = None) -> Decision:
+    """The decision on a comparison. `experiment`: of the one folder that is compared, whose latencies it may be about.
+
+    The ground truth is no choice.
+    """
+    rows = comparison.overall[~comparison.overall["configuration"].isin(comparison.truths)]
+    rows = rows[rows["difference"].notna()]
+    scale = _choose_scale(rows)
+    rows = rows[rows["metric"] == scale.metric]
+    if not len(rows) or comparison.baseline in comparison.truths:
+        return Decision(f"There is no answer: nothing can be held against {comparison.baseline}.")
+    values = {str(row.configuration): float(row.value) for row in rows.itertuples(index=False)}
+    base = float(rows["baseline_value"].iloc[0])
+    words = {str(row.configuration): _judge_row(row, scale) for row in rows.itertuples(index=False)}
+    ranked = values | {comparison.baseline: base}
+    top = max(ranked.values(), key=scale.gain)
+    best = tuple(name for name, value in ranked.items() if not scale.matters(value - top))
+    if any(words.get(name) == ALIKE for name in best):
+        best = tuple(dict.fromkeys([*best, comparison.baseline]))
+    told = _tell_latencies(comparison.baseline, base, values, words, scale, experiment)
+    told = told or _tell_groups(comparison.baseline, base, values, words, scale)
+    unsure = rows["interval_over"].isna().all()
+    return Decision(f"{told}{', on these objects alone: there is no interval' if unsure else ''}.", best)
+
+
+def _choose_scale(rows: pd.DataFrame) -> _Scale:
+    """The share that passes where it differs at all, else the mean time."""
+    differences = rows.loc[rows["metric"] == "pass_share", "difference"]
+    return _Scale("pass_share" if (differences.abs() > NOTHING).any() else "ttd_rmst_s")
+
+
+def _judge_row(row: object, scale: _Scale) -> str:
+    """Whether a configuration is better than the baseline; without an interval by its value."""
+    difference, low, high = (float(getattr(row, name)) for name in ("difference", "low", "high"))
+    limits = [difference] if np.isnan(low) or np.isnan(high) else [low, high]
+    gains = [scale.gain(limit) for limit in limits]
+    if not scale.matters(difference) or (min(gains) <= NOTHING and max(gains) >= -NOTHING):
+        return ALIKE
+    return BETTER if min(gains) > NOTHING else WORSE
+
+
+def _tell_groups(baseline: str, base: float, values: Values, words: dict[str, str], scale: _Scale) -> str:
+    """Who is better than the baseline, of whom no difference is shown, who is worse."""
+    of = {word: {name: value for name, value in values.items() if words[name] == word} for word in words.values()}
+    better, worse = ("better", "worse") if scale.is_share else ("sooner", "later")
+    held = f"{baseline} ({scale.say(base)})"
+    if set(of) == {ALIKE}:
+        return f"No difference to {held} is shown: {_list_values(values, scale)}"
+    first = f"{better.capitalize()} than {held}: {_list_values(of[BETTER], scale)}" if BETTER in of else (
+        f"Nothing is shown to be {better} than {held}"
+    )  # fmt: skip
+    others = {"no difference shown": of.get(ALIKE), worse: of.get(WORSE)}
+    return "; ".join([first, *(f"{word}: {_list_values(group, scale)}" for word, group in others.items() if group)])
+
+
+def _list_values(values: Values, scale: _Scale) -> str:
+    """`A and B 96 %, C 92 %`, the best first; those of one number together, of many the first."""
+    by_number: dict[str, list[str]] = {}
+    for name, value in sorted(values.items(), key=lambda item: -scale.gain(item[1])):
+        by_number.setdefault(scale.number(value), []).append(name)
+    shown, left = [], _NAMED
+    for number, names in by_number.items():
+        kept = names[:left]
+        left -= len(kept)
+        if kept:
+            shown.append(f"{' and '.join([', '.join(kept[:-1])] * (len(kept) > 1) + kept[-1:])} {number}")
+    more = len(values) - _NAMED
+    return ", ".join(shown) + (f" and {more} more" if more > 0 else "")
+
+
+# Of configurations that differ in nothing but their latency.
+
+
+def _tell_latencies(
+    baseline: str, base: float, values: Values, words: dict[str, str], scale: _Scale, experiment: Experiment | None
+) -> str | None:
+    """Up to which latency the others help, and from which on they are worse; None: they differ in more than that."""
+    found = None if experiment is None else _order_by_latency(experiment, baseline, list(values))
+    if found is None or experiment is None:
+        return None
+    latencies_s, units = found
+    names, judged = list(latencies_s), [words[name] for name in latencies_s]
+    if sorted(judged, key=[BETTER, ALIKE, WORSE].index) != judged:
+        return None  # not in the order of latencies: each has to be named
+    cooperates = units > set(experiment.units_of(experiment.configurations[baseline]))
+    what, none = ("cooperation", f"{baseline} alone") if cooperates else (names[0].partition(":")[0], baseline)
+    parts: list[str] = []
+    for word, says in ((BETTER, "{what} helps"), (ALIKE, "no difference to {none} is shown")):
+        if word in judged:
+            last = [name for name in names if words[name] == word][-1]
+            up_to = f"up to {latencies_s[last]:g} s of latency" if latencies_s[last] else "without latency"
+            against = "" if parts else f" against {scale.number(base)} with {none}"
+            parts.append(f"{up_to} {says.format(what=what, none=none)}: {scale.say(values[last])}{against}")
+    if WORSE in judged:
+        first = names[judged.index(WORSE)]
+        against = "" if parts else f" against {scale.number(base)} with {none}"
+        figure = f"{scale.number(values[first])}{against}"
+        parts.append(f"from {latencies_s[first]:g} s of latency on {what} is worse than {none}: {figure}")
+    told = "; ".join(parts)
+    return told[:1].upper() + told[1:]
+
+
+def _order_by_latency(
+    experiment: Experiment, baseline: str, names: Sequence[str]
+) -> tuple[dict[str, float], set[str]] | None:
+    """Latencies of configurations, the smallest first, and their units; None: they differ in more than one latency."""
+    configurations = experiment.configurations
+    if len(names) < 2 or not set(names) <= set(configurations):
+        return None
+    first, *others = (configurations[name].model_copy(update={"latency_s": 0.0}) for name in names)
+    latencies_s = {name: configurations[name].latency_s for name in names}
+    units = set(experiment.units_of(first))
+    if not units or any(other != first for other in others):
+        return None
+    numbers = {name: latency_s for name, latency_s in latencies_s.items() if not isinstance(latency_s, dict)}
+    if len(set(numbers.values())) < len(names):
+        return None
+    return dict(sorted(numbers.items(), key=itemgetter(1))), units

@@ -1,0 +1,150 @@
+"""The decision in one sentence, from comparisons and verdicts written down by hand."""
+
+from __future__ import annotations
+
+import math
+
+import pandas as pd
+import pytest
+
+import copem_replay as cr
+from copem_replay.results.compare import Comparison
+from copem_replay.results.decision import Decision, decide_compared, describe_verdicts
+from copem_replay.results.verdicts import MET, NOT_MET, UNDECIDED, Judgement, Verdict
+
+Row = tuple[str, float, float, float | None, float | None]
+"""Configuration, its value, that of the baseline, and the limits of the difference."""
+
+
+def compared(metric: str, *rows: Row, baseline: str = "PEM", truths: tuple[str, ...] = ()) -> Comparison:
+    names = ["configuration", "value", "baseline_value", "low", "high"]
+    table = pd.DataFrame(rows, columns=names).astype({"low": float, "high": float})
+    table = table.assign(metric=metric, log="all", difference=table["value"] - table["baseline_value"])
+    table["interval_over"] = [None if math.isnan(low) else "logs" for low in table["low"]]
+    return Comparison(table, baseline, None, tuple(row[0] for row in rows), 5.0, None, (), truths=truths)
+
+
+def cooperating(**latencies_s: float) -> cr.Experiment:
+    """PEM is the ego alone, the others have the mast, too, each with its latency."""
+    late = {name: {"units": "all", "latency_s": latency_s} for name, latency_s in latencies_s.items()}
+    plain = {
+        "version": 1,
+        "logs": ["drive.mcap"],
+        "pems": {"sure": [{"detection": {"kind": "constant", "probability": 1.0}}]},
+        "units": {
+            "ego": {"on": "ego", "height_m": 1.8, "pem": "sure"},
+            "mast": {"at": [0, 0], "height_m": 5.0, "pem": "sure"},
+        },
+        "configurations": {"PEM": {"units": ["ego"]}, **late},
+    }
+    return cr.Experiment.model_validate(plain)
+
+
+class TestLatencies:
+    def test_up_to_which_latency_cooperation_helps(self) -> None:
+        found = decide_compared(
+            compared(
+                "pass_share",
+                ("co0", 0.996, 0.844, 0.1, 0.2),
+                ("co1", 0.64, 0.844, -0.25, -0.15),
+                ("co05", 0.96, 0.844, 0.05, 0.15),
+            ),
+            cooperating(co0=0.0, co05=0.5, co1=1.0),
+        )
+        assert found.sentence == (
+            "Up to 0.5 s of latency cooperation helps: 96 % of conflicts pass against 84 % with PEM alone; from 1 s of "
+            "latency on cooperation is worse than PEM alone: 64 %."
+        )
+        assert found.best == ("co0",)
+
+    def test_with_one_in_between_that_cannot_be_told(self) -> None:
+        found = decide_compared(
+            compared("ttd_rmst_s", ("co0", 0.0, 0.7, -0.8, -0.6), ("co1", 0.9, 0.7, -0.1, 0.5)),
+            cooperating(co0=0.0, co1=1.0),
+        )
+        assert found.sentence == (
+            "Without latency cooperation helps: an object is known after 0 s on average against 0.7 s with PEM alone; "
+            "up to 1 s of latency no difference to PEM alone is shown: an object is known after 0.9 s on average."
+        )
+
+    def test_out_of_their_order_each_is_named(self) -> None:
+        found = decide_compared(
+            compared("ttd_rmst_s", ("co0", 0.9, 0.7, 0.1, 0.3), ("co1", 0.1, 0.7, -0.7, -0.5)),
+            cooperating(co0=0.0, co1=1.0),
+        )
+        assert found.sentence == (
+            "Sooner than PEM (an object is known after 0.7 s on average): co1 0.1 s; later: co0 0.9 s."
+        )
+
+
+class TestGroups:
+    def test_better_alike_and_worse(self) -> None:
+        found = decide_compared(
+            compared(
+                "pass_share",
+                ("GT", 1.0, 0.5, 0.4, 0.6),
+                ("a", 0.9, 0.5, 0.3, 0.5),
+                ("b", 0.6, 0.5, -0.1, 0.3),
+                ("c", 0.2, 0.5, -0.4, -0.2),
+                truths=("GT",),
+            )
+        )
+        assert found == Decision(
+            "Better than PEM (50 % of conflicts pass): a 90 %; no difference shown: b 60 %; worse: c 20 %.", ("a",)
+        )
+
+    @pytest.mark.parametrize(("apart_s", "crowned"), [(0.0002, False), (0.049, False), (0.051, True)])
+    def test_nobody_is_crowned_by_a_hair(self, apart_s: float, crowned: bool) -> None:
+        """All intervals exclude 0."""
+        found = decide_compared(compared("ttd_rmst_s", ("a", 1 - apart_s, 1.0, -apart_s - 1e-5, -apart_s + 1e-5)))
+        assert found.sentence.startswith("Sooner than PEM" if crowned else "No difference to PEM")
+        assert found.best == (("a",) if crowned else ("a", "PEM"))
+
+    def test_the_best_has_a_better_mean_than_all_and_no_interval_that_excludes_0(self) -> None:
+        found = decide_compared(compared("ttd_rmst_s", ("a", 0.5, 1.0, -1.2, 0.2), ("b", 2.0, 1.0, 0.5, 1.5)))
+        assert found.sentence.startswith(
+            "Nothing is shown to be sooner than PEM (an object is known after 1 s on average)"
+        )
+        assert set(found.best) == {"a", "PEM"}
+
+    def test_without_intervals_it_says_so(self) -> None:
+        found = decide_compared(compared("pass_share", ("a", 1.0, 0.0, None, None)))
+        assert found.sentence == (
+            "Better than PEM (0 % of conflicts pass): a 100 %, on these objects alone: there is no interval."
+        )
+
+    def test_equal_figures_share_a_number_and_many_are_counted(self) -> None:
+        rows = [(name, 1.0, 0.5, 0.4, 0.6) for name in "abcdef"]
+        found = decide_compared(compared("pass_share", *rows))
+        assert found.sentence == "Better than PEM (50 % of conflicts pass): a, b, c and d 100 % and 2 more."
+
+    @pytest.mark.parametrize(
+        ("share", "said"), [(0.994, "99 %"), (0.9951, "99.5 %"), (0.9996, "> 99.9 %"), (0.0004, "< 0.1 %")]
+    )
+    def test_all_and_none_are_all_and_none(self, share: float, said: str) -> None:
+        other = 0.5
+        low, high = sorted([share - other - 0.01, share - other + 0.01])
+        assert f"a {said}" in decide_compared(compared("pass_share", ("a", share, other, low, high))).sentence
+
+
+def verdict(name: str, word: str) -> Verdict:
+    return Verdict(
+        name, "PEM", "", "ttd_rmst_s", None, "at_most", 0.5, 0.95, "these_logs", 0.7, 0.6, 0.8, "jackknife", "logs", 5,
+        100, word, word == MET, "",
+    )  # fmt: skip
+
+
+def test_criteria_are_the_sentence() -> None:
+    def said(*words: str) -> str:
+        return describe_verdicts(Judgement("r", tuple(verdict(f"v{k}", word) for k, word in enumerate(words))))
+
+    assert said(MET) == "Good enough: the one verdict passes."
+    assert said(MET, MET) == "Good enough: all 2 verdicts pass."
+    assert said(MET, UNDECIDED) == (
+        "Not shown to be good enough: 1 of 2 verdicts does not pass: v1 with PEM is undecided (asked: ttd_rmst_s ≤ "
+        "0.5, found: 0.7)."
+    )
+    assert said(UNDECIDED, NOT_MET, MET) == (
+        "Not good enough: 2 of 3 verdicts do not pass: v1 with PEM is not met (asked: ttd_rmst_s ≤ 0.5, found: 0.7), "
+        "and 1 more."
+    )
