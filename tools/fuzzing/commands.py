@@ -263,7 +263,8 @@ _REST = 10
 
 def _results(made: Originals, place: Path, dice: random.Random) -> Case:
     words = {
-        "compare": 38, "view": 18, "layout": 13, "run": 13, "verdict": 8, "history": 2, "report": 5, "plot": 3, "film": 1,
+        "compare": 38, "view": 18, "layout": 13, "run": 13, "verdict": 8, "history": 2, "report": 5, "plot": 3,
+        "film": 1,
     }  # fmt: skip
     word = dice.choices([*words], [*words.values()])[0]
     name = dice.choice(_SHOWN_ONES if word in ("view", "layout", "verdict", "history") else ("plain", *_SHOWN_ONES))

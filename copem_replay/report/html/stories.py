@@ -394,7 +394,7 @@ def _draw_units(story: ObjectStory, world: Tracks, view: _View, row: Any) -> Ite
     poses = unit_pose(drive, name, drive.experiment.modelled[name], world)
     if poses.present.any():
         line = view.points(np.array([[poses.x_m[0], poses.y_m[0]], target[0]]))
-        colour = _HIDER if row is None else css_colour(story.study.looks[str(row["configuration"])].edge)
+        colour = _HIDER if row is None else css_colour(story.study.looks[str(row["configuration"])].colour)
         dash = "5 4" if row is None else None
         yield make_tag("polyline", points=line, fill="none", stroke=colour, stroke_width="2", stroke_dasharray=dash)
 
@@ -442,7 +442,7 @@ def _draw_lane(story: ObjectStory, row: Any, y: float, height: float, scale: flo
     x = _LANE_LEFT + max(known_s - story.onset_s, 0.0) * scale
     if row["detected"]:
         look = story.study.looks[name]
-        rest = {"fill": css_colour(look.colour), "stroke": css_colour(look.edge)}
-        yield make_tag("rect", x=f"{x:.1f}", width=f"{max(_WIDTH - 60 - x, 2):.1f}", **rest, **common)
+        width, fill = max(_WIDTH - 60 - x, 2), css_colour(look.colour)
+        yield make_tag("rect", x=f"{x:.1f}", width=f"{width:.1f}", fill=fill, **common)
     flag = _format_time(row["unknown_s"]) if row["detected"] else "✕ never"
     yield make_tag("text", flag, x=f"{_WIDTH - 54}", y=f"{y + height - 2:.1f}", class_="label")
