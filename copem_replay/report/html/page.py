@@ -25,6 +25,7 @@ from copem_replay.report.html.markup import (
     make_tag,
     replace_greys,
 )
+from copem_replay.report.html.player import player_section
 from copem_replay.report.html.setup import (
     describe_configurations,
     describe_question,
@@ -149,6 +150,7 @@ def build_page(study: ReportData) -> str:
     sections = [
         *_verdict_sections(study),
         _Section("differences-of-it", "Differences", _difference_parts(study)),
+        *([_Section("play", "One run, side by side", [player])] if (player := player_section(study)) else []),
         *_figure_sections(study, ("trade_off",)),
         _Section(
             "configurations-of-it",
