@@ -105,7 +105,8 @@
       pen.stroke();
     }
     pen.textAlign = "center";
-    for (const [name, x, y] of data.units) pen.fillText(`▲ ${name}`, ...seen.at(x, y));
+    const few = data.units.length <= 6; // more names would lie on each other
+    for (const [name, x, y] of data.units) pen.fillText(few ? `▲ ${name}` : "▲", ...seen.at(x, y));
   };
 
   const entries = (pen, seen, one) => {
@@ -137,9 +138,14 @@
 
   const LANE = 22;
   const chosen = (pen, seen, one, tone) => {
-    const where = place(truth, object, frame);
-    if (!where) return;
-    const [x, y] = seen.at(where[0], where[1]), [name] = data.objects[object];
+    const where = place(truth, object, frame), [name] = data.objects[object];
+    if (!where) {
+      pen.fillStyle = tone("--ink");
+      pen.textAlign = "left";
+      pen.fillText(`${name} is not there`, 8, 18);
+      return;
+    }
+    const [x, y] = seen.at(where[0], where[1]);
     const inside = x >= 0 && x <= seen.width && y >= 0 && y <= seen.height;
     const [px, py] = [Math.min(Math.max(x, 26), seen.width - 26), Math.min(Math.max(y, 20), seen.height - 20)];
     pen.strokeStyle = pen.fillStyle = tone("--ink");
@@ -234,7 +240,13 @@
     frame = Math.min(Math.max(to, 0), data.frames - 1);
     draw();
   };
-  const begin = () => go(Math.floor((measured.get(object).onset - 0.5 - data.from) / data.step));
+  // Where the two differ, halfway between the instants at which they know the object; else at its onset.
+  const begin = () => {
+    const { onset, ended } = measured.get(object);
+    const times = panels.map((panel) => Math.max(onset, Math.min(shown(panel).known[object] ?? ended, ended)));
+    const at = times.length > 1 && times[0] !== times[1] ? (times[0] + times[1]) / 2 : onset;
+    go(Math.ceil((at - data.from) / data.step - 1e-6));
+  };
   const choose = (k) => {
     object = k;
     const buttons = [...list.querySelectorAll("button")];

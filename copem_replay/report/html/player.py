@@ -238,7 +238,9 @@ def _outline_solids(replayed: ReplayedRun, grid: Grid) -> list[list[float]]:
 def _list_places(replayed: ReplayedRun, grid: Grid) -> list[list[Any]]:
     """Units with a place of their own: name, x and y, m from the middle."""
     poses = replayed.replay.placed.poses
-    fixed = (name for name, unit in replayed.experiment.modelled.items() if unit.at is not None and len(poses[name].x_m))
+    fixed = (
+        name for name, unit in replayed.experiment.modelled.items() if unit.at is not None and len(poses[name].x_m)
+    )
     return [
         [name, *(round(float(at[0]) - of, 2) for at, of in zip((poses[name].x_m, poses[name].y_m), grid.middle_m))]
         for name in fixed
