@@ -64,7 +64,7 @@ def press(browser: Browser, *keys: str) -> None:
 
 def move_to(browser: Browser, at_s: float) -> None:
     browser.run(
-        """const slider = document.querySelector("#player .at");
+        """const slider = document.querySelector("#player .moment");
         slider.value = arguments[0];
         slider.dispatchEvent(new Event("input"));""",
         round(10 * at_s),

@@ -13,7 +13,7 @@ from copem_replay.core.errors import OutputError
 from copem_replay.core.files import atomic_file
 from copem_replay.report.figures.registry import FIGURES
 from copem_replay.report.figures.selection import Selection
-from copem_replay.report.figures.style import render_figure
+from copem_replay.report.figures.style import render_figure, take_note
 from copem_replay.report.html.conclusions import write_details, write_lead
 from copem_replay.report.html.markup import (
     Html,
@@ -125,11 +125,13 @@ def _enlarge(size: re.Match[str]) -> str:
 
 def figure_element(name: str, figure: Figure, title: str, shows: str) -> Html:
     """A figure as an element of a page, scrolled where there is no room; `shows`: text for screen readers."""
+    note = take_note(figure)
     svg = render_figure(figure, (".svg",))[".svg"].decode("utf-8")
     svg = _NOT_DRAWN.sub("", svg[svg.index("<svg ") :])  # comments repeat texts of users without escapes
     svg = replace_greys(_SIZE.sub(_enlarge, _IDS.sub(f"{name}-", svg), count=1))
     plot = make_tag("div", Html(svg), id_=name, class_="plot", role="img", aria_label=shows)
-    return make_tag("div", plot, class_="scroll figure", tabindex="0", role="region", aria_label=title)
+    drawn = make_tag("div", plot, class_="scroll figure", tabindex="0", role="region", aria_label=title)
+    return join_html([drawn, make_tag("div", note, class_="below note")]) if note else drawn
 
 
 _ANSWER, _DIFFERENCES = "answer", "differences"

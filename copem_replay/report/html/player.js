@@ -3,7 +3,7 @@
   const data = JSON.parse(document.getElementById("played").textContent);
   const player = document.getElementById("player");
   const find = (what) => player.querySelector(what);
-  const slider = find(".at"), button = find(".play"), clock = find("output"), list = find("tbody");
+  const slider = find(".moment"), button = find(".play"), clock = find("output"), list = find("tbody");
   const numbers = (text) => new Int16Array(Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0)).buffer);
 
   // Places: of each object pieces [first frame, frames, numbers, offset], of entries about no object by frame.

@@ -241,8 +241,9 @@ def _list_places(replayed: ReplayedRun, grid: Grid) -> list[list[Any]]:
     fixed = (
         name for name, unit in replayed.experiment.modelled.items() if unit.at is not None and len(poses[name].x_m)
     )
+    east_m, north_m = grid.middle_m
     return [
-        [name, *(round(float(at[0]) - of, 2) for at, of in zip((poses[name].x_m, poses[name].y_m), grid.middle_m))]
+        [name, round(float(poses[name].x_m[0]) - east_m, 2), round(float(poses[name].y_m[0]) - north_m, 2)]
         for name in fixed
     ]
 
@@ -285,7 +286,9 @@ def _write_player(data: dict[str, Any], says: str) -> Html:
     names = [one["name"] for one in data["configurations"]]
     panels = [_write_panel(letter, names, k) for letter, k in zip("AB", data["shown"], strict=False)]
     last = str(data["frames"] - 1)
-    slider = make_tag("input", type="range", min="0", max=last, value="0", step="1", aria_label="instant", class_="at")
+    slider = make_tag(
+        "input", type="range", min="0", max=last, value="0", step="1", aria_label="instant", class_="moment"
+    )
     head = make_tag("tr", *(make_tag("th", word, scope="col") for word in ("object", *"AB"[: len(panels)])))
     table = make_tag("table", make_tag("caption", "Known after"), make_tag("thead", head), make_tag("tbody"))
     listed = make_tag("div", table, class_="objects", tabindex="0", role="region", aria_label="Objects")
