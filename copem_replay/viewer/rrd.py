@@ -216,7 +216,8 @@ def _begin_file(
     write_summary_text(out, replay, experiment, summary, run, further)
     write_legend_text(out, any(content.lists.values()))
     write_legend_bars(out, file.colours)
-    write_onset_texts(out, scene, content.table)
+    chosen = content.table[content.table["object_id"].isin([scene.object_ids[k] for k in content.objects])]
+    write_onset_texts(out, scene, chosen)
     boxes.write_grid(out, replay.truth)
     boxes.write_solids(out, replay.placed)
     boxes.write_lane_boundaries(out, replay.lane_boundaries)
@@ -224,7 +225,10 @@ def _begin_file(
     mark_onsets(out, replay, experiment, content.table, content.objects)
     boxes.write_truth(out, scene, replay.truth, content.objects)
     for name, colour in file.colours.items():
-        write_event_texts(out, scene, name, content.table[content.table["configuration"] == name])
+        if (
+            experiment.configurations[name].units != TRUTH or len(file.colours) == 1
+        ):  # what is known at once is no event
+            write_event_texts(out, scene, name, chosen[chosen["configuration"] == name])
         mark_detections(out, replay, experiment, content.table, name, content.objects, colour)
         write_list_fates(out, name, content.lists[name])
         write_list_lanes(out, content.lists[name])

@@ -108,7 +108,7 @@ def test_reports_and_figures_do_without(tmp_path: Path) -> None:
     assert any(line.startswith("There are no intervals: every run is the same") for line in found.lines())
     assert "Detected: no 95 % interval of GT, hit: nothing drawn, every run is the same." in found.words
     cell = found.tables["summary"]["GT"]["detected_share"]
-    assert (cell.text.strip(), cell.low, cell.high) == ("100", None, None)
+    assert (cell.text.strip(), cell.low, cell.high) == ("100.0", None, None)
     assert "(nothing drawn)" in found.tables["regret"]["hit"]["ttd_rmst_s"].text
     figure = curves_figure(read_results(folder))
     assert not figure.axes[0].collections

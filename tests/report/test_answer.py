@@ -217,7 +217,7 @@ class TestEighteen:
         every = tuple(many.experiment.configurations)
         assert len(every) == 19
         figure = curves_figure(many)
-        shown = [text.get_text() for text in figure.legends[0].get_texts()]
+        shown = [text.get_text().strip() for text in figure.axes[0].texts]
         assert len(shown) <= 12
         left = [name for name in every if name not in shown]
         assert (
@@ -337,7 +337,10 @@ def test_headers_have_units_also_of_own_metrics() -> None:
     assert {name: column_header(name) for name in own} == own
     assert strip_unit("ttd_rmst_s") == "mean time to detection"
     assert difference_column_header("pass_share") == "passes, percentage points"
-    assert (format_value("late_share", 0.5), format_value("cost", math.nan)) == ("50", "–")
+    assert (format_value("late_share", 0.5), format_value("cost", math.nan)) == ("50.0", "–")
+    assert [format_value("cost", value) for value in (0.2, -0.0, 4.87e-5, -4.87e-5, 12.345, 4321.5)] == [
+        "0.20", "0.00", "< 0.01", "> −0.01", "12.35", "4322",
+    ]  # fmt: skip
     assert [format_signed_difference("late_share", value) for value in (0.125, -0.5, 1e-12)] == ["+12.5", "−50", "±0"]
     assert sort_columns(["n", "detected_share", "ttd_rmst_s"]) == ["ttd_rmst_s", "detected_share", "n"]
 

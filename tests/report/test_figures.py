@@ -340,11 +340,11 @@ class TestCommand:
 
 
 class TestRuns:
-    def test_from_worst_to_best(self, results: Results) -> None:
+    def test_from_best_to_worst(self, results: Results) -> None:
         # hit, near and never do not pass; of them who never knows is worst, then who knows last.
         choice = choose_object_and_run(results, Selection())
         assert (choice.log, choice.object_id, choice.run) == ("drive", "2", 0)
-        assert choice.configurations == ("never", "hit", "late", "GT")
+        assert choice.configurations == ("GT", "late", "hit", "never")
         assert choose_object_and_run(results, Selection(["hit", "GT", "hit"])).configurations == ("hit", "GT")
         assert choose_object_and_run(results, Selection(object_id="3", run=2)).object_id == "3"
 
@@ -408,7 +408,7 @@ class TestRuns:
         )
         figure = runs_figure(read_results(replayed(tmp_path, text)), Selection())
         titles = [axes.get_title(loc="left") for axes in figure.axes[:2]]
-        assert titles == ["PEM\nknown after 0 s", "GT\nknown after 0 s"]
+        assert titles == ["GT\nknown after 0 s", "PEM\nknown after 0 s"]
         assert "declared driver" not in note(figure)
 
     def test_labels_have_room(self) -> None:
@@ -539,11 +539,12 @@ class TestCurves:
         for name, late_s, last in (("GT", 0.0, 1.0), ("late", 0.5, 1.0), ("hit", 1.8, 1.0)):
             x, y = line(axes, name)
             assert x[1:-1] == pytest.approx([late_s])
-            assert y == pytest.approx([0, last, last])
+            assert y == pytest.approx([1, 1 - last, 1 - last])
             assert (x[0], x[-1]) == pytest.approx(axes.get_xlim())
-        assert list(line(axes, "never")[1]) == [0, 0]
+        assert list(line(axes, "never")[1]) == [1, 1]
         assert "No bands: 2 objects of one drive, fewer than 5" in note(figure)
-        assert [text.get_text() for text in figure.legends[0].get_texts()] == ["GT", "late", "near", "hit", "never"]
+        assert [text.get_text().strip() for text in axes.texts] == ["GT", "late", "near", "hit", "never"]
+        assert figure.legends == [], "names are at the ends of lines"
 
     def test_one_object_has_bands_over_runs(self, tmp_path: Path) -> None:
         # One in two lists holds him, so that the runs differ.
@@ -554,12 +555,12 @@ class TestCurves:
         (axes,) = figure.axes
         rows = results.table[results.table["configuration"] == "late"]
         times_s, share = cumulative_incidence(rows["time_to_detection_s"].to_numpy(), np.full(40, DETECTED))
-        assert line(axes, "late")[1][1:-1] == pytest.approx(share)
+        assert line(axes, "late")[1][1:-1] == pytest.approx(1 - share)
         (drawn,) = (c for c in axes.collections if c.get_label() == "band of late")
         corners = drawn.get_paths()[0].vertices
         # Around the first step: the binomial band of 40 runs is about ± 2 √(p (1 − p) / 40) wide.
         at_first = corners[np.isclose(corners[:, 0], times_s[0])][:, 1]
-        low, high = at_first[at_first > 0].min(), at_first.max()
+        low, high = 1 - at_first[at_first < 1].max(), 1 - at_first.min()
         half = 1.96 * (share[0] * (1 - share[0]) / 40) ** 0.5
         assert (low, high) == (pytest.approx(share[0] - half, abs=0.05), pytest.approx(share[0] + half, abs=0.05))
         assert "Bands: 95 %, over 40 runs of this one object: how far other draws" in " ".join(note(figure).split())
@@ -575,8 +576,8 @@ class TestCurves:
         figure = curves_figure(read_results(mine), configurations=["GT"])
         x, y = line(figure.axes[0], "exact")
         assert x[1:-1] == pytest.approx([0, 1])
-        assert y == pytest.approx([0, 0.25, 0.75, 0.75])
-        assert "Dashed: the exact share detected by then" in note(figure)
+        assert y == pytest.approx([1, 0.75, 0.25, 0.25])
+        assert "Dashed: the exact share" in note(figure)
 
 
 class TestBands:
@@ -727,7 +728,7 @@ class TestWords:
         results = read_results(replayed(tmp_path, text))
         files, notes = write_figure_files(results, None, Selection())
         assert (len(files), notes) == (2 * len(NAMES), [])
-        labels = [text.get_text() for text in curves_figure(results).legends[0].get_texts()]
+        labels = [text.get_text().strip() for text in curves_figure(results).axes[0].texts]
         assert labels == ["GT", "$a$_{<&>}", "near", "_試", "never"]
 
     def test_looks_differ(self) -> None:

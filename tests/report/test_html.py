@@ -113,12 +113,16 @@ def test_what_does_not_count_is_said(tmp_path: Path) -> None:
     assert said in page.words
 
 
+RANKED = ["GT", "half", "late", "hit", "never"]
+"""The truth, then the soonest first, as in the figures."""
+
+
 class TestNumbers:
     def test_the_summary_has_the_numbers_of_the_file(self, read: Page, made: Path) -> None:
         rows = summary_rows(made)
         checked = 0
         for id_ in ("summary", "undetected", "braking", "accuracy", "lists"):
-            assert list(read.tables[id_]) == list(NAMES)
+            assert list(read.tables[id_]) == RANKED
             for name, cells in read.tables[id_].items():
                 for column, cell in cells.items():
                     assert (cell.value or "") == rows[name][column], (id_, name, column)
@@ -128,7 +132,7 @@ class TestNumbers:
                     checked += 1
         assert checked == len(NAMES) * (7 + 2 + 1 + 11)
 
-    def test_cells_have_three_digits_and_shares_are_in_per_cent(self, read: Page, made: Path) -> None:
+    def test_cells_have_two_decimals_and_shares_one_in_per_cent(self, read: Page, made: Path) -> None:
         rows = summary_rows(made)
 
         def plainly(column: str, text: str) -> str:
@@ -138,8 +142,9 @@ class TestNumbers:
             value = Decimal(text) * (100 if column.endswith("_share") else 1)
             if abs(value) >= 1000:
                 return str(int(value.to_integral_value()))
-            short = round(value, 2 - value.adjusted()) if value else value
-            return format(short.normalize(), "f").replace("-", "−") if short else "0"
+            if column in ("n", "n_conflict"):
+                return str(int(value))
+            return str(round(value, 1 if column.endswith("_share") else 2)).replace("-", "−")
 
         seen = 0
         for id_ in ("summary", "undetected", "braking", "accuracy", "lists"):
@@ -514,10 +519,10 @@ class TestWaterfall:
         cells = read.tables["stages"]
         shown = {name: {stage: cell.text for stage, cell in row.items()} for name, row in cells.items()}
         assert shown["late"] == {
-            "detected": "6 of 6", HIDDEN: "0", IN_SIGHT: "0", UNTIL_CAPTURED: "–", TRANSPORT: "0.5", FUSION: "0",
-            "sum": "0.5",
+            "detected": "6 of 6", HIDDEN: "0.00", IN_SIGHT: "0.00", UNTIL_CAPTURED: "–", TRANSPORT: "0.50",
+            FUSION: "0.00", "sum": "0.50",
         }  # fmt: skip
-        assert (shown["GT"][UNTIL_CAPTURED], shown["GT"][HIDDEN], shown["GT"]["sum"]) == ("0", "–", "0")
+        assert (shown["GT"][UNTIL_CAPTURED], shown["GT"][HIDDEN], shown["GT"]["sum"]) == ("0.00", "–", "0.00")
         assert (shown["never"]["detected"], shown["never"]["sum"]) == ("0 of 6", "–")
         assert float(cells["half"][IN_SIGHT].value or "nan") == pytest.approx(float(cells["half"]["sum"].value or 0))
 
@@ -655,7 +660,7 @@ class TestFigures:
         text = text.replace("braking: {", "braking: {brakes_for: conflict, ")
         found = Page(build_page(load_study(replayed(tmp_path, text))))
         assert "Distance when the collision is foreseen" in found.words
-        assert list(found.tables["conflict"]) == ["GT", "late", "half"]
+        assert list(found.tables["conflict"]) == ["GT", "half", "late"], "the soonest first"
 
     def test_the_page_is_small(self, html: str) -> None:
         assert len(html.encode()) < 1_500_000

@@ -31,11 +31,11 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 
 def demo(place: Path) -> Path:
-    """The sample experiment in fewer runs."""
+    """The sample experiment in fewer runs, one of which the page plays."""
     source = read_experiment_file(DEMO)
     experiment, found = find_problems(source)
     assert experiment is not None, found
-    experiment = experiment.model_copy(update={"runs": 20, "show": experiment.show.model_copy(update={"run": None})})
+    experiment = experiment.model_copy(update={"runs": 20})
     recordings, refused = read_logs(experiment, log_paths(source)[0], source)
     assert not refused
     save_run(place / "demo", experiment, recordings)
@@ -63,6 +63,7 @@ def violations(browser: Browser) -> list[dict[str, Any]]:
 def test_no_grave_violation(browser: Browser, reports: dict[str, Path], name: str, scheme: str) -> None:
     browser.scheme(scheme)
     browser.open(reports[name])
+    assert browser.run("return document.getElementById('player') !== null") == (name == "demo")
     for details in browser.driver.find_elements("css selector", "details"):
         browser.run("arguments[0].open = true", details)
     found = violations(browser)

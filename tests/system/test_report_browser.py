@@ -85,10 +85,35 @@ def test_the_summary_has_the_numbers_of_the_file(opened: Browser, folder: Path) 
     )
     with (folder / "summary.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    assert [name for name, _ in shown] == [row["configuration"] for row in rows] == NAMES
-    for (_, cells), row in zip(shown, rows, strict=True):
+    assert [row["configuration"] for row in rows] == NAMES
+    assert [name for name, _ in shown] == ["GT", "half", NAMES[1], "hit", "never"], "the soonest first, as in figures"
+    by_name = {row["configuration"]: row for row in rows}
+    for configuration, cells in shown:
         assert len(cells) == 7
-        assert cells == {name: row[name] for name in cells}
+        assert cells == {name: by_name[configuration][name] for name in cells}
+
+
+def test_a_header_sorts_its_table(opened: Browser) -> None:
+    names = 'return [...document.querySelectorAll("#summary tbody tr")].map((row) => row.dataset.row)'
+    before = opened.run(names)
+    press = 'document.querySelectorAll("#summary thead button")[1].click()'
+    opened.run(press)
+    opened.run(press)
+    assert opened.run(names) == before[::-1], "the latest first"
+    assert opened.run('return document.querySelectorAll("#summary thead th")[1].ariaSort') == "descending"
+    opened.run(press)
+    assert opened.run(names) == before
+
+
+def test_pointing_at_a_row_shows_its_configuration_in_figures(opened: Browser) -> None:
+    strong = """document.querySelector(`#summary tr[data-row="${arguments[0]}"]`)
+        .dispatchEvent(new PointerEvent("pointerover", {bubbles: true}));
+      return [...document.querySelectorAll('#curves [id*="-configuration-"]')]
+        .filter((one) => getComputedStyle(one).opacity === "1").map((one) => Number(one.id.split("-")[2]))"""
+    assert set(opened.run(strong, "half")) == {2}
+    every = """document.querySelector("h1").dispatchEvent(new PointerEvent("pointerover", {bubbles: true}));
+      return document.querySelectorAll(".pointed, .at").length"""
+    assert opened.run(every) == 0
 
 
 def test_names_in_figures_do_nothing(opened: Browser) -> None:

@@ -1,7 +1,7 @@
-"""Figure of curves: share of objects detected over the time since the onset, with 95 % bands, by configuration.
+"""Figure of curves: share of objects not yet known over the time since the onset, with 95 % bands, by configuration.
 
-The curves are cumulative incidences of detection (Aalen–Johansen, departure competing: `metrics/survival.py`): objects
-that are never detected keep them below 100 %.
+The curves are what cumulative incidences of detection (Aalen–Johansen, departure competing: `metrics/survival.py`)
+leave of 100 %: objects that are never detected keep them above 0.
 
 Bands are those of `metrics/figure_limits.py`. Letters of the shapes: n rows, M steps of a curve.
 """
@@ -73,7 +73,7 @@ class DetectionCurve:
 
 
 def curves_figure(results: Results, *, configurations: Sequence[str] | None = None) -> Figure:
-    """Share detected over the time since the onset, of up to twelve configurations that differ.
+    """Share not yet known over the time since the onset, of up to twelve configurations that differ.
 
     With 95 % bands for up to `MOST_BANDS` configurations, and with exact curves if the results have them.
     """
@@ -139,26 +139,46 @@ def _draw_curves(
     begin_s, end_s = choose_time_limits([*curves.values(), *exact.values()])
     figure = new_figure(8.0, 4.5)
     axes = figure.subplots()
-    handles: list[Any] = []
     numbers = {name: k for k, name in enumerate(looks)}
     for name, curve in curves.items():
         with mark_configuration(numbers[name], axes):
             _draw_band(axes, curve, name, looks[name], begin_s, end_s)
-            handles += _draw_step(axes, curve, begin_s, end_s, label=name, zorder=2.2, **looks[name].line())
-    for k, (name, curve) in enumerate(exact.items()):
+            _draw_step(axes, curve, begin_s, end_s, label=name, zorder=2.2, **looks[name].line())
+    for name, curve in exact.items():
         with mark_configuration(numbers[name], axes):
-            lines = _draw_step(axes, curve, begin_s, end_s, label="exact", zorder=3, **_EXACT)
-        handles += lines if k == 0 else []
+            _draw_step(axes, curve, begin_s, end_s, label="exact", zorder=3, **_EXACT)
     _set_up_axes(axes, begin_s, end_s)
+    places = spread_labels([1 - _evaluate_share(curve, end_s) for curve in curves.values()])
+    for (name, curve), place in zip(curves.items(), places, strict=True):
+        with mark_configuration(numbers[name], axes):
+            _draw_label(axes, short[name], looks[name], (end_s, 1 - _evaluate_share(curve, end_s)), place)
     axes.set_xlabel("Time since the onset (s)")
-    axes.set_ylabel("Share detected by then")
-    figure.legend(
-        handles=handles,
-        labels=[*(short[name] for name in curves), *(["exact"] if exact else [])],
-        loc="outside right upper",
-        handlelength=3.6,
-    )
+    axes.set_ylabel("Share not yet known")
     return figure
+
+
+_APART = 0.05
+"""Least distance of two labels at the ends of lines, as a share of the axis: the height of their letters."""
+
+
+def spread_labels(ends: Sequence[float]) -> list[float]:
+    """Places of labels at the ends of lines, in their order and `_APART` or more apart, the lowest at its end."""
+    places = [0.0] * len(ends)
+    lowest = -math.inf
+    for k in sorted(range(len(ends)), key=lambda k: ends[k]):
+        lowest = places[k] = max(ends[k], lowest + _APART)
+    over = max([0.0, *(place - 1.02 for place in places)])
+    return (
+        [place - over for place in places] if over and max(ends, default=0) - min(ends, default=0) < _APART else places
+    )
+
+
+def _draw_label(axes: Axes, name: str, look: Appearance, end: tuple[float, float], place: float) -> None:
+    """Write a name at the end of its line, right of the axis, with a thin line from one to the other."""
+    begin_s, end_s = axes.get_xlim()
+    beside = end[0] + 0.03 * (end_s - begin_s)
+    axes.plot([end[0], beside], [end[1], place], color=look.edge, linewidth=0.8, clip_on=False)
+    axes.text(beside, place, f" {name}", va="center", ha="left", fontsize=8.5, clip_on=False)
 
 
 def _set_up_axes(axes: Axes, begin_s: float, end_s: float) -> None:
@@ -171,6 +191,7 @@ def _draw_band(axes: Axes, curve: DetectionCurve, name: str, look: Appearance, b
     if curve.low is None or curve.high is None:
         return
     x, low, high = (_step_vertices(curve.times_s, values, begin_s, end_s) for values in (None, curve.low, curve.high))
+    low, high = 1 - high, 1 - low
     axes.fill_between(
         x, low, high, step="post", color=look.colour, alpha=0.2, linewidth=0, zorder=1, label=f"band of {name}"
     )
@@ -188,7 +209,7 @@ def choose_time_limits(curves: Sequence[DetectionCurve]) -> tuple[float, float]:
 
 def _draw_step(axes: Axes, curve: DetectionCurve, begin_s: float, end_s: float, **line: Any) -> list[Any]:
     x, y = (_step_vertices(curve.times_s, values, begin_s, end_s) for values in (None, curve.share))
-    return axes.step(x, y, where="post", **line)
+    return axes.step(x, 1 - y, where="post", **line)
 
 
 def _step_vertices(times_s: Float, values: Float | None, begin_s: float, end_s: float) -> Float:
@@ -226,9 +247,9 @@ def _add_caption(
             left,
             describe_results(results, names),
             describe_list_rates(results.summary, names),
-            "Cumulative incidence of detection: what departs undetected is never detected",
+            "What departs undetected is never known (Aalen–Johansen, departure competing)",
             bands,
-            "Dashed: the exact share detected by then" if exact else "",
+            "Dashed: the exact share" if exact else "",
             f"Beyond the axis at most {math.ceil(1000 * later) / 10:g} % more are detected" if later > 0 else "",
         ],
     )

@@ -102,13 +102,13 @@ FIGURES: dict[str, FigureKind] = {
     ),
     "curves": FigureKind(
         "How soon",
-        "share detected over the time since the clock started, a line per configuration",
+        "share not yet known over the time since the clock started, a line per configuration",
         lambda results, of: curves_figure(results, configurations=of.configurations),
         about=lambda results: (
-            "A curve gives the share of all rows (measured objects × runs × logs) that are detected this long after "
-            "the onset: the cumulative incidence of detection (Aalen–Johansen, departure competing). Objects that "
-            "leave the scene undetected count as never detected and keep the curve below 100 %. Where lines coincide, "
-            "the thinner ones are on top.",
+            "A curve gives the share of all rows (measured objects × runs × logs) that are not yet known this long "
+            "after the onset, the lower the better: 100 % less the cumulative incidence of detection (Aalen–Johansen, "
+            "departure competing). Objects that leave the scene undetected keep the curve above 0. Where lines "
+            "coincide, the thinner ones are on top.",
         ),
     ),
     "late_paths": FigureKind(

@@ -61,7 +61,7 @@ def choose_object_and_run(results: Results, selection: Selection) -> Choice:
     """The selected object, run and configurations.
 
     By default these are the most telling object that counts (`find_most_telling`), the run shown in the .rrd, else the
-    first, and four configurations from worst to best. Any object may be named. Raises InputError for a selection that
+    first, and four configurations from best to worst. Any object may be named. Raises InputError for a selection that
     is not among the results.
     """
     known = results.tally[results.tally["event"] == DETECTED]
@@ -87,7 +87,7 @@ def choose_object_and_run(results: Results, selection: Selection) -> Choice:
     shown = (
         present_names
         if selection.configurations
-        else pick_worst_to_best(rows[rows["object_id"] == object_id], present_names)
+        else pick_best_to_worst(rows[rows["object_id"] == object_id], present_names)
     )
     return Choice(log, object_id, run, shown, bool(selection.configurations))
 
@@ -171,8 +171,8 @@ def describe_left_out(names: Sequence[str], shown: Sequence[str]) -> str:
     return f"{len(shown)} of {len(names)} configurations, from the soonest to the latest; not drawn: {', '.join(left)}"
 
 
-def pick_worst_to_best(rows: pd.DataFrame, names: Sequence[str]) -> tuple[str, ...]:
-    """Up to four configurations from worst to best, by the share of rows that pass, then by mean time to detection.
+def pick_best_to_worst(rows: pd.DataFrame, names: Sequence[str]) -> tuple[str, ...]:
+    """Up to four configurations from best to worst, by the share of rows that pass, then by mean time to detection.
 
     An object that is never detected counts as the longest episode.
     """
@@ -182,5 +182,5 @@ def pick_worst_to_best(rows: pd.DataFrame, names: Sequence[str]) -> tuple[str, .
     if "conflict" in rows and rows["conflict"].any():
         passes = rows["braking_pass"].astype(float).groupby(rows["configuration"]).mean()
     # Of equal ones the first ranks better: usually that is the truth.
-    ranked = sorted(names, key=lambda name: (passes[name], -late_s[name], -names.index(name)))
+    ranked = sorted(names, key=lambda name: (-passes[name], late_s[name], names.index(name)))
     return pick_evenly(ranked, _COLUMNS)

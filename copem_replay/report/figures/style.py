@@ -202,8 +202,28 @@ def add_note(figure: Figure, sentences: Sequence[str]) -> float:
     engine = figure.get_layout_engine()
     if engine is not None:
         engine.set(rect=(0, below, 1, 1 - below))  # type: ignore[call-arg]
-    figure.text(0.1 / width_in, 0.06 / height_in, "\n".join(lines), fontsize=NOTE_PT, color="0.3", va="bottom")
+    figure.text(
+        0.1 / width_in, 0.06 / height_in, "\n".join(lines), fontsize=NOTE_PT, color="0.3", va="bottom", gid=_NOTE
+    )
     return below_in
+
+
+_NOTE = "note"
+"""What tells the text of a note from others of a figure."""
+
+
+def take_note(figure: Figure) -> str:
+    """Take the note from a figure, with the space it was in: a page has it as a text of its own. Empty without one."""
+    notes = [text for text in figure.texts if text.get_gid() == _NOTE]
+    engine = figure.get_layout_engine()
+    if not notes or engine is None:
+        return ""
+    words = notes[0].get_text()
+    notes[0].remove()
+    engine.set(rect=(0, 0, 1, 1))  # type: ignore[call-arg]
+    below_in = (words.count("\n") + 1) * NOTE_PT * 1.3 / 72 + 0.12
+    figure.set_size_inches(figure.get_size_inches()[0], figure.get_size_inches()[1] - below_in)
+    return " ".join(words.replace("\u00a0", " ").split("\n"))
 
 
 # Words of figures: names that fit, numbers of rows, list rates, formats of numbers.
@@ -269,8 +289,18 @@ def format_per_cent(share: float) -> str:
 
 
 def format_three_digits(value: float) -> str:
-    """A number to three significant digits; whole from 1000 on, 0 below 10⁻⁹."""
+    """A number to three significant digits; whole from 1000 on, 0 below 10⁻⁹, and no exponent below 10⁻³."""
+    if 1e-9 <= abs(value) < 1e-3:
+        return "< 0.001" if value > 0 else "> −0.001"
     return "0" if abs(value) < 1e-9 else f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}".replace("-", "−")
+
+
+def format_two_decimals(value: float) -> str:
+    """A number with two decimals, as those below each other in a table; whole from 1000 on, never `−0.00`."""
+    if 1e-9 <= abs(value) < 5e-3:
+        return "< 0.01" if value > 0 else "> −0.01"
+    shown = "0.00" if abs(value) < 1e-9 else f"{value:.0f}" if abs(value) >= 1000 else f"{value:.2f}"
+    return shown.replace("-", "−")
 
 
 def describe_over(results: Results) -> str:

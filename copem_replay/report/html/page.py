@@ -13,7 +13,7 @@ from copem_replay.core.errors import OutputError, RecordingError
 from copem_replay.core.files import atomic_file
 from copem_replay.report.figures.registry import FIGURES
 from copem_replay.report.figures.selection import Selection
-from copem_replay.report.figures.style import Appearance, render_figure
+from copem_replay.report.figures.style import Appearance, render_figure, take_note
 from copem_replay.report.html.conclusions import write_details, write_lead
 from copem_replay.report.html.markup import (
     Html,
@@ -26,6 +26,7 @@ from copem_replay.report.html.markup import (
     replace_colours,
     replace_greys,
 )
+from copem_replay.report.html.player import player_section
 from copem_replay.report.html.setup import (
     describe_configurations,
     describe_question,
@@ -129,12 +130,14 @@ def figure_element(name: str, figure: Figure, title: str, shows: str, looks: Ite
 
     `shows`: text for screen readers. `looks`: of configurations, whose colours are others on a dark page.
     """
+    note = take_note(figure)
     svg = render_figure(figure, (".svg",))[".svg"].decode("utf-8")
     svg = _NOT_DRAWN.sub("", svg[svg.index("<svg ") :])  # comments repeat texts of users without escapes
     svg = _SIZE.sub(_enlarge, _IDS.sub(f"{name}-", svg), count=1)
     svg = replace_greys(replace_colours(svg, looks))
     plot = make_tag("div", Html(svg), id_=name, class_="plot", role="img", aria_label=shows)
-    return make_tag("div", plot, class_="scroll figure", tabindex="0", role="region", aria_label=title)
+    drawn = make_tag("div", plot, class_="scroll figure", tabindex="0", role="region", aria_label=title)
+    return join_html([drawn, make_tag("div", note, class_="below note")]) if note else drawn
 
 
 _ANSWER, _DIFFERENCES = "answer", "differences"
@@ -158,6 +161,7 @@ def build_page(study: ReportData) -> str:
         *_verdict_sections(study),
         _Section("differences-of-it", "Differences", _difference_parts(study)),
         *([_Section("stories", "Stories of single objects", story_parts(study))] if measured else []),
+        *([_Section("play", "One run, side by side", [player])] if (player := player_section(study)) else []),
         *_figure_sections(study, ("late_paths", "trade_off")),
         _Section(
             "configurations-of-it",

@@ -12,7 +12,7 @@ from copem_replay.core.errors import count_noun
 from copem_replay.metrics.slices import describe_chance
 from copem_replay.metrics.summary import EPISODE
 from copem_replay.report.figures.slices import MOST_GROUPS
-from copem_replay.report.figures.style import format_per_cent, format_three_digits
+from copem_replay.report.figures.style import format_per_cent, format_two_decimals
 from copem_replay.report.html.markup import (
     Html,
     allow_breaks,
@@ -109,7 +109,7 @@ def _object_table(rows: pd.DataFrame, names: list[str]) -> Html:
         head = make_tag("th", f"{of[0]}{f' ({of[1] + 1})' if of[1] else ''}", scope="row")
         cells = [make_tag("td", str(episode["object_class"]), class_="text")]
         cells += [
-            make_tag("td", format_three_digits(float(episode[name]))) for name in ("onset_s", "distance_at_onset_m")
+            make_tag("td", format_two_decimals(float(episode[name]))) for name in ("onset_s", "distance_at_onset_m")
         ]
         cells += [make_tag("td", _when_known(found.get((*of, name)))) for name in names]
         lines.append(make_tag("tr", head, *cells))
@@ -123,4 +123,4 @@ def _when_known(found: tuple[float, float] | None) -> str:
     share, mean_s = found
     if not share:
         return "never"
-    return f"{format_three_digits(mean_s)} s" + ("" if share == 1 else f" in {format_per_cent(share)} %")
+    return f"{format_two_decimals(mean_s)} s" + ("" if share == 1 else f" in {format_per_cent(share)} %")

@@ -96,6 +96,12 @@ class ReportData:
         """Configurations that are not the truth; all, if there are no others."""
         return find_contenders(self.results)
 
+    @cached_property
+    def ranked(self) -> tuple[str, ...]:
+        """All configurations as figures have them: the truth, then the soonest first."""
+        truths = tuple(name for name in self.names if name not in self.contenders)
+        return (*truths, *sort_soonest_first(self.results, self.contenders))
+
     @property
     def looks(self) -> dict[str, Appearance]:
         """How each configuration is drawn."""

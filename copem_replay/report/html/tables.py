@@ -1,6 +1,6 @@
 """Tables: summary, differences, missed objects and stages of the latency, with the meaning of their columns.
 
-Cells have three significant digits; `data-value` holds the number of `summary.csv`.
+Cells have two decimals, shares three significant digits; `data-value` holds the number of `summary.csv`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from copem_replay.metrics.summary_metrics import COMPARED, METRIC, METRICS, PART
 from copem_replay.metrics.survival import EndReason
 from copem_replay.report.figures.differences import excludes_0
 from copem_replay.report.figures.latency_breakdown import STAGES, count_detected, mean_stages_by_configuration
-from copem_replay.report.figures.style import format_per_cent, format_three_digits
+from copem_replay.report.figures.style import format_per_cent, format_three_digits, format_two_decimals
 from copem_replay.report.html.markup import (
     Html,
     allow_breaks,
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from copem_replay.results.compare import Comparison
 
 
-# Headers of columns and formats of their values: three significant digits, shares in per cent.
+# Headers of columns and formats of their values: two decimals, counts whole, shares in per cent.
 
 _HEADERS = {name: metric.header for name, metric in (METRIC | COMPARED).items() if metric.header}
 _UNITS = {
@@ -80,7 +80,12 @@ def format_value(name: str, value: float) -> str:
     """A value of a column; NaN as a dash."""
     if value != value:
         return "–"
-    return format_per_cent(value) if is_share(name) else format_three_digits(value)
+    if name in _COUNTS:
+        return f"{value:.0f}"
+    if is_share(name):
+        shown = format_per_cent(value)
+        return shown if shown.startswith(("<", ">")) else f"{100 * value:.1f}"
+    return format_two_decimals(value)
 
 
 def difference_column_header(name: str) -> str:
@@ -89,7 +94,9 @@ def difference_column_header(name: str) -> str:
 
 
 def format_difference(name: str, value: float) -> str:
-    """A limit of a difference, in the unit of its column."""
+    """A limit of a difference, in the unit of its column; without a column, as in sentences, to three digits."""
+    if name and not is_share(name):
+        return format_two_decimals(value)
     return format_three_digits(value * (100 if is_share(name) else 1))
 
 
@@ -140,8 +147,8 @@ def _common_values(rows: pd.DataFrame, names: Sequence[str]) -> list[str]:
 
 def _summary_table(study: ReportData, part: str, columns: dict[str, str]) -> Html:
     rows = []
-    for row in study.results.summary.to_dict("records"):
-        cells = [_summary_cell(row, name) for name in columns]
+    for _, row in study.results.summary.set_index("configuration", drop=False).loc[list(study.ranked)].iterrows():
+        cells = [_summary_cell(row.to_dict(), name) for name in columns]
         rows.append(
             make_tag("tr", row_head(study, str(row["configuration"])), *cells, data_row=str(row["configuration"]))
         )
@@ -214,7 +221,8 @@ def regret_table(study: ReportData) -> Html:
         reason = "no object is measured" if study.best is None else "there is one configuration only"
         return make_tag("p", f"No differences: {reason}.")
     rows = {(row.configuration, row.metric): row for row in regret.overall.itertuples(index=False)}
-    metrics = sort_columns([m for m in COMPARED if any((name, m) in rows for name in regret.configurations)])
+    compared = [name for name in study.ranked if name in regret.configurations]
+    metrics = sort_columns([m for m in COMPARED if any(_is_compared(rows.get((name, m))) for name in compared)])
     words = [(m, f"{of.words}; {'more' if COMPARED[m].better > 0 else 'less'} is better") for m in metrics
              if (of := COMPARED[m].compared)]  # fmt: skip
     tables = []
@@ -226,7 +234,7 @@ def regret_table(study: ReportData) -> Html:
             make_tag(
                 "tr", row_head(study, name), *(_difference_cell(rows.get((name, m)), m) for m in columns), data_row=name
             )
-            for name in regret.configurations
+            for name in compared
         ]
         head = ["configuration", *map(difference_column_header, columns)]
         tables += (
@@ -244,6 +252,11 @@ def regret_table(study: ReportData) -> Html:
             ),
         ]
     )
+
+
+def _is_compared(row: Any) -> bool:
+    """Whether there is a difference: a column without any is left out."""
+    return row is not None and bool(pd.notna(row.difference))
 
 
 def _held_table(study: ReportData, regret: Comparison) -> Html:
@@ -422,12 +435,12 @@ def _stages_table(
     study: ReportData, means: dict[str, dict[str, float]], stages: list[str], detected: dict[str, tuple[int, int]]
 ) -> Html:
     rows = []
-    for name in study.names:
+    for name in study.ranked:
         figures = [*(means[name].get(stage) for stage in stages), sum(means[name].values()) if means[name] else None]
         cells = [
             make_tag(
                 "td",
-                "–" if value is None else format_three_digits(value),
+                "–" if value is None else format_two_decimals(value),
                 data_column=stage,
                 data_value=full_number(value) or "",
             )
