@@ -177,7 +177,7 @@ def _draw_label(axes: Axes, name: str, look: Appearance, end: tuple[float, float
     """Write a name at the end of its line, right of the axis, with a thin line from one to the other."""
     begin_s, end_s = axes.get_xlim()
     beside = end[0] + 0.03 * (end_s - begin_s)
-    axes.plot([end[0], beside], [end[1], place], color=look.edge, linewidth=0.8, clip_on=False)
+    axes.plot([end[0], beside], [end[1], place], color=look.colour, linewidth=0.8, clip_on=False)
     axes.text(beside, place, f" {name}", va="center", ha="left", fontsize=8.5, clip_on=False)
 
 
