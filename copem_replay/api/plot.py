@@ -98,7 +98,7 @@ def write_figures(
 
     >>> files, notes = cr.plot.write_figures("out/tc016d", "figures", configurations=["GT", "PEM"])
     >>> sorted({file.stem for file in files})
-    ['answer', 'curves', 'differences', 'distances', 'latency_breakdown', 'runs']
+    ['answer', 'curves', 'differences', 'distances', 'late_paths', 'latency_breakdown', 'runs']
     """
     from copem_replay.report.figures.registry import write_figure_files
     from copem_replay.report.figures.selection import Selection

@@ -34,6 +34,9 @@ class Explanation:
     `causes`: seconds of each configuration by cause. `units`: what each of its units is worth. `triage`: its late
     episodes in groups, those that cost most first. `sensitivity`: time unknown by variation of the PEMs, run by run;
     `orders`: pairs that change order. `notes`: what was left out, and why. Columns: docs/guide/why.md.
+
+    >>> cr.Explanation(notes=("nothing was asked for",)).files
+    {}
     """
 
     causes: pd.DataFrame | None = None

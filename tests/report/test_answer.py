@@ -275,7 +275,7 @@ class TestWhichObject:
         chosen = choose_object_and_run(with_rows(two, table, tmp_path / "without"), Selection(run=run))
         assert spread[chosen.object_id] == spread.max()
         assert len(chosen.configurations) == 4
-        assert (chosen.configurations[0], chosen.configurations[-1]) == ("never", "GT")
+        assert (chosen.configurations[0], chosen.configurations[-1]) == ("GT", "never")
 
 
 class TestLooks:
