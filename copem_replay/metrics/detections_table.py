@@ -11,10 +11,9 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from copem_replay.core.interpolation import interpolate_states
@@ -30,6 +29,9 @@ from copem_replay.metrics.onset import began_texts
 from copem_replay.metrics.survival import end_reason_texts
 from copem_replay.perception.visibility import rectangle_corners
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 
 def concatenate_columns(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Columns by name, those of each part one beneath the other. All parts have the columns of the first."""
@@ -38,6 +40,8 @@ def concatenate_columns(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 def build_frame(columns: Mapping[str, Any]) -> pd.DataFrame:
     """Columns as a table; `braking_pass` is null where the episode is not in conflict."""
+    import pandas as pd
+
     rows = dict(columns)
     if "braking_pass" in rows:
         rows["braking_pass"] = pd.arrays.BooleanArray(rows["braking_pass"], ~rows["conflict"])
@@ -298,6 +302,8 @@ def measure_distances(
 
     Runs share objects and instants: each pair is computed once.
     """
+    import pandas as pd
+
     distance_m, gap_m = np.full(len(time_s), np.nan), np.full(len(time_s), np.nan)
     timed = np.flatnonzero(~np.isnan(time_s))
     if not len(timed):

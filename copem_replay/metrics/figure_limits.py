@@ -14,10 +14,9 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
-import pandas as pd
 
 from copem_replay.core.tracks import Bool, Float, Int
 from copem_replay.metrics.intervals import (
@@ -50,6 +49,9 @@ from copem_replay.metrics.survival import (
     restricted_means_without,
 )
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 # Clusters of rows.
 
 _SAME = 1e-9
@@ -67,12 +69,16 @@ class RowClusters:
     @cached_property
     def number(self) -> Int:
         """(n,) the cluster of each row, 0 … K − 1 in the order of their names."""
+        import pandas as pd
+
         number: Int = pd.factorize(np.asarray(self.name), sort=True)[0]
         return number
 
     @cached_property
     def weights(self) -> Float:
         """(K,) objects of each cluster; runs count one each."""
+        import pandas as pd
+
         size = int(self.number.max(initial=-1)) + 1
         if self.over == "runs":
             return np.ones(size)
@@ -88,6 +94,8 @@ class RowClusters:
     @cached_property
     def looks(self) -> float:
         """Objects that a run looks at."""
+        import pandas as pd
+
         return float(len(pd.unique(np.asarray(self.object))))
 
 

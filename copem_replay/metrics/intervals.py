@@ -16,11 +16,15 @@ docs/guide/metrics.md. Functions of arrays take any leading axes (…). Letters 
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-import pandas as pd
 
 from copem_replay.core.errors import count_noun
 from copem_replay.core.tracks import Float, Int
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 FEWEST_LOGS = 3
 """From so many logs on intervals are over logs."""

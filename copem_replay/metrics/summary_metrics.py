@@ -10,10 +10,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from operator import attrgetter, itemgetter
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from copem_replay.core.tracks import Bool, Float
@@ -31,6 +30,9 @@ from copem_replay.metrics.survival import (
     quantile_with_never,
     restricted_mean,
 )
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @dataclass(frozen=True)
@@ -119,6 +121,8 @@ class ShareEstimate:
 
 def _estimate_share(part: pd.DataFrame, successes: NDArray[np.int64], *, fixed: bool) -> ShareEstimate:
     """The share of `successes (n,)` among the runs of the tally's rows (n,). `fixed`: equal in every run."""
+    import pandas as pd
+
     n, total = int(part["runs"].sum()), int(successes.sum())
     share = total / n if n else None
     over, cluster = choose_clusters(part)

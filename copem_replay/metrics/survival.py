@@ -17,13 +17,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from copem_replay.core.tracks import Bool, Float, Int
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 CENSORED = 0
 """The ego left or the log ended: the object was still there to be detected."""

@@ -13,10 +13,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from copem_replay.communication.link import UnitLinks, delay_until_ready, sample_arrivals, transmit
 from copem_replay.communication.radio import Radio
@@ -39,6 +38,9 @@ from copem_replay.perception.pem.model import Pem
 from copem_replay.pipeline.expansion import ExpandedExperiment, find_facts
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.sweep import list_points
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 # Detection that lasts: which units share a held number, and whether that has a closed form.
 
@@ -226,6 +228,8 @@ def exact_table(replay: Replay, experiment: Experiment) -> pd.DataFrame:
 
     Raises ExperimentError for a configuration that has no closed form.
     """
+    import pandas as pd
+
     braking = experiment.braking
     if braking is not None and braking.brakes_for == "conflict":
         raise ExperimentError(

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import pandas as pd
 
 from copem_replay.core.tracks import TRUTH, Bool, Int, Tracks, splice_rows
 from copem_replay.experiment.schema import Experiment
@@ -33,6 +32,9 @@ from copem_replay.pipeline.prepare import ROWS_A_CHUNK, Replay
 from copem_replay.pipeline.receiver import Receivers, states_needed
 from copem_replay.pipeline.scoring import ConfigurationScores, Judge
 from copem_replay.pipeline.world import States, Transmission, has_channel
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 BLOCK_BYTES = 200_000_000
 """Bytes that a block may hold. Larger: fewer blocks, and more memory for each worker."""

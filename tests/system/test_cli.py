@@ -166,6 +166,15 @@ class TestInstalled:
         assert done.returncode == 0
         assert done.stdout
 
+    def test_a_check_needs_no_tables(self, here: Path) -> None:
+        code = (
+            "import sys; from copem_replay.cli import main as cli; code = cli._run_to_exit_code(); "
+            "heavy = {'pandas', 'rerun', 'pyarrow', 'matplotlib'} & sys.modules.keys(); "
+            "sys.exit(f'imported {heavy}' if heavy else code)"
+        )
+        done = subprocess.run([sys.executable, "-c", code, "check", "e.yaml"], cwd=here, capture_output=True, text=True)
+        assert (done.stderr, done.returncode) == ("", 0)
+
     def test_run(self, here: Path) -> None:
         done = installed("run", "e.yaml", folder=here)
         assert done.returncode == 0
