@@ -53,6 +53,8 @@ STEADY_S = 0.4
 """Shorter spans become part of those around them: their words could not be read."""
 MARK = 1 / 40
 """Length of the mark that ends at the onset, as a share of the axis: just wide enough for both halves."""
+FLAG = 6
+"""Length of words such as “0.60 s known”, as a multiple of the mark's."""
 ONSET_IS = ("onset", "onset of the object")
 """The two halves of the mark."""
 _STEADY_NS = round(STEADY_S * 1e9)
@@ -87,7 +89,7 @@ def write_lanes(
             texts = [_span_text(ids, units, sight, status, m, span) for span in spans]
             begins = status.elapsed_ns[[span.first for span in spans]]
             onset_ns = int(clocks[name].onset_ns[k])
-            _add_flag(begins, texts, int(clocks[name].known_ns[k]), onset_ns)
+            _add_flag(begins, texts, int(clocks[name].known_ns[k]), onset_ns, FLAG * mark_ns)
             tints = [status_colour(span.status, colours[name]) if span.status else ONSET[0] for span in spans]
             style = {text: tint for text, tint in zip(texts, tints, strict=True) if text}
             style |= dict(zip(ONSET_IS, ONSET, strict=True))
@@ -140,11 +142,15 @@ def _span_text(
     return lane_text(span.status, units[by], body_name(ids, sight.solids, what))
 
 
-def _add_flag(begins: Int, texts: list[str | None], known_ns: int, onset_ns: int) -> None:
-    """Say how long after the onset the object is first known, where that begins: “0.60 s known”."""
-    first = np.flatnonzero(begins == known_ns)
-    if len(first):
-        texts[first[0]] = f"{(known_ns - onset_ns) / 1e9:.2f} s {texts[first[0]]}"
+def _add_flag(begins: Int, texts: list[str | None], known_ns: int, onset_ns: int, room_ns: int) -> None:
+    """Say how long after the onset the object is first known, where that begins: “0.60 s known”.
+
+    Where that lasts for less than `room_ns`, too short for words, what follows says it, too.
+    """
+    for k in np.flatnonzero(begins == known_ns)[:1].tolist():
+        texts[k] = flag = f"{(known_ns - onset_ns) / 1e9:.2f} s {texts[k]}"
+        if k + 1 < len(texts) and texts[k + 1] is not None and begins[k + 1] - known_ns < room_ns:
+            texts[k + 1] = f"{flag}, then {texts[k + 1]}"
 
 
 def _add_name(

@@ -87,7 +87,7 @@ def write_rrd(
     """Write one run of one log to a file and, with an address, to a viewer. Returns notes. Raises OutputError.
 
     More than six configurations go into several files, such as `replay.configurations_7-12.rrd`; the ground truth is
-    none of them, unless it is alone or the baseline. Colours depend on all of the experiment's configurations, also on
+    none of them, unless it is alone or compared. Colours depend on all of the experiment's configurations, also on
     those that are not written.
 
     `run_tracks`: by time chunk, the receiver's fused tracks of each configuration in this run, with a frame per issued
@@ -98,9 +98,9 @@ def write_rrd(
     later_chunks = iter(run_tracks)
     first = next(later_chunks)
     truths = [name for name, asked in experiment.configurations.items() if asked.units == TRUTH]
-    # The truth is in every view, so it needs none of its own.
-    names = [name for name in first if name not in truths or name == baseline] or list(first)
-    parts = split_into_files(names, baseline)
+    # The truth is in every view, so it needs none of its own; configurations that are compared were chosen.
+    beside = [name for name in first if name not in truths] if baseline is None else []
+    parts = split_into_files(beside or list(first), baseline)
     collector = TrackCollector(_measured_indices(replay, table, truths))
     objects = collector.object_ix.tolist()
     with ExitStack() as stack:

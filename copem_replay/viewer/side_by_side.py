@@ -145,6 +145,9 @@ def write_side_by_side(
     all_results = read_folders(folders)
     check_comparable(all_results)
     chosen = choose_configurations(label_configurations(all_results), configurations, baseline)
+    if configurations is None:  # the truth is in every view: beside others it is left out
+        beside = [choice for choice in chosen[1:] if not choice.results.facts[choice.configuration].truth]
+        chosen = (chosen[0], *(beside or chosen[1:]))
     labels = [choice.label for choice in chosen]
     _check_one_recording(list(dict.fromkeys(choice.results for choice in chosen)))
     used = [check_complete(results) for results in dict.fromkeys(choice.results for choice in chosen)]

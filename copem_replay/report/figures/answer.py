@@ -132,7 +132,7 @@ def _draw_truth_line(axes: Axes, values: dict[str, float], unit: str) -> None:
     """Draw the ground truth as dashed lines with their values: an upper bound, not ranked."""
     for name, value in values.items():
         if not np.isnan(value):
-            axes.axvline(value, color="0.45", linewidth=1.2, linestyle=(0, (4, 2)), zorder=1, label=name)
+            axes.axvline(value, color="0.45", linewidth=0.75, linestyle=(0, (4, 2)), zorder=1, label=name)
     shown = ", ".join(
         f"{short} {format_three_digits(values[name])}{unit}" for name, short in shorten_names(list(values)).items()
     )
