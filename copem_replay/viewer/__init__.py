@@ -12,7 +12,8 @@
 | `world/eyes/ego`, `world/eyes/<object>` | origins of the views that follow ego or object |
 | `lanes/<object>/<place>_<configuration>` | the object's status (`viewer/status.py`), a mark at the onset |
 | `lists/<place>_<configuration>/<unit>` | lost, late and overtaken lists of a unit that sends by a link |
-| `plots/visible_share/<object>/…` | visible share from the ego's units, and from the best of all units |
+| `world/<configuration>/false` | entries about no object: dashed outlines with a cross |
+| `plots/visible_share/<object>/…` | visible share from the ego's units, and the best of all; `…_outside`: out of view |
 | `plots/visible_share/<object>/mark_1`, … | onset and detections on these curves |
 | `plots/position_error/<object>/<configuration>` | fused to true position: running quartiles |
 | `plots/gospa/<configuration>`, `plots/known/<configuration>` | of all measured objects: GOSPA, number known |

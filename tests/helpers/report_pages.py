@@ -165,7 +165,7 @@ class Page(HTMLParser):
             self._plot = None
         if tag in ("td", "th"):
             self.rows[self._table][-1].append(self._cell.text)
-        if tag in ("p", "li", "h1", "h2", "h3", "summary"):
+        if tag in ("p", "li", "h1", "h2", "h3", "summary", "div"):
             self.words += "\n"
         if tag == "header":
             self.head = self.words[self._header :]

@@ -246,13 +246,13 @@ class TestWords:
             "Nothing is shown to be better than late (100 % of conflicts pass); no difference shown: half 100 %; "
             "worse: hit and never 0 %."
         )
-        assert lines[3] == (
+        assert lines[4] == (
             f"half detects soonest, after {mean_s:.3g} s on average (an object that is never detected counts as "
             "4.5 s), sooner than the other 3."
         )
         difference = 0.5 - mean_s
-        assert lines[4].startswith(f"Later, the interval of the difference excluding 0: late (+{difference:.3g} s [")
-        assert lines[4].index("hit (") < lines[4].index("never (")
+        assert lines[5].startswith(f"Later, the interval of the difference excluding 0: late (+{difference:.3g} s [")
+        assert lines[5].index("hit (") < lines[5].index("never (")
         assert "The same figures pick the winner, which flatters it a little." in lines
         assert "never never detects any object." in lines
         assert any(
@@ -267,10 +267,10 @@ class TestWords:
         assert re.fullmatch(
             r"half has the shortest mean time, \S+ s "
             r"\(an object that is never detected counts as 4\.5 s\)\.",
-            lines[3],
+            lines[4],
         )
-        assert lines[4].startswith("Later, without an interval: late (+")
-        assert "[" not in lines[4]
+        assert lines[5].startswith("Later, without an interval: late (+")
+        assert "[" not in lines[5]
         assert lines[2].endswith(", on these objects alone: there is no interval.")
         assert "No interval: 2 objects of one drive, fewer than 5." in lines
         assert any(line.startswith("There are no intervals: 2 objects of one drive, fewer than 5. ") for line in lines)
@@ -287,7 +287,7 @@ class TestWords:
         lines = whole.lines()
         assert int(rows["half"]["n"]) == int(rows["late"]["n"]) / 2
         assert float(rows["half"]["ttd_rmst_s"]) < float(rows["late"]["ttd_rmst_s"])
-        assert "late has the shortest mean time" in lines[3]
+        assert "late has the shortest mean time" in lines[4]
         assert any(line.startswith("half is ranked last: some logs lack the units, and means and") for line in lines)
         assert any(line.startswith("Sooner by pairs, without an interval: half (−") for line in lines)
         assert not any(line.startswith("Later") and "half" in line for line in lines)
@@ -306,7 +306,7 @@ class TestWords:
     def test_who_is_alike_is_no_winner(self, tmp_path: Path) -> None:
         text = changed(ONE, ("  hit: {units: [ego], latency_s: 1.8}", "  hit: {units: [weak]}"), *ALONE[:2], ALONE[3])
         lines = lines_of(replayed(tmp_path, text))
-        assert re.match(r"half and hit detect at the same times: after ", lines[3])
+        assert re.match(r"half and hit detect at the same times: after ", lines[4])
         assert lines[2].startswith("No difference to half (an object is known after ")
         assert not any("No difference" in line or "includes 0" in line for line in lines[3:])
         assert "The same figures pick the winners, which flatters them a little." not in lines, "no loser"
@@ -317,14 +317,14 @@ class TestWords:
         lines = lines_of(replayed(tmp_path, changed(("  half: {units: [weak]}", "  half: {units: [ego]}"), second)))
         few = "No interval: 2 objects of one drive, fewer than 5."
         assert few in lines
-        assert lines[3] == "half and second detect every object at its onset. The other 2 are below."
-        assert re.match(r"Later, without an interval: late \(\+0\.5 s\), never \(\+4\.5 s\)\.", lines[4])
+        assert lines[4] == "half and second detect every object at its onset. The other 2 are below."
+        assert re.match(r"Later, without an interval: late \(\+0\.5 s\), never \(\+4\.5 s\)\.", lines[5])
         assert not any("shortest" in line or "soonest" in line for line in lines)
         three = ("  late: {units: [ego], latency_s: 0.5}", "  late: {units: [ego]}")
         text = changed(("  half: {units: [weak]}", "  half: {units: [ego]}"), second, three, ALONE[3])
         lines = lines_of(replayed(tmp_path / "all", text))
-        assert lines[3] == "late, half and second detect every object at its onset."
-        assert not lines[4].startswith("Later")
+        assert lines[4] == "late, half and second detect every object at its onset."
+        assert not lines[5].startswith("Later")
 
     def test_the_same_mean_at_other_times_is_a_tie_too(self, tmp_path: Path) -> None:
         """One unit sees only the one object, the other only the other: at once and never, whichever it is."""
@@ -338,7 +338,7 @@ class TestWords:
             ("  hit: {units: [ego], latency_s: 1.8}", "  hit: {units: [near]}"), ALONE[1], ALONE[3],
         )  # fmt: skip
         lines = lines_of(replayed(tmp_path, text))
-        assert lines[3] == (
+        assert lines[4] == (
             "hit and half have the same mean time, 0.05 s (an object that is never detected counts as 0.1 s), "
             "though they do not always detect at the same time."
         )
@@ -359,9 +359,9 @@ class TestWords:
         other = ("  eye: {", "  other: {on: ego, height_m: 1.8, pem: half}\n  eye: {")
         hit = ("  hit: {units: [ego], latency_s: 1.8}", "  hit: {units: [other]}")
         lines = lines_of(replayed(tmp_path, changed(ONE, other, hit, *ALONE[:2], ALONE[3])))
-        assert re.search(r", but the interval of its difference to (hit|half) includes 0\.$", lines[3])
-        assert re.match(r"No difference to it is shown, the interval including 0: (hit|half) \(\+0\.\d+ s \[", lines[4])
-        assert lines[4].endswith("]). That does not show that there is none.")
+        assert re.search(r", but the interval of its difference to (hit|half) includes 0\.$", lines[4])
+        assert re.match(r"No difference to it is shown, the interval including 0: (hit|half) \(\+0\.\d+ s \[", lines[5])
+        assert lines[5].endswith("]). That does not show that there is none.")
 
     @pytest.mark.parametrize(
         ("low", "high", "includes"),
@@ -399,7 +399,7 @@ class TestWords:
         assert re.fullmatch(
             r"hit and again detect at the same times: after \S+ s on average\. The interval of their difference to the "
             r"other includes 0\.",
-            lines[3],
+            lines[4],
         )
         assert re.search(r'half \(<span class="tight">\+\S+ s \[−\S+, \S+\]</span>\)', html), "no line breaks within"
 
@@ -410,7 +410,7 @@ class TestWords:
         assert "with the one configuration of perception units" in lines[1]
         assert lines[2].startswith("half: an object is known after ")
         assert lines[2].endswith(" of conflicts pass; there is nothing to compare it with.")
-        assert lines[3].endswith("There is nothing to compare it with: it is the only configuration.")
+        assert lines[4].endswith("There is nothing to compare it with: it is the only configuration.")
         assert "No differences: there is one configuration only." in found.words
         assert "regret" not in found.tables
         assert list(found.tables["summary"]) == ["half"]

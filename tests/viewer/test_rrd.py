@@ -552,8 +552,8 @@ def test_a_blueprint_inside_and_one_name_per_layout(made: Made, tmp_path: Path) 
         if "ViewBlueprint:display_name" in b.schema.names
     ]
     assert set(names) >= {
-        "PEM · 1 of 2 known", "pole · 2 of 2 known", "none · 0 of 2 known", "7 car, onset 2.0 s",
-        "9 pedestrian, onset 0.0 s", "What difference it made",
+        "PEM · 1 of 2 known", "pole · 2 of 2 known", "none · 0 of 2 known",
+        "7 car, onset 2.0 s", "9 pedestrian, onset 0.0 s", "What difference it made",
         "7 car: position error, m", "GOSPA of all measured objects, m", "Measured objects known (grey: there are)",
         "Events", "Legend",
         "Summary of all runs", "PEM: 9 pedestrian never known", "pole: 7 car known 0.00 s after its onset",

@@ -137,6 +137,29 @@ def test_lanes_say_whose_they_are_and_how_soon(hiding: Made) -> None:
     assert said("4_pedestrian/1_PEM") == ["PEM: behind obstacle 0 (from ego)"]
 
 
+def test_a_flag_without_room_is_told_by_what_follows(tmp_path: Path) -> None:
+    """He is seen for 0.2 s between two trucks, then hidden until the end."""
+    scene = recording(
+        [
+            Thing("ego", "car", standing(0, 0)),
+            Thing("2", "pedestrian", standing(-30, 0)),
+            Thing("1", "truck", standing(-15, 0.5), there=lambda t: t < 0.99),
+            Thing("3", "truck", standing(-15, 0.5), there=lambda t: t > 1.19),
+        ],
+        until_s=4.0,
+    )
+    seen = [{"detection": {"kind": "visible_share"}}]
+    only = {"PEM": {"units": ["ego"]}}
+    made = make(tmp_path / "x.rrd", scene, measure=PERSON, pems={"sure": seen}, configurations=only)
+    found = rows(made.path, "/lanes/2_pedestrian/1_PEM")
+    said = [(row["elapsed"] / 1e9, row["StateChange:state"][0]) for row in found]
+    hidden = "behind 3 (from ego)"
+    [known_s] = made.table["detection_s"]
+    flag = f"{known_s:.2f} s known"
+    assert [text for _, text in said] == ["PEM: behind 1 (from ego)", flag, f"{flag}, then {hidden}"]
+    assert said[1][0] == pytest.approx(known_s)
+
+
 def test_lines_from_units_to_what_they_listed(hiding: Made) -> None:
     # Only from the unit that listed each first: the pole, and the ego when it alone sees the second one.
     ends = [line.tolist() for line in lines(at(hiding.path, "/world/both/listings", 0.5))]
