@@ -374,8 +374,9 @@ def _draw_plan(
     labels = {number: story.object_id, scene.ego_ix: "ego", **({hider[1]: hider[0]} if hider else {})}
     for k, label in labels.items():
         for at in _places(world, k) if k >= 0 else ():
-            x, y = view.points(at[None]).split(",")
-            yield make_tag("text", label, x=f"{float(x) + 6:.1f}", y=f"{float(y) - 6:.1f}", class_="label")
+            x, y = map(float, view.points(at[None]).split(","))
+            x, y, anchor = (x, y + 20, "middle") if hider and k == hider[1] else (x + 6, y - 9, "start")
+            yield make_tag("text", label, x=f"{x:.1f}", y=f"{y:.1f}", class_="label", text_anchor=anchor)
 
 
 def _draw_units(story: ObjectStory, world: Tracks, view: _View, row: Any) -> Iterator[Html]:
