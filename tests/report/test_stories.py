@@ -14,7 +14,7 @@ import pytest
 
 import copem_replay as cr
 from copem_replay.report.figures import FIGURES, Selection
-from copem_replay.report.figures.paths import late_paths_figure, measure_unknown
+from copem_replay.report.figures.paths import average_unknown, late_paths_figure
 from copem_replay.report.html.page import build_page
 from copem_replay.report.html.stories import choose_stories, story_parts
 from copem_replay.report.html.study import load_study
@@ -113,7 +113,7 @@ class TestLatePaths:
             table.loc[one, name] = 1.0 if name == "time_to_detection_s" else 1.5
             table.loc[one & (table["run"] < 2), name] = np.nan
         table.loc[one, "detected"] = table.loc[one, "run"] >= 2
-        found = measure_unknown(with_rows(results, table, tmp_path / "r"), ["late"]).set_index("object_id")
+        found = average_unknown(with_rows(results, table, tmp_path / "r"), ["late"]).set_index("object_id")
         assert found.loc["2", "unknown_s"] == pytest.approx(13 / 6)
         assert found.loc["2", "never_share"] == pytest.approx(2 / 6)
 

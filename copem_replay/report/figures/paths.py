@@ -87,11 +87,11 @@ def read_drive(results: Results, log: str) -> Drive:
 
 def find_latest_log(results: Results) -> str:
     """The log whose objects stay unknown longest on average, over all contenders."""
-    rows = measure_unknown(results, find_contenders(results))
+    rows = average_unknown(results, find_contenders(results))
     return str(rows["unknown_s"].groupby(rows["log"], sort=False).mean().idxmax())
 
 
-def measure_unknown(results: Results, names: Sequence[str]) -> pd.DataFrame:
+def average_unknown(results: Results, names: Sequence[str]) -> pd.DataFrame:
     """A row per configuration and episode: mean `unknown_s` over runs, of never until its end; `never_share`."""
     rows = results.known
     rows = rows[rows["configuration"].isin(list(names))]
@@ -127,7 +127,7 @@ def late_paths_figure(results: Results, selection: Selection) -> Figure:
     asked = sort_soonest_first(results, find_contenders(results, selection.configurations))
     names = [name for name in asked if name in find_differing(results, asked)]
     drive = read_drive(results, selection.log or find_latest_log(results))
-    rows = measure_unknown(results, names)
+    rows = average_unknown(results, names)
     rows = rows[rows["log"] == drive.log]
     most_s = max(float(rows["unknown_s"].max()) if len(rows) else 0.0, 0.1)
     box = _find_box(drive, rows)
