@@ -214,15 +214,18 @@ _NOTE = "note"
 
 def take_note(figure: Figure) -> str:
     """Take the note from a figure, with the space it was in: a page has it as a text of its own. Empty without one."""
+    from matplotlib.layout_engine import PlaceHolderLayoutEngine
+
     notes = [text for text in figure.texts if text.get_gid() == _NOTE]
     engine = figure.get_layout_engine()
     if not notes or engine is None:
         return ""
     words = notes[0].get_text()
     notes[0].remove()
-    engine.set(rect=(0, 0, 1, 1))  # type: ignore[call-arg]
-    below_in = (words.count("\n") + 1) * NOTE_PT * 1.3 / 72 + 0.12
-    figure.set_size_inches(figure.get_size_inches()[0], figure.get_size_inches()[1] - below_in)
+    if not isinstance(engine, PlaceHolderLayoutEngine):  # else panels have their places already
+        engine.set(rect=(0, 0, 1, 1))  # type: ignore[call-arg]
+        below_in = (words.count("\n") + 1) * NOTE_PT * 1.3 / 72 + 0.12
+        figure.set_size_inches(figure.get_size_inches()[0], figure.get_size_inches()[1] - below_in)
     return " ".join(words.replace("\u00a0", " ").split("\n"))
 
 
