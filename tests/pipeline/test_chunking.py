@@ -333,9 +333,9 @@ def test_visible_shares_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> No
     """However many blocks of runs, passes and files there are; of the same units and rows."""
     views: list[int] = []
 
-    def counted(world: Tracks, static: Any, observers: Any, model: Any) -> Any:
+    def counted(world: Tracks, static: Any, observers: Any, model: Any, *asked: Any) -> Any:
         views.append(len(world.frame_ix) * len(observers.carrier_ix))
-        return visible_shares(world, static, observers, model)
+        return visible_shares(world, static, observers, model, *asked)
 
     monkeypatch.setattr("copem_replay.perception.observation.visible_shares", counted)
     monkeypatch.setattr(chunking, "ROWS_AT_ONCE", 1)
@@ -412,8 +412,9 @@ def test_the_results_folder(
     for name in files - {"replay.rrd"}:
         assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "pieces" / name).read_bytes(), name
     whole, pieces = (shown_in(tmp_path / out / "replay.rrd") for out in ("whole", "pieces"))
-    assert {"/world/gnn/status", "/world/ideal/listings", "/lanes/2_pedestrian/3_gnn"} <= whole.keys()
+    assert {"/world/gnn/status", "/world/ideal/listings"} <= whole.keys()
+    assert any(name.startswith("/lanes/2_pedestrian/") and name.endswith("_gnn") for name in whole)
     why = [name for name in whole if name.endswith(("status", "hiding", "listings")) or name.startswith("/lanes")]
-    assert len(why) == 4 + 3 + 4 * 2  # of all configurations, of those with units, of each and both objects
+    assert len(why) == 3 + 3 + 3 * 2  # of all but the truth: statuses, lists, lanes of both objects
     assert {name: whole[name] for name in why} == {name: pieces[name] for name in why}
     assert whole.keys() == pieces.keys()

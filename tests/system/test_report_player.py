@@ -88,8 +88,8 @@ def test_it_counts_what_is_known_at_each_instant(played: Browser, report: Path) 
 
 
 def test_what_is_listed_is_drawn_in_the_colour_of_its_configuration(played: Browser) -> None:
-    orange = played.run("return document.querySelector('#played').textContent.match(/rgb\\([^)]*\\)/)[0]")
-    rgb = [int(part) for part in orange[4:-1].split(",")]
+    colour = played.run("return document.querySelector('#played').textContent.match(/#[0-9a-f]{6}/)[0]")
+    rgb = list(bytes.fromhex(colour[1:]))
     counts = []
     for at_s in (0.2, 0.8, 1.2):  # the first list comes at 0.5 s: then outlines, from 1.0 s on filled
         move_to(played, at_s)

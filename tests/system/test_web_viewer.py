@@ -59,7 +59,7 @@ def test_the_page_opens_at_the_onset_and_asks_nobody_else(tmp_path: Path) -> Non
             thread.join()
     # A cursor: timeline `elapsed`, a duration, at 500 000 000 ns = 0x1DCD6500.
     assert b"\x0a\x09\x0a\x07elapsed\x10\x02\x1a\x06\x08\x80\xca\xb5\xee\x01" in state
-    for view in (b"GT", b"PEM", b"coPEM", b"GOSPA of all measured objects"):
+    for view in (b"PEM", b"coPEM", b"GOSPA of all measured objects"):
         assert view in state, "the layout of the recording, not the viewer's own"
     answered = {m["params"]["response"]["url"] for m in log if m["method"] == "Network.responseReceived"}
     hosts = {urlsplit(url).netloc for url in answered if not url.startswith(("data:", "blob:", "chrome"))}
