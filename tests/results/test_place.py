@@ -218,13 +218,13 @@ class TestMade:
         for command in commands:
             assert call(*command).code == 0, command
         results = set(json.loads((folder / "provenance.json").read_text())["files"])
-        assert {"sweep.csv", "exact.parquet", "bands.csv", "replay_1.rrd", "replay.configurations_7.rrd"} <= results
+        assert {"sweep.csv", "exact.parquet", "bands.csv", "replay_1.rrd"} <= results
         made = set(belongings.list_names(folder)) - results
         assert {
             f"figures/{name}.{kind}" for name in ("answer", "differences", "sweeps") for kind in ("png", "svg")
         } <= made
         assert {"film.gif", "report.html", "pages/second.html", "replay.foxglove.json", "wide.json"} <= made
-        assert {"c.csv", "c.md", "beside.rrd", "beside.configurations_7.rrd", "more figures/curves.svg"} <= made
+        assert {"c.csv", "c.md", "beside.rrd", "more figures/curves.svg"} <= made
         (folder / "figures/mine.svg").write_text("<svg/>")
         (folder / "notes.txt").write_text("mine\n")
         (here / "e.yaml").write_text(TEXT.replace("probability: 0.5", "probability: 0.9"))
