@@ -7,6 +7,7 @@ import json
 import math
 import os
 import shutil
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -147,9 +148,11 @@ class TestReplaced:
         assert call("run", "e.yaml", "--out", "plain").code == 0
         (here / "e.yaml").write_text(SHOWN)
         old, outcomes = sha256("drive.mcap"), gather.replay_outcomes
+        one_at_a_time = threading.Lock()  # blocks are replayed by several threads
 
         def meanwhile(*a: Any) -> Any:
-            replaced(here / "drive.mcap", here / "other.mcap")
+            with one_at_a_time:
+                replaced(here / "drive.mcap", here / "other.mcap")
             return outcomes(*a)
 
         monkeypatch.setattr(gather, "replay_outcomes", meanwhile)
