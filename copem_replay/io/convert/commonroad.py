@@ -65,9 +65,12 @@ class XmlNode:
         return node
 
 
-def read_parts(path: Path, root_tags: tuple[str, ...]) -> Iterator[XmlNode]:
-    """Yield the root without its children, then each child once it is complete. Raises InputError."""
-    reading = _ParserHandlers(path, root_tags)
+def read_parts(path: Path, root_tags: tuple[str, ...], *, most_elements: int | None = None) -> Iterator[XmlNode]:
+    """Yield the root without its children, then each child once it is complete.
+
+    `most_elements`: of one child. Raises InputError.
+    """
+    reading = _ParserHandlers(path, root_tags, most_elements)
     try:
         with path.open("rb") as stream:
             while block := stream.read(_BLOCK_BYTES):
@@ -88,8 +91,9 @@ def read_parts(path: Path, root_tags: tuple[str, ...]) -> Iterator[XmlNode]:
 class _ParserHandlers:
     """Handlers of the parser, with the parts they have completed."""
 
-    def __init__(self, path: Path, root_tags: tuple[str, ...]) -> None:
-        self.path, self.root_tags = path, root_tags
+    def __init__(self, path: Path, root_tags: tuple[str, ...], most_elements: int | None) -> None:
+        self.path, self.root_tags, self.most_elements = path, root_tags, most_elements
+        self.elements = 0  # of the child of the root that is open
         self.open: list[XmlNode] = []
         self.done: deque[XmlNode] = deque()
         self.parser = parser = expat.ParserCreate()
@@ -108,6 +112,12 @@ class _ParserHandlers:
             self.done.append(node)
         elif len(self.open) > 1:  # children of the root are handed out, not kept
             self.open[-1].children.append(node)
+            self.elements += 1
+            if self.most_elements is not None and self.elements > self.most_elements:
+                expected = f"expected <{self.open[1].tag}> with at most {self.most_elements:,} elements, found more"
+                raise InputError(f"{self.path}:{self.open[1].line}: {expected}")
+        else:
+            self.elements = 0
         self.open.append(node)
 
     def _end(self, _tag: str) -> None:

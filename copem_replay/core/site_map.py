@@ -1,0 +1,80 @@
+"""What a map says of a site: lanes, areas and solids. Readers of map formats fill these; nothing else knows formats.
+
+Places are metres in the frame of the map until a log's frame is asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from copem_replay.core.tracks import Float
+
+LaneKind = Literal["driving", "bicycle", "walking", "parking", "other"]
+AreaKind = Literal["crosswalk", "junction", "drivable", "parking", "yours"]
+
+
+@dataclass(frozen=True)
+class Lane:
+    """A lane by its two borders, both in the direction in which it is driven."""
+
+    id: str
+    kind: LaneKind
+    left_m: Float  # (K, 3)
+    right_m: Float  # (L, 3)
+    junction: bool = False
+
+    @property
+    def outline_m(self) -> Float:
+        """The corners (K + L, 2): along the left border and back along the right."""
+        return np.concatenate([self.left_m[:, :2], self.right_m[::-1, :2]])
+
+
+@dataclass(frozen=True)
+class Area:
+    """A part of the plane that has a name and a kind: the rings of its polygon, the outer first, then its holes."""
+
+    name: str
+    kind: AreaKind
+    rings_m: tuple[Float, ...]  # (K, 2) each, without the first corner again
+
+
+@dataclass(frozen=True)
+class MapSolid:
+    """An upright prism that hides: its rings, the outer first, and heights in the map; where it is from."""
+
+    name: str
+    kind: str  # building, wall, barrier, …
+    rings_m: tuple[Float, ...]  # (K, 2) each
+    bottom_m: float
+    top_m: float
+
+
+@dataclass(frozen=True)
+class SiteMap:
+    """A map as its file has it. `proj`: the projection that the file names for its metres, "": none."""
+
+    lanes: tuple[Lane, ...] = ()
+    areas: tuple[Area, ...] = ()
+    solids: tuple[MapSolid, ...] = ()
+    proj: str = ""
+    offset_m: tuple[float, float] = (0.0, 0.0)  # p_projected = R(yaw)·p + offset
+    yaw_rad: float = 0.0
+    degrees: bool = False  # x is the longitude, y the latitude of WGS84: `proj` tells nothing
+    assumed: tuple[str, ...] = field(default=())  # a line for each kind of thing assumed or left out
+
+    def moved(self, move: Callable[[Float], Float]) -> SiteMap:
+        """The map with all places (N, 2) moved by a function; heights stay."""
+
+        def border(line: Float) -> Float:
+            return np.column_stack([move(line[:, :2]), line[:, 2]])
+
+        return replace(
+            self,
+            lanes=tuple(replace(a, left_m=border(a.left_m), right_m=border(a.right_m)) for a in self.lanes),
+            areas=tuple(replace(a, rings_m=tuple(map(move, a.rings_m))) for a in self.areas),
+            solids=tuple(replace(s, rings_m=tuple(map(move, s.rings_m))) for s in self.solids),
+        )  # fmt: skip

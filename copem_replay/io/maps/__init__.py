@@ -1,0 +1,1 @@
+"""Readers of map formats: each fills a `SiteMap` (docs/guide/place.md)."""

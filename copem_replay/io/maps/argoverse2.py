@@ -1,0 +1,108 @@
+"""Maps of Argoverse 2 sensor logs, `map/log_map_archive_*.json`: lanes, crosswalks and drivable areas in metres."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from copem_replay.core.errors import InputError
+from copem_replay.core.site_map import Area, Lane, LaneKind, SiteMap
+from copem_replay.core.tracks import Float
+from copem_replay.io.convert.conversion import quote_value
+
+_FARTHEST: Final = 1e8
+_MOST_BYTES: Final = 64_000_000
+"""Of a file of JSON: maps of drives have 1 MB, and what is parsed takes ten times as much memory."""
+_KIND: Final[dict[str, LaneKind]] = {"VEHICLE": "driving", "BUS": "driving", "BIKE": "bicycle"}
+
+
+def read_json(path: Path) -> Any:
+    """What a file of JSON holds. Raises InputError with file and line; NaN and Infinity are no JSON."""
+    try:
+        size = path.stat().st_size
+        if size > _MOST_BYTES:
+            raise InputError(
+                f"{path}: expected JSON of at most {_MOST_BYTES // 1_000_000} MB, found {size / 1e6:.0f} MB"
+            )
+        return json.loads(path.read_bytes(), parse_constant=_refuse_constant)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be opened: {error.strerror}") from None
+    except json.JSONDecodeError as error:
+        raise InputError(
+            f"{path}:{error.lineno}: expected JSON, found something else or its end: {error.msg}"
+        ) from None
+    except RecursionError:
+        raise InputError(f"{path}: expected JSON of a map, found values nested without end") from None
+    except ValueError as error:  # not UTF-8, a constant, a number of too many digits
+        raise InputError(f"{path}: expected JSON, found something else: {error}") from None
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"{name} is no number of JSON")
+
+
+def read_argoverse2_map(path: Path) -> SiteMap:
+    """Lanes and areas of a log's map. Raises InputError."""
+    parts = read_json(path)
+    if not isinstance(parts, dict):
+        raise InputError(f"{path}: expected a map of Argoverse 2, found {quote_value(parts)}")
+    lanes = tuple(_read_lane(name, item, path) for name, item in _items(parts, "lane_segments", path))
+    crossings, drivable = list[Area](), list[Area]()
+    for name, item in _items(parts, "pedestrian_crossings", path):
+        edges = [_points(item, edge, f"{path}: pedestrian_crossings {name}") for edge in ("edge1", "edge2")]
+        crossings.append(Area(f"crosswalk {name}", "crosswalk", (_hull(np.concatenate(edges)[:, :2]),)))
+    for name, item in _items(parts, "drivable_areas", path):
+        ring = _points(item, "area_boundary", f"{path}: drivable_areas {name}")[:, :2]
+        drivable.append(Area(f"drivable {name}", "drivable", (ring,)))
+    return SiteMap(lanes, (*crossings, *drivable))
+
+
+def _read_lane(name: str, item: Mapping[str, Any], path: Path) -> Lane:
+    left, right = (
+        _points(item, f"{side}_lane_boundary", f"{path}: lane_segments {name}") for side in ("left", "right")
+    )
+    kind = _KIND.get(str(item.get("lane_type")), "other")
+    return Lane(name, kind, left, right, item.get("is_intersection") is True)
+
+
+def _items(parts: Mapping[str, Any], name: str, path: Path) -> list[tuple[str, dict[str, Any]]]:
+    """The entries of a part of the map, by id. Raises InputError."""
+    items = parts.get(name, {})
+    if not isinstance(items, dict):
+        raise InputError(f"{path}: {name}: expected entries by id, found {quote_value(items)}")
+    for ident, item in items.items():
+        if not isinstance(item, dict):
+            raise InputError(f"{path}: {name} {quote_value(ident)}: expected an entry, found {quote_value(item)}")
+    return list(items.items())
+
+
+def _points(item: Mapping[str, Any], name: str, where: str) -> Float:
+    """Points (K, 3), two at least. Raises InputError."""
+    points = item.get(name)
+    if not isinstance(points, list) or len(points) < 2:
+        raise InputError(f"{where}: {name}: expected two points or more, found {quote_value(points)}")
+    rows = []
+    for point in points:
+        values = [point.get(axis, 0.0 if axis == "z" else None) for axis in "xyz"] if isinstance(point, dict) else []
+        if len(values) < 3 or not all(_is_near(value) for value in values):
+            raise InputError(f"{where}: {name}: expected x, y, z of at most 1e8 m, found {quote_value(point)}")
+        rows.append(values)
+    return np.array(rows, dtype=np.float64)
+
+
+def _is_near(value: object) -> bool:
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return number and math.isfinite(value) and abs(value) <= _FARTHEST  # type: ignore[arg-type]
+
+
+def _hull(points: Float) -> Float:
+    """The convex hull of the ends of two edges, which may be stored against each other; a line where it has no area."""
+    import shapely
+
+    hull = shapely.MultiPoint(points).convex_hull
+    return np.array(hull.exterior.coords)[:-1] if hull.geom_type == "Polygon" else points
