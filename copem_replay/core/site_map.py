@@ -11,10 +11,10 @@ from typing import Literal
 
 import numpy as np
 
-from copem_replay.core.tracks import Float
+from copem_replay.core.tracks import Area, Float
 
 LaneKind = Literal["driving", "bicycle", "walking", "parking", "other"]
-AreaKind = Literal["crosswalk", "junction", "drivable", "parking", "yours"]
+AreaKind = Literal["crosswalk", "junction", "drivable", "parking"]
 
 
 @dataclass(frozen=True)
@@ -33,13 +33,10 @@ class Lane:
         return np.concatenate([self.left_m[:, :2], self.right_m[::-1, :2]])
 
 
-@dataclass(frozen=True)
-class Area:
-    """A part of the plane that has a name and a kind: the rings of its polygon, the outer first, then its holes."""
-
-    name: str
-    kind: AreaKind
-    rings_m: tuple[Float, ...]  # (K, 2) each, without the first corner again
+def make_area(name: str, kind: AreaKind, *rings_m: Float) -> Area:
+    """An area of rings (K, 2), the outer first; the first corner may be there again at the end."""
+    rings = [ring[:-1] if len(ring) > 1 and (ring[0] == ring[-1]).all() else ring for ring in rings_m]
+    return Area(name, kind, tuple(tuple((float(x), float(y)) for x, y in ring[:, :2]) for ring in rings))
 
 
 @dataclass(frozen=True)
@@ -75,6 +72,11 @@ class SiteMap:
         return replace(
             self,
             lanes=tuple(replace(a, left_m=border(a.left_m), right_m=border(a.right_m)) for a in self.lanes),
-            areas=tuple(replace(a, rings_m=tuple(map(move, a.rings_m))) for a in self.areas),
+            areas=tuple(_move_area(a, move) for a in self.areas),
             solids=tuple(replace(s, rings_m=tuple(map(move, s.rings_m))) for s in self.solids),
         )  # fmt: skip
+
+
+def _move_area(area: Area, move: Callable[[Float], Float]) -> Area:
+    rings = (tuple((float(x), float(y)) for x, y in move(np.array(ring))) for ring in area.rings_m)
+    return area._replace(rings_m=tuple(rings))

@@ -82,12 +82,21 @@ class Solid(NamedTuple):
         return self.bottom_m + self.height_m
 
 
+class Area(NamedTuple):
+    """A part of the plane that has a name and a kind: the rings of its polygon, the outer first, then its holes."""
+
+    name: str
+    kind: str  # crosswalk, junction, drivable, parking
+    rings_m: tuple[tuple[tuple[float, float], ...], ...]  # without the first corner again
+
+
 @dataclass(frozen=True)
 class Scene:
     """The constants of one log: its objects, their classes, its start and end, its ego, and what else hides them.
 
     `moving` is False for stationary objects (they hide others; they are measured only when named).
-    `solids` are stationary objects with an outline of their own: they hide, and are no objects.
+    `solids` are stationary objects with an outline of their own, and those of maps: they hide, and are no objects.
+    `areas` are those of maps.
     `ego_ix` is −1 where the log has no ego vehicle, or none was chosen. `tags`: what the recording, or the experiment,
     says of the drive, by name.
 
@@ -106,6 +115,7 @@ class Scene:
     ego_sized: bool = True  # False: the size of the ego is not known, nor are gaps to it
     solids: tuple[Solid, ...] = ()
     tags: Mapping[str, str] = field(default_factory=dict)
+    areas: tuple[Area, ...] = ()
 
     @cached_property
     def object_number(self) -> dict[str, int]:

@@ -25,6 +25,7 @@ from copem_replay.core.tracks import (
     CLASSES,
     SAME_INSTANT_S,
     TRUTH,
+    Area,
     Bool,
     Float,
     Scene,
@@ -573,6 +574,10 @@ def scene_from_json(data: dict[str, Any]) -> Scene:
             "moving": np.array(data["moving"], dtype=bool),
             "solids": tuple(
                 Solid(name, tuple((x, y) for x, y in corners), *rest) for name, corners, *rest in data["solids"]
+            ),
+            "areas": tuple(
+                Area(name, kind, tuple(tuple((x, y) for x, y in ring) for ring in rings))
+                for name, kind, rings in data["areas"]
             ),
         }
     )

@@ -11,8 +11,8 @@ from typing import Any, Final
 import numpy as np
 
 from copem_replay.core.errors import InputError
-from copem_replay.core.site_map import Area, Lane, LaneKind, SiteMap
-from copem_replay.core.tracks import Float
+from copem_replay.core.site_map import Lane, LaneKind, SiteMap, make_area
+from copem_replay.core.tracks import Area, Float
 from copem_replay.io.convert.conversion import quote_value
 
 _FARTHEST: Final = 1e8
@@ -55,10 +55,10 @@ def read_argoverse2_map(path: Path) -> SiteMap:
     crossings, drivable = list[Area](), list[Area]()
     for name, item in _items(parts, "pedestrian_crossings", path):
         edges = [_points(item, edge, f"{path}: pedestrian_crossings {name}") for edge in ("edge1", "edge2")]
-        crossings.append(Area(f"crosswalk {name}", "crosswalk", (_hull(np.concatenate(edges)[:, :2]),)))
+        crossings.append(make_area(f"crosswalk {name}", "crosswalk", _hull(np.concatenate(edges)[:, :2])))
     for name, item in _items(parts, "drivable_areas", path):
-        ring = _points(item, "area_boundary", f"{path}: drivable_areas {name}")[:, :2]
-        drivable.append(Area(f"drivable {name}", "drivable", (ring,)))
+        ring = _points(item, "area_boundary", f"{path}: drivable_areas {name}")
+        drivable.append(make_area(f"drivable {name}", "drivable", ring))
     return SiteMap(lanes, (*crossings, *drivable))
 
 

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from copem_replay.core.errors import InputError, count_noun
-from copem_replay.core.site_map import Area, AreaKind, Lane, LaneKind, SiteMap
+from copem_replay.core.site_map import AreaKind, Lane, LaneKind, SiteMap, make_area
 from copem_replay.core.tracks import Float
 from copem_replay.io.convert.commonroad import XmlNode, read_parts
 from copem_replay.io.convert.conversion import quote_value
@@ -64,13 +64,13 @@ def read_lanelet2(path: Path) -> SiteMap:
         else:
             lanes.append(lane)
     areas = [
-        Area(f"crosswalk {lane.id}", "crosswalk", (lane.outline_m,))
+        make_area(f"crosswalk {lane.id}", "crosswalk", lane.outline_m)
         for lane, relation in zip(lanes, (r for r in relations if _find_lane(r, lines)), strict=True)
         if _tags(relation).get("subtype") == "crosswalk"
     ]
     for name, way in ways.items():
         if (kind := _AREA.get(_tags(way).get("type", ""))) is not None and len(lines[name]) > 3:
-            areas.append(Area(f"{kind} {name}", kind, (_open_ring(lines[name][:, :2]),)))
+            areas.append(make_area(f"{kind} {name}", kind, lines[name]))
     notes = [f"{count_noun(n, noun)} without two borders of two points: left out" for noun, n in counts.items()]
     return SiteMap(tuple(lanes), tuple(areas), degrees=not local, assumed=tuple(notes))
 
@@ -140,7 +140,3 @@ def _turn_borders(left: Float, right: Float) -> tuple[Float, Float]:
     if np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y) > 0.0:  # counter-clockwise: the left one is on the right
         return left[::-1], right[::-1]
     return left, right
-
-
-def _open_ring(corners: Float) -> Float:
-    return corners[:-1] if (corners[0] == corners[-1]).all() else corners

@@ -16,8 +16,8 @@ from typing import Final
 import numpy as np
 
 from copem_replay.core.errors import InputError, count_noun
-from copem_replay.core.site_map import Area, Lane, LaneKind, MapSolid, SiteMap
-from copem_replay.core.tracks import Float
+from copem_replay.core.site_map import Lane, LaneKind, MapSolid, SiteMap, make_area
+from copem_replay.core.tracks import Area, Float
 from copem_replay.io.convert.commonroad import XmlNode, read_parts
 from copem_replay.io.convert.conversion import quote_value
 from copem_replay.io.maps.opendrive_geometry import CHORD_M, SHAPES, Cubics, Piece, RoadLine
@@ -244,8 +244,8 @@ def _join_junctions(reading: _Reading) -> None:
         joined = shapely.union_all([shapely.make_valid(shapely.Polygon(outline)).buffer(0.05) for outline in outlines])
         for polygon in shapely.get_parts(joined):
             if polygon.geom_type == "Polygon" and polygon.area > 1.0:
-                rings = [np.array(ring.coords)[:-1] for ring in (polygon.exterior, *polygon.interiors)]
-                reading.areas.append(Area(f"junction {name}", "junction", tuple(rings)))
+                rings = [np.array(ring.coords) for ring in (polygon.exterior, *polygon.interiors)]
+                reading.areas.append(make_area(f"junction {name}", "junction", *rings))
 
 
 # Objects.
@@ -269,7 +269,7 @@ def _read_object(reading: _Reading, node: XmlNode, line: RoadLine, road: str) ->
     for corners, bottom_m, top_m in prisms:
         reading.spend(len(corners), node)
         if kind == "crosswalk":
-            reading.areas.append(Area(name, "crosswalk", (corners,)))
+            reading.areas.append(make_area(name, "crosswalk", corners))
         elif top_m - bottom_m > _FLAT_M + 1e-9:
             reading.solids.append(MapSolid(name, kind, (corners,), bottom_m, top_m))
         else:

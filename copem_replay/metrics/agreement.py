@@ -1,0 +1,203 @@
+"""Agreement of a map and the traffic of a log: whether both are in one frame, and by how much they may be apart.
+
+*Agreement* is the share of states of moving vehicles (faster than 1 m/s) whose centre is in a lane, of any kind that is
+driven, that runs within 45° of their heading. It cannot tell a map that is 1 or 2 m off from one that is right.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from copem_replay.core.site_map import Lane
+from copem_replay.core.tracks import CLASS_GROUPS, CLASSES, Bool, Float, Int, Scene, Tracks
+
+NOTED_BELOW: Final = 0.6
+REFUSED_BELOW: Final = 0.3
+_FEWEST: Final = 100
+"""States: of fewer the share is printed, and nothing is concluded from it."""
+_MOVES_MPS: Final = 1.0
+_ALONG_RAD: Final = math.pi / 4
+
+_REACH_M: Final = 40.0
+"""The shift is sought this far from where the map is said to be."""
+_CELL_M: Final = 0.5
+_HEADINGS: Final = 16
+_MOST_STATES: Final = 3000
+_AS_GOOD: Final = 0.95
+_ELSEWHERE_M: Final = 3.0
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Of `states` of moving vehicles, `along` are in a lane of their heading."""
+
+    states: int
+    along: int
+
+    @property
+    def share(self) -> float | None:
+        """None: no vehicle moves."""
+        return self.along / self.states if self.states else None
+
+    @property
+    def words(self) -> str:
+        """One line, without the map's name."""
+        if self.share is None:
+            return "agreement with the traffic unknown: no vehicle moves"
+        told = f"agreement with the traffic {self.share:.2f}: {self.along:,} of {self.states:,} states of moving"
+        told += " vehicles are in a lane of their heading"
+        if self.states < _FEWEST:
+            return f"{told}; too few to conclude from"
+        return told + ("; is the map in the frame of the log? (1–2 m are not seen)" if self.share < NOTED_BELOW else "")
+
+    @property
+    def refused(self) -> bool:
+        """Whether the map cannot be where the traffic is."""
+        return self.share is not None and self.states >= _FEWEST and self.share < REFUSED_BELOW
+
+
+def moving_vehicle_rows(scene: Scene, truth: Tracks) -> Int:
+    """Rows (N,) of the truth in which a vehicle, no pedestrian and no cyclist, is faster than 1 m/s."""
+    motor = np.array([name in CLASS_GROUPS["vehicles"] for name in CLASSES])
+    fast = np.hypot(truth.vx_mps[0], truth.vy_mps[0]) > _MOVES_MPS
+    vehicle = motor[scene.object_class[truth.row_object_ix]] & scene.moving[truth.row_object_ix]
+    return np.flatnonzero(truth.valid[0] & fast & vehicle)
+
+
+def find_agreement(scene: Scene, truth: Tracks, lanes: Sequence[Lane]) -> Agreement:
+    """Agreement of lanes, in the frame of the log, with its traffic."""
+    rows = moving_vehicle_rows(scene, truth)
+    directed = DirectedLanes(lanes)
+    along = directed.are_along(truth.x_m[0, rows], truth.y_m[0, rows], truth.yaw_rad[0, rows])
+    return Agreement(len(rows), int(along.sum()))
+
+
+class DirectedLanes:
+    """Lanes that are driven, cut across into quadrangles with a direction each."""
+
+    def __init__(self, lanes: Sequence[Lane]) -> None:
+        import shapely
+
+        cuts = [_cut_lane(lane) for lane in lanes if lane.kind == "driving"]
+        corners = np.concatenate([corners for corners, _ in cuts]) if cuts else np.zeros((0, 4, 2))
+        self.direction_rad = np.concatenate([heading for _, heading in cuts]) if cuts else np.zeros(0)
+        self.middles_m = corners.mean(axis=1)
+        self.ends_m = np.stack([(corners[:, 0] + corners[:, 3]) / 2, (corners[:, 1] + corners[:, 2]) / 2], axis=1)
+        self.tree = shapely.STRtree(shapely.convex_hull(shapely.polygons(corners)) if len(corners) else [])
+
+    def are_along(self, x_m: Float, y_m: Float, yaw_rad: Float) -> Bool:
+        """Whether places (N,) are in a lane that runs within 45° of their headings."""
+        import shapely
+
+        along = np.zeros(len(x_m), dtype=bool)
+        place, piece = self.tree.query(shapely.points(x_m, y_m), predicate="intersects")
+        turn = np.abs(np.angle(np.exp(1j * (yaw_rad[place] - self.direction_rad[piece]))))
+        along[place[turn <= _ALONG_RAD]] = True
+        return along
+
+
+def _cut_lane(lane: Lane) -> tuple[Float, Float]:
+    """Quadrangles (K, 4, 2) across a lane, left border, right border back; and their headings (K,).
+
+    Both borders are cut at the same shares of their lengths.
+    """
+    lengths = [_lengths(line) for line in (lane.left_m, lane.right_m)]
+    shares = np.unique(np.concatenate([length / length[-1] for length in lengths if length[-1] > 0.0] or [[0.0, 1.0]]))
+    left, right = (
+        np.column_stack([np.interp(shares * length[-1], length, line[:, k]) for k in (0, 1)])
+        for line, length in zip((lane.left_m, lane.right_m), lengths, strict=True)
+    )
+    corners = np.stack([left[:-1], left[1:], right[1:], right[:-1]], axis=1)
+    ahead = left[1:] - left[:-1] + right[1:] - right[:-1]
+    return corners, np.arctan2(ahead[:, 1], ahead[:, 0])
+
+
+def _lengths(line: Float) -> Float:
+    """Metres (K,) along a line to each of its points."""
+    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))])
+
+
+@dataclass(frozen=True)
+class Shift:
+    """By how much the map would have to move to agree best, and the best score more than 3 m from there."""
+
+    east_m: float
+    north_m: float
+    score: float
+    elsewhere: float
+    elsewhere_deg: float  # direction of that other place, from east towards north, 0 … 180
+
+    @property
+    def words(self) -> str:
+        """One line; it is printed and never applied."""
+        told = f"best agreement with the map moved by [{self.east_m:g}, {self.north_m:g}] m (east, north)"
+        ratio = self.elsewhere / self.score if self.score else 1.0
+        told += f"; the best more than {_ELSEWHERE_M:g} m from there is {ratio:.0%} as good"
+        if ratio >= _AS_GOOD:
+            told += f": not determined along {self.elsewhere_deg:.0f}° (from east towards north)"
+        return f"{told}; nothing is moved by itself (`offset_m` of the map does it)"
+
+
+def estimate_shift(scene: Scene, truth: Tracks, lanes: Sequence[Lane]) -> Shift | None:
+    """The shift of the map within ±40 m that puts the traffic best on the middles of lanes; None: no traffic, no lanes.
+
+    The middles of lanes are drawn into rasters of 0.5 m by heading, blurred by 1 m, and every shift is tried.
+    """
+    rows, directed = moving_vehicle_rows(scene, truth), DirectedLanes(lanes)
+    if not len(rows) or not len(directed.direction_rad):
+        return None
+    rows = rows[:: max(1, len(rows) // _MOST_STATES)]
+    at_m = np.stack([truth.x_m[0, rows], truth.y_m[0, rows]], axis=1)
+    raster = _HeadingRaster(directed, at_m)
+    scores = raster.score_shifts(at_m, truth.yaw_rad[0, rows])
+    steps_m = _CELL_M * np.arange(-raster.reach, raster.reach + 1)
+    i, j = np.unravel_index(int(scores.argmax()), scores.shape)
+    away_m = np.hypot(*np.meshgrid(steps_m - steps_m[i], steps_m - steps_m[j], indexing="ij"))
+    others = np.where(away_m > _ELSEWHERE_M, scores, -1.0)
+    k, m = np.unravel_index(int(others.argmax()), others.shape)
+    direction = math.degrees(math.atan2(steps_m[m] - steps_m[j], steps_m[k] - steps_m[i])) % 180.0
+    east_m, north_m = -float(steps_m[i]) + 0.0, -float(steps_m[j]) + 0.0  # the traffic moved that way, so the map back
+    return Shift(east_m, north_m, float(scores[i, j]), float(others[k, m]), direction)
+
+
+class _HeadingRaster:
+    """Middles of lanes around the traffic, by heading: (16, W, H) numbers, 1 on a middle of that heading."""
+
+    reach: Final = round(_REACH_M / _CELL_M)
+
+    def __init__(self, directed: DirectedLanes, at_m: Float) -> None:
+        from scipy.ndimage import gaussian_filter
+
+        margin_m = _REACH_M + 5.0
+        self.low_m = at_m.min(axis=0) - margin_m
+        extent = np.ceil((at_m.max(axis=0) + margin_m - self.low_m) / _CELL_M).astype(np.int64)
+        self.width, self.height = (int(min(n, 4000)) for n in extent)
+        layers = np.zeros((_HEADINGS, self.width, self.height), dtype=np.float32)
+        for (start, end), bin_ in zip(directed.ends_m, self.bins(directed.direction_rad), strict=True):
+            n = max(2, min(10_000, math.ceil(float(np.hypot(*(end - start))) / _CELL_M) + 1))
+            cell = np.floor((np.linspace(start, end, n) - self.low_m) / _CELL_M).astype(np.int64)
+            inside = ((cell >= 0) & (cell < (self.width, self.height))).all(axis=1)
+            layers[bin_, cell[inside, 0], cell[inside, 1]] = 1.0
+        blurred = np.stack([gaussian_filter(layer, 1.0 / _CELL_M) for layer in layers])
+        self.layers = blurred + 0.6 * np.roll(blurred, 1, axis=0) + 0.6 * np.roll(blurred, -1, axis=0)
+
+    @staticmethod
+    def bins(heading_rad: Float) -> Int:
+        """The layer of each heading."""
+        return np.rint(heading_rad / (2 * np.pi) * _HEADINGS).astype(np.int64) % _HEADINGS
+
+    def score_shifts(self, at_m: Float, yaw_rad: Float) -> Float:
+        """(2R + 1, 2R + 1) the mean score of places moved by R cells west to east, and south to north."""
+        cell = np.floor((at_m - self.low_m) / _CELL_M).astype(np.int64)
+        layer, n = self.bins(yaw_rad), 2 * self.reach + 1
+        sums = np.zeros((n, n))
+        for (i, j), k in zip(cell - self.reach, layer, strict=True):
+            if i >= 0 and j >= 0 and i + n <= self.width and j + n <= self.height:
+                sums += self.layers[k, i : i + n, j : j + n]
+        scores: Float = sums / len(cell)
+        return scores
