@@ -72,7 +72,7 @@ def apply_settings(experiment: Experiment, settings: LogSettings) -> Experiment:
     """An experiment with the settings of one log, and no `logs`. Raises SettingsError where they do not fit."""
     keys = settings.model_fields_set
     changed: dict[str, Any] = {key: getattr(settings, key) for key in ("ego", "window_s") if key in keys}
-    changed |= {key: value for key in ("read", "obstacles") if (value := getattr(settings, key)) is not None}
+    changed |= {key: value for key in ("read", "obstacles", "maps") if (value := getattr(settings, key)) is not None}
     units = _apply_units(experiment, settings)
     changed |= {"units": units, "configurations": _keep_configurations(experiment, units)}
     if settings.tags:

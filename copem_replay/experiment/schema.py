@@ -41,10 +41,11 @@ from copem_replay.core.components import (
 )
 from copem_replay.core.tracks import TRUTH
 from copem_replay.experiment.criteria import Criterion, CriterionName
+from copem_replay.experiment.maps import MapFile
 from copem_replay.fusion import FUSIONS
 from copem_replay.fusion.interface import Fusion, IdealFusion
 from copem_replay.io.config import Ego, HowRead, RecordedOutput, RecordedTopic, TruthTopic, WindowOf
-from copem_replay.metrics.config import Braking, Measure
+from copem_replay.metrics.config import Braking, Measure, OwnArea
 from copem_replay.perception.config import Carriers, Obstacle, Placement, Rate
 from copem_replay.perception.pem.model import MeanNumber, Pem
 from copem_replay.perception.visibility import Surface, Visibility
@@ -344,6 +345,7 @@ class LogSettings(Frozen):
     window_s: WindowOf | None = None
     units: dict[Id, dict[str, Any] | None] = Field(default_factory=dict)
     obstacles: tuple[Obstacle, ...] | None = None
+    maps: tuple[MapFile, ...] | None = Field(default=None, exclude_if=lambda maps: maps is None)
     read: HowRead | None = None
     measure: dict[str, Any] = Field(default_factory=dict)
     tags: dict[Id, TagText] = Field(default_factory=dict)
@@ -426,7 +428,8 @@ class Experiment(Frozen):
 
     `logs`: paths or URLs, or mappings with settings for one log. `window_s`: the part of each log that is read,
     [from, to] in log time since the first message of its truth. `tags`: those of all logs, to slice the summary by
-    (`measure.by`) and for conditions of PEMs; a log may have others.
+    (`measure.by`) and for conditions of PEMs; a log may have others. `maps` of the site: lanes, areas, solids. `areas`:
+    your own, by name, for `measure.objects.within.areas`.
 
     >>> experiment = cr.Experiment(version=1, runs=20, configurations={"GT": cr.Configuration(units="truth")})
     >>> experiment.model_copy(update={"runs": 50}).runs, experiment.seed
@@ -447,6 +450,8 @@ class Experiment(Frozen):
     pems: dict[Id, Pem] = Field(default_factory=dict)
     units: dict[UnitName, Unit] = Field(default_factory=dict)
     obstacles: tuple[Obstacle, ...] = ()
+    maps: tuple[MapFile, ...] = Field(default=(), exclude_if=lambda maps: not maps)
+    areas: dict[Id, OwnArea] = Field(default_factory=dict, exclude_if=lambda areas: not areas)
     visibility: Visibility = Field(default=Surface(), json_schema_extra={"default": "surface"})
     links: dict[LinkName, AnyLink] = Field(default_factory=dict, exclude_if=lambda links: not links)
     configurations: Annotated[dict[ConfigurationName, Configuration], Field(min_length=1)]

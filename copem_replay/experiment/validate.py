@@ -37,6 +37,7 @@ from copem_replay.experiment.file import (
     settings_places,
     source_folder,
 )
+from copem_replay.experiment.maps import add_maps
 from copem_replay.experiment.schema import Experiment, LogSettings, output_unit
 from copem_replay.io.config import TruthFields
 from copem_replay.io.open import (
@@ -81,6 +82,10 @@ def check_against_log(
     within = experiment.measure.objects.within
     if not studied and within is not None and within.of_ego:
         yield ("measure", "objects", "within"), "no ego in this study, and so no path of it; give `polygon_m`"
+    known_areas = (*experiment.areas, *(name for area in scene.areas for name in (area.kind, area.name)))
+    for k, name in enumerate((within.areas if within is not None else None) or ()):
+        if name not in known_areas:
+            yield ("measure", "objects", "within", "areas", k), unknown_name_message("area", name, known_areas)
     for name, unit in experiment.units.items():
         if unit.on == "ego":
             if not studied:
@@ -380,6 +385,8 @@ def _read_local_recording(experiment: Experiment, place: Local) -> tuple[Recordi
         return None, [RefusedLog(path, line) for line in error.within(path)]
     scene = replace(recording.scene, tags={**recording.scene.tags, **experiment.tags})
     recording = replace(recording, scene=scene, lists=lists, notes=tuple(notes))
+    recording, disagreeing = add_maps(recording, experiment.maps)
+    wrong += [RefusedLog(path, line, key) for key, line in disagreeing]
     return recording, wrong + [
         RefusedLog(path, reason, where) for where, reason in check_against_log(experiment, recording, known=bool(wrong))
     ]

@@ -9,11 +9,13 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Annotated, Literal, Protocol, Self
 
+import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from copem_replay.core.components import Flag, Frozen, Id, NotNegative, Positive, Slot
 from copem_replay.core.errors import unknown_name_message
+from copem_replay.core.tracks import Bool, Float
 from copem_replay.metrics.braking.driver import DRIVERS, Driver
 from copem_replay.metrics.metric import RowMetric
 from copem_replay.metrics.onset import BEGAN, ONSETS, Began, InRange, Onset, Requires
@@ -35,20 +37,22 @@ def _check_exactly_one(self: BaseModel, *names: str) -> None:
 
 
 class Within(Frozen):
-    """Which objects matter, by the truth: in a polygon or near the ego's path at their onset, or soon on that path.
+    """Which objects matter, by the truth: in a polygon, in areas or near the ego's path at onset, or soon on that path.
 
     `corridor_m`: largest distance from the path of the ego's centre from the onset to the end of the episode.
     `conflict_s`: at some instant of its episode the object, at constant velocity, would within this time enter the area
     that the ego, at constant speed, sweeps along its path, with the margin of `measure.conflict` around it.
+    `areas`: by name, your own and those of maps, or by kind: `crosswalk`, `junction`, `drivable`, `parking`.
     """
 
     polygon_m: Polygon | None = None
     corridor_m: NotNegative | None = None
     conflict_s: Positive | None = None
+    areas: Annotated[tuple[Id, ...], Field(min_length=1)] | None = Field(default=None, exclude_if=_is_none)
 
     @model_validator(mode="after")
     def _one(self) -> Self:
-        _check_exactly_one(self, "polygon_m", "corridor_m", "conflict_s")
+        _check_exactly_one(self, "polygon_m", "corridor_m", "conflict_s", "areas")
         if self.polygon_m is not None:
             check_polygon(self.polygon_m)
         return self
@@ -56,7 +60,34 @@ class Within(Frozen):
     @property
     def of_ego(self) -> bool:
         """Whether the condition needs an ego."""
-        return self.polygon_m is None
+        return self.polygon_m is None and self.areas is None
+
+
+class OwnArea(Frozen):
+    """An area of your own: a polygon, or a strip of some width along a line; its ends are cut straight."""
+
+    polygon_m: Polygon | None = None
+    along_m: Annotated[tuple[InPlane, ...], Field(min_length=2)] | None = None
+    width_m: Positive | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> Self:
+        _check_exactly_one(self, "polygon_m", "along_m")
+        if self.polygon_m is not None:
+            check_polygon(self.polygon_m)
+        if (self.along_m is None) != (self.width_m is None):
+            raise ValueError("expected `width_m` with `along_m`, and not with `polygon_m`")
+        return self
+
+    def covers(self, x_m: Float, y_m: Float) -> Bool:
+        """Whether places (K,) are in it, or on its border."""
+        import shapely
+
+        points = shapely.points(x_m, y_m)
+        if self.along_m is None or self.width_m is None:
+            return np.asarray(shapely.intersects(shapely.Polygon(self.polygon_m), points))
+        strip = shapely.buffer(shapely.LineString(self.along_m), self.width_m / 2, cap_style="flat", join_style="mitre")
+        return np.asarray(shapely.intersects(strip, points))
 
 
 class AnnotatedArea(Frozen):
@@ -352,6 +383,10 @@ class MetricsSetup(PerceptionSetup, Protocol):
     @property
     def braking(self) -> Braking | None:
         """What the driver does; None: the experiment does not ask."""
+
+    @property
+    def areas(self) -> Mapping[str, OwnArea]:
+        """Areas of one's own, by name."""
 
     @property
     def recorded(self) -> Mapping[str, object]:

@@ -10,6 +10,7 @@ What a configuration is, by truth id, fixed, or regretted to which ideal, is dec
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -25,7 +26,7 @@ from copem_replay.experiment.schema import Configuration, Experiment, Unit, outp
 from copem_replay.fusion.interface import IdealFusion, ListFusion, PredictedFusion, RecordedFusion
 from copem_replay.io.config import RecordedOutput, RecordedTopic
 from copem_replay.metrics.braking.driver import ConstantReaction
-from copem_replay.metrics.config import Braking, Measure
+from copem_replay.metrics.config import Braking, Measure, OwnArea
 from copem_replay.metrics.onset import Requires
 from copem_replay.perception.config import Carriers, Obstacle
 from copem_replay.perception.pem.model import Pem
@@ -198,6 +199,11 @@ class ExpandedExperiment:
     def measure(self) -> Measure:
         """What is measured."""
         return self.written.measure
+
+    @property
+    def areas(self) -> Mapping[str, OwnArea]:
+        """Areas of one's own, by name."""
+        return self.written.areas
 
     @property
     def braking(self) -> Braking | None:

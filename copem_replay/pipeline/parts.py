@@ -42,6 +42,7 @@ from copem_replay.core.errors import (
 from copem_replay.core.files import parse_json
 from copem_replay.core.waiting import await_server
 from copem_replay.experiment.drive import RecordedLatency, cache_last_experiment
+from copem_replay.experiment.maps import MapFile
 from copem_replay.experiment.schema import Configuration, Experiment
 from copem_replay.metrics.onset import Requires
 from copem_replay.pipeline.tables import PartTables, pack_part, unpack_part
@@ -223,7 +224,7 @@ def write_recipe(experiment: Experiment, name: str, log: Mapping[str, Any], runs
 
 
 @cache_last_experiment
-def _recipe_parts(experiment: Experiment, name: str) -> tuple[dict[str, Any], list[Component]]:
+def _recipe_parts(experiment: Experiment, name: str) -> tuple[dict[str, Any], list[Component | MapFile]]:
     data = experiment.as_written()
     configuration = experiment.configurations[name]
     units, members = _list_dependencies(experiment, configuration), experiment.units_of(configuration)
@@ -242,7 +243,7 @@ def _recipe_parts(experiment: Experiment, name: str) -> tuple[dict[str, Any], li
     own = own_components(
         configuration, experiment.visibility, experiment.measure.model_copy(update={"metrics": ()}),
         experiment.braking, *(experiment.pems[pem] for pem in pems),
-        *(experiment.units[unit] for unit in units), *(experiment.links[link] for link in links),
+        *(experiment.units[unit] for unit in units), *(experiment.links[link] for link in links), *experiment.maps,
     )  # fmt: skip
     for key in NOT_OF_A_PART:
         within, _, last = key.rpartition(".")
@@ -260,22 +261,23 @@ def _list_dependencies(experiment: Experiment, configuration: Configuration) -> 
     return [name for name in experiment.units if name in members or name == measure.distance_to]
 
 
-def own_components(*models: BaseModel | None) -> list[Component]:
-    """Components of models that depend on files: the user's own ones, and recorded latencies."""
+def own_components(*models: BaseModel | None) -> list[Component | MapFile]:
+    """What of models depends on files: the user's own components, recorded latencies, maps."""
     components = (one for model in models for one in _find_components(model))
-    return [one for one in components if is_own(type(one)) or isinstance(one, RecordedLatency)]
+    return [one for one in components if is_own(type(one)) or isinstance(one, RecordedLatency | MapFile)]
 
 
-def file_digests(own: Sequence[Component]) -> dict[str, str]:
-    """SHA-256 of the files that define own components (not of what they import), and of recorded latencies."""
+def file_digests(own: Sequence[Component | MapFile]) -> dict[str, str]:
+    """SHA-256 of the files that define own components (not of what they import), of recorded latencies and of maps."""
     files = {kind: Path(inspect.getfile(kind)) for kind in {type(one) for one in own if is_own(type(one))}}
     contents = {f"{k.__module__}:{k.__qualname__}": f.read_bytes() for k, f in files.items()}
     contents |= {one.file: repr(one.sorted_s).encode() for one in own if isinstance(one, RecordedLatency)}
-    return {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
+    maps = {one.file: one.sha256 for one in own if isinstance(one, MapFile)}
+    return {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()} | maps
 
 
-def _find_components(value: object) -> Iterator[Component]:
-    if isinstance(value, Component):
+def _find_components(value: object) -> Iterator[Component | MapFile]:
+    if isinstance(value, Component | MapFile):
         yield value
     if isinstance(value, BaseModel):
         value = [getattr(value, name) for name in type(value).model_fields]

@@ -18,6 +18,7 @@ from copem_replay.core.components import Component
 from copem_replay.core.errors import ExperimentError, RecordingError, RemoteFile
 from copem_replay.core.tracks import TRUTH, VALUES, Tracks
 from copem_replay.experiment.drive import cache_last_experiment, resolve_for_log
+from copem_replay.experiment.maps import MapFile
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.ground_truth import truth_digest
 from copem_replay.io.open import (
@@ -181,9 +182,9 @@ def survey_key(place: Place, experiment: Experiment, seen: Sequence[Stamp] | Non
 
 
 @cache_last_experiment
-def _survey_parts(experiment: Experiment) -> tuple[str, list[Component]]:
+def _survey_parts(experiment: Experiment) -> tuple[str, list[Component | MapFile]]:
     data = {key: value for key, value in experiment.as_written().items() if key not in _NOT_OF_A_SURVEY}
-    of_all = recipe_key(canonical_json({"survey": 4, "fingerprint": take_fingerprint(), "experiment": data}))
+    of_all = recipe_key(canonical_json({"survey": 5, "fingerprint": take_fingerprint(), "experiment": data}))
     return of_all, own_components(experiment)
 
 

@@ -213,6 +213,8 @@ def _write_files(place: ResultsPlace, study: StudyTables) -> None:
     data["logs"] = log_entries(experiment.logs, study.recordings, place.folder)
     for latency in _find_recorded_latencies(data):
         latency["file"] = os.path.relpath(latency["file"], place.folder)
+    for site in (one for entry in (data, *data["logs"]) if isinstance(entry, dict) for one in entry.get("maps") or ()):
+        site["file"] = os.path.relpath(site["file"], place.folder)
     (scratch / EXPERIMENT).write_text(dump_yaml(data), encoding="utf-8")
     _write_rows(study, scratch)
     write_csv(study.summary, scratch / "summary.csv")

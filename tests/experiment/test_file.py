@@ -360,7 +360,7 @@ SWEEP = "sweep: %s", "19: sweep"
 """What a line looks like, and how a problem with it begins."""
 
 KEYS = (
-    "braking, configurations, criteria, ego, links, logs, max_gap_s, measure, obstacles, pems, read, runs, seed, show, "
+    "braking, configurations, criteria, ego, links, logs, maps, max_gap_s, measure, obstacles, pems, read, runs, seed, show, "
     "sweep, tags, units, version, visibility, window_s"
 )
 CLASSES = "pedestrian, bicycle, motorcycle, car, van, truck, bus, trailer, animal, other, vehicle, vru, vehicles"

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import replace
+from typing import Any, ClassVar
 
 import numpy as np
 import pandas as pd
 import pytest
 import shapely
+from pydantic import ValidationError
 
 from copem_replay.core.errors import ExperimentError
+from copem_replay.core.tracks import Area
 from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import check_against_log
 from copem_replay.io.recording import Recording
@@ -41,12 +44,65 @@ def passing() -> Recording:
     )  # fmt: skip
 
 
-def kept(log: Recording, within: Any, **measure: Any) -> set[str]:
-    wanted = experiment(measure=APPEARS | {"objects": {"within": within}} | measure)
+def kept(log: Recording, within: Any, areas: Any = None, **measure: Any) -> set[str]:
+    wanted = experiment(measure=APPEARS | {"objects": {"within": within}} | measure, areas=areas or {})
     every = find_episodes(log.scene, log.truth, NO_STATICS, wanted)
     found, outside_ix = keep_episodes_within(log.scene, log.truth, every, wanted)
     assert sorted([*found.object_ix, *outside_ix]) == sorted(every.object_ix)
     return {log.scene.object_ids[k] for k in found.object_ix}
+
+
+class TestAreas:
+    """At the onset: parked at (20, 3), behind at (−10, 0), aside at (20, 12), walker at (40, −20)."""
+
+    OWN: ClassVar = {
+        "square": {"polygon_m": [[19, 2], [21, 2], [21, 13], [19, 13]]},
+        "kerb": {"along_m": [[-11, 0], [-9, 0], [-9, 5]], "width_m": 0.2},
+    }
+
+    @pytest.mark.parametrize(
+        ("names", "expected"),
+        [
+            (["square"], {"parked", "aside"}),
+            (["kerb"], {"behind"}),
+            (["square", "kerb"], {"parked", "aside", "behind"}),
+        ],
+    )
+    def test_of_ones_own(self, names: list[str], expected: set[str]) -> None:
+        assert kept(passing(), {"areas": names}, self.OWN) == expected
+
+    @pytest.mark.parametrize(
+        ("name", "expected"), [("crosswalk", {"parked", "walker"}), ("north", {"parked"}), ("south", {"walker"})]
+    )
+    def test_of_a_map_by_name_and_by_kind(self, name: str, expected: set[str]) -> None:
+        log = passing()
+        rings = {"north": ((15, 0), (25, 0), (25, 5), (15, 5)), "south": ((35, -25), (45, -25), (45, -15), (35, -15))}
+        hole = ((19.5, 11.5), (20.5, 11.5), (20.5, 12.5), (19.5, 12.5))
+        around = Area("ring", "junction", (((15, 8), (25, 8), (25, 15), (15, 15)), hole))
+        areas = (*(Area(name, "crosswalk", (ring,)) for name, ring in rings.items()), around)
+        log = replace(log, scene=replace(log.scene, areas=areas))
+        assert kept(log, {"areas": [name]}) == expected
+        assert kept(log, {"areas": ["junction"]}) == set()  # he stands in its hole
+
+    def test_an_area_of_ones_own_comes_before_one_of_a_map(self) -> None:
+        log = passing()
+        log = replace(log, scene=replace(log.scene, areas=(Area("kerb", "crosswalk", (((19, 2), (21, 2), (21, 4)),)),)))
+        assert kept(log, {"areas": ["kerb"]}, self.OWN) == {"behind"}
+
+    def test_an_unknown_area_is_refused_with_the_nearest(self) -> None:
+        wanted = experiment(measure={"objects": {"within": {"areas": ["kerb", "sqare"]}}}, areas=self.OWN)
+        problems = dict(check_against_log(wanted, passing()))
+        key = ("measure", "objects", "within", "areas", 1)
+        assert problems[key] == "no area is named 'sqare'; did you mean square?"
+        assert ("measure", "objects", "within", "areas", 0) not in problems
+
+    @pytest.mark.parametrize(
+        "area", [{}, {"polygon_m": [[0, 0], [1, 0], [1, 1]], "width_m": 2}, {"along_m": [[0, 0], [1, 0]]},
+                 {"polygon_m": [[0, 0], [1, 1], [1, 0], [0, 1]]}, {"along_m": [[0, 0]], "width_m": 1}],
+    )  # fmt: skip
+    def test_areas_that_are_none(self, area: dict[str, Any]) -> None:
+        with pytest.raises(ValidationError):
+            experiment(areas={"a": area})
 
 
 class TestByHand:
@@ -212,7 +268,7 @@ class TestInARun:
 @pytest.mark.parametrize(
     ("measure", "said"),
     [
-        ({"objects": {"within": {}}}, "expected one of polygon_m, corridor_m, conflict_s, found none"),
+        ({"objects": {"within": {}}}, "expected one of polygon_m, corridor_m, conflict_s, areas, found none"),
         ({"objects": {"within": {"corridor_m": 1.0, "conflict_s": 2.0}}}, "found corridor_m and conflict_s"),
         ({"objects": {"within": {"polygon_m": [[0, 0], [1, 1], [1, 0], [0, 1]]}}}, "edges that cross or overlap"),
         ({"annotated": {}}, "expected one of polygon_m, range_m, found none"),

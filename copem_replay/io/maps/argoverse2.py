@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,36 +13,10 @@ from copem_replay.core.errors import InputError
 from copem_replay.core.site_map import Lane, LaneKind, SiteMap, make_area
 from copem_replay.core.tracks import Area, Float
 from copem_replay.io.convert.conversion import quote_value
+from copem_replay.io.maps.registry import read_json
 
 _FARTHEST: Final = 1e8
-_MOST_BYTES: Final = 64_000_000
-"""Of a file of JSON: maps of drives have 1 MB, and what is parsed takes ten times as much memory."""
 _KIND: Final[dict[str, LaneKind]] = {"VEHICLE": "driving", "BUS": "driving", "BIKE": "bicycle"}
-
-
-def read_json(path: Path) -> Any:
-    """What a file of JSON holds. Raises InputError with file and line; NaN and Infinity are no JSON."""
-    try:
-        size = path.stat().st_size
-        if size > _MOST_BYTES:
-            raise InputError(
-                f"{path}: expected JSON of at most {_MOST_BYTES // 1_000_000} MB, found {size / 1e6:.0f} MB"
-            )
-        return json.loads(path.read_bytes(), parse_constant=_refuse_constant)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be opened: {error.strerror}") from None
-    except json.JSONDecodeError as error:
-        raise InputError(
-            f"{path}:{error.lineno}: expected JSON, found something else or its end: {error.msg}"
-        ) from None
-    except RecursionError:
-        raise InputError(f"{path}: expected JSON of a map, found values nested without end") from None
-    except ValueError as error:  # not UTF-8, a constant, a number of too many digits
-        raise InputError(f"{path}: expected JSON, found something else: {error}") from None
-
-
-def _refuse_constant(name: str) -> None:
-    raise ValueError(f"{name} is no number of JSON")
 
 
 def read_argoverse2_map(path: Path) -> SiteMap:

@@ -226,6 +226,8 @@ def describe_excluded(within: Within) -> str:
     """Where the excluded objects are, for a note."""
     if within.polygon_m is not None:
         return "outside the polygon at their onset"
+    if within.areas is not None:
+        return f"outside {', '.join(within.areas)} at their onset"
     if within.corridor_m is not None:
         return f"more than {within.corridor_m:g} m beside the ego's way ahead"
     return f"never within {within.conflict_s:g} s of the ego's way"
@@ -241,10 +243,30 @@ def _is_within_at_onset(scene: Scene, truth: Tracks, episodes: Episodes, experim
     x_m, y_m = state["x_m"], state["y_m"]
     if within.polygon_m is not None:
         return present & are_in_area(x_m, y_m, x_m, y_m, polygon_corners(within.polygon_m), np.inf)
+    if within.areas is not None:
+        return present & _are_in_areas(x_m, y_m, scene, within.areas, experiment)
     assert within.corridor_m is not None
     beside_m = _distance_to_path_m(EgoPath(scene, truth, experiment.max_gap_s), x_m, y_m, episodes)
     near: Bool = present & (beside_m <= within.corridor_m + _TOLERANCE_M)
     return near
+
+
+def _are_in_areas(x_m: Float, y_m: Float, scene: Scene, names: tuple[str, ...], experiment: MetricsSetup) -> Bool:
+    """(M,) whether places are in any area of these names or kinds: one's own, or of the log's maps."""
+    import shapely
+
+    inside = np.zeros(len(x_m), dtype=bool)
+    points = shapely.points(x_m, y_m)
+    for name in names:
+        if (own := experiment.areas.get(name)) is not None:
+            inside |= own.covers(x_m, y_m)
+            continue
+        for area in scene.areas:
+            if name in (area.name, area.kind):
+                inside |= shapely.intersects(
+                    shapely.make_valid(shapely.Polygon(area.rings_m[0], area.rings_m[1:])), points
+                )
+    return inside
 
 
 def _distance_to_path_m(ego: EgoPath, x_m: Float, y_m: Float, episodes: Episodes) -> Float:

@@ -1,0 +1,109 @@
+"""Maps of an experiment: what they add to a recording, what is said of them, and what is refused."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from pathlib import Path
+
+import pytest
+import yaml
+
+import copem_replay as cr
+from copem_replay.api.study import read_study
+from copem_replay.core.errors import InputError
+from copem_replay.experiment.file import read_experiment_file
+from copem_replay.io.recording import Recording
+from tests.helpers.experiments import changed
+from tests.helpers.recordings import Obj, write_recording
+
+ROAD = """<OpenDRIVE><header/><road id="7" length="200" junction="-1"><planView>
+<geometry s="0" x="-50" y="0" hdg="0" length="200"><line/></geometry></planView><lanes><laneSection s="0">
+<left><lane id="1" type="driving"><width sOffset="0" a="4" b="0" c="0" d="0"/></lane></left>
+<right><lane id="-1" type="driving"><width sOffset="0" a="4" b="0" c="0" d="0"/></lane></right></laneSection></lanes>
+<objects><object id="1" type="building" s="80" t="14" zOffset="0" hdg="0" length="10" width="6" height="8"/>
+<object id="2" type="building" s="190" t="900" zOffset="0" hdg="0" length="10" width="6" height="8"/>
+<object id="3" type="crosswalk" s="100" t="0" zOffset="0" hdg="0" length="4" width="8"/></objects>
+</road></OpenDRIVE>"""
+
+HOUSE = """version: 1
+logs: [drive.mcap]
+runs: 4
+pems:
+  onboard: [{detection: {kind: visible_share}, error: {kind: gaussian, covariance_m2: [[1.0, 0.0], [0.0, 1.0]]}}]
+units: {mast: {at: [-10, 30], height_m: 3, pem: onboard}}
+configurations: {PEM: {units: [mast]}}
+measure: {onset: {kind: in_range, range_m: 200}, distance_to: mast, horizon_s: 2, began: [log_start, crossed]}
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Four cars drive west on the northern lane, 31 frames each; their map lies beside."""
+    cars = [(70.0 + 10 * n, 2.0) for n in range(4)]
+    frames = [
+        (0.1 * k, [Obj(id=1, x=0.0, y=-2.0), *(Obj(id=2 + n, x=x - k, y=y, vx=-10.0, yaw=math.pi)
+                                                for n, (x, y) in enumerate(cars))])
+        for k in range(31)
+    ]  # fmt: skip
+    write_recording(tmp_path / "drive.mcap", frames, host=1)
+    (tmp_path / "town.xodr").write_text(ROAD)
+    return tmp_path
+
+
+def read(folder: Path, *lines: str) -> Recording:
+    (folder / "experiment.yaml").write_text(changed(*lines))
+    return read_study(read_experiment_file(folder / "experiment.yaml")).recordings[0]
+
+
+def test_lanes_areas_and_solids_of_a_map(folder: Path) -> None:
+    recording = read(folder, "maps: [{file: town.xodr, frame: same}]")
+    assert len(recording.lane_boundaries) == 4  # three borders, of which two lanes share one, and a crosswalk
+    assert [(area.name, area.kind) for area in recording.scene.areas] == [("road 7 object 3", "crosswalk")]
+    (solid,) = recording.scene.solids
+    assert solid.corners_m == ((35, 17), (25, 17), (25, 11), (35, 11))
+    assert recording.notes[-3:] == (
+        "maps[0] town.xodr: agreement with the traffic 1.00: 124 of 124 states of moving vehicles are in a lane of "
+        "their heading",
+        "maps[0] town.xodr: 1 solid of the map may hide",
+        "maps[0] town.xodr: 1 solid beyond 200 m of every object: left out",
+    )
+
+
+def test_a_map_is_moved_and_parts_of_it_left_out(folder: Path) -> None:
+    recording = read(folder, "maps: [{file: town.xodr, frame: same, offset_m: [1, -1], lanes: false, solids: false}]")
+    assert (recording.lane_boundaries, recording.scene.solids) == ((), ())
+    assert recording.scene.areas[0].rings_m[0][0] == (53, 3)
+
+
+@pytest.mark.parametrize(("entry", "says"), [
+    ("{file: town.xodr, frame: same, offset_m: [0, -4]}", "found 0%: is the map in the frame of the log?"),
+    ("{file: towm.xodr, frame: same}", "towm.xodr: no such file"),
+    ("{file: town.xodr}", "maps.0.frame|maps\\[0\\].frame"),
+    ("{file: experiment.yaml, frame: same}", "expected a map of OpenDRIVE, Lanelet2, Argoverse 2, found none"),
+])  # fmt: skip
+def test_maps_that_are_refused(folder: Path, entry: str, says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        read(folder, f"maps: [{entry}]")
+
+
+def test_a_map_that_does_not_agree_is_taken_where_asked(folder: Path) -> None:
+    recording = read(folder, "maps: [{file: town.xodr, frame: same, offset_m: [0, -4], agreement: ignore}]")
+    assert "0.00: 0 of 124 states" in recording.notes[-3]
+
+
+def test_a_house_of_the_map_hides(folder: Path) -> None:
+    """From the mast at (−10, 30) the house at x 25 … 35, y 11 … 17 is before cars at (70, 2) and (80, 2)."""
+    seen_s = []
+    for solids in ("true", "false"):
+        (folder / "experiment.yaml").write_text(f"{HOUSE}maps: [{{file: town.xodr, frame: same, solids: {solids}}}]\n")
+        seen_s.append(cr.run(folder / "experiment.yaml").detections["detection_s"].mean())
+    assert seen_s[0] > seen_s[1]
+
+
+def test_results_name_the_map_from_their_folder(folder: Path) -> None:
+    (folder / "experiment.yaml").write_text(changed("maps: [{file: town.xodr, frame: same}]"))
+    cr.run(folder / "experiment.yaml").save(folder / "out")
+    written = yaml.safe_load((folder / "out/experiment.yaml").read_text())
+    assert (folder / "out" / written["maps"][0]["file"]).resolve() == folder / "town.xodr"
+    shutil.rmtree(folder / "out")
