@@ -48,6 +48,8 @@ class MapSolid:
     rings_m: tuple[Float, ...]  # (K, 2) each
     bottom_m: float
     top_m: float
+    above_ground: bool = False  # heights are above the ground at its place, not above z = 0
+    on_ground: bool = False  # nothing is seen below it
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,7 @@ class SiteMap:
     yaw_rad: float = 0.0
     degrees: bool = False  # x is the longitude, y the latitude of WGS84: `proj` tells nothing
     assumed: tuple[str, ...] = field(default=())  # a line for each kind of thing assumed or left out
+    licence: str = ""  # what the file says must be said wherever the map is shown
 
     def moved(self, move: Callable[[Float], Float]) -> SiteMap:
         """The map with all places (N, 2) moved by a function; heights stay."""

@@ -214,7 +214,7 @@ def test_header_says_where_the_map_is(tmp_path: Path) -> None:
     (road().replace("<header/>", "<a>" * 300_002 + "</a>" * 300_002), "with at most 300,000 elements, found more"),
     ("<!DOCTYPE a><OpenDRIVE/>", "expected no DOCTYPE"),
     ("\n<OpenDRIVE><road>", ":2: expected XML, found something else or its end"),
-    ("nothing", "expected a map of OpenDRIVE, Lanelet2, Argoverse 2, found none of them"),
+    ("nothing", "expected a map of OpenDRIVE, Lanelet2, .*, found none of them"),
 ])  # fmt: skip
 def test_what_is_refused(tmp_path: Path, text: str, says: str) -> None:
     with pytest.raises(InputError, match=says):
@@ -311,7 +311,7 @@ def test_map_of_argoverse(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("text", "says"), [
-    ("[" * 200_000, "expected a map of OpenDRIVE, Lanelet2, Argoverse 2, found none"),
+    ("[" * 200_000, "nested without end"),
     ('{"a":' * 200_000, "nested without end"),
     (json.dumps(city()).replace("3.0", "NaN", 1).replace('"x": 0', '"x": NaN', 1), "NaN is no number of JSON"),
     (json.dumps(city()).replace('"x": 0', '"x": 1e308', 1), "expected x, y, z of at most 1e8 m, found"),

@@ -13,17 +13,13 @@ from copem_replay.core.errors import InputError
 from copem_replay.core.site_map import Lane, LaneKind, SiteMap, make_area
 from copem_replay.core.tracks import Area, Float
 from copem_replay.io.convert.conversion import quote_value
-from copem_replay.io.maps.registry import read_json
 
 _FARTHEST: Final = 1e8
 _KIND: Final[dict[str, LaneKind]] = {"VEHICLE": "driving", "BUS": "driving", "BIKE": "bicycle"}
 
 
-def read_argoverse2_map(path: Path) -> SiteMap:
+def read_argoverse2_map(path: Path, parts: dict[str, Any], _heights_m: Mapping[str, float]) -> SiteMap:
     """Lanes and areas of a log's map. Raises InputError."""
-    parts = read_json(path)
-    if not isinstance(parts, dict):
-        raise InputError(f"{path}: expected a map of Argoverse 2, found {quote_value(parts)}")
     lanes = tuple(_read_lane(name, item, path) for name, item in _items(parts, "lane_segments", path))
     crossings, drivable = list[Area](), list[Area]()
     for name, item in _items(parts, "pedestrian_crossings", path):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -43,7 +44,7 @@ class _Nodes:
     degrees: dict[str, tuple[float, float, float]]
 
 
-def read_lanelet2(path: Path) -> SiteMap:
+def read_lanelet2(path: Path, _heights_m: Mapping[str, float] | None = None) -> SiteMap:
     """Lanes and areas of a map. Raises InputError with file and line."""
     nodes, ways, relations = _Nodes({}, {}), dict[str, XmlNode](), list[XmlNode]()
     for part in read_parts(path, ("osm",), most_elements=300_000):

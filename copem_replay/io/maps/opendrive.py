@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -81,7 +81,7 @@ class _Reading:
             )
 
 
-def read_opendrive(path: Path, *, chord_m: float = CHORD_M) -> SiteMap:
+def read_opendrive(path: Path, _heights_m: Mapping[str, float] | None = None, *, chord_m: float = CHORD_M) -> SiteMap:
     """Lanes, areas and solids of a map. Raises InputError with file and line."""
     reading = _Reading(path)
     proj, offset_m, yaw_rad = "", (0.0, 0.0), 0.0

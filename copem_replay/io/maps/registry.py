@@ -3,36 +3,75 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+import mmap
+import re
+from collections.abc import Callable, Mapping
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from copem_replay.core.errors import InputError
 from copem_replay.core.site_map import SiteMap
+from copem_replay.io.maps.solids import DEFAULT_HEIGHTS_M
 
-FORMATS: Final[dict[str, tuple[Callable[[bytes], bool], str]]] = {
-    "OpenDRIVE": (lambda head: b"<OpenDRIVE" in head, "copem_replay.io.maps.opendrive:read_opendrive"),
-    "Lanelet2": (lambda head: b"<osm" in head, "copem_replay.io.maps.lanelet2:read_lanelet2"),
-    "Argoverse 2": (lambda head: head.lstrip()[:1] == b"{", "copem_replay.io.maps.argoverse2:read_argoverse2_map"),
-}
-"""By name: whether the first 4,096 bytes of a file are of this format, and the function that reads it."""
+_LANELET: Final = re.compile(rb"""v\s*=\s*["']lanelet["']""")
+
+
+class _File(NamedTuple):
+    """A file as formats are told by it."""
+
+    path: Path
+    head: bytes  # its first 4,096 bytes
+    content: dict[str, Any] | None  # of JSON; None: it is none
+
+    def has_lanelets(self) -> bool:
+        """Whether a relation is a lanelet: looked for in the whole file."""
+        with self.path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            return _LANELET.search(data) is not None
+
+
+def _has_key(name: str) -> Callable[[_File], bool]:
+    return lambda file: file.content is not None and name in file.content
+
+
+def _is_geojson(file: _File) -> bool:
+    return file.content is not None and file.content.get("type") in ("FeatureCollection", "Feature")
+
+
+FORMATS: Final[dict[str, tuple[Callable[[_File], bool], str]]] = {
+    "OpenDRIVE": (lambda file: b"<OpenDRIVE" in file.head, "copem_replay.io.maps.opendrive:read_opendrive"),
+    "Lanelet2": (
+        lambda file: b"<osm" in file.head and file.has_lanelets(), "copem_replay.io.maps.lanelet2:read_lanelet2",
+    ),
+    "OpenStreetMap": (lambda file: b"<osm" in file.head, "copem_replay.io.maps.osm:read_osm"),
+    "Overpass": (_has_key("elements"), "copem_replay.io.maps.osm:read_overpass"),
+    "GeoJSON": (_is_geojson, "copem_replay.io.maps.geojson:read_geojson"),
+    "Argoverse 2": (_has_key("lane_segments"), "copem_replay.io.maps.argoverse2:read_argoverse2_map"),
+}  # fmt: skip
+"""By name: whether a file is of this format, and the function that reads it.
+
+It is called with the path, the content if it is JSON, and the heights where a map does not say them."""
 _MOST_BYTES: Final = 64_000_000
 """Of a file of JSON: maps of drives have 1 MB, and what is parsed takes ten times as much memory."""
 
 
-def read_map(path: Path) -> SiteMap:
-    """Read a map of any format. Raises InputError: no such file, or no map."""
+def read_map(path: Path, heights_m: Mapping[str, float] = DEFAULT_HEIGHTS_M) -> SiteMap:
+    """Read a map of any format, with heights by kind where it does not say. Raises InputError: no file, or no map."""
     try:
         with path.open("rb") as stream:
             head = stream.read(4096)
     except OSError as error:
         raise InputError(f"{path}: cannot be opened: {error.strerror}") from None
+    if b"OSMHeader" in head[:64]:
+        line = "osmium extract -b WEST,SOUTH,EAST,NORTH"
+        raise InputError(f"{path}: expected XML of OpenStreetMap, found PBF; cut it: `{line} {path.name} -o site.osm`")
+    parsed = read_json(path) if head.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] in (b"{", b"[") else None
+    file = _File(path, head, parsed if isinstance(parsed, dict) else None)
     for is_format, function in FORMATS.values():
-        if is_format(head):
+        if is_format(file):
             module, _, name = function.partition(":")
-            read: Callable[[Path], SiteMap] = getattr(import_module(module), name)
-            return read(path)
+            read: Callable[..., SiteMap] = getattr(import_module(module), name)
+            return read(path, *([file.content] if file.content is not None else []), heights_m)
     raise InputError(f"{path}: expected a map of {', '.join(FORMATS)}, found none of them")
 
 
