@@ -201,6 +201,8 @@ def test_a_lane_that_crosses_itself_often_is_in_no_junction(tmp_path: Path) -> N
     text = road('<arc curvature="0.5"/>', 500.0).replace('junction="-1"', 'junction="12"')
     found = read_map(written(tmp_path, text))
     assert (len(found.lanes), found.areas) == (1, ())
+    assert np.hypot(*(found.lanes[0].left_m[:, :2] - [10, 22]).T) == pytest.approx(2)
+    assert len(found.lanes[0].left_m) > 40 * 4  # four chords of a circle of 2 m are .6 m from it
     assert found.assumed == ("1 lane whose outline crosses itself: not in the area of its junction",)
 
 
