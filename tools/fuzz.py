@@ -5,12 +5,12 @@
 
 Targets are `mcap`, `trace` (OSI) and `folder` (rosbag2), with none of these given eight of ten inputs are MCAP; and
 `experiment` (checked and run), `results` (compared, viewed, plotted, filmed, reported, run again over it with damaged
-parts), `fit` and `convert`. Every input is made from a seed. A recording is surveyed and read, then its other lists
-are read and its messages copied; on the others commands are called. That is done in a process whose memory is watched
-and that is ended when it takes more than 30 s of computing. Good ends: it was read (and what was skipped is said), or
-it is refused in single lines. Printed are lines of JSON: each defect with its seed and where the input is that shows
-it, at the end the counts, and how many inputs got past the header: of a recording messages were found, a document is
-of its format.
+parts), `fit` and `convert`; and `map` (OpenDRIVE, Lanelet2, Argoverse 2). Every input is made from a seed. A
+recording is surveyed and read, then its other lists are read and its messages copied; on the others commands are
+called. That is done in a process whose memory is watched and that is ended when it takes more than 30 s of computing.
+Good ends: it was read (and what was skipped is said), or it is refused in single lines. Printed are lines of JSON:
+each defect with its seed and where the input is that shows it, at the end the counts, and how many inputs got past
+the header: of a recording messages were found, a document is of its format.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from typing import Any
 
 from fuzzing.commands import COMMANDS, make_originals, outcome_of, put_case
 from fuzzing.containers import TARGETS, put
+from fuzzing.maps import outcome_of_map, put_map
 from fuzzing.mcap_model import Model, Piece
 from fuzzing.samples import samples
 
@@ -41,6 +42,7 @@ MOST_BYTES = 1_000_000_000
 _ROOM_BYTES = 3 << 30  # of address space beside what is taken at the start
 _MOST_CALLS = 600  # of commands in a process: writers of Rerun leave threads, whose stacks are address space
 READ, REFUSED = "read", "refused"
+MAP = "map"
 _IN_MEMORY = Path("/dev/shm")  # nothing waits for a disk
 
 
@@ -130,6 +132,13 @@ def _maker(folder: Path, most: int, own: bool, target: str | None) -> Callable[[
             return case.folder, case.done, lambda pipe: outcome_of(case, originals.expected)
 
         return command
+    if target == MAP:
+
+        def site(seed: str) -> Made:
+            path, done = put_map(seed, folder)
+            return path, done, lambda pipe: outcome_of_map(path)
+
+        return site
     all_samples = samples(most, own=own)
     warm = folder / "warm.mcap"
     for sample in all_samples:  # compiles
@@ -282,7 +291,7 @@ def _kept(made: Path, place: Path) -> Path:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("target", nargs="?", choices=(*TARGETS, *COMMANDS))
+    parser.add_argument("target", nargs="?", choices=(*TARGETS, *COMMANDS, MAP))
     parser.add_argument("--inputs", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--minutes", type=float, default=10.0)

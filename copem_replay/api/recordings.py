@@ -76,6 +76,35 @@ def read_lists(path: AnyPath, topic: str, scene: Scene) -> Tracks:
     return read_sensor_data(Path(path), topic, scene)
 
 
+def compare_with_map(path: AnyPath, map_path: AnyPath) -> list[str]:
+    """Lines on how well the lanes of a map agree with the traffic of a recording, and on the shift that is best.
+
+    The map's metres are taken for the recording's; nothing is moved. Raises InputError.
+    """
+    import numpy as np
+
+    from copem_replay.core.errors import InputError, count_noun
+    from copem_replay.io.maps.registry import read_map
+    from copem_replay.metrics.agreement import estimate_shift, find_agreement
+
+    recording, name = read_recording(path), os.path.basename(map_path)
+    site = read_map(Path(map_path))
+    if site.degrees:
+        raise InputError(f"{map_path}: its places are degrees, not metres of the log")
+    found = f"{count_noun(len(site.lanes), 'lane')}, {count_noun(len(site.areas), 'area')}"
+    lines = [f"map {name}: {found}, {count_noun(len(site.solids), 'solid')}; taken as in the frame of the log"]
+    if site.lanes:
+        truth = recording.truth
+        borders = np.concatenate([line[:, :2] for lane in site.lanes for line in (lane.left_m, lane.right_m)])
+        middles = (np.median(borders, axis=0), np.median(np.stack([truth.x_m[0], truth.y_m[0]], axis=1), axis=0))
+        lines.append(f"map {name}: {find_agreement(recording.scene, truth, site.lanes).words}")
+        if (apart_m := float(np.hypot(*(middles[0] - middles[1])))) > np.hypot(*np.ptp(borders, axis=0)):
+            lines.append(f"map {name}: its middle is {apart_m / 1000:.3g} km from the traffic's: not in the same frame")
+        elif (shift := estimate_shift(recording.scene, truth, site.lanes)) is not None:
+            lines.append(f"map {name}: {shift.words}")
+    return lines
+
+
 def inspect_recording(path: AnyPath) -> dict[str, Any]:
     """Survey a recording: topics, true objects, lists of units, span in seconds, rates in Hz, ego, what is missing.
 

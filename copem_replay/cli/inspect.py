@@ -39,12 +39,15 @@ def info(
     logs: LogFiles,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON: one array, an entry per recording.")] = False,
     together: OneDrive = False,
+    maps: Annotated[list[Path] | None, typer.Option("--map", help="A map in the frame of the log. Repeatable.")] = None,
 ) -> int:
     """Describe recordings: what is in them, what is missing.
 
     Topics, object lists, objects, span, rate, ego vehicle. The exit code is 0 when at least one object list is
-    readable, else 2.
+    readable, else 2. With --map: how well lanes agree with the traffic, and the shift at which they would best.
     """
+    if maps and (as_json or together):
+        raise InputError("--map: expected neither --json nor --together beside it")
     if together:
         return _print_clocks(logs, as_json=as_json)
     from copem_replay.experiment.draft.findings import survey_as_json
@@ -56,6 +59,12 @@ def info(
         print(json.dumps([survey_as_json(s) for s in surveys], indent=1, ensure_ascii=False))
     else:
         print_blocks(describe_survey(s, width_of(sys.stdout)) for s in surveys if s.topics)
+    for log in logs if maps else ():
+        from copem_replay.api.recordings import compare_with_map
+
+        for path in maps or ():
+            for line in compare_with_map(log, path):
+                print_line(f"{log}: {line}")
     print_problems(s.reason for s in surveys if s.reason is not None)
     return 0 if any(s.readable or any(u.problem is None for u in s.units) for s in surveys) else 2
 

@@ -5,9 +5,9 @@ Places are metres in the frame of the map until a log's frame is asked for.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -83,3 +83,27 @@ class SiteMap:
 def _move_area(area: Area, move: Callable[[Float], Float]) -> Area:
     rings = (tuple((float(x), float(y)) for x, y in move(np.array(ring))) for ring in area.rings_m)
     return area._replace(rings_m=tuple(rings))
+
+
+def find_borders(lanes: Sequence[Lane]) -> Iterator[Float]:
+    """The borders of lanes, once where two lanes share one."""
+    seen = set[bytes]()
+    for line in (line for lane in lanes for line in (lane.left_m, lane.right_m)):
+        names = {line.tobytes(), line[::-1].tobytes()}
+        if not names & seen:
+            seen |= names
+            yield line
+
+
+_MOST_CROSSING = 200
+"""Corners of an outline that crosses itself and is mended: with more, crossings may be more than can be found."""
+
+
+def make_polygon(rings_m: Sequence[Any]) -> Any:
+    """The polygon of rings as shapely has it, mended where its edges cross; empty where they cross and are many."""
+    import shapely
+
+    polygon = shapely.Polygon(rings_m[0], rings_m[1:]) if len(rings_m[0]) > 2 else shapely.Polygon()
+    if polygon.is_valid:
+        return polygon
+    return shapely.make_valid(polygon) if sum(map(len, rings_m)) <= _MOST_CROSSING else shapely.Polygon()

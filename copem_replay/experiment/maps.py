@@ -14,7 +14,7 @@ from pydantic import Field, PrivateAttr, ValidationInfo, field_validator, model_
 
 from copem_replay.core.components import Flag, Frozen, Positive, error_at_key
 from copem_replay.core.errors import InputError, count_noun
-from copem_replay.core.site_map import Lane, MapSolid, SiteMap
+from copem_replay.core.site_map import MapSolid, SiteMap, find_borders, make_polygon
 from copem_replay.core.tracks import Float, Solid
 from copem_replay.core.yaml import Key
 from copem_replay.io.maps.registry import read_map
@@ -88,8 +88,12 @@ def add_maps(recording: Recording, maps: Sequence[MapFile]) -> tuple[Recording, 
             notes.append(f"{where}: {found.words}")
             if found.refused and asked.agreement == "check":
                 problems.append((("maps", k), _explain_refusal(asked, found.share or 0.0)))
-            lines += [*_find_borders(site.lanes), *_raise_crosswalks(site)]
-        areas += site.areas
+            lines += [*find_borders(site.lanes), *_raise_crosswalks(site)]
+        drawn = [area for area in site.areas if not make_polygon(area.rings_m).is_empty]
+        areas += drawn
+        if len(drawn) < len(site.areas):
+            left_out = count_noun(len(site.areas) - len(drawn), "area")
+            notes.append(f"{where}: {left_out} whose outline crosses itself or has no extent: left out")
         near, counts = _choose_solids(recording, site.solids if asked.solids else (), asked.within_m, where)
         solids += near
         notes += [f"{where}: {count_noun(number, 'solid')} {what}" for what, number in counts.items()]
@@ -103,16 +107,6 @@ def _explain_refusal(asked: MapFile, share: float) -> str:
         f"their heading (on real drives {NOTED_BELOW:.0%} and more), found {share:.0%}: is the map in the frame of the "
         "log? `copem-replay info LOG --map FILE` estimates a shift for `offset_m`; or `agreement: ignore`"
     )
-
-
-def _find_borders(lanes: Sequence[Lane]) -> Iterator[Float]:
-    """The borders of lanes, once where two lanes share one."""
-    seen = set[bytes]()
-    for line in (line for lane in lanes for line in (lane.left_m, lane.right_m)):
-        names = {line.tobytes(), line[::-1].tobytes()}
-        if not names & seen:
-            seen |= names
-            yield line
 
 
 def _raise_crosswalks(site: SiteMap) -> Iterator[Float]:

@@ -29,6 +29,7 @@ _CELL_M: Final = 0.5
 _HEADINGS: Final = 16
 _MOST_STATES: Final = 3000
 _AS_GOOD: Final = 0.95
+_EQUAL: Final = 0.99
 _ELSEWHERE_M: Final = 3.0
 
 
@@ -156,7 +157,8 @@ def estimate_shift(scene: Scene, truth: Tracks, lanes: Sequence[Lane]) -> Shift 
     raster = _HeadingRaster(directed, at_m)
     scores = raster.score_shifts(at_m, truth.yaw_rad[0, rows])
     steps_m = _CELL_M * np.arange(-raster.reach, raster.reach + 1)
-    i, j = np.unravel_index(int(scores.argmax()), scores.shape)
+    move_m = np.where(scores >= _EQUAL * scores.max(), np.hypot(*np.meshgrid(steps_m, steps_m, indexing="ij")), np.inf)
+    i, j = np.unravel_index(int(move_m.argmin()), scores.shape)  # of equals the nearest to where the map is
     away_m = np.hypot(*np.meshgrid(steps_m - steps_m[i], steps_m - steps_m[j], indexing="ij"))
     others = np.where(away_m > _ELSEWHERE_M, scores, -1.0)
     k, m = np.unravel_index(int(others.argmax()), others.shape)

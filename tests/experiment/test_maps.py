@@ -8,9 +8,11 @@ from pathlib import Path
 
 import pytest
 import yaml
+from typer.testing import CliRunner
 
 import copem_replay as cr
 from copem_replay.api.study import read_study
+from copem_replay.cli.main import app
 from copem_replay.core.errors import InputError
 from copem_replay.experiment.file import read_experiment_file
 from copem_replay.io.recording import Recording
@@ -107,3 +109,25 @@ def test_results_name_the_map_from_their_folder(folder: Path) -> None:
     written = yaml.safe_load((folder / "out/experiment.yaml").read_text())
     assert (folder / "out" / written["maps"][0]["file"]).resolve() == folder / "town.xodr"
     shutil.rmtree(folder / "out")
+
+
+def test_info_says_how_a_map_agrees_and_moves_nothing(folder: Path) -> None:
+    """The map lies 3 m too far south: the middle of the lane that goes west is at y = −1, the cars are at 2."""
+    (folder / "off.xodr").write_text(ROAD.replace('y="0"', 'y="-3"'))
+    result = CliRunner().invoke(app, ["info", str(folder / "drive.mcap"), "--map", str(folder / "off.xodr")])
+    assert result.exit_code == 0
+    assert "map off.xodr: 2 lanes, 1 area, 2 solids; taken as in the frame of the log" in result.output
+    assert "agreement with the traffic 0.00: 0 of 124 states" in result.output
+    assert "best agreement with the map moved by [0, 3] m (east, north)" in result.output
+    assert "not determined along 0°" in result.output  # a straight street: the map could lie anywhere along it
+
+
+def test_info_says_that_a_map_is_elsewhere(folder: Path) -> None:
+    (folder / "off.xodr").write_text(ROAD.replace('y="0"', 'y="4000"'))
+    result = CliRunner().invoke(app, ["info", str(folder / "drive.mcap"), "--map", str(folder / "off.xodr")])
+    assert "its middle is 4 km from the traffic's: not in the same frame" in result.output
+
+
+def test_info_refuses_a_map_beside_json(folder: Path) -> None:
+    result = CliRunner().invoke(app, ["info", str(folder / "drive.mcap"), "--json", "--map", str(folder / "town.xodr")])
+    assert "--map: expected neither --json nor --together beside it" in str(result.exception)

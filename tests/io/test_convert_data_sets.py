@@ -97,6 +97,31 @@ def test_argoverse2_from_the_rear_axle_to_the_city(run: Runner) -> None:
         assert f"note: {note}" in found.printed
 
 
+def test_argoverse2_brings_the_borders_of_its_map(run: Runner) -> None:
+    """Two lanes side by side have three borders; they are in the first message alone."""
+    log = av2_log(run, BOXES, POSES)
+    (log / "map").mkdir()
+
+    def line(y: float) -> list[dict[str, float]]:
+        return [{"x": x, "y": y, "z": 20.0} for x in (90.0, 110.0)]
+
+    lanes = {
+        name: {"left_lane_boundary": line(y), "right_lane_boundary": line(y - 3)} for name, y in (("1", 6), ("2", 3))
+    }
+    (log / "map/log_map_archive_x____PIT_city_1.json").write_text(json.dumps({"lane_segments": lanes}))
+    found = run("argoverse2", log)
+    assert [b[:, 1].tolist() for b in found.recording.lane_boundaries] == [[6, 6], [3, 3], [0, 0]]
+    assert not found.messages[1].lane_boundary
+    assert "2 lanes of log_map_archive_x____PIT_city_1.json: its borders are lane boundaries" in found.printed
+
+
+def test_argoverse2_a_map_that_is_none_is_refused(run: Runner) -> None:
+    log = av2_log(run, BOXES, POSES)
+    (log / "map").mkdir()
+    (log / "map/log_map_archive_x.json").write_text("[")
+    assert "log_map_archive_x.json:1: expected JSON" in run.refused("argoverse2", log)
+
+
 def test_argoverse2_a_quaternion_that_overflows_is_no_turn(run: Runner) -> None:
     found = run("argoverse2", av2_log(run, [{**BOXES[0], "qw": 1e200}, *BOXES[1:]], POSES))
     assert len(found.values(found.id_of("car-uuid"), "x_m")) == 1  # of two
@@ -179,6 +204,33 @@ def ego() -> dict[str, Any]:
         width=np.full((4, 1), 4.08),
         height=np.full((4, 1), 1.56),
     )
+
+
+def test_scenarionet_brings_lines_of_the_road_and_outlines_of_lanes(run: Runner) -> None:
+    whole = scenario(ego=ego())
+    whole["map_features"] = {
+        "1": {"type": "ROAD_LINE_SOLID_SINGLE_WHITE", "polyline": np.array([[0.0, 1.0], [5.0, 1.0], [9.0, 1.0]])},
+        "2": {
+            "type": "LANE_SURFACE_STREET",
+            "polyline": np.zeros((2, 2)),
+            "polygon": [[0, 0, 4], [9, 0, 4], [9, 3, 4]],
+        },
+        "3": {"type": "LANE_SURFACE_STREET", "polyline": np.zeros((2, 2))},
+    }
+    found = run("scenarionet", run.file("s.pkl", pickle.dumps(whole)))
+    assert [line.tolist() for line in found.recording.lane_boundaries] == [
+        [[0, 1, 0], [9, 1, 0]], [[0, 0, 4], [9, 0, 4], [9, 3, 4]],
+    ]  # fmt: skip
+    assert "2 lines of the road taken as lane boundaries" in found.printed
+
+
+@pytest.mark.parametrize(
+    "points", [[[0, 1e300], [1, 1]], [[0, math.nan], [1, 1]], [0, 1], "x", [[1], [2]], [[10**400, 1]]]
+)
+def test_scenarionet_lines_that_are_none(run: Runner, points: Any) -> None:
+    whole = scenario(ego=ego()) | {"map_features": {"1": {"type": "ROAD_EDGE_BOUNDARY", "polyline": points}}}
+    said = run.refused("scenarionet", run.file("s.pkl", pickle.dumps(whole)))
+    assert "map_features 1: polyline: expected rows of 2 or 3 numbers of at most 1e+08, found something else" in said
 
 
 def test_scenarionet_ego_put_right(run: Runner) -> None:

@@ -196,6 +196,16 @@ def test_crosswalks_and_junctions_are_areas(tmp_path: Path) -> None:
     assert shapely.Polygon(junction.rings_m[0]).area == pytest.approx(300, rel=0.05)
 
 
+def test_a_lane_that_crosses_itself_often_is_in_no_junction(tmp_path: Path) -> None:
+    """A road that goes around forty times: mending its outline would take longer than anybody waits."""
+    text = road('<arc curvature="0.5"/>', 500.0).replace('junction="-1"', 'junction="12"')
+    found = read_map(written(tmp_path, text))
+    assert (len(found.lanes), found.areas) == (1, ())
+    assert np.hypot(*(found.lanes[0].left_m[:, :2] - [10, 22]).T) == pytest.approx(2)
+    assert len(found.lanes[0].left_m) > 40 * 4  # four chords of a circle of 2 m are .6 m from it
+    assert found.assumed == ("1 lane whose outline crosses itself: not in the area of its junction",)
+
+
 def test_header_says_where_the_map_is(tmp_path: Path) -> None:
     reference, offset = "<![CDATA[ EPSG:25832 ]]>", '<offset x="-1000" y="5" z="0" hdg="0.5"/>'
     header = f"<header><geoReference>{reference}</geoReference>{offset}</header>"

@@ -3,7 +3,7 @@
 Boxes are in the frame of the ego vehicle, whose origin is the rear axle, not the centre of the car: each is brought
 to the city frame with the ego pose of its time stamp. Quaternions are w x y z. Stamps are integer nanoseconds of the
 recording car's own clock (3.159e17: not Unix time). The columns and categories are those of av2-api (MIT). There are
-no velocities. A rider and his bicycle are two boxes.
+no velocities. A rider and his bicycle are two boxes. Borders of lanes are those of `map/log_map_archive_*.json`.
 """
 
 from __future__ import annotations
@@ -17,8 +17,10 @@ import pyarrow as pa
 import pyarrow.feather
 
 from copem_replay.core.errors import InputError
+from copem_replay.core.site_map import find_borders
 from copem_replay.core.tracks import Float
 from copem_replay.io.convert.conversion import KINDS, Box, ConversionReport, Frame, rotation_from_quaternion
+from copem_replay.io.maps.argoverse2 import read_argoverse2_map
 
 EGO_SIZE_M: Final = (4.877, 2.0, 1.473)
 """Length, width, height of the cars, Ford Fusion Hybrid; the recording `av2_3b3570b4` gives the ego this size."""
@@ -85,6 +87,7 @@ def frames(
         f"ego vehicle: id 1, {size} m, its centre {centre} m (ahead, left, up) of the rear axle, where the log has it"
     )
     ego_R_object, ego_t_object = _read_se3(boxes)
+    lines = _read_borders(log, report)
     for stamp_ns, rows in _group_by_stamp(boxes["timestamp_ns"]):
         if (pose := pose_of.get(stamp_ns)) is None:
             report.count("annotated instant", "without an ego pose of the same time stamp: skipped")
@@ -108,7 +111,18 @@ def frames(
                     size_m=(length, width, height),
                 )
             )
-        yield Frame(stamp_ns, frame_boxes, host=1)
+        yield Frame(stamp_ns, frame_boxes, host=1, lines=lines)
+        lines = []
+
+
+def _read_borders(log: Path, report: ConversionReport) -> list[Float]:
+    """The borders of lanes of the log's map, in the city frame; none without a map."""
+    lines = list[Float]()
+    for path in sorted((log / "map").glob("log_map_archive_*.json")):
+        site = read_argoverse2_map(path)
+        lines += find_borders(site.lanes)
+        report.count("lane", f"of {path.name}: its borders are lane boundaries", len(site.lanes))
+    return lines
 
 
 def _make_ego_box(R: Float, t: Float, size_m: tuple[float, float, float], centre_m: tuple[float, float, float]) -> Box:

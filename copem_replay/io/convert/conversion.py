@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
 from importlib import import_module
@@ -18,6 +18,7 @@ from typing import Any, Final
 
 import numpy as np
 from osi3.osi_groundtruth_pb2 import GroundTruth
+from osi3.osi_lane_pb2 import LaneBoundary
 from osi3.osi_object_pb2 import MovingObject, StationaryObject
 
 from copem_replay.core.errors import InputError, OutputError, count_noun, unknown_name_message
@@ -192,6 +193,7 @@ class Frame:
     stamp_ns: int
     boxes: list[Box]
     host: int | None = None
+    lines: Sequence[Float] = ()  # (K, 3) each: borders of lanes, in the first frame alone
 
 
 @dataclass
@@ -259,6 +261,12 @@ def _encode_messages(
 
 def _encode_message(frame: Frame, report: ConversionReport) -> GroundTruth:
     osi = empty_ground_truth(frame.stamp_ns, frame.host)
+    for number, line in enumerate(frame.lines):
+        boundary = osi.lane_boundary.add()
+        boundary.id.value, boundary.classification.type = number, LaneBoundary.Classification.TYPE_NO_LINE
+        for point in line.tolist():
+            place = boundary.boundary_line.add().position
+            place.x, place.y, place.z = point
     for box in frame.boxes:
         if not all(map(math.isfinite, (*box.at_m, box.yaw_rad, *box.size_m))):
             report.count("object state", "with a number that is none: skipped")

@@ -31,6 +31,7 @@ from copem_replay.io.convert.conversion import (
 )
 
 _MOST_COLUMNS: Final = 16  # of an array; formats have at most 3
+_FARTHEST_M: Final = 1e8  # of lines of the map
 _MOST_STEPS: Final = 10_000_000  # eleven days at 10 Hz; a longer array is an error
 
 EGO_CENTRE_M: Final = 1.385
@@ -104,9 +105,38 @@ def frames(path: Path, report: ConversionReport, *, ego_centre_m: float | None =
             report.assume(f"position of the ego vehicle ({host}): its rear axle, the centre {ego_centre_m:g} m ahead")
             _move_ahead(tracks[host], ego_centre_m)
     report.names |= {ids[name]: name for name in tracks}
+    lines = _read_road_lines(scenario, str(path), report)
     for step, stamp_ns in enumerate(stamps_ns):
         boxes = [_make_box(ids[name], t, step) for name, t in tracks.items() if t.valid[step]]
-        yield Frame(stamp_ns, boxes, ids.get(host) if host is not None else None)
+        yield Frame(stamp_ns, boxes, ids.get(host) if host is not None else None, lines if step == 0 else ())
+
+
+def _read_road_lines(scenario: Any, where: str, report: ConversionReport) -> list[Float]:
+    """Lines on the road and outlines of lanes, (K, 3) each, thinned to 5 cm; lanes without an outline have none."""
+    import shapely
+
+    lines, features = list[Float](), scenario.get("map_features") if isinstance(scenario, dict) else None
+    for name, feature in features.items() if isinstance(features, dict) else ():
+        kind = str(feature.get("type", "")) if isinstance(feature, dict) else ""
+        key = "polyline" if kind.startswith("ROAD_") else "polygon" if kind.startswith("LANE_") else None
+        if key is None or key not in feature:
+            continue
+        points = _read_points(feature[key], f"{where}: map_features {name}: {key}")
+        if len(points) > 1:
+            lines.append(shapely.get_coordinates(shapely.LineString(points).simplify(0.05), include_z=True))
+    report.count("line", "of the road taken as lane boundaries", len(lines))
+    return lines
+
+
+def _read_points(value: Any, where: str) -> Float:
+    """Points (K, 3), z = 0 where there is none. Raises InputError."""
+    try:
+        points = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        points = np.zeros(0)
+    if points.ndim != 2 or points.shape[1] not in (2, 3) or not (np.abs(points) <= _FARTHEST_M).all():
+        raise InputError(f"{where}: expected rows of 2 or 3 numbers of at most {_FARTHEST_M:g}, found something else")
+    return np.concatenate([points, np.zeros((len(points), 3 - points.shape[1]))], axis=1)
 
 
 def _make_box(ident: int, track: _Track, step: int) -> Box:

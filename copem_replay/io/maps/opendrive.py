@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from copem_replay.core.errors import InputError, count_noun
-from copem_replay.core.site_map import Lane, LaneKind, MapSolid, SiteMap, make_area
+from copem_replay.core.site_map import Lane, LaneKind, MapSolid, SiteMap, make_area, make_polygon
 from copem_replay.core.tracks import Area, Float
 from copem_replay.io.convert.commonroad import XmlNode, read_parts
 from copem_replay.io.convert.conversion import quote_value
@@ -241,7 +241,10 @@ def _join_junctions(reading: _Reading) -> None:
     import shapely
 
     for name, outlines in reading.outlines.items():
-        joined = shapely.union_all([shapely.make_valid(shapely.Polygon(outline)).buffer(0.05) for outline in outlines])
+        polygons = [make_polygon([outline]) for outline in outlines]
+        if crossing := sum(polygon.is_empty for polygon in polygons):
+            reading.counts["lane", "whose outline crosses itself: not in the area of its junction"] += crossing
+        joined = shapely.union_all([polygon.buffer(0.05) for polygon in polygons])
         for polygon in shapely.get_parts(joined):
             if polygon.geom_type == "Polygon" and polygon.area > 1.0:
                 rings = [np.array(ring.coords) for ring in (polygon.exterior, *polygon.interiors)]

@@ -60,6 +60,12 @@ class Piece:
     shape: str
     numbers: Mapping[str, float]
 
+    @property
+    def sharpest_per_m(self) -> float:
+        """The largest curvature; of cubics one that nobody drives in a bend."""
+        bends = [abs(self.numbers[name]) for name in ("curvature", "curvStart", "curvEnd") if name in self.numbers]
+        return max(bends, default=0.0 if self.shape == "line" else 0.1)
+
     def follow(self, ds: Float) -> tuple[Float, Float, Float]:
         """Place ahead, place to the left and turn, (K,) each, at distances along the piece from its start."""
         return SHAPES[self.shape][1](ds, self.length_m, self.numbers)
@@ -183,8 +189,13 @@ class RoadLine:
         return places
 
     def _split_turns(self, places: Float) -> Float:
-        """Cut stretches longer than 100 m: a circle that closes has its ends and its middle on one line."""
-        counts = np.maximum(1, np.ceil(np.diff(places) / 100.0))
+        """Cut stretches longer than 100 m or that turn by more than a radian: a quarter of the way might be on a chord
+        again, some circles later.
+        """
+        starts = np.array([piece.s for piece in self.pieces])
+        which = np.clip(np.searchsorted(starts, places[:-1] + _SAME_S_M, side="right") - 1, 0, len(starts) - 1)
+        bends = np.array([piece.sharpest_per_m for piece in self.pieces])[which]
+        counts = np.ceil(np.diff(places) * np.maximum(bends, 0.01))
         if counts.sum() > _MOST_PLACES:
             raise InputError(f"{self.name}: expected a road of at most {_MOST_PLACES:,} places, found more")
         cut = [np.linspace(a, b, int(n), endpoint=False) for a, b, n in zip(places, places[1:], counts, strict=False)]

@@ -21,6 +21,7 @@ from copem_replay.core.errors import ExperimentError
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.geometry import are_in_area, polygon_corners, pose_on_path
 from copem_replay.core.interpolation import interpolate_states
+from copem_replay.core.site_map import make_polygon
 from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int, Scene, Tracks
 from copem_replay.metrics.braking.encounter import EgoPath
 from copem_replay.metrics.config import Confirm, Conflict, MetricsSetup, Within
@@ -263,9 +264,7 @@ def _are_in_areas(x_m: Float, y_m: Float, scene: Scene, names: tuple[str, ...], 
             continue
         for area in scene.areas:
             if name in (area.name, area.kind):
-                inside |= shapely.intersects(
-                    shapely.make_valid(shapely.Polygon(area.rings_m[0], area.rings_m[1:])), points
-                )
+                inside |= shapely.intersects(make_polygon(area.rings_m), points)
     return inside
 
 
