@@ -5,7 +5,7 @@
 
 Targets are `mcap`, `trace` (OSI) and `folder` (rosbag2), with none of these given eight of ten inputs are MCAP; and
 `experiment` (checked and run), `results` (compared, viewed, plotted, filmed, reported, run again over it with damaged
-parts), `fit` and `convert`; and `map` (OpenDRIVE, Lanelet2, Argoverse 2). Every input is made from a seed. A
+parts), `fit` and `convert`; and `map` (all formats). Every input is made from a seed. A
 recording is surveyed and read, then its other lists are read and its messages copied; on the others commands are
 called. That is done in a process whose memory is watched and that is ended when it takes more than 30 s of computing.
 Good ends: it was read (and what was skipped is said), or it is refused in single lines. Printed are lines of JSON:

@@ -1,4 +1,4 @@
-"""Hostile maps for `fuzz.py`: OpenDRIVE, Lanelet2 and Argoverse 2, hit in every way, read and added to a recording."""
+"""Hostile maps of all formats for `fuzz.py`, hit in every way, read and added to a recording."""
 
 from __future__ import annotations
 
@@ -76,7 +76,50 @@ def _city() -> str:
     )
 
 
-SEEDS = {"map.xodr": _ROAD, "map.osm": _lanelets(), "map.json": _city()}
+def _houses() -> str:
+    """OpenStreetMap: a house with a hole of two ways, a part with levels, a wall, a roof."""
+    at = [(0, 0), (20, 0), (20, 20), (0, 20), (5, 5), (10, 5), (10, 10), (30, 0)]
+    nodes = "".join(f'<node id="{k}" lat="{48 + y / 1e5}" lon="{11 + x / 1e5}"/>' for k, (x, y) in enumerate(at))
+
+    def way(ident: int, refs: tuple[int, ...], **tags: str) -> str:
+        said = "".join(f'<tag k="{k.replace("_", ":")}" v="{v}"/>' for k, v in tags.items())
+        return f'<way id="{ident}">{"".join(f"""<nd ref="{ref}"/>""" for ref in refs)}{said}</way>'
+
+    ways = way(10, (0, 1, 2)) + way(11, (2, 3, 0)) + way(12, (4, 5, 6, 4))
+    ways += way(13, (0, 1, 2, 0), building_part="yes", building_levels="3", min_height="2 m")
+    ways += way(14, (3, 7), barrier="wall", height="12'6&quot;") + way(15, (0, 4, 7, 0), building="roof")
+    members = "".join(
+        f'<member type="way" ref="{ref}" role="{role}"/>' for ref, role in ((10, "outer"), (11, "outer"), (12, "inner"))
+    )
+    relation = f'<relation id="20">{members}<tag k="type" v="multipolygon"/><tag k="building" v="yes"/></relation>'
+    return f"<osm>{nodes}{ways}{relation}</osm>"
+
+
+def _features() -> str:
+    ring = [[11.0, 48.0], [11.001, 48.0], [11.001, 48.001], [11.0, 48.0]]
+    shapes = [
+        {"type": "Polygon", "coordinates": [ring]}, {"type": "MultiPolygon", "coordinates": [[ring]]},
+        {"type": "LineString", "coordinates": ring},
+    ]  # fmt: skip
+    said = {"building": "yes", "height": "7", "levels": 2, "min_height": 1, "barrier": "wall"}
+    return json.dumps(
+        {
+            "type": "FeatureCollection",
+            "features": [{"type": "Feature", "properties": said, "geometry": g} for g in shapes],
+        }
+    )
+
+
+def _elements() -> str:
+    nodes = [{"type": "node", "id": k, "lat": 48 + k % 2 / 1e4, "lon": 11 + k // 2 / 1e4} for k in range(4)]
+    way = {"type": "way", "id": 9, "nodes": [0, 1, 3, 0], "tags": {"building": "yes", "building:levels": "2"}}
+    members = [{"type": "way", "ref": 9, "role": "outer"}]
+    relation = {"type": "relation", "id": 8, "members": members, "tags": {"type": "multipolygon", "building": "yes"}}
+    return json.dumps({"elements": [*nodes, way, relation]})
+
+
+SEEDS = {"map.xodr": _ROAD, "map.osm": _lanelets(), "map.json": _city(), "houses.osm": _houses(),
+         "features.json": _features(), "elements.json": _elements()}  # fmt: skip
 _VALUES = ("nan", "inf", "-inf", "1e308", "-1e308", "1e-320", "0", "-1", "1e7", "1e8", "99999999999999999999", "", "x",
            "\u0661", "1_0", " 3 ", "1e-9", "1e6", "-0", "0x10", "true", "LHT", "driving", "crosswalk")  # fmt: skip
 
@@ -126,15 +169,16 @@ def put_map(seed: str, folder: Path) -> tuple[Path, str]:
     dice = random.Random(seed)
     name = dice.choice(sorted(SEEDS))
     data = SEEDS[name].encode()
-    if dice.random() < 0.5 and name != "map.json":
+    is_json = name.endswith(".json")
+    if dice.random() < 0.5 and not is_json:
         data = _xml_hit(data, dice)
-    elif name == "map.json" and dice.random() < 0.01:
+    elif is_json and dice.random() < 0.01:
         data = b'{"a":' * dice.choice((500, 100_000)) + b"1"
-    elif name == "map.json" and dice.random() < 0.005:
+    elif is_json and dice.random() < 0.005:
         points = ",".join(['{"x":1,"y":2}'] * dice.choice((100_000, 1_000_000)))
         data = f'{{"drivable_areas":{{"1":{{"area_boundary":[{points}]}}}}}}'.encode()
     else:
-        data = document_hit(name if name == "map.json" else "map.xml", data, dice)
+        data = document_hit(name if is_json else "map.xml", data, dice)
     path = folder / name
     path.write_bytes(data)
     return path, name
@@ -175,4 +219,5 @@ def outcome_of_map(path: Path) -> dict[str, Any]:
     for line in said:
         if len(line.splitlines()) > 1 or not all(c.isprintable() for c in line):
             return {"outcome": "defect", "what": f"not one printable line: {line[:150]!r}"}
-    return {"outcome": end, "said": said, "past": end == "read"}
+    past = end == "read" or any("places are degrees" in line for line in said)
+    return {"outcome": end, "said": said, "past": past}

@@ -45,7 +45,7 @@ def _find_shapes(feature: object, where: str, k: int) -> Iterator[Shape]:
     if not isinstance(feature, dict):
         raise InputError(f"{where}: expected a feature, found {quote_value(feature)}")
     geometry, tags = feature.get("geometry"), _find_tags(feature, where)
-    if not isinstance(geometry, dict) or geometry.get("type") not in _DEPTH:
+    if not isinstance(geometry, dict) or str(geometry.get("type")) not in _DEPTH:
         return
     depth = _DEPTH[geometry["type"]]
     lists = _check_positions(geometry.get("coordinates"), depth, where)
