@@ -86,6 +86,16 @@ def test_commands_on_what_is_hostile_end_well(target, inputs):
 
 
 @pytest.mark.long
+@watched
+def test_hostile_maps_end_well():
+    """Maps of every format are read and added to a recording, or refused in lines."""
+    found = fuzz.fuzz(300, 6, target=fuzz.MAP)
+    assert found["defects"] == []
+    assert found["inputs"] == 300
+    assert found["past_header"] > 60
+
+
+@pytest.mark.long
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="processes are found through /proc")
 @pytest.mark.parametrize(("command", "kills"), [("convert", 10), ("fit", 2)])
 def test_killed_commands_leave_the_old_or_the_new(command, kills):

@@ -27,6 +27,8 @@ _FARTHEST: Final = 1e8
 _MOST_COPIES: Final = 20_000
 _MOST_CORNERS: Final = 1_000_000
 """Of all borders and outlines of a map."""
+_MOST_LANES: Final = 100
+"""Beside one another on one side."""
 _FLAT_M: Final = 0.05
 
 _LANE_KIND: Final[dict[str, LaneKind]] = {
@@ -181,7 +183,11 @@ def _read_lanes(reading: _Reading, road: XmlNode, line: RoadLine, chord_m: float
         if not end - start > 1e-6:
             continue
         for side, sign in (("left", 1), ("right", -1)):
-            lanes = [_read_lane(reading, node, start) for node in _children(section, side, "lane")]
+            nodes = _children(section, side, "lane")
+            if len(nodes) > _MOST_LANES:
+                expected = f"expected at most {_MOST_LANES} lanes, found {len(nodes):,}"
+                raise InputError(f"{reading.path}:{section.line}: <{side}>: {expected}")
+            lanes = [_read_lane(reading, node, start) for node in nodes]
             lanes = sorted((lane for lane in lanes if lane.number), key=lambda lane: abs(lane.number))
             if not lanes:
                 continue

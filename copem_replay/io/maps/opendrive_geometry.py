@@ -19,7 +19,7 @@ from copem_replay.core.tracks import Float
 CHORD_M: Final = 0.05
 """A chord is at most this far from the curve that it stands for."""
 _MOST_PLACES: Final = 50_000
-"""Places along one section of a road: 500 km with chords of 10 m. A road that asks for more is refused."""
+"""Places on all curves of one section of a road together: with ten lanes 50 km in chords of 10 m."""
 _SAME_S_M: Final = 1e-9
 _NO_SPIRAL_RAD: Final = 1e-7
 """A curvature that changes the heading by less over its whole length is constant: 3e-5 m in a kilometre."""
@@ -174,21 +174,26 @@ class RoadLine:
         """
         inner = [s for s in (*breaks, *(piece.s for piece in self.pieces)) if start < s < end]
         places = np.unique(np.array([start, *inner, end]))
-        places = self._split_turns(places)
+        most = _MOST_PLACES // len(beside(places[:1]))
+        self._check_places(len(places), most)
+        places = self._split_turns(places, most)
         open_ = np.ones(len(places) - 1, dtype=bool)
         while open_.any():
             first, last = places[:-1][open_], places[1:][open_]
             far = self._is_far(first, last, beside, chord_m) & (last - first > 0.01)
             new = ((first + last) / 2)[far]
-            if len(places) + len(new) > _MOST_PLACES:
-                raise InputError(f"{self.name}: expected a road of at most {_MOST_PLACES:,} places, found more")
+            self._check_places(len(places) + len(new), most)
             again = np.zeros(len(open_), dtype=bool)
             again[np.flatnonzero(open_)[far]] = True
             at = np.flatnonzero(again)
             places, open_ = np.insert(places, at + 1, new), np.repeat(again, 1 + again)
         return places
 
-    def _split_turns(self, places: Float) -> Float:
+    def _check_places(self, number: float, most: int) -> None:
+        if number > most:
+            raise InputError(f"{self.name}: expected at most {most:,} places along a section to follow it, found more")
+
+    def _split_turns(self, places: Float, most: int) -> Float:
         """Cut stretches longer than 100 m or that turn by more than a radian: a quarter of the way might be on a chord
         again, some circles later.
         """
@@ -196,8 +201,7 @@ class RoadLine:
         which = np.clip(np.searchsorted(starts, places[:-1] + _SAME_S_M, side="right") - 1, 0, len(starts) - 1)
         bends = np.array([piece.sharpest_per_m for piece in self.pieces])[which]
         counts = np.ceil(np.diff(places) * np.maximum(bends, 0.01))
-        if counts.sum() > _MOST_PLACES:
-            raise InputError(f"{self.name}: expected a road of at most {_MOST_PLACES:,} places, found more")
+        self._check_places(float(counts.sum()), most)
         cut = [np.linspace(a, b, int(n), endpoint=False) for a, b, n in zip(places, places[1:], counts, strict=False)]
         return np.concatenate([*cut, places[-1:]])
 
