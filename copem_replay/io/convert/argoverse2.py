@@ -20,7 +20,7 @@ from copem_replay.core.errors import InputError
 from copem_replay.core.site_map import find_borders
 from copem_replay.core.tracks import Float
 from copem_replay.io.convert.conversion import KINDS, Box, ConversionReport, Frame, rotation_from_quaternion
-from copem_replay.io.maps.argoverse2 import read_argoverse2_map
+from copem_replay.io.maps.registry import read_map
 
 EGO_SIZE_M: Final = (4.877, 2.0, 1.473)
 """Length, width, height of the cars, Ford Fusion Hybrid; the recording `av2_3b3570b4` gives the ego this size."""
@@ -119,7 +119,7 @@ def _read_borders(log: Path, report: ConversionReport) -> list[Float]:
     """The borders of lanes of the log's map, in the city frame; none without a map."""
     lines = list[Float]()
     for path in sorted((log / "map").glob("log_map_archive_*.json")):
-        site = read_argoverse2_map(path)
+        site = read_map(path)
         lines += find_borders(site.lanes)
         report.count("lane", f"of {path.name}: its borders are lane boundaries", len(site.lanes))
     return lines
