@@ -18,10 +18,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import shapely
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -75,11 +78,19 @@ class Solid(NamedTuple):
     bottom_m: float  # above z = 0
     height_m: float
     on_ground: bool = False  # its bottom is the ground, as far as that is known
+    holes_m: tuple[tuple[tuple[float, float], ...], ...] = ()  # courtyards: corners of each
 
     @property
     def top_m(self) -> float:
         """Above z = 0."""
         return self.bottom_m + self.height_m
+
+    @property
+    def outline(self) -> shapely.Polygon:
+        """The polygon with its holes."""
+        import shapely
+
+        return shapely.Polygon(self.corners_m, self.holes_m)
 
 
 class Area(NamedTuple):

@@ -3,40 +3,66 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Final, Literal, Self
 
 import numpy as np
 from pydantic import Field, PrivateAttr, ValidationInfo, field_validator, model_validator
 
 from copem_replay.core.components import Flag, Frozen, Positive, error_at_key
 from copem_replay.core.errors import InputError, count_noun
-from copem_replay.core.site_map import MapSolid, SiteMap, find_borders, make_polygon
+from copem_replay.core.site_map import MapSolid, OnEarth, SiteMap, find_borders, make_polygon
 from copem_replay.core.tracks import Float, Solid
 from copem_replay.core.yaml import Key
 from copem_replay.io.maps.registry import read_map
+from copem_replay.io.maps.solids import DEFAULT_HEIGHTS_M
 from copem_replay.io.open import sha256_of
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.agreement import NOTED_BELOW, REFUSED_BELOW, find_agreement
 from copem_replay.perception.config import InPlane
+from copem_replay.perception.sensor_poses import FAR_GROUND_M, find_ground, make_solid_statics
+
+SolidKind = Literal["building", "wall", "hedge", "barrier", "vegetation", "pole"]
+_KINDS_OF: Final[Mapping[SolidKind, tuple[str, ...]]] = {
+    "wall": ("wall", "retaining_wall", "city_wall"),
+    "barrier": ("barrier", "railing", "obstacle"),
+    "vegetation": ("vegetation", "tree"),
+    "pole": ("pole", "gantry"),
+}
+"""Kinds of maps by those that are asked for; others by their own name."""
+_MOST_PARTS: Final = 50_000
+"""Convex parts of the solids of one log: each is looked at from each unit in each list."""
+
+
+class MapHeights(Frozen):
+    """Metres by kind, where a map does not say; `level`: of one storey."""
+
+    building: Positive = DEFAULT_HEIGHTS_M["building"]
+    wall: Positive = DEFAULT_HEIGHTS_M["wall"]
+    hedge: Positive = DEFAULT_HEIGHTS_M["hedge"]
+    retaining_wall: Positive = DEFAULT_HEIGHTS_M["retaining_wall"]
+    city_wall: Positive = DEFAULT_HEIGHTS_M["city_wall"]
+    level: Positive = DEFAULT_HEIGHTS_M["level"]
 
 
 class MapFile(Frozen):
-    """A map: OpenDRIVE, Lanelet2 or Argoverse 2, told apart by content. `file` is relative to the experiment file.
+    """A map: OpenStreetMap, GeoJSON, OpenDRIVE, Lanelet2 or Argoverse 2. `file` is relative to the experiment file.
 
-    `frame: same`: the map's metres are the log's. `offset_m` is added to them. `lanes`: they are drawn, and held
-    against the traffic. `solids`: the map's objects hide; `within_m`: those this near to any object of the log.
+    `frame: same`: the map's metres are the log's; left out: the map's degrees, by the place of the log. `offset_m` is
+    added to its metres. `lanes`: they are drawn, and held against the traffic. `solids`: the map's objects hide, or
+    those of the kinds that are listed; `within_m`: those this near to any object of the log.
     `agreement: ignore`: a map whose lanes the traffic does not keep to is not refused.
     """
 
     file: Annotated[str, Field(min_length=1)]
-    frame: Literal["same"]
+    frame: Literal["same"] | None = None
     offset_m: InPlane = (0.0, 0.0)
     lanes: Flag = True
-    solids: Flag = True
+    solids: Flag | tuple[SolidKind, ...] = True
+    heights_m: MapHeights = MapHeights()
     within_m: Positive = 200.0
     agreement: Literal["check", "ignore"] = "check"
     _sha256: str = PrivateAttr("")
@@ -53,7 +79,7 @@ class MapFile(Frozen):
             if not Path(self.file).is_file():
                 raise InputError(f"{self.file}: no such file")
             self._sha256 = sha256_of(Path(self.file))
-            if _read_map_once(self.file, self._sha256).degrees:
+            if self.read_once().degrees and self.frame == "same":
                 raise InputError(f"{self.file}: its places are degrees, not metres of the log: no `frame: same`")
         except InputError as error:
             raise error_at_key("file", str(error)) from None
@@ -64,24 +90,48 @@ class MapFile(Frozen):
         """Of the file when the experiment was read."""
         return self._sha256
 
-    @property
-    def site(self) -> SiteMap:
-        """The map in the frame of the log."""
-        offset_m = np.array(self.offset_m)
-        return _read_map_once(self.file, self._sha256).moved(lambda at_m: at_m + offset_m)
+    def read_once(self) -> SiteMap:
+        """The map as its file has it. Raises InputError."""
+        return _read_map_once(self.file, self._sha256, tuple(self.heights_m.model_dump().items()))
+
+    def place(self, frame: OnEarth | None) -> SiteMap:
+        """The map in metres of a log with this frame. Raises InputError: its place is not known."""
+        site, offset_m = self.read_once(), np.array(self.offset_m)
+        if self.frame == "same":
+            return site.moved(lambda at_m: at_m + offset_m)
+        if not site.degrees:
+            raise InputError(f"{self.file}: its places are metres: expected `frame: same` where they are the log's")
+        if frame is None:
+            raise InputError(f"{self.file}: its places are degrees, and the log has no place on earth: write `frame:`")
+        return site.moved(lambda degrees: frame.from_wgs84(degrees[:, ::-1]) + offset_m)
+
+    def choose_kinds(self, site: SiteMap) -> list[MapSolid]:
+        """The solids of a map that are asked for."""
+        if isinstance(self.solids, bool):
+            return list(site.solids) if self.solids else []
+        wanted = {name for kind in self.solids for name in _KINDS_OF.get(kind, (kind,))}
+        return [solid for solid in site.solids if solid.kind in wanted]
 
 
 @lru_cache(maxsize=4)
-def _read_map_once(file: str, _sha256: str) -> SiteMap:
-    return read_map(Path(file))
+def _read_map_once(file: str, _sha256: str, heights_m: tuple[tuple[str, float], ...]) -> SiteMap:
+    return read_map(Path(file), dict(heights_m))
 
 
-def add_maps(recording: Recording, maps: Sequence[MapFile]) -> tuple[Recording, list[tuple[Key, str]]]:
-    """A recording with what its maps add, and the problems with them, by key."""
+def add_maps(
+    recording: Recording, maps: Sequence[MapFile], frame: OnEarth | None = None
+) -> tuple[Recording, list[tuple[Key, str]]]:
+    """A recording with what its maps add, and the problems with them, by key. `frame`: of the recording."""
     lines, areas, solids = list(recording.lane_boundaries), list(recording.scene.areas), list(recording.scene.solids)
     notes, problems = list(recording.notes), list[tuple[Key, str]]()
     for k, asked in enumerate(maps):
-        site, where = asked.site, f"maps[{k}] {Path(asked.file).name}"
+        where = f"maps[{k}] {Path(asked.file).name}"
+        try:
+            site = asked.place(frame)
+        except InputError as error:
+            problems.append((("maps", k), str(error)))
+            continue
+        notes += [f"{where}: {site.licence}"] if site.licence else []
         notes += [f"{where}: {line}" for line in site.assumed]
         if asked.lanes and site.lanes:
             found = find_agreement(recording.scene, recording.truth, site.lanes)
@@ -94,9 +144,14 @@ def add_maps(recording: Recording, maps: Sequence[MapFile]) -> tuple[Recording, 
         if len(drawn) < len(site.areas):
             left_out = count_noun(len(site.areas) - len(drawn), "area")
             notes.append(f"{where}: {left_out} whose outline crosses itself or has no extent: left out")
-        near, counts = _choose_solids(recording, site.solids if asked.solids else (), asked.within_m, where)
+        near, said, refused = _choose_solids(recording, asked.choose_kinds(site), asked.within_m, where)
         solids += near
-        notes += [f"{where}: {count_noun(number, 'solid')} {what}" for what, number in counts.items()]
+        notes += [f"{where}: {line}" for line in said]
+        if refused and not site.lanes:
+            problems.append((("maps", k), refused))
+    if maps and (parts := len(make_solid_statics(solids).body)) > _MOST_PARTS:
+        expected = f"expected solids of at most {_MOST_PARTS:,} convex parts, found {parts:,}"
+        problems.append((("maps",), f"{expected}: take a smaller `within_m`, or fewer kinds as `solids`"))
     scene = replace(recording.scene, areas=tuple(areas), solids=tuple(solids))
     return replace(recording, scene=scene, lane_boundaries=tuple(lines), notes=tuple(notes)), problems
 
@@ -123,27 +178,43 @@ def _raise_crosswalks(site: SiteMap) -> Iterator[Float]:
 
 def _choose_solids(
     recording: Recording, solids: Sequence[MapSolid], within_m: float, where: str
-) -> tuple[list[Solid], Counter[str]]:
-    """The solids near any object of the log, and how many are left out and why."""
+) -> tuple[list[Solid], list[str], str]:
+    """The solids near any object of the log, what is said of the others, and why none is there, if none is."""
     import shapely
 
-    counts, near = Counter[str](), list[Solid]()
-    if not solids:
-        return near, counts
+    counts, near, far_m = Counter[str](), list[Solid](), list[float]()
     truth = recording.truth
     valid = truth.valid[0]
     at_m = np.unique(np.round(np.stack([truth.x_m[0, valid], truth.y_m[0, valid]], axis=1)), axis=0)
     tree = shapely.STRtree(shapely.points(at_m))
+    least_m = np.inf
     for solid in solids:
         outline = shapely.Polygon(solid.rings_m[0], solid.rings_m[1:])
         if not outline.is_valid or outline.area <= 0.0:
             counts["whose outline crosses itself: left out"] += 1
         elif not len(tree.query(outline, predicate="dwithin", distance=within_m)):
             counts[f"beyond {within_m:g} m of every object: left out"] += 1
+            if not near and len(at_m):
+                least_m = min(least_m, float(shapely.distance(outline, tree.geometries[tree.nearest(outline)])))
         else:
-            corners = tuple((float(x), float(y)) for x, y in solid.rings_m[0])
-            name = f"{where} {solid.name}"
-            near.append(Solid(name, corners, solid.bottom_m, solid.top_m - solid.bottom_m))
-    if near:
-        counts = Counter({"of the map may hide": len(near)}) + counts
-    return near, counts
+            near.append(_stand_solid(recording, solid, where, far_m))
+    said = [f"{count_noun(len(near), 'solid')} of the map may hide"] if near else []
+    said += [f"{count_noun(number, 'solid')} {what}" for what, number in counts.items()]
+    if far_m:
+        what = f"ground of {count_noun(len(far_m), 'solid')} taken from the nearest object"
+        said.append(f"{what}, up to {max(far_m):.0f} m away")
+    if near or not np.isfinite(least_m):
+        return near, said, ""
+    found = f"0 of {count_noun(len(solids), 'solid')} within {within_m:g} m of the log"
+    return near, said, f"{where.split(' ', 1)[1]}: {found}; nearest {least_m / 1000:,.3g} km: is the frame right?"
+
+
+def _stand_solid(recording: Recording, solid: MapSolid, where: str, far_m: list[float]) -> Solid:
+    """A solid of a map at its height; `far_m` gets how far away its ground was found, where that is far."""
+    outer, *holes = (tuple((float(x), float(y)) for x, y in ring) for ring in solid.rings_m)
+    ground_m = 0.0
+    if solid.above_ground:
+        ground_m, distance_m = find_ground(recording.truth, solid.rings_m[0])
+        far_m += [distance_m] if distance_m > FAR_GROUND_M else []
+    name, bottom_m, height_m = f"{where} {solid.name}", ground_m + solid.bottom_m, solid.top_m - solid.bottom_m
+    return Solid(name, outer, bottom_m, height_m, solid.on_ground, tuple(holes))

@@ -378,5 +378,7 @@ def truth_digest(scene: Scene, truth: Tracks) -> str:
         for name in VALUES:
             digest.update((np.asarray(getattr(truth, name)[0, rows], dtype="<f8") + 0.0).tobytes())  # no −0
     if scene.solids:
-        digest.update(json.dumps(sorted(scene.solids)).encode())
+        digest.update(
+            json.dumps(sorted(solid[:5] + solid[5:] * bool(solid.holes_m) for solid in scene.solids)).encode()
+        )
     return digest.hexdigest()

@@ -189,9 +189,7 @@ def make_solid_statics(solids: Sequence[Solid]) -> Statics:
     """Solids as visibility takes them."""
     if not solids:
         return NO_STATICS
-    outlines, bottoms_m, heights_m = zip(
-        *((np.array(s.corners_m), s.bottom_m, s.height_m) for s in solids), strict=True
-    )
+    outlines, bottoms_m, heights_m = zip(*((s.outline, s.bottom_m, s.height_m) for s in solids), strict=True)
     static = make_statics(outlines, bottoms_m, heights_m)
     return static._replace(bottom_m=np.array([_hides_from_m(solid) for solid in solids])[static.body])
 
@@ -212,22 +210,21 @@ def find_enclosing_solid(
     x, y = offset_places(np.array(unit.at[0]), np.array(unit.at[1]), np.array(np.deg2rad(unit.yaw_deg)), unit.offset_m)
     place = shapely.Point(float(x), float(y))
 
-    def depth_m(corners_m: Sequence[tuple[float, float]]) -> float:
-        outline = shapely.Polygon(corners_m)
-        return float(outline.exterior.distance(place)) if outline.contains(place) else 0.0
+    def depth_m(outline: shapely.Polygon) -> float:
+        return float(outline.boundary.distance(place)) if outline.contains(place) else 0.0
 
     of_experiment = (
         _make_solid(truth, k, candidate)
         for k, candidate in enumerate(obstacles)
-        if depth_m(candidate.polygon_m) > TOUCHES_M
+        if depth_m(shapely.Polygon(candidate.polygon_m)) > TOUCHES_M
     )
     for solid in (
         *of_experiment,
-        *(candidate for candidate in scene.solids if depth_m(candidate.corners_m) > TOUCHES_M),
+        *(candidate for candidate in scene.solids if depth_m(candidate.outline) > TOUCHES_M),
     ):
         z = unit_ground(truth, "", unit) + unit.height_m
         if _hides_from_m(solid) + TOUCHES_M < z < solid.top_m - TOUCHES_M:
-            return solid, depth_m(solid.corners_m)
+            return solid, depth_m(solid.outline)
     return None
 
 
@@ -260,7 +257,7 @@ def _note_objects_inside(scene: Scene, truth: Tracks, solids: Sequence[Solid]) -
 
     if not solids:
         return []
-    outlines = shapely.polygons([shapely.linearrings(solid.corners_m) for solid in solids])
+    outlines = np.array([solid.outline for solid in solids])
     x, y, z = truth.x_m[0], truth.y_m[0], truth.z_m[0]
     west, south, east, north = shapely.total_bounds(outlines)
     near = np.flatnonzero((x >= west) & (x <= east) & (y >= south) & (y <= north))

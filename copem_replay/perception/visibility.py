@@ -13,7 +13,7 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import BeforeValidator, PlainSerializer, WithJsonSchema
@@ -27,23 +27,25 @@ from copem_replay.perception.visibility_kernel import Boxes, compute_shares
 from copem_replay.perception.visibility_kernel import Observers as Observers
 from copem_replay.perception.visibility_kernel import Statics as Statics
 
+if TYPE_CHECKING:
+    import shapely
+
 _ROWS_PER_THREAD = 20_000
 """Views that a thread computes at least: with fewer it costs more than it brings. No result depends on it."""
 
 
-def make_statics(polygons: Sequence[Float], bottom_m: Sequence[float], height_m: Sequence[float]) -> Statics:
-    """Static obstacles from simple polygons, each (K, 2), convex or not, any order of corners."""
+def make_statics(
+    polygons: Sequence[Float | shapely.Polygon], bottom_m: Sequence[float], height_m: Sequence[float]
+) -> Statics:
+    """Static obstacles from simple polygons, each (K, 2), or with holes; convex or not, any order of corners."""
     import shapely
 
     parts: list[Float] = []
     body: list[int] = []
     for k, corners in enumerate(polygons):
-        polygon = shapely.orient_polygons(shapely.Polygon(corners))
-        convex = polygon.convex_hull.area - polygon.area <= 1e-9 * polygon.area
-        pieces = [polygon.convex_hull] if convex else shapely.constrained_delaunay_triangles(polygon).geoms
-        for piece in pieces:
-            parts.append(np.array(shapely.orient_polygons(piece).exterior.coords)[:-1])
-            body.append(k)
+        pieces = cut_convex(corners if isinstance(corners, shapely.Polygon) else shapely.Polygon(corners))
+        parts += pieces
+        body += [k] * len(pieces)
     index = np.array(body, dtype=np.int64)
     bottom = np.array(bottom_m, dtype=float)
     return Statics(
@@ -53,6 +55,58 @@ def make_statics(polygons: Sequence[Float], bottom_m: Sequence[float], height_m:
         bottom_m=bottom[index],
         top_m=(bottom + np.array(height_m, dtype=float))[index],
     )
+
+
+def cut_convex(polygon: shapely.Polygon) -> list[Float]:
+    """Convex parts of a polygon, corners (K, 2) counter-clockwise; holes stay holes.
+
+    Constrained Delaunay triangles, of which edges are dropped as long as both ends stay convex (Hertel and Mehlhorn:
+    at most four times as many parts as are needed).
+    """
+    import shapely
+
+    polygon = shapely.orient_polygons(polygon)
+    hull = polygon.convex_hull
+    if not polygon.interiors and hull.area - polygon.area <= 1e-9 * polygon.area:
+        return [_corners_of(hull)]
+    triangles = shapely.constrained_delaunay_triangles(polygon).geoms
+    rings = {k: [(x, y) for x, y in _corners_of(triangle)] for k, triangle in enumerate(triangles)}
+    owner = {edge: k for k, ring in rings.items() for edge in _edges_of(ring)}
+    for a, b in [(a, b) for a, b in owner if a < b and (b, a) in owner]:
+        one, other = owner[a, b], owner[b, a]
+        merged = _merge_rings(rings[one], rings[other], a, b) if one != other else None
+        if merged is not None:
+            rings[one] = merged
+            owner |= dict.fromkeys(_edges_of(rings.pop(other)), one)
+    return [_corners_of(shapely.Polygon(ring).convex_hull) for ring in rings.values()]
+
+
+def _corners_of(polygon: shapely.Polygon) -> Float:
+    import shapely
+
+    return np.array(shapely.orient_polygons(polygon).exterior.coords)[:-1]
+
+
+_Corner = tuple[float, float]
+
+
+def _edges_of(ring: list[_Corner]) -> list[tuple[_Corner, _Corner]]:
+    return list(zip(ring, ring[1:] + ring[:1], strict=True))
+
+
+def _merge_rings(one: list[_Corner], other: list[_Corner], a: _Corner, b: _Corner) -> list[_Corner] | None:
+    """Two convex rings without the edge a–b that both have; None: they are not convex together."""
+    start, end = one.index(b), other.index(a)
+    first, second = one[start:] + one[:start], other[end:] + other[:end]  # b … a, and a … b
+    if not _turns_left(first[-2], a, second[1]) or not _turns_left(second[-2], b, first[1]):
+        return None
+    return first + second[1:-1]
+
+
+def _turns_left(before: _Corner, at: _Corner, after: _Corner) -> bool:
+    """Whether a way turns to the left, or not at all as far as rounding lets it be known."""
+    ux, uy, vx, vy = at[0] - before[0], at[1] - before[1], after[0] - at[0], after[1] - at[1]
+    return ux * vy - uy * vx >= -1e-12 * (ux * ux + uy * uy + vx * vx + vy * vy) and (vx, vy) != (-ux, -uy)
 
 
 NO_STATICS = Statics(

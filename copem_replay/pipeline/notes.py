@@ -573,11 +573,15 @@ def scene_from_json(data: dict[str, Any]) -> Scene:
             "object_class": np.array(data["object_class"], dtype=np.int8),
             "moving": np.array(data["moving"], dtype=bool),
             "solids": tuple(
-                Solid(name, tuple((x, y) for x, y in corners), *rest) for name, corners, *rest in data["solids"]
+                Solid(name, _read_ring(corners), bottom_m, height_m, on_ground, tuple(map(_read_ring, holes)))
+                for name, corners, bottom_m, height_m, on_ground, holes in data["solids"]
             ),
             "areas": tuple(
-                Area(name, kind, tuple(tuple((x, y) for x, y in ring) for ring in rings))
-                for name, kind, rings in data["areas"]
+                Area(name, kind, tuple(_read_ring(ring) for ring in rings)) for name, kind, rings in data["areas"]
             ),
         }
     )
+
+
+def _read_ring(corners: Sequence[Sequence[float]]) -> tuple[tuple[float, float], ...]:
+    return tuple((x, y) for x, y in corners)

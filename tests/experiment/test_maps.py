@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import math
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
+import shapely
 import yaml
 from typer.testing import CliRunner
 
@@ -15,6 +18,7 @@ from copem_replay.api.study import read_study
 from copem_replay.cli.main import app
 from copem_replay.core.errors import InputError
 from copem_replay.experiment.file import read_experiment_file
+from copem_replay.experiment.maps import MapFile, add_maps
 from copem_replay.io.recording import Recording
 from tests.helpers.experiments import changed
 from tests.helpers.recordings import Obj, write_recording
@@ -81,7 +85,7 @@ def test_a_map_is_moved_and_parts_of_it_left_out(folder: Path) -> None:
 @pytest.mark.parametrize(("entry", "says"), [
     ("{file: town.xodr, frame: same, offset_m: [0, -4]}", "found 0%: is the map in the frame of the log?"),
     ("{file: towm.xodr, frame: same}", "towm.xodr: no such file"),
-    ("{file: town.xodr}", "maps.0.frame|maps\\[0\\].frame"),
+    ("{file: town.xodr}", "its places are metres: expected `frame: same`"),
     ("{file: experiment.yaml, frame: same}", "expected a map of OpenDRIVE, Lanelet2, OpenStreetMap, Overpass, GeoJSON"),
 ])  # fmt: skip
 def test_maps_that_are_refused(folder: Path, entry: str, says: str) -> None:
@@ -131,3 +135,81 @@ def test_info_says_that_a_map_is_elsewhere(folder: Path) -> None:
 def test_info_refuses_a_map_beside_json(folder: Path) -> None:
     result = CliRunner().invoke(app, ["info", str(folder / "drive.mcap"), "--json", "--map", str(folder / "town.xodr")])
     assert "--map: expected neither --json nor --together beside it" in str(result.exception)
+
+
+class EastOfGreenwich:
+    """A log whose metres are those of a plane at 0° N, 0° E."""
+
+    def from_wgs84(self, points: np.ndarray) -> np.ndarray:
+        return points[:, ::-1] * (111_319.49079327358, 110_574.2758215944)
+
+
+def houses(*boxes: tuple[float, float, float, float], **properties: object) -> str:
+    rings = [
+        [[x / 111_319.49079327358, y / 110_574.2758215944] for x, y in shapely.box(*box).exterior.coords]
+        for box in boxes
+    ]
+    return json.dumps({"type": "FeatureCollection", "copyright": "© the city", "features": [
+        {"type": "Feature", "properties": {"building": "yes", **properties},
+         "geometry": {"type": "Polygon", "coordinates": [ring]}} for ring in rings]})  # fmt: skip
+
+
+def placed(folder: Path, text: str, **keys: object) -> tuple[Recording, list[str]]:
+    """The recording with a map in degrees, and its problems."""
+    (folder / "site.geojson").write_text(text)
+    maps = [MapFile.model_validate({"file": str(folder / "site.geojson"), **keys})]
+    recording, problems = add_maps(read(folder), maps, EastOfGreenwich())
+    return recording, [line for _, line in problems]
+
+
+def test_houses_in_degrees_stand_on_the_ground_of_the_log(folder: Path) -> None:
+    recording, problems = placed(folder, houses((25, 11, 35, 17), (900, 0, 910, 10)), heights_m={"building": 6})
+    (solid,) = recording.scene.solids
+    assert problems == []
+    assert shapely.Polygon(solid.corners_m).normalize().equals_exact(shapely.box(25, 11, 35, 17).normalize(), 1e-6)
+    assert (solid.bottom_m, solid.height_m, solid.on_ground) == (0, 6, True)
+    assert recording.notes[-4:] == (
+        "maps[0] site.geojson: © the city",
+        "maps[0] site.geojson: 2 × height of building not said: 6 m taken",
+        "maps[0] site.geojson: 1 solid of the map may hide",
+        "maps[0] site.geojson: 1 solid beyond 200 m of every object: left out",
+    )
+
+
+def test_what_is_beyond_changes_nothing_of_nearer_solids(folder: Path) -> None:
+    near, far = (25, 11, 35, 17), (900, 0, 910, 10)
+    one, two = (placed(folder, houses(*boxes))[0].scene.solids for boxes in ([near], [near, far]))
+    assert one[0].corners_m == pytest.approx(np.array(two[0].corners_m), abs=1e-9)
+    assert len(placed(folder, houses(near, far), within_m=2000)[0].scene.solids) == 2
+
+
+def test_only_kinds_that_are_listed_hide(folder: Path) -> None:
+    assert len(placed(folder, houses((25, 11, 35, 17)), solids=["building"])[0].scene.solids) == 1
+    assert placed(folder, houses((25, 11, 35, 17)), solids=["hedge", "wall"])[0].scene.solids == ()
+
+
+def test_no_solid_near_the_log_is_refused(folder: Path) -> None:
+    problems = placed(folder, houses((25_000, 0, 25_010, 10)))[1]
+    assert problems == ["site.geojson: 0 of 1 solid within 200 m of the log; nearest 24.9 km: is the frame right?"]
+
+
+def test_too_many_parts_are_refused(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("copem_replay.experiment.maps._MOST_PARTS", 1)
+    (line,) = placed(folder, houses((25, 11, 35, 17), (25, 21, 35, 27)))[1]
+    assert line.startswith("expected solids of at most 1 convex parts, found 2: take a smaller `within_m`")
+
+
+def test_degrees_need_a_place_on_earth(folder: Path) -> None:
+    (folder / "site.geojson").write_text(houses((25, 11, 35, 17)))
+    with pytest.raises(InputError, match="its places are degrees, and the log has no place on earth: write `frame:`"):
+        read(folder, "maps: [{file: site.geojson}]")
+    with pytest.raises(InputError, match="its places are degrees, not metres of the log: no `frame: same`"):
+        read(folder, "maps: [{file: site.geojson, frame: same}]")
+
+
+def test_a_unit_in_a_house_of_the_map_is_refused(folder: Path) -> None:
+    (folder / "experiment.yaml").write_text(
+        HOUSE.replace("[-10, 30]", "[30, 14]") + "maps: [{file: town.xodr, frame: same}]\n"
+    )
+    with pytest.raises(InputError, match="road 7 object 1"):
+        read_study(read_experiment_file(folder / "experiment.yaml"))

@@ -21,6 +21,7 @@ from copem_replay.perception.visibility import (
     Statics,
     Surface,
     box_corners,
+    cut_convex,
     find_blockers,
     make_statics,
     visible_shares,
@@ -435,3 +436,59 @@ def test_a_wall_from_far_behind_to_the_front_hides_what_is_ahead(side: int) -> N
     assert seen == pytest.approx(free / (free + hidden), abs=1e-3)
     assert wall == 1
     assert find_blockers(world, NO_STATICS, at((0, 0, 1)), Flat())[0].tolist() == [1, -1]
+
+
+def star(rng: np.random.Generator, corners: int) -> shapely.Polygon:
+    """A polygon around the origin, mostly not convex, with a courtyard."""
+    angle = np.sort(rng.uniform(0, 2 * np.pi, corners))
+    outer = shapely.Polygon(rng.uniform(5, 20, corners)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+    return outer.difference(shapely.box(-1.5, -1, 1, 2))
+
+
+def test_convex_parts_cover_a_polygon_and_leave_its_holes() -> None:
+    rng, triangles, parts = np.random.default_rng(7), 0, 0
+    for _ in range(60):
+        polygon = star(rng, int(rng.integers(5, 30)))
+        if polygon.geom_type != "Polygon":
+            continue
+        cut = [shapely.Polygon(part) for part in cut_convex(polygon)]
+        for part in cut:
+            assert part.exterior.is_ccw
+            assert part.convex_hull.area - part.area <= 1e-9 * part.area
+        assert sum(part.area for part in cut) == pytest.approx(polygon.area, rel=1e-9)  # none over another
+        assert shapely.union_all(cut).symmetric_difference(polygon).area <= 1e-9 * polygon.area
+        triangles += len(shapely.constrained_delaunay_triangles(polygon).geoms)
+        parts += len(cut)
+    assert parts < 0.7 * triangles
+
+
+def test_a_house_with_a_courtyard_hides_as_its_halves_do_by_rays() -> None:
+    """Also from the courtyard, where a unit is not inside the house."""
+    house = shapely.box(-8, -8, 8, 8).difference(shapely.box(-3, -4, 4, 3))
+    halves = [np.array(house.intersection(shapely.box(*half)).exterior.coords)[:-1]
+              for half in ((-8, -8, 0.5, 8), (0.5, -8, 8, 8))]  # fmt: skip
+    target = rectangle(30, 5, 5, 2, 0.3)
+    world = one_list([(30, 5, 0.3, 5, 2, 0, 2)])
+    static = make_statics([house], [0.0], [3.0])
+    for eye in ((-20, -6, 1.5), (0, 0, 1.5), (0, 0, 2.9), (-12, 3, 6), (1, 1, 14), (5, -20, 2)):
+        by_rays = surface_share(eye, (target, 0.0, 2.0), [], azimuths=8000, solids=[(h, 0.0, 3.0) for h in halves])
+        assert shares(world, eye, static, flat=False)[0] == pytest.approx(by_rays, abs=2e-4)
+    assert shares(world, (0, 0, 1.5), static, flat=False)[0] == 0
+
+
+def test_solids_and_log_moved_together_are_seen_alike() -> None:
+    rng, turn, shift = np.random.default_rng(11), 0.7, np.array([300.0, -120.0])
+    matrix = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    for _ in range(30):
+        house = shapely.affinity.translate(star(rng, 9), 25, 0)
+        if house.geom_type != "Polygon":
+            continue
+        there = shapely.transform(house, lambda xy: xy @ matrix + shift)
+        eye = np.array([-5.0, rng.uniform(-9, 9)])
+        (x, y), (u, v) = (60.0, rng.uniform(-9, 9)), eye @ matrix + shift
+        p, q = np.array([x, y]) @ matrix + shift
+        here = shares(one_list([(x, y, 0.2, 4, 2, 0, 2)]), (*eye, 6), make_statics([house], [0], [5]), flat=False)
+        moved = shares(
+            one_list([(p, q, 0.2 + turn, 4, 2, 0, 2)]), (u, v, 6), make_statics([there], [0], [5]), flat=False
+        )
+        assert moved == pytest.approx(here, abs=1e-9)

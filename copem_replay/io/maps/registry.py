@@ -17,7 +17,7 @@ from copem_replay.io.maps.solids import DEFAULT_HEIGHTS_M
 _LANELET: Final = re.compile(rb"""v\s*=\s*["']lanelet["']""")
 
 
-class _File(NamedTuple):
+class _Candidate(NamedTuple):
     """A file as formats are told by it."""
 
     path: Path
@@ -30,15 +30,15 @@ class _File(NamedTuple):
             return _LANELET.search(data) is not None
 
 
-def _has_key(name: str) -> Callable[[_File], bool]:
+def _has_key(name: str) -> Callable[[_Candidate], bool]:
     return lambda file: file.content is not None and name in file.content
 
 
-def _is_geojson(file: _File) -> bool:
+def _is_geojson(file: _Candidate) -> bool:
     return file.content is not None and file.content.get("type") in ("FeatureCollection", "Feature")
 
 
-FORMATS: Final[dict[str, tuple[Callable[[_File], bool], str]]] = {
+FORMATS: Final[dict[str, tuple[Callable[[_Candidate], bool], str]]] = {
     "OpenDRIVE": (lambda file: b"<OpenDRIVE" in file.head, "copem_replay.io.maps.opendrive:read_opendrive"),
     "Lanelet2": (
         lambda file: b"<osm" in file.head and file.has_lanelets(), "copem_replay.io.maps.lanelet2:read_lanelet2",
@@ -66,7 +66,7 @@ def read_map(path: Path, heights_m: Mapping[str, float] = DEFAULT_HEIGHTS_M) -> 
         line = "osmium extract -b WEST,SOUTH,EAST,NORTH"
         raise InputError(f"{path}: expected XML of OpenStreetMap, found PBF; cut it: `{line} {path.name} -o site.osm`")
     parsed = read_json(path) if head.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] in (b"{", b"[") else None
-    file = _File(path, head, parsed if isinstance(parsed, dict) else None)
+    file = _Candidate(path, head, parsed if isinstance(parsed, dict) else None)
     for is_format, function in FORMATS.values():
         if is_format(file):
             module, _, name = function.partition(":")
