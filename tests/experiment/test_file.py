@@ -360,8 +360,8 @@ SWEEP = "sweep: %s", "19: sweep"
 """What a line looks like, and how a problem with it begins."""
 
 KEYS = (
-    "areas, braking, configurations, criteria, ego, links, logs, maps, max_gap_s, measure, obstacles, pems, read, runs, "
-    "seed, show, sweep, tags, units, version, visibility, window_s"
+    "areas, braking, configurations, criteria, ego, links, logs, maps, max_gap_s, measure, obstacles, pems, read, "
+    "runs, seed, show, sweep, tags, units, version, visibility, window_s"
 )
 CLASSES = "pedestrian, bicycle, motorcycle, car, van, truck, bus, trailer, animal, other, vehicle, vru, vehicles"
 FUSIONS = "ideal, union, nms, gnn, tracker"
