@@ -496,7 +496,7 @@ def test_solids_and_log_moved_together_are_seen_alike() -> None:
 
 def test_what_a_unit_sees_of_a_house_does_not_depend_on_where_it_was_before() -> None:
     """A unit that stands, goes away and comes back, and units that are there for one list each."""
-    world = read_log(Path(__file__).parents[2] / "logs/crossing.mcap", name="crossing")[1]
+    world = read_log(Path(__file__).parents[2] / "logs/crossing.mcap", name="crossing").truth
     lists, frames = 9, len(world.stamp_ns)
     house = make_statics([shapely.box(-9, -9, 9, 9).difference(shapely.box(-1, -1, 1, 1))], [0.0], [5.0])
     place_m = np.zeros((1, frames, 3))
