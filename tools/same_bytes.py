@@ -152,7 +152,14 @@ CASES = (
     Case("tc016d", "tc016d", _OF_RESULTS),
     *(
         Case(name, name)
-        for name in ("tc016d_beyond", "crossing_radio", "crossing_share", "crossing_units", "crossing_wall")
+        for name in (
+            "tc016d_beyond",
+            "crossing_radio",
+            "crossing_share",
+            "crossing_units",
+            "crossing_wall",
+            "crossing_map",
+        )
     ),
     *(Case(name, name) for name in _RECORDED),
     *_modes("tc016d"),

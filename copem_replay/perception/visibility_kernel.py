@@ -127,10 +127,22 @@ _MOST_SECTORS = 256
 """Sectors of azimuth by which bodies are found. No result depends on it."""
 _WORD = 64
 """Bodies in a word of the index."""
+_MOST_KEPT = 200_000
+"""Static bodies as units see them that are kept from list to list: 40 MB in each thread. No result depends on it."""
 _LOWEST_BIT = 0x03F79D71B4CB0A89
 """De Bruijn's sequence: times a power of two, its top six bits tell which power. No two windows of six are equal."""
 _PLACE_OF = np.zeros(_WORD, dtype=np.int64)
 _PLACE_OF[[(_LOWEST_BIT << place & 2**64 - 1) >> 58 for place in range(_WORD)]] = np.arange(_WORD)
+
+
+class _Still(NamedTuple):
+    # Static bodies, and what units saw of them in the list before.
+    xy: Float  # (G, corners, 2)
+    of: Any  # (G,) as far as it does not depend on a unit
+    eye_m: Float  # (U, 3) from where; NaN: from nowhere yet
+    kept: Bool  # (U,) whether what follows is there
+    seen: Any  # (U, G)
+    azimuth: Float  # (U, G, corners)
 
 
 class _Index(NamedTuple):
@@ -178,17 +190,20 @@ def compute_shares(
         np.empty((most, 2)),
     )  # fmt: skip
     work = _make_workspace(most, widest)
+    still = _gather_statics(obstacles, len(places.carrier_ix), widest)
     shown = np.zeros((len(places.carrier_ix), asked.stretch.max() + 1), np.bool_)  # of each stretch from each unit
     for f in range(f0, f1):
         first = boxes.bounds[f]
         n = boxes.bounds[f + 1] - first
-        _gather_bodies(first, n, boxes, obstacles, xy, of)
+        _gather_bodies(first, n, boxes, still, xy, of)
         bodies = of[: n + len(obstacles.body)]
         for u in range(places.present.shape[0]):
             if places.present[u, f] and _find_next(0, u, first, n, asked, shown) < n:
                 eye_m = (places.place_m[u, f, 0], places.place_m[u, f, 1], places.place_m[u, f, 2])
                 mine = places.carrier_ix[u]
-                _look_at_bodies(eye_m, n, boxes.object_ix[first : first + n], mine, flat, xy, bodies, work.azimuth)
+                _look_around(
+                    u, eye_m, n, boxes.object_ix[first : first + n], mine, flat, xy, bodies, work.azimuth, still
+                )
                 _index_bodies(bodies, index)
                 t = -1
                 while True:
@@ -218,29 +233,78 @@ def _find_next(t: int, u: int, first: int, n: int, asked: Asked, shown: Bool) ->
     return t
 
 
+@nb.njit
+def _gather_statics(obstacles: Statics, units: int, widest: int) -> _Still:
+    # The static bodies, and room for what the first units see of them.
+    count = len(obstacles.body)
+    units = min(units, _MOST_KEPT // max(count, 1))
+    still = _Still(
+        np.empty((count, widest, 2)), np.empty(count, BODY), np.full((units, 3), np.nan),
+        np.zeros(units, np.bool_), np.empty((units, count), BODY), np.empty((units, count, widest)),
+    )  # fmt: skip
+    for g in range(count):
+        still.of[g].size, still.of[g].owner = obstacles.start[g + 1] - obstacles.start[g], obstacles.body[g]
+        still.of[g].bottom_m, still.of[g].top_m = obstacles.bottom_m[g], obstacles.top_m[g]
+        for k in range(still.of[g].size):
+            v = obstacles.start[g] + k
+            still.xy[g, k, 0], still.xy[g, k, 1] = obstacles.xy_m[v, 0], obstacles.xy_m[v, 1]
+        _enclose(still.xy[g], still.of[g])
+    return still
+
+
 @borrowing
-def _gather_bodies(first: int, n: int, boxes: Boxes, obstacles: Statics, xy: Float, of: Any) -> None:
+def _gather_bodies(first: int, n: int, boxes: Boxes, still: _Still, xy: Float, of: Any) -> None:
     # Out: the bodies of one list.
-    for b in range(n + len(obstacles.body)):
-        if b < n:
-            of[b].size, of[b].owner = 4, -1
-            of[b].bottom_m, of[b].top_m = boxes.bottom_m[first + b], boxes.top_m[first + b]
-            for k in range(4):
-                xy[b, k, 0], xy[b, k, 1] = boxes.corners_m[first + b, k, 0], boxes.corners_m[first + b, k, 1]
-        else:
-            g = b - n
-            of[b].size, of[b].owner = obstacles.start[g + 1] - obstacles.start[g], obstacles.body[g]
-            of[b].bottom_m, of[b].top_m = obstacles.bottom_m[g], obstacles.top_m[g]
-            for k in range(of[b].size):
-                v = obstacles.start[g] + k
-                xy[b, k, 0], xy[b, k, 1] = obstacles.xy_m[v, 0], obstacles.xy_m[v, 1]
-        mx = my = r2 = 0.0
-        for k in range(of[b].size):
-            mx += xy[b, k, 0] / of[b].size
-            my += xy[b, k, 1] / of[b].size
-        for k in range(of[b].size):
-            r2 = max(r2, (xy[b, k, 0] - mx) ** 2 + (xy[b, k, 1] - my) ** 2)
-        of[b].x_m, of[b].y_m, of[b].radius_m = mx, my, np.sqrt(r2)
+    for b in range(n):
+        of[b].size, of[b].owner = 4, -1
+        of[b].bottom_m, of[b].top_m = boxes.bottom_m[first + b], boxes.top_m[first + b]
+        for k in range(4):
+            xy[b, k, 0], xy[b, k, 1] = boxes.corners_m[first + b, k, 0], boxes.corners_m[first + b, k, 1]
+        _enclose(xy[b], of[b])
+    for g in range(len(still.of)):
+        of[n + g] = still.of[g]
+        for k in range(still.of[g].size):
+            xy[n + g, k, 0], xy[n + g, k, 1] = still.xy[g, k, 0], still.xy[g, k, 1]
+
+
+@borrowing
+def _enclose(polygon: Float, body: Any) -> None:
+    # Out: the middle and the radius of a body.
+    mx = my = r2 = 0.0
+    for k in range(body.size):
+        mx += polygon[k, 0] / body.size
+        my += polygon[k, 1] / body.size
+    for k in range(body.size):
+        r2 = max(r2, (polygon[k, 0] - mx) ** 2 + (polygon[k, 1] - my) ** 2)
+    body.x_m, body.y_m, body.radius_m = mx, my, np.sqrt(r2)
+
+
+@borrowing
+def _look_around(
+    u: int, eye_m: tuple[float, float, float], n: int, object_ix: Int, mine: int, flat: bool, xy: Float, of: Any,
+    azimuth: Float, still: _Still,
+) -> None:  # fmt: skip
+    # Out: what of the bodies depends on the observer u. Static ones are as before where it has not moved for two lists.
+    count = len(still.of)
+    stands = u < len(still.eye_m) and (
+        still.eye_m[u, 0] == eye_m[0] and still.eye_m[u, 1] == eye_m[1] and still.eye_m[u, 2] == eye_m[2]
+    )
+    there = stands and still.kept[u]
+    _look_at_bodies(eye_m, n, object_ix, mine, flat, xy, of[:n] if there else of, azimuth)
+    if there:
+        for g in range(count):
+            of[n + g] = still.seen[u, g]
+            for k in range(still.of[g].size):
+                azimuth[n + g, k] = still.azimuth[u, g, k]
+    elif stands:
+        still.kept[u] = True
+        for g in range(count):
+            still.seen[u, g] = of[n + g]
+            for k in range(still.of[g].size):
+                still.azimuth[u, g, k] = azimuth[n + g, k]
+    elif u < len(still.eye_m):
+        still.kept[u] = False
+        still.eye_m[u, 0], still.eye_m[u, 1], still.eye_m[u, 2] = eye_m[0], eye_m[1], eye_m[2]
 
 
 @borrowing

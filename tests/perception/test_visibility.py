@@ -492,3 +492,22 @@ def test_solids_and_log_moved_together_are_seen_alike() -> None:
             one_list([(p, q, 0.2 + turn, 4, 2, 0, 2)]), (u, v, 6), make_statics([there], [0], [5]), flat=False
         )
         assert moved == pytest.approx(here, abs=1e-9)
+
+
+def test_what_a_unit_sees_of_a_house_does_not_depend_on_where_it_was_before() -> None:
+    """A unit that stands, goes away and comes back, and units that are there for one list each."""
+    world = read_log(Path(__file__).parents[2] / "logs/crossing.mcap", name="crossing").truth
+    lists, frames = 9, len(world.stamp_ns)
+    house = make_statics([shapely.box(-9, -9, 9, 9).difference(shapely.box(-1, -1, 1, 1))], [0.0], [5.0])
+    place_m = np.zeros((1, frames, 3))
+    place_m[0, :] = (-14.0, -12.0, 4.0)
+    place_m[0, 4:6] = (14.0, -12.0, 6.0)
+    once = np.zeros((lists, frames), dtype=bool)
+    once[np.arange(lists), np.arange(lists)] = True
+    [one] = visible_shares(world, house, Observers(place_m, once.any(axis=0)[None], np.array([-1])), Surface())
+    each = visible_shares(
+        world, house, Observers(np.repeat(place_m, lists, axis=0), once, np.full(lists, -1)), Surface()
+    )
+    row = np.flatnonzero(world.frame_ix < lists)
+    assert np.array_equal(one[row], each[world.frame_ix[row], row])
+    assert len(np.unique(one[row])) > 5

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from benches import common
-from copem_replay.perception.visibility import NO_STATICS, Flat, Observers, Surface, visible_shares
+from copem_replay.perception.visibility import NO_STATICS, Flat, Observers, Surface, make_statics, visible_shares
 from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.replay import replay_block
 from copem_replay.pipeline.run import run_experiment
@@ -36,6 +36,30 @@ def visibility() -> Iterator[common.Line]:
             line = {f"views_per_cpu_s_{count}": round(rate) for count, rate in zip(counts, rates, strict=True)}
             steeper = np.log(rates[0] / rates[-1]) / np.log(counts[-1] / counts[0])
             yield {"visibility": model.kind, "boxes": scene} | line | {"exponent": round(1 + steeper, 2)}
+
+
+def solids() -> Iterator[common.Line]:
+    """Views per processor second from 6 units with 3,600 houses (14,400 edges) around 60 boxes, and with none.
+
+    Units that stand see static bodies as in the list before; those that move look at each again.
+    """
+    frames, units = 200, 6
+    east, north = np.meshgrid(np.arange(60) * 20.0 - 590, np.arange(60) * 20.0 - 590)
+    corners = np.stack([east.ravel(), north.ravel()], axis=1)[:, None] + [(0, 0), (8, 0), (8, 8), (0, 8)]
+    houses = make_statics(list(corners), np.zeros(len(corners)), np.full(len(corners), 9.0))
+    rng = np.random.default_rng(1)
+    stands = np.repeat(
+        np.column_stack([rng.uniform(-60, 60, (units, 2)), np.full(units, 5.0)])[:, None], frames, axis=1
+    )
+    moves = stands + np.linspace(0, 1, frames)[None, :, None] * [1, 0, 0]
+    for around, static in (("none", NO_STATICS), ("houses", houses)):
+        line: common.Line = {"solids": around, "edges": len(static.xy_m)}
+        for name, place_m in (("stands", stands), ("moves", moves)):
+            observers = Observers(place_m, np.ones((units, frames), dtype=bool), np.full(units, -1))
+            call = partial(visible_shares, common.boxes(frames, 60), static, observers, Surface())
+            [seconds] = common.interleaved([call], 3)
+            line |= {f"views_per_cpu_s_{name}": round(units * frames * 60 / seconds)}
+        yield line
 
 
 def paper() -> Iterator[common.Line]:
