@@ -1,4 +1,4 @@
-"""Open the recordings of a results folder in a viewer, here or in a browser, just before the first onset.
+"""Open the recordings of a results folder in a viewer, here or in a browser, when something differs.
 
 A layout in a recording cannot hold the instant at which it opens (Rerun 0.41), and addresses with an instant (`#when=`)
 are for servers only. So it is set from outside: by `seek_recordings` in the viewer on this machine, by a script in the
@@ -25,23 +25,15 @@ from importlib.util import find_spec
 from pathlib import Path
 from urllib.parse import quote, unquote, urlsplit
 
-import pandas as pd
+from copem_replay.core.errors import OutputError
+from copem_replay.viewer.sink import ELAPSED, OPENS
 
-from copem_replay.core.errors import CopemError, OutputError
-from copem_replay.core.files import portable_name
-from copem_replay.metrics.detections_table import first_episodes
-from copem_replay.results.read import Results, open_results
-from copem_replay.viewer.sink import ELAPSED, SHOWN_OBJECTS, choose_telling_objects
-
-BEFORE_ONSET_S = 0.5
-"""A recording opens this long before the first onset, so that the change is about to come."""
 HOST = "127.0.0.1"
 READY_S, AGAIN_S = 60.0, 0.2
 """Time for a viewer to load a recording, and the interval of asking it: after that it opens at its beginning."""
 _PATTERNS = ("replay.rrd", "replay.*.rrd", "replay/**/*.rrd", "replay_*.rrd", "replay_*/**/*.rrd")
 _OWN_HOSTS = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?", re.IGNORECASE)
 """What browsers call this server, of any port, as it may be forwarded. Other names that lead here are of others."""
-_FURTHER_FILE = re.compile(r"\.configurations_\d+(-\d+)?$")
 
 
 def list_rrd_files(folder: Path) -> list[Path]:
@@ -54,47 +46,24 @@ def list_rrd_files(folder: Path) -> list[Path]:
     return list(dict.fromkeys(path for path in found if path.is_file()))
 
 
-def opening_s(folder: Path, files: Sequence[Path]) -> dict[Path, float]:
-    """The instant at which each recording opens, in seconds since its log starts.
+def opening_s(files: Sequence[Path]) -> dict[Path, float]:
+    """The instant at which each recording opens, in seconds since its log starts, as it says itself.
 
-    Half a second before the earliest onset among the objects of interest. A recording of no known run, or without an
-    onset, is left out: it opens at its beginning.
+    A recording that says none is left out: it opens at its beginning.
     """
+    from rerun.chunk import RrdReader
+
     instants_s = {}
-    try:
-        results = open_results(folder)
-        runs = _map_runs(results)
-        truths = [name for name, of in results.facts.items() if of.truth and name in results.rows.configurations]
-        for path in files:
-            stem = _FURTHER_FILE.sub("", path.relative_to(folder.absolute()).with_suffix("").as_posix())
-            if stem in runs:
-                log, run = runs[stem]
-                (rows,) = results.each(log=log, every=True)
-                onset_s = _first_onset_s(first_episodes(rows[rows["run"] == run]), truths)
-                if onset_s is not None:
-                    instants_s[path] = max(0.0, onset_s - BEFORE_ONSET_S)
-    except (CopemError, KeyError, TypeError, AttributeError, ValueError, OverflowError):
-        return {}  # recordings open without readable tables, too
+    for path in files:
+        try:
+            with warnings.catch_warnings(action="ignore"):  # a file was cut off
+                for chunk in RrdReader(str(path)).store().stream().filter(content="/__properties/replay"):
+                    batch = chunk.to_record_batch()
+                    if OPENS in batch.schema.names:
+                        instants_s[path] = float(batch.column(OPENS).to_pylist()[0][0])
+        except (OSError, RuntimeError, ValueError):
+            continue
     return instants_s
-
-
-def _map_runs(results: Results) -> dict[str, tuple[str, int]]:
-    """Log and run of each recording, by its path in the folder without suffix."""
-    shown = results.provenance.data["runs_shown"]
-    several = len(shown) > 1
-    return {
-        (f"{shown_run['file']}/{portable_name(log)}" if several else shown_run["file"]): (log, int(shown_run["run"]))
-        for log, runs in shown.items()
-        for shown_run in runs
-    }
-
-
-def _first_onset_s(table: pd.DataFrame, truths: Sequence[str]) -> float | None:
-    """The earliest onset (s) of the objects with words and lanes; None without an object."""
-    if not len(table):
-        return None
-    of_interest = choose_telling_objects(table, truths, SHOWN_OBJECTS)
-    return float(table.loc[table["object_id"].isin(of_interest), "onset_s"].min())
 
 
 @dataclass(frozen=True)
@@ -122,7 +91,7 @@ def read_identities(files: Sequence[Path]) -> dict[Path, RecordingIdentity]:
 
 def open_viewer(folder: Path, files: Sequence[Path]) -> int:
     """Open recordings in the viewer on this machine, and wait until it ends. Returns its exit code."""
-    instants_s = opening_s(folder, files)
+    instants_s = opening_s(files)
     identities = read_identities(list(instants_s))
     port = find_free_port()
     # `-m rerun` is there in every environment with rerun-sdk, whatever the PATH. The viewer shows what it opened last.
@@ -253,7 +222,7 @@ def serve_recordings(folder: Path, files: Sequence[Path]) -> Server:
     The caller closes it. Raises OutputError if the files of the viewer cannot be had.
     """
     by_name = {path.relative_to(folder.absolute()).as_posix(): path for path in files}
-    instants_s, identities = opening_s(folder, files), read_identities(files)
+    instants_s, identities = opening_s(files), read_identities(files)
     requests = [set_time(identities[path], at_s) for path, at_s in instants_s.items() if path in identities]
     assets = viewer_files()
     last_shown = list(reversed(by_name))  # the viewer shows what it opened last
