@@ -92,7 +92,7 @@ def test_logs_called_what_windows_refuses(tmp_path: Path) -> None:
     folder = cr.run(tmp_path / "e.yaml").save(tmp_path / "r")
     made = {path.name for path in (folder / "replay").iterdir() if path.suffix == ".rrd"}
     assert made == {"%61ux.rrd", "a%3Ab.rrd", "usual.rrd"}
-    assert len(opening_s(folder, list_rrd_files(folder))) == 3
+    assert len(opening_s(list_rrd_files(folder))) == 3
     assert [table_file(Path("t"), log).as_posix() for log in ("aux", "a:b", "usual", "com1.x")] == [
         "t/%61ux.parquet", "t/a%3Ab.parquet", "t/usual.parquet", "t/%63om1.x.parquet"
     ]  # fmt: skip

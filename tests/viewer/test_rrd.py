@@ -29,7 +29,7 @@ from copem_replay.pipeline.one_run import RunTracks, tracks_of_run
 from copem_replay.pipeline.prepare import Replay, prepare_log
 from copem_replay.pipeline.replay import replay_block
 from copem_replay.viewer import write_rrd
-from copem_replay.viewer.sink import ELAPSED, TIME, choose_telling_objects
+from copem_replay.viewer.sink import ELAPSED, TIME
 from tests.helpers.scenes import EGO_UNIT, SEES_60_M, SEES_ALL, T0_NS, Thing, driving, experiment, recording, standing
 
 os.environ["RERUN_ANALYTICS"] = "0"  # before it is imported, which is when something is written
@@ -602,28 +602,6 @@ def test_at_most_thirty_seven_bytes_a_box_and_a_layout(tmp_path: Path) -> None:
     assert boxes > 70_000
     layout = 600_000  # whatever the number of boxes
     assert made.path.stat().st_size <= 37 * boxes + layout
-
-
-def test_of_many_objects_those_that_tell_configurations_apart_are_shown() -> None:
-    episodes = pd.DataFrame(
-        {
-            "configuration": ["GT"] * 5 + ["x"] * 5 + ["y"] * 5,
-            "object_id": ["a", "b", "c", "d", "e"] * 3,
-            "onset_s": 1.0,
-            "ended_s": 10.0,
-            "time_to_detection_s": [0.0] * 5 + [0.0, 1.0, 5.0, 0.5, None] + [0.2, None, 5.0, 0.5, None],
-        }
-    )
-    # Apart: a 0.2 s, b 8 s (never: 9 s); as soon as each other c after 5 s, d after 0.5 s, e never.
-    assert choose_telling_objects(episodes, ["GT"], 1) == ["b"]
-    assert choose_telling_objects(episodes, ["GT"], 2) == ["a", "b"]
-    assert choose_telling_objects(episodes, ["GT"], 3) == ["a", "b", "e"]
-    assert choose_telling_objects(episodes, ["GT"], 9) == ["a", "b", "c", "d", "e"]
-    meeting = episodes.assign(conflict=episodes["object_id"] == "d")
-    assert choose_telling_objects(meeting, ["GT"], 2) == ["b", "d"]
-    assert choose_telling_objects(episodes[episodes["configuration"] == "GT"], ["GT"], 2) == ["a", "b"], (
-        "nothing but the truth"
-    )
 
 
 def test_colours_do_not_repeat() -> None:
