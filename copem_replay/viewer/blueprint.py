@@ -281,12 +281,14 @@ def errors_page(content: RecordingContent) -> rrb.Container:
 
 
 def units_page(content: RecordingContent) -> rrb.Container:
-    """The configuration with most units from above: units, fields of view, fused tracks."""
+    """The configuration with most units from above: units, fields of view, fused tracks; and all recorded units."""
     import rerun.blueprint as rrb
 
     largest = max(content.configurations, key=lambda name: len(content.received(name)))
     units = content.received(largest)
+    placed = [name for name, unit in content.experiment.units.items() if unit.recorded is not None]
     title = f"In colour: what {largest} lists. Grey: the truth. Pale ground: fields of view. Lines: listed it first"
+    units = (*units, *(name for name in placed if name not in units))
     view = world_view(
         content, largest, title, content.above, units=units, fields=True, named=[n for n in content.named if n in units]
     )

@@ -34,12 +34,12 @@ EYE_RAD, MARGIN_M = np.deg2rad(55.0), 2.5
 CLOSE_M, LEAST_AWAY_M = (20.0, 38.0), 20.0
 """Least and greatest distance from camera to target on one object, and the least from above. From farther away people
 are a few pixels."""
-WIDE_M, WIDEST_M, AHEAD_M = 60.0, 165.0, 20.0
+WIDE_M, WIDEST_M, AHEAD_M = 60.0, 180.0, 20.0
 """Width in view around the ego, the greatest one, and the distance ahead of the ego of its middle."""
 SMOOTH_S, SOON_S = 1.0, 1.5
 """Time over which turns and widths are averaged, and how long before and after a story it is in view: no jerks."""
 EDGE, ARROW_NS = 0.85, 200_000_000
-"""Where arrows are, as a share of the way from the middle to the edge of the picture, and how often they are drawn."""
+"""Where arrows are, as a share of the way from the middle to the edge of the picture; how often they are drawn."""
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,8 @@ def _choose_scale(
     """(K,) how many times `WIDE_M` the picture is wide: smooth, and enough for each object during its story."""
     needed = np.ones(len(time_s))
     for k, place in seen.items():
-        far = np.nan_to_num(_fitting_distances(place, np.pi / 2, eye.aspect) / float(np.linalg.norm(eye.place_m)))
+        away_m = _fitting_distances(place / EDGE, np.pi / 2, eye.aspect)  # the words beside it are in the picture, too
+        far = np.nan_to_num(away_m / float(np.linalg.norm(eye.place_m)))
         needed = np.maximum(needed, np.where((time_s >= stories[k][0]) & (time_s <= stories[k][1]), far, 1.0))
     needed = np.minimum(needed, WIDEST_M / WIDE_M)
     begin, end = (np.searchsorted(time_s, time_s + side * SOON_S, "left" if side < 0 else "right") for side in (-1, 1))
