@@ -93,7 +93,7 @@ class RecordingContent:
     """What one file shows: a run, its configurations in order, and the shown objects, the most telling one first.
 
     `episodes`: rows of the table by object; `axes_s`: first and last second of each object's axis.
-    Camera `eye` follows the ego, if there is one, `eyes` follow objects; `above` looks at the units, of which `named` have
+    Camera `eye` follows the ego, if there is one, `eyes` the objects; `above` looks at the units, of which `named` have
     names. `lists`: lists that units send by a link, by configuration. `too_short`: ids of objects too short to judge.
     `opens_s`: the instant at which the recording opens.
     """
@@ -145,7 +145,7 @@ def overview_page(content: RecordingContent) -> rrb.Container:
 
     views = list[rrb.View](tracks_views(content, choose_overview(content)))
     columns = 1 if len(views) < FEW else 2
-    words = [difference_view()]
+    words: list[rrb.View] = [difference_view()]
     if len(views) % columns:
         views.append(legend_view())  # into the free cell
     else:

@@ -46,10 +46,9 @@ EDGE, ARROW_NS = 0.85, 200_000_000
 class Camera:
     """Place and target of a camera, `(3,)` each, as seen from the entity `path`.
 
-    A camera that follows has a `path` that moves with object `object_ix`, `ahead_m` of it: a view with that origin shows
-    the same whenever it is first drawn. If `turns`, it turns with the object, too, and zooms. `at_m`: the target in the
-    world, at the onset; `heading_rad`: the direction of view there. `aspect`: width
-    by height of the view.
+    A camera that follows has a `path` that moves with object `object_ix`, `ahead_m` of it: a view with that origin
+    shows the same whenever it is first drawn. If `turns`, it turns with the object, too, and zooms. `at_m`: the target
+    in the world, at the onset; `heading_rad`: the direction of view there. `aspect`: width by height of the view.
     """
 
     place_m: Float

@@ -76,9 +76,9 @@ def select_differing_rows(experiment: Experiment, table: pd.DataFrame) -> pd.Dat
 def find_opening_s(experiment: Experiment, by_object: Sequence[pd.DataFrame]) -> float | None:
     """The instant (s) at which a recording opens: some configurations know an object and others do not yet.
 
-    It is early in the longest such time of the first object that has one, within its axis. Where all objects are known to all
-    configurations at once, it is just before the first onset; None without an object. `by_object`: rows of each object,
-    the most telling one first.
+    It is early in the longest such time of the first object that has one, within its axis. Where all objects are known
+    to all configurations at once, it is just before the first onset; None without an object. `by_object`: rows of each
+    object, the most telling one first.
     """
     for rows in by_object:
         rows = select_differing_rows(experiment, rows)

@@ -17,7 +17,7 @@ import pandas as pd
 from copem_replay.core.colours import Rgb, configuration_colours
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.object_list import Entries
-from copem_replay.core.tracks import TRUTH, Bool, Float, Int, Tracks, splice_rows
+from copem_replay.core.tracks import Bool, Float, Int, Tracks, splice_rows
 from copem_replay.experiment.schema import Experiment
 from copem_replay.perception.observation import Observations
 from copem_replay.pipeline.one_run import share_curves
@@ -93,8 +93,8 @@ def write_rrd(
 ) -> list[str]:
     """Write one run of one log to a file and, with an address, to a viewer. Returns notes. Raises OutputError.
 
-    More than seven configurations go into several files, such as `replay.configurations_8-14.rrd`. Colours depend on the
-    places of all of the experiment's configurations, also of those that are not written.
+    More than seven configurations go into several files, such as `replay.configurations_8-14.rrd`. Colours depend on
+    the places of all of the experiment's configurations, also of those that are not written.
 
     `run_tracks`: by time chunk, the receiver's fused tracks of each configuration in this run, with a frame per issued
     list (one unit, values (1, P)). `table`: the rows of `detections.parquet` of this log and run. `summary`: over all
@@ -166,8 +166,8 @@ def _build_content(
     above = camera_above(np.stack([*named_units.values(), eye.at_m], axis=1), eye.heading_rad)
     compared = [rows[rows["configuration"].isin(list(configurations))] for rows in episodes.values()]
     return RecordingContent(
-        replay, experiment, table, episodes, configurations, objects, axes_s, eye, eyes, above, list(named_units), lists,
-        baseline, shown.too_short, find_opening_s(experiment, compared),
+        replay, experiment, table, episodes, configurations, objects, axes_s, eye, eyes, above, list(named_units),
+        lists, baseline, shown.too_short, find_opening_s(experiment, compared),
     )  # fmt: skip
 
 
@@ -305,6 +305,7 @@ def _write_properties(out: RecordingSink, content: RecordingContent, run: int, r
     name = f"{scene.log}: run {run}" + (f": {run_is}" if run_is else "")
     out.send(lambda rec: rec.send_recording_name(name))
     out.send(lambda rec: rec.send_recording_start_time_nanos(scene.t0_ns))
+    opens: dict[str, Any] = {} if content.opens_s is None else {OPENS: content.opens_s}
     values = rr.AnyValues(
         log=scene.log,
         run=run,
@@ -312,7 +313,7 @@ def _write_properties(out: RecordingSink, content: RecordingContent, run: int, r
         seed=str(experiment.seed),  # 64 bits without a sign, too
         visibility=experiment.visibility.label,
         configurations=list(content.configurations),
-        **({} if content.opens_s is None else {OPENS: content.opens_s}),
+        **opens,
         copem_replay=version("copem-replay"),
         rerun_sdk=version("rerun-sdk"),
     )

@@ -262,7 +262,9 @@ class TestWhichObject:
         table["onset_s"], table["ended_s"] = 0.0, 4.0
         table["conflict"] = [data.draw(st.booleans())] * len(table)
         after = {
-            o: table.loc[(table["object_id"] == o) & (table["configuration"] != "GT"), "time_to_detection_s"].fillna(4.0)
+            o: table.loc[(table["object_id"] == o) & (table["configuration"] != "GT"), "time_to_detection_s"].fillna(
+                4.0
+            )
             for o in dict.fromkeys(table["object_id"])
         }
         first = max(after, key=lambda o: (after[o].max() - after[o].min(), after[o].max()))

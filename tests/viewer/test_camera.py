@@ -94,7 +94,7 @@ def corners(replay: Replay, row: int) -> Float:
     signs = np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]) * half
     cos, sin = np.cos(truth.yaw_rad[0, row]), np.sin(truth.yaw_rad[0, row])
     turned = signs @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
-    return np.asarray(turned + [truth.x_m[0, row], truth.y_m[0, row], truth.z_m[0, row]])
+    return np.asarray(turned + np.array([truth.x_m[0, row], truth.y_m[0, row], truth.z_m[0, row]]))
 
 
 def share_inside(replay: Replay, given: Experiment, table: Any, path: Path) -> tuple[float, int]:
@@ -182,7 +182,9 @@ def test_sixty_metres_wide_twenty_ahead_and_turned_with_the_ego(tmp_path: Path) 
 
 def test_the_picture_widens_for_the_story_of_a_far_object_and_only_then(tmp_path: Path) -> None:
     _, eye = follow(tmp_path / "x.rrd", {"61": (4.0, 5.0)}, left_m=45.0)
-    scales = {round(at, 1): (origin, scale) for origin in origins(tmp_path / "x.rrd", eye) for at, *_, scale in [origin]}
+    scales = {
+        round(at, 1): (origin, scale) for origin in origins(tmp_path / "x.rrd", eye) for at, *_, scale in [origin]
+    }
     assert [scales[at][1] for at in (0.0, 1.9, 7.1, 10.0)] == [1.0] * 4
     for at in (4.0, 4.5, 5.0):
         origin, scale = scales[at]

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from copem_replay.core.tracks import Float
 from copem_replay.perception.pem.condition import Couple
 from copem_replay.perception.sensor_poses import couple_outlines
 from copem_replay.pipeline.prepare import prepare_log
