@@ -78,20 +78,13 @@ def _replay(folder: Path) -> None:
 
 
 def _city(folder: Path) -> float:
-    """The city's results; when some know of the object that tells most, and others do not."""
+    """The city's results; the instant at which they open."""
     import copem_replay as cr
     from city_traffic import experiment, write
-    from copem_replay.viewer.sink import choose_measured_objects
+    from copem_replay.viewer.open import opening_s
 
-    result = cr.run(experiment(write(folder.parent)))
-    result.save(folder)
-    table = result.detections
-    table = table[table["run"] == next(iter(cr.load_results(folder).provenance.run_shown.values()))]
-    episodes = table[
-        (table["object_id"] == choose_measured_objects(table, ["GT"])[0]) & (table["configuration"] != "GT")
-    ]
-    times = episodes["detection_s"].dropna()
-    return float(times.min() + times.max()) / 2
+    cr.run(experiment(write(folder.parent))).save(folder)
+    return opening_s([folder / "replay.rrd"])[folder / "replay.rrd"]
 
 
 def _differences(folder: Path, out: Path) -> None:
