@@ -23,7 +23,7 @@ from copem_replay.pipeline.expansion import resolve_for_run
 from copem_replay.pipeline.prepare import Replay, prepare_log
 from copem_replay.pipeline.replay import replay_block
 from copem_replay.viewer.blueprint import select_perceiving, view_aspect
-from copem_replay.viewer.camera import Camera, camera_on_ego, write_moving_origin
+from copem_replay.viewer.camera import TOGETHER_M, Camera, camera_on_ego, include_places, write_moving_origin
 from copem_replay.viewer.objects import choose_shown_objects, find_opening_s, select_differing_rows
 from copem_replay.viewer.sink import RecordingSink, axis_s, file_stream
 from tests.helpers.recordings import SHARED
@@ -224,3 +224,17 @@ def test_without_an_ego_the_whole_site_is_in_view(tmp_path: Path) -> None:
     assert np.abs(seen).max() <= 1.02
     assert np.ptp(seen[:, 0]) > 1.8, "as large as it can be"
     assert select_perceiving(given, ["pole"]) == ["pole"]
+
+
+def test_a_near_view_holds_the_units_that_see_the_object() -> None:
+    """One 20 m behind and one 40 m beside it; one that is too far away changes nothing."""
+    near = Camera(np.array([-9.0, 0.0, 18.0]), np.zeros(3), np.zeros(3), 0)
+    origin = (0.0, np.zeros(3), 0.0, 1.0)
+    units = np.array([[-20.0, 0.0, 2.0], [0.0, 40.0, 6.0]])
+    assert np.abs(picture(near, origin, units, 1.7)).max() > 1
+    both = include_places(near, units.T)
+    assert np.abs(picture(both, origin, np.vstack([units, np.zeros((1, 3))]), 1.7)).max() < 1
+    far = np.array([[TOGETHER_M + 1, 0.0, 2.0]])
+    assert include_places(near, far.T) is near
+    beside = include_places(near, np.vstack([units, far]).T)
+    assert (beside.place_m.tolist(), beside.target_m.tolist()) == (both.place_m.tolist(), both.target_m.tolist())
