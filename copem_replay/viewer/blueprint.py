@@ -173,10 +173,10 @@ def overview_page(content: RecordingContent) -> rrb.Container:
 
 
 def choose_overview(content: RecordingContent) -> list[str]:
-    """The configurations of the overview: all with units, of more than four those that differ most, and the baseline.
+    """The configurations of the overview: all with units, of more than four the baseline and those that differ most.
 
-    Of more than four, they are spread evenly from the one that knows the shown objects first to the one that knows them
-    last.
+    The baseline is the first one with units, unless configurations are compared with another. The rest is spread evenly
+    from the one that knows the shown objects first to the one that knows them last.
     """
     perceiving = select_perceiving(content.experiment, content.configurations)
     if len(perceiving) <= OVERVIEW:
@@ -184,11 +184,10 @@ def choose_overview(content: RecordingContent) -> list[str]:
     rows = content.table[content.table["object_id"].isin([content.replay.scene.object_ids[k] for k in content.objects])]
     after_s = rows["time_to_detection_s"].fillna(rows["ended_s"] - rows["onset_s"])
     mean_s = after_s.groupby(rows["configuration"]).mean()
-    ranked = sorted(
-        (name for name in perceiving if name != content.baseline), key=lambda name: float(mean_s.get(name, 0.0))
-    )
-    places = OVERVIEW - (content.baseline in perceiving)
-    chosen = {ranked[round(k * (len(ranked) - 1) / (places - 1))] for k in range(places)} | {content.baseline}
+    baseline = content.baseline if content.baseline in perceiving else perceiving[0]
+    ranked = sorted((name for name in perceiving if name != baseline), key=lambda name: float(mean_s.get(name, 0.0)))
+    places = OVERVIEW - 1
+    chosen = {ranked[round(k * (len(ranked) - 1) / (places - 1))] for k in range(places)} | {baseline}
     return [name for name in perceiving if name in chosen]
 
 

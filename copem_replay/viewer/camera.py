@@ -174,20 +174,23 @@ def _choose_scale(
 def _write_arrows(
     out: RecordingSink, replay: Replay, eye: Camera, elapsed_ns: Int, seen: Mapping[int, Float], scale: Float
 ) -> None:
-    """Write a point with an arrow near the edge of the picture, on the ground, for each object that is outside it."""
+    """Write a point with an arrow near the edge of the picture, on the ground, for each object outside it.
+
+    Objects farther from the ego than `WIDEST_M` have none: their names would cover those of nearer ones.
+    """
     import rerun as rr
 
     place = np.stack([*seen.values()])  # (M, 3, K)
     across, high = _project(place / scale, eye)
     far_out = np.maximum(np.abs(across), np.abs(high))
     _, step = np.unique(elapsed_ns // ARROW_NS, return_index=True)
-    row, m = np.nonzero(far_out[:, step].T > 1.0)
+    distance_m = np.hypot(place[:, 0] + AHEAD_M, place[:, 1])
+    row, m = np.nonzero((far_out[:, step].T > 1.0) & (distance_m[:, step].T <= WIDEST_M))
     at = m, step[row]
     u, v = EDGE * across[at] / far_out[at], EDGE * high[at] / far_out[at]
     sides = np.where(np.abs(u) >= np.abs(v), np.where(u > 0, "→", "←"), np.where(v > 0, "↑", "↓"))
-    distance_m = np.hypot(place[:, 0] + AHEAD_M, place[:, 1])[at]
     ids = np.array(short_ids(replay.scene), dtype=object)[np.array([*seen])[m]]
-    labels = [f"{name} {side} {far:.0f} m" for name, side, far in zip(ids, sides, distance_m, strict=True)]
+    labels = [f"{name} {side} {far:.0f} m" for name, side, far in zip(ids, sides, distance_m[at], strict=True)]
     towards, right, up = _axes(np.pi / 2)
     tall = np.tan(EYE_RAD / 2)
     ray = towards[:, None] + u * eye.aspect * tall * right[:, None] + v * tall * up[:, None]
