@@ -269,8 +269,16 @@ class Results:
 
     @cached_property
     def tally(self) -> pd.DataFrame:
-        """`tally.parquet`."""
-        return self.frame("tally.parquet")
+        """`tally.parquet`, which counts the rows of `detections.parquet`. Raises InputError where it counts others."""
+        tally = self.frame("tally.parquet")
+        if self.study is None:
+            of = tally[tally["event"] == DETECTED]
+            if (counts := of.groupby(["log", "configuration"])["runs"].sum()).to_dict() != self.rows.counts:
+                raise InputError(
+                    f"{self.place}/tally.parquet: expected the {sum(self.rows.counts.values())} rows of "
+                    f"detections.parquet counted, found {int(counts.sum())}; {AGAIN}"
+                )
+        return tally
 
     @cached_property
     def known(self) -> pd.DataFrame:
@@ -420,14 +428,6 @@ def check_complete(results: Results, *, rowless: bool = False) -> Results:
     check_columns(rows.place, results.provenance.kinds(rows.place.name), rows.kinds)
     if rows.counts or not rowless:
         check_configurations(rows, experiment.configurations)
-    tally = results.tally[results.tally["event"] == DETECTED]
-    counts = tally.groupby(["log", "configuration"])["runs"].sum()
-    if counts.to_dict() != rows.counts:
-        expected, found = sum(rows.counts.values()), int(counts.sum())
-        raise InputError(
-            f"{results.place}/tally.parquet: expected the {expected} rows of detections.parquet counted, found "
-            f"{found}; {AGAIN}"
-        )
     for what, expected, found in (
         ("logs", len(experiment.logs), len(results.provenance.logs)),
         ("configurations", len(experiment.configurations), len(experiment.configurations.keys() & results.facts)),
@@ -436,6 +436,6 @@ def check_complete(results: Results, *, rowless: bool = False) -> Results:
             raise InputError(
                 f"{results.place}/{MARK}: expected {expected} {what} as in experiment.yaml, found {found}; {AGAIN}"
             )
-    for name in ("summary", "summary_by", "exact", "sweep"):
+    for name in ("tally", "summary", "summary_by", "exact", "sweep"):
         getattr(results, name)
     return results
