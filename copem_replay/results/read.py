@@ -369,12 +369,23 @@ class Results:
     def recording(self, log: str, experiment: Experiment) -> Recording:
         """The recording of a log, read again as an experiment, this one or one made of it, has it.
 
-        Raises RecordingError, one line, where the recording is missing or not the one that was replayed.
+        Raises RecordingError, one line, where the recording is missing or not the one that was replayed; InputError
+        where rows name objects that it does not have.
         """
         if self.study is not None:
             return self.study.find_log(log).whole()
         (recorded,) = (one for one in self.provenance.logs if one.name == log)
-        return reread_recording(recorded, self.log_place(log), resolve_for_log(experiment, log))
+        recording = reread_recording(recorded, self.log_place(log), resolve_for_log(experiment, log))
+        (rows,) = self.each("object_id", log=log, every=True)
+        named = {"detections.parquet": rows["object_id"]}
+        if self.has("tally.parquet"):
+            named["tally.parquet"] = self.tally.loc[self.tally["log"] == log, "object_id"]
+        for name, objects in named.items():
+            if unknown := set(objects.unique()) - recording.scene.object_number.keys():
+                raise InputError(
+                    f"{self.place}/{name}: expected objects of the recording {log}, found {min(unknown)!r}; {AGAIN}"
+                )
+        return recording
 
     def chosen(self, configurations: Sequence[str] | None) -> tuple[str, ...]:
         """The configurations to draw, each once; None: all. Raises InputError for a name that is not there."""

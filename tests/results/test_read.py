@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 from pathlib import Path
@@ -11,11 +12,13 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
+import copem_replay as cr
 from copem_replay.core.errors import InputError
 from copem_replay.metrics.columns import TABLES
 from copem_replay.results.read import open_results, read_results
 from copem_replay.results.table_files import read_csv, read_frame, read_parquet, write_parquet
 from tests.helpers.compare_folders import row, write_folder
+from tests.helpers.experiments import changed, drive
 
 
 @pytest.fixture
@@ -170,3 +173,30 @@ def test_a_tally_counts_the_rows_of_detections(folder: Path) -> None:
         InputError, match=r"tally\.parquet: expected the 2 rows of detections\.parquet counted, found 3; run the "
     ):
         _ = open_results(folder).tally
+
+
+def test_a_key_of_gospa_that_is_missing_stands_for_its_default(folder: Path) -> None:
+    file = folder / "provenance.json"
+    data = json.loads(file.read_text())
+    del data["measure"]["gospa"]["power"]
+    file.write_text(json.dumps(data))
+    assert open_results(folder).provenance.measure["gospa"] == {"cutoff_m": None, "power": 2.0}
+
+
+@pytest.mark.parametrize("name", ["detections.parquet", "tally.parquet"])
+def test_objects_that_the_recording_does_not_have_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    drive(Path("drive.mcap"))
+    Path("e.yaml").write_text(changed("show: null"))
+    cr.run("e.yaml").save("out")
+    table = parquet.read_table(f"out/{name}")
+    k = table.column_names.index("object_id")
+    parquet.write_table(table.set_column(k, "object_id", pa.array(["-1"] * len(table))), f"out/{name}")
+    results = cr.load_results("out")
+    with pytest.raises(InputError) as refused:
+        results.recording("drive", results.experiment)
+    assert refused.value.problems == (
+        f"out/{name}: expected objects of the recording drive, found '-1'; run the experiment again with --overwrite",
+    )
