@@ -101,6 +101,7 @@ class Results:
 
     def __post_init__(self) -> None:
         self._called = self.folder or Path(f"run {next(_NUMBERS)}")
+        self._read_last: tuple[tuple[str, Experiment], Recording] | None = None
         if self.study is None:
             self._seen = os.stat(self._called)
             self.__dict__["provenance"] = read_provenance(self._called / MARK)
@@ -369,13 +370,21 @@ class Results:
     def recording(self, log: str, experiment: Experiment) -> Recording:
         """The recording of a log, read again as an experiment, this one or one made of it, has it.
 
-        Raises RecordingError, one line, where the recording is missing or not the one that was replayed; InputError
-        where rows name objects that it does not have.
+        The one that was read last is kept, for the next that shows it. Raises RecordingError, one line, where the
+        recording is missing or not the one that was replayed; InputError where rows name objects that it does not have.
         """
         if self.study is not None:
             return self.study.find_log(log).whole()
-        (recorded,) = (one for one in self.provenance.logs if one.name == log)
-        recording = reread_recording(recorded, self.log_place(log), resolve_for_log(experiment, log))
+        asked = (log, resolve_for_log(experiment, log))
+        if self._read_last is None or self._read_last[0] != asked:
+            (recorded,) = (one for one in self.provenance.logs if one.name == log)
+            recording = reread_recording(recorded, self.log_place(log), asked[1])
+            self._check_objects(log, recording)
+            self._read_last = asked, recording
+        return self._read_last[1]
+
+    def _check_objects(self, log: str, recording: Recording) -> None:
+        """Raise InputError where rows of a log name objects that its recording does not have."""
         (rows,) = self.each("object_id", log=log, every=True)
         named = {"detections.parquet": rows["object_id"]}
         if self.has("tally.parquet"):
@@ -385,7 +394,6 @@ class Results:
                 raise InputError(
                     f"{self.place}/{name}: expected objects of the recording {log}, found {min(unknown)!r}; {AGAIN}"
                 )
-        return recording
 
     def chosen(self, configurations: Sequence[str] | None) -> tuple[str, ...]:
         """The configurations to draw, each once; None: all. Raises InputError for a name that is not there."""

@@ -24,6 +24,7 @@ from copem_replay.viewer.sink import (
     RecordingSink,
     configuration_part,
     entity_names,
+    pair_points,
     short_ids,
     stack_float32,
     table_rows,
@@ -296,7 +297,7 @@ def _write_reference_lines(
     _, mark = np.nonzero(np.arange(len(rows)) < counts[:, None])
     lines = np.stack(ends, axis=1)[mark]
     if len(rows) <= LINED:
-        out.columns([*path, "line"], instants, rr.LineStrips3D.columns(strips=lines).partition(counts))
+        out.columns([*path, "line"], instants, rr.LineStrips3D.columns(strips=pair_points(lines)).partition(counts))
         out.static([*path, "line"], rr.LineStrips3D.from_fields(colors=[colour], radii=rr.Radius.ui_points(1.0)))
     words = pa.array(texts, pa.string()).take(pa.array(rows[mark]))
     out.columns(path, instants, rr.Points3D.columns(positions=lines.mean(axis=1), labels=words).partition(counts))

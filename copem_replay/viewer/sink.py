@@ -411,3 +411,12 @@ def axis_s(episodes: pd.DataFrame, end_s: float) -> tuple[float, float]:
     last_s = float(detected_s.max()) if len(detected_s) else min(float(episodes["ended_s"].max()), onset_s + UNKNOWN_S)
     first_s = max(min(onset_s, float(detected_s.min()) if len(detected_s) else onset_s) - BEFORE_S, 0.0)
     return first_s, min(max(last_s + AFTER_S, first_s + LEAST_S), max(end_s, first_s + AFTER_S))
+
+
+def pair_points(ends: np.ndarray) -> pa.Array:
+    """Lines (…, 2, 3) as strips of two points: Rerun itself counts the points of each strip in Python."""
+    import rerun as rr
+
+    kind = rr.components.LineStrip3DBatch._ARROW_DATATYPE
+    points = pa.FixedSizeListArray.from_arrays(pa.array(ends.astype(np.float32).ravel()), type=kind.value_type)
+    return pa.ListArray.from_arrays(pa.array(np.arange(0, len(points) + 1, 2, dtype=np.int32)), points, type=kind)
