@@ -28,6 +28,7 @@ WINDOW = "1280x720"
 BAR_PX = 36
 """Of the viewer's menu, which also says that it runs without a window: cut off."""
 QUESTIONS = {
+    "Overview": "crowded.png",
     "Who knew when": "who_knew_when.png",
     "Why not earlier": "why_not_earlier.png",
     "What each believes": "what_each_believes.png",
@@ -56,6 +57,7 @@ def main() -> None:
         _differences(folder, differences)
         made = {
             "replay.png": _seen(folder / "replay.rrd", AT_S)["Overview"],
+            "crossing.png": _crossing(Path(scratch) / "crossing"),
             "differences.png": _seen(differences, AT_S)["Overview"],
             "runs.png": _drawn(folder),
         }
@@ -77,21 +79,25 @@ def _replay(folder: Path) -> None:
     cr.run(experiment.model_copy(update={"show": experiment.show.model_copy(update={"run": "median"})})).save(folder)
 
 
+def _crossing(folder: Path) -> Picture:
+    """The overview of `copem-replay run logs/crossing_memory.yaml`, at the instant at which its recording opens."""
+    import copem_replay as cr
+    from copem_replay.viewer.open import opening_s
+
+    experiment = cr.load_experiment(ROOT / "logs/crossing_memory.yaml")
+    cr.run(experiment.model_copy(update={"show": experiment.show.model_copy(update={"run": 0})})).save(folder)
+    recording = folder / "replay.rrd"
+    return _seen(recording, opening_s(folder, [recording])[recording])["Overview"]
+
+
 def _city(folder: Path) -> float:
-    """The city's results; when some know of the object that tells most, and others do not."""
+    """The city's results; the instant at which they open."""
     import copem_replay as cr
     from city_traffic import experiment, write
-    from copem_replay.viewer.sink import choose_measured_objects
+    from copem_replay.viewer.open import opening_s
 
-    result = cr.run(experiment(write(folder.parent)))
-    result.save(folder)
-    table = result.detections
-    table = table[table["run"] == next(iter(cr.load_results(folder).provenance.run_shown.values()))]
-    episodes = table[
-        (table["object_id"] == choose_measured_objects(table, ["GT"])[0]) & (table["configuration"] != "GT")
-    ]
-    times = episodes["detection_s"].dropna()
-    return float(times.min() + times.max()) / 2
+    cr.run(experiment(write(folder.parent))).save(folder)
+    return opening_s(folder, [folder / "replay.rrd"])[folder / "replay.rrd"]
 
 
 def _differences(folder: Path, out: Path) -> None:

@@ -162,44 +162,54 @@ def _own_folder() -> tuple[str, str]:
     return own, f" for this process alone ({folder} is not a folder of this user alone)"
 
 
-# Cached code that cannot be used. Numba offers no place for this: the method that reads its cache is replaced, for the
-# functions of this package alone, when Numba is imported.
+# Two places of Numba are changed when it is imported, as it offers none for this. The method that reads its cache is
+# replaced, for the functions of this package alone: cached code may be of no use.
 
-_CACHING = "numba.core.caching"
+_CACHING, _ALGEBRA = "numba.core.caching", "numba.np.linalg"
 _unusable: list[tuple[str, str]] = []
 """The functions whose cached code could not be used in this process, and why."""
 
 
 class _NumbaWatch:
-    """An entry of `sys.meta_path` that has Numba's module of caches tolerant as soon as it is imported."""
+    """An entry of `sys.meta_path` that changes a module of Numba as soon as it is imported."""
+
+    def __init__(self, name: str, change: Callable[[Any], None]) -> None:
+        self.name, self.change = name, change
 
     def find_spec(self, name: str, path: Any = None, target: Any = None) -> Any:
         """The specification of that one module, once; None for all others."""
-        if name != _CACHING:
+        if name != self.name:
             return None
         sys.meta_path.remove(self)
         spec = importlib.util.find_spec(name)
         if spec is not None and spec.loader is not None:
             run = spec.loader.exec_module
 
-            def run_and_tolerate(module: Any) -> None:
+            def run_and_change(module: Any) -> None:
                 run(module)
-                _tolerate(module.FunctionCache)
+                self.change(module)
 
-            spec.loader.exec_module = run_and_tolerate  # type: ignore[method-assign]
+            spec.loader.exec_module = run_and_change  # type: ignore[method-assign]
         return spec
 
 
 def watch_numba() -> None:
     """From now on cached code of this package that cannot be used is compiled again, whoever imports Numba."""
-    if _CACHING in sys.modules:
-        _tolerate(sys.modules[_CACHING].FunctionCache)
-    else:
-        sys.meta_path.insert(0, _NumbaWatch())
+    for name, change in ((_CACHING, _tolerate), (_ALGEBRA, _assume_blas)):
+        if name in sys.modules:
+            change(sys.modules[name])
+        else:
+            sys.meta_path.insert(0, _NumbaWatch(name, change))
 
 
-def _tolerate(caches: Any) -> None:
-    """Replace how a class of Numba's caches loads: what cannot be loaded is forgotten, and there is nothing."""
+def _assume_blas(algebra: Any) -> None:
+    """SciPy is there, with its BLAS: to see that, Numba imports scipy.linalg in every process, a tenth of a second."""
+    algebra.ensure_blas = lambda: None
+
+
+def _tolerate(caching: Any) -> None:
+    """Replace how Numba's caches load: what cannot be loaded is forgotten, and there is nothing."""
+    caches = caching.FunctionCache
     load = caches.load_overload
 
     def load_or_forget(self: Any, sig: Any, target_context: Any) -> Any:

@@ -378,7 +378,7 @@ def _remove_listed(scratch: Path, path: Path | None = None) -> bool:
                 return False
             place.rmdir()
             return True
-        if inside in files or (path is not None and _is_link(place, path / inside.partition("/")[2])):
+        if inside in files or (path is not None and is_hard_link(place, path / inside.partition("/")[2])):
             place.unlink()
             return True
         return False
@@ -398,9 +398,9 @@ def _read_scratch_list(scratch: Path) -> set[str]:
         return set()
 
 
-def _is_link(place: Path, other: Path) -> bool:
-    """Whether two names are of one file."""
-    return os.path.lexists(other) and os.path.samestat(os.lstat(place), os.lstat(other))
+def is_hard_link(place: Path, other: Path) -> bool:
+    """Whether two names are there and of one file. Raises OSError."""
+    return os.path.lexists(place) and os.path.lexists(other) and os.path.samestat(os.lstat(place), os.lstat(other))
 
 
 def flush_all(folder: Path) -> None:

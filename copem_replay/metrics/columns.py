@@ -26,6 +26,7 @@ class Column:
     `kind`: text, text or null, numbers, whole numbers, true or false, or lists of these. `when`: what an experiment
     has to ask for (`braking`, `conflict`, `accuracy`; `link`: a link, `ready` or `sends`; `fleet`: units that only some
     runs have); empty: it is always there. `compared`: whether comparisons read it. `single`: in single precision.
+    `full`: no row is without it. `infinite`: numbers may be infinite.
     """
 
     name: str
@@ -34,6 +35,8 @@ class Column:
     when: str = ""
     compared: bool = False
     single: bool = False
+    full: bool = False
+    infinite: bool = False
 
     @property
     def arrow(self) -> pa.DataType:
@@ -50,6 +53,7 @@ class Table:
 
     words: str
     columns: tuple[Column, ...]
+    keys: tuple[str, ...] = ()  # columns that no two rows have alike
 
     def kinds(self, *when: str, compared: bool = False) -> dict[str, str]:
         """The kinds of the columns that are always there, and of those that are there `when` this is asked for."""
@@ -64,16 +68,16 @@ class Table:
 
 _CONFIGURATION = Column("configuration", "text", "name of the configuration, as in the experiment", compared=True)
 _LOG = (Column("log", "text", "name of the recording", compared=True), _CONFIGURATION)
-_RUN = Column("run", "whole numbers", "number of the run, from 0 on", compared=True)
+_RUN = Column("run", "whole numbers", "number of the run, from 0 on", compared=True, full=True)
 _OBJECT = Column("object_id", "text", "id of the object in the truth", compared=True)
 _CLASS = Column("object_class", "text", "class of the object in the truth")
 _EPISODE = Column("episode", "whole numbers",
                   "which episode of the object, from 0 on; above 0 only with "
-                  "[`again_after_s`](../guide/metrics.md#who-comes-back)", compared=True)  # fmt: skip
+                  "[`again_after_s`](../guide/metrics.md#who-comes-back)", compared=True, full=True)  # fmt: skip
 _ONSET = Column("onset_s", "numbers",
                 "when the clock starts, in seconds since the log's start: the first frame at which the onset's "
                 "condition holds while the ego is in the log. An object without onset has no row",
-                compared=True)  # fmt: skip
+                compared=True, full=True)  # fmt: skip
 _ONSET_RANGE = Column("distance_at_onset_m", "numbers",
                       "true horizontal distance to the ego at `onset_s`, centre to centre; null when there is none to "
                       "measure from")  # fmt: skip
@@ -81,7 +85,8 @@ _BEGAN = Column("began", "text",
                 "how the episode began: `log_start`, `appeared` or `crossed`, "
                 "[below](../guide/metrics.md#which-objects-count)", compared=True)  # fmt: skip
 _ENDED = (
-    Column("ended_s", "numbers", "the end of the episode; a list that arrives later does not count", compared=True),
+    Column("ended_s", "numbers", "the end of the episode; a list that arrives later does not count", compared=True,
+           full=True),
     Column("ended_by", "text",
            "why the episode ended: the object's own last frame (`object_left`), the ego's (`ego_left`), the log's "
            "(`log_end`)", compared=True),
@@ -98,7 +103,8 @@ _DISTANCES = (
 )  # fmt: skip
 _IN_CONFLICT = Column("conflict", "true or false",
                       "in [conflict](../guide/metrics.md#would-it-have-braked-in-time). The columns from `brake_s` to "
-                      "`required_deceleration_mps2` are null where it is not", "braking", compared=True)  # fmt: skip
+                      "`required_deceleration_mps2` are null where it is not", "braking", compared=True,
+                      full=True)  # fmt: skip
 
 
 def _as_in_summary(*names: str, kind: str = "numbers", when: str = "") -> tuple[Column, ...]:
@@ -122,7 +128,7 @@ _SUMMARY_BY = (
 )  # fmt: skip
 _DETECTIONS = (
     *_LOG, _RUN, _OBJECT, _CLASS, _EPISODE, _ONSET, _ONSET_RANGE, _BEGAN,
-    Column("detected", "true or false", "whether the object was detected", compared=True),
+    Column("detected", "true or false", "whether the object was detected", compared=True, full=True),
     _DETECTION,
     Column("captured_s", "numbers", "newest capture that contributed to that list"),
     Column("in_sight_s", "numbers",
@@ -150,7 +156,7 @@ _DETECTIONS = (
            "smallest constant deceleration from `brake_s` on with which the ego is never within the margin: 0 if "
            "keeping its speed is enough, infinite if none helps (the gap is used up, or the object comes from "
            "behind), null if not detected. Braking harder is not always better: a standing ego may be run into",
-           "braking"),
+           "braking", infinite=True),
     Column("matched_lists", "whole numbers", "lists of the stay with a match that counts as a pair", "accuracy"),
     Column("unplaced_lists", "whole numbers", "of these, lists that are available in a gap of the truth", "accuracy"),
     *_as_in_summary("position_rmse_m", "position_rmse_captured_m", "bias_east_m", "bias_north_m", "velocity_rmse_mps",
@@ -174,13 +180,13 @@ _TALLY = (
     *_LOG,
     Column("event", "text", "`detected`, or `conflict`: the first list that implied a collision"),
     _OBJECT, _CLASS, _EPISODE, _ONSET, _ONSET_RANGE, _BEGAN, *_ENDED, _DETECTION, _TIME, *_DISTANCES,
-    Column("runs", "whole numbers", "in how many runs it is so"),
-    Column("in_conflict", "true or false", "whether the ego is in conflict with the object", "braking"),
-    Column("passed", "whole numbers", "in how many of these runs the ego passes", "braking"),
+    Column("runs", "whole numbers", "in how many runs it is so", full=True),
+    Column("in_conflict", "true or false", "whether the ego is in conflict with the object", "braking", full=True),
+    Column("passed", "whole numbers", "in how many of these runs the ego passes", "braking", full=True),
 )  # fmt: skip
 _EXACT = (
     *_LOG, _OBJECT, _CLASS, _EPISODE, _ONSET, _BEGAN, _DETECTION,
-    Column("probability", "numbers", "of being detected at this instant; on the row for never, of missing"),
+    Column("probability", "numbers", "of being detected at this instant; on the row for never, of missing", full=True),
     Column("incidence", "numbers", "probability of being detected up to this instant"),
     Column("miss_log10", "numbers",
            "log₁₀ of the probability to miss the object, on the row for never; null where detection is certain"),
@@ -300,24 +306,27 @@ TABLES = {
     "summary.csv": Table(
         "One row per configuration. A column is there where the experiment asks for it. "
         "[Definitions](../guide/metrics.md#one-row-of-summarycsv), [intervals](../guide/metrics.md#intervals). Own "
-        "metrics come last.", _SUMMARY),
+        "metrics come last.", _SUMMARY, keys=("configuration",)),
     "sweep.csv": Table(
         "One row per value of a sweep and configuration; other columns as in `summary.csv`. "
         "[Definitions](../guide/metrics.md#sweeps).",
-        (Column("sweep", "text", "key that is swept"), Column("value", "numbers", "its value"), _CONFIGURATION)),
+        (Column("sweep", "text", "key that is swept"), Column("value", "numbers", "its value"), _CONFIGURATION),
+        keys=("sweep", "value", "configuration")),
     "summary_by.csv": Table(
         "One row per entry of `measure: {by: …}`, group and configuration; other columns as in `summary.csv`. "
-        "[Definitions](../guide/slices.md).", _SUMMARY_BY),
+        "[Definitions](../guide/slices.md).", _SUMMARY_BY, keys=("by", "group", "configuration")),
     "detections.parquet": Table(
         "One row per log, configuration, run and measured object. "
         "[Definitions](../guide/metrics.md#one-row-of-detectionsparquet), those of accuracy "
         "[here](../guide/metrics.md#how-far-off), of this object in this run.", _DETECTIONS),
     "tally.parquet": Table(
         "One row per log, configuration, event, object and instant at which it happens in any run, and one for never. "
-        "[Definitions](../guide/metrics.md#one-row-of-tallyparquet).", _TALLY),
+        "[Definitions](../guide/metrics.md#one-row-of-tallyparquet).", _TALLY,
+        keys=("log", "configuration", "event", "object_id", "episode", "detection_s")),
     "exact.parquet": Table(
         "One row per log, configuration, object and instant at which it may be detected, and one for never, without an "
-        "instant. [Definitions](../guide/metrics.md#exactly-without-a-draw).", _EXACT),
+        "instant. [Definitions](../guide/metrics.md#exactly-without-a-draw).", _EXACT,
+        keys=("log", "configuration", "object_id", "episode", "detection_s")),
     "accuracy.parquet": Table(f"One row per row of `detections.parquet`, in its order. {_FAR_OFF}.", _ACCURACY),
     "instants.parquet": Table(
         "One row per log and configuration, and per run where runs differ in their instants.", _INSTANTS),
@@ -333,6 +342,13 @@ TABLES = {
 """The files of a results folder, beside the experiment and the replays."""
 COMPARED_FILES = ("accuracy.parquet", "instants.parquet", "lists.parquet", "thresholds.parquet")
 """Optional files that comparisons read."""
+
+
+def find_columns(name: str) -> dict[str, Column]:
+    """By name the columns that a file may have, with those that it has as `summary.csv` has them."""
+    shared = _SUMMARY if name in ("sweep.csv", "summary_by.csv") else ()
+    return {column.name: column for column in (*shared, *TABLES[name].columns)}
+
 
 COMPARISON = Table(
     "One row per log (`all`, and each where there are several), configuration and metric. "

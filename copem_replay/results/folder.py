@@ -30,6 +30,7 @@ from copem_replay.core.files import (
     flush_all,
     flush_file,
     hidden_name,
+    is_hard_link,
     is_scratch,
     make_scratch_folder,
     overwrite_file,
@@ -353,13 +354,19 @@ class ResultsPlace:
                 _move_over(name, old, self.folder, os.rename)
             except OSError as error:
                 self.notes.append(f"{self.asked}/{name}: cannot be moved over ({error.strerror}); it is in {old}")
+        # What is in both goes from here, also where a command then writes another file of that name.
+        both = [name for name in after.others(files) if is_hard_link(old / name, self.folder / name)]
+        self._list_ours(old.name, after, files, both)
         return None
 
-    def _list_ours(self, where: str, held: FolderFiles, files: Sequence[str]) -> None:
-        """List what may be removed of the scratch folder, in which the old results come to lie as `where`."""
-        ours = set(held.every).difference(held.others(files))
-        places = {_NEW, OLD, where}
-        self.scratch.will_hold(f"{at}/{name}" for at in places for name in {*files, *ours})
+    def _list_ours(self, where: str, held: FolderFiles, files: Sequence[str], both: Sequence[str] = ()) -> None:
+        """List what may be removed of the scratch folder, in which the old results come to lie as `where`.
+
+        `both`: the user's own files of them that the new results have, too.
+        """
+        ours = {*held.every}.difference(held.others(files)).union(files)
+        listed = {f"{at}/{name}" for at in {_NEW, OLD, where} for name in ours}
+        self.scratch.will_hold(listed.union(f"{where}/{name}" for name in both))
 
     def _elsewhere(self, why: str) -> None:
         """Give the new folder another name."""

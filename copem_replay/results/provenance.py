@@ -118,10 +118,12 @@ def parse_provenance(data: Any, place: Path) -> Provenance:
     if not all(isinstance(note, str) for note in notes):
         raise ValueError("expected text in notes and logs_skipped")
     # A missing key, from an older version, stands for its default.
-    measure = Measure().model_dump(mode="json", by_alias=True) | dict(data["measure"])
+    defaults = Measure().model_dump(mode="json", by_alias=True)
+    measure = defaults | dict(data["measure"])
     braking, gap_s = data.get("braking"), data.get("max_gap_s")
     used_s, run_shown = float(measure.pop("horizon_used_s")), data.get("run_shown") or {}
     _check_measure(measure)
+    measure["gospa"] = defaults["gospa"] | measure["gospa"]
     if not 1 <= int(data["runs"]) <= MOST_RUNS:
         raise ValueError(f"expected 1 to {MOST_RUNS} runs, found {data['runs']}")
     return Provenance(

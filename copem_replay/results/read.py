@@ -101,6 +101,7 @@ class Results:
 
     def __post_init__(self) -> None:
         self._called = self.folder or Path(f"run {next(_NUMBERS)}")
+        self._read_last: tuple[tuple[str, Experiment], Recording] | None = None
         if self.study is None:
             self._seen = os.stat(self._called)
             self.__dict__["provenance"] = read_provenance(self._called / MARK)
@@ -269,8 +270,16 @@ class Results:
 
     @cached_property
     def tally(self) -> pd.DataFrame:
-        """`tally.parquet`."""
-        return self.frame("tally.parquet")
+        """`tally.parquet`, which counts the rows of `detections.parquet`. Raises InputError where it counts others."""
+        tally = self.frame("tally.parquet")
+        if self.study is None:
+            of = tally[tally["event"] == DETECTED]
+            if (counts := of.groupby(["log", "configuration"])["runs"].sum()).to_dict() != self.rows.counts:
+                raise InputError(
+                    f"{self.place}/tally.parquet: expected the {sum(self.rows.counts.values())} rows of "
+                    f"detections.parquet counted, found {int(counts.sum())}; {AGAIN}"
+                )
+        return tally
 
     @cached_property
     def known(self) -> pd.DataFrame:
@@ -361,12 +370,30 @@ class Results:
     def recording(self, log: str, experiment: Experiment) -> Recording:
         """The recording of a log, read again as an experiment, this one or one made of it, has it.
 
-        Raises RecordingError, one line, where the recording is missing or not the one that was replayed.
+        The one that was read last is kept, for the next that shows it. Raises RecordingError, one line, where the
+        recording is missing or not the one that was replayed; InputError where rows name objects that it does not have.
         """
         if self.study is not None:
             return self.study.find_log(log).whole()
-        (recorded,) = (one for one in self.provenance.logs if one.name == log)
-        return reread_recording(recorded, self.log_place(log), resolve_for_log(experiment, log))
+        asked = (log, resolve_for_log(experiment, log))
+        if self._read_last is None or self._read_last[0] != asked:
+            (recorded,) = (one for one in self.provenance.logs if one.name == log)
+            recording = reread_recording(recorded, self.log_place(log), asked[1])
+            self._check_objects(log, recording)
+            self._read_last = asked, recording
+        return self._read_last[1]
+
+    def _check_objects(self, log: str, recording: Recording) -> None:
+        """Raise InputError where rows of a log name objects that its recording does not have."""
+        (rows,) = self.each("object_id", log=log, every=True)
+        named = {"detections.parquet": rows["object_id"]}
+        if self.has("tally.parquet"):
+            named["tally.parquet"] = self.tally.loc[self.tally["log"] == log, "object_id"]
+        for name, objects in named.items():
+            if unknown := set(objects.unique()) - recording.scene.object_number.keys():
+                raise InputError(
+                    f"{self.place}/{name}: expected objects of the recording {log}, found {min(unknown)!r}; {AGAIN}"
+                )
 
     def chosen(self, configurations: Sequence[str] | None) -> tuple[str, ...]:
         """The configurations to draw, each once; None: all. Raises InputError for a name that is not there."""
@@ -420,14 +447,6 @@ def check_complete(results: Results, *, rowless: bool = False) -> Results:
     check_columns(rows.place, results.provenance.kinds(rows.place.name), rows.kinds)
     if rows.counts or not rowless:
         check_configurations(rows, experiment.configurations)
-    tally = results.tally[results.tally["event"] == DETECTED]
-    counts = tally.groupby(["log", "configuration"])["runs"].sum()
-    if counts.to_dict() != rows.counts:
-        expected, found = sum(rows.counts.values()), int(counts.sum())
-        raise InputError(
-            f"{results.place}/tally.parquet: expected the {expected} rows of detections.parquet counted, found "
-            f"{found}; {AGAIN}"
-        )
     for what, expected, found in (
         ("logs", len(experiment.logs), len(results.provenance.logs)),
         ("configurations", len(experiment.configurations), len(experiment.configurations.keys() & results.facts)),
@@ -436,6 +455,6 @@ def check_complete(results: Results, *, rowless: bool = False) -> Results:
             raise InputError(
                 f"{results.place}/{MARK}: expected {expected} {what} as in experiment.yaml, found {found}; {AGAIN}"
             )
-    for name in ("summary", "summary_by", "exact", "sweep"):
+    for name in ("tally", "summary", "summary_by", "exact", "sweep"):
         getattr(results, name)
     return results

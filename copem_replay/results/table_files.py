@@ -22,7 +22,7 @@ from pyarrow import parquet
 
 from copem_replay.core.errors import InputError
 from copem_replay.core.files import avoid_device_name
-from copem_replay.metrics.columns import TABLES
+from copem_replay.metrics.columns import TABLES, Column, find_columns
 
 AGAIN = "run the experiment again with --overwrite"
 """The way out for a table that is damaged or of an older version."""
@@ -46,14 +46,33 @@ def read_parquet(path: Path, files: Sequence[Path] = ()) -> pd.DataFrame:
 
 
 def read_frame(path: Path, reader: Callable[[Path], pd.DataFrame], kinds: Mapping[str, str]) -> pd.DataFrame:
-    """A table with at least these columns. Raises InputError."""
+    """A table with at least these columns, each checked by what is known of it. Raises InputError."""
     with _report_damage(path):
         table = reader(path)
     check_columns(path, kinds, table.columns)
-    for name in (name for name, kind in kinds.items() if kind in ("numbers", "whole numbers")):
-        if table[name].dtype.kind not in "iuf" and table[name].notna().any():
-            raise InputError(f"{path}: column {name}: expected numbers, found {table[name].dtype}; {AGAIN}")
+    of_csv = path.suffix == ".csv"
+    columns = find_columns(path.name)
+    if of_csv:  # other columns are metrics of the user's own
+        columns |= {name: Column(name, "numbers", "", infinite=True) for name in table if name not in columns}
+    for name, column in columns.items() if len(table) else ():
+        if name in table:
+            _check_series(path, column, table[name], optional=of_csv)
+    keys = [name for name in TABLES[path.name].keys if name in table]
+    if keys and (twice := table.duplicated(keys)).any():
+        found = ", ".join(map(str, table.loc[twice.idxmax(), keys]))
+        raise InputError(f"{path}: expected one row for each {', '.join(keys)}, found several for {found}; {AGAIN}")
     return table
+
+
+def _check_series(path: Path, column: Column, values: pd.Series, *, optional: bool) -> None:
+    """Raise InputError where a column as pandas has it is of another kind, or its values cannot be."""
+    try:
+        array = pa.array(values, from_pandas=True)
+    except (TypeError, ValueError, OverflowError):  # values of several kinds
+        raise InputError(f"{path}: column {column.name}: expected {column.kind}, found others; {AGAIN}") from None
+    if array.null_count < len(array):  # with nulls pandas has whole numbers as others
+        check_kind(path, column.name, column.kind.replace("whole numbers", "numbers"), array.type)
+    check_values(path, column, array, optional=optional)
 
 
 def check_columns(path: Path, expected: Iterable[str], found: Collection[str]) -> None:
@@ -67,13 +86,43 @@ def check_columns(path: Path, expected: Iterable[str], found: Collection[str]) -
 def check_kind(path: Path, name: str, kind: str, found: pa.DataType) -> None:
     """Raise InputError where a column is of another kind."""
     if not _is_kind(kind, found):
-        raise InputError(f"{path}: column {name}: expected {kind}, found {found}; {AGAIN}")
+        shown = "text" if _is_kind("text", found) else found
+        raise InputError(f"{path}: column {name}: expected {kind}, found {shown}; {AGAIN}")
 
 
-def check_text(path: Path, name: str, column: pa.ChunkedArray) -> None:
-    """Raise InputError where a name is missing."""
-    if column.null_count:
-        raise InputError(f"{path}: column {name}: expected text in every row, found none in some; {AGAIN}")
+_MOST_S = 1e10
+"""Times of recordings are 64-bit nanoseconds."""
+_MOST = 1e100
+"""Squares of numbers, and their sums, are numbers."""
+_MOST_WHOLE = 1e15
+"""Whole numbers up to here are exact as others, too."""
+_IN_EVERY_ROW = {"text": "text", "true or false": "true or false", "numbers": "a number", "whole numbers": "a number"}
+
+
+def check_values(path: Path, column: Column, values: Any, *, optional: bool = False) -> None:
+    """Raise InputError where values, an array of Arrow, are missing in a column that is full, or absurd.
+
+    Text is missing nowhere but where its column says so, or where it is `optional`. Numbers are finite but where their
+    column says otherwise; whole ones, which count or number something, are not below 0.
+    """
+    kind = column.kind
+    full = column.full or (kind == "text" and not optional)
+    if full and pc.any(pc.is_null(values, nan_is_null=True)).as_py():
+        raise InputError(
+            f"{path}: column {column.name}: expected {_IN_EVERY_ROW[kind]} in every row, found none in some; {AGAIN}"
+        )
+    if pa.types.is_list(values.type) or pa.types.is_large_list(values.type):
+        values = pc.list_flatten(values)
+    if column.infinite or not (pa.types.is_integer(values.type) or pa.types.is_floating(values.type)):
+        return
+    whole = kind.endswith("whole numbers")
+    most = _MOST_WHOLE if whole else _MOST_S if column.name.endswith("_s") else _MOST
+    least = 0 if whole else -most
+    for value in pc.min_max(values).as_py().values():
+        if value is not None and not least <= value <= most and value == value:
+            raise InputError(
+                f"{path}: column {column.name}: expected numbers from {least:g} to {most:g}, found {value:g}; {AGAIN}"
+            )
 
 
 def _is_kind(kind: str, what: pa.DataType) -> bool:
@@ -114,9 +163,11 @@ class LogRows:
         names = [name for name in self.kinds if name != "log"]
         parts = self.read(log, names)
         table = pa.concat_tables(parts) if parts else self.without_rows.select(names)
+        columns = find_columns(self.place.name)
         for k, name in enumerate(names):
+            if name in columns:
+                check_values(self.place, columns[name], table[name])
             if self.kinds[name] == "text":
-                check_text(self.place, name, table[name])
                 table = table.set_column(k, name, table[name].cast(pa.string()))
         return table
 
@@ -165,7 +216,7 @@ def read_log_rows(place: Path, kinds: Mapping[str, str], files: Sequence[Path] =
             with _report_damage(place):
                 group = file.read_row_group(k, names).unify_dictionaries()
             for name in names:
-                check_text(place, name, group[name])
+                check_values(place, find_columns(place.name)[name], group[name])
             counts.update(_count_rows(group))
             for log, begin, end in _find_stretches(group["log"].combine_chunks()):
                 where.setdefault(log, []).append((path, k, begin, end))
@@ -345,6 +396,7 @@ def _unquote_cell(value: Any) -> Any:
 
 def read_csv(path: Path) -> pd.DataFrame:
     """A table from CSV: names are text, whatever they look like, and only empty cells are missing."""
-    text = {"configuration": str, "sweep": str, "by": str, "group": str}
+    text = {name: str for name, column in find_columns(path.name).items() if column.kind.startswith("text")}
     table = pd.read_csv(path, dtype=text, na_values=[""], keep_default_na=False)
-    return unquote_names(table.fillna({name: "" for name in text if name in table}), [n for n in text if n in table])
+    names = [name for name in ("configuration", "sweep", "by", "group") if name in table]
+    return unquote_names(table.fillna(dict.fromkeys(names, "")), names)

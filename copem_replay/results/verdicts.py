@@ -261,7 +261,7 @@ def write_verdicts(verdicts: Judgement, path: Path, form: str = "jsonl") -> Path
     """Write verdicts as a file, complete or not at all; an existing one is replaced. Raises OutputError."""
     with atomic_file(path) as scratch:
         scratch.write_text(FORMS[form](verdicts), encoding="utf-8", newline="\n")
-        folder = path.resolve().parent
+        folder = path.parent.resolve()
         if (folder / MARK).is_file():
             add_to_made_list(folder, [path])
     return path

@@ -10,6 +10,7 @@
 | `world/<configuration>/status`, `hiding`, `listings` | per object: known or why not; what hides it; its first unit |
 | `world/<configuration>/marks`, `marks/from`, `marks/from/line` | where an object was first known, and how far away |
 | `world/eyes/ego`, `world/eyes/<object>` | origins of the views that follow ego or object |
+| `world/eyes/ego/arrows` | shown objects that are outside the picture around the ego |
 | `lanes/<object>/<place>_<configuration>` | the object's status (`viewer/status.py`), a mark at the onset |
 | `lists/<place>_<configuration>/<unit>` | lost, late and overtaken lists of a unit that sends by a link |
 | `world/<configuration>/false` | entries about no object: dashed outlines with a cross |
@@ -21,7 +22,7 @@
 | `legend/…` | the colour of each configuration |
 | `events/onsets`, `events/<configuration>`, `…/lists`, `difference`, `summary`, `words` | texts |
 
-`<object>` is for example `6_pedestrian`. More than six configurations go into several files (`viewer/sink.py`).
+`<object>` is for example `6_pedestrian`. More than seven configurations go into several files (`viewer/sink.py`).
 
 An entity holds all its objects, because hundreds of entities slow the viewer down. The viewer shows the newest row of
 an entity until the next one, so an instant at which there is nothing to show has an empty row. Columns are sent in

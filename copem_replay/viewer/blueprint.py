@@ -16,13 +16,13 @@ from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.viewer.camera import Camera
 from copem_replay.viewer.lanes import UnitLists, select_list_lanes
+from copem_replay.viewer.objects import SHOWN_OBJECTS
 from copem_replay.viewer.sink import (
     EGO,
     ELAPSED,
     GROUND,
     HIDES,
     NOTICED,
-    SHOWN_OBJECTS,
     RecordingSink,
     configuration_part,
     digest_texts,
@@ -81,11 +81,15 @@ NEAR_BY = SHOWN_OBJECTS
 """Most objects with views that follow them: each of those shown."""
 SHARE_TITLE = "Visible share (white: ego, grey: any, x: out of view)"
 BESIDE = 4
-"""Objects with lanes on one page: the lanes of six configurations fit into a height of 720 points."""
+"""Objects with lanes on one page: the lanes of seven configurations fit into a height of 720 points."""
 BESIDE_LISTS = 2
 """Objects on one page if lanes of lists are under theirs: thirteen lanes fit into a height of 720 points."""
 MANY = 4
-"""More configurations than this need half of the overview's height for their lanes."""
+"""More configurations than this need half of a page's height for their lanes."""
+OVERVIEW, FEW = 4, 3
+"""Most views of the overview, and the number from which they are in two columns: each at least 400 × 200 points."""
+OVERVIEW_SHARES = (2.1, 1.0)
+"""Widths of the overview's views and of what is beside them."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +98,8 @@ class RecordingContent:
 
     `episodes`: rows of the table by object; `axes_s`: first and last second of each object's axis.
     Camera `eye` follows the ego, if there is one, `eyes` the objects; `above` looks at the units, of which `named` have
-    names. `lists`: lists that units send by a link, by configuration. `false`: how many false entries each one had.
+    names. `lists`: lists that units send by a link, by configuration. `too_short`: ids of objects too short to judge.
+    `opens_s`: the instant at which the recording opens. `false`: how many false entries each configuration had.
     """
 
     replay: Replay
@@ -110,6 +115,8 @@ class RecordingContent:
     named: Sequence[str]
     lists: Mapping[str, Sequence[UnitLists]]
     baseline: str | None = None
+    too_short: Sequence[str] = ()
+    opens_s: float | None = None
     false: Mapping[str, int] = field(default_factory=dict)
 
     def id_of(self, object_ix: int) -> str:
@@ -145,28 +152,43 @@ def make_time_axis(first_s: float, last_s: float) -> rrb.TimeAxis:
 
 
 def overview_page(content: RecordingContent) -> rrb.Container:
-    """The fused tracks of each configuration; below them lanes, and the table of times to detection."""
+    """The fused tracks of four configurations at most; beside them lanes, and the table of times to detection."""
     import rerun.blueprint as rrb
 
-    views, lower_row, shares = (
-        list[rrb.View](tracks_views(content)),
-        list[rrb.Container | rrb.View]([difference_view()]),
-        [4.0],
-    )
-    if content.objects:
-        lower_row.insert(0, rrb.Tabs(*(lanes_view(content, k) for k in content.objects)))
-        shares.append(4.0)
-    columns = count_columns(len(views))
+    views = list[rrb.View](tracks_views(content, choose_overview(content)))
+    columns = 1 if len(views) < FEW else 2
+    words: list[rrb.View] = [difference_view()]
     if len(views) % columns:
         views.append(legend_view())  # into the free cell
     else:
-        lower_row[-1] = rrb.Tabs(difference_view(), legend_view())
-    return rrb.Vertical(
+        words.append(legend_view())
+    lanes = [rrb.Tabs(*(lanes_view(content, k) for k in content.objects))] if content.objects else []
+    beside = [*lanes, rrb.Tabs(*words)]
+    return rrb.Horizontal(
         rrb.Grid(*views, grid_columns=columns),
-        rrb.Horizontal(*lower_row, column_shares=shares),
-        row_shares=[3, 2] if len(content.configurations) <= MANY else [11, 10],
+        rrb.Vertical(*beside),
+        column_shares=list(OVERVIEW_SHARES),
         name="Overview",
     )
+
+
+def choose_overview(content: RecordingContent) -> list[str]:
+    """The configurations of the overview: all with units, of more than four the baseline and those that differ most.
+
+    The baseline is the first one with units, unless configurations are compared with another. The rest is spread evenly
+    from the one that knows the shown objects first to the one that knows them last.
+    """
+    perceiving = select_perceiving(content.experiment, content.configurations)
+    if len(perceiving) <= OVERVIEW:
+        return perceiving
+    rows = content.table[content.table["object_id"].isin([content.replay.scene.object_ids[k] for k in content.objects])]
+    after_s = rows["time_to_detection_s"].fillna(rows["ended_s"] - rows["onset_s"])
+    mean_s = after_s.groupby(rows["configuration"]).mean()
+    baseline = content.baseline if content.baseline in perceiving else perceiving[0]
+    ranked = sorted((name for name in perceiving if name != baseline), key=lambda name: float(mean_s.get(name, 0.0)))
+    places = OVERVIEW - 1
+    chosen = {ranked[round(k * (len(ranked) - 1) / (places - 1))] for k in range(places)} | {baseline}
+    return [name for name in perceiving if name in chosen]
 
 
 def lanes_page(content: RecordingContent) -> rrb.Container:
@@ -214,8 +236,7 @@ def _last_and_first(content: RecordingContent, object_ix: int) -> list[tuple[str
     For a single shown object also the one in the middle.
     """
     episodes = content.episodes[object_ix]
-    perceiving = [name for name in content.configurations if content.experiment.configurations[name].units != TRUTH]
-    episodes = episodes[episodes["configuration"].isin(perceiving or list(content.configurations))]
+    episodes = episodes[episodes["configuration"].isin(select_perceiving(content.experiment, content.configurations))]
     when_s = dict(zip(episodes["configuration"], episodes["time_to_detection_s"].fillna(np.inf), strict=True))
     if not when_s:
         return []
@@ -234,7 +255,7 @@ def tracks_page(content: RecordingContent) -> rrb.Container:
     """A view per configuration, as large as possible."""
     import rerun.blueprint as rrb
 
-    views: list[rrb.View] = list(tracks_views(content, " believes"))
+    views: list[rrb.View] = list(tracks_views(content, content.configurations, " believes"))
     columns = count_columns(len(views))
     if len(views) % columns:
         return rrb.Grid(*views, legend_view(), grid_columns=columns, name="What each believes")
@@ -272,12 +293,14 @@ def errors_page(content: RecordingContent) -> rrb.Container:
 
 
 def units_page(content: RecordingContent) -> rrb.Container:
-    """The configuration with most units from above: units, fields of view, fused tracks."""
+    """The configuration with most units from above: units, fields of view, fused tracks; and all recorded units."""
     import rerun.blueprint as rrb
 
     largest = max(content.configurations, key=lambda name: len(content.received(name)))
     units = content.received(largest)
+    placed = [name for name, unit in content.experiment.units.items() if unit.recorded is not None]
     title = f"In colour: what {largest} lists. Grey: the truth. Pale ground: fields of view. Lines: listed it first"
+    units = (*units, *(name for name in placed if name not in units))
     view = world_view(
         content, largest, title, content.above, units=units, fields=True, named=[n for n in content.named if n in units]
     )
@@ -300,20 +323,22 @@ def text_page() -> rrb.Container:
     )
 
 
-def tracks_views(content: RecordingContent, title_suffix: str = "") -> list[rrb.Spatial3DView]:
-    """A view of the fused tracks per configuration, from the ego's side."""
+def tracks_views(
+    content: RecordingContent, configurations: Sequence[str], title_suffix: str = ""
+) -> list[rrb.Spatial3DView]:
+    """A view of the fused tracks of each of these configurations, around the ego, with arrows to objects outside it."""
     marks = len(content.objects) == 1
     return [
         world_view(
             content, name, content.title(name, title_suffix), content.eye, units=content.received(name), marks=marks
         )
-        for name in content.configurations
+        for name in configurations
     ]
 
 
 def count_columns(views: int) -> int:
-    """The number of columns for this many views."""
-    return SMALL if views in (3, 5, 6) else min(views, 2)
+    """The number of columns of this many views on a page of their own."""
+    return SMALL if views == 3 or views > 4 else min(views, 2)
 
 
 def world_view(
@@ -333,6 +358,7 @@ def world_view(
     contents += [f"+ {part}/**"] if marks else [f"+ {part}/**", f"- {part}/marks/**"]
     shown = rr.Points3D.from_fields(show_labels=True)
     contents += [f"- {part}/status"] if named else []  # there the names are the only labels
+    contents += [f"+ {make_entity_path(*eye.path, 'arrows')}"] if eye.turns else []
     return rrb.Spatial3DView(
         origin=make_entity_path(*eye.path),
         name=title,
@@ -392,8 +418,6 @@ def _curves_view(
 
 LAYOUT = 5
 """Version of the blueprint, raised with every change: a viewer prefers the one it has kept for an application id."""
-ALL_VIEWS = 3.1
-"""Width by height of all views together: they have three fifths of a 16:9 window's height, less its bars."""
 
 
 def build_blueprint(content: RecordingContent) -> tuple[rrb.Blueprint, str]:
@@ -447,7 +471,12 @@ def build_blueprint(content: RecordingContent) -> tuple[rrb.Blueprint, str]:
     return blueprint, digest_texts(repr(parts))
 
 
-def view_aspect(views: int) -> float:
-    """Width by height of each of this many views."""
-    across = count_columns(views)
-    return ALL_VIEWS * -(-views // across) / across
+def view_aspect(experiment: Experiment, configurations: Sequence[str]) -> float:
+    """Width by height of a view of the overview in a window of 1280 × 720: two views are one above the other."""
+    return 3.0 if len(select_perceiving(experiment, configurations)) == FEW - 1 else 1.5
+
+
+def select_perceiving(experiment: Experiment, configurations: Sequence[str]) -> list[str]:
+    """The configurations that have units; all, if none does."""
+    perceiving = [name for name in configurations if experiment.configurations[name].units != TRUTH]
+    return perceiving or list(configurations)

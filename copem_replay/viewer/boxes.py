@@ -18,6 +18,7 @@ from copem_replay.viewer.sink import (
     STANDING,
     RecordingSink,
     object_labels,
+    pair_points,
     slice_by_frame,
     stack_float32,
     upright_turns,
@@ -214,7 +215,7 @@ class FalseEntries:
             return
         self._count(fused_tracks, np.flatnonzero(false))
         for rows, counts, available_ns in slice_by_frame(tracks, false):
-            strips = rr.LineStrips3D.columns(strips=_dashed_crosses(tracks, rows).reshape(-1, 2, 3))
+            strips = rr.LineStrips3D.columns(strips=pair_points(_dashed_crosses(tracks, rows)))
             self._out.columns(self._path, available_ns, strips.partition(counts * _LINES))
         if not self._shown:
             self._out.static(

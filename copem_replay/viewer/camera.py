@@ -2,44 +2,57 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 
 from copem_replay.core.interpolation import interpolate_states
 from copem_replay.core.tracks import Float, Int, Scene
 from copem_replay.experiment.schema import Experiment
-from copem_replay.perception.sensor_poses import find_carrier, offset_places
+from copem_replay.perception.sensor_poses import find_carrier
 from copem_replay.pipeline.prepare import Replay
-from copem_replay.viewer.sink import RecordingSink, entity_names, stack_float32, to_nanoseconds
+from copem_replay.viewer.sink import (
+    WAITING,
+    RecordingSink,
+    entity_names,
+    short_ids,
+    stack_float32,
+    to_nanoseconds,
+    upright_turns,
+)
 
-FARTHEST_BESIDE_M = 16.0
-"""Farthest target from the ego, on the way to the object, so that the ego stays in the picture."""
-AROUND_UNIT_M = 40.0
-"""Radius in view around a fixed unit from which distances are measured: all of long paths would be too small."""
 EYES = ("world", "eyes")
 BESIDE_ASPECT = 1.7
 """Width by height of two views beside each other, at least."""
 TOGETHER_M = 60.0
 """Farthest unit that is in one picture with what it sees: from farther away people are a few pixels."""
 TURNED_RAD, DOWN_RAD = np.deg2rad((65.0, 65.0))
-"""Direction of view, right of the ego's heading and down: from so high few words overlap."""
-ABOVE_RAD = np.deg2rad(75.0)
-"""Downward angle of the camera on the units: fields of view are hardly foreshortened."""
+"""Direction of view on one object, right of the ego's heading and down."""
+ABOVE_RAD = np.deg2rad(78.0)
+"""Downward angle of the camera on the ego and on the units: distances and fields of view are hardly foreshortened."""
 EYE_RAD, MARGIN_M = np.deg2rad(55.0), 2.5
 """The viewer's vertical field of view, and room around centres: half the length of a car."""
-NEAR_FAR_M, FOLLOWING_M, CLOSE_M = (20.0, 150.0), (18.0, 48.0), (20.0, 38.0)
-"""Least and greatest distance from camera to target: not following, following the ego, following an object. From
-farther away people are a few pixels."""
+CLOSE_M, LEAST_AWAY_M = (20.0, 38.0), 20.0
+"""Least and greatest distance from camera to target on one object, and the least from above. From farther away people
+are a few pixels."""
+WIDE_M, WIDEST_M, AHEAD_M = 60.0, 180.0, 20.0
+"""Width in view around the ego, the greatest one, and the distance ahead of the ego of its middle."""
+SMOOTH_S, SOON_S = 1.0, 1.5
+"""Time over which turns and widths are averaged, and how long before and after a story it is in view: no jerks."""
+EDGE, ARROW_NS = 0.85, 200_000_000
+"""Where arrows are, as a share of the way from the middle to the edge of the picture; how often they are drawn."""
 
 
 @dataclass(frozen=True)
 class Camera:
     """Place and target of a camera, `(3,)` each, as seen from the entity `path`.
 
-    A camera that follows has a `path` that moves with object `object_ix`, `ahead_m` and `left_m` of it: a view with
-    that origin shows the same whenever it is first drawn. `at_m`: the target in the world, at the onset.
+    A camera that follows has a `path` that moves with object `object_ix`, `ahead_m` of it: a view with that origin
+    shows the same whenever it is first drawn. If `turns`, it turns with the object, too, and zooms. `at_m`: the target
+    in the world, at the onset; `heading_rad`: the direction of view there. `aspect`: width by height of the view.
     """
 
     place_m: Float
@@ -47,64 +60,155 @@ class Camera:
     at_m: Float
     object_ix: int | None = None
     ahead_m: float = 0.0
-    left_m: float = 0.0
     path: tuple[str, ...] = ("world",)
+    turns: bool = False
+    heading_rad: float = 0.0
+    aspect: float = 1.5
 
 
-def camera_on_object(
-    replay: Replay, experiment: Experiment, table: pd.DataFrame, first: int | None, aspect: float
+def camera_on_ego(
+    replay: Replay, experiment: Experiment, stories: Mapping[int, tuple[float, float]], aspect: float
 ) -> Camera:
-    """A camera with object `first` in view, from the ego's side, at the log's start and at the object's onset.
+    """A camera from above that moves and turns with the ego, which drives to the right in the picture.
 
-    Without an ego or a carried unit to follow, the paths of all objects of the table are in view. `wide`: width of a
-    view by its height.
+    Without an ego or a carried unit to follow, the whole site is in view, its longer side across. `stories`: first and
+    last second of each shown object's axis, by index, the most telling one first. `aspect`: width by height of a view.
     """
-    truth, scene, unit = replay.truth, replay.scene, _followed_unit(replay.scene, experiment)
-    episodes = table.drop_duplicates("object_id")
-    on = find_carrier(scene, experiment.units[unit]) if unit is not None else -1
-    first_onset_s = episodes["onset_s"][
-        episodes["object_id"] == (scene.object_ids[first] if first is not None else None)
-    ]
-    if on >= 0 and first is not None and len(first_onset_s):
-        # The onset first: its heading of the ego turns the camera.
-        time_s = np.array([float(first_onset_s.iloc[0]), 0.0])
-        own, followed = (_interpolate_states(replay, experiment, np.full(2, k), time_s) for k in (on, first))
-        shared = np.flatnonzero(~np.isnan(own[0]) & ~np.isnan(followed[0]))
-        if len(shared):
-            yaw_rad = own[3, shared[0]]
-            off = followed[:3, shared] - own[:3, shared]
-            cos, sin = np.cos(own[3, shared]), np.sin(own[3, shared])
-            half = np.array([cos[0] * off[0, 0] + sin[0] * off[1, 0], cos[0] * off[1, 0] - sin[0] * off[0, 0]]) / 2
-            half *= min(1.0, FARTHEST_BESIDE_M / max(float(np.hypot(*half)), 1e-9))
-            ahead_m, left_m = (round(float(way), 1) for way in half)
-            middle = np.stack([ahead_m * cos - left_m * sin, ahead_m * sin + left_m * cos, 0 * cos])
-            places = np.concatenate([off - middle, -middle], axis=1)
-            at_m, towards = own[:3, shared[0]] + middle[:, 0], _view_direction(yaw_rad)
-            place = -_fitting_distance(places, towards, FOLLOWING_M, aspect) * towards
-            return Camera(np.round(place, 1), np.zeros(3), at_m, on, ahead_m, left_m, (*EYES, "ego"))
-    measured = episodes["object_id"].map(scene.object_number).to_numpy(dtype=np.int64)
-    rows = np.flatnonzero(np.isin(truth.row_object_ix, measured if len(measured) else truth.object_ix))
-    place = np.stack([truth.x_m[0, rows], truth.y_m[0, rows], truth.z_m[0, rows]])
-    distance_unit = experiment.units.get(experiment.measure.distance_to)
-    if distance_unit is not None and distance_unit.at is not None:
-        unit_at = np.array([*distance_unit.at, place[2].mean() if place.size else 0.0])[:, None]
-        near = np.hypot(*(place - unit_at)[:2]) <= AROUND_UNIT_M
-        place = np.concatenate([place[:, near if near.any() else slice(None)], unit_at], axis=1)
+    truth, on = replay.truth, find_followed(replay.scene, experiment)
+    if on >= 0:
+        onset_s = np.array([next(iter(stories.values()), (0.0, 0.0))[0]])
+        own = interpolate_places(replay, experiment, np.array([on]), onset_s)[:, 0]
+        if np.isnan(own[0]):
+            own = _own_states(replay, on)[1][:, 0]
+        ahead = np.array([np.cos(own[3]), np.sin(own[3]), 0.0])
+        place = -WIDE_M / (2 * aspect * np.tan(EYE_RAD / 2)) * _axes(np.pi / 2)[0]
+        at_m = own[:3] + AHEAD_M * ahead
+        path = (*EYES, "ego")
+        up_rad = float(own[3]) + np.pi / 2
+        return Camera(np.round(place, 1), np.zeros(3), at_m, on, AHEAD_M, path, True, up_rad, aspect)
+    units = [unit.at for unit in experiment.units.values() if unit.at is not None]
+    ground_m = float(truth.z_m[0].mean()) if truth.z_m.size else 0.0
+    place = np.array([*((*at[:2], ground_m) for at in units)]).reshape(-1, 3).T
+    place = np.concatenate([np.stack([truth.x_m[0], truth.y_m[0], truth.z_m[0]]), place], axis=1)
     if not place.size:
-        return Camera(np.array([-14.0, 0.0, 30.0]), np.zeros(3), np.zeros(3))
-    target, towards = place.mean(axis=1), _view_direction(0.0)
-    eye = target - _fitting_distance(place - target[:, None], towards, NEAR_FAR_M, aspect) * towards
-    return Camera(np.round(eye, 1), np.round(target, 1), target)
+        return Camera(np.array([0.0, -8.0, 37.0]), np.zeros(3), np.zeros(3), heading_rad=np.pi / 2)
+    return camera_above(place, _longest_way_rad(place) + np.pi / 2, aspect)
+
+
+def write_moving_origin(
+    out: RecordingSink, replay: Replay, experiment: Experiment, eye: Camera,
+    stories: Mapping[int, tuple[float, float]],
+) -> None:  # fmt: skip
+    """Write the entity that a turning camera follows, and an arrow for each shown object that is out of the picture.
+
+    The origin's scale is how much wider than `WIDE_M` the picture is, which holds every object during its story.
+    Arrows say how far an object is from the ego: “61 → 44 m”.
+    """
+    import rerun as rr
+
+    assert eye.object_ix is not None
+    time_s, own = _own_states(replay, eye.object_ix)
+    yaw_rad = _smooth(time_s, np.unwrap(own[3]))
+    ahead = np.stack([np.cos(yaw_rad), np.sin(yaw_rad), np.zeros(len(yaw_rad))])
+    target = own[:3] + AHEAD_M * ahead
+    seen = {k: _as_seen(replay, experiment, k, time_s, target, yaw_rad) for k in stories}
+    scale = _choose_scale(time_s, eye, seen, stories)
+    elapsed_ns = to_nanoseconds(time_s)
+    elapsed_ns[:1] = 0  # before the ego comes, the camera waits where it will
+    origin = rr.Transform3D.columns(
+        translation=stack_float32(*target), rotation_axis_angle=upright_turns(yaw_rad),
+        scale=stack_float32(scale, scale, scale),
+    )  # fmt: skip
+    out.columns(eye.path, elapsed_ns, origin)
+    if seen:
+        _write_arrows(out, replay, eye, elapsed_ns, seen, scale)
+
+
+def _own_states(replay: Replay, object_ix: int) -> tuple[Float, Float]:
+    """Instants (K,) of an object's frames, in s, and its x, y, ground and heading (4, K) then."""
+    truth = replay.truth
+    rows = np.flatnonzero(truth.row_object_ix == object_ix)
+    ground_m = truth.z_m[0, rows] - truth.height_m[0, rows] / 2
+    states = np.stack([truth.x_m[0, rows], truth.y_m[0, rows], ground_m, truth.yaw_rad[0, rows]])
+    return truth.row_captured_s[rows], states
+
+
+def _smooth(time_s: Float, values: Float) -> Float:
+    """The mean of values (K,) over `SMOOTH_S` around each instant; beyond the ends they stay as they are."""
+    if len(time_s) < 2:
+        return values
+    area = np.concatenate([[0.0], np.cumsum((values[1:] + values[:-1]) / 2 * np.diff(time_s))])
+
+    def until(at_s: Float) -> Float:
+        inside = np.interp(at_s, time_s, area)
+        before, after = np.minimum(at_s - time_s[0], 0), np.maximum(at_s - time_s[-1], 0)
+        return np.asarray(inside + before * values[0] + after * values[-1])
+
+    return (until(time_s + SMOOTH_S / 2) - until(time_s - SMOOTH_S / 2)) / SMOOTH_S
+
+
+def _as_seen(
+    replay: Replay, experiment: Experiment, object_ix: int, time_s: Float, target: Float, yaw_rad: Float
+) -> Float:
+    """(3, K) ahead, left and up of the target, where an object is; NaN while it is absent."""
+    off = interpolate_places(replay, experiment, np.full(len(time_s), object_ix), time_s)[:3] - target
+    cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+    return np.stack([cos * off[0] + sin * off[1], cos * off[1] - sin * off[0], off[2]])
+
+
+def _choose_scale(
+    time_s: Float, eye: Camera, seen: Mapping[int, Float], stories: Mapping[int, tuple[float, float]]
+) -> Float:
+    """(K,) how many times `WIDE_M` the picture is wide: smooth, and enough for each object during its story."""
+    needed = np.ones(len(time_s))
+    for k, place in seen.items():
+        away_m = _fitting_distances(place / EDGE, np.pi / 2, eye.aspect)  # the words beside it are in the picture, too
+        far = np.nan_to_num(away_m / float(np.linalg.norm(eye.place_m)))
+        needed = np.maximum(needed, np.where((time_s >= stories[k][0]) & (time_s <= stories[k][1]), far, 1.0))
+    needed = np.minimum(needed, WIDEST_M / WIDE_M)
+    begin, end = (np.searchsorted(time_s, time_s + side * SOON_S, "left" if side < 0 else "right") for side in (-1, 1))
+    held = np.array([needed[a:b].max() for a, b in zip(begin.tolist(), end.tolist(), strict=True)])
+    return _smooth(time_s, held)
+
+
+def _write_arrows(
+    out: RecordingSink, replay: Replay, eye: Camera, elapsed_ns: Int, seen: Mapping[int, Float], scale: Float
+) -> None:
+    """Write a point with an arrow near the edge of the picture, on the ground, for each object outside it.
+
+    Objects farther from the ego than `WIDEST_M` have none: their names would cover those of nearer ones.
+    """
+    import rerun as rr
+
+    place = np.stack([*seen.values()])  # (M, 3, K)
+    across, high = _project(place / scale, eye)
+    far_out = np.maximum(np.abs(across), np.abs(high))
+    _, step = np.unique(elapsed_ns // ARROW_NS, return_index=True)
+    distance_m = np.hypot(place[:, 0] + AHEAD_M, place[:, 1])
+    row, m = np.nonzero((far_out[:, step].T > 1.0) & (distance_m[:, step].T <= WIDEST_M))
+    at = m, step[row]
+    u, v = EDGE * across[at] / far_out[at], EDGE * high[at] / far_out[at]
+    sides = np.where(np.abs(u) >= np.abs(v), np.where(u > 0, "→", "←"), np.where(v > 0, "↑", "↓"))
+    ids = np.array(short_ids(replay.scene), dtype=object)[np.array([*seen])[m]]
+    labels = [f"{name} {side} {far:.0f} m" for name, side, far in zip(ids, sides, distance_m[at], strict=True)]
+    towards, right, up = _axes(np.pi / 2)
+    tall = np.tan(EYE_RAD / 2)
+    ray = towards[:, None] + u * eye.aspect * tall * right[:, None] + v * tall * up[:, None]
+    spots = eye.place_m[:, None] - eye.place_m[2] / ray[2] * ray
+    columns = rr.Points3D.columns(positions=stack_float32(*spots), labels=pa.array(labels, pa.string()))
+    counts = np.bincount(row, minlength=len(step))
+    out.columns([*eye.path, "arrows"], elapsed_ns[step], columns.partition(counts))
+    style = rr.Points3D.from_fields(colors=[WAITING], radii=rr.Radius.ui_points(1.5), show_labels=True)
+    out.static([*eye.path, "arrows"], style)
 
 
 def camera_following(replay: Replay, experiment: Experiment, table: pd.DataFrame, object_ix: int) -> Camera:
     """A camera that follows an object of the table, with the ego in view at the onset if `CLOSE_M` allows."""
     scene = replay.scene
     onset_s = table["onset_s"][table["object_id"] == scene.object_ids[object_ix]].to_numpy(dtype=float)[:1]
-    target = _interpolate_states(replay, experiment, np.array([object_ix]), onset_s)[:3, 0]
-    unit = _followed_unit(scene, experiment)
-    on = find_carrier(scene, experiment.units[unit]) if unit is not None else -1
-    own = _interpolate_states(replay, experiment, np.array([max(on, 0)]), onset_s)[:, 0]
+    target = interpolate_places(replay, experiment, np.array([object_ix]), onset_s)[:3, 0]
+    on = find_followed(scene, experiment)
+    own = interpolate_places(replay, experiment, np.array([max(on, 0)]), onset_s)[:, 0]
     has_ego = on >= 0 and not np.isnan(own[0])
     towards = _view_direction(own[3] if has_ego else 0.0)
     away_m = float(np.clip(np.hypot(*(own - np.append(target, 0))[:2]) if has_ego else 0.0, *CLOSE_M))
@@ -131,46 +235,36 @@ def include_places(eye: Camera, places_m: Float) -> Camera:
     return replace(eye, place_m=np.round(middle + away_m * back, 1), target_m=np.round(middle, 1))
 
 
-def camera_above(places_m: Float, eye: Camera) -> Camera:
-    """A camera that looks down on places (3, K) and on the target of `eye`, in its direction; it follows nothing."""
-    place = np.concatenate([places_m, eye.at_m[:, None]], axis=1)
-    target = (place.min(axis=1) + place.max(axis=1)) / 2
-    turned = float(np.arctan2(*(eye.target_m - eye.place_m)[[1, 0]]))
-    towards = np.array([np.cos(turned), np.sin(turned), -np.tan(ABOVE_RAD)])
-    towards /= np.linalg.norm(towards)
-    away_m = _fitting_distance(place - target[:, None], towards, NEAR_FAR_M, 1.5)
-    return Camera(np.round(target - away_m * towards, 1), np.round(target, 1), target)
+def camera_above(places_m: Float, heading_rad: float, aspect: float = 1.5) -> Camera:
+    """A camera that looks down on places (3, K), in a direction that is up in the picture; it follows nothing."""
+    towards, right, _ = _axes(heading_rad)
+    forward = np.array([np.cos(heading_rad), np.sin(heading_rad), 0.0])
+    middle = [(way @ places_m).min() / 2 + (way @ places_m).max() / 2 for way in (right, forward)]
+    target = middle[0] * right + middle[1] * forward + [0.0, 0.0, places_m[2].mean()]
+    away_m = max(float(_fitting_distances(places_m - target[:, None], heading_rad, aspect).max()), LEAST_AWAY_M)
+    return Camera(np.round(target - away_m * towards, 1), np.round(target, 1), target, heading_rad=heading_rad)
 
 
 def write_camera_origin(out: RecordingSink, replay: Replay, eye: Camera) -> None:
-    """Write the entity that a camera follows: on the ground at or beside the object, not rotated."""
+    """Write the entity that a near camera follows: on the ground at the object, not rotated."""
     import rerun as rr
 
-    if eye.object_ix is None:
-        return
-    truth = replay.truth
-    rows = np.flatnonzero(truth.row_object_ix == eye.object_ix)
-    yaw_rad = truth.yaw_rad[0, rows]
-    x_m, y_m = offset_places(truth.x_m[0, rows], truth.y_m[0, rows], yaw_rad, (eye.ahead_m, eye.left_m))
-    place = stack_float32(x_m, y_m, truth.z_m[0, rows] - truth.height_m[0, rows] / 2)
-    elapsed = to_nanoseconds(truth.row_captured_s[rows])
+    assert eye.object_ix is not None
+    time_s, own = _own_states(replay, eye.object_ix)
+    elapsed, place = to_nanoseconds(time_s), stack_float32(*own[:3])
     if elapsed[0] > 0:  # before the object comes, the camera waits where it will
         elapsed, place = np.append(0, elapsed), np.concatenate([place[:1], place])
     out.columns(eye.path, elapsed, rr.Transform3D.columns(translation=place))
 
 
-def _followed_unit(scene: Scene, experiment: Experiment) -> str | None:
-    """The first unit on the ego; without an ego the unit from which distances are measured, if it is carried."""
-    for name, unit in experiment.modelled.items():
-        if find_carrier(scene, unit) == scene.ego_ix >= 0:
-            return name
-    to = experiment.measure.distance_to
-    carried = to in experiment.units and experiment.units[to].on is not None
-    return to if scene.ego_ix < 0 and carried and find_carrier(scene, experiment.units[to]) >= 0 else None
+def find_followed(scene: Scene, experiment: Experiment) -> int:
+    """Index of the ego, without one of what carries the unit of `distance_to`; −1: there is neither."""
+    unit = experiment.units.get(experiment.measure.distance_to)
+    return scene.ego_ix if scene.ego_ix >= 0 or unit is None else find_carrier(scene, unit)
 
 
-def _interpolate_states(replay: Replay, experiment: Experiment, objects: Int, time_s: Float) -> Float:
-    """(4, K) x, y, z and heading of objects at times, NaN while absent."""
+def interpolate_places(replay: Replay, experiment: Experiment, objects: Int, time_s: Float) -> Float:
+    """(4, K) x, y, z and heading of objects (K,) at times (K,), in s; NaN while absent."""
     states, _ = interpolate_states(
         replay.truth, objects, time_s, t0_ns=replay.scene.t0_ns, max_gap_s=experiment.max_gap_s
     )
@@ -185,10 +279,31 @@ def _view_direction(yaw_rad: float) -> Float:
     return unit
 
 
-def _fitting_distance(place_m: Float, ahead: Float, within_m: tuple[float, float], aspect: float) -> float:
-    """The distance, within `within_m`, from which all places (3, K), relative to the target, are in the picture."""
-    right = np.array([ahead[1], -ahead[0], 0]) / np.hypot(*ahead[:2])
-    up = np.cross(right, ahead)
+def _axes(heading_rad: float) -> tuple[Float, Float, Float]:
+    """(3,) each: the direction of view from above, and what is right and up in the picture."""
+    towards = np.array([np.cos(heading_rad), np.sin(heading_rad), -np.tan(ABOVE_RAD)])
+    towards /= np.linalg.norm(towards)
+    right = np.array([np.sin(heading_rad), -np.cos(heading_rad), 0.0])
+    return towards, right, np.cross(right, towards)
+
+
+def _project(place_m: Float, eye: Camera) -> tuple[Float, Float]:
+    """Where places (…, 3, K) relative to the target of a turning camera are in its picture: −1 … 1 across and up."""
+    towards, right, up = _axes(np.pi / 2)
+    depth_m = np.maximum(np.linalg.norm(eye.place_m) + towards @ place_m, 1.0) * np.tan(EYE_RAD / 2)
+    return (right @ place_m) / (depth_m * eye.aspect), (up @ place_m) / depth_m
+
+
+def _fitting_distances(place_m: Float, heading_rad: float, aspect: float) -> Float:
+    """(K,) least distance from the target from which each place (3, K), relative to it, is in the picture."""
+    towards, right, up = _axes(heading_rad)
     beside = (np.abs(right @ place_m) + MARGIN_M) / (aspect * np.tan(EYE_RAD / 2))
     above = (np.abs(up @ place_m) + MARGIN_M) / np.tan(EYE_RAD / 2)
-    return float(np.clip((np.maximum(beside, above) - ahead @ place_m).max(), *within_m))
+    needed: Float = np.maximum(beside, above) - towards @ place_m
+    return needed
+
+
+def _longest_way_rad(place_m: Float) -> float:
+    """The direction in which places (3, K) are farthest apart, −90° to 90°."""
+    east, north = place_m[:2] - place_m[:2].mean(axis=1, keepdims=True)
+    return float(np.arctan2(2 * (east * north).sum(), (east**2 - north**2).sum()) / 2)

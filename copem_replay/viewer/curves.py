@@ -39,6 +39,7 @@ from copem_replay.viewer.sink import (
     configuration_part,
     elapsed_ns,
     entity_names,
+    pair_points,
     plain_part,
     sort_by_frame,
     stack_float32,
@@ -413,7 +414,9 @@ def _write_ways(
     counts = len(lines) - last  # lines up to each instant: the index of its last one
     _, way = np.nonzero(np.arange(len(lines)) < counts[:, None])
     path = ["world", configuration_part(name), "difference", "first"]
-    strips = rr.LineStrips3D.columns(strips=lines[way], labels=pa.array(labels, pa.string()).take(pa.array(way)))
+    strips = rr.LineStrips3D.columns(
+        strips=pair_points(lines[way]), labels=pa.array(labels, pa.string()).take(pa.array(way))
+    )
     out.columns(path, instants, strips.partition(counts))
     out.static(
         path, rr.LineStrips3D.from_fields(colors=[DIFFERENCE], radii=rr.Radius.ui_points(2.5), show_labels=False)

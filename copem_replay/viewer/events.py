@@ -24,6 +24,7 @@ from copem_replay.viewer.sink import (
     RecordingSink,
     configuration_part,
     entity_names,
+    pair_points,
     short_ids,
     stack_float32,
     table_rows,
@@ -90,16 +91,22 @@ def describe_verdict(episode: Any) -> str | None:
 
 
 def write_difference_text(
-    out: RecordingSink, replay: Replay, table: pd.DataFrame, shown: Sequence[int], left_out: Sequence[str]
-) -> None:
-    """Write tables of times to detection in this run: over all objects, if there are several, then per object."""
+    out: RecordingSink, replay: Replay, table: pd.DataFrame, shown: Sequence[int], left_out: Sequence[str],
+    too_short: Sequence[str],
+) -> None:  # fmt: skip
+    """Write tables of times to detection in this run: over all objects, if there are several, then per object.
+
+    Below them are the files with further configurations, and the objects `too_short` to judge.
+    """
     import rerun as rr
 
     by_object = [table[table["object_id"] == replay.scene.object_ids[k]] for k in shown]
     tables = [_difference_table(episodes, replay.scene) for episodes in by_object]
     if len(shown) > 1:
         tables.insert(0, _overview_table(by_object, replay.scene))
-    text = "\n\n".join([*tables, *_describe_left_out(left_out)])
+    ids = [short_ids(replay.scene)[replay.scene.object_number[name]] for name in too_short]
+    short = [f"Too short to judge: {_escape_cell(', '.join(ids))}."] if ids else []
+    text = "\n\n".join([*tables, *short, *_describe_left_out(left_out)])
     out.static(["difference"], rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
 
 
@@ -169,6 +176,7 @@ LEGEND = """A configuration has one colour in every file and figure of its exper
 - red lines: from the unit that sees most of an object to what hides it
 - lines of sight: from the unit that listed an object first, where it was at capture, to where it listed the object
 - strong lines on the ground: distance when an object was first known
+- an arrow at the edge of a view, `61 → 44 m`: object 61 is farther that way, 44 m from the ego
 - white points: units; pale ground with an outline: their fields of view
 - lanes: in full colour *known*, from the time of detection in the table on; at half its strength *listed*, which does
   not count: before the onset, not confirmed, or too late; grey and brown: why not; the white mark ends at the onset
@@ -289,7 +297,7 @@ def _write_reference_lines(
     _, mark = np.nonzero(np.arange(len(rows)) < counts[:, None])
     lines = np.stack(ends, axis=1)[mark]
     if len(rows) <= LINED:
-        out.columns([*path, "line"], instants, rr.LineStrips3D.columns(strips=lines).partition(counts))
+        out.columns([*path, "line"], instants, rr.LineStrips3D.columns(strips=pair_points(lines)).partition(counts))
         out.static([*path, "line"], rr.LineStrips3D.from_fields(colors=[colour], radii=rr.Radius.ui_points(1.0)))
     words = pa.array(texts, pa.string()).take(pa.array(rows[mark]))
     out.columns(path, instants, rr.Points3D.columns(positions=lines.mean(axis=1), labels=words).partition(counts))

@@ -1,4 +1,4 @@
-"""Open the recordings of a results folder in a viewer, here or in a browser, just before the first onset.
+"""Open the recordings of a results folder in a viewer, here or in a browser, when something differs.
 
 A layout in a recording cannot hold the instant at which it opens (Rerun 0.41), and addresses with an instant (`#when=`)
 are for servers only. So it is set from outside: by `seek_recordings` in the viewer on this machine, by a script in the
@@ -25,16 +25,12 @@ from importlib.util import find_spec
 from pathlib import Path
 from urllib.parse import quote, unquote, urlsplit
 
-import pandas as pd
-
 from copem_replay.core.errors import CopemError, OutputError
 from copem_replay.core.files import portable_name
 from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.results.read import Results, open_results
-from copem_replay.viewer.sink import ELAPSED, SHOWN_OBJECTS, choose_telling_objects
+from copem_replay.viewer.sink import BEFORE_S, ELAPSED, OPENS
 
-BEFORE_ONSET_S = 0.5
-"""A recording opens this long before the first onset, so that the change is about to come."""
 HOST = "127.0.0.1"
 READY_S, AGAIN_S = 60.0, 0.2
 """Time for a viewer to load a recording, and the interval of asking it: after that it opens at its beginning."""
@@ -47,7 +43,7 @@ _FURTHER_FILE = re.compile(r"\.configurations_\d+(-\d+)?$")
 def list_rrd_files(folder: Path) -> list[Path]:
     """Absolute paths of the recordings in a results folder, each once, the first shown run first."""
     place = folder.absolute()  # so that no path looks like an option
-    # A recording comes before its further configurations: `replay.rrd`, then `replay.configurations_7-12.rrd`.
+    # A recording comes before its further configurations: `replay.rrd`, then `replay.configurations_8-14.rrd`.
     found = (
         path for pattern in _PATTERNS for path in sorted(place.glob(pattern), key=lambda path: path.with_suffix(""))
     )
@@ -63,27 +59,49 @@ class Sought:
 
 
 def opening_s(folder: Path, files: Sequence[Path], sought: Sought | None = None) -> dict[Path, float]:
-    """The instant at which each recording opens, in seconds since its log starts.
+    """The instant at which each recording opens, in seconds since its log starts, as it says itself.
 
-    Half a second before the earliest onset among the objects of interest, or before that of the object `sought`. A
-    recording of no known run, or without an onset, is left out: it opens at its beginning.
+    With an object `sought` just before its onset, where the results say that the recording has it. A recording without
+    an instant is left out: it opens at its beginning.
     """
+    return _read_opening_s(files) if sought is None else _find_onsets_s(folder, files, sought)
+
+
+def _read_opening_s(files: Sequence[Path]) -> dict[Path, float]:
+    """The instant that each recording says; one that says none is left out."""
+    from rerun.chunk import RrdReader
+
+    instants_s = {}
+    for path in files:
+        try:
+            with warnings.catch_warnings(action="ignore"):  # a file was cut off
+                for chunk in RrdReader(str(path)).store().stream().filter(content="/__properties/replay"):
+                    batch = chunk.to_record_batch()
+                    if OPENS in batch.schema.names:
+                        instants_s[path] = float(batch.column(OPENS).to_pylist()[0][0])
+        except (OSError, RuntimeError, ValueError):
+            continue
+    return instants_s
+
+
+def _find_onsets_s(folder: Path, files: Sequence[Path], sought: Sought) -> dict[Path, float]:
+    """The instant just before the onset of the object sought, by recording that has it."""
     instants_s = {}
     try:
         results = open_results(folder)
         runs = _map_runs(results)
-        truths = [name for name, of in results.facts.items() if of.truth and name in results.rows.configurations]
         for path in files:
             stem = _FURTHER_FILE.sub("", path.relative_to(folder.absolute()).with_suffix("").as_posix())
-            if stem in runs:
-                log, run = runs[stem]
-                (rows,) = results.each(log=log, every=True)
-                of_run = first_episodes(rows[rows["run"] == run])
-                onset_s = _first_onset_s(of_run, truths) if sought is None else _onset_of(of_run, log, sought)
-                if onset_s is not None:
-                    instants_s[path] = max(0.0, onset_s - BEFORE_ONSET_S)
+            if stem not in runs or sought.log not in (None, runs[stem][0]):
+                continue
+            log, run = runs[stem]
+            (rows,) = results.each(log=log, every=True)
+            of_run = first_episodes(rows[rows["run"] == run])
+            onset_s = of_run.loc[of_run["object_id"] == sought.object_id, "onset_s"]
+            if len(onset_s):
+                instants_s[path] = max(0.0, float(onset_s.min()) - BEFORE_S)
     except (CopemError, KeyError, TypeError, AttributeError, ValueError, OverflowError):
-        return {}  # recordings open without readable tables, too
+        return {}  # tables that cannot be read have no object
     return instants_s
 
 
@@ -96,20 +114,6 @@ def _map_runs(results: Results) -> dict[str, tuple[str, int]]:
         for log, runs in shown.items()
         for shown_run in runs
     }
-
-
-def _onset_of(table: pd.DataFrame, log: str, sought: Sought) -> float | None:
-    """The onset (s) of the object sought; None: it is not in this log."""
-    onset_s = table.loc[(table["object_id"] == sought.object_id) & (sought.log in (None, log)), "onset_s"]
-    return float(onset_s.min()) if len(onset_s) else None
-
-
-def _first_onset_s(table: pd.DataFrame, truths: Sequence[str]) -> float | None:
-    """The earliest onset (s) of the objects with words and lanes; None without an object."""
-    if not len(table):
-        return None
-    of_interest = choose_telling_objects(table, truths, SHOWN_OBJECTS)
-    return float(table.loc[table["object_id"].isin(of_interest), "onset_s"].min())
 
 
 @dataclass(frozen=True)

@@ -28,9 +28,10 @@ from copem_replay.viewer.blueprint import NEAR_BY, RecordingContent, build_bluep
 from copem_replay.viewer.camera import (
     camera_above,
     camera_following,
-    camera_on_object,
+    camera_on_ego,
     include_places,
     write_camera_origin,
+    write_moving_origin,
 )
 from copem_replay.viewer.curves import write_differences
 from copem_replay.viewer.events import (
@@ -45,13 +46,14 @@ from copem_replay.viewer.events import (
 )
 from copem_replay.viewer.lanes import UnitLists, find_linked_lists, write_list_fates, write_list_lanes
 from copem_replay.viewer.line_of_sight import Sight, compute_sight, find_looked_at
+from copem_replay.viewer.objects import ShownObjects, choose_shown_objects, find_opening_s
 from copem_replay.viewer.sensors import FaultsShown, choose_named_units
 from copem_replay.viewer.sink import (
+    OPENS,
     RecordingPart,
     RecordingSink,
     ViewerStream,
     axis_s,
-    choose_measured_objects,
     configuration_part,
     digest_texts,
     entity_names,
@@ -86,7 +88,7 @@ def write_rrd(
 ) -> list[str]:
     """Write one run of one log to a file and, with an address, to a viewer. Returns notes. Raises OutputError.
 
-    More than six configurations go into several files, such as `replay.configurations_7-12.rrd`; the ground truth is
+    More than seven configurations go into several files, such as `replay.configurations_8-14.rrd`; the ground truth is
     none of them, unless it is alone or compared. Colours depend on all of the experiment's configurations, also on
     those that are not written.
 
@@ -101,12 +103,13 @@ def write_rrd(
     # The truth is in every view, so it needs none of its own; configurations that are compared were chosen.
     beside = [name for name in first if name not in truths] if baseline is None else []
     parts = split_into_files(beside or list(first), baseline)
-    collector = TrackCollector(_measured_indices(replay, table, truths))
-    objects = collector.object_ix.tolist()
+    shown = choose_shown_objects(replay, experiment, table)
+    objects = list(shown.object_ix)
+    collector = TrackCollector(objects)
     with ExitStack() as stack:
         files = []
         for part in parts:
-            content = _build_content(replay, experiment, table, part.configurations, objects, first, baseline)
+            content = _build_content(replay, experiment, table, part.configurations, shown, first, baseline)
             panels, appearance = build_blueprint(content)
             identity = (experiment.model_dump_json(), replay.scene.log, str(run), run_is, part.infix)
             # The viewer takes two files of one identity for one recording.
@@ -117,8 +120,8 @@ def write_rrd(
             _begin_file(files[-1], panels, summary, run, run_is, [p.path(path).name for p in parts if p != part])
         if baseline is not None:  # of all objects at once: such a log is not long
             for file in files:
-                shown = {name: first[name] for name in file.colours}
-                write_differences(file.out, replay, experiment, shown, table, baseline, objects, file.colours)
+                compared = {name: first[name] for name in file.colours}
+                write_differences(file.out, replay, experiment, compared, table, baseline, objects, file.colours)
         chunks = chain(iter([first]), later_chunks)
         del first  # so that only one chunk is held at a time
         _write_chunks(files, chunks, replay, experiment, collector)
@@ -147,35 +150,29 @@ class _RecordingFile:
         return {name: read_episode_clocks(scene, table, name) for name in self.colours}
 
 
-def _measured_indices(replay: Replay, table: pd.DataFrame, truths: Sequence[str]) -> list[int]:
-    """Indices of the objects that words, lanes and curves are about; all files have the same ones."""
-    return [replay.scene.object_number[name] for name in choose_measured_objects(table, truths)]
-
-
 def _build_content(
-    replay: Replay, experiment: Experiment, table: pd.DataFrame, configurations: Sequence[str], shown: Sequence[int],
+    replay: Replay, experiment: Experiment, table: pd.DataFrame, configurations: Sequence[str], shown: ShownObjects,
     first: Mapping[str, FusedTracks], baseline: str | None,
 ) -> RecordingContent:  # fmt: skip
     """What a file with these configurations shows. `first`: fused tracks of the first time chunk, with all lists."""
-    by_name = experiment.configurations
+    by_name, scene, objects = experiment.configurations, replay.scene, shown.object_ix
     lists: dict[str, list[UnitLists]] = {
         name: find_linked_lists(first[name], k, name, by_name[name].max_age_s) for k, name in enumerate(configurations)
     }
-    aspect = view_aspect(len(configurations))
-    eye = camera_on_object(replay, experiment, table, shown[0] if len(shown) else None, aspect)
-    scene = replay.scene
-    episodes = {k: table[table["object_id"] == scene.object_ids[k]] for k in shown}
+    episodes = {k: table[table["object_id"] == scene.object_ids[k]] for k in objects}
+    axes_s = {k: axis_s(rows, scene.end_s) for k, rows in episodes.items()}
+    eye = camera_on_ego(replay, experiment, axes_s, view_aspect(experiment, configurations))
     eyes = [
         include_places(camera_following(replay, experiment, table, k), sensors.watching_places(replay, episodes[k]))
-        for k in shown[:NEAR_BY]
+        for k in objects[:NEAR_BY]
     ]
-    onset_s = float(episodes[shown[0]]["onset_s"].iloc[0]) if len(shown) else 0.0
-    axes_s = {k: axis_s(rows, scene.end_s) for k, rows in episodes.items()}
+    onset_s = float(episodes[objects[0]]["onset_s"].iloc[0]) if objects else 0.0
     named_units = choose_named_units(replay, experiment, eye.at_m, onset_s)
-    above = camera_above(np.stack([*named_units.values(), eye.at_m], axis=1), eye)
+    above = camera_above(np.stack([*named_units.values(), eye.at_m], axis=1), eye.heading_rad)
+    compared = [rows[rows["configuration"].isin(list(configurations))] for rows in episodes.values()]
     return RecordingContent(
-        replay, experiment, table, episodes, configurations, shown, axes_s, eye, eyes, above, list(named_units), lists,
-        baseline,
+        replay, experiment, table, episodes, configurations, objects, axes_s, eye, eyes, above, list(named_units),
+        lists, baseline, shown.too_short, find_opening_s(experiment, compared),
     )  # fmt: skip
 
 
@@ -207,12 +204,14 @@ def _begin_file(
     replay, experiment, scene = content.replay, content.experiment, content.replay.scene
     if out.live is not None:
         out.live.send(lambda rec: rec.send_blueprint(panels, make_active=True))
-    for eye in (content.eye, *content.eyes):
+    if content.eye.object_ix is not None:
+        write_moving_origin(out, replay, experiment, content.eye, content.axes_s)
+    for eye in content.eyes:
         write_camera_origin(out, replay, eye)
-    _write_properties(out, replay, experiment, list(content.configurations), run, run_is)
+    _write_properties(out, content, run, run_is)
     out.static([], rr.ViewCoordinates.RIGHT_HAND_Z_UP, boxes.names_and_colours(scene))
     rows = content.table[content.table["configuration"].isin(list(content.configurations))]
-    write_difference_text(out, replay, rows, content.objects, further)
+    write_difference_text(out, replay, rows, content.objects, further, content.too_short)
     write_summary_text(out, replay, experiment, summary, run, further)
     write_legend_text(out, any(content.lists.values()))
     write_legend_bars(out, file.colours)
@@ -313,21 +312,22 @@ def _list_notes(path: Path, parts: Sequence[RecordingPart], lives: Sequence[View
         yield f"{path.name}: the viewer at {gone.url} went before it had everything; the file is complete"
 
 
-def _write_properties(
-    out: RecordingSink, replay: Replay, experiment: Experiment, configurations: list[str], run: int, run_is: str
-) -> None:
+def _write_properties(out: RecordingSink, content: RecordingContent, run: int, run_is: str) -> None:
     import rerun as rr
 
-    name = f"{replay.scene.log}: run {run}" + (f": {run_is}" if run_is else "")
+    scene, experiment = content.replay.scene, content.experiment
+    name = f"{scene.log}: run {run}" + (f": {run_is}" if run_is else "")
     out.send(lambda rec: rec.send_recording_name(name))
-    out.send(lambda rec: rec.send_recording_start_time_nanos(replay.scene.t0_ns))
+    out.send(lambda rec: rec.send_recording_start_time_nanos(scene.t0_ns))
+    opens: dict[str, Any] = {} if content.opens_s is None else {OPENS: content.opens_s}
     values = rr.AnyValues(
-        log=replay.scene.log,
+        log=scene.log,
         run=run,
         run_is=run_is,
         seed=str(experiment.seed),  # 64 bits without a sign, too
         visibility=experiment.visibility.label,
-        configurations=configurations,
+        configurations=list(content.configurations),
+        **opens,
         copem_replay=version("copem-replay"),
         rerun_sdk=version("rerun-sdk"),
     )

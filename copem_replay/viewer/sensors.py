@@ -33,6 +33,8 @@ NAMED_UNITS = 6
 """Most units with names in the view of the units: more labels cover it."""
 APART_M, NAMED_WITHIN_M = 12.0, 110.0
 """Names overlap where units are nearer than the first; units farther away than the second are out of the picture."""
+MARK_POINTS = 4.0
+"""Radius of a unit's point: larger than that of a word, so that a unit is found."""
 FIELD_ALPHA = 10
 """Opacity of a field of view on the ground, of 255: low, because the fields of many units add up."""
 
@@ -45,7 +47,7 @@ def write_units(out: RecordingSink, replay: Replay, experiment: Experiment) -> N
 
     for name, unit in experiment.units.items():
         path = ["world", "units", name]
-        mark = rr.Radius.ui_points(2)
+        mark = rr.Radius.ui_points(MARK_POINTS)
         style = rr.Points3D.from_fields(colors=[EGO], radii=mark, labels=[name], show_labels=False)
         if unit.recorded is not None:
             stamps = replay.truth.stamp_ns if unit.on is not None else replay.truth.stamp_ns[:1]
@@ -73,9 +75,17 @@ def write_units(out: RecordingSink, replay: Replay, experiment: Experiment) -> N
 
 
 def choose_named_units(replay: Replay, experiment: Experiment, at_m: Float, time_s: float) -> dict[str, Float]:
-    """Names and places (3,) of the units to be named: the ego's, then those nearest to `at_m`, none `APART_M` near."""
+    """Names and places (3,) of the units to be named: the ego's, then those nearest to `at_m`, none `APART_M` near.
+
+    A recorded unit has a name if the experiment says where it is.
+    """
     place = {}
-    for name in experiment.modelled:
+    for name, unit in experiment.units.items():
+        if unit.recorded is not None:
+            [at] = _locate_recorded_unit(replay, experiment, unit, np.array([time_s]))
+            if not np.isnan(at[0]):
+                place[name] = at
+            continue
         poses = replay.placed.poses[name]
         stamp = replay.scene.t0_ns + round(time_s * 1e9)
         row = int(np.searchsorted(replay.placed.stamps_ns[name], stamp, side="right")) - 1

@@ -1,7 +1,7 @@
 """Sink: where a Rerun recording is written, and what all its parts share.
 
-Streams to a file and to a running viewer, entity paths, colours and statuses, values in the viewer's types, and the
-choice of what is shown of many configurations and objects.
+Streams to a file and to a running viewer, entity paths, colours and statuses, values in the viewer's types, and which
+configurations a file holds.
 """
 
 from __future__ import annotations
@@ -198,6 +198,8 @@ def check_viewer(url: str) -> None:
 
 ELAPSED, TIME = "elapsed", "time"
 """The two timelines: time since the log's start, and the log's own clock."""
+OPENS = "opens_at_s"
+"""The property of a recording that has the instant (s) at which it opens."""
 SLICE_ROWS = 100_000
 """Boxes that are made and sent at a time: some ten megabytes."""
 LONG_ID = 12
@@ -356,12 +358,10 @@ def upright_turns(yaw_rad: Float) -> pa.Array:
     return pa.StructArray.from_arrays([axis, pa.array(yaw_rad.astype(np.float32))], fields=list(kind))
 
 
-# Selection: which configurations a file holds, and which objects words, lines, lanes and plots are about.
+# Selection: which configurations a file holds.
 
-SHOWN_OBJECTS = 6
-"""Most measured objects with words, lines, lanes and plots: more would cover each other and slow the viewer down."""
-VIEWED = 6
-"""Most configurations of a file: more views beside each other are too small."""
+VIEWED = 7
+"""Most configurations of a file: those of a drafted experiment. More lanes of an object are too thin."""
 
 
 @dataclass(frozen=True)
@@ -377,7 +377,7 @@ class RecordingPart:
 
 
 def split_into_files(configurations: Sequence[str], baseline: str | None = None) -> list[RecordingPart]:
-    """All configurations in their order, six per file: `replay.rrd`, `replay.configurations_7-12.rrd` and so on.
+    """All configurations in their order, seven per file: `replay.rrd`, `replay.configurations_8-14.rrd` and so on.
 
     The baseline of a comparison is in every file, and the first of it.
     """
@@ -391,39 +391,6 @@ def split_into_files(configurations: Sequence[str], baseline: str | None = None)
         last = f"-{begin + len(names) - 1}" if len(names) > 1 else ""
         parts.append(RecordingPart((*shared, *names), f".configurations_{begin}{last}"))
     return parts
-
-
-def choose_measured_objects(table: pd.DataFrame, baselines: Sequence[str]) -> list[str]:
-    """Ids of the objects that words, lanes and curves are about, the most telling one first."""
-    return sorted(
-        choose_telling_objects(table, baselines, SHOWN_OBJECTS),
-        key=choose_telling_objects(table, baselines, 1).__contains__,
-        reverse=True,
-    )
-
-
-def choose_telling_objects(table: pd.DataFrame, baselines: Sequence[str], most: int) -> list[str]:
-    """Ids of up to `most` objects that tell configurations apart, in the table's order.
-
-    Objects in conflict with the ego rank first, then by the spread of their times to detection over configurations,
-    then by the latest of them. An object that was never known counts as known at the end of its episode. `baselines`
-    are left out, unless there are no other configurations.
-    """
-    others = table[~table["configuration"].isin(baselines)]
-    episodes = others if len(others) else table
-    time_s = episodes["time_to_detection_s"].fillna(episodes["ended_s"] - episodes["onset_s"])
-    by_object = time_s.groupby(episodes["object_id"], sort=False)
-    conflict = episodes["conflict"] if "conflict" in episodes else pd.Series(False, index=episodes.index)
-    rank = pd.DataFrame(
-        {
-            "conflict": conflict.fillna(False).astype(bool).groupby(episodes["object_id"], sort=False).any(),
-            "apart": by_object.max() - by_object.min(),
-            "late": by_object.max(),
-        }
-    )
-    rank = rank.loc[list(dict.fromkeys(episodes["object_id"]))]
-    chosen = set(rank.sort_values(["conflict", "apart", "late"], ascending=False, kind="stable").index[:most])
-    return [name for name in dict.fromkeys(table["object_id"]) if name in chosen]
 
 
 # Time axes of an object's lanes and curves.
@@ -444,3 +411,12 @@ def axis_s(episodes: pd.DataFrame, end_s: float) -> tuple[float, float]:
     last_s = float(detected_s.max()) if len(detected_s) else min(float(episodes["ended_s"].max()), onset_s + UNKNOWN_S)
     first_s = max(min(onset_s, float(detected_s.min()) if len(detected_s) else onset_s) - BEFORE_S, 0.0)
     return first_s, min(max(last_s + AFTER_S, first_s + LEAST_S), max(end_s, first_s + AFTER_S))
+
+
+def pair_points(ends: np.ndarray) -> pa.Array:
+    """Lines (…, 2, 3) as strips of two points: Rerun itself counts the points of each strip in Python."""
+    import rerun as rr
+
+    kind = rr.components.LineStrip3DBatch._ARROW_DATATYPE
+    points = pa.FixedSizeListArray.from_arrays(pa.array(ends.astype(np.float32).ravel()), type=kind.value_type)
+    return pa.ListArray.from_arrays(pa.array(np.arange(0, len(points) + 1, 2, dtype=np.int32)), points, type=kind)

@@ -315,3 +315,18 @@ def test_configurations_are_equal_where_all_options_are() -> None:
     assert hash(plain) == hash(said)
     assert (plain.values(), other.values()) == (said.values(), {**said.values(), "nrt": other.nrt})
     assert plain != 1
+
+
+def test_a_kernel_loads_no_linear_algebra_and_products_of_matrices_compile() -> None:
+    """Numba imports scipy.linalg to see that BLAS is there; what multiplies matrices finds it without."""
+    lines = [
+        "import sys",
+        "import numba, numpy as np",
+        "from copem_replay.core.compiled import cache_note",
+        "cache_note()",
+        "assert numba.njit(lambda a: a + 1)(1) == 2",
+        "print('scipy.linalg' in sys.modules)",
+        "print(numba.njit(lambda a: np.dot(a, a))(np.array([[1.0, 2.0], [3.0, 4.0]])).tolist())",
+    ]
+    done = subprocess.run([sys.executable, "-c", "\n".join(lines)], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == ["False", "[[7.0, 10.0], [15.0, 22.0]]"]

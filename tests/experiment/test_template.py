@@ -226,7 +226,9 @@ def test_lists_of_the_log_become_units(tmp_path: Path, replayed: Callable[..., A
     assert experiment["configurations"]["recorded"]["units"] == ["rsu", "front", "ego_recorded"]
     assert "with ego_recorded" not in experiment["configurations"]
     assert experiment["configurations"]["with rsu"] == {"units": ["ego", "rsu"], "fusion": {"kind": "gnn"}}
-    assert "  # broken cannot be a unit: " in format_draft(survey_recording("log.mcap"))
+    draft = format_draft(survey_recording("log.mcap"))
+    assert "  # broken cannot be a unit: " in draft
+    assert draft.count("    # at: [0.0, 0.0]   # where is it? ") == 3, "of each recorded unit"
 
 
 def test_topics_without_a_name(tmp_path: Path, replayed: Callable[..., Any]) -> None:

@@ -536,6 +536,12 @@ def test_captures_confirm_not_arrivals():
     assert [len(one) for one in fuse_one(inputs, late="stale", confirm_s=0.05)] == [0, 1]
 
 
+def test_a_claim_of_exactly_the_threshold_is_not_published():
+    inputs = inputs_of([[entry(0.0, existence=0.5)]], ["a"], [0.0], [0.0])
+    found = [len(fuse_one(inputs, publish=at, **AT_ONCE)[-1]) for at in (0.5, math.nextafter(0.5, 0.0))]
+    assert found == [0, 1]
+
+
 def test_a_track_fades_out_of_the_list_and_then_out_of_memory():
     def held(*looks_s: float) -> list[Entries]:
         lists = [[entry(0.0, existence=0.8), *(entries_of(0) for _ in looks_s), entry(0.0, existence=0.8)]]

@@ -906,9 +906,12 @@ def test_no_conflict_no_verdict() -> None:
     assert not {"conflict", *COLUMNS} & {*without.columns}
 
 
-def test_never_detected_does_not_brake_and_is_judged() -> None:
+@pytest.mark.parametrize("margin_m", [0.5, 0.0])
+def test_never_detected_does_not_brake_and_is_judged(margin_m: float) -> None:
+    """Without a margin, too: what is hit is exactly 0 m away, and not passed."""
     wanted = plan(
         driver=GAMMA,
+        margin_m=margin_m,
         pems={"sure": SEES_NOTHING},
         configurations={"GT": {"units": "truth"}, "blind": {"units": ["ego"]}},
     )

@@ -53,7 +53,6 @@ from copem_replay.report.html.tables import (
 )
 from copem_replay.results.compare import compare_folders
 from copem_replay.results.read import Results, read_results
-from copem_replay.viewer.sink import choose_telling_objects
 from tests.helpers.report_pages import ALONE, ONE, changed, eighteen, named, replayed, with_rows
 from tests.oracles import intervals as oracle
 
@@ -250,8 +249,8 @@ class TestEighteen:
 
 class TestWhichObject:
     @given(st.data())
-    def test_the_same_as_in_the_viewer(self, data: st.DataObject) -> None:
-        """Of one log: the one object that the viewer would choose."""
+    def test_the_one_known_at_the_most_different_times(self, data: st.DataObject) -> None:
+        """Of one log: the first object with the largest difference between A and B, then the one known last."""
         objects, names = data.draw(st.integers(1, 5)), ("GT", "A", "B")
         table = pd.DataFrame(
             [("x", str(o), name) for name in names for o in range(objects)],
@@ -262,7 +261,14 @@ class TestWhichObject:
         table["time_to_detection_s"] = table["time_to_detection_s"].astype(float)
         table["onset_s"], table["ended_s"] = 0.0, 4.0
         table["conflict"] = [data.draw(st.booleans())] * len(table)
-        assert find_most_telling(table, ("GT",)) == ("x", choose_telling_objects(table, ("GT",), 1)[0])
+        after = {
+            o: table.loc[(table["object_id"] == o) & (table["configuration"] != "GT"), "time_to_detection_s"].fillna(
+                4.0
+            )
+            for o in dict.fromkeys(table["object_id"])
+        }
+        first = max(after, key=lambda o: (after[o].max() - after[o].min(), after[o].max()))
+        assert find_most_telling(table, ("GT",)) == ("x", first)
 
     def test_by_default_the_one_of_the_run_that_is_drawn(self, two: Results, tmp_path: Path) -> None:
         """The pedestrian in the way is in conflict; without that, the one that `half` knows later."""

@@ -365,6 +365,13 @@ def test_a_folder_given_twice(tmp_path):
     assert problems() == ["compare: expected a results folder, found none"]
 
 
+def test_a_link_to_itself_is_no_folder(tmp_path):
+    (tmp_path / "loop").symlink_to("loop")
+    assert problems(tmp_path / "loop") == [
+        f"{tmp_path}/loop: expected a results folder, found no such folder; `copem-replay run` writes one"
+    ]
+
+
 @pytest.mark.parametrize("per_min", [-1.0, float("nan"), float("inf")])
 def test_a_rate_that_is_none(tmp_path, per_min):
     (problem,) = problems(write_folder(tmp_path / "first", ROWS), false_positives_per_min=per_min)

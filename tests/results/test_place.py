@@ -94,6 +94,24 @@ class TestOthers:
         assert written(old)["provenance.json"] != before["provenance.json"]
         assert os.listdir(old.parent) == ["e"]
 
+    @pytest.mark.parametrize("in_one_step", [True, False])
+    @pytest.mark.parametrize("text", [None, '"verdic', "null"])
+    def test_with_a_damaged_list_of_what_was_made_leaves_nothing_behind(
+        self, here: Path, call: Call, monkeypatch: pytest.MonkeyPatch, text: str | None, in_one_step: bool
+    ) -> None:
+        """The verdicts of before count as the user's then, and are replaced by those of the new results."""
+        (here / "e.yaml").write_text(changed("criteria: {known: {metric: detected_share, at_least: 0}}"))
+        call("run", "e.yaml")
+        made = here / "out/e/made.jsonl"
+        assert made.read_text() == '"verdicts.jsonl"\n'
+        made.unlink()
+        if text is not None:
+            made.write_text(text)
+        if not in_one_step:
+            monkeypatch.setattr(place, "exchange_folders", lambda *_: False)
+        again(call)
+        assert (os.listdir(here / "out"), made.read_text()) == (["e"], '"verdicts.jsonl"\n')
+
     @pytest.mark.parametrize(("name", "taken"), [("sweep.csv", "sweep.csv"), ("replay.rrd/x", "replay.rrd/x")])
     def test_of_one_name_with_new_results_is_refused_before_the_replay(
         self, old: Path, call: Call, monkeypatch: pytest.MonkeyPatch, name: str, taken: str

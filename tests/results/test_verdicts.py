@@ -81,6 +81,13 @@ def test_what_is_written_is_read(tmp_path_factory: pytest.TempPathFactory, of: l
     assert (folder / FILE).read_text() == verdicts_jsonl(written)
 
 
+def test_a_link_to_itself_is_replaced(tmp_path: Path) -> None:
+    path = tmp_path / FILE
+    path.symlink_to(FILE)
+    assert read_verdicts(write_verdicts(ALL, path)).all == ALL.all
+    assert not path.is_symlink()
+
+
 def test_a_folder_without_verdicts_has_none(tmp_path: Path) -> None:
     assert find_verdicts(tmp_path) is None
 

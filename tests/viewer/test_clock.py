@@ -21,7 +21,8 @@ from copem_replay.pipeline.prepare import Replay, prepare_log
 from copem_replay.pipeline.replay import replay_block
 from copem_replay.viewer import write_rrd
 from copem_replay.viewer.line_of_sight import compute_sight
-from copem_replay.viewer.sink import ABSENT, EARLY, KNOWN, SHOWN_OBJECTS, TOO_LATE, UNCONFIRMED, choose_telling_objects
+from copem_replay.viewer.objects import choose_shown_objects
+from copem_replay.viewer.sink import ABSENT, EARLY, KNOWN, TOO_LATE, UNCONFIRMED
 from copem_replay.viewer.status import compute_status, read_episode_clocks
 from tests.helpers.recordings import SHARED
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
@@ -83,8 +84,7 @@ MEASURES: dict[str, dict[str, Any]] = {
 
 def shown_in(replay: Replay, wanted: Experiment, run: int) -> tuple[pd.DataFrame, list[int]]:
     table = replay_block(replay, wanted, np.array([run]))
-    names = choose_telling_objects(table, ["GT", "GT late"], SHOWN_OBJECTS)
-    return table, [replay.scene.object_number[name] for name in names]
+    return table, list(choose_shown_objects(replay, wanted, table).object_ix)
 
 
 def agrees(replay: Replay, wanted: Experiment, run: int, table: pd.DataFrame, shown: list[int]) -> set[int]:

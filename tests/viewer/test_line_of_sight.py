@@ -11,11 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from copem_replay.core.tracks import Float
 from copem_replay.perception.pem.condition import Couple
 from copem_replay.perception.sensor_poses import couple_outlines
 from copem_replay.pipeline.prepare import prepare_log
-from copem_replay.viewer.camera import EYE_RAD, Camera, camera_on_object
 from copem_replay.viewer.line_of_sight import compute_sight
 from copem_replay.viewer.sensors import choose_named_units
 from tests.helpers.scenes import EGO_UNIT, SEES_60_M, SEES_ALL, Thing, driving, experiment, recording, standing
@@ -230,101 +228,6 @@ def test_six_units_are_named_in_their_view_and_apart(tmp_path: Path) -> None:
     assert named[0] == "ego"
     numbers = sorted(int(name[1:]) for name in named if name != "ego")
     assert min(np.diff(numbers)) >= 3, "12 m"
-
-
-def eyes(path: Path) -> list[list[Any]]:
-    from rerun.chunk import RrdReader
-
-    reader = RrdReader(path)
-    [blueprint] = reader.blueprints()
-    return [
-        [np.array(batch.column(f"EyeControls3D:{name}")[0].as_py()[0]) for name in ("position", "look_target")]
-        for batch in (c.to_record_batch() for c in reader.stream(store=blueprint))
-        if "EyeControls3D:position" in batch.schema.names
-    ]
-
-
-def in_view(eye: Any, target: Any, place: Any, wide: float) -> bool:
-    ahead = (target - eye) / np.linalg.norm(target - eye)
-    right = np.array([ahead[1], -ahead[0], 0]) / np.hypot(ahead[0], ahead[1])
-    seen, half = np.array(place) - eye, np.tan(np.deg2rad(55) / 2)
-    up = np.cross(right, ahead)
-    return bool(seen @ ahead > 0 and max(abs(seen @ up), abs(seen @ right) / wide) <= half * (seen @ ahead))
-
-
-def test_the_eye_looks_ahead_of_the_ego_and_sees_the_object(tmp_path: Path) -> None:
-    # Northwards at 10 m/s; the pedestrian appears 20 m ahead: the middle between both is 10 m ahead of the ego.
-    scene = recording(
-        [
-            Thing("ego", "car", driving(0, 0, 0, 10), yaw_rad=np.pi / 2),
-            Thing("9", "pedestrian", standing(0, 30), there=lambda t: t > 0.99),
-        ],
-        until_s=2.0,
-    )
-    made = make(tmp_path / "x.rrd", scene, measure=PERSON)
-    # A view of each configuration in the overview and on its page, and one of each that follows the pedestrian.
-    found = [(position, target) for position, target in eyes(made.path) if not target.any()]
-    assert len(found) == 2
-    for position, _ in found:
-        # As seen from 10 m ahead of the ego, on the ground, steeply: it is 10 m behind, he is 10 m ahead.
-        assert position[2] / np.linalg.norm(position) == pytest.approx(np.sin(np.deg2rad(65)), abs=0.02)
-        assert in_view(position, np.zeros(3), [0, 10, 0.9], 1.55)
-        assert in_view(position, np.zeros(3), [0, -10, 0.75], 1.55)
-    # From near by he is in the picture together with the ego's unit, 20 m behind him when he appears.
-    [near] = [
-        (position, target)
-        for position, target in eyes(made.path)
-        if target.any() and abs(target[0]) < 5 and target[1] < 0
-    ][:1]
-    assert in_view(*near, [0, 0, 0.9], 1.7)
-    assert in_view(*near, [0, -20, 1.8], 1.7)
-    assert not in_view(*near, [0, 60, 0.9], 1.7)
-    followed = rows(made.path, "/world/eyes/ego")
-    assert [row["Transform3D:translation"] for row in followed[:2]] == [[pytest.approx([0, y, 0])] for y in (10, 11)]
-    # He comes at 1 s; until then the eye that follows him waits there.
-    waits = rows(made.path, "/world/eyes/9_pedestrian")
-    assert [(row["elapsed"] / 1e9, row["Transform3D:translation"]) for row in waits[:2]] == [
-        (0.0, [[0, 30, 0]]),
-        (1.0, [[0, 30, 0]]),
-    ]
-
-
-def is_in_picture(eye: Camera, offset_m: Float, aspect: float) -> bool:
-    """Whether a place (3,), relative to the camera's target, is in the picture."""
-    towards = (eye.target_m - eye.place_m) / np.linalg.norm(eye.target_m - eye.place_m)
-    right = np.array([towards[1], -towards[0], 0]) / np.hypot(*towards[:2])
-    depth = float(np.linalg.norm(eye.target_m - eye.place_m) + offset_m @ towards)
-    high = depth * np.tan(EYE_RAD / 2)
-    up = np.cross(right, towards)
-    return bool(depth > 0 and abs(up @ offset_m) <= high and abs(right @ offset_m) <= aspect * high)
-
-
-def test_at_the_start_ego_and_object_are_framed(tmp_path: Path) -> None:
-    """A car 30 m away at 0 s, whose onset is when it is 20 m away: a viewer that opens at 0 s shows both."""
-    scene = recording(
-        [Thing("ego", "car", standing(0, 0)), Thing("7", "car", driving(30, 0, -5), yaw_rad=np.pi)], until_s=3.0
-    )
-    made = make(tmp_path / "x.rrd", scene, measure={"onset": {"kind": "in_range", "range_m": 20}})
-    eye = camera_on_object(made.replay, made.given, made.table, made.replay.scene.object_number["7"], 1.55)
-    for x in (0.0, 20.0, 30.0):
-        assert is_in_picture(eye, np.array([x - eye.ahead_m, 0, 0]), 1.55)
-    assert not is_in_picture(eye, np.array([200.0, 0, 0]), 1.55)
-
-
-def test_without_an_ego_the_eye_sees_the_unit_and_who_passes_it(tmp_path: Path) -> None:
-    scene = recording([Thing("7", "car", driving(40, 0, -10, 10))], until_s=4.0, ego=None)
-    pole = {"at": [20, -10], "height_m": 6.0, "ground_z_m": 0.0, "pem": "all"}
-    made = make(
-        tmp_path / "x.rrd", scene, units={"pole": pole}, configurations={"pole": {"units": ["pole"]}},
-        measure={"onset": {"kind": "appears"}, "distance_to": "pole"},
-    )  # fmt: skip
-    whole = [(position, target) for position, target in eyes(made.path) if target.any()]
-    assert len(whole) == 4, "overview, its own page, near by, units"
-    # The last part of its way is more than 40 m from the pole.
-    places = ([40, 0, 0.75], [20, 20, 0.75], [20, -10, 0.75])
-    all_seen = [all(in_view(position, target, place, 3.1) for place in places) for position, target in whole]
-    assert sum(all_seen) >= 2
-    assert not list(chunks(made.path, "/world/eyes/ego"))
 
 
 def test_no_nan_anywhere(passing: Made) -> None:

@@ -180,7 +180,7 @@ def test_at_most_six_labels_a_view(city: Made) -> None:
         elif entity.startswith("/world/") and column is not None:
             labelled[entity] += [(0, batch.column(column).to_pylist()[0])]
     loud = set(labelled) - silent
-    assert {entity.rsplit("/", 1)[-1] for entity in loud} == {"status"}, "only what is told of objects of interest"
+    assert {entity.rsplit("/", 1)[-1] for entity in loud} == {"status", "arrows"}, "only objects of interest"
     wanted = {city.replay.scene.object_ids[k] for k in range(len(city.replay.scene.object_ids))}
     for entity in loud:
         assert max(len(told or ()) for _, told in labelled[entity]) <= MOST_LABELS

@@ -275,20 +275,20 @@ def test_gospa_is_of_the_measured_objects(tmp_path: Path) -> None:
     assert values("late") == pytest.approx([np.sqrt(2)] * 6 + [np.sqrt(3 * 4.5)] * 5)
 
 
-def test_six_configurations_a_file_and_nothing_dropped() -> None:
+def test_seven_configurations_a_file_and_nothing_dropped() -> None:
     names = [f"c{k}" for k in range(1, 19)]
     parts = split_into_files(names)
     assert [part.path(Path("out/replay_4.rrd")).name for part in parts] == [
         "replay_4.rrd",
-        "replay_4.configurations_7-12.rrd",
-        "replay_4.configurations_13-18.rrd",
+        "replay_4.configurations_8-14.rrd",
+        "replay_4.configurations_15-18.rrd",
     ]
     assert [name for part in parts for name in part.configurations] == names
-    assert [part.infix for part in split_into_files(names[:6])] == [""]
-    assert [part.infix for part in split_into_files(names[:7])] == ["", ".configurations_7"]
-    beside = split_into_files(["base", *names[:7]], "base")
-    assert [part.configurations for part in beside] == [("base", *names[:5]), ("base", *names[5:7])]
-    assert [part.infix for part in beside] == ["", ".configurations_7-8"]
+    assert [part.infix for part in split_into_files(names[:7])] == [""]
+    assert [part.infix for part in split_into_files(names[:8])] == ["", ".configurations_8"]
+    beside = split_into_files(["base", *names[:8]], "base")
+    assert [part.configurations for part in beside] == [("base", *names[:6]), ("base", *names[6:8])]
+    assert [part.infix for part in beside] == ["", ".configurations_8-9"]
 
 
 def test_further_configurations_are_in_further_files(tmp_path: Path) -> None:
@@ -299,14 +299,14 @@ def test_further_configurations_are_in_further_files(tmp_path: Path) -> None:
     many = {f"GT{k}": {"units": "truth", "latency_s": k / 10} for k in range(8)}
     made = make(tmp_path / "x.rrd", scene, measure=PERSON, configurations=many)
     said = write_rrd(tmp_path / "y.rrd", made.replay, made.given, [made.run_tracks], made.table, SUMMARY, 3)
-    assert said == ["y.rrd: GT6, GT7 in y.configurations_7-8.rrd"]
-    first, second = tmp_path / "y.rrd", tmp_path / "y.configurations_7-8.rrd"
+    assert said == ["y.rrd: GT7 in y.configurations_8.rrd"]
+    first, second = tmp_path / "y.rrd", tmp_path / "y.configurations_8.rrd"
     assert [name for kind in list_exporters() for name in kind.files("y", 8)] == ["y.mcap", first.name, second.name]
-    assert "In further files: y.configurations_7-8.rrd." in static(first, "/summary")["TextDocument:text"][0]
-    assert [bool(list(chunks(path, "/world/GT5/boxes"))) for path in (first, second)] == [True, False]
-    assert [bool(list(chunks(path, "/world/GT6/boxes"))) for path in (first, second)] == [False, True]
+    assert "In further files: y.configurations_8.rrd." in static(first, "/summary")["TextDocument:text"][0]
+    assert [bool(list(chunks(path, "/world/GT6/boxes"))) for path in (first, second)] == [True, False]
+    assert [bool(list(chunks(path, "/world/GT7/boxes"))) for path in (first, second)] == [False, True]
     every = list(configuration_colours(many).values())
-    for path, name, place in ((first, "GT5", 5), (second, "GT6", 6), (second, "GT7", 7)):
+    for path, name, place in ((first, "GT6", 6), (second, "GT7", 7)):
         red, green, blue = every[place]
         drawn = at(path, f"/world/{name}/boxes", 0.95)["Boxes3D:colors"][0] >> 8
         assert drawn == red << 16 | green << 8 | blue, "by its place among all"

@@ -68,14 +68,14 @@ def asked(server: Server, hosts: list[str], path: str) -> tuple[int, bytes]:
 
 
 class TestOpening:
-    def test_half_a_second_before_the_first_onset(self, results: Path) -> None:
+    def test_some_know_an_object_and_others_do_not_yet(self, results: Path) -> None:
         files = list_rrd_files(results)
         assert [path.name for path in files] == ["replay.rrd", "replay_worst.rrd"]
-        assert opening_s(results, files) == {path: pytest.approx(0.5) for path in files}
-
-    def test_a_part_of_the_configurations_opens_where_the_rest_does(self, results: Path) -> None:
-        part = results.absolute() / "replay.configurations_7-12.rrd"
-        assert opening_s(results, [part]) == {part: pytest.approx(0.5)}
+        table = cr.load_results(results).detections
+        for path, run in zip(files, cr.load_results(results).provenance.data["runs_shown"]["drive"], strict=True):
+            known_s = table.loc[table["run"] == run["run"], "detection_s"].fillna(3.0)
+            assert known_s.nunique() > 1
+            assert known_s.min() < opening_s(results, [path])[path] < known_s.max()
 
     def test_of_several_logs_each_at_its_own(self, tmp_path: Path) -> None:
         drive(tmp_path / "drive.mcap")
@@ -87,7 +87,7 @@ class TestOpening:
             "replay/again.rrd",
             "replay/drive.rrd",
         ]
-        assert opening_s(folder, files) == {path: pytest.approx(0.5) for path in files}
+        assert opening_s(folder, files).keys() == set(files)
 
     def test_at_an_object(self, results: Path) -> None:
         """Its onset is at 1 s, as that of all others; of an object that is nowhere there is no instant."""
@@ -96,8 +96,9 @@ class TestOpening:
         assert opening_s(results, files, Sought("2", "elsewhere")) == {}
         assert opening_s(results, files, Sought("none")) == {}
 
-    def test_a_recording_without_results_beside_it_opens_at_its_beginning(self, results: Path, tmp_path: Path) -> None:
-        (tmp_path / "replay.rrd").write_bytes((results / "replay.rrd").read_bytes())
+    def test_what_is_no_recording_opens_at_its_beginning(self, results: Path, tmp_path: Path) -> None:
+        (tmp_path / "replay.rrd").write_bytes((results / "replay.rrd").read_bytes()[:-100])
+        (tmp_path / "replay_1.rrd").write_bytes(b"no recording")
         assert opening_s(tmp_path, list_rrd_files(tmp_path)) == {}
 
     def test_each_recording_has_an_identity(self, results: Path, tmp_path: Path) -> None:

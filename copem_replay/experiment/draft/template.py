@@ -292,7 +292,9 @@ def _draft_units(drives: Sequence[_Drive], recorded: Sequence[tuple[str, UnitFou
     for name, unit in recorded:
         yield from (f"  # {_format_comment(line)}" for line in unit.oddities)
         late = "" if unit.delay is None else f"   # delay_s {_format_comment(unit.delay)}"
-        yield f"  {name}: {{recorded: {_format_recorded(unit)}}}{late}"
+        yield f"  {name}:"
+        yield f"    recorded: {_format_recorded(unit)}{late}"
+        yield "    # at: [0.0, 0.0]   # where is it? x, y as in the log, or `on: ego`: without, no picture shows it"
     for unit in drives[0].truth.units if len(drives) == 1 else ():
         if unit.problem:
             yield f"  # {quote_yaml(unit.topic)} cannot be a unit: {_format_comment(unit.problem)}"

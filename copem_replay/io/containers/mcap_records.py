@@ -40,10 +40,12 @@ from mcap.summary import Summary
 from copem_replay.io.window import Span, has_overlap, is_kept
 
 MAGIC = b"\x89MCAP0\r\n"
-RECORD_LIMIT_BYTES = 1 << 29
+RECORD_LIMIT_BYTES = 1 << 28
 """Longest record: room for the largest chunk, compressed or not, and its head."""
-CHUNK_LIMIT_BYTES = 1 << 28
+CHUNK_LIMIT_BYTES = 1 << 27
 """Most bytes of a decompressed chunk: writers make chunks of 1 to 16 MB."""
+DEFINITION_LIMIT_BYTES = 1 << 24
+"""Longest header, schema, channel or metadata: the definitions of OSI take 1 MB."""
 MOST_RECORDS = 1 << 18
 """Most records of a chunk: 8 MB of the shortest messages are as many."""
 _SMALL_BYTES = 1 << 26
@@ -79,6 +81,7 @@ _NEEDED: dict[int, Any] = {
     Opcode.ATTACHMENT: Attachment,
     Opcode.METADATA: Metadata,
 }
+_DEFINING = _NEEDED.keys() - {Opcode.ATTACHMENT}
 _IN_CHUNKS = frozenset((int(Opcode.SCHEMA), int(Opcode.CHANNEL), int(Opcode.MESSAGE)))
 
 
@@ -130,6 +133,8 @@ def parse_record(opcode: int, body: bytes | memoryview) -> McapRecord | None:
             publish_time=publish_time,
             sequence=sequence,
         )
+    if opcode in _DEFINING and len(body) > DEFINITION_LIMIT_BYTES:
+        raise ValueError(f"a definition takes more than {DEFINITION_LIMIT_BYTES >> 20} MiB")
     record: McapRecord | None = _NEEDED[opcode].read(_ExactStream(BytesIO(body))) if opcode in _NEEDED else None
     return record
 
@@ -250,7 +255,7 @@ def _decompress_lz4(content: memoryview, allowance: ChunkAllowance) -> tuple[byt
 # An MCAP file through its index: the summary at its end, and messages in order of log time.
 
 _FOOTER = struct.Struct("<QQI")  # summary_start, summary_offset_start, summary_crc
-_HELD_LIMIT_BYTES = 1 << 29
+_HELD_LIMIT_BYTES = 1 << 28
 """Most bytes of messages that wait for their turn, of chunks that overlap in time: two of the largest chunks."""
 
 

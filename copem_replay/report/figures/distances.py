@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from copem_replay.core.errors import count_noun
+from copem_replay.core.errors import InputError, count_noun
 from copem_replay.core.tracks import Bool, Float, Int
 from copem_replay.metrics.summary import CONFLICT, DETECTED
 from copem_replay.report.figures.style import (
@@ -31,6 +31,7 @@ from copem_replay.report.figures.style import (
     new_figure,
     shorten_names,
 )
+from copem_replay.results.table_files import AGAIN
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -69,6 +70,11 @@ class Strip:
         count = np.zeros((int(cell.max(initial=0)) + 1, len(KINDS)), dtype=np.int64)
         np.add.at(count, cell, count_kinds(tally if judged else tally[["runs"]])[placed])
         return cls(width_m, count, judged, int(runs[~detected].sum()), int(runs[detected & ~placed].sum()))
+
+    def has(self, distance_m: Float, kind: Int) -> bool:
+        """Whether rows (n,) are among those that the tally counts."""
+        cell = _bin_distances(distance_m, self.width_m)
+        return bool(cell.max(initial=0) < len(self.count) and self.count[cell, kind].all())
 
     def place(self, distance_m: Float, kind: Int, before: Int) -> tuple[Float, Bool]:
         """Places (n,) of points across the strip, −1 … 1, even within a bin; and which points (n,) are drawn.
@@ -202,6 +208,11 @@ def _place_points(results: Results, strips: Mapping[tuple[str, str], Strip]) -> 
             of_strip = rows[(rows["configuration"] == key[1]) & rows[_COLUMNS[key[0]]].notna()]
             distance_m = of_strip[_COLUMNS[key[0]]].to_numpy(dtype=float)
             kind = row_kinds(of_strip) if strip.judged else np.full(len(of_strip), KINDS.index(NEUTRAL))
+            if not strip.has(distance_m, kind):
+                raise InputError(
+                    f"{results.place}/tally.parquet: expected the rows of detections.parquet counted, found others; "
+                    f"{AGAIN}"
+                )
             across, drawn = strip.place(distance_m, kind, before[key])
             parts[key].append((distance_m[drawn], across[drawn], kind[drawn]))
     return {key: _Points(*map(np.concatenate, zip(*chunks, strict=True))) for key, chunks in parts.items()}

@@ -9,7 +9,6 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import pandas as pd
@@ -68,21 +67,14 @@ class Drive:
         return {name: unit.at for name, unit in self.experiment.modelled.items() if unit.at is not None}
 
 
-_LAST: WeakKeyDictionary[Results, Drive] = WeakKeyDictionary()
-"""The drive that was read last, for the next figure of it."""
-
-
 def read_drive(results: Results, log: str) -> Drive:
     """A drive of the results. Raises RecordingError where its recording is missing, another one, or elsewhere."""
-    if (last := _LAST.get(results)) is not None and last.log == log:
-        return last
     place = results.log_place(log)
     if isinstance(place, RemoteFile):
         raise RecordingError("plans need the recording on this machine", path=place)
     experiment = resolve_for_log(results.experiment, log)
     recording = results.recording(log, experiment)
-    drive = _LAST[results] = Drive(log, experiment, recording.scene, recording.truth)
-    return drive
+    return Drive(log, experiment, recording.scene, recording.truth)
 
 
 def find_latest_log(results: Results) -> str:

@@ -111,8 +111,8 @@ def find_most_telling(table: pd.DataFrame, upper: Sequence[str]) -> tuple[str, s
     """Log and id of the object that tells configurations apart most; of equal ones the first.
 
     Objects in conflict with the ego rank first, then by the spread of their times to detection over configurations,
-    then by the latest of them, as in `choose_telling_objects` of the viewer. An object that was never known counts as
-    known at the end of its episode. `upper`, the ground truth, is left out unless there are no others.
+    then by the latest of them. An object that was never known counts as known at the end of its episode. `upper`, the
+    ground truth, is left out unless there are no others.
     """
     others = table[~table["configuration"].isin(list(upper))]
     rows = others if len(others) else table

@@ -306,7 +306,7 @@ def _prepare_object(results: Results, log: str, object_id: str) -> Replay:
     of_log = resolve_for_log(results.experiment, log)
     measure = of_log.measure.model_copy(update={"objects": Objects(ids=(object_id,))})
     experiment = of_log.model_copy(update={"measure": measure})
-    recording = results.recording(log, experiment)
+    recording = results.recording(log, of_log)
     if recording.scene.ego_ix < 0:
         raise RecordingError("no ego in this study, whose runs could be drawn", path=recording.path)
     return prepare_log(recording, experiment)

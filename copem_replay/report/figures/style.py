@@ -154,11 +154,18 @@ def figure_style() -> Iterator[None]:
     """The package's settings of matplotlib while a figure is made or written, whatever the user's are."""
     import matplotlib
 
+    settings: Any = matplotlib.rcParams
     with matplotlib.rc_context():
-        matplotlib.rcdefaults()
-        for name, value in _STYLE.items():
-            matplotlib.rcParams[name] = value  # type: ignore[index]
+        if not _SETTINGS:  # once, as checking all defaults takes milliseconds
+            matplotlib.rcdefaults()
+            settings.update(_STYLE)
+            _SETTINGS.update(dict.items(settings))
+        dict.update(settings, _SETTINGS)
         yield
+
+
+_SETTINGS: dict[str, Any] = {}
+"""All settings of matplotlib as figures have them."""
 
 
 _MARKED: WeakKeyDictionary[Any, int] = WeakKeyDictionary()

@@ -57,16 +57,16 @@ def read_history(folders: Sequence[Path], page: Path) -> list[JudgedFolder]:
     """
     found: list[JudgedFolder] = []
     problems: list[str] = []
-    seen: dict[Path, Path] = {}
+    seen: dict[str, Path] = {}
     for folder in folders:
         try:
-            if (first := seen.setdefault(folder.resolve(), folder)) is not folder:
+            if (first := seen.setdefault(os.path.realpath(folder), folder)) is not folder:
                 raise InputError(f"{folder}: expected each folder once, found it twice ({first})")
             results = open_results(folder, "summary.csv")
             if (verdicts := find_verdicts(folder)) is None:
                 raise InputError(f"{folder}: expected {FILE}, found none; `copem-replay verdict {folder}` writes it")
             there = (folder / REPORT).is_file()
-            path = os.path.relpath((folder / REPORT).resolve(), page.resolve().parent)
+            path = os.path.relpath(os.path.realpath(folder / REPORT), os.path.realpath(page.parent))
             label = str(results.provenance.data.get("label") or results.name)
             found.append(JudgedFolder(results, verdicts, label, quote(Path(path).as_posix()) if there else None))
         except InputError as error:

@@ -7,6 +7,7 @@ Logs are read one by one, so that no rows are kept but their sums.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -142,13 +143,13 @@ def read_folders(given: Sequence[Path | Results]) -> list[Results]:
     """
     folders: list[Results] = []
     problems: list[str] = []
-    seen: dict[Path, Path] = {}
+    seen: dict[str, Path] = {}
     for folder in given:
         path = folder.place if isinstance(folder, Results) else folder
-        if path.resolve() in seen:
-            problems.append(f"{path}: expected each folder once, found it twice ({seen[path.resolve()]})")
+        if (place := os.path.realpath(path)) in seen:
+            problems.append(f"{path}: expected each folder once, found it twice ({seen[place]})")
             continue
-        seen[path.resolve()] = path
+        seen[place] = path
         try:
             folders.append(_read_folder(folder))
         except InputError as error:

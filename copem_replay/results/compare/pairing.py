@@ -170,9 +170,8 @@ def lay_out_configuration(labelled: LabelledConfiguration, tables: dict[str, pa.
     cell, size = grid.cells(rows), len(grid.episodes) * grid.runs
     _check_once(place, cell, labelled.configuration)
     columns = _read_columns(place, rows)
-    for name, needed in (("onset_s", True), ("ended_s", True), ("detection_s", columns["detected"])):
-        if (np.isnan(columns[name]) & needed).any():
-            raise InputError(f"{place}: column {name}: expected a number in every row, found none in some; {AGAIN}")
+    if (np.isnan(columns["detection_s"]) & columns["detected"]).any():
+        raise InputError(f"{place}: column detection_s: expected a number where detected, found none in some; {AGAIN}")
     columns["left"] = flag_column(pc.is_in(rows["ended_by"], pa.array(COMPETES)))
     began = rows.select([*COUNTS_BY]).to_pandas()
     return PairSide(

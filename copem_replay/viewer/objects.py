@@ -1,0 +1,115 @@
+"""Objects shown: those that words, lanes, curves and near views are about, and the instant at which a recording opens.
+
+An object is worth a look if configurations know it at different times while it is near the ego's path. One that is in
+the log for less than `OBSERVED_S` before or after its onset tells nothing of them: how soon it could have been known is
+decided by where the log is cut. It is listed as too short to judge.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from copem_replay.core.tracks import SAME_INSTANT_S, TRUTH, Float
+from copem_replay.experiment.schema import Experiment
+from copem_replay.pipeline.prepare import Replay
+from copem_replay.viewer.camera import find_followed, interpolate_places
+from copem_replay.viewer.sink import AFTER_S, BEFORE_S, UNKNOWN_S
+
+SHOWN_OBJECTS = 6
+"""Most measured objects with words, lines, lanes and plots: more would cover each other and slow the viewer down."""
+OBSERVED_S = 2.0
+"""Least time from the log's start to the onset, and from the onset to the end of the episode."""
+PATH_S, NEAR_M = 3.0, 10.0
+"""How much of the ego's path is ahead of it, and the distance from it at which an object counts half."""
+_STEP_S = 0.25
+
+
+@dataclass(frozen=True)
+class ShownObjects:
+    """Indices of the objects shown, the most telling one first, and ids of the measured objects too short to judge.
+
+    Where all measured objects are too short to judge, some of them are shown all the same.
+    """
+
+    object_ix: tuple[int, ...] = ()
+    too_short: tuple[str, ...] = ()
+
+
+def choose_shown_objects(replay: Replay, experiment: Experiment, table: pd.DataFrame) -> ShownObjects:
+    """The objects with the largest product of difference in time and nearness to the ego's path, six at most.
+
+    The difference is between the first and the last configuration that knows an object; one that never does counts as
+    knowing it at the end of the episode. Equal products are in the order of nearness. `table`: rows of one run of one
+    log, a row per object and configuration.
+    """
+    if not len(table):
+        return ShownObjects()
+    rows = select_differing_rows(experiment, table)
+    by_object = rows.groupby("object_id", sort=False)
+    after_s = rows["time_to_detection_s"].fillna(rows["ended_s"] - rows["onset_s"]).groupby(rows["object_id"])
+    episodes = by_object[["onset_s", "ended_s"]].first()
+    episodes["apart_s"] = after_s.max() - after_s.min()
+    known_s = by_object["detection_s"].max()
+    episodes["last_s"] = known_s.fillna(np.minimum(episodes["ended_s"], episodes["onset_s"] + UNKNOWN_S))
+    episodes["near"] = 1 / (1 + (_distance_to_path(replay, experiment, episodes) / NEAR_M) ** 2)
+    episodes["rank"] = (episodes["apart_s"] * episodes["near"]).round(6)  # rounding of times decides nothing
+    until_s = episodes["ended_s"] - episodes["onset_s"]
+    observed = np.minimum(episodes["onset_s"], until_s) >= OBSERVED_S - SAME_INSTANT_S
+    judged = episodes[observed] if observed.any() else episodes
+    chosen = judged.sort_values(["rank", "near"], ascending=False, kind="stable").index[:SHOWN_OBJECTS]
+    return ShownObjects(
+        tuple(replay.scene.object_number[name] for name in chosen), tuple(episodes.index[~observed].tolist())
+    )
+
+
+def select_differing_rows(experiment: Experiment, table: pd.DataFrame) -> pd.DataFrame:
+    """The rows of configurations with units, of all if there is only one such: it differs from the truth alone."""
+    truths = [name for name, asked in experiment.configurations.items() if asked.units == TRUTH]
+    others = table[~table["configuration"].isin(truths)]
+    return others if others["configuration"].nunique() > 1 else table
+
+
+def find_opening_s(experiment: Experiment, by_object: Sequence[pd.DataFrame]) -> float | None:
+    """The instant (s) at which a recording opens: some configurations know an object and others do not yet.
+
+    It is early in the longest such time of the first object that has one, within its axis. Where all objects are known
+    to all configurations at once, it is just before the first onset; None without an object. `by_object`: rows of each
+    object, the most telling one first.
+    """
+    for rows in by_object:
+        rows = select_differing_rows(experiment, rows)
+        never_s = np.minimum(rows["ended_s"], rows["onset_s"] + UNKNOWN_S)
+        times_s = np.sort(rows["detection_s"].fillna(never_s).to_numpy(dtype=float))
+        waits_s = np.diff(times_s)
+        if waits_s.max(initial=0.0) > SAME_INSTANT_S:
+            k = int(waits_s.argmax())
+            return float(times_s[k] + min(waits_s[k] / 2, AFTER_S))
+    onsets_s = [float(rows["onset_s"].iloc[0]) for rows in by_object]
+    return max(min(onsets_s) - BEFORE_S, 0.0) if onsets_s else None
+
+
+def _distance_to_path(replay: Replay, experiment: Experiment, episodes: pd.DataFrame) -> Float:
+    """(M,) least distance (m) of each object from the ego's path of the next `PATH_S`, from onset to last detection.
+
+    0 without an ego; inf where the ego is not there.
+    """
+    ego_ix = find_followed(replay.scene, experiment)
+    if ego_ix < 0:
+        return np.zeros(len(episodes))
+    first_s, last_s = (episodes[name].to_numpy(dtype=float) for name in ("onset_s", "last_s"))
+    steps = np.maximum(np.ceil((last_s - first_s) / _STEP_S), 0).astype(np.int64) + 1
+    which = np.repeat(np.arange(len(steps)), steps)
+    within = np.arange(len(which)) - np.repeat(np.cumsum(steps) - steps, steps)
+    time_s = np.minimum(first_s[which] + _STEP_S * within, np.maximum(last_s, first_s)[which])
+    numbers = episodes.index.map(replay.scene.object_number).to_numpy(dtype=np.int64)
+    place = interpolate_places(replay, experiment, numbers[which], time_s)
+    nearest = np.full(len(steps), np.inf)
+    for ahead_s in np.arange(0.0, PATH_S + _STEP_S / 2, _STEP_S):
+        own = interpolate_places(replay, experiment, np.full(len(which), ego_ix), time_s + ahead_s)
+        distance = np.hypot(*(place - own)[:2])
+        np.minimum.at(nearest, which, np.where(np.isnan(distance), np.inf, distance))
+    return nearest

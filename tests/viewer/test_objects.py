@@ -1,0 +1,122 @@
+"""Which objects a recording is about, and when it opens: near the ego's path, known at different times, seen enough."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from copem_replay.experiment.schema import Experiment
+from copem_replay.pipeline.prepare import Replay, prepare_log
+from copem_replay.viewer.objects import choose_shown_objects, find_opening_s
+from tests.helpers.scenes import Thing, driving, experiment, recording, standing
+from tests.viewer.test_rrd import make, static
+
+NAMES = {"GT": {"units": "truth"}, "x": {"units": ["ego"]}, "y": {"units": ["ego"], "latency_s": 0.5}}
+PLACES = {
+    "near": (30.0, 2.0),
+    "beside": (30.0, 20.0),
+    "far": (30.0, 60.0),
+    "early": (30.0, -2.0),
+    "short": (30.0, -3.0),
+    "alike": (30.0, 5.0),
+    "behind": (-40.0, 0.0),
+}
+"""The ego drives along y = 0 from x = 0 to 100 within 10 s."""
+
+
+def ready(**things: tuple[float, float]) -> tuple[Replay, Experiment]:
+    scene = recording(
+        [
+            Thing("ego", "car", driving(0, 0, 10)),
+            *(Thing(name, "pedestrian", standing(*at)) for name, at in things.items()),
+        ],
+        until_s=10.0,
+    )
+    asked = experiment(configurations=NAMES)
+    return prepare_log(scene, asked), asked
+
+
+def table(*rows: tuple[str, float, float, float | None, float | None]) -> pd.DataFrame:
+    """Of each object id, onset and end, and when x and y know it; the truth knows it at once."""
+    found: list[dict[str, Any]] = []
+    for name, onset_s, ended_s, *known in rows:
+        for configuration, known_s in zip(NAMES, (onset_s, *known), strict=True):
+            found.append({
+                "configuration": configuration, "object_id": name, "onset_s": onset_s, "ended_s": ended_s,
+                "detection_s": known_s, "detected": known_s is not None,
+                "time_to_detection_s": None if known_s is None else known_s - onset_s,
+            })  # fmt: skip
+    columns = ["onset_s", "ended_s", "detection_s", "time_to_detection_s"]
+    return pd.DataFrame(found).astype(dict.fromkeys(columns, float))
+
+
+def shown(rows: pd.DataFrame) -> tuple[list[str], list[str]]:
+    replay, asked = ready(**PLACES)
+    chosen = choose_shown_objects(replay, asked, rows)
+    return [replay.scene.object_ids[k] for k in chosen.object_ix], list(chosen.too_short)
+
+
+def test_difference_times_nearness() -> None:
+    """2 m, 20 m and 60 m from the path: 1.04, 5 and 37 times less than on it; differences of 1, 4 and 8 s."""
+    rows = table(
+        ("near", 2.0, 10.0, 2.0, 3.0), ("beside", 2.0, 10.0, 2.0, 6.0), ("far", 2.0, 10.0, 2.0, None),
+        ("alike", 2.0, 10.0, 4.0, 4.0),
+    )  # fmt: skip
+    assert shown(rows) == (["near", "beside", "far", "alike"], [])
+    rows = rows.replace({"detection_s": {3.0: 2.5}, "time_to_detection_s": {1.0: 0.5}})
+    assert shown(rows)[0] == ["beside", "near", "far", "alike"], "4 s / 5 is more than 0.5 s / 1.04"
+
+
+def test_the_path_is_that_of_the_next_three_seconds() -> None:
+    """An object that the ego has passed 60 m ago, and one it will pass after 10 s, are not on its way."""
+    rows = table(("behind", 2.0, 10.0, 2.0, 6.0), ("beside", 2.0, 10.0, 2.0, 6.0))
+    assert shown(rows)[0] == ["beside", "behind"]
+
+
+def test_two_seconds_before_and_after() -> None:
+    rows = table(
+        ("early", 1.9, 10.0, 2.0, 9.0), ("short", 5.0, 6.9, 5.0, None), ("near", 2.0, 4.0, 2.0, 2.1),
+    )  # fmt: skip
+    assert shown(rows) == (["near"], ["early", "short"])
+    assert shown(rows[rows["object_id"] != "near"]) == (["early", "short"], ["early", "short"]), "better than none"
+
+
+def test_six_at_most_and_none_of_none() -> None:
+    replay, asked = ready(**PLACES)
+    assert len(choose_shown_objects(replay, asked, table(*((n, 2.0, 9.0, 2.0, 3.0) for n in PLACES))).object_ix) == 6
+    assert choose_shown_objects(replay, asked, table(("near", 2.0, 9.0, 2.0, 3.0))[:0]).object_ix == ()
+
+
+def test_with_one_configuration_the_difference_is_to_the_truth() -> None:
+    rows = table(("alike", 2.0, 10.0, 2.2, 0.0), ("near", 2.0, 10.0, 4.0, 0.0))
+    assert shown(rows[rows["configuration"] != "y"])[0] == ["near", "alike"]
+
+
+def test_it_opens_while_some_know_and_others_do_not() -> None:
+    _, asked = ready()
+    slow, alike = table(("a", 3.0, 9.0, 3.4, 5.0)), table(("b", 2.0, 9.0, 4.0, 4.0))
+    assert find_opening_s(asked, [slow]) == pytest.approx(3.9), "half a second after the first"
+    assert find_opening_s(asked, [alike, slow]) == pytest.approx(3.9)
+    assert find_opening_s(asked, [table(("a", 3.0, 9.0, 3.4, 3.6))]) == pytest.approx(3.5), "in the middle"
+    assert find_opening_s(asked, [table(("a", 3.0, 9.0, None, 4.0))]) == pytest.approx(4.5), "one never"
+    assert find_opening_s(asked, [alike]) == pytest.approx(1.5), "no difference: just before the onset"
+    assert find_opening_s(asked, []) is None
+
+
+def test_what_is_too_short_is_listed(tmp_path: Path) -> None:
+    scene = recording(
+        [
+            Thing("ego", "car", standing(0, 0)),
+            Thing("7", "car", standing(30, 5), there=lambda t: t > 2.95),
+            Thing("8", "car", standing(30, -5)),
+        ],
+        until_s=6.0,
+    )
+    made = make(tmp_path / "x.rrd", scene, measure={"onset": {"kind": "appears"}})
+    [text] = static(made.path, "/difference")["TextDocument:text"]
+    assert "Too short to judge: 8." in text
+    assert "7 car" in text
+    assert "8 car" not in text
