@@ -26,7 +26,7 @@ class Column:
     `kind`: text, text or null, numbers, whole numbers, true or false, or lists of these. `when`: what an experiment
     has to ask for (`braking`, `conflict`, `accuracy`; `link`: a link, `ready` or `sends`; `fleet`: units that only some
     runs have); empty: it is always there. `compared`: whether comparisons read it. `single`: in single precision.
-    `full`: no row is without it. `infinite`: numbers may be infinite.
+    `full`: no row is without it. `infinite`: numbers may be infinite. `among`: the words it may have; empty: any.
     """
 
     name: str
@@ -37,6 +37,7 @@ class Column:
     single: bool = False
     full: bool = False
     infinite: bool = False
+    among: tuple[str, ...] = ()
 
     @property
     def arrow(self) -> pa.DataType:
@@ -108,12 +109,16 @@ _IN_CONFLICT = Column("conflict", "true or false",
 
 
 def _as_in_summary(*names: str, kind: str = "numbers", when: str = "") -> tuple[Column, ...]:
-    return tuple(Column(name, kind, METRIC[name].help, when) for name in names)
+    return tuple(Column(name, kind, METRIC[name].help, when, among=METRIC[name].among) for name in names)
 
 
 _SUMMARY = (
     _CONFIGURATION,
-    *(Column(metric.name, metric.kind, metric.help, when) for when, of in METRICS_OF.items() for metric in of),
+    *(
+        Column(metric.name, metric.kind, metric.help, when, among=metric.among)
+        for when, of in METRICS_OF.items()
+        for metric in of
+    ),
 )
 _SUMMARY_BY = (
     Column("by", "text", "what rows are grouped by, as on the command line: `class`, `log*class`"),

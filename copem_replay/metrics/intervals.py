@@ -45,7 +45,7 @@ _TELLS = {
     "objects": "how far other objects of this drive may differ; nothing about other drives",
     "runs": "how far other draws of the same models may differ for this one object; nothing about other traffic",
 }
-_UNITS = {"logs": ("log", ""), "objects": ("object", " of this drive"), "runs": ("run", " of this one object")}
+CLUSTERS = {"logs": ("log", ""), "objects": ("object", " of this drive"), "runs": ("run", " of this one object")}
 
 
 def choose_over(logs: int, objects: int) -> str | None:
@@ -75,7 +75,7 @@ def describe_clusters(over: str, number: int | None = None, fewest: int | None =
 
     `fewest`: where intervals are over different numbers of clusters, up to `number`.
     """
-    noun, whose = _UNITS[over]
+    noun, whose = CLUSTERS[over]
     counted = f"{noun}s" if number is None else count_noun(number, noun)
     up_to = "" if fewest is None or fewest == number else f"{fewest} to "
     return f"{up_to}{counted}{whose}: {_TELLS[over]}"

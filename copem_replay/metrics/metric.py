@@ -77,7 +77,7 @@ class Metric:
     with equal statistics share the function, which is called once. `value`: computes the value from the sums; None: no
     sample. `better`: 1 more, −1 less, 0 neither. `part`: the table that shows the metric on the terminal and in the
     report; empty: none. `header`: of its column in the report, with the unit; empty: made of the name. `compared`:
-    None: it is not compared. `kind`: as of a column of results.
+    None: it is not compared. `kind`, `among`: as of a column of results.
     """
 
     name: str
@@ -89,6 +89,7 @@ class Metric:
     header: str = ""
     compared: Compared | None = None
     kind: str = "numbers"
+    among: tuple[str, ...] = ()
 
 
 def compared_metric(name: str, better: Literal[-1, 1], part: str, header: str, compared: Compared) -> Metric:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from copem_replay.core.tracks import Bool, Float
 from copem_replay.metrics.accuracy.metrics import ACCURACY
 from copem_replay.metrics.braking.driver import UNRESOLVED
-from copem_replay.metrics.intervals import EXACT, NOTHING_DRAWN, choose_clusters, exact_limits, limit_share
+from copem_replay.metrics.intervals import CLUSTERS, EXACT, NOTHING_DRAWN, choose_clusters, exact_limits, limit_share
 from copem_replay.metrics.metric import LINK, OUTPUT, Compared, Metric, MetricInputs, compared_metric
 from copem_replay.metrics.survival import (
     CENSORED,
@@ -277,7 +277,7 @@ def _limit_metrics(
         row(f"{of}_high", value=attrgetter("high"), help=f"upper limit of {of}, 95 %"),
         row(f"{prefix}interval", value=attrgetter("kind"), kind="text",
             help=f"kind of the limits of {of}, or why there are none"),
-        row(f"{prefix}interval_over", value=attrgetter("over"), kind="text",
+        row(f"{prefix}interval_over", value=attrgetter("over"), kind="text", among=tuple(CLUSTERS),
             help=f"what the limits of {of} are over: logs, objects of one log or runs of one object"),
         row(f"{prefix}interval_clusters", value=attrgetter("clusters"),
             help=f"how many of these the limits of {of} are over"),

@@ -111,6 +111,9 @@ def check_values(path: Path, column: Column, values: Any, *, optional: bool = Fa
         raise InputError(
             f"{path}: column {column.name}: expected {_IN_EVERY_ROW[kind]} in every row, found none in some; {AGAIN}"
         )
+    if column.among and (others := set(pc.unique(values).drop_null().to_pylist()).difference(column.among)):
+        expected = f"one of {', '.join(column.among)}"
+        raise InputError(f"{path}: column {column.name}: expected {expected}, found {min(others)!r}; {AGAIN}")
     if pa.types.is_list(values.type) or pa.types.is_large_list(values.type):
         values = pc.list_flatten(values)
     if column.infinite or not (pa.types.is_integer(values.type) or pa.types.is_floating(values.type)):
