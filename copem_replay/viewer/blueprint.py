@@ -128,11 +128,14 @@ class RecordingContent:
         return make_time_axis(*self.axes_s[object_ix])
 
     def title(self, configuration: str, suffix: str = "") -> str:
-        """The title of a view: “bursty · 18 of 24 known · 3 false”, over the run; `suffix`: after the name."""
+        """The title of a view: “bursty · whole run: 18 of 24 known, 3 false”; `suffix`: after the name.
+
+        False entries are left out as long as they are not counted.
+        """
         rows = self.table[self.table["configuration"] == configuration]
-        false = self.false.get(configuration, 0)
-        known = [f"{rows['detected'].sum()} of {len(rows)} known"] if len(rows) else []
-        return " · ".join([configuration + suffix, *known, *([f"{false} false"] if false else [])])
+        counts = [f"{rows['detected'].sum()} of {len(rows)} known"] if len(rows) else []
+        counts += [f"{self.false[configuration]} false"] if configuration in self.false else []
+        return f"{configuration}{suffix} · whole run: {', '.join(counts)}" if counts else configuration + suffix
 
     def under(self, object_ix: int) -> list[str]:
         """Entities of the lanes of lists under those of an object."""

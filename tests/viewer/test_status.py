@@ -387,7 +387,10 @@ def test_false_entries_are_crossed_and_counted(tmp_path: Path) -> None:
         around_m = np.linalg.norm(ends[:12, 1] - ends[:12, 0], axis=1).sum()
         half_m = fused.length_m[0, entry] + fused.width_m[0, entry]
         assert around_m == pytest.approx(0.6 * 2 * half_m, abs=1e-5), "three fifths of the outline"
-    assert titles(made.path) >= {"gnn · 0 of 1 known · 1 false", "ideal · 1 of 1 known"}
+    assert titles(made.path) >= {
+        "gnn · whole run: 0 of 1 known, 1 false",
+        "ideal · whole run: 1 of 1 known, 0 false",
+    }
 
 
 def titles(path: Path) -> set[str]:
