@@ -39,7 +39,9 @@ def info(
     logs: LogFiles,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON: one array, an entry per recording.")] = False,
     together: OneDrive = False,
-    maps: Annotated[list[Path] | None, typer.Option("--map", help="A map in the frame of the log. Repeatable.")] = None,
+    maps: Annotated[
+        list[Path] | None, typer.Option("--map", metavar="FILE", help="A map in the frame of the log. Repeatable.")
+    ] = None,
 ) -> int:
     """Describe recordings: what is in them, what is missing.
 

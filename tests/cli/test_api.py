@@ -278,7 +278,10 @@ class TestFolders:
         row = results.detections.iloc[0]
         cr.view(results, object_id=str(row["object_id"]), log=str(row["log"]))
         at_s = {file: pytest.approx(max(float(row["onset_s"]) - 0.5, 0.0))}
-        assert called == [([file], at_s)] * 2
+        (files, opens_s), sought = called
+        assert (files, sought) == ([file], ([file], at_s))
+        times_s = results.detections["detection_s"].fillna(np.inf)
+        assert times_s.min() < opens_s[file] < times_s.max(), "some know it and others do not yet"
         with pytest.raises(cr.InputError, match=r"^out/e: no recording of log nowhere has the measured object '2'$"):
             cr.view("out/e", object_id="2", log="nowhere")
         with pytest.raises(cr.InputError, match=r"^--log: expected --object ID with it, found none$"):

@@ -343,7 +343,7 @@ def test_a_run_is_drawn_from_the_log_where_it_lies(here: Path, drives: Bucket) -
     drive(here / "other.mcap", first=7, host=7)
     drives.put(here / "other.mcap", "drives/b.mcap")
     with pytest.raises(cr.RecordingError, match=rf"^{drives.url}/drives/b.mcap: expected the log that was replayed"):
-        results.recording("b", results.experiment)
+        cr.load_results("out").recording("b", results.experiment)
 
 
 def test_two_hundred_names_are_replayed_with_few_words_and_found_again_unread(

@@ -205,7 +205,7 @@ def outcome_of_map(path: Path) -> dict[str, Any]:
         try:
             asked = MapFile.model_validate({"file": str(path), "frame": "same", "agreement": "ignore"})
             added, _ = add_maps(recording, [asked])
-            estimate_shift(recording.scene, recording.truth, asked.site.lanes)
+            estimate_shift(recording.scene, recording.truth, asked.place(None).lanes)
             said += added.notes
         except ValidationError as error:
             end = "refused"
