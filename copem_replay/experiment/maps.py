@@ -97,14 +97,12 @@ class MapFile(Frozen):
     def place(self, frame: OnEarth | None) -> SiteMap:
         """The map in metres of a log with this frame. Raises InputError: its place is not known."""
         site, offset_m = self.read_once(), np.array(self.offset_m)
-        if not site.degrees:
-            if self.frame != "same":
-                raise InputError(f"{self.file}: its places are metres: expected `frame: same` where they are the log's")
+        if self.frame == "same":
             return site.moved(lambda at_m: at_m + offset_m)
-        if frame is None or self.frame == "same":
-            raise InputError(
-                f"{self.file}: its places are degrees: expected a map in metres of the log, with `frame: same`"
-            )
+        if not site.degrees:
+            raise InputError(f"{self.file}: its places are metres: expected `frame: same` where they are the log's")
+        if frame is None:
+            raise InputError(f"{self.file}: its places are degrees: expected metres of the log, with `frame: same`")
         return site.moved(lambda degrees: frame.from_wgs84(degrees[:, ::-1]) + offset_m)
 
     def choose_kinds(self, site: SiteMap) -> list[MapSolid]:

@@ -201,9 +201,7 @@ def test_too_many_parts_are_refused(folder: Path, monkeypatch: pytest.MonkeyPatc
 
 def test_degrees_need_a_place_on_earth(folder: Path) -> None:
     (folder / "site.geojson").write_text(houses((25, 11, 35, 17)))
-    with pytest.raises(
-        InputError, match="its places are degrees: expected a map in metres of the log, with `frame: same`"
-    ):
+    with pytest.raises(InputError, match="its places are degrees: expected metres of the log, with `frame: same`"):
         read(folder, "maps: [{file: site.geojson}]")
     with pytest.raises(InputError, match="its places are degrees, not metres of the log: no `frame: same`"):
         read(folder, "maps: [{file: site.geojson, frame: same}]")
