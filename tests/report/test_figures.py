@@ -570,7 +570,14 @@ class TestCurves:
         columns = ["object_id", "time_to_detection_s", "probability"]
         rows = [("2", 0.0, 0.5), ("2", 1.0, 0.5), ("3", 1.0, 0.5), ("3", None, 0.5), ("3", 2.0, 0.0)]
         exact = pd.DataFrame(rows, columns=columns).assign(log="drive", configuration="GT", episode=0, began="crossed")
-        exact = exact.assign(onset_s=0.0, ended_s=5.0, object_class="car", ended_by="log_end", conflict=False)
+        exact = exact.assign(
+            onset_s=0.0,
+            ended_s=5.0,
+            object_class="car",
+            ended_by="log_end",
+            conflict=False,
+            detection_s=exact["time_to_detection_s"],
+        )
         exact = exact.reindex(columns=[*exact, *TABLES["exact.parquet"].kinds("braking").keys() - {*exact}])
         exact.to_parquet(mine / "exact.parquet")
         figure = curves_figure(read_results(mine), configurations=["GT"])
