@@ -1,11 +1,11 @@
-# make demo | test | test-random | bench | check | notebooks | pictures: each sets up .venv on its first call and never again
+# make demo | test | test-random | bench | check | notebooks | pictures | release: each sets up .venv on its first call and never again
 # while pyproject and requirements stay.
 # Another Python beside it: make test PYTHON=python3.13 VENV=.venv-3.13
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-random bench check notebooks pictures requirements clean
+.PHONY: demo test test-random bench check notebooks pictures release requirements clean
 
 # Packages come by hash, through uv where it is there: what runs need, and for all but `demo` the rest.
 INSTALL := $(if $(shell command -v uv),uv pip install --quiet --python $(BIN)/python,$(BIN)/python -m pip install --quiet --disable-pip-version-check)
@@ -50,7 +50,16 @@ notebooks: $(VENV)/.rest
 pictures: $(VENV)/.rest
 	$(BIN)/python tools/pictures.py
 
-# Both files of pins anew, by uv; PINS= takes newer versions.
+# Builds, checks and tries a release, writes its section of the changelog and tags it: docs/develop/release.md.
+$(VENV)-release/.installed: requirements-release.txt
+	$(PYTHON) -m venv $(VENV)-release
+	$(VENV)-release/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes --requirement requirements-release.txt
+	touch $@
+
+release: $(VENV)-release/.installed
+	$(VENV)-release/bin/python tools/release.py $(RELEASE)
+
+# The files of pins anew, by uv; PINS= takes newer versions.
 PINS := --constraint requirements.txt --constraint requirements-dev.txt
 COMPILE := uv pip compile --quiet pyproject.toml --universal --python-version 3.11 --generate-hashes --no-annotate --no-emit-index-url --no-header
 requirements:
@@ -58,7 +67,10 @@ requirements:
 	$(COMPILE) $(PINS) --extra dev --extra bench $$(sed -n 's/^\([A-Za-z0-9._-]*\)==.*/--no-emit-package \1/p' requirements.new) --output-file requirements-dev.new
 	(sed -n '/^#/p' requirements.txt; cat requirements.new) > requirements.made && mv requirements.made requirements.txt
 	(sed -n '/^#/p;/^-r/p' requirements-dev.txt; cat requirements-dev.new) > requirements.made && mv requirements.made requirements-dev.txt
-	rm requirements.new requirements-dev.new
+	$(PYTHON) -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["release"], sep="\n")' \
+	  | $(subst pyproject.toml,-,$(COMPILE)) $(PINS) --constraint requirements-release.txt --output-file requirements-release.new
+	(sed -n '/^#/p' requirements-release.txt; cat requirements-release.new) > requirements.made && mv requirements.made requirements-release.txt
+	rm requirements.new requirements-dev.new requirements-release.new
 
 clean:
-	rm -rf .venv .venv-* out build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv .venv-* out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

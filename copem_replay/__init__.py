@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 from copem_replay.core.compiled import cache_note as _cache_note
 
 if TYPE_CHECKING:
+    __version__: str
     from copem_replay.api import plot
     from copem_replay.api.fit import FittedPem, fit
     from copem_replay.api.recordings import (
@@ -177,6 +178,8 @@ _cache_note()  # before Numba is imported
 if not TYPE_CHECKING:  # with it type checkers would accept every name
 
     def __getattr__(name: str) -> object:
+        if name == "__version__":
+            return _importlib.import_module("importlib.metadata").version("copem-replay")
         if name not in _MODULE:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         if name == "plot":
@@ -185,4 +188,4 @@ if not TYPE_CHECKING:  # with it type checkers would accept every name
 
 
 def __dir__() -> list[str]:
-    return sorted({*__all__, *(name for name in globals() if name.startswith("__"))})
+    return sorted({*__all__, "__version__", *(name for name in globals() if name.startswith("__"))})

@@ -18,6 +18,7 @@ try:  # an interrupt during the imports, too, ends without a traceback
     from typing import Annotated, Any
 
     import typer
+    import typer.core
 
     from copem_replay.cli import convert, fit, inspect, results, run
     from copem_replay.cli.terminal import print_problems
@@ -28,9 +29,24 @@ except KeyboardInterrupt:
     print("interrupted", file=sys.stderr)
     sys.exit(130)
 
+
+class _Grouped(typer.core.TyperGroup):
+    """The commands of `--help` in groups; those of no group are of the first."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write the names and the first line of each."""
+        named = [[command.__name__ for command in commands] for commands in GROUPS.values()]
+        named[0] += [name for name in self.commands if not any(name in group for group in named)]
+        width = formatter.width - max(map(len, self.commands)) - 6
+        for title, names in zip(GROUPS, named, strict=True):
+            with formatter.section(title):
+                formatter.write_dl([(name, self.commands[name].get_short_help_str(width)) for name in names])
+
+
 app = typer.Typer(
+    cls=_Grouped,
     help="Replay recorded traffic through perception error models of one or many cooperating units.",
-    add_completion=False,
+    add_completion=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -53,25 +69,16 @@ def version(
         raise InputError(f"copem-replay: expected a command, one of {commands}; --help tells more")
 
 
-for command in (
-    inspect.info,
-    inspect.init,
-    inspect.check,
-    run.run,
-    fit.fit,
-    results.compare,
-    run.why,
-    results.verdict,
-    results.history,
-    results.plot,
-    results.film,
-    results.report,
-    results.view,
-    results.layout,
-    inspect.schema,
-    inspect.samples,
-):
-    app.command()(command)
+GROUPS = {
+    "From a recording to an experiment": (inspect.info, inspect.init, inspect.check, inspect.schema, inspect.samples),
+    "Replay": (run.run, run.why, fit.fit),
+    "Judge": (results.compare, results.verdict, results.history),
+    "Look": (results.view, results.report, results.plot, results.film, results.layout, results.export),
+}
+"""All commands but `convert`, by what they are for."""
+for commands_of_group in GROUPS.values():
+    for command in commands_of_group:
+        app.command()(command)
 app.add_typer(convert.app, name="convert")
 
 
@@ -138,6 +145,8 @@ def _call_command(arguments: list[str]) -> int:
     """Run a command and return its exit code. Typer's own `main` would print errors and interrupts its own way."""
     command = typer.main.get_command(app)
     _hide_argument_types(command)
+    if "_COPEM_REPLAY_COMPLETE" in os.environ:  # a shell asks what may follow
+        command.main(prog_name="copem-replay")
     try:
         with command.make_context("copem-replay", arguments) as context:
             code = command.invoke(context)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
 
 import copem_replay as cr
 from copem_replay.cli import main as cli
@@ -337,3 +338,39 @@ class TestRecordings:
         with pytest.raises(cr.RecordingError) as refused:
             cr.draft_experiment("bad.mcap")
         assert refused.value.problems == (found["reason"],)
+
+
+class TestShownShortly:
+    """What a notebook prints of objects, and the versions of names that it completes."""
+
+    def test_recordings_and_tracks_fit_a_line(self) -> None:
+        recording = cr.read_recording(ROOT / "logs" / "tc016d.mcap")
+        assert repr(recording) == "Recording(tc016d.mcap, ground_truth: 9 objects, 81 frames, 8.0 s)"
+        assert repr(recording.truth) == "Tracks(729 states of 9 tracks in 81 lists of truth, runs: 1)"
+
+    def test_the_truth_as_a_table(self) -> None:
+        recording = cr.read_recording(ROOT / "logs" / "tc016d.mcap")
+        table = recording.truth.to_dataframe(recording.scene)
+        assert len(table) == 729
+        assert table["captured_s"].is_monotonic_increasing
+        ego = table[table["object_id"] == "1"]
+        assert (ego["object_class"] == "car").all()
+        # 10 m/s over 8 s.
+        assert ego["x_m"].iloc[-1] - ego["x_m"].iloc[0] == pytest.approx(80.0)
+        assert "object_id" not in recording.truth.to_dataframe()
+
+    def test_names_of_plot_are_figures_and_what_writes_them(self) -> None:
+        assert dir(cr.plot) == sorted(cr.plot.__all__)
+
+    def test_the_version_is_the_installed_one(self) -> None:
+        from importlib.metadata import version
+
+        assert cr.__version__ == version("copem-replay")
+
+
+def test_an_experiment_read_by_yaml_1_1_has_its_on() -> None:
+    """`yaml.safe_load` reads the key `on` as True."""
+    loaded = yaml.safe_load((ROOT / "logs" / "tc016d.yaml").read_text())
+    assert any(True in unit for unit in loaded["units"].values())
+    loaded["logs"] = [str(ROOT / "logs" / "tc016d.mcap")]
+    assert cr.load_experiment(loaded).units["ego"].on == "ego"

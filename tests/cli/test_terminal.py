@@ -33,8 +33,8 @@ configurations:
   gnn: {units: all, latency_s: {ego: 0, default: 0.3}, fusion: {kind: gnn}}
   a fusion of two units, with a long name: {units: all, latency_s: 1.0, fusion: {kind: gnn}}
 """
-COMMANDS = ("", "info", "init", "check", "run", "fit", "compare", "why", "verdict", "history", "plot", "film",
-            "report", "view", "layout", "schema", "samples", "convert")  # fmt: skip
+COMMANDS = ("", "info", "init", "check", "schema", "samples", "convert", "run", "why", "fit", "compare", "verdict",
+            "history", "view", "report", "plot", "film", "layout", "export")  # fmt: skip
 FORMATS = ("argoverse2", "scenarionet", "openlabel", "commonroad", "sumo", "csv")
 
 
@@ -85,9 +85,11 @@ class TestWidth:
 
     def test_a_command_is_one_line_of_help(self, show: Show, width: int) -> None:
         lines = show(width, "--help")
-        commands = lines[lines.index("Commands:") + 1 :]
-        assert [line.split()[0] for line in commands if line] == list(COMMANDS[1:])
-        assert all(line.endswith(".") for line in commands if line)
+        groups = lines[lines.index("From a recording to an experiment:") :]
+        assert [line for line in groups if line.endswith(":")][1:] == ["Replay:", "Judge:", "Look:"]
+        commands = [line for line in groups if line.startswith("  ")]
+        assert [line.split()[0] for line in commands] == list(COMMANDS[1:])
+        assert all(line.endswith(".") for line in commands)
 
     def test_info(self, show: Show, here: Path, width: int) -> None:
         more: list[Topic] = [truth_topic([], name="perception/object_recognition/tracking/objects_of_the_roadside")]

@@ -24,7 +24,7 @@ def read_pins(file: str) -> dict[str, tuple[str, list[str]]]:
     return {canonicalize_name(one[1]): (one[2], one[4].split()) for one in found if one}
 
 
-RUNS, REST = read_pins("requirements.txt"), read_pins("requirements-dev.txt")
+RUNS, REST, RELEASE = (read_pins(f"requirements{of}.txt") for of in ("", "-dev", "-release"))
 
 
 def test_every_dependency_has_both_bounds_and_the_pin_is_within() -> None:
@@ -43,4 +43,9 @@ def test_every_extra_is_pinned_and_what_is_compiled_has_files_for_many_platforms
         for needed in map(Requirement, project["optional-dependencies"][name]):
             if needed.name != "copem-replay":
                 assert needed.specifier.contains(pins[canonicalize_name(needed.name)][0]), str(needed)
+    for needed in map(Requirement, project["optional-dependencies"]["release"]):
+        assert needed.specifier.contains(RELEASE[canonicalize_name(needed.name)][0]), str(needed)
+    assert {name: pin for name, pin in RELEASE.items() if name in pins} == {
+        name: pin for name, pin in pins.items() if name in RELEASE
+    }, "one version of each package"
     assert all(len(pins[name][1]) > 20 for name in ("numpy", "pandas", "pyarrow", "scipy", "shapely"))
