@@ -32,7 +32,8 @@ class Explanation:
     """Tables of the parts that were asked for; None: not asked for, or nothing it applies to.
 
     `causes`: seconds of each configuration by cause. `units`: what each of its units is worth. `triage`: its late
-    episodes in groups, those that cost most first. `sensitivity`: time unknown by variation of the PEMs, run by run;
+    episodes in groups, those that cost most first; `late`: the episodes, each with its causes in words.
+    `sensitivity`: time unknown by variation of the PEMs, run by run;
     `orders`: pairs that change order. `notes`: what was left out, and why. Columns: docs/guide/why.md.
 
     >>> cr.Explanation(notes=("nothing was asked for",)).files
@@ -42,6 +43,7 @@ class Explanation:
     causes: pd.DataFrame | None = None
     units: pd.DataFrame | None = None
     triage: pd.DataFrame | None = None
+    late: pd.DataFrame | None = None
     sensitivity: pd.DataFrame | None = None
     orders: pd.DataFrame | None = None
     notes: tuple[str, ...] = ()
@@ -51,16 +53,22 @@ class Explanation:
         """The tables by the names of their files."""
         tables = {
             "why.csv": self.causes, "units.csv": self.units, "triage.csv": self.triage,
-            "sensitivity.csv": self.sensitivity,
+            "late_episodes.csv": self.late, "sensitivity.csv": self.sensitivity,
         }  # fmt: skip
         return {name: table for name, table in tables.items() if table is not None}
 
     def save(self, folder: AnyPath) -> list[Path]:
-        """Write the tables as CSV, all or none; those that are there are replaced. Raises OutputError."""
+        """Write the tables as CSV, all or none; those that are there are replaced. Raises OutputError.
+
+        In a results folder they go when its results go.
+        """
+        from copem_replay.results.folder import add_to_made_list
+
         place = Path(folder)
         with atomic_files(place, list(self.files)) as scratch:
             for name, table in self.files.items():
                 table.to_csv(scratch / name, index=False, lineterminator="\n")
+            add_to_made_list(place.parent, [place / name for name in self.files])
         return [place / name for name in self.files]
 
     def blocks(self, width: int | None = None) -> Iterator[list[str]]:
@@ -121,7 +129,7 @@ def _explain(
 ) -> Explanation:
     from copem_replay.pipeline.sensitivity import compare_orders, vary_pems
 
-    notes, tables = list[str](), {part: list[pd.DataFrame]() for part in PARTS}
+    notes, tables = list[str](), {part: list[pd.DataFrame]() for part in (*PARTS, "late")}
     if 1 < experiment.runs < _FEW_RUNS:
         notes.append(f"{experiment.runs} runs: standard errors are over these; {_FEW_RUNS} make them about 2 %")
     for name in asked or [
@@ -142,7 +150,9 @@ def _explain(
             orders = compare_orders(varied)
         except ExperimentError as error:
             notes.append(str(error))
-    return Explanation(found.get("causes"), found.get("units"), found.get("triage"), varied, orders, tuple(notes))
+    return Explanation(
+        found.get("causes"), found.get("units"), found.get("triage"), found.get("late"), varied, orders, tuple(notes)
+    )
 
 
 def _explain_configuration(
@@ -150,7 +160,7 @@ def _explain_configuration(
 ) -> Iterator[tuple[str, pd.DataFrame | ExperimentError]]:
     """The tables of a configuration by part, or why there is none."""
     from copem_replay.pipeline.causes import Counterfactuals, share_lateness, tabulate_causes
-    from copem_replay.pipeline.triage import group_late_episodes, rank_groups
+    from copem_replay.pipeline.triage import group_late_episodes, list_late_episodes, rank_groups
     from copem_replay.pipeline.worth import compute_unit_worths
 
     def attempt(part: str, work: Callable[[], pd.DataFrame]) -> Iterator[tuple[str, pd.DataFrame | ExperimentError]]:
@@ -171,8 +181,9 @@ def _explain_configuration(
     if "causes" in parts:
         yield from attempt("causes", lambda: tabulate_causes(shares))
     if "triage" in parts:
-        groups = [group_late_episodes(replays, of)[0] for replays, of in shares]
+        groups, episodes = zip(*(group_late_episodes(replays, of) for replays, of in shares), strict=True)
         yield "triage", rank_groups(pd.concat([of for of in groups if len(of)] or groups[:1], ignore_index=True))
+        yield "late", pd.concat([list_late_episodes(of) for of in episodes], ignore_index=True)
     if "units" in parts:
         yield from attempt("units", lambda: compute_unit_worths(logs, name, units).table)
 

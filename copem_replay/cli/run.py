@@ -302,21 +302,25 @@ def why(
         str | None, typer.Option(metavar="A,B,…", help="Units whose worth is asked for [all but the ego's].")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Folder of the tables [out/<experiment>_why].")
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Folder of the tables [out/<experiment>_why, FOLDER/why]."),
     ] = None,
 ) -> int:
     """Explain lateness: causes, worth of units, triage, sensitivity.
 
-    Each is a replay on the same draws without something. Without any of the four, all are computed.
+    Each is a replay on the same draws without something. Without any of the four, all are computed. Of a results folder
+    the tables are put into it, and its report shows them.
     """
     from copem_replay.api.why import PARTS
     from copem_replay.api.why import why as explain
 
+    folder = out or Path("out") / f"{experiment.stem}_why"
+    if experiment.is_dir():
+        folder, experiment = out or experiment / "why", experiment / "experiment.yaml"
     asked = [part for part, on in zip(PARTS, (causes, units, triage, sensitivity), strict=True) if on]
     found = explain(experiment, configurations=configuration, parts=asked or PARTS, units=split_names(unit))
     print_notes(found.notes)
     print_blocks(list(found.blocks(width_of(sys.stdout))))
-    folder = out or Path("out") / f"{experiment.stem}_why"
     written = found.save(folder)
     tidy_outputs(written)
     print_line(f"{', '.join(path.name for path in written)} in {folder}")

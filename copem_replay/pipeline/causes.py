@@ -169,7 +169,7 @@ CAUSES = (
     Cause("rate", "unit", "between two lists of a unit", _list_all_frames),
     Cause("outages", "unit", "outages of units", lambda e: _change_units(e, outages=None)),
     Cause("range", "sensor", "out of range or view", lambda e: change_pems(e, _widen)),
-    Cause("missed", "sensor", "in sight, and missed", lambda e: change_pems(e, change_couples(_list_whatever_shows))),
+    Cause("missed", "sensor", "missed in sight", lambda e: change_pems(e, change_couples(_list_whatever_shows))),
     Cause("memory", "sensor", "missed in list after list", lambda e: change_pems(e, _forget)),
     Cause("processing", "unit", "processing of units", lambda e: _change_units(e, ready=None)),
     Cause("sends", "radio", "left out by the sending rule", lambda e: _change_units(e, sends=None)),

@@ -74,6 +74,13 @@ def group_late_episodes(
     return rank_groups(pd.DataFrame(grouped, columns=COLUMNS)), episodes
 
 
+def list_late_episodes(episodes: pd.DataFrame, late_s: float = LATE_S) -> pd.DataFrame:
+    """The rows of `late_episodes.csv`: episodes unknown for longer than `late_s` in the mean, with the words."""
+    late = episodes[episodes["unknown_s"] > late_s]
+    words = [describe_episode(episode) for _, episode in late.iterrows()]
+    return late.drop(columns="structural_share").assign(words=words).reset_index(drop=True)
+
+
 COLUMNS = [
     "log", "cause", "where", "episodes", "objects", "lost_s", "never_share", "structural_share", "example",
     "example_class", "example_onset_s",

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import html
+import re
 import sys
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
+import copem_replay as cr
 from copem_replay.cli import main as cli
+from copem_replay.core.errors import InputError
 from tests.helpers.experiments import changed, drive
 
 TEXT = changed("show: null")
@@ -33,7 +37,7 @@ def call(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
 def test_all_parts_of_all_configurations_with_units(call) -> None:  # type: ignore[no-untyped-def]
     code, said, notes = call("e.yaml")
     assert code == 0
-    assert said[-1] == "why.csv, units.csv, triage.csv, sensitivity.csv in out/e_why"
+    assert said[-1] == "why.csv, units.csv, triage.csv, late_episodes.csv, sensitivity.csv in out/e_why"
     causes = pd.read_csv("out/e_why/why.csv")
     assert list(dict.fromkeys(causes["configuration"])) == ["PEM", "coPEM"]
     late = causes[causes["configuration"] == "coPEM"].set_index("cause")
@@ -65,3 +69,64 @@ def test_wrong_input_is_a_line(call, words: tuple[str, ...], line: str) -> None:
     code, _, problems = call("e.yaml", *words)
     assert (code, problems[-1]) == (2, line)
     assert not Path("out").exists()
+
+
+@pytest.fixture
+def results(call) -> Path:  # type: ignore[no-untyped-def]
+    """A results folder of the drive, explained; with 1.5 s of latency, so that an object is late."""
+    text = Path("e.yaml").read_text()
+    Path("e.yaml").write_text(text.replace("latency_s: 0.5", "latency_s: 1.5"))
+    cr.run("e.yaml", jobs=1).save("results")
+    code, said, _ = call("results", "--causes", "--units", "--triage")
+    assert code == 0
+    assert said[-1] == "why.csv, units.csv, triage.csv, late_episodes.csv in results/why"
+    return Path("results")
+
+
+def test_the_report_of_a_folder_shows_what_why_put_there(results: Path) -> None:
+    """The table has the seconds of `why.csv`, rounded; stories say why, of the runs' mean."""
+    page = html.unescape(cr.write_report(results).read_text(encoding="utf-8"))
+    section = page[page.index('<section id="why">') :]
+    section = section[: section.index("</section>")]
+    causes = pd.read_csv(results / "why/why.csv")
+    rows = [re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", row) for row in re.findall(r"<tr>(.*?)</tr>", section)]
+    head = rows[0]
+    last = next(k for k, row in enumerate(rows) if row[0] == "all")
+    table = {row[0]: dict(zip(head, row, strict=True)) for row in rows[1 : last + 1]}
+    assert head == ["cause", "PEM", "coPEM"]
+    assert table["latency"] == {"cause": "latency", "PEM": "", "coPEM": "1.50"}
+    for name, of in causes.groupby("configuration"):
+        assert float(table["all"][str(name)]) == pytest.approx(of["added_s"].sum(), abs=0.006)
+    late = pd.read_csv(results / "why/late_episodes.csv", dtype={"object_id": str})
+    told = set(late["configuration"] + " " + late["words"])
+    stories = re.findall(r"Mean over all runs: (.*?)\.</p>", page)
+    assert stories
+    for line in stories:
+        assert all(part in told or part.endswith(" is not late") for part in line.split("; "))
+
+
+def test_without_why_the_report_has_no_such_section(call) -> None:  # type: ignore[no-untyped-def]
+    cr.run("e.yaml", jobs=1).save("results")
+    page = cr.write_report("results").read_text(encoding="utf-8")
+    assert 'id="why"' not in page
+    assert "Mean over all runs" not in page
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "line"),
+    [
+        ("why.csv", "", "results/why/why.csv: cannot be read"),
+        ("why.csv", "configuration,cause\nPEM,hidden\n", "results/why/why.csv: cannot be read"),
+        ("why.csv", "configuration,cause,added_s,error_s,gained_s\nPEM,hidden,much,0,0\n", "why.csv: cannot be read"),
+        ("late_episodes.csv", "configuration,log,object_id,onset_s\n", "expected a column words, found none"),
+    ],
+)  # fmt: skip
+def test_damaged_tables_are_refused(results: Path, name: str, text: str, line: str) -> None:
+    (results / "why" / name).write_text(text)
+    with pytest.raises(InputError, match=line):
+        cr.write_report(results)
+
+
+def test_they_go_with_the_results(results: Path) -> None:
+    cr.run("e.yaml", jobs=1).save(results, overwrite=True)
+    assert not (results / "why").exists() or not list((results / "why").iterdir())

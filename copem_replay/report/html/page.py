@@ -45,6 +45,7 @@ from copem_replay.report.html.tables import (
     summary_tables,
     verdicts_table,
 )
+from copem_replay.report.html.why import why_parts
 from copem_replay.results.folder import add_to_made_list
 from copem_replay.results.read import Results
 
@@ -162,6 +163,7 @@ def build_page(study: ReportData) -> str:
         _Section("differences-of-it", "Differences", _difference_parts(study)),
         *([_Section("stories", "Stories of single objects", story_parts(study))] if measured else []),
         *([_Section("play", "One run, side by side", [player])] if (player := player_section(study)) else []),
+        *([_Section("why", "Why it is late", [*why_parts(study.why)])] if study.why else []),
         *_figure_sections(study, ("late_paths", "trade_off")),
         _Section(
             "configurations-of-it",
