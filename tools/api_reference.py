@@ -65,7 +65,8 @@ def entries(name: str) -> Iterator[str]:
     elif inspect.isfunction(found):
         yield entry(f"cr.{name}", found.__doc__ or "", signature(found))
     elif inspect.isclass(found):
-        yield entry(f"cr.{name}", (found.__doc__ or "").rstrip() + "\n" + fields(found))
+        # Python 3.13 has no indentation in docstrings any more.
+        yield entry(f"cr.{name}", inspect.cleandoc(found.__doc__ or "") + "\n" + fields(found))
         for inner, member in vars(found).items():
             if inspect.isfunction(member) and not inner.startswith("_") and member.__doc__:
                 yield entry(f"cr.{name}.{inner}", member.__doc__, signature(member))
@@ -103,12 +104,12 @@ def fields(kind: type) -> str:
     """The fields of a class, for the end of its docstring."""
     if issubclass(kind, BaseModel):
         names = [field.alias or name for name, field in kind.model_fields.items() if name != "kind"]
-        return f"\n    Keys: {', '.join(f'`{name}`' for name in names)}." if names else ""
+        return f"\nKeys: {', '.join(f'`{name}`' for name in names)}." if names else ""
     if not dataclasses.is_dataclass(kind):
         return ""
     said = [f"`{field.name}: {field.type}`" for field in dataclasses.fields(kind)]
     said += [f"`{name}`" for name, member in vars(kind).items() if is_property(member) and not name.startswith("_")]
-    return f"\n    Fields: {', '.join(said)}."
+    return f"\nFields: {', '.join(said)}."
 
 
 def is_property(member: object) -> bool:

@@ -21,6 +21,7 @@ import signal
 import sys
 import tempfile
 import time
+import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -84,7 +85,9 @@ class Trial:
 
     def forked(self, seed: int, before: Callable[[], None] = lambda: None) -> int:
         """Begin a run; the process that does it."""
-        child = os.fork()
+        with warnings.catch_warnings():  # from Python 3.12 on: threads that idle in pools hold no lock
+            warnings.filterwarnings("ignore", "This process .* is multi-threaded", DeprecationWarning)
+            child = os.fork()
         if child:
             self.last = child
             return child

@@ -149,3 +149,7 @@ def write_film(
     every = configuration_colours(read.experiment.configurations)
     colours = {name: every[name] for name in choice.configurations}
     return draw_film(path, replayed, table, choice.object_id, colours, read.place)
+
+
+def __dir__() -> list[str]:
+    return [*__all__]

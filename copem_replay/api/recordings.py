@@ -79,7 +79,8 @@ def read_lists(path: AnyPath, topic: str, scene: Scene) -> Tracks:
 def compare_with_map(path: AnyPath, map_path: AnyPath) -> list[str]:
     """Lines on how well the lanes of a map agree with the traffic of a recording, and on the shift that is best.
 
-    The map's metres are taken for the recording's; nothing is moved. Raises InputError.
+    A map in degrees is placed by what the recording says of its place; metres are taken for the recording's. Nothing
+    is moved. Raises InputError.
     """
     import numpy as np
 
@@ -89,10 +90,14 @@ def compare_with_map(path: AnyPath, map_path: AnyPath) -> list[str]:
 
     recording, name = read_recording(path), os.path.basename(map_path)
     site = read_map(Path(map_path))
+    how = "taken as in the frame of the log"
     if site.degrees:
-        raise InputError(f"{map_path}: its places are degrees, not metres of the log")
+        if recording.place_said is None:
+            raise InputError(f"{map_path}: its places are degrees, and the recording does not say where it is")
+        frame, _ = recording.place_said.read()
+        site, how = site.moved(lambda degrees: frame.from_wgs84(degrees[:, ::-1])), "placed by what the recording says"
     found = f"{count_noun(len(site.lanes), 'lane')}, {count_noun(len(site.areas), 'area')}"
-    lines = [f"map {name}: {found}, {count_noun(len(site.solids), 'solid')}; taken as in the frame of the log"]
+    lines = [f"map {name}: {found}, {count_noun(len(site.solids), 'solid')}; {how}"]
     if site.lanes:
         truth = recording.truth
         borders = np.concatenate([line[:, :2] for lane in site.lanes for line in (lane.left_m, lane.right_m)])

@@ -78,6 +78,13 @@ def load_experiment(experiment: AnyExperiment) -> Experiment:
     return checked.model_copy(update={"logs": resolve_entries(checked, source)})
 
 
+def _name_on(data: Any) -> Any:
+    """Plain data in which the key `on` has its name; YAML 1.1, which `yaml.safe_load` reads, takes it for True."""
+    if isinstance(data, Mapping):
+        return {"on" if key is True else key: _name_on(value) for key, value in data.items()}
+    return [_name_on(value) for value in data] if isinstance(data, list) else data
+
+
 def load_source(experiment: AnyExperiment) -> tuple[ExperimentSource, Experiment | None]:
     """Plain data of an experiment; and the experiment, if it is an object.
 
@@ -86,7 +93,7 @@ def load_source(experiment: AnyExperiment) -> tuple[ExperimentSource, Experiment
     if isinstance(experiment, Experiment):
         return make_plain_source(experiment.as_written()), experiment
     if isinstance(experiment, Mapping):
-        return make_plain_source(experiment), None
+        return make_plain_source(_name_on(experiment)), None
     return read_experiment_file(Path(experiment)), None
 
 

@@ -1,4 +1,4 @@
-"""Commands on results folders: `compare`, `plot`, `film`, `report`, `view`, `layout`."""
+"""Commands on results folders: `compare`, `plot`, `film`, `report`, `view`, `layout`, `export`."""
 
 from __future__ import annotations
 
@@ -272,6 +272,28 @@ def report(
     path = write_report(folder, out, baseline=baseline, by=split_entries(by))
     tidy_leftovers(path)
     print_line(f"report in {path}")
+    return 0
+
+
+def export(
+    folder: ResultsFolder,
+    geojson: Annotated[
+        bool, typer.Option("--geojson", help="Units, paths of objects, lanes and houses, for maps of cities.")
+    ] = False,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder of the files [FOLDER/geojson].")] = None,
+) -> int:
+    """Write results in formats of other tools.
+
+    GeoJSON has longitudes and latitudes: only of logs whose place on earth is known (`frame`).
+    """
+    from copem_replay.results.geojson import write_geojson
+
+    if not geojson:
+        raise InputError("export: expected a format, --geojson, found none")
+    files, notes = write_geojson(folder, out)
+    print_notes(notes)
+    tidy_leftovers(files[0].parent, files[0].parent)
+    print_blocks([[str(file) for file in files]])
     return 0
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 
@@ -15,13 +15,6 @@ from copem_replay.core.tracks import Area, Float
 
 LaneKind = Literal["driving", "bicycle", "walking", "parking", "other"]
 AreaKind = Literal["crosswalk", "junction", "drivable", "parking"]
-
-
-class OnEarth(Protocol):
-    """Where a log's metres are on earth."""
-
-    def from_wgs84(self, points: Float) -> Float:
-        """Metres of the log (N, 2) of places (N, 2): latitude, longitude in degrees."""
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
+    import pandas as pd
     import shapely
+
+    from copem_replay.core.frame import Frame
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -107,7 +110,7 @@ class Scene:
 
     `moving` is False for stationary objects (they hide others; they are measured only when named).
     `solids` are stationary objects with an outline of their own, and those of maps: they hide, and are no objects.
-    `areas` are those of maps.
+    `areas` are those of maps. `frame`: where it is on earth, if that is known.
     `ego_ix` is −1 where the log has no ego vehicle, or none was chosen. `tags`: what the recording, or the experiment,
     says of the drive, by name.
 
@@ -127,6 +130,7 @@ class Scene:
     solids: tuple[Solid, ...] = ()
     tags: Mapping[str, str] = field(default_factory=dict)
     areas: tuple[Area, ...] = ()
+    frame: Frame | None = None
 
     @cached_property
     def object_number(self) -> dict[str, int]:
@@ -139,7 +143,7 @@ class Scene:
         return (self.end_ns - self.t0_ns) * 1e-9
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Tracks:
     """Object states in the lists of units, over time and runs. Shapes are checked here and nowhere else.
 
@@ -198,6 +202,39 @@ class Tracks:
             runs.add(array.shape[0])
         if len(runs) > 2:
             raise ValueError(f"Tracks: values disagree on the number of runs: {sorted(runs)}")
+
+    def __repr__(self) -> str:
+        shown = ", ".join(self.units) if len(self.units) <= 3 else f"{len(self.units)} units"
+        rows, lists, runs = len(self.frame_ix), len(self.stamp_ns), max(len(self.valid), len(self.arrives_s))
+        return f"Tracks({rows} states of {len(self.unit_ix)} tracks in {lists} lists of {shown}, runs: {runs})"
+
+    def to_dataframe(self, scene: Scene | None = None) -> pd.DataFrame:
+        """The states of one run, list by list: `captured_s`, `unit`, the object, and the state.
+
+        The object is `object_ix`, with its `scene` also `object_id` and `object_class`. Raises ValueError for tracks of
+        several runs.
+
+        >>> recording = cr.read_recording("logs/tc016d.mcap")
+        >>> recording.truth.to_dataframe(recording.scene)["object_id"].nunique() == len(recording.scene.object_ids)
+        True
+        """
+        import pandas as pd
+
+        if len(self.valid) != 1:
+            raise ValueError(f"to_dataframe: expected the tracks of one run, found {len(self.valid)}")
+        rows = self.by_frame[0][self.valid[0, self.by_frame[0]]]
+        object_ix = self.row_object_ix[rows]
+        columns: dict[str, object] = {
+            "captured_s": self.captured_s[self.frame_ix[rows]],
+            "unit": np.array(self.units, dtype=object)[self.row_unit_ix[rows]],
+            "object_ix": object_ix,
+        }
+        if scene is not None:  # −1, of no object, is the last
+            columns["object_id"] = np.array([*scene.object_ids, None], dtype=object)[object_ix]
+            kinds = np.array([*np.array(CLASSES, dtype=object)[scene.object_class], None], dtype=object)
+            columns["object_class"] = kinds[object_ix]
+        stated = {name: getattr(self, name) for name in (*VALUES, *UNCERTAINTIES)}
+        return pd.DataFrame(columns | {name: of[0, rows] for name, of in stated.items() if of is not None})
 
     @property
     def common_arrives_s(self) -> Float:

@@ -40,7 +40,8 @@ def check_references(source: ExperimentSource) -> Iterator[str]:
     if isinstance(measure, dict):
         place = measure.get("distance_to", "ego")
         unit = dict(_mapping_items(data.get("units"))).get(str(place), {})
-        if place != "ego" and unit.get("recorded") is not None and unit.get("at") is None and unit.get("on") is None:
+        placed = any(unit.get(key) is not None for key in ("on", "at", "at_wgs84"))
+        if place != "ego" and unit.get("recorded") is not None and not placed:
             yield source.at(
                 ("measure", "distance_to"), f"unit {place!r} has no place; say `at: [x, y]` or `on: <object id>` of it"
             )

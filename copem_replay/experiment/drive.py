@@ -19,6 +19,7 @@ from copem_replay.core.components import error_at_key
 from copem_replay.core.errors import InputError, count_noun
 from copem_replay.core.tracks import Float
 from copem_replay.core.yaml import Key
+from copem_replay.experiment.degrees import resolve_degrees
 from copem_replay.experiment.schema import Configuration, Experiment, LogSettings, Unit
 from copem_replay.io.encodings import make_definition
 from copem_replay.io.encodings.columns import DefinitionError, shred_messages
@@ -28,8 +29,9 @@ from copem_replay.io.schemas.description import find_stamp_paths, parse_nanoseco
 from copem_replay.metrics.config import Measure, Objects
 
 T = TypeVar("T")
-_INSTEAD = {"on": "at", "at": "on", "pem": "recorded", "recorded": "pem", "classes": "ids", "ids": "classes"}
-"""Keys that exclude each other: a setting of the one replaces the other."""
+_INSTEAD = {"pem": "recorded", "recorded": "pem", "classes": "ids", "ids": "classes"}
+_PLACES = {"on", "at", "at_wgs84"}
+"""Keys that exclude each other: a setting of the one replaces the others."""
 
 
 class SettingsError(ValueError):
@@ -69,17 +71,23 @@ def _settings_by_name(experiment: Experiment) -> dict[str | None, LogSettings]:
 
 
 def apply_settings(experiment: Experiment, settings: LogSettings) -> Experiment:
-    """An experiment with the settings of one log, and no `logs`. Raises SettingsError where they do not fit."""
+    """An experiment with the settings of one log, and no `logs`; metres for degrees where they give the frame.
+
+    Raises SettingsError where they do not fit.
+    """
     keys = settings.model_fields_set
     changed: dict[str, Any] = {key: getattr(settings, key) for key in ("ego", "window_s") if key in keys}
-    changed |= {key: value for key in ("read", "obstacles", "maps") if (value := getattr(settings, key)) is not None}
+    changed |= {
+        key: value for key in ("read", "obstacles", "maps", "frame") if (value := getattr(settings, key)) is not None
+    }
     units = _apply_units(experiment, settings)
     changed |= {"units": units, "configurations": _keep_configurations(experiment, units)}
     if settings.tags:
         changed["tags"] = experiment.tags | settings.tags
     if settings.measure:
         changed["measure"] = _apply_measure(experiment.measure, settings.measure)
-    return experiment.model_copy(update=changed | {"logs": ()})
+    of_log = experiment.model_copy(update=changed | {"logs": ()})
+    return of_log if of_log.frame is None else resolve_degrees(of_log, of_log.frame.frame)
 
 
 def _apply_units(experiment: Experiment, settings: LogSettings) -> dict[str, Unit]:
@@ -100,7 +108,10 @@ def _apply_units(experiment: Experiment, settings: LogSettings) -> dict[str, Uni
 
 def _replace_keys(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """The data with changed keys, without the keys that these exclude."""
-    gone = {_INSTEAD[key] for key, value in changes.items() if key in _INSTEAD and value is not None} - changes.keys()
+    given = {key for key, value in changes.items() if value is not None}
+    gone = {_INSTEAD[key] for key in given & _INSTEAD.keys()} - changes.keys()
+    if given & _PLACES:
+        gone |= _PLACES - changes.keys()
     return {key: value for key, value in data.items() if key not in gone} | dict(changes)
 
 

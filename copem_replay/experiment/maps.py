@@ -14,7 +14,8 @@ from pydantic import Field, PrivateAttr, ValidationInfo, field_validator, model_
 
 from copem_replay.core.components import Flag, Frozen, Positive, error_at_key
 from copem_replay.core.errors import InputError, count_noun
-from copem_replay.core.site_map import MapSolid, OnEarth, SiteMap, find_borders, make_polygon
+from copem_replay.core.frame import Frame, SaidPlace
+from copem_replay.core.site_map import MapSolid, SiteMap, find_borders, make_polygon
 from copem_replay.core.tracks import Float, Solid
 from copem_replay.core.yaml import Key
 from copem_replay.io.maps.registry import read_map
@@ -51,7 +52,7 @@ class MapHeights(Frozen):
 class MapFile(Frozen):
     """A map: OpenStreetMap, GeoJSON, OpenDRIVE, Lanelet2 or Argoverse 2. `file` is relative to the experiment file.
 
-    `frame: same`: the map's metres are the log's; left out: the map's degrees, by the place of the log. `offset_m` is
+    `frame: same`: the map's metres are the log's; left out: by its own reference and the log's place. `offset_m` is
     added to its metres. `lanes`: they are drawn, and held against the traffic. `solids`: the map's objects hide, or
     those of the kinds that are listed; `within_m`: those this near to any object of the log.
     `agreement: ignore`: a map whose lanes the traffic does not keep to is not refused.
@@ -94,16 +95,24 @@ class MapFile(Frozen):
         """The map as its file has it. Raises InputError."""
         return _read_map_once(self.file, self._sha256, tuple(self.heights_m.model_dump().items()))
 
-    def place(self, frame: OnEarth | None) -> SiteMap:
+    def place(self, frame: Frame | None) -> SiteMap:
         """The map in metres of a log with this frame. Raises InputError: its place is not known."""
         site, offset_m = self.read_once(), np.array(self.offset_m)
         if self.frame == "same":
             return site.moved(lambda at_m: at_m + offset_m)
-        if not site.degrees:
+        if not site.degrees and not site.proj:
             raise InputError(f"{self.file}: its places are metres: expected `frame: same` where they are the log's")
         if frame is None:
-            raise InputError(f"{self.file}: its places are degrees: expected metres of the log, with `frame: same`")
-        return site.moved(lambda degrees: frame.from_wgs84(degrees[:, ::-1]) + offset_m)
+            what = "degrees" if site.degrees else f"metres of {site.proj!r}"
+            expected = "expected `frame: {proj: …}` of the log" + " or, where they are the log's, `frame: same`" * (
+                not site.degrees
+            )
+            raise InputError(f"{self.file}: its places are {what}, and the log does not say where it is: {expected}")
+        if site.degrees:
+            return site.moved(lambda degrees: frame.from_wgs84(degrees[:, ::-1]) + offset_m)
+        of_map, notes = SaidPlace(site.proj, site.offset_m, site.yaw_rad).read()
+        moved = site.moved(lambda at_m: frame.take(of_map, at_m + offset_m))
+        return replace(moved, assumed=(*moved.assumed, *notes))
 
     def choose_kinds(self, site: SiteMap) -> list[MapSolid]:
         """The solids of a map that are asked for."""
@@ -119,7 +128,7 @@ def _read_map_once(file: str, _sha256: str, heights_m: tuple[tuple[str, float], 
 
 
 def add_maps(
-    recording: Recording, maps: Sequence[MapFile], frame: OnEarth | None = None
+    recording: Recording, maps: Sequence[MapFile], frame: Frame | None = None
 ) -> tuple[Recording, list[tuple[Key, str]]]:
     """A recording with what its maps add, and the problems with them, by key. `frame`: of the recording."""
     lines, areas, solids = list(recording.lane_boundaries), list(recording.scene.areas), list(recording.scene.solids)

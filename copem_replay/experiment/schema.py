@@ -41,6 +41,7 @@ from copem_replay.core.components import (
 )
 from copem_replay.core.tracks import TRUTH
 from copem_replay.experiment.criteria import Criterion, CriterionName
+from copem_replay.experiment.frame import FrameOfLog
 from copem_replay.experiment.maps import MapFile
 from copem_replay.fusion import FUSIONS
 from copem_replay.fusion.interface import Fusion, IdealFusion
@@ -255,20 +256,24 @@ class Unit(Placement):
     def _place(self) -> Self:
         if (self.pem is None) == (self.recorded is None):
             raise ValueError("expected one of `pem: <name>` and `recorded: {topic: …}`")
+        places = (self.on, self.at, self.at_wgs84)
+        if self.at_wgs84 is not None and len(self.at_wgs84) == 3 and "yaw_deg" in self.model_fields_set:
+            raise error_at_key("yaw_deg", "the heading is the third number of at_wgs84; expected one of both")
         if self.recorded is not None:
             for key, why in _NOT_RECORDED.items():
                 if getattr(self, key) is not None:
                     raise error_at_key(key, f"a recorded unit {why}; only for units with a pem")
-            if self.rate_hz is not None or isinstance(self.on, Carriers) or (self.on and self.at):
+            if self.rate_hz is not None or isinstance(self.on, Carriers) or sum(map(bool, places)) > 1:
                 raise ValueError("recorded: goes with one place, `on` an object or `at` a point, and without rate_hz")
             return self
-        if (self.on is None) == (self.at is None):
+        if sum(place is not None for place in places) != 1:
             raise ValueError(
-                "expected one of `on: ego`, `on: <object id>`, `on: {classes, penetration_rate}` and `at: [x, y]`"
+                "expected one of `on: ego`, `on: <object id>`, `on: {classes, penetration_rate}`, `at: [x, y]` and "
+                "`at_wgs84: [latitude, longitude]`"
             )
-        if self.height_m is None and self.at is not None:
+        if self.height_m is None and self.on is None:
             raise ValueError("height_m: needed for a unit `at` a place; only a carried one is on a roof by default")
-        if self.ground_z_m is not None and self.at is None:
+        if self.ground_z_m is not None and self.on is not None:
             raise ValueError("ground_z_m: only for a unit `at` a place; a carrier brings its own ground")
         if self.phase_s and self.rate_hz is None:
             raise ValueError("phase_s: needs rate_hz (without it there is one list per frame of the truth)")
@@ -346,6 +351,7 @@ class LogSettings(Frozen):
     units: dict[Id, dict[str, Any] | None] = Field(default_factory=dict)
     obstacles: tuple[Obstacle, ...] | None = None
     maps: tuple[MapFile, ...] | None = Field(default=None, exclude_if=lambda maps: maps is None)
+    frame: FrameOfLog | None = Field(default=None, exclude_if=lambda frame: frame is None)
     read: HowRead | None = None
     measure: dict[str, Any] = Field(default_factory=dict)
     tags: dict[Id, TagText] = Field(default_factory=dict)
@@ -428,8 +434,8 @@ class Experiment(Frozen):
 
     `logs`: paths or URLs, or mappings with settings for one log. `window_s`: the part of each log that is read,
     [from, to] in log time since the first message of its truth. `tags`: those of all logs, to slice the summary by
-    (`measure.by`) and for conditions of PEMs; a log may have others. `maps` of the site: lanes, areas, solids. `areas`:
-    your own, by name, for `measure.objects.within.areas`.
+    (`measure.by`) and for conditions of PEMs; a log may have others. `frame`: where the logs are on earth. `maps` of
+    the site: lanes, areas, solids. `areas`: your own, by name, for `measure.objects.within.areas`.
 
     >>> experiment = cr.Experiment(version=1, runs=20, configurations={"GT": cr.Configuration(units="truth")})
     >>> experiment.model_copy(update={"runs": 50}).runs, experiment.seed
@@ -450,6 +456,7 @@ class Experiment(Frozen):
     pems: dict[Id, Pem] = Field(default_factory=dict)
     units: dict[UnitName, Unit] = Field(default_factory=dict)
     obstacles: tuple[Obstacle, ...] = ()
+    frame: FrameOfLog | None = Field(default=None, exclude_if=lambda frame: frame is None)
     maps: tuple[MapFile, ...] = Field(default=(), exclude_if=lambda maps: not maps)
     areas: dict[Id, OwnArea] = Field(default_factory=dict, exclude_if=lambda areas: not areas)
     visibility: Visibility = Field(default=Surface(), json_schema_extra={"default": "surface"})

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from copem_replay.core.errors import (
     EgoError,
@@ -23,6 +23,7 @@ from copem_replay.core.errors import (
 from copem_replay.core.tracks import Scene
 from copem_replay.core.yaml import Key
 from copem_replay.experiment.cross_references import NO_EGO, check_references
+from copem_replay.experiment.degrees import check_degrees, resolve_degrees, uses_degrees
 from copem_replay.experiment.drive import SettingsError, apply_settings, resolve_for_log
 from copem_replay.experiment.file import (
     ExperimentSource,
@@ -37,6 +38,7 @@ from copem_replay.experiment.file import (
     settings_places,
     source_folder,
 )
+from copem_replay.experiment.frame import find_frame, write_frame
 from copem_replay.experiment.maps import add_maps
 from copem_replay.experiment.schema import Experiment, LogSettings, output_unit
 from copem_replay.io.config import TruthFields
@@ -52,7 +54,7 @@ from copem_replay.io.open import (
     sha256_of,
 )
 from copem_replay.io.recorded_units import read_recorded_output, read_recorded_unit
-from copem_replay.io.recording import Recording, moving_ids, read_log
+from copem_replay.io.recording import Recording, find_middle, moving_ids, read_log
 from copem_replay.metrics.config import parse_slices
 from copem_replay.metrics.onset import Requires
 from copem_replay.perception.config import Carriers
@@ -297,12 +299,15 @@ def settings_by_place(experiment: Experiment, source: ExperimentSource | None) -
 def bind_logs(experiment: Experiment, recordings: Sequence[Recording], source: ExperimentSource | None) -> Experiment:
     """The experiment with an entry of `logs` per recording, named and with settings, where any log has settings."""
     settings_of = settings_by_place(experiment, source)
-    if not settings_of:
+    if not settings_of and not uses_degrees(experiment):
         return experiment
     logs = []
     for recording in recordings:
         _, settings = settings_of.get(place_identity(recording.place), (0, LogSettings(file=".")))
-        logs.append(relocate_settings(settings, recording.place).model_copy(update={"name": recording.scene.log}))
+        changes: dict[str, Any] = {"name": recording.scene.log}
+        if recording.scene.frame is not None and uses_degrees(apply_settings(experiment, settings)):
+            changes["frame"] = write_frame(recording.scene.frame)  # the recording's own: written where it is needed
+        logs.append(relocate_settings(settings, recording.place).model_copy(update=changes))
     return experiment.model_copy(update={"logs": tuple(logs)})
 
 
@@ -385,8 +390,16 @@ def _read_local_recording(experiment: Experiment, place: Local) -> tuple[Recordi
         return None, [RefusedLog(path, line) for line in error.within(path)]
     scene = replace(recording.scene, tags={**recording.scene.tags, **experiment.tags})
     recording = replace(recording, scene=scene, lists=lists, notes=tuple(notes))
-    recording, disagreeing = add_maps(recording, experiment.maps)
-    wrong += [RefusedLog(path, line, key) for key, line in disagreeing]
+    frame, why = None, ""
+    try:
+        frame, why, of_frame = find_frame(experiment.frame, experiment.maps, recording)
+        recording = replace(recording, scene=replace(scene, frame=frame), notes=(*notes, *of_frame))
+    except InputError as error:
+        wrong += [RefusedLog(path, line, ("frame",)) for line in error.problems]
+    far = [] if wrong else [*check_degrees(experiment, frame, why, find_middle(recording))]
+    experiment = resolve_degrees(experiment, frame)
+    recording, disagreeing = add_maps(recording, experiment.maps, frame)
+    wrong += [RefusedLog(path, line, key) for key, line in (*far, *disagreeing)]
     return recording, wrong + [
         RefusedLog(path, reason, where) for where, reason in check_against_log(experiment, recording, known=bool(wrong))
     ]

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from copem_replay.core.errors import count_noun
+from copem_replay.core.frame import SaidPlace
 from copem_replay.core.tracks import CLASSES, SAME_INSTANT_NS, TRUTH, VALUES, Bool, Float, Int, Scene, Solid, Tracks
 
 FARTHEST_M = 1e7
@@ -38,6 +39,7 @@ class DecodedObjects:
     values: Float  # (P, len(VALUES))
     lane_boundaries: tuple[Float, ...] = ()  # (K, 3) each, in the truth's frame of reference: for showing only
     solids: tuple[Solid, ...] = ()  # in the truth's frame of reference
+    place: SaidPlace | None = None  # what it says of its place on earth
     hosts: tuple[str, ...] = ()  # the host vehicle's id, once per message that states one
     notes: tuple[str, ...] = ()  # a line for each kind of state that was skipped or completed
 

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from copem_replay.core.errors import EgoError, RecordingError, RemoteFile, count_noun, escape_unprintable
+from copem_replay.core.frame import SaidPlace
 from copem_replay.core.tracks import CLASSES, Float, Scene, Tracks
 from copem_replay.io.channel import Channel
 from copem_replay.io.decoded_size import DecodeAllowance, OversizeError
@@ -49,7 +50,7 @@ _TOPIC = ("read", "topic")  # the key of an experiment that names the topic of t
 _SHOWN = 12  # ids or topics named in an error; the rest is counted
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Recording:
     """A recording in memory: its scene, its ground truth, and notes on what was derived, corrected or skipped.
 
@@ -74,11 +75,16 @@ class Recording:
     world: str = ""  # name of the frame of reference of the truth, "": none is named, as in OSI
     window: Window | None = None  # the log time that was read; None: all
     lane_boundaries: tuple[Float, ...] = ()  # (K, 3) each, for showing only
+    place_said: SaidPlace | None = None  # what it says of its place on earth
     together: DriveRecordings | None = None  # the recordings of the drive, `path` being the first; None: it is one
     remote: RemoteFile | None = None  # where it lies, if not on this machine: `path` was a copy
     sha256: str | None = None  # of the files that were read, where it is known already
     stamps: Stamps | None = None  # of its files on this machine before they were read; None: a copy, or not known
     survey: StoredSurvey | None = None  # of a recording that was not read: no truth, no lists (`read_whole_recording`)
+
+    def __repr__(self) -> str:
+        objects, frames, lasts_s = len(self.scene.object_ids), len(self.truth.stamp_ns), self.scene.end_s
+        return f"Recording({self.path.name}, {self.topic}: {objects} objects, {frames} frames, {lasts_s:.1f} s)"
 
     @property
     def place(self) -> Place:
@@ -177,8 +183,15 @@ def _read(
     return Recording(
         scene, truth, log.path, topic, all_notes, host, damage,
         around=around, encoding=encoding, world=world, window=log.window,
-        lane_boundaries=columns.lane_boundaries, together=find_drive_recordings(log),
+        lane_boundaries=columns.lane_boundaries, place_said=columns.place, together=find_drive_recordings(log),
     )  # fmt: skip
+
+
+def find_middle(recording: Recording) -> Float:
+    """The median (2,) of the places of all objects, in metres of the log."""
+    truth = recording.truth
+    valid = truth.valid[0]
+    return np.array([np.median(truth.x_m[0, valid]), np.median(truth.y_m[0, valid])])
 
 
 def is_truth(channel: Channel) -> bool:

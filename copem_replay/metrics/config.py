@@ -19,7 +19,7 @@ from copem_replay.core.tracks import Bool, Float
 from copem_replay.metrics.braking.driver import DRIVERS, Driver
 from copem_replay.metrics.metric import RowMetric
 from copem_replay.metrics.onset import BEGAN, ONSETS, Began, InRange, Onset, Requires
-from copem_replay.perception.config import InPlane, PerceptionSetup, check_polygon
+from copem_replay.perception.config import InPlane, OnEarthPolygon, PerceptionSetup, check_polygon
 from copem_replay.perception.pem.condition import ClassNames
 
 
@@ -36,6 +36,12 @@ def _check_exactly_one(self: BaseModel, *names: str) -> None:
         raise ValueError(f"expected one of {', '.join(names)}, found {' and '.join(present) or 'none'}")
 
 
+def _check_outline(self: Within | OwnArea | AnnotatedArea) -> None:
+    for key in ("polygon_m", "polygon_wgs84"):
+        if (corners := getattr(self, key)) is not None:
+            check_polygon(corners, key)
+
+
 class Within(Frozen):
     """Which objects matter, by the truth: in a polygon, in areas or near the ego's path at onset, or soon on that path.
 
@@ -46,37 +52,37 @@ class Within(Frozen):
     """
 
     polygon_m: Polygon | None = None
+    polygon_wgs84: OnEarthPolygon | None = Field(default=None, exclude_if=_is_none)
     corridor_m: NotNegative | None = None
     conflict_s: Positive | None = None
     areas: Annotated[tuple[Id, ...], Field(min_length=1)] | None = Field(default=None, exclude_if=_is_none)
 
     @model_validator(mode="after")
     def _one(self) -> Self:
-        _check_exactly_one(self, "polygon_m", "corridor_m", "conflict_s", "areas")
-        if self.polygon_m is not None:
-            check_polygon(self.polygon_m)
+        _check_exactly_one(self, "polygon_m", "polygon_wgs84", "corridor_m", "conflict_s", "areas")
+        _check_outline(self)
         return self
 
     @property
     def of_ego(self) -> bool:
         """Whether the condition needs an ego."""
-        return self.polygon_m is None and self.areas is None
+        return self.polygon_m is None and self.polygon_wgs84 is None and self.areas is None
 
 
 class OwnArea(Frozen):
     """An area of your own: a polygon, or a strip of some width along a line; its ends are cut straight."""
 
     polygon_m: Polygon | None = None
+    polygon_wgs84: OnEarthPolygon | None = Field(default=None, exclude_if=_is_none)
     along_m: Annotated[tuple[InPlane, ...], Field(min_length=2)] | None = None
     width_m: Positive | None = None
 
     @model_validator(mode="after")
     def _one(self) -> Self:
-        _check_exactly_one(self, "polygon_m", "along_m")
-        if self.polygon_m is not None:
-            check_polygon(self.polygon_m)
+        _check_exactly_one(self, "polygon_m", "polygon_wgs84", "along_m")
+        _check_outline(self)
         if (self.along_m is None) != (self.width_m is None):
-            raise ValueError("expected `width_m` with `along_m`, and not with `polygon_m`")
+            raise ValueError("expected `width_m` with `along_m`, and not with a polygon")
         return self
 
     def covers(self, x_m: Float, y_m: Float) -> Bool:
@@ -94,13 +100,13 @@ class AnnotatedArea(Frozen):
     """Where the truth has all objects: a polygon, or a range around the place that distances are measured from."""
 
     polygon_m: Polygon | None = None
+    polygon_wgs84: OnEarthPolygon | None = Field(default=None, exclude_if=_is_none)
     range_m: Positive | None = None
 
     @model_validator(mode="after")
     def _one(self) -> Self:
-        _check_exactly_one(self, "polygon_m", "range_m")
-        if self.polygon_m is not None:
-            check_polygon(self.polygon_m)
+        _check_exactly_one(self, "polygon_m", "polygon_wgs84", "range_m")
+        _check_outline(self)
         return self
 
 

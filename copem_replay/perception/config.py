@@ -6,9 +6,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated, Protocol, Self
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, Self
 
-from pydantic import BeforeValidator, Field, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    SerializerFunctionWrapHandler,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
 from copem_replay.core.components import Either, Flag, Frozen, Id, NotNegative, Number, Positive, Share
 from copem_replay.core.memory import MemoryPart, Parts
@@ -87,6 +95,22 @@ def _check_two_numbers(value: object) -> object:
 InPlane = Annotated[Point, BeforeValidator(_check_two_numbers)]
 """A point in the plane; three numbers are refused with a pointer to `height_m`."""
 
+
+def _check_degrees(place: tuple[float, ...]) -> tuple[float, ...]:
+    lat, lon = place[:2]
+    if abs(lat) > 84 or abs(lon) > 180:
+        raise ValueError(
+            f"expected latitude (-84 … 84) and longitude (-180 … 180) in degrees, found [{lat:g}, {lon:g}]"
+        )
+    return place
+
+
+OnEarthPlace = Annotated[tuple[Number, Number], AfterValidator(_check_degrees)]
+"""Latitude and longitude of WGS84 in degrees, in this order."""
+OnEarthPose = Annotated[tuple[Number, ...], Field(min_length=2, max_length=3), AfterValidator(_check_degrees)]
+"""Latitude, longitude and, if it is given, the heading clockwise from true north, in degrees."""
+OnEarthPolygon = Annotated[tuple[OnEarthPlace, ...], Field(min_length=3)]
+
 Rate = Annotated[float, Field(strict=True, ge=0.001, le=1000)]
 """Lists per second."""
 
@@ -104,12 +128,15 @@ On = Either[Id, Carriers]
 class Placement(Frozen):
     """Carried `on` the ego, another object or a share of some classes, or standing `at` a place; lists at some rate.
 
+    `at_wgs84`, instead of `at`: latitude, longitude and, instead of `yaw_deg`, heading clockwise from true north.
+
     `height_m` above the ground; left out, a carried unit is on the roof. `placed`: how wrong the unit is about its own
     pose, `clock`: about the time, `outages`: when it makes no lists.
     """
 
     on: On | None = None
     at: InPlane | None = None
+    at_wgs84: OnEarthPose | None = Field(default=None, exclude_if=lambda place: place is None)
     offset_m: InPlane = (0.0, 0.0)
     yaw_deg: Number = 0.0
     height_m: NotNegative | None = None
@@ -120,6 +147,14 @@ class Placement(Frozen):
     placed: PoseError | None = Field(default=None, exclude_if=lambda placed: placed is None)
     clock: ClockError | None = Field(default=None, exclude_if=lambda clock: clock is None)
     outages: Outages | None = Field(default=None, exclude_if=lambda outages: outages is None)
+
+    @model_serializer(mode="wrap")
+    def _with_one_heading(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Without `yaw_deg` where `at_wgs84` has the heading, as both are refused."""
+        written: dict[str, Any] = write(self)
+        if isinstance(self.at_wgs84, tuple) and len(self.at_wgs84) == 3:
+            written.pop("yaw_deg", None)
+        return written
 
 
 def _describe_polygon_fault(reason: str) -> str:
@@ -133,27 +168,34 @@ def _describe_polygon_fault(reason: str) -> str:
     return words.get(what, "corners without an area between them")
 
 
-def check_polygon(points_m: tuple[Point, ...]) -> tuple[Point, ...]:
+def check_polygon(points_m: tuple[Point, ...], key: str = "polygon_m") -> tuple[Point, ...]:
     """The corners of an area. Raises ValueError where its edges cross, or there is nothing between them."""
     import shapely
 
     polygon = shapely.Polygon(points_m)
     if not polygon.is_valid or polygon.area <= 0:
         fault = _describe_polygon_fault(shapely.is_valid_reason(polygon))
-        raise ValueError(f"polygon_m: expected the corners in order around an area, each once, found {fault}")
+        raise ValueError(f"{key}: expected the corners in order around an area, each once, found {fault}")
     return points_m
 
 
 class Obstacle(Frozen):
-    """A static obstacle beside those in the log."""
+    """A static obstacle beside those in the log: its outline in metres of the log, or as latitudes and longitudes."""
 
-    polygon_m: Annotated[tuple[Point, ...], Field(min_length=3)]
+    polygon_m: Annotated[tuple[Point, ...], Field(min_length=3)] = Field(default=(), exclude_if=lambda one: not one)
+    polygon_wgs84: OnEarthPolygon | None = Field(default=None, exclude_if=lambda one: one is None)
     height_m: Positive
     ground_z_m: Number | None = None
 
     @model_validator(mode="after")
     def _simple(self) -> Self:
-        check_polygon(self.polygon_m)
+        if bool(self.polygon_m) == (self.polygon_wgs84 is not None):
+            found = "both" if self.polygon_m else "none"
+            raise ValueError(f"expected one of polygon_m and polygon_wgs84, found {found}")
+        if self.polygon_wgs84 is not None:
+            check_polygon(self.polygon_wgs84, "polygon_wgs84")
+        else:
+            check_polygon(self.polygon_m)
         return self
 
 

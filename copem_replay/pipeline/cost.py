@@ -156,10 +156,12 @@ def peak_bytes() -> int | None:
 
 
 def return_memory() -> None:
-    """Give freed memory back to the system, where the C library is asked for that: glibc keeps what threads have freed.
+    """Give freed memory back to the system: Arrow's pool keeps some, and glibc what threads have freed.
 
     Measured: 160 of 600 MB after 20 runs of a drive of 5 minutes with 100 objects.
     """
+    if (arrow := sys.modules.get("pyarrow")) is not None:
+        arrow.default_memory_pool().release_unused()
     if sys.platform.startswith("linux"):
         import ctypes
 

@@ -19,6 +19,7 @@ from copem_replay.communication.arrivals import receiver_instants
 from copem_replay.communication.radio import Radio
 from copem_replay.communication.reception import RadioPath, ReceptionModel, ask_reception_probability
 from copem_replay.core.errors import count_noun
+from copem_replay.core.frame import Frame
 from copem_replay.core.interpolation import wrap_angles
 from copem_replay.core.tracks import (
     CLASS_GROUPS,
@@ -561,6 +562,7 @@ class LogFacts:
 def scene_as_json(scene: Scene) -> dict[str, Any]:
     """A scene as plain data for JSON."""
     values = {f.name: getattr(scene, f.name) for f in fields(Scene)}
+    values |= {"frame": scene.frame and asdict(scene.frame)}
     return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()}
 
 
@@ -579,6 +581,7 @@ def scene_from_json(data: dict[str, Any]) -> Scene:
             "areas": tuple(
                 Area(name, kind, tuple(_read_ring(ring) for ring in rings)) for name, kind, rings in data["areas"]
             ),
+            "frame": (said := data["frame"]) and Frame(said["proj"], (*said["offset_m"],), said["yaw_rad"]),
         }
     )
 

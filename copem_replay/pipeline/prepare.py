@@ -190,6 +190,11 @@ class Replay:
             each.episode_ix: find_passing_intervals(each, braking.driver, braking.margin_m) for each in self.encounters
         }
 
+    @cached_property
+    def measured_truth(self) -> Tracks:
+        """The truth of objects that have an episode; its lists are those of all."""
+        return self.truth.take_tracks(np.isin(self.truth.object_ix, self.episodes.object_ix))
+
     def find_episodes_of(self, experiment: Experiment) -> Episodes:
         """The episodes of this log by another `measure`."""
         return _find_kept_episodes(self.scene, self.truth, self.placed, experiment)[0]
@@ -205,14 +210,15 @@ class Replay:
         return self._overview[1]
 
     @cached_property
-    def _overview(self) -> tuple[Float, Bool]:
-        sights: list[Float] = []
-        met: list[Bool] = []
+    def _overview(self) -> tuple[Float, Bool, int]:
+        """`first_sights_s`, `ever_met`, and the number of observation rows of objects that have an episode."""
+        sights, met, rows = list[Float](), list[Bool](), 0
         for chunk in self.chunks:
             observations = self.observe(chunk)
             sights.append(first_sights(observations, self.episodes))
             met.append(observations.ever_met)
-        return np.min(sights, axis=0), np.any(met, axis=0)
+            rows += int(np.isin(observations.tracks.row_object_ix, self.episodes.object_ix).sum())
+        return np.min(sights, axis=0), np.any(met, axis=0), rows
 
     @cached_property
     def truth_cache(self) -> TruthCache:
@@ -282,8 +288,7 @@ class Replay:
     @property
     def rows_kept(self) -> int:
         """How many observation rows are kept: all of a log in one time chunk, of others those of measured objects."""
-        kept = self.measured if len(self.chunks) > 1 else self._whole
-        return len(kept.tracks.frame_ix)
+        return self._overview[2] if len(self.chunks) > 1 else len(self._whole.tracks.frame_ix)
 
     def add_recorded(self, seen: Tracks, recorded: RecordedUnits | None) -> Tracks:
         """What modelled units list, and then lists of recorded ones; units are in the experiment's order."""

@@ -336,8 +336,13 @@ class Receivers:
             faults = _find_faults(world, sent, None if states == "expected" else world.ghosts)
         if isinstance(fusion, IdealFusion) and faults is not None:
             faults = replace(faults, ghosts=faults.ghosts[:0])  # ideal fusion leaves ghosts out
+        received = self._lists.receive(sent, name)
+        if faults is not None:  # what came in before the chunk is told of in an earlier list
+            earlier_s = self.issue_s(name)[: np.searchsorted(self.issue_s(name), world.chunk.from_s)]
+            came_s = received.common_arrives_s[received.frame_ix[faults.ghosts]] - SAME_INSTANT_S
+            faults = replace(faults, ghosts=faults.ghosts[came_s > earlier_s.max(initial=-np.inf)])
         output = ReceiverOutput(
-            received=self._lists.receive(sent, name), sent=sent,
+            received=received, sent=sent,
             instants=self._schedules[name].between(world.chunk.from_s, world.chunk.until_s),
             fused_tracks=None, scene=world.scene, fused=None, whole=len(world.log.chunks) == 1, faults=faults,
         )  # fmt: skip

@@ -200,8 +200,8 @@ def find_events(lists: Transmission, name: str, listed: Tracks, known: FirstDete
     log, units, measure = lists.log, lists.experiment, lists.experiment.measure
     configuration = units.configurations[name]
     names, of_truth = units.units_of(configuration), configuration.units == TRUTH
-    listed, made = (log.truth, lists.truth) if of_truth else (listed, lists.lists)
-    received = lists.receive(log.truth if of_truth else lists.send(listed), name)
+    listed, made = (log.measured_truth, lists.truth) if of_truth else (listed, lists.lists)
+    received = lists.receive(listed if of_truth else lists.send(listed), name)
     detections = known or detect_by_truth_id(
         received, log.episodes, confirm=measure.confirm, count_earlier=measure.count_earlier,
         max_age_s=configuration.max_age_s,

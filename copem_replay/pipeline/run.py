@@ -114,6 +114,8 @@ class Gatherer:
         for log in logs:
             alone = resolve_for_log(experiment, log.name)
             log.facts(experiment)  # while the log is in memory
+            if _is_long(log):  # what reading it took
+                return_memory()
             blocks = cut_parts(alone.runs, log.object_states)
             for runs in blocks:
                 kept = self._read_parts(log, alone, runs, reading)
@@ -156,7 +158,7 @@ class Gatherer:
             return [part for part in kept.values() if part is not None]
         self._cost.add(0.0, outcomes)
         parts = build_parts(log.name, outcomes, block.missing)
-        if log.object_states > STATES_A_PART // MOST_RUNS:  # the part took long enough for it to cost nothing
+        if _is_long(log):
             outcomes.clear()
             return_memory()
         for part in parts:
@@ -182,6 +184,11 @@ class Gatherer:
             rows.append(part.rows)
         log.drop()
         return pa.concat_tables(rows, promote_options="permissive").to_pandas()
+
+
+def _is_long(log: StudyLog) -> bool:
+    """Whether a part takes so long that giving memory back costs nothing beside it."""
+    return log.object_states > STATES_A_PART // MOST_RUNS
 
 
 # The tables of a study.
@@ -246,6 +253,10 @@ class StudyTables:
         if name in COMPARED_FILES:
             return self.accuracy.get(name)
         return self.table if name == "detections.parquet" else getattr(self, name.partition(".")[0])
+
+    def has_table(self, name: str) -> bool:
+        """Whether there is a table, by the name of its file; none is made for that."""
+        return self.bands is not None if name in COMPARED_FILES else self.find_table(name) is not None
 
     def find_log(self, name: str) -> StudyLog:
         """A log by its name."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from os import PathLike
@@ -161,7 +161,7 @@ class Results:
     def has(self, name: str) -> bool:
         """Whether there is a table, by the name of its file."""
         if self.study is not None:
-            return self.study.find_table(name) is not None
+            return self.study.has_table(name)
         return _exists(self.place, name)
 
     def frame(self, name: str) -> pd.DataFrame:
@@ -338,8 +338,8 @@ class Results:
         return tuple(map(str, notes)) if isinstance(notes, list) else ()
 
     @cached_property
-    def by_log(self) -> dict[str, LogRows]:
-        """By file name the tables that comparisons read, those that exist."""
+    def by_log(self) -> Mapping[str, LogRows]:
+        """By file name the tables that comparisons read, those that exist, each opened when it is first asked for."""
         rows = self.rows
         if not rows.counts:
             raise InputError(f"{self.place}: nothing can be compared: no measured object has an onset")
@@ -350,12 +350,11 @@ class Results:
         ):
             if unknown:
                 raise InputError(f"{rows.place}: expected the {what} of provenance.json, found {min(unknown)!r}")
-        tables = {rows.place.name: rows} | {n: self.log_rows(n) for n in COMPARED_FILES if self.has(n)}
-        return {name: of.only(TABLES[name].kinds("braking", "fleet", compared=True)) for name, of in tables.items()}
+        return _OpenedTables(self, [rows.place.name, *filter(self.has, COMPARED_FILES)])
 
-    def rows_of(self, log: str, *names: str) -> dict[str, pa.Table]:
-        """A log's rows of the named tables, by default of all that comparisons read."""
-        tables = {name: rows.of(log) for name, rows in self.by_log.items() if not names or name in names}
+    def rows_of(self, log: str, names: Collection[str] | None = None) -> dict[str, pa.Table]:
+        """A log's rows of the named tables (None: all) of those that comparisons read."""
+        tables = {name: self.by_log[name].of(log) for name in self.by_log if names is None or name in names}
         self.check_unchanged()
         return tables
 
@@ -458,3 +457,25 @@ def check_complete(results: Results, *, rowless: bool = False) -> Results:
     for name in ("tally", "summary", "summary_by", "exact", "sweep"):
         getattr(results, name)
     return results
+
+
+class _OpenedTables(Mapping[str, LogRows]):
+    """The tables that comparisons read, log by log; those of a run in memory are large, and made when asked for."""
+
+    def __init__(self, results: Results, names: Sequence[str]) -> None:
+        self._results, self._opened = results, dict[str, LogRows | None].fromkeys(names)
+
+    def __getitem__(self, name: str) -> LogRows:
+        if (rows := self._opened[name]) is None:
+            kinds = TABLES[name].kinds("braking", "fleet", compared=True)
+            rows = self._opened[name] = self._results.log_rows(name).only(kinds)
+        return rows
+
+    def __contains__(self, name: object) -> bool:  # of a mapping it would open the table
+        return name in self._opened
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._opened)
+
+    def __len__(self) -> int:
+        return len(self._opened)

@@ -6,11 +6,13 @@ What an entity looks like is told once, and where it is in every frame: in colum
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from copem_replay.core.tracks import CLASSES, Int, Scene, Tracks
+from copem_replay.core.tracks import CLASSES, Float, Int, Scene, Tracks
 from copem_replay.io.write.message_family import EGO_FRAME, MIDDLE_FRAME
 from copem_replay.io.write.scene import Ellipse, Entity, Line, MovingEntities, Place, Pose, Rgba, Text, TruthScene
 from copem_replay.perception.sensor_poses import couple_outlines, mounting_height
@@ -40,7 +42,7 @@ def draw_truth(replayed: ReplayedRun, table: pd.DataFrame) -> TruthScene:
             static.append(_draw_unit(replayed, name, field=True).placed(pose))
     named = {replay.scene.object_number[name] for name in choose_named_objects(table)}
     follow = EGO_FRAME if replay.scene.ego_ix >= 0 else MIDDLE_FRAME
-    return TruthScene(static, _join_moving(replayed, named), _find_followed(replay.scene, replay.truth), follow)
+    return TruthScene(static, _draw_moving(replayed, named), _find_followed(replay.scene, replay.truth), follow)
 
 
 def choose_named_objects(table: pd.DataFrame) -> list[str]:
@@ -67,27 +69,45 @@ def _find_middle(truth: Tracks) -> Pose | None:
     return Pose(*(float(np.median(getattr(truth, name)[0, valid])) for name in ("x_m", "y_m", "z_m")))
 
 
-def _join_moving(replayed: ReplayedRun, named: Collection[int]) -> MovingEntities:
+MOST_ROWS = 200_000
+"""Rows of entities at a time, some 20 MB; frames stay whole. The messages do not depend on it."""
+
+
+def _draw_moving(replayed: ReplayedRun, named: Collection[int]) -> Iterator[MovingEntities]:
     """Bodies and the marks of carried units, frame by frame: bodies first, then units in the experiment's order."""
-    truth = replayed.replay.truth
-    parts = [_draw_bodies(replayed.replay.scene, truth, named), *_draw_carried_units(replayed)]
-    before = np.cumsum([0, *(len(looks) for looks, *_ in parts)])
-    frame = np.concatenate([part[1] for part in parts])
-    look = np.concatenate([part[2] + first for part, first in zip(parts, before[:-1], strict=True)])
-    poses = np.concatenate([part[3] for part in parts], axis=1)
-    order = np.argsort(frame, kind="stable")
-    start = np.searchsorted(frame[order], np.arange(len(truth.stamp_ns) + 1))
-    looks = [look for part in parts for look in part[0]]
-    return MovingEntities(looks, truth.stamp_ns, start, look[order], *poses[:, order])
+    scene, truth = replayed.replay.scene, replayed.replay.truth
+    order, bounds = truth.by_frame
+    carried = [*_draw_carried_units(replayed)]
+    cuts = np.unique(np.searchsorted(bounds, np.arange(0, len(order), MOST_ROWS)))
+    for begin, end in pairwise([*cuts.tolist(), len(truth.stamp_ns)]):
+        bodies = _draw_bodies(scene, truth, order[bounds[begin] : bounds[end]], named)
+        parts = [bodies, *(part.between(begin, end) for part in carried)]
+        before = np.cumsum([0, *(len(part.looks) for part in parts)])
+        frame = np.concatenate([part.frame for part in parts])
+        by_frame = np.argsort(frame, kind="stable")
+        start = np.searchsorted(frame, np.arange(begin, end + 1), sorter=by_frame)
+        look = np.concatenate([part.look + first for part, first in zip(parts, before[:-1], strict=True)])
+        poses = np.concatenate([part.poses for part in parts], axis=1)[:, by_frame]
+        looks = [look for part in parts for look in part.looks]
+        yield MovingEntities(looks, truth.stamp_ns[begin:end], start, look[by_frame], *poses)
 
 
-_Moving = tuple[list[Entity], Int, Int, np.ndarray]
-"""Looks; of P rows the frame, the number of the look, and the pose (4, P): x, y, z, yaw."""
+class _Moving(NamedTuple):
+    """Looks; of P rows the frame, the number of the look, and the pose (4, P): x, y, z, yaw."""
+
+    looks: list[Entity]
+    frame: Int
+    look: Int
+    poses: Float
+
+    def between(self, begin: int, end: int) -> _Moving:
+        """The rows of some frames."""
+        rows = slice(*np.searchsorted(self.frame, [begin, end]))
+        return self._replace(frame=self.frame[rows], look=self.look[rows], poses=self.poses[:, rows])
 
 
-def _draw_bodies(scene: Scene, truth: Tracks, named: Collection[int]) -> _Moving:
-    """All valid rows of the truth; an object has a look of its own as long as its size stays."""
-    rows = truth.by_frame[0]
+def _draw_bodies(scene: Scene, truth: Tracks, rows: Int, named: Collection[int]) -> _Moving:
+    """The valid ones of some rows of the truth; an object has a look of its own as long as its size stays."""
     rows = rows[truth.valid[0, rows]]
     numbers = np.stack([truth.row_object_ix[rows], *(getattr(truth, f"{n}_m")[0, rows] for n in _SIZES)])
     by_object = np.argsort(numbers[0], kind="stable")
@@ -97,7 +117,7 @@ def _draw_bodies(scene: Scene, truth: Tracks, named: Collection[int]) -> _Moving
     look[by_object] = np.cumsum(first) - 1
     looks = [_draw_body(scene, int(k), size, named=int(k) in named) for k, *size in ordered[:, first].T.tolist()]
     poses = np.stack([getattr(truth, name)[0, rows] for name in ("x_m", "y_m", "z_m", "yaw_rad")])
-    return looks, truth.frame_ix[rows], look, poses
+    return _Moving(looks, truth.frame_ix[rows], look, poses)
 
 
 _SIZES = ("length", "width", "height")
@@ -121,9 +141,9 @@ def _draw_carried_units(replayed: ReplayedRun) -> Iterator[_Moving]:
         newest = np.searchsorted(placed.stamps_ns[name], stamps_ns, side="right") - 1
         poses, frame = placed.poses[name], np.flatnonzero(newest >= 0)
         frame = frame[poses.present[newest[frame]]]
-        columns = (poses.x_m, poses.y_m, poses.z_m, poses.heading_rad)
         look = _draw_unit(replayed, name, field=len(carried) <= MANY_MOVING)
-        yield [look], frame, np.zeros_like(frame), np.stack([column[newest[frame]] for column in columns])
+        poses_m = np.stack([poses.x_m, poses.y_m, poses.z_m, poses.heading_rad])[:, newest[frame]]
+        yield _Moving([look], frame, np.zeros_like(frame), poses_m)
 
 
 def _draw_unit(replayed: ReplayedRun, name: str, *, field: bool) -> Entity:

@@ -254,7 +254,7 @@ def _dashed_crosses(tracks: Tracks, rows: Int) -> np.ndarray:
     side = np.roll(corner, -1, axis=1) - corner
     dashes = corner[:, :, None, None] + side[:, :, None, None] * _DASHES[..., None]  # (R, 4, 3, 2, 3)
     cross = corner[:, [[0, 2], [1, 3]]]
-    return np.concatenate([dashes.reshape(len(rows), -1, 2, 3), cross], axis=1).astype(np.float32)
+    return np.concatenate([dashes.reshape(len(rows), _LINES - 2, 2, 3), cross], axis=1).astype(np.float32)
 
 
 def _pack_rgba(colour: tuple[int, int, int, int]) -> int:

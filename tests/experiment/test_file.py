@@ -360,8 +360,8 @@ SWEEP = "sweep: %s", "19: sweep"
 """What a line looks like, and how a problem with it begins."""
 
 KEYS = (
-    "areas, braking, configurations, criteria, ego, links, logs, maps, max_gap_s, measure, obstacles, pems, read, "
-    "runs, seed, show, sweep, tags, units, version, visibility, window_s"
+    "areas, braking, configurations, criteria, ego, frame, links, logs, maps, max_gap_s, measure, obstacles, pems, "
+    "read, runs, seed, show, sweep, tags, units, version, visibility, window_s"
 )
 CLASSES = "pedestrian, bicycle, motorcycle, car, van, truck, bus, trailer, animal, other, vehicle, vru, vehicles"
 FUSIONS = "ideal, union, nms, gnn, tracker"
@@ -375,7 +375,10 @@ SEED = "4: seed: expected a whole number of 64 bits (-2^63 … 2^64 - 1), found 
 A_TURN = "expected degrees from -360 to 360"
 EITHER = "expected one of `pem: <name>` and `recorded: {topic: …}`"
 RECORDED = "recorded: goes with one place, `on` an object or `at` a point, and without rate_hz"
-PLACE = "expected one of `on: ego`, `on: <object id>`, `on: {classes, penetration_rate}` and `at: [x, y]`"
+PLACE = (
+    "expected one of `on: ego`, `on: <object id>`, `on: {classes, penetration_rate}`, `at: [x, y]` and "
+    "`at_wgs84: [latitude, longitude]`"
+)
 CASES = [
     (TOP, "version: 2", "1: version: expected 1, found 2"),
     (TOP, "version: '1'", "1: version: expected 1, found '1'"),

@@ -77,6 +77,7 @@ def test_survey(path):
                 "missing": [],
                 "damage": None,
                 "notes": ["1 message of nav_msgs/msg/Odometry not read"],
+                "place": "none (the recording does not say where on earth it is)",
                 "vehicles": "4 (car), 7 (pedestrian)",
                 "units": [
                     {
@@ -128,6 +129,7 @@ def test_describe(path):
         "truth: truth",
         "  6 frames, 1.500 s, 4.00 Hz (median), longest gap 0.500 s at 0.750 s",
         "  within x 0 … 30 m, y 0 … 3 m",
+        "  place: none (the recording does not say where on earth it is)",
         "  1 gap above 0.5 s inside tracks",
         "  moving: 1 pedestrian, 1 car",
         "  stationary: 1 other",

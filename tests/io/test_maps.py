@@ -72,6 +72,24 @@ def test_chords_of_an_arc_are_within_five_centimetres(tmp_path: Path) -> None:
         assert 0.01 < off_m.max() < 0.05
 
 
+@pytest.mark.parametrize(
+    "shape",
+    [
+        '<spiral curvStart="0.05" curvEnd="-0.02"/>',
+        '<paramPoly3 aU="0" bU="15" cU="0" dU="0" aV="0" bV="0" cV="2" dV="0" pRange="normalized"/>',
+    ],
+)
+def test_a_piece_without_length_is_a_point(tmp_path: Path, shape: str) -> None:
+    """Nothing is divided by its length, which no number would hold; warnings are errors here."""
+    text = (
+        road(shape, 30.0)
+        .replace('length="30.0"><s', 'length="1e-320"><s')
+        .replace('length="30.0"><p', 'length="1e-320"><p')
+    )
+    assert 'length="1e-320"' in text
+    read_map(written(tmp_path, text))
+
+
 @pytest.mark.parametrize(("start", "end"), [(0.0, 0.1), (0.05, -0.05), (-0.02, 0.1), (0.1, 0.1 + 1e-7), (1e-9, 0)])
 def test_spiral_against_numerical_integrals(start: float, end: float) -> None:
     length_m, change = 60.0, (end - start) / 60.0

@@ -18,7 +18,7 @@ import pytest
 import scipy.optimize
 import scipy.stats
 import shapely
-from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import HealthCheck, assume, example, given, settings
 from hypothesis import strategies as st
 from mpmath import mpf
 
@@ -831,6 +831,7 @@ def test_probability_to_fail_between_and_before_what_passes() -> None:
     borders=st.lists(st.floats(0, 9), min_size=2, max_size=6, unique=True).filter(lambda b: len(b) % 2 == 0),
     known_s=st.lists(st.floats(0, 9) | st.just(NEVER), min_size=1, max_size=5),
 )
+@example(reaction=ConstantReaction(delay_s=5e-324), borders=[0.0, 1.0], known_s=[NEVER])
 def test_it_passes_or_fails(reaction: Reaction, borders: list[float], known_s: list[float]) -> None:
     between_s = np.sort(borders).reshape(-1, 2)
     passes = pass_probability(between_s, np.array(known_s), reaction)

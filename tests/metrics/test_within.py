@@ -268,10 +268,13 @@ class TestInARun:
 @pytest.mark.parametrize(
     ("measure", "said"),
     [
-        ({"objects": {"within": {}}}, "expected one of polygon_m, corridor_m, conflict_s, areas, found none"),
+        (
+            {"objects": {"within": {}}},
+            "expected one of polygon_m, polygon_wgs84, corridor_m, conflict_s, areas, found none",
+        ),
         ({"objects": {"within": {"corridor_m": 1.0, "conflict_s": 2.0}}}, "found corridor_m and conflict_s"),
         ({"objects": {"within": {"polygon_m": [[0, 0], [1, 1], [1, 0], [0, 1]]}}}, "edges that cross or overlap"),
-        ({"annotated": {}}, "expected one of polygon_m, range_m, found none"),
+        ({"annotated": {}}, "expected one of polygon_m, polygon_wgs84, range_m, found none"),
         (
             {"annotated": {"polygon_m": [[0, 0], [1, 1], [2, 2]]}},
             "polygon_m: expected the corners in order around an area",

@@ -392,7 +392,9 @@ def test_the_results_folder(
     ]
     write_recording(tmp_path / "drive.mcap", frames, host=1)
     (tmp_path / "plan.yaml").write_text(
-        "version: 1\nlogs: [drive.mcap]\nruns: 2\npems: {p: [{detection: {kind: constant, probability: 0.7}}]}\n"
+        "version: 1\nlogs: [drive.mcap]\nruns: 2\npems: {p: {"
+        "couples: [{detection: {kind: constant, probability: 0.7}}], "
+        "ghosts: [{in_list: 0.1, where: {kind: field, range_m: [5, 40]}}]}}\n"
         "units: {ego: {on: ego, height_m: 1.8, pem: p}, mast: {at: [9, 9], height_m: 5, pem: p}}\n"
         "configurations: {GT: {units: truth}, ideal: {units: all, latency_s: 0.2}, gnn: {units: all, fusion: "
         "{kind: gnn}}, tracker: {units: all, fusion: {kind: tracker}}}\nmeasure: {began: [log_start, crossed]}\n"
@@ -402,6 +404,7 @@ def test_the_results_folder(
         with monkeypatch.context() as patch:
             patch.setattr(chunking, "ROWS_AT_ONCE", count)
             patch.setattr(chunking, "ROWS_A_CHUNK", count)
+            patch.setattr("copem_replay.results.truth_scene.MOST_ROWS", count)
             patch.setattr("sys.argv", ["copem-replay", "run", "plan.yaml", "--out", out])
             with pytest.raises(SystemExit) as ended:
                 cli.main()

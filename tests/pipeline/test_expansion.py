@@ -826,8 +826,8 @@ FLEET = "  mast: {on: {classes: [car], penetration_rate: 0.5}, pem: onboard}"
         (
             [FLEET.replace("pem", "at: [1, 2], pem")],
             [
-                "12: units.mast: expected one of `on: ego`, `on: <object id>`, `on: {classes, penetration_rate}` and "
-                "`at: [x, y]`"
+                "12: units.mast: expected one of `on: ego`, `on: <object id>`, `on: {classes, penetration_rate}`, "
+                "`at: [x, y]` and `at_wgs84: [latitude, longitude]`"
             ],
         ),
         ([FLEET.replace("onboard", "onbord")], ["12: units.mast.pem: no PEM is named 'onbord'; did you mean onboard?"]),

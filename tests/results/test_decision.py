@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
 
 import copem_replay as cr
+from copem_replay.pipeline.run import StudyTables
 from copem_replay.results.compare import Comparison
-from copem_replay.results.decision import Decision, decide_compared, describe_verdicts
+from copem_replay.results.decision import Decision, decide, decide_compared, describe_verdicts
 from copem_replay.results.verdicts import MET, NOT_MET, UNDECIDED, Judgement, Verdict
+from tests.helpers.recordings import Obj, pedestrian, write_recording
 
 Row = tuple[str, float, float, float | None, float | None]
 """Configuration, its value, that of the baseline, and the limits of the difference."""
@@ -148,3 +152,29 @@ def test_criteria_are_the_sentence() -> None:
         "Not good enough: 2 of 3 verdicts do not pass: v1 with PEM is not met (asked: ttd_rmst_s ≤ 0.5, found: 0.7), "
         "and 1 more."
     )
+
+
+def test_results_in_memory_are_decided_on_without_tables_of_accuracy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of an hour they take half a gigabyte, and no decision is about them; a comparison of all metrics makes them."""
+    frames = [(0.1 * k, [Obj(id=1, x=1.0 * k), pedestrian(id=2, x=60.0, y=-2)]) for k in range(31)]
+    write_recording(tmp_path / "drive.mcap", frames, host=1)
+    (tmp_path / "plan.yaml").write_text(
+        "version: 1\nlogs: [drive.mcap]\npems: {p: [{detection: {kind: constant, probability: 1}}]}\n"
+        "units: {ego: {on: ego, height_m: 1.8, pem: p}}\n"
+        "configurations: {ideal: {units: all}, late: {units: all, latency_s: 0.3}}\n"
+    )
+    asked: list[int] = []
+    made = StudyTables.accuracy_of
+
+    def counted(self: StudyTables, *of: Any) -> Any:
+        asked.append(1)
+        return made(self, *of)
+
+    monkeypatch.setattr(StudyTables, "accuracy_of", counted)
+    result = cr.run(tmp_path / "plan.yaml")
+    assert "late" in decide(result).sentence
+    assert not asked
+    cr.compare(result)
+    assert asked == [1]

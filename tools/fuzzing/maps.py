@@ -192,32 +192,49 @@ def _recording() -> Any:
 
 
 def outcome_of_map(path: Path) -> dict[str, Any]:
-    """What becomes of a map: it is read and added to a recording, or refused in single lines."""
-    from pydantic import ValidationError
+    """What becomes of a map: it is read and added to a recording, or refused in single lines.
 
-    from copem_replay.experiment.maps import MapFile, add_maps
-    from copem_replay.metrics.agreement import estimate_shift
-
-    recording = _recording()
-    end, said = "read", list[str]()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    It is added as if in the frame of the log, and by its own reference to a log at 48° N, 11° E.
+    """
+    ends, said = set[str](), list[str]()
+    for same in (True, False):
         try:
-            asked = MapFile.model_validate({"file": str(path), "frame": "same", "agreement": "ignore"})
-            added, _ = add_maps(recording, [asked])
-            estimate_shift(recording.scene, recording.truth, asked.place(None).lanes)
-            said += added.notes
-        except ValidationError as error:
-            end = "refused"
-            said += [str(one["msg"]) for one in error.errors()]
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")
+                end, lines = _add_map(path, same=same)
         except BaseException as error:
             if isinstance(error, KeyboardInterrupt):
                 raise
             ours = [f for f in traceback.extract_tb(error.__traceback__) if "copem_replay" in f.filename]
             where = f"{Path(ours[-1].filename).name}:{ours[-1].lineno}" if ours else "?"
             return {"outcome": "defect", "what": f"{type(error).__name__} at {where}: {str(error)[:200]}"}
+        ends.add(end)
+        said += lines
     for line in said:
         if len(line.splitlines()) > 1 or not all(c.isprintable() for c in line):
             return {"outcome": "defect", "what": f"not one printable line: {line[:150]!r}"}
-    past = end == "read" or any("places are degrees" in line for line in said)
-    return {"outcome": end, "said": said, "past": past}
+    end = "read" if "read" in ends else "refused"
+    return {"outcome": end, "said": said, "past": end == "read"}
+
+
+def _add_map(path: Path, *, same: bool) -> tuple[str, list[str]]:
+    """Whether a map is read, and the lines that are said of it."""
+    from pydantic import ValidationError
+
+    from copem_replay.core.errors import InputError
+    from copem_replay.core.frame import Frame, make_local_proj
+    from copem_replay.experiment.maps import MapFile, add_maps
+    from copem_replay.metrics.agreement import estimate_shift
+
+    recording, frame = _recording(), Frame(make_local_proj(48.0, 11.0))
+    asked = {"file": str(path), "agreement": "ignore"} | ({"frame": "same"} if same else {})
+    try:
+        a_map = MapFile.model_validate(asked)
+        added, problems = add_maps(recording, [a_map], frame)
+        lanes = a_map.place(frame).lanes
+    except ValidationError as error:
+        return "refused", [str(one["msg"]) for one in error.errors()]
+    except InputError as error:
+        return "refused", error.problems
+    estimate_shift(recording.scene, recording.truth, lanes)
+    return "read", [*added.notes, *(line for _, line in problems)]

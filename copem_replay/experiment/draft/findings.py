@@ -110,6 +110,7 @@ class TruthFound:
     missing: list[str]  # keys that a user may have to give
     damage: str | None
     notes: list[str]
+    place: str  # on earth: projection and middle of the log, or why there is none
     vehicles: str  # ids of objects that move, as messages list them
     units: list[UnitFound]
     suggested: Suggestion

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from copem_replay.core.errors import RecordingError
+from copem_replay.core.errors import InputError, RecordingError
+from copem_replay.core.frame import check_scale, write_degrees
 from copem_replay.core.tracks import CLASSES, Bool, Float, Scene
 from copem_replay.experiment.draft.findings import (
     EgoFound,
@@ -29,6 +30,7 @@ from copem_replay.io.open import Local, first_recording, label_files, name_log, 
 from copem_replay.io.recording import (
     Recording,
     choose_topic,
+    find_middle,
     foreign_channels,
     is_truth,
     moving_ids,
@@ -211,10 +213,25 @@ def _survey_truth(
         missing=_list_missing(recording, poses),
         damage=recording.damage,
         notes=list(recording.notes),
+        place=_describe_place(recording),
         vehicles=moving_ids(scene, shown=6),
         units=list(_survey_units(recording, units)),
         suggested=suggest_experiment(log, recording, fields),
     )
+
+
+def _describe_place(recording: Recording) -> str:
+    """Where the recording says that it is, or why that is not known."""
+    if recording.place_said is None:
+        return "none (the recording does not say where on earth it is)"
+    try:
+        frame, notes = recording.place_said.read()
+        middle_m = find_middle(recording)
+        notes += check_scale(frame, middle_m)
+        where = f"{frame.proj}, {write_degrees(*frame.to_wgs84(middle_m)[0])} at the middle of the log"
+    except InputError as error:
+        return f"none ({error})"
+    return "; ".join([where, *notes])
 
 
 def _round_extent(values: Float) -> list[float]:

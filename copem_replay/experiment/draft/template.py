@@ -501,6 +501,7 @@ def _truth_lines(truth: TruthFound) -> list[str]:
     lines.append(span)
     (x0, x1), (y0, y1) = truth.x_m, truth.y_m
     lines.append(f"  within x {x0:g} … {x1:g} m, y {y0:g} … {y1:g} m")
+    lines.append(f"  place: {truth.place}")
     if truth.gaps_inside_tracks:
         lines.append(f"  {count_noun(truth.gaps_inside_tracks, 'gap')} above {MAX_GAP_S:g} s inside tracks")
     for kind, counts in (("moving", truth.moving), ("stationary", truth.stationary)):

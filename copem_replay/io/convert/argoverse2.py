@@ -19,7 +19,7 @@ import pyarrow.feather
 from copem_replay.core.errors import InputError
 from copem_replay.core.site_map import find_borders
 from copem_replay.core.tracks import Float
-from copem_replay.io.convert.conversion import KINDS, Box, ConversionReport, Frame, rotation_from_quaternion
+from copem_replay.io.convert.conversion import KINDS, Box, ConversionReport, ConvertedFrame, rotation_from_quaternion
 from copem_replay.io.maps.registry import read_map
 
 EGO_SIZE_M: Final = (4.877, 2.0, 1.473)
@@ -70,7 +70,7 @@ def frames(
     *,
     ego_size_m: tuple[float, float, float] = EGO_SIZE_M,
     centre_from_rear_axle_m: tuple[float, float, float] = CENTRE_FROM_REAR_AXLE_M,
-) -> Iterator[Frame]:
+) -> Iterator[ConvertedFrame]:
     """All annotated instants, with the ego vehicle as host. Raises InputError."""
     if not log.is_dir():
         raise InputError(f"{log}: expected the folder of an Argoverse 2 sensor log, found no folder")
@@ -111,7 +111,7 @@ def frames(
                     size_m=(length, width, height),
                 )
             )
-        yield Frame(stamp_ns, frame_boxes, host=1, lines=lines)
+        yield ConvertedFrame(stamp_ns, frame_boxes, host=1, lines=lines)
         lines = []
 
 

@@ -21,7 +21,7 @@ from copem_replay.io.convert.conversion import (
     KINDS,
     Box,
     ConversionReport,
-    Frame,
+    ConvertedFrame,
     OsiKind,
     parse_number,
     parse_positive,
@@ -173,7 +173,7 @@ class _Shape:
     yaw_rad: float = 0.0
 
 
-def frames(path: Path, report: ConversionReport) -> Iterator[Frame]:
+def frames(path: Path, report: ConversionReport) -> Iterator[ConvertedFrame]:
     """All steps at which a dynamic obstacle has a state; static ones are in all of them. Raises InputError."""
     source = read_parts(path, ("commonRoad",))
     step_s = _read_time_step(next(source), path)
@@ -201,7 +201,7 @@ def frames(path: Path, report: ConversionReport) -> Iterator[Frame]:
                     static.append(box)
     for step in sorted(steps or {0: []}):
         stamp_ns = parse_seconds_as_ns(step, f"{path}: time step {step}", times=step_s)
-        yield Frame(stamp_ns, [*steps.get(step, []), *static])
+        yield ConvertedFrame(stamp_ns, [*steps.get(step, []), *static])
 
 
 def _read_time_step(root: XmlNode, path: Path) -> Decimal:

@@ -187,7 +187,7 @@ class Box:
 
 
 @dataclass(frozen=True)
-class Frame:
+class ConvertedFrame:
     """All boxes of one instant."""
 
     stamp_ns: int
@@ -222,7 +222,7 @@ class ConversionReport:
 
 
 def write_recording(
-    path: Path, frames: Iterable[Frame], report: ConversionReport, *, source: Path, format_name: str
+    path: Path, frames: Iterable[ConvertedFrame], report: ConversionReport, *, source: Path, format_name: str
 ) -> None:
     """Write the recording, complete or not at all. Raises InputError: no object, or times not in order."""
     record: dict[str, str] = {}
@@ -237,7 +237,7 @@ def write_recording(
 
 
 def _encode_messages(
-    frames: Iterable[Frame], report: ConversionReport, source: Path, format_name: str, record: dict[str, str]
+    frames: Iterable[ConvertedFrame], report: ConversionReport, source: Path, format_name: str, record: dict[str, str]
 ) -> Iterator[tuple[str, GroundTruth]]:
     """Encode frame by frame; `record` is filled after the last, since only then all names are known."""
     last_ns = -1
@@ -259,7 +259,7 @@ def _encode_messages(
     record |= {"format": format_name, "ids": json.dumps(ids, ensure_ascii=False), "notes": notes}
 
 
-def _encode_message(frame: Frame, report: ConversionReport) -> GroundTruth:
+def _encode_message(frame: ConvertedFrame, report: ConversionReport) -> GroundTruth:
     osi = empty_ground_truth(frame.stamp_ns, frame.host)
     for number, line in enumerate(frame.lines):
         boundary = osi.lane_boundary.add()
@@ -361,7 +361,7 @@ def convert_source(
     """
     if format not in FORMATS:
         raise InputError(unknown_name_message("format", format, FORMATS))
-    frames: Callable[..., Iterator[Frame]] = import_module(f"copem_replay.io.convert.{FORMATS[format]}").frames
+    frames: Callable[..., Iterator[ConvertedFrame]] = import_module(f"copem_replay.io.convert.{FORMATS[format]}").frames
     report = ConversionReport()
     write_recording(out, frames(source, report, **(options or {})), report, source=source, format_name=format)
     return report

@@ -14,7 +14,7 @@ from copem_replay.io.convert.conversion import (
     KINDS,
     Box,
     ConversionReport,
-    Frame,
+    ConvertedFrame,
     OsiKind,
     number_names,
     parse_number,
@@ -48,7 +48,7 @@ class _BoxRow:
     host: bool
 
 
-def frames(path: Path, report: ConversionReport) -> Iterator[Frame]:
+def frames(path: Path, report: ConversionReport) -> Iterator[ConvertedFrame]:
     """All instants in order of time. Raises InputError."""
     rows = list(_read_rows(path))
     ids = number_names(row.name for row in rows)
@@ -76,7 +76,7 @@ def frames(path: Path, report: ConversionReport) -> Iterator[Frame]:
     host = next((ids[name] for name in hosts), None)
     for stamp_ns in sorted(instants):
         boxes = [_make_box(row, ids[row.name], report, moves=row.name in moves) for row in instants[stamp_ns].values()]
-        yield Frame(stamp_ns, boxes, host)
+        yield ConvertedFrame(stamp_ns, boxes, host)
 
 
 def _make_box(row: _BoxRow, ident: int, report: ConversionReport, *, moves: bool) -> Box:

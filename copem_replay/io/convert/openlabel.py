@@ -23,7 +23,7 @@ from copem_replay.io.convert.conversion import (
     KINDS,
     Box,
     ConversionReport,
-    Frame,
+    ConvertedFrame,
     OsiKind,
     number_names,
     parse_number,
@@ -160,7 +160,7 @@ def frames(
     rate_hz: float | None = None,
     source: str | None = None,
     target: str | None = None,
-) -> Iterator[Frame]:
+) -> Iterator[ConvertedFrame]:
     """All frames in order of time, without a host. Raises InputError.
 
     `rate_hz`: for frames without time stamps, number / rate. `source`: the coordinate system of cuboids that name
@@ -177,7 +177,7 @@ def frames(
             if box is not None:
                 boxes.append(box)
                 report.names[box.id] = name
-        yield Frame(frame.stamp_ns, boxes)
+        yield ConvertedFrame(frame.stamp_ns, boxes)
 
 
 def _list_files(path: Path) -> list[Path]:

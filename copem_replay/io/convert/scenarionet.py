@@ -23,7 +23,7 @@ from copem_replay.io.convert.conversion import (
     LAST_SECOND,
     Box,
     ConversionReport,
-    Frame,
+    ConvertedFrame,
     OsiKind,
     number_names,
     quote_value,
@@ -81,7 +81,7 @@ class _Track:
     velocity_mps: Float  # (T, 2), NaN: not given
 
 
-def frames(path: Path, report: ConversionReport, *, ego_centre_m: float | None = None) -> Iterator[Frame]:
+def frames(path: Path, report: ConversionReport, *, ego_centre_m: float | None = None) -> Iterator[ConvertedFrame]:
     """All steps, with the track of `sdc_id` as host. Raises InputError.
 
     `ego_centre_m`: of the ego's box ahead of the position given for it; None: `EGO_CENTRE_M` for nuScenes, else 0.
@@ -108,7 +108,7 @@ def frames(path: Path, report: ConversionReport, *, ego_centre_m: float | None =
     lines = _read_road_lines(scenario, str(path), report)
     for step, stamp_ns in enumerate(stamps_ns):
         boxes = [_make_box(ids[name], t, step) for name, t in tracks.items() if t.valid[step]]
-        yield Frame(stamp_ns, boxes, ids.get(host) if host is not None else None, lines if step == 0 else ())
+        yield ConvertedFrame(stamp_ns, boxes, ids.get(host) if host is not None else None, lines if step == 0 else ())
 
 
 def _read_road_lines(scenario: Any, where: str, report: ConversionReport) -> list[Float]:

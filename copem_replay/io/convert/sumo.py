@@ -19,7 +19,7 @@ from copem_replay.io.convert.conversion import (
     KINDS,
     Box,
     ConversionReport,
-    Frame,
+    ConvertedFrame,
     OsiKind,
     parse_number,
     parse_positive,
@@ -110,7 +110,7 @@ _CLASS: Final = {"vehicle": "passenger", "person": "pedestrian"}
 
 def frames(
     path: Path, report: ConversionReport, *, type_files: Iterable[Path] = (), host: str | None = None
-) -> Iterator[Frame]:
+) -> Iterator[ConvertedFrame]:
     """All time steps; `host` is the id of a vehicle. Raises InputError."""
     types = read_types(type_files)
     # A vehicle and a person may have the same id: both are numbered together, the host first.
@@ -137,7 +137,7 @@ def frames(
             ident = ids.setdefault(key, len(ids) + 1)
             report.names[ident] = " ".join(key)
             boxes.append(_make_box(ident, node, _find_type(node, types, report), path, report))
-        yield Frame(stamp_ns, boxes, host=None if host is None else 1)
+        yield ConvertedFrame(stamp_ns, boxes, host=None if host is None else 1)
     if not met:
         vehicles = [name for tag, name in ids if tag == "vehicle" and name != host]
         more = f", … ({len(vehicles)} in all)" if len(vehicles) > _SHOWN else ""

@@ -21,6 +21,8 @@ CHORD_M: Final = 0.05
 _MOST_PLACES: Final = 50_000
 """Places on all curves of one section of a road together: with ten lanes 50 km in chords of 10 m."""
 _SAME_S_M: Final = 1e-9
+_SHORT_M: Final = 1e-9
+"""Shorter pieces are points: what is divided by their length may be beyond all numbers."""
 _NO_SPIRAL_RAD: Final = 1e-7
 """A curvature that changes the heading by less over its whole length is constant: 3e-5 m in a kilometre."""
 
@@ -100,7 +102,7 @@ def _follow_arc(ds: Float, _length_m: float, numbers: Mapping[str, float]) -> tu
 
 
 def _follow_spiral(ds: Float, length_m: float, numbers: Mapping[str, float]) -> tuple[Float, Float, Float]:
-    change = (numbers["curvEnd"] - numbers["curvStart"]) / length_m if length_m else 0.0
+    change = (numbers["curvEnd"] - numbers["curvStart"]) / length_m if length_m > _SHORT_M else 0.0
     return follow_clothoid(ds, numbers["curvStart"], change)
 
 
@@ -114,7 +116,7 @@ def _follow_poly3(ds: Float, length_m: float, numbers: Mapping[str, float]) -> t
 
 
 def _follow_param_poly3(ds: Float, length_m: float, numbers: Mapping[str, float]) -> tuple[Float, Float, Float]:
-    p = ds / length_m if numbers["normalized"] and length_m else ds
+    p = ds / length_m if numbers["normalized"] and length_m > _SHORT_M else ds
     (au, bu, cu, du), (av, bv, cv, dv) = ([numbers[name + axis] for name in "abcd"] for axis in "UV")
     turn = np.arctan2(bv + p * (2 * cv + 3 * p * dv), bu + p * (2 * cu + 3 * p * du))
     return au + p * (bu + p * (cu + p * du)), av + p * (bv + p * (cv + p * dv)), turn

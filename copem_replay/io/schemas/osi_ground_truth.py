@@ -20,6 +20,7 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from copem_replay.core.errors import count_noun
+from copem_replay.core.frame import SaidPlace
 from copem_replay.core.tracks import CLASSES, VALUES, Bool, Float, Int, Solid
 from copem_replay.io.channel import LAST_NS
 from copem_replay.io.decoded_size import MOST_OBJECTS, STATE_BYTES, DecodeAllowance, check_objects
@@ -183,6 +184,7 @@ class GroundTruthDecoder:
         self._waiting: list[tuple[int, bytes]] = []  # moving objects that are still to be added, and of which message
         self._waiting_bytes, self._waiting_objects, self._batches, self._walk = 0, 0, 0, False
         self._lane_boundaries: list[Float] = []
+        self._place: SaidPlace | None = None
         self._solids: dict[int, Solid | None] = {}  # of stationary objects by OSI id; None: a box
         # What is counted and what is the matter with it: how many, and where the first is.
         self._notes: dict[tuple[str, str], tuple[int, _Place]] = {}
@@ -218,6 +220,8 @@ class GroundTruthDecoder:
         self._stamp_ns.append(seconds * 1_000_000_000 + nanos - (0 if stamped is None else ahead_ns))
         self._stamped.append(stamped is not None)
         self._add_host(message, truth)
+        if truth.proj_string:
+            self._add_place(truth, self._stamp_ns[-1])
         if not self._lane_boundaries and len(truth.lane_boundary):  # the lanes of one message are those of all
             self._add_lanes(truth.lane_boundary)
         check_objects(len(truth.moving_object) + len(truth.stationary_object))
@@ -231,7 +235,10 @@ class GroundTruthDecoder:
             check_osi(self._message_of[schema], payload)
             with suppress(DecodeError):
                 message = self._message_of[schema].FromString(payload)
-                self._add_lanes((message.global_ground_truth if schema == SENSOR_VIEW else message).lane_boundary)
+                truth = message.global_ground_truth if schema == SENSOR_VIEW else message
+                self._add_lanes(truth.lane_boundary)
+                if truth.proj_string and self._place is None:
+                    self._add_place(truth, 0)
 
     def columns(self) -> DecodedObjects:
         """The columns of all messages that were added; none can be added after. Raises OversizeError."""
@@ -248,6 +255,7 @@ class GroundTruthDecoder:
             moving=np.array(moving, dtype=bool),
             **_join_rows(self._moving, self._stationary),
             lane_boundaries=tuple(self._lane_boundaries),
+            place=self._place,
             solids=solids,
             hosts=tuple(self._hosts),
             notes=tuple(f"{count_noun(number, noun)} {what}" for (noun, what), number in notes.items()),
@@ -259,6 +267,18 @@ class GroundTruthDecoder:
             if source.HasField("host_vehicle_id"):
                 self._hosts.append(str(source.host_vehicle_id.value))
                 return
+
+    def _add_place(self, truth: Any, stamp_ns: int) -> None:
+        """Take the place on earth that a message says, or that it says another than one before."""
+        offset = truth.proj_frame_offset
+        place = SaidPlace(truth.proj_string, (offset.position.x, offset.position.y), offset.yaw)
+        if self._place is None:
+            self._place = place
+        elif not self._place.changed and place != self._place:
+            what = "proj_string" if place.proj != self._place.proj else "proj_frame_offset"
+            before, now = (repr(one.proj) if what == "proj_string" else one[1:3] for one in (self._place, place))
+            changed = f"{what} is {before} first and {now} at {stamp_ns / 1e9:.3f} s: expected one of all messages"
+            self._place = place._replace(changed=changed)
 
     def _wait(self, truth: Any) -> None:
         """Keep the moving objects of a message, no map; add those that wait where they are many."""

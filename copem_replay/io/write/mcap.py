@@ -179,8 +179,9 @@ def _encode_chunk_extras(
 
 def _encode_truth(writer: TruthWriter, truth: TruthScene) -> Iterator[Message]:
     """The messages of the truth's scene; static entities once, at the start."""
-    frames = zip(truth.moving.time_ns.tolist(), writer.moving(truth.moving), truth.followed, strict=True)
-    for k, (time_ns, moving, followed) in enumerate(frames):
+    messages = (zip(part.time_ns.tolist(), writer.moving(part), strict=True) for part in truth.moving)
+    frames = zip(chain.from_iterable(messages), truth.followed, strict=True)
+    for k, ((time_ns, moving), followed) in enumerate(frames):
         if k == 0:
             yield Message(writer.static, time_ns, writer.drawn(truth.static, time_ns), time_ns, 0)
         yield Message(writer.scene, time_ns, moving, time_ns, 0)

@@ -113,10 +113,13 @@ class MovingEntities:
 
 @dataclass(frozen=True)
 class TruthScene:
-    """The truth as a scene: static entities, moving ones, and in each frame the pose of the frame `follow`, if any."""
+    """The truth as a scene: static entities, moving ones, and in each frame the pose of the frame `follow`, if any.
+
+    `moving`: of some frames at a time, read once.
+    """
 
     static: Sequence[Entity]
-    moving: MovingEntities
+    moving: Iterable[MovingEntities]
     followed: Sequence[Pose | None]
     follow: str
 

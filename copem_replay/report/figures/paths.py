@@ -43,12 +43,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Drive:
-    """The truth of one log, and what stands in it."""
+    """The truth of one log, what stands in it, and who has to be named beside a plan of it."""
 
     log: str
     experiment: Experiment
     scene: Scene
     truth: Tracks
+    lanes_m: tuple[Float, ...] = ()  # borders (K, 3)
+    credits: tuple[str, ...] = ()
 
     def path(self, object_ix: int) -> tuple[Float, Float]:
         """Instants (K,) in seconds since the log's start, and places (K, 2) in metres, of an object; NaN in gaps."""
@@ -62,6 +64,12 @@ class Drive:
         yield from (np.array(one.polygon_m) for one in self.experiment.obstacles)
         yield from (np.array(solid.corners_m) for solid in self.scene.solids)
 
+    def lanes_within(self, west_m: float, east_m: float, south_m: float, north_m: float) -> list[Float]:
+        """Borders of lanes (K, 2) that come into a box."""
+        borders = (line[:, :2] for line in self.lanes_m)
+        low, high = (west_m, south_m), (east_m, north_m)
+        return [line for line in borders if (line.max(axis=0) >= low).all() and (line.min(axis=0) <= high).all()]
+
     def fixed_units(self) -> dict[str, tuple[float, float]]:
         """Places of the units that stand."""
         return {name: unit.at for name, unit in self.experiment.modelled.items() if unit.at is not None}
@@ -74,7 +82,8 @@ def read_drive(results: Results, log: str) -> Drive:
         raise RecordingError("plans need the recording on this machine", path=place)
     experiment = resolve_for_log(results.experiment, log)
     recording = results.recording(log, experiment)
-    return Drive(log, experiment, recording.scene, recording.truth)
+    credits = dict.fromkeys(note[note.index("©") :] for note in recording.notes if "©" in note)
+    return Drive(log, experiment, recording.scene, recording.truth, recording.lane_boundaries, tuple(credits))
 
 
 def find_latest_log(results: Results) -> str:
@@ -167,7 +176,7 @@ def _find_box(drive: Drive, rows: pd.DataFrame) -> tuple[float, float, float, fl
 
 def _draw_ground(axes: Axes, drive: Drive, box: tuple[float, float, float, float]) -> None:
     """Draw what stands there, the way of the ego, and the places of units."""
-    from matplotlib.collections import PolyCollection
+    from matplotlib.collections import LineCollection, PolyCollection
 
     axes.set_facecolor(_GROUND)
     axes.set_aspect("equal", adjustable="box")
@@ -180,6 +189,7 @@ def _draw_ground(axes: Axes, drive: Drive, box: tuple[float, float, float, float
     at_m = box[0] + 0.04 * (box[1] - box[0]), box[2] + 0.05 * (box[3] - box[2])
     axes.plot([at_m[0], at_m[0] + long_m], [at_m[1]] * 2, color=INK, linewidth=2, solid_capstyle="butt", label="_scale")
     axes.annotate(f"{long_m} m", at_m, (0, 3), textcoords="offset points", fontsize=7.5, color=INK)
+    axes.add_collection(LineCollection(drive.lanes_within(*box), colors="0.85", linewidths=0.6, zorder=0.9))
     axes.add_collection(PolyCollection(list(drive.outlines()), facecolor="0.8", edgecolor="0.6", linewidth=0.6))
     if drive.scene.ego_ix >= 0:
         axes.plot(
@@ -237,5 +247,6 @@ def _note_sentences(
         f"took; darker is later{never}",
         *(["Dashed: the way of the ego"] if drive.scene.ego_ix >= 0 else []),
         *(["Triangles: fixed units"] if drive.fixed_units() else []),
+        *(f"Map: {line}" for line in drive.credits),
         describe_left_out(asked, names),
     ]

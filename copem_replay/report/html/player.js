@@ -90,6 +90,13 @@
   const world = (pen, seen, tone) => {
     pen.lineWidth = 1;
     pen.fillStyle = pen.strokeStyle = tone("--line");
+    pen.globalAlpha = 0.4;
+    for (const lane of data.lanes) {
+      pen.beginPath();
+      for (let k = 0; k < lane.length; k += 2) pen.lineTo(...seen.at(lane[k], lane[k + 1]));
+      pen.stroke();
+    }
+    pen.globalAlpha = 1;
     for (const solid of data.solids) {
       pen.beginPath();
       for (let k = 0; k < solid.length; k += 2) pen.lineTo(...seen.at(solid[k], solid[k + 1]));

@@ -158,6 +158,7 @@ def collect_player_data(study: ReportData, choice: Choice) -> dict[str, Any]:
         "ego": scene.ego_ix,
         "truth": _to_text(encode_tracks(tracks[""], grid)),
         "solids": _outline_solids(replayed, grid),
+        "lanes": _list_lanes(replayed, grid),
         "units": _list_places(replayed, grid),
         "measured": _list_measured(scene, table, choice.object_id),
         "configurations": [
@@ -233,6 +234,18 @@ def _outline_solids(replayed: ReplayedRun, grid: Grid) -> list[list[float]]:
         (static.xy_m[static.start[k] : static.start[k + 1]] - grid.middle_m).round(2).ravel().tolist()
         for k in range(len(static.body))
     ]
+
+
+_MOST_LANE_POINTS = 20_000
+"""Of borders of lanes on a page, some 200 kB; with more they are left out."""
+
+
+def _list_lanes(replayed: ReplayedRun, grid: Grid) -> list[list[float]]:
+    """Borders of lanes as x and y in turn, m from the middle."""
+    lines = replayed.replay.lane_boundaries
+    if sum(map(len, lines)) > _MOST_LANE_POINTS:
+        return []
+    return [(line[:, :2] - grid.middle_m).round(1).ravel().tolist() for line in lines]
 
 
 def _list_places(replayed: ReplayedRun, grid: Grid) -> list[list[Any]]:

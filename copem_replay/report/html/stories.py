@@ -33,6 +33,7 @@ from copem_replay.report.figures.selection import pick_evenly
 from copem_replay.report.figures.style import shorten_names
 from copem_replay.report.html.markup import Html, css_colour, make_tag, replace_greys
 from copem_replay.report.html.study import NO_RECORDING, ReportData
+from copem_replay.report.html.why import why_late
 
 MOST_STORIES = 6
 """Half of them the latest objects, half those on which configurations differ most."""
@@ -280,7 +281,11 @@ def _story_element(story: ObjectStory, why: str, log: str | None) -> Html:
         viewBox=f"0 0 {_WIDTH} {_HEIGHT}",
     )  # fmt: skip
     figure = make_tag("div", Html(replace_greys(picture)), class_="scroll", tabindex="0", role="region", aria_label=why)
-    return make_tag("div", title, make_tag("p", said, *beside), figure)
+    late = why_late(story.study.why, story.drive.log, story.object_id, story.onset_s)
+    named = dict.fromkeys(str(row["configuration"]) for row in (story.first, story.last))
+    lines = [f"{name} {late.get(name, 'is not late')}" for name in named]
+    causes = [make_tag("p", "Mean over all runs: ", "; ".join(lines), ".")] if late else []
+    return make_tag("div", title, make_tag("p", said, *beside), *causes, figure)
 
 
 @dataclass(frozen=True)
@@ -354,6 +359,9 @@ def _draw_plan(
     """Boxes of all bodies, obstacles, units, and the line of who lists it, at the onset of who does not see it."""
     drive, scene = story.drive, story.drive.scene
     yield make_tag("rect", x=f"{view.left}", y=f"{_TOP}", width=f"{_PLAN_W}", height=f"{_PLAN_H}", fill="#f7f7f7")
+    wide_m, high_m = _PLAN_W / view.scale, _PLAN_H / view.scale
+    for line in drive.lanes_within(view.west_m, view.west_m + wide_m, view.north_m - high_m, view.north_m):
+        yield make_tag("polyline", points=view.points(line), fill="none", stroke="#d9d9d9")
     for outline in drive.outlines():
         yield make_tag("polygon", points=view.points(outline), fill="#b3b3b3", stroke="#8c8c8c")
     number = scene.object_number[story.object_id]

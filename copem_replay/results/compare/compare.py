@@ -55,6 +55,7 @@ from copem_replay.results.compare.metrics import (
     explain_incomparable,
     find_operating_points,
     ghost_totals,
+    list_tables,
     notes_on_equal_ghosts,
 )
 from copem_replay.results.compare.pairing import (
@@ -163,8 +164,9 @@ def read_folders(given: Sequence[Path | Results]) -> list[Results]:
 
 def _read_folder(folder: Path | Results) -> Results:
     results = folder if isinstance(folder, Results) else open_results(folder)
-    for name in ("by_log", "source"):
-        getattr(results, name)
+    results.source  # noqa: B018
+    if results.study is None:  # damage is found here
+        dict(results.by_log)
     return results
 
 
@@ -286,8 +288,9 @@ def compare_folders(
     check_log_names(against, others, renames)
     used = list(dict.fromkeys(labelled.results for labelled in (against, *others)))
     logs, runs = [log.name for log in read[0].provenance.logs], min(folder.provenance.runs for folder in read)
-    totals = ghost_totals((against, *others), logs, runs)
     own_rate = false_positives_per_min is None
+    of_ghosts = not own_rate or "thresholds.parquet" in list_tables(metrics)
+    totals = ghost_totals((against, *others), logs, runs) if of_ghosts else {}
     if own_rate and against in totals:
         false_positives_per_min = totals[against].per_min
     horizon_s, horizon_notes = _settle_horizon(used)
@@ -367,7 +370,7 @@ def _compare_each_log(
     rows: list[dict[str, object]] = []
     for k, log in enumerate(logs):
         tables = {
-            results: results.rows_of(log)
+            results: results.rows_of(log, list_tables(metrics))
             for results in dict.fromkeys(labelled.results for labelled in (against, *pairs))
         }
         detections = (of_folder["detections.parquet"] for of_folder in tables.values())

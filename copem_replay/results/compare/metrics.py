@@ -112,7 +112,7 @@ def ghost_totals(
         for results in dict.fromkeys(
             labelled.results for labelled in sides if {*_FILES} <= set(labelled.results.by_log)
         ):
-            tables = results.rows_of(log, *_FILES)
+            tables = results.rows_of(log, _FILES)
             for labelled in (labelled for labelled in sides if labelled.results is results):
                 rows, steps = configuration_rows(labelled, tables).values()
                 totals[labelled] = _add_log(labelled, totals.get(labelled), rows, steps, runs)
@@ -498,3 +498,9 @@ FIGURES: Mapping[Any, Callable[[_Pair], PairStatistic | None]] = {
     "passes": _passes,
 }
 """Figures of pairs by the names that metrics compared by them give; None: a side has no data."""
+
+
+def list_tables(metrics: Sequence[str] | None) -> set[str]:
+    """Names of the tables that metrics (None: all) are of; most others are larger."""
+    asked = [of.compared for name, of in COMPARED.items() if of.compared and (metrics is None or name in metrics)]
+    return {"detections.parquet", *(name for of in asked for name in of.files)}
