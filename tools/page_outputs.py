@@ -7,13 +7,14 @@ where a block differs; this writes it anew, and the difference is for a reader: 
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
+
+from processor import plain_environment
 
 ROOT = Path(__file__).resolve().parents[1]
 _BLOCK = re.compile(r"(<!-- output: (.*?) -->\n```text\n)(.*?)(```)", re.DOTALL)
@@ -25,7 +26,7 @@ def printed(command: str, scratch: Path) -> str:
     words = [str(scratch / word) if word.startswith("out/") else word for word in shlex.split(command)]
     start = "import sys; from copem_replay.cli.main import main; sys.argv[0] = 'copem-replay'; sys.exit(main())"
     program = [sys.executable] if words[0] == "python" else [sys.executable, "-c", start]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    environment = plain_environment() | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run([*program, *words[1:]], cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True)
     if done.returncode:
         raise SystemExit(f"`{command}` ended with {done.returncode}")

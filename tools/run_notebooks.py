@@ -12,6 +12,8 @@ from typing import Any
 import nbformat
 from nbclient import NotebookClient
 
+from processor import plain_environment
+
 NOTEBOOKS = sorted((Path(__file__).resolve().parents[1] / "notebooks").glob("*.ipynb"))
 
 
@@ -19,7 +21,8 @@ def executed(path: Path) -> Any:
     """The notebook with fresh outputs, run in its own folder; without times. Raises CellExecutionError."""
     notebook = nbformat.read(path, as_version=4)
     place = {"metadata": {"path": str(path.parent)}}
-    NotebookClient(notebook, kernel_name="python3", timeout=600, record_timing=False, resources=place).execute()
+    client = NotebookClient(notebook, kernel_name="python3", timeout=600, record_timing=False, resources=place)
+    client.execute(env=plain_environment())
     return notebook
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import platform
 import sys
 from pathlib import Path
 
@@ -13,6 +14,10 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 from run_notebooks import NOTEBOOKS, executed, printed
 
 
+@pytest.mark.skipif(
+    platform.machine() not in {"x86_64", "AMD64"},
+    reason="notebooks are kept as x86-64 prints them: others round otherwise",
+)
 @pytest.mark.long
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_prints_what_it_shows(path: Path) -> None:

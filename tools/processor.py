@@ -1,0 +1,20 @@
+"""On which processor pages and notebooks are written: one that every x86-64 of the last ten years can stand for.
+
+NumPy and OpenBLAS choose their code by processor, and the last bits of a sine or of a sum differ with it. A detection
+that hangs on the last bit is then another; of thousands one does. What pages show is made with code that all have.
+"""
+
+from __future__ import annotations
+
+import os
+
+PLAIN = {
+    "NPY_DISABLE_CPU_FEATURES": "X86_V3 X86_V4 AVX512_ICL AVX512_SPR",
+    "OPENBLAS_CORETYPE": "Haswell",
+    "OPENBLAS_NUM_THREADS": "1",
+}
+
+
+def plain_environment() -> dict[str, str]:
+    """The environment of a process whose numbers are those of the pages, on any x86-64."""
+    return dict(os.environ) | PLAIN
