@@ -83,10 +83,11 @@ def write_tally(folder: Path) -> int:
         "ended_by": np.repeat(np.where(rng.random(episodes) < 1 / 3, "log_end", "object_left"), INSTANTS),
         "detection_s": time_s, "time_to_detection_s": time_s,
         "distance_at_detection_m": 60.0 - 10.0 * time_s, "gap_at_detection_m": 55.0 - 10.0 * time_s,
-        "runs": rng.integers(1, 20, len(time_s)),
+        "runs": 1,
     })  # fmt: skip
     write_parquet(tally, folder / "tally.parquet")
-    write_parquet(tally.iloc[:0].assign(run=0, detected=True), folder / "detections.parquet")
+    rows = tally.assign(run=np.arange(len(tally)) % INSTANTS, detected=~np.isnan(time_s))
+    write_parquet(rows.drop(columns=["event", "runs"]), folder / "detections.parquet")
     (folder / "summary.csv").write_text("configuration,detected_share\n")
     criteria = {
         f"{metric} of {name}": {"metric": metric, "at_most": 1.0, "each": "log", "configurations": [name]}
