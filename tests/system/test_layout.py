@@ -3,6 +3,7 @@
 import ast
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,8 @@ FLOORS = (
     {"__init__"},  # the public API: no wing, and no wing imports it
 )
 MOST_ROOMS = 249
+MOST_STATEMENTS = 41_608
+"""Without docstrings. A change that needs more says what it let go."""
 SMALL_LINES = 60
 VERBS_OF_SEVERAL = {
     "frames",  # what every converter of a data set gives
@@ -53,6 +56,7 @@ def imports(tree: ast.AST, at: str = "module") -> Iterator[tuple[ast.Import | as
             yield from imports(node, at)
 
 
+@cache
 def graph(root: Path) -> dict[Edge, set[str]]:
     """Which module of a package imports which, and where: (importer, imported) → places."""
     files = {name_of(path, root): path for path in root.rglob("*.py")}
@@ -118,6 +122,15 @@ def names_of_several(root: Path) -> dict[str, set[str]]:
     return {name: modules for name, modules in places.items() if len(modules) > 1}
 
 
+def count_statements(text: str) -> int:
+    """Statements of a module, each of a block counted, without docstrings and other bare texts."""
+    every = (node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.stmt))
+    return sum(
+        not (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str))
+        for node in every
+    )
+
+
 def test_there_are_fourteen_wings_and_nothing_else() -> None:
     entries = {path.name for path in PACKAGE.iterdir() if path.name != "__pycache__"}
     assert entries == set(FLOOR) - {"__init__"} | {"__init__.py", "py.typed"}
@@ -135,6 +148,14 @@ def test_no_circle() -> None:
 def test_rooms_are_few_and_none_is_a_piece_of_its_only_user() -> None:
     assert len(rooms(PACKAGE)) <= MOST_ROOMS
     assert small_rooms(PACKAGE) == []
+
+
+def test_the_package_does_not_grow_unnoticed() -> None:
+    assert sum(count_statements(path.read_text()) for path in PACKAGE.rglob("*.py")) <= MOST_STATEMENTS
+
+
+def test_statements_are_counted_without_words() -> None:
+    assert count_statements('"""Says what."""\nx = 1\ndef f():\n    "No more."\n    if x:\n        return 2\n') == 4
 
 
 def test_one_name_is_one_thing() -> None:
