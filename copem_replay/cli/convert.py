@@ -18,7 +18,9 @@ app = typer.Typer(
 Source = Annotated[Path, typer.Argument(metavar="SOURCE", help="File or folder of the format.")]
 Out = Annotated[Path, typer.Option(metavar="FILE", help="Recording to write (.mcap).")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing recording.")]
-OutFolder = Annotated[Path, typer.Option(metavar="DIR", help="Folder of the recordings; with --only, one (.mcap).")]
+OutFolder = Annotated[
+    Path, typer.Option(metavar="DIR", help="Folder of the recordings; of one alone its file (.mcap).")
+]
 Only = Annotated[str | None, typer.Option(metavar="NAME", help="Only the recording of this name [all].")]
 Metres = tuple[float, float, float]
 _MOST_HZ = 1000.0
@@ -83,6 +85,32 @@ def nuscenes(
     if ego_centre_m is not None:
         options["ego_centre_m"] = _check_finite(ego_centre_m, "--ego-centre-m")
     return _convert_sources("nuscenes", source, out, overwrite, only, **options)
+
+
+@app.command()
+def opv2v(
+    source: Source,
+    out: OutFolder,
+    overwrite: Overwrite = False,
+    only: Only = None,
+    host: Annotated[
+        str | None, typer.Option(metavar="AGENT", help="Agent that is the host [the first vehicle].")
+    ] = None,
+    infrastructure: Annotated[
+        list[str] | None,
+        typer.Option(metavar="AGENT", help="Agent that is no vehicle; may be given several times [those below 0]."),
+    ] = None,
+    rate_hz: Annotated[float | None, typer.Option(metavar="HZ", help="Rate of the frames [10].")] = None,
+    axes: Annotated[
+        str | None, typer.Option(metavar="left|right", help="Whether y is to the right, as in CARLA [by the files].")
+    ] = None,
+) -> int:
+    """OPV2V, V2XSet, V2X-Real, CooperScene: the folder of a scenario, or of several."""
+    if axes not in (None, "left", "right"):
+        raise InputError(f"--axes: expected left or right, found {axes!r}")
+    rate_hz = None if rate_hz is None else _check_rate(rate_hz)
+    options = {"host": host, "infrastructure": infrastructure or (), "rate_hz": rate_hz, "axes": axes}
+    return _convert_sources("opv2v", source, out, overwrite, only, **options)
 
 
 @app.command()

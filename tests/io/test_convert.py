@@ -69,7 +69,7 @@ def test_what_a_killed_conversion_left_goes_with_the_next(tmp_path: Path) -> Non
 def test_a_wrong_command_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     for words, what in (
         (["kitti", "a", "--out", "b.mcap"], "No such command 'kitti'"),
-        ([], "expected a format, one of argoverse2, nuscenes, scenarionet, openlabel, commonroad, sumo, csv"),
+        ([], "expected a format, one of argoverse2, nuscenes, opv2v, scenarionet, openlabel, commonroad, sumo, csv"),
         (["csv", "a"], "Missing option '--out'"),
         (["openlabel", "a", "--out", "b.mcap", "--rate-hz", "0"], "--rate-hz: expected a number above 0, found 0"),
         (["scenarionet", "a", "--out", "b.mcap", "--ego-centre-m", "nan"], "--ego-centre-m: expected a number, found"),

@@ -305,6 +305,7 @@ def _add_box(osi: Any, box: Box) -> None:
 FORMATS: Final[Mapping[str, str]] = {
     "argoverse2": "argoverse2",
     "nuscenes": "nuscenes",
+    "opv2v": "opv2v",
     "scenarionet": "scenarionet",
     "openlabel": "openlabel",
     "commonroad": "commonroad",
