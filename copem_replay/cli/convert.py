@@ -114,6 +114,23 @@ def opv2v(
 
 
 @app.command()
+def v2xseq(
+    source: Source,
+    out: OutFolder,
+    overwrite: Overwrite = False,
+    only: Only = None,
+    ego_size_m: Annotated[
+        Metres | None, typer.Option(metavar="LENGTH WIDTH HEIGHT", help="Size of the vehicle [4.9 1.9 1.5].")
+    ] = None,
+) -> int:
+    """V2X-Seq (SPD) of DAIR-V2X: its folder, of which each sequence is a recording."""
+    options: dict[str, Any] = {}
+    if ego_size_m is not None:
+        options["ego_size_m"] = tuple(_check_positive(value, "--ego-size-m") for value in ego_size_m)
+    return _convert_sources("v2xseq", source, out, overwrite, only, **options)
+
+
+@app.command()
 def scenarionet(
     source: Source,
     out: Annotated[Path, typer.Option(metavar="FILE", help="Recording to write; for a folder, a folder.")],

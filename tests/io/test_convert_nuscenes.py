@@ -60,14 +60,14 @@ def tables() -> dict[str, list[dict[str, Any]]]:
     of = {"turning": "vehicle.car", "cone": "movable_object.trafficcone", "odd": "hovercraft"}
     whole["instance"] = [{"token": i, "category_token": c, "nbr_annotations": 1} for i, c in of.items()]
     for row in whole["instance"]:
-        row |= {"first_annotation_token": "", "last_annotation_token": ""}
-    whole["category"] = [{"token": c, "name": c, "description": "", "index": k} for k, c in enumerate(of.values())]
+        row |= {"first_annotation_token": "", "last_annotation_token": "", "instance_name": row["token"]}
+    whole["category"] = [{"token": c, "name": c, "description": ""} for c in of.values()]
     whole["sensor"] = [{"token": c, "channel": c.upper(), "modality": c} for c in ("lidar", "camera")]
-    at_ego = {"translation": [0, 0, 0], "rotation": [1, 0, 0, 0], "camera_intrinsic": []}
+    at_ego = {"translation": [0, 0, 0], "rotation": [1, 0, 0, 0], "camera_intrinsic": [], "camera_distortion": []}
     whole["calibrated_sensor"] = [
         {"token": f"calibrated-{c}", "sensor_token": c, **at_ego} for c in ("lidar", "camera")
     ]
-    log = {"token": "log", "logfile": "", "vehicle": "", "date_captured": "", "location": "singapore-onenorth"}
+    log = {"token": "log", "logfile": "", "vehicle": "", "data_captured": "", "location": "singapore-onenorth"}
     whole["log"] = [log]
     whole["map"] = [{"token": "map", "log_tokens": ["log"], "category": "semantic_prior", "filename": ""}]
     scene = {"log_token": "log", "nbr_samples": 1, "description": ""}

@@ -165,6 +165,12 @@ def number_names(names: Iterable[str]) -> dict[str, int]:
     return {name: k for k, name in enumerate(unique, start=1)}
 
 
+def sign_files(paths: Iterable[Path]) -> tuple[tuple[str, int, int], ...]:
+    """Names, sizes and times of files: what is kept of them for the next recording holds as long as these are equal."""
+    stats = [(path, path.stat()) for path in sorted(paths) if path.is_file()]
+    return tuple((str(path.absolute()), stat.st_size, stat.st_mtime_ns) for path, stat in stats)
+
+
 # A recording of osi3.GroundTruth from boxes: the last step of every converter.
 
 TOPIC: Final = "ground_truth"
@@ -306,6 +312,7 @@ FORMATS: Final[Mapping[str, str]] = {
     "argoverse2": "argoverse2",
     "nuscenes": "nuscenes",
     "opv2v": "opv2v",
+    "v2xseq": "v2xseq",
     "scenarionet": "scenarionet",
     "openlabel": "openlabel",
     "commonroad": "commonroad",

@@ -33,6 +33,7 @@ from copem_replay.io.convert.conversion import (
     parse_number,
     quote_value,
     rotation_from_quaternion,
+    sign_files,
 )
 
 EGO_CENTRE_M: Final = 1.385
@@ -194,8 +195,8 @@ class _Tables:
 
 
 @lru_cache(maxsize=1)
-def _read_tables(folder: Path) -> _Tables:
-    """The tables of a data set, read once for all scenes. Raises InputError."""
+def _read_tables(folder: Path, _signature: object) -> _Tables:
+    """The tables of a data set, read once for all scenes as long as the files stay. Raises InputError."""
     scene_of: dict[str, str] = {}
     samples: dict[str, list[_Sample]] = {}
     stamp_us: dict[str, float] = {}
@@ -305,7 +306,7 @@ def frames(
     `scene`: its token, None: there is only one. `rate_hz`: of the frames between key frames, None: none.
     """
     folder = _find_tables(source)
-    tables = _read_tables(folder.resolve())
+    tables = _read_tables(folder, sign_files(folder.glob("*.json")))
     if scene is None:
         planned = list_recordings(source)
         if len(planned) > 1:
