@@ -74,7 +74,7 @@ def nuscenes(
         float | None, typer.Option(metavar="AHEAD", help="Centre of the ego's box ahead of its rear axle [1.385].")
     ] = None,
 ) -> int:
-    """Tables of nuScenes or T4 (TIER IV): a folder, of which each scene is a recording."""
+    """Tables of nuScenes or T4: a folder of scenes."""
     options: dict[str, Any] = {}
     if key_frames and rate_hz is not None:
         raise InputError("--rate-hz: expected without --key-frames, found both")
@@ -105,7 +105,7 @@ def opv2v(
         str | None, typer.Option(metavar="left|right", help="Whether y is to the right, as in CARLA [by the files].")
     ] = None,
 ) -> int:
-    """OPV2V, V2XSet, V2X-Real, CooperScene: the folder of a scenario, or of several."""
+    """OPV2V, V2XSet, V2X-Real: a scenario, or several."""
     if axes not in (None, "left", "right"):
         raise InputError(f"--axes: expected left or right, found {axes!r}")
     rate_hz = None if rate_hz is None else _check_rate(rate_hz)
@@ -123,7 +123,7 @@ def v2xseq(
         Metres | None, typer.Option(metavar="LENGTH WIDTH HEIGHT", help="Size of the vehicle [4.9 1.9 1.5].")
     ] = None,
 ) -> int:
-    """V2X-Seq (SPD) of DAIR-V2X: its folder, of which each sequence is a recording."""
+    """V2X-Seq (DAIR-V2X): a folder of sequences."""
     options: dict[str, Any] = {}
     if ego_size_m is not None:
         options["ego_size_m"] = tuple(_check_positive(value, "--ego-size-m") for value in ego_size_m)

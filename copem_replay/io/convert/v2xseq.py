@@ -55,7 +55,7 @@ _KIND: Final = {  # lower case
 
 
 @dataclass(frozen=True)
-class _Pair:
+class _FramePair:
     """A frame of the vehicle and that of the infrastructure it is paired with."""
 
     vehicle: str
@@ -144,7 +144,7 @@ def _say_where_infrastructure_is(source: Path, frame: str, report: ConversionRep
 
 
 @lru_cache(maxsize=1)
-def _read_sequences(source: Path, _signature: object) -> dict[str, list[_Pair]]:
+def _read_sequences(source: Path, _signature: object) -> dict[str, list[_FramePair]]:
     """The pairs of frames of each sequence of the vehicle, in order of time. Raises InputError."""
     stamps_ns: dict[str, int] = {}
     path = source / _FRAMES
@@ -154,7 +154,7 @@ def _read_sequences(source: Path, _signature: object) -> dict[str, list[_Pair]]:
         if not 0 <= stamp_us <= LAST_SECOND * 1e6:
             raise InputError(f"{where}: pointcloud_timestamp: expected microseconds, found {stamp_us:g}")
         stamps_ns[_get_text(row, "frame_id", where)] = 1000 * round(stamp_us)
-    sequences: dict[str, list[_Pair]] = {}
+    sequences: dict[str, list[_FramePair]] = {}
     path = source / _PAIRS
     for number, row in enumerate(_read_list(path), start=1):
         where = f"{path}: row {number}"
@@ -165,7 +165,7 @@ def _read_sequences(source: Path, _signature: object) -> dict[str, list[_Pair]]:
         )
         if vehicle not in stamps_ns:
             raise InputError(f"{where}: expected a frame of vehicle-side/data_info.json, found {vehicle!r}")
-        sequences.setdefault(sequence, []).append(_Pair(vehicle, infrastructure, stamps_ns[vehicle]))
+        sequences.setdefault(sequence, []).append(_FramePair(vehicle, infrastructure, stamps_ns[vehicle]))
     if not sequences:
         raise InputError(f"{path}: expected pairs of frames, found none")
     return {name: sorted(pairs, key=lambda pair: pair.stamp_ns) for name, pairs in sequences.items()}
