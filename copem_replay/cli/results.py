@@ -280,19 +280,36 @@ def export(
     geojson: Annotated[
         bool, typer.Option("--geojson", help="Units, paths of objects, lanes and houses, for maps of cities.")
     ] = False,
-    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder of the files [FOLDER/geojson].")] = None,
+    trackeval: Annotated[
+        bool, typer.Option("--trackeval", help="Truth and what is held, as MOTChallenge files for TrackEval.")
+    ] = False,
+    nuscenes: Annotated[
+        bool, typer.Option("--nuscenes", help="Truth and what is held, as nuScenes tracking results.")
+    ] = False,
+    run: Annotated[int | None, typer.Option(metavar="N", help="Run that is tracked [as in replay.mcap].")] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder of the files [FOLDER/geojson, …/trackeval, …/nuscenes].")
+    ] = None,
 ) -> int:
     """Write results in formats of other tools.
 
     GeoJSON has longitudes and latitudes: only of logs whose place on earth is known (`frame`).
     """
     from copem_replay.results.geojson import write_geojson
+    from copem_replay.results.track_files import write_nuscenes, write_trackeval
 
-    if not geojson:
-        raise InputError("export: expected a format, --geojson, found none")
-    files, notes = write_geojson(folder, out)
+    if geojson + trackeval + nuscenes != 1:
+        found = "none" if geojson + trackeval + nuscenes == 0 else "several"
+        raise InputError(f"export: expected one format, --geojson, --trackeval or --nuscenes, found {found}")
+    if geojson and run is not None:
+        raise InputError("--run: expected --trackeval or --nuscenes with it, found --geojson")
+    if geojson:
+        files, notes = write_geojson(folder, out)
+    else:
+        files, notes = (write_trackeval if trackeval else write_nuscenes)(folder, out, run=run)
     print_notes(notes)
-    tidy_leftovers(files[0].parent, files[0].parent)
+    for place in dict.fromkeys(file.parent for file in files):
+        tidy_leftovers(place, place)
     print_blocks([[str(file) for file in files]])
     return 0
 

@@ -2,7 +2,7 @@
 
 A column states its kind, what it means, and what an experiment has to ask for so that it is there. What makes tables,
 writers, readers, `compare`, and the reference of the columns (`tools/column_reference.py`) go by it. Columns of the
-summary are the metrics of `metrics/summary_metrics.py`. Units are in the names.
+summary are the metrics of `metrics/summary_metrics.py`. Units are in the names, and in Parquet beside each column.
 """
 
 from __future__ import annotations
@@ -17,6 +17,21 @@ from copem_replay.metrics.summary_metrics import METRIC, METRICS_OF
 
 _IN_PANDAS = {"text": "object", "numbers": "float64", "whole numbers": "Int64", "true or false": "boolean"}
 _IN_ARROW = {"text": pa.string(), "numbers": pa.float64(), "whole numbers": pa.int64(), "true or false": pa.bool_()}
+
+
+_UNITS = {
+    "deg": "deg", "hz": "Hz", "m": "m", "m2": "m²", "minutes": "min",
+    "mps": "m/s", "mps2": "m/s²", "rad": "rad", "s": "s",
+}  # fmt: skip
+
+
+def find_unit(name: str) -> str | None:
+    """The unit of a column, by the last word of its name; None: it counts, names, or is a share.
+
+    >>> find_unit("required_deceleration_mps2")
+    'm/s²'
+    """
+    return _UNITS.get(name.rpartition("_")[2])
 
 
 @dataclass(frozen=True)

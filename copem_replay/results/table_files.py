@@ -22,7 +22,7 @@ from pyarrow import parquet
 
 from copem_replay.core.errors import InputError
 from copem_replay.core.files import avoid_device_name
-from copem_replay.metrics.columns import TABLES, Column, find_columns
+from copem_replay.metrics.columns import TABLES, Column, find_columns, find_unit
 
 AGAIN = "run the experiment again with --overwrite"
 """The way out for a table that is damaged or of an older version."""
@@ -337,8 +337,7 @@ class TableFile:
     def add(self, table: Any) -> None:
         """Add rows."""
         arrow = pa.Table.from_pandas(table, preserve_index=False) if isinstance(table, pd.DataFrame) else table
-        fields = [pa.field(f.name, pa.string()) if pa.types.is_large_string(f.type) else f for f in arrow.schema]
-        arrow = arrow.cast(pa.schema(fields, arrow.schema.metadata))
+        arrow = arrow.cast(pa.schema([_write_field(field) for field in arrow.schema], arrow.schema.metadata))
         if self._writer is None:
             self._writer = parquet.ParquetWriter(self._path, arrow.schema, compression="zstd")
         if self._left is not None:
@@ -353,6 +352,13 @@ class TableFile:
         assert self._writer is not None
         self._writer.write_table(rows.combine_chunks(), row_group_size=ROWS_A_GROUP)
         self._written = True
+
+
+def _write_field(field: pa.Field) -> pa.Field:
+    """A column as it is written: with its unit in its metadata, as `unit`."""
+    unit = find_unit(field.name)
+    kind = pa.string() if pa.types.is_large_string(field.type) else field.type
+    return pa.field(field.name, kind, field.nullable, metadata=None if unit is None else {"unit": unit})
 
 
 def _count_group_rows(table: pa.Table) -> int:

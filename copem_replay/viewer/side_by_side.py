@@ -11,20 +11,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 
 from copem_replay.communication.link import LinkModel
 from copem_replay.core.errors import InputError, OutputError
-from copem_replay.core.tracks import SAME_INSTANT_S
 from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.experiment.schema import Configuration, Experiment, Unit
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.perception.pem.model import Pem
-from copem_replay.pipeline.one_run import STEM, ReplayedRun, replay_run
+from copem_replay.pipeline.one_run import STEM, ReplayedRun
 from copem_replay.pipeline.prepare import prepare_log
-from copem_replay.pipeline.replay import replay_block
+from copem_replay.results.again import replay_again
 from copem_replay.results.compare.compare import read_folders
 from copem_replay.results.compare.labels import (
     LabelledConfiguration,
@@ -247,25 +245,7 @@ def _choose_run(first: Results, all_results: Sequence[Results], log: str | None,
 def _replay_side(results: Results, chosen: Sequence[LabelledConfiguration], log: str, run: int) -> _Side:
     """One folder's part of the run, computed again. Raises InputError if its table differs."""
     labels = {replayed.configuration: replayed.label for replayed in chosen}
-    alone = resolve_for_log(results.experiment, log)
-    configurations = {name: configuration for name, configuration in alone.configurations.items() if name in labels}
-    experiment = alone.model_copy(update={"configurations": configurations, "sweep": None})
-    replayed = replay_run(results.recording(log, experiment), experiment, run)
-    (detections,) = results.each(log=log, every=True)
-    rows = detections[(detections["run"] == run) & detections["configuration"].isin(list(configurations))].assign(
-        log=log
-    )
-    again = replay_block(replayed.replay, replayed.experiment, np.array([run]))
-    keys = ["configuration", "object_id", "episode"]
-    times = [table.set_index(keys)["detection_s"].sort_index() for table in (rows, again)]
-    same = times[0].index.equals(times[1].index) and np.allclose(
-        times[0], times[1], rtol=0, atol=SAME_INSTANT_S, equal_nan=True
-    )
-    if not same:
-        raise InputError(
-            f"{results.place}: log {log}: run {run} comes out otherwise than in detections.parquet: another version "
-            "made it; run the experiment again with --overwrite"
-        )
+    replayed, rows = replay_again(results, log, run, labels)
     return _Side(results, labels, replayed, first_episodes(rows))
 
 

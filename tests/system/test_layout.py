@@ -22,12 +22,12 @@ FLOORS = (
     {"cli"},
     {"__init__"},  # the public API: no wing, and no wing imports it
 )
-MOST_ROOMS = 249
+MOST_ROOMS = 254
 MOST_STATEMENTS = 41_608
 """Without docstrings. A change that needs more says what it let go."""
 SMALL_LINES = 60
 VERBS_OF_SEVERAL = {
-    "frames",  # what every converter of a data set gives
+    "frames", "list_recordings",  # what every converter of a data set gives
     "run", "compare", "fit", "view", "why",  # a command, and the function of the public API that does it
 }  # fmt: skip
 FLOOR = {wing: number for number, wings in enumerate(FLOORS, start=1) for wing in wings}

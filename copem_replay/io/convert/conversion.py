@@ -23,7 +23,6 @@ from osi3.osi_object_pb2 import MovingObject, StationaryObject
 
 from copem_replay.core.errors import InputError, OutputError, count_noun, unknown_name_message
 from copem_replay.core.tracks import Float
-from copem_replay.io.convert import restricted_pickle
 from copem_replay.io.ground_truth import HEIGHTS_M
 from copem_replay.io.write.osi import NANOS_PER_SECOND, OsiTrace, empty_ground_truth, write_osi_trace
 
@@ -166,6 +165,12 @@ def number_names(names: Iterable[str]) -> dict[str, int]:
     return {name: k for k, name in enumerate(unique, start=1)}
 
 
+def sign_files(paths: Iterable[Path]) -> tuple[tuple[str, int, int], ...]:
+    """Names, sizes and times of files: what is kept of them for the next recording holds as long as these are equal."""
+    stats = [(path, path.stat()) for path in sorted(paths) if path.is_file()]
+    return tuple((str(path.absolute()), stat.st_size, stat.st_mtime_ns) for path, stat in stats)
+
+
 # A recording of osi3.GroundTruth from boxes: the last step of every converter.
 
 TOPIC: Final = "ground_truth"
@@ -301,45 +306,13 @@ def _add_box(osi: Any, box: Box) -> None:
         rear.x, rear.y, rear.z = box.rear_axle_m
 
 
-# Folders of ScenarioNet: a pickle for each scenario, in a folder for each worker, and two with indexes. The mapping
-# names the files and their folders relative to itself: a data set may be nothing but a mapping to others. Without it
-# all pickles in the folder and below are scenarios.
-
-_MAPPING: Final = "dataset_mapping.pkl"
-_SUMMARY: Final = "dataset_summary.pkl"  # of metadata that the scenarios have, too
-
-
-def find_scenarios(folder: Path) -> dict[str, Path]:
-    """Files of the scenarios by their names without the ending, in order of the names. Raises InputError."""
-    mapping = folder / _MAPPING
-    files = _read_mapping(mapping) if mapping.is_file() else sorted(folder.rglob("*.pkl"))
-    found: dict[str, Path] = {}
-    for path in sorted(files, key=lambda path: path.name):
-        if path.name in (_MAPPING, _SUMMARY):
-            continue
-        if (other := found.setdefault(path.stem, path)) != path:
-            raise InputError(f"{folder}: expected one scenario {path.stem}, found {other} and {path}")
-    if not found:
-        raise InputError(f"{folder}: expected scenarios of ScenarioNet, found no *.pkl in the folder")
-    return found
-
-
-def _read_mapping(mapping: Path) -> list[Path]:
-    places = restricted_pickle.load_pickle(mapping)
-    if not isinstance(places, dict):
-        raise InputError(f"{mapping}: expected the folder of each scenario by its file, found {type(places).__name__}")
-    for name, place in places.items():
-        if not (isinstance(name, str) and isinstance(place, str)) or not name or Path(name).name != name:
-            raise InputError(
-                f"{mapping}: expected files and their folders, found {quote_value(name)} in {quote_value(place)}"
-            )
-    return [mapping.parent / place / name for name, place in places.items()]
-
-
 # Conversion of one source, or of many.
 
 FORMATS: Final[Mapping[str, str]] = {
     "argoverse2": "argoverse2",
+    "nuscenes": "nuscenes",
+    "opv2v": "opv2v",
+    "v2xseq": "v2xseq",
     "scenarionet": "scenarionet",
     "openlabel": "openlabel",
     "commonroad": "commonroad",
@@ -351,6 +324,14 @@ _MOST_LINES: Final = 10
 """Lines of one kind in a summary, at most: a data set has thousands of scenarios."""
 
 
+@dataclass(frozen=True)
+class PlannedRecording:
+    """What a recording is made of: a file or folder, and which part of it, as options of the format's `frames`."""
+
+    source: Path
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
 def convert_source(
     source: Path, out: Path, *, format: str, options: Mapping[str, Any] | None = None
 ) -> ConversionReport:
@@ -359,29 +340,43 @@ def convert_source(
     `options`: keyword arguments of the format's `frames`. Raises InputError: unknown format, or a source that cannot be
     converted; OutputError.
     """
-    if format not in FORMATS:
-        raise InputError(unknown_name_message("format", format, FORMATS))
-    frames: Callable[..., Iterator[ConvertedFrame]] = import_module(f"copem_replay.io.convert.{FORMATS[format]}").frames
+    frames: Callable[..., Iterator[ConvertedFrame]] = _import_format(format).frames
     report = ConversionReport()
     write_recording(out, frames(source, report, **(options or {})), report, source=source, format_name=format)
     return report
 
 
-def plan_outputs(source: Path, out: Path, *, format: str, overwrite: bool = False) -> dict[Path, Path]:
-    """Return the source of each recording to write: one, or one per scenario of a folder of ScenarioNet.
+def _import_format(format: str) -> Any:
+    """The module of a format. Raises InputError."""
+    if format not in FORMATS:
+        raise InputError(unknown_name_message("format", format, FORMATS))
+    return import_module(f"copem_replay.io.convert.{FORMATS[format]}")
 
-    Raises InputError: the source does not exist, or an output exists already.
+
+def plan_outputs(
+    source: Path, out: Path, *, format: str, overwrite: bool = False, only: str | None = None
+) -> dict[Path, PlannedRecording]:
+    """What each recording to write is made of: one, or one for each that the format's `list_recordings` finds.
+
+    `only`: one of these. Raises InputError: the source does not exist or has no recording, or an output exists already.
     """
     if not source.exists():
         raise InputError(f"{source}: no such file or folder")
-    if format == "scenarionet" and source.is_dir():
-        if out.suffix == ".mcap" or out.is_file():
-            raise InputError(f"{out}: expected a folder for the recordings of one, found a file's name")
-        asked = {out / f"{name}.mcap": path for name, path in find_scenarios(source).items()}
-    else:
+    found: dict[str, PlannedRecording] | None = None
+    if (listing := getattr(_import_format(format), "list_recordings", None)) is not None:
+        found = listing(source)
+    if only is not None and found is not None:
+        if only not in found:
+            raise InputError(f"--only: {unknown_name_message('recording', only, found)}")
+        found = {only: found[only]}
+    if found is None or (only is not None and out.suffix == ".mcap"):
         if out.suffix != ".mcap":
             raise InputError(f"{out}: expected an output that ends in .mcap, found {out.name!r}")
-        asked = {out: source}
+        asked = {out: next(iter(found.values())) if found else PlannedRecording(source)}
+    else:
+        if out.suffix == ".mcap" or out.is_file():
+            raise InputError(f"{out}: expected a folder for the recordings of one, found a file's name")
+        asked = {out / f"{name}.mcap": part for name, part in found.items()}
     existing = [path for path in asked if path.is_file()]
     if existing and not overwrite:
         more = f", and {count_noun(len(existing) - 1, 'other')}" if len(existing) > 1 else ""
@@ -430,7 +425,11 @@ class Conversion:
 
 
 def convert_all(
-    asked: Mapping[Path, Path], conversion: Conversion, *, format: str, options: Mapping[str, Any] | None = None
+    asked: Mapping[Path, PlannedRecording],
+    conversion: Conversion,
+    *,
+    format: str,
+    options: Mapping[str, Any] | None = None,
 ) -> Iterator[str]:
     """Convert every source of `asked` to its output and yield a line per recording, as soon as it is written.
 
@@ -438,11 +437,14 @@ def convert_all(
     all the same. Nothing further is tried once an output cannot be written.
     """
     conversion.asked = len(asked)
-    for output, source in asked.items():
+    for output, planned in asked.items():
         try:
-            report = convert_source(source, output, format=format, options=options)
+            report = convert_source(
+                planned.source, output, format=format, options={**(options or {}), **planned.options}
+            )
         except InputError as error:
-            conversion.wrong += error.problems
+            # Recordings of one folder may share what is wrong: it is said once.
+            conversion.wrong += [line for line in error.problems if line not in conversion.wrong]
             continue
         except OutputError as error:
             conversion.wrong += error.problems

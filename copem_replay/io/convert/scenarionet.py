@@ -25,39 +25,17 @@ from copem_replay.io.convert.conversion import (
     ConversionReport,
     ConvertedFrame,
     OsiKind,
+    PlannedRecording,
     number_names,
     quote_value,
     wrap_yaw,
 )
+from copem_replay.io.convert.nuscenes import EGO_CENTRE_M, find_kind
 
 _MOST_COLUMNS: Final = 16  # of an array; formats have at most 3
 _FARTHEST_M: Final = 1e8  # of lines of the map
 _MOST_STEPS: Final = 10_000_000  # eleven days at 10 Hz; a longer array is an error
 
-EGO_CENTRE_M: Final = 1.385
-"""Centre of nuScenes' Renault Zoe ahead of its rear axle: as in py123d, from the model's data."""
-
-_KIND_OF_NUSCENES: Final = {  # by category or its beginning; the longest that fits counts
-    "animal": "animal",
-    "human.pedestrian": "pedestrian",
-    "human.pedestrian.personal_mobility": "scooter",
-    "human.pedestrian.stroller": "other",
-    "human.pedestrian.wheelchair": "wheelchair",
-    "movable_object": "static",
-    "movable_object.barrier": "barrier",
-    "movable_object.trafficcone": "cone",
-    "static_object": "static",
-    "vehicle": "vehicle",
-    "vehicle.bicycle": "bicycle",
-    "vehicle.bus": "bus",
-    "vehicle.car": "car",
-    "vehicle.construction": "work machine",
-    "vehicle.emergency.ambulance": "van",
-    "vehicle.emergency.police": "car",
-    "vehicle.motorcycle": "motorcycle",
-    "vehicle.trailer": "trailer",
-    "vehicle.truck": "truck",
-}
 _KIND_OF_METADRIVE: Final = {
     "VEHICLE": "vehicle",
     "PEDESTRIAN": "pedestrian",
@@ -79,6 +57,48 @@ class _Track:
     yaw_rad: Float
     size_m: Float  # (T, 3)
     velocity_mps: Float  # (T, 2), NaN: not given
+
+
+# Folders of ScenarioNet: a pickle for each scenario, in a folder for each worker, and two with indexes. The mapping
+# names the files and their folders relative to itself: a data set may be nothing but a mapping to others. Without it
+# all pickles in the folder and below are scenarios.
+
+_MAPPING: Final = "dataset_mapping.pkl"
+_SUMMARY: Final = "dataset_summary.pkl"  # of metadata that the scenarios have, too
+
+
+def list_recordings(source: Path) -> dict[str, PlannedRecording] | None:
+    """The scenarios of a folder; None: a file is one. Raises InputError."""
+    if not source.is_dir():
+        return None
+    return {name: PlannedRecording(path) for name, path in find_scenarios(source).items()}
+
+
+def find_scenarios(folder: Path) -> dict[str, Path]:
+    """Files of the scenarios by their names without the ending, in order of the names. Raises InputError."""
+    mapping = folder / _MAPPING
+    files = _read_mapping(mapping) if mapping.is_file() else sorted(folder.rglob("*.pkl"))
+    found: dict[str, Path] = {}
+    for path in sorted(files, key=lambda path: path.name):
+        if path.name in (_MAPPING, _SUMMARY):
+            continue
+        if (other := found.setdefault(path.stem, path)) != path:
+            raise InputError(f"{folder}: expected one scenario {path.stem}, found {other} and {path}")
+    if not found:
+        raise InputError(f"{folder}: expected scenarios of ScenarioNet, found no *.pkl in the folder")
+    return found
+
+
+def _read_mapping(mapping: Path) -> list[Path]:
+    places = restricted_pickle.load_pickle(mapping)
+    if not isinstance(places, dict):
+        raise InputError(f"{mapping}: expected the folder of each scenario by its file, found {type(places).__name__}")
+    for name, place in places.items():
+        if not (isinstance(name, str) and isinstance(place, str)) or not name or Path(name).name != name:
+            raise InputError(
+                f"{mapping}: expected files and their folders, found {quote_value(name)} in {quote_value(place)}"
+            )
+    return [mapping.parent / place / name for name, place in places.items()]
 
 
 def frames(path: Path, report: ConversionReport, *, ego_centre_m: float | None = None) -> Iterator[ConvertedFrame]:
@@ -191,10 +211,8 @@ def _map_kind(track: Mapping[str, Any], report: ConversionReport) -> OsiKind:
     """The kind of an object, by its category in nuScenes if it has one, else by its type in MetaDrive."""
     metadata = track.get("metadata")
     category = str(metadata.get("type", "")) if isinstance(metadata, dict) else ""
-    parts = category.split(".")
-    for length in range(len(parts), 0, -1):
-        if name := _KIND_OF_NUSCENES.get(".".join(parts[:length])):
-            return KINDS[name]
+    if name := find_kind(category):
+        return KINDS[name]
     if (kind := str(track.get("type"))) not in _KIND_OF_METADRIVE:
         report.count("track", f"of the unknown type {quote_value(kind)}: taken as other")
     return KINDS[_KIND_OF_METADRIVE.get(kind, "other")]
