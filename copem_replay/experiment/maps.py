@@ -22,7 +22,14 @@ from copem_replay.io.maps.registry import read_map
 from copem_replay.io.maps.solids import DEFAULT_HEIGHTS_M
 from copem_replay.io.open import sha256_of
 from copem_replay.io.recording import Recording
-from copem_replay.metrics.agreement import NOTED_BELOW, REFUSED_BELOW, find_agreement
+from copem_replay.metrics.agreement import (
+    NOTED_BELOW,
+    REFUSED_BELOW,
+    SOLIDS_REFUSED_ABOVE,
+    Inside,
+    find_agreement,
+    find_inside,
+)
 from copem_replay.perception.config import InPlane
 from copem_replay.perception.sensor_poses import FAR_GROUND_M, find_ground, make_solid_statics
 
@@ -108,10 +115,13 @@ class MapFile(Frozen):
                 not site.degrees
             )
             raise InputError(f"{self.file}: its places are {what}, and the log does not say where it is: {expected}")
-        if site.degrees:
-            return site.moved(lambda degrees: frame.from_wgs84(degrees[:, ::-1]) + offset_m)
-        of_map, notes = SaidPlace(site.proj, site.offset_m, site.yaw_rad).read()
-        moved = site.moved(lambda at_m: frame.take(of_map, at_m + offset_m))
+        try:
+            if site.degrees:
+                return site.moved(lambda degrees: frame.from_wgs84(degrees[:, ::-1]) + offset_m)
+            of_map, notes = SaidPlace(site.proj, site.offset_m, site.yaw_rad).read()
+            moved = site.moved(lambda at_m: frame.take(of_map, at_m + offset_m))
+        except InputError as error:
+            raise InputError(f"{self.file}: {error}") from None
         return replace(moved, assumed=(*moved.assumed, *notes))
 
     def choose_kinds(self, site: SiteMap) -> list[MapSolid]:
@@ -156,8 +166,13 @@ def add_maps(
         near, said, refused = _choose_solids(recording, asked.choose_kinds(site), asked.within_m, where)
         solids += near
         notes += [f"{where}: {line}" for line in said]
-        if refused and not site.lanes:
-            problems.append((("maps", k), refused))
+        if site.lanes:
+            continue
+        problems += [(("maps", k), refused)] if refused else []
+        inside = find_inside(recording.scene, recording.truth, [solid.outline for solid in near])
+        notes += [f"{where}: {inside.words}"] if inside.words else []
+        if inside.refused and asked.agreement == "check":
+            problems.append((("maps", k), _explain_inside(asked, inside)))
     if maps and (parts := len(make_solid_statics(solids).body)) > _MOST_PARTS:
         expected = f"expected solids of at most {_MOST_PARTS:,} convex parts, found {parts:,}"
         problems.append((("maps",), f"{expected}: take a smaller `within_m`, or fewer kinds as `solids`"))
@@ -170,6 +185,13 @@ def _explain_refusal(asked: MapFile, share: float) -> str:
         f"{Path(asked.file).name}: expected at least {REFUSED_BELOW:.0%} of the states of moving vehicles in a lane of "
         f"their heading (on real drives {NOTED_BELOW:.0%} and more), found {share:.0%}: is the map in the frame of the "
         "log? `copem-replay info LOG --map FILE` estimates a shift for `offset_m`; or `agreement: ignore`"
+    )
+
+
+def _explain_inside(asked: MapFile, inside: Inside) -> str:
+    return (
+        f"{Path(asked.file).name}: expected at most {SOLIDS_REFUSED_ABOVE:.0%} of the states of moving vehicles inside "
+        f"its solids, found {inside.share:.0%}: is the map in the frame of the log? Or `agreement: ignore`"
     )
 
 
