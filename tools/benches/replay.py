@@ -68,7 +68,7 @@ def site() -> Iterator[common.Line]:
     Houses of 8 × 8 m stand in its four quarters, no farther than 200 m from any object, as `within_m` has it.
     """
     experiment = common.cr.load_experiment(common.ROOT / "logs/crossing_units.yaml")
-    at_m = [(x, y) for x in range(14, 250, 12) for y in range(14, 250, 12)]
+    at_m = [(x, y) for x in range(18, 250, 12) for y in range(18, 250, 12)]
     at_m = [(sx * x, sy * y) for x, y in sorted(at_m, key=lambda at: at[0] ** 2 + at[1] ** 2) for sx, sy in _QUARTERS]
     objects = "".join(
         f'<object id="{k}" type="building" s="{x + 300}" t="{y}" hdg="0" length="8" width="8" height="9"/>'
