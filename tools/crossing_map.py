@@ -2,7 +2,8 @@
 
     python tools/crossing_map.py [--out logs]
 
-The same bytes on every call. Houses and wall are the obstacles of `logs/crossing_wall.yaml`.
+The same bytes on every call. Houses and wall are the obstacles of `logs/crossing_wall.yaml`, but for the
+kiosk beside the mast in the south-west.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ SOLIDS: Final = {
     "house_north_east": ("building", 14.0, ((14, 14), (60, 14), (60, 40), (14, 40))),
     "house_north_west": ("building", 12.0, ((-70, 14), (-14, 14), (-14, 60), (-26, 60), (-26, 26), (-70, 26))),
     "house_south_east": ("building", 9.0, ((14, -34), (50, -34), (50, -14), (14, -14))),
+    "kiosk": ("building", 6.0, ((-16, -17), (-8, -17), (-8, -13), (-16, -13))),
     "garden_wall": ("barrier", 2.0, ((10.3, 26.6), (10.6, 26.6), (10.6, 60), (10.3, 60))),
 }
 """By id: type, height and corners in metres. They are objects of road 1, of which s is x + 150 and t is y."""

@@ -79,7 +79,7 @@ By: TypeAlias = Annotated[
     typer.Option(
         "--by",
         metavar="ENTRY",
-        help="Also by groups: log, class, began, range_at_onset, tags.NAME; a cross is log*class [as in the results].",
+        help="Also by groups: log, class, began, range_at_onset, area, tags.NAME; a cross: log*class [as in results].",
     ),
 ]
 

@@ -43,9 +43,16 @@ class Frame:
         return np.column_stack([lat, lon])
 
     def from_wgs84(self, points: Any) -> Places:
-        """Metres of the log (N, 2) of places (N, 2): latitude, longitude in degrees."""
+        """Metres of the log (N, 2) of places (N, 2): latitude, longitude in degrees.
+
+        Raises InputError where the projection does not reach a place.
+        """
         lat, lon = np.asarray(points, dtype=np.float64).reshape(-1, 2).T
-        return self.unproject(np.column_stack(_transformer(self.proj).transform(lon, lat)))
+        projected_m = np.column_stack(_transformer(self.proj).transform(lon, lat))
+        if len(beyond := np.flatnonzero(~np.isfinite(projected_m).all(axis=1))):
+            where = write_degrees(lat[beyond[0]], lon[beyond[0]])
+            raise InputError(f"{self.proj}: expected a place that this projection has, found {where}")
+        return self.unproject(projected_m)
 
     def project(self, points_m: Any) -> Places:
         """Projected metres (N, 2), east and north, of places of the log (N, 2)."""
@@ -60,10 +67,18 @@ class Frame:
         return np.column_stack([c * x + s * y, c * y - s * x])
 
     def take(self, other: Frame, points_m: Any) -> Places:
-        """Places of this log (N, 2) of places of another frame (N, 2); of one projection without rounding of PROJ."""
+        """Places of this log (N, 2) of places of another frame (N, 2); of one projection without rounding of PROJ.
+
+        Raises InputError where one of them does not reach a place.
+        """
         if other.proj == self.proj:
             return self.unproject(other.project(points_m))
-        return self.from_wgs84(other.to_wgs84(points_m))
+        degrees = other.to_wgs84(points_m)
+        if len(beyond := np.flatnonzero(~np.isfinite(degrees).all(axis=1))):
+            x_m, y_m = other.project(points_m)[beyond[0]]
+            found = f"{x_m:,.0f} m east, {y_m:,.0f} m north"
+            raise InputError(f"{other.proj}: expected places on earth, found {found}: is it the right offset?")
+        return self.from_wgs84(degrees)
 
     def yaw_of_heading(self, heading_deg: float, lat: float, lon: float) -> float:
         """Yaw in the log, degrees from its x axis to the left, of a heading clockwise from true north at a place."""

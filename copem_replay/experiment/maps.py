@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Final, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 import numpy as np
 from pydantic import Field, PrivateAttr, ValidationInfo, field_validator, model_validator
@@ -22,9 +22,16 @@ from copem_replay.io.maps.registry import read_map
 from copem_replay.io.maps.solids import DEFAULT_HEIGHTS_M
 from copem_replay.io.open import sha256_of
 from copem_replay.io.recording import Recording
-from copem_replay.metrics.agreement import NOTED_BELOW, REFUSED_BELOW, find_agreement
+from copem_replay.metrics.agreement import (
+    NOTED_BELOW,
+    REFUSED_BELOW,
+    SOLIDS_REFUSED_ABOVE,
+    Inside,
+    find_agreement,
+    find_inside,
+)
 from copem_replay.perception.config import InPlane
-from copem_replay.perception.sensor_poses import FAR_GROUND_M, find_ground, make_solid_statics
+from copem_replay.perception.sensor_poses import FAR_GROUND_M, find_grounds, make_solid_statics
 
 SolidKind = Literal["building", "wall", "hedge", "barrier", "vegetation", "pole"]
 _KINDS_OF: Final[Mapping[SolidKind, tuple[str, ...]]] = {
@@ -108,10 +115,13 @@ class MapFile(Frozen):
                 not site.degrees
             )
             raise InputError(f"{self.file}: its places are {what}, and the log does not say where it is: {expected}")
-        if site.degrees:
-            return site.moved(lambda degrees: frame.from_wgs84(degrees[:, ::-1]) + offset_m)
-        of_map, notes = SaidPlace(site.proj, site.offset_m, site.yaw_rad).read()
-        moved = site.moved(lambda at_m: frame.take(of_map, at_m + offset_m))
+        try:
+            if site.degrees:
+                return site.moved(lambda degrees: frame.from_wgs84(degrees[:, ::-1]) + offset_m)
+            of_map, notes = SaidPlace(site.proj, site.offset_m, site.yaw_rad).read()
+            moved = site.moved(lambda at_m: frame.take(of_map, at_m + offset_m))
+        except InputError as error:
+            raise InputError(f"{self.file}: {error}") from None
         return replace(moved, assumed=(*moved.assumed, *notes))
 
     def choose_kinds(self, site: SiteMap) -> list[MapSolid]:
@@ -156,9 +166,16 @@ def add_maps(
         near, said, refused = _choose_solids(recording, asked.choose_kinds(site), asked.within_m, where)
         solids += near
         notes += [f"{where}: {line}" for line in said]
-        if refused and not site.lanes:
-            problems.append((("maps", k), refused))
-    if maps and (parts := len(make_solid_statics(solids).body)) > _MOST_PARTS:
+        if site.lanes:
+            continue
+        problems += [(("maps", k), refused)] if refused else []
+        inside = find_inside(recording.scene, recording.truth, [solid.outline for solid in near])
+        notes += [f"{where}: {inside.words}"] if inside.words else []
+        if inside.refused and asked.agreement == "check":
+            problems.append((("maps", k), _explain_inside(asked, inside)))
+    corners = sum(len(solid.corners_m) + sum(map(len, solid.holes_m)) + 2 * len(solid.holes_m) for solid in solids)
+    # As many triangles at most as corners, and two more for each hole: most maps need not be cut to know.
+    if maps and corners > _MOST_PARTS and (parts := len(make_solid_statics(solids).body)) > _MOST_PARTS:
         expected = f"expected solids of at most {_MOST_PARTS:,} convex parts, found {parts:,}"
         problems.append((("maps",), f"{expected}: take a smaller `within_m`, or fewer kinds as `solids`"))
     scene = replace(recording.scene, areas=tuple(areas), solids=tuple(solids))
@@ -170,6 +187,13 @@ def _explain_refusal(asked: MapFile, share: float) -> str:
         f"{Path(asked.file).name}: expected at least {REFUSED_BELOW:.0%} of the states of moving vehicles in a lane of "
         f"their heading (on real drives {NOTED_BELOW:.0%} and more), found {share:.0%}: is the map in the frame of the "
         "log? `copem-replay info LOG --map FILE` estimates a shift for `offset_m`; or `agreement: ignore`"
+    )
+
+
+def _explain_inside(asked: MapFile, inside: Inside) -> str:
+    return (
+        f"{Path(asked.file).name}: expected at most {SOLIDS_REFUSED_ABOVE:.0%} of the states of moving vehicles inside "
+        f"its solids, found {inside.share:.0%}: is the map in the frame of the log? Or `agreement: ignore`"
     )
 
 
@@ -191,39 +215,43 @@ def _choose_solids(
     """The solids near any object of the log, what is said of the others, and why none is there, if none is."""
     import shapely
 
-    counts, near, far_m = Counter[str](), list[Solid](), list[float]()
-    truth = recording.truth
+    counts, truth = Counter[str](), recording.truth
     valid = truth.valid[0]
     at_m = np.unique(np.round(np.stack([truth.x_m[0, valid], truth.y_m[0, valid]], axis=1)), axis=0)
-    tree = shapely.STRtree(shapely.points(at_m))
-    least_m = np.inf
-    for solid in solids:
-        outline = shapely.Polygon(solid.rings_m[0], solid.rings_m[1:])
-        if not outline.is_valid or outline.area <= 0.0:
-            counts["whose outline crosses itself: left out"] += 1
-        elif not len(tree.query(outline, predicate="dwithin", distance=within_m)):
-            counts[f"beyond {within_m:g} m of every object: left out"] += 1
-            if not near and len(at_m):
-                least_m = min(least_m, float(shapely.distance(outline, tree.geometries[tree.nearest(outline)])))
-        else:
-            near.append(_stand_solid(recording, solid, where, far_m))
+    outlines = np.array([shapely.Polygon(solid.rings_m[0], solid.rings_m[1:]) for solid in solids], dtype=object)
+    whole = np.flatnonzero(shapely.is_valid(outlines) & (shapely.area(outlines) > 0.0)) if len(solids) else []
+    distance_m = np.full(len(whole), np.inf)
+    if len(at_m) and len(whole):
+        (which, _), nearest_m = shapely.STRtree(shapely.points(at_m)).query_nearest(
+            outlines[whole], return_distance=True, all_matches=False
+        )
+        distance_m[which] = nearest_m
+    chosen = whole[distance_m <= within_m] if len(whole) else []
+    counts["whose outline crosses itself: left out"] += len(solids) - len(whole)
+    counts[f"beyond {within_m:g} m of every object: left out"] += len(whole) - len(chosen)
+    near, far_m = _stand_solids(recording, [solids[k] for k in chosen], outlines[chosen] if len(chosen) else [], where)
     said = [f"{count_noun(len(near), 'solid')} of the map may hide"] if near else []
-    said += [f"{count_noun(number, 'solid')} {what}" for what, number in counts.items()]
+    said += [f"{count_noun(number, 'solid')} {what}" for what, number in counts.items() if number]
     if far_m:
         what = f"ground of {count_noun(len(far_m), 'solid')} taken from the nearest object"
         said.append(f"{what}, up to {max(far_m):.0f} m away")
+    least_m = distance_m.min(initial=np.inf)
     if near or not np.isfinite(least_m):
         return near, said, ""
     found = f"0 of {count_noun(len(solids), 'solid')} within {within_m:g} m of the log"
     return near, said, f"{where.split(' ', 1)[1]}: {found}; nearest {least_m / 1000:,.3g} km: is the frame right?"
 
 
-def _stand_solid(recording: Recording, solid: MapSolid, where: str, far_m: list[float]) -> Solid:
-    """A solid of a map at its height; `far_m` gets how far away its ground was found, where that is far."""
-    outer, *holes = (tuple((float(x), float(y)) for x, y in ring) for ring in solid.rings_m)
-    ground_m = 0.0
-    if solid.above_ground:
-        ground_m, distance_m = find_ground(recording.truth, solid.rings_m[0])
-        far_m += [distance_m] if distance_m > FAR_GROUND_M else []
-    name, bottom_m, height_m = f"{where} {solid.name}", ground_m + solid.bottom_m, solid.top_m - solid.bottom_m
-    return Solid(name, outer, bottom_m, height_m, solid.on_ground, tuple(holes))
+def _stand_solids(
+    recording: Recording, solids: Sequence[MapSolid], outlines: Sequence[Any], where: str
+) -> tuple[list[Solid], list[float]]:
+    """Solids of a map at their heights, and how far away the ground of some was found, of those where that is far."""
+    grounds_m, distances_m = np.zeros(len(solids)), np.zeros(len(solids))
+    above = np.flatnonzero([solid.above_ground for solid in solids])
+    grounds_m[above], distances_m[above] = find_grounds(recording.truth, [outlines[k] for k in above])
+    stood = []
+    for solid, ground_m in zip(solids, grounds_m.tolist(), strict=True):
+        outer, *holes = (tuple((float(x), float(y)) for x, y in ring) for ring in solid.rings_m)
+        name, bottom_m, height_m = f"{where} {solid.name}", ground_m + solid.bottom_m, solid.top_m - solid.bottom_m
+        stood.append(Solid(name, outer, bottom_m, height_m, solid.on_ground, tuple(holes)))
+    return stood, distances_m[distances_m > FAR_GROUND_M].tolist()

@@ -6,6 +6,7 @@ Units are in the names of keys. References (a unit's `pem`, a configuration's `u
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Literal, Self
 
@@ -15,6 +16,7 @@ from pydantic import (
     ConfigDict,
     Discriminator,
     Field,
+    PrivateAttr,
     SerializerFunctionWrapHandler,
     Tag,
     field_validator,
@@ -113,13 +115,16 @@ class Show(Frozen):
     """Which logs, run or runs, and configurations (by default all) are written to MCAP and .rrd.
 
     `run: null` writes none; `pipeline/one_run.py` says which run is `median`, `worst` or `best`. `truth: false` leaves
-    the drawn truth out of the MCAP, the topics `copem/truth/…`; the recorded one is always in it.
+    the drawn truth out of the MCAP, the topics `copem/truth/…`; the recorded one is always in it. `map: true` adds a
+    view on a map of the world to the .rrd, for which the viewer asks a foreign host for tiles: it learns where the
+    drive was.
     """
 
     logs: Annotated[tuple[Id, ...], Field(min_length=1)] = ("first",)
     run: WhichRun | Annotated[tuple[WhichRun, ...], Field(min_length=1), AfterValidator(_check_runs_unique)] | None = 0
     configurations: Annotated[tuple[Id, ...], Field(min_length=1)] | None = None
     truth: bool = True
+    map: Annotated[bool, Field(exclude_if=operator.not_)] = False
 
     def asked(self) -> tuple[WhichRun, ...]:
         """The runs in their order: several, one or none."""
@@ -467,6 +472,13 @@ class Experiment(Frozen):
     sweep: Sweep | None = None
     show: Show | None = Show()
     criteria: dict[CriterionName, Criterion] = Field(default_factory=dict, exclude_if=lambda criteria: not criteria)
+    _has_areas: bool = PrivateAttr(False)  # stays that of all logs in a copy for one
+
+    @model_validator(mode="after")
+    def _find_areas(self) -> Self:
+        of_logs = any(isinstance(entry, LogSettings) and entry.maps for entry in self.logs)
+        self._has_areas = bool(self.areas or self.maps or of_logs)
+        return self
 
     @field_validator("configurations", mode="after")
     @classmethod
@@ -512,6 +524,11 @@ class Experiment(Frozen):
         added = UnitLinks(f"configurations.{name}.latency_s", ConstantLink(latency_s=configuration.latency_s))
         senders = {where: None if every else frozenset(by_link[where]) for where in links}
         return [*(UnitLinks(where, link, senders[where]) for where, link in links.items()), added]
+
+    @property
+    def has_areas(self) -> bool:
+        """Whether the study has areas, its own or of maps, in any of its logs."""
+        return self._has_areas or bool(self.areas or self.maps)
 
     def has_way(self, name: str) -> bool:
         """Whether lists of a configuration come by a link, or of a unit with `ready` or `sends`."""

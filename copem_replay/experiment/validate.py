@@ -55,7 +55,7 @@ from copem_replay.io.open import (
 )
 from copem_replay.io.recorded_units import read_recorded_output, read_recorded_unit
 from copem_replay.io.recording import Recording, find_middle, moving_ids, read_log
-from copem_replay.metrics.config import parse_slices
+from copem_replay.metrics.config import AREA, NO_AREAS, parse_slices
 from copem_replay.metrics.onset import Requires
 from copem_replay.perception.config import Carriers
 from copem_replay.perception.sensor_poses import find_enclosing_solid
@@ -405,8 +405,8 @@ def _read_local_recording(experiment: Experiment, place: Local) -> tuple[Recordi
     ]
 
 
-def _check_tags(experiment: Experiment, scenes: Sequence[Scene], at: Callable[[Key, str], str]) -> Iterator[str]:
-    """Tags that the summary is sliced by, or that a PEM asks for, and no log has."""
+def _check_slices(experiment: Experiment, scenes: Sequence[Scene], at: Callable[[Key, str], str]) -> Iterator[str]:
+    """Tags that the summary is sliced by, or that a PEM asks for, and no log has; areas that there are none of."""
     known = {name for scene in scenes for name in scene.tags}
     asked: list[tuple[Key, str]] = [
         (("measure", "by", k), name) for k, by in enumerate(parse_slices(experiment.measure.by)) for name in by.tags
@@ -415,6 +415,9 @@ def _check_tags(experiment: Experiment, scenes: Sequence[Scene], at: Callable[[K
         asked += [
             (("pems", pem, k, "when", "tags"), n) for k, one in enumerate(of.couples) for n in one.when.tags or ()
         ]
+    for k, by in enumerate(parse_slices(experiment.measure.by)):
+        if by.names(AREA) and not experiment.has_areas:
+            yield at(("measure", "by", k), NO_AREAS)
     for key, name in asked if scenes else ():
         if name not in known:
             has = f"there are {', '.join(sorted(known))}" if known else "`logs: [{file: …, tags: {…}}]` gives tags"
@@ -441,7 +444,7 @@ def check_across_logs(
             if "objects" in settings.measure and wanted not in scene.object_number:
                 of_id: Key = ("logs", entry, "measure", "objects", "ids", n)
                 yield at(of_id, f"no object {wanted!r} in the log; there are {moving_ids(scene)}")
-    yield from _check_tags(experiment, scenes, at)
+    yield from _check_slices(experiment, scenes, at)
     everywhere = bind_logs(experiment, recordings, source)
     kept = [resolve_for_log(everywhere, scene.log).configurations for scene in scenes]
     for name in experiment.configurations if scenes else ():

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -60,6 +60,49 @@ class Agreement:
     def refused(self) -> bool:
         """Whether the map cannot be where the traffic is."""
         return self.share is not None and self.states >= _FEWEST and self.share < REFUSED_BELOW
+
+
+SOLIDS_NOTED_ABOVE: Final = 0.02
+SOLIDS_REFUSED_ABOVE: Final = 0.1
+
+
+@dataclass(frozen=True)
+class Inside:
+    """Of `states` of moving vehicles, `inside` are in a solid of a map."""
+
+    states: int
+    inside: int
+
+    @property
+    def share(self) -> float:
+        """0 where no vehicle moves."""
+        return self.inside / self.states if self.states else 0.0
+
+    @property
+    def words(self) -> str:
+        """One line, without the map's name; empty: nothing has to be said."""
+        if self.states < _FEWEST or self.share <= SOLIDS_NOTED_ABOVE:
+            return ""
+        told = f"{self.inside:,} of {self.states:,} states of moving vehicles are inside a solid"
+        return f"{told} ({self.share:.0%}): is the map in the frame of the log?"
+
+    @property
+    def refused(self) -> bool:
+        """Whether the map cannot be where the traffic is."""
+        return self.states >= _FEWEST and self.share > SOLIDS_REFUSED_ABOVE
+
+
+def find_inside(scene: Scene, truth: Tracks, outlines: Sequence[Any]) -> Inside:
+    """How often the centre of a moving vehicle is in one of the outlines of solids: polygons as shapely has them.
+
+    Of a map without lanes this is what agreement can be told by.
+    """
+    import shapely
+
+    rows = moving_vehicle_rows(scene, truth)
+    points = shapely.points(truth.x_m[0, rows], truth.y_m[0, rows])
+    found = shapely.STRtree(points).query(outlines, predicate="contains")[1] if len(outlines) else []
+    return Inside(len(rows), len(np.unique(found)))
 
 
 def moving_vehicle_rows(scene: Scene, truth: Tracks) -> Int:

@@ -39,9 +39,10 @@ class Column:
     """A column of a file, or a key of `provenance.json`.
 
     `kind`: text, text or null, numbers, whole numbers, true or false, or lists of these. `when`: what an experiment
-    has to ask for (`braking`, `conflict`, `accuracy`; `link`: a link, `ready` or `sends`; `fleet`: units that only some
-    runs have); empty: it is always there. `compared`: whether comparisons read it. `single`: in single precision.
-    `full`: no row is without it. `infinite`: numbers may be infinite. `among`: the words it may have; empty: any.
+    has to ask for (`braking`, `conflict`, `accuracy`, `areas`; `link`: a link, `ready` or `sends`; `fleet`: units that
+    only some runs have); empty: it is always there. `compared`: whether comparisons read it. `single`: in single
+    precision. `full`: no row is without it. `infinite`: numbers may be infinite. `among`: the words it may have; empty:
+    any.
     """
 
     name: str
@@ -100,6 +101,9 @@ _ONSET_RANGE = Column("distance_at_onset_m", "numbers",
 _BEGAN = Column("began", "text",
                 "how the episode began: `log_start`, `appeared` or `crossed`, "
                 "[below](../guide/metrics.md#which-objects-count)", compared=True)  # fmt: skip
+_AREA = Column("area", "text or null",
+               "the [area](../guide/place.md#only-what-happens-in-an-area) in which the object's centre is at "
+               "`onset_s`: the first of one's own, else the kind of a map's; null in none", "areas")  # fmt: skip
 _ENDED = (
     Column("ended_s", "numbers", "the end of the episode; a list that arrives later does not count", compared=True,
            full=True),
@@ -147,7 +151,7 @@ _SUMMARY_BY = (
     Column("note", "text or null", "why there is no interval; how few episodes last as long as the horizon"),
 )  # fmt: skip
 _DETECTIONS = (
-    *_LOG, _RUN, _OBJECT, _CLASS, _EPISODE, _ONSET, _ONSET_RANGE, _BEGAN,
+    *_LOG, _RUN, _OBJECT, _CLASS, _EPISODE, _ONSET, _ONSET_RANGE, _BEGAN, _AREA,
     Column("detected", "true or false", "whether the object was detected", compared=True, full=True),
     _DETECTION,
     Column("captured_s", "numbers", "newest capture that contributed to that list"),
@@ -199,7 +203,7 @@ _DETECTIONS = (
 _TALLY = (
     *_LOG,
     Column("event", "text", "`detected`, or `conflict`: the first list that implied a collision"),
-    _OBJECT, _CLASS, _EPISODE, _ONSET, _ONSET_RANGE, _BEGAN, *_ENDED, _DETECTION, _TIME, *_DISTANCES,
+    _OBJECT, _CLASS, _EPISODE, _ONSET, _ONSET_RANGE, _BEGAN, _AREA, *_ENDED, _DETECTION, _TIME, *_DISTANCES,
     Column("runs", "whole numbers", "in how many runs it is so", full=True),
     Column("in_conflict", "true or false", "whether the ego is in conflict with the object", "braking", full=True),
     Column("passed", "whole numbers", "in how many of these runs the ego passes", "braking", full=True),

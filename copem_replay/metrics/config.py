@@ -204,10 +204,10 @@ BeganWords = Annotated[
 
 # What the summary is sliced by.
 
-LOG, CLASS, BEGAN_BY, RANGE, TAGS = "log", "class", "began", "range_at_onset", "tags."
+LOG, CLASS, BEGAN_BY, RANGE, AREA, TAGS = "log", "class", "began", "range_at_onset", "area", "tags."
 RANGE_EDGES_M = (10.0, 20.0, 30.0, 50.0, 75.0, 100.0)
 """Edges of `range_at_onset` where none are given; nearer and farther objects have groups, too."""
-_EXPECTED = f"{LOG}, {CLASS}, {BEGAN_BY}, {RANGE} or {TAGS}NAME"
+_EXPECTED = f"{LOG}, {CLASS}, {BEGAN_BY}, {RANGE}, {AREA} or {TAGS}NAME"
 
 
 @dataclass(frozen=True)
@@ -282,9 +282,9 @@ def _parse_dimension(word: str) -> Dimension:
     name, *edges = word.split(":") if word.startswith(RANGE) else [word]
     if name == RANGE:
         return Dimension(name, _parse_edges(edges) if edges else RANGE_EDGES_M)
-    if name in (LOG, CLASS, BEGAN_BY) or (name.startswith(TAGS) and len(name) > len(TAGS)):
+    if name in (LOG, CLASS, BEGAN_BY, AREA) or (name.startswith(TAGS) and len(name) > len(TAGS)):
         return Dimension(name)
-    message = unknown_name_message("slice", word, (LOG, CLASS, BEGAN_BY, RANGE))
+    message = unknown_name_message("slice", word, (LOG, CLASS, BEGAN_BY, RANGE, AREA))
     raise ValueError(f"{message} (expected {_EXPECTED}; a cross as [log, class] or log*class)")
 
 
@@ -314,7 +314,7 @@ class Measure(Frozen):
 
     `annotated`: the area in which entries at no true object are ghosts, by default everywhere. `metrics`: your own
     columns of the summary. `by`: what the summary is sliced by, once more for each entry: `log`, `class`, `began`,
-    `range_at_onset` (`range_at_onset:20:40`: by edges of your own, in metres), `tags.NAME`; a list is a cross.
+    `range_at_onset` (`range_at_onset:20:40`: by edges of your own, in metres), `area`, `tags.NAME`; a list is a cross.
 
     >>> measure = cr.Measure(objects={"classes": ["vru"]}, onset={"kind": "in_range", "range_m": 30.0})
     >>> measure.onset.range_m, measure.confirm.hits
@@ -356,6 +356,11 @@ class Measure(Frozen):
         return self
 
 
+NO_AREAS = (
+    f"{AREA}: expected areas to group by, found none; name them with `areas: {{…}}`, or give `maps: [{{file: …}}]`"
+)
+
+
 def find_range_problem(onset: Onset, slices: Sequence[Slice]) -> str | None:
     """Why episodes cannot be grouped by their range at this onset; None: they can, or are not asked to be."""
     if not isinstance(onset, InRange) or not any(by.names(RANGE) for by in slices):
@@ -393,6 +398,10 @@ class MetricsSetup(PerceptionSetup, Protocol):
     @property
     def areas(self) -> Mapping[str, OwnArea]:
         """Areas of one's own, by name."""
+
+    @property
+    def has_areas(self) -> bool:
+        """Whether the study has areas, its own or of maps."""
 
     @property
     def recorded(self) -> Mapping[str, object]:

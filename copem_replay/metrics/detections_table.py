@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from copem_replay.core.interpolation import interpolate_states
 from copem_replay.core.random import CounterRng, RandomKey, object_words
 from copem_replay.core.tracks import CLASSES, SAME_INSTANT_S, Float, Int, Scene, Tracks
+from copem_replay.metrics.areas import name_areas
 from copem_replay.metrics.braking.driver import reaction_delays
 from copem_replay.metrics.braking.encounter import Encounter
 from copem_replay.metrics.braking.verdict import Verdicts, judge_braking
@@ -175,9 +176,12 @@ def build_detection_columns(
     """The columns of `detections.parquet` of one log and block of runs, by configuration, run and object."""
     delay_s = _reaction_delays(scene, experiment, episodes, runs)
     onset_m, _ = measure_distances(scene, truth, experiment, episodes.object_ix, episodes.onset_s)
+    area = name_areas(scene, truth, episodes, experiment) if experiment.has_areas else None
     parts = []
     for name, event in events.items():
         columns = _configuration_columns(scene, truth, experiment, episodes, runs, name, event, onset_m)
+        if area is not None:
+            columns["area"] = np.broadcast_to(area, (len(runs), len(area))).ravel()
         if delay_s is not None:
             columns |= _braking_columns(experiment, episodes, encounters, delay_s, event)
         if any(other.way is not None for other in events.values()):

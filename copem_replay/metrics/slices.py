@@ -1,10 +1,10 @@
 """Slices: the rows of a study in groups, by drive, class, range at the onset, how an episode began, or a drive's tags.
 
 An *entry* names what episodes are grouped by: `log`, `class`, `began`, `range_at_onset` (`range_at_onset:20:40` with
-edges of one's own, in metres), `tags.NAME`; a *cross* of several, `[log, class]` or `log*class`, has a group for each
-pair that occurs. A *group* is a set of episodes, of all configurations alike; its figures are those of `summary.csv`,
-by the same functions, from its rows alone (`StudyRows`). What belongs to no episode has a figure only where groups are
-of whole logs: false positives. What is of whole lists (GOSPA, OSPA, existence) has none.
+edges of one's own, in metres), `area`, `tags.NAME`; a *cross* of several, `[log, class]` or `log*class`, has a group
+for each pair that occurs. A *group* is a set of episodes, of all configurations alike; its figures are those of
+`summary.csv`, by the same functions, from its rows alone (`StudyRows`). What belongs to no episode has a figure only
+where groups are of whole logs: false positives. What is of whole lists (GOSPA, OSPA, existence) has none.
 
 Letters of the shapes: n rows, E episodes.
 """
@@ -22,7 +22,7 @@ import pandas as pd
 from copem_replay.core.errors import count_noun
 from copem_replay.core.tracks import CLASSES, Bool, Float, Int
 from copem_replay.metrics.accuracy.statistics import EXISTENCE, OBJECT, RUN, AccuracySettings, AccuracyTotal
-from copem_replay.metrics.config import BEGAN_BY, CLASS, LOG, RANGE, TAGS, Dimension, Slice
+from copem_replay.metrics.config import AREA, BEGAN_BY, CLASS, LOG, RANGE, TAGS, Dimension, Slice
 from copem_replay.metrics.intervals import CONFIDENCE, choose_over, explain_no_clusters
 from copem_replay.metrics.metric import (
     LINK,
@@ -39,8 +39,9 @@ from copem_replay.metrics.onset import BEGAN, COUNTS_BY, is_counted, select_coun
 from copem_replay.metrics.summary import CONFLICT, DETECTED, EPISODE, describe_followed
 from copem_replay.metrics.summary_metrics import METRICS, estimate_detected_share
 
-NO_TAG, NO_RANGE = "(no tag)", "(no range)"
-"""Groups of episodes whose log has no such tag, or at whose onset there is no place to measure the range from."""
+NO_TAG, NO_RANGE, NO_AREA = "(no tag)", "(no range)", "(no area)"
+"""Groups of episodes whose log has no such tag, at whose onset there is no place to measure the range from, or that
+begin in no area."""
 
 # Groups.
 
@@ -71,6 +72,9 @@ def _name_values(table: pd.DataFrame, dimension: Dimension, tags: Tags) -> tuple
         values = table["log"].map({log: of.get(dimension.name.removeprefix(TAGS), NO_TAG) for log, of in tags.items()})
         values = values.fillna(NO_TAG)
         order = sorted(values.unique(), key=lambda value: (value == NO_TAG, value))
+    elif dimension.name == AREA:
+        values = table["area"].astype(object).where(table["area"].notna(), NO_AREA)
+        order = sorted(values.unique(), key=lambda value: (value == NO_AREA, value))
     else:
         values = table["object_class" if dimension.name == CLASS else "began"]
         order = [*(CLASSES if dimension.name == CLASS else BEGAN)]
@@ -80,7 +84,8 @@ def _name_values(table: pd.DataFrame, dimension: Dimension, tags: Tags) -> tuple
 def number_groups(table: pd.DataFrame, by: Slice, tags: Tags) -> tuple[Int, list[tuple[str, ...]]]:
     """(n,) the group of each row, and the groups that occur, each with its value of every dimension of the entry.
 
-    `table`: rows with the columns that the entry is about: `log`, `object_class`, `began`, `distance_at_onset_m`.
+    `table`: rows with the columns that the entry is about: `log`, `object_class`, `began`, `distance_at_onset_m`,
+    `area`.
     """
     number, columns = np.zeros(len(table), dtype=np.int64), []
     for dimension in by.dimensions:
@@ -222,6 +227,7 @@ class StudyRows:
     def episodes(self) -> pd.DataFrame:
         """The E episodes, in the order of the tally: `EPISODE`, class, range at the onset, began, from and to."""
         columns = [*EPISODE, "object_class", "distance_at_onset_m", *COUNTS_BY]
+        columns += ["area"] if "area" in self.tally else []
         return self.tally[columns].drop_duplicates([*EPISODE]).reset_index(drop=True)
 
     @cached_property

@@ -58,7 +58,8 @@ _EVENT_COLUMNS = {
 }
 """By event the columns of the tally, and their names in `detections.parquet`; null in the row for never."""
 _OBJECT_COLUMNS = (
-    "object_id", "object_class", "episode", "onset_s", "distance_at_onset_m", "began", "ended_s", "ended_by",
+    "object_id", "object_class", "episode", "onset_s", "distance_at_onset_m", "began", "area", "ended_s",
+    "ended_by",
 )  # fmt: skip
 
 

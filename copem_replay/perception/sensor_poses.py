@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -148,6 +149,21 @@ def find_ground(truth: Tracks, corners: Float) -> tuple[float, float]:
     return float(truth.z_m[0, nearest] - truth.height_m[0, nearest] / 2), float(distance.min())
 
 
+def find_grounds(truth: Tracks, outlines: Sequence[Any]) -> tuple[Float, Float]:
+    """As `find_ground`, of many outlines (K,), polygons as shapely has them: grounds (K,), distances (K,)."""
+    import shapely
+
+    grounds_m, far_m = np.zeros(len(outlines)), np.full(len(outlines), np.inf)
+    if len(truth.frame_ix) and len(outlines):
+        tree = shapely.STRtree(shapely.points(truth.x_m[0], truth.y_m[0]))
+        (which, state), distance_m = tree.query_nearest(outlines, return_distance=True)
+        order = np.lexsort((state, which))  # of equally near states the first
+        which, first = np.unique(which[order], return_index=True)
+        nearest, far_m[which] = state[order][first], distance_m[order][first]
+        grounds_m[which] = truth.z_m[0, nearest] - truth.height_m[0, nearest] / 2
+    return grounds_m, far_m
+
+
 def _nearest_candidates(x_m: Float, y_m: Float, corners: Float) -> Int:
     """The states (R,) that may be nearest: their distance from the corners' bounds is within the least from a corner.
 
@@ -210,6 +226,11 @@ def find_enclosing_solid(
     x, y = offset_places(np.array(unit.at[0]), np.array(unit.at[1]), np.array(np.deg2rad(unit.yaw_deg)), unit.offset_m)
     place = shapely.Point(float(x), float(y))
 
+    def is_around(solid: Solid) -> bool:
+        """Whether it may hold the place, told without a polygon: of thousands hardly any does."""
+        east, north = zip(*solid.corners_m, strict=True)
+        return bool(min(east) <= x <= max(east) and min(north) <= y <= max(north))
+
     def depth_m(outline: shapely.Polygon) -> float:
         return float(outline.boundary.distance(place)) if outline.contains(place) else 0.0
 
@@ -220,7 +241,7 @@ def find_enclosing_solid(
     )
     for solid in (
         *of_experiment,
-        *(candidate for candidate in scene.solids if depth_m(candidate.outline) > TOUCHES_M),
+        *(candidate for candidate in scene.solids if is_around(candidate) and depth_m(candidate.outline) > TOUCHES_M),
     ):
         z = unit_ground(truth, "", unit) + unit.height_m
         if _hides_from_m(solid) + TOUCHES_M < z < solid.top_m - TOUCHES_M:

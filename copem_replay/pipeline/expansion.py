@@ -206,6 +206,11 @@ class ExpandedExperiment:
         return self.written.areas
 
     @property
+    def has_areas(self) -> bool:
+        """Whether the study has areas, its own or of maps."""
+        return self.written.has_areas
+
+    @property
     def braking(self) -> Braking | None:
         """The driver of which verdicts are asked for; None: no verdicts."""
         return self.written.braking

@@ -240,6 +240,8 @@ def _recipe_parts(experiment: Experiment, name: str) -> tuple[dict[str, Any], li
     }
     if any(couple.when.tags for pem in pems for couple in experiment.pems[pem].couples):
         of_part["tags"] = experiment.tags
+    if experiment.has_areas:
+        of_part["areas_named"] = True  # a column of the rows, of a log without areas, too
     own = own_components(
         configuration, experiment.visibility, experiment.measure.model_copy(update={"metrics": ()}),
         experiment.braking, *(experiment.pems[pem] for pem in pems),

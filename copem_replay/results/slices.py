@@ -14,7 +14,7 @@ import pandas as pd
 
 from copem_replay.core.errors import InputError, wrap_line
 from copem_replay.experiment.drive import resolve_for_log
-from copem_replay.metrics.config import Slice, find_range_problem, parse_slices
+from copem_replay.metrics.config import AREA, NO_AREAS, Slice, find_range_problem, parse_slices
 from copem_replay.metrics.intervals import describe_clusters
 from copem_replay.metrics.slices import (
     KEYS,
@@ -43,6 +43,8 @@ def read_slices(results: Results, entries: Sequence[str], where: str = "--by") -
     tags = {log.name: log.tags for log in results.provenance.logs}
     onsets = [resolve_for_log(results.experiment, log).measure.onset for log in tags]
     problems = [*(find_range_problem(onset, slices) for onset in onsets), find_unknown_tag(slices, tags)]
+    if any(by.names(AREA) for by in slices) and "area" not in results.tally:
+        problems.append(NO_AREAS)
     for problem in filter(None, problems):
         raise InputError(f"{where}: {problem}")
     return slices

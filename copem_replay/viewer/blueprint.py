@@ -16,6 +16,7 @@ from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.viewer.camera import Camera
 from copem_replay.viewer.lanes import UnitLists, select_list_lanes
+from copem_replay.viewer.map_view import asks_for_map, map_page
 from copem_replay.viewer.objects import SHOWN_OBJECTS
 from copem_replay.viewer.sink import (
     EGO,
@@ -434,6 +435,8 @@ def build_blueprint(content: RecordingContent) -> tuple[rrb.Blueprint, str]:
     pages += [tracks_page(content), errors_page(content)]
     if any(content.received(name) for name in content.configurations):
         pages.append(units_page(content))
+    with_map = scene.frame is not None and asks_for_map(content.experiment)
+    pages += [map_page()] if with_map else []
     pages.append(text_page())
     onset_ns = int(to_nanoseconds(content.table["onset_s"].min())) if len(content.table) else 0
     end_ns = max(scene.end_ns - scene.t0_ns, onset_ns)
@@ -470,6 +473,7 @@ def build_blueprint(content: RecordingContent) -> tuple[rrb.Blueprint, str]:
         content.baseline,
         [content.title(name) for name in content.configurations],
         *([under] if any(under := [content.under(k) for k in content.objects]) else []),
+        *(["map"] if with_map else []),
     )
     return blueprint, digest_texts(repr(parts))
 

@@ -46,6 +46,7 @@ from copem_replay.viewer.events import (
 )
 from copem_replay.viewer.lanes import UnitLists, find_linked_lists, write_list_fates, write_list_lanes
 from copem_replay.viewer.line_of_sight import Sight, compute_sight, find_looked_at
+from copem_replay.viewer.map_view import NO_PLACE, asks_for_map, write_map
 from copem_replay.viewer.objects import ShownObjects, choose_shown_objects, find_opening_s
 from copem_replay.viewer.sensors import FaultsShown, choose_named_units
 from copem_replay.viewer.sink import (
@@ -127,7 +128,8 @@ def write_rrd(
         _write_chunks(files, chunks, replay, experiment, collector)
         for file in files:
             _send_layout(file)
-    return list(_list_notes(path, parts, [file.out.live for file in files]))
+    notes = [NO_PLACE] if asks_for_map(experiment) and replay.scene.frame is None else []
+    return [*notes, *_list_notes(path, parts, [file.out.live for file in files])]
 
 
 @dataclass(frozen=True)
@@ -220,6 +222,8 @@ def _begin_file(
     boxes.write_grid(out, replay.truth)
     boxes.write_solids(out, replay.placed)
     boxes.write_lane_boundaries(out, replay.lane_boundaries)
+    if scene.frame is not None and asks_for_map(experiment):
+        write_map(out, replay, experiment, scene.frame)
     sensors.write_units(out, replay, experiment)
     mark_onsets(out, replay, experiment, content.table, content.objects)
     boxes.write_truth(out, scene, replay.truth, content.objects)

@@ -190,6 +190,29 @@ def test_no_solid_near_the_log_is_refused(folder: Path) -> None:
     assert problems == ["site.geojson: 0 of 1 solid within 200 m of the log; nearest 24.9 km: is the frame right?"]
 
 
+@pytest.mark.parametrize(
+    ("x_m", "share"), [((55.0, 71.0), 0.16), ((60.0, 61.4), 0.04), ((60.0, 60.4), None)], ids=["in", "some", "few"]
+)
+def test_houses_that_traffic_drives_through(folder: Path, x_m: tuple[float, float], share: float | None) -> None:
+    """By hand: 124 states a metre apart at y = 2 m; ends of the house lie between them."""
+    box = (x_m[0] + 0.5, 0.0, x_m[1] + 0.5, 9.0)
+    at_m = [70 + 10 * n - k for n in range(4) for k in range(31)]
+    inside = sum(box[0] < x < box[2] for x in at_m)
+    told = f"{inside} of 124 states of moving vehicles are inside a solid ({inside / 124:.0%})"
+    recording, problems = placed(folder, houses(box))
+    ignored = placed(folder, houses(box), agreement="ignore")[1]
+    assert any(told in note for note in recording.notes) == (share is not None)
+    assert (len(problems), ignored) == (int((share or 0) > 0.1), [])
+    for line in problems:
+        assert line.startswith("site.geojson: expected at most 10% of the states of moving vehicles inside its solids")
+
+
+def test_a_map_that_the_projection_does_not_reach(folder: Path) -> None:
+    far = houses((0, 0, 10, 10)).replace("[0.0, 0.0]", "[95.0, 0.0]")
+    (line,) = placed(folder, far)[1]
+    assert line.endswith("expected a place that this projection has, found 0.00000 N 95.00000 E")
+
+
 def test_too_many_parts_are_refused(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("copem_replay.experiment.maps._MOST_PARTS", 1)
     (line,) = placed(folder, houses((25, 11, 35, 17), (25, 21, 35, 27)))[1]

@@ -16,6 +16,7 @@ import pytest
 from osi3.osi_object_pb2 import StationaryObject
 
 from copem_replay.core.errors import InputError
+from copem_replay.core.frame import Frame
 from copem_replay.io.convert import restricted_pickle
 from copem_replay.io.recording import read_log
 from tests.helpers.conversions import Runner, convert, run
@@ -113,6 +114,11 @@ def test_argoverse2_brings_the_borders_of_its_map(run: Runner) -> None:
     assert [b[:, 1].tolist() for b in found.recording.lane_boundaries] == [[6, 6], [3, 3], [0, 0]]
     assert not found.messages[1].lane_boundary
     assert "2 lanes of log_map_archive_x____PIT_city_1.json: its borders are lane boundaries" in found.printed
+    assert "place on earth: that of city PIT, by the name of log_map_archive_x____PIT_city_1.json" in found.printed
+    place = found.recording.place_said
+    assert place is not None
+    origin = Frame(place.proj, place.offset_m).to_wgs84([(0.0, 0.0)])[0]  # as av2's geometry/utm.py has it
+    assert origin == pytest.approx([40.44177902989321, -80.01294377242584], abs=1e-9)
 
 
 def test_argoverse2_a_map_that_is_none_is_refused(run: Runner) -> None:

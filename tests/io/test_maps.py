@@ -296,6 +296,22 @@ def test_lanelets_without_local_places_have_degrees(tmp_path: Path) -> None:
     assert found.lanes[0].left_m[0, :2] == pytest.approx([11, 48.003])
 
 
+@pytest.mark.parametrize("local", [True, False])
+def test_walls_of_lanelets_hide_and_guard_rails_do_not(tmp_path: Path, local: bool) -> None:
+    text = lanelet([(0, 3), (9, 3)], [(0, 0), (9, 0)], local=local)
+    rail = '<way id="7"><nd ref="0"/><nd ref="1"/><tag k="type" v="guard_rail"/></way>'
+    wall = rail.replace('"7"', '"8"').replace("guard_rail", "wall").replace("</way>", '<tag k="height" v="3 m"/></way>')
+    found = read_map(written(tmp_path, text.replace("<relation", f"{rail}{wall}<relation"), "map.osm"))
+    (solid,) = found.solids
+    assert (solid.name, solid.kind, solid.bottom_m, solid.top_m, solid.on_ground) == ("way/8", "wall", 0.0, 3.0, True)
+    west, south, east, north = shapely.Polygon(solid.rings_m[0]).bounds
+    if local:
+        assert (west, south, east, north) == pytest.approx((0, 2.85, 9, 3.15))
+    else:  # a degree of latitude at 48° N has 111.2 km
+        assert (west, east) == pytest.approx((11.0, 11.009))
+        assert (north - south) * 111_200 == pytest.approx(0.3, abs=1e-3)
+
+
 @pytest.mark.parametrize(("old", "new", "says"), [
     ('v="3"', 'v="1e308"', "<node> local_y: expected a number of at most 1e\\+08, found '1e308'"),
     ('<nd ref="0"/>', '<nd ref="77"/>', "<nd ref>: expected a node of this file with a place, found '77'"),

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from copem_replay.perception.observation import observe_objects
-from copem_replay.perception.sensor_poses import find_ground, place_units
+from copem_replay.perception.sensor_poses import find_ground, find_grounds, place_units
 from tests.helpers.scenes import EGO_UNIT, Thing, experiment, recording
 
 SQUARE = [[-4.0, -3.0], [6.0, -3.0], [6.0, 5.0], [-4.0, 5.0]]
@@ -38,6 +38,10 @@ def test_it_is_that_of_the_nearest_of_all_the_first_of_equals(
     place = shapely.Point(given_[0]) if len(given_) == 1 else shapely.Polygon(given_)
     distance = [place.distance(shapely.Point(one)) for one in at]
     assert find_ground(states(at), given_) == (float(np.argmin(distance)), min(distance))
+    far = place.centroid.buffer(1e3)
+    grounds_m, far_m = find_grounds(states(at), [place, far])
+    assert (grounds_m[0], far_m[0]) == (float(np.argmin(distance)), min(distance))
+    assert (grounds_m[1], far_m[1]) == (0.0, 0.0)  # all are inside
 
 
 def test_no_states_ground_at_zero() -> None:

@@ -62,6 +62,39 @@ def solids() -> Iterator[common.Line]:
         yield line
 
 
+def site() -> Iterator[common.Line]:
+    """Processor seconds of a run of 20 s of the crossing from 5 units, without a map and with one of 3,000 edges.
+
+    Houses of 8 × 8 m stand in its four quarters, no farther than 200 m from any object, as `within_m` has it.
+    """
+    experiment = common.cr.load_experiment(common.ROOT / "logs/crossing_units.yaml")
+    at_m = [(x, y) for x in range(18, 250, 12) for y in range(18, 250, 12)]
+    at_m = [(sx * x, sy * y) for x, y in sorted(at_m, key=lambda at: at[0] ** 2 + at[1] ** 2) for sx, sy in _QUARTERS]
+    objects = "".join(
+        f'<object id="{k}" type="building" s="{x + 300}" t="{y}" hdg="0" length="8" width="8" height="9"/>'
+        for k, (x, y) in enumerate(at_m[:750])
+    )
+    plan = '<planView><geometry s="0" x="-300" y="0" hdg="0" length="600"><line/></geometry></planView>'
+    units = list(experiment.units)[:5]
+    only: dict[str, object] = {"configurations": {"all": {"units": units}}, "obstacles": [], "show": None}
+    only |= {"window_s": [0.0, 20.0], "units": {name: experiment.as_written()["units"][name] for name in units}}
+    with common.scratch() as folder:
+        town = folder / "town.xodr"
+        town.write_text(f'<OpenDRIVE><road id="1" length="600">{plan}<objects>{objects}</objects></road></OpenDRIVE>')
+        for runs in (1, 20):
+            calls = []
+            for maps in ([], [{"file": str(town), "frame": "same"}]):
+                asked = experiment.as_written() | only | {"maps": maps, "runs": runs}
+                asked["logs"] = [str(common.ROOT / "logs/crossing.mcap")]
+                calls.append(partial(common.cr.run, common.cr.load_experiment(asked), jobs=1))
+            without, houses = common.interleaved(calls, 3)
+            line = {"cpu_s_without": round(without, 2), "cpu_s_with": round(houses, 2)}
+            yield {"site_ratio": round(houses / without, 2), "runs": runs, "units": len(units), "edges": 3000} | line
+
+
+_QUARTERS = ((1, 1), (-1, 1), (-1, -1), (1, -1))
+
+
 def paper() -> Iterator[common.Line]:
     """The six configurations × 500 runs of the sample scenario.
 

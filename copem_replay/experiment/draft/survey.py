@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -23,7 +23,8 @@ from copem_replay.experiment.draft.findings import (
     UnitFound,
     suggest_experiment,
 )
-from copem_replay.io.channel import Channel
+from copem_replay.io.channel import Channel, schema_name
+from copem_replay.io.frame_fit import FIXES, FrameFit, fit_fixes
 from copem_replay.io.ground_truth import MAX_GAP_S
 from copem_replay.io.log import Log
 from copem_replay.io.open import Local, first_recording, label_files, name_log, open_log
@@ -213,17 +214,18 @@ def _survey_truth(
         missing=_list_missing(recording, poses),
         damage=recording.damage,
         notes=list(recording.notes),
-        place=_describe_place(recording),
+        place=_describe_place(log, recording),
         vehicles=moving_ids(scene, shown=6),
         units=list(_survey_units(recording, units)),
         suggested=suggest_experiment(log, recording, fields),
     )
 
 
-def _describe_place(recording: Recording) -> str:
-    """Where the recording says that it is, or why that is not known."""
+def _describe_place(log: Log, recording: Recording) -> str:
+    """Where the recording says that it is, or why that is not known, and what fixes beside its odometry say."""
     if recording.place_said is None:
-        return "none (the recording does not say where on earth it is)"
+        fits = [fit.words for fit in _fit_fixes(log, recording)]
+        return "; ".join(["none (the recording does not say where on earth it is)", *fits])
     try:
         frame, notes = recording.place_said.read()
         middle_m = find_middle(recording)
@@ -232,6 +234,15 @@ def _describe_place(recording: Recording) -> str:
     except InputError as error:
         return f"none ({error})"
     return "; ".join([where, *notes])
+
+
+def _fit_fixes(log: Log, recording: Recording) -> Iterable[FrameFit]:
+    if not any(schema_name(channel) in FIXES for channel in log.channels):
+        return ()
+    try:
+        return [*fit_fixes(log, recording)]
+    except InputError:  # no pyproj
+        return ()
 
 
 def _round_extent(values: Float) -> list[float]:

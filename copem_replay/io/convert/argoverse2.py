@@ -8,6 +8,7 @@ no velocities. A rider and his bicycle are two boxes. Borders of lanes are those
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
@@ -17,6 +18,7 @@ import pyarrow as pa
 import pyarrow.feather
 
 from copem_replay.core.errors import InputError
+from copem_replay.core.frame import SaidPlace, read_argoverse2_city
 from copem_replay.core.site_map import find_borders
 from copem_replay.core.tracks import Float
 from copem_replay.io.convert.conversion import KINDS, Box, ConversionReport, ConvertedFrame, rotation_from_quaternion
@@ -27,6 +29,7 @@ EGO_SIZE_M: Final = (4.877, 2.0, 1.473)
 CENTRE_FROM_REAR_AXLE_M: Final = (1.339, 0.0, 0.438)
 """Centre of the box ahead of, left of and above the rear axle: estimate of py123d from model data and lidar points."""
 
+_CITY: Final = re.compile(r"____([A-Z]{3})_city_")
 _EGO: Final = "EGO_VEHICLE"
 _POSE: Final = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 _SIZE: Final = ("length_m", "width_m", "height_m")
@@ -87,7 +90,7 @@ def frames(
         f"ego vehicle: id 1, {size} m, its centre {centre} m (ahead, left, up) of the rear axle, where the log has it"
     )
     ego_R_object, ego_t_object = _read_se3(boxes)
-    lines = _read_borders(log, report)
+    lines, place = _read_borders(log, report), _find_place(log, report)
     for stamp_ns, rows in _group_by_stamp(boxes["timestamp_ns"]):
         if (pose := pose_of.get(stamp_ns)) is None:
             report.count("annotated instant", "without an ego pose of the same time stamp: skipped")
@@ -111,8 +114,8 @@ def frames(
                     size_m=(length, width, height),
                 )
             )
-        yield ConvertedFrame(stamp_ns, frame_boxes, host=1, lines=lines)
-        lines = []
+        yield ConvertedFrame(stamp_ns, frame_boxes, host=1, lines=lines, place=place)
+        lines, place = [], None
 
 
 def _read_borders(log: Path, report: ConversionReport) -> list[Float]:
@@ -123,6 +126,21 @@ def _read_borders(log: Path, report: ConversionReport) -> list[Float]:
         lines += find_borders(site.lanes)
         report.count("lane", f"of {path.name}: its borders are lane boundaries", len(site.lanes))
     return lines
+
+
+def _find_place(log: Path, report: ConversionReport) -> SaidPlace | None:
+    """The frame of the log's city, which only the names of its maps say; None: they say none."""
+    for path in sorted((log / "map").glob("log_map_archive_*.json")):
+        if (named := _CITY.search(path.name)) is None:
+            continue
+        try:
+            proj, offset_m = read_argoverse2_city(named[1])
+        except InputError as error:
+            report.count("place on earth", f"left out: {error}")
+            return None
+        report.assume(f"place on earth: that of city {named[1]}, by the name of {path.name}")
+        return SaidPlace(proj, offset_m)
+    return None
 
 
 def _make_ego_box(R: Float, t: Float, size_m: tuple[float, float, float], centre_m: tuple[float, float, float]) -> Box:

@@ -22,6 +22,7 @@ from osi3.osi_lane_pb2 import LaneBoundary
 from osi3.osi_object_pb2 import MovingObject, StationaryObject
 
 from copem_replay.core.errors import InputError, OutputError, count_noun, unknown_name_message
+from copem_replay.core.frame import SaidPlace
 from copem_replay.core.tracks import Float
 from copem_replay.io.ground_truth import HEIGHTS_M
 from copem_replay.io.write.osi import NANOS_PER_SECOND, OsiTrace, empty_ground_truth, write_osi_trace
@@ -199,6 +200,7 @@ class ConvertedFrame:
     boxes: list[Box]
     host: int | None = None
     lines: Sequence[Float] = ()  # (K, 3) each: borders of lanes, in the first frame alone
+    place: SaidPlace | None = None  # where its metres are on earth, in the first frame alone
 
 
 @dataclass
@@ -266,6 +268,10 @@ def _encode_messages(
 
 def _encode_message(frame: ConvertedFrame, report: ConversionReport) -> GroundTruth:
     osi = empty_ground_truth(frame.stamp_ns, frame.host)
+    if frame.place is not None:
+        osi.proj_string, offset = frame.place.proj, osi.proj_frame_offset
+        offset.position.x, offset.position.y = frame.place.offset_m
+        offset.yaw = frame.place.yaw_rad
     for number, line in enumerate(frame.lines):
         boundary = osi.lane_boundary.add()
         boundary.id.value, boundary.classification.type = number, LaneBoundary.Classification.TYPE_NO_LINE

@@ -1,4 +1,4 @@
-"""Lanelet2 maps, `.osm` with relations of the type lanelet: lanes, crosswalks, areas of intersections and parking.
+"""Lanelet2 maps, `.osm` with relations of the type lanelet: lanes, crosswalks, intersections, parking, walls.
 
 Where all nodes have `local_x` and `local_y`, these are taken; else the longitude and latitude. Borders may be stored
 against each other and against the lane: they are turned so that the left one is on the left. Neither speed limits nor
@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -21,6 +21,7 @@ from copem_replay.core.site_map import AreaKind, Lane, LaneKind, SiteMap, make_a
 from copem_replay.core.tracks import Float
 from copem_replay.io.convert.commonroad import XmlNode, read_parts
 from copem_replay.io.convert.conversion import quote_value
+from copem_replay.io.maps.solids import DEFAULT_HEIGHTS_M, Shape, make_site
 
 _FARTHEST: Final = 1e8
 _KIND: Final[dict[str, LaneKind]] = {
@@ -44,8 +45,10 @@ class _Nodes:
     degrees: dict[str, tuple[float, float, float]]
 
 
-def read_lanelet2(path: Path, _heights_m: Mapping[str, float] | None = None) -> SiteMap:
-    """Lanes and areas of a map. Raises InputError with file and line."""
+def read_lanelet2(path: Path, heights_m: Mapping[str, float] = DEFAULT_HEIGHTS_M) -> SiteMap:
+    """Lanes, areas and walls of a map. Raises InputError with file and line."""
+    import shapely
+
     nodes, ways, relations = _Nodes({}, {}), dict[str, XmlNode](), list[XmlNode]()
     for part in read_parts(path, ("osm",), most_elements=300_000):
         if part.tag == "node":
@@ -73,7 +76,22 @@ def read_lanelet2(path: Path, _heights_m: Mapping[str, float] | None = None) -> 
         if (kind := _AREA.get(_tags(way).get("type", ""))) is not None and len(lines[name]) > 3:
             areas.append(make_area(f"{kind} {name}", kind, lines[name]))
     notes = [f"{count_noun(n, noun)} without two borders of two points: left out" for noun, n in counts.items()]
-    return SiteMap(tuple(lanes), tuple(areas), degrees=not local, assumed=tuple(notes))
+    walls = [
+        Shape(f"way/{name}", shapely.LineString(lines[name][:, :2]), _wall_tags(way))
+        for name, way in ways.items()
+        if _is_wall(way)
+    ]
+    site = make_site(walls, heights_m, Counter(), degrees=not local)
+    return replace(site, lanes=tuple(lanes), areas=tuple(areas), assumed=(*notes, *site.assumed))
+
+
+def _is_wall(way: XmlNode) -> bool:
+    """Whether a line hides: guard rails, fences and kerbs are seen through."""
+    return _tags(way).get("type") == "wall" and len({nd.attributes.get("ref") for nd in way.all("nd")}) > 1
+
+
+def _wall_tags(way: XmlNode) -> dict[str, str]:
+    return {name: value for name, value in _tags(way).items() if name in ("height", "width")} | {"barrier": "wall"}
 
 
 def _add_node(nodes: _Nodes, node: XmlNode, path: Path) -> None:

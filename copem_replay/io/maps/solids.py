@@ -108,22 +108,30 @@ def _number(text: str | None) -> float:
 
 
 def make_site(
-    shapes: Iterable[Shape], heights_m: Mapping[str, float], counts: Counter[str], licence: str = ""
+    shapes: Iterable[Shape],
+    heights_m: Mapping[str, float],
+    counts: Counter[str],
+    licence: str = "",
+    *,
+    degrees: bool = True,
 ) -> SiteMap:
-    """The solids of shapes that hide, in degrees, with what was assumed and left out, counted in `counts`, too."""
+    """The solids of shapes that hide, with what was assumed and left out, counted in `counts`, too.
+
+    `degrees`: whether shapes are in degrees, and so the solids; else both are in metres.
+    """
     import shapely
 
     wanted = [shape for shape in shapes if hides(shape.tags) and not shape.geometry.is_empty]
     if not wanted:
-        return SiteMap(degrees=True, assumed=_list_counts(counts), licence=licence)
+        return SiteMap(degrees=degrees, assumed=_list_counts(counts), licence=licence)
     middle = np.median(shapely.get_coordinates([shape.geometry for shape in wanted]), axis=0)
-    scale = _metres_per_degree(float(middle[1]))
+    scale = _metres_per_degree(float(middle[1])) if degrees else np.ones(2)
     blocks = list[_Block]()
     for shape in wanted:
-        geometry = shapely.transform(shape.geometry, lambda degrees: (degrees - middle) * scale)
+        geometry = shapely.transform(shape.geometry, lambda places: (places - middle) * scale)
         blocks += _make_blocks(shape._replace(geometry=geometry), heights_m, counts)
     solids = [_make_map_solid(block) for block in _cut_outlines(blocks, counts)]
-    site = SiteMap(solids=tuple(solids), degrees=True, assumed=_list_counts(counts), licence=licence)
+    site = SiteMap(solids=tuple(solids), degrees=degrees, assumed=_list_counts(counts), licence=licence)
     return site.moved(lambda metres: metres / scale + middle)
 
 

@@ -21,8 +21,8 @@ from copem_replay.core.errors import ExperimentError
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.geometry import are_in_area, polygon_corners, pose_on_path
 from copem_replay.core.interpolation import interpolate_states
-from copem_replay.core.site_map import make_polygon
 from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int, Scene, Tracks
+from copem_replay.metrics.areas import are_in_areas
 from copem_replay.metrics.braking.encounter import EgoPath
 from copem_replay.metrics.config import Confirm, Conflict, MetricsSetup, Within
 
@@ -245,27 +245,11 @@ def _is_within_at_onset(scene: Scene, truth: Tracks, episodes: Episodes, experim
     if within.polygon_m is not None:
         return present & are_in_area(x_m, y_m, x_m, y_m, polygon_corners(within.polygon_m), np.inf)
     if within.areas is not None:
-        return present & _are_in_areas(x_m, y_m, scene, within.areas, experiment)
+        return present & are_in_areas(x_m, y_m, scene, within.areas, experiment)
     assert within.corridor_m is not None
     beside_m = _distance_to_path_m(EgoPath(scene, truth, experiment.max_gap_s), x_m, y_m, episodes)
     near: Bool = present & (beside_m <= within.corridor_m + _TOLERANCE_M)
     return near
-
-
-def _are_in_areas(x_m: Float, y_m: Float, scene: Scene, names: tuple[str, ...], experiment: MetricsSetup) -> Bool:
-    """(M,) whether places are in any area of these names or kinds: one's own, or of the log's maps."""
-    import shapely
-
-    inside = np.zeros(len(x_m), dtype=bool)
-    points = shapely.points(x_m, y_m)
-    for name in names:
-        if (own := experiment.areas.get(name)) is not None:
-            inside |= own.covers(x_m, y_m)
-            continue
-        for area in scene.areas:
-            if name in (area.name, area.kind):
-                inside |= shapely.intersects(make_polygon(area.rings_m), points)
-    return inside
 
 
 def _distance_to_path_m(ego: EgoPath, x_m: Float, y_m: Float, episodes: Episodes) -> Float:
