@@ -10,8 +10,7 @@ from typing import Final
 import pandas as pd
 
 from copem_replay.core.errors import InputError, count_noun
-from copem_replay.pipeline.causes import CAUSES
-from copem_replay.pipeline.triage import describe_cause
+from copem_replay.pipeline.causes import CAUSES, describe_cause
 from copem_replay.report.figures.style import format_per_cent, format_two_decimals
 from copem_replay.report.html.markup import (
     Html,
