@@ -252,9 +252,9 @@ def list_causes(experiment: Experiment) -> list[Cause]:
     acting = [cause for cause in CAUSES if cause.remove(experiment) != experiment]
     if experiment.recorded:
         return [cause for cause in acting if cause.name in _OF_RECORDED]
-    if is_own(kind := type(experiment.visibility)):
+    if is_own(own := type(experiment.visibility)):
         raise ExperimentError(
-            f"visibility: {kind.__module__}:{kind.__qualname__} is your own: what bodies hide is not told apart from "
+            f"visibility: {own.__module__}:{own.__qualname__} is your own: what bodies hide is not told apart from "
             "what else it says; use `surface` or `flat`"
         )
     return acting

@@ -162,6 +162,14 @@ def _find_sides(replay: Replay, objects: Int, at_s: Float) -> list[str]:
 # In words.
 
 
+def describe_chance(structural_share: float) -> str:
+    """`, by structure`: late although nothing in sight is missed; `, by chance`; or the share; empty where unknown."""
+    if np.isnan(structural_share):
+        return ""
+    sure = {1.0: "by structure", 0.0: "by chance"}
+    return f", {sure.get(structural_share, f'{structural_share:.0%} of it by structure')}"
+
+
 def describe_episode(episode: pd.Series) -> str:
     """Why an object is late: `1.9 s late: 1.2 hidden by bus 12, 0.5 latency`; parts below .05 s are left out."""
     parts = []
