@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import pandas as pd
 
 from copem_replay.api.study import AnyExperiment, AnyPath, AnyRecordings, check_any_counted, make_study
-from copem_replay.core.errors import ExperimentError, InputError, count_noun
+from copem_replay.core.errors import ExperimentError, InputError, count_noun, unknown_name_message
 from copem_replay.core.files import atomic_files
 from copem_replay.core.tracks import TRUTH
 from copem_replay.experiment.drive import resolve_for_log
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 PARTS = ("causes", "units", "triage", "sensitivity")
 _SHOWN_GROUPS = 10
+_VISIBLE_S = 0.005
+"""Seconds that are not 0 when they are rounded to two decimals."""
 _FEW_RUNS = 50
 """With fewer runs standard errors of causes are more than about two per cent of the time unknown."""
 
@@ -79,15 +81,21 @@ class Explanation:
         if self.units is not None:
             for name, of in self.units.groupby("configuration", sort=False):
                 yield _describe_units(str(name), of, width)
-        if self.triage is not None:
+        if self.triage is not None and self.late is not None:
             for name, of in self.triage.groupby("configuration", sort=False):
                 yield _describe_groups(str(name), of)
             if not len(self.triage):
                 yield ["no object is unknown for more than 1 s in one run of twenty or more"]
+            yield from _describe_hopeless(self.late)
         if self.sensitivity is not None and self.orders is not None:
-            from copem_replay.pipeline.sensitivity import describe_orders
+            from copem_replay.pipeline.sensitivity import describe_orders, tabulate_variations
 
-            yield describe_orders(self.sensitivity, self.orders)
+            yield [
+                "seconds unknown as PEMs vary",
+                *format_table(tabulate_variations(self.sensitivity), width).splitlines(),
+            ]
+            if len(orders := describe_orders(self.sensitivity, self.orders)):
+                yield orders
 
 
 def why(
@@ -95,116 +103,177 @@ def why(
     recordings: AnyRecordings | None = None,
     *,
     configurations: Sequence[str] | None = None,
-    parts: Sequence[str] = PARTS,
+    parts: Sequence[str] | None = None,
     units: Sequence[str] | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Explanation:
     """Explain the time that objects are unknown, `unknown_s`, by replays on the same draws.
 
     `experiment`, `recordings`: as `cr.run` takes them. `configurations`: only these; None: all that have units.
-    `parts`: of `causes`, `units`, `triage`, `sensitivity`. `units`: those whose worth is asked for, the others are
-    given; None: all but the ego's.
+    `parts`: of `causes`, `units`, `triage`, `sensitivity`; None: all, where they apply. `units`: those whose worth is
+    asked for, the others are given; None: all but the ego's. `progress(done, total)` is called after each
+    configuration.
 
-    Raises InputError: a configuration or unit that is not there, or one that cannot be explained, with the reason.
-    Where none is named, such ones are left out, with a note.
+    Raises InputError: a configuration or unit that is not there, or a part that is asked for of a configuration by
+    name, which cannot have it, with the reason. What is not named is left out then, with a note.
 
     >>> explained = cr.why("logs/tc016d.yaml", configurations=["PEM"], parts=["causes"])
     >>> explained.causes["cause"].tolist()
     ['no unit there', 'hidden', 'missed']
     """
-    for part in parts:
+    for part in parts or ():
         if part not in PARTS:
             raise InputError(f"parts: expected some of {', '.join(PARTS)}, found {part!r}")
     study = make_study(experiment, recordings)
     check_any_counted(study)
     logs = [(one, resolve_for_log(study.experiment, one.scene.log)) for one in study.recordings]
-    return _explain(study.experiment, logs, configurations, parts, units)
+    _check_names(study.experiment, configurations or (), units or ())
+    return _explain(logs, _Question(configurations, parts, units), progress or (lambda _done, _total: None))
+
+
+def _check_names(experiment: Experiment, configurations: Sequence[str], units: Sequence[str]) -> None:
+    """Raises ExperimentError for a name that is not there, before anything is replayed."""
+    for name in configurations:
+        if name not in experiment.configurations:
+            raise ExperimentError(unknown_name_message("configuration", name, experiment.configurations))
+    for unit in units:
+        if unit not in experiment.units:
+            raise ExperimentError(unknown_name_message("unit", unit, experiment.units))
+
+
+@dataclass(frozen=True)
+class _Question:
+    """What is asked of an experiment; None: all there is."""
+
+    configurations: Sequence[str] | None
+    asked_parts: Sequence[str] | None
+    units: Sequence[str] | None
+
+    @property
+    def parts(self) -> Sequence[str]:
+        return self.asked_parts or PARTS
+
+    def select(self, experiment: Experiment) -> list[str]:
+        """The configurations that are explained."""
+        with_units = [n for n, one in experiment.configurations.items() if one.units != TRUTH and one.recorded is None]
+        return list(dict.fromkeys(self.configurations or with_units))
+
+    def note(self, part: str, errors: Sequence[ExperimentError], found: bool) -> Iterator[str]:
+        """Why a part is left out. Raises what was asked for by name and cannot be had."""
+        for error in errors:
+            if self.configurations is not None and (self.asked_parts is not None or not found):
+                raise error
+            yield f"no {part}: {error}"
 
 
 def _explain(
-    experiment: Experiment,
-    logs: Sequence[tuple[Recording, Experiment]],
-    asked: Sequence[str] | None,
-    parts: Sequence[str],
-    units: Sequence[str] | None,
+    logs: Sequence[tuple[Recording, Experiment]], question: _Question, progress: Callable[[int, int], None]
 ) -> Explanation:
+    notes, tables = list[str](), {part: list[pd.DataFrame]() for part in (*PARTS, "late")}
+    experiment = logs[0][1]
+    beside: dict[int, Counterfactuals] = {}
+    names, parts = question.select(experiment), question.parts
+    if experiment.runs < _FEW_RUNS:
+        few = count_noun(experiment.runs, "run")
+        notes.append(f"{few}: with {_FEW_RUNS} standard errors of causes are about 2 % of the time unknown")
+    steps = len(names) + ("sensitivity" in parts)
+    for k, name in enumerate(names):
+        found = _explain_configuration(name, logs, question, beside)
+        for part, table in found.tables.items():
+            tables[part].append(table.assign(configuration=name)[["configuration", *table.columns]])
+        for part, error in found.errors.items():
+            notes += question.note(part, [error], bool(found.tables))
+        progress(k + 1, steps)
+    joined = {part: pd.concat(of, ignore_index=True) for part, of in tables.items() if of}
+    varied, orders, why_not = _vary(logs, names) if "sensitivity" in parts else (None, None, [])
+    notes += question.note("sensitivity", why_not, bool(joined))
+    progress(steps, steps)
+    causes, units, triage, late = (joined.get(part) for part in ("causes", "units", "triage", "late"))
+    return Explanation(causes, units, triage, late, varied, orders, tuple(dict.fromkeys(notes)))
+
+
+def _vary(
+    logs: Sequence[tuple[Recording, Experiment]], names: Sequence[str]
+) -> tuple[pd.DataFrame | None, pd.DataFrame | None, list[ExperimentError]]:
+    """Time unknown as the PEMs vary, pairs that change order, or why there is none of it."""
     from copem_replay.pipeline.sensitivity import compare_orders, vary_pems
 
-    notes, tables = list[str](), {part: list[pd.DataFrame]() for part in (*PARTS, "late")}
-    if 1 < experiment.runs < _FEW_RUNS:
-        notes.append(f"{experiment.runs} runs: standard errors are over these; {_FEW_RUNS} make them about 2 %")
-    for name in asked or [
-        n for n, one in experiment.configurations.items() if one.units != TRUTH and one.recorded is None
-    ]:
-        for part, table in _explain_configuration(name, logs, parts, units):
-            if isinstance(table, pd.DataFrame):
-                tables[part].append(table.assign(configuration=name)[["configuration", *table.columns]])
-            elif asked is None:
-                notes.append(f"{part}: {table}")
-            else:
-                raise table
-    found = {part: pd.concat(of, ignore_index=True) for part, of in tables.items() if of}
-    varied = orders = None
-    if "sensitivity" in parts:
-        try:
-            varied = vary_pems(logs)
-            orders = compare_orders(varied)
-        except ExperimentError as error:
-            notes.append(str(error))
-    return Explanation(
-        found.get("causes"), found.get("units"), found.get("triage"), found.get("late"), varied, orders, tuple(notes)
-    )
+    try:
+        varied = vary_pems(logs, names)
+    except ExperimentError as error:
+        return None, None, [error]
+    return varied, compare_orders(varied), []
+
+
+class _Found(NamedTuple):
+    """The tables of a configuration by part, and why there is none of a part."""
+
+    tables: dict[str, pd.DataFrame]
+    errors: dict[str, ExperimentError]
 
 
 def _explain_configuration(
-    name: str, logs: Sequence[tuple[Recording, Experiment]], parts: Sequence[str], units: Sequence[str] | None
-) -> Iterator[tuple[str, pd.DataFrame | ExperimentError]]:
-    """The tables of a configuration by part, or why there is none."""
+    name: str, logs: Sequence[tuple[Recording, Experiment]], question: _Question, beside: dict[int, Counterfactuals]
+) -> _Found:
+    """`beside`: by number of log the replays of the configuration before, which is replaced."""
     from copem_replay.pipeline.causes import Counterfactuals, share_lateness, tabulate_causes
     from copem_replay.pipeline.triage import group_late_episodes, list_late_episodes, rank_groups
     from copem_replay.pipeline.worth import compute_unit_worths
 
-    def attempt(part: str, work: Callable[[], pd.DataFrame]) -> Iterator[tuple[str, pd.DataFrame | ExperimentError]]:
-        try:
-            yield part, work()
-        except ExperimentError as error:
-            yield part, error
-
-    shares: list[tuple[Counterfactuals, list[CauseShares]]] = []
+    parts, found = question.parts, _Found({}, {})
     if {"causes", "triage"} & set(parts):
+        shares: list[tuple[Counterfactuals, list[CauseShares]]] = []
         try:
-            for recording, experiment in logs:
-                replays = Counterfactuals(recording, experiment, name)
+            for k, (recording, experiment) in enumerate(logs):
+                beside[k] = replays = Counterfactuals(recording, experiment, name, beside.get(k))
                 shares.append((replays, share_lateness(replays)))
         except ExperimentError as error:
-            yield "causes", error
-            return
-    if "causes" in parts:
-        yield from attempt("causes", lambda: tabulate_causes(shares))
-    if "triage" in parts:
-        groups, episodes = zip(*(group_late_episodes(replays, of) for replays, of in shares), strict=True)
-        yield "triage", rank_groups(pd.concat([of for of in groups if len(of)] or groups[:1], ignore_index=True))
-        yield "late", pd.concat([list_late_episodes(of) for of in episodes], ignore_index=True)
+            found.errors["causes"] = error
+        else:
+            if "causes" in parts:
+                found.tables["causes"] = tabulate_causes(shares)
+            if "triage" in parts:
+                groups, episodes = zip(*(group_late_episodes(*of_log) for of_log in shares), strict=True)
+                some = [of for of in groups if len(of)] or groups[:1]
+                found.tables["triage"] = rank_groups(pd.concat(some, ignore_index=True))
+                found.tables["late"] = pd.concat([list_late_episodes(of) for of in episodes], ignore_index=True)
     if "units" in parts:
-        yield from attempt("units", lambda: compute_unit_worths(logs, name, units).table)
+        try:
+            found.tables["units"] = compute_unit_worths(logs, name, question.units).table
+        except ExperimentError as error:
+            found.errors["units"] = error
+    return found
 
 
 # In words.
 
 
 def _describe_causes(name: str, causes: pd.DataFrame, width: int | None) -> list[str]:
-    from copem_replay.pipeline.triage import describe_cause
+    from copem_replay.pipeline.causes import NO_UNIT, describe_cause
 
+    total_s, overlap_s = causes["added_s"].sum(), causes["gained_s"].sum()
+    causes = causes[(causes["cause"] != NO_UNIT) | (causes["added_s"] != 0)]
     shown = pd.DataFrame({
         "cause": [describe_cause(one) for one in causes["cause"]], "added_s": causes["added_s"].to_numpy(),
         "± s": causes["error_s"].to_numpy(), "gained_s": causes["gained_s"].to_numpy(),
     })  # fmt: skip
-    total_s, overlap_s = causes["added_s"].sum(), causes["gained_s"].sum()
     lines = [f"{name}: objects are unknown for {total_s:.2f} s in the mean", *format_table(shown, width).splitlines()]
     if total_s > 0:
-        lines.append(
-            f"added_s sums to it; gained_s, if only that were gone, does not ({overlap_s / total_s:.2f} of it)"
-        )
-    return lines
+        sums = f"they sum to {overlap_s / total_s:.2f} times the whole" if overlap_s > 0 else "they do not sum"
+        lines.append(f"added_s sums to the whole; gained_s is what is won if only that cause were gone: {sums}")
+    return [*lines, *_explain_negative(causes)]
+
+
+def _explain_negative(causes: pd.DataFrame) -> Iterator[str]:
+    """Sentences about shares below 0."""
+    of = causes.set_index("cause")
+    if "fusion" in of.index and of["added_s"]["fusion"] < -_VISIBLE_S:
+        yield "fusion below 0: entries of a neighbour within the gate are taken for an object that no list has yet"
+    worse = [name for name in of.index[of["gained_s"] < -_VISIBLE_S] if name != "fusion"]
+    if worse and "queue" in of.index:
+        yield f"gained_s below 0 ({', '.join(worse)}): without it lists are longer, and wait for the channel"
+    elif worse:
+        yield f"gained_s below 0 ({', '.join(worse)}): without it the fusion, or other draws, know objects later"
 
 
 def _describe_units(name: str, units: pd.DataFrame, width: int | None) -> list[str]:
@@ -214,16 +283,27 @@ def _describe_units(name: str, units: pd.DataFrame, width: int | None) -> list[s
 
 
 def _describe_groups(name: str, groups: pd.DataFrame) -> list[str]:
-    from copem_replay.pipeline.triage import describe_cause
+    from copem_replay.pipeline.causes import describe_cause
+    from copem_replay.pipeline.triage import describe_chance
 
     lost_s, lines = groups["lost_s"].sum(), list[str]()
     for row in groups.head(_SHOWN_GROUPS).itertuples():
         where = f" ({row.where})" if row.where else ""
         objects, cause = count_noun(int(row.objects), "object"), describe_cause(str(row.cause))
         lines.append(
-            f"{row.log}: {objects}, {row.lost_s:.1f} s, {cause}{where}; "
+            f"{row.log}: {objects}, {row.lost_s:.1f} s, {cause}{where}{describe_chance(float(row.structural_share))}; "
             f"such as {row.example_class} {row.example} at {row.example_onset_s:.1f} s"
         )
-    rest = len(groups) - _SHOWN_GROUPS
+    rest, first = len(groups) - _SHOWN_GROUPS, groups.iloc[0]
     more = [f"and {count_noun(rest, 'group')} more in triage.csv"] if rest > 0 else []
-    return [f"{name}: late for more than 1 s, {lost_s:.1f} s in {count_noun(len(groups), 'group')}", *lines, *more]
+    look = f"look at one in results: copem-replay view FOLDER --object {first['example']} --log {first['log']}"
+    head = f"{name}: late for more than 1 s, {lost_s:.1f} s in {count_noun(len(groups), 'group')}"
+    return [head, *lines, *more, look]
+
+
+def _describe_hopeless(late: pd.DataFrame) -> Iterator[list[str]]:
+    """How many episodes nobody can know in time, which are in no group."""
+    hopeless = late[late["hopeless_share"] >= 1]
+    for name, of in hopeless.groupby("configuration", sort=False):
+        what, lost_s = count_noun(len(of), "episode"), of["unknown_s"].sum()
+        yield [f"{name}: {what}, {lost_s:.1f} s, end before any list can tell of them: in no group"]

@@ -318,7 +318,18 @@ def why(
     if experiment.is_dir():
         folder, experiment = out or experiment / "why", experiment / "experiment.yaml"
     asked = [part for part, on in zip(PARTS, (causes, units, triage, sensitivity), strict=True) if on]
-    found = explain(experiment, configurations=configuration, parts=asked or PARTS, units=split_names(unit))
+    if asked and unit is not None and "units" not in asked:
+        asked.append("units")
+    found = show_progress(
+        "explaining",
+        lambda progress: explain(
+            experiment,
+            configurations=configuration,
+            parts=asked or None,
+            units=split_names(unit),
+            progress=progress,
+        ),
+    )
     print_notes(found.notes)
     print_blocks(list(found.blocks(width_of(sys.stdout))))
     written = found.save(folder)

@@ -21,7 +21,7 @@ from copem_replay.communication.latency import ConstantLatency
 from copem_replay.communication.link import ConstantLink, LinkModel
 from copem_replay.communication.radio import Radio
 from copem_replay.communication.reception import ConstantReception
-from copem_replay.core.errors import ExperimentError, unknown_name_message
+from copem_replay.core.errors import ExperimentError, is_own, unknown_name_message
 from copem_replay.core.tracks import TRUTH, Float, Tracks
 from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.experiment.schema import Experiment
@@ -34,6 +34,7 @@ from copem_replay.perception.pem.condition import Couple
 from copem_replay.perception.pem.detection import DetectionModel
 from copem_replay.perception.pem.model import Pem
 from copem_replay.perception.visibility import Observers, Statics, VisibilityModel
+from copem_replay.pipeline.expansion import expand_experiment
 from copem_replay.pipeline.prepare import Replay, prepare_log
 from copem_replay.pipeline.replay import cut_blocks, replay_block
 from copem_replay.pipeline.world import asks_for_path
@@ -185,6 +186,12 @@ CAUSES = (
 """The causes in the order in which they act."""
 NO_UNIT = "no unit there"
 """What is left without any cause: there is no unit, or it does not list its own carrier."""
+RECORDED = "recorded"
+"""What is left of a configuration with recorded units: what these list, and when, is as it was recorded."""
+_LEFT = {
+    NO_UNIT: Cause(NO_UNIT, NO_UNIT, NO_UNIT, lambda e: e),
+    RECORDED: Cause(RECORDED, RECORDED, "not in a recorded list", lambda e: e),
+}
 _OF_RECORDED = ("latency", "loss", "queue", "ticks", "fusion", "confirmation")
 """Causes of a configuration with recorded units: what these would list otherwise is not known."""
 
@@ -232,7 +239,8 @@ def _keep(named: Mapping[str, Any], names: Container[Any]) -> dict[str, Any]:
 def list_causes(experiment: Experiment) -> list[Cause]:
     """The causes that act in an experiment of one configuration: without each of them it is another experiment.
 
-    Raises ExperimentError for a link of the user's own, whose latency and losses cannot be told apart.
+    Raises ExperimentError for a link of the user's own, whose latency and losses cannot be told apart, and for a
+    visibility of the user's own, which may hide by more than bodies.
     """
     (name, one), *_ = experiment.configurations.items()
     for unit in experiment.units_of(one):
@@ -242,7 +250,14 @@ def list_causes(experiment: Experiment) -> list[Cause]:
             kind = f"{type(model).__module__}:{type(model).__qualname__}"
             raise ExperimentError(f"configuration {name}: {kind} is a link whose latency and losses are not told apart")
     acting = [cause for cause in CAUSES if cause.remove(experiment) != experiment]
-    return [cause for cause in acting if cause.name in _OF_RECORDED] if experiment.recorded else acting
+    if experiment.recorded:
+        return [cause for cause in acting if cause.name in _OF_RECORDED]
+    if is_own(own := type(experiment.visibility)):
+        raise ExperimentError(
+            f"visibility: {own.__module__}:{own.__qualname__} is your own: what bodies hide is not told apart from "
+            "what else it says; use `surface` or `flat`"
+        )
+    return acting
 
 
 # Replays on the same draws: units, seed and log keep their names, by which draws are addressed.
@@ -260,57 +275,61 @@ class Counterfactuals:
     """The time unknown of one configuration of one log, in replays without some causes.
 
     Onsets and episodes are those of the experiment as it is, and so is the geometry of the radio: bodies that hide
-    nothing from sensors are still between a unit and the ego.
+    nothing from sensors are still between a unit and the ego. `beside`: those of another configuration of the log,
+    whose replays are used again where both are the same without some causes.
     """
 
-    def __init__(self, recording: Recording, experiment: Experiment, name: str) -> None:
+    def __init__(
+        self, recording: Recording, experiment: Experiment, name: str, beside: Counterfactuals | None = None
+    ) -> None:
         self._recording, self.only = recording, select_configuration(experiment, name)
-        self._whole = prepare_log(recording, experiment)
-        self._found: dict[str, Float] = {}
+        self._whole: Replay = prepare_log(recording, experiment) if beside is None else beside._whole
+        self._found: dict[str, Float] = {} if beside is None else beside._found
 
     @cached_property
     def replay(self) -> Replay:
         """The log as it is, made ready."""
-        return self._prepare(self.only)
+        replay = prepare_log(self._recording, self.only)
+        return replace(replay, episodes=self._whole.episodes, outside_ix=self._whole.outside_ix)
 
     @cached_property
     def rows(self) -> pd.DataFrame:
         """The rows that count, as they are: log, run, object, `unknown_s` and what else `detections.parquet` has."""
-        return self._replay(self.only)
+        return replay_rows(self.replay, self.only)
 
     def unknown_s(self, gone: Sequence[Cause]) -> Float:
         """(n,) seconds unknown of the rows that count without some causes; each replay is made once."""
         experiment = reduce(lambda one, cause: cause.remove(one), gone, self.only)
-        key = experiment.model_dump_json()
+        (one,) = experiment.configurations.values()
+        key = experiment.model_copy(update={"configurations": {"": one}}).model_dump_json()
         if key not in self._found:
-            rows = self._replay(experiment)
+            rows = self.rows if experiment == self.only else replay_rows(self._prepare(experiment), experiment)
             same = rows[["run", "object_id", "onset_s"]].reset_index(drop=True)
             if not same.equals(self.rows[["run", "object_id", "onset_s"]].reset_index(drop=True)):
                 raise AssertionError("expected the same episodes in every replay")
             self._found[key] = rows["unknown_s"].to_numpy(dtype=float)
         return self._found[key]
 
-    def _replay(self, experiment: Experiment) -> pd.DataFrame:
-        replay = self.replay if experiment is self.only else self._prepare(experiment)
-        return replay_rows(replay, experiment)
-
     def _prepare(self, experiment: Experiment) -> Replay:
-        as_it_is = experiment.model_copy(update={"visibility": self.only.visibility})
-        replay = prepare_log(self._recording, as_it_is)
-        replay = replace(replay, episodes=self._whole.episodes, outside_ix=self._whole.outside_ix)
-        if experiment.visibility == self.only.visibility:
-            return replay
-        clear = replace(replay, expanded=replay.expanded.with_(experiment))
-        if asks_for_path(replay.expanded, replay.scene):
-            clear.__dict__["paths"] = replay.paths
-        return clear
+        """The log made ready for an experiment without some causes; of what stays the same nothing is made anew."""
+        base, clear = self.replay, experiment.visibility != self.only.visibility
+        if experiment.units != self.only.units:
+            as_it_is = experiment.model_copy(update={"visibility": self.only.visibility})
+            base = prepare_log(self._recording, as_it_is)
+            base = replace(base, episodes=self._whole.episodes, outside_ix=self._whole.outside_ix)
+        elif experiment.pems == self.only.pems and not clear:
+            return base
+        changed = replace(base, expanded=expand_experiment(experiment, base.scene))
+        if clear and asks_for_path(base.expanded, base.scene):
+            changed.__dict__["paths"] = base.paths
+        return changed
 
 
 @dataclass(frozen=True)
 class CauseShares:
     """Seconds of rows (n,) of a cause: `added_s` in the chain, `gained_s` if only it were gone (None: it cannot be)."""
 
-    cause: Cause | None  # None: no unit there
+    cause: Cause
     added_s: Float
     gained_s: Float | None
 
@@ -319,7 +338,7 @@ def share_lateness(replays: Counterfactuals) -> list[CauseShares]:
     """What each acting cause adds to the time unknown of every row; the rows of `added_s` sum to it."""
     causes = list_causes(replays.only)
     known = replays.unknown_s(causes)
-    shares = [CauseShares(None, known, None)]
+    shares = [CauseShares(_LEFT[RECORDED if replays.only.recorded else NO_UNIT], known, None)]
     whole = replays.unknown_s(())
     for k, cause in enumerate(causes):
         later = replays.unknown_s(causes[k + 1 :])
@@ -336,7 +355,7 @@ def tabulate_causes(of_logs: Sequence[tuple[Counterfactuals, list[CauseShares]]]
     """
     rows = pd.concat([replays.rows for replays, _ in of_logs], ignore_index=True)
     names = dict.fromkeys(name_cause(one) for _, shares in of_logs for one in shares)
-    order = [NO_UNIT, *(cause.name for cause in CAUSES)]
+    order = [*_LEFT, *(cause.name for cause in CAUSES)]
     table = []
     for name in sorted(names, key=order.index):
         found = [_find(shares, name) for _, shares in of_logs]
@@ -349,7 +368,7 @@ def tabulate_causes(of_logs: Sequence[tuple[Counterfactuals, list[CauseShares]]]
         cause = next(one.cause for one in found if one is not None)
         by_run = pd.Series(added).groupby(rows["run"].to_numpy()).mean()
         table.append({
-            "cause": name, "group": NO_UNIT if cause is None else cause.group,
+            "cause": name, "group": cause.group,
             "added_s": added.mean(),
             "error_s": by_run.std(ddof=1) / math.sqrt(len(by_run)) if len(by_run) > 1 else math.nan,
             "gained_s": np.concatenate(known).mean() if len(known) == len(gains) else math.nan,
@@ -360,7 +379,12 @@ def tabulate_causes(of_logs: Sequence[tuple[Counterfactuals, list[CauseShares]]]
 
 def name_cause(share: CauseShares) -> str:
     """The name of what a share is of."""
-    return NO_UNIT if share.cause is None else share.cause.name
+    return share.cause.name
+
+
+def describe_cause(name: str) -> str:
+    """A cause in the words of pages and terminals."""
+    return next((cause.words for cause in (*_LEFT.values(), *CAUSES) if cause.name == name), name)
 
 
 def _find(shares: Sequence[CauseShares], name: str) -> CauseShares | None:

@@ -110,30 +110,32 @@ VARIATIONS: dict[str, Callable[[Experiment], Experiment]] = {
 """What is varied; where it changes nothing, as no detection lasts or no fusion goes by errors, it is left out."""
 
 
-def vary_pems(logs: Sequence[tuple[Recording, Experiment]]) -> pd.DataFrame:
-    """The time unknown of each configuration with units in each variation, run by run: variation, run, configuration,
-    `unknown_s`. Raises ExperimentError where fewer than two configurations have units.
+def vary_pems(logs: Sequence[tuple[Recording, Experiment]], names: Sequence[str] | None = None) -> pd.DataFrame:
+    """The time unknown of each configuration in each variation, run by run: variation, run, configuration, `unknown_s`.
+
+    `names`: only these configurations; None: all. Raises ExperimentError where none of them has modelled units alone.
     """
-    found = []
+    modelled, found = [(recording, _select_modelled(e, names)) for recording, e in logs], []
     for variation, vary in VARIATIONS.items():
-        if variation != AS_IT_IS and all(vary(_select_modelled(e)) == _select_modelled(e) for _, e in logs):
+        if variation != AS_IT_IS and all(vary(e) == e for _, e in modelled):
             continue
-        rows = pd.concat([_replay(recording, vary(_select_modelled(e))) for recording, e in logs], ignore_index=True)
+        rows = pd.concat([_replay(recording, vary(e)) for recording, e in modelled], ignore_index=True)
         means = rows.groupby(["configuration", "run"], sort=False)["unknown_s"].mean().reset_index()
         found.append(means.assign(variation=variation))
     return pd.concat(found, ignore_index=True)
 
 
-def _select_modelled(experiment: Experiment) -> Experiment:
+def _select_modelled(experiment: Experiment, names: Sequence[str] | None) -> Experiment:
     configurations = {
         name: one
         for name, one in experiment.configurations.items()
-        if one.recorded is None and one.units != TRUTH and not set(experiment.units_of(one)) & set(experiment.recorded)
+        if one.recorded is None
+        and one.units != TRUTH
+        and (names is None or name in names)
+        and not set(experiment.units_of(one)) & set(experiment.recorded)
     }
-    if len(configurations) < 2:
-        raise ExperimentError(
-            "sensitivity: expected two configurations with modelled units, found fewer: there is no order"
-        )
+    if not configurations:
+        raise ExperimentError("sensitivity: expected a configuration with modelled units alone, found none")
     return measure_times_only(experiment.model_copy(update={"configurations": configurations}))
 
 
@@ -170,9 +172,17 @@ def _difference(of_runs: pd.Series) -> tuple[float, float]:
     return float(of_runs.mean()), float(of_runs.std(ddof=1)) / math.sqrt(len(of_runs)) if len(of_runs) > 1 else math.inf
 
 
+def tabulate_variations(varied: pd.DataFrame) -> pd.DataFrame:
+    """Mean seconds unknown: a row for each configuration, a column for each variation."""
+    means = varied.groupby(["configuration", "variation"], sort=False)["unknown_s"].mean().unstack(sort=False)
+    return means.reset_index().rename_axis(columns=None)
+
+
 def describe_orders(varied: pd.DataFrame, orders: pd.DataFrame) -> list[str]:
-    """A sentence for each variation: how many pairs keep their order, and which do not."""
+    """A sentence for each variation: how many pairs keep their order, and which do not; none without a pair."""
     count = varied["configuration"].nunique()
+    if count < 2:
+        return []
     pairs, lines = count * (count - 1) // 2, []
     for variation in varied["variation"].unique():
         if variation == AS_IT_IS:

@@ -24,8 +24,8 @@ LATE_S = 1.0
 """An episode that is unknown for longer is late: on fourteen recorded drives, four fifths of all seconds."""
 _MOST_LATE = 0.05
 """Episodes that are late in a larger share of the runs are in the groups."""
-_SENSED = ("hidden", "rate", "outages", "range", "missed", "memory")
-"""Causes before a list is made: without these, what stays unknown nobody can know in time."""
+_HELPED = ("hidden", "rate", "outages", "range", "missed", "memory", "fusion", "pose", "ghosts")
+"""Causes of sensors and of the fusion: what stays unknown without these nobody can know in time."""
 EPISODE = ["log", "object_id", "episode"]
 
 
@@ -33,16 +33,20 @@ def tabulate_episodes(replays: Counterfactuals, shares: Sequence[CauseShares], l
     """A row for each episode of a log: the means over runs of its seconds, in all and by cause, and what became of it.
 
     `late_share`, `never_share`: of the runs; `structural_share`: late although nothing is missed; `hopeless_share`: not
-    known in time even if every list of every unit held it. `cause`: the one that adds most.
+    known in time even if every list of every unit held it. `cause`: the one that adds most. What recorded units missed
+    is not known: structural is NaN, and nothing is hopeless.
     """
-    rows, gone = replays.rows, [one.cause for one in shares if one.cause is not None]
+    rows, gone = replays.rows, [one.cause for one in shares if one.gained_s is not None]
     unknown_s, length_s = rows["unknown_s"].to_numpy(), (rows["ended_s"] - rows["onset_s"]).to_numpy(dtype=float)
     unmissed_s = replays.unknown_s([cause for cause in gone if cause.name in ("missed", "memory")])
-    at_best_s = replays.unknown_s([cause for cause in gone if cause.name in _SENSED])
+    at_best_s = replays.unknown_s([cause for cause in gone if cause.name in _HELPED])
+    structural, hopeless = (unmissed_s > late_s).astype(float), at_best_s >= length_s - SAME_INSTANT_S
+    if replays.only.recorded:
+        structural, hopeless = np.full(len(rows), np.nan), np.zeros(len(rows), dtype=bool)
     names = [name_cause(one) for one in shares]
     values = pd.DataFrame({
-        "unknown_s": unknown_s, "late_share": unknown_s > late_s, "structural_share": unmissed_s > late_s,
-        "never_share": rows["detection_s"].isna().to_numpy(), "hopeless_share": at_best_s >= length_s - SAME_INSTANT_S,
+        "unknown_s": unknown_s, "late_share": unknown_s > late_s, "structural_share": structural,
+        "never_share": rows["detection_s"].isna().to_numpy(), "hopeless_share": hopeless,
         **{f"added {name}": one.added_s for name, one in zip(names, shares, strict=True)},
     }).astype(float)  # fmt: skip
     keys = [*EPISODE, "object_class", "onset_s", "ended_s"]
@@ -68,10 +72,15 @@ def group_late_episodes(
         grouped.append({
             "log": log, "cause": cause, "where": where, "episodes": len(of), "objects": of["object_id"].nunique(),
             "lost_s": of["unknown_s"].sum(), "never_share": of["never_share"].mean(),
-            "structural_share": float((of["structural_share"] > 1 - _MOST_LATE).mean()), "example": worst["object_id"],
+            "structural_share": _share_structural(of["structural_share"]), "example": worst["object_id"],
             "example_class": worst["object_class"], "example_onset_s": worst["onset_s"],
         })  # fmt: skip
     return rank_groups(pd.DataFrame(grouped, columns=COLUMNS)), episodes
+
+
+def _share_structural(of_episodes: pd.Series) -> float:
+    known = of_episodes.dropna()
+    return float((known > 1 - _MOST_LATE).mean()) if len(known) else float("nan")
 
 
 def list_late_episodes(episodes: pd.DataFrame, late_s: float = LATE_S) -> pd.DataFrame:
@@ -153,9 +162,12 @@ def _find_sides(replay: Replay, objects: Int, at_s: Float) -> list[str]:
 # In words.
 
 
-def describe_cause(name: str) -> str:
-    """A cause in the words of pages and terminals."""
-    return next((cause.words for cause in CAUSES if cause.name == name), name)
+def describe_chance(structural_share: float) -> str:
+    """`, by structure`: late although nothing in sight is missed; `, by chance`; or the share; empty where unknown."""
+    if np.isnan(structural_share):
+        return ""
+    sure = {1.0: "by structure", 0.0: "by chance"}
+    return f", {sure.get(structural_share, f'{structural_share:.0%} of it by structure')}"
 
 
 def describe_episode(episode: pd.Series) -> str:

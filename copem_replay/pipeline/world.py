@@ -168,6 +168,7 @@ class Transmission:
         self.states: States = "sampled" if self.experiment.sends else states  # what is sent depends on errors
         self._complete = complete
         self._whole: WorldChunk | None = None
+        self._arriving: tuple[str, Tracks] | None = None
         self._path = self._objects = self._sending = None
         if self.experiment.arrivals_differ:
             if asks_for_path(self.experiment, log.scene):
@@ -208,8 +209,13 @@ class Transmission:
     def arriving(self, name: str) -> Tracks:
         """The lists that the receiver of a configuration hears, by when links deliver them; those of others never are.
 
-        Raises InputError where a link of the user's own fails.
+        Those of the last configuration are kept. Raises InputError where a link of the user's own fails.
         """
+        if self._arriving is None or self._arriving[0] != name:
+            self._arriving = name, self._transmit(name)
+        return self._arriving[1]
+
+    def _transmit(self, name: str) -> Tracks:
         experiment, lists, heard = self.experiment, self.lists, None
         if experiment.configurations[name].units == TRUTH:
             lists = self.truth

@@ -63,7 +63,9 @@ class UnitWorths:
         """The rows of `units.csv`."""
         columns = {"share_s": self.share_s, "alone_s": self.alone_s, "left_out_s": self.left_out_s}
         table = pd.DataFrame({"unit": self.units, **columns})
-        return table.sort_values("share_s", ascending=False, kind="stable", ignore_index=True)
+        return table.sort_values(  # units that are alike stay in their order, whatever rounding does
+            "share_s", ascending=False, kind="stable", ignore_index=True, key=lambda share_s: share_s.round(9)
+        )
 
 
 def compute_unit_worths(

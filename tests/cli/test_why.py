@@ -61,7 +61,8 @@ def test_only_what_is_asked_for_is_written(call) -> None:  # type: ignore[no-unt
         (("--configuration", "coPEN"), "no configuration is named 'coPEN'; did you mean coPEM?"),
         (("--configuration", "GT"), "configuration GT: is the truth, which is never late; choose one with units"),
         (("--configuration", "coPEM", "--units", "--unit", "mats"),
-         "configuration coPEM: no unit is named 'mats'; did you mean mast?"),
+         "no unit is named 'mats'; did you mean mast?"),
+        (("--unit", "mats"), "no unit is named 'mats'; did you mean mast?"),
         (("--out", "drive.mcap"), "drive.mcap: cannot be written: expected a folder, found a file"),
     ],
 )  # fmt: skip

@@ -10,8 +10,9 @@ from typing import Final
 import pandas as pd
 
 from copem_replay.core.errors import InputError, count_noun
-from copem_replay.pipeline.causes import CAUSES
-from copem_replay.pipeline.triage import describe_cause
+from copem_replay.pipeline.causes import CAUSES, describe_cause
+from copem_replay.pipeline.sensitivity import compare_orders, describe_orders, tabulate_variations
+from copem_replay.pipeline.triage import describe_chance
 from copem_replay.report.figures.style import format_per_cent, format_two_decimals
 from copem_replay.report.html.markup import (
     Html,
@@ -27,8 +28,19 @@ FOLDER: Final = "why"
 COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
     "why.csv": ("configuration", "cause", "added_s", "error_s", "gained_s"),
     "units.csv": ("configuration", "unit", "share_s", "alone_s", "left_out_s"),
-    "triage.csv": ("configuration", "log", "cause", "where", "objects", "lost_s", "example", "example_class"),
+    "triage.csv": (
+        "configuration",
+        "log",
+        "cause",
+        "where",
+        "objects",
+        "lost_s",
+        "structural_share",
+        "example",
+        "example_class",
+    ),
     "late_episodes.csv": ("configuration", "log", "object_id", "onset_s", "words"),
+    "sensitivity.csv": ("variation", "configuration", "run", "unknown_s"),
 }
 _MOST_GROUPS: Final = 10
 
@@ -43,7 +55,7 @@ def read_why(folder: Path | None) -> dict[str, pd.DataFrame]:
         try:
             table = pd.read_csv(path, dtype={"object_id": str, "example": str, "log": str}, keep_default_na=False)
             for column in columns:
-                if column.endswith("_s"):
+                if column.endswith(("_s", "_share")):
                     table[column] = pd.to_numeric(table[column])
         except (OSError, ValueError, KeyError) as error:
             raise InputError(f"{path}: cannot be read ({error}); run `copem-replay why` on the folder again") from None
@@ -72,6 +84,11 @@ def why_parts(tables: Mapping[str, pd.DataFrame]) -> Iterator[Html]:
         if not len(tables["triage.csv"]):
             yield make_tag("p", "No object is unknown for more than 1 s in one run of twenty or more.")
         yield from _by_configuration(tables["triage.csv"], _group_list)
+    if "sensitivity.csv" in tables:
+        yield make_tag("h3", "How much hangs on the perception error models")
+        varied = tables["sensitivity.csv"]
+        yield _variation_table(tabulate_variations(varied))
+        yield make_list(describe_orders(varied, compare_orders(varied)))
 
 
 def _by_configuration(table: pd.DataFrame, write: Callable[[str, pd.DataFrame], Html]) -> Iterator[Html]:
@@ -113,6 +130,15 @@ def _unit_table(name: str, of: pd.DataFrame) -> Html:
     return make_table(["unit", "its share (Shapley), s", "alone, s", "if left out, s"], rows, caption=name)
 
 
+def _variation_table(means: pd.DataFrame) -> Html:
+    rows = []
+    for row in means.itertuples(index=False):
+        name, *seconds = row
+        cells = [make_tag("td", format_two_decimals(float(value))) for value in seconds]
+        rows.append(make_tag("tr", make_tag("th", allow_breaks(str(name)), scope="row"), *cells))
+    return make_table(list(map(str, means.columns)), rows, caption="Seconds that objects are unknown, in the mean")
+
+
 def _group_list(name: str, of: pd.DataFrame) -> Html:
     lost_s = float(of["lost_s"].sum())
     lines = []
@@ -121,7 +147,8 @@ def _group_list(name: str, of: pd.DataFrame) -> Html:
         objects, share = count_noun(int(row["objects"]), "object"), format_per_cent(float(row["lost_s"]) / lost_s)
         words = f"{row['log']}: {objects}, {float(row['lost_s']):.1f} s ({share}), {describe_cause(str(row['cause']))}"
         example = f"copem-replay view FOLDER --object {row['example']} --log {row['log']}"
-        lines.append(make_tag("span", f"{words}{where}; such as {row['example_class']} ", make_tag("code", example)))
+        words += where + describe_chance(float(row["structural_share"]))
+        lines.append(make_tag("span", f"{words}; such as {row['example_class']} ", make_tag("code", example)))
     rest = len(of) - _MOST_GROUPS
     more = [f"and {count_noun(rest, 'group')} more in {FOLDER}/triage.csv"] if rest > 0 else []
     head = make_tag("p", f"{name}: late for more than 1 s, {lost_s:.1f} s in all")
