@@ -2,14 +2,14 @@
 
 Pages link to each other as files of the repository do. Here the links of each page are turned to where a file is in the
 site: README, changelog and notebooks are pages, the folder of decisions is a list of them, every other file of the
-repository comes along as it is. So the site needs no address of a repository, and a link that leads nowhere stops the build.
+repository comes along as it is. So the site needs no address of a repository, and a link that leads nowhere stops the
+build.
 """
 
 from __future__ import annotations
 
 import base64
 import json
-import os
 import posixpath
 import re
 from collections.abc import Iterator
