@@ -250,8 +250,8 @@ class NonconformingError(AssertionError):
 class KeptRules:
     """What was checked of a fusion that keeps the rules; in a shell it says so in one sentence.
 
-    `kind`: of the fusion. `scenes`: the names of the scenes. `asked`: by rule how often it was put to the test, 0: not at
-    all, as `resumable` or `units_in_any_order` is False. `seed`: of scenes and orders.
+    `kind`: of the fusion. `scenes`: the names of the scenes. `asked`: how often, by rule; 0: not at all, as `resumable`
+    or `units_in_any_order` is False. `seed`: of scenes and orders.
     """
 
     kind: str
@@ -262,12 +262,14 @@ class KeptRules:
     def __repr__(self) -> str:
         kept = [f"{rule} ({times})" for rule, times in self.asked.items() if times]
         left = [rule for rule, times in self.asked.items() if not times]
-        said = f"{self.kind} keeps {len(kept)} rules in {len(self.scenes)} scenes of seed {self.seed}: {', '.join(kept)}"
+        said = (
+            f"{self.kind} keeps {len(kept)} rules in {len(self.scenes)} scenes of seed {self.seed}: {', '.join(kept)}"
+        )
         return said + (f"; not asked: {', '.join(left)}" if left else "")
 
 
 def check_fusion(fusion: ListFusion, *, seed: int = 0, units_in_any_order: bool = True) -> KeptRules:
-    """Raise NonconformingError for the first broken rule; where a fusion keeps all FUSION_RULES, return what was checked.
+    """Raise NonconformingError for the first broken rule; return what was checked where a fusion keeps FUSION_RULES.
 
     `seed`: of the scenes, and of the orders tried. `units_in_any_order`: whether the order of units must not matter.
     What is returned has the names of the `scenes`, and by rule how often it was `asked`.

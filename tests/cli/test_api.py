@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import filecmp
+import inspect
 import subprocess
 import sys
 from dataclasses import replace
@@ -17,6 +18,7 @@ import yaml
 
 import copem_replay as cr
 from copem_replay.cli import main as cli
+from copem_replay.report.figures.registry import FIGURES
 from copem_replay.viewer import open as opening
 from tests.helpers.experiments import TEXT, drive
 
@@ -318,7 +320,7 @@ class TestFolders:
 
     def test_what_is_not_in_a_folder_is_said(self, here: Path) -> None:
         result = cr.run("e.yaml")
-        for call in (cr.view, cr.write_report, cr.plot.write_figures, cr.plot.write_film):
+        for call in (cr.view, cr.write_report, cr.write_figures, cr.write_film):
             with pytest.raises(cr.InputError, match=r"found some that are not saved; result\.save\(folder\) does"):
                 call(result)
         with pytest.raises(cr.InputError, match="expected results of a run to save, found some that were read"):
@@ -359,8 +361,23 @@ class TestShownShortly:
         assert ego["x_m"].iloc[-1] - ego["x_m"].iloc[0] == pytest.approx(80.0)
         assert "object_id" not in recording.truth.to_dataframe()
 
-    def test_names_of_plot_are_figures_and_what_writes_them(self) -> None:
+    def test_names_of_plot_are_figures_alone_and_all_of_them(self) -> None:
+        """One function for each figure that `plot` writes; two have names that say more than those of their files."""
         assert dir(cr.plot) == sorted(cr.plot.__all__)
+        called = {"curves": "detection_curves", "runs": "single_runs"}
+        assert dir(cr.plot) == sorted(called.get(name, name) for name in FIGURES)
+        assert {inspect.signature(getattr(cr.plot, name)).return_annotation for name in cr.plot.__all__} == {"Figure"}
+
+    def test_a_figure_that_results_lack_is_refused_with_the_reason(self, here: Path) -> None:
+        result = cr.run("e.yaml")
+        with pytest.raises(cr.InputError, match="no figure of trade_off: fewer than two configurations have both"):
+            cr.plot.trade_off(result)
+        with pytest.raises(cr.InputError, match="no slices"):
+            cr.plot.slices(result)
+        with pytest.raises(cr.InputError, match="no figure of late_paths: of the truth alone nothing is late"):
+            cr.plot.late_paths(result, configurations=["GT"])
+        with pytest.raises(cr.InputError, match="nowhere"):
+            cr.plot.answer(result, configurations=["nowhere"])
 
     def test_the_version_is_the_installed_one(self) -> None:
         from importlib.metadata import version
