@@ -9,6 +9,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ import pytest
 import yaml
 
 import copem_replay as cr
+from copem_replay.api import run as api_run
 from copem_replay.cli import main as cli
 from copem_replay.report.figures.registry import FIGURES
 from copem_replay.viewer import open as opening
@@ -326,6 +328,58 @@ class TestFolders:
         with pytest.raises(cr.InputError, match="expected results of a run to save, found some that were read"):
             cr.load_results(result.save("out/e")).save("out/again")
         assert not Path("out/again").exists()
+
+
+class TestProgressInANotebook:
+    @pytest.fixture
+    def told(self, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+        """What a kernel would show: the first line, then what takes its place."""
+        told: list[Any] = []
+
+        class Handle:
+            def update(self, words: dict[str, str], *, raw: bool) -> None:
+                assert raw
+                told.append(words["text/plain"])
+
+        def display(words: dict[str, str], *, raw: bool, display_id: bool) -> Handle:
+            assert (raw, display_id, told) == (True, True, []), "one line for the whole run"
+            told.append(words["text/plain"])
+            return Handle()
+
+        shell = type("Shell", (), {"kernel": object()})()
+        monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
+        monkeypatch.setitem(sys.modules, "IPython.display", SimpleNamespace(display=display))
+        return told
+
+    def test_a_line_that_is_empty_in_the_end(
+        self, here: Path, told: list[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(api_run, "SHOWN_AFTER_S", 0.0)
+        show = api_run.show_below_cell()
+        assert show is not None
+        for done in (0, 1, 3, 4):
+            show(done, 4)
+        assert told == ["replaying: 0 %", "replaying: 25 %", "replaying: 75 %", ""]
+
+    def test_a_run_calls_it_and_one_of_yours_takes_its_place(self, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        below: list[tuple[int, int]] = []
+        own: list[tuple[int, int]] = []
+        monkeypatch.setattr(api_run, "show_below_cell", lambda: lambda *reached: below.append(reached))
+        cr.run("e.yaml", progress=lambda *reached: own.append(reached))
+        assert (bool(own), below) == (True, [])
+        cr.run("e.yaml")
+        assert below == own
+
+    def test_short_runs_and_runs_elsewhere_show_nothing(
+        self, here: Path, told: list[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(api_run, "SHOWN_AFTER_S", 1e9)
+        cr.run("e.yaml")
+        assert told == []
+        monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: None))
+        assert api_run.show_below_cell() is None  # IPython is imported, yet nobody's shell
+        monkeypatch.delitem(sys.modules, "IPython")
+        assert api_run.show_below_cell() is None
 
 
 class TestRecordings:
