@@ -1,11 +1,11 @@
-# make demo | test | test-random | bench | check | notebooks | pictures | release: each sets up .venv on its first call and never again
-# while pyproject and requirements stay.
+# make demo | test | test-random | bench | check | notebooks | pictures | site | release: each sets up .venv on its first call and
+# never again while pyproject and requirements stay.
 # Another Python beside it: make test PYTHON=python3.13 VENV=.venv-3.13
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-random bench check notebooks pictures release requirements clean
+.PHONY: demo test test-random bench check notebooks pictures site release requirements clean
 
 # Packages come by hash, through uv where it is there: what runs need, and for all but `demo` the rest.
 INSTALL := $(if $(shell command -v uv),uv pip install --quiet --python $(BIN)/python,$(BIN)/python -m pip install --quiet --disable-pip-version-check)
@@ -50,6 +50,11 @@ notebooks: $(VENV)/.rest
 pictures: $(VENV)/.rest
 	$(BIN)/python tools/pictures.py
 
+# out/site, from docs/ by mkdocs.yml; a link or an anchor that leads nowhere stops it.
+site: $(VENV)/.rest
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+	@echo "out/site/index.html; with its search: $(BIN)/mkdocs serve"
+
 # Builds, checks and tries a release, writes its section of the changelog and tags it: docs/develop/release.md.
 $(VENV)-release/.installed: requirements-release.txt
 	$(PYTHON) -m venv $(VENV)-release
@@ -59,12 +64,12 @@ $(VENV)-release/.installed: requirements-release.txt
 release: $(VENV)-release/.installed
 	$(VENV)-release/bin/python tools/release.py $(RELEASE)
 
-# The files of pins anew, by uv; PINS= takes newer versions.
+# The files of pins anew, by uv; PINS= takes newer versions. The site needs colorama on every system, runs on Windows alone.
 PINS := --constraint requirements.txt --constraint requirements-dev.txt
 COMPILE := uv pip compile --quiet pyproject.toml --universal --python-version 3.11 --generate-hashes --no-annotate --no-emit-index-url --no-header
 requirements:
 	$(COMPILE) $(PINS) --output-file requirements.new
-	$(COMPILE) $(PINS) --extra dev --extra bench $$(sed -n 's/^\([A-Za-z0-9._-]*\)==.*/--no-emit-package \1/p' requirements.new) --output-file requirements-dev.new
+	$(COMPILE) $(PINS) --extra dev --extra bench $$(sed -n '/^colorama==/d;s/^\([A-Za-z0-9._-]*\)==.*/--no-emit-package \1/p' requirements.new) --output-file requirements-dev.new
 	(sed -n '/^#/p' requirements.txt; cat requirements.new) > requirements.made && mv requirements.made requirements.txt
 	(sed -n '/^#/p;/^-r/p' requirements-dev.txt; cat requirements-dev.new) > requirements.made && mv requirements.made requirements-dev.txt
 	$(PYTHON) -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["release"], sep="\n")' \

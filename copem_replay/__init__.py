@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     __version__: str
     from copem_replay.api import plot
     from copem_replay.api.fit import FittedPem, fit
+    from copem_replay.api.plot import write_figures, write_film
     from copem_replay.api.recordings import (
         draft_experiment,
         inspect_recording,
@@ -131,6 +132,8 @@ __all__ = [
     "run",
     "view",
     "why",
+    "write_figures",
+    "write_film",
     "write_history",
     "write_report",
 ]
@@ -138,6 +141,7 @@ __all__ = [
 _PLACES = {
     "api": "plot",
     "api.fit": "FittedPem fit",
+    "api.plot": "write_figures write_film",
     "api.recordings": "draft_experiment inspect_recording read_lists read_recording read_recordings",
     "api.results": "compare judge load_results view write_history write_report",
     "api.run": "fused_tracks observations run",

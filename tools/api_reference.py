@@ -34,7 +34,7 @@ GROUPS = {
     "Runs": "run observations fused_tracks FusedTracks read_lists why Explanation",
     "Fits": "fit FittedPem",
     "Results": "load_results Results compare Comparison judge Judgement write_report write_history view",
-    "Figures": "plot",
+    "Figures": "plot write_figures write_film",
     "Keys of an experiment": "Experiment Unit Configuration Measure Onset",
     "Data": "Recording Scene Tracks ObjectLists Inputs Inbox entries_of ViewGeometry Errors CLASSES",
     "Own components": "DetectionModel ErrorModel VisibilityModel LatencyModel ReceptionModel RadioPath LinkModel "

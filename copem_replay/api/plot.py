@@ -1,5 +1,5 @@
-"""Figures of results, as matplotlib Figures: `cr.plot.detection_curves(results)`. `write_figures` makes the files,
-`write_film` a film.
+"""Figures of results, as matplotlib Figures: `cr.plot.detection_curves(results)`; all that `copem-replay plot` writes.
+`cr.write_figures` makes the files, `cr.write_film` a film.
 """
 
 from __future__ import annotations
@@ -7,15 +7,56 @@ from __future__ import annotations
 from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from copem_replay.api.results import AnyResults, take_results
+from copem_replay.core.errors import InputError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from copem_replay.results.compare import Comparison
 
-__all__ = ["detection_curves", "distances", "single_runs", "sweeps", "write_figures", "write_film"]
+
+__all__ = [
+    "answer",
+    "detection_curves",
+    "differences",
+    "distances",
+    "late_paths",
+    "latency_breakdown",
+    "single_runs",
+    "slices",
+    "sweeps",
+    "trade_off",
+]
+
+
+def answer(results: AnyResults, *, configurations: Sequence[str] | None = None) -> Figure:
+    """Mean time to detection and share that passes, a dot with its interval per configuration, the soonest first.
+
+    Raises InputError for a configuration that is not among the results.
+
+    >>> len(cr.plot.answer("out/tc016d").axes)
+    2
+    """
+    return _draw("answer", results, configurations)
+
+
+def differences(
+    results: AnyResults, *, configurations: Sequence[str] | None = None, comparison: Comparison | None = None
+) -> Figure:
+    """Each configuration minus the baseline, a dot with its interval, and the line of 0.
+
+    `comparison`: of `cr.compare`; None: with its default baseline.
+
+    Raises InputError for a configuration that is not among the results, and where there is nothing to compare.
+
+    >>> against = cr.compare("out/tc016d", baseline="coPEM:0s")
+    >>> len(cr.plot.differences("out/tc016d", comparison=against).axes) > 0
+    True
+    """
+    return _draw("differences", results, configurations, differences=comparison)
 
 
 def detection_curves(results: AnyResults, *, configurations: Sequence[str] | None = None) -> Figure:
@@ -44,6 +85,30 @@ def distances(results: AnyResults, *, configurations: Sequence[str] | None = Non
     return distances_figure(take_results(results), configurations=configurations)
 
 
+def late_paths(results: AnyResults, *, configurations: Sequence[str] | None = None, log: str | None = None) -> Figure:
+    """The path of every measured object, coloured by the seconds for which it is unknown: a panel per configuration.
+
+    `log`: None: the one in which objects are known latest.
+
+    Raises InputError for what is not among the results, RecordingError where the recording is gone or has changed.
+
+    >>> len(cr.plot.late_paths("out/tc016d", configurations=["PEM", "coPEM:1s"]).axes) > 0
+    True
+    """
+    return _draw("late_paths", results, configurations, log=log)
+
+
+def latency_breakdown(results: AnyResults, *, configurations: Sequence[str] | None = None) -> Figure:
+    """Mean seconds of the stages from the onset to the detection: a bar per configuration.
+
+    Raises InputError for a configuration that is not among the results, and where nothing was detected.
+
+    >>> len(cr.plot.latency_breakdown("out/tc016d").axes)
+    1
+    """
+    return _draw("latency_breakdown", results, configurations)
+
+
 def single_runs(
     results: AnyResults,
     *,
@@ -67,6 +132,24 @@ def single_runs(
     return runs_figure(take_results(results), Selection(configurations, log, object_id, run))
 
 
+def slices(
+    results: AnyResults, *, configurations: Sequence[str] | None = None, by: Sequence[str] | None = None
+) -> Figure:
+    """Mean time to detection by group: a row per group and a column per configuration, darker is later.
+
+    `by`: what rows are grouped by, `["log", "class"]`; None: by what the experiment says (`measure.by`).
+
+    Raises InputError for what is not among the results, and where nothing is grouped.
+
+    >>> len(cr.plot.slices("out/tc016d", by=["class"]).axes) > 0
+    True
+    """
+    from copem_replay.results.slices import summarise_slices
+
+    read = take_results(results)
+    return _draw("slices", read, configurations, sliced=summarise_slices(read, by))
+
+
 def sweeps(results: AnyResults, *, configurations: Sequence[str] | None = None) -> Figure:
     """Shares and times over the values of each sweep. Raises InputError where the results have no sweep.
 
@@ -77,6 +160,38 @@ def sweeps(results: AnyResults, *, configurations: Sequence[str] | None = None) 
     from copem_replay.report.figures.sweeps import sweeps_figure
 
     return sweeps_figure(take_results(results), configurations=configurations)
+
+
+def trade_off(results: AnyResults, *, configurations: Sequence[str] | None = None) -> Figure:
+    """False positives per minute over the position error (RMSE) in metres: a mark per configuration.
+
+    Raises InputError for a configuration that is not among the results, and where fewer than two have both figures.
+
+    >>> cr.plot.trade_off("out/tc016d")
+    Traceback (most recent call last):
+    copem_replay.core.errors.InputError: out/tc016d: no figure of trade_off: ...
+    """
+    return _draw("trade_off", results, configurations)
+
+
+_LACKING = {
+    "trade_off": "fewer than two configurations have both false positives and position errors",
+    "late_paths": "of the truth alone nothing is late",
+}
+"""Why a figure cannot be drawn, where `plot` leaves it out without a word."""
+
+
+def _draw(name: str, results: AnyResults, configurations: Sequence[str] | None, **of: Any) -> Figure:
+    """A figure of the registry. Raises InputError where the results have none."""
+    from copem_replay.report.figures.registry import FIGURES
+    from copem_replay.report.figures.selection import Selection
+
+    read, selection = take_results(results), Selection(configurations, **of)
+    read.chosen(configurations)
+    missing = FIGURES[name].missing(read, selection)
+    if missing is not None and (reason := missing or _LACKING.get(name)):
+        raise InputError(f"{read.place}: no figure of {name}: {reason}")
+    return FIGURES[name].draw(read, selection)  # which itself says what else is missing
 
 
 def write_figures(
@@ -96,7 +211,7 @@ def write_figures(
 
     Raises InputError for what is not among the results, OutputError where a file is not writable.
 
-    >>> files, notes = cr.plot.write_figures("out/tc016d", "figures", configurations=["GT", "PEM"])
+    >>> files, notes = cr.write_figures("out/tc016d", "figures", configurations=["GT", "PEM"])
     >>> sorted({file.stem for file in files})
     ['answer', 'curves', 'differences', 'distances', 'late_paths', 'latency_breakdown', 'runs']
     """
@@ -127,7 +242,7 @@ def write_film(
     Raises InputError for what is not among the results and for more configurations, RecordingError where the recording
     is gone or has changed, OutputError where the file is not writable.
 
-    >>> cr.plot.write_film("out/tc016d", "film.gif", configurations=["PEM", "coPEM:0s"]).name
+    >>> cr.write_film("out/tc016d", "film.gif", configurations=["PEM", "coPEM:0s"]).name
     'film.gif'
     """
     from copem_replay.core.colours import configuration_colours

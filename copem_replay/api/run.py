@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 import os
+import sys
+import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
@@ -56,7 +59,8 @@ def run(
 
     `experiment`: an Experiment, its keys and values in a dict, or the path of its file. `recordings`: Recordings or
     paths, one or several; None: those the experiment names. `jobs`: workers; None: one per core. The result does not
-    depend on it. `progress(done, total)` is called after each block of runs, with a crew after each log. `pieces`: a
+    depend on it. `progress(done, total)` is called after each block of runs, with a crew after each log; None: in a
+    notebook a line below the cell, from the second second on until the end, elsewhere nothing. `pieces`: a
     folder or a URL where what was computed is kept, and found by the next run (docs/guide/scale.md). `crew`: an
     executor of processes on this machine or on others, such as ProcessPoolExecutor or `Client.get_executor()` of Dask,
     in place of `jobs`; it needs `pieces` that all of them see, and recordings by their paths.
@@ -71,6 +75,7 @@ def run(
     from copem_replay.pipeline.parts import PartCache
     from copem_replay.pipeline.study_log import LogSurvey
 
+    progress = progress or show_below_cell()
     cache = None if pieces is None else PartCache(str(pieces))
     if crew is None:
         study = make_study(experiment, recordings, LogSurvey(cache))
@@ -86,6 +91,34 @@ def run(
         workers = Crew(crew, cache, show)
         study = read_with_crew(lambda: make_study(experiment, recordings, LogSurvey(cache), workers), workers)
     return replay_study(study, prepare_study(study)[0], jobs, progress, cache)
+
+
+SHOWN_AFTER_S = 2.0
+"""Runs that are over sooner show no progress in a notebook."""
+
+
+def show_below_cell() -> Progress | None:
+    """Progress as a line below the cell of the notebook that this process is the kernel of; None: it is of none.
+
+    The line is empty in the end: what a notebook keeps does not depend on how long a run took, but for that line.
+    """
+    shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
+    if getattr(shell, "kernel", None) is None:  # a terminal, or no IPython
+        return None
+    display = importlib.import_module("IPython.display").display
+    begun_s = time.monotonic()
+    shown: list[Any] = []
+
+    def show(done: int, total: int) -> None:
+        if not shown and (done == total or time.monotonic() - begun_s < SHOWN_AFTER_S):
+            return
+        words = {"text/plain": "" if done == total else f"replaying: {100 * done // total} %"}
+        if shown:
+            shown[0].update(words, raw=True)
+        else:
+            shown.append(display(words, raw=True, display_id=True))
+
+    return show
 
 
 def read_with_crew(read: Callable[[], LoadedStudy], crew: Crew) -> LoadedStudy:

@@ -246,10 +246,34 @@ class NonconformingError(AssertionError):
         super().__init__(f"{kind} breaks the rule {rule!r}: {FUSION_RULES[rule]}. {where}: {said}.")
 
 
-def check_fusion(fusion: ListFusion, *, seed: int = 0, units_in_any_order: bool = True) -> None:
-    """Raise NonconformingError for the first broken rule; return nothing where a fusion keeps all FUSION_RULES.
+@dataclass(frozen=True, repr=False)
+class KeptRules:
+    """What was checked of a fusion that keeps the rules; in a shell it says so in one sentence.
+
+    `kind`: of the fusion. `scenes`: the names of the scenes. `asked`: how often, by rule; 0: not at all, as `resumable`
+    or `units_in_any_order` is False. `seed`: of scenes and orders.
+    """
+
+    kind: str
+    scenes: tuple[str, ...]
+    asked: dict[str, int]
+    seed: int
+
+    def __repr__(self) -> str:
+        kept = [f"{rule} ({times})" for rule, times in self.asked.items() if times]
+        left = [rule for rule, times in self.asked.items() if not times]
+        said = (
+            f"{self.kind} keeps {len(kept)} rules in {len(self.scenes)} scenes of seed {self.seed}: {', '.join(kept)}"
+        )
+        return said + (f"; not asked: {', '.join(left)}" if left else "")
+
+
+def check_fusion(fusion: ListFusion, *, seed: int = 0, units_in_any_order: bool = True) -> KeptRules:
+    """Raise NonconformingError for the first broken rule; return what was checked where a fusion keeps FUSION_RULES.
 
     `seed`: of the scenes, and of the orders tried. `units_in_any_order`: whether the order of units must not matter.
+    What is returned has the names of the `scenes`, and by rule how often it was `asked`.
+
 
     >>> class Silent(cr.StepFusion):
     ...     def step(self, now_s, inbox, memory):
@@ -258,7 +282,8 @@ def check_fusion(fusion: ListFusion, *, seed: int = 0, units_in_any_order: bool 
     Traceback (most recent call last):
     copem_replay.fusion.testing.NonconformingError: my_package.fusions:Silent breaks the rule 'silence': ...
     """
-    trials = [_FusionTrial(fusion, scene) for scene in make_small_scenes(seed)]
+    asked = dict.fromkeys(FUSION_RULES, 0)
+    trials = [_FusionTrial(fusion, scene, asked) for scene in make_small_scenes(seed)]
     firsts = [trial.answer(trial.scene) for trial in trials]
     for number, (trial, first) in enumerate(zip(trials, firsts, strict=True)):
         scene, rng = trial.scene, np.random.default_rng((seed, number, 1))
@@ -278,16 +303,19 @@ def check_fusion(fusion: ListFusion, *, seed: int = 0, units_in_any_order: bool 
         if units_in_any_order:
             other = scene.of_units(rng.permutation(len(scene.units)))
             trial.same("order of units", first, other, f"units in the order {', '.join(other.units)}")
+    asked["silence"] = len(firsts)
     if not any(len(first.entries) for first in firsts):
         raise NonconformingError("silence", fusion.kind, f"All scenes of seed {seed}", "expected entries, found none")
+    return KeptRules(fusion.kind, tuple(trial.scene.name for trial in trials), asked, seed)
 
 
 @dataclass(frozen=True)
 class _FusionTrial:
-    """A fusion in one scene. Its checks raise NonconformingError."""
+    """A fusion in one scene. Its checks raise NonconformingError, and are counted by rule in `asked`."""
 
     fusion: ListFusion
     scene: SmallScene
+    asked: dict[str, int]
 
     def broken(self, rule: str, scene: SmallScene, said: object, s: int = -1, now_s: float = 0.0) -> NonconformingError:
         when = f", run {scene.runs[s]}, instant {now_s:.3f} s" if s >= 0 else ""
@@ -295,6 +323,8 @@ class _FusionTrial:
 
     def answer(self, scene: SmallScene) -> ObjectLists:
         """The lists that the fusion gives for a scene, checked."""
+        self.asked["answer"] += 1
+        self.asked["inputs"] += 1
         inputs = scene.inputs()
         before = _content_bytes(inputs)
         try:
@@ -340,6 +370,7 @@ class _FusionTrial:
 
     def compare(self, rule: str, first: ObjectLists, found: ObjectLists, scene: SmallScene, until_s: float) -> None:
         """Check that the lists found for a scene are those of `first`: as sets, or to the last bit."""
+        self.asked[rule] += 1
         issue_s = scene.inputs().issue_s
         exact = rule in ("again", "runs", "chunks")
         unit_number = np.array([*map((*self.scene.units, *scene.units).index, scene.units), -1])

@@ -73,8 +73,8 @@ def describe_oddities(lists: RecordedLists, object_ix: Int, scene: Scene) -> Ite
     backwards = backwards_share(lists)
     if backwards is not None and backwards > MANY:
         yield (
-            f"its velocities point against the way its own tracks move ({backwards:.0%} of its entries); what goes by "
-            "them (`tracker` with `late: predict`, new tracks) is led astray"
+            f"its velocities point against the way its own tracks move ({backwards:.0%} of its entries); a fusion that "
+            "uses velocities (`tracker` with `late: predict`, new tracks) will put objects in wrong places"
         )
     yield from _changing_ids(lists, object_ix, scene)
     count = len(object_ix)

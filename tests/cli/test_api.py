@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import ast
 import filecmp
+import inspect
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,7 +18,9 @@ import pytest
 import yaml
 
 import copem_replay as cr
+from copem_replay.api import run as api_run
 from copem_replay.cli import main as cli
+from copem_replay.report.figures.registry import FIGURES
 from copem_replay.viewer import open as opening
 from tests.helpers.experiments import TEXT, drive
 
@@ -318,12 +322,64 @@ class TestFolders:
 
     def test_what_is_not_in_a_folder_is_said(self, here: Path) -> None:
         result = cr.run("e.yaml")
-        for call in (cr.view, cr.write_report, cr.plot.write_figures, cr.plot.write_film):
+        for call in (cr.view, cr.write_report, cr.write_figures, cr.write_film):
             with pytest.raises(cr.InputError, match=r"found some that are not saved; result\.save\(folder\) does"):
                 call(result)
         with pytest.raises(cr.InputError, match="expected results of a run to save, found some that were read"):
             cr.load_results(result.save("out/e")).save("out/again")
         assert not Path("out/again").exists()
+
+
+class TestProgressInANotebook:
+    @pytest.fixture
+    def told(self, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+        """What a kernel would show: the first line, then what takes its place."""
+        told: list[Any] = []
+
+        class Handle:
+            def update(self, words: dict[str, str], *, raw: bool) -> None:
+                assert raw
+                told.append(words["text/plain"])
+
+        def display(words: dict[str, str], *, raw: bool, display_id: bool) -> Handle:
+            assert (raw, display_id, told) == (True, True, []), "one line for the whole run"
+            told.append(words["text/plain"])
+            return Handle()
+
+        shell = type("Shell", (), {"kernel": object()})()
+        monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
+        monkeypatch.setitem(sys.modules, "IPython.display", SimpleNamespace(display=display))
+        return told
+
+    def test_a_line_that_is_empty_in_the_end(
+        self, here: Path, told: list[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(api_run, "SHOWN_AFTER_S", 0.0)
+        show = api_run.show_below_cell()
+        assert show is not None
+        for done in (0, 1, 3, 4):
+            show(done, 4)
+        assert told == ["replaying: 0 %", "replaying: 25 %", "replaying: 75 %", ""]
+
+    def test_a_run_calls_it_and_one_of_yours_takes_its_place(self, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        below: list[tuple[int, int]] = []
+        own: list[tuple[int, int]] = []
+        monkeypatch.setattr(api_run, "show_below_cell", lambda: lambda *reached: below.append(reached))
+        cr.run("e.yaml", progress=lambda *reached: own.append(reached))
+        assert (bool(own), below) == (True, [])
+        cr.run("e.yaml")
+        assert below == own
+
+    def test_short_runs_and_runs_elsewhere_show_nothing(
+        self, here: Path, told: list[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(api_run, "SHOWN_AFTER_S", 1e9)
+        cr.run("e.yaml")
+        assert told == []
+        monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: None))
+        assert api_run.show_below_cell() is None  # IPython is imported, yet nobody's shell
+        monkeypatch.delitem(sys.modules, "IPython")
+        assert api_run.show_below_cell() is None
 
 
 class TestRecordings:
@@ -359,8 +415,23 @@ class TestShownShortly:
         assert ego["x_m"].iloc[-1] - ego["x_m"].iloc[0] == pytest.approx(80.0)
         assert "object_id" not in recording.truth.to_dataframe()
 
-    def test_names_of_plot_are_figures_and_what_writes_them(self) -> None:
+    def test_names_of_plot_are_figures_alone_and_all_of_them(self) -> None:
+        """One function for each figure that `plot` writes; two have names that say more than those of their files."""
         assert dir(cr.plot) == sorted(cr.plot.__all__)
+        called = {"curves": "detection_curves", "runs": "single_runs"}
+        assert dir(cr.plot) == sorted(called.get(name, name) for name in FIGURES)
+        assert {inspect.signature(getattr(cr.plot, name)).return_annotation for name in cr.plot.__all__} == {"Figure"}
+
+    def test_a_figure_that_results_lack_is_refused_with_the_reason(self, here: Path) -> None:
+        result = cr.run("e.yaml")
+        with pytest.raises(cr.InputError, match="no figure of trade_off: fewer than two configurations have both"):
+            cr.plot.trade_off(result)
+        with pytest.raises(cr.InputError, match="no slices"):
+            cr.plot.slices(result)
+        with pytest.raises(cr.InputError, match="no figure of late_paths: of the truth alone nothing is late"):
+            cr.plot.late_paths(result, configurations=["GT"])
+        with pytest.raises(cr.InputError, match="nowhere"):
+            cr.plot.answer(result, configurations=["nowhere"])
 
     def test_the_version_is_the_installed_one(self) -> None:
         from importlib.metadata import version

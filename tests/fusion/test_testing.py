@@ -87,6 +87,24 @@ def test_one_that_keeps_the_rules_passes(fusion: ListFusion, seed: int) -> None:
     check_fusion(fusion, seed=seed)
 
 
+def test_it_says_what_it_has_checked() -> None:
+    """Nine scenes: each once more, in four choices of runs, with a unit unheard, entries and units in another order."""
+    kept = check_fusion(Plain(), seed=3)
+    assert kept.kind == Plain().kind
+    assert len(kept.scenes) == 9
+    assert kept.scenes[0] == "one object and one unit"
+    assert list(kept.asked) == list(FUSION_RULES)
+    each = {"again": 9, "runs": 36, "unheard": 9, "order of entries": 9, "order of units": 9, "silence": 9, "chunks": 18}
+    assert {rule: kept.asked[rule] for rule in each} == each
+    # each scene itself and each variation is answered; chunks are resumed, which is no answer of its own
+    varied = sum(each.values()) - each["silence"] - each["chunks"] + kept.asked["causality"]
+    assert kept.asked["answer"] == kept.asked["inputs"] == 9 + varied
+    assert kept.asked["causality"] > 0
+    said = repr(check_fusion(FirstUnitLeads(), units_in_any_order=False))
+    assert said.startswith(f"{FirstUnitLeads().kind} keeps 9 rules in 9 scenes of seed 0: answer (")
+    assert said.endswith("; not asked: order of units")
+
+
 # ---------------------------------------------------------------------------------------------- numbers that are wrong
 
 

@@ -24,7 +24,7 @@ def older(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(
-    "read", [cr.load_results, cr.compare, cr.write_report, cr.view, cr.plot.write_figures, cr.plot.write_film]
+    "read", [cr.load_results, cr.compare, cr.write_report, cr.view, cr.write_figures, cr.write_film]
 )
 def test_an_older_format_is_refused(older: Path, read: Callable[[Path], object]) -> None:
     with pytest.raises(cr.InputError) as failure:

@@ -134,7 +134,7 @@ def test_the_terminal_the_figure_and_the_report_show_it(folder: Path) -> None:
     assert "by class: 2 groups looked at in 2 configurations" in text
     assert "pedestrian, car: no interval of detected_share: 2 logs, fewer than 3" in text
     assert "95 %: over 11 objects of this drive" in text
-    files, _ = cr.plot.write_figures(results, folder / "figures", by=["log*class"])
+    files, _ = cr.write_figures(results, folder / "figures", by=["log*class"])
     assert {"slices.png", "slices.svg"} <= {file.name for file in files}
     assert "one, pedestrian" in (folder / "figures/slices.svg").read_text(encoding="utf-8")
     page = cr.write_report(results, folder / "report.html").read_text(encoding="utf-8")

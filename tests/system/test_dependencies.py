@@ -37,7 +37,9 @@ def test_every_dependency_has_both_bounds_and_the_pin_is_within() -> None:
 
 def test_every_extra_is_pinned_and_what_is_compiled_has_files_for_many_platforms() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    assert not RUNS.keys() & REST.keys(), "no package is pinned twice"
+    twice = RUNS.keys() & REST.keys()
+    assert twice == {"colorama"}, "pinned twice: only what the site needs on every system, runs on Windows alone"
+    assert RUNS["colorama"] == REST["colorama"]
     pins = RUNS | REST
     for name in ("cluster", "dev", "bench"):
         for needed in map(Requirement, project["optional-dependencies"][name]):
@@ -49,3 +51,16 @@ def test_every_extra_is_pinned_and_what_is_compiled_has_files_for_many_platforms
         name: pin for name, pin in pins.items() if name in RELEASE
     }, "one version of each package"
     assert all(len(pins[name][1]) > 20 for name in ("numpy", "pandas", "pyarrow", "scipy", "shapely"))
+
+
+def test_decision_6_says_of_every_package_what_it_is_for() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    page = (ROOT / "docs/develop/decisions/0006-dependencies.md").read_text(encoding="utf-8")
+    rows = [line.split("|")[1:-1] for line in page.splitlines() if re.match(r"\| [\w`]", line)][1:]
+    assert all(len(row) == 5 and all(cell.strip() for cell in row) for row in rows)
+    runs = " ".join(row[0] for row in rows)
+    extras = project["optional-dependencies"]
+    used = {Requirement(text).name for text in (*project["dependencies"], *extras["cluster"], *extras["maps"])}
+    assert set(re.findall(r"[a-z][\w.-]+", runs)) == used | {"cluster", "maps"}
+    rest = {Requirement(text).name for name in ("dev", "bench", "release") for text in extras[name]}
+    assert rest - {"copem-replay"} <= set(re.findall(r"[a-z][\w.-]*\w", page.rpartition("|")[2]))

@@ -40,7 +40,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def film(results: Path) -> Path:
-    return cr.plot.write_film(results, configurations=NAMES)
+    return cr.write_film(results, configurations=NAMES)
 
 
 def frames(path: Path) -> list[np.ndarray]:
@@ -111,7 +111,7 @@ def test_a_configuration_without_a_list_draws_no_boxes(film: Path) -> None:
 
 
 def test_the_same_bytes_again(results: Path, film: Path, tmp_path: Path) -> None:
-    again = cr.plot.write_film(results, tmp_path / "again.gif", configurations=NAMES, object_id="2", run=0)
+    again = cr.write_film(results, tmp_path / "again.gif", configurations=NAMES, object_id="2", run=0)
     assert again.read_bytes() == film.read_bytes()
 
 
@@ -143,6 +143,6 @@ def test_what_is_wrong_is_one_line(
 def test_a_recording_that_is_gone_is_one_line(results: Path, tmp_path: Path) -> None:
     shutil.copytree(results, tmp_path / "r")  # the log is not beside this one
     with pytest.raises(cr.InputError, match=r"drive\.mcap: cannot be opened: No such file") as error:
-        cr.plot.write_film(tmp_path / "r", tmp_path / "x.gif")
+        cr.write_film(tmp_path / "r", tmp_path / "x.gif")
     assert len(str(error.value).splitlines()) == 1
     assert not (tmp_path / "x.gif").exists()
