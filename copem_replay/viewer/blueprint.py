@@ -14,15 +14,25 @@ from copem_replay.core.colours import Rgb
 from copem_replay.core.tracks import CLASSES, TRUTH
 from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.prepare import Replay
+from copem_replay.results.shown_objects import SHOWN_OBJECTS
 from copem_replay.viewer.camera import Camera
-from copem_replay.viewer.lanes import UnitLists, select_list_lanes
-from copem_replay.viewer.objects import SHOWN_OBJECTS
+from copem_replay.viewer.lanes import UnitLists, lanes_axis_s, select_list_lanes
 from copem_replay.viewer.sink import (
+    CAPTURED,
     EGO,
     ELAPSED,
+    FIELD,
     GROUND,
+    HIDDEN,
     HIDES,
+    LOST,
     NOTICED,
+    OUT,
+    STATUS,
+    UNLISTED,
+    UNMATCHED,
+    VISIBLE,
+    WAITING,
     RecordingSink,
     configuration_part,
     digest_texts,
@@ -43,23 +53,40 @@ _MARKS: tuple[tuple[str, Rgb, float], ...] = (
     ("truth", TRUTH_COLOUR, 1.0),
     ("ego", EGO, 6.0),
     ("hides it", HIDES, 2.0),
+    ("field of view", FIELD, 1.0),
 )
+_FALSE = "false, dashed"
+_STATUSES = {
+    OUT: "out of view", HIDDEN: "hidden", VISIBLE: "seen, not listed", UNLISTED: "not listed", LOST: "list lost",
+    CAPTURED: "on its way", UNMATCHED: "unmatched",
+}  # fmt: skip
+"""Words of statuses in lanes, in the order in which they follow each other."""
 _BAR_POINTS, _WIDE, _GAP = 7.0, 4.0, 1.0
 """Half the height of a bar in points; its width and the gap beside it in rows."""
-LEGEND_X, LEGEND_Y = (-0.5, 2 * _WIDE + _GAP + 0.5), (-1.0, 6.0)
-"""Bounds of the legend's view: two columns and six rows."""
+LEGEND_X, LEGEND_Y = (-0.5, 3 * _WIDE + 2 * _GAP + 0.5), (-1.0, 7.0)
+"""Bounds of the legend's view: three columns and seven rows."""
 
 
 def write_legend_bars(out: RecordingSink, colours: Mapping[str, Rgb]) -> None:
-    """Write a bar per configuration with its name, and in a second column those common to all configurations."""
+    """Write a bar per configuration with its name; beside them those common to all configurations, and statuses.
+
+    In lanes an object that is listed but not known has the configuration's colour at half strength.
+    """
     import rerun as rr
 
-    columns = ([(name, colour, _BAR_POINTS) for name, colour in colours.items()], list(_MARKS))
+    of_all = [*_MARKS, (_FALSE, WAITING, 0.9)]
+    statuses = [(word, STATUS[status], _BAR_POINTS) for status, word in _STATUSES.items()]
+    columns = ([(name, colour, _BAR_POINTS) for name, colour in colours.items()], of_all, statuses)
     rows = [(*row, c * (_WIDE + _GAP), float(k)) for c, column in enumerate(columns) for k, row in enumerate(column)]
+    strips = [
+        (strip, colour, points)
+        for name, colour, points, x, y in rows
+        for strip in (_dash(x, y) if name == _FALSE else [[[x, y], [x + _WIDE, y]]])
+    ]
     drawn = rr.LineStrips2D(
-        [[[x, y], [x + _WIDE, y]] for _, _, _, x, y in rows],
-        colors=[colour for _, colour, *_ in rows],
-        radii=rr.Radius.ui_points([points for _, _, points, *_ in rows]),
+        [strip for strip, _, _ in strips],
+        colors=[colour for _, colour, _ in strips],
+        radii=rr.Radius.ui_points([points for _, _, points in strips]),
     )
     out.static(["legend", "bars"], drawn)
     # A label stands below its point: a point a little higher puts it on the bar.
@@ -71,6 +98,11 @@ def write_legend_bars(out: RecordingSink, colours: Mapping[str, Rgb]) -> None:
         show_labels=True,
     )
     out.static(["legend", "names"], names)
+
+
+def _dash(x: float, y: float) -> list[list[list[float]]]:
+    """A bar of dashes."""
+    return [[[x + k * _WIDE / 5, y], [x + (k + 0.6) * _WIDE / 5, y]] for k in range(5)]
 
 
 # Pages.
@@ -124,8 +156,13 @@ class RecordingContent:
         return f"{short_ids(self.replay.scene)[object_ix]} {CLASSES[self.replay.scene.object_class[object_ix]]}"
 
     def axis(self, object_ix: int) -> rrb.TimeAxis:
-        """The time axis of an object's lanes and curves."""
+        """The time axis of an object's curves."""
         return make_time_axis(*self.axes_s[object_ix])
+
+    def lanes_axis_s(self, object_ix: int) -> tuple[float, float]:
+        """First and last second of an object's lanes."""
+        onset_s = float(self.episodes[object_ix]["onset_s"].iloc[0])
+        return lanes_axis_s(self.axes_s[object_ix], onset_s, self.configurations)
 
     def title(self, configuration: str, suffix: str = "") -> str:
         """The title of a view: “bursty · whole run: 18 of 24 known, 3 false”; `suffix`: after the name.
@@ -384,7 +421,7 @@ def lanes_view(content: RecordingContent, object_ix: int, under: Sequence[str] =
         origin=make_entity_path(*object_lanes_path(scene, object_ix)),
         contents=["+ $origin/**", *(f"+ {path}" for path in under)] if under else "$origin/**",
         name=f"{content.id_of(object_ix)}, onset {onset_s:.1f} s",
-        time_view=content.axis(object_ix),
+        time_view=make_time_axis(*content.lanes_axis_s(object_ix)),
     )
 
 
@@ -419,7 +456,7 @@ def _curves_view(
     )
 
 
-LAYOUT = 5
+LAYOUT = 6
 """Version of the blueprint, raised with every change: a viewer prefers the one it has kept for an application id."""
 
 

@@ -1,10 +1,10 @@
 """Lanes: the status of each shown object in each configuration over time, and lost, late and overtaken lists of units.
 
 An entity per object and configuration, such as `lanes/6_pedestrian/2_PEM`; the number is the configuration's place in
-the file. What holds when the object's axis begins is told after the configuration's name, “PEM: out of view”. Changes
-too short to follow are left out, but known begins exactly at `detection_s`, with how long after the onset, “0.60 s
-known”. A mark ends at the onset, white and black, so that it stands out in any theme. A lane is empty while the object
-is absent.
+the file. A lane begins with the configuration's name: the viewer's own titles of lanes are paths. Changes too short to
+follow are left out, but known begins exactly at `detection_s`, with how long after the onset, “0.60 s known”. Words
+that do not fit into their span are shortened or left out. A mark ends at the onset, white and black, so that it stands
+out in any theme. A lane is empty while the object is absent.
 
 An entity per configuration and unit, such as `lists/2_bursts/rsu1`, under the lanes of the objects, shows lists sent by
 a link, if one did not come in time; events say it in words.
@@ -12,6 +12,7 @@ a link, if one did not come in time; events say it in words.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -25,6 +26,7 @@ from copem_replay.core.colours import Rgb
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import SAME_INSTANT_S, TRUTH, Float, Int, Scene
 from copem_replay.experiment.schema import Experiment
+from copem_replay.results.shown_objects import AFTER_S, BEFORE_S, LEAST_S
 from copem_replay.viewer.sink import (
     ABSENT,
     CAPTURED,
@@ -55,8 +57,14 @@ MARK = 1 / 40
 """Length of the mark that ends at the onset, as a share of the axis: just wide enough for both halves."""
 FLAG = 6
 """Length of words such as “0.60 s known”, as a multiple of the mark's."""
+NAME: Rgb = (58, 60, 66)
+"""Ground of the configuration's name, where a lane begins: no colour of a status."""
 ONSET_IS = ("onset", "onset of the object")
 """The two halves of the mark."""
+WIDTH_POINTS, LETTER_POINTS, PADDING_POINTS = 380.0, 7.0, 10.0
+"""Width of the narrowest lanes in a window of 1280 × 720, of a letter (rounded up), and of what is beside words."""
+MOST_NAME = 0.42
+"""Most of a lane's width that is before the onset, for the name."""
 _STEADY_NS = round(STEADY_S * 1e9)
 
 
@@ -75,7 +83,7 @@ def write_lanes(
 ) -> None:  # fmt: skip
     """Write a lane per shown object and configuration, with a mark that ends at the onset.
 
-    `axes`: first and last second of each object's axis, by its index.
+    `axes`: first and last second of each object's lanes, by its index.
     """
     import rerun as rr
 
@@ -91,16 +99,75 @@ def write_lanes(
             onset_ns = int(clocks[name].onset_ns[k])
             _add_flag(begins, texts, int(clocks[name].known_ns[k]), onset_ns, FLAG * mark_ns)
             tints = [status_colour(span.status, colours[name]) if span.status else ONSET[0] for span in spans]
-            style = {text: tint for text, tint in zip(texts, tints, strict=True) if text}
-            style |= dict(zip(ONSET_IS, ONSET, strict=True))
+            colour_of = {text: tint for text, tint in zip(texts, tints, strict=True) if text}
+            colour_of |= dict(zip(ONSET_IS, ONSET, strict=True)) | {_name_text(name): NAME}
+            first_ns, last_ns = to_nanoseconds(axes[k]).tolist()
+            known_ns = int(clocks[name].known_ns[k])
             elapsed, texts = _insert_onset(begins, texts, onset_ns, mark_ns)
-            style |= _add_name(elapsed, texts, name, to_nanoseconds(axes[k][0]), style)
+            elapsed, texts = _insert_name(elapsed, texts, name, first_ns, min(onset_ns - mark_ns, known_ns))
+            values, label_of = _fit_words(elapsed, texts, (first_ns, last_ns))
             path = lane_path(scene, k, place, name)
-            labels = [text for text in texts if text is not None]  # the row is empty while the object is absent
-            states = rr.StateChange.columns(state=pa.array(labels, pa.string()))
-            out.columns(path, elapsed, states.partition(np.array([text is not None for text in texts], dtype=np.int64)))
-            values = list(style)
-            out.static(path, rr.StateConfiguration(values=values, labels=values, colors=list(style.values())))
+            told = [value for value in values if value is not None]  # the row is empty while the object is absent
+            states = rr.StateChange.columns(state=pa.array(told, pa.string()))
+            count = np.array([value is not None for value in values], dtype=np.int64)
+            out.columns(path, elapsed, states.partition(count))
+            tints = [_tint(value, name, colour_of) for value in label_of]
+            style = rr.StateConfiguration(values=list(label_of), labels=list(label_of.values()), colors=tints)
+            out.static(path, style)
+
+
+def lanes_axis_s(axis_s: tuple[float, float], onset_s: float, configurations: Sequence[str]) -> tuple[float, float]:
+    """First and last second of an object's lanes: with room for names before the onset, and for the last flag.
+
+    `axis_s`: of the object, from 0.5 s before its onset, or before it is known, to 0.5 s after it is last known.
+    """
+    longest = max(map(len, configurations), default=0)
+    name = min(_words_points(longest) / WIDTH_POINTS + MARK, MOST_NAME)
+    flag = _words_points(len("10.00 s known")) / WIDTH_POINTS
+    start_s = min(onset_s, axis_s[0] + BEFORE_S)
+    end_s = max(axis_s[1] - AFTER_S, start_s)
+    length_s = max((end_s - start_s) / (1 - name - flag), LEAST_S)
+    first_s = max(start_s - name * length_s, 0.0)
+    return first_s, max(first_s + length_s, end_s + flag * length_s)
+
+
+def _words_points(letters: int) -> float:
+    return letters * LETTER_POINTS + PADDING_POINTS
+
+
+def _fit_words(
+    begins: Int, texts: Sequence[str | None], axis_ns: tuple[int, int]
+) -> tuple[list[str | None], dict[str, str]]:
+    """Values of states, and the label of each value: as many of its words as fit into its span on the axis.
+
+    A state whose words are shortened here and not elsewhere has a space more at the end of its value. Without words the
+    label is a space: for an empty one the viewer takes the value.
+    """
+    per_point_ns = (axis_ns[1] - axis_ns[0]) / WIDTH_POINTS
+    ends = np.append(begins[1:], axis_ns[1])
+    values: list[str | None] = []
+    label_of = dict.fromkeys(ONSET_IS, " ")
+    for text, begin_ns, end_ns in zip(texts, begins.tolist(), ends.tolist(), strict=True):
+        if text is None or text in ONSET_IS:
+            values.append(text)
+            continue
+        lasts_ns = min(end_ns, axis_ns[1]) - max(begin_ns, axis_ns[0])
+        room = int((lasts_ns / per_point_ns - PADDING_POINTS) / LETTER_POINTS) if lasts_ns > 0 else len(text)
+        label = next((words for words in _shorten_words(text) if len(words) <= room), " ")
+        value = next(text + k * " " for k in range(len(texts) + 1) if label_of.get(text + k * " ", label) == label)
+        label_of[value] = label
+        values.append(value)
+    return values, label_of
+
+
+def _shorten_words(text: str) -> Iterator[str]:
+    """Words of a span, the longest first: “behind 3 (from ego)”, “behind 3”; “0.60 s known”, “0.60 s”."""
+    yield text.removesuffix(": ")
+    yield text.partition(", then ")[0]
+    yield text.partition(" (from ")[0]
+    yield text.partition(" from ")[0]
+    if flag := re.match(r"-?[0-9.]+ s ", text):
+        yield flag[0].rstrip()
 
 
 def smooth_status(elapsed_ns: Int, status: Int) -> list[Span]:
@@ -153,20 +220,37 @@ def _add_flag(begins: Int, texts: list[str | None], known_ns: int, onset_ns: int
             texts[k + 1] = f"{flag}, then {texts[k + 1]}"
 
 
-def _add_name(
-    begins: Int, texts: list[str | None], name: str, first_ns: int, style: Mapping[str, Rgb]
-) -> dict[str, Rgb]:
-    """Put the configuration's name before the first text on the axis: the viewer's own titles of lanes are paths.
+def _tint(value: str, name: str, colour_of: Mapping[str, Rgb]) -> Rgb:
+    """The colour of a value: spaces at its end and a name before it change nothing."""
+    plain = value if value in colour_of else value.rstrip().removeprefix(_name_text(name))
+    return colour_of[plain]
 
-    Returns what `style` lacks, the colour of that text.
+
+def _name_text(name: str) -> str:
+    return f"{name}: "
+
+
+def _insert_name(
+    elapsed_ns: Int, texts: list[str | None], name: str, first_ns: int, until_ns: int
+) -> tuple[Int, list[str | None]]:
+    """Put the configuration's name from the begin of the axis to `until_ns`, in place of what holds then.
+
+    Where there is no room for it, it is before the first text on the axis, “PEM: out of view”.
     """
-    current = max(int(np.searchsorted(begins, first_ns, side="right")) - 1, 0)
-    told = next((k for k in range(current, len(texts)) if texts[k] is not None), None)
-    text = None if told is None else texts[told]
-    if told is None or text is None:
-        return {}
-    texts[told] = named = f"{name}: {text}"
-    return {named: style[text]}
+    if until_ns - first_ns > _STEADY_NS:
+        kept = np.flatnonzero((elapsed_ns <= first_ns) | (elapsed_ns >= until_ns))
+        kept = kept[elapsed_ns[kept] != first_ns]
+        before = int(np.count_nonzero(elapsed_ns[kept] < first_ns))
+        told = [texts[k] for k in kept.tolist()]
+        held, times = int(np.searchsorted(elapsed_ns, until_ns, side="right")) - 1, elapsed_ns[kept]
+        at = [first_ns] if before < len(kept) and times[before] == until_ns else [first_ns, until_ns]
+        after = [_name_text(name), *([] if len(at) == 1 else [texts[held] if held >= 0 else None])]
+        return np.concatenate([times[:before], at, times[before:]]), [*told[:before], *after, *told[before:]]
+    current = max(int(np.searchsorted(elapsed_ns, first_ns, side="right")) - 1, 0)
+    told_at = next((k for k in range(current, len(texts)) if texts[k] is not None), None)
+    if told_at is not None:
+        texts[told_at] = f"{_name_text(name)}{texts[told_at]}"
+    return elapsed_ns, texts
 
 
 def _insert_onset(
