@@ -1,4 +1,4 @@
-"""Blueprint: the layout of a recording in the viewer, with a page per question, and its legend."""
+"""Blueprint: the layout of a recording in the viewer, with a page per question."""
 
 from __future__ import annotations
 
@@ -9,100 +9,28 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from copem_replay.core.colours import TRUTH as TRUTH_COLOUR
-from copem_replay.core.colours import Rgb
 from copem_replay.core.tracks import CLASSES, TRUTH
 from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.results.shown_objects import SHOWN_OBJECTS
 from copem_replay.viewer.camera import Camera
 from copem_replay.viewer.lanes import UnitLists, lanes_axis_s, select_list_lanes
+from copem_replay.viewer.legend import legend_view
 from copem_replay.viewer.sink import (
-    CAPTURED,
-    EGO,
     ELAPSED,
-    FIELD,
     GROUND,
-    HIDDEN,
-    HIDES,
-    LOST,
-    NOTICED,
-    OUT,
-    STATUS,
-    UNLISTED,
-    UNMATCHED,
-    VISIBLE,
-    WAITING,
-    RecordingSink,
     configuration_part,
     digest_texts,
     entity_names,
     make_entity_path,
     object_lanes_path,
     short_ids,
+    show_seconds,
     to_nanoseconds,
 )
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
-
-
-# Legend: bars in the colours of configurations, and of lines and boxes, with names on them, in a view of their own.
-
-_MARKS: tuple[tuple[str, Rgb, float], ...] = (
-    ("truth", TRUTH_COLOUR, 1.0),
-    ("ego", EGO, 6.0),
-    ("hides it", HIDES, 2.0),
-    ("field of view", FIELD, 1.0),
-)
-_FALSE = "false, dashed"
-_STATUSES = {
-    OUT: "out of view", HIDDEN: "hidden", VISIBLE: "seen, not listed", UNLISTED: "not listed", LOST: "list lost",
-    CAPTURED: "on its way", UNMATCHED: "unmatched",
-}  # fmt: skip
-"""Words of statuses in lanes, in the order in which they follow each other."""
-_BAR_POINTS, _WIDE, _GAP = 7.0, 4.0, 1.0
-"""Half the height of a bar in points; its width and the gap beside it in rows."""
-LEGEND_X, LEGEND_Y = (-0.5, 3 * _WIDE + 2 * _GAP + 0.5), (-1.0, 7.0)
-"""Bounds of the legend's view: three columns and seven rows."""
-
-
-def write_legend_bars(out: RecordingSink, colours: Mapping[str, Rgb]) -> None:
-    """Write a bar per configuration with its name; beside them those common to all configurations, and statuses.
-
-    In lanes an object that is listed but not known has the configuration's colour at half strength.
-    """
-    import rerun as rr
-
-    of_all = [*_MARKS, (_FALSE, WAITING, 0.9)]
-    statuses = [(word, STATUS[status], _BAR_POINTS) for status, word in _STATUSES.items()]
-    columns = ([(name, colour, _BAR_POINTS) for name, colour in colours.items()], of_all, statuses)
-    rows = [(*row, c * (_WIDE + _GAP), float(k)) for c, column in enumerate(columns) for k, row in enumerate(column)]
-    strips = [
-        (strip, colour, points)
-        for name, colour, points, x, y in rows
-        for strip in (_dash(x, y) if name == _FALSE else [[[x, y], [x + _WIDE, y]]])
-    ]
-    drawn = rr.LineStrips2D(
-        [strip for strip, _, _ in strips],
-        colors=[colour for _, colour, _ in strips],
-        radii=rr.Radius.ui_points([points for _, _, points in strips]),
-    )
-    out.static(["legend", "bars"], drawn)
-    # A label stands below its point: a point a little higher puts it on the bar.
-    names = rr.Points2D(
-        [[x + _WIDE / 2, y - 0.4] for *_, x, y in rows],
-        labels=[name for name, *_ in rows],
-        colors=[NOTICED],
-        radii=rr.Radius.ui_points(0.0),
-        show_labels=True,
-    )
-    out.static(["legend", "names"], names)
-
-
-def _dash(x: float, y: float) -> list[list[list[float]]]:
-    """A bar of dashes."""
-    return [[[x + k * _WIDE / 5, y], [x + (k + 0.6) * _WIDE / 5, y]] for k in range(5)]
 
 
 # Pages.
@@ -285,7 +213,7 @@ def _last_and_first(content: RecordingContent, object_ix: int) -> list[tuple[str
     chosen = dict.fromkeys([ranked[0], *between, ranked[-1]])
     label = content.id_of(object_ix)
     titles = {
-        name: f"{name}: {label} known {s:.2f} s after its onset" if np.isfinite(s) else f"{name}: {label} never known"
+        name: f"{name}: {label} " + (f"known {show_seconds(s)} s after its onset" if np.isfinite(s) else "never known")
         for name, s in when_s.items()
     }
     return [(name, titles[name]) for name in chosen]
@@ -430,14 +358,6 @@ def difference_view() -> rrb.TextDocumentView:
     import rerun.blueprint as rrb
 
     return rrb.TextDocumentView(origin="difference", name="What difference it made")
-
-
-def legend_view() -> rrb.Spatial2DView:
-    """The legend."""
-    import rerun.blueprint as rrb
-
-    bounds = rrb.VisualBounds2D(x_range=LEGEND_X, y_range=LEGEND_Y)
-    return rrb.Spatial2DView(origin="legend", name="Legend", background=GROUND, visual_bounds=bounds)
 
 
 def _curves_view(

@@ -26,6 +26,7 @@ from copem_replay.viewer.sink import (
     entity_names,
     pair_points,
     short_ids,
+    show_seconds,
     stack_float32,
     table_rows,
     to_nanoseconds,
@@ -117,7 +118,7 @@ def _difference_table(episodes: pd.DataFrame, scene: Scene) -> str:
     lines = [f"| {' | '.join(head)} |", "| --- |" + " ---: |" * (len(head) - 1)]
     for episode in table_rows(episodes):
         cells = [
-            f"{episode.time_to_detection_s:.2f} s" if episode.detected else "never",
+            f"{show_seconds(episode.time_to_detection_s)} s" if episode.detected else "never",
             _format_metres(episode.distance_at_detection_m),
             *([_tell_outcome(episode)] if braking else []),
         ]
@@ -143,7 +144,7 @@ def _overview_table(by_object: Sequence[pd.DataFrame], scene: Scene) -> str:
     for name in by_object[0]["configuration"]:
         cells = []
         for episodes in rows_by_object:
-            after = f"{episodes[name].time_to_detection_s:.2f}" if episodes[name].detected else "never"
+            after = show_seconds(episodes[name].time_to_detection_s) if episodes[name].detected else "never"
             cells.append(after + {None: "", "stays clear": ""}.get(describe_verdict(episodes[name]), " **fail**"))
         lines.append(f"| {_escape_cell(name)} | {' | '.join(cells)} |")
     return "\n".join(lines)

@@ -41,6 +41,7 @@ from copem_replay.viewer.sink import (
     make_distinct,
     plain_part,
     short_ids,
+    show_seconds,
     status_colour,
     to_nanoseconds,
 )
@@ -89,31 +90,45 @@ def write_lanes(
 
     ids, units = short_ids(scene), [*experiment.units, TRUTH]
     for m, k in enumerate(sight.object_ix.tolist()):
-        mark_ns = round((axes[k][1] - axes[k][0]) * MARK * 1e9)
+        axis_ns = tuple(to_nanoseconds(axes[k]).tolist())
         for place, (name, status) in enumerate(statuses.items()):
             if not len(status.elapsed_ns):
                 continue
             spans = smooth_status(status.elapsed_ns, status.status[:, m])
             texts = [_span_text(ids, units, sight, status, m, span) for span in spans]
             begins = status.elapsed_ns[[span.first for span in spans]]
-            onset_ns = int(clocks[name].onset_ns[k])
-            _add_flag(begins, texts, int(clocks[name].known_ns[k]), onset_ns, FLAG * mark_ns)
             tints = [status_colour(span.status, colours[name]) if span.status else ONSET[0] for span in spans]
-            colour_of = {text: tint for text, tint in zip(texts, tints, strict=True) if text}
-            colour_of |= dict(zip(ONSET_IS, ONSET, strict=True)) | {_name_text(name): NAME}
-            first_ns, last_ns = to_nanoseconds(axes[k]).tolist()
-            known_ns = int(clocks[name].known_ns[k])
-            elapsed, texts = _insert_onset(begins, texts, onset_ns, mark_ns)
-            elapsed, texts = _insert_name(elapsed, texts, name, first_ns, min(onset_ns - mark_ns, known_ns))
-            values, label_of = _fit_words(elapsed, texts, (first_ns, last_ns))
+            clock_ns = int(clocks[name].onset_ns[k]), int(clocks[name].known_ns[k])
+            elapsed, values, styles = _tell_lane(begins, texts, tints, name, clock_ns, axis_ns)
             path = lane_path(scene, k, place, name)
             told = [value for value in values if value is not None]  # the row is empty while the object is absent
             states = rr.StateChange.columns(state=pa.array(told, pa.string()))
-            count = np.array([value is not None for value in values], dtype=np.int64)
-            out.columns(path, elapsed, states.partition(count))
-            tints = [_tint(value, name, colour_of) for value in label_of]
-            style = rr.StateConfiguration(values=list(label_of), labels=list(label_of.values()), colors=tints)
-            out.static(path, style)
+            out.columns(path, elapsed, states.partition(np.array([v is not None for v in values], dtype=np.int64)))
+            labels, drawn = zip(*styles.values(), strict=True)
+            out.static(path, rr.StateConfiguration(values=list(styles), labels=list(labels), colors=list(drawn)))
+
+
+def _tell_lane(
+    begins: Int, texts: list[str | None], tints: Sequence[Rgb], name: str, clock_ns: tuple[int, int],
+    axis_ns: tuple[int, int],
+) -> tuple[Int, list[str | None], dict[str, tuple[str, Rgb]]]:  # fmt: skip
+    """Instants and values of a lane with its name, flag and mark; label and colour of each value.
+
+    `texts`, `tints`: of spans that begin at `begins`. `clock_ns`: onset of the object, and when it is known.
+    """
+    (onset_ns, known_ns), (first_ns, last_ns) = clock_ns, axis_ns
+    mark_ns = round((last_ns - first_ns) * MARK)
+    _add_flag(begins, texts, known_ns, onset_ns, FLAG * mark_ns)
+    colour_of = {text: tint for text, tint in zip(texts, tints, strict=True) if text}
+    colour_of |= dict(zip(ONSET_IS, ONSET, strict=True)) | {_name_text(name): NAME}
+    elapsed, texts = _insert_onset(begins, texts, onset_ns, mark_ns)
+    until_ns = min(onset_ns - mark_ns, known_ns)
+    if until_ns - first_ns >= (last_ns - first_ns) * _words_points(len(name)) / WIDTH_POINTS:
+        elapsed, texts = _insert_name(elapsed, texts, name, first_ns, until_ns)
+    else:
+        _prepend_name(elapsed, texts, name, first_ns)
+    values, label_of = _fit_words(elapsed, texts, axis_ns)
+    return elapsed, values, {value: (label, _tint(value, name, colour_of)) for value, label in label_of.items()}
 
 
 def lanes_axis_s(axis_s: tuple[float, float], onset_s: float, configurations: Sequence[str]) -> tuple[float, float]:
@@ -122,7 +137,7 @@ def lanes_axis_s(axis_s: tuple[float, float], onset_s: float, configurations: Se
     `axis_s`: of the object, from 0.5 s before its onset, or before it is known, to 0.5 s after it is last known.
     """
     longest = max(map(len, configurations), default=0)
-    name = min(_words_points(longest) / WIDTH_POINTS + MARK, MOST_NAME)
+    name = min((_words_points(longest) + 2) / WIDTH_POINTS + MARK, MOST_NAME)
     flag = _words_points(len("10.00 s known")) / WIDTH_POINTS
     start_s = min(onset_s, axis_s[0] + BEFORE_S)
     end_s = max(axis_s[1] - AFTER_S, start_s)
@@ -164,6 +179,8 @@ def _shorten_words(text: str) -> Iterator[str]:
     """Words of a span, the longest first: “behind 3 (from ego)”, “behind 3”; “0.60 s known”, “0.60 s”."""
     yield text.removesuffix(": ")
     yield text.partition(", then ")[0]
+    if ": " in text:
+        yield text.partition(": ")[0]
     yield text.partition(" (from ")[0]
     yield text.partition(" from ")[0]
     if flag := re.match(r"-?[0-9.]+ s ", text):
@@ -215,7 +232,7 @@ def _add_flag(begins: Int, texts: list[str | None], known_ns: int, onset_ns: int
     Where that lasts for less than `room_ns`, too short for words, what follows says it, too.
     """
     for k in np.flatnonzero(begins == known_ns)[:1].tolist():
-        texts[k] = flag = f"{(known_ns - onset_ns) / 1e9:.2f} s {texts[k]}"
+        texts[k] = flag = f"{show_seconds((known_ns - onset_ns) / 1e9)} s {texts[k]}"
         if k + 1 < len(texts) and texts[k + 1] is not None and begins[k + 1] - known_ns < room_ns:
             texts[k + 1] = f"{flag}, then {texts[k + 1]}"
 
@@ -233,24 +250,21 @@ def _name_text(name: str) -> str:
 def _insert_name(
     elapsed_ns: Int, texts: list[str | None], name: str, first_ns: int, until_ns: int
 ) -> tuple[Int, list[str | None]]:
-    """Put the configuration's name from the begin of the axis to `until_ns`, in place of what holds then.
+    """Put the configuration's name from the begin of the axis to `until_ns`, in place of what holds then."""
+    before = int(np.searchsorted(elapsed_ns, first_ns))
+    after = int(np.searchsorted(elapsed_ns, until_ns, side="right")) - 1  # what holds at `until_ns`
+    held = texts[after] if after >= 0 else None
+    return np.concatenate([elapsed_ns[:before], [first_ns, until_ns], elapsed_ns[after + 1 :]]), [
+        *texts[:before], _name_text(name), held, *texts[after + 1 :]
+    ]  # fmt: skip
 
-    Where there is no room for it, it is before the first text on the axis, “PEM: out of view”.
-    """
-    if until_ns - first_ns > _STEADY_NS:
-        kept = np.flatnonzero((elapsed_ns <= first_ns) | (elapsed_ns >= until_ns))
-        kept = kept[elapsed_ns[kept] != first_ns]
-        before = int(np.count_nonzero(elapsed_ns[kept] < first_ns))
-        told = [texts[k] for k in kept.tolist()]
-        held, times = int(np.searchsorted(elapsed_ns, until_ns, side="right")) - 1, elapsed_ns[kept]
-        at = [first_ns] if before < len(kept) and times[before] == until_ns else [first_ns, until_ns]
-        after = [_name_text(name), *([] if len(at) == 1 else [texts[held] if held >= 0 else None])]
-        return np.concatenate([times[:before], at, times[before:]]), [*told[:before], *after, *told[before:]]
+
+def _prepend_name(elapsed_ns: Int, texts: list[str | None], name: str, first_ns: int) -> None:
+    """Put the name before the first text on the axis, “PEM: out of view”: it has no room of its own."""
     current = max(int(np.searchsorted(elapsed_ns, first_ns, side="right")) - 1, 0)
     told_at = next((k for k in range(current, len(texts)) if texts[k] is not None), None)
     if told_at is not None:
         texts[told_at] = f"{_name_text(name)}{texts[told_at]}"
-    return elapsed_ns, texts
 
 
 def _insert_onset(

@@ -25,7 +25,7 @@ from copem_replay.pipeline.prepare import Replay
 from copem_replay.results.shown_objects import ShownObjects, axis_s, choose_shown_objects, find_opening_s
 from copem_replay.results.write import Exporter, RunToExport
 from copem_replay.viewer import boxes, curves, lanes, sensors
-from copem_replay.viewer.blueprint import NEAR_BY, RecordingContent, build_blueprint, view_aspect, write_legend_bars
+from copem_replay.viewer.blueprint import NEAR_BY, RecordingContent, build_blueprint, view_aspect
 from copem_replay.viewer.camera import (
     camera_above,
     camera_following,
@@ -46,6 +46,7 @@ from copem_replay.viewer.events import (
     write_summary_text,
 )
 from copem_replay.viewer.lanes import UnitLists, find_linked_lists, write_list_fates, write_list_lanes
+from copem_replay.viewer.legend import write_legend_bars
 from copem_replay.viewer.line_of_sight import Sight, compute_sight, find_looked_at
 from copem_replay.viewer.sensors import FaultsShown, choose_named_units
 from copem_replay.viewer.sink import (

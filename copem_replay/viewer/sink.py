@@ -336,6 +336,11 @@ def to_nanoseconds(time_s: Any) -> Any:
     return np.rint(np.asarray(time_s) * 1e9).astype(np.int64)
 
 
+def show_seconds(time_s: float) -> str:
+    """Seconds with two decimals, never `-0.00`."""
+    return f"{round(time_s, 2) + 0.0:.2f}"
+
+
 def elapsed_ns(tracks: Tracks) -> Int:
     """(F,) when each list is available, ns since the log's start."""
     elapsed: Int = to_nanoseconds(tracks.common_arrives_s)

@@ -177,7 +177,7 @@ class TestDifferences:
                 name for name in dots(axes) if table.loc[(name, metric), "low"] * table.loc[(name, metric), "high"] > 0
             ]
             assert len(bold) == len(sure)
-        assert "The ground truth, an upper bound, is not drawn: GT −0.5 " in note(figure)
+        assert "The ground truth, an upper bound, is not drawn: GT −0.50 (all alike) s" in note(figure)
 
     def test_a_report_has_its_own_baseline(self, results: Results) -> None:
         found = compare_folders([results], baseline="hit")

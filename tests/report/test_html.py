@@ -247,7 +247,7 @@ class TestWords:
             "worse: hit and never 0 %."
         )
         assert lines[4] == (
-            f"half detects soonest, after {mean_s:.3g} s on average (an object that is never detected counts as "
+            f"half detects soonest, after {mean_s:.2f} s on average (an object that is never detected counts as "
             "4.5 s), sooner than the other 3."
         )
         difference = 0.5 - mean_s

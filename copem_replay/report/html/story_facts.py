@@ -242,7 +242,9 @@ def _tell_captured(row: Any, story: ObjectStory) -> str:
     listed_s, since_s = float(row.get("listed_s", np.nan)), max(float(row["in_sight_s"]), story.onset_s)
     if row["captured_s"] - listed_s > SAME_INSTANT_S and listed_s >= story.onset_s:
         fate = f"the radio lost {count_noun(lost, 'list')}" if lost else "these lists were late or held back"
-        told += f" (listed from {format_seconds(listed_s - story.onset_s)} on; {fate})"
+        after_s = listed_s - story.onset_s
+        since = f"{format_seconds(after_s)} on" if after_s > SAME_INSTANT_S else "the onset on"
+        told += f" (listed from {since}; {fate})"
     elif row["captured_s"] - since_s > SAME_INSTANT_S:
         told += f" ({_tell_sight(story, since_s)}, but in no list that counts)"
     return told + (f", whose list takes {format_seconds(took_s)}" if took_s > SAME_INSTANT_S and told else "")
@@ -254,5 +256,5 @@ def _tell_sight(story: ObjectStory, since_s: float) -> str:
 
 
 def format_seconds(time_s: float) -> str:
-    """`2.30 s`."""
-    return f"{time_s:.2f} s".replace("-", "−")
+    """`2.30 s`, never `−0.00 s`."""
+    return f"{round(time_s, 2) + 0.0:.2f} s".replace("-", "−")
