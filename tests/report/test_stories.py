@@ -148,3 +148,13 @@ class TestLatePaths:
     def test_of_the_truth_alone_there_is_none(self, results: Results) -> None:
         assert FIGURES["late_paths"].missing(results, Selection(("GT",))) == ""
         assert FIGURES["late_paths"].missing(results, Selection()) is None
+
+
+def test_a_dark_page_has_the_colours_of_its_theme(hidden: Path) -> None:
+    """In stories, too: a colour that stands out on paper may not on a dark screen."""
+    study = load_study(hidden)
+    [_, story] = story_parts(study)
+    light = {bytes(round(255 * channel) for channel in look.colour).hex() for look in study.looks.values()}
+    drawn = set(re.findall(r'(?:fill|stroke)="#([0-9a-f]{6})"', story))
+    assert drawn & light == set()
+    assert len(re.findall(r'"var\(--c-[0-9a-f]{6}-[0-9a-f]{6}\)"', story)) >= 2

@@ -49,7 +49,8 @@ def story_parts(study: ReportData) -> list[Html]:
         "the most different times, near the way of the ego."
     )
     named = ", ".join(too_short[:_NAMED]) + (", …" if len(too_short) > _NAMED else "")
-    short = f" Too short to judge, seen for less than 2 s before or after the onset: {named}." if too_short else ""
+    short = f" Too short to judge, seen for less than 2 s before or after the onset: {named}" if too_short else ""
+    short += "." if short and not short.endswith("…") else ""
     parts = [make_tag("p", said + short)]
     for name, of in told.items():
         parts.append(_story_element(ObjectStory(study, drive, of, lost.get(name, {})), log if several else None))

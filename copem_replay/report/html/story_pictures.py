@@ -11,7 +11,7 @@ import numpy as np
 from copem_replay.core.tracks import SAME_INSTANT_S, Float, Tracks
 from copem_replay.perception.visibility import box_corners
 from copem_replay.report.figures.selection import pick_evenly
-from copem_replay.report.html.markup import Html, css_colour, make_tag, replace_greys
+from copem_replay.report.html.markup import Html, css_colour, make_tag, replace_colours, replace_greys
 from copem_replay.report.html.story_facts import ObjectStory, format_seconds, unit_pose, world_at
 
 JUDGED_S = 2.0
@@ -20,7 +20,8 @@ _LANES = 6
 _WIDTH, _HEIGHT = 960, 360
 _PLAN_W, _PLAN_H, _GAP, _TOP = 312, 212, 12, 18
 _LANES_TOP, _LANE_LEFT = 250, 150
-_OBJECT, _HIDER = "#c2410c", "#7a1fa2"
+_OBJECT, _HIDER = "var(--object)", "var(--hides)"
+"""Set in `page.css`, for either theme."""
 _SPAN_M, _NEAR_M = 30.0, 60.0
 """Least width of a plan, and from how far away the ego and units are in it."""
 _MARGIN_M = 6.0
@@ -33,7 +34,7 @@ def draw_story(story: ObjectStory, hider: tuple[str, int] | None, said: str) -> 
         "svg", *_draw_plans(story, hider), *_draw_lanes(story), class_="story", role="img", aria_label=said,
         viewBox=f"0 0 {_WIDTH} {_HEIGHT}",
     )  # fmt: skip
-    return Html(replace_greys(picture))
+    return Html(replace_greys(replace_colours(picture, story.study.looks.values())))
 
 
 @dataclass(frozen=True)
