@@ -109,7 +109,7 @@ class _Scale:
     def number(self, value: float) -> str:
         """`85 %`, `0.73 s`; 0 and 100 % only for none and all."""
         if not self.is_share:
-            return f"{value + 0.0:.2f}".rstrip("0").rstrip(".").replace("-", "−") + " s"
+            return f"{round(value, 2) + 0.0:.2f} s".replace("-", "−")
         return f"{100 * value:.0f} %" if 0.005 <= value < 0.995 or value in (0, 1) else _format_edge(value)
 
     def say(self, value: float) -> str:

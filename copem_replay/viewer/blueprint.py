@@ -1,4 +1,4 @@
-"""Blueprint: the layout of a recording in the viewer, with a page per question, and its legend."""
+"""Blueprint: the layout of a recording in the viewer, with a page per question."""
 
 from __future__ import annotations
 
@@ -9,69 +9,29 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from copem_replay.core.colours import TRUTH as TRUTH_COLOUR
-from copem_replay.core.colours import Rgb
 from copem_replay.core.tracks import CLASSES, TRUTH
 from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.prepare import Replay
+from copem_replay.results.shown_objects import SHOWN_OBJECTS
 from copem_replay.viewer.camera import Camera
-from copem_replay.viewer.lanes import UnitLists, select_list_lanes
+from copem_replay.viewer.lanes import UnitLists, lanes_axis_s, select_list_lanes
+from copem_replay.viewer.legend import legend_view
 from copem_replay.viewer.map_view import asks_for_map, map_page
-from copem_replay.viewer.objects import SHOWN_OBJECTS
 from copem_replay.viewer.sink import (
-    EGO,
     ELAPSED,
     GROUND,
-    HIDES,
-    NOTICED,
-    RecordingSink,
     configuration_part,
     digest_texts,
     entity_names,
     make_entity_path,
     object_lanes_path,
     short_ids,
+    show_seconds,
     to_nanoseconds,
 )
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
-
-
-# Legend: bars in the colours of configurations, and of lines and boxes, with names on them, in a view of their own.
-
-_MARKS: tuple[tuple[str, Rgb, float], ...] = (
-    ("truth", TRUTH_COLOUR, 1.0),
-    ("ego", EGO, 6.0),
-    ("hides it", HIDES, 2.0),
-)
-_BAR_POINTS, _WIDE, _GAP = 7.0, 4.0, 1.0
-"""Half the height of a bar in points; its width and the gap beside it in rows."""
-LEGEND_X, LEGEND_Y = (-0.5, 2 * _WIDE + _GAP + 0.5), (-1.0, 6.0)
-"""Bounds of the legend's view: two columns and six rows."""
-
-
-def write_legend_bars(out: RecordingSink, colours: Mapping[str, Rgb]) -> None:
-    """Write a bar per configuration with its name, and in a second column those common to all configurations."""
-    import rerun as rr
-
-    columns = ([(name, colour, _BAR_POINTS) for name, colour in colours.items()], list(_MARKS))
-    rows = [(*row, c * (_WIDE + _GAP), float(k)) for c, column in enumerate(columns) for k, row in enumerate(column)]
-    drawn = rr.LineStrips2D(
-        [[[x, y], [x + _WIDE, y]] for _, _, _, x, y in rows],
-        colors=[colour for _, colour, *_ in rows],
-        radii=rr.Radius.ui_points([points for _, _, points, *_ in rows]),
-    )
-    out.static(["legend", "bars"], drawn)
-    # A label stands below its point: a point a little higher puts it on the bar.
-    names = rr.Points2D(
-        [[x + _WIDE / 2, y - 0.4] for *_, x, y in rows],
-        labels=[name for name, *_ in rows],
-        colors=[NOTICED],
-        radii=rr.Radius.ui_points(0.0),
-        show_labels=True,
-    )
-    out.static(["legend", "names"], names)
 
 
 # Pages.
@@ -125,8 +85,13 @@ class RecordingContent:
         return f"{short_ids(self.replay.scene)[object_ix]} {CLASSES[self.replay.scene.object_class[object_ix]]}"
 
     def axis(self, object_ix: int) -> rrb.TimeAxis:
-        """The time axis of an object's lanes and curves."""
+        """The time axis of an object's curves."""
         return make_time_axis(*self.axes_s[object_ix])
+
+    def lanes_axis_s(self, object_ix: int) -> tuple[float, float]:
+        """First and last second of an object's lanes."""
+        onset_s = float(self.episodes[object_ix]["onset_s"].iloc[0])
+        return lanes_axis_s(self.axes_s[object_ix], onset_s, self.configurations)
 
     def title(self, configuration: str, suffix: str = "") -> str:
         """The title of a view: “bursty · whole run: 18 of 24 known, 3 false”; `suffix`: after the name.
@@ -249,7 +214,7 @@ def _last_and_first(content: RecordingContent, object_ix: int) -> list[tuple[str
     chosen = dict.fromkeys([ranked[0], *between, ranked[-1]])
     label = content.id_of(object_ix)
     titles = {
-        name: f"{name}: {label} known {s:.2f} s after its onset" if np.isfinite(s) else f"{name}: {label} never known"
+        name: f"{name}: {label} " + (f"known {show_seconds(s)} s after its onset" if np.isfinite(s) else "never known")
         for name, s in when_s.items()
     }
     return [(name, titles[name]) for name in chosen]
@@ -385,7 +350,7 @@ def lanes_view(content: RecordingContent, object_ix: int, under: Sequence[str] =
         origin=make_entity_path(*object_lanes_path(scene, object_ix)),
         contents=["+ $origin/**", *(f"+ {path}" for path in under)] if under else "$origin/**",
         name=f"{content.id_of(object_ix)}, onset {onset_s:.1f} s",
-        time_view=content.axis(object_ix),
+        time_view=make_time_axis(*content.lanes_axis_s(object_ix)),
     )
 
 
@@ -394,14 +359,6 @@ def difference_view() -> rrb.TextDocumentView:
     import rerun.blueprint as rrb
 
     return rrb.TextDocumentView(origin="difference", name="What difference it made")
-
-
-def legend_view() -> rrb.Spatial2DView:
-    """The legend."""
-    import rerun.blueprint as rrb
-
-    bounds = rrb.VisualBounds2D(x_range=LEGEND_X, y_range=LEGEND_Y)
-    return rrb.Spatial2DView(origin="legend", name="Legend", background=GROUND, visual_bounds=bounds)
 
 
 def _curves_view(
@@ -420,7 +377,7 @@ def _curves_view(
     )
 
 
-LAYOUT = 5
+LAYOUT = 6
 """Version of the blueprint, raised with every change: a viewer prefers the one it has kept for an application id."""
 
 

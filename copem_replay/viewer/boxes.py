@@ -219,7 +219,7 @@ class FalseEntries:
             self._out.columns(self._path, available_ns, strips.partition(counts * _LINES))
         if not self._shown:
             self._out.static(
-                self._path, rr.LineStrips3D.from_fields(colors=[self._colour], radii=rr.Radius.ui_points(0.9))
+                self._path, rr.LineStrips3D.from_fields(colors=[self._colour], radii=rr.Radius.ui_points(1.2))
             )
         self._shown = True
 
@@ -233,12 +233,14 @@ class FalseEntries:
 
 _DASHES = np.array([(0.0, 0.2), (0.4, 0.6), (0.8, 1.0)])
 """Where a side is drawn, as shares of its length: it begins and ends with a dash, so that corners are closed."""
+CROSS_M = 4.0
+"""Least length of the lines of a cross: that over a false pedestrian would be 4 pixels wide."""
 _LINES = 4 * len(_DASHES) + 2
 """Lines of a false entry: dashes of four sides, and two of the cross."""
 
 
 def _dashed_crosses(tracks: Tracks, rows: Int) -> np.ndarray:
-    """(R, `_LINES`, 2, 3) ends of the lines of false entries, at the height of their tops."""
+    """(R, `_LINES`, 2, 3) ends of the lines of false entries, at the height of their tops; crosses reach beyond."""
     along = np.array([1.0, -1.0, -1.0, 1.0]) * tracks.length_m[0, rows, None] / 2
     across = np.array([1.0, 1.0, -1.0, -1.0]) * tracks.width_m[0, rows, None] / 2
     cos, sin = np.cos(tracks.yaw_rad[0, rows, None]), np.sin(tracks.yaw_rad[0, rows, None])
@@ -254,6 +256,9 @@ def _dashed_crosses(tracks: Tracks, rows: Int) -> np.ndarray:
     side = np.roll(corner, -1, axis=1) - corner
     dashes = corner[:, :, None, None] + side[:, :, None, None] * _DASHES[..., None]  # (R, 4, 3, 2, 3)
     cross = corner[:, [[0, 2], [1, 3]]]
+    middle = cross.mean(axis=2, keepdims=True)
+    size_m = np.linalg.norm(cross[:, :, 1:] - cross[:, :, :1], axis=-1, keepdims=True)
+    cross = middle + (cross - middle) * np.maximum(1.0, CROSS_M / np.maximum(size_m, 0.1))
     return np.concatenate([dashes.reshape(len(rows), _LINES - 2, 2, 3), cross], axis=1).astype(np.float32)
 
 

@@ -9,11 +9,10 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
-from copem_replay.core.interpolation import interpolate_states
-from copem_replay.core.tracks import Float, Int, Scene
+from copem_replay.core.tracks import Float, Int
 from copem_replay.experiment.schema import Experiment
-from copem_replay.perception.sensor_poses import find_carrier
 from copem_replay.pipeline.prepare import Replay
+from copem_replay.results.shown_objects import find_followed, interpolate_places
 from copem_replay.viewer.sink import (
     WAITING,
     RecordingSink,
@@ -77,7 +76,7 @@ def camera_on_ego(
     truth, on = replay.truth, find_followed(replay.scene, experiment)
     if on >= 0:
         onset_s = np.array([next(iter(stories.values()), (0.0, 0.0))[0]])
-        own = interpolate_places(replay, experiment, np.array([on]), onset_s)[:, 0]
+        own = interpolate_places(replay.scene, replay.truth, experiment, np.array([on]), onset_s)[:, 0]
         if np.isnan(own[0]):
             own = _own_states(replay, on)[1][:, 0]
         ahead = np.array([np.cos(own[3]), np.sin(own[3]), 0.0])
@@ -151,7 +150,8 @@ def _as_seen(
     replay: Replay, experiment: Experiment, object_ix: int, time_s: Float, target: Float, yaw_rad: Float
 ) -> Float:
     """(3, K) ahead, left and up of the target, where an object is; NaN while it is absent."""
-    off = interpolate_places(replay, experiment, np.full(len(time_s), object_ix), time_s)[:3] - target
+    alone = np.full(len(time_s), object_ix)
+    off = interpolate_places(replay.scene, replay.truth, experiment, alone, time_s)[:3] - target
     cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
     return np.stack([cos * off[0] + sin * off[1], cos * off[1] - sin * off[0], off[2]])
 
@@ -206,9 +206,9 @@ def camera_following(replay: Replay, experiment: Experiment, table: pd.DataFrame
     """A camera that follows an object of the table, with the ego in view at the onset if `CLOSE_M` allows."""
     scene = replay.scene
     onset_s = table["onset_s"][table["object_id"] == scene.object_ids[object_ix]].to_numpy(dtype=float)[:1]
-    target = interpolate_places(replay, experiment, np.array([object_ix]), onset_s)[:3, 0]
+    target = interpolate_places(replay.scene, replay.truth, experiment, np.array([object_ix]), onset_s)[:3, 0]
     on = find_followed(scene, experiment)
-    own = interpolate_places(replay, experiment, np.array([max(on, 0)]), onset_s)[:, 0]
+    own = interpolate_places(replay.scene, replay.truth, experiment, np.array([max(on, 0)]), onset_s)[:, 0]
     has_ego = on >= 0 and not np.isnan(own[0])
     towards = _view_direction(own[3] if has_ego else 0.0)
     away_m = float(np.clip(np.hypot(*(own - np.append(target, 0))[:2]) if has_ego else 0.0, *CLOSE_M))
@@ -255,20 +255,6 @@ def write_camera_origin(out: RecordingSink, replay: Replay, eye: Camera) -> None
     if elapsed[0] > 0:  # before the object comes, the camera waits where it will
         elapsed, place = np.append(0, elapsed), np.concatenate([place[:1], place])
     out.columns(eye.path, elapsed, rr.Transform3D.columns(translation=place))
-
-
-def find_followed(scene: Scene, experiment: Experiment) -> int:
-    """Index of the ego, without one of what carries the unit of `distance_to`; −1: there is neither."""
-    unit = experiment.units.get(experiment.measure.distance_to)
-    return scene.ego_ix if scene.ego_ix >= 0 or unit is None else find_carrier(scene, unit)
-
-
-def interpolate_places(replay: Replay, experiment: Experiment, objects: Int, time_s: Float) -> Float:
-    """(4, K) x, y, z and heading of objects (K,) at times (K,), in s; NaN while absent."""
-    states, _ = interpolate_states(
-        replay.truth, objects, time_s, t0_ns=replay.scene.t0_ns, max_gap_s=experiment.max_gap_s
-    )
-    return np.stack([states["x_m"], states["y_m"], states["z_m"], states["yaw_rad"]])
 
 
 def _view_direction(yaw_rad: float) -> Float:

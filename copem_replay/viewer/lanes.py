@@ -1,10 +1,10 @@
 """Lanes: the status of each shown object in each configuration over time, and lost, late and overtaken lists of units.
 
 An entity per object and configuration, such as `lanes/6_pedestrian/2_PEM`; the number is the configuration's place in
-the file. What holds when the object's axis begins is told after the configuration's name, “PEM: out of view”. Changes
-too short to follow are left out, but known begins exactly at `detection_s`, with how long after the onset, “0.60 s
-known”. A mark ends at the onset, white and black, so that it stands out in any theme. A lane is empty while the object
-is absent.
+the file. A lane begins with the configuration's name: the viewer's own titles of lanes are paths. Changes too short to
+follow are left out, but known begins exactly at `detection_s`, with how long after the onset, “0.60 s known”. Words
+that do not fit into their span are shortened or left out. A mark ends at the onset, white and black, so that it stands
+out in any theme. A lane is empty while the object is absent.
 
 An entity per configuration and unit, such as `lists/2_bursts/rsu1`, under the lanes of the objects, shows lists sent by
 a link, if one did not come in time; events say it in words.
@@ -12,6 +12,7 @@ a link, if one did not come in time; events say it in words.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -25,6 +26,7 @@ from copem_replay.core.colours import Rgb
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import SAME_INSTANT_S, TRUTH, Float, Int, Scene
 from copem_replay.experiment.schema import Experiment
+from copem_replay.results.shown_objects import AFTER_S, BEFORE_S, LEAST_S
 from copem_replay.viewer.sink import (
     ABSENT,
     CAPTURED,
@@ -39,6 +41,7 @@ from copem_replay.viewer.sink import (
     make_distinct,
     plain_part,
     short_ids,
+    show_seconds,
     status_colour,
     to_nanoseconds,
 )
@@ -55,8 +58,14 @@ MARK = 1 / 40
 """Length of the mark that ends at the onset, as a share of the axis: just wide enough for both halves."""
 FLAG = 6
 """Length of words such as “0.60 s known”, as a multiple of the mark's."""
+NAME: Rgb = (58, 60, 66)
+"""Ground of the configuration's name, where a lane begins: no colour of a status."""
 ONSET_IS = ("onset", "onset of the object")
 """The two halves of the mark."""
+WIDTH_POINTS, LETTER_POINTS, PADDING_POINTS = 380.0, 7.0, 10.0
+"""Width of the narrowest lanes in a window of 1280 × 720, of a letter (rounded up), and of what is beside words."""
+MOST_NAME = 0.42
+"""Most of a lane's width that is before the onset, for the name."""
 _STEADY_NS = round(STEADY_S * 1e9)
 
 
@@ -75,32 +84,107 @@ def write_lanes(
 ) -> None:  # fmt: skip
     """Write a lane per shown object and configuration, with a mark that ends at the onset.
 
-    `axes`: first and last second of each object's axis, by its index.
+    `axes`: first and last second of each object's lanes, by its index.
     """
     import rerun as rr
 
     ids, units = short_ids(scene), [*experiment.units, TRUTH]
     for m, k in enumerate(sight.object_ix.tolist()):
-        mark_ns = round((axes[k][1] - axes[k][0]) * MARK * 1e9)
+        axis_ns = tuple(to_nanoseconds(axes[k]).tolist())
         for place, (name, status) in enumerate(statuses.items()):
             if not len(status.elapsed_ns):
                 continue
             spans = smooth_status(status.elapsed_ns, status.status[:, m])
             texts = [_span_text(ids, units, sight, status, m, span) for span in spans]
             begins = status.elapsed_ns[[span.first for span in spans]]
-            onset_ns = int(clocks[name].onset_ns[k])
-            _add_flag(begins, texts, int(clocks[name].known_ns[k]), onset_ns, FLAG * mark_ns)
             tints = [status_colour(span.status, colours[name]) if span.status else ONSET[0] for span in spans]
-            style = {text: tint for text, tint in zip(texts, tints, strict=True) if text}
-            style |= dict(zip(ONSET_IS, ONSET, strict=True))
-            elapsed, texts = _insert_onset(begins, texts, onset_ns, mark_ns)
-            style |= _add_name(elapsed, texts, name, to_nanoseconds(axes[k][0]), style)
+            clock_ns = int(clocks[name].onset_ns[k]), int(clocks[name].known_ns[k])
+            elapsed, values, styles = _tell_lane(begins, texts, tints, name, clock_ns, axis_ns)
             path = lane_path(scene, k, place, name)
-            labels = [text for text in texts if text is not None]  # the row is empty while the object is absent
-            states = rr.StateChange.columns(state=pa.array(labels, pa.string()))
-            out.columns(path, elapsed, states.partition(np.array([text is not None for text in texts], dtype=np.int64)))
-            values = list(style)
-            out.static(path, rr.StateConfiguration(values=values, labels=values, colors=list(style.values())))
+            told = [value for value in values if value is not None]  # the row is empty while the object is absent
+            states = rr.StateChange.columns(state=pa.array(told, pa.string()))
+            out.columns(path, elapsed, states.partition(np.array([v is not None for v in values], dtype=np.int64)))
+            labels, drawn = zip(*styles.values(), strict=True)
+            out.static(path, rr.StateConfiguration(values=list(styles), labels=list(labels), colors=list(drawn)))
+
+
+def _tell_lane(
+    begins: Int, texts: list[str | None], tints: Sequence[Rgb], name: str, clock_ns: tuple[int, int],
+    axis_ns: tuple[int, int],
+) -> tuple[Int, list[str | None], dict[str, tuple[str, Rgb]]]:  # fmt: skip
+    """Instants and values of a lane with its name, flag and mark; label and colour of each value.
+
+    `texts`, `tints`: of spans that begin at `begins`. `clock_ns`: onset of the object, and when it is known.
+    """
+    (onset_ns, known_ns), (first_ns, last_ns) = clock_ns, axis_ns
+    mark_ns = round((last_ns - first_ns) * MARK)
+    _add_flag(begins, texts, known_ns, onset_ns, FLAG * mark_ns)
+    colour_of = {text: tint for text, tint in zip(texts, tints, strict=True) if text}
+    colour_of |= dict(zip(ONSET_IS, ONSET, strict=True)) | {_name_text(name): NAME}
+    elapsed, texts = _insert_onset(begins, texts, onset_ns, mark_ns)
+    until_ns = min(onset_ns - mark_ns, known_ns)
+    if until_ns - first_ns >= (last_ns - first_ns) * _words_points(len(name)) / WIDTH_POINTS:
+        elapsed, texts = _insert_name(elapsed, texts, name, first_ns, until_ns)
+    else:
+        _prepend_name(elapsed, texts, name, first_ns)
+    values, label_of = _fit_words(elapsed, texts, axis_ns)
+    return elapsed, values, {value: (label, _tint(value, name, colour_of)) for value, label in label_of.items()}
+
+
+def lanes_axis_s(axis_s: tuple[float, float], onset_s: float, configurations: Sequence[str]) -> tuple[float, float]:
+    """First and last second of an object's lanes: with room for names before the onset, and for the last flag.
+
+    `axis_s`: of the object, from 0.5 s before its onset, or before it is known, to 0.5 s after it is last known.
+    """
+    longest = max(map(len, configurations), default=0)
+    name = min((_words_points(longest) + 2) / WIDTH_POINTS + MARK, MOST_NAME)
+    flag = _words_points(len("10.00 s known")) / WIDTH_POINTS
+    start_s = min(onset_s, axis_s[0] + BEFORE_S)
+    end_s = max(axis_s[1] - AFTER_S, start_s)
+    length_s = max((end_s - start_s) / (1 - name - flag), LEAST_S)
+    first_s = max(start_s - name * length_s, 0.0)
+    return first_s, max(first_s + length_s, end_s + flag * length_s)
+
+
+def _words_points(letters: int) -> float:
+    return letters * LETTER_POINTS + PADDING_POINTS
+
+
+def _fit_words(
+    begins: Int, texts: Sequence[str | None], axis_ns: tuple[int, int]
+) -> tuple[list[str | None], dict[str, str]]:
+    """Values of states, and the label of each value: as many of its words as fit into its span on the axis.
+
+    A state whose words are shortened here and not elsewhere has a space more at the end of its value. Without words the
+    label is a space: for an empty one the viewer takes the value.
+    """
+    per_point_ns = (axis_ns[1] - axis_ns[0]) / WIDTH_POINTS
+    ends = np.append(begins[1:], axis_ns[1])
+    values: list[str | None] = []
+    label_of = dict.fromkeys(ONSET_IS, " ")
+    for text, begin_ns, end_ns in zip(texts, begins.tolist(), ends.tolist(), strict=True):
+        if text is None or text in ONSET_IS:
+            values.append(text)
+            continue
+        lasts_ns = min(end_ns, axis_ns[1]) - max(begin_ns, axis_ns[0])
+        room = int((lasts_ns / per_point_ns - PADDING_POINTS) / LETTER_POINTS) if lasts_ns > 0 else len(text)
+        label = next((words for words in _shorten_words(text) if len(words) <= room), " ")
+        value = next(text + k * " " for k in range(len(texts) + 1) if label_of.get(text + k * " ", label) == label)
+        label_of[value] = label
+        values.append(value)
+    return values, label_of
+
+
+def _shorten_words(text: str) -> Iterator[str]:
+    """Words of a span, the longest first: “behind 3 (from ego)”, “behind 3”; “0.60 s known”, “0.60 s”."""
+    yield text.removesuffix(": ")
+    yield text.partition(", then ")[0]
+    if ": " in text:
+        yield text.partition(": ")[0]
+    yield text.partition(" (from ")[0]
+    yield text.partition(" from ")[0]
+    if flag := re.match(r"-?[0-9.]+ s ", text):
+        yield flag[0].rstrip()
 
 
 def smooth_status(elapsed_ns: Int, status: Int) -> list[Span]:
@@ -148,25 +232,39 @@ def _add_flag(begins: Int, texts: list[str | None], known_ns: int, onset_ns: int
     Where that lasts for less than `room_ns`, too short for words, what follows says it, too.
     """
     for k in np.flatnonzero(begins == known_ns)[:1].tolist():
-        texts[k] = flag = f"{(known_ns - onset_ns) / 1e9:.2f} s {texts[k]}"
+        texts[k] = flag = f"{show_seconds((known_ns - onset_ns) / 1e9)} s {texts[k]}"
         if k + 1 < len(texts) and texts[k + 1] is not None and begins[k + 1] - known_ns < room_ns:
             texts[k + 1] = f"{flag}, then {texts[k + 1]}"
 
 
-def _add_name(
-    begins: Int, texts: list[str | None], name: str, first_ns: int, style: Mapping[str, Rgb]
-) -> dict[str, Rgb]:
-    """Put the configuration's name before the first text on the axis: the viewer's own titles of lanes are paths.
+def _tint(value: str, name: str, colour_of: Mapping[str, Rgb]) -> Rgb:
+    """The colour of a value: spaces at its end and a name before it change nothing."""
+    plain = value if value in colour_of else value.rstrip().removeprefix(_name_text(name))
+    return colour_of[plain]
 
-    Returns what `style` lacks, the colour of that text.
-    """
-    current = max(int(np.searchsorted(begins, first_ns, side="right")) - 1, 0)
-    told = next((k for k in range(current, len(texts)) if texts[k] is not None), None)
-    text = None if told is None else texts[told]
-    if told is None or text is None:
-        return {}
-    texts[told] = named = f"{name}: {text}"
-    return {named: style[text]}
+
+def _name_text(name: str) -> str:
+    return f"{name}: "
+
+
+def _insert_name(
+    elapsed_ns: Int, texts: list[str | None], name: str, first_ns: int, until_ns: int
+) -> tuple[Int, list[str | None]]:
+    """Put the configuration's name from the begin of the axis to `until_ns`, in place of what holds then."""
+    before = int(np.searchsorted(elapsed_ns, first_ns))
+    after = int(np.searchsorted(elapsed_ns, until_ns, side="right")) - 1  # what holds at `until_ns`
+    held = texts[after] if after >= 0 else None
+    return np.concatenate([elapsed_ns[:before], [first_ns, until_ns], elapsed_ns[after + 1 :]]), [
+        *texts[:before], _name_text(name), held, *texts[after + 1 :]
+    ]  # fmt: skip
+
+
+def _prepend_name(elapsed_ns: Int, texts: list[str | None], name: str, first_ns: int) -> None:
+    """Put the name before the first text on the axis, “PEM: out of view”: it has no room of its own."""
+    current = max(int(np.searchsorted(elapsed_ns, first_ns, side="right")) - 1, 0)
+    told_at = next((k for k in range(current, len(texts)) if texts[k] is not None), None)
+    if told_at is not None:
+        texts[told_at] = f"{_name_text(name)}{texts[told_at]}"
 
 
 def _insert_onset(

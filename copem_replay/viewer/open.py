@@ -29,7 +29,8 @@ from copem_replay.core.errors import CopemError, OutputError
 from copem_replay.core.files import portable_name
 from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.results.read import Results, open_results
-from copem_replay.viewer.sink import BEFORE_S, ELAPSED, OPENS
+from copem_replay.results.shown_objects import BEFORE_S
+from copem_replay.viewer.sink import ELAPSED, OPENS
 
 HOST = "127.0.0.1"
 READY_S, AGAIN_S = 60.0, 0.2

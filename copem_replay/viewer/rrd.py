@@ -22,9 +22,10 @@ from copem_replay.experiment.schema import Experiment
 from copem_replay.perception.observation import Observations
 from copem_replay.pipeline.one_run import share_curves
 from copem_replay.pipeline.prepare import Replay
+from copem_replay.results.shown_objects import ShownObjects, axis_s, choose_shown_objects, find_opening_s
 from copem_replay.results.write import Exporter, RunToExport
 from copem_replay.viewer import boxes, curves, lanes, sensors
-from copem_replay.viewer.blueprint import NEAR_BY, RecordingContent, build_blueprint, view_aspect, write_legend_bars
+from copem_replay.viewer.blueprint import NEAR_BY, RecordingContent, build_blueprint, view_aspect
 from copem_replay.viewer.camera import (
     camera_above,
     camera_following,
@@ -45,16 +46,15 @@ from copem_replay.viewer.events import (
     write_summary_text,
 )
 from copem_replay.viewer.lanes import UnitLists, find_linked_lists, write_list_fates, write_list_lanes
+from copem_replay.viewer.legend import write_legend_bars
 from copem_replay.viewer.line_of_sight import Sight, compute_sight, find_looked_at
 from copem_replay.viewer.map_view import NO_PLACE, asks_for_map, write_map
-from copem_replay.viewer.objects import ShownObjects, choose_shown_objects, find_opening_s
 from copem_replay.viewer.sensors import FaultsShown, choose_named_units
 from copem_replay.viewer.sink import (
     OPENS,
     RecordingPart,
     RecordingSink,
     ViewerStream,
-    axis_s,
     configuration_part,
     digest_texts,
     entity_names,
@@ -104,7 +104,7 @@ def write_rrd(
     # The truth is in every view, so it needs none of its own; configurations that are compared were chosen.
     beside = [name for name in first if name not in truths] if baseline is None else []
     parts = split_into_files(beside or list(first), baseline)
-    shown = choose_shown_objects(replay, experiment, table)
+    shown = choose_shown_objects(replay.scene, replay.truth, experiment, table)
     objects = list(shown.object_ix)
     collector = TrackCollector(objects)
     with ExitStack() as stack:
@@ -294,7 +294,8 @@ def _write_knowledge(file: _RecordingFile, run_tracks: Mapping[str, FusedTracks]
         first_unit = dict(zip(detections["object_id"].map(scene.object_number), detections["first_unit"], strict=True))
         write_listing_lines(out, name, replay, experiment, fused_tracks, sight, colour, first_unit)
         curves.write_position_errors(out, replay, experiment, name, fused_tracks.fused, content.objects, colour)
-    lanes.write_lanes(out, scene, experiment, sight, statuses, file.colours, file.clocks, content.axes_s)
+    axes = {k: content.lanes_axis_s(k) for k in content.objects}
+    lanes.write_lanes(out, scene, experiment, sight, statuses, file.colours, file.clocks, axes)
 
 
 def _write_shares(file: _RecordingFile, observed: Observations, sight: Sight) -> None:

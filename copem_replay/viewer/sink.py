@@ -336,6 +336,11 @@ def to_nanoseconds(time_s: Any) -> Any:
     return np.rint(np.asarray(time_s) * 1e9).astype(np.int64)
 
 
+def show_seconds(time_s: float) -> str:
+    """Seconds with two decimals, never `-0.00`."""
+    return f"{round(time_s, 2) + 0.0:.2f}"
+
+
 def elapsed_ns(tracks: Tracks) -> Int:
     """(F,) when each list is available, ns since the log's start."""
     elapsed: Int = to_nanoseconds(tracks.common_arrives_s)
@@ -391,26 +396,6 @@ def split_into_files(configurations: Sequence[str], baseline: str | None = None)
         last = f"-{begin + len(names) - 1}" if len(names) > 1 else ""
         parts.append(RecordingPart((*shared, *names), f".configurations_{begin}{last}"))
     return parts
-
-
-# Time axes of an object's lanes and curves.
-
-BEFORE_S, AFTER_S, LEAST_S = 0.5, 0.5, 2.0
-"""Margins before the onset and after the last detection, and the shortest axis: longer ones make changes narrow."""
-UNKNOWN_S = 10.0
-"""Length after the onset, if no configuration detects the object; it ends earlier with the episode."""
-
-
-def axis_s(episodes: pd.DataFrame, end_s: float) -> tuple[float, float]:
-    """First and last second of an object's axis: 0.5 s before the onset to 0.5 s after the last detection.
-
-    `episodes`: rows of one object and run, of all configurations.
-    """
-    onset_s = float(episodes["onset_s"].iloc[0])
-    detected_s = episodes["detection_s"][episodes["detected"]]
-    last_s = float(detected_s.max()) if len(detected_s) else min(float(episodes["ended_s"].max()), onset_s + UNKNOWN_S)
-    first_s = max(min(onset_s, float(detected_s.min()) if len(detected_s) else onset_s) - BEFORE_S, 0.0)
-    return first_s, min(max(last_s + AFTER_S, first_s + LEAST_S), max(end_s, first_s + AFTER_S))
 
 
 def pair_points(ends: np.ndarray) -> pa.Array:

@@ -177,7 +177,7 @@ class TestDifferences:
                 name for name in dots(axes) if table.loc[(name, metric), "low"] * table.loc[(name, metric), "high"] > 0
             ]
             assert len(bold) == len(sure)
-        assert "The ground truth, an upper bound, is not drawn: GT −0.5 " in note(figure)
+        assert "The ground truth, an upper bound, is not drawn: GT −0.50 (all alike) s" in note(figure)
 
     def test_a_report_has_its_own_baseline(self, results: Results) -> None:
         found = compare_folders([results], baseline="hit")
@@ -347,7 +347,14 @@ def test_headers_have_units_also_of_own_metrics() -> None:
     assert [format_value("cost", value) for value in (0.2, -0.0, 4.87e-5, -4.87e-5, 12.345, 4321.5)] == [
         "0.20", "0.00", "< 0.01", "> −0.01", "12.35", "4322",
     ]  # fmt: skip
-    assert [format_signed_difference("late_share", value) for value in (0.125, -0.5, 1e-12)] == ["+12.5", "−50", "±0"]
+    assert [format_signed_difference("late_share", value) for value in (0.125, -0.5, 1e-12)] == [
+        "+12.50", "−50.00", "±0",
+    ]  # fmt: skip
+    assert [format_signed_difference("cost", value) for value in (4e-3, -4e-3, 5.1e-3)] == [
+        "< 0.01",
+        "> −0.01",
+        "+0.01",
+    ]
     assert sort_columns(["n", "detected_share", "ttd_rmst_s"]) == ["ttd_rmst_s", "detected_share", "n"]
 
 

@@ -247,11 +247,11 @@ class TestWords:
             "worse: hit and never 0 %."
         )
         assert lines[4] == (
-            f"half detects soonest, after {mean_s:.3g} s on average (an object that is never detected counts as "
+            f"half detects soonest, after {mean_s:.2f} s on average (an object that is never detected counts as "
             "4.5 s), sooner than the other 3."
         )
         difference = 0.5 - mean_s
-        assert lines[5].startswith(f"Later, the interval of the difference excluding 0: late (+{difference:.3g} s [")
+        assert lines[5].startswith(f"Later, the interval of the difference excluding 0: late (+{difference:.2f} s [")
         assert lines[5].index("hit (") < lines[5].index("never (")
         assert "The same figures pick the winner, which flatters it a little." in lines
         assert "never never detects any object." in lines
@@ -318,7 +318,7 @@ class TestWords:
         few = "No interval: 2 objects of one drive, fewer than 5."
         assert few in lines
         assert lines[4] == "half and second detect every object at its onset. The other 2 are below."
-        assert re.match(r"Later, without an interval: late \(\+0\.5 s\), never \(\+4\.5 s\)\.", lines[5])
+        assert re.match(r"Later, without an interval: late \(\+0\.50 s\), never \(\+4\.50 s\)\.", lines[5])
         assert not any("shortest" in line or "soonest" in line for line in lines)
         three = ("  late: {units: [ego], latency_s: 0.5}", "  late: {units: [ego]}")
         text = changed(("  half: {units: [weak]}", "  half: {units: [ego]}"), second, three, ALONE[3])

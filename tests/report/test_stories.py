@@ -7,18 +7,21 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 
 import copem_replay as cr
 from copem_replay.report.figures import FIGURES, Selection
-from copem_replay.report.figures.paths import average_unknown, late_paths_figure
+from copem_replay.report.figures.paths import average_unknown, late_paths_figure, read_drive
 from copem_replay.report.html.page import build_page
 from copem_replay.report.html.stories import choose_stories, story_parts
+from copem_replay.report.html.story_facts import find_lost
 from copem_replay.report.html.study import load_study
 from copem_replay.results.read import Results, read_results
+from copem_replay.results.shown_objects import choose_shown_objects
 from tests.helpers.recordings import Obj, pedestrian, write_recording
 from tests.helpers.report_pages import ALONE, ONE, Page, changed, replayed, with_rows
 
@@ -28,39 +31,6 @@ MAST = (
     ("  late: {units: [ego], latency_s: 0.5}", "  late: {units: [ego]}"),
 )
 """A change: `half` has a mast that sees the pedestrian at the side, `late` does not."""
-
-
-def rows(**times_s: list[float | None]) -> pd.DataFrame:
-    """Rows of one run: by object the times of its configurations; None: never in 4 s."""
-    table = [(name, str(k), time_s) for name, of in times_s.items() for k, time_s in enumerate(of)]
-    frame = pd.DataFrame(table, columns=["object_id", "configuration", "time_to_detection_s"])
-    frame = frame.assign(onset_s=0.0, ended_s=4.0)
-    return frame.assign(unknown_s=frame["time_to_detection_s"].astype(float).fillna(4.0))
-
-
-class TestChoice:
-    def test_the_latest_and_those_that_differ_most(self) -> None:
-        table = rows(
-            at_once=[0.0, 0.0], a=[3.0, 3.0], b=[2.9, 2.9], c=[None, 0.0], d=[0.0, 3.5], e=[0.0, 1.0], f=[0.2, 0.2],
-            g=[0.0, 0.1],
-        )  # fmt: skip
-        assert choose_stories(table) == {
-            "a": "unknown longest",
-            "b": "unknown longest",
-            "c": "unknown longest",
-            "d": "differs most",
-            "e": "differs most",
-            "g": "differs most",
-        }
-
-    def test_what_is_too_short_to_judge_only_if_all_are(self) -> None:
-        table = rows(short=[1.0, 1.5], long=[0.2, 0.3])
-        table.loc[table["object_id"] == "short", "ended_s"] = 1.9
-        assert list(choose_stories(table)) == ["long"]
-        assert list(choose_stories(table[table["object_id"] == "short"])) == ["short"]
-
-    def test_of_what_all_know_at_once_there_is_none(self) -> None:
-        assert choose_stories(rows(a=[0.0, 0.0])) == {}
 
 
 @pytest.fixture(scope="module")
@@ -87,11 +57,55 @@ def test_a_story_names_what_hides_and_who_listed_it(hidden: Path) -> None:
     assert 'viewBox="0 0 960 360"' in story
 
 
+def test_stories_are_those_of_the_viewer(hidden: Path) -> None:
+    """One rule: nearer to the way of the ego before farther from it, as `tests/viewer/test_objects.py` has it."""
+    results = read_results(hidden)
+    (table,) = results.each(log="drive", every=True)
+    table = table[table["run"] == 0]
+    drive = read_drive(results, "drive")
+    rows = table[table["configuration"] != "GT"].assign(unknown_s=1.0)
+    assert choose_stories(drive, table, rows) == (["3"], ("3",)), (
+        "in the log for less than 2 s before its onset, but there is no other"
+    )
+    assert choose_stories(drive, table, rows.assign(unknown_s=0.0)) == ([], ("3",)), "all know it at its onset"
+    shown = choose_shown_objects(drive.scene, drive.truth, drive.experiment, table)
+    assert [drive.scene.object_ids[k] for k in shown.object_ix] == ["3"]
+
+
+@pytest.mark.parametrize(("until_s", "expected"), [(1.0, 0), (1.4, 2), (3.0, 3)])
+def test_lists_that_the_radio_lost(until_s: float, expected: int) -> None:
+    """Five lists with object 0 at 1.0 … 1.4 s; lost are those at 1.1, 1.2 and 1.4 s, at 0.9 s one without it."""
+    captured_s = np.array([0.9, 1.0, 1.1, 1.2, 1.3, 1.4])
+    arrives_s = np.array([np.inf, 1.1, np.inf, np.inf, 1.4, np.inf])
+    lists = SimpleNamespace(
+        frame_ix=np.arange(6), row_object_ix=np.array([1, 0, 0, 0, 0, 0]), valid=np.ones((1, 6), dtype=bool),
+        captured_s=captured_s, common_arrives_s=arrives_s, frame_unit_ix=np.zeros(6, dtype=np.int64),
+    )  # fmt: skip
+    tracks: Any = SimpleNamespace(received=lists, by_link=np.ones(6, dtype=bool))
+    assert len(find_lost(tracks, 0, 0.0, until_s)) == expected
+    tracks.by_link[2] = False  # held back: never sent
+    assert len(find_lost(tracks, 0, 0.0, until_s)) == max(expected - 1, 0)
+
+
+def test_the_sentence_counts_lists_that_the_radio_lost(tmp_path: Path) -> None:
+    """Of ten lists a second, all with the object, one in seven arrives: all before the one that counts are lost."""
+    link = "links: {lossy: {reception: {kind: constant, probability: 0.15}}}\nconfigurations:"
+    changes = ("configurations:", link), ("half: {units: [weak]}", "half: {units: [ego], link: lossy}")
+    folder = replayed(tmp_path, changed(ONE, ("seed: 1", "seed: 4"), *changes, *ALONE))
+    (rows,) = read_results(folder).each(log="drive")
+    [row] = rows[rows["run"] == 0].itertuples(index=False)
+    lost = round((row.captured_s - row.onset_s) / 0.1)
+    assert lost > 1
+    words = Page(build_page(load_study(folder))).words
+    assert f"half knows it after {row.time_to_detection_s:.2f} s by ego (listed from the onset on; " in words
+    assert f"the radio lost {lost} lists)" in words
+
+
 def test_stories_are_in_the_report_and_without_the_recording_the_reason(tmp_path: Path) -> None:
     folder = replayed(tmp_path, changed(ONE))
     page = Page(build_page(load_study(folder)))
     assert {"late_paths", "answer"} <= set(page.plots)
-    assert "pedestrian 2: unknown longest" in page.words
+    assert "pedestrian 2: " in page.words
     (tmp_path / "drive.mcap").unlink()
     page = Page(build_page(load_study(folder)))
     assert "late_paths" not in page.plots
@@ -134,3 +148,13 @@ class TestLatePaths:
     def test_of_the_truth_alone_there_is_none(self, results: Results) -> None:
         assert FIGURES["late_paths"].missing(results, Selection(("GT",))) == ""
         assert FIGURES["late_paths"].missing(results, Selection()) is None
+
+
+def test_a_dark_page_has_the_colours_of_its_theme(hidden: Path) -> None:
+    """In stories, too: a colour that stands out on paper may not on a dark screen."""
+    study = load_study(hidden)
+    [_, story] = story_parts(study)
+    light = {bytes(round(255 * channel) for channel in look.colour).hex() for look in study.looks.values()}
+    drawn = set(re.findall(r'(?:fill|stroke)="#([0-9a-f]{6})"', story))
+    assert drawn & light == set()
+    assert len(re.findall(r'"var\(--c-[0-9a-f]{6}-[0-9a-f]{6}\)"', story)) >= 2

@@ -67,8 +67,9 @@ class TestLatencies:
             cooperating(co0=0.0, co1=1.0),
         )
         assert found.sentence == (
-            "Without latency cooperation helps: an object is known after 0 s on average against 0.7 s with PEM alone; "
-            "up to 1 s of latency no difference to PEM alone is shown: an object is known after 0.9 s on average."
+            "Without latency cooperation helps: an object is known after 0.00 s on average against 0.70 s with PEM "
+            "alone; up to 1 s of latency no difference to PEM alone is shown: an object is known after 0.90 s on "
+            "average."
         )
 
     def test_out_of_their_order_each_is_named(self) -> None:
@@ -77,7 +78,7 @@ class TestLatencies:
             cooperating(co0=0.0, co1=1.0),
         )
         assert found.sentence == (
-            "Sooner than PEM (an object is known after 0.7 s on average): co1 0.1 s; later: co0 0.9 s."
+            "Sooner than PEM (an object is known after 0.70 s on average): co1 0.10 s; later: co0 0.90 s."
         )
 
 
@@ -107,7 +108,7 @@ class TestGroups:
     def test_the_best_has_a_better_mean_than_all_and_no_interval_that_excludes_0(self) -> None:
         found = decide_compared(compared("ttd_rmst_s", ("a", 0.5, 1.0, -1.2, 0.2), ("b", 2.0, 1.0, 0.5, 1.5)))
         assert found.sentence.startswith(
-            "Nothing is shown to be sooner than PEM (an object is known after 1 s on average)"
+            "Nothing is shown to be sooner than PEM (an object is known after 1.00 s on average)"
         )
         assert set(found.best) == {"a", "PEM"}
 

@@ -22,7 +22,7 @@ FLOORS = (
     {"cli"},
     {"__init__"},  # the public API: no wing, and no wing imports it
 )
-MOST_ROOMS = 257
+MOST_ROOMS = 260
 MOST_STATEMENTS = 41_608
 """Without docstrings. A change that needs more says what it let go."""
 SMALL_LINES = 60

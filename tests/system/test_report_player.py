@@ -157,3 +157,19 @@ def test_on_a_phone_the_panels_are_stacked(played: Browser) -> None:
     played.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
     assert first[3] < second[1]
     assert max(first[2], second[2]) <= 390
+
+
+def test_on_paper_every_row_of_the_list_has_its_name(played: Browser) -> None:
+    played.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+    try:
+        drawn = played.run(
+            """return [...document.querySelectorAll("#player .objects button")].map((one) => one.offsetWidth > 0);"""
+        )
+        squashed = played.run(
+            """return [...document.querySelectorAll("#player canvas")].map((one) =>
+              (one.offsetWidth / one.offsetHeight) / (one.width / one.height));"""
+        )
+    finally:
+        played.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
+    assert drawn == [True, True]
+    assert squashed == pytest.approx([1.0, 1.0], abs=0.03)

@@ -22,10 +22,10 @@ from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.pipeline.expansion import resolve_for_run
 from copem_replay.pipeline.prepare import Replay, prepare_log
 from copem_replay.pipeline.replay import replay_block
+from copem_replay.results.shown_objects import axis_s, choose_shown_objects, find_opening_s, select_differing_rows
 from copem_replay.viewer.blueprint import select_perceiving, view_aspect
 from copem_replay.viewer.camera import TOGETHER_M, Camera, camera_on_ego, include_places, write_moving_origin
-from copem_replay.viewer.objects import choose_shown_objects, find_opening_s, select_differing_rows
-from copem_replay.viewer.sink import RecordingSink, axis_s, file_stream
+from copem_replay.viewer.sink import RecordingSink, file_stream
 from tests.helpers.recordings import SHARED
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
 from tests.viewer.test_rrd import rows
@@ -99,7 +99,7 @@ def corners(replay: Replay, row: int) -> Float:
 
 def share_inside(replay: Replay, given: Experiment, table: Any, path: Path) -> tuple[float, int]:
     """Share of object × frame, of the shown objects during their axes, with all of the box in the picture; how many."""
-    shown = choose_shown_objects(replay, given, table).object_ix
+    shown = choose_shown_objects(replay.scene, replay.truth, given, table).object_ix
     names = replay.scene.object_ids
     stories = {k: axis_s(table[table["object_id"] == names[k]], replay.scene.end_s) for k in shown}
     perceiving = [name for name, asked in given.configurations.items() if asked.units != "truth"]
@@ -117,7 +117,7 @@ def share_inside(replay: Replay, given: Experiment, table: Any, path: Path) -> t
 
 
 def differs_at_opening(replay: Replay, given: Experiment, table: Any) -> bool:
-    shown = choose_shown_objects(replay, given, table).object_ix
+    shown = choose_shown_objects(replay.scene, replay.truth, given, table).object_ix
     by_object = [table[table["object_id"] == replay.scene.object_ids[k]] for k in shown]
     opens_s = find_opening_s(given, by_object)
     known = [(select_differing_rows(given, rows)["detection_s"] <= opens_s).nunique() for rows in by_object]
@@ -133,7 +133,7 @@ def test_nine_of_ten_boxes_of_the_samples_are_in_the_picture(name: str, tmp_path
     assert share >= 0.9
     assert differs_at_opening(replay, given, table)
     if name.startswith("crossing"):
-        assert len(choose_shown_objects(replay, given, table).object_ix) == 6
+        assert len(choose_shown_objects(replay.scene, replay.truth, given, table).object_ix) == 6
 
 
 @pytest.mark.parametrize("name", RECORDINGS)

@@ -19,9 +19,9 @@ from copem_replay.io.recording import Recording, read_log
 from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import Replay, prepare_log
 from copem_replay.pipeline.replay import replay_block
+from copem_replay.results.shown_objects import choose_shown_objects
 from copem_replay.viewer import write_rrd
 from copem_replay.viewer.line_of_sight import compute_sight
-from copem_replay.viewer.objects import choose_shown_objects
 from copem_replay.viewer.sink import ABSENT, EARLY, KNOWN, TOO_LATE, UNCONFIRMED
 from copem_replay.viewer.status import compute_status, read_episode_clocks
 from tests.helpers.recordings import SHARED
@@ -84,7 +84,7 @@ MEASURES: dict[str, dict[str, Any]] = {
 
 def shown_in(replay: Replay, wanted: Experiment, run: int) -> tuple[pd.DataFrame, list[int]]:
     table = replay_block(replay, wanted, np.array([run]))
-    return table, list(choose_shown_objects(replay, wanted, table).object_ix)
+    return table, list(choose_shown_objects(replay.scene, replay.truth, wanted, table).object_ix)
 
 
 def agrees(replay: Replay, wanted: Experiment, run: int, table: pd.DataFrame, shown: list[int]) -> set[int]:

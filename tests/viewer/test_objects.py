@@ -10,7 +10,7 @@ import pytest
 
 from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.prepare import Replay, prepare_log
-from copem_replay.viewer.objects import choose_shown_objects, find_opening_s
+from copem_replay.results.shown_objects import choose_shown_objects, find_opening_s
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
 from tests.viewer.test_rrd import make, static
 
@@ -55,7 +55,7 @@ def table(*rows: tuple[str, float, float, float | None, float | None]) -> pd.Dat
 
 def shown(rows: pd.DataFrame) -> tuple[list[str], list[str]]:
     replay, asked = ready(**PLACES)
-    chosen = choose_shown_objects(replay, asked, rows)
+    chosen = choose_shown_objects(replay.scene, replay.truth, asked, rows)
     return [replay.scene.object_ids[k] for k in chosen.object_ix], list(chosen.too_short)
 
 
@@ -86,8 +86,9 @@ def test_two_seconds_before_and_after() -> None:
 
 def test_six_at_most_and_none_of_none() -> None:
     replay, asked = ready(**PLACES)
-    assert len(choose_shown_objects(replay, asked, table(*((n, 2.0, 9.0, 2.0, 3.0) for n in PLACES))).object_ix) == 6
-    assert choose_shown_objects(replay, asked, table(("near", 2.0, 9.0, 2.0, 3.0))[:0]).object_ix == ()
+    seven, none = table(*((n, 2.0, 9.0, 2.0, 3.0) for n in PLACES)), table(("near", 2.0, 9.0, 2.0, 3.0))[:0]
+    assert len(choose_shown_objects(replay.scene, replay.truth, asked, seven).object_ix) == 6
+    assert choose_shown_objects(replay.scene, replay.truth, asked, none).object_ix == ()
 
 
 def test_with_one_configuration_the_difference_is_to_the_truth() -> None:

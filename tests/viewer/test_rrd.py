@@ -468,13 +468,13 @@ def test_what_becomes_of_a_conflict_is_told(made: Made, tmp_path: Path) -> None:
     text = "PEM: 7 car detected by ego 2.00 s after the onset, at 60.0 m; the ego does not stay clear"
     assert (end["TextLog:level"], end["TextLog:text"]) == (["WARN"], [text])
     assert static(path, "/difference")["TextDocument:text"][0].splitlines() == [
-        "**7 car**, onset at 2.00 s",
+        "**7 car**, known after its onset at 2.00 s",
         "",
-        "| configuration | known after | at | verdict | closest | by |",
-        "| --- | ---: | ---: | ---: | ---: | ---: |",
-        "| PEM | 2.00 s | 60.0 m | **fail** at 4.0 m/s | 0.0 m | ego |",
-        "| pole | 0.00 s | 80.0 m | **fail** | 0.2 m | pole |",
-        "| none | never | – | **fail** at 10.0 m/s | 0.0 m | – |",
+        "| configuration | after | at | the ego | by |",
+        "| --- | ---: | ---: | ---: | ---: |",
+        "| PEM | 2.00 s | 60.0 m | **hits** at 4.0 m/s | ego |",
+        "| pole | 0.00 s | 80.0 m | **too near**, 0.2 m | pole |",
+        "| none | never | – | **hits** at 10.0 m/s | – |",
     ]
     # The strong line on the ground, and in its middle the same in short.
     mark = at(path, "/world/PEM/marks/from", 4.0)

@@ -23,11 +23,12 @@ from copem_replay.pipeline.expansion import resolve_for_run
 from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.replay import replay_block
+from copem_replay.results.shown_objects import axis_s
 from copem_replay.viewer import sink as palette
 from copem_replay.viewer import write_rrd
 from copem_replay.viewer.curves import break_lines, running_median
-from copem_replay.viewer.lanes import STEADY_S, smooth_status
-from copem_replay.viewer.sink import KNOWN, STATUSES
+from copem_replay.viewer.lanes import STEADY_S, lanes_axis_s, smooth_status
+from copem_replay.viewer.sink import KNOWN, STATUSES, show_seconds
 from tests.helpers.report_pages import named
 from tests.oracles.colour import apart_for_a_deuteranope, contrast
 from tests.viewer.test_rrd import SUMMARY, Made
@@ -197,6 +198,44 @@ def test_paths_of_lanes_and_plots_need_no_escapes(city: Made) -> None:
     assert {path.split("/")[2].split("_")[1] for path in paths} <= {"car", "pedestrian"}
 
 
+def test_words_of_lanes_fit_into_their_spans(city: Made) -> None:
+    """In lanes 380 points wide, letters of 7 points and 10 points beside them; the configuration is named first."""
+    names = [name for name, asked in city.given.configurations.items() if asked.units != "truth"]
+    lanes = defaultdict(list)
+    label_of = {}
+    for entity, batch in batches(city.path):
+        if entity.startswith("/lanes/") and "StateConfiguration:values" in batch.schema.names:
+            said = (batch.column(f"StateConfiguration:{kind}").to_pylist()[0] for kind in ("values", "labels"))
+            label_of[entity] = dict(zip(*said, strict=True))
+        elif entity.startswith("/lanes/"):
+            times_s = [time / 1e9 for time in batch.column("elapsed").cast("int64").to_pylist()]
+            lanes[entity] += list(zip(times_s, batch.column("StateChange:state").to_pylist(), strict=True))
+    assert len(lanes) == 24
+    told = 0
+    for entity, changes in lanes.items():
+        rows = city.table[city.table["object_id"] == entity.split("/")[2].split("_")[0]]
+        axis = lanes_axis_s(axis_s(rows, city.replay.scene.end_s), float(rows["onset_s"].iloc[0]), names)
+        spans = [
+            (max(begin, axis[0]), min(end, axis[1]), state)
+            for (begin, state), (end, _) in pairwise([*changes, (axis[1], None)])
+            if begin < axis[1] and end > axis[0]
+        ]
+        shown = [(end - begin, label_of[entity][state[0]].strip()) for begin, end, state in spans if state]
+        assert shown[0][1] == names[int(entity.split("/")[3].split("_")[0]) - 1]
+        for lasts_s, label in shown:
+            assert not label or 7 * len(label) + 10 <= 380 * lasts_s / (axis[1] - axis[0]) + 1e-3, label
+        told += len([label for _, label in shown if label])
+    assert told > 48, "names, and when each is known"
+
+
+def test_the_legend_names_statuses_and_what_is_common(city: Made) -> None:
+    [names] = [batch for entity, batch in batches(city.path) if entity == "/legend/names"]
+    said = set(names.column("Points2D:labels").to_pylist()[0])
+    assert {"truth", "ego", "hides it", "field of view", "false, dashed"} <= said
+    assert {"hidden", "out of view", "list lost", "on its way", "unmatched", "not listed"} <= said
+    assert set(city.given.configurations) - {"GT"} <= said | {"truth"}
+
+
 # ------------------------------------------------------------------------------- who knew when
 
 
@@ -268,3 +307,13 @@ def test_lines_break_exactly_where_rows_are_far_apart(steps_ns: list[int], steps
             expected.append((now + 500_000_000, []))
     assert found == expected
     assert next(said, None) is None
+
+
+# ------------------------------------------------------------------------------- numbers
+
+
+def test_no_time_is_minus_nothing() -> None:
+    """Times on a grid of ticks are differences of floats, such as −4e-16."""
+    assert [show_seconds(value) for value in (-4e-16, -0.004, 0.004, 0.2, -0.5)] == [
+        "0.00", "0.00", "0.00", "0.20", "-0.50",
+    ]  # fmt: skip

@@ -23,8 +23,9 @@ from copem_replay.report.figures.style import (
     figure_style,
     find_contenders,
     find_truths,
-    format_per_cent,
+    format_aligned_per_cent,
     format_three_digits,
+    format_two_decimals,
     new_figure,
     shorten_names,
     sort_soonest_first,
@@ -92,10 +93,10 @@ def _time_dots(results: Results, names: Sequence[str]) -> tuple[list[Dot], list[
             reason = f"all {over} alike"
         if limits is None:
             without.setdefault(reason, []).append(name)
-            dots.append(Dot(mean_s, None, None, format_three_digits(mean_s)))
+            dots.append(Dot(mean_s, None, None, format_two_decimals(mean_s)))
         else:
-            low, high = map(format_three_digits, limits)
-            dots.append(Dot(mean_s, *limits, f"{format_three_digits(mean_s)} [{low}, {high}]"))
+            low, high = map(format_two_decimals, limits)
+            dots.append(Dot(mean_s, *limits, f"{format_two_decimals(mean_s)} [{low}, {high}]"))
     return dots, [_explain_without(reason, lacking, names) for reason, lacking in without.items()]
 
 
@@ -119,12 +120,12 @@ def _share_dot(row: Any, share: str) -> Dot:
     if value is None:
         return Dot(None, None, None, "no conflict")
     if low is None or high is None:
-        return Dot(100 * value, None, None, format_per_cent(value))
+        return Dot(100 * value, None, None, format_aligned_per_cent(value))
     return Dot(
         100 * value,
         100 * low,
         100 * high,
-        f"{format_per_cent(value)} [{format_per_cent(low)}, {format_per_cent(high)}]",
+        f"{format_aligned_per_cent(value)} [{format_aligned_per_cent(low)}, {format_aligned_per_cent(high)}]",
     )
 
 

@@ -22,7 +22,8 @@ from copem_replay.report.figures.style import (
     explain_no_intervals,
     figure_style,
     find_truths,
-    format_three_digits,
+    format_signed_decimals,
+    format_two_decimals,
     new_figure,
     sort_soonest_first,
 )
@@ -118,11 +119,11 @@ def _make_dot(row: Any, metric: str) -> Dot:
         None if pd.isna(number) else times * float(number) for number in (row.difference, row.low, row.high)
     )
     assert value is not None
-    words = "±0" if abs(value) < NOTHING else ("+" if value > 0 else "") + format_three_digits(value)
+    words = format_signed_decimals(value)
     if pd.isna(row.interval_over) or low is None or high is None:
         return Dot(value, None, None, " ".join([words, *(f"({why})" for why in explain_no_interval(row))]))
     return Dot(
-        value, low, high, f"{words} [{format_three_digits(low)}, {format_three_digits(high)}]", sure=excludes_0(row)
+        value, low, high, f"{words} [{format_two_decimals(low)}, {format_two_decimals(high)}]", sure=excludes_0(row)
     )
 
 

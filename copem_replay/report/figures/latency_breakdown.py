@@ -222,4 +222,4 @@ def _stages_since_capture(
 def _label_bar(total_s: float, detected: int, rows: int) -> str:
     if not detected:
         return " never known"
-    return f" {total_s:.3g} s" + ("" if detected == rows else f", {format_share(detected / rows)} known")
+    return f" {total_s:.2f} s" + ("" if detected == rows else f", {format_share(detected / rows)} known")

@@ -7,7 +7,7 @@ detected, the vehicle brakes. Perception is open-loop: lists are those of an ego
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,7 +26,13 @@ from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.metrics.survival import EndReason
 from copem_replay.pipeline.one_run import BY_EGO, share_curves
 from copem_replay.pipeline.prepare import Replay, prepare_log
-from copem_replay.report.figures.selection import Choice, Selection, choose_object_and_run, describe_left_out
+from copem_replay.report.figures.selection import (
+    Choice,
+    Selection,
+    choose_object_and_run,
+    describe_left_out,
+    find_differing,
+)
 from copem_replay.report.figures.style import (
     FAINT,
     INK,
@@ -286,6 +292,9 @@ _LABELS = ("Speed of\nthe ego (m/s)", "Distance between\nthe boxes (m)", "Visibl
 def runs_figure(results: Results, selection: Selection) -> Figure:
     """Speed of the ego, distance and visible share of one object in one run, a column per configuration.
 
+    Where the ego does not brake, the curves of all configurations are the same: they are drawn once, with a mark of
+    when each configuration knows the object.
+
     Raises InputError for a selection that is not among the results, RecordingError if the log is missing or has
     changed.
     """
@@ -294,9 +303,13 @@ def runs_figure(results: Results, selection: Selection) -> Figure:
     (rows,) = results.each(log=choice.log, every=True)
     of_run = first_episodes(rows[(rows["object_id"] == choice.object_id) & (rows["run"] == choice.run)])
     of_run = of_run.set_index("configuration", drop=False)
+    alike = not replay.encounters or results.experiment.braking is None
+    if alike and not choice.named:
+        present = [name for name in results.chosen(None) if name in of_run.index]
+        choice = replace(choice, configurations=find_differing(results, present))
     stories = [tell_story(replay, results.experiment, of_run.loc[name]) for name in choice.configurations]
     with figure_style():
-        figure = _draw_stories(results, replay, stories)
+        figure = (_draw_together if alike else _draw_stories)(results, replay, stories)
         add_note(figure, _note_sentences(results, choice, stories))
     return figure
 
@@ -315,7 +328,7 @@ def _prepare_object(results: Results, log: str, object_id: str) -> Replay:
 def _draw_stories(results: Results, replay: Replay, stories: Sequence[Story]) -> Figure:
     shown = [story.configuration for story in stories]
     looks, names = choose_appearances(results, shown), shorten_names(shown)
-    begin_s, end_s = _choose_limits(stories)
+    begin_s, end_s = _choose_limits([event for story in stories for event in story.events], _WIDTH_IN)
     steps = max(len(story.events) for story in stories)
     figure = new_figure(0.75 + (_WIDTH_IN + 0.12) * len(stories), 3 * _HEIGHT_IN + steps * STEP_IN + 1.35)
     panels = figure.subplots(3, len(stories), sharex=True, sharey="row", squeeze=False)
@@ -342,12 +355,59 @@ def _draw_stories(results: Results, replay: Replay, stories: Sequence[Story]) ->
     return figure
 
 
-def _choose_limits(stories: Sequence[Story]) -> tuple[float, float]:
+_OF_ONE = ("captured", "arrives", "foreseen", "ended")
+"""Kinds of events that differ between configurations."""
+_WIDE_IN = 6.4
+"""Approximate width of the panels of all configurations together (inches)."""
+
+
+def _draw_together(results: Results, replay: Replay, stories: Sequence[Story]) -> Figure:
+    """One column of panels for all configurations, with a mark and a label of when each knows the object."""
+    shown = [story.configuration for story in stories]
+    looks, names = choose_appearances(results, shown), shorten_names(shown)
+    first = stories[0]
+    common = [event for event in first.events if event.kind not in _OF_ONE]
+    known = {story.configuration: _find_known(story) for story in stories}
+    never = [names[name] for name, event in known.items() if event is None]
+    marks = [(name, replace(event, label=f"{names[name]}: {event.label}")) for name, event in known.items() if event]
+    labelled = sorted([*(("", event) for event in common), *marks], key=lambda mark: mark[1].time_s)
+    events = [event for _, event in labelled]
+    begin_s, end_s = _choose_limits(events, _WIDE_IN)
+    figure = new_figure(0.75 + _WIDE_IN, 3 * _HEIGHT_IN + len(events) * STEP_IN + 1.1)
+    column = figure.subplots(3, 1, sharex=True)
+    since_s = np.unique(np.concatenate([np.arange(begin_s, end_s, _NODE_S), [event.time_s for event in events]]))
+    course = recorded_course(replay, results.experiment.max_gap_s, first.object_ix, since_s + first.onset_s)
+    for axes, values in zip(column, (course.speed_mps, course.gap_m), strict=False):
+        axes.plot(since_s, values, label="as recorded", color=INK, linewidth=1.6)
+        axes.set_ylim(-0.04 * (top := max(axes.get_ylim()[1], 1.0)), top)
+    _draw_share(column[2], first, results, replay, replace(looks[shown[0]], colour=INK))
+    for name, event in labelled:
+        style = event_line_style(event) | ({"color": looks[name].colour, "linewidth": 1.8} if name else {})
+        for axes in column:
+            axes.axvline(event.time_s, label=f"of {name}" if name else event.kind, **style)
+    draw_labels(column[0], events, len(events), _HEIGHT_IN)
+    title = f"never known: {', '.join(never)}" if never else "known by all that are shown"
+    column[0].set_title(title, pad=(len(events) * STEP_IN + 0.08) * 72, loc="left")
+    for axes, label in zip(column, _LABELS, strict=True):
+        axes.set_ylabel(label)
+    column[2].set_xlabel("Time since the onset (s)")
+    column[2].set_ylim(-0.05, 1.05)
+    column[0].set_xlim(begin_s, end_s)
+    return figure
+
+
+def _find_known(story: Story) -> StoryEvent | None:
+    """When a configuration knows the object, with the result; None: never."""
+    arrives = [event for event in story.events if event.kind == "arrives"]
+    return replace(arrives[0], label=story.result.partition(",")[0]) if arrives else None
+
+
+def _choose_limits(events: Sequence[StoryEvent], width_in: float) -> tuple[float, float]:
     """Limits of the time axis around all events, with room for all labels."""
-    instants = [event.time_s for story in stories for event in story.events]
+    instants = [event.time_s for event in events]
     span_s = max(max(instants) - min(instants), 1.0)
     begin_s, end_s = min(instants) - _BEFORE * span_s, max(instants) + _AFTER * span_s
-    return begin_s, max(last_instant(story.events, begin_s, end_s, _WIDTH_IN) for story in stories)
+    return begin_s, last_instant(events, begin_s, end_s, width_in)
 
 
 def _draw_courses(

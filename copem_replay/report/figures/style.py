@@ -298,6 +298,18 @@ def format_per_cent(share: float) -> str:
     return format_three_digits(100 * share)
 
 
+def format_aligned_per_cent(share: float) -> str:
+    """A share in per cent with one decimal, as those below each other; 100 and 0 only for all and nothing."""
+    shown = format_per_cent(share)
+    return shown if shown.startswith(("<", ">", "–")) else f"{100 * share:.1f}"
+
+
+def format_signed_decimals(value: float) -> str:
+    """A difference with its sign and two decimals; `±0` for none."""
+    shown = format_two_decimals(value)
+    return "±0" if shown == "0.00" else shown if value < 0 or shown.startswith("<") else f"+{shown}"
+
+
 def format_three_digits(value: float) -> str:
     """A number to three significant digits; whole from 1000 on, 0 below 10⁻⁹, and no exponent below 10⁻³."""
     if 1e-9 <= abs(value) < 1e-3:

@@ -18,12 +18,13 @@ from copem_replay.report.figures.style import (
     explain_no_intervals,
     find_with_fewer_rows,
     format_per_cent,
+    format_signed_decimals,
     format_three_digits,
+    format_two_decimals,
 )
 from copem_replay.report.html.markup import Html, escape_text, fold_parts, join_html, make_list, make_tag
 from copem_replay.report.html.setup import join_names, shorten_list
 from copem_replay.report.html.study import ReportData, detects_at_onset, explain_missing_interval
-from copem_replay.report.html.tables import format_signed_difference
 from copem_replay.results.compare import Comparison
 from copem_replay.results.compare.tables import NOTHING, describe_gain
 from copem_replay.results.decision import MATTERS_S, decide
@@ -89,7 +90,7 @@ def _soonest_sentence(study: ReportData) -> Html:
     name = make_tag("b", study.best)
     if study.lead is None:
         only = "it is the only configuration" if len(study.names) == 1 else "only the ground truth is beside it"
-        after = f" detects after {format_three_digits(mean_s)} s on average{counted_as}."
+        after = f" detects after {format_two_decimals(mean_s)} s on average{counted_as}."
         return join_html([name, f"{after} There is nothing to compare it with: {only}."])
     tied = study.as_soon
     if len(tied) == 1:
@@ -97,7 +98,7 @@ def _soonest_sentence(study: ReportData) -> Html:
     _, alike, sooner, _ = _split_by_difference(study.lead)
     when = "every object at its onset"
     if not detects_at_onset(study):
-        when = f"at the same times: after {format_three_digits(mean_s)} s on average{counted_as}"
+        when = f"at the same times: after {format_two_decimals(mean_s)} s on average{counted_as}"
     not_tied = len(study.lead.configurations) + 1 - len(tied)
     undecided = sum(name not in tied for rows in (alike, sooner) for name in rows["configuration"])
     others = f"the other {not_tied}" if not_tied > 1 else "the other"
@@ -141,7 +142,7 @@ def _first_sentence(study: ReportData, name: Html, mean_s: float, counted_as: st
     level = list(unsure.loc[unsure["difference"].abs() <= NOTHING, "configuration"])
     if level:
         names = make_tag("b", join_names([str(study.best), *level]))
-        mean = f" have the same mean time, {format_three_digits(mean_s)} s{counted_as},"
+        mean = f" have the same mean time, {format_two_decimals(mean_s)} s{counted_as},"
         return join_html([names, f"{mean} though they do not always detect at the same time."])
     near = _metric_rows(study.lead, RANKED_BY).query("abs(difference) < @MATTERS_S")["configuration"]
     if len(near):
@@ -149,14 +150,14 @@ def _first_sentence(study: ReportData, name: Html, mean_s: float, counted_as: st
         return join_html(
             [
                 names,
-                f" detect soonest, after {format_three_digits(mean_s)} s on average{counted_as}: differences below "
+                f" detect soonest, after {format_two_decimals(mean_s)} s on average{counted_as}: differences below "
                 f"{MATTERS_S:g} s name no winner.",
             ]
         )
     rivals = f"the other {others}" if others > 1 else study.lead.configurations[0]
-    has, sure = f" has the shortest mean time, {format_three_digits(mean_s)} s", ""
+    has, sure = f" has the shortest mean time, {format_two_decimals(mean_s)} s", ""
     if len(later) == others:
-        has, sure = f" detects soonest, after {format_three_digits(mean_s)} s on average", f", sooner than {rivals}"
+        has, sure = f" detects soonest, after {format_two_decimals(mean_s)} s on average", f", sooner than {rivals}"
     elif undecided:
         to = f"{undecided} of {rivals}" if undecided < others else rivals
         sure = f", but the interval of its difference to {to} includes 0"
@@ -182,6 +183,8 @@ def _other_sentences(study: ReportData) -> Iterator[str]:
     later, alike, sooner, unsure = (
         rows[~rows["configuration"].isin(tied)] for rows in _split_by_difference(study.lead)
     )
+    if len(tied) == 1:  # nearer ones share the first place, in a sentence of their own
+        alike = alike[alike["difference"].abs() >= MATTERS_S]
     unsure = unsure[unsure["difference"].abs() > NOTHING]
     if len(later):
         yield f"Later, the interval of the difference excluding 0: {_list_differences(later)}."
@@ -205,11 +208,11 @@ def _list_differences(rows: pd.DataFrame) -> str:
 
 
 def _format_difference(row: Any, unit: str = " s") -> str:
-    shown = format_signed_difference("", row.difference) + unit
+    shown = format_signed_decimals(row.difference) + unit
     if pd.isna(row.interval_over) or pd.isna(row.low) or pd.isna(row.high):
         return shown
     logs = "" if pd.isna(row.logs_better) else f", {describe_gain(row)}"
-    return f"{shown} [{format_three_digits(row.low)}, {format_three_digits(row.high)}]{logs}"
+    return f"{shown} [{format_two_decimals(row.low)}, {format_two_decimals(row.high)}]{logs}"
 
 
 def _format_unsure(row: Any) -> str:
@@ -300,7 +303,7 @@ def _variation_sentences(study: ReportData) -> Iterator[str]:
     sd_s = {what: float(np.sqrt(np.average(of**2, weights=weight))) for what, of in apart.items()}
     shown = [(what, value) for what, value in sorted(sd_s.items(), key=itemgetter(1), reverse=True) if value >= 0.005]
     if shown:
-        words = (f"from {what} to {what} by {format_three_digits(round(value, 2))} s" for what, value in shown)
+        words = (f"from {what} to {what} by {format_two_decimals(value)} s" for what, value in shown)
         yield f"Times vary most {', then '.join(words)} (standard deviations of means)."
 
 

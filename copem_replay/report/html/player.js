@@ -37,6 +37,8 @@
     counted: panel.querySelector(".counted"),
   }));
 
+  const dark = matchMedia("screen and (prefers-color-scheme: dark)");
+  const hue = (one) => (dark.matches ? one.dark : one.colour);
   let frame = 0, object = data.measured[0][0], zoom = 1, timer = 0;
   const instant = (k = frame) => data.from + k * data.step;
   const known = (one, k, at = instant()) => k in one.known && one.known[k] <= at + 1e-6;
@@ -118,7 +120,7 @@
 
   const entries = (pen, seen, one) => {
     let marked = 0;
-    pen.strokeStyle = pen.fillStyle = one.colour;
+    pen.strokeStyle = pen.fillStyle = hue(one);
     for (const k of one.tracks.keys()) {
       const where = place(one.tracks, k, frame), [, , length, width] = data.objects[k];
       if (!where || k === data.ego) continue;
@@ -173,7 +175,7 @@
     const { onset, ended } = measured.get(object);
     pen.fillStyle = tone("--line");
     pen.fillRect(0, top, canvas.clientWidth, LANE);
-    pen.fillStyle = one.colour;
+    pen.fillStyle = hue(one);
     for (const [first, count] of one.tracks.get(object) || []) pen.fillRect(first * across, top + LANE - 7, count * across, 3);
     if (object in one.known) {
       const begin = Math.max(0, (one.known[object] - data.from) / data.step) * across;

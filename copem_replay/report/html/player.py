@@ -165,6 +165,7 @@ def collect_player_data(study: ReportData, choice: Choice) -> dict[str, Any]:
             {
                 "name": name,
                 "colour": css_colour(study.looks[name].colour),
+                "dark": css_colour(study.looks[name].dark),
                 "tracks": _to_text(encode_tracks(tracks[name], grid)),
                 "false": _to_text(encode_false(tracks[name], grid)),
                 "known": _list_known(scene, table, name),

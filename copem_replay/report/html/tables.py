@@ -20,7 +20,12 @@ from copem_replay.metrics.summary_metrics import COMPARED, METRIC, METRICS, PART
 from copem_replay.metrics.survival import EndReason
 from copem_replay.report.figures.differences import excludes_0
 from copem_replay.report.figures.latency_breakdown import STAGES, count_detected, mean_stages_by_configuration
-from copem_replay.report.figures.style import format_per_cent, format_three_digits, format_two_decimals
+from copem_replay.report.figures.style import (
+    format_aligned_per_cent,
+    format_signed_decimals,
+    format_three_digits,
+    format_two_decimals,
+)
 from copem_replay.report.html.markup import (
     Html,
     allow_breaks,
@@ -31,7 +36,7 @@ from copem_replay.report.html.markup import (
     make_table,
     make_tag,
 )
-from copem_replay.results.compare.tables import NOTHING, comparison_lines, explain_no_interval, held_cells
+from copem_replay.results.compare.tables import comparison_lines, explain_no_interval, held_cells
 from copem_replay.results.verdicts import MET, NOT_MEASURED, NOT_MET, UNDECIDED, Judgement, Verdict
 
 if TYPE_CHECKING:
@@ -83,8 +88,7 @@ def format_value(name: str, value: float) -> str:
     if name in _COUNTS:
         return f"{value:.0f}"
     if is_share(name):
-        shown = format_per_cent(value)
-        return shown if shown.startswith(("<", ">")) else f"{100 * value:.1f}"
+        return format_aligned_per_cent(value)
     return format_two_decimals(value)
 
 
@@ -94,17 +98,13 @@ def difference_column_header(name: str) -> str:
 
 
 def format_difference(name: str, value: float) -> str:
-    """A limit of a difference, in the unit of its column; without a column, as in sentences, to three digits."""
-    if name and not is_share(name):
-        return format_two_decimals(value)
-    return format_three_digits(value * (100 if is_share(name) else 1))
+    """A limit of a difference, in the unit of its column."""
+    return format_two_decimals(value * (100 if is_share(name) else 1))
 
 
 def format_signed_difference(name: str, value: float) -> str:
     """A difference with its sign."""
-    if abs(value) < NOTHING:
-        return "±0"
-    return ("+" if value > 0 else "") + format_difference(name, value)
+    return format_signed_decimals(value * (100 if is_share(name) else 1))
 
 
 _INTERVALS = {"detected_share": "interval", "pass_share": "pass_interval"}

@@ -1,4 +1,4 @@
-"""Objects shown: those that words, lanes, curves and near views are about, and the instant at which a recording opens.
+"""Objects shown, in viewers and in stories of reports: those that words, lanes and near views are about, and when.
 
 An object is worth a look if configurations know it at different times while it is near the ego's path. One that is in
 the log for less than `OBSERVED_S` before or after its onset tells nothing of them: how soon it could have been known is
@@ -13,11 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from copem_replay.core.tracks import SAME_INSTANT_S, TRUTH, Float
+from copem_replay.core.interpolation import interpolate_states
+from copem_replay.core.tracks import SAME_INSTANT_S, TRUTH, Float, Int, Scene, Tracks
 from copem_replay.experiment.schema import Experiment
-from copem_replay.pipeline.prepare import Replay
-from copem_replay.viewer.camera import find_followed, interpolate_places
-from copem_replay.viewer.sink import AFTER_S, BEFORE_S, UNKNOWN_S
+from copem_replay.perception.sensor_poses import find_carrier
 
 SHOWN_OBJECTS = 6
 """Most measured objects with words, lines, lanes and plots: more would cover each other and slow the viewer down."""
@@ -25,6 +24,10 @@ OBSERVED_S = 2.0
 """Least time from the log's start to the onset, and from the onset to the end of the episode."""
 PATH_S, NEAR_M = 3.0, 10.0
 """How much of the ego's path is ahead of it, and the distance from it at which an object counts half."""
+BEFORE_S, AFTER_S, LEAST_S = 0.5, 0.5, 2.0
+"""Margins before the onset and after the last detection, and the shortest axis: longer ones make changes narrow."""
+UNKNOWN_S = 10.0
+"""Length after the onset, if no configuration detects the object; it ends earlier with the episode."""
 _STEP_S = 0.25
 
 
@@ -39,7 +42,7 @@ class ShownObjects:
     too_short: tuple[str, ...] = ()
 
 
-def choose_shown_objects(replay: Replay, experiment: Experiment, table: pd.DataFrame) -> ShownObjects:
+def choose_shown_objects(scene: Scene, truth: Tracks, experiment: Experiment, table: pd.DataFrame) -> ShownObjects:
     """The objects with the largest product of difference in time and nearness to the ego's path, six at most.
 
     The difference is between the first and the last configuration that knows an object; one that never does counts as
@@ -55,15 +58,13 @@ def choose_shown_objects(replay: Replay, experiment: Experiment, table: pd.DataF
     episodes["apart_s"] = after_s.max() - after_s.min()
     known_s = by_object["detection_s"].max()
     episodes["last_s"] = known_s.fillna(np.minimum(episodes["ended_s"], episodes["onset_s"] + UNKNOWN_S))
-    episodes["near"] = 1 / (1 + (_distance_to_path(replay, experiment, episodes) / NEAR_M) ** 2)
+    episodes["near"] = 1 / (1 + (_distance_to_path(scene, truth, experiment, episodes) / NEAR_M) ** 2)
     episodes["rank"] = (episodes["apart_s"] * episodes["near"]).round(6)  # rounding of times decides nothing
     until_s = episodes["ended_s"] - episodes["onset_s"]
     observed = np.minimum(episodes["onset_s"], until_s) >= OBSERVED_S - SAME_INSTANT_S
     judged = episodes[observed] if observed.any() else episodes
     chosen = judged.sort_values(["rank", "near"], ascending=False, kind="stable").index[:SHOWN_OBJECTS]
-    return ShownObjects(
-        tuple(replay.scene.object_number[name] for name in chosen), tuple(episodes.index[~observed].tolist())
-    )
+    return ShownObjects(tuple(scene.object_number[name] for name in chosen), tuple(episodes.index[~observed].tolist()))
 
 
 def select_differing_rows(experiment: Experiment, table: pd.DataFrame) -> pd.DataFrame:
@@ -92,12 +93,12 @@ def find_opening_s(experiment: Experiment, by_object: Sequence[pd.DataFrame]) ->
     return max(min(onsets_s) - BEFORE_S, 0.0) if onsets_s else None
 
 
-def _distance_to_path(replay: Replay, experiment: Experiment, episodes: pd.DataFrame) -> Float:
+def _distance_to_path(scene: Scene, truth: Tracks, experiment: Experiment, episodes: pd.DataFrame) -> Float:
     """(M,) least distance (m) of each object from the ego's path of the next `PATH_S`, from onset to last detection.
 
     0 without an ego; inf where the ego is not there.
     """
-    ego_ix = find_followed(replay.scene, experiment)
+    ego_ix = find_followed(scene, experiment)
     if ego_ix < 0:
         return np.zeros(len(episodes))
     first_s, last_s = (episodes[name].to_numpy(dtype=float) for name in ("onset_s", "last_s"))
@@ -105,11 +106,38 @@ def _distance_to_path(replay: Replay, experiment: Experiment, episodes: pd.DataF
     which = np.repeat(np.arange(len(steps)), steps)
     within = np.arange(len(which)) - np.repeat(np.cumsum(steps) - steps, steps)
     time_s = np.minimum(first_s[which] + _STEP_S * within, np.maximum(last_s, first_s)[which])
-    numbers = episodes.index.map(replay.scene.object_number).to_numpy(dtype=np.int64)
-    place = interpolate_places(replay, experiment, numbers[which], time_s)
+    numbers = episodes.index.map(scene.object_number).to_numpy(dtype=np.int64)
+    place = interpolate_places(scene, truth, experiment, numbers[which], time_s)
     nearest = np.full(len(steps), np.inf)
     for ahead_s in np.arange(0.0, PATH_S + _STEP_S / 2, _STEP_S):
-        own = interpolate_places(replay, experiment, np.full(len(which), ego_ix), time_s + ahead_s)
+        own = interpolate_places(scene, truth, experiment, np.full(len(which), ego_ix), time_s + ahead_s)
         distance = np.hypot(*(place - own)[:2])
         np.minimum.at(nearest, which, np.where(np.isnan(distance), np.inf, distance))
     return nearest
+
+
+def find_followed(scene: Scene, experiment: Experiment) -> int:
+    """Index of the ego, without one of what carries the unit of `distance_to`; −1: there is neither."""
+    unit = experiment.units.get(experiment.measure.distance_to)
+    return scene.ego_ix if scene.ego_ix >= 0 or unit is None else find_carrier(scene, unit)
+
+
+def interpolate_places(scene: Scene, truth: Tracks, experiment: Experiment, objects: Int, time_s: Float) -> Float:
+    """(4, K) x, y, z and heading of objects (K,) at times (K,), in s; NaN while absent."""
+    states, _ = interpolate_states(truth, objects, time_s, t0_ns=scene.t0_ns, max_gap_s=experiment.max_gap_s)
+    return np.stack([states["x_m"], states["y_m"], states["z_m"], states["yaw_rad"]])
+
+
+# Time axes of an object's lanes and curves.
+
+
+def axis_s(episodes: pd.DataFrame, end_s: float) -> tuple[float, float]:
+    """First and last second of an object's axis: 0.5 s before the onset to 0.5 s after the last detection.
+
+    `episodes`: rows of one object and run, of all configurations.
+    """
+    onset_s = float(episodes["onset_s"].iloc[0])
+    detected_s = episodes["detection_s"][episodes["detected"]]
+    last_s = float(detected_s.max()) if len(detected_s) else min(float(episodes["ended_s"].max()), onset_s + UNKNOWN_S)
+    first_s = max(min(onset_s, float(detected_s.min()) if len(detected_s) else onset_s) - BEFORE_S, 0.0)
+    return first_s, min(max(last_s + AFTER_S, first_s + LEAST_S), max(end_s, first_s + AFTER_S))

@@ -1,0 +1,92 @@
+"""Legend: bars in the colours of configurations, of lines and boxes, and of statuses, with names on them, in a view."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from copem_replay.core.colours import TRUTH as TRUTH_COLOUR
+from copem_replay.core.colours import Rgb
+from copem_replay.viewer.sink import (
+    CAPTURED,
+    EGO,
+    FIELD,
+    GROUND,
+    HIDDEN,
+    HIDES,
+    LOST,
+    NOTICED,
+    OUT,
+    STATUS,
+    UNLISTED,
+    UNMATCHED,
+    VISIBLE,
+    WAITING,
+    RecordingSink,
+)
+
+if TYPE_CHECKING:
+    import rerun.blueprint as rrb
+
+_MARKS: tuple[tuple[str, Rgb, float], ...] = (
+    ("truth", TRUTH_COLOUR, 1.0),
+    ("ego", EGO, 6.0),
+    ("hides it", HIDES, 2.0),
+    ("field of view", FIELD, 1.0),
+)
+_FALSE = "false, dashed"
+_STATUSES = {
+    OUT: "out of view", HIDDEN: "hidden", VISIBLE: "seen, not listed", UNLISTED: "not listed", LOST: "list lost",
+    CAPTURED: "on its way", UNMATCHED: "unmatched",
+}  # fmt: skip
+"""Words of statuses in lanes, in the order in which they follow each other."""
+_BAR_POINTS, _WIDE, _GAP = 7.0, 4.0, 1.0
+"""Half the height of a bar in points; its width and the gap beside it in rows."""
+LEGEND_X, LEGEND_Y = (-0.5, 3 * _WIDE + 2 * _GAP + 0.5), (-1.0, 7.0)
+"""Bounds of the legend's view: three columns and seven rows."""
+
+
+def write_legend_bars(out: RecordingSink, colours: Mapping[str, Rgb]) -> None:
+    """Write a bar per configuration with its name; beside them those common to all configurations, and statuses.
+
+    In lanes an object that is listed but not known has the configuration's colour at half strength.
+    """
+    import rerun as rr
+
+    of_all = [*_MARKS, (_FALSE, WAITING, 0.9)]
+    statuses = [(word, STATUS[status], _BAR_POINTS) for status, word in _STATUSES.items()]
+    columns = ([(name, colour, _BAR_POINTS) for name, colour in colours.items()], of_all, statuses)
+    rows = [(*row, c * (_WIDE + _GAP), float(k)) for c, column in enumerate(columns) for k, row in enumerate(column)]
+    strips = [
+        (strip, colour, points)
+        for name, colour, points, x, y in rows
+        for strip in (_dash(x, y) if name == _FALSE else [[[x, y], [x + _WIDE, y]]])
+    ]
+    drawn = rr.LineStrips2D(
+        [strip for strip, _, _ in strips],
+        colors=[colour for _, colour, _ in strips],
+        radii=rr.Radius.ui_points([points for _, _, points in strips]),
+    )
+    out.static(["legend", "bars"], drawn)
+    # A label stands below its point: a point a little higher puts it on the bar.
+    names = rr.Points2D(
+        [[x + _WIDE / 2, y - 0.4] for *_, x, y in rows],
+        labels=[name for name, *_ in rows],
+        colors=[NOTICED],
+        radii=rr.Radius.ui_points(0.0),
+        show_labels=True,
+    )
+    out.static(["legend", "names"], names)
+
+
+def _dash(x: float, y: float) -> list[list[list[float]]]:
+    """A bar of dashes."""
+    return [[[x + k * _WIDE / 5, y], [x + (k + 0.6) * _WIDE / 5, y]] for k in range(5)]
+
+
+def legend_view() -> rrb.Spatial2DView:
+    """The legend."""
+    import rerun.blueprint as rrb
+
+    bounds = rrb.VisualBounds2D(x_range=LEGEND_X, y_range=LEGEND_Y)
+    return rrb.Spatial2DView(origin="legend", name="Legend", background=GROUND, visual_bounds=bounds)
