@@ -73,11 +73,10 @@ def write_trackeval(
     for tracked in _track_logs(results, run):
         log = _name_file(tracked.log)
         logs.append(log)
-        texts[f"gt/{_SET}/{log}/gt/gt.txt"] = _write_mot(tracked.truth, {}, truth=True)
+        texts[f"gt/{_SET}/{log}/gt/gt.txt"] = _write_mot(tracked.truth, truth=True)
         texts[f"gt/{_SET}/{log}/seqinfo.ini"] = f"[Sequence]\nname={log}\nseqLength={len(tracked.stamps_ns)}\n"
-        numbers: dict[Any, int] = {}
         for name, held in tracked.held.items():
-            texts[f"trackers/{_SET}/{_name_file(name)}/data/{log}.txt"] = _write_mot(held, numbers, truth=False)
+            texts[f"trackers/{_SET}/{_name_file(name)}/data/{log}.txt"] = _write_mot(held, truth=False)
     texts[f"gt/seqmaps/{_SET}.txt"] = "".join(f"{line}\n" for line in ("name", *logs))
     return _write_texts(results, folder, texts), []
 
@@ -128,9 +127,9 @@ def _name_file(name: str) -> str:
     return avoid_device_name(quote(name, safe=" +="))
 
 
-def _write_mot(table: pd.DataFrame, numbers: dict[Any, int], *, truth: bool) -> str:
+def _write_mot(table: pd.DataFrame, *, truth: bool) -> str:
     """Lines `frame,id,left,top,width,height,confidence,…` of MOTChallenge; frames and ids count from 1."""
-    lines = []
+    lines, numbers = [], dict[str, int]()
     for row in table.to_dict("records"):
         cos, sin = abs(math.cos(row["yaw_rad"])), abs(math.sin(row["yaw_rad"]))
         width = cos * row["length_m"] + sin * row["width_m"]
@@ -165,10 +164,10 @@ def _track_logs(results: Results, run: int | None) -> Iterator[TrackedRun]:
         raise InputError(f"--run: expected 0 to {results.experiment.runs - 1}, found {run}")
     for log in results.provenance.logs:
         number = run if run is not None else results.provenance.run_shown.get(log.name, 0)
-        yield track_run(results, log.name, number)
+        yield collect_held(results, log.name, number)
 
 
-def track_run(results: Results, log: str, run: int) -> TrackedRun:
+def collect_held(results: Results, log: str, run: int) -> TrackedRun:
     """What every configuration holds in one run of a log, and the truth. Raises InputError."""
     replayed, rows = replay_again(results, log, run, tuple(results.experiment.configurations))
     scene, truth = replayed.replay.scene, replayed.replay.truth
