@@ -17,7 +17,7 @@ from copem_replay.core.components import Flag, Frozen, Positive, error_at_key
 from copem_replay.core.errors import InputError, count_noun
 from copem_replay.core.frame import Frame, SaidPlace
 from copem_replay.core.site_map import MapSolid, SiteMap, find_borders, make_polygon
-from copem_replay.core.tracks import Float, Solid
+from copem_replay.core.tracks import FROM_MAP, Float, Solid
 from copem_replay.core.yaml import Key
 from copem_replay.io.maps.registry import read_map
 from copem_replay.io.maps.solids import DEFAULT_HEIGHTS_M
@@ -145,7 +145,7 @@ def add_maps(
     lines, areas, solids = list(recording.lane_boundaries), list(recording.scene.areas), list(recording.scene.solids)
     notes, problems = list(recording.notes), list[tuple[Key, str]]()
     for k, asked in enumerate(maps):
-        where = f"maps[{k}] {Path(asked.file).name}"
+        where = f"{FROM_MAP}{k}] {Path(asked.file).name}"
         try:
             site = asked.place(frame)
         except InputError as error:
@@ -241,6 +241,24 @@ def _choose_solids(
         return near, said, ""
     found = f"0 of {count_noun(len(solids), 'solid')} within {within_m:g} m of the log"
     return near, said, f"{where.split(' ', 1)[1]}: {found}; nearest {_write_km(least_m)}: is the frame right?"
+
+
+def list_far_units(
+    recording: Recording, maps: Sequence[MapFile], places_m: Mapping[str, tuple[float, float]]
+) -> Iterator[str]:
+    """A note on each place of a unit, by name, near which solids of a map may be left out: no object comes near it."""
+    import shapely
+
+    truth, reach_m = recording.truth, min((asked.within_m for asked in maps if asked.solids), default=np.inf)
+    valid = truth.valid[0]
+    if not np.isfinite(reach_m) or not valid.any() or not recording.scene.solids:
+        return
+    tree = shapely.STRtree(shapely.points(truth.x_m[0, valid], truth.y_m[0, valid]))
+    for name, at_m in places_m.items():
+        _, (distance_m, *_) = tree.query_nearest(shapely.Point(at_m), return_distance=True)
+        if distance_m > reach_m:
+            what = "solids of maps near it are left out"
+            yield f"units.{name}: {distance_m:.0f} m from every object; {what} (`within_m: {reach_m:g}`)"
 
 
 def _write_km(distance_m: float) -> str:
