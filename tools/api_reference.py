@@ -68,7 +68,12 @@ def entries(name: str) -> Iterator[str]:
         # Python 3.13 has no indentation in docstrings any more.
         yield entry(f"cr.{name}", inspect.cleandoc(found.__doc__ or "") + "\n" + fields(found))
         for inner, member in vars(found).items():
-            if inspect.isfunction(member) and not inner.startswith("_") and member.__doc__:
+            if (
+                inspect.isfunction(member)
+                and not inner.startswith("_")
+                and member.__doc__
+                and inner != "model_post_init"
+            ):
                 yield entry(f"cr.{name}.{inner}", member.__doc__, signature(member))
     else:
         yield entry(f"cr.{name}", constant_doc(name) + (f"\n\n{found!r}" if isinstance(found, tuple) else ""))

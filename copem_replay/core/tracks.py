@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,6 +71,10 @@ def class_indices(names: tuple[str, ...]) -> NDArray[np.int8]:
     """Indices into `CLASSES` of class and group names, sorted, each once: (K,)."""
     members = {m for name in names for m in CLASS_GROUPS.get(name, (name,))}
     return np.array(sorted(CLASSES.index(m) for m in members), dtype=np.int8)
+
+
+FROM_MAP: Final = "maps["
+"""How the names of solids of maps begin."""
 
 
 class Solid(NamedTuple):

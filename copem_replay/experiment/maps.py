@@ -7,16 +7,17 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, Self
+from typing import Annotated, Final, Literal, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, ValidationInfo, field_validator, model_validator
 
 from copem_replay.core.components import Flag, Frozen, Positive, error_at_key
 from copem_replay.core.errors import InputError, count_noun
 from copem_replay.core.frame import Frame, SaidPlace
 from copem_replay.core.site_map import MapSolid, SiteMap, find_borders, make_polygon
-from copem_replay.core.tracks import Float, Solid
+from copem_replay.core.tracks import FROM_MAP, Float, Solid
 from copem_replay.core.yaml import Key
 from copem_replay.io.maps.registry import read_map
 from copem_replay.io.maps.solids import DEFAULT_HEIGHTS_M
@@ -144,7 +145,7 @@ def add_maps(
     lines, areas, solids = list(recording.lane_boundaries), list(recording.scene.areas), list(recording.scene.solids)
     notes, problems = list(recording.notes), list[tuple[Key, str]]()
     for k, asked in enumerate(maps):
-        where = f"maps[{k}] {Path(asked.file).name}"
+        where = f"{FROM_MAP}{k}] {Path(asked.file).name}"
         try:
             site = asked.place(frame)
         except InputError as error:
@@ -219,17 +220,17 @@ def _choose_solids(
     valid = truth.valid[0]
     at_m = np.unique(np.round(np.stack([truth.x_m[0, valid], truth.y_m[0, valid]], axis=1)), axis=0)
     outlines = np.array([shapely.Polygon(solid.rings_m[0], solid.rings_m[1:]) for solid in solids], dtype=object)
-    whole = np.flatnonzero(shapely.is_valid(outlines) & (shapely.area(outlines) > 0.0)) if len(solids) else []
+    whole = np.flatnonzero(shapely.is_valid(outlines) & (shapely.area(outlines) > 0.0))
     distance_m = np.full(len(whole), np.inf)
     if len(at_m) and len(whole):
         (which, _), nearest_m = shapely.STRtree(shapely.points(at_m)).query_nearest(
             outlines[whole], return_distance=True, all_matches=False
         )
         distance_m[which] = nearest_m
-    chosen = whole[distance_m <= within_m] if len(whole) else []
+    chosen = whole[distance_m <= within_m]
     counts["whose outline crosses itself: left out"] += len(solids) - len(whole)
     counts[f"beyond {within_m:g} m of every object: left out"] += len(whole) - len(chosen)
-    near, far_m = _stand_solids(recording, [solids[k] for k in chosen], outlines[chosen] if len(chosen) else [], where)
+    near, far_m = _stand_solids(recording, [solids[k] for k in chosen], outlines[chosen], where)
     said = [f"{count_noun(len(near), 'solid')} of the map may hide"] if near else []
     said += [f"{count_noun(number, 'solid')} {what}" for what, number in counts.items() if number]
     if far_m:
@@ -239,16 +240,38 @@ def _choose_solids(
     if near or not np.isfinite(least_m):
         return near, said, ""
     found = f"0 of {count_noun(len(solids), 'solid')} within {within_m:g} m of the log"
-    return near, said, f"{where.split(' ', 1)[1]}: {found}; nearest {least_m / 1000:,.3g} km: is the frame right?"
+    return near, said, f"{where.split(' ', 1)[1]}: {found}; nearest {_write_km(least_m)}: is the frame right?"
+
+
+def list_far_units(
+    recording: Recording, maps: Sequence[MapFile], places_m: Mapping[str, tuple[float, float]]
+) -> Iterator[str]:
+    """A note on each place of a unit, by name, near which solids of a map may be left out: no object comes near it."""
+    import shapely
+
+    truth, reach_m = recording.truth, min((asked.within_m for asked in maps if asked.solids), default=np.inf)
+    valid = truth.valid[0]
+    if not np.isfinite(reach_m) or not valid.any() or not recording.scene.solids:
+        return
+    tree = shapely.STRtree(shapely.points(truth.x_m[0, valid], truth.y_m[0, valid]))
+    for name, at_m in places_m.items():
+        _, (distance_m, *_) = tree.query_nearest(shapely.Point(at_m), return_distance=True)
+        if distance_m > reach_m:
+            what = "solids of maps near it are left out"
+            yield f"units.{name}: {distance_m:.0f} m from every object; {what} (`within_m: {reach_m:g}`)"
+
+
+def _write_km(distance_m: float) -> str:
+    return f"{distance_m / 1000:,.0f} km" if distance_m >= 100_000.0 else f"{distance_m / 1000:.3g} km"
 
 
 def _stand_solids(
-    recording: Recording, solids: Sequence[MapSolid], outlines: Sequence[Any], where: str
+    recording: Recording, solids: Sequence[MapSolid], outlines: NDArray[np.object_], where: str
 ) -> tuple[list[Solid], list[float]]:
     """Solids of a map at their heights, and how far away the ground of some was found, of those where that is far."""
     grounds_m, distances_m = np.zeros(len(solids)), np.zeros(len(solids))
     above = np.flatnonzero([solid.above_ground for solid in solids])
-    grounds_m[above], distances_m[above] = find_grounds(recording.truth, [outlines[k] for k in above])
+    grounds_m[above], distances_m[above] = find_grounds(recording.truth, outlines[above])
     stood = []
     for solid, ground_m in zip(solids, grounds_m.tolist(), strict=True):
         outer, *holes = (tuple((float(x), float(y)) for x, y in ring) for ring in solid.rings_m)

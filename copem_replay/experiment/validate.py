@@ -39,7 +39,7 @@ from copem_replay.experiment.file import (
     source_folder,
 )
 from copem_replay.experiment.frame import find_frame, write_frame
-from copem_replay.experiment.maps import add_maps
+from copem_replay.experiment.maps import add_maps, list_far_units
 from copem_replay.experiment.schema import Experiment, LogSettings, output_unit
 from copem_replay.io.config import TruthFields
 from copem_replay.io.open import (
@@ -399,6 +399,9 @@ def _read_local_recording(experiment: Experiment, place: Local) -> tuple[Recordi
     far = [] if wrong else [*check_degrees(experiment, frame, why, find_middle(recording))]
     experiment = resolve_degrees(experiment, frame)
     recording, disagreeing = add_maps(recording, experiment.maps, frame)
+    standing = {name: unit.at for name, unit in experiment.units.items() if unit.at is not None}
+    alone = list_far_units(recording, experiment.maps, standing) if standing and experiment.maps else ()
+    recording = replace(recording, notes=(*recording.notes, *alone))
     wrong += [RefusedLog(path, line, key) for key, line in (*far, *disagreeing)]
     return recording, wrong + [
         RefusedLog(path, reason, where) for where, reason in check_against_log(experiment, recording, known=bool(wrong))

@@ -84,8 +84,8 @@ class FrameFit:
 def fit_fixes(log: Log, recording: Recording) -> Iterator[FrameFit]:
     """The fit of each topic of fixes to the way of the ego; none without an ego, or fixes while it is there."""
     scene, truth = recording.scene, recording.truth
-    rows = np.flatnonzero((truth.row_object_ix == scene.ego_ix) & truth.valid[0]) if scene.ego_ix >= 0 else []
-    if len(rows) < 2:
+    rows = np.flatnonzero((truth.row_object_ix == scene.ego_ix) & truth.valid[0])
+    if scene.ego_ix < 0 or len(rows) < 2:
         return
     stamp_ns = scene.t0_ns + np.rint(truth.row_captured_s[rows] * 1e9).astype(np.int64)
     way_m = np.stack([truth.x_m[0, rows], truth.y_m[0, rows]], axis=1)

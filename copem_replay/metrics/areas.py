@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from copem_replay.core.interpolation import interpolate_states
 from copem_replay.core.site_map import make_polygon
@@ -40,7 +41,7 @@ def _are_in_map_areas(x_m: Float, y_m: Float, scene: Scene, name: str) -> Bool:
     return inside
 
 
-def name_areas(scene: Scene, truth: Tracks, episodes: Episodes, experiment: MetricsSetup) -> np.ndarray:
+def name_areas(scene: Scene, truth: Tracks, episodes: Episodes, experiment: MetricsSetup) -> NDArray[np.object_]:
     """(M,) the area in which the centre of each object is at its onset; None: in none, or in a gap of the truth.
 
     It is the first of one's own, in the order of the experiment, else the first kind of the log's maps.

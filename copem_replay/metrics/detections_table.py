@@ -179,9 +179,7 @@ def build_detection_columns(
     area = name_areas(scene, truth, episodes, experiment) if experiment.has_areas else None
     parts = []
     for name, event in events.items():
-        columns = _configuration_columns(scene, truth, experiment, episodes, runs, name, event, onset_m)
-        if area is not None:
-            columns["area"] = np.broadcast_to(area, (len(runs), len(area))).ravel()
+        columns = _configuration_columns(scene, truth, experiment, episodes, runs, name, event, onset_m, area)
         if delay_s is not None:
             columns |= _braking_columns(experiment, episodes, encounters, delay_s, event)
         if any(other.way is not None for other in events.values()):
@@ -201,10 +199,11 @@ def _configuration_columns(
     configuration: str,
     event: DetectionEvents,
     onset_m: Float,
+    area: NDArray[np.object_] | None,
 ) -> dict[str, Any]:
     """Columns (S · M,) of one configuration: whether, when and how far away each object is detected.
 
-    `onset_m (M,)`: distances at the onset.
+    `onset_m (M,)`: distances at the onset; `area (M,)`: the areas then, None: the study has none.
     """
     S, M = len(runs), len(episodes.object_ix)
 
@@ -226,6 +225,7 @@ def _configuration_columns(
         "onset_s": onset_s,
         "distance_at_onset_m": flat(onset_m),
         "began": began_texts(flat(episodes.began)),
+        **({} if area is None else {"area": flat(area)}),
         "detected": ~np.isnan(detection_s),
         "detection_s": detection_s,
         "captured_s": flat(detections.captured_s),

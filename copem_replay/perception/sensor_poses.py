@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from copem_replay.core.errors import count_noun
 from copem_replay.core.interpolation import interpolate_at_instants, wrap_angles
@@ -149,7 +150,7 @@ def find_ground(truth: Tracks, corners: Float) -> tuple[float, float]:
     return float(truth.z_m[0, nearest] - truth.height_m[0, nearest] / 2), float(distance.min())
 
 
-def find_grounds(truth: Tracks, outlines: Sequence[Any]) -> tuple[Float, Float]:
+def find_grounds(truth: Tracks, outlines: Sequence[Any] | NDArray[np.object_]) -> tuple[Float, Float]:
     """As `find_ground`, of many outlines (K,), polygons as shapely has them: grounds (K,), distances (K,)."""
     import shapely
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from copem_replay.core.tracks import CLASSES, Float, Int, Scene, Tracks
+from copem_replay.core.tracks import CLASSES, FROM_MAP, Float, Int, Scene, Tracks
 from copem_replay.io.write.message_family import EGO_FRAME, MIDDLE_FRAME
 from copem_replay.io.write.scene import Ellipse, Entity, Line, MovingEntities, Place, Pose, Rgba, Text, TruthScene
 from copem_replay.perception.sensor_poses import couple_outlines, mounting_height
@@ -165,11 +165,17 @@ def _draw_lanes(replayed: ReplayedRun) -> Iterator[Entity]:
 
 
 def _draw_obstacles(replayed: ReplayedRun) -> Iterator[Entity]:
-    """Outlines of the convex parts of obstacles, at the bottom and at the top."""
+    """Outlines of the convex parts of obstacles, at the bottom and at the top; those of maps as one entity."""
     static, solids = replayed.replay.placed.static, replayed.replay.placed.solids
+    of_maps: list[Line] = []
     for part in range(len(static.body)):
         corners = static.xy_m[static.start[part] : static.start[part + 1]].tolist()
         around = [*corners, *corners[:1]]
         solid = solids[static.body[part]]
         lines = [Line([(x, y, z) for x, y in around], STATIC) for z in (solid.bottom_m, solid.top_m)]
-        yield Entity(f"{solid.name}:{part}", {"obstacle": solid.name.split()[-1]}, lines)
+        if solid.name.startswith(FROM_MAP):
+            of_maps += lines
+        else:
+            yield Entity(f"{solid.name}:{part}", {"obstacle": solid.name.split()[-1]}, lines)
+    if of_maps:
+        yield Entity("solids of maps", lines=of_maps)

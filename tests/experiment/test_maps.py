@@ -227,6 +227,18 @@ def test_degrees_need_a_place_on_earth(folder: Path) -> None:
         read(folder, "maps: [{file: site.geojson, frame: same}]")
 
 
+def test_a_mast_that_nobody_comes_near_is_noted(folder: Path) -> None:
+    """The cars end at x = 40 m, y = 2 m at the nearest, and another stands at (0, −2)."""
+    drive = HOUSE.replace("[-10, 30]", "[0, 248]").replace("range_m: 200", "range_m: 400")
+    (folder / "experiment.yaml").write_text(drive + "maps: [{file: town.xodr, frame: same}]\n")
+    notes = read_study(read_experiment_file(folder / "experiment.yaml")).recordings[0].notes
+    far_m = min(math.hypot(0, 250), math.hypot(40, 246))
+    assert (
+        f"units.mast: {far_m:.0f} m from every object; solids of maps near it are left out (`within_m: 200`)" in notes
+    )
+    assert not any("units.mast" in note for note in read(folder, "maps: [{file: town.xodr, frame: same}]").notes)
+
+
 def test_a_unit_in_a_house_of_the_map_is_refused(folder: Path) -> None:
     (folder / "experiment.yaml").write_text(
         HOUSE.replace("[-10, 30]", "[30, 14]") + "maps: [{file: town.xodr, frame: same}]\n"

@@ -134,6 +134,22 @@ class TestTruth:
         top = found["obstacle 0:0"].lines[1]
         assert {(point.x, point.y) for point in top.points} == {(10, 10), (20, 10), (20, 20)}
 
+    def test_houses_of_a_map_are_one_entity(self, tmp_path: Path) -> None:
+        drive(tmp_path / "drive.mcap")
+        houses = "".join(
+            f'<object id="{k}" type="building" s="{20 + 10 * k}" t="20" length="6" width="4" height="5"/>'
+            for k in (0, 1)
+        )
+        line = '<planView><geometry s="0" x="0" y="0" hdg="0" length="90"><line/></geometry></planView>'
+        (tmp_path / "town.xodr").write_text(
+            f'<OpenDRIVE><road id="1" length="90">{line}<objects>{houses}</objects></road></OpenDRIVE>'
+        )
+        (tmp_path / "e.yaml").write_text(changed("show: {run: 0}", "maps: [{file: town.xodr, frame: same}]"))
+        ((_, data),) = messages(cr.run(tmp_path / "e.yaml").save(tmp_path / "r") / "replay.mcap", "copem/truth/static")
+        (entity,) = (e for e in SceneUpdate.FromString(data).entities if "unit" not in e.id)
+        assert (entity.id, len(entity.lines)) == ("solids of maps", 4)
+        assert {(p.x, p.y, p.z) for p in entity.lines[1].points} == {(x, y, 5) for x in (17, 23) for y in (18, 22)}
+
     def test_lanes_are_one_entity_of_what_does_not_move(self, tmp_path: Path) -> None:
         drive(tmp_path / "drive.mcap")
         (tmp_path / "e.yaml").write_text(changed("show: {run: 0}"))

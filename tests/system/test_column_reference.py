@@ -44,6 +44,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     data["units"]["fleet"] = FLEET
     data["measure"]["conflict"] = {"horizon_s": 3.0}
     data["measure"]["by"] = ["class"]
+    data["areas"] = {"here": {"polygon_m": [[0, 0], [9, 0], [9, 9]]}}
     data["units"]["ego"]["ready"] = 0.0  # so lists have a way that is told
     return cr.run(data).save(tmp_path_factory.mktemp("results") / "out")
 

@@ -55,6 +55,7 @@ def _lanelets() -> str:
     ways += (
         '<way id="20"><nd ref="0"/><nd ref="2"/><nd ref="8"/><nd ref="6"/><tag k="type" v="intersection_area"/></way>'
     )
+    ways += '<way id="21"><nd ref="0"/><nd ref="4"/><tag k="type" v="wall"/><tag k="height" v="3 m"/></way>'
     relations = "".join(
         f'<relation id="{30 + n}"><member type="way" role="left" ref="{11 + n}"/><member type="way" role="right" '
         f'ref="{10 + n}"/><tag k="type" v="lanelet"/><tag k="subtype" v="{kind}"/></relation>'
