@@ -366,8 +366,8 @@ def find_range_problem(onset: Onset, slices: Sequence[Slice]) -> str | None:
     if not isinstance(onset, InRange) or not any(by.names(RANGE) for by in slices):
         return None
     return (
-        f"{RANGE}: expected an onset that is no range, found in_range: who comes nearer is at {onset.range_m:g} m, and "
-        f"all others began nearer; slice by {BEGAN_BY}, or see bands.csv for accuracy by range at the instant"
+        f"{RANGE}: expected an onset that is no range, found in_range: what comes nearer is at {onset.range_m:g} m, "
+        f"and all else began nearer; slice by {BEGAN_BY}, or see bands.csv for accuracy by range at the instant"
     )
 
 

@@ -138,8 +138,8 @@ def test_slices_need_no_replay(tmp_path: Path) -> None:
         pd.testing.assert_series_equal(found[name], expected[name], check_dtype=False)
     for entry, said in (
         ("tags.site", "--by: tags.site: expected a tag that some log has, found none; tags are weather"),
-        ("range_at_onset", "--by: range_at_onset: expected an onset that is no range, found in_range: who comes nearer "
-                           "is at 60 m, and all others began nearer"),
+        ("range_at_onset", "--by: range_at_onset: expected an onset that is no range, found in_range: what comes "
+                           "nearer is at 60 m, and all else began nearer"),
     ):  # fmt: skip
         with pytest.raises(InputError) as error:
             summarise_slices(results, [entry])

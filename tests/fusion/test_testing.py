@@ -94,15 +94,9 @@ def test_it_says_what_it_has_checked() -> None:
     assert len(kept.scenes) == 9
     assert kept.scenes[0] == "one object and one unit"
     assert list(kept.asked) == list(FUSION_RULES)
-    each = {
-        "again": 9,
-        "runs": 36,
-        "unheard": 9,
-        "order of entries": 9,
-        "order of units": 9,
-        "silence": 9,
-        "chunks": 18,
-    }
+    each = {"again": 9, "runs": 36, "chunks": 18} | dict.fromkeys(
+        ("unheard", "order of entries", "order of units", "silence"), 9
+    )
     assert {rule: kept.asked[rule] for rule in each} == each
     # each scene itself and each variation is answered; chunks are resumed, which is no answer of its own
     varied = sum(each.values()) - each["silence"] - each["chunks"] + kept.asked["causality"]

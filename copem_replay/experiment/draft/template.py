@@ -337,7 +337,7 @@ def _draft_configurations(first: Sequence[str], recorded: Sequence[str], *, ego:
 def _draft_outputs(outputs: Sequence[tuple[str, UnitFound]], recorded: Sequence[str]) -> Iterator[str]:
     """Configurations of a stack's recorded outputs, told by their topics: measured like a fusion."""
     for name, unit in outputs:
-        yield "  # Its name suggests that this is the output of a stack, whose inputs are these units; if it is not, make it a unit"
+        yield "  # Its name suggests a stack's own output, with these units as inputs; if it is not, make it a unit"
         yield from (f"  # {_format_comment(line)}" for line in unit.oddities)
         late = "" if unit.delay is None else f"   # delay_s {_format_comment(unit.delay)}"
         yield f"  {name}: {{recorded: {_format_recorded(unit)}, inputs: [{', '.join(recorded)}]}}{late}"
