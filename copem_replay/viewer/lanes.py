@@ -191,7 +191,8 @@ def smooth_status(elapsed_ns: Int, status: Int) -> list[Span]:
     """The spans of a status (K,), none shorter than `STEADY_S`.
 
     A sequence of shorter statuses becomes one span, of the status with the longest total duration. A sequence that is
-    too short as a whole continues the span before. The first span in which the object is known stays, however short.
+    too short as a whole continues the span before, unless the object is absent then. The first span in which the object
+    is known stays, however short.
     """
     first = np.flatnonzero(np.diff(status, prepend=-1))
     values, lasts = status[first], np.diff(elapsed_ns[first], append=elapsed_ns[-1] + _STEADY_NS)
@@ -204,7 +205,8 @@ def smooth_status(elapsed_ns: Int, status: Int) -> list[Span]:
         if not long_enough[k]:
             end = next((n for n in range(k, len(first)) if long_enough[n]), len(first))
         duration_by_status = np.bincount(values[k:end], weights=lasts[k:end])
-        if long_enough[k] or not spans or duration_by_status.sum() >= _STEADY_NS:
+        alone = not spans or spans[-1].status == ABSENT
+        if long_enough[k] or alone or duration_by_status.sum() >= _STEADY_NS:
             spans.append(Span(int(first[k]), len(status), int(duration_by_status.argmax())))
         k = end
     merged = [span for n, span in enumerate(spans) if n == 0 or span.status != spans[n - 1].status]

@@ -28,7 +28,7 @@ from copem_replay.viewer import sink as palette
 from copem_replay.viewer import write_rrd
 from copem_replay.viewer.curves import break_lines, running_median
 from copem_replay.viewer.lanes import STEADY_S, lanes_axis_s, smooth_status
-from copem_replay.viewer.sink import KNOWN, STATUSES, show_seconds
+from copem_replay.viewer.sink import ABSENT, HIDDEN, KNOWN, STATUSES, show_seconds
 from tests.helpers.report_pages import named
 from tests.oracles.colour import apart_for_a_deuteranope, contrast
 from tests.viewer.test_rrd import SUMMARY, Made
@@ -274,6 +274,12 @@ def test_steady_lanes_begin_known_where_it_begins(runs: list[tuple[int, int]]) -
         end = next((k for k in range(first + 1, len(what)) if merged[k]), len(what))
         if lasts[first:end].sum() / 10 >= STEADY_S:
             assert any(span.first <= first < span.end and span.status == what[first] for span in spans)
+
+
+def test_what_is_short_after_an_absence_is_no_absence() -> None:
+    """Absent for 1 s, hidden for 0.3 s, known from then on."""
+    spans = smooth_status(np.array([0, 10, 13]) * 100_000_000, np.array([ABSENT, HIDDEN, KNOWN]))
+    assert [(span.first, span.status) for span in spans] == [(0, ABSENT), (1, HIDDEN), (2, KNOWN)]
 
 
 # ------------------------------------------------------------------------------- errors
