@@ -27,14 +27,15 @@ from benches import (
     replay,
     scaling,
     slices,
+    why,
     writing,
 )
 
 BENCHES = (
     compiling.compile, commands.pieces, compare.compare, compare.verdict, slices.slices, crew.crew, replay.visibility,
     replay.solids, replay.site, memory.memory, fit.fit, replay.paper, reading.reading, writing.writing,
-    commands.commands, commands.reports, fusion.fusion, peers.peers, links.links, scaling.scaling, long.crowd,
-    long.long,
+    commands.commands, commands.reports, fusion.fusion, peers.peers, links.links, why.why, scaling.scaling,
+    long.crowd, long.long,
 )  # fmt: skip
 """All there are, in the order in which they run; each is called without arguments, by its name."""
 ALONE = "--alone"

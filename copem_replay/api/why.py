@@ -188,6 +188,8 @@ def _explain(
     varied, orders, why_not = _vary(logs, names) if "sensitivity" in parts else (None, None, [])
     notes += question.note("sensitivity", why_not, bool(joined))
     progress(steps, steps)
+    if not joined and varied is None:
+        raise ExperimentError(notes[-1] if notes else "expected a configuration with units, found none")
     causes, units, triage, late = (joined.get(part) for part in ("causes", "units", "triage", "late"))
     return Explanation(causes, units, triage, late, varied, orders, tuple(dict.fromkeys(notes)))
 

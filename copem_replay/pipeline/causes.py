@@ -188,10 +188,11 @@ NO_UNIT = "no unit there"
 """What is left without any cause: there is no unit, or it does not list its own carrier."""
 RECORDED = "recorded"
 """What is left of a configuration with recorded units: what these list, and when, is as it was recorded."""
-_LEFT = {
+LEFT = {
     NO_UNIT: Cause(NO_UNIT, NO_UNIT, NO_UNIT, lambda e: e),
     RECORDED: Cause(RECORDED, RECORDED, "not in a recorded list", lambda e: e),
 }
+"""What is left without any cause."""
 _OF_RECORDED = ("latency", "loss", "queue", "ticks", "fusion", "confirmation")
 """Causes of a configuration with recorded units: what these would list otherwise is not known."""
 
@@ -217,8 +218,15 @@ def select_configuration(experiment: Experiment, name: str) -> Experiment:
         )
     units = {unit: experiment.units[unit] for unit in experiment.units_of(one)}
     links = [one.link_of(unit) for unit in units]
+    measure = experiment.measure
+    if measure.distance_to not in ("ego", *units):  # distances are from somewhere, though no time depends on it
+        modelled = [unit for unit, its in units.items() if its.recorded is None]
+        if modelled:
+            measure = measure.model_copy(update={"distance_to": modelled[0]})
+        else:
+            units[measure.distance_to] = experiment.units[measure.distance_to]
     only = {
-        "configurations": {name: one}, "units": units,
+        "configurations": {name: one}, "units": units, "measure": measure,
         "pems": _keep(experiment.pems, {unit.pem for unit in units.values()}),
         "links": _keep(experiment.links, {link for link in links if isinstance(link, str)}),
     }  # fmt: skip
@@ -228,7 +236,7 @@ def select_configuration(experiment: Experiment, name: str) -> Experiment:
 def measure_times_only(experiment: Experiment) -> Experiment:
     """The experiment with nothing that a time of detection does not need."""
     nothing: dict[str, Any] = {"sweep": None, "show": None, "criteria": {}, "braking": None}
-    measure = {"accuracy": False, "exact": False, "by": (), "metrics": (), "conflict": None, "distance_to": "ego"}
+    measure = {"accuracy": False, "exact": False, "by": (), "metrics": (), "conflict": None}
     return experiment.model_copy(update=nothing | {"measure": experiment.measure.model_copy(update=measure)})
 
 
@@ -338,7 +346,7 @@ def share_lateness(replays: Counterfactuals) -> list[CauseShares]:
     """What each acting cause adds to the time unknown of every row; the rows of `added_s` sum to it."""
     causes = list_causes(replays.only)
     known = replays.unknown_s(causes)
-    shares = [CauseShares(_LEFT[RECORDED if replays.only.recorded else NO_UNIT], known, None)]
+    shares = [CauseShares(LEFT[RECORDED if replays.only.recorded else NO_UNIT], known, None)]
     whole = replays.unknown_s(())
     for k, cause in enumerate(causes):
         later = replays.unknown_s(causes[k + 1 :])
@@ -355,7 +363,7 @@ def tabulate_causes(of_logs: Sequence[tuple[Counterfactuals, list[CauseShares]]]
     """
     rows = pd.concat([replays.rows for replays, _ in of_logs], ignore_index=True)
     names = dict.fromkeys(name_cause(one) for _, shares in of_logs for one in shares)
-    order = [*_LEFT, *(cause.name for cause in CAUSES)]
+    order = [*LEFT, *(cause.name for cause in CAUSES)]
     table = []
     for name in sorted(names, key=order.index):
         found = [_find(shares, name) for _, shares in of_logs]
@@ -384,7 +392,7 @@ def name_cause(share: CauseShares) -> str:
 
 def describe_cause(name: str) -> str:
     """A cause in the words of pages and terminals."""
-    return next((cause.words for cause in (*_LEFT.values(), *CAUSES) if cause.name == name), name)
+    return next((cause.words for cause in (*LEFT.values(), *CAUSES) if cause.name == name), name)
 
 
 def _find(shares: Sequence[CauseShares], name: str) -> CauseShares | None:

@@ -17,7 +17,7 @@ from copem_replay.core.tracks import CLASSES, SAME_INSTANT_S, Float, Int
 from copem_replay.perception.observation import interpolate_worlds
 from copem_replay.perception.sensor_poses import make_observers
 from copem_replay.perception.visibility import find_blockers
-from copem_replay.pipeline.causes import CAUSES, CauseShares, Counterfactuals, name_cause
+from copem_replay.pipeline.causes import CAUSES, LEFT, CauseShares, Counterfactuals, name_cause
 from copem_replay.pipeline.prepare import Replay
 
 LATE_S = 1.0
@@ -173,7 +173,7 @@ def describe_chance(structural_share: float) -> str:
 def describe_episode(episode: pd.Series) -> str:
     """Why an object is late: `1.9 s late: 1.2 hidden by bus 12, 0.5 latency`; parts below .05 s are left out."""
     parts = []
-    for cause in CAUSES:
+    for cause in (*LEFT.values(), *CAUSES):
         added_s = float(episode.get(f"added {cause.name}", 0.0))
         if added_s >= 0.05:
             by = f"hidden by {episode['hidden_by']}" if cause.name == "hidden" and episode["hidden_by"] else cause.words

@@ -131,3 +131,26 @@ def test_damaged_tables_are_refused(results: Path, name: str, text: str, line: s
 def test_they_go_with_the_results(results: Path) -> None:
     cr.run("e.yaml", jobs=1).save(results, overwrite=True)
     assert not (results / "why").exists() or not list((results / "why").iterdir())
+
+
+def test_what_does_not_apply_is_left_out_unless_it_is_asked_for(call) -> None:  # type: ignore[no-untyped-def]
+    """The ego alone has no other unit, and one configuration no order; its time is told as the PEMs vary."""
+    code, said, notes = call("e.yaml", "--configuration", "PEM")
+    assert code == 0
+    assert notes[-1] == "note: no units: configuration PEM: expected a unit beside the ego's, found ego alone"
+    assert "seconds unknown as PEMs vary" in said
+    assert not any("pairs" in line for line in said)
+    code, _, problems = call("e.yaml", "--configuration", "PEM", "--units")
+    assert (code, problems[-1]) == (2, "configuration PEM: expected a unit beside the ego's, found ego alone")
+
+
+def test_what_nobody_can_know_is_counted_apart(call) -> None:  # type: ignore[no-untyped-def]
+    """2 s from the onset to the end, and no list arrives within 2.5 s."""
+    Path("e.yaml").write_text(TEXT.replace("latency_s: 0.5", "latency_s: 2.5"))
+    code, said, _ = call("e.yaml", "--triage", "--configuration", "coPEM")
+    assert code == 0
+    late = pd.read_csv("out/e_why/late_episodes.csv")
+    hopeless = late[late["hopeless_share"] == 1]
+    assert len(hopeless) == 1
+    lost_s = hopeless["unknown_s"].sum()
+    assert f"coPEM: 1 episode, {lost_s:.1f} s, end before any list can tell of them: in no group" in said
