@@ -207,7 +207,7 @@ def _vary(
     return varied, compare_orders(varied), []
 
 
-class _Found(NamedTuple):
+class _PartTables(NamedTuple):
     """The tables of a configuration by part, and why there is none of a part."""
 
     tables: dict[str, pd.DataFrame]
@@ -216,13 +216,13 @@ class _Found(NamedTuple):
 
 def _explain_configuration(
     name: str, logs: Sequence[tuple[Recording, Experiment]], question: _Question, beside: dict[int, Counterfactuals]
-) -> _Found:
+) -> _PartTables:
     """`beside`: by number of log the replays of the configuration before, which is replaced."""
     from copem_replay.pipeline.causes import Counterfactuals, share_lateness, tabulate_causes
     from copem_replay.pipeline.triage import group_late_episodes, list_late_episodes, rank_groups
     from copem_replay.pipeline.worth import compute_unit_worths
 
-    parts, found = question.parts, _Found({}, {})
+    parts, found = question.parts, _PartTables({}, {})
     if {"causes", "triage"} & set(parts):
         shares: list[tuple[Counterfactuals, list[CauseShares]]] = []
         try:
@@ -286,14 +286,15 @@ def _describe_units(name: str, units: pd.DataFrame, width: int | None) -> list[s
 
 def _describe_groups(name: str, groups: pd.DataFrame) -> list[str]:
     from copem_replay.pipeline.causes import describe_cause
-    from copem_replay.pipeline.triage import describe_chance
+    from copem_replay.pipeline.triage import describe_structure
 
     lost_s, lines = groups["lost_s"].sum(), list[str]()
     for row in groups.head(_SHOWN_GROUPS).itertuples():
         where = f" ({row.where})" if row.where else ""
         objects, cause = count_noun(int(row.objects), "object"), describe_cause(str(row.cause))
+        how = describe_structure(float(row.structural_share))
         lines.append(
-            f"{row.log}: {objects}, {row.lost_s:.1f} s, {cause}{where}{describe_chance(float(row.structural_share))}; "
+            f"{row.log}: {objects}, {row.lost_s:.1f} s, {cause}{where}{how}; "
             f"such as {row.example_class} {row.example} at {row.example_onset_s:.1f} s"
         )
     rest, first = len(groups) - _SHOWN_GROUPS, groups.iloc[0]

@@ -162,7 +162,7 @@ def _find_sides(replay: Replay, objects: Int, at_s: Float) -> list[str]:
 # In words.
 
 
-def describe_chance(structural_share: float) -> str:
+def describe_structure(structural_share: float) -> str:
     """`, by structure`: late although nothing in sight is missed; `, by chance`; or the share; empty where unknown."""
     if np.isnan(structural_share):
         return ""

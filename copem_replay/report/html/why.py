@@ -12,7 +12,7 @@ import pandas as pd
 from copem_replay.core.errors import InputError, count_noun
 from copem_replay.pipeline.causes import CAUSES, describe_cause
 from copem_replay.pipeline.sensitivity import compare_orders, describe_orders, tabulate_variations
-from copem_replay.pipeline.triage import describe_chance
+from copem_replay.pipeline.triage import describe_structure
 from copem_replay.report.figures.style import format_per_cent, format_two_decimals
 from copem_replay.report.html.markup import (
     Html,
@@ -147,7 +147,7 @@ def _group_list(name: str, of: pd.DataFrame) -> Html:
         objects, share = count_noun(int(row["objects"]), "object"), format_per_cent(float(row["lost_s"]) / lost_s)
         words = f"{row['log']}: {objects}, {float(row['lost_s']):.1f} s ({share}), {describe_cause(str(row['cause']))}"
         example = f"copem-replay view FOLDER --object {row['example']} --log {row['log']}"
-        words += where + describe_chance(float(row["structural_share"]))
+        words += where + describe_structure(float(row["structural_share"]))
         lines.append(make_tag("span", f"{words}; such as {row['example_class']} ", make_tag("code", example)))
     rest = len(of) - _MOST_GROUPS
     more = [f"and {count_noun(rest, 'group')} more in {FOLDER}/triage.csv"] if rest > 0 else []
