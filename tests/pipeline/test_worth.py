@@ -100,6 +100,35 @@ def test_a_drive_by_hand(tmp_path: Path, fusion: str) -> None:
     assert (found.given_s, found.all_s) == pytest.approx((2.0, 0.5))
 
 
+@pytest.mark.parametrize(("of", "together"), [("pair", False), ("object", True)])
+def test_masts_that_miss_together_are_no_product(tmp_path: Path, of: str, together: bool) -> None:
+    """Two masts in one place that see the car half of the time, for good. What they miss together one spares as well as
+    two; what each misses by itself the other may see.
+    """
+    memory = f"{{detection: [{{share: 1, correlation_s: always, of: {of}}}]}}"
+    seen = "detection: {kind: constant, probability: 0.5}"
+    text = TEXT.format(fusion="").replace(
+        "far: [{when: {range_m: [0, 55.05]}, detection: {kind: constant, probability: 1.0}}]",
+        f"far: {{couples: [{{when: {{range_m: [0, 55.05]}}, {seen}}}], memory: {memory}}}",
+    )
+    drive(tmp_path / "drive.mcap")
+    (tmp_path / "e.yaml").write_text(text + "runs: 40\n")
+    study = make_study(tmp_path / "e.yaml")
+    found = compute_unit_worths(
+        [(one, resolve_for_log(study.experiment, one.scene.log)) for one in study.recordings], "all"
+    )
+    table = found.table.set_index("unit")
+    assert found.by_curves is not together
+    if together:  # 1.5 s in the runs that see, half for each
+        assert table["alone_s"]["mast"] > 0.3
+        assert table["share_s"]["mast"] == pytest.approx(table["alone_s"]["mast"] / 2, abs=1e-9)
+        assert table["left_out_s"]["mast"] == pytest.approx(0.0, abs=1e-9)
+    else:  # alone 1.5 s in half of all cases; after the other half of what is left
+        assert table["alone_s"]["mast"] == pytest.approx(0.75, abs=1e-9)
+        assert table["left_out_s"]["mast"] == pytest.approx(0.375, abs=1e-9)
+        assert table["share_s"]["mast"] == pytest.approx(0.5625, abs=1e-9)
+
+
 def test_a_unit_that_is_not_there_is_refused_with_the_nearest(tmp_path: Path) -> None:
     with pytest.raises(ExperimentError, match=r"no unit is named 'mats'; did you mean mast\?"):
         worths_of(tmp_path, "", ("mats",))
