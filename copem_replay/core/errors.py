@@ -161,6 +161,13 @@ def wrap_line(line: str, width: int | None) -> list[str]:
     )  # fmt: skip
 
 
+def quote_value(value: object) -> str:
+    """Return the value as an error quotes it: on one line, shortened."""
+    text = "nothing" if value is None else repr(value)
+    text = " ".join(text.split())
+    return text if len(text) <= 60 else text[:57] + "…"
+
+
 def count_noun(number: int, noun: str, plural: str = "") -> str:
     """`1 message`, `2 messages`; `plural` where it is not the noun with an s."""
     return f"{number} {noun if number == 1 else plural or noun + 's'}"

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final
 from xml.parsers import expat
 
-from copem_replay.core.errors import InputError
+from copem_replay.core.errors import InputError, quote_value
 from copem_replay.io.convert.conversion import (
     KINDS,
     Box,
@@ -26,7 +26,6 @@ from copem_replay.io.convert.conversion import (
     parse_number,
     parse_positive,
     parse_seconds_as_ns,
-    quote_value,
     wrap_yaw,
 )
 

@@ -21,7 +21,7 @@ from osi3.osi_groundtruth_pb2 import GroundTruth
 from osi3.osi_lane_pb2 import LaneBoundary
 from osi3.osi_object_pb2 import MovingObject, StationaryObject
 
-from copem_replay.core.errors import InputError, OutputError, count_noun, unknown_name_message
+from copem_replay.core.errors import InputError, OutputError, count_noun, quote_value, unknown_name_message
 from copem_replay.core.frame import SaidPlace
 from copem_replay.core.tracks import Float
 from copem_replay.io.ground_truth import HEIGHTS_M
@@ -147,13 +147,6 @@ def parse_seconds_as_ns(text: object, where: str, *, times: Decimal = Decimal(1)
     if not seconds.is_finite() or not 0 <= seconds <= LAST_SECOND:
         raise InputError(f"{where}: expected a time of 0 to {LAST_SECOND} s, found {quote_value(text)}")
     return round(seconds * 1_000_000_000)
-
-
-def quote_value(value: object) -> str:
-    """Return the value as an error quotes it: on one line, shortened."""
-    text = "nothing" if value is None else repr(value)
-    text = " ".join(text.split())
-    return text if len(text) <= 60 else text[:57] + "…"
 
 
 def number_names(names: Iterable[str]) -> dict[str, int]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from copem_replay.core.errors import InputError
+from copem_replay.core.errors import InputError, quote_value
 from copem_replay.io.convert.conversion import (
     KINDS,
     Box,
@@ -20,7 +20,6 @@ from copem_replay.io.convert.conversion import (
     parse_number,
     parse_positive,
     parse_seconds_as_ns,
-    quote_value,
     wrap_yaw,
 )
 

@@ -19,7 +19,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from copem_replay.core.errors import InputError, count_noun
+from copem_replay.core.errors import InputError, count_noun, quote_value
 from copem_replay.core.files import avoid_device_name
 from copem_replay.core.tracks import Float
 from copem_replay.io.convert.conversion import (
@@ -31,7 +31,6 @@ from copem_replay.io.convert.conversion import (
     OsiKind,
     PlannedRecording,
     parse_number,
-    quote_value,
     rotation_from_quaternion,
     sign_files,
 )

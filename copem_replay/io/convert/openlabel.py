@@ -16,7 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from copem_replay.core.errors import InputError
+from copem_replay.core.errors import InputError, quote_value
 from copem_replay.core.files import parse_json
 from copem_replay.core.tracks import Float
 from copem_replay.io.convert.conversion import (
@@ -28,7 +28,6 @@ from copem_replay.io.convert.conversion import (
     number_names,
     parse_number,
     parse_seconds_as_ns,
-    quote_value,
     rotation_from_euler,
     rotation_from_quaternion,
 )

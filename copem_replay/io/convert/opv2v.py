@@ -19,7 +19,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from copem_replay.core.errors import InputError, unknown_name_message
+from copem_replay.core.errors import InputError, quote_value, unknown_name_message
 from copem_replay.core.tracks import Float
 from copem_replay.core.yaml import NotYamlError, parse_yaml
 from copem_replay.io.convert.conversion import (
@@ -31,7 +31,6 @@ from copem_replay.io.convert.conversion import (
     number_names,
     parse_number,
     parse_seconds_as_ns,
-    quote_value,
     rotation_from_euler,
     wrap_yaw,
 )

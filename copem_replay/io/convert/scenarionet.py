@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from copem_replay.core.errors import InputError, count_noun
+from copem_replay.core.errors import InputError, count_noun, quote_value
 from copem_replay.core.tracks import Bool, Float
 from copem_replay.io.convert import restricted_pickle
 from copem_replay.io.convert.conversion import (
@@ -27,7 +27,6 @@ from copem_replay.io.convert.conversion import (
     OsiKind,
     PlannedRecording,
     number_names,
-    quote_value,
     wrap_yaw,
 )
 from copem_replay.io.convert.nuscenes import EGO_CENTRE_M, find_kind

@@ -18,7 +18,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from copem_replay.core.errors import InputError
+from copem_replay.core.errors import InputError, quote_value
 from copem_replay.core.files import avoid_device_name, parse_json
 from copem_replay.core.tracks import Float
 from copem_replay.io.convert.conversion import (
@@ -29,7 +29,6 @@ from copem_replay.io.convert.conversion import (
     ConvertedFrame,
     PlannedRecording,
     parse_number,
-    quote_value,
     sign_files,
 )
 

@@ -9,10 +9,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from copem_replay.core.errors import InputError
+from copem_replay.core.errors import InputError, quote_value
 from copem_replay.core.site_map import Lane, LaneKind, SiteMap, make_area
 from copem_replay.core.tracks import Area, Float
-from copem_replay.io.convert.conversion import quote_value
 
 _FARTHEST: Final = 1e8
 _KIND: Final[dict[str, LaneKind]] = {"VEHICLE": "driving", "BUS": "driving", "BIKE": "bicycle"}

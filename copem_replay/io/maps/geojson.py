@@ -7,9 +7,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from copem_replay.core.errors import InputError
+from copem_replay.core.errors import InputError, quote_value
 from copem_replay.core.site_map import SiteMap
-from copem_replay.io.convert.conversion import quote_value
 from copem_replay.io.maps.solids import Place, Shape, Tags, check_place, make_site, tag_text
 
 if TYPE_CHECKING:

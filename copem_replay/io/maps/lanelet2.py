@@ -16,11 +16,10 @@ from typing import Final
 
 import numpy as np
 
-from copem_replay.core.errors import InputError, count_noun
+from copem_replay.core.errors import InputError, count_noun, quote_value
 from copem_replay.core.site_map import AreaKind, Lane, LaneKind, SiteMap, make_area
 from copem_replay.core.tracks import Float
 from copem_replay.io.convert.commonroad import XmlNode, read_parts
-from copem_replay.io.convert.conversion import quote_value
 from copem_replay.io.maps.solids import DEFAULT_HEIGHTS_M, Shape, make_site
 
 _FARTHEST: Final = 1e8

@@ -15,11 +15,10 @@ from typing import Final
 
 import numpy as np
 
-from copem_replay.core.errors import InputError, count_noun
+from copem_replay.core.errors import InputError, count_noun, quote_value
 from copem_replay.core.site_map import Lane, LaneKind, MapSolid, SiteMap, make_area, make_polygon
 from copem_replay.core.tracks import Area, Float
 from copem_replay.io.convert.commonroad import XmlNode, read_parts
-from copem_replay.io.convert.conversion import quote_value
 from copem_replay.io.maps.opendrive_geometry import CHORD_M, SHAPES, Cubics, Piece, RoadLine
 
 _FARTHEST: Final = 1e8

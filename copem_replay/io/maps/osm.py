@@ -13,10 +13,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from copem_replay.core.errors import InputError
+from copem_replay.core.errors import InputError, quote_value
 from copem_replay.core.site_map import SiteMap
 from copem_replay.io.convert.commonroad import XmlNode, read_parts
-from copem_replay.io.convert.conversion import quote_value
 from copem_replay.io.maps.solids import Place, Shape, Tags, check_place, hides, make_site, tag_text
 
 if TYPE_CHECKING:

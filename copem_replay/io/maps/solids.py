@@ -14,10 +14,9 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from copem_replay.core.errors import InputError
+from copem_replay.core.errors import InputError, quote_value
 from copem_replay.core.site_map import MapSolid, SiteMap
 from copem_replay.core.tracks import Float
-from copem_replay.io.convert.conversion import quote_value
 
 if TYPE_CHECKING:
     import shapely
