@@ -221,7 +221,7 @@ def test_the_page_shows_commands_that_are_understood_and_a_table_that_converts(r
     group = typer.main.get_group(convert_command.app)
     page = (ROOT / "docs/guide/data-sets.md").read_text(encoding="utf-8")
     commands = re.findall(r"`copem-replay convert (.*?)`", page)
-    assert len(commands) == 8
+    assert {command.split()[0] for command in commands} == set(group.commands)
     for command in commands:
         name, *words = shlex.split(command)
         group.commands[name].make_context(name, words)  # raises where an option is unknown or missing
