@@ -3,7 +3,8 @@
 A kind is how many configurations there are of each family, eight in all. Candidates are a grid in OKLCh that has the
 contrast to every ground, and keeps away from the greys. Simulated annealing over them asks for ΔE2000 ≥ 15 between
 any two, plainly seen and by a deuteranope, then for one hue within a family, other hues in other families, the same
-hue in both themes, and strong colours. `tests/core/test_colours.py` holds the result against plain formulas.
+hue in both themes, and strong colours. A palette with a greyish colour, which may be taken for the truth, is searched
+again among strong candidates. `tests/core/test_colours.py` holds the result against plain formulas.
 
 Sources: OKLab, B. Ottosson, "A perceptual color space for image processing" (2020); rest: `tests/oracles/colour.py`.
 """
@@ -29,11 +30,13 @@ GROUNDS: dict[Theme, tuple[tuple[int, int, int], ...]] = {
 HUES_DEG = (255, 60, 145, 340, 295, 25, 110, 200)
 """Hues in OKLCh that families have if they can."""
 APART, APART_FROM_REST, CONTRAST = 15.03, 12.0, 3.02
+GREYISH, MIDDLE, STRONG = 0.06, (0.45, 0.85), 0.09
+"""Chroma in OKLCh below which a colour of middle lightness looks grey, and least chroma of the search after that."""
 STEPS, TRIES = 3000, 8
 
 
 def make_candidates(theme: Theme) -> dict[str, Any]:
-    """Colours (N, 3), their hues, strengths and luminances (N,), and least differences (N, N)."""
+    """Colours (N, 3), their hues, strengths, luminances and whether they look grey (N,), least differences (N, N)."""
     light, strong, hue_deg = (
         v.ravel() for v in np.meshgrid(np.arange(0.22, 0.96, 0.035), np.arange(0.04, 0.26, 0.03), np.arange(0, 360, 10))
     )
@@ -52,11 +55,23 @@ def make_candidates(theme: Theme) -> dict[str, Any]:
     kept = (apart[:, 0] >= APART) & (apart[:, 1] >= APART_FROM_REST)
     kept &= [min(contrast(tuple(c), ground) for ground in GROUNDS[theme]) >= CONTRAST for c in colours.tolist()]
     colours = colours[kept]
+    greyish = (strong < GREYISH) & (light > MIDDLE[0]) & (light < MIDDLE[1])
     return {
+        "greyish": greyish[shown][kept],
         "colours": colours, "hue_deg": hue_deg[shown][kept], "strong": strong[shown][kept],
         "luminance": _linear(colours) @ np.array([0.2126, 0.7152, 0.0722]),
         "apart": _least_apart(colours[:, None], colours[None]),
     }  # fmt: skip
+
+
+def search_strong_palette(shape: tuple[int, ...], of: dict[str, Any], *wanted: Any) -> np.ndarray:
+    """Indices (8,) as `search_palette` finds them, all of strong candidates if some were greyish."""
+    found = search_palette(shape, of, *wanted)
+    if not of["greyish"][found].any():
+        return found
+    kept = np.flatnonzero(of["strong"] >= STRONG)
+    rest = {name: value[kept][:, kept] if name == "apart" else value[kept] for name, value in of.items()}
+    return kept[search_palette(shape, rest, *wanted)]
 
 
 def search_palette(shape: tuple[int, ...], of: dict[str, Any], hues_deg: tuple[float, ...], pull: float) -> np.ndarray:
@@ -143,7 +158,7 @@ def main() -> None:
     for shape in list_shapes(MOST_COLOURS):
         hues_deg, pull = tuple(map(float, HUES_DEG)), 0.05
         for theme, of in candidates.items():
-            families = np.split(search_palette(shape, of, hues_deg, pull), np.cumsum(shape)[:-1])
+            families = np.split(search_strong_palette(shape, of, hues_deg, pull), np.cumsum(shape)[:-1])
             if theme == "light":  # the dark palette keeps the hues of the light one
                 turns = [np.exp(1j * np.radians(of["hue_deg"][k])).sum() for k in families]
                 hues_deg, pull = tuple(float(np.degrees(np.angle(turn)) % 360) for turn in turns), 0.15

@@ -21,8 +21,8 @@ _PALETTES: dict[Theme, dict[str, str]] = {
     "light": {
         "8": "271320 670463 88001f 653545 b81894 b63a58 f23ec6 ff4777",
         "71": "1f0051 251323 3d18b6 57395e 9435c9 8a6a91 c065f9 ca5e00",
-        "62": "13192d 140087 484b76 3543ee 72758f 6180fe 9b4805 d66919",
-        "611": "150e47 1e13ad 42445c 654db6 72758f 7978fb 9b4805 50a33d",
+        "62": "2d0236 6f0083 6c2c4e 8d5789 a431e1 d564cd 9b4805 d66919",
+        "611": "2d0236 6f0083 6c2c4e 8d5789 a431e1 d564cd d66919 227702",
         "53": "0a0755 240ec9 474f66 4a63c9 7b8ab7 670400 b71c0e f53f2d",
         "521": "0a0755 240ec9 3e465c 4a63c9 7b8ab7 670400 f53f2d 227702",
         "5111": "0a0755 240ec9 474f66 4a63c9 7b8ab7 d66919 227702 830043",
@@ -45,16 +45,16 @@ _PALETTES: dict[Theme, dict[str, str]] = {
     "dark": {
         "8": "fedbda fbb4e2 fe61f5 ff4777 bf35db db1f0f 9f5455 8d5789",
         "71": "fbdae8 fda8a8 fa8cd7 f53a51 d939d2 9f5455 8d5789 f7a224",
-        "62": "f8dbed fc9af3 fe93a4 d939d2 cd345d 8d5789 f8b35d be7c1c",
-        "611": "f8dbed fc9af3 fe93a4 d939d2 d81459 8d5789 e27429 6efe48",
+        "62": "fbdae8 fc9af3 fe93a4 d939d2 cd345d 8d5789 f8b35d be7c1c",
+        "611": "fbdae8 fc9af3 fe93a4 d939d2 d81459 8d5789 e27429 6efe48",
         "53": "f1ddf6 baa1ce c065f9 8a6a91 6f57c2 f3898a f53f2d ac494d",
         "521": "f1ddf6 baa1ce c065f9 8a6a91 6f57c2 f38b7b e83120 6efe48",
         "5111": "f1ddf6 baa1ce c065f9 8a6a91 6f57c2 e27429 6efe48 d81459",
-        "44": "bcccfd 718ef8 72758f 455ed9 fedbd5 f38b7b e83120 ac494d",
-        "431": "c4c9fc 8588f6 72758f 5d57d7 f38b7b e83120 ac494d 6efe48",
-        "422": "b1c1f1 718ef8 72758f 455ed9 f38b7b e83120 6efe48 238142",
-        "4211": "b1c1f1 718ef8 72758f 455ed9 f36329 aa4e2c 6efe48 fe93a4",
-        "41111": "b9bef0 8588f6 72758f 5d57d7 e27429 6efe48 d81459 f8dbed",
+        "44": "ebb9f7 c67af8 a431e1 8d5789 fda8a8 fb8a44 db1f0f 9f5455",
+        "431": "ebb9f7 c67af8 986193 a431e1 f3898a f53f2d ac494d 61f239",
+        "422": "ebb9f7 c67af8 986193 a431e1 f38b7b e83120 6efe48 238142",
+        "4211": "ebb9f7 c67af8 a431e1 8d5789 f36329 aa4e2c 6efe48 fe93a4",
+        "41111": "ebb9f7 c67af8 986193 a431e1 f4902c a9ff96 db1f0f ff4777",
         "332": "b1c1f1 718ef8 455ed9 e77e7f e83120 ac494d b6faa7 46db05",
         "3311": "b1c1f1 718ef8 455ed9 f3898a f53f2d ac494d 61f239 b24a95",
         "3221": "b1c1f1 718ef8 455ed9 f38b7b e83120 6efe48 238142 b24a95",
@@ -69,8 +69,9 @@ _PALETTES: dict[Theme, dict[str, str]] = {
 }
 """Palettes by theme and by the numbers of configurations of each family, the largest family first.
 
-Any two colours are 15 or more apart (ΔE2000), for a deuteranope, too, and from `TRUTH`. Contrast to white, or to the
-dark grounds of viewer and report, is 3:1 or more. The first of a family has the most.
+Any two colours are 15 or more apart (ΔE2000), for a deuteranope, too, and from `TRUTH`; none of middle lightness
+looks grey. Contrast to white, or to the dark grounds of viewer and report, is 3:1 or more. The first of a family
+has the most.
 """
 
 

@@ -60,11 +60,16 @@ def choose_shown_objects(scene: Scene, truth: Tracks, experiment: Experiment, ta
     episodes["last_s"] = known_s.fillna(np.minimum(episodes["ended_s"], episodes["onset_s"] + UNKNOWN_S))
     episodes["near"] = 1 / (1 + (_distance_to_path(scene, truth, experiment, episodes) / NEAR_M) ** 2)
     episodes["rank"] = (episodes["apart_s"] * episodes["near"]).round(6)  # rounding of times decides nothing
-    until_s = episodes["ended_s"] - episodes["onset_s"]
-    observed = np.minimum(episodes["onset_s"], until_s) >= OBSERVED_S - SAME_INSTANT_S
+    observed = is_observed_long(episodes)
     judged = episodes[observed] if observed.any() else episodes
     chosen = judged.sort_values(["rank", "near"], ascending=False, kind="stable").index[:SHOWN_OBJECTS]
     return ShownObjects(tuple(scene.object_number[name] for name in chosen), tuple(episodes.index[~observed].tolist()))
+
+
+def is_observed_long(episodes: pd.DataFrame) -> pd.Series:
+    """Of each row whether its object is in the log for `OBSERVED_S` before and after its onset."""
+    least_s = np.minimum(episodes["onset_s"], episodes["ended_s"] - episodes["onset_s"])
+    return least_s >= OBSERVED_S - SAME_INSTANT_S
 
 
 def select_differing_rows(experiment: Experiment, table: pd.DataFrame) -> pd.DataFrame:

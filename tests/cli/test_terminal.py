@@ -16,7 +16,7 @@ import pytest
 
 import copem_replay as cr
 from copem_replay.cli import main as cli
-from copem_replay.cli.terminal import ProgressLines, format_duration, show_progress
+from copem_replay.cli.terminal import ProgressLines, format_duration, print_table, show_progress
 from copem_replay.core.compiled import compiling
 from copem_replay.core.errors import wrap_line
 from copem_replay.metrics.summary import format_summary, format_table
@@ -70,6 +70,21 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     lines = changed("show: {run: 0}", "measure: {onset: {kind: in_range, range_m: 60}, exact: false}")
     (tmp_path / "e.yaml").write_text(re.sub(r"(?ms)^configurations:.*?(?=^measure)", MORE, lines))
     return tmp_path
+
+
+def test_the_best_rows_are_bold_on_a_terminal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In each of its blocks, and no row whose name only begins alike; in a pipe nothing is."""
+    lines = ["configuration  n", "PEM            6", "PEM:1s         6", "PEM late       6", "", "mean", "PEM  0.25"]
+    print_table("\n".join(lines), ["PEM"])
+    assert capsys.readouterr().out.splitlines() == lines, "a pipe"
+    screen = Terminal()
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setattr(sys, "stdout", screen)
+    print_table("\n".join(lines), ["PEM"])
+    bold = {1: f"\x1b[1m{lines[1]}\x1b[0m", 6: f"\x1b[1m{lines[6]}\x1b[0m"}
+    assert screen.getvalue().splitlines() == [bold.get(k, line) for k, line in enumerate(lines)]
 
 
 @pytest.mark.parametrize("width", [80, 120])

@@ -47,6 +47,16 @@ def test_colours_stay_apart_and_stand_out(theme: Theme) -> None:
 
 
 @pytest.mark.parametrize("theme", THEMES)
+def test_no_colour_looks_grey(theme: Theme) -> None:
+    """A chroma of 25 or more (CIELAB), unless it is nearly black, or nearly white in a family of more than four."""
+    for shape in SHAPES:
+        for colour in configuration_colours(names_of(shape), theme=theme).values():
+            light, a, b = lab(linear(colour))
+            excepted = light < 40 or (light > 80 and max(shape) > 4)
+            assert (a**2 + b**2) ** 0.5 >= 25 or excepted, (theme, shape, colour)
+
+
+@pytest.mark.parametrize("theme", THEMES)
 def test_a_family_has_one_hue(theme: Theme) -> None:
     """Up to three variants within 40 degrees, and each lighter (or, on dark ground, darker) than the one before."""
     from math import atan2, degrees

@@ -270,6 +270,17 @@ class TestWhichObject:
         first = max(after, key=lambda o: (after[o].max() - after[o].min(), after[o].max()))
         assert find_most_telling(table, ("GT",)) == ("x", first)
 
+    def test_one_at_the_edge_of_the_log_comes_after_those_that_can_be_judged_unless_it_is_in_conflict(self) -> None:
+        """`early` and `late` tell configurations apart by 1.5 s, `whole` by 1 s; the clocks of `early` start at 1.9 s,
+        and `late` is gone 1.9 s after its onset."""
+        episodes = [("early", 1.5, 1.9, 9.0), ("late", 1.5, 7.0, 8.9), ("whole", 1.0, 2.0, 4.0)]
+        columns = ["object_id", "time_to_detection_s", "onset_s", "ended_s"]
+        later = pd.DataFrame(episodes, columns=columns).assign(log="x", configuration="B")
+        table = pd.concat([later.assign(time_to_detection_s=0.0, configuration="A"), later], ignore_index=True)
+        assert find_most_telling(table, ()) == ("x", "whole")
+        in_conflict = table.assign(conflict=table["object_id"] == "late")
+        assert find_most_telling(in_conflict, ()) == ("x", "late")
+
     def test_by_default_the_one_of_the_run_that_is_drawn(self, two: Results, tmp_path: Path) -> None:
         """The pedestrian in the way is in conflict; without that, the one that `half` knows later."""
         assert choose_object_and_run(two, Selection()).object_id == "2"

@@ -595,12 +595,20 @@ class TestWaterfall:
         folder = replayed(tmp_path, changed(("time_s: 0.5}}", "time_s: 0.5}, count_earlier: true}")))
         found = Page(build_page(load_study(folder)))
         assert "No figure: with count_earlier" in found.words
-        assert found.plots == ["answer", "differences", "late_paths", "curves", "distances"]
+        assert found.plots == ["answer-stacked", "answer", "differences", "late_paths", "curves", "distances"]
 
 
 class TestFigures:
     def test_each_that_the_report_has(self, read: Page, tmp_path: Path) -> None:
-        assert read.plots == ["answer", "differences", "late_paths", "curves", "distances", "latency_breakdown"]
+        assert read.plots == [
+            "answer-stacked",
+            "answer",
+            "differences",
+            "late_paths",
+            "curves",
+            "distances",
+            "latency_breakdown",
+        ]
         text = changed(ONE, *ALONE[2:]) + "sweep: {latency_s: [0, 0.5], rate_hz: [2, 10]}\n"
         assert Page(build_page(load_study(replayed(tmp_path, text)))).plots == [*read.plots, "sweeps"]
 

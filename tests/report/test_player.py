@@ -12,7 +12,11 @@ import pytest
 
 from copem_replay.core.tracks import TRUTH, Tracks
 from copem_replay.report import write_html_report
+from copem_replay.report.figures.selection import Selection, choose_object_and_run
+from copem_replay.report.html import player
 from copem_replay.report.html.player import Grid, Rows, encode_false, encode_tracks, find_rows
+from copem_replay.report.html.study import load_study
+from copem_replay.results.shown_objects import ShownObjects
 from tests.helpers.report_pages import changed, replayed
 
 SHOWN = changed(("show: null\n", ""))
@@ -68,6 +72,15 @@ def data_of(page: Path) -> dict[str, Any]:
     assert found is not None
     data: dict[str, Any] = json.loads(found[1])
     return data
+
+
+def test_the_objects_that_the_viewer_shows_come_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pedestrian 2 is in conflict, but the viewer shows 3, the third of the log: so does the player."""
+    study = load_study(replayed(tmp_path, SHOWN))
+    choice = choose_object_and_run(study.results, Selection(configurations=("late", "half")))
+    assert choice.object_id == "2"
+    monkeypatch.setattr(player, "choose_shown_objects", lambda *given: ShownObjects((2,)))
+    assert [k for k, _, _ in player.collect_player_data(study, choice)["measured"]] == [2, 1]
 
 
 def test_a_page_has_the_run_that_the_viewer_shows(tmp_path: Path) -> None:

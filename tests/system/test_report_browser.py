@@ -16,7 +16,7 @@ from tests.helpers.report_pages import ONE, changed, replayed
 
 NAMES = ["GT", "<img src=x onerror=alert(1)>", "half", "hit", "never"]
 SIZES = """
-return [...document.querySelectorAll(".plot")].map((plot) => {
+return [...document.querySelectorAll(".plot")].filter((plot) => plot.checkVisibility()).map((plot) => {
   const svg = plot.querySelector("svg");
   const box = svg ? svg.getBoundingClientRect() : { width: 0, height: 0 };
   const drawn = [...plot.querySelectorAll("path")].filter((t) => t.getBoundingClientRect().width > 0);
@@ -206,10 +206,30 @@ def test_the_contents_lead_to_every_section(opened: Browser) -> None:
     assert titles[0] == "Differences"
 
 
-def test_on_a_phone_figures_are_scrolled(browser: Browser, report: Path) -> None:
+def test_on_a_phone_the_answer_is_stacked_and_other_figures_are_scrolled(browser: Browser, report: Path) -> None:
     browser.narrow(390)
     browser.open(report)
-    for one in browser.run(SIZES):
+    answer, *others = browser.run(SIZES)
+    assert answer["id"] == "answer-stacked"
+    assert 340 <= answer["width"] <= 362, "as wide as the page"
+    panels, words, sideways, note = browser.run(
+        """const plot = document.querySelector("#answer-stacked"), box = (e) => e.getBoundingClientRect();
+        const ground = (k) => plot.querySelector(`#answer-stacked-axes_${k} > [id*="-patch_"]`);
+        const panels = [1, 2].map((k) => box(ground(k)));
+        const texts = [...plot.querySelectorAll("[id*='-text_']")].map(box);
+        const scroll = plot.closest(".scroll"), note = document.querySelector(".beside .note");
+        return [panels.map((p) => [p.left, p.width, p.top, p.bottom]),
+                [Math.min(...texts.map((t) => t.left)), Math.max(...texts.map((t) => t.right))],
+                scroll.scrollWidth - scroll.clientWidth, note.checkVisibility() && note.textContent];"""
+    )
+    (left, width, _, bottom), (below_left, below_width, top, _) = panels
+    assert abs(left - below_left) < 1
+    assert min(width, below_width) > 150, "a long name leaves room for the axis"
+    assert bottom < top, "the share is below the times"
+    assert 0 <= words[0] < words[1] <= 390, "no word is cut"
+    assert sideways == 0, "nothing to scroll"
+    assert "Mean of min(time" in note, "its caption is text of the page"
+    for one in others:
         assert one["width"] == 600, one  # letters that can be read
     wide = 'return [...document.querySelectorAll(".figure")].map((frame) => frame.getBoundingClientRect().width)'
     assert max(browser.run(wide)) <= 362

@@ -40,20 +40,33 @@ if TYPE_CHECKING:
 
 _SHARES = {"pass_share": "Passes, of rows in conflict", "detected_share": "Detected"}
 """Shares of which the first informative one is drawn, too, with their labels."""
+STACKED_IN = 3.6
+"""Width of the figure on a phone, where its letters are about as large as those of tables."""
+STACKED_ROW_IN = 0.44
+"""Height of a row there: its name is above the dot, beside it a long one would leave no room for the axis."""
 
 
-def answer_figure(results: Results, *, configurations: Sequence[str] | None = None) -> Figure:
-    """Mean time to detection and share that passes, dots with 95 % intervals; the ground truth as a line."""
+def answer_figure(results: Results, *, configurations: Sequence[str] | None = None, stacked: bool = False) -> Figure:
+    """Mean time to detection and share that passes, dots with 95 % intervals; the ground truth as a line.
+
+    `stacked`: the panels below each other, as narrow as a phone.
+    """
     names = sort_soonest_first(results, find_contenders(results, configurations))
     rows = results.summary.set_index("configuration")
     upper = [name for name in find_truths(results) if name in results.chosen(configurations) and name not in names]
     times, reasons = _time_dots(results, names)
     share = _choose_share(rows, names)
     with figure_style():
-        figure = new_figure(8.0, 1.0 + ROW_IN * len(names) + 0.15 * bool(upper))
-        panels = figure.subplots(1, 1 + bool(share), squeeze=False, width_ratios=[1.5, 1.0] if share else None)[0]
+        count = 1 + bool(share)
+        height_in = (STACKED_ROW_IN if stacked else ROW_IN) * len(names) + 0.15 * bool(upper)
+        if stacked:
+            figure = new_figure(STACKED_IN, 0.6 + count * (0.5 + height_in))
+            panels = figure.subplots(count, 1, squeeze=False)[:, 0]
+        else:
+            figure = new_figure(8.0, 1.0 + height_in)
+            panels = figure.subplots(1, count, squeeze=False, width_ratios=[1.5, 1.0] if share else None)[0]
         looks = choose_appearances(results, configurations)
-        draw_rows(panels[0], list(zip(names, times, strict=True)), looks, named=True)
+        draw_rows(panels[0], list(zip(names, times, strict=True)), looks, named=not stacked)
         panels[0].set_xlabel("Mean time to detection (s)")
         _draw_truth_line(panels[0], {name: float(rows.loc[name, RANKED_BY]) for name in upper}, " s")
         _start_at_zero(panels[0], times)
@@ -63,9 +76,19 @@ def answer_figure(results: Results, *, configurations: Sequence[str] | None = No
             panels[1].set_xlabel(f"{_SHARES[share]} (%)")
             panels[1].set_xlim(-4, 104)
             _draw_truth_line(panels[1], {name: 100 * float(rows.loc[name, share]) for name in upper}, " %")
+        if stacked:
+            for panel in panels:
+                _name_rows(panel, names)
         drawn = any(dot.low is not None for dot in times)
         add_note(figure, [*reasons, *_note_sentences(results, names, rows, intervals=drawn)])
     return figure
+
+
+def _name_rows(axes: Axes, names: Sequence[str]) -> None:
+    """Write the name of each row above its dot."""
+    short = shorten_names(names)
+    for row, name in enumerate(names):
+        axes.text(0.0, row - 0.46, short[name], fontsize=8, va="top", transform=axes.get_yaxis_transform())
 
 
 def _time_dots(results: Results, names: Sequence[str]) -> tuple[list[Dot], list[str]]:

@@ -14,6 +14,7 @@ from copem_replay.core.errors import InputError
 from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.metrics.summary import DETECTED
 from copem_replay.report.figures.style import find_truths, shorten_names, sort_soonest_first
+from copem_replay.results.shown_objects import is_observed_long
 
 if TYPE_CHECKING:
     from copem_replay.results.compare import Comparison
@@ -110,10 +111,12 @@ def _rows_of_run(results: Results, known: pd.DataFrame, run: int | None) -> pd.D
 def find_most_telling(table: pd.DataFrame, upper: Sequence[str]) -> tuple[str, str]:
     """Log and id of the object that tells configurations apart most; of equal ones the first.
 
-    Objects in conflict with the ego rank first, then by the spread of their times to detection over configurations,
-    then by the latest of them. An object that was never known counts as known at the end of its episode. `upper`, the
-    ground truth, is left out unless there are no others.
+    Objects in conflict with the ego rank first, then those that are not too short to judge, as in the viewer, then by
+    the spread of their times to detection over configurations, then by the latest of them. An object that was never
+    known counts as known at the end of its episode. `upper`, the ground truth, is left out unless there are no others.
     """
+    # A conflict decides, unlike in the viewer: the figure of runs is about how the ego brakes. How near its path an
+    # object is takes the recording, which a table of results may lack.
     others = table[~table["configuration"].isin(list(upper))]
     rows = others if len(others) else table
     time_s = rows["time_to_detection_s"].fillna(rows["ended_s"] - rows["onset_s"])
@@ -123,6 +126,7 @@ def find_most_telling(table: pd.DataFrame, upper: Sequence[str]) -> tuple[str, s
     rank = pd.DataFrame(
         {
             "conflict": conflict.fillna(False).astype(bool).groupby(keys, sort=False).any(),
+            "observed": is_observed_long(rows).groupby(keys, sort=False).any(),
             "apart": by_object.max() - by_object.min(),
             "late": by_object.max(),
         }

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from copem_replay.core.errors import OutputError, RecordingError
 from copem_replay.core.files import atomic_file
+from copem_replay.report.figures.answer import answer_figure
 from copem_replay.report.figures.registry import FIGURES
 from copem_replay.report.figures.selection import Selection
 from copem_replay.report.figures.style import Appearance, render_figure, take_note
@@ -184,7 +185,7 @@ def build_page(study: ReportData) -> str:
         make_tag("h1", "When was it known?"),
         make_tag("p", describe_question(study), class_="question"),
         write_lead(study),
-        *([_embed_figure(study, _ANSWER)] if measured else []),
+        *([_embed_answer(study)] if measured else []),
         write_details(study),
         section_links((section.id, section.title) for section in sections),
         *([_configuration_key(study)] if measured and len(study.names) > 1 else []),
@@ -204,6 +205,16 @@ def _embed_figure(study: ReportData, name: str) -> Html:
     kind = FIGURES[name]
     drawn = kind.draw(study.results, _select(study))
     return figure_element(name, drawn, kind.title, kind.shows, study.looks.values())
+
+
+def _embed_answer(study: ReportData) -> Html:
+    """The figure of the answer, and the same with its panels stacked, of which a screen shows what it has room for."""
+    kind, looks = FIGURES[_ANSWER], study.looks.values()
+    stacked = answer_figure(study.results, stacked=True)
+    take_note(stacked)  # the other one has it
+    narrow = figure_element(f"{_ANSWER}-stacked", stacked, kind.title, kind.shows, looks)
+    wide = figure_element(_ANSWER, kind.draw(study.results, _select(study)), kind.title, kind.shows, looks)
+    return join_html([make_tag("div", narrow, class_="stacked"), make_tag("div", wide, class_="beside")])
 
 
 def _select(study: ReportData) -> Selection:

@@ -23,6 +23,7 @@ from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.report.figures.selection import Choice, Selection, choose_object_and_run, find_differing
 from copem_replay.report.figures.style import sort_soonest_first
 from copem_replay.report.html.markup import Html, css_colour, join_html, make_tag
+from copem_replay.results.shown_objects import choose_shown_objects
 
 if TYPE_CHECKING:
     from copem_replay.pipeline.one_run import ReplayedRun
@@ -134,14 +135,18 @@ def collect_player_data(study: ReportData, choice: Choice) -> dict[str, Any]:
     from copem_replay.pipeline.one_run import replay_run
 
     results = study.results
-    experiment = resolve_for_log(results.experiment, choice.log)
-    chosen = {name: experiment.configurations[name] for name in choice.configurations}
-    experiment = experiment.model_copy(update={"configurations": chosen})
+    asked = resolve_for_log(results.experiment, choice.log)
+    chosen = {name: asked.configurations[name] for name in choice.configurations}
+    experiment = asked.model_copy(update={"configurations": chosen})
     replayed = replay_run(results.recording(choice.log, results.experiment), experiment, choice.run)
     (rows,) = results.each(log=choice.log, every=True)
-    table = first_episodes(rows[(rows["run"] == choice.run) & rows["configuration"].isin(list(chosen))])
-    onset_s = float(table.loc[table["object_id"] == choice.object_id, "onset_s"].iloc[0])
+    of_run = first_episodes(rows[rows["run"] == choice.run])
+    table = of_run[of_run["configuration"].isin(list(chosen))]
     scene, truth = replayed.replay.scene, replayed.replay.truth
+    # No conflict decides here, unlike in `plot runs`: the page has the stories of these objects above.
+    shown = [scene.object_ids[k] for k in choose_shown_objects(scene, truth, asked, of_run).object_ix]
+    measured = _list_measured(scene, table, shown)
+    onset_s = measured[0][1]
     begin_s = 0.0 if scene.end_s <= LONGEST_S else max(0.0, onset_s - BEFORE_S)
     instants_s = np.arange(begin_s, min(scene.end_s, begin_s + LONGEST_S) + STEP_S / 2, STEP_S)
     tracks = {"": find_rows(truth, truth.captured_s, instants_s), **_find_fused(replayed, instants_s)}
@@ -160,7 +165,7 @@ def collect_player_data(study: ReportData, choice: Choice) -> dict[str, Any]:
         "solids": _outline_solids(replayed, grid),
         "lanes": _list_lanes(replayed, grid),
         "units": _list_places(replayed, grid),
-        "measured": _list_measured(scene, table, choice.object_id),
+        "measured": measured,
         "configurations": [
             {
                 "name": name,
@@ -262,12 +267,13 @@ def _list_places(replayed: ReplayedRun, grid: Grid) -> list[list[Any]]:
     ]
 
 
-def _list_measured(scene: Scene, table: pd.DataFrame, first: str) -> list[list[Any]]:
-    """Measured objects, that which tells configurations apart first, then by how much they do: onset and end (s)."""
+def _list_measured(scene: Scene, table: pd.DataFrame, shown: Sequence[str]) -> list[list[Any]]:
+    """Measured objects, those that the viewer shows first, the rest by how much they tell apart: onset and end (s)."""
     time_s = table["time_to_detection_s"].fillna(table["ended_s"] - table["onset_s"])
     apart = time_s.groupby(table["object_id"], sort=False).agg(np.ptp)
     once = table.drop_duplicates("object_id").set_index("object_id")
-    ranked = sorted(apart.index, key=lambda name: (name != first, -round(apart[name], 6)))
+    rest = [name for name in apart.index if name not in shown]
+    ranked = [name for name in shown if name in apart.index] + sorted(rest, key=lambda name: -round(apart[name], 6))
     return [
         [scene.object_number[name], *once.loc[name, ["onset_s", "ended_s"]].astype(float).round(6).tolist()]
         for name in ranked
