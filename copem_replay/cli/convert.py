@@ -19,7 +19,7 @@ Source = Annotated[Path, typer.Argument(metavar="SOURCE", help="File or folder o
 Out = Annotated[Path, typer.Option(metavar="FILE", help="Recording to write (.mcap).")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing recording.")]
 OutFolder = Annotated[
-    Path, typer.Option(metavar="DIR", help="Folder of the recordings; of one alone its file (.mcap).")
+    Path, typer.Option(metavar="DIR", help="Folder of the recordings; for a single one its file (.mcap).")
 ]
 Only = Annotated[str | None, typer.Option(metavar="NAME", help="Only the recording of this name [all].")]
 Metres = tuple[float, float, float]

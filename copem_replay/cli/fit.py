@@ -23,7 +23,7 @@ def fit(
     ] = None,
     truth: Annotated[
         str | None,
-        typer.Option(metavar="KIND", help="partial: the truth may lack objects of entries; complete: it has all."),
+        typer.Option(metavar="KIND", help="partial: lists may have objects that the truth lacks; complete: not."),
     ] = None,
     by: Annotated[
         str | None,
@@ -38,7 +38,7 @@ def fit(
         typer.Option(
             "--delay-by",
             metavar="KIND",
-            help="log: each log has a delay of its own; class: that of its objects' class [one for all].",
+            help="log: each log has its own delay; class: logs of one class have that of the class [one for all].",
         ),
     ] = None,
     out: Annotated[

@@ -53,7 +53,7 @@ def compare(
     ] = None,
     fail_on: Annotated[
         list[str] | None,
-        typer.Option(metavar="'METRIC > N'", help="End with 1 where the first folder is shown to be so much worse."),
+        typer.Option(metavar="'METRIC > N'", help="Exit with 1 if the first folder is shown to be worse by so much."),
     ] = None,
 ) -> int:
     """Compare configurations with a baseline, with intervals.
@@ -151,7 +151,7 @@ def verdict(
         Path | None, typer.Option(metavar="FILE", help="Criteria, a file with this key [those of the experiment].")
     ] = None,
     before: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Results of before, for criteria that are against them.")
+        Path | None, typer.Option(metavar="FOLDER", help="Earlier results, for criteria that compare with them.")
     ] = None,
     junit: Annotated[Path | None, typer.Option(metavar="FILE", help="Also write JUnit XML.")] = None,
     markdown: Annotated[Path | None, typer.Option(metavar="FILE", help="Also write Markdown; - prints it.")] = None,

@@ -84,9 +84,7 @@ def run(
     pieces: Pieces = None,
     cluster: Cluster = None,
     report: Annotated[bool, typer.Option("--report", help="Also write report.html.")] = False,
-    label: Annotated[
-        str | None, typer.Option(metavar="TEXT", help="What these results are called in a history.")
-    ] = None,
+    label: Annotated[str | None, typer.Option(metavar="TEXT", help="Name of these results in a history.")] = None,
     live: Annotated[bool, typer.Option("--live", help="Also show the replay in a running Rerun viewer.")] = False,
     viewer: Annotated[str | None, typer.Option(metavar="URL", help="Address of that viewer [on this machine].")] = None,
 ) -> int:
@@ -244,7 +242,7 @@ def _check_viewer(experiment: Experiment, url: str | None) -> str:
     from copem_replay.viewer import VIEWER, check_viewer
 
     if experiment.show is None or experiment.show.run is None:
-        raise InputError("--live: nothing to show, the experiment says so (`show: null`, or its `run`)")
+        raise InputError("--live: nothing to show: the experiment has `show: null` or `show: {run: null}`")
     check_viewer(url or VIEWER)
     return url or VIEWER
 

@@ -317,7 +317,9 @@ def _check_inputs(
         if _is_name(unit) and str(unit) not in units:
             yield source.at((*key, "inputs", k), unknown_name_message("unit", unit, units))
         elif str(unit) in modelled:
-            yield source.at((*key, "inputs", k), f"unit {str(unit)!r} has a PEM; a stack had what was `recorded`")
+            yield source.at(
+                (*key, "inputs", k), f"unit {str(unit)!r} has a PEM; the inputs of a stack are `recorded` units"
+            )
         elif unit in inputs[:k]:
             yield source.at((*key, "inputs", k), f"unit {str(unit)!r} named twice")
     measure = source.data.get("measure")

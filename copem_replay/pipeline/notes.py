@@ -156,7 +156,7 @@ def notes_on_output_regret(experiment: Experiment) -> Iterator[str]:
     for name in experiment.outputs:
         inputs = experiment.configurations[name].inputs
         if inputs is None:
-            yield f"configuration {name}: no regret, for it has no `inputs`: ideal fusion of what it had is not known"
+            yield f"configuration {name}: no regret: it has no `inputs`, so the ideal fusion of its inputs is not known"
             continue
         ideal = facts[name].ideal
         yield f"configuration {name}: its regret is the difference to {ideal}, ideal fusion of {', '.join(inputs)}"
@@ -447,7 +447,7 @@ def _explain_unmeasured(replay: Replay, experiment: Experiment) -> Iterator[str]
     elif (instant_s := measure.onset.instant_s) is not None and instant_s > scene.end_s:
         yield f"no rows: the onset at {instant_s:g} s lies after the log's end, {scene.end_s:g} s"
     elif not len(episodes.object_ix) and outside:
-        yield "no rows: no object with an onset matters by `objects.within`"
+        yield "no rows: `objects.within` keeps no object with an onset"
     elif not len(episodes.object_ix):
         yield f"no rows: no measured object has an onset ({measure.onset.kind})"
     elif not count_counted(numbers := episodes.count_began(), measure.began):

@@ -138,7 +138,7 @@ def check_unchanged(folder: Path, seen: os.stat_result) -> None:
     except OSError:
         same = False
     if not same:
-        raise InputError(f"{folder}: other results took its place while it was read; do it once more")
+        raise InputError(f"{folder}: other results took its place while it was read; run the command again")
 
 
 def list_names(folder: Path, at: str = "") -> Iterator[str]:
@@ -221,7 +221,9 @@ def _try_lock(path: Path, folder: Path) -> tuple[int, bool]:
                 )
         finally:
             os.close(fd)
-    raise OutputError(f"{folder}: cannot be written: {path} comes and goes; choose another folder with --out")
+    raise OutputError(
+        f"{folder}: cannot be written: {path} is created and removed again and again; choose another folder with --out"
+    )
 
 
 def _open_lock(path: Path) -> int:
@@ -242,7 +244,7 @@ def _is_still(path: Path, fd: int) -> bool:
 
 EXPERIMENT = "experiment.yaml"
 _NEW = "results"
-_OTHERS = "something else came there during the run, and stays"
+_OTHERS = "other content came there during the run and is kept"
 _PATH_BYTES = 32_767
 """Length of the longest path where the system does not say it: on Windows, where long paths are enabled."""
 _ROOM = 600
@@ -511,4 +513,6 @@ def check_inputs(place: ResultsPlace, inputs: Sequence[Path]) -> None:
         name = path.resolve().relative_to(place.folder).as_posix()
         goes = ours is None or any(one == name or one.startswith(f"{name}/") for one in ours)
         if goes and name != EXPERIMENT:
-            raise OutputError(f"{place.asked}: {path} is in it and would go with it; choose another folder with --out")
+            raise OutputError(
+                f"{place.asked}: {path} is in this folder and would be removed; choose another folder with --out"
+            )

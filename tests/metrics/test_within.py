@@ -233,7 +233,7 @@ class TestInARun:
             passing(), wanted := experiment(measure=APPEARS | {"objects": {"within": {"corridor_m": 1}}})
         )
         said = list(list_oddities(replay, wanted))
-        assert "no rows: no object with an onset matters by `objects.within`" in said
+        assert "no rows: `objects.within` keeps no object with an onset" in said
         assert "objects.within: 4 of 4 objects with an onset left out, more than 1 m beside the ego's way ahead" in said
 
     @pytest.mark.parametrize("within", [{"corridor_m": 5.0}, {"conflict_s": 2.0}])

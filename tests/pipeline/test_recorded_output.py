@@ -320,7 +320,7 @@ class TestRegret:
         experiment = plan(path, inputs=None, configurations=configurations)
         _, result = replayed(experiment)
         assert list(experiment.configurations) == ["GT", "stack"]
-        said = "configuration stack: no regret, for it has no `inputs`: ideal fusion of what it had is not known"
+        said = "configuration stack: no regret: it has no `inputs`, so the ideal fusion of its inputs is not known"
         assert said in result.notes
         Results(study=result, exporters=lambda _: ()).save(tmp_path / "out")
         chosen = compare_folders([tmp_path / "out"])
@@ -337,7 +337,7 @@ class TestRefused:
             ({"fusion": {"kind": "gnn"}, "latency_s": 1.0}, "so it goes without fusion, latency_s"),
             ({"inputs": ["rus"]}, "configurations: stack: inputs[0]: no unit is named 'rus'; did you mean rsu?"),
             ({"inputs": ["rsu", "rsu"]}, "inputs[1]: unit 'rsu' named twice"),
-            ({"inputs": ["camera"]}, "inputs[0]: unit 'camera' has a PEM; a stack had what was `recorded`"),
+            ({"inputs": ["camera"]}, "inputs[0]: unit 'camera' has a PEM; the inputs of a stack are `recorded` units"),
             ({"inputs": []}, "expected at least 1 in the list, found []"),
             ({"recorded": {"topic": "stack", "tells_of": "now"}}, "expected 'stamp' or 'available', found 'now'"),
             ({"recorded": None, "units": ["rsu"]}, "inputs: what a `recorded` output was made of"),

@@ -138,7 +138,7 @@ class TestOthers:
 
         (old.parents[1] / "e.yaml").write_text(changed("sweep: {latency_s: [0, 0.2]}"))
         monkeypatch.setattr(runs, "run_experiment", meanwhile)
-        said = f"something else came there during the run, and stays; the results of this run are in {old}-2"
+        said = f"other content came there during the run and is kept; the results of this run are in {old}-2"
         assert again(call).lines == [f"note: out/e: {said}"]
         assert (old / "sweep.csv").read_text() == "mine\n"
         assert (old.parent / "e-2/sweep.csv").read_text().startswith("sweep,value")
@@ -408,7 +408,7 @@ class TestOneWriter:
         }
         assert found == {"e": 3, "e-2": 2, "e-3": 1}
         assert ended.lines == [
-            "note: out/e: something else came there during the run, and stays; the results of this run are in "
+            "note: out/e: other content came there during the run and is kept; the results of this run are in "
             f"{here}/out/e-3"
         ]
         assert f"results in {here}/out/e-3\n" in ended.out
@@ -655,7 +655,7 @@ def test_what_is_made_of_old_results_does_not_get_among_new_ones(
     monkeypatch.setattr(page, "build_page", meanwhile(page.build_page))
     ended = call(command, "out/e")
     assert ended.code == 2
-    assert ended.lines[-1] == "out/e: other results took its place while it was read; do it once more"
+    assert ended.lines[-1] == "out/e: other results took its place while it was read; run the command again"
     assert set(belongings.list_names(old)) == MINE | set(json.loads((old / "provenance.json").read_text())["files"])
 
 
@@ -676,7 +676,7 @@ def test_tables_of_old_and_new_results_are_not_read_as_one(
     ended = call("compare", "out/e", "--baseline", "GT")
     assert (ended.code, ended.lines[-1]) == (
         2,
-        "out/e: other results took its place while it was read; do it once more",
+        "out/e: other results took its place while it was read; run the command again",
     )
 
 

@@ -55,7 +55,7 @@ def test_tables_of_other_results_are_refused(folder: Path, tmp_path: Path) -> No
     shutil.copytree(folder, tmp_path / "other")
     shutil.rmtree(folder)
     (tmp_path / "other").rename(folder)
-    with pytest.raises(InputError, match="other results took its place while it was read; do it once more"):
+    with pytest.raises(InputError, match="other results took its place while it was read; run the command again"):
         _ = found.rows_of("a")
     assert found.source.data["version"] == 1, "what was read before"
 

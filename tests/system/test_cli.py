@@ -731,7 +731,7 @@ class TestLive:
     @pytest.mark.parametrize("show", ["null", "{run: null}"])
     def test_nothing_to_show(self, here: Path, call: Call, show: str) -> None:
         (here / "e.yaml").write_text(shown(show))
-        said = "--live: nothing to show, the experiment says so (`show: null`, or its `run`)"
+        said = "--live: nothing to show: the experiment has `show: null` or `show: {run: null}`"
         assert call("run", "e.yaml", "--live") == (2, "", [said])
 
 
@@ -1052,7 +1052,7 @@ class TestTarget:
         ended = call("run", "e.yaml", "--log", "out/e/replay.mcap", "--overwrite")
         assert ended.code == 2
         assert ended.lines == [
-            "out/e: out/e/replay.mcap is in it and would go with it; choose another folder with --out"
+            "out/e: out/e/replay.mcap is in this folder and would be removed; choose another folder with --out"
         ]
         assert written(here / "out/e") == before
         assert call("run", "e.yaml", "--log", "out/e/replay.mcap", "--out", "out/f").code == 0
