@@ -246,20 +246,17 @@ def write_film(
     'film.gif'
     """
     from copem_replay.core.colours import configuration_colours
-    from copem_replay.experiment.drive import resolve_for_log
     from copem_replay.metrics.detections_table import first_episodes
-    from copem_replay.pipeline.one_run import replay_run
     from copem_replay.report.figures.selection import Selection, choose_object_and_run
+    from copem_replay.results.again import replay_again
     from copem_replay.viewer.film import check_film, draw_film
 
     read = take_results(results)
     path = read.require_folder() / "film.gif" if file is None else Path(file)
     check_film(path, configurations)
     choice = choose_object_and_run(read, Selection(configurations, log, object_id, run))
-    (rows,) = read.each(log=choice.log, every=True)
-    table = first_episodes(rows[rows["run"] == choice.run])
-    recording = read.recording(choice.log, read.experiment)
-    replayed = replay_run(recording, resolve_for_log(read.experiment, choice.log), choice.run)
+    replayed, rows = replay_again(read, choice.log, choice.run, read.experiment.configurations)
+    table = first_episodes(rows)
     read.check_unchanged()
     every = configuration_colours(read.experiment.configurations)
     colours = {name: every[name] for name in choice.configurations}

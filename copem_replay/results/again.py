@@ -33,7 +33,7 @@ def replay_again(
     )
     if not same:
         raise InputError(
-            f"{results.place}: log {log}: run {run} comes out otherwise than in detections.parquet: another version "
-            "made it; run the experiment again with --overwrite"
+            f"{results.place}: log {log}: run {run} comes out otherwise than in detections.parquet: another version, "
+            "or another kind of processor, made it; run the experiment again with --overwrite"
         )
     return replayed, rows

@@ -8,14 +8,16 @@ from __future__ import annotations
 import re
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import pytest
 
 import copem_replay as cr
+from copem_replay.core.errors import InputError
 from copem_replay.report.figures import FIGURES, Selection
 from copem_replay.report.figures.paths import average_unknown, late_paths_figure, read_drive
+from copem_replay.report.html import story_facts
 from copem_replay.report.html.page import build_page
 from copem_replay.report.html.stories import choose_stories, story_parts
 from copem_replay.report.html.story_facts import find_lost
@@ -99,6 +101,21 @@ def test_the_sentence_counts_lists_that_the_radio_lost(tmp_path: Path) -> None:
     words = Page(build_page(load_study(folder))).words
     assert f"half knows it after {row.time_to_detection_s:.2f} s by ego (listed from the onset on; " in words
     assert f"the radio lost {lost} lists)" in words
+
+
+def test_lists_that_cannot_be_counted_are_not_said_to_be_late(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A folder from another kind of processor may come out otherwise: then nobody knows what became of the lists."""
+
+    def differs(*_: object) -> NoReturn:
+        raise InputError("run 0 comes out otherwise")
+
+    link = "links: {lossy: {reception: {kind: constant, probability: 0.15}}}\nconfigurations:"
+    changes = ("configurations:", link), ("half: {units: [weak]}", "half: {units: [ego], link: lossy}")
+    folder = replayed(tmp_path, changed(ONE, ("seed: 1", "seed: 4"), *changes, *ALONE))
+    monkeypatch.setattr(story_facts, "replay_again", differs)
+    words = Page(build_page(load_study(folder))).words
+    assert "(listed from the onset on; the first of these lists were lost, late or held back)" in words
+    assert "the radio lost" not in words
 
 
 def test_stories_are_in_the_report_and_without_the_recording_the_reason(tmp_path: Path) -> None:

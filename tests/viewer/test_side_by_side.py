@@ -209,8 +209,8 @@ class TestRefusals:
         table.to_parquet("a/detections.parquet")
         code, (line,) = call("compare", "a", "b", "--baseline", "b:PEM", "--rrd", "ab.rrd")
         assert (code, line) == (
-            2, "a: log drive: run 0 comes out otherwise than in detections.parquet: another version made it; run the "
-            "experiment again with --overwrite",
+            2, "a: log drive: run 0 comes out otherwise than in detections.parquet: another version, or another "
+            "kind of processor, made it; run the experiment again with --overwrite",
         )  # fmt: skip
         assert not (tmp_path / "ab.rrd").exists()
 

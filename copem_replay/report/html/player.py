@@ -23,6 +23,7 @@ from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.report.figures.selection import Choice, Selection, choose_object_and_run, find_differing
 from copem_replay.report.figures.style import sort_soonest_first
 from copem_replay.report.html.markup import Html, css_colour, join_html, make_tag
+from copem_replay.results.again import replay_again
 from copem_replay.results.shown_objects import choose_shown_objects
 
 if TYPE_CHECKING:
@@ -132,16 +133,12 @@ def player_section(study: ReportData) -> Html | None:
 
 def collect_player_data(study: ReportData, choice: Choice) -> dict[str, Any]:
     """What `player.js` draws of one run. Raises CopemError where the log cannot be read or replayed again."""
-    from copem_replay.pipeline.one_run import replay_run
-
     results = study.results
     asked = resolve_for_log(results.experiment, choice.log)
-    chosen = {name: asked.configurations[name] for name in choice.configurations}
-    experiment = asked.model_copy(update={"configurations": chosen})
-    replayed = replay_run(results.recording(choice.log, results.experiment), experiment, choice.run)
+    chosen = list(choice.configurations)
+    replayed, its_rows = replay_again(results, choice.log, choice.run, chosen)
     (rows,) = results.each(log=choice.log, every=True)
-    of_run = first_episodes(rows[rows["run"] == choice.run])
-    table = of_run[of_run["configuration"].isin(list(chosen))]
+    of_run, table = first_episodes(rows[rows["run"] == choice.run]), first_episodes(its_rows)
     scene, truth = replayed.replay.scene, replayed.replay.truth
     # No conflict decides here, unlike in `plot runs`: the page has the stories of these objects above.
     shown = [scene.object_ids[k] for k in choose_shown_objects(scene, truth, asked, of_run).object_ix]
@@ -151,7 +148,7 @@ def collect_player_data(study: ReportData, choice: Choice) -> dict[str, Any]:
     instants_s = np.arange(begin_s, min(scene.end_s, begin_s + LONGEST_S) + STEP_S / 2, STEP_S)
     tracks = {"": find_rows(truth, truth.captured_s, instants_s), **_find_fused(replayed, instants_s)}
     grid, tracks = _fit_frames(tracks, instants_s)
-    ranked = sort_soonest_first(results, list(chosen))
+    ranked = sort_soonest_first(results, chosen)
     return {
         "log": choice.log,
         "run": choice.run,
@@ -177,7 +174,7 @@ def collect_player_data(study: ReportData, choice: Choice) -> dict[str, Any]:
             }
             for name in chosen
         ],
-        "shown": [list(chosen).index(name) for name in dict.fromkeys((ranked[-1], ranked[0]))],
+        "shown": [chosen.index(name) for name in dict.fromkeys((ranked[-1], ranked[0]))],
     }
 
 

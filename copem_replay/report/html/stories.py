@@ -53,7 +53,8 @@ def story_parts(study: ReportData) -> list[Html]:
     short += "." if short and not short.endswith("…") else ""
     parts = [make_tag("p", said + short)]
     for name, of in told.items():
-        parts.append(_story_element(ObjectStory(study, drive, of, lost.get(name, {})), log if several else None))
+        story = ObjectStory(study, drive, of, None if lost is None else lost.get(name, {}))
+        parts.append(_story_element(story, log if several else None))
     return parts
 
 

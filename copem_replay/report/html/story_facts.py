@@ -25,10 +25,10 @@ from copem_replay.perception.sensor_poses import (
     unit_ground,
 )
 from copem_replay.perception.visibility import find_blockers
-from copem_replay.pipeline.one_run import replay_run
 from copem_replay.report.figures.paths import Drive
 from copem_replay.report.figures.style import shorten_names
 from copem_replay.report.html.study import ReportData
+from copem_replay.results.again import replay_again
 
 # Facts of a story.
 
@@ -37,13 +37,13 @@ from copem_replay.report.html.study import ReportData
 class ObjectStory:
     """One object in one run. `rows`: of its first episode, a row per configuration, with `unknown_s`.
 
-    `lost`: by configuration how many lists with the object the radio lost until it was known.
+    `lost`: by configuration how many lists with the object the radio lost until it was known; None: cannot be told.
     """
 
     study: ReportData
     drive: Drive
     rows: pd.DataFrame
-    lost: Mapping[str, int]
+    lost: Mapping[str, int] | None
 
     @property
     def name(self) -> str:
@@ -148,11 +148,11 @@ def unit_pose(drive: Drive, name: str, unit: Unit, world: Tracks) -> UnitPoses:
 
 def count_lost_lists(
     study: ReportData, drive: Drive, run: int, told: Mapping[str, pd.DataFrame]
-) -> dict[str, dict[str, int]]:
+) -> dict[str, dict[str, int]] | None:
     """How many lists with each object the radio lost, after its onset and before the capture that made it known.
 
-    `told`: the rows of each object. By object and configuration; nothing where all first lists arrived, or where the
-    log cannot be replayed again.
+    `told`: the rows of each object. By object and configuration, nothing where all first lists arrived; None: the run
+    cannot be replayed again, or comes out otherwise.
     """
     until_s = {
         (name, str(row["configuration"])): float(row["captured_s"] if row["detected"] else row["ended_s"])
@@ -167,11 +167,9 @@ def count_lost_lists(
     }
     if not waits:
         return {}
-    chosen = {name: asked for name, asked in drive.experiment.configurations.items() if name in waits}
-    experiment = drive.experiment.model_copy(update={"configurations": chosen})
     lost: dict[tuple[str, str], set[tuple[int, float]]] = defaultdict(set)
     try:
-        replayed = replay_run(study.results.recording(drive.log, experiment), experiment, run)
+        replayed, _ = replay_again(study.results, drive.log, run, waits)
         for chunk in replayed.run_tracks:  # a list near the border of two chunks is in both
             for (name, configuration), end_s in until_s.items():
                 if configuration in chunk:
@@ -179,7 +177,7 @@ def count_lost_lists(
                     found = find_lost(chunk[configuration], drive.scene.object_number[name], since_s, end_s)
                     lost[name, configuration] |= found
     except CopemError:
-        return {}
+        return None
     counts: dict[str, dict[str, int]] = defaultdict(dict)
     for (name, configuration), lists in lost.items():
         counts[name][configuration] = len(lists)
@@ -233,7 +231,7 @@ def _tell_known(row: Any) -> str:
 
 def _tell_captured(row: Any, story: ObjectStory) -> str:
     """By which unit's list, what became of lists before it, and how long it took to come."""
-    lost = story.lost.get(str(row["configuration"]), 0)
+    lost = None if story.lost is None else story.lost.get(str(row["configuration"]), 0)
     if not row["detected"]:
         seen = "" if np.isnan(row["in_sight_s"]) else f", though {_tell_sight(story, row['in_sight_s'])}"
         return f"{seen}; the radio lost {count_noun(lost, 'list')} with it" if lost else seen
@@ -241,7 +239,9 @@ def _tell_captured(row: Any, story: ObjectStory) -> str:
     told = f" by {unit}" if isinstance(unit, str) and unit else ""
     listed_s, since_s = float(row.get("listed_s", np.nan)), max(float(row["in_sight_s"]), story.onset_s)
     if row["captured_s"] - listed_s > SAME_INSTANT_S and listed_s >= story.onset_s:
-        fate = f"the radio lost {count_noun(lost, 'list')}" if lost else "these lists were late or held back"
+        fate = "the first of these lists were lost, late or held back"
+        if lost is not None:
+            fate = f"the radio lost {count_noun(lost, 'list')}" if lost else "these lists were late or held back"
         after_s = listed_s - story.onset_s
         since = f"{format_seconds(after_s)} on" if after_s > SAME_INSTANT_S else "the onset on"
         told += f" (listed from {since}; {fate})"
