@@ -21,7 +21,7 @@ import numpy as np
 import pandas as pd
 
 from copem_replay.core.errors import InputError, count_noun
-from copem_replay.core.files import atomic_file, avoid_device_name
+from copem_replay.core.files import atomic_files, avoid_device_name
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import CLASSES, SAME_INSTANT_S, Float, Int, Scene, Tracks
 from copem_replay.metrics.accuracy.held import find_newest_lists, thin_frames
@@ -114,11 +114,14 @@ def write_nuscenes(
 
 
 def _write_texts(results: Results, folder: Path, texts: dict[str, str]) -> list[Path]:
+    """Write texts by their paths in a folder; the files of one folder change in one step."""
     files = [folder / name for name in texts]
-    for file, text in zip(files, texts.values(), strict=True):
-        with atomic_file(file) as scratch:
-            scratch.write_text(text, encoding="utf-8")
-            add_to_made_list(results.place, [file])
+    for place in dict.fromkeys(file.parent for file in files):
+        here = {file.name: text for file, text in zip(files, texts.values(), strict=True) if file.parent == place}
+        with atomic_files(place, list(here)) as scratch:
+            for name, text in here.items():
+                (scratch / name).write_text(text, encoding="utf-8")
+            add_to_made_list(results.place, [place / name for name in here])
     return files
 
 
