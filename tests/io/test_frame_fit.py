@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -35,11 +36,15 @@ def fixes(kind: str, speed: float = 1.0) -> Topic:
         if kind.startswith("foxglove"):
             messages.append((t_s, {"timestamp": {"sec": int(t_s), "nsec": round(t_s % 1 * 1e9)},
                                    "latitude": lat, "longitude": lon}))  # fmt: skip
+        elif kind.startswith("geographic"):
+            stamp = {"sec": int(t_s), "nanosec": round(t_s % 1 * 1e9)}
+            place = {"latitude": lat, "longitude": lon, "altitude": 500.0}
+            messages.append((t_s, {"header": {"stamp": stamp}, "pose": {"position": place}}))
         else:
             status = ros2.made("sensor_msgs/msg/NavSatStatus", status=0)
             where = {"latitude": lat, "longitude": lon, "status": status}
             messages.append((t_s, ros2.made(kind, header=ros2.header(t_s, "gps"), **where)))
-    if kind.startswith("foxglove"):
+    if kind.startswith(("foxglove", "geographic")):
         return Topic("/gps", kind, [(ns(t_s), json.dumps(one).encode()) for t_s, one in messages], "json")
     none = ros2.made("sensor_msgs/msg/NavSatStatus", status=-1)
     messages.append((1.0, ros2.made(kind, header=ros2.header(1.0, "gps"), latitude=10.0, status=none)))
@@ -52,7 +57,9 @@ def drive(folder: Path, *more: Topic, speed: float = 1.0) -> Path:
     return write_recording(folder / "drive.mcap", frames, host=1, more=more)
 
 
-@pytest.mark.parametrize("kind", ["sensor_msgs/msg/NavSatFix", "foxglove.LocationFix"])
+@pytest.mark.parametrize(
+    "kind", ["sensor_msgs/msg/NavSatFix", "foxglove.LocationFix", "geographic_msgs/msg/GeoPoseStamped"]
+)
 def test_the_frame_of_the_fixes_is_found(tmp_path: Path, kind: str) -> None:
     """UTM's scale there is 1.00005: the middle of 50 m is 1 cm nearer than in the local projection."""
     path = drive(tmp_path, fixes(kind))
@@ -66,6 +73,14 @@ def test_the_frame_of_the_fixes_is_found(tmp_path: Path, kind: str) -> None:
     assert "not say where on earth it is); 20 fixes of /gps, over 46 m that the ego gets around fit `frame: " in said
     assert f"{{proj: {{at_wgs84: [{lat:.7f}, {lon:.7f}]}}, offset_m: [" in said
     assert "not applied" in said
+
+
+def test_fixes_without_pyproj_are_not_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyproj", None)
+    speed = 1.3  # a place of its own: projections that were made before stay
+    path = drive(tmp_path, fixes("foxglove.LocationFix", speed), speed=speed)
+    said = CliRunner().invoke(app, ["info", str(path)]).output
+    assert "; its fixes cannot be used: places on earth need pyproj: `pip install 'copem-replay[maps]'`" in said
 
 
 def test_a_car_that_stands_tells_no_turn(tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -24,7 +24,7 @@ from copem_replay.experiment.draft.findings import (
     suggest_experiment,
 )
 from copem_replay.io.channel import Channel, schema_name
-from copem_replay.io.frame_fit import FIXES, FrameFit, fit_fixes
+from copem_replay.io.frame_fit import FIXES, fit_fixes
 from copem_replay.io.ground_truth import MAX_GAP_S
 from copem_replay.io.log import Log
 from copem_replay.io.open import Local, first_recording, label_files, name_log, open_log
@@ -224,8 +224,8 @@ def _survey_truth(
 def _describe_place(log: Log, recording: Recording) -> str:
     """Where the recording says that it is, or why that is not known, and what fixes beside its odometry say."""
     if recording.place_said is None:
-        fits = [fit.words for fit in _fit_fixes(log, recording)]
-        return "; ".join(["none (the recording does not say where on earth it is)", *fits])
+        none = "none (the recording does not say where on earth it is)"
+        return "; ".join([none, *_describe_fixes(log, recording)])
     try:
         frame, notes = recording.place_said.read()
         middle_m = find_middle(recording)
@@ -236,13 +236,14 @@ def _describe_place(log: Log, recording: Recording) -> str:
     return "; ".join([where, *notes])
 
 
-def _fit_fixes(log: Log, recording: Recording) -> Iterable[FrameFit]:
+def _describe_fixes(log: Log, recording: Recording) -> list[str]:
+    """What fixes beside the odometry say of the place, topic by topic, or why that cannot be told."""
     if not any(schema_name(channel) in FIXES for channel in log.channels):
-        return ()
+        return []
     try:
-        return [*fit_fixes(log, recording)]
-    except InputError:  # no pyproj
-        return ()
+        return [fit.words for fit in fit_fixes(log, recording)]
+    except InputError as error:  # pyproj is not there, or a fix is none
+        return [f"its fixes cannot be used: {error}"]
 
 
 def _round_extent(values: Float) -> list[float]:
