@@ -183,7 +183,7 @@ def test_wrong_folders_are_one_line(run: Runner) -> None:
         ("lidar_pose: [0, 0, 0, 0, 0, 0]\nvehicles: {4: 1}", "vehicle 4: expected location, center, angle and extent"),
         ("lidar_pose: [0, 0, 0, 0, 0, 0]\nvehicles: {4: {}}", "vehicle 4: location: expected 3 numbers, found nothing"),
         ("camera: [\nvehicles:\n  4: {location: [1,\n", "000068.yaml:"),
-        ("lidar_pose: [0, 0, 1e99, 0, 0, 0]\nvehicles: {}", "expected numbers of at most 1e+07, found 1e+99"),
+        ("lidar_pose: [0, 0, 1e99, 0, 0, 0]\nvehicles: {}", "expected numbers of at most 1e+08, found 1e+99"),
         ("true_ego_pos: !!python/tuple [1]\nvehicles: {}", "000068.yaml"),
     ],
 )

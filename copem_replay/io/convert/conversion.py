@@ -116,6 +116,7 @@ def wrap_yaw(yaw_rad: float) -> float:
 
 # Numbers, times and ids from texts. Errors name the place.
 
+LARGEST_M: Final = 1e8  # places and sizes beyond it are none
 LAST_SECOND: Final = 4_000_000_000  # Unix time of 2096; reading takes no later stamp (`LAST_NS`)
 _LARGEST_ID: Final = 2**63 - 1  # OSI ids have 64 bits, which many readers keep in a signed integer
 
@@ -136,6 +137,20 @@ def parse_positive(text: object, where: str) -> float:
     if (value := parse_number(text, where)) <= 0.0:
         raise InputError(f"{where}: expected a number above 0, found {quote_value(text)}")
     return value
+
+
+def parse_vector(values: object, count: int, where: str) -> Float:
+    """Return the numbers (count,) of a list, of `LARGEST_M` at most. Raises InputError."""
+    if not isinstance(values, list) or len(values) != count:
+        raise InputError(f"{where}: expected {count} numbers, found {quote_value(values)}")
+    return check_size(np.array([parse_number(value, where) for value in values]), where)
+
+
+def check_size(values: Float, where: str) -> Float:
+    """Return the values. Raises InputError where one is beyond `LARGEST_M`."""
+    if (largest := np.abs(values).max()) > LARGEST_M:
+        raise InputError(f"{where}: expected numbers of at most {LARGEST_M:g}, found {largest:g}")
+    return values
 
 
 def parse_seconds_as_ns(text: object, where: str, *, times: Decimal = Decimal(1)) -> int:

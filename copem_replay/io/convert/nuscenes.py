@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -24,6 +24,7 @@ from copem_replay.core.files import avoid_device_name
 from copem_replay.core.tracks import Float
 from copem_replay.io.convert.conversion import (
     KINDS,
+    LARGEST_M,
     LAST_SECOND,
     Box,
     ConversionReport,
@@ -31,8 +32,10 @@ from copem_replay.io.convert.conversion import (
     OsiKind,
     PlannedRecording,
     parse_number,
+    parse_vector,
     rotation_from_quaternion,
     sign_files,
+    wrap_yaw,
 )
 
 EGO_CENTRE_M: Final = 1.385
@@ -45,7 +48,6 @@ RATE_HZ: Final = 10.0
 _EGO: Final = "ego"
 _LONGEST_NS: Final = 1_050_000_000  # between key frames that are interpolated: one of 2 Hz may be missing
 _NEAR_M: Final = 100.0  # lanes within this distance of the ego's path
-_LARGEST_M: Final = 1e8
 _KIND: Final = {  # by category or its beginning; the longest that fits counts
     "animal": "animal",
     "human.pedestrian": "pedestrian",
@@ -220,7 +222,10 @@ def _read_tables(folder: Path, _signature: object) -> _Tables:
         where = f"{path}: row {number}"
         if row["instance_token"] not in instances:
             raise InputError(f"{where}: expected an instance of instance.json, found {row['instance_token']!r}")
-        values = [_read_vector(row, key, n, where) for key, n in (("translation", 3), ("size", 3), ("rotation", 4))]
+        values = [
+            parse_vector(row.get(key), n, f"{where}: {key}")
+            for key, n in (("translation", 3), ("size", 3), ("rotation", 4))
+        ]
         boxes.setdefault(row["sample_token"], []).append((row["instance_token"], np.concatenate(values)))
     category = {instance: categories[token] for instance, token in instances.items()}
     return _Tables(samples, _read_ego_poses(folder, stamp_us), boxes, category, _read_locations(folder))
@@ -249,7 +254,8 @@ def _read_ego_poses(folder: Path, stamp_us: Mapping[str, float]) -> dict[str, tu
     for number, row in enumerate(_read_rows(path, "token"), start=1):
         if row["token"] in wanted:
             where = f"{path}: row {number}"
-            poses[row["token"]] = _read_vector(row, "translation", 3, where), _read_vector(row, "rotation", 4, where)
+            position, quaternion = _read_vectors(row, ("translation", "rotation"), where)
+            poses[row["token"]] = position, quaternion
     return {sample: poses[pose] for sample, (*_, pose) in best.items() if pose in poses}
 
 
@@ -270,14 +276,11 @@ def _read_stamp(row: Mapping[str, Any], where: str) -> float:
     return stamp
 
 
-def _read_vector(row: Mapping[str, Any], key: str, count: int, where: str) -> Float:
-    values = row.get(key)
-    if not isinstance(values, list) or len(values) != count:
-        raise InputError(f"{where}: {key}: expected {count} numbers, found {quote_value(values)}")
-    vector = np.array([parse_number(value, f"{where}: {key}") for value in values])
-    if np.abs(vector).max() > _LARGEST_M:
-        raise InputError(f"{where}: {key}: expected numbers of at most {_LARGEST_M:g}, found {np.abs(vector).max():g}")
-    return vector
+_COUNTS: Final = {"translation": 3, "size": 3, "rotation": 4}
+
+
+def _read_vectors(row: Mapping[str, Any], keys: Sequence[str], where: str) -> list[Float]:
+    return [parse_vector(row.get(key), _COUNTS[key], f"{where}: {key}") for key in keys]
 
 
 # Frames.
@@ -378,7 +381,7 @@ def _fill_between(
             (number, pose, later[number].values - pose.values) for number, pose in objects.items() if number in later
         ]
         for _, _, change in pairs:
-            change[3] = math.remainder(change[3], math.tau)
+            change[3] = wrap_yaw(change[3])
         for part in range(1, parts):
             boxes = [
                 _make_box(number, pose.kind, pose.values + change * part / parts) for number, pose, change in pairs
@@ -398,7 +401,7 @@ def _make_box(number: int, kind: OsiKind, values: Float) -> Box:
         number,
         kind,
         (x, y, z),
-        math.remainder(yaw_rad, math.tau) if math.isfinite(yaw_rad) else yaw_rad,
+        wrap_yaw(yaw_rad) if math.isfinite(yaw_rad) else yaw_rad,
         (length, width, height),
     )
 
@@ -454,5 +457,5 @@ def _read_map(path: Path) -> dict[str, list[dict[str, Any]]]:
 def _is_of(value: Any, kind: type) -> bool:
     """Whether a value is text, a list of texts, or a number that is a place."""
     if kind is float:
-        return type(value) in (int, float) and abs(value) <= _LARGEST_M
+        return type(value) in (int, float) and abs(value) <= LARGEST_M
     return isinstance(value, kind) and (not isinstance(value, list) or all(isinstance(token, str) for token in value))

@@ -31,6 +31,7 @@ from copem_replay.io.convert.conversion import (
     number_names,
     parse_number,
     parse_seconds_as_ns,
+    parse_vector,
     rotation_from_euler,
     wrap_yaw,
 )
@@ -42,7 +43,6 @@ _SIZE_M: Final = (4.5, 1.8, 1.5)  # of an agent that no other agent labels
 _SAME_M: Final = 2.0  # two cars side by side are farther apart, centre to centre
 _APART_M: Final = 0.5  # labels of one object by two agents that differ by more are counted
 _SHORT_M: Final = 1.2  # an object without a class that is no longer stands on two legs
-_LARGEST_M: Final = 1e7
 _PROTOCOL: Final = "data_protocol.yaml"
 _USED: Final = ("vehicles", "objects", "lidar_pose", "true_ego_pos", "RSU")
 _KIND: Final = {  # `obj_type` of V2X-Real, in lower case
@@ -89,6 +89,8 @@ class _AgentFrame:
 
 Scenario = Mapping[str, Mapping[int, _AgentFrame]]
 """Frames by number, by agent."""
+UnitedLabels = Mapping[int, Mapping[str, _Label]]
+"""Labels of all agents by id, by number of the frame."""
 
 
 def list_recordings(source: Path) -> dict[str, PlannedRecording] | None:
@@ -180,9 +182,9 @@ def _read_keys(path: Path) -> dict[str, Any]:
 def _read_pose(value: Any, where: str) -> tuple[Float, bool]:
     """X y z yaw of x y z roll yaw pitch, or of a matrix (4, 4); and whether it is a matrix. Raises InputError."""
     if isinstance(value, list) and len(value) == 4 and all(isinstance(row, list) for row in value):
-        rows = np.array([_read_vector(row, 4, where) for row in value])
+        rows = np.array([parse_vector(row, 4, where) for row in value])
         return np.array([*rows[:3, 3], math.atan2(rows[1, 0], rows[0, 0])]), True
-    x, y, z, _, yaw_deg, _ = _read_vector(value, 6, where)
+    x, y, z, _, yaw_deg, _ = parse_vector(value, 6, where)
     return np.array([x, y, z, math.radians(yaw_deg)]), False
 
 
@@ -190,25 +192,16 @@ def _read_label(value: Any, where: str) -> _Label:
     if not isinstance(value, dict):
         raise InputError(f"{where}: expected location, center, angle and extent, found {quote_value(value)}")
     location, angle = (
-        _read_vector(value.get("location"), 3, f"{where}: location"),
-        _read_vector(value.get("angle"), 3, f"{where}: angle"),
+        parse_vector(value.get("location"), 3, f"{where}: location"),
+        parse_vector(value.get("angle"), 3, f"{where}: angle"),
     )
-    centre = _read_vector(value["center"], 3, f"{where}: center") if value.get("center") is not None else np.zeros(3)
-    length, width, height = (2 * _read_vector(value.get("extent"), 3, f"{where}: extent")).tolist()
+    centre = parse_vector(value["center"], 3, f"{where}: center") if value.get("center") is not None else np.zeros(3)
+    length, width, height = (2 * parse_vector(value.get("extent"), 3, f"{where}: extent")).tolist()
     roll, yaw, pitch = np.radians(angle)
     at_m = location + rotation_from_euler(-roll, -pitch, yaw) @ centre  # a nose that rises has a pitch above 0
     return _Label(
         np.array([*at_m, yaw]), (length, width, height), str(value.get("obj_type") or value.get("bp_id") or "")
     )
-
-
-def _read_vector(value: Any, count: int, where: str) -> Float:
-    if not isinstance(value, list) or len(value) != count:
-        raise InputError(f"{where}: expected {count} numbers, found {quote_value(value)}")
-    vector = np.array([parse_number(number, where) for number in value])
-    if np.abs(vector).max() > _LARGEST_M:
-        raise InputError(f"{where}: expected numbers of at most {_LARGEST_M:g}, found {np.abs(vector).max():g}")
-    return vector
 
 
 def _find_step_s(scenario: Path, numbers: list[int], rate_hz: float | None) -> Decimal:
@@ -234,13 +227,13 @@ def _find_step_s(scenario: Path, numbers: list[int], rate_hz: float | None) -> D
 # Who is who.
 
 
-def _find_own_labels(agents: Scenario, vehicles: list[str]) -> dict[str, str]:
+def _find_own_labels(agents: Scenario, vehicles: list[str], united: UnitedLabels) -> dict[str, str]:
     """The id under which others label each vehicle: what is where it is, in most frames that have both."""
     found: dict[str, str] = {}
     for name in vehicles:
         shared, there = Counter[str](), Counter[str]()
         for number, frame in agents[name].items():
-            for ident, label in _unite_labels(agents, number).items():
+            for ident, label in united[number].items():
                 shared[ident] += 1
                 there[ident] += math.dist(label.pose[:2], frame.pose[:2]) <= _SAME_M
         likely = [ident for ident, count in there.items() if 2 * count > shared[ident] and ident not in found.values()]
@@ -249,13 +242,13 @@ def _find_own_labels(agents: Scenario, vehicles: list[str]) -> dict[str, str]:
     return found
 
 
-def _unite_labels(agents: Scenario, number: int, report: ConversionReport | None = None) -> dict[str, _Label]:
+def _unite_labels(agents: Scenario, number: int, report: ConversionReport) -> dict[str, _Label]:
     """The labels of all agents at a frame; of those of one object that of the first agent."""
     united: dict[str, _Label] = {}
     for frames_of in agents.values():
         for ident, label in (frames_of[number].labels if number in frames_of else {}).items():
             first = united.setdefault(ident, label)
-            if report is not None and math.dist(first.pose[:2], label.pose[:2]) > _APART_M:
+            if math.dist(first.pose[:2], label.pose[:2]) > _APART_M:
                 report.count(
                     "label", f"more than {_APART_M:g} m from that of another agent for the same object: skipped"
                 )
@@ -279,11 +272,11 @@ class _Body:
         )
 
 
-def _find_body(name: str, agents: Scenario, own_label: str | None) -> _Body:
+def _find_body(name: str, agents: Scenario, own_label: str | None, united: UnitedLabels) -> _Body:
     """The box of an agent, from what others label as it; else of the size of a car."""
     offsets, labels = [], list[_Label]()
     for number, frame in agents[name].items():
-        label = _unite_labels(agents, number).get(own_label) if own_label is not None else None
+        label = united[number].get(own_label) if own_label is not None else None
         if label is not None:
             dx, dy, dz = label.pose[:3] - frame.pose[:3]
             cos, sin = math.cos(frame.pose[3]), math.sin(frame.pose[3])
@@ -339,14 +332,15 @@ def frames(
     )
     numbers = sorted({number for own in agents.values() for number in own})
     step_s = _find_step_s(source, numbers, rate_hz)
-    own_labels = _find_own_labels(agents, vehicles)
-    bodies = {name: _find_body(name, agents, own_labels.get(name)) for name in vehicles}
+    united = {number: _unite_labels(agents, number, report) for number in numbers}
+    own_labels = _find_own_labels(agents, vehicles, united)
+    bodies = {name: _find_body(name, agents, own_labels.get(name), united) for name in vehicles}
     ids, name_of = _number_objects(agents, vehicles, own_labels)
     report.names |= {number: name for name, number in ids.items()}
     _say_what_is_assumed(report, agents, fixed, own_labels, step_s, right_handed)
     for number in numbers:
         placed: dict[str, tuple[str, Float, tuple[float, float, float]]] = {}
-        for ident, label in _unite_labels(agents, number, report).items():
+        for ident, label in united[number].items():
             placed[ident] = _name_kind(label, report), label.pose, label.size_m
         for name in vehicles:
             if number in agents[name]:

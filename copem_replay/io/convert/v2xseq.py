@@ -28,6 +28,7 @@ from copem_replay.io.convert.conversion import (
     ConversionReport,
     ConvertedFrame,
     PlannedRecording,
+    check_size,
     parse_number,
     sign_files,
 )
@@ -38,7 +39,6 @@ EGO_SIZE_M: Final = (4.9, 1.9, 1.5)
 _EGO: Final = "ego"
 _PAIRS: Final = "cooperative/data_info.json"
 _FRAMES: Final = "vehicle-side/data_info.json"
-_LARGEST_M: Final = 1e8
 _KIND: Final = {  # lower case
     "barrowlist": "other",
     "bus": "bus",
@@ -223,16 +223,10 @@ def _read_numbers(value: Any, count: int, where: str) -> Float:
     )
     if len(flat) != count:
         raise InputError(f"{where}: expected {count} numbers, found {quote_value(value)}")
-    return _check_size(np.array([parse_number(number, where) for number in flat]), where)
+    return check_size(np.array([parse_number(number, where) for number in flat]), where)
 
 
 def _read_named(value: Any, names: str, where: str) -> Float:
     if not isinstance(value, dict):
         raise InputError(f"{where}: expected {', '.join(names)}, found {quote_value(value)}")
-    return _check_size(np.array([parse_number(value.get(name), f"{where}: {name}") for name in names]), where)
-
-
-def _check_size(values: Float, where: str) -> Float:
-    if np.abs(values).max() > _LARGEST_M:
-        raise InputError(f"{where}: expected numbers of at most {_LARGEST_M:g}, found {np.abs(values).max():g}")
-    return values
+    return check_size(np.array([parse_number(value.get(name), f"{where}: {name}") for name in names]), where)
