@@ -7,12 +7,16 @@ that hangs on the last bit is then another; of thousands one does. What pages sh
 from __future__ import annotations
 
 import os
+import platform
 
 PLAIN = {
     "NPY_DISABLE_CPU_FEATURES": "X86_V3 X86_V4 AVX512_ICL AVX512_SPR",
     "OPENBLAS_CORETYPE": "Haswell",
     "OPENBLAS_NUM_THREADS": "1",
 }
+
+IS_X86 = platform.machine() in {"x86_64", "AMD64"}
+"""Whether this machine can stand for it; others round otherwise, so there pages are not held against commands."""
 
 
 def plain_environment() -> dict[str, str]:

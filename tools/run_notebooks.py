@@ -23,10 +23,15 @@ def executed(path: Path) -> Any:
     place = {"metadata": {"path": str(path.parent)}}
     client = NotebookClient(notebook, kernel_name="python3", timeout=600, record_timing=False, resources=place)
     client.execute(env=plain_environment())
-    for cell in notebook.cells:
-        if "outputs" in cell:  # the line of progress, which is there where a run took long, and empty in the end
-            cell.outputs = [one for one in cell.outputs if one.get("data") != {"text/plain": ""}]
+    drop_progress(notebook)
     return notebook
+
+
+def drop_progress(notebook: Any) -> None:
+    """Leave out the line of progress of `cr.run`, which is there where a run took long, and empty in the end."""
+    for cell in notebook.cells:
+        if "outputs" in cell:
+            cell.outputs = [one for one in cell.outputs if one.get("data") != {"text/plain": ""}]
 
 
 def printed(notebook: Any) -> list[str]:

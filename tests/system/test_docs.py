@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import json
 import os
-import platform
 import re
 import subprocess
 import sys
@@ -32,13 +31,10 @@ from tests.helpers.scenes import experiment
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 
 from page_outputs import printed
-from processor import plain_environment
+from processor import IS_X86, plain_environment
 
 ROOT = Path(__file__).parents[2]
-on_x86 = pytest.mark.skipif(
-    platform.machine() not in {"x86_64", "AMD64"},
-    reason="pages are written on x86-64: other processors round otherwise",
-)
+on_x86 = pytest.mark.skipif(not IS_X86, reason="pages are written on x86-64: other processors round otherwise")
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted(ROOT.glob("docs/**/*.md"))]
 
 
