@@ -42,6 +42,8 @@ _STATUSES = {
 """Words of statuses in lanes, in the order in which they follow each other."""
 _BAR_POINTS, _WIDE, _GAP = 7.0, 4.0, 1.0
 """Half the height of a bar in points; its width and the gap beside it in rows."""
+_BROAD_POINTS = 4.0
+"""Broader bars have their names on them, narrower ones below."""
 LEGEND_X, LEGEND_Y = (-0.5, 3 * _WIDE + 2 * _GAP + 0.5), (-1.0, 7.0)
 """Bounds of the legend's view: three columns and seven rows."""
 
@@ -68,9 +70,9 @@ def write_legend_bars(out: RecordingSink, colours: Mapping[str, Rgb]) -> None:
         radii=rr.Radius.ui_points([points for _, _, points in strips]),
     )
     out.static(["legend", "bars"], drawn)
-    # A label stands below its point: a point a little higher puts it on the bar.
+    # A label stands below its point: a point a little higher puts it on a bar; a line would run through it.
     names = rr.Points2D(
-        [[x + _WIDE / 2, y - 0.4] for *_, x, y in rows],
+        [[x + _WIDE / 2, y - (0.4 if points >= _BROAD_POINTS else 0.1)] for _, _, points, x, y in rows],
         labels=[name for name, *_ in rows],
         colors=[NOTICED],
         radii=rr.Radius.ui_points(0.0),

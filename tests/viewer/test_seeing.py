@@ -234,6 +234,11 @@ def test_the_legend_names_statuses_and_what_is_common(city: Made) -> None:
     assert {"truth", "ego", "hides it", "field of view", "false, dashed"} <= said
     assert {"hidden", "out of view", "list lost", "on its way", "unmatched", "not listed"} <= said
     assert set(city.given.configurations) - {"GT"} <= said | {"truth"}
+    # A word hangs below its point: on a bar from above its middle, below a line that would strike it through.
+    labels, places = (names.column(f"Points2D:{what}").to_pylist()[0] for what in ("labels", "positions"))
+    above = {word: round(y) - y for word, (_, y) in zip(labels, places, strict=True)}
+    on_bars = {"ego", "hidden", "unmatched"}
+    assert all((above[word] > 0.3) == (word in on_bars) for word in (*on_bars, "truth", "hides it", "false, dashed"))
 
 
 # ------------------------------------------------------------------------------- who knew when
