@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -170,6 +170,7 @@ def _explain(
     logs: Sequence[tuple[Recording, Experiment]], question: _Question, progress: Callable[[int, int], None]
 ) -> Explanation:
     notes, tables = list[str](), {part: list[pd.DataFrame]() for part in (*PARTS, "late")}
+    known: dict[str, pd.DataFrame] = {}
     experiment = logs[0][1]
     beside: dict[int, Counterfactuals] = {}
     names, parts = question.select(experiment), question.parts
@@ -183,9 +184,11 @@ def _explain(
             tables[part].append(table.assign(configuration=name)[["configuration", *table.columns]])
         for part, error in found.errors.items():
             notes += question.note(part, [error], bool(found.tables))
+        if found.rows is not None:
+            known[name] = found.rows
         progress(k + 1, steps)
     joined = {part: pd.concat(of, ignore_index=True) for part, of in tables.items() if of}
-    varied, orders, why_not = _vary(logs, names) if "sensitivity" in parts else (None, None, [])
+    varied, orders, why_not = _vary(logs, names, known) if "sensitivity" in parts else (None, None, [])
     notes += question.note("sensitivity", why_not, bool(joined))
     progress(steps, steps)
     if not joined and varied is None:
@@ -195,23 +198,24 @@ def _explain(
 
 
 def _vary(
-    logs: Sequence[tuple[Recording, Experiment]], names: Sequence[str]
+    logs: Sequence[tuple[Recording, Experiment]], names: Sequence[str], known: Mapping[str, pd.DataFrame]
 ) -> tuple[pd.DataFrame | None, pd.DataFrame | None, list[ExperimentError]]:
     """Time unknown as the PEMs vary, pairs that change order, or why there is none of it."""
     from copem_replay.pipeline.sensitivity import compare_orders, vary_pems
 
     try:
-        varied = vary_pems(logs, names)
+        varied = vary_pems(logs, names, known)
     except ExperimentError as error:
         return None, None, [error]
     return varied, compare_orders(varied), []
 
 
 class _PartTables(NamedTuple):
-    """The tables of a configuration by part, and why there is none of a part."""
+    """The tables of a configuration by part, why there is none of a part, and the rows that causes are of."""
 
     tables: dict[str, pd.DataFrame]
     errors: dict[str, ExperimentError]
+    rows: pd.DataFrame | None = None
 
 
 def _explain_configuration(
@@ -232,6 +236,7 @@ def _explain_configuration(
         except ExperimentError as error:
             found.errors["causes"] = error
         else:
+            found = found._replace(rows=pd.concat([replays.rows for replays, _ in shares], ignore_index=True))
             if "causes" in parts:
                 found.tables["causes"] = tabulate_causes(shares)
             if "triage" in parts:

@@ -40,6 +40,9 @@ ENTRY = np.dtype(
 )
 """One entry of an object list."""
 
+NUMBERS = (ENTRY.itemsize - 2 * 8) // 8
+"""So many numbers an entry begins with; two integers follow: `unit_ix`, `track_id`."""
+
 COVARIANCES = ("cov_ee_m2", "cov_en_m2", "cov_nn_m2")
 
 Entries = NDArray[Any]
@@ -57,6 +60,11 @@ def take_entries(entries: Entries, rows: Int) -> Entries:
 def join_entries(parts: Sequence[Entries]) -> Entries:
     """All entries one after the other, copied as `take_entries` does."""
     return np.concatenate([_view_as_words(entries_of(0)), *map(_view_as_words, parts)]).view(ENTRY)[:, 0]
+
+
+def view_as_numbers(entries: Entries) -> Float:
+    """Entries as rows of numbers (N, V), x and y first; only the first `NUMBERS` are numbers, integers follow."""
+    return _view_as_words(entries).view(np.float64)
 
 
 def _view_as_words(entries: Entries) -> Int:

@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from copem_replay.core.components import NotNegative, Share
-from copem_replay.core.object_list import AGREE, Entries, Inputs, ObjectLists
+from copem_replay.core.object_list import AGREE, Entries, Inputs, ObjectLists, view_as_numbers
 from copem_replay.fusion.combine import (
     CROSS,
     INVERSE,
@@ -18,7 +18,6 @@ from copem_replay.fusion.combine import (
     unite_conflicting,
 )
 from copem_replay.fusion.gnn_kernel import EntryClusters, cluster_run, intersect_clusters
-from copem_replay.fusion.inputs import view_as_numbers
 from copem_replay.fusion.interface import ListFusion
 from copem_replay.fusion.union import join_runs
 

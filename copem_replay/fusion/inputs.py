@@ -12,7 +12,7 @@ import numpy as np
 
 from copem_replay.communication.arrivals import FusionSchedule, KeptEntries, fusion_schedule
 from copem_replay.core.compiled import kernel
-from copem_replay.core.object_list import COVARIANCES, ENTRY, Entries, Inputs, ObjectLists, join_entries, take_entries
+from copem_replay.core.object_list import COVARIANCES, ENTRY, Inputs, ObjectLists, join_entries, take_entries
 from copem_replay.core.tracks import CLASSES, VALUES, Bool, Float, Int, Tracks
 from copem_replay.fusion.ideal import floor_covariances
 from copem_replay.perception.perceive import EntryClaims
@@ -114,12 +114,6 @@ WIDTH = 13 + len(CLASSES)
 assert list(ENTRY.names or ())[13:15] == ["class_probability", "captured_s"]
 _BLOCK = 16
 """Rows in a block that is sorted by insertion, before blocks are merged. It changes the time alone."""
-
-
-def view_as_numbers(entries: Entries) -> Float:
-    """Entries as rows of numbers (N, V), x and y first; only the first `WIDTH` are numbers, integers follow."""
-    values: Float = np.ascontiguousarray(entries).view(np.float64).reshape(len(entries), ENTRY.itemsize // 8)
-    return values
 
 
 @kernel

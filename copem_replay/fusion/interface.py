@@ -13,8 +13,17 @@ import numpy as np
 
 from copem_replay.core.compiled import kernel
 from copem_replay.core.components import Component, GivenError, ask_component, wrong_answer_error
-from copem_replay.core.object_list import COVARIANCES, ENTRY, Entries, Inputs, ObjectLists, TellsOf
-from copem_replay.core.tracks import SAME_INSTANT_S, VALUES, Bool, Float, Int
+from copem_replay.core.object_list import (
+    COVARIANCES,
+    ENTRY,
+    NUMBERS,
+    Entries,
+    Inputs,
+    ObjectLists,
+    TellsOf,
+    view_as_numbers,
+)
+from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int
 
 
 class Fusion(Component, ABC):
@@ -210,9 +219,9 @@ def form_problem(answer: object, inputs: Inputs) -> str | None:
 
 def content_problem(answer: ObjectLists, inputs: Inputs) -> str | None:
     """What is wrong with the entries of lists of the right form; None: nothing."""
-    for name in (*VALUES, *COVARIANCES, "existence", "captured_s", "class_probability"):
-        if not np.isfinite(answer.entries[name]).all():
-            return f"{name}: expected numbers, found NaN or infinity"
+    if not np.isfinite(view_as_numbers(answer.entries)[:, :NUMBERS]).all():
+        name = next(each for each in ENTRY.names or () if not np.isfinite(answer.entries[each]).all())
+        return f"{name}: expected numbers, found NaN or infinity"
     existence = answer.entries["existence"]
     if ((existence < -1e-9) | (existence > 1 + 1e-9)).any():
         return f"existence: expected probabilities, found {existence.min():g} … {existence.max():g}"
@@ -222,16 +231,23 @@ def content_problem(answer: ObjectLists, inputs: Inputs) -> str | None:
     if not (arrived := _has_arrived(answer, inputs)).all():
         wrong = float(answer.entries["captured_s"][np.argmin(arrived)])
         return f"captured_s: expected the capture of a list that has arrived, found {wrong:.9g} s"
-    tracked = answer.entries["track_id"] >= 0
-    of_list = np.repeat(np.arange(answer.start[:, 1:].size), np.diff(answer.start, axis=1).ravel())[tracked]
-    order = np.lexsort((answer.entries["track_id"][tracked], of_list))
-    twice = np.diff(of_list[order]) == 0
-    if (twice & (np.diff(answer.entries["track_id"][tracked][order]) == 0)).any():
+    if _has_track_twice(answer):
         return "track_id: expected each once in a list, found one twice (−1: no track is kept)"
     unit_ix = answer.entries["unit_ix"]
     if ((unit_ix < -1) | (unit_ix >= len(inputs.units))).any():
         return f"unit_ix: expected −1 … {len(inputs.units) - 1}, found {unit_ix.min()} … {unit_ix.max()}"
     return None
+
+
+def _has_track_twice(answer: ObjectLists) -> bool:
+    """Whether a list has two entries of one track."""
+    tracked = np.flatnonzero(answer.entries["track_id"] >= 0)
+    if not len(tracked):
+        return False
+    track_id = answer.entries["track_id"][tracked]
+    of_list = np.repeat(np.arange(answer.start[:, 1:].size), np.diff(answer.start, axis=1).ravel())[tracked]
+    order = np.lexsort((track_id, of_list))
+    return bool(((np.diff(of_list[order]) == 0) & (np.diff(track_id[order]) == 0)).any())
 
 
 def _has_arrived(answer: ObjectLists, inputs: Inputs) -> Bool:

@@ -35,9 +35,8 @@ from copem_replay.perception.pem.detection import DetectionModel
 from copem_replay.perception.pem.model import Pem
 from copem_replay.perception.visibility import Observers, Statics, VisibilityModel
 from copem_replay.pipeline.expansion import expand_experiment
-from copem_replay.pipeline.prepare import Replay, prepare_log
+from copem_replay.pipeline.prepare import ROWS_AT_ONCE, Replay, prepare_log
 from copem_replay.pipeline.replay import cut_blocks, replay_block
-from copem_replay.pipeline.world import asks_for_path
 
 # What it is that is gone: an experiment of one configuration, without a cause.
 
@@ -293,12 +292,12 @@ class Counterfactuals:
         self._recording, self.only = recording, select_configuration(experiment, name)
         self._whole: Replay = prepare_log(recording, experiment) if beside is None else beside._whole
         self._found: dict[str, Float] = {} if beside is None else beside._found
+        self._ready: dict[str, Replay] = {} if beside is None else beside._ready
 
     @cached_property
     def replay(self) -> Replay:
         """The log as it is, made ready."""
-        replay = prepare_log(self._recording, self.only)
-        return replace(replay, episodes=self._whole.episodes, outside_ix=self._whole.outside_ix)
+        return self._find_ready(self.only)
 
     @cached_property
     def rows(self) -> pd.DataFrame:
@@ -311,26 +310,37 @@ class Counterfactuals:
         (one,) = experiment.configurations.values()
         key = experiment.model_copy(update={"configurations": {"": one}}).model_dump_json()
         if key not in self._found:
-            rows = self.rows if experiment == self.only else replay_rows(self._prepare(experiment), experiment)
+            rows = self.rows if experiment == self.only else replay_rows(self._find_ready(experiment), experiment)
             same = rows[["run", "object_id", "onset_s"]].reset_index(drop=True)
             if not same.equals(self.rows[["run", "object_id", "onset_s"]].reset_index(drop=True)):
                 raise AssertionError("expected the same episodes in every replay")
             self._found[key] = rows["unknown_s"].to_numpy(dtype=float)
         return self._found[key]
 
+    def _find_ready(self, experiment: Experiment) -> Replay:
+        """The log made ready for an experiment; what is observed is kept while there is room for it."""
+        key = experiment.model_dump_json(exclude={"configurations", "links"})
+        if key in self._ready:
+            return self._ready[key]
+        ready = self._prepare(experiment)
+        if len(ready.chunks) == 1 and sum(one.rows_kept for one in (*self._ready.values(), ready)) <= ROWS_AT_ONCE:
+            self._ready[key] = ready
+        return ready
+
     def _prepare(self, experiment: Experiment) -> Replay:
         """The log made ready for an experiment without some causes; of what stays the same nothing is made anew."""
-        base, clear = self.replay, experiment.visibility != self.only.visibility
-        if experiment.units != self.only.units:
+        clear = experiment.visibility != self.only.visibility
+        if experiment.units != self.only.units or experiment == self.only:
             as_it_is = experiment.model_copy(update={"visibility": self.only.visibility})
             base = prepare_log(self._recording, as_it_is)
             base = replace(base, episodes=self._whole.episodes, outside_ix=self._whole.outside_ix)
-        elif experiment.pems == self.only.pems and not clear:
-            return base
-        changed = replace(base, expanded=expand_experiment(experiment, base.scene))
-        if clear and asks_for_path(base.expanded, base.scene):
-            changed.__dict__["paths"] = base.paths
-        return changed
+        else:
+            base = self.replay
+            if experiment.pems == self.only.pems and not clear:
+                return base
+        return replace(
+            base, expanded=expand_experiment(experiment, base.scene), paths_of=base if clear else base.paths_of
+        )
 
 
 @dataclass(frozen=True)

@@ -172,6 +172,7 @@ class Replay:
     outside_ix: Int = field(
         default_factory=lambda: np.empty(0, dtype=np.int64)
     )  # (K,) objects that `within` leaves out
+    paths_of: Replay | None = None  # the log with bodies between a unit and the ego; None: this one
     kept_draws: KeptDraws = field(init=False, default_factory=KeptDraws)  # what links drew for the lists of this log
     _shares: KeptShares = field(init=False, default_factory=KeptShares)
 
@@ -308,6 +309,8 @@ class Replay:
 
         A list aboard the ego has distance 0, one of a recorded unit NaN, one without an observation of the ego ∞.
         """
+        if self.paths_of is not None:
+            return self.paths_of.paths
         expanded, senders = self.expanded, self.senders
         of_ego, F = self._observe_objects(np.array([self.scene.ego_ix])), len(senders)
         distance_m: Float = np.full(F, np.inf)

@@ -9,7 +9,7 @@ of runs. p = 0 and p = 1 do not move by odds. docs/guide/why.md
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from itertools import combinations
 from typing import Any, Literal
@@ -110,16 +110,25 @@ VARIATIONS: dict[str, Callable[[Experiment], Experiment]] = {
 """What is varied; where it changes nothing, as no detection lasts or no fusion goes by errors, it is left out."""
 
 
-def vary_pems(logs: Sequence[tuple[Recording, Experiment]], names: Sequence[str] | None = None) -> pd.DataFrame:
+def vary_pems(
+    logs: Sequence[tuple[Recording, Experiment]],
+    names: Sequence[str] | None = None,
+    known: Mapping[str, pd.DataFrame] | None = None,
+) -> pd.DataFrame:
     """The time unknown of each configuration in each variation, run by run: variation, run, configuration, `unknown_s`.
 
-    `names`: only these configurations; None: all. Raises ExperimentError where none of them has modelled units alone.
+    `names`: only these configurations; None: all. `known`: by configuration the rows of all logs as they are, which are
+    not replayed again. Raises ExperimentError where no configuration has modelled units alone.
     """
     modelled, found = [(recording, _select_modelled(e, names)) for recording, e in logs], []
+    asked, known = modelled[0][1].configurations, known or {}
     for variation, vary in VARIATIONS.items():
         if variation != AS_IT_IS and all(vary(e) == e for _, e in modelled):
             continue
-        rows = pd.concat([_replay(recording, vary(e)) for recording, e in modelled], ignore_index=True)
+        if variation == AS_IT_IS and known.keys() >= asked.keys():
+            rows = pd.concat([known[name] for name in asked], ignore_index=True)
+        else:
+            rows = pd.concat([_replay(recording, vary(e)) for recording, e in modelled], ignore_index=True)
         means = rows.groupby(["configuration", "run"], sort=False)["unknown_s"].mean().reset_index()
         found.append(means.assign(variation=variation))
     return pd.concat(found, ignore_index=True)

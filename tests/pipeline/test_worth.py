@@ -129,6 +129,33 @@ def test_masts_that_miss_together_are_no_product(tmp_path: Path, of: str, togeth
         assert table["share_s"]["mast"] == pytest.approx(0.5625, abs=1e-9)
 
 
+@pytest.mark.parametrize(("of", "together"), [("unit", False), ("all", True)])
+def test_masts_whose_lists_are_lost_together_are_no_product(tmp_path: Path, of: str, together: bool) -> None:
+    """Two masts in one place whose links are dead for good in half of all runs: both in the same runs, or each in its
+    own. What both give at once one spares as well as two.
+    """
+    memory = f"{{reception: [{{share: 1, correlation_s: always, of: {of}}}]}}"
+    link = f"{{latency: 0, reception: {{kind: constant, probability: 0.5}}, memory: {memory}}}"
+    text = TEXT.format(fusion=", link: {ego: none, default: radio}") + f"links: {{radio: {link}}}\nruns: 40\n"
+    drive(tmp_path / "drive.mcap")
+    (tmp_path / "e.yaml").write_text(text)
+    study = make_study(tmp_path / "e.yaml")
+    found = compute_unit_worths(
+        [(one, resolve_for_log(study.experiment, one.scene.log)) for one in study.recordings], "all"
+    )
+    table = found.table.set_index("unit")
+    assert not found.by_curves
+    alive = table["alone_s"] / 1.5  # shares of the runs
+    assert (alive[["mast", "twin"]].between(0.3, 0.7)).all()
+    if together:
+        assert table["share_s"]["mast"] == pytest.approx(table["alone_s"]["mast"] / 2, abs=1e-9)
+        assert table["share_s"]["twin"] == pytest.approx(table["share_s"]["mast"], abs=1e-9)
+        assert table["left_out_s"]["mast"] == pytest.approx(0.0, abs=1e-9)
+    else:
+        assert table["left_out_s"]["mast"] > 0.15
+        assert found.given_s - found.all_s > table["alone_s"].max() + 0.15
+
+
 def test_a_unit_that_is_not_there_is_refused_with_the_nearest(tmp_path: Path) -> None:
     with pytest.raises(ExperimentError, match=r"no unit is named 'mats'; did you mean mast\?"):
         worths_of(tmp_path, "", ("mats",))
