@@ -242,10 +242,14 @@ def test_a_long_log_in_stretches_has_the_parts_of_each_configuration_alone(
     assert (computed, found, again) == (2, 2 * 3, plain)
 
 
-@pytest.mark.parametrize("kept", [None, "kept"])
-@pytest.mark.parametrize("many", [False, True], ids=["one file", "a file per log"])
+_FUSED = study(LINKS, gnn=True).replace("measure:", RADIO)
+_FLEET = study(FLEET, "sweep: {penetration_rate: [0, 0.3]}")
+
+
 @pytest.mark.parametrize(
-    "text", [study(LINKS, gnn=True).replace("measure:", RADIO), study(FLEET, "sweep: {penetration_rate: [0, 0.3]}")]
+    ("text", "many", "kept"),
+    [(_FUSED, False, "kept"), (_FUSED, True, None), (_FLEET, False, None), (_FLEET, True, "kept")],
+    ids=["fused, one file, kept", "fused, a file per log", "fleet, one file", "fleet, a file per log, kept"],
 )
 def test_few_parts_are_in_memory_at_a_time(
     text: str, many: bool, kept: str | None, here: Path, monkeypatch: pytest.MonkeyPatch

@@ -10,7 +10,7 @@ import pytest
 
 from copem_replay.core.colours import configuration_colours
 from copem_replay.core.errors import InputError
-from copem_replay.viewer import check_viewer, write_rrd
+from copem_replay.viewer import check_viewer, sink, write_rrd
 from copem_replay.viewer.open import read_identities, seek_recordings
 from tests.helpers.viewer import Viewer, free_port, headless_viewer
 from tests.viewer.test_rrd import CHANGES, SUMMARY, Made, approaching, make, rerun, rows
@@ -88,7 +88,10 @@ def test_sent_to_a_viewer_that_runs(made: Made, viewer: Viewer, tmp_path: Path) 
     assert rerun("rrd", "compare", "--unordered", path, tmp_path / "alone.rrd").returncode == 0
 
 
-def test_a_viewer_that_goes_leaves_the_file_complete(made: Made, tmp_path: Path) -> None:
+def test_a_viewer_that_goes_leaves_the_file_complete(
+    made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sink, "TAKES_S", 2.0)  # nothing listens: nothing is waited for
     path, url = tmp_path / "x.rrd", f"rerun+http://127.0.0.1:{free_port()}/proxy"
     said = write_rrd(path, made.replay, made.given, [made.run_tracks], made.table, SUMMARY, 3, viewer=url)
     assert said == [f"x.rrd: the viewer at {url} went before it had everything; the file is complete"]
