@@ -4,6 +4,8 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
+# Modules are kept compiled, wherever this runs: else every command compiles two hundred of them anew.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: demo test test-random bench check notebooks pictures site release requirements clean
 

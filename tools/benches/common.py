@@ -76,7 +76,10 @@ def spent(
     `stdout` None: what it prints is printed. Processes that it waits for count, of memory the largest alone.
     """
     began, whole = time.perf_counter(), [*command, *arguments]
-    process = subprocess.Popen(whole, cwd=folder, stdout=stdout, stderr=subprocess.DEVNULL if stdout else None)
+    process = subprocess.Popen(
+        whole, cwd=folder, stdout=stdout, stderr=subprocess.DEVNULL if stdout else None,
+        env=os.environ | {"PYTHONDONTWRITEBYTECODE": ""},  # modules are compiled once, as they are for users
+    )  # fmt: skip
     _, status, used = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
     if status:
