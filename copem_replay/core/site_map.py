@@ -32,6 +32,10 @@ class Lane:
         """The corners (K + L, 2): along the left border and back along the right."""
         return np.concatenate([self.left_m[:, :2], self.right_m[::-1, :2]])
 
+    def turned(self) -> Lane:
+        """The lane driven the other way."""
+        return replace(self, left_m=self.right_m[::-1], right_m=self.left_m[::-1])
+
 
 def make_area(name: str, kind: AreaKind, *rings_m: Float) -> Area:
     """An area of rings (K, 2), the outer first; the first corner may be there again at the end."""

@@ -143,7 +143,9 @@ def add_maps(
 ) -> tuple[Recording, list[tuple[Key, str]]]:
     """A recording with what its maps add, and the problems with them, by key. `frame`: of the recording."""
     lines, areas, solids = list(recording.lane_boundaries), list(recording.scene.areas), list(recording.scene.solids)
-    notes, problems = list(recording.notes), list[tuple[Key, str]]()
+    lanes, notes, problems = list(recording.lanes), list(recording.notes), list[tuple[Key, str]]()
+    if lanes:
+        notes.append(f"lanes of the recording: {find_agreement(recording.scene, recording.truth, lanes).words}")
     for k, asked in enumerate(maps):
         where = f"{FROM_MAP}{k}] {Path(asked.file).name}"
         try:
@@ -159,6 +161,7 @@ def add_maps(
             if found.refused and asked.agreement == "check":
                 problems.append((("maps", k), _explain_refusal(asked, found.share or 0.0)))
             lines += [*find_borders(site.lanes), *_raise_crosswalks(site)]
+            lanes += site.lanes
         drawn = [area for area in site.areas if not make_polygon(area.rings_m).is_empty]
         areas += drawn
         if len(drawn) < len(site.areas):
@@ -180,7 +183,9 @@ def add_maps(
         expected = f"expected solids of at most {_MOST_PARTS:,} convex parts, found {parts:,}"
         problems.append((("maps",), f"{expected}: take a smaller `within_m`, or fewer kinds as `solids`"))
     scene = replace(recording.scene, areas=tuple(areas), solids=tuple(solids))
-    return replace(recording, scene=scene, lane_boundaries=tuple(lines), notes=tuple(notes)), problems
+    return replace(
+        recording, scene=scene, lane_boundaries=tuple(lines), lanes=tuple(lanes), notes=tuple(notes)
+    ), problems
 
 
 def _explain_refusal(asked: MapFile, share: float) -> str:
