@@ -32,6 +32,17 @@ class Lane:
         """The corners (K + L, 2): along the left border and back along the right."""
         return np.concatenate([self.left_m[:, :2], self.right_m[::-1, :2]])
 
+    def across(self) -> tuple[Float, Float]:
+        """Points (N, 3) of the left and the right border at the same shares of their lengths: where either has one."""
+        lines = (self.left_m, self.right_m)
+        lengths = [np.append(0.0, np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))) for line in lines]
+        shares = np.unique(np.concatenate([at / at[-1] for at in lengths if at[-1] > 0.0] or [[0.0, 1.0]]))
+        left, right = (
+            np.column_stack([np.interp(shares * at[-1], at, line[:, k]) for k in range(3)])
+            for line, at in zip(lines, lengths, strict=True)
+        )
+        return left, right
+
     def turned(self) -> Lane:
         """The lane driven the other way."""
         return replace(self, left_m=self.right_m[::-1], right_m=self.left_m[::-1])
@@ -97,6 +108,18 @@ def find_borders(lanes: Sequence[Lane]) -> Iterator[Float]:
         if not names & seen:
             seen |= names
             yield line
+
+
+def outline_crosswalks(areas: Sequence[Area], lanes: Sequence[Lane]) -> Iterator[Float]:
+    """Outlines (K, 3) of crosswalks, the first corner again, as high as the nearest points of lanes' borders."""
+    from scipy.spatial import KDTree
+
+    points = np.concatenate([np.zeros((1, 3)) if not lanes else np.empty((0, 3)), *find_borders(lanes)])
+    tree = KDTree(points[:, :2])
+    for area in areas:
+        if area.kind == "crosswalk":
+            ring = np.array([*area.rings_m[0], area.rings_m[0][0]])
+            yield np.column_stack([ring, points[tree.query(ring)[1], 2]])
 
 
 _MOST_CROSSING = 200

@@ -16,8 +16,8 @@ from pydantic import Field, PrivateAttr, ValidationInfo, field_validator, model_
 from copem_replay.core.components import Flag, Frozen, Positive, error_at_key
 from copem_replay.core.errors import InputError, count_noun
 from copem_replay.core.frame import Frame, SaidPlace
-from copem_replay.core.site_map import MapSolid, SiteMap, find_borders, make_polygon
-from copem_replay.core.tracks import FROM_MAP, Float, Solid
+from copem_replay.core.site_map import MapSolid, SiteMap, find_borders, make_polygon, outline_crosswalks
+from copem_replay.core.tracks import FROM_MAP, Solid
 from copem_replay.core.yaml import Key
 from copem_replay.io.maps.registry import read_map
 from copem_replay.io.maps.solids import DEFAULT_HEIGHTS_M
@@ -160,7 +160,7 @@ def add_maps(
             notes.append(f"{where}: {found.words}")
             if found.refused and asked.agreement == "check":
                 problems.append((("maps", k), _explain_refusal(asked, found.share or 0.0)))
-            lines += [*find_borders(site.lanes), *_raise_crosswalks(site)]
+            lines += [*find_borders(site.lanes), *outline_crosswalks(site.areas, site.lanes)]
             lanes += site.lanes
         drawn = [area for area in site.areas if not make_polygon(area.rings_m).is_empty]
         areas += drawn
@@ -201,18 +201,6 @@ def _explain_inside(asked: MapFile, inside: Inside) -> str:
         f"{Path(asked.file).name}: expected at most {SOLIDS_REFUSED_ABOVE:.0%} of the states of moving vehicles inside "
         f"its solids, found {inside.share:.0%}: is the map in the frame of the log? Or `agreement: ignore`"
     )
-
-
-def _raise_crosswalks(site: SiteMap) -> Iterator[Float]:
-    """The outlines of crosswalks, each corner as high as the nearest point of a lane's border."""
-    from scipy.spatial import KDTree
-
-    points = np.concatenate([line for lane in site.lanes for line in (lane.left_m, lane.right_m)])
-    tree = KDTree(points[:, :2])
-    for area in site.areas:
-        if area.kind == "crosswalk":
-            ring = np.array([*area.rings_m[0], area.rings_m[0][0]])
-            yield np.column_stack([ring, points[tree.query(ring)[1], 2]])
 
 
 def _choose_solids(
