@@ -48,7 +48,7 @@ class Lane:
         return replace(self, left_m=self.right_m[::-1], right_m=self.left_m[::-1])
 
 
-def make_area(name: str, kind: AreaKind, *rings_m: Float) -> Area:
+def make_area(name: str, kind: AreaKind | LaneKind, *rings_m: Float) -> Area:
     """An area of rings (K, 2), the outer first; the first corner may be there again at the end."""
     rings = [ring[:-1] if len(ring) > 1 and (ring[0] == ring[-1]).all() else ring for ring in rings_m]
     return Area(name, kind, tuple(tuple((float(x), float(y)) for x, y in ring[:, :2]) for ring in rings))

@@ -114,7 +114,8 @@ class Scene:
 
     `moving` is False for stationary objects (they hide others; they are measured only when named).
     `solids` are stationary objects with an outline of their own, and those of maps: they hide, and are no objects.
-    `areas` are those of maps. `frame`: where it is on earth, if that is known.
+    `areas` are those of maps and of the recording, `lanes` those that `measure.objects.within` names.
+    `frame`: where it is on earth, if that is known.
     `ego_ix` is −1 where the log has no ego vehicle, or none was chosen. `tags`: what the recording, or the experiment,
     says of the drive, by name.
 
@@ -134,6 +135,7 @@ class Scene:
     solids: tuple[Solid, ...] = ()
     tags: Mapping[str, str] = field(default_factory=dict)
     areas: tuple[Area, ...] = ()
+    lanes: tuple[Area, ...] = ()
     frame: Frame | None = None
 
     @cached_property
