@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -54,8 +54,7 @@ def make_area(name: str, kind: AreaKind | LaneKind, *rings_m: Float) -> Area:
     return Area(name, kind, tuple(tuple((float(x), float(y)) for x, y in ring[:, :2]) for ring in rings))
 
 
-@dataclass(frozen=True)
-class MapSolid:
+class MapSolid(NamedTuple):
     """An upright prism that hides: its rings, the outer first, and heights in the map; where it is from."""
 
     name: str
@@ -91,7 +90,7 @@ class SiteMap:
             self,
             lanes=tuple(replace(a, left_m=border(a.left_m), right_m=border(a.right_m)) for a in self.lanes),
             areas=tuple(_move_area(a, move) for a in self.areas),
-            solids=tuple(replace(s, rings_m=tuple(map(move, s.rings_m))) for s in self.solids),
+            solids=tuple(s._replace(rings_m=tuple(map(move, s.rings_m))) for s in self.solids),
         )  # fmt: skip
 
 

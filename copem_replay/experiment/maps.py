@@ -17,7 +17,7 @@ from copem_replay.core.components import Flag, Frozen, Positive, error_at_key
 from copem_replay.core.errors import InputError, count_noun
 from copem_replay.core.frame import Frame, SaidPlace
 from copem_replay.core.site_map import MapSolid, SiteMap, find_borders, make_polygon, outline_crosswalks
-from copem_replay.core.tracks import FROM_MAP, Solid
+from copem_replay.core.tracks import FROM_MAP, Solid, make_outlines, outline_solids
 from copem_replay.core.yaml import Key
 from copem_replay.io.maps.registry import read_map
 from copem_replay.io.maps.solids import DEFAULT_HEIGHTS_M
@@ -173,7 +173,7 @@ def add_maps(
         if site.lanes:
             continue
         problems += [(("maps", k), refused)] if refused else []
-        inside = find_inside(recording.scene, recording.truth, [solid.outline for solid in near])
+        inside = find_inside(recording.scene, recording.truth, outline_solids(near))
         notes += [f"{where}: {inside.words}"] if inside.words else []
         if inside.refused and asked.agreement == "check":
             problems.append((("maps", k), _explain_inside(asked, inside)))
@@ -211,12 +211,12 @@ def _choose_solids(
 
     counts, truth = Counter[str](), recording.truth
     valid = truth.valid[0]
-    at_m = np.unique(np.round(np.stack([truth.x_m[0, valid], truth.y_m[0, valid]], axis=1)), axis=0)
-    outlines = np.array([shapely.Polygon(solid.rings_m[0], solid.rings_m[1:]) for solid in solids], dtype=object)
+    at_m = np.unique(np.round(truth.x_m[0, valid]) + 1j * np.round(truth.y_m[0, valid]))  # pairs would be sorted slowly
+    outlines = make_outlines([solid.rings_m for solid in solids])
     whole = np.flatnonzero(shapely.is_valid(outlines) & (shapely.area(outlines) > 0.0))
     distance_m = np.full(len(whole), np.inf)
     if len(at_m) and len(whole):
-        (which, _), nearest_m = shapely.STRtree(shapely.points(at_m)).query_nearest(
+        (which, _), nearest_m = shapely.STRtree(shapely.points(at_m.real, at_m.imag)).query_nearest(
             outlines[whole], return_distance=True, all_matches=False
         )
         distance_m[which] = nearest_m
@@ -267,7 +267,7 @@ def _stand_solids(
     grounds_m[above], distances_m[above] = find_grounds(recording.truth, outlines[above])
     stood = []
     for solid, ground_m in zip(solids, grounds_m.tolist(), strict=True):
-        outer, *holes = (tuple((float(x), float(y)) for x, y in ring) for ring in solid.rings_m)
+        outer, *holes = (tuple((x, y) for x, y in ring.tolist()) for ring in solid.rings_m)
         name, bottom_m, height_m = f"{where} {solid.name}", ground_m + solid.bottom_m, solid.top_m - solid.bottom_m
         stood.append(Solid(name, outer, bottom_m, height_m, solid.on_ground, tuple(holes)))
     return stood, distances_m[distances_m > FAR_GROUND_M].tolist()

@@ -9,9 +9,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from copem_replay.core.site_map import Lane
 from copem_replay.core.tracks import CLASS_GROUPS, CLASSES, Bool, Float, Int, Scene, Tracks
@@ -92,7 +93,7 @@ class Inside:
         return self.states >= _FEWEST and self.share > SOLIDS_REFUSED_ABOVE
 
 
-def find_inside(scene: Scene, truth: Tracks, outlines: Sequence[Any]) -> Inside:
+def find_inside(scene: Scene, truth: Tracks, outlines: NDArray[np.object_]) -> Inside:
     """How often the centre of a moving vehicle is in one of the outlines of solids: polygons as shapely has them.
 
     Of a map without lanes this is what agreement can be told by.
