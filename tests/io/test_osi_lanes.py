@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Sequence
 
+import numpy as np
 import pytest
 import shapely
+from google.protobuf.message import DecodeError
+from hypothesis import given
+from hypothesis import strategies as st
 from osi3.osi_groundtruth_pb2 import GroundTruth
 from osi3.osi_logicallane_pb2 import LogicalLane
 
@@ -195,6 +200,34 @@ def test_markings_that_are_no_crosswalk() -> None:
     assert read_road(flat).notes == ["1 crosswalk without an extent on the ground: left out"]
     flat.road_marking[0].base.position.x = math.nan
     assert read_road(flat).crosswalks == []
+
+
+WHOLE = logical_street()
+logical(WHOLE, 30, [21, 22], [23])
+add_boundary(WHOLE, 4, [(60.0, -4.0), (100.0, -4.5)])
+add_lane(WHOLE, 10, [2], [4, 3], [(0, -2), (100, -2)])
+add_marking(WHOLE).road_marking[0].base.base_polygon.add(x=3, y=1)
+NUMBERS = st.sampled_from([math.nan, math.inf, 1e308, -1e308, 5e-324, 1e9, 0.0])
+HIT = st.tuples(st.integers(0, WHOLE.ByteSize() - 1), NUMBERS | st.integers(0, 255))
+
+
+@given(st.lists(HIT, max_size=5), st.booleans())
+def test_no_message_stops_the_reading_of_its_road(hits: list[tuple[int, float]], logical_too: bool) -> None:
+    content = bytearray(WHOLE.SerializeToString())
+    for at, value in hits:
+        new = struct.pack("<d", value) if isinstance(value, float) else bytes([value])
+        content[at : at + len(new)] = new
+    try:
+        truth = GroundTruth.FromString(bytes(content))
+    except DecodeError:
+        return
+    if not logical_too:
+        truth.ClearField("logical_lane")
+    with np.errstate(over="ignore", invalid="ignore"):  # as where recordings are read
+        road = read_road(truth)
+    for lane in road.lanes:
+        assert min(len(lane.left_m), len(lane.right_m)) > 1
+        assert np.isfinite(lane.outline_m).all()
 
 
 # Lanes that esmini writes, against those of the OpenDRIVE map that it drives on.
