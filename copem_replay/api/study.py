@@ -30,6 +30,7 @@ from copem_replay.experiment.validate import (
     find_problems,
     log_names,
     read_logs,
+    take_lanes,
 )
 from copem_replay.io.open import File, first_recording, list_recordings
 from copem_replay.io.recording import Recording
@@ -182,11 +183,13 @@ def _check_recordings(
     experiment, problems = _examine_source(source, given)
     if experiment is None:
         raise ExperimentError(problems)
+    taken = list[Recording]()
     for recording in recordings:
         alone = resolve_for_log(bind_logs(experiment, [recording], source), recording.scene.log)
         problems += _describe_misread(alone, recording)
         reasons = check_against_log(alone, recording)
         problems += [source.at(key, f"{recording.path}: {reason}") for key, reason in reasons]
+        taken.append(take_lanes(alone, recording))
     problems += check_across_logs(experiment, recordings, source)
     names = [recording.scene.log for recording in recordings]
     if len(set(names)) < len(names):
@@ -194,7 +197,7 @@ def _check_recordings(
         problems += [f"recordings: expected each once, found {n} twice" for n in {*names} if names.count(n) > 1]
     if problems:
         raise InputError(problems)
-    recordings = tuple(replace(r, scene=replace(r.scene, log=name)) for r, name in zip(recordings, names, strict=True))
+    recordings = tuple(replace(r, scene=replace(r.scene, log=name)) for r, name in zip(taken, names, strict=True))
     return LoadedStudy(source, bind_logs(experiment, recordings, source), recordings)
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -32,15 +32,29 @@ class Lane:
         """The corners (K + L, 2): along the left border and back along the right."""
         return np.concatenate([self.left_m[:, :2], self.right_m[::-1, :2]])
 
+    def across(self) -> tuple[Float, Float]:
+        """Points (N, 3) of the left and the right border at the same shares of their lengths: where either has one."""
+        lines = (self.left_m, self.right_m)
+        lengths = [np.append(0.0, np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))) for line in lines]
+        shares = np.unique(np.concatenate([at / at[-1] for at in lengths if at[-1] > 0.0] or [[0.0, 1.0]]))
+        left, right = (
+            np.column_stack([np.interp(shares * at[-1], at, line[:, k]) for k in range(3)])
+            for line, at in zip(lines, lengths, strict=True)
+        )
+        return left, right
 
-def make_area(name: str, kind: AreaKind, *rings_m: Float) -> Area:
+    def turned(self) -> Lane:
+        """The lane driven the other way."""
+        return replace(self, left_m=self.right_m[::-1], right_m=self.left_m[::-1])
+
+
+def make_area(name: str, kind: AreaKind | LaneKind, *rings_m: Float) -> Area:
     """An area of rings (K, 2), the outer first; the first corner may be there again at the end."""
     rings = [ring[:-1] if len(ring) > 1 and (ring[0] == ring[-1]).all() else ring for ring in rings_m]
     return Area(name, kind, tuple(tuple((float(x), float(y)) for x, y in ring[:, :2]) for ring in rings))
 
 
-@dataclass(frozen=True)
-class MapSolid:
+class MapSolid(NamedTuple):
     """An upright prism that hides: its rings, the outer first, and heights in the map; where it is from."""
 
     name: str
@@ -76,7 +90,7 @@ class SiteMap:
             self,
             lanes=tuple(replace(a, left_m=border(a.left_m), right_m=border(a.right_m)) for a in self.lanes),
             areas=tuple(_move_area(a, move) for a in self.areas),
-            solids=tuple(replace(s, rings_m=tuple(map(move, s.rings_m))) for s in self.solids),
+            solids=tuple(s._replace(rings_m=tuple(map(move, s.rings_m))) for s in self.solids),
         )  # fmt: skip
 
 
@@ -93,6 +107,18 @@ def find_borders(lanes: Sequence[Lane]) -> Iterator[Float]:
         if not names & seen:
             seen |= names
             yield line
+
+
+def outline_crosswalks(areas: Sequence[Area], lanes: Sequence[Lane]) -> Iterator[Float]:
+    """Outlines (K, 3) of crosswalks, the first corner again, as high as the nearest points of lanes' borders."""
+    from scipy.spatial import KDTree
+
+    points = np.concatenate([np.zeros((1, 3)) if not lanes else np.empty((0, 3)), *find_borders(lanes)])
+    tree = KDTree(points[:, :2])
+    for area in areas:
+        if area.kind == "crosswalk":
+            ring = np.array([*area.rings_m[0], area.rings_m[0][0]])
+            yield np.column_stack([ring, points[tree.query(ring)[1], 2]])
 
 
 _MOST_CROSSING = 200

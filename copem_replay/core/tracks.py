@@ -100,6 +100,24 @@ class Solid(NamedTuple):
         return shapely.Polygon(self.corners_m, self.holes_m)
 
 
+def make_outlines(rings_m: Sequence[Sequence[Any]]) -> NDArray[np.object_]:
+    """Polygons (N,) as shapely has them, of rings (K, 2) each, the outer first, made together: one by one is slow."""
+    import shapely
+
+    rings = [np.asarray(ring, dtype=np.float64) for of_one in rings_m for ring in of_one]
+    corners = np.concatenate([*rings, np.empty((0, 2))])
+    lines = shapely.linearrings(corners, indices=np.repeat(np.arange(len(rings)), [len(ring) for ring in rings]))
+    outlines: NDArray[np.object_] = shapely.polygons(
+        lines, indices=np.repeat(np.arange(len(rings_m)), [len(of_one) for of_one in rings_m])
+    )
+    return outlines
+
+
+def outline_solids(solids: Sequence[Solid]) -> NDArray[np.object_]:
+    """The `outline` of each solid."""
+    return make_outlines([(solid.corners_m, *solid.holes_m) for solid in solids])
+
+
 class Area(NamedTuple):
     """A part of the plane that has a name and a kind: the rings of its polygon, the outer first, then its holes."""
 
@@ -114,7 +132,8 @@ class Scene:
 
     `moving` is False for stationary objects (they hide others; they are measured only when named).
     `solids` are stationary objects with an outline of their own, and those of maps: they hide, and are no objects.
-    `areas` are those of maps. `frame`: where it is on earth, if that is known.
+    `areas` are those of maps and of the recording, `lanes` those that `measure.objects.within` names.
+    `frame`: where it is on earth, if that is known.
     `ego_ix` is −1 where the log has no ego vehicle, or none was chosen. `tags`: what the recording, or the experiment,
     says of the drive, by name.
 
@@ -134,6 +153,7 @@ class Scene:
     solids: tuple[Solid, ...] = ()
     tags: Mapping[str, str] = field(default_factory=dict)
     areas: tuple[Area, ...] = ()
+    lanes: tuple[Area, ...] = ()
     frame: Frame | None = None
 
     @cached_property

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Final, Self
 
 from pydantic import Field, PrivateAttr, model_validator
 
 from copem_replay.core.components import Frozen, Number, error_at_key
-from copem_replay.core.errors import InputError
+from copem_replay.core.errors import InputError, quote_value
 from copem_replay.core.frame import (
     Frame,
     SaidPlace,
@@ -58,6 +59,14 @@ class FrameOfLog(Frozen):
     yaw_deg: Number = 0.0
     _frame: Frame | None = PrivateAttr(None)
     _notes: tuple[str, ...] = PrivateAttr(())
+
+    @model_validator(mode="before")
+    @classmethod
+    def _hint_key(cls, written: object) -> object:
+        if isinstance(written, Mapping | FrameOfLog):
+            return written
+        proj = json.dumps(written) if isinstance(written, str) and written != "same" else '"EPSG:25833"'
+        raise ValueError(f"expected keys and values such as `frame: {{proj: {proj}}}`, found {quote_value(written)}")
 
     @model_validator(mode="after")
     def _read(self) -> Self:

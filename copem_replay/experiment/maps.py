@@ -16,8 +16,8 @@ from pydantic import Field, PrivateAttr, ValidationInfo, field_validator, model_
 from copem_replay.core.components import Flag, Frozen, Positive, error_at_key
 from copem_replay.core.errors import InputError, count_noun
 from copem_replay.core.frame import Frame, SaidPlace
-from copem_replay.core.site_map import MapSolid, SiteMap, find_borders, make_polygon
-from copem_replay.core.tracks import FROM_MAP, Float, Solid
+from copem_replay.core.site_map import MapSolid, SiteMap, find_borders, make_polygon, outline_crosswalks
+from copem_replay.core.tracks import FROM_MAP, Solid, make_outlines, outline_solids
 from copem_replay.core.yaml import Key
 from copem_replay.io.maps.registry import read_map
 from copem_replay.io.maps.solids import DEFAULT_HEIGHTS_M
@@ -143,7 +143,9 @@ def add_maps(
 ) -> tuple[Recording, list[tuple[Key, str]]]:
     """A recording with what its maps add, and the problems with them, by key. `frame`: of the recording."""
     lines, areas, solids = list(recording.lane_boundaries), list(recording.scene.areas), list(recording.scene.solids)
-    notes, problems = list(recording.notes), list[tuple[Key, str]]()
+    lanes, notes, problems = list(recording.lanes), list(recording.notes), list[tuple[Key, str]]()
+    if lanes:
+        notes.append(f"lanes of the recording: {find_agreement(recording.scene, recording.truth, lanes).words}")
     for k, asked in enumerate(maps):
         where = f"{FROM_MAP}{k}] {Path(asked.file).name}"
         try:
@@ -158,7 +160,8 @@ def add_maps(
             notes.append(f"{where}: {found.words}")
             if found.refused and asked.agreement == "check":
                 problems.append((("maps", k), _explain_refusal(asked, found.share or 0.0)))
-            lines += [*find_borders(site.lanes), *_raise_crosswalks(site)]
+            lines += [*find_borders(site.lanes), *outline_crosswalks(site.areas, site.lanes)]
+            lanes += site.lanes
         drawn = [area for area in site.areas if not make_polygon(area.rings_m).is_empty]
         areas += drawn
         if len(drawn) < len(site.areas):
@@ -170,7 +173,7 @@ def add_maps(
         if site.lanes:
             continue
         problems += [(("maps", k), refused)] if refused else []
-        inside = find_inside(recording.scene, recording.truth, [solid.outline for solid in near])
+        inside = find_inside(recording.scene, recording.truth, outline_solids(near))
         notes += [f"{where}: {inside.words}"] if inside.words else []
         if inside.refused and asked.agreement == "check":
             problems.append((("maps", k), _explain_inside(asked, inside)))
@@ -180,7 +183,9 @@ def add_maps(
         expected = f"expected solids of at most {_MOST_PARTS:,} convex parts, found {parts:,}"
         problems.append((("maps",), f"{expected}: take a smaller `within_m`, or fewer kinds as `solids`"))
     scene = replace(recording.scene, areas=tuple(areas), solids=tuple(solids))
-    return replace(recording, scene=scene, lane_boundaries=tuple(lines), notes=tuple(notes)), problems
+    return replace(
+        recording, scene=scene, lane_boundaries=tuple(lines), lanes=tuple(lanes), notes=tuple(notes)
+    ), problems
 
 
 def _explain_refusal(asked: MapFile, share: float) -> str:
@@ -198,18 +203,6 @@ def _explain_inside(asked: MapFile, inside: Inside) -> str:
     )
 
 
-def _raise_crosswalks(site: SiteMap) -> Iterator[Float]:
-    """The outlines of crosswalks, each corner as high as the nearest point of a lane's border."""
-    from scipy.spatial import KDTree
-
-    points = np.concatenate([line for lane in site.lanes for line in (lane.left_m, lane.right_m)])
-    tree = KDTree(points[:, :2])
-    for area in site.areas:
-        if area.kind == "crosswalk":
-            ring = np.array([*area.rings_m[0], area.rings_m[0][0]])
-            yield np.column_stack([ring, points[tree.query(ring)[1], 2]])
-
-
 def _choose_solids(
     recording: Recording, solids: Sequence[MapSolid], within_m: float, where: str
 ) -> tuple[list[Solid], list[str], str]:
@@ -218,12 +211,12 @@ def _choose_solids(
 
     counts, truth = Counter[str](), recording.truth
     valid = truth.valid[0]
-    at_m = np.unique(np.round(np.stack([truth.x_m[0, valid], truth.y_m[0, valid]], axis=1)), axis=0)
-    outlines = np.array([shapely.Polygon(solid.rings_m[0], solid.rings_m[1:]) for solid in solids], dtype=object)
+    at_m = np.unique(np.round(truth.x_m[0, valid]) + 1j * np.round(truth.y_m[0, valid]))  # pairs would be sorted slowly
+    outlines = make_outlines([solid.rings_m for solid in solids])
     whole = np.flatnonzero(shapely.is_valid(outlines) & (shapely.area(outlines) > 0.0))
     distance_m = np.full(len(whole), np.inf)
     if len(at_m) and len(whole):
-        (which, _), nearest_m = shapely.STRtree(shapely.points(at_m)).query_nearest(
+        (which, _), nearest_m = shapely.STRtree(shapely.points(at_m.real, at_m.imag)).query_nearest(
             outlines[whole], return_distance=True, all_matches=False
         )
         distance_m[which] = nearest_m
@@ -274,7 +267,7 @@ def _stand_solids(
     grounds_m[above], distances_m[above] = find_grounds(recording.truth, outlines[above])
     stood = []
     for solid, ground_m in zip(solids, grounds_m.tolist(), strict=True):
-        outer, *holes = (tuple((float(x), float(y)) for x, y in ring) for ring in solid.rings_m)
+        outer, *holes = (tuple((x, y) for x, y in ring.tolist()) for ring in solid.rings_m)
         name, bottom_m, height_m = f"{where} {solid.name}", ground_m + solid.bottom_m, solid.top_m - solid.bottom_m
         stood.append(Solid(name, outer, bottom_m, height_m, solid.on_ground, tuple(holes)))
     return stood, distances_m[distances_m > FAR_GROUND_M].tolist()

@@ -48,7 +48,7 @@ from copem_replay.experiment.maps import MapFile
 from copem_replay.fusion import FUSIONS
 from copem_replay.fusion.interface import Fusion, IdealFusion
 from copem_replay.io.config import Ego, HowRead, RecordedOutput, RecordedTopic, TruthTopic, WindowOf
-from copem_replay.metrics.config import Braking, Measure, OwnArea
+from copem_replay.metrics.config import AREA, Braking, Measure, OwnArea, parse_slices
 from copem_replay.perception.config import Carriers, Obstacle, Placement, Rate
 from copem_replay.perception.pem.model import MeanNumber, Pem
 from copem_replay.perception.visibility import Surface, Visibility
@@ -477,7 +477,8 @@ class Experiment(Frozen):
     @model_validator(mode="after")
     def _find_areas(self) -> Self:
         of_logs = any(isinstance(entry, LogSettings) and entry.maps for entry in self.logs)
-        self._has_areas = bool(self.areas or self.maps or of_logs)
+        by_area = any(by.names(AREA) for by in parse_slices(self.measure.by))  # of recordings that have areas, too
+        self._has_areas = bool(self.areas or self.maps or of_logs or by_area)
         return self
 
     @field_validator("configurations", mode="after")

@@ -20,6 +20,7 @@ from copem_replay.core.errors import (
     near_name_hint,
     unknown_name_message,
 )
+from copem_replay.core.site_map import make_area
 from copem_replay.core.tracks import Scene
 from copem_replay.core.yaml import Key
 from copem_replay.experiment.cross_references import NO_EGO, check_references
@@ -88,6 +89,10 @@ def check_against_log(
     for k, name in enumerate((within.areas if within is not None else None) or ()):
         if name not in known_areas:
             yield ("measure", "objects", "within", "areas", k), unknown_name_message("area", name, known_areas)
+    known_lanes = [*(lane.kind for lane in recording.lanes), *(lane.id for lane in recording.lanes)]
+    for k, name in enumerate((within.lanes if within is not None else None) or ()):
+        if name not in known_lanes:
+            yield ("measure", "objects", "within", "lanes", k), unknown_name_message("lane", name, known_lanes)
     for name, unit in experiment.units.items():
         if unit.on == "ego":
             if not studied:
@@ -401,11 +406,21 @@ def _read_local_recording(experiment: Experiment, place: Local) -> tuple[Recordi
     recording, disagreeing = add_maps(recording, experiment.maps, frame)
     standing = {name: unit.at for name, unit in experiment.units.items() if unit.at is not None}
     alone = list_far_units(recording, experiment.maps, standing) if standing and experiment.maps else ()
-    recording = replace(recording, notes=(*recording.notes, *alone))
+    recording = take_lanes(experiment, replace(recording, notes=(*recording.notes, *alone)))
     wrong += [RefusedLog(path, line, key) for key, line in (*far, *disagreeing)]
     return recording, wrong + [
         RefusedLog(path, reason, where) for where, reason in check_against_log(experiment, recording, known=bool(wrong))
     ]
+
+
+def take_lanes(experiment: Experiment, recording: Recording) -> Recording:
+    """A recording whose scene has the lanes that `measure.objects.within` of its experiment names."""
+    within = experiment.measure.objects.within
+    if within is None or within.lanes is None:
+        return recording
+    named = (lane for lane in recording.lanes if {lane.id, lane.kind} & {*within.lanes})
+    areas = tuple(make_area(lane.id, lane.kind, lane.outline_m) for lane in named)
+    return replace(recording, scene=replace(recording.scene, lanes=areas))
 
 
 def _check_slices(experiment: Experiment, scenes: Sequence[Scene], at: Callable[[Key, str], str]) -> Iterator[str]:
@@ -419,7 +434,7 @@ def _check_slices(experiment: Experiment, scenes: Sequence[Scene], at: Callable[
             (("pems", pem, k, "when", "tags"), n) for k, one in enumerate(of.couples) for n in one.when.tags or ()
         ]
     for k, by in enumerate(parse_slices(experiment.measure.by)):
-        if by.names(AREA) and not experiment.has_areas:
+        if by.names(AREA) and scenes and not (experiment.areas or any(scene.areas for scene in scenes)):
             yield at(("measure", "by", k), NO_AREAS)
     for key, name in asked if scenes else ():
         if name not in known:

@@ -15,7 +15,20 @@ from numpy.typing import NDArray
 
 from copem_replay.core.errors import count_noun
 from copem_replay.core.frame import SaidPlace
-from copem_replay.core.tracks import CLASSES, SAME_INSTANT_NS, TRUTH, VALUES, Bool, Float, Int, Scene, Solid, Tracks
+from copem_replay.core.site_map import Lane
+from copem_replay.core.tracks import (
+    CLASSES,
+    SAME_INSTANT_NS,
+    TRUTH,
+    VALUES,
+    Area,
+    Bool,
+    Float,
+    Int,
+    Scene,
+    Solid,
+    Tracks,
+)
 
 FARTHEST_M = 1e7
 """A larger coordinate is no position: UTM northings end at 1e7."""
@@ -37,8 +50,12 @@ class DecodedObjects:
     object_ix: Int  # (P,) index into object_ids
     class_ix: NDArray[np.int8]  # (P,) index into CLASSES
     values: Float  # (P, len(VALUES))
-    lane_boundaries: tuple[Float, ...] = ()  # (K, 3) each, in the truth's frame of reference: for showing only
-    solids: tuple[Solid, ...] = ()  # in the truth's frame of reference
+    lane_boundaries: tuple[
+        Float, ...
+    ] = ()  # (K, 3) each, for showing only; it and what follows are in the truth's frame of reference
+    lanes: tuple[Lane, ...] = ()
+    areas: tuple[Area, ...] = ()  # crosswalks
+    solids: tuple[Solid, ...] = ()
     place: SaidPlace | None = None  # what it says of its place on earth
     hosts: tuple[str, ...] = ()  # the host vehicle's id, once per message that states one
     notes: tuple[str, ...] = ()  # a line for each kind of state that was skipped or completed

@@ -19,6 +19,7 @@ import numpy as np
 
 from copem_replay.core.errors import EgoError, RecordingError, RemoteFile, count_noun, escape_unprintable
 from copem_replay.core.frame import SaidPlace
+from copem_replay.core.site_map import Lane
 from copem_replay.core.tracks import CLASSES, Float, Scene, Tracks
 from copem_replay.io.channel import Channel
 from copem_replay.io.decoded_size import DecodeAllowance, OversizeError
@@ -75,6 +76,7 @@ class Recording:
     world: str = ""  # name of the frame of reference of the truth, "": none is named, as in OSI
     window: Window | None = None  # the log time that was read; None: all
     lane_boundaries: tuple[Float, ...] = ()  # (K, 3) each, for showing only
+    lanes: tuple[Lane, ...] = ()  # with a direction; those of maps, too
     place_said: SaidPlace | None = None  # what it says of its place on earth
     together: DriveRecordings | None = None  # the recordings of the drive, `path` being the first; None: it is one
     remote: RemoteFile | None = None  # where it lies, if not on this machine: `path` was a copy
@@ -177,13 +179,13 @@ def _read(
     window_lines = window_notes(window_s)
     notes = [*([damage] if damage else []), *window_lines, *log.notes, *ignored, *notes, *host_notes, *ego_notes]
     sized = around is None or around.ego is None or (asked is not None and asked.size_m is not None)
-    scene = replace(scene, ego_ix=ego_ix, ego_sized=sized, tags=dict(log.tags))
+    scene = replace(scene, ego_ix=ego_ix, ego_sized=sized, tags=dict(log.tags), areas=columns.areas)
     all_notes = tuple(escape_unprintable(note) for note in notes)
     encoding = next(c.encoding for c in log.channels if c.topic == topic and c.messages)
     return Recording(
         scene, truth, log.path, topic, all_notes, host, damage,
-        around=around, encoding=encoding, world=world, window=log.window,
-        lane_boundaries=columns.lane_boundaries, place_said=columns.place, together=find_drive_recordings(log),
+        around=around, encoding=encoding, world=world, window=log.window, lane_boundaries=columns.lane_boundaries,
+        lanes=columns.lanes, place_said=columns.place, together=find_drive_recordings(log),
     )  # fmt: skip
 
 

@@ -9,9 +9,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from copem_replay.core.site_map import Lane
 from copem_replay.core.tracks import CLASS_GROUPS, CLASSES, Bool, Float, Int, Scene, Tracks
@@ -92,7 +93,7 @@ class Inside:
         return self.states >= _FEWEST and self.share > SOLIDS_REFUSED_ABOVE
 
 
-def find_inside(scene: Scene, truth: Tracks, outlines: Sequence[Any]) -> Inside:
+def find_inside(scene: Scene, truth: Tracks, outlines: NDArray[np.object_]) -> Inside:
     """How often the centre of a moving vehicle is in one of the outlines of solids: polygons as shapely has them.
 
     Of a map without lanes this is what agreement can be told by.
@@ -146,24 +147,11 @@ class DirectedLanes:
 
 
 def _cut_lane(lane: Lane) -> tuple[Float, Float]:
-    """Quadrangles (K, 4, 2) across a lane, left border, right border back; and their headings (K,).
-
-    Both borders are cut at the same shares of their lengths.
-    """
-    lengths = [_lengths(line) for line in (lane.left_m, lane.right_m)]
-    shares = np.unique(np.concatenate([length / length[-1] for length in lengths if length[-1] > 0.0] or [[0.0, 1.0]]))
-    left, right = (
-        np.column_stack([np.interp(shares * length[-1], length, line[:, k]) for k in (0, 1)])
-        for line, length in zip((lane.left_m, lane.right_m), lengths, strict=True)
-    )
+    """Quadrangles (K, 4, 2) across a lane, left border, right border back; and their headings (K,)."""
+    left, right = (line[:, :2] for line in lane.across())
     corners = np.stack([left[:-1], left[1:], right[1:], right[:-1]], axis=1)
     ahead = left[1:] - left[:-1] + right[1:] - right[:-1]
     return corners, np.arctan2(ahead[:, 1], ahead[:, 0])
-
-
-def _lengths(line: Float) -> Float:
-    """Metres (K,) along a line to each of its points."""
-    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))])
 
 
 @dataclass(frozen=True)

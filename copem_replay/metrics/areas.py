@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from copem_replay.core.interpolation import interpolate_states
 from copem_replay.core.site_map import make_polygon
-from copem_replay.core.tracks import Bool, Float, Scene, Tracks
+from copem_replay.core.tracks import Area, Bool, Float, Scene, Tracks
 from copem_replay.metrics.config import MetricsSetup
 
 if TYPE_CHECKING:
@@ -27,16 +27,17 @@ def are_in_areas(x_m: Float, y_m: Float, scene: Scene, names: Sequence[str], exp
         if (own := experiment.areas.get(name)) is not None:
             inside |= own.covers(x_m, y_m)
         else:
-            inside |= _are_in_map_areas(x_m, y_m, scene, name)
+            inside |= are_in_named(x_m, y_m, scene.areas, [name])
     return inside
 
 
-def _are_in_map_areas(x_m: Float, y_m: Float, scene: Scene, name: str) -> Bool:
+def are_in_named(x_m: Float, y_m: Float, areas: Sequence[Area], names: Sequence[str]) -> Bool:
+    """(M,) whether places are in any of the areas of these names or kinds, or on a border."""
     import shapely
 
     inside, points = np.zeros(len(x_m), dtype=bool), shapely.points(x_m, y_m)
-    for area in scene.areas:
-        if name in (area.name, area.kind):
+    for area in areas:
+        if area.name in names or area.kind in names:
             inside |= shapely.intersects(make_polygon(area.rings_m), points)
     return inside
 
@@ -60,4 +61,4 @@ def _list_areas(x_m: Float, y_m: Float, scene: Scene, experiment: MetricsSetup) 
     for name, own in experiment.areas.items():
         yield name, own.covers(x_m, y_m)
     for kind in _KINDS:
-        yield kind, _are_in_map_areas(x_m, y_m, scene, kind)
+        yield kind, are_in_named(x_m, y_m, scene.areas, [kind])

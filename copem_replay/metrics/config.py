@@ -49,6 +49,7 @@ class Within(Frozen):
     `conflict_s`: at some instant of its episode the object, at constant velocity, would within this time enter the area
     that the ego, at constant speed, sweeps along its path, with the margin of `measure.conflict` around it.
     `areas`: by name, your own and those of maps, or by kind: `crosswalk`, `junction`, `drivable`, `parking`.
+    `lanes`: of maps and of the recording, by id, or by kind: `driving`, `bicycle`, `walking`, `parking`, `other`.
     """
 
     polygon_m: Polygon | None = None
@@ -56,17 +57,18 @@ class Within(Frozen):
     corridor_m: NotNegative | None = None
     conflict_s: Positive | None = None
     areas: Annotated[tuple[Id, ...], Field(min_length=1)] | None = Field(default=None, exclude_if=_is_none)
+    lanes: Annotated[tuple[Id, ...], Field(min_length=1)] | None = Field(default=None, exclude_if=_is_none)
 
     @model_validator(mode="after")
     def _one(self) -> Self:
-        _check_exactly_one(self, "polygon_m", "polygon_wgs84", "corridor_m", "conflict_s", "areas")
+        _check_exactly_one(self, "polygon_m", "polygon_wgs84", "corridor_m", "conflict_s", "areas", "lanes")
         _check_outline(self)
         return self
 
     @property
     def of_ego(self) -> bool:
         """Whether the condition needs an ego."""
-        return self.polygon_m is None and self.polygon_wgs84 is None and self.areas is None
+        return self.corridor_m is not None or self.conflict_s is not None
 
 
 class OwnArea(Frozen):

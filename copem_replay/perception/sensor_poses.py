@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from copem_replay.core.errors import count_noun
 from copem_replay.core.interpolation import interpolate_at_instants, wrap_angles
-from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int, Scene, Solid, Tracks
+from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int, Scene, Solid, Tracks, outline_solids
 from copem_replay.perception.config import Obstacle, PerceptionSetup, Placement
 from copem_replay.perception.pem.condition import Condition, Couple
 from copem_replay.perception.visibility import NO_STATICS, Observers, Statics, make_statics
@@ -206,8 +206,8 @@ def make_solid_statics(solids: Sequence[Solid]) -> Statics:
     """Solids as visibility takes them."""
     if not solids:
         return NO_STATICS
-    outlines, bottoms_m, heights_m = zip(*((s.outline, s.bottom_m, s.height_m) for s in solids), strict=True)
-    static = make_statics(outlines, bottoms_m, heights_m)
+    bottoms_m, heights_m = zip(*((solid.bottom_m, solid.height_m) for solid in solids), strict=True)
+    static = make_statics(outline_solids(solids), bottoms_m, heights_m)
     return static._replace(bottom_m=np.array([_hides_from_m(solid) for solid in solids])[static.body])
 
 
@@ -279,7 +279,7 @@ def _note_objects_inside(scene: Scene, truth: Tracks, solids: Sequence[Solid]) -
 
     if not solids:
         return []
-    outlines = np.array([solid.outline for solid in solids])
+    outlines = outline_solids(solids)
     x, y, z = truth.x_m[0], truth.y_m[0], truth.z_m[0]
     west, south, east, north = shapely.total_bounds(outlines)
     near = np.flatnonzero((x >= west) & (x <= east) & (y >= south) & (y <= north))

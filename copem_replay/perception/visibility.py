@@ -11,11 +11,12 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BeforeValidator, PlainSerializer, WithJsonSchema
 from pydantic_core import PydanticKnownError
 
@@ -35,15 +36,18 @@ _ROWS_PER_THREAD = 20_000
 
 
 def make_statics(
-    polygons: Sequence[Float | shapely.Polygon], bottom_m: Sequence[float], height_m: Sequence[float]
+    polygons: Sequence[Float | shapely.Polygon] | NDArray[np.object_],
+    bottom_m: Sequence[float],
+    height_m: Sequence[float],
 ) -> Statics:
     """Static obstacles from simple polygons, each (K, 2), or with holes; convex or not, any order of corners."""
     import shapely
 
+    outlines = np.empty(len(polygons), dtype=object)
+    outlines[:] = [p if isinstance(p, shapely.Polygon) else shapely.Polygon(p) for p in polygons]
     parts: list[Float] = []
     body: list[int] = []
-    for k, corners in enumerate(polygons):
-        pieces = cut_convex(corners if isinstance(corners, shapely.Polygon) else shapely.Polygon(corners))
+    for k, pieces in enumerate(_cut_all_convex(shapely.orient_polygons(outlines))):
         parts += pieces
         body += [k] * len(pieces)
     index = np.array(body, dtype=np.int64)
@@ -57,6 +61,16 @@ def make_statics(
     )
 
 
+def _cut_all_convex(polygons: NDArray[np.object_]) -> Iterator[list[Float]]:
+    """The convex parts of each polygon, counter-clockwise ones. Most are their own: that is asked of all at once."""
+    import shapely
+
+    hulls, areas_m2 = shapely.convex_hull(polygons), shapely.area(polygons)
+    convex = (shapely.get_num_interior_rings(polygons) == 0) & (shapely.area(hulls) - areas_m2 <= 1e-9 * areas_m2)
+    for is_convex, polygon, hull in zip(convex, polygons, shapely.orient_polygons(hulls), strict=True):
+        yield [shapely.get_coordinates(hull)[:-1]] if is_convex else cut_convex(polygon)
+
+
 def cut_convex(polygon: shapely.Polygon) -> list[Float]:
     """Convex parts of a polygon, corners (K, 2) counter-clockwise; holes stay holes.
 
@@ -65,11 +79,7 @@ def cut_convex(polygon: shapely.Polygon) -> list[Float]:
     """
     import shapely
 
-    polygon = shapely.orient_polygons(polygon)
-    hull = polygon.convex_hull
-    if not polygon.interiors and hull.area - polygon.area <= 1e-9 * polygon.area:
-        return [_corners_of(hull)]
-    triangles = shapely.constrained_delaunay_triangles(polygon).geoms
+    triangles = shapely.constrained_delaunay_triangles(shapely.orient_polygons(polygon)).geoms
     rings = {k: [(x, y) for x, y in _corners_of(triangle)] for k, triangle in enumerate(triangles)}
     owner = {edge: k for k, ring in rings.items() for edge in _edges_of(ring)}
     for a, b in [(a, b) for a, b in owner if a < b and (b, a) in owner]:

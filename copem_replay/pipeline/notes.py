@@ -578,9 +578,10 @@ def scene_from_json(data: dict[str, Any]) -> Scene:
                 Solid(name, _read_ring(corners), bottom_m, height_m, on_ground, tuple(map(_read_ring, holes)))
                 for name, corners, bottom_m, height_m, on_ground, holes in data["solids"]
             ),
-            "areas": tuple(
-                Area(name, kind, tuple(_read_ring(ring) for ring in rings)) for name, kind, rings in data["areas"]
-            ),
+            **{
+                key: tuple(Area(name, kind, tuple(map(_read_ring, rings))) for name, kind, rings in data[key])
+                for key in ("areas", "lanes")
+            },
             "frame": (said := data["frame"]) and Frame(said["proj"], (*said["offset_m"],), said["yaw_rad"]),
         }
     )

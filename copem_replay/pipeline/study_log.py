@@ -161,7 +161,7 @@ def read_content_digest(recording: Recording) -> str:
 def drop_content(recording: Recording, read: Callable[[], Recording]) -> Recording:
     """A recording without its truth and its lists, which `read` reads again where they are needed."""
     survey = StoredSurvey(compute_log_digests(recording) | {"states": recording.object_states}, read)
-    return replace(recording, truth=_empty_tracks(), lists={}, around=None, lane_boundaries=(), survey=survey)
+    return replace(recording, truth=_empty_tracks(), lists={}, around=None, lane_boundaries=(), lanes=(), survey=survey)
 
 
 def survey_key(place: Place, experiment: Experiment, seen: Sequence[Stamp] | None = None) -> str:

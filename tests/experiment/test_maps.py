@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import shapely
 import yaml
+from mcap.reader import make_reader
 from typer.testing import CliRunner
 
 import copem_replay as cr
@@ -22,7 +23,8 @@ from copem_replay.experiment.file import read_experiment_file
 from copem_replay.experiment.maps import MapFile, add_maps
 from copem_replay.io.recording import Recording
 from tests.helpers.experiments import changed
-from tests.helpers.recordings import Obj, write_recording
+from tests.helpers.recordings import Obj, Topic, ground_truth, write_mcap, write_recording
+from tests.helpers.roads import add_marking, two_lanes
 
 ROAD = """<OpenDRIVE><header/><road id="7" length="200" junction="-1"><planView>
 <geometry s="0" x="-50" y="0" hdg="0" length="200"><line/></geometry></planView><lanes><laneSection s="0">
@@ -245,3 +247,47 @@ def test_a_unit_in_a_house_of_the_map_is_refused(folder: Path) -> None:
     )
     with pytest.raises(InputError, match="road 7 object 1"):
         read_study(read_experiment_file(folder / "experiment.yaml"))
+
+
+def test_lanes_and_crosswalks_that_the_recording_has(folder: Path) -> None:
+    """The northern lane, on which the cars drive west, is stored towards the east: held against their headings."""
+    recording = read(with_road(folder))
+    assert [(lane.id, lane.kind) for lane in recording.lanes] == [("8", "driving"), ("9", "driving")]
+    assert [(area.name, area.kind) for area in recording.scene.areas] == [("crosswalk 40", "crosswalk")]
+    assert len(recording.lane_boundaries) == 4  # three borders and the crosswalk
+    assert recording.notes[-1] == (
+        "lanes of the recording: agreement with the traffic 1.00: 124 of 124 states of moving vehicles are in a lane "
+        "of their heading"
+    )
+
+
+def test_only_objects_in_lanes_of_the_recording_and_groups_by_its_areas(folder: Path) -> None:
+    """Cars are in the northern lane 60 m ahead, where two of four come to; one stands on the crosswalk at (30, 1)."""
+    with_road(folder, parked=True)
+    counted = {}
+    for within in ("lanes: [9]", "lanes: [8]", "areas: [crosswalk]"):
+        (folder / "experiment.yaml").write_text(
+            changed(f"measure: {{onset: {{kind: in_range, range_m: 60}}, horizon_s: 2, by: [area], "
+                    f"began: [log_start, crossed], objects: {{within: {{{within}}}}}}}")
+        )  # fmt: skip
+        results = cr.run(folder / "experiment.yaml")
+        again = cr.run(folder / "experiment.yaml", cr.read_recordings(folder / "experiment.yaml"))
+        assert again.tally.equals(results.tally)
+        counted[within] = {key: set(rows["area"].fillna("")) for key, rows in results.tally.groupby("object_id")}
+    assert counted == {
+        "lanes: [9]": {"2": {""}, "3": {""}, "9": {"crosswalk"}},
+        "lanes: [8]": {},
+        "areas: [crosswalk]": {"9": {"crosswalk"}},
+    }
+
+
+def with_road(folder: Path, *, parked: bool = False) -> Path:
+    """The drive of `folder` with two lanes of 4 m, 8 to the south and 9 to the north of y = 0, and a crosswalk."""
+    road, car = two_lanes(-20, 120), ground_truth(None, [Obj(id=9, x=30.0, y=1.0)] * parked)
+    add_marking(road)
+    with (folder / "drive.mcap").open("rb") as file:
+        found = [(message.log_time, message.data) for *_, message in make_reader(file).iter_messages()]
+    first = car.SerializeToString() + road.SerializeToString()
+    messages = [(log_ns, data + first * (k == 0)) for k, (log_ns, data) in enumerate(found)]
+    write_mcap(folder / "drive.mcap", [Topic("truth", "osi3.GroundTruth", messages)])
+    return folder

@@ -458,9 +458,61 @@ def test_commonroad_what_is_skipped_is_said(run: Runner) -> None:
         assert f"note: {note}\n" in found.printed
 
 
+def lanelet(ident: str, left: str, right: str, *types: str) -> str:
+    """Bounds as "x,y x,y"."""
+    bounds = "".join(
+        f"<{side}>{''.join('<point><x>{}</x><y>{}</y></point>'.format(*at.split(',')) for at in line.split())}</{side}>"
+        for side, line in (("leftBound", left), ("rightBound", right))
+    )
+    return f'<lanelet id="{ident}">{bounds}{"".join(f"<laneletType>{one}</laneletType>" for one in types)}</lanelet>'
+
+
+def test_commonroad_lanelets_are_lanes_and_crosswalks_are_areas(run: Runner) -> None:
+    """Two lanelets of one street, driven against each other; 7 is a crossing by its intersection alone."""
+    parts = (
+        lanelet("5", "0,0 50,0", "0,-3 20,-4 50,-3", "urban"),
+        lanelet("6", "50,0 0,0", "50,3 0,3"),
+        lanelet("7", "10,3 10,-3", "8,3 8,-3", "sidewalk"),
+        lanelet("8", "30,3 30,-3", "28,3 28,-3", "urban", "crosswalk"),
+        lanelet("9", "0,3 50,3", "0,3 50,3", "bicycleLane"),
+        lanelet("10", "0,3", "0,3 50,3"),
+        '<intersection id="90"><incoming/><crossing><crossingLanelet ref="7"/></crossing></intersection>',
+        obstacle("dynamicObstacle", "42", "car", BOX, AT_0),
+    )
+    found = run("commonroad", run.file("s.xml", scenario(*parts)))
+    lanes = {lane.id: lane for lane in found.recording.lanes}
+    assert {name: lane.kind for name, lane in lanes.items()} == {
+        "5": "driving", "6": "driving", "7": "walking", "8": "walking", "9": "bicycle",
+    }  # fmt: skip
+    assert lanes["5"].right_m.tolist() == [[0, -3, 0], [20, -4, 0], [50, -3, 0]]
+    assert lanes["6"].left_m.tolist() == [[50, 0, 0], [0, 0, 0]]
+    areas = {area.name: set(area.rings_m[0]) for area in found.recording.scene.areas}
+    assert areas == {
+        "crosswalk 7": {(10, 3), (10, -3), (8, -3), (8, 3)}, "crosswalk 8": {(30, 3), (30, -3), (28, -3), (28, 3)},
+    }  # fmt: skip
+    for note in (
+        "5 lanes of the scenario",
+        "2 crosswalks among its lanes",
+        "1 lanelet without two bounds of two points: left out",
+    ):
+        assert f"note: {note}\n" in found.printed
+
+
 @pytest.mark.parametrize(
     ("text", "line"),
     [
+        (
+            scenario(lanelet("5", "0,0 1e9,0", "0,-3 9,-3")),
+            "s.xml:3: <lanelet>: expected numbers of at most 1e+08, found 1e+09",
+        ),
+        (
+            scenario(lanelet("a", "0,0 9,0", "0,-3 9,-3")),
+            "s.xml:3: expected <lanelet> with a whole number as id, found 'a'",
+        ),
+        (
+            scenario("<intersection><crossing><crossingLanelet/></crossing></intersection>"),
+            "s.xml:3: expected <crossingLanelet> with the attribute ref, found none",
+        ),
         ("<fcd-export/>", "s.xml:1: expected <commonRoad>, found <fcd-export>"),
         (scenario(step="0"), "s.xml:2: expected timeStepSize in seconds (1e-6 to 1000), found '0'"),
         (scenario(step="x"), "s.xml:2: expected timeStepSize in seconds (1e-6 to 1000), found 'x'"),

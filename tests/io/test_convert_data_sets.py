@@ -12,8 +12,10 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 import pytest
 from osi3.osi_object_pb2 import StationaryObject
+from pyarrow import feather
 
 from copem_replay.core.errors import InputError
 from copem_replay.core.frame import Frame
@@ -98,8 +100,8 @@ def test_argoverse2_from_the_rear_axle_to_the_city(run: Runner) -> None:
         assert f"note: {note}" in found.printed
 
 
-def test_argoverse2_brings_the_borders_of_its_map(run: Runner) -> None:
-    """Two lanes side by side have three borders; they are in the first message alone."""
+def test_argoverse2_brings_the_lanes_of_its_map(run: Runner) -> None:
+    """Two lanes side by side have three borders; in the first message alone. The crosswalk is at their height."""
     log = av2_log(run, BOXES, POSES)
     (log / "map").mkdir()
 
@@ -107,13 +109,29 @@ def test_argoverse2_brings_the_borders_of_its_map(run: Runner) -> None:
         return [{"x": x, "y": y, "z": 20.0} for x in (90.0, 110.0)]
 
     lanes = {
-        name: {"left_lane_boundary": line(y), "right_lane_boundary": line(y - 3)} for name, y in (("1", 6), ("2", 3))
+        name: {"left_lane_boundary": line(y), "right_lane_boundary": line(y - 3), "lane_type": kind}
+        for name, y, kind in (("71", 6, "BIKE"), ("72", 3, "VEHICLE"))
     }
-    (log / "map/log_map_archive_x____PIT_city_1.json").write_text(json.dumps({"lane_segments": lanes}))
+    crossing = {"edge1": [{"x": 95, "y": 0}, {"x": 95, "y": 6}], "edge2": [{"x": 98, "y": 0}, {"x": 98, "y": 6}]}
+    site = {"lane_segments": lanes, "pedestrian_crossings": {"73": crossing}}
+    (log / "map/log_map_archive_x____PIT_city_1.json").write_text(json.dumps(site))
     found = run("argoverse2", log)
-    assert [b[:, 1].tolist() for b in found.recording.lane_boundaries] == [[6, 6], [3, 3], [0, 0]]
-    assert not found.messages[1].lane_boundary
-    assert "2 lanes of log_map_archive_x____PIT_city_1.json: its borders are lane boundaries" in found.printed
+    *borders, outline = found.recording.lane_boundaries
+    assert [b[:, 1].tolist() for b in borders] == [[6, 6], [3, 3], [0, 0]]
+    assert [(lane.id, lane.kind) for lane in found.recording.lanes] == [("71", "bicycle"), ("72", "driving")]
+    assert found.recording.lanes[1].left_m.tolist() == [[90, 3, 20], [110, 3, 20]]
+    assert found.messages[0].lane[1].classification.centerline[1].y == 1.5
+    (area,) = found.recording.scene.areas
+    assert (area.name, area.kind, set(area.rings_m[0])) == (
+        "crosswalk 73",
+        "crosswalk",
+        {(95, 0), (95, 6), (98, 6), (98, 0)},
+    )
+    assert (outline[:, 2] == 20).all()
+    later = found.messages[1]
+    assert not any((later.lane_boundary, later.lane, later.road_marking))
+    assert "note: 2 lanes of log_map_archive_x____PIT_city_1.json" in found.printed
+    assert "note: 1 crosswalk of the map" in found.printed
     assert "place on earth: that of city PIT, by the name of log_map_archive_x____PIT_city_1.json" in found.printed
     place = found.recording.place_said
     assert place is not None
@@ -161,10 +179,11 @@ def test_argoverse2_refuses(run: Runner) -> None:
     log = av2_log(run, BOXES, POSES)
     annotations, poses = log / "annotations.feather", log / "city_SE3_egovehicle.feather"
     assert "expected the folder of an Argoverse 2 sensor log" in run.refused("argoverse2", annotations)
-    pd.DataFrame(BOXES).drop(columns=["qx", "category"]).to_feather(annotations)
+    table = pa.Table.from_pandas(pd.DataFrame(BOXES).drop(columns=["qx", "category"]))
+    feather.write_feather(table.append_column("tx_m", table["tx_m"]), annotations)
     line = run.refused("argoverse2", log)
     assert line.startswith(f"{annotations}: expected the columns timestamp_ns, category")
-    assert line.endswith("missing: category, qx")
+    assert line.endswith(", once each; found no category, no qx, 2 tx_m")
     pd.DataFrame(BOXES).assign(tx_m="far").to_feather(annotations)
     assert "annotations.feather: column tx_m: expected double, found " in run.refused("argoverse2", log)
     pd.DataFrame(BOXES).assign(track_uuid=None).to_feather(annotations)

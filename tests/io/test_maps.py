@@ -9,12 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
+from osi3.osi_groundtruth_pb2 import GroundTruth
 from scipy.integrate import quad
 
 from copem_replay.core.errors import InputError
 from copem_replay.io.maps.opendrive import read_opendrive
 from copem_replay.io.maps.opendrive_geometry import follow_clothoid
 from copem_replay.io.maps.registry import read_map
+from copem_replay.io.schemas.osi_lanes import read_road
+from copem_replay.io.write.osi import add_road
 
 SHARED = Path(__file__).parents[3] / "shared/data"
 MAPS = SHARED / "maps"
@@ -367,3 +370,22 @@ def test_map_of_argoverse(tmp_path: Path) -> None:
 def test_refused_maps_of_argoverse(tmp_path: Path, text: str, says: str) -> None:
     with pytest.raises(InputError, match=says):
         read_map(written(tmp_path, text, "map.json"))
+
+
+def test_a_map_of_argoverse_comes_back_from_osi() -> None:
+    """As `convert argoverse2` writes it: every lane with its borders, bit for bit, and every crosswalk to µm."""
+    found = sorted((MAPS / "av2").glob("log_map_archive_*.json"))
+    if not found:
+        pytest.skip("no map of Argoverse 2 here")
+    site, osi = read_map(found[0]), GroundTruth()
+    add_road(osi, (), site)
+    road = read_road(GroundTruth.FromString(osi.SerializeToString()))
+    assert len(road.lanes) == len(site.lanes) == 150
+    for lane, written in zip(road.lanes, site.lanes, strict=True):
+        assert (lane.id, lane.kind) == (written.id, written.kind)
+        np.testing.assert_array_equal(lane.left_m, written.left_m)
+        np.testing.assert_array_equal(lane.right_m, written.right_m)
+    crosswalks = [area for area in site.areas if area.kind == "crosswalk"]
+    assert [area.name for area in road.crosswalks] == [area.name for area in crosswalks]
+    for area, as_written in zip(road.crosswalks, crosswalks, strict=True):
+        np.testing.assert_allclose(area.rings_m[0], as_written.rings_m[0], atol=1e-6)

@@ -243,7 +243,8 @@ def test_json_and_geojson_of_one_place_are_one(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["neukolln", "quad_intersection"])
 def test_areas_are_those_of_osm2geojson(name: str) -> None:
     """Without walls, which it leaves lines. It drops ways with tags of their own that are members of multipolygons."""
-    osm2geojson = pytest.importorskip("osm2geojson")
+    import osm2geojson  # with requests, which the other tests do without
+
     path = need(f"osm/{name}.osm")
     site = read_map(path)
     middle = site.solids[0].rings_m[0].mean(axis=0)

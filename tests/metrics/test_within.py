@@ -12,9 +12,10 @@ import shapely
 from pydantic import ValidationError
 
 from copem_replay.core.errors import ExperimentError
-from copem_replay.core.tracks import Area
+from copem_replay.core.site_map import Lane
+from copem_replay.core.tracks import Area, Float
 from copem_replay.experiment.schema import Experiment
-from copem_replay.experiment.validate import check_against_log
+from copem_replay.experiment.validate import check_against_log, take_lanes
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.detection.conflict import keep_episodes_within
 from copem_replay.metrics.episodes import find_episodes
@@ -50,6 +51,10 @@ def kept(log: Recording, within: Any, areas: Any = None, **measure: Any) -> set[
     found, outside_ix = keep_episodes_within(log.scene, log.truth, every, wanted)
     assert sorted([*found.object_ix, *outside_ix]) == sorted(every.object_ix)
     return {log.scene.object_ids[k] for k in found.object_ix}
+
+
+def line(*points: tuple[float, float]) -> Float:
+    return np.array([(x, y, 0.0) for x, y in points])
 
 
 class TestAreas:
@@ -95,6 +100,36 @@ class TestAreas:
         key = ("measure", "objects", "within", "areas", 1)
         assert problems[key] == "no area is named 'sqare'; did you mean square?"
         assert ("measure", "objects", "within", "areas", 0) not in problems
+
+    def test_lanes_by_id_and_by_kind(self) -> None:
+        """A border counts; a lane that is driven both ways is one."""
+        log = passing()
+        street = Lane("38109167", "driving", line((-50, 3), (50, 3)), line((-50, 0), (50, 0)))
+        path = Lane("7", "bicycle", line((10, 14), (30, 14)), line((10, 11), (30, 11)))
+        log = replace(log, lanes=(street, street.turned(), path))
+        for names, expected in (
+            ([38109167], {"parked", "behind"}),
+            (["bicycle"], {"aside"}),
+            (["driving", "7"], {"parked", "behind", "aside"}),
+        ):
+            wanted = experiment(measure=APPEARS | {"objects": {"within": {"lanes": names}}})
+            assert kept(take_lanes(wanted, log), {"lanes": names}) == expected
+        assert take_lanes(experiment(), log) is log
+
+    @pytest.mark.parametrize(
+        ("name", "says"),
+        [
+            ("drivng", "no lane is named 'drivng'; did you mean driving?"),
+            (3810916, "no lane is named '3810916'; did you mean 38109167?"),
+            ("parking", "no lane is named 'parking'; there are driving, 38109167"),
+        ],
+    )
+    def test_an_unknown_lane_is_refused_with_the_nearest(self, name: str | int, says: str) -> None:
+        log = replace(passing(), lanes=(Lane("38109167", "driving", line((0, 3), (50, 3)), line((0, 0), (50, 0))),))
+        wanted = experiment(measure={"objects": {"within": {"lanes": ["driving", name]}}})
+        problems = dict(check_against_log(wanted, log))
+        assert problems["measure", "objects", "within", "lanes", 1] == says
+        assert ("measure", "objects", "within", "lanes", 0) not in problems
 
     @pytest.mark.parametrize(
         "area", [{}, {"polygon_m": [[0, 0], [1, 0], [1, 1]], "width_m": 2}, {"along_m": [[0, 0], [1, 0]]},
@@ -270,7 +305,7 @@ class TestInARun:
     [
         (
             {"objects": {"within": {}}},
-            "expected one of polygon_m, polygon_wgs84, corridor_m, conflict_s, areas, found none",
+            "expected one of polygon_m, polygon_wgs84, corridor_m, conflict_s, areas, lanes, found none",
         ),
         ({"objects": {"within": {"corridor_m": 1.0, "conflict_s": 2.0}}}, "found corridor_m and conflict_s"),
         ({"objects": {"within": {"polygon_m": [[0, 0], [1, 1], [1, 0], [0, 1]]}}}, "edges that cross or overlap"),

@@ -12,7 +12,7 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from copem_replay.core.tracks import Tracks
+from copem_replay.core.tracks import Solid, Tracks, outline_solids
 from copem_replay.io.recording import read_log
 from copem_replay.perception.visibility import (
     NO_STATICS,
@@ -511,3 +511,20 @@ def test_what_a_unit_sees_of_a_house_does_not_depend_on_where_it_was_before() ->
     row = np.flatnonzero(world.frame_ix < lists)
     assert np.array_equal(one[row], each[world.frame_ix[row], row])
     assert len(np.unique(one[row])) > 5
+
+
+def test_polygons_made_together_are_those_made_one_by_one() -> None:
+    """Byte for byte, with holes and without; and a solid that is convex is its own only part."""
+    rng, square, yard = np.random.default_rng(3), ((-9, -9), (9, -9), (9, 9), (-9, 9)), ((-1, -1), (1, -1), (1, 1))
+    solids = [Solid("yard", square, 0.0, 3.0, holes_m=(yard,))]
+    for count in range(3, 20):
+        angle = np.sort(rng.uniform(0, 2 * np.pi, count))
+        ring = rng.uniform(5, 20, count)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        solids.append(Solid("star", tuple((x, y) for x, y in ring.tolist()), 0.0, 3.0))
+    solids.append(Solid("square", square[::-1], 0.0, 3.0))
+    assert [one.wkb for one in outline_solids(solids)] == [solid.outline.wkb for solid in solids]
+    assert len(outline_solids([])) == 0
+    static = make_statics(outline_solids(solids), [0.0] * len(solids), [3.0] * len(solids))
+    assert [(static.body == k).sum() for k in (1, len(solids) - 1)] == [1, 1]
+    assert {(x, y) for x, y in static.xy_m[static.start[-2] :].tolist()} == {*square}
+    assert (static.body == 0).sum() > 1

@@ -210,6 +210,8 @@ def _write_data_sets(folder: Path) -> None:
     parts = [
         tables.obstacle("dynamicObstacle", "42", "car", tables.BOX, f"{tables.AT_0}<trajectory>{turned}</trajectory>"),
         tables.obstacle("staticObstacle", "44", "parkedVehicle", tables.BOX, tables.AT_0),
+        tables.lanelet("5", "0,0 50,0", "0,-3 20,-4 50,-3", "urban", "crosswalk"),
+        '<intersection id="9"><crossing><crossingLanelet ref="5"/></crossing></intersection>',
     ]
     (folder / "commonroad.xml").write_text(tables.scenario(*parts))
     (folder / "openlabel.json").write_text(sets.labels(**sets.kitti()))

@@ -19,8 +19,8 @@ import pyarrow.feather
 
 from copem_replay.core.errors import InputError
 from copem_replay.core.frame import SaidPlace, read_argoverse2_city
-from copem_replay.core.site_map import find_borders
-from copem_replay.core.tracks import Float
+from copem_replay.core.site_map import Lane, SiteMap
+from copem_replay.core.tracks import Area, Float
 from copem_replay.io.convert.conversion import KINDS, Box, ConversionReport, ConvertedFrame, rotation_from_quaternion
 from copem_replay.io.maps.registry import read_map
 
@@ -90,7 +90,8 @@ def frames(
         f"ego vehicle: id 1, {size} m, its centre {centre} m (ahead, left, up) of the rear axle, where the log has it"
     )
     ego_R_object, ego_t_object = _read_se3(boxes)
-    lines, place = _read_borders(log, report), _find_place(log, report)
+    site: SiteMap | None
+    site, place = _read_site(log, report), _find_place(log, report)
     for stamp_ns, rows in _group_by_stamp(boxes["timestamp_ns"]):
         if (pose := pose_of.get(stamp_ns)) is None:
             report.count("annotated instant", "without an ego pose of the same time stamp: skipped")
@@ -114,18 +115,20 @@ def frames(
                     size_m=(length, width, height),
                 )
             )
-        yield ConvertedFrame(stamp_ns, frame_boxes, host=1, lines=lines, place=place)
-        lines, place = [], None
+        yield ConvertedFrame(stamp_ns, frame_boxes, host=1, site=site, place=place)
+        site, place = None, None
 
 
-def _read_borders(log: Path, report: ConversionReport) -> list[Float]:
-    """The borders of lanes of the log's map, in the city frame; none without a map."""
-    lines = list[Float]()
+def _read_site(log: Path, report: ConversionReport) -> SiteMap:
+    """Lanes and crosswalks of the log's map, in the city frame; none without a map."""
+    lanes, areas = list[Lane](), list[Area]()
     for path in sorted((log / "map").glob("log_map_archive_*.json")):
         site = read_map(path)
-        lines += find_borders(site.lanes)
-        report.count("lane", f"of {path.name}: its borders are lane boundaries", len(site.lanes))
-    return lines
+        lanes += site.lanes
+        areas += [area for area in site.areas if area.kind == "crosswalk"]
+        report.count("lane", f"of {path.name}", len(site.lanes))
+    report.count("crosswalk", "of the map", len(areas))
+    return SiteMap(tuple(lanes), tuple(areas))
 
 
 def _find_place(log: Path, report: ConversionReport) -> SaidPlace | None:
@@ -185,8 +188,9 @@ def _read_table(path: Path, numbers: tuple[str, ...], texts: tuple[str, ...] = (
     except (pa.ArrowException, OSError, ValueError) as error:
         raise InputError(f"{path}: expected a feather file, found {str(error).splitlines()[0]}") from None
     expected = ("timestamp_ns", *texts, *numbers)
-    if missing := [name for name in expected if name not in table.column_names]:
-        raise InputError(f"{path}: expected the columns {', '.join(expected)}; missing: {', '.join(missing)}")
+    if wrong := [name for name in expected if table.column_names.count(name) != 1]:
+        found = ", ".join(f"{table.column_names.count(name) or 'no'} {name}" for name in wrong)
+        raise InputError(f"{path}: expected the columns {', '.join(expected)}, once each; found {found}")
     columns: dict[str, Any] = {}
     for name in expected:
         kind = pa.int64() if name == "timestamp_ns" else pa.string() if name in texts else pa.float64()

@@ -1,4 +1,4 @@
-"""CommonRoad scenarios, XML of the versions 2018b and 2020a.
+"""CommonRoad scenarios, XML of the versions 2018b and 2020a, with their lanes.
 
 The world is flat: boxes stand on z = 0, with the typical height of their class. Times are steps of `timeStepSize`.
 Values are exact or intervals, of which the middle is taken. The planning problem has no body and no trajectory: it
@@ -16,13 +16,17 @@ from pathlib import Path
 from typing import Final
 from xml.parsers import expat
 
+import numpy as np
+
 from copem_replay.core.errors import InputError, quote_value
+from copem_replay.core.site_map import Lane, LaneKind, SiteMap, make_area
 from copem_replay.io.convert.conversion import (
     KINDS,
     Box,
     ConversionReport,
     ConvertedFrame,
     OsiKind,
+    check_size,
     parse_number,
     parse_positive,
     parse_seconds_as_ns,
@@ -152,6 +156,15 @@ _KIND: Final = {
     "truck": "truck",
     "unknown": "other",
 }
+_LANE_KIND: Final[dict[str, LaneKind]] = {  # of `laneletType`; others, and lanelets without a type, are driven
+    "bicycleLane": "bicycle",
+    "border": "other",
+    "crosswalk": "walking",
+    "parking": "parking",
+    "restricted": "other",
+    "shoulder": "other",
+    "sidewalk": "walking",
+}
 _LAST_STEP: Final = 10_000_000  # eleven days at 10 Hz; a larger step is an error
 _IGNORED: Final = {
     "environmentObstacle": "has no pose: skipped",
@@ -178,8 +191,11 @@ def frames(path: Path, report: ConversionReport) -> Iterator[ConvertedFrame]:
     step_s = _read_time_step(next(source), path)
     steps: dict[int, list[Box]] = {}
     static: list[Box] = []
+    road = _Road(path, report)
     for node in source:
-        if node.tag in _IGNORED:
+        if node.tag in ("lanelet", "intersection"):
+            road.add(node)
+        elif node.tag in _IGNORED:
             report.count(node.tag, _IGNORED[node.tag])
         elif node.tag in ("dynamicObstacle", "staticObstacle"):
             moving = node.tag == "dynamicObstacle"
@@ -198,9 +214,45 @@ def frames(path: Path, report: ConversionReport) -> Iterator[ConvertedFrame]:
                     steps.setdefault(_read_time(state, path), []).append(box)
                 else:
                     static.append(box)
+    site: SiteMap | None = road.build_site()
     for step in sorted(steps or {0: []}):
         stamp_ns = parse_seconds_as_ns(step, f"{path}: time step {step}", times=step_s)
-        yield ConvertedFrame(stamp_ns, [*steps.get(step, []), *static])
+        yield ConvertedFrame(stamp_ns, [*steps.get(step, []), *static], site=site)
+        site = None
+
+
+class _Road:
+    """The lanelets of a scenario, and which of them are crosswalks: by their type, or by an intersection."""
+
+    def __init__(self, path: Path, report: ConversionReport) -> None:
+        self._path, self._report = path, report
+        self._lanes, self._crossings = dict[str, Lane](), set[str]()
+
+    def add(self, node: XmlNode) -> None:
+        """Add a lanelet, or the crossings of an intersection. Raises InputError."""
+        if node.tag == "intersection":
+            crossed = [one for part in node.all("crossing") for one in part.all("crossingLanelet")]
+            self._crossings |= {one.attribute("ref", self._path) for one in crossed}
+            return
+        parts = [part.all("point") if (part := node.find(side)) else [] for side in ("leftBound", "rightBound")]
+        if min(map(len, parts)) < 2:
+            self._report.count("lanelet", "without two bounds of two points: left out")
+            return
+        bounds = [np.array([(*_read_point(point, self._path), 0.0) for point in part]) for part in parts]
+        left, right = (check_size(bound, f"{self._path}:{node.line}: <lanelet>") for bound in bounds)
+        name, types = str(_read_id(node, self._path)), [one.text.strip() for one in node.all("laneletType")]
+        kinds: list[LaneKind] = [_LANE_KIND[one] for one in types if one in _LANE_KIND]
+        self._lanes[name] = Lane(name, kinds[0] if kinds else "driving", left, right)
+        if "crosswalk" in types:
+            self._crossings.add(name)
+
+    def build_site(self) -> SiteMap:
+        """The lanes and crosswalks, counted."""
+        crosswalks = [lane for name, lane in self._lanes.items() if name in self._crossings]
+        self._report.count("lane", "of the scenario", len(self._lanes))
+        self._report.count("crosswalk", "among its lanes", len(crosswalks))
+        areas = (make_area(f"crosswalk {lane.id}", "crosswalk", lane.outline_m) for lane in crosswalks)
+        return SiteMap(tuple(self._lanes.values()), tuple(areas))
 
 
 def _read_time_step(root: XmlNode, path: Path) -> Decimal:

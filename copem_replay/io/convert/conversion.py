@@ -18,14 +18,14 @@ from typing import Any, Final
 
 import numpy as np
 from osi3.osi_groundtruth_pb2 import GroundTruth
-from osi3.osi_lane_pb2 import LaneBoundary
 from osi3.osi_object_pb2 import MovingObject, StationaryObject
 
 from copem_replay.core.errors import InputError, OutputError, count_noun, quote_value, unknown_name_message
 from copem_replay.core.frame import SaidPlace
+from copem_replay.core.site_map import SiteMap
 from copem_replay.core.tracks import Float
 from copem_replay.io.ground_truth import HEIGHTS_M
-from copem_replay.io.write.osi import NANOS_PER_SECOND, OsiTrace, empty_ground_truth, write_osi_trace
+from copem_replay.io.write.osi import NANOS_PER_SECOND, OsiTrace, add_road, empty_ground_truth, write_osi_trace
 
 # Kinds of objects in OSI. Each format maps its own names onto these.
 
@@ -208,6 +208,7 @@ class ConvertedFrame:
     boxes: list[Box]
     host: int | None = None
     lines: Sequence[Float] = ()  # (K, 3) each: borders of lanes, in the first frame alone
+    site: SiteMap | None = None  # lanes and crosswalks, in the first frame alone
     place: SaidPlace | None = None  # where its metres are on earth, in the first frame alone
 
 
@@ -280,12 +281,7 @@ def _encode_message(frame: ConvertedFrame, report: ConversionReport) -> GroundTr
         osi.proj_string, offset = frame.place.proj, osi.proj_frame_offset
         offset.position.x, offset.position.y = frame.place.offset_m
         offset.yaw = frame.place.yaw_rad
-    for number, line in enumerate(frame.lines):
-        boundary = osi.lane_boundary.add()
-        boundary.id.value, boundary.classification.type = number, LaneBoundary.Classification.TYPE_NO_LINE
-        for point in line.tolist():
-            place = boundary.boundary_line.add().position
-            place.x, place.y, place.z = point
+    add_road(osi, frame.lines, frame.site or SiteMap())
     for box in frame.boxes:
         if not all(map(math.isfinite, (*box.at_m, box.yaw_rad, *box.size_m))):
             report.count("object state", "with a number that is none: skipped")

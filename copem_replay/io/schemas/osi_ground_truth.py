@@ -25,6 +25,7 @@ from copem_replay.core.tracks import CLASSES, VALUES, Bool, Float, Int, Solid
 from copem_replay.io.channel import LAST_NS
 from copem_replay.io.decoded_size import MOST_OBJECTS, STATE_BYTES, DecodeAllowance, check_objects
 from copem_replay.io.ground_truth import FARTHEST_M, DecodedObjects
+from copem_replay.io.schemas.osi_lanes import OsiRoad, read_road
 
 if TYPE_CHECKING:
     from copem_replay.io.encodings.protobuf import WalkedMessages
@@ -183,7 +184,7 @@ class GroundTruthDecoder:
         self._moving, self._stationary = _ObjectRows(), _ObjectRows()
         self._waiting: list[tuple[int, bytes]] = []  # moving objects that are still to be added, and of which message
         self._waiting_bytes, self._waiting_objects, self._batches, self._walk = 0, 0, 0, False
-        self._lane_boundaries: list[Float] = []
+        self._road = OsiRoad()  # of the first message that has one: the lanes of one message are those of all
         self._place: SaidPlace | None = None
         self._solids: dict[int, Solid | None] = {}  # of stationary objects by OSI id; None: a box
         # What is counted and what is the matter with it: how many, and where the first is.
@@ -222,21 +223,20 @@ class GroundTruthDecoder:
         self._add_host(message, truth)
         if truth.proj_string:
             self._add_place(truth, self._stamp_ns[-1])
-        if not self._lane_boundaries and len(truth.lane_boundary):  # the lanes of one message are those of all
-            self._add_lanes(truth.lane_boundary)
+        self._road = self._road or read_road(truth)
         check_objects(len(truth.moving_object) + len(truth.stationary_object))
         self._add_stationary(truth.stationary_object)
         self._allowance.spend(0, self._stationary.of_message[-1])
         self._wait(truth)
 
     def add_road(self, payload: bytes, schema: str) -> None:
-        """Take the lanes of a message that is not read otherwise, where none has had any. Raises OversizeError."""
-        if not self._lane_boundaries:
+        """Take the road of a message that is not read otherwise, where none has had one. Raises OversizeError."""
+        if not self._road:
             check_osi(self._message_of[schema], payload)
             with suppress(DecodeError):
                 message = self._message_of[schema].FromString(payload)
                 truth = message.global_ground_truth if schema == SENSOR_VIEW else message
-                self._add_lanes(truth.lane_boundary)
+                self._road = read_road(truth)
                 if truth.proj_string and self._place is None:
                     self._add_place(truth, 0)
 
@@ -254,11 +254,16 @@ class GroundTruthDecoder:
             object_ids=ids,
             moving=np.array(moving, dtype=bool),
             **_join_rows(self._moving, self._stationary),
-            lane_boundaries=tuple(self._lane_boundaries),
+            lane_boundaries=tuple(self._road.lines),
+            lanes=tuple(self._road.lanes),
+            areas=tuple(self._road.crosswalks),
             place=self._place,
             solids=solids,
             hosts=tuple(self._hosts),
-            notes=tuple(f"{count_noun(number, noun)} {what}" for (noun, what), number in notes.items()),
+            notes=(
+                *(f"{count_noun(number, noun)} {what}" for (noun, what), number in notes.items()),
+                *self._road.notes,
+            ),
         )
 
     def _add_host(self, message: Any, truth: Any) -> None:
@@ -431,15 +436,6 @@ class GroundTruthDecoder:
         if not 0.0 < height_m <= FARTHEST_M:  # a note tells of it when its box is assembled
             return None
         return Solid(f"object {ident}", corners, position.z - height_m / 2, height_m)
-
-    def _add_lanes(self, boundaries: Any) -> None:
-        """Add the boundaries that have two points or more; points beyond `FARTHEST_M` or NaN are left out."""
-        for boundary in boundaries:
-            points = [(p.position.x, p.position.y, p.position.z) for p in boundary.boundary_line]
-            line = np.array(points, dtype=np.float64).reshape(-1, 3)
-            line = line[(np.abs(line) <= FARTHEST_M).all(axis=1)]  # no NaN, either
-            if len(line) > 1:
-                self._lane_boundaries.append(line)
 
     def _next_number(self, number_of: dict[int, int], ident: int) -> int:
         """Give a number to an object not seen before; moving and stationary ones are numbered together."""

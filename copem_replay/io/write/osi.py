@@ -8,7 +8,7 @@ truth. A trace has neither a creation time nor any other clock: given content gi
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -18,9 +18,14 @@ import osi3
 from google.protobuf import __version__ as protobuf_version
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import build_file_descriptor_set
+from osi3.osi_common_pb2 import BaseStationary
 from osi3.osi_groundtruth_pb2 import GroundTruth
+from osi3.osi_lane_pb2 import Lane as OsiLane
+from osi3.osi_lane_pb2 import LaneBoundary
+from osi3.osi_roadmarking_pb2 import RoadMarking
 
 from copem_replay.core.files import atomic_file
+from copem_replay.core.site_map import SiteMap, outline_crosswalks
 from copem_replay.core.tracks import CLASSES, NO_CAPTURE_NS, Float, Int, Scene
 from copem_replay.io.encodings.column_bytes import (
     Content,
@@ -32,6 +37,7 @@ from copem_replay.io.encodings.column_bytes import (
     start_offsets,
 )
 from copem_replay.io.schemas.osi_ground_truth import load_sensor_data_class, osi_id
+from copem_replay.io.schemas.osi_lanes import SUBTYPES, ZEBRA
 
 if TYPE_CHECKING:
     from copem_replay.core.fused_tracks import FusedTracks
@@ -64,6 +70,45 @@ def empty_ground_truth(stamp_ns: int, host_id: int | None) -> GroundTruth:
     if host_id is not None:
         osi.host_vehicle_id.value = host_id
     return osi
+
+
+def add_road(osi: GroundTruth, lines: Iterable[Float], site: SiteMap) -> None:
+    """Add boundaries: lines (K, 3) and the borders of lanes, once each; lanes by them; crosswalks as road markings.
+
+    Each lane is stored as it is driven. Ids are those of the source where all are whole numbers.
+    """
+    numbers, lane_types = dict[bytes, int](), OsiLane.Classification
+    for line in (*lines, *(line for lane in site.lanes for line in (lane.left_m, lane.right_m))):
+        if (number := numbers.setdefault(line.tobytes(), len(numbers))) == len(osi.lane_boundary):
+            boundary = osi.lane_boundary.add(id={"value": number})
+            boundary.classification.type = LaneBoundary.Classification.TYPE_NO_LINE
+            for x, y, z in line.tolist():
+                boundary.boundary_line.add(position={"x": x, "y": y, "z": z})
+    for lane, ident in zip(site.lanes, _number_ids([lane.id for lane in site.lanes]), strict=True):
+        of = osi.lane.add(id={"value": ident}).classification
+        of.type = lane_types.TYPE_DRIVING if lane.kind == "driving" else lane_types.TYPE_NONDRIVING
+        of.subtype, of.centerline_is_driving_direction = SUBTYPES[lane.kind], True
+        left, right = lane.across()
+        for x, y, z in ((left + right) / 2).tolist():
+            of.centerline.add(x=x, y=y, z=z)
+        of.left_lane_boundary_id.add(value=numbers[lane.left_m.tobytes()])
+        of.right_lane_boundary_id.add(value=numbers[lane.right_m.tobytes()])
+    outlines = list(outline_crosswalks(site.areas, site.lanes))
+    names = [area.name.split()[-1] for area in site.areas if area.kind == "crosswalk"]
+    for ring, ident in zip(outlines, _number_ids(names), strict=True):
+        low, high = ring.min(axis=0), ring.max(axis=0)
+        x, y, z = (low + high) / 2
+        size = {"length": high[0] - low[0], "width": high[1] - low[1]}
+        corners = [{"x": east, "y": north} for east, north, _ in (ring[:-1] - (x, y, z)).tolist()]
+        marking = osi.road_marking.add(id={"value": ident})
+        marking.base.CopyFrom(BaseStationary(position={"x": x, "y": y, "z": z}, dimension=size, base_polygon=corners))
+        marking.classification.type = RoadMarking.Classification.TYPE_SYMBOLIC_TRAFFIC_SIGN
+        marking.classification.traffic_main_sign_type = ZEBRA
+
+
+def _number_ids(names: Sequence[str]) -> list[int]:
+    whole = all(name.isascii() and name.isdecimal() and len(name) < 19 for name in names)
+    return [int(name) for name in names] if whole else list(range(1, len(names) + 1))
 
 
 def write_osi_trace(trace: OsiTrace, path: Path) -> None:

@@ -22,7 +22,7 @@ from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.geometry import are_in_area, polygon_corners, pose_on_path
 from copem_replay.core.interpolation import interpolate_states
 from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int, Scene, Tracks
-from copem_replay.metrics.areas import are_in_areas
+from copem_replay.metrics.areas import are_in_areas, are_in_named
 from copem_replay.metrics.braking.encounter import EgoPath
 from copem_replay.metrics.config import Confirm, Conflict, MetricsSetup, Within
 
@@ -229,6 +229,8 @@ def describe_excluded(within: Within) -> str:
         return "outside the polygon at their onset"
     if within.areas is not None:
         return f"outside {', '.join(within.areas)} at their onset"
+    if within.lanes is not None:
+        return f"outside the lanes {', '.join(within.lanes)} at their onset"
     if within.corridor_m is not None:
         return f"more than {within.corridor_m:g} m beside the ego's way ahead"
     return f"never within {within.conflict_s:g} s of the ego's way"
@@ -246,6 +248,8 @@ def _is_within_at_onset(scene: Scene, truth: Tracks, episodes: Episodes, experim
         return present & are_in_area(x_m, y_m, x_m, y_m, polygon_corners(within.polygon_m), np.inf)
     if within.areas is not None:
         return present & are_in_areas(x_m, y_m, scene, within.areas, experiment)
+    if within.lanes is not None:
+        return present & are_in_named(x_m, y_m, scene.lanes, within.lanes)
     assert within.corridor_m is not None
     beside_m = _distance_to_path_m(EgoPath(scene, truth, experiment.max_gap_s), x_m, y_m, episodes)
     near: Bool = present & (beside_m <= within.corridor_m + _TOLERANCE_M)
