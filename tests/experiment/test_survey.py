@@ -4,9 +4,11 @@ import json
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from osi3.osi_groundtruth_pb2 import GroundTruth
 from typer.testing import CliRunner
 
 from copem_replay.cli.main import app
@@ -14,6 +16,7 @@ from copem_replay.experiment.draft.findings import survey_as_json
 from copem_replay.experiment.draft.survey import survey_recording
 from copem_replay.experiment.draft.template import describe_survey
 from tests.helpers.recordings import SHARED, Obj, Topic, pedestrian, truth_topic, write_mcap, write_recording
+from tests.helpers.roads import add_marking, two_lanes
 
 # A car at 10 m/s for 1.5 s, a pedestrian who is there at 0, 0.25 and 1.5 s, a cone; no list at 1 s.
 CONE = Obj(id=9, x=5, y=3, z=0.35, length=0.4, width=0.4, height=0.7, stationary=True)
@@ -28,6 +31,18 @@ ODOMETRY = Topic("/odom", "nav_msgs/msg/Odometry", [(0, b"x")], "cdr")
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     return tmp_path / "log.mcap"
+
+
+def test_lanes_and_crosswalks_of_a_recording_are_counted(path):
+    topic = truth_topic(FRAMES, host=4)
+    (at_ns, first), *later = topic.messages
+    message = GroundTruth.FromString(first)
+    for road in (two_lanes(), add_marking(GroundTruth())):
+        message.MergeFrom(road)
+    write_mcap(path, [replace(topic, messages=[(at_ns, message.SerializeToString()), *later])])
+    survey = survey_recording(path)
+    assert survey.truth[0].ground == {"driving lane": 2, "crosswalk": 1}
+    assert "  ground: 2 driving lanes, 1 crosswalk" in describe_survey(survey)
 
 
 def test_survey(path):
@@ -72,6 +87,7 @@ def test_survey(path):
                 "gaps_inside_tracks": 1,
                 "moving": {"pedestrian": 1, "car": 1},
                 "stationary": {"other": 1},
+                "ground": {},
                 "host_id": "4",
                 "ego": {"id": "4", "class": "car", "size_m": [4.5, 2.0, 1.5], "from_s": 0.0, "to_s": 1.5},
                 "missing": [],

@@ -105,6 +105,7 @@ class TruthFound:
     y_m: list[float]
     moving: dict[str, int]  # objects by class
     stationary: dict[str, int]
+    ground: dict[str, int]  # lanes by kind, and areas by kind, that the recording has
     host_id: str | None
     ego: EgoFound | None
     missing: list[str]  # keys that a user may have to give

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -209,6 +210,7 @@ def _survey_truth(
         y_m=_round_extent(truth.y_m[0]),
         moving=_count_by_class(scene, scene.moving),
         stationary=_count_by_class(scene, ~scene.moving),
+        ground=_count_ground(recording),
         host_id=recording.host_id,
         ego=_describe_ego(recording),
         missing=_list_missing(recording, poses),
@@ -219,6 +221,15 @@ def _survey_truth(
         units=list(_survey_units(recording, units)),
         suggested=suggest_experiment(log, recording, fields),
     )
+
+
+def _count_ground(recording: Recording) -> dict[str, int]:
+    """How many lanes of each kind and areas of each kind a recording has, most first."""
+    lanes = Counter(f"{lane.kind} lane" for lane in recording.lanes)
+    areas = Counter(
+        each.kind if each.kind in ("crosswalk", "junction") else f"{each.kind} area" for each in recording.scene.areas
+    )
+    return dict((lanes + areas).most_common())
 
 
 def _describe_place(log: Log, recording: Recording) -> str:

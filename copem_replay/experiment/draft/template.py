@@ -507,6 +507,8 @@ def _truth_lines(truth: TruthFound) -> list[str]:
     for kind, counts in (("moving", truth.moving), ("stationary", truth.stationary)):
         objects = ", ".join(f"{number} {name}" for name, number in counts.items())
         lines.append(f"  {kind}: {objects or 'none'}")
+    if truth.ground:
+        lines.append(f"  ground: {', '.join(count_noun(number, kind) for kind, number in truth.ground.items())}")
     if ego := truth.ego:
         size = " × ".join(f"{side:.2f}" for side in ego.size_m)
         lines.append(f"  ego: {ego.id} ({ego.class_}, {size} m), {ego.from_s:.3f} – {ego.to_s:.3f} s")
