@@ -3,8 +3,9 @@
 An entity per object and configuration, such as `lanes/6_pedestrian/2_PEM`; the number is the configuration's place in
 the file. A lane begins with the configuration's name: the viewer's own titles of lanes are paths. Changes too short to
 follow are left out, but known begins exactly at `detection_s`, with how long after the onset, “0.60 s known”. Words
-that do not fit into their span are shortened or left out. A mark ends at the onset, white and black, so that it stands
-out in any theme. A lane is empty while the object is absent.
+that do not fit into their span are shortened or left out, and are never on another span; the time of a short one is
+beside the name, “PEM, 0.60 s”, where there is room. A mark ends at the onset, white and black, so that it stands out in
+any theme. A lane is empty while the object is absent.
 
 An entity per configuration and unit, such as `lists/2_bursts/rsu1`, under the lanes of the objects, shows lists sent by
 a link, if one did not come in time; events say it in words.
@@ -57,7 +58,7 @@ STEADY_S = 0.4
 MARK = 1 / 40
 """Length of the mark that ends at the onset, as a share of the axis: just wide enough for both halves."""
 FLAG = 6
-"""Length of words such as “0.60 s known”, as a multiple of the mark's."""
+"""Length of words such as “0.60 s”, as a multiple of the mark's."""
 NAME: Rgb = (58, 60, 66)
 """Ground of the configuration's name, where a lane begins: no colour of a status."""
 ONSET_IS = ("onset", "onset of the object")
@@ -118,17 +119,19 @@ def _tell_lane(
     """
     (onset_ns, known_ns), (first_ns, last_ns) = clock_ns, axis_ns
     mark_ns = round((last_ns - first_ns) * MARK)
-    _add_flag(begins, texts, known_ns, onset_ns, FLAG * mark_ns)
+    flag = _add_flag(begins, texts, known_ns, onset_ns, FLAG * mark_ns)
     colour_of = {text: tint for text, tint in zip(texts, tints, strict=True) if text}
-    colour_of |= dict(zip(ONSET_IS, ONSET, strict=True)) | {_name_text(name): NAME}
     elapsed, texts = _insert_onset(begins, texts, onset_ns, mark_ns)
     until_ns = min(onset_ns - mark_ns, known_ns)
     if until_ns - first_ns >= (last_ns - first_ns) * _words_points(len(name)) / WIDTH_POINTS:
-        elapsed, texts = _insert_name(elapsed, texts, name, first_ns, until_ns)
+        title = f"{name}{flag}: "
+        elapsed, texts = _insert_title(elapsed, texts, title, first_ns, until_ns)
     else:
-        _prepend_name(elapsed, texts, name, first_ns)
+        title = f"{name}: "
+        _prepend_title(elapsed, texts, title, first_ns)
+    colour_of |= dict(zip(ONSET_IS, ONSET, strict=True)) | {title: NAME}
     values, label_of = _fit_words(elapsed, texts, axis_ns)
-    return elapsed, values, {value: (label, _tint(value, name, colour_of)) for value, label in label_of.items()}
+    return elapsed, values, {value: (label, _tint(value, title, colour_of)) for value, label in label_of.items()}
 
 
 def lanes_axis_s(axis_s: tuple[float, float], onset_s: float, configurations: Sequence[str]) -> tuple[float, float]:
@@ -176,11 +179,11 @@ def _fit_words(
 
 
 def _shorten_words(text: str) -> Iterator[str]:
-    """Words of a span, the longest first: “behind 3 (from ego)”, “behind 3”; “0.60 s known”, “0.60 s”."""
+    """Words of a span, the longest first: “behind 3 (from ego)”, “behind 3”; “PEM, 0.60 s”, “PEM”."""
     yield text.removesuffix(": ")
-    yield text.partition(", then ")[0]
     if ": " in text:
-        yield text.partition(": ")[0]
+        yield (title := text.partition(": ")[0])
+        yield re.sub(r", -?[0-9.]+ s$", "", title)
     yield text.partition(" (from ")[0]
     yield text.partition(" from ")[0]
     if flag := re.match(r"-?[0-9.]+ s ", text):
@@ -228,45 +231,42 @@ def _span_text(
     return lane_text(span.status, units[by], body_name(ids, sight.solids, what))
 
 
-def _add_flag(begins: Int, texts: list[str | None], known_ns: int, onset_ns: int, room_ns: int) -> None:
+def _add_flag(begins: Int, texts: list[str | None], known_ns: int, onset_ns: int, room_ns: int) -> str:
     """Say how long after the onset the object is first known, where that begins: “0.60 s known”.
 
-    Where that lasts for less than `room_ns`, too short for words, what follows says it, too.
+    Returns what is added to the name, “, 0.60 s”, where that lasts for less than `room_ns`, too short for words.
     """
     for k in np.flatnonzero(begins == known_ns)[:1].tolist():
-        texts[k] = flag = f"{show_seconds((known_ns - onset_ns) / 1e9)} s {texts[k]}"
-        if k + 1 < len(texts) and texts[k + 1] is not None and begins[k + 1] - known_ns < room_ns:
-            texts[k + 1] = f"{flag}, then {texts[k + 1]}"
+        after = f"{show_seconds((known_ns - onset_ns) / 1e9)} s"
+        texts[k] = f"{after} {texts[k]}"
+        return f", {after}" if (begins[k + 1 :] - known_ns < room_ns).any() else ""
+    return ""
 
 
-def _tint(value: str, name: str, colour_of: Mapping[str, Rgb]) -> Rgb:
-    """The colour of a value: spaces at its end and a name before it change nothing."""
-    plain = value if value in colour_of else value.rstrip().removeprefix(_name_text(name))
+def _tint(value: str, title: str, colour_of: Mapping[str, Rgb]) -> Rgb:
+    """The colour of a value: spaces at its end and a title before it change nothing."""
+    plain = value if value in colour_of else value.rstrip().removeprefix(title)
     return colour_of[plain]
 
 
-def _name_text(name: str) -> str:
-    return f"{name}: "
-
-
-def _insert_name(
-    elapsed_ns: Int, texts: list[str | None], name: str, first_ns: int, until_ns: int
+def _insert_title(
+    elapsed_ns: Int, texts: list[str | None], title: str, first_ns: int, until_ns: int
 ) -> tuple[Int, list[str | None]]:
-    """Put the configuration's name from the begin of the axis to `until_ns`, in place of what holds then."""
+    """Put the title from the begin of the axis to `until_ns`, in place of what holds then."""
     before = int(np.searchsorted(elapsed_ns, first_ns))
     after = int(np.searchsorted(elapsed_ns, until_ns, side="right")) - 1  # what holds at `until_ns`
     held = texts[after] if after >= 0 else None
     return np.concatenate([elapsed_ns[:before], [first_ns, until_ns], elapsed_ns[after + 1 :]]), [
-        *texts[:before], _name_text(name), held, *texts[after + 1 :]
+        *texts[:before], title, held, *texts[after + 1 :]
     ]  # fmt: skip
 
 
-def _prepend_name(elapsed_ns: Int, texts: list[str | None], name: str, first_ns: int) -> None:
-    """Put the name before the first text on the axis, “PEM: out of view”: it has no room of its own."""
+def _prepend_title(elapsed_ns: Int, texts: list[str | None], title: str, first_ns: int) -> None:
+    """Put the title before the first text on the axis, “PEM: out of view”: it has no room of its own."""
     current = max(int(np.searchsorted(elapsed_ns, first_ns, side="right")) - 1, 0)
     told_at = next((k for k in range(current, len(texts)) if texts[k] is not None), None)
     if told_at is not None:
-        texts[told_at] = f"{_name_text(name)}{texts[told_at]}"
+        texts[told_at] = f"{title}{texts[told_at]}"
 
 
 def _insert_onset(
