@@ -20,6 +20,8 @@ from copem_replay.viewer.map_view import asks_for_map, map_page
 from copem_replay.viewer.sink import (
     ELAPSED,
     GROUND,
+    NEAR_WORDS,
+    WORDS,
     configuration_part,
     digest_texts,
     entity_names,
@@ -326,8 +328,12 @@ def world_view(
     part = make_entity_path("world", configuration_part(configuration))
     contents += [f"+ {part}/**"] if marks else [f"+ {part}/**", f"- {part}/marks/**"]
     shown = rr.Points3D.from_fields(show_labels=True)
-    contents += [f"- {part}/status"] if named else []  # there the names are the only labels
-    contents += [f"+ {make_entity_path(*eye.path, 'arrows')}"] if eye.turns else []
+    near = not eye.turns and eye.object_ix is not None
+    # Words of the other pictures would lie over bodies; with named units, names are the only labels.
+    contents += [f"- {part}/{words}" for words in (WORDS, NEAR_WORDS) if named or (words == WORDS) == near]
+    if eye.turns:
+        on_edge = ["arrows"], ["false", configuration_part(configuration)]
+        contents += [f"+ {make_entity_path(*eye.path, *entity)}" for entity in on_edge]
     return rrb.Spatial3DView(
         origin=make_entity_path(*eye.path),
         name=title,
@@ -377,7 +383,7 @@ def _curves_view(
     )
 
 
-LAYOUT = 6
+LAYOUT = 7
 """Version of the blueprint, raised with every change: a viewer prefers the one it has kept for an application id."""
 
 

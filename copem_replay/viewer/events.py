@@ -175,17 +175,19 @@ def _describe_left_out(names: Sequence[str]) -> list[str]:
 LEGEND = """A configuration has one colour in every file and figure of its experiment.
 
 - grey outlines: what was there, and the ways of those we look at; the white body: the ego; grey bodies: obstacles
-- filled in colour: what is believed, where it is believed to be, paler the older it is (0 to 1 s); ellipses: 2σ of the
-  position
-- words over an object we look at: only its name, it is known; else why it is not: `58 behind 41`; a
+- filled in colour: what is believed, where it is believed to be, paler the older it is (0 to 1 s); pale discs: 2σ of
+  the position
+- dashed with a cross: believed, but nothing is there; `false: 24 m ahead, 6 m left`: where, seen from the ego
+- words below an object we look at: only its name, it is known; else why it is not: `58 behind 41`; a
   sentence, when it is selected
 - red lines: from the unit that sees most of an object to what hides it
 - lines of sight: from the unit that listed an object first, where it was at capture, to where it listed the object
 - strong lines on the ground: distance when an object was first known
 - an arrow at the edge of a view, `61 → 44 m`: object 61 is farther that way, 44 m from the ego
 - white points: units; pale ground with an outline: their fields of view
-- lanes: in full colour *known*, from the time of detection in the table on; at half its strength *listed*, which does
-  not count: before the onset, not confirmed, or too late; grey and brown: why not; the white mark ends at the onset
+- lanes: in full colour *known*, from the time of detection in the table on; at half its strength *listed, not known*,
+  since the list does not count: it is from before the onset, not confirmed, or too late; grey and brown: why not; the
+  white mark ends at the onset
 - compared with a baseline: a large white dot, only the baseline holds it; a small one, the baseline does not"""
 LINKS = """
 - lanes `lists/…` under those of an object: a unit that sends by a link; from the capture of a list to that of the next,

@@ -186,6 +186,7 @@ def _shorten_words(text: str) -> Iterator[str]:
         yield re.sub(r", -?[0-9.]+ s$", "", title)
     yield text.partition(" (from ")[0]
     yield text.partition(" from ")[0]
+    yield text.removeprefix("listed ")
     if flag := re.match(r"-?[0-9.]+ s ", text):
         yield flag[0].rstrip()
 

@@ -27,9 +27,12 @@ from copem_replay.results.write import Exporter, RunToExport
 from copem_replay.viewer import boxes, curves, lanes, sensors
 from copem_replay.viewer.blueprint import NEAR_BY, RecordingContent, build_blueprint, view_aspect
 from copem_replay.viewer.camera import (
+    MovingPicture,
     camera_above,
     camera_following,
     camera_on_ego,
+    find_up_rad,
+    follow_ego,
     include_places,
     write_camera_origin,
     write_moving_origin,
@@ -51,7 +54,9 @@ from copem_replay.viewer.line_of_sight import Sight, compute_sight, find_looked_
 from copem_replay.viewer.map_view import NO_PLACE, asks_for_map, write_map
 from copem_replay.viewer.sensors import FaultsShown, choose_named_units
 from copem_replay.viewer.sink import (
+    NEAR_WORDS,
     OPENS,
+    WORDS,
     RecordingPart,
     RecordingSink,
     ViewerStream,
@@ -151,6 +156,14 @@ class _RecordingFile:
         scene, table = self.content.replay.scene, self.content.table
         return {name: read_episode_clocks(scene, table, name) for name in self.colours}
 
+    @cached_property
+    def picture(self) -> MovingPicture | None:
+        """What the camera on the ego shows; None: it stands still."""
+        content = self.content
+        if not content.eye.turns:
+            return None
+        return follow_ego(content.replay, content.experiment, content.eye, content.axes_s)
+
 
 def _build_content(
     replay: Replay, experiment: Experiment, table: pd.DataFrame, configurations: Sequence[str], shown: ShownObjects,
@@ -206,8 +219,8 @@ def _begin_file(
     replay, experiment, scene = content.replay, content.experiment, content.replay.scene
     if out.live is not None:
         out.live.send(lambda rec: rec.send_blueprint(panels, make_active=True))
-    if content.eye.object_ix is not None:
-        write_moving_origin(out, replay, experiment, content.eye, content.axes_s)
+    if file.picture is not None:
+        write_moving_origin(out, replay, file.picture)
     for eye in content.eyes:
         write_camera_origin(out, replay, eye)
     _write_properties(out, content, run, run_is)
@@ -270,7 +283,7 @@ def _write_fused(file: _RecordingFile, run_tracks: Mapping[str, FusedTracks]) ->
     for name, colour in file.colours.items():
         path = ["world", configuration_part(name)]
         boxes.write_fused_boxes(out, path, content.replay.scene, run_tracks[name], colour)
-        file.false.setdefault(name, boxes.FalseEntries(out, path, colour)).add(run_tracks[name])
+        file.false.setdefault(name, boxes.FalseEntries(out, name, colour, file.picture)).add(run_tracks[name])
         if len(content.replay.episodes.object_ix):
             before = file.last_gospa.get(name, curves.NO_LIST)
             file.last_gospa[name] = curves.write_gospa(
@@ -284,11 +297,16 @@ def _write_knowledge(file: _RecordingFile, run_tracks: Mapping[str, FusedTracks]
     """Write status, reasons and position errors. `run_tracks`: of the shown objects, over the whole log."""
     out, content = file.out, file.content
     replay, experiment, scene = content.replay, content.experiment, content.replay.scene
+    near_up_rad = {eye.object_ix: eye.heading_rad for eye in content.eyes}
     statuses = {}
     for name, colour in file.colours.items():
         fused_tracks, clock = run_tracks[name], file.clocks[name]
         statuses[name] = compute_status(replay, experiment, name, fused_tracks, sight, clock)
-        write_status_words(out, name, replay, experiment, sight, statuses[name], clock)
+        up_rad = {
+            WORDS: find_up_rad(file.picture, content.eye, statuses[name].elapsed_ns)[:, None],
+            NEAR_WORDS: np.array([[near_up_rad[k] for k in sight.object_ix.tolist()]]),
+        }
+        write_status_words(out, name, replay, experiment, sight, statuses[name], clock, up_rad)
         write_hiding_lines(out, name, sight, statuses[name])
         detections = content.table[(content.table["configuration"] == name) & content.table["detected"]]
         first_unit = dict(zip(detections["object_id"].map(scene.object_number), detections["first_unit"], strict=True))

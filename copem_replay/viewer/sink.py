@@ -86,14 +86,19 @@ HALF = 0.5
 """Strength of a configuration's colour where the object is listed but not known: darker than known, still a colour."""
 
 
+WORDS, NEAR_WORDS = "status", "status_near"
+"""Entities with words of statuses, in views around the ego and in those of one object: each is below bodies there."""
+
+
 def status_colour(status: int, colour: Rgb) -> Rgb:
     """Colour of a status in a lane: neutral until the object is listed, then `colour`, at `HALF` until known."""
     if status < EARLY:
         return STATUS[status]
-    return colour if status == KNOWN else _scale_colour(colour, HALF)
+    return colour if status == KNOWN else scale_colour(colour, HALF)
 
 
-def _scale_colour(colour: Rgb, share: float) -> Rgb:
+def scale_colour(colour: Rgb, share: float) -> Rgb:
+    """A colour, darker by a share."""
     red, green, blue = (round(channel * share) for channel in colour)
     return red, green, blue
 

@@ -231,17 +231,17 @@ def test_lists_under_way_and_what_is_stale(tmp_path: Path) -> None:
     assert told(made.path, "late", 0.3) == ["9 listed by pole, arrives in 0.2 s"]
     assert told(made.path, "late", 0.5) == ["9 known, 0.5 s old"]
     assert told(made.path, "late", 0.7) == ["9 known, 0.7 s old"]
-    # The words are where he is, the box where he was half a second before.
-    assert at(made.path, "/world/late/status", 0.7, "Points3D:positions")["Points3D:positions"][0][:2] == pytest.approx(
-        [30, 1.4]
-    )
+    # The words are below where he is, the box is where he was half a second before. North is up in the picture of a
+    # site that is longer from west to east; he is 0.5 m long and 1.8 m tall.
+    below_m = 0.25 + 1.8 * np.tan(np.deg2rad(27.5 + 78 - 90))
+    [word] = at(made.path, "/world/late/status", 0.7, "Points3D:positions")["Points3D:positions"]
+    assert word == pytest.approx([30, 1.4 - below_m, 0])
     [box] = at(made.path, "/world/late/boxes", 0.7)["Boxes3D:centers"]
     assert box[:2] == pytest.approx([30, 0])
     # Gone at 1.1 s, still believed until the list of 1.25 s, which has him no more, arrives.
     assert told(made.path, "late", 1.5) == ["9 known, 0.5 s old"]
-    assert at(made.path, "/world/late/status", 1.5, "Points3D:positions")["Points3D:positions"][0][:2] == pytest.approx(
-        [30, 2]
-    )
+    [word] = at(made.path, "/world/late/status", 1.5, "Points3D:positions")["Points3D:positions"]
+    assert word == pytest.approx([30, 2 - below_m, 0])
     assert lane(made.path, "9 pedestrian", 0) == [(0, "on its way from pole"), (0.5, "known"), (1.75, None)]
 
 
