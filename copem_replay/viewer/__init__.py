@@ -22,7 +22,7 @@
 | `plots/gospa/<configuration>`, `plots/known/<configuration>` | of all measured objects: GOSPA, number known |
 | `…/difference/…`, `plots/error_difference` | differences to a baseline (`viewer/curves.py`) |
 | `legend/…` | the colour of each configuration |
-| `events/onsets`, `events/<configuration>`, `…/lists`, `difference`, `summary`, `words` | texts |
+| `events/onsets`, `events/<configuration>`, `…/lists`, `difference`, `difference_short`, `summary`, `words` | texts |
 
 `<object>` is for example `6_pedestrian`. More than seven configurations go into several files (`viewer/sink.py`).
 

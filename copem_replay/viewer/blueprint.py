@@ -18,6 +18,8 @@ from copem_replay.viewer.lanes import UnitLists, lanes_axis_s, select_list_lanes
 from copem_replay.viewer.legend import legend_view
 from copem_replay.viewer.map_view import asks_for_map, map_page
 from copem_replay.viewer.sink import (
+    DIFFERENCE_SHORT,
+    DIFFERENCE_TEXT,
     ELAPSED,
     GROUND,
     NEAR_WORDS,
@@ -95,15 +97,15 @@ class RecordingContent:
         onset_s = float(self.episodes[object_ix]["onset_s"].iloc[0])
         return lanes_axis_s(self.axes_s[object_ix], onset_s, self.configurations)
 
-    def title(self, configuration: str, suffix: str = "") -> str:
-        """The title of a view: “bursty · whole run: 18 of 24 known, 3 false”; `suffix`: after the name.
+    def title(self, configuration: str) -> str:
+        """The title of a view: “bursty · whole run: 18 of 24 known, 3 false”.
 
         False entries are left out as long as they are not counted.
         """
         rows = self.table[self.table["configuration"] == configuration]
         counts = [f"{rows['detected'].sum()} of {len(rows)} known"] if len(rows) else []
         counts += [f"{self.false[configuration]} false"] if configuration in self.false else []
-        return f"{configuration}{suffix} · whole run: {', '.join(counts)}" if counts else configuration + suffix
+        return f"{configuration} · whole run: {', '.join(counts)}" if counts else configuration
 
     def under(self, object_ix: int) -> list[str]:
         """Entities of the lanes of lists under those of an object."""
@@ -128,7 +130,7 @@ def overview_page(content: RecordingContent) -> rrb.Container:
 
     views = list[rrb.View](tracks_views(content, choose_overview(content)))
     columns = 1 if len(views) < FEW else 2
-    words: list[rrb.View] = [difference_view()]
+    words: list[rrb.View] = [difference_view(DIFFERENCE_SHORT)]
     if len(views) % columns:
         views.append(legend_view())  # into the free cell
     else:
@@ -177,7 +179,10 @@ def lanes_page(content: RecordingContent) -> rrb.Container:
         for group in groups
     ]
     return rrb.Horizontal(
-        grids[0] if len(grids) == 1 else rrb.Tabs(*grids), difference_view(), column_shares=[3, 2], name="Who knew when"
+        grids[0] if len(grids) == 1 else rrb.Tabs(*grids),
+        difference_view(DIFFERENCE_TEXT),
+        column_shares=[3, 2],
+        name="Who knew when",
     )
 
 
@@ -214,9 +219,8 @@ def _last_and_first(content: RecordingContent, object_ix: int) -> list[tuple[str
     ranked = sorted(when_s, key=lambda name: when_s[name], reverse=True)
     between = [ranked[len(ranked) // 2]] if len(content.objects) == 1 else []
     chosen = dict.fromkeys([ranked[0], *between, ranked[-1]])
-    label = content.id_of(object_ix)
     titles = {
-        name: f"{name}: {label} " + (f"known {show_seconds(s)} s after its onset" if np.isfinite(s) else "never known")
+        name: f"{name}: known {show_seconds(s)} s after the onset" if np.isfinite(s) else f"{name}: never known"
         for name, s in when_s.items()
     }
     return [(name, titles[name]) for name in chosen]
@@ -226,7 +230,7 @@ def tracks_page(content: RecordingContent) -> rrb.Container:
     """A view per configuration, as large as possible."""
     import rerun.blueprint as rrb
 
-    views: list[rrb.View] = list(tracks_views(content, content.configurations, " believes"))
+    views: list[rrb.View] = list(tracks_views(content, content.configurations))
     columns = count_columns(len(views))
     if len(views) % columns:
         return rrb.Grid(*views, legend_view(), grid_columns=columns, name="What each believes")
@@ -294,15 +298,11 @@ def text_page() -> rrb.Container:
     )
 
 
-def tracks_views(
-    content: RecordingContent, configurations: Sequence[str], title_suffix: str = ""
-) -> list[rrb.Spatial3DView]:
+def tracks_views(content: RecordingContent, configurations: Sequence[str]) -> list[rrb.Spatial3DView]:
     """A view of the fused tracks of each of these configurations, around the ego, with arrows to objects outside it."""
     marks = len(content.objects) == 1
     return [
-        world_view(
-            content, name, content.title(name, title_suffix), content.eye, units=content.received(name), marks=marks
-        )
+        world_view(content, name, content.title(name), content.eye, units=content.received(name), marks=marks)
         for name in configurations
     ]
 
@@ -360,11 +360,11 @@ def lanes_view(content: RecordingContent, object_ix: int, under: Sequence[str] =
     )
 
 
-def difference_view() -> rrb.TextDocumentView:
-    """The table of times to detection."""
+def difference_view(path: Sequence[str]) -> rrb.TextDocumentView:
+    """The table of times to detection at an entity."""
     import rerun.blueprint as rrb
 
-    return rrb.TextDocumentView(origin="difference", name="What difference it made")
+    return rrb.TextDocumentView(origin=make_entity_path(*path), name="What difference it made")
 
 
 def _curves_view(

@@ -19,7 +19,10 @@ from copem_replay.metrics.survival import EndReason
 from copem_replay.perception.sensor_poses import find_carrier
 from copem_replay.pipeline.one_run import BY_ANY, BY_EGO, Curve
 from copem_replay.pipeline.prepare import Replay
+from copem_replay.results.decision import tell_what_helps
 from copem_replay.viewer.sink import (
+    DIFFERENCE_SHORT,
+    DIFFERENCE_TEXT,
     ONSET,
     RecordingSink,
     configuration_part,
@@ -92,23 +95,32 @@ def describe_verdict(episode: Any) -> str | None:
 
 
 def write_difference_text(
-    out: RecordingSink, replay: Replay, table: pd.DataFrame, shown: Sequence[int], left_out: Sequence[str],
-    too_short: Sequence[str],
+    out: RecordingSink, replay: Replay, helping: Experiment | None, table: pd.DataFrame, shown: Sequence[int],
+    left_out: Sequence[str], too_short: Sequence[str],
 ) -> None:  # fmt: skip
     """Write tables of times to detection in this run: over all objects, if there are several, then per object.
 
-    Below them are the files with further configurations, and the objects `too_short` to judge.
+    Below the table of an object is what would help, if `helping` has all the configurations; the overview has that of
+    the first one. Below them are the files with further configurations, and the objects `too_short` to judge.
     """
     import rerun as rr
 
     by_object = [table[table["object_id"] == replay.scene.object_ids[k]] for k in shown]
-    tables = [_difference_table(episodes, replay.scene) for episodes in by_object]
+    helps = ["" if helping is None else _escape_cell(tell_what_helps(helping, episodes)) for episodes in by_object]
+    tables = [
+        "\n\n".join([_difference_table(episodes, replay.scene), words]).rstrip()
+        for episodes, words in zip(by_object, helps, strict=True)
+    ]
+    first = tables[:1]
     if len(shown) > 1:
+        name = _name_object(table_rows(by_object[0])[0], replay.scene)
         tables.insert(0, _overview_table(by_object, replay.scene))
+        first = [tables[0], *([f"**{name}** · {helps[0]}"] if helps[0] else [])]
     ids = [short_ids(replay.scene)[replay.scene.object_number[name]] for name in too_short]
     short = [f"Too short to judge: {_escape_cell(', '.join(ids))}."] if ids else []
-    text = "\n\n".join([*tables, *short, *_describe_left_out(left_out)])
-    out.static(["difference"], rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+    for path, parts in ((DIFFERENCE_TEXT, tables), (DIFFERENCE_SHORT, first)):
+        text = "\n\n".join([*parts, *short, *_describe_left_out(left_out)])
+        out.static(path, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
 
 
 def _difference_table(episodes: pd.DataFrame, scene: Scene) -> str:

@@ -31,6 +31,7 @@ from copem_replay.results.shown_objects import AFTER_S, BEFORE_S, LEAST_S
 from copem_replay.viewer.sink import (
     ABSENT,
     CAPTURED,
+    EARLY,
     HIDDEN,
     KNOWN,
     ONSET,
@@ -185,8 +186,7 @@ def _shorten_words(text: str) -> Iterator[str]:
         yield (title := text.partition(": ")[0])
         yield re.sub(r", -?[0-9.]+ s$", "", title)
     yield text.partition(" (from ")[0]
-    yield text.partition(" from ")[0]
-    yield text.removeprefix("listed ")
+    yield "old list" if text == lane_text(EARLY, "", "") else text.partition(" from ")[0]
     if flag := re.match(r"-?[0-9.]+ s ", text):
         yield flag[0].rstrip()
 

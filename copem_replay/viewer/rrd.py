@@ -226,7 +226,8 @@ def _begin_file(
     _write_properties(out, content, run, run_is)
     out.static([], rr.ViewCoordinates.RIGHT_HAND_Z_UP, boxes.names_and_colours(scene))
     rows = content.table[content.table["configuration"].isin(list(content.configurations))]
-    write_difference_text(out, replay, rows, content.objects, further, content.too_short)
+    helping = experiment if content.baseline is None else None  # of several folders more than configurations may differ
+    write_difference_text(out, replay, helping, rows, content.objects, further, content.too_short)
     write_summary_text(out, replay, experiment, summary, run, further)
     write_legend_text(out, any(content.lists.values()))
     write_legend_bars(out, file.colours)

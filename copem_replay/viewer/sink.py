@@ -86,6 +86,8 @@ HALF = 0.5
 """Strength of a configuration's colour where the object is listed but not known: darker than known, still a colour."""
 
 
+DIFFERENCE_TEXT, DIFFERENCE_SHORT = ("difference",), ("difference_short",)
+"""Entities with the tables of times to detection: of all shown objects, and what of them fits into the overview."""
 WORDS, NEAR_WORDS = "status", "status_near"
 """Entities with words of statuses, in views around the ego and in those of one object: each is below bodies there."""
 

@@ -319,7 +319,7 @@ def _format_label(name: str, unit: str, hider: str, key: list[int]) -> str:
     _, status, _, _, _, _, near, started = key
     words = {
         KNOWN: "",
-        EARLY: " listed before onset" if started else " listed",
+        EARLY: " only in old list" if started else " listed",
         UNCONFIRMED: " not confirmed",
         TOO_LATE: " too late",
         CAPTURED: " on its way",
@@ -363,7 +363,7 @@ def lane_text(status: int, unit: str, hider: str) -> str:
         return "not listed yet" if unit == TRUTH else f"seen by {unit}, not listed"
     if status == CAPTURED:
         return f"on its way from {unit}"
-    return "listed before onset" if status == EARLY else STATUSES[status]
+    return "list from before onset" if status == EARLY else STATUSES[status]
 
 
 # Words below the shown objects, lines to hiding bodies, lines of sight of the units that listed objects first.

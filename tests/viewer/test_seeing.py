@@ -34,7 +34,7 @@ from copem_replay.viewer.sink import ABSENT, HIDDEN, KNOWN, STATUSES, show_secon
 from tests.helpers.report_pages import named
 from tests.oracles.colour import apart_for_a_deuteranope, contrast
 from tests.viewer.test_camera import corners, origins, picture
-from tests.viewer.test_rrd import SUMMARY, Made, rows
+from tests.viewer.test_rrd import SUMMARY, Made, rows, static
 from tests.viewer.test_status import lane
 
 ROOT = Path(__file__).parents[2]
@@ -269,11 +269,21 @@ def test_words_of_lanes_fit_into_their_spans(city: Made) -> None:
     assert told > 48, "names, and when each is known"
 
 
+def test_the_overview_has_the_table_that_fits(city: Made) -> None:
+    """Of all objects, and what would help with the first one; the other page has a table of each, too."""
+    short, whole = (static(city.path, path)["TextDocument:text"][0] for path in ("/difference_short", "/difference"))
+    assert [line.count("|") for line in short.split("\n\n")[0].splitlines()] == [8] * 6, "six objects"
+    assert short.count("| --- |") == 1
+    assert "What would help ego: mast1, mast2 besides" in short
+    assert whole.count("| --- |") == 7
+    assert whole.count("What would help") == 6
+
+
 def test_the_legend_names_statuses_and_what_is_common(city: Made) -> None:
     [names] = [batch for entity, batch in batches(city.path) if entity == "/legend/names"]
     said = set(names.column("Points2D:labels").to_pylist()[0])
     assert {"truth", "ego", "hides it", "field of view", "false, dashed"} <= said
-    assert {"pale disc: 2σ", "listed, not known"} <= said, "what else is in pictures and lanes"
+    assert {"disc: place ± 2σ", "listed, not known"} <= said, "what else is in pictures and lanes"
     assert {"hidden", "out of view", "list lost", "on its way", "unmatched", "not listed"} <= said
     assert set(city.given.configurations) - {"GT"} <= said | {"truth"}
     # A word hangs below its point: on a bar from above its middle, below a line that would strike it through.
