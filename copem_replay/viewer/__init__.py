@@ -22,7 +22,8 @@
 | `plots/gospa/<configuration>`, `plots/known/<configuration>` | of all measured objects: GOSPA, number known |
 | `…/difference/…`, `plots/error_difference` | differences to a baseline (`viewer/curves.py`) |
 | `legend/…` | the colour of each configuration |
-| `events/onsets`, `events/<configuration>`, `…/lists`, `difference`, `difference_short`, `summary`, `words` | texts |
+| `events/onsets`, `events/<configuration>`, `…/lists`, `difference`, `summary`, `words` | texts |
+| `difference_short`, `helps/<object>` | what of the differences is in the overview; what would help with an object |
 
 `<object>` is for example `6_pedestrian`. More than seven configurations go into several files (`viewer/sink.py`).
 

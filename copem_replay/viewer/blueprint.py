@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -12,6 +12,7 @@ import pandas as pd
 from copem_replay.core.tracks import CLASSES, TRUTH
 from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.prepare import Replay
+from copem_replay.results.decision import tell_what_helps
 from copem_replay.results.shown_objects import SHOWN_OBJECTS
 from copem_replay.viewer.camera import Camera
 from copem_replay.viewer.lanes import UnitLists, lanes_axis_s, select_list_lanes
@@ -27,6 +28,7 @@ from copem_replay.viewer.sink import (
     configuration_part,
     digest_texts,
     entity_names,
+    helps_path,
     make_entity_path,
     object_lanes_path,
     short_ids,
@@ -64,7 +66,8 @@ class RecordingContent:
     `episodes`: rows of the table by object; `axes_s`: first and last second of each object's axis.
     Camera `eye` follows the ego, if there is one, `eyes` the objects; `above` looks at the units, of which `named` have
     names. `lists`: lists that units send by a link, by configuration. `too_short`: ids of objects too short to judge.
-    `opens_s`: the instant at which the recording opens. `false`: how many false entries each configuration had.
+    `opens_s`: the instant at which the recording opens. `false`: how many false entries each configuration had;
+    `brief`: objects that are known too briefly for words in a lane.
     """
 
     replay: Replay
@@ -83,6 +86,7 @@ class RecordingContent:
     too_short: Sequence[str] = ()
     opens_s: float | None = None
     false: Mapping[str, int] = field(default_factory=dict)
+    brief: Collection[int] = ()
 
     def id_of(self, object_ix: int) -> str:
         """Id of an object as drawn, with its class."""
@@ -95,7 +99,7 @@ class RecordingContent:
     def lanes_axis_s(self, object_ix: int) -> tuple[float, float]:
         """First and last second of an object's lanes."""
         onset_s = float(self.episodes[object_ix]["onset_s"].iloc[0])
-        return lanes_axis_s(self.axes_s[object_ix], onset_s, self.configurations)
+        return lanes_axis_s(self.axes_s[object_ix], onset_s, self.configurations, object_ix in self.brief)
 
     def title(self, configuration: str) -> str:
         """The title of a view: “bursty · whole run: 18 of 24 known, 3 false”.
@@ -106,6 +110,12 @@ class RecordingContent:
         counts = [f"{rows['detected'].sum()} of {len(rows)} known"] if len(rows) else []
         counts += [f"{self.false[configuration]} false"] if configuration in self.false else []
         return f"{configuration} · whole run: {', '.join(counts)}" if counts else configuration
+
+    def helps(self, object_ix: int) -> str:
+        """What would help with an object; “” where configurations are of several folders: more than they may differ."""
+        rows = self.episodes[object_ix]
+        rows = rows[rows["configuration"].isin(list(self.configurations))]
+        return tell_what_helps(self.experiment, rows) if self.baseline is None else ""
 
     def under(self, object_ix: int) -> list[str]:
         """Entities of the lanes of lists under those of an object."""
@@ -198,7 +208,12 @@ def reasons_page(content: RecordingContent) -> rrb.Container:
         ]
         origin = make_entity_path("plots", "visible_share", entity_names(content.replay.scene)[k])
         share = _curves_view(origin, SHARE_TITLE, content.axis(k), values=(-0.05, 1.05))
-        lower_row = rrb.Horizontal(lanes_view(content, k), share, column_shares=[3, 2])
+        beside: rrb.View | rrb.Container = share
+        if content.helps(k):
+            origin = make_entity_path(*helps_path(content.replay.scene, k))
+            helps = rrb.TextDocumentView(origin=origin, name="What would help")
+            beside = rrb.Vertical(share, helps, row_shares=[2, 1])
+        lower_row = rrb.Horizontal(lanes_view(content, k), beside, column_shares=[3, 2])
         first_s, last_s = content.axes_s[k]
         name = f"{short_ids(content.replay.scene)[k]} · {first_s:.1f}–{last_s:.1f} s"
         rows = [3, 2] if len(content.configurations) <= MANY else [1, 1]

@@ -19,7 +19,6 @@ from copem_replay.metrics.survival import EndReason
 from copem_replay.perception.sensor_poses import find_carrier
 from copem_replay.pipeline.one_run import BY_ANY, BY_EGO, Curve
 from copem_replay.pipeline.prepare import Replay
-from copem_replay.results.decision import tell_what_helps
 from copem_replay.viewer.sink import (
     DIFFERENCE_SHORT,
     DIFFERENCE_TEXT,
@@ -27,6 +26,7 @@ from copem_replay.viewer.sink import (
     RecordingSink,
     configuration_part,
     entity_names,
+    helps_path,
     pair_points,
     short_ids,
     show_seconds,
@@ -95,18 +95,21 @@ def describe_verdict(episode: Any) -> str | None:
 
 
 def write_difference_text(
-    out: RecordingSink, replay: Replay, helping: Experiment | None, table: pd.DataFrame, shown: Sequence[int],
-    left_out: Sequence[str], too_short: Sequence[str],
+    out: RecordingSink, replay: Replay, table: pd.DataFrame, shown: Mapping[int, str], left_out: Sequence[str],
+    too_short: Sequence[str],
 ) -> None:  # fmt: skip
     """Write tables of times to detection in this run: over all objects, if there are several, then per object.
 
-    Below the table of an object is what would help, if `helping` has all the configurations; the overview has that of
-    the first one. Below them are the files with further configurations, and the objects `too_short` to judge.
+    `shown`: the objects, with a sentence of what would help, or “”, which is below the table of each; in the overview
+    it is that of the first one. Below them are the files with further configurations, and the objects `too_short` to
+    judge.
     """
     import rerun as rr
 
     by_object = [table[table["object_id"] == replay.scene.object_ids[k]] for k in shown]
-    helps = ["" if helping is None else _escape_cell(tell_what_helps(helping, episodes)) for episodes in by_object]
+    helps = [_escape_cell(words) for words in shown.values()]
+    for k, words in zip(shown, helps, strict=True):
+        out.static(helps_path(replay.scene, k), rr.TextDocument(words, media_type=rr.MediaType.MARKDOWN))
     tables = [
         "\n\n".join([_difference_table(episodes, replay.scene), words]).rstrip()
         for episodes, words in zip(by_object, helps, strict=True)

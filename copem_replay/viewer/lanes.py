@@ -14,7 +14,7 @@ a link, if one did not come in time; events say it in words.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -135,12 +135,15 @@ def _tell_lane(
     return elapsed, values, {value: (label, _tint(value, title, colour_of)) for value, label in label_of.items()}
 
 
-def lanes_axis_s(axis_s: tuple[float, float], onset_s: float, configurations: Sequence[str]) -> tuple[float, float]:
+def lanes_axis_s(
+    axis_s: tuple[float, float], onset_s: float, configurations: Sequence[str], beside: bool = False
+) -> tuple[float, float]:
     """First and last second of an object's lanes: with room for names before the onset, and for the last flag.
 
     `axis_s`: of the object, from 0.5 s before its onset, or before it is known, to 0.5 s after it is last known.
+    `beside`: with room for times beside the names.
     """
-    longest = max(map(len, configurations), default=0)
+    longest = max(map(len, configurations), default=0) + beside * len(", 0.00 s")
     name = min((_words_points(longest) + 2) / WIDTH_POINTS + MARK, MOST_NAME)
     flag = _words_points(len("10.00 s known")) / WIDTH_POINTS
     start_s = min(onset_s, axis_s[0] + BEFORE_S)
@@ -148,6 +151,19 @@ def lanes_axis_s(axis_s: tuple[float, float], onset_s: float, configurations: Se
     length_s = max((end_s - start_s) / (1 - name - flag), LEAST_S)
     first_s = max(start_s - name * length_s, 0.0)
     return first_s, max(first_s + length_s, end_s + flag * length_s)
+
+
+def is_briefly_known(statuses: Iterable[Status], m: int, axis_s: tuple[float, float]) -> bool:
+    """Whether any lane of object m has a first span of known that is too short for its time on an axis."""
+    least_ns = FLAG * MARK * (axis_s[1] - axis_s[0]) * 1e9
+    for status in statuses:
+        for span in smooth_status(status.elapsed_ns, status.status[:, m]):
+            if span.status == KNOWN:
+                end = min(span.end, len(status.elapsed_ns) - 1)
+                if end == span.end and status.elapsed_ns[end] - status.elapsed_ns[span.first] < least_ns:
+                    return True
+                break
+    return False
 
 
 def _words_points(letters: int) -> float:

@@ -142,6 +142,7 @@ class _RecordingFile:
     """One of the files: its streams, its content, and the colours of its configurations, in order.
 
     By configuration, in the time chunks so far: `last_gospa` the last point of its curve, `false` its false entries.
+    `brief`: as in the content, found at the end.
     """
 
     out: RecordingSink
@@ -149,6 +150,7 @@ class _RecordingFile:
     colours: dict[str, Rgb]
     last_gospa: dict[str, tuple[Int, Float]] = field(default_factory=dict)
     false: dict[str, boxes.FalseEntries] = field(default_factory=dict)
+    brief: set[int] = field(default_factory=set)
 
     @cached_property
     def clocks(self) -> dict[str, EpisodeClocks]:
@@ -226,8 +228,8 @@ def _begin_file(
     _write_properties(out, content, run, run_is)
     out.static([], rr.ViewCoordinates.RIGHT_HAND_Z_UP, boxes.names_and_colours(scene))
     rows = content.table[content.table["configuration"].isin(list(content.configurations))]
-    helping = experiment if content.baseline is None else None  # of several folders more than configurations may differ
-    write_difference_text(out, replay, helping, rows, content.objects, further, content.too_short)
+    helps = {k: content.helps(k) for k in content.objects}
+    write_difference_text(out, replay, rows, helps, further, content.too_short)
     write_summary_text(out, replay, experiment, summary, run, further)
     write_legend_text(out, any(content.lists.values()))
     write_legend_bars(out, file.colours)
@@ -256,7 +258,7 @@ def _begin_file(
 def _send_layout(file: _RecordingFile) -> None:
     """Write the layout, whose titles count false entries; active, so that no viewer replaces it by a guess."""
     counts = {name: false.count for name, false in file.false.items()}
-    panels, _ = build_blueprint(replace(file.content, false=counts))
+    panels, _ = build_blueprint(replace(file.content, false=counts, brief=file.brief))
     file.out.send(lambda rec: rec.send_blueprint(panels, make_active=True))
 
 
@@ -313,7 +315,10 @@ def _write_knowledge(file: _RecordingFile, run_tracks: Mapping[str, FusedTracks]
         first_unit = dict(zip(detections["object_id"].map(scene.object_number), detections["first_unit"], strict=True))
         write_listing_lines(out, name, replay, experiment, fused_tracks, sight, colour, first_unit)
         curves.write_position_errors(out, replay, experiment, name, fused_tracks.fused, content.objects, colour)
-    axes = {k: content.lanes_axis_s(k) for k in content.objects}
+    for m, k in enumerate(sight.object_ix.tolist()):
+        if lanes.is_briefly_known(statuses.values(), m, content.lanes_axis_s(k)):
+            file.brief.add(k)
+    axes = {k: replace(content, brief=file.brief).lanes_axis_s(k) for k in content.objects}
     lanes.write_lanes(out, scene, experiment, sight, statuses, file.colours, file.clocks, axes)
 
 

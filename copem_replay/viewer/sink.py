@@ -282,6 +282,11 @@ def make_distinct(names: Sequence[str]) -> list[str]:
     return [f"{name}_{k}" if name in twice else name for k, name in enumerate(names)]
 
 
+def helps_path(scene: Scene, object_ix: int) -> tuple[str, ...]:
+    """The entity with the sentence of what would help with an object."""
+    return "helps", entity_names(scene)[object_ix]
+
+
 def object_lanes_path(scene: Scene, object_ix: int) -> list[str]:
     """The entity above all lanes of an object."""
     return ["lanes", entity_names(scene)[object_ix]]

@@ -139,7 +139,7 @@ def test_lanes_say_whose_they_are_and_how_soon(hiding: Made) -> None:
 
 
 def test_a_flag_without_room_is_on_no_other_span(tmp_path: Path) -> None:
-    """He is seen for 0.2 s between two trucks, then hidden until the end. The long name gives the short one room."""
+    """He is seen for 0.2 s between two trucks, then hidden until the end. Beside the long name is no room."""
     scene = recording(
         [
             Thing("ego", "car", standing(0, 0)),
@@ -158,7 +158,7 @@ def test_a_flag_without_room_is_on_no_other_span(tmp_path: Path) -> None:
         style = static(made.path, path)
         label_of = dict(zip(style["StateConfiguration:values"], style["StateConfiguration:labels"], strict=True))
         said = [(row["elapsed"] / 1e9, *row["StateChange:state"]) for row in rows(made.path, path)]
-        assert [label_of[text[0]] for _, *text in said if text] == [beside, "behind 1 (from ego)", " ", "behind 3"]
+        assert [label_of[text[0]] for _, *text in said if text] == [beside, "behind 1", " ", "behind 3"]
         assert [at for at, *_ in said[-3:]] == pytest.approx([6.0, 7.0, 7.2])
 
 
