@@ -250,13 +250,17 @@ def _order_by_latency(
 
 # Of one object in one run: what would help.
 
-_KEYS = ("units", "link", "latency_s", "fusion", "issue_hz", "max_age_s")
+_KEYS = {
+    "units": "units", "link": "link", "latency_s": "latency", "fusion": "fusion", "issue_hz": "issue rate",
+    "max_age_s": "greatest age",
+}  # fmt: skip
+"""Keys of configurations that are compared, and their words."""
 _MOST_UNITS = 3
 """Most units that a sentence names."""
 
 
 def tell_what_helps(experiment: Experiment, rows: pd.DataFrame) -> str:
-    """What would help the configuration that knows an object last: “What would help PEM: mast1 besides, as in all: …”.
+    """What would help the configuration that knows an object last: “What would help PEM: mast1 as well, as in all: …”.
 
     It is another configuration that knows the object earlier, with the same draws, and differs in one key or has more
     units: of those with the fewest other keys the earliest; “” where there is none. `rows`: of one object and run, a
@@ -290,12 +294,12 @@ def _value_of(experiment: Experiment, key: str, name: str) -> Any:
 
 
 def _describe_change(experiment: Experiment, keys: Sequence[str], last: str, best: str) -> str:
-    """What is different in the better one: “0 s of latency instead of 1.5 s”, “mast1 besides”; “” for much else."""
+    """What is different in the better one: “0 s of latency instead of 1.5 s”, “mast1 as well”; “” for much else."""
     values = {key: (_value_of(experiment, key, last), _value_of(experiment, key, best)) for key in keys}
     old_units, new_units = values.pop("units", (frozenset(), frozenset()))
-    rest = f", with another {' and '.join(values)}" if values else ""
+    rest = f", with another {' and '.join(_KEYS[key] for key in values)}" if values else ""
     if new_units > old_units:
-        return f"{_name_units(new_units - old_units)} besides{rest}"
+        return f"{_name_units(new_units - old_units)} as well{rest}"
     if len(keys) != 1:
         return ""
     if not values:
@@ -305,7 +309,7 @@ def _describe_change(experiment: Experiment, keys: Sequence[str], last: str, bes
         return f"{new:g} s of latency instead of {old:g} s"
     if key == "fusion" and old.kind != new.kind:
         return f"fusion {new.kind} instead of {old.kind}"
-    return "no link" if key == "link" and new is None else f"another {key}"
+    return "no link" if key == "link" and new is None else f"another {_KEYS[key]}"
 
 
 def _name_units(units: frozenset[str]) -> str:

@@ -14,7 +14,7 @@ a link, if one did not come in time; events say it in words.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -131,7 +131,7 @@ def _tell_lane(
         title = f"{name}: "
         _prepend_title(elapsed, texts, title, first_ns)
     colour_of |= dict(zip(ONSET_IS, ONSET, strict=True)) | {title: NAME}
-    values, label_of = _fit_words(elapsed, texts, axis_ns)
+    values, label_of = _fit_words(texts, _measure_spans(elapsed, axis_ns))
     return elapsed, values, {value: (label, _tint(value, title, colour_of)) for value, label in label_of.items()}
 
 
@@ -170,24 +170,26 @@ def _words_points(letters: int) -> float:
     return letters * LETTER_POINTS + PADDING_POINTS
 
 
-def _fit_words(
-    begins: Int, texts: Sequence[str | None], axis_ns: tuple[int, int]
-) -> tuple[list[str | None], dict[str, str]]:
-    """Values of states, and the label of each value: as many of its words as fit into its span on the axis.
+def _measure_spans(begins: Int, axis_ns: tuple[int, int], end_ns: int | None = None) -> Float:
+    """(K,) widths in points, on an axis, of spans that begin at `begins` and end at `end_ns`; at most 0: not on it."""
+    ends = np.append(begins[1:], axis_ns[1] if end_ns is None else end_ns)
+    lasts_ns = np.minimum(ends, axis_ns[1]) - np.maximum(begins, axis_ns[0])
+    return np.asarray(lasts_ns * WIDTH_POINTS / (axis_ns[1] - axis_ns[0]))
+
+
+def _fit_words(texts: Sequence[str | None], points: Float) -> tuple[list[str | None], dict[str, str]]:
+    """Values of states, and the label of each value: as many of its words as fit into its width, unless that is 0.
 
     A state whose words are shortened here and not elsewhere has a space more at the end of its value. Without words the
     label is a space: for an empty one the viewer takes the value.
     """
-    per_point_ns = (axis_ns[1] - axis_ns[0]) / WIDTH_POINTS
-    ends = np.append(begins[1:], axis_ns[1])
     values: list[str | None] = []
     label_of = dict.fromkeys(ONSET_IS, " ")
-    for text, begin_ns, end_ns in zip(texts, begins.tolist(), ends.tolist(), strict=True):
+    for text, wide in zip(texts, points.tolist(), strict=True):
         if text is None or text in ONSET_IS:
             values.append(text)
             continue
-        lasts_ns = min(end_ns, axis_ns[1]) - max(begin_ns, axis_ns[0])
-        room = int((lasts_ns / per_point_ns - PADDING_POINTS) / LETTER_POINTS) if lasts_ns > 0 else len(text)
+        room = (wide - PADDING_POINTS) / LETTER_POINTS if wide > 0 else len(text)
         label = next((words for words in _shorten_words(text) if len(words) <= room), " ")
         value = next(text + k * " " for k in range(len(texts) + 1) if label_of.get(text + k * " ", label) == label)
         label_of[value] = label
@@ -412,29 +414,38 @@ def _format_times(time_s: Float) -> str:
     return f"{first} s" if first == last else f"{first} to {last} s"
 
 
-def write_list_lanes(out: RecordingSink, lists: Sequence[UnitLists]) -> None:
-    """Write a lane for each unit with a lost, late or overtaken list, which lasts until the next capture."""
+def write_list_lanes(out: RecordingSink, lists: Sequence[UnitLists], axes: Collection[tuple[float, float]]) -> None:
+    """Write a lane for each unit with a lost, late or overtaken list, which lasts until the next capture.
+
+    `axes`: first and last second of the lanes of all objects. Words are left out that do not fit on each that has them.
+    """
     import rerun as rr
 
+    axes_ns = [(int(first_ns), int(last_ns)) for first_ns, last_ns in map(to_nanoseconds, axes)]
     for unit_lists in lists:
         if not unit_lists.fate.any():
             continue
         first = np.flatnonzero(np.diff(unit_lists.fate, prepend=IN_TIME))
         counts = np.diff(first, append=len(unit_lists.fate))
         fate, begins = unit_lists.fate[first], unit_lists.elapsed_ns[first]
-        texts = [FATES[f] if n == 1 else f"{n} {FATES[f]}" for f, n in zip(fate.tolist(), counts.tolist(), strict=True)]
+        texts = [
+            None if f == IN_TIME else FATES[f] if n == 1 else f"{n} {FATES[f]}"
+            for f, n in zip(fate.tolist(), counts.tolist(), strict=True)
+        ]
+        end = int(unit_lists.elapsed_ns[-1] + to_nanoseconds(min(unit_lists.interval_s, 1.0)))
+        points = np.array([np.zeros(len(texts)), *(_measure_spans(begins, axis, end) for axis in axes_ns)])
+        narrowest = np.where(points > 0, points, np.inf).min(axis=0)
+        values, label_of = _fit_words(texts, narrowest)
+        style = {value: COLOURS[f] for value, f in zip(values, fate.tolist(), strict=True) if value is not None}
         if fate[-1] != IN_TIME:  # the last list ends after an interval
-            fate, begins = (
-                np.append(fate, IN_TIME),
-                np.append(begins, unit_lists.elapsed_ns[-1] + to_nanoseconds(min(unit_lists.interval_s, 1.0))),
-            )
-        marked = fate != IN_TIME
-        labels = [text for text, is_told in zip(texts, marked.tolist(), strict=False) if is_told]
-        states = rr.StateChange.columns(state=pa.array(labels, pa.string()))
-        out.columns(unit_lists.path, begins, states.partition(marked.astype(np.int64)))
-        style = dict(zip(labels, (COLOURS[f] for f in fate[marked].tolist()), strict=True))
-        values = list(style)
-        out.static(unit_lists.path, rr.StateConfiguration(values=values, labels=values, colors=list(style.values())))
+            values, begins = [*values, None], np.append(begins, end)
+        states = rr.StateChange.columns(state=pa.array([value for value in values if value is not None], pa.string()))
+        out.columns(
+            unit_lists.path, begins, states.partition(np.array([v is not None for v in values], dtype=np.int64))
+        )
+        labels = [label_of[value] for value in style]
+        drawn = rr.StateConfiguration(values=list(style), labels=labels, colors=list(style.values()))
+        out.static(unit_lists.path, drawn)
 
 
 def select_list_lanes(lists: Mapping[str, Sequence[UnitLists]], axis_s: tuple[float, float]) -> list[tuple[str, ...]]:

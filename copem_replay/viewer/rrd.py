@@ -250,7 +250,6 @@ def _begin_file(
             write_event_texts(out, scene, name, chosen[chosen["configuration"] == name])
         mark_detections(out, replay, experiment, content.table, name, content.objects, colour)
         write_list_fates(out, name, content.lists[name])
-        write_list_lanes(out, content.lists[name])
     if len(replay.episodes.object_ix):
         curves.write_known_count(out, replay, "truth", replay.truth)
 
@@ -320,6 +319,8 @@ def _write_knowledge(file: _RecordingFile, run_tracks: Mapping[str, FusedTracks]
             file.brief.add(k)
     axes = {k: replace(content, brief=file.brief).lanes_axis_s(k) for k in content.objects}
     lanes.write_lanes(out, scene, experiment, sight, statuses, file.colours, file.clocks, axes)
+    for name in file.colours:
+        write_list_lanes(out, content.lists[name], axes.values())
 
 
 def _write_shares(file: _RecordingFile, observed: Observations, sight: Sight) -> None:
