@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import pandas as pd
@@ -44,6 +45,8 @@ SMOOTH_S, SOON_S = 1.0, 1.5
 """Time over which turns and widths are averaged, and how long before and after a story it is in view: no jerks."""
 EDGE, ARROW_NS = 0.85, 200_000_000
 """Where arrows are, as a share of the way from the middle to the edge of the picture; how often they are drawn."""
+EDGE_WORDS = 0.4, 0.16
+"""Width and height of words such as “61 → 144 m” by half the sides of a view of the overview at 1280 × 720."""
 NAMED_FALSE, BESIDE_M = 3, 2.5
 """Most false entries that a picture names, the nearest ones; how far below the middle of its cross the words are."""
 LEAN = np.tan(EYE_RAD / 2 + ABOVE_RAD - np.pi / 2)
@@ -211,23 +214,39 @@ def _write_arrows(out: RecordingSink, replay: Replay, picture: MovingPicture) ->
     distance_m = np.hypot(place[0] + AHEAD_M, place[1])
     row, m = np.nonzero((far_out[:, step].T > 1.0) & (distance_m[:, step].T <= WIDEST_M))
     at = m, step[row]
-    spots, sides = _move_to_edge(place[:, *at] / picture.scale[step[row]], picture.eye)
+    spots, sides = _move_to_edge(place[:, *at] / picture.scale[step[row]], picture.eye, row)
     ids = np.array(short_ids(replay.scene), dtype=object)[np.array([*picture.seen])[m]]
     labels = [f"{name} {side} {far:.0f} m" for name, side, far in zip(ids, sides, distance_m[at], strict=True)]
     counts = np.bincount(row, minlength=len(step))
     _write_words(out, [*picture.eye.path, "arrows"], picture.elapsed_ns[step], spots, labels, counts, 1.5)
 
 
-def _move_to_edge(place: Float, eye: Camera) -> tuple[Float, Sequence[str]]:
-    """Places (3, R) in the frame of a camera, outside its picture, moved to its edge, on the ground; arrows (R,)."""
+def _move_to_edge(place: Float, eye: Camera, row: Int) -> tuple[Float, Sequence[str]]:
+    """Places (3, R) in the frame of a camera, outside its picture, moved to its edge, on the ground; arrows (R,).
+
+    `row` (R,): ascending numbers of instants; words of one instant are apart.
+    """
     across, high = _project(place, eye)
     far_out = np.maximum(np.abs(across), np.abs(high))
     u, v = EDGE * across / far_out, EDGE * high / far_out
     sides = np.where(np.abs(u) >= np.abs(v), np.where(u > 0, "→", "←"), np.where(v > 0, "↑", "↓"))
+    _spread_words(u, v, row)
     towards, right, up = _axes(np.pi / 2)
     tall = np.tan(EYE_RAD / 2)
     ray = towards[:, None] + u * eye.aspect * tall * right[:, None] + v * tall * up[:, None]
     return eye.place_m[:, None] - eye.place_m[2] / ray[2] * ray, sides.tolist()
+
+
+def _spread_words(u: Float, v: Float, row: Int) -> None:
+    """Move places (R,) up or down a picture, towards its middle, until their words do not lie on each other."""
+    bounds = np.flatnonzero(np.diff(row, prepend=-1, append=-1)).tolist()
+    for first, end in pairwise(bounds):
+        placed: list[int] = []
+        for k in sorted(range(first, end), key=lambda k: -abs(v[k])):
+            step = -np.copysign(EDGE_WORDS[1], v[k])
+            while any(abs(u[k] - u[n]) < EDGE_WORDS[0] and abs(v[k] - v[n]) < 0.99 * EDGE_WORDS[1] for n in placed):
+                v[k] += step
+            placed.append(k)
 
 
 def _write_words(
@@ -265,7 +284,7 @@ def write_false_words(
         f"{'left' if left >= 0 else 'right'}"
         for ahead, left in zip(ahead_m[order].tolist(), left_m[order].tolist(), strict=True)
     ]
-    spots[:, outside], sides = _move_to_edge(spots[:, outside], picture.eye)
+    spots[:, outside], sides = _move_to_edge(spots[:, outside], picture.eye, row[order][outside])
     for k, side in zip(np.flatnonzero(outside).tolist(), sides, strict=True):
         labels[k] = f"false {side} {distance_m[order[k]]:.0f} m"
     kept = np.bincount(row[order], minlength=len(counts))

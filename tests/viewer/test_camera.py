@@ -216,6 +216,21 @@ def test_an_arrow_for_what_is_outside(tmp_path: Path) -> None:
     assert -0.2 < across < 0, "the target is 20 m ahead of the ego"
 
 
+def test_words_at_the_edge_are_apart(tmp_path: Path) -> None:
+    """Three cars far to the left of the ego's way, one behind the other as seen from it."""
+    cars = [Thing(name, "car", standing(-100 - 8 * k, 20)) for k, name in enumerate(("61", "62", "63"))]
+    scene = recording([Thing("ego", "car", driving(0, 0, 0, 1), yaw_rad=np.pi / 2), *cars], until_s=4.0)
+    given = experiment(configurations={"GT": {"units": "truth"}})
+    written(tmp_path / "x.rrd", prepare_log(scene, given), given, dict.fromkeys((1, 2, 3), (-2.0, -1.0)))
+    eye = camera_on_ego(prepare_log(scene, given), given, {}, 1.5)
+    for row in rows(tmp_path / "x.rrd", "/world/eyes/ego/arrows"):
+        assert len(row["Points3D:labels"]) == 3
+        seen = picture(eye, (0.0, np.zeros(3), 0.0, 1.0), np.array(row["Points3D:positions"]))
+        assert np.abs(seen).max() < 0.9
+        apart = np.abs(seen[:, None] - seen)[np.triu_indices(3, 1)]
+        assert ((apart[:, 0] > 0.39) | (apart[:, 1] > 0.15)).all()
+
+
 def test_the_nearest_false_entries_are_named_by_their_places(tmp_path: Path) -> None:
     """The ego drives north, at 10 m/s; in its second list there is nothing about no object."""
     replay, eye = follow(tmp_path / "x.rrd", {"7": (0.0, 10.0)})
