@@ -101,15 +101,15 @@ class RecordingContent:
         onset_s = float(self.episodes[object_ix]["onset_s"].iloc[0])
         return lanes_axis_s(self.axes_s[object_ix], onset_s, self.configurations, object_ix in self.brief)
 
-    def title(self, configuration: str) -> str:
-        """The title of a view: “bursty · whole run: 18 of 24 known, 3 false”.
+    def title(self, configuration: str, mark: str = " · ") -> str:
+        """The title of a view: “bursty · whole run: 18 of 24 known, 3 false”; `mark`: after the name.
 
         False entries are left out as long as they are not counted.
         """
         rows = self.table[self.table["configuration"] == configuration]
         counts = [f"{rows['detected'].sum()} of {len(rows)} known"] if len(rows) else []
         counts += [f"{self.false[configuration]} false"] if configuration in self.false else []
-        return f"{configuration} · whole run: {', '.join(counts)}" if counts else configuration
+        return f"{configuration}{mark}whole run: {', '.join(counts)}" if counts else configuration
 
     def helps(self, object_ix: int) -> str:
         """What would help with an object; “” where configurations are of several folders: more than they may differ."""
@@ -245,7 +245,7 @@ def tracks_page(content: RecordingContent) -> rrb.Container:
     """A view per configuration, as large as possible."""
     import rerun.blueprint as rrb
 
-    views: list[rrb.View] = list(tracks_views(content, content.configurations))
+    views: list[rrb.View] = list(tracks_views(content, content.configurations, ", "))
     columns = count_columns(len(views))
     if len(views) % columns:
         return rrb.Grid(*views, legend_view(), grid_columns=columns, name="What each believes")
@@ -313,11 +313,16 @@ def text_page() -> rrb.Container:
     )
 
 
-def tracks_views(content: RecordingContent, configurations: Sequence[str]) -> list[rrb.Spatial3DView]:
-    """A view of the fused tracks of each of these configurations, around the ego, with arrows to objects outside it."""
+def tracks_views(
+    content: RecordingContent, configurations: Sequence[str], mark: str = " · "
+) -> list[rrb.Spatial3DView]:
+    """A view of the fused tracks of each of these configurations, around the ego, with arrows to objects outside it.
+
+    `mark`: in their titles, by which views of two pages are told apart.
+    """
     marks = len(content.objects) == 1
     return [
-        world_view(content, name, content.title(name), content.eye, units=content.received(name), marks=marks)
+        world_view(content, name, content.title(name, mark), content.eye, units=content.received(name), marks=marks)
         for name in configurations
     ]
 
