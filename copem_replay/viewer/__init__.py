@@ -8,9 +8,11 @@
 | `world/units/<unit>`, `world/fields/<unit>` | units, and the fields of view of their PEMs |
 | `world/<configuration>/boxes`, `covariance` | the receiver's fused tracks, paler the older; 2σ of the position |
 | `world/<configuration>/status`, `hiding`, `listings` | per object: known or why not; what hides it; its first unit |
+| `world/<configuration>/status_near` | the same words as in `status`, placed for the views of one object |
 | `world/<configuration>/marks`, `marks/from`, `marks/from/line` | where an object was first known, and how far away |
 | `world/eyes/ego`, `world/eyes/<object>` | origins of the views that follow ego or object |
 | `world/eyes/ego/arrows` | shown objects that are outside the picture around the ego |
+| `world/eyes/ego/false/<configuration>` | where the nearest false entries are, in words or as arrows at the edge |
 | `lanes/<object>/<place>_<configuration>` | the object's status (`viewer/status.py`), a mark at the onset |
 | `lists/<place>_<configuration>/<unit>` | lost, late and overtaken lists of a unit that sends by a link |
 | `world/<configuration>/false` | entries about no object: dashed outlines with a cross |
@@ -21,6 +23,7 @@
 | `…/difference/…`, `plots/error_difference` | differences to a baseline (`viewer/curves.py`) |
 | `legend/…` | the colour of each configuration |
 | `events/onsets`, `events/<configuration>`, `…/lists`, `difference`, `summary`, `words` | texts |
+| `difference_short`, `helps/<object>` | what of the differences is in the overview; what would help with an object |
 
 `<object>` is for example `6_pedestrian`. More than seven configurations go into several files (`viewer/sink.py`).
 

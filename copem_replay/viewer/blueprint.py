@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -12,17 +12,23 @@ import pandas as pd
 from copem_replay.core.tracks import CLASSES, TRUTH
 from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.prepare import Replay
+from copem_replay.results.decision import tell_what_helps
 from copem_replay.results.shown_objects import SHOWN_OBJECTS
 from copem_replay.viewer.camera import Camera
 from copem_replay.viewer.lanes import UnitLists, lanes_axis_s, select_list_lanes
 from copem_replay.viewer.legend import legend_view
 from copem_replay.viewer.map_view import asks_for_map, map_page
 from copem_replay.viewer.sink import (
+    DIFFERENCE_SHORT,
+    DIFFERENCE_TEXT,
     ELAPSED,
     GROUND,
+    NEAR_WORDS,
+    WORDS,
     configuration_part,
     digest_texts,
     entity_names,
+    helps_path,
     make_entity_path,
     object_lanes_path,
     short_ids,
@@ -60,7 +66,8 @@ class RecordingContent:
     `episodes`: rows of the table by object; `axes_s`: first and last second of each object's axis.
     Camera `eye` follows the ego, if there is one, `eyes` the objects; `above` looks at the units, of which `named` have
     names. `lists`: lists that units send by a link, by configuration. `too_short`: ids of objects too short to judge.
-    `opens_s`: the instant at which the recording opens. `false`: how many false entries each configuration had.
+    `opens_s`: the instant at which the recording opens. `false`: how many false entries each configuration had;
+    `brief`: objects that are known too briefly for words in a lane.
     """
 
     replay: Replay
@@ -79,6 +86,7 @@ class RecordingContent:
     too_short: Sequence[str] = ()
     opens_s: float | None = None
     false: Mapping[str, int] = field(default_factory=dict)
+    brief: Collection[int] = ()
 
     def id_of(self, object_ix: int) -> str:
         """Id of an object as drawn, with its class."""
@@ -91,17 +99,23 @@ class RecordingContent:
     def lanes_axis_s(self, object_ix: int) -> tuple[float, float]:
         """First and last second of an object's lanes."""
         onset_s = float(self.episodes[object_ix]["onset_s"].iloc[0])
-        return lanes_axis_s(self.axes_s[object_ix], onset_s, self.configurations)
+        return lanes_axis_s(self.axes_s[object_ix], onset_s, self.configurations, object_ix in self.brief)
 
-    def title(self, configuration: str, suffix: str = "") -> str:
-        """The title of a view: “bursty · whole run: 18 of 24 known, 3 false”; `suffix`: after the name.
+    def title(self, configuration: str, mark: str = " · ") -> str:
+        """The title of a view: “bursty · whole run: 18 of 24 known, 3 false”; `mark`: after the name.
 
         False entries are left out as long as they are not counted.
         """
         rows = self.table[self.table["configuration"] == configuration]
         counts = [f"{rows['detected'].sum()} of {len(rows)} known"] if len(rows) else []
         counts += [f"{self.false[configuration]} false"] if configuration in self.false else []
-        return f"{configuration}{suffix} · whole run: {', '.join(counts)}" if counts else configuration + suffix
+        return f"{configuration}{mark}whole run: {', '.join(counts)}" if counts else configuration
+
+    def helps(self, object_ix: int) -> str:
+        """What would help with an object; “” where configurations are of several folders: more than they may differ."""
+        rows = self.episodes[object_ix]
+        rows = rows[rows["configuration"].isin(list(self.configurations))]
+        return tell_what_helps(self.experiment, rows) if self.baseline is None else ""
 
     def under(self, object_ix: int) -> list[str]:
         """Entities of the lanes of lists under those of an object."""
@@ -126,7 +140,7 @@ def overview_page(content: RecordingContent) -> rrb.Container:
 
     views = list[rrb.View](tracks_views(content, choose_overview(content)))
     columns = 1 if len(views) < FEW else 2
-    words: list[rrb.View] = [difference_view()]
+    words: list[rrb.View] = [difference_view(DIFFERENCE_SHORT)]
     if len(views) % columns:
         views.append(legend_view())  # into the free cell
     else:
@@ -175,7 +189,10 @@ def lanes_page(content: RecordingContent) -> rrb.Container:
         for group in groups
     ]
     return rrb.Horizontal(
-        grids[0] if len(grids) == 1 else rrb.Tabs(*grids), difference_view(), column_shares=[3, 2], name="Who knew when"
+        grids[0] if len(grids) == 1 else rrb.Tabs(*grids),
+        difference_view(DIFFERENCE_TEXT),
+        column_shares=[3, 2],
+        name="Who knew when",
     )
 
 
@@ -191,7 +208,12 @@ def reasons_page(content: RecordingContent) -> rrb.Container:
         ]
         origin = make_entity_path("plots", "visible_share", entity_names(content.replay.scene)[k])
         share = _curves_view(origin, SHARE_TITLE, content.axis(k), values=(-0.05, 1.05))
-        lower_row = rrb.Horizontal(lanes_view(content, k), share, column_shares=[3, 2])
+        beside: rrb.View | rrb.Container = share
+        if content.helps(k):
+            origin = make_entity_path(*helps_path(content.replay.scene, k))
+            helps = rrb.TextDocumentView(origin=origin, name="What would help")
+            beside = rrb.Vertical(share, helps, row_shares=[2, 1])
+        lower_row = rrb.Horizontal(lanes_view(content, k), beside, column_shares=[3, 2])
         first_s, last_s = content.axes_s[k]
         name = f"{short_ids(content.replay.scene)[k]} · {first_s:.1f}–{last_s:.1f} s"
         rows = [3, 2] if len(content.configurations) <= MANY else [1, 1]
@@ -212,9 +234,8 @@ def _last_and_first(content: RecordingContent, object_ix: int) -> list[tuple[str
     ranked = sorted(when_s, key=lambda name: when_s[name], reverse=True)
     between = [ranked[len(ranked) // 2]] if len(content.objects) == 1 else []
     chosen = dict.fromkeys([ranked[0], *between, ranked[-1]])
-    label = content.id_of(object_ix)
     titles = {
-        name: f"{name}: {label} " + (f"known {show_seconds(s)} s after its onset" if np.isfinite(s) else "never known")
+        name: f"{name}: known {show_seconds(s)} s after the onset" if np.isfinite(s) else f"{name}: never known"
         for name, s in when_s.items()
     }
     return [(name, titles[name]) for name in chosen]
@@ -224,7 +245,7 @@ def tracks_page(content: RecordingContent) -> rrb.Container:
     """A view per configuration, as large as possible."""
     import rerun.blueprint as rrb
 
-    views: list[rrb.View] = list(tracks_views(content, content.configurations, " believes"))
+    views: list[rrb.View] = list(tracks_views(content, content.configurations, ", "))
     columns = count_columns(len(views))
     if len(views) % columns:
         return rrb.Grid(*views, legend_view(), grid_columns=columns, name="What each believes")
@@ -293,14 +314,15 @@ def text_page() -> rrb.Container:
 
 
 def tracks_views(
-    content: RecordingContent, configurations: Sequence[str], title_suffix: str = ""
+    content: RecordingContent, configurations: Sequence[str], mark: str = " · "
 ) -> list[rrb.Spatial3DView]:
-    """A view of the fused tracks of each of these configurations, around the ego, with arrows to objects outside it."""
+    """A view of the fused tracks of each of these configurations, around the ego, with arrows to objects outside it.
+
+    `mark`: in their titles, by which views of two pages are told apart.
+    """
     marks = len(content.objects) == 1
     return [
-        world_view(
-            content, name, content.title(name, title_suffix), content.eye, units=content.received(name), marks=marks
-        )
+        world_view(content, name, content.title(name, mark), content.eye, units=content.received(name), marks=marks)
         for name in configurations
     ]
 
@@ -326,8 +348,12 @@ def world_view(
     part = make_entity_path("world", configuration_part(configuration))
     contents += [f"+ {part}/**"] if marks else [f"+ {part}/**", f"- {part}/marks/**"]
     shown = rr.Points3D.from_fields(show_labels=True)
-    contents += [f"- {part}/status"] if named else []  # there the names are the only labels
-    contents += [f"+ {make_entity_path(*eye.path, 'arrows')}"] if eye.turns else []
+    near = not eye.turns and eye.object_ix is not None
+    # Words of the other pictures would lie over bodies; with named units, names are the only labels.
+    contents += [f"- {part}/{words}" for words in (WORDS, NEAR_WORDS) if named or (words == WORDS) == near]
+    if eye.turns:
+        on_edge = ["arrows"], ["false", configuration_part(configuration)]
+        contents += [f"+ {make_entity_path(*eye.path, *entity)}" for entity in on_edge]
     return rrb.Spatial3DView(
         origin=make_entity_path(*eye.path),
         name=title,
@@ -354,11 +380,11 @@ def lanes_view(content: RecordingContent, object_ix: int, under: Sequence[str] =
     )
 
 
-def difference_view() -> rrb.TextDocumentView:
-    """The table of times to detection."""
+def difference_view(path: Sequence[str]) -> rrb.TextDocumentView:
+    """The table of times to detection at an entity."""
     import rerun.blueprint as rrb
 
-    return rrb.TextDocumentView(origin="difference", name="What difference it made")
+    return rrb.TextDocumentView(origin=make_entity_path(*path), name="What difference it made")
 
 
 def _curves_view(
@@ -377,7 +403,7 @@ def _curves_view(
     )
 
 
-LAYOUT = 6
+LAYOUT = 7
 """Version of the blueprint, raised with every change: a viewer prefers the one it has kept for an application id."""
 
 

@@ -11,12 +11,14 @@ from copem_replay.core.colours import TRUTH, Rgb
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import CLASSES, Bool, Float, Int, Scene, Tracks
 from copem_replay.perception.sensor_poses import SensorPoses
+from copem_replay.viewer.camera import MovingPicture, write_false_words
 from copem_replay.viewer.sink import (
     EGO,
     GRID,
     LANE,
     STANDING,
     RecordingSink,
+    configuration_part,
     object_labels,
     pair_points,
     slice_by_frame,
@@ -188,14 +190,15 @@ def write_fused_boxes(
 
 
 class FalseEntries:
-    """Draws entries about no object as dashed outlines with a cross over their boxes, and counts them.
+    """Draws entries about no object as dashed outlines with a cross over their boxes, names and counts them.
 
     An entry that the fusion follows counts once, whenever it is about no object; of those without an identity, as many
     count as are in one list.
     """
 
-    def __init__(self, out: RecordingSink, path: list[str], colour: Rgb) -> None:
-        self._out, self._path, self._colour = out, [*path, "false"], colour
+    def __init__(self, out: RecordingSink, name: str, colour: Rgb, picture: MovingPicture | None) -> None:
+        self._out, self._name, self._colour, self._picture = out, name, colour, picture
+        self._path = ["world", configuration_part(name), "false"]
         self._tracks: set[int] = set()
         self._at_once = 0
         self._shown = False
@@ -217,6 +220,9 @@ class FalseEntries:
         for rows, counts, available_ns in slice_by_frame(tracks, false):
             strips = rr.LineStrips3D.columns(strips=pair_points(_dashed_crosses(tracks, rows)))
             self._out.columns(self._path, available_ns, strips.partition(counts * _LINES))
+            if self._picture is not None:
+                place_m = np.stack([tracks.x_m[0, rows], tracks.y_m[0, rows], tracks.z_m[0, rows]])
+                write_false_words(self._out, self._name, self._picture, available_ns, counts, place_m)
         if not self._shown:
             self._out.static(
                 self._path, rr.LineStrips3D.from_fields(colors=[self._colour], radii=rr.Radius.ui_points(1.2))

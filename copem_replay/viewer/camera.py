@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import pandas as pd
@@ -16,6 +17,7 @@ from copem_replay.results.shown_objects import find_followed, interpolate_places
 from copem_replay.viewer.sink import (
     WAITING,
     RecordingSink,
+    configuration_part,
     entity_names,
     short_ids,
     stack_float32,
@@ -43,6 +45,12 @@ SMOOTH_S, SOON_S = 1.0, 1.5
 """Time over which turns and widths are averaged, and how long before and after a story it is in view: no jerks."""
 EDGE, ARROW_NS = 0.85, 200_000_000
 """Where arrows are, as a share of the way from the middle to the edge of the picture; how often they are drawn."""
+EDGE_WORDS = 0.4, 0.16
+"""Width and height of words such as “61 → 144 m” by half the sides of a view of the overview at 1280 × 720."""
+NAMED_FALSE, BESIDE_M = 3, 2.5
+"""Most false entries that a picture names, the nearest ones; how far below the middle of its cross the words are."""
+LEAN = np.tan(EYE_RAD / 2 + ABOVE_RAD - np.pi / 2)
+"""By how much of its height a body leans downwards at the lower edge of a picture from above: more than any other."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +59,7 @@ class Camera:
 
     A camera that follows has a `path` that moves with object `object_ix`, `ahead_m` of it: a view with that origin
     shows the same whenever it is first drawn. If `turns`, it turns with the object, too, and zooms. `at_m`: the target
-    in the world, at the onset; `heading_rad`: the direction of view there. `aspect`: width by height of the view.
+    in the world, at the onset; `heading_rad`: what is up in the picture there. `aspect`: width by height of the view.
     """
 
     place_m: Float
@@ -94,33 +102,67 @@ def camera_on_ego(
     return camera_above(place, _longest_way_rad(place) + np.pi / 2, aspect)
 
 
-def write_moving_origin(
-    out: RecordingSink, replay: Replay, experiment: Experiment, eye: Camera,
-    stories: Mapping[int, tuple[float, float]],
-) -> None:  # fmt: skip
+@dataclass(frozen=True)
+class MovingPicture:
+    """What a turning camera shows at the instants (K,): its middle on the ground, what is ahead there, how wide it is.
+
+    `scale`: how many times `WIDE_M` it is wide, which holds every object during its story. `seen`: by shown object
+    where it is, (3, K) ahead, left and up of the middle; NaN while it is absent.
+    """
+
+    eye: Camera
+    elapsed_ns: Int  # (K,) since the log's start
+    target: Float  # (3, K)
+    yaw_rad: Float  # (K,)
+    scale: Float  # (K,)
+    seen: Mapping[int, Float]
+
+    def frames_at(self, elapsed_ns: Int) -> Int:
+        """The newest of the instants (K,) at others (R,): what the viewer shows then; the first before it."""
+        rows: Int = np.maximum(np.searchsorted(self.elapsed_ns, elapsed_ns, side="right") - 1, 0)
+        return rows
+
+    def locate(self, place_m: Float, frame: Int) -> Float:
+        """(3, R) ahead, left and up of the middle at instants `frame` (R,), of places (3, R) in the world."""
+        off, yaw_rad = place_m - self.target[:, frame], self.yaw_rad[frame]
+        cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+        return np.stack([cos * off[0] + sin * off[1], cos * off[1] - sin * off[0], off[2]])
+
+
+def follow_ego(
+    replay: Replay, experiment: Experiment, eye: Camera, stories: Mapping[int, tuple[float, float]]
+) -> MovingPicture:
+    """What a turning camera shows; `stories`: as in `camera_on_ego`."""
+    assert eye.object_ix is not None
+    time_s, own = _own_states(replay, eye.object_ix)
+    elapsed_ns, yaw_rad = to_nanoseconds(time_s), _smooth(time_s, np.unwrap(own[3]))
+    elapsed_ns[:1] = 0  # before the ego comes, the camera waits where it will
+    ahead = np.stack([np.cos(yaw_rad), np.sin(yaw_rad), np.zeros(len(yaw_rad))])
+    wide = np.ones(len(time_s))
+    turning, each = MovingPicture(eye, elapsed_ns, own[:3] + AHEAD_M * ahead, yaw_rad, wide, {}), np.arange(len(wide))
+    seen = {
+        k: turning.locate(
+            interpolate_places(replay.scene, replay.truth, experiment, np.full(len(time_s), k), time_s)[:3], each
+        )
+        for k in stories
+    }
+    return replace(turning, scale=_choose_scale(time_s, eye, seen, stories), seen=seen)
+
+
+def write_moving_origin(out: RecordingSink, replay: Replay, picture: MovingPicture) -> None:
     """Write the entity that a turning camera follows, and an arrow for each shown object that is out of the picture.
 
-    The origin's scale is how much wider than `WIDE_M` the picture is, which holds every object during its story.
-    Arrows say how far an object is from the ego: “61 → 44 m”.
+    The origin has the picture's scale. Arrows say how far an object is from the ego: “61 → 44 m”.
     """
     import rerun as rr
 
-    assert eye.object_ix is not None
-    time_s, own = _own_states(replay, eye.object_ix)
-    yaw_rad = _smooth(time_s, np.unwrap(own[3]))
-    ahead = np.stack([np.cos(yaw_rad), np.sin(yaw_rad), np.zeros(len(yaw_rad))])
-    target = own[:3] + AHEAD_M * ahead
-    seen = {k: _as_seen(replay, experiment, k, time_s, target, yaw_rad) for k in stories}
-    scale = _choose_scale(time_s, eye, seen, stories)
-    elapsed_ns = to_nanoseconds(time_s)
-    elapsed_ns[:1] = 0  # before the ego comes, the camera waits where it will
     origin = rr.Transform3D.columns(
-        translation=stack_float32(*target), rotation_axis_angle=upright_turns(yaw_rad),
-        scale=stack_float32(scale, scale, scale),
+        translation=stack_float32(*picture.target), rotation_axis_angle=upright_turns(picture.yaw_rad),
+        scale=stack_float32(*[picture.scale] * 3),
     )  # fmt: skip
-    out.columns(eye.path, elapsed_ns, origin)
-    if seen:
-        _write_arrows(out, replay, eye, elapsed_ns, seen, scale)
+    out.columns(picture.eye.path, picture.elapsed_ns, origin)
+    if picture.seen:
+        _write_arrows(out, replay, picture)
 
 
 def _own_states(replay: Replay, object_ix: int) -> tuple[Float, Float]:
@@ -146,16 +188,6 @@ def _smooth(time_s: Float, values: Float) -> Float:
     return (until(time_s + SMOOTH_S / 2) - until(time_s - SMOOTH_S / 2)) / SMOOTH_S
 
 
-def _as_seen(
-    replay: Replay, experiment: Experiment, object_ix: int, time_s: Float, target: Float, yaw_rad: Float
-) -> Float:
-    """(3, K) ahead, left and up of the target, where an object is; NaN while it is absent."""
-    alone = np.full(len(time_s), object_ix)
-    off = interpolate_places(replay.scene, replay.truth, experiment, alone, time_s)[:3] - target
-    cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
-    return np.stack([cos * off[0] + sin * off[1], cos * off[1] - sin * off[0], off[2]])
-
-
 def _choose_scale(
     time_s: Float, eye: Camera, seen: Mapping[int, Float], stories: Mapping[int, tuple[float, float]]
 ) -> Float:
@@ -171,35 +203,110 @@ def _choose_scale(
     return _smooth(time_s, held)
 
 
-def _write_arrows(
-    out: RecordingSink, replay: Replay, eye: Camera, elapsed_ns: Int, seen: Mapping[int, Float], scale: Float
-) -> None:
+def _write_arrows(out: RecordingSink, replay: Replay, picture: MovingPicture) -> None:
     """Write a point with an arrow near the edge of the picture, on the ground, for each object outside it.
 
     Objects farther from the ego than `WIDEST_M` have none: their names would cover those of nearer ones.
     """
-    import rerun as rr
-
-    place = np.stack([*seen.values()])  # (M, 3, K)
-    across, high = _project(place / scale, eye)
-    far_out = np.maximum(np.abs(across), np.abs(high))
-    _, step = np.unique(elapsed_ns // ARROW_NS, return_index=True)
-    distance_m = np.hypot(place[:, 0] + AHEAD_M, place[:, 1])
+    place = np.stack([*picture.seen.values()], axis=1)  # (3, M, K)
+    far_out = np.abs(_project(place / picture.scale, picture.eye)).max(axis=0)
+    _, step = np.unique(picture.elapsed_ns // ARROW_NS, return_index=True)
+    distance_m = np.hypot(place[0] + AHEAD_M, place[1])
     row, m = np.nonzero((far_out[:, step].T > 1.0) & (distance_m[:, step].T <= WIDEST_M))
     at = m, step[row]
-    u, v = EDGE * across[at] / far_out[at], EDGE * high[at] / far_out[at]
-    sides = np.where(np.abs(u) >= np.abs(v), np.where(u > 0, "→", "←"), np.where(v > 0, "↑", "↓"))
-    ids = np.array(short_ids(replay.scene), dtype=object)[np.array([*seen])[m]]
+    spots, sides = _move_to_edge(place[:, *at] / picture.scale[step[row]], picture.eye, row)
+    ids = np.array(short_ids(replay.scene), dtype=object)[np.array([*picture.seen])[m]]
     labels = [f"{name} {side} {far:.0f} m" for name, side, far in zip(ids, sides, distance_m[at], strict=True)]
+    counts = np.bincount(row, minlength=len(step))
+    _write_words(out, [*picture.eye.path, "arrows"], picture.elapsed_ns[step], spots, labels, counts, 1.5)
+
+
+def _move_to_edge(place: Float, eye: Camera, row: Int) -> tuple[Float, Sequence[str]]:
+    """Places (3, R) in the frame of a camera, outside its picture, moved to its edge, on the ground; arrows (R,).
+
+    `row` (R,): ascending numbers of instants; words of one instant are apart.
+    """
+    across, high = _project(place, eye)
+    far_out = np.maximum(np.abs(across), np.abs(high))
+    u, v = EDGE * across / far_out, EDGE * high / far_out
+    sides = np.where(np.abs(u) >= np.abs(v), np.where(u > 0, "→", "←"), np.where(v > 0, "↑", "↓"))
+    _spread_words(u, v, row)
     towards, right, up = _axes(np.pi / 2)
     tall = np.tan(EYE_RAD / 2)
     ray = towards[:, None] + u * eye.aspect * tall * right[:, None] + v * tall * up[:, None]
-    spots = eye.place_m[:, None] - eye.place_m[2] / ray[2] * ray
+    return eye.place_m[:, None] - eye.place_m[2] / ray[2] * ray, sides.tolist()
+
+
+def _spread_words(u: Float, v: Float, row: Int) -> None:
+    """Move places (R,) up or down a picture, towards its middle, until their words do not lie on each other."""
+    bounds = np.flatnonzero(np.diff(row, prepend=-1, append=-1)).tolist()
+    for first, end in pairwise(bounds):
+        placed: list[int] = []
+        for k in sorted(range(first, end), key=lambda k: -abs(v[k])):
+            step = -np.copysign(EDGE_WORDS[1], v[k])
+            while any(abs(u[k] - u[n]) < EDGE_WORDS[0] and abs(v[k] - v[n]) < 0.99 * EDGE_WORDS[1] for n in placed):
+                v[k] += step
+            placed.append(k)
+
+
+def _write_words(
+    out: RecordingSink, path: Sequence[str], elapsed_ns: Int, spots: Float, labels: Sequence[str], counts: Int,
+    points: float,
+) -> None:  # fmt: skip
+    """Write words at spots (3, R) of the picture, `counts` of them at each of some instants."""
+    import rerun as rr
+
     columns = rr.Points3D.columns(positions=stack_float32(*spots), labels=pa.array(labels, pa.string()))
-    counts = np.bincount(row, minlength=len(step))
-    out.columns([*eye.path, "arrows"], elapsed_ns[step], columns.partition(counts))
-    style = rr.Points3D.from_fields(colors=[WAITING], radii=rr.Radius.ui_points(1.5), show_labels=True)
-    out.static([*eye.path, "arrows"], style)
+    out.columns(path, elapsed_ns, columns.partition(counts))
+    out.static(path, rr.Points3D.from_fields(colors=[WAITING], radii=rr.Radius.ui_points(points), show_labels=True))
+
+
+def write_false_words(
+    out: RecordingSink, name: str, picture: MovingPicture, elapsed_ns: Int, counts: Int, place_m: Float
+) -> None:
+    """Write where the nearest false entries of a configuration are: “false: 24 m ahead, 6 m left” of the ego.
+
+    `place_m`: (3, R) places of all of them in the world, `counts` of them in each list, which is available from
+    `elapsed_ns` on. For those outside the picture “false → 61 m” is at its edge, up to `WIDEST_M` from the ego.
+    """
+    row = np.repeat(np.arange(len(counts)), counts)
+    frame = picture.frames_at(elapsed_ns[row])
+    place = picture.locate(place_m, frame)
+    ahead_m, left_m = place[0] + AHEAD_M, place[1]
+    distance_m = np.hypot(ahead_m, left_m)
+    order = np.lexsort((distance_m, row))
+    order = order[(np.arange(len(row)) - np.searchsorted(row, row) < NAMED_FALSE) & (distance_m[order] <= WIDEST_M)]
+    spots = place[:, order] / picture.scale[frame[order]]
+    spots[1] -= BESIDE_M / picture.scale[frame[order]]
+    outside = np.abs(_project(spots, picture.eye)).max(axis=0) > 1.0
+    labels = [
+        f"false: {abs(ahead):.0f} m {'ahead' if ahead >= 0 else 'behind'}, {abs(left):.0f} m "
+        f"{'left' if left >= 0 else 'right'}"
+        for ahead, left in zip(ahead_m[order].tolist(), left_m[order].tolist(), strict=True)
+    ]
+    spots[:, outside], sides = _move_to_edge(spots[:, outside], picture.eye, row[order][outside])
+    for k, side in zip(np.flatnonzero(outside).tolist(), sides, strict=True):
+        labels[k] = f"false {side} {distance_m[order[k]]:.0f} m"
+    kept = np.bincount(row[order], minlength=len(counts))
+    _write_words(out, [*picture.eye.path, "false", configuration_part(name)], elapsed_ns, spots, labels, kept, 0.0)
+
+
+def find_up_rad(picture: MovingPicture | None, eye: Camera, elapsed_ns: Int) -> Float:
+    """(R,) the heading that is up in the picture at some instants; `picture`: of a turning camera."""
+    if picture is None:
+        return np.full(len(elapsed_ns), eye.heading_rad)
+    return np.asarray(picture.yaw_rad[picture.frames_at(elapsed_ns)] + np.pi / 2)
+
+
+def below_bodies(body: Mapping[str, Float], up_rad: Float) -> Float:
+    """(3, …) the places on the ground just below bodies (…) in a picture, where words do not lie over them.
+
+    `up_rad`: the heading that is up in the picture.
+    """
+    turned = body["yaw_rad"] - up_rad
+    half_m = (np.abs(np.cos(turned)) * body["length_m"] + np.abs(np.sin(turned)) * body["width_m"]) / 2
+    away_m, ground_m = half_m + LEAN * body["height_m"], body["z_m"] - body["height_m"] / 2
+    return np.stack([body["x_m"] - np.cos(up_rad) * away_m, body["y_m"] - np.sin(up_rad) * away_m, ground_m])
 
 
 def camera_following(replay: Replay, experiment: Experiment, table: pd.DataFrame, object_ix: int) -> Camera:
@@ -213,7 +320,10 @@ def camera_following(replay: Replay, experiment: Experiment, table: pd.DataFrame
     towards = _view_direction(own[3] if has_ego else 0.0)
     away_m = float(np.clip(np.hypot(*(own - np.append(target, 0))[:2]) if has_ego else 0.0, *CLOSE_M))
     path = (*EYES, entity_names(scene)[object_ix])
-    return Camera(np.round(-away_m * towards, 1), np.zeros(3), np.nan_to_num(target), object_ix, path=path)
+    up_rad = float(np.arctan2(towards[1], towards[0]))
+    return Camera(
+        np.round(-away_m * towards, 1), np.zeros(3), np.nan_to_num(target), object_ix, path=path, heading_rad=up_rad
+    )
 
 
 def include_places(eye: Camera, places_m: Float) -> Camera:
@@ -273,11 +383,11 @@ def _axes(heading_rad: float) -> tuple[Float, Float, Float]:
     return towards, right, np.cross(right, towards)
 
 
-def _project(place_m: Float, eye: Camera) -> tuple[Float, Float]:
-    """Where places (…, 3, K) relative to the target of a turning camera are in its picture: −1 … 1 across and up."""
-    towards, right, up = _axes(np.pi / 2)
-    depth_m = np.maximum(np.linalg.norm(eye.place_m) + towards @ place_m, 1.0) * np.tan(EYE_RAD / 2)
-    return (right @ place_m) / (depth_m * eye.aspect), (up @ place_m) / depth_m
+def _project(place_m: Float, eye: Camera) -> Float:
+    """(2, …) where places (3, …) relative to the target of a turning camera are in its picture, −1 … 1: across, up."""
+    towards, right, up = (np.tensordot(axis, place_m, 1) for axis in _axes(np.pi / 2))
+    depth_m = np.maximum(np.linalg.norm(eye.place_m) + towards, 1.0) * np.tan(EYE_RAD / 2)
+    return np.stack([right / (depth_m * eye.aspect), up / depth_m])
 
 
 def _fitting_distances(place_m: Float, heading_rad: float, aspect: float) -> Float:

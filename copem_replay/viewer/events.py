@@ -20,10 +20,13 @@ from copem_replay.perception.sensor_poses import find_carrier
 from copem_replay.pipeline.one_run import BY_ANY, BY_EGO, Curve
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.viewer.sink import (
+    DIFFERENCE_SHORT,
+    DIFFERENCE_TEXT,
     ONSET,
     RecordingSink,
     configuration_part,
     entity_names,
+    helps_path,
     pair_points,
     short_ids,
     show_seconds,
@@ -92,23 +95,35 @@ def describe_verdict(episode: Any) -> str | None:
 
 
 def write_difference_text(
-    out: RecordingSink, replay: Replay, table: pd.DataFrame, shown: Sequence[int], left_out: Sequence[str],
+    out: RecordingSink, replay: Replay, table: pd.DataFrame, shown: Mapping[int, str], left_out: Sequence[str],
     too_short: Sequence[str],
 ) -> None:  # fmt: skip
     """Write tables of times to detection in this run: over all objects, if there are several, then per object.
 
-    Below them are the files with further configurations, and the objects `too_short` to judge.
+    `shown`: the objects, with a sentence of what would help, or “”, which is below the table of each; in the overview
+    it is that of the first one. Below them are the files with further configurations, and the objects `too_short` to
+    judge.
     """
     import rerun as rr
 
     by_object = [table[table["object_id"] == replay.scene.object_ids[k]] for k in shown]
-    tables = [_difference_table(episodes, replay.scene) for episodes in by_object]
+    helps = [_escape_cell(words) for words in shown.values()]
+    for k, words in zip(shown, helps, strict=True):
+        out.static(helps_path(replay.scene, k), rr.TextDocument(words, media_type=rr.MediaType.MARKDOWN))
+    tables = [
+        "\n\n".join([_difference_table(episodes, replay.scene), words]).rstrip()
+        for episodes, words in zip(by_object, helps, strict=True)
+    ]
+    first = tables[:1]
     if len(shown) > 1:
+        name = _name_object(table_rows(by_object[0])[0], replay.scene)
         tables.insert(0, _overview_table(by_object, replay.scene))
+        first = [tables[0], *([f"**{name}** · {helps[0]}"] if helps[0] else [])]
     ids = [short_ids(replay.scene)[replay.scene.object_number[name]] for name in too_short]
     short = [f"Too short to judge: {_escape_cell(', '.join(ids))}."] if ids else []
-    text = "\n\n".join([*tables, *short, *_describe_left_out(left_out)])
-    out.static(["difference"], rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+    for path, parts in ((DIFFERENCE_TEXT, tables), (DIFFERENCE_SHORT, first)):
+        text = "\n\n".join([*parts, *short, *_describe_left_out(left_out)])
+        out.static(path, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
 
 
 def _difference_table(episodes: pd.DataFrame, scene: Scene) -> str:
@@ -175,17 +190,19 @@ def _describe_left_out(names: Sequence[str]) -> list[str]:
 LEGEND = """A configuration has one colour in every file and figure of its experiment.
 
 - grey outlines: what was there, and the ways of those we look at; the white body: the ego; grey bodies: obstacles
-- filled in colour: what is believed, where it is believed to be, paler the older it is (0 to 1 s); ellipses: 2σ of the
-  position
-- words over an object we look at: only its name, it is known; else why it is not: `58 behind 41`; a
+- filled in colour: what is believed, where it is believed to be, paler the older it is (0 to 1 s); pale discs: 2σ of
+  the position
+- dashed with a cross: believed, but nothing is there; `false: 24 m ahead, 6 m left`: where, seen from the ego
+- words below an object we look at: only its name, it is known; else why it is not: `58 behind 41`; a
   sentence, when it is selected
 - red lines: from the unit that sees most of an object to what hides it
 - lines of sight: from the unit that listed an object first, where it was at capture, to where it listed the object
 - strong lines on the ground: distance when an object was first known
 - an arrow at the edge of a view, `61 → 44 m`: object 61 is farther that way, 44 m from the ego
 - white points: units; pale ground with an outline: their fields of view
-- lanes: in full colour *known*, from the time of detection in the table on; at half its strength *listed*, which does
-  not count: before the onset, not confirmed, or too late; grey and brown: why not; the white mark ends at the onset
+- lanes: in full colour *known*, from the time of detection in the table on; at half its strength *listed, not known*,
+  since the list does not count: it is from before the onset, not confirmed, or too late; grey and brown: why not; the
+  white mark ends at the onset
 - compared with a baseline: a large white dot, only the baseline holds it; a small one, the baseline does not"""
 LINKS = """
 - lanes `lists/…` under those of an object: a unit that sends by a link; from the capture of a list to that of the next,

@@ -3,8 +3,9 @@
 An entity per object and configuration, such as `lanes/6_pedestrian/2_PEM`; the number is the configuration's place in
 the file. A lane begins with the configuration's name: the viewer's own titles of lanes are paths. Changes too short to
 follow are left out, but known begins exactly at `detection_s`, with how long after the onset, “0.60 s known”. Words
-that do not fit into their span are shortened or left out. A mark ends at the onset, white and black, so that it stands
-out in any theme. A lane is empty while the object is absent.
+that do not fit into their span are shortened or left out, and are never on another span; the time of a short one is
+beside the name, “PEM, 0.60 s”, where there is room. A mark ends at the onset, white and black, so that it stands out in
+any theme. A lane is empty while the object is absent.
 
 An entity per configuration and unit, such as `lists/2_bursts/rsu1`, under the lanes of the objects, shows lists sent by
 a link, if one did not come in time; events say it in words.
@@ -13,7 +14,7 @@ a link, if one did not come in time; events say it in words.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -30,6 +31,7 @@ from copem_replay.results.shown_objects import AFTER_S, BEFORE_S, LEAST_S
 from copem_replay.viewer.sink import (
     ABSENT,
     CAPTURED,
+    EARLY,
     HIDDEN,
     KNOWN,
     ONSET,
@@ -57,7 +59,7 @@ STEADY_S = 0.4
 MARK = 1 / 40
 """Length of the mark that ends at the onset, as a share of the axis: just wide enough for both halves."""
 FLAG = 6
-"""Length of words such as “0.60 s known”, as a multiple of the mark's."""
+"""Length of words such as “0.60 s”, as a multiple of the mark's."""
 NAME: Rgb = (58, 60, 66)
 """Ground of the configuration's name, where a lane begins: no colour of a status."""
 ONSET_IS = ("onset", "onset of the object")
@@ -118,25 +120,30 @@ def _tell_lane(
     """
     (onset_ns, known_ns), (first_ns, last_ns) = clock_ns, axis_ns
     mark_ns = round((last_ns - first_ns) * MARK)
-    _add_flag(begins, texts, known_ns, onset_ns, FLAG * mark_ns)
+    flag = _add_flag(begins, texts, known_ns, onset_ns, FLAG * mark_ns)
     colour_of = {text: tint for text, tint in zip(texts, tints, strict=True) if text}
-    colour_of |= dict(zip(ONSET_IS, ONSET, strict=True)) | {_name_text(name): NAME}
     elapsed, texts = _insert_onset(begins, texts, onset_ns, mark_ns)
     until_ns = min(onset_ns - mark_ns, known_ns)
     if until_ns - first_ns >= (last_ns - first_ns) * _words_points(len(name)) / WIDTH_POINTS:
-        elapsed, texts = _insert_name(elapsed, texts, name, first_ns, until_ns)
+        title = f"{name}{flag}: "
+        elapsed, texts = _insert_title(elapsed, texts, title, first_ns, until_ns)
     else:
-        _prepend_name(elapsed, texts, name, first_ns)
-    values, label_of = _fit_words(elapsed, texts, axis_ns)
-    return elapsed, values, {value: (label, _tint(value, name, colour_of)) for value, label in label_of.items()}
+        title = f"{name}: "
+        _prepend_title(elapsed, texts, title, first_ns)
+    colour_of |= dict(zip(ONSET_IS, ONSET, strict=True)) | {title: NAME}
+    values, label_of = _fit_words(texts, _measure_spans(elapsed, axis_ns))
+    return elapsed, values, {value: (label, _tint(value, title, colour_of)) for value, label in label_of.items()}
 
 
-def lanes_axis_s(axis_s: tuple[float, float], onset_s: float, configurations: Sequence[str]) -> tuple[float, float]:
+def lanes_axis_s(
+    axis_s: tuple[float, float], onset_s: float, configurations: Sequence[str], beside: bool = False
+) -> tuple[float, float]:
     """First and last second of an object's lanes: with room for names before the onset, and for the last flag.
 
     `axis_s`: of the object, from 0.5 s before its onset, or before it is known, to 0.5 s after it is last known.
+    `beside`: with room for times beside the names.
     """
-    longest = max(map(len, configurations), default=0)
+    longest = max(map(len, configurations), default=0) + beside * len(", 0.00 s")
     name = min((_words_points(longest) + 2) / WIDTH_POINTS + MARK, MOST_NAME)
     flag = _words_points(len("10.00 s known")) / WIDTH_POINTS
     start_s = min(onset_s, axis_s[0] + BEFORE_S)
@@ -146,28 +153,43 @@ def lanes_axis_s(axis_s: tuple[float, float], onset_s: float, configurations: Se
     return first_s, max(first_s + length_s, end_s + flag * length_s)
 
 
+def is_briefly_known(statuses: Iterable[Status], m: int, axis_s: tuple[float, float]) -> bool:
+    """Whether any lane of object m has a first span of known that is too short for its time on an axis."""
+    least_ns = FLAG * MARK * (axis_s[1] - axis_s[0]) * 1e9
+    for status in statuses:
+        for span in smooth_status(status.elapsed_ns, status.status[:, m]):
+            if span.status == KNOWN:
+                end = min(span.end, len(status.elapsed_ns) - 1)
+                if end == span.end and status.elapsed_ns[end] - status.elapsed_ns[span.first] < least_ns:
+                    return True
+                break
+    return False
+
+
 def _words_points(letters: int) -> float:
     return letters * LETTER_POINTS + PADDING_POINTS
 
 
-def _fit_words(
-    begins: Int, texts: Sequence[str | None], axis_ns: tuple[int, int]
-) -> tuple[list[str | None], dict[str, str]]:
-    """Values of states, and the label of each value: as many of its words as fit into its span on the axis.
+def _measure_spans(begins: Int, axis_ns: tuple[int, int], end_ns: int | None = None) -> Float:
+    """(K,) widths in points, on an axis, of spans that begin at `begins` and end at `end_ns`; at most 0: not on it."""
+    ends = np.append(begins[1:], axis_ns[1] if end_ns is None else end_ns)
+    lasts_ns = np.minimum(ends, axis_ns[1]) - np.maximum(begins, axis_ns[0])
+    return np.asarray(lasts_ns * WIDTH_POINTS / (axis_ns[1] - axis_ns[0]))
+
+
+def _fit_words(texts: Sequence[str | None], points: Float) -> tuple[list[str | None], dict[str, str]]:
+    """Values of states, and the label of each value: as many of its words as fit into its width, unless that is 0.
 
     A state whose words are shortened here and not elsewhere has a space more at the end of its value. Without words the
     label is a space: for an empty one the viewer takes the value.
     """
-    per_point_ns = (axis_ns[1] - axis_ns[0]) / WIDTH_POINTS
-    ends = np.append(begins[1:], axis_ns[1])
     values: list[str | None] = []
     label_of = dict.fromkeys(ONSET_IS, " ")
-    for text, begin_ns, end_ns in zip(texts, begins.tolist(), ends.tolist(), strict=True):
+    for text, wide in zip(texts, points.tolist(), strict=True):
         if text is None or text in ONSET_IS:
             values.append(text)
             continue
-        lasts_ns = min(end_ns, axis_ns[1]) - max(begin_ns, axis_ns[0])
-        room = int((lasts_ns / per_point_ns - PADDING_POINTS) / LETTER_POINTS) if lasts_ns > 0 else len(text)
+        room = (wide - PADDING_POINTS) / LETTER_POINTS if wide > 0 else len(text)
         label = next((words for words in _shorten_words(text) if len(words) <= room), " ")
         value = next(text + k * " " for k in range(len(texts) + 1) if label_of.get(text + k * " ", label) == label)
         label_of[value] = label
@@ -176,13 +198,13 @@ def _fit_words(
 
 
 def _shorten_words(text: str) -> Iterator[str]:
-    """Words of a span, the longest first: “behind 3 (from ego)”, “behind 3”; “0.60 s known”, “0.60 s”."""
+    """Words of a span, the longest first: “behind 3 (from ego)”, “behind 3”; “PEM, 0.60 s”, “PEM”."""
     yield text.removesuffix(": ")
-    yield text.partition(", then ")[0]
     if ": " in text:
-        yield text.partition(": ")[0]
+        yield (title := text.partition(": ")[0])
+        yield re.sub(r", -?[0-9.]+ s$", "", title)
     yield text.partition(" (from ")[0]
-    yield text.partition(" from ")[0]
+    yield "old list" if text == lane_text(EARLY, "", "") else text.partition(" from ")[0]
     if flag := re.match(r"-?[0-9.]+ s ", text):
         yield flag[0].rstrip()
 
@@ -228,45 +250,42 @@ def _span_text(
     return lane_text(span.status, units[by], body_name(ids, sight.solids, what))
 
 
-def _add_flag(begins: Int, texts: list[str | None], known_ns: int, onset_ns: int, room_ns: int) -> None:
+def _add_flag(begins: Int, texts: list[str | None], known_ns: int, onset_ns: int, room_ns: int) -> str:
     """Say how long after the onset the object is first known, where that begins: “0.60 s known”.
 
-    Where that lasts for less than `room_ns`, too short for words, what follows says it, too.
+    Returns what is added to the name, “, 0.60 s”, where that lasts for less than `room_ns`, too short for words.
     """
     for k in np.flatnonzero(begins == known_ns)[:1].tolist():
-        texts[k] = flag = f"{show_seconds((known_ns - onset_ns) / 1e9)} s {texts[k]}"
-        if k + 1 < len(texts) and texts[k + 1] is not None and begins[k + 1] - known_ns < room_ns:
-            texts[k + 1] = f"{flag}, then {texts[k + 1]}"
+        after = f"{show_seconds((known_ns - onset_ns) / 1e9)} s"
+        texts[k] = f"{after} {texts[k]}"
+        return f", {after}" if (begins[k + 1 :] - known_ns < room_ns).any() else ""
+    return ""
 
 
-def _tint(value: str, name: str, colour_of: Mapping[str, Rgb]) -> Rgb:
-    """The colour of a value: spaces at its end and a name before it change nothing."""
-    plain = value if value in colour_of else value.rstrip().removeprefix(_name_text(name))
+def _tint(value: str, title: str, colour_of: Mapping[str, Rgb]) -> Rgb:
+    """The colour of a value: spaces at its end and a title before it change nothing."""
+    plain = value if value in colour_of else value.rstrip().removeprefix(title)
     return colour_of[plain]
 
 
-def _name_text(name: str) -> str:
-    return f"{name}: "
-
-
-def _insert_name(
-    elapsed_ns: Int, texts: list[str | None], name: str, first_ns: int, until_ns: int
+def _insert_title(
+    elapsed_ns: Int, texts: list[str | None], title: str, first_ns: int, until_ns: int
 ) -> tuple[Int, list[str | None]]:
-    """Put the configuration's name from the begin of the axis to `until_ns`, in place of what holds then."""
+    """Put the title from the begin of the axis to `until_ns`, in place of what holds then."""
     before = int(np.searchsorted(elapsed_ns, first_ns))
     after = int(np.searchsorted(elapsed_ns, until_ns, side="right")) - 1  # what holds at `until_ns`
     held = texts[after] if after >= 0 else None
     return np.concatenate([elapsed_ns[:before], [first_ns, until_ns], elapsed_ns[after + 1 :]]), [
-        *texts[:before], _name_text(name), held, *texts[after + 1 :]
+        *texts[:before], title, held, *texts[after + 1 :]
     ]  # fmt: skip
 
 
-def _prepend_name(elapsed_ns: Int, texts: list[str | None], name: str, first_ns: int) -> None:
-    """Put the name before the first text on the axis, “PEM: out of view”: it has no room of its own."""
+def _prepend_title(elapsed_ns: Int, texts: list[str | None], title: str, first_ns: int) -> None:
+    """Put the title before the first text on the axis, “PEM: out of view”: it has no room of its own."""
     current = max(int(np.searchsorted(elapsed_ns, first_ns, side="right")) - 1, 0)
     told_at = next((k for k in range(current, len(texts)) if texts[k] is not None), None)
     if told_at is not None:
-        texts[told_at] = f"{_name_text(name)}{texts[told_at]}"
+        texts[told_at] = f"{title}{texts[told_at]}"
 
 
 def _insert_onset(
@@ -395,29 +414,38 @@ def _format_times(time_s: Float) -> str:
     return f"{first} s" if first == last else f"{first} to {last} s"
 
 
-def write_list_lanes(out: RecordingSink, lists: Sequence[UnitLists]) -> None:
-    """Write a lane for each unit with a lost, late or overtaken list, which lasts until the next capture."""
+def write_list_lanes(out: RecordingSink, lists: Sequence[UnitLists], axes: Collection[tuple[float, float]]) -> None:
+    """Write a lane for each unit with a lost, late or overtaken list, which lasts until the next capture.
+
+    `axes`: first and last second of the lanes of all objects. Words are left out that do not fit on each that has them.
+    """
     import rerun as rr
 
+    axes_ns = [(int(first_ns), int(last_ns)) for first_ns, last_ns in map(to_nanoseconds, axes)]
     for unit_lists in lists:
         if not unit_lists.fate.any():
             continue
         first = np.flatnonzero(np.diff(unit_lists.fate, prepend=IN_TIME))
         counts = np.diff(first, append=len(unit_lists.fate))
         fate, begins = unit_lists.fate[first], unit_lists.elapsed_ns[first]
-        texts = [FATES[f] if n == 1 else f"{n} {FATES[f]}" for f, n in zip(fate.tolist(), counts.tolist(), strict=True)]
+        texts = [
+            None if f == IN_TIME else FATES[f] if n == 1 else f"{n} {FATES[f]}"
+            for f, n in zip(fate.tolist(), counts.tolist(), strict=True)
+        ]
+        end = int(unit_lists.elapsed_ns[-1] + to_nanoseconds(min(unit_lists.interval_s, 1.0)))
+        points = np.array([np.zeros(len(texts)), *(_measure_spans(begins, axis, end) for axis in axes_ns)])
+        narrowest = np.where(points > 0, points, np.inf).min(axis=0)
+        values, label_of = _fit_words(texts, narrowest)
+        style = {value: COLOURS[f] for value, f in zip(values, fate.tolist(), strict=True) if value is not None}
         if fate[-1] != IN_TIME:  # the last list ends after an interval
-            fate, begins = (
-                np.append(fate, IN_TIME),
-                np.append(begins, unit_lists.elapsed_ns[-1] + to_nanoseconds(min(unit_lists.interval_s, 1.0))),
-            )
-        marked = fate != IN_TIME
-        labels = [text for text, is_told in zip(texts, marked.tolist(), strict=False) if is_told]
-        states = rr.StateChange.columns(state=pa.array(labels, pa.string()))
-        out.columns(unit_lists.path, begins, states.partition(marked.astype(np.int64)))
-        style = dict(zip(labels, (COLOURS[f] for f in fate[marked].tolist()), strict=True))
-        values = list(style)
-        out.static(unit_lists.path, rr.StateConfiguration(values=values, labels=values, colors=list(style.values())))
+            values, begins = [*values, None], np.append(begins, end)
+        states = rr.StateChange.columns(state=pa.array([value for value in values if value is not None], pa.string()))
+        out.columns(
+            unit_lists.path, begins, states.partition(np.array([v is not None for v in values], dtype=np.int64))
+        )
+        labels = [label_of[value] for value in style]
+        drawn = rr.StateConfiguration(values=list(style), labels=labels, colors=list(style.values()))
+        out.static(unit_lists.path, drawn)
 
 
 def select_list_lanes(lists: Mapping[str, Sequence[UnitLists]], axis_s: tuple[float, float]) -> list[tuple[str, ...]]:

@@ -27,9 +27,12 @@ from copem_replay.results.write import Exporter, RunToExport
 from copem_replay.viewer import boxes, curves, lanes, sensors
 from copem_replay.viewer.blueprint import NEAR_BY, RecordingContent, build_blueprint, view_aspect
 from copem_replay.viewer.camera import (
+    MovingPicture,
     camera_above,
     camera_following,
     camera_on_ego,
+    find_up_rad,
+    follow_ego,
     include_places,
     write_camera_origin,
     write_moving_origin,
@@ -51,7 +54,9 @@ from copem_replay.viewer.line_of_sight import Sight, compute_sight, find_looked_
 from copem_replay.viewer.map_view import NO_PLACE, asks_for_map, write_map
 from copem_replay.viewer.sensors import FaultsShown, choose_named_units
 from copem_replay.viewer.sink import (
+    NEAR_WORDS,
     OPENS,
+    WORDS,
     RecordingPart,
     RecordingSink,
     ViewerStream,
@@ -137,6 +142,7 @@ class _RecordingFile:
     """One of the files: its streams, its content, and the colours of its configurations, in order.
 
     By configuration, in the time chunks so far: `last_gospa` the last point of its curve, `false` its false entries.
+    `brief`: as in the content, found at the end.
     """
 
     out: RecordingSink
@@ -144,12 +150,21 @@ class _RecordingFile:
     colours: dict[str, Rgb]
     last_gospa: dict[str, tuple[Int, Float]] = field(default_factory=dict)
     false: dict[str, boxes.FalseEntries] = field(default_factory=dict)
+    brief: set[int] = field(default_factory=set)
 
     @cached_property
     def clocks(self) -> dict[str, EpisodeClocks]:
         """The clocks of all objects, by configuration."""
         scene, table = self.content.replay.scene, self.content.table
         return {name: read_episode_clocks(scene, table, name) for name in self.colours}
+
+    @cached_property
+    def picture(self) -> MovingPicture | None:
+        """What the camera on the ego shows; None: it stands still."""
+        content = self.content
+        if not content.eye.turns:
+            return None
+        return follow_ego(content.replay, content.experiment, content.eye, content.axes_s)
 
 
 def _build_content(
@@ -206,14 +221,15 @@ def _begin_file(
     replay, experiment, scene = content.replay, content.experiment, content.replay.scene
     if out.live is not None:
         out.live.send(lambda rec: rec.send_blueprint(panels, make_active=True))
-    if content.eye.object_ix is not None:
-        write_moving_origin(out, replay, experiment, content.eye, content.axes_s)
+    if file.picture is not None:
+        write_moving_origin(out, replay, file.picture)
     for eye in content.eyes:
         write_camera_origin(out, replay, eye)
     _write_properties(out, content, run, run_is)
     out.static([], rr.ViewCoordinates.RIGHT_HAND_Z_UP, boxes.names_and_colours(scene))
     rows = content.table[content.table["configuration"].isin(list(content.configurations))]
-    write_difference_text(out, replay, rows, content.objects, further, content.too_short)
+    helps = {k: content.helps(k) for k in content.objects}
+    write_difference_text(out, replay, rows, helps, further, content.too_short)
     write_summary_text(out, replay, experiment, summary, run, further)
     write_legend_text(out, any(content.lists.values()))
     write_legend_bars(out, file.colours)
@@ -234,7 +250,6 @@ def _begin_file(
             write_event_texts(out, scene, name, chosen[chosen["configuration"] == name])
         mark_detections(out, replay, experiment, content.table, name, content.objects, colour)
         write_list_fates(out, name, content.lists[name])
-        write_list_lanes(out, content.lists[name])
     if len(replay.episodes.object_ix):
         curves.write_known_count(out, replay, "truth", replay.truth)
 
@@ -242,7 +257,7 @@ def _begin_file(
 def _send_layout(file: _RecordingFile) -> None:
     """Write the layout, whose titles count false entries; active, so that no viewer replaces it by a guess."""
     counts = {name: false.count for name, false in file.false.items()}
-    panels, _ = build_blueprint(replace(file.content, false=counts))
+    panels, _ = build_blueprint(replace(file.content, false=counts, brief=file.brief))
     file.out.send(lambda rec: rec.send_blueprint(panels, make_active=True))
 
 
@@ -270,7 +285,7 @@ def _write_fused(file: _RecordingFile, run_tracks: Mapping[str, FusedTracks]) ->
     for name, colour in file.colours.items():
         path = ["world", configuration_part(name)]
         boxes.write_fused_boxes(out, path, content.replay.scene, run_tracks[name], colour)
-        file.false.setdefault(name, boxes.FalseEntries(out, path, colour)).add(run_tracks[name])
+        file.false.setdefault(name, boxes.FalseEntries(out, name, colour, file.picture)).add(run_tracks[name])
         if len(content.replay.episodes.object_ix):
             before = file.last_gospa.get(name, curves.NO_LIST)
             file.last_gospa[name] = curves.write_gospa(
@@ -284,18 +299,28 @@ def _write_knowledge(file: _RecordingFile, run_tracks: Mapping[str, FusedTracks]
     """Write status, reasons and position errors. `run_tracks`: of the shown objects, over the whole log."""
     out, content = file.out, file.content
     replay, experiment, scene = content.replay, content.experiment, content.replay.scene
+    near_up_rad = {eye.object_ix: eye.heading_rad for eye in content.eyes}
     statuses = {}
     for name, colour in file.colours.items():
         fused_tracks, clock = run_tracks[name], file.clocks[name]
         statuses[name] = compute_status(replay, experiment, name, fused_tracks, sight, clock)
-        write_status_words(out, name, replay, experiment, sight, statuses[name], clock)
+        up_rad = {
+            WORDS: find_up_rad(file.picture, content.eye, statuses[name].elapsed_ns)[:, None],
+            NEAR_WORDS: np.array([[near_up_rad[k] for k in sight.object_ix.tolist()]]),
+        }
+        write_status_words(out, name, replay, experiment, sight, statuses[name], clock, up_rad)
         write_hiding_lines(out, name, sight, statuses[name])
         detections = content.table[(content.table["configuration"] == name) & content.table["detected"]]
         first_unit = dict(zip(detections["object_id"].map(scene.object_number), detections["first_unit"], strict=True))
         write_listing_lines(out, name, replay, experiment, fused_tracks, sight, colour, first_unit)
         curves.write_position_errors(out, replay, experiment, name, fused_tracks.fused, content.objects, colour)
-    axes = {k: content.lanes_axis_s(k) for k in content.objects}
+    for m, k in enumerate(sight.object_ix.tolist()):
+        if lanes.is_briefly_known(statuses.values(), m, content.lanes_axis_s(k)):
+            file.brief.add(k)
+    axes = {k: replace(content, brief=file.brief).lanes_axis_s(k) for k in content.objects}
     lanes.write_lanes(out, scene, experiment, sight, statuses, file.colours, file.clocks, axes)
+    for name in file.colours:
+        write_list_lanes(out, content.lists[name], axes.values())
 
 
 def _write_shares(file: _RecordingFile, observed: Observations, sight: Sight) -> None:

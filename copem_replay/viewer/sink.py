@@ -86,14 +86,21 @@ HALF = 0.5
 """Strength of a configuration's colour where the object is listed but not known: darker than known, still a colour."""
 
 
+DIFFERENCE_TEXT, DIFFERENCE_SHORT = ("difference",), ("difference_short",)
+"""Entities with the tables of times to detection: of all shown objects, and what of them fits into the overview."""
+WORDS, NEAR_WORDS = "status", "status_near"
+"""Entities with words of statuses, in views around the ego and in those of one object: each is below bodies there."""
+
+
 def status_colour(status: int, colour: Rgb) -> Rgb:
     """Colour of a status in a lane: neutral until the object is listed, then `colour`, at `HALF` until known."""
     if status < EARLY:
         return STATUS[status]
-    return colour if status == KNOWN else _scale_colour(colour, HALF)
+    return colour if status == KNOWN else scale_colour(colour, HALF)
 
 
-def _scale_colour(colour: Rgb, share: float) -> Rgb:
+def scale_colour(colour: Rgb, share: float) -> Rgb:
+    """A colour, darker by a share."""
     red, green, blue = (round(channel * share) for channel in colour)
     return red, green, blue
 
@@ -273,6 +280,11 @@ def make_distinct(names: Sequence[str]) -> list[str]:
     """The names, with their index after those that occur more than once."""
     twice = {name for name, count in Counter(names).items() if count > 1}
     return [f"{name}_{k}" if name in twice else name for k, name in enumerate(names)]
+
+
+def helps_path(scene: Scene, object_ix: int) -> tuple[str, ...]:
+    """The entity with the sentence of what would help with an object."""
+    return "helps", entity_names(scene)[object_ix]
 
 
 def object_lanes_path(scene: Scene, object_ix: int) -> list[str]:

@@ -35,6 +35,7 @@ from copem_replay.core.interpolation import interpolate_states
 from copem_replay.core.tracks import SAME_INSTANT_NS, TRUTH, Bool, Float, Int, Scene, Tracks
 from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.prepare import Replay
+from copem_replay.viewer.camera import below_bodies
 from copem_replay.viewer.line_of_sight import CLEAR_ABOVE, Sight
 from copem_replay.viewer.sensors import unit_places
 from copem_replay.viewer.sink import (
@@ -65,6 +66,7 @@ from copem_replay.viewer.sink import (
 )
 
 NEVER_NS = np.iinfo(np.int64).max
+BODY = ("x_m", "y_m", "z_m", "yaw_rad", "length_m", "width_m", "height_m")
 
 
 @dataclass(frozen=True)
@@ -101,9 +103,7 @@ class Status:
     unit_ix: Int  # unit of the experiment that sees most of it, or has a list under way
     until_s: Float  # time until a list under way arrives
     age_of_information_s: Float  # of the entry in the newest list
-    x_m: Float  # true position, or fused position while absent
-    y_m: Float
-    top_m: Float  # height of the top of the box
+    body: Mapping[str, Float]  # by name of `BODY`: true place and size, or the fused ones while absent
 
 
 def compute_status(
@@ -129,18 +129,16 @@ def compute_status(
     frame = np.searchsorted(sight.elapsed_ns, instants + SAME_INSTANT_NS, side="right") - 1
     shape = (len(instants), len(sight.object_ix))
     statuses = Status(
-        instants, frame, np.full(shape, ABSENT), np.full(shape, -1), *(np.full(shape, np.nan) for _ in range(5))
-    )
+        instants, frame, np.full(shape, ABSENT), np.full(shape, -1), np.full(shape, np.nan), np.full(shape, np.nan),
+        {name: np.full(shape, np.nan) for name in BODY},
+    )  # fmt: skip
     for m, k in enumerate(sight.object_ix.tolist()):
         states, present = interpolate_states(
             replay.truth, np.full(len(instants), k), instants * np.float64(1e-9),
             t0_ns=replay.scene.t0_ns, max_gap_s=experiment.max_gap_s,
         )  # fmt: skip
-        statuses.x_m[:, m], statuses.y_m[:, m], statuses.top_m[:, m] = (
-            states["x_m"],
-            states["y_m"],
-            states["z_m"] + states["height_m"] / 2,
-        )
+        for part, values in statuses.body.items():
+            values[:, m] = states[part]
         statuses.status[present, m] = VISIBLE if of_truth else OUT if modelled else UNLISTED
         if modelled and len(instants):
             _find_best_unit(sight, modelled, m, present & (frame >= 0), statuses)
@@ -242,10 +240,9 @@ def _mark_held(
     row = row[held]
     captured_s = fused_tracks.captured_s[0, row]
     statuses.age_of_information_s[held, m] = statuses.elapsed_ns[held] * 1e-9 - captured_s
-    gone = np.isnan(statuses.x_m[held, m])  # absent: the fused position is used
-    top_m = fused.z_m[0] + fused.height_m[0] / 2
-    for column, value in ((statuses.x_m, fused.x_m[0]), (statuses.y_m, fused.y_m[0]), (statuses.top_m, top_m)):
-        column[held[gone], m] = value[row[gone]]
+    gone = np.isnan(statuses.body["x_m"][held, m])  # absent: the fused position is used
+    for name, values in statuses.body.items():
+        values[held[gone], m] = getattr(fused, name)[0, row[gone]]
     too_late = elapsed_ns(fused)[fused.frame_ix[row]] - SAME_INSTANT_NS > clock.ended_ns[object_ix]
     status = np.where(too_late, TOO_LATE, UNCONFIRMED)
     if not count_earlier:
@@ -322,7 +319,7 @@ def _format_label(name: str, unit: str, hider: str, key: list[int]) -> str:
     _, status, _, _, _, _, near, started = key
     words = {
         KNOWN: "",
-        EARLY: " listed, onset not known" if started else " listed",
+        EARLY: " only in old list" if started else " listed",
         UNCONFIRMED: " not confirmed",
         TOO_LATE: " too late",
         CAPTURED: " on its way",
@@ -340,7 +337,7 @@ def _format_sentence(name: str, unit: str, hider: str, key: list[int]) -> str:
     _, status, _, tenths, hundredths, _, near, started = key
     if status >= EARLY:
         old = "" if tenths * 0.1 <= OLD_S else f", {tenths / 10:.1f} s old"
-        early = ", onset not known yet" if started else ""
+        early = ", from before the onset" if started else ""
         after = {EARLY: f"{old}{early}", UNCONFIRMED: f"{old}, not confirmed yet", TOO_LATE: f" too late{old}"}
         return f"{name} known{old}" if status == KNOWN else f"{name} listed{after[status]}"
     if status == CAPTURED:
@@ -366,13 +363,11 @@ def lane_text(status: int, unit: str, hider: str) -> str:
         return "not listed yet" if unit == TRUTH else f"seen by {unit}, not listed"
     if status == CAPTURED:
         return f"on its way from {unit}"
-    return "listed early" if status == EARLY else STATUSES[status]
+    return "list from before onset" if status == EARLY else STATUSES[status]
 
 
-# Words over the shown objects, lines to hiding bodies, lines of sight of the units that listed objects first.
+# Words below the shown objects, lines to hiding bodies, lines of sight of the units that listed objects first.
 
-ABOVE_M = 2.0
-"""Height of words above the top of an object, clear of its box."""
 RAY_ALPHA = 110
 """Opacity of lines of sight, of 255: what is behind them stays visible."""
 
@@ -385,13 +380,15 @@ def write_status_words(
     sight: Sight,
     statuses: Status,
     clock: EpisodeClocks,
+    up_rad: Mapping[str, Float],
 ) -> None:
-    """Write over the true place of each object “58 behind 41”, and a sentence that selecting it shows."""
+    """Write below the true place of each object “58 behind 41”, and a sentence that selecting it shows.
+
+    `up_rad`: for each entity with the words, what is up in the pictures that show it, to be broadcast to (K, M).
+    """
     import rerun as rr
 
-    rows, column = np.nonzero((statuses.status != ABSENT) & ~np.isnan(statuses.x_m))
-    place = stack_float32(*(getattr(statuses, n)[rows, column] for n in ("x_m", "y_m", "top_m")))
-    place[:, 2] += ABOVE_M
+    rows, column = np.nonzero((statuses.status != ABSENT) & ~np.isnan(statuses.body["x_m"]))
     colours = np.full((len(rows), 3), WAITING, dtype=np.uint8)
     status = statuses.status[rows, column]
     colours[status == HIDDEN], colours[status == KNOWN] = BEHIND, NOTICED
@@ -404,16 +401,19 @@ def write_status_words(
     # Words move with the boxes at frames of the truth; at other instants a row is needed only for a change.
     drawn = changes | np.isin(statuses.elapsed_ns, sight.elapsed_ns)
     drawn_rows = drawn[rows]
-    columns = rr.Points3D.columns(
-        positions=place[drawn_rows], labels=reasons.labels.filter(pa.array(drawn_rows)), colors=colours[drawn_rows]
-    )
-    path = ["world", configuration_part(name), "status"]
-    out.columns(path, statuses.elapsed_ns[drawn], columns.partition(counts[drawn]))
-    out.static(path, rr.Points3D.from_fields(radii=rr.Radius.ui_points(1.5), show_labels=True))
     # Sentences have rows only where one changes: the viewer shows the newest.
     told_then = reasons.sentences.filter(pa.array(changes[rows]))
-    sentences = rr.DynamicArchetype.columns(archetype="why", components={"why": told_then})
-    out.columns(path, statuses.elapsed_ns[changes], sentences.partition(counts[changes]))
+    for entity, headings in up_rad.items():
+        place = below_bodies(statuses.body, headings)[:, rows, column]
+        columns = rr.Points3D.columns(
+            positions=stack_float32(*place[:, drawn_rows]), labels=reasons.labels.filter(pa.array(drawn_rows)),
+            colors=colours[drawn_rows],
+        )  # fmt: skip
+        path = ["world", configuration_part(name), entity]
+        out.columns(path, statuses.elapsed_ns[drawn], columns.partition(counts[drawn]))
+        out.static(path, rr.Points3D.from_fields(radii=rr.Radius.ui_points(0.0), show_labels=True))
+        sentences = rr.DynamicArchetype.columns(archetype="why", components={"why": told_then})
+        out.columns(path, statuses.elapsed_ns[changes], sentences.partition(counts[changes]))
 
 
 def write_hiding_lines(out: RecordingSink, name: str, sight: Sight, statuses: Status) -> None:

@@ -21,6 +21,7 @@ from copem_replay.report.html import story_facts
 from copem_replay.report.html.page import build_page
 from copem_replay.report.html.stories import choose_stories, story_parts
 from copem_replay.report.html.story_facts import find_lost
+from copem_replay.report.html.story_pictures import place_words
 from copem_replay.report.html.study import load_study
 from copem_replay.results.read import Results, read_results
 from copem_replay.results.shown_objects import choose_shown_objects
@@ -175,3 +176,18 @@ def test_a_dark_page_has_the_colours_of_its_theme(hidden: Path) -> None:
     drawn = set(re.findall(r'(?:fill|stroke)="#([0-9a-f]{6})"', story))
     assert drawn & light == set()
     assert len(re.findall(r'"var\(--c-[0-9a-f]{6}-[0-9a-f]{6}\)"', story)) >= 2
+
+
+def test_names_in_plans_are_clear_of_bodies_and_of_each_other() -> None:
+    """A van hides a pedestrian above it from the ego below it; plans are 312 × 212 pixels, 18 from the top."""
+
+    def corners(x: float, y: float, half_x: float, half_y: float) -> Any:
+        return np.array([[x + a * half_x, y + b * half_y] for a, b in ((1, 1), (-1, 1), (-1, -1), (1, -1))])
+
+    beside = [("7", corners(100, 100, 3, 3)), ("ego", corners(100, 135, 12, 6)), ("van 8", corners(100, 115, 30, 10))]
+    words = {name: (x, y) for name, x, y in place_words(beside, left=0)}
+    assert words["7"] == (100, 93), "above"
+    assert words["ego"] == (100, 153), "the van is above it"
+    assert words["van 8"] == (100 + 30 + 2.5 * 6.5 + 4, 119), "right, as there are bodies above and below"
+    [(_, x, _)] = place_words([("pedestrian 61", corners(300, 30, 3, 3))], left=0)
+    assert x < 300 - 3 - 6 * 6.5, "left, since the plan ends at 312"

@@ -24,7 +24,15 @@ from copem_replay.pipeline.prepare import Replay, prepare_log
 from copem_replay.pipeline.replay import replay_block
 from copem_replay.results.shown_objects import axis_s, choose_shown_objects, find_opening_s, select_differing_rows
 from copem_replay.viewer.blueprint import select_perceiving, view_aspect
-from copem_replay.viewer.camera import TOGETHER_M, Camera, camera_on_ego, include_places, write_moving_origin
+from copem_replay.viewer.camera import (
+    TOGETHER_M,
+    Camera,
+    camera_on_ego,
+    follow_ego,
+    include_places,
+    write_false_words,
+    write_moving_origin,
+)
 from copem_replay.viewer.sink import RecordingSink, file_stream
 from tests.helpers.recordings import SHARED
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
@@ -54,7 +62,8 @@ def written(
     eye = camera_on_ego(replay, given, stories, aspect)
     if eye.object_ix is not None:
         with file_stream(path, "a", "b") as rec:
-            write_moving_origin(RecordingSink(rec, replay.scene.t0_ns), replay, given, eye, stories)
+            picture = follow_ego(replay, given, eye, stories)
+            write_moving_origin(RecordingSink(rec, replay.scene.t0_ns), replay, picture)
     return eye
 
 
@@ -205,6 +214,48 @@ def test_an_arrow_for_what_is_outside(tmp_path: Path) -> None:
     [[across, high]] = picture(eye, still, np.array([place]))
     assert 0.8 < high < 0.9
     assert -0.2 < across < 0, "the target is 20 m ahead of the ego"
+
+
+def test_words_at_the_edge_are_apart(tmp_path: Path) -> None:
+    """Three cars far to the left of the ego's way, one behind the other as seen from it."""
+    cars = [Thing(name, "car", standing(-100 - 8 * k, 20)) for k, name in enumerate(("61", "62", "63"))]
+    scene = recording([Thing("ego", "car", driving(0, 0, 0, 1), yaw_rad=np.pi / 2), *cars], until_s=4.0)
+    given = experiment(configurations={"GT": {"units": "truth"}})
+    written(tmp_path / "x.rrd", prepare_log(scene, given), given, dict.fromkeys((1, 2, 3), (-2.0, -1.0)))
+    eye = camera_on_ego(prepare_log(scene, given), given, {}, 1.5)
+    for row in rows(tmp_path / "x.rrd", "/world/eyes/ego/arrows"):
+        assert len(row["Points3D:labels"]) == 3
+        seen = picture(eye, (0.0, np.zeros(3), 0.0, 1.0), np.array(row["Points3D:positions"]))
+        assert np.abs(seen).max() < 0.9
+        apart = np.abs(seen[:, None] - seen)[np.triu_indices(3, 1)]
+        assert ((apart[:, 0] > 0.39) | (apart[:, 1] > 0.15)).all()
+
+
+def test_the_nearest_false_entries_are_named_by_their_places(tmp_path: Path) -> None:
+    """The ego drives north, at 10 m/s; in its second list there is nothing about no object."""
+    replay, eye = follow(tmp_path / "x.rrd", {"7": (0.0, 10.0)})
+    moving = follow_ego(replay, experiment(configurations={"GT": {"units": "truth"}}), eye, {})
+    entries = np.array([[-6, 34, 1], [3, 4, 1], [0, 61, 1], [70, 10, 1], [0, 200, 1]], dtype=float).T
+    path = tmp_path / "y.rrd"
+    with file_stream(path, "a", "b") as rec:
+        out = RecordingSink(rec, replay.scene.t0_ns)
+        lists_ns = np.array([1_000_000_000, 2_000_000_000])
+        write_false_words(out, "PEM", moving, lists_ns, np.array([5, 0]), entries)
+        write_false_words(out, "far", moving, lists_ns[:1], np.array([2]), entries[:, 3:])
+    found = rows(path, "/world/eyes/ego/false/PEM")
+    assert [row["Points3D:labels"] for row in found] == [
+        ["false: 6 m behind, 3 m right", "false: 24 m ahead, 6 m left", "false → 51 m"], []
+    ]  # fmt: skip
+    [origin] = [origin for origin in origins(tmp_path / "x.rrd", eye) if origin[0] == pytest.approx(1.0)]
+    still = (0.0, np.zeros(3), 0.0, 1.0)  # they are drawn in the picture's own frame
+    behind, ahead, edge = picture(eye, still, np.array(found[0]["Points3D:positions"]))
+    crosses = picture(eye, origin, entries.T[[1, 0]])
+    for word, cross in zip((behind, ahead), crosses, strict=True):
+        assert word[0] == pytest.approx(cross[0], abs=0.02)
+        assert 0.05 < cross[1] - word[1] < 0.15, "below its cross"
+    assert edge == pytest.approx([0.85, 0.0], abs=0.1)
+    [far] = rows(path, "/world/eyes/ego/false/far")
+    assert far["Points3D:labels"] == ["false ↓ 70 m"], "the other one is farther away than pictures are wide"
 
 
 def test_without_an_ego_the_whole_site_is_in_view(tmp_path: Path) -> None:

@@ -211,18 +211,18 @@ def test_what_was_captured_before_the_onset_is_not_known(tmp_path: Path) -> None
     write_rrd(path, replay, wanted, [tracks_of_run(replay, wanted, 0)], table, SUMMARY, 0)
     assert lane(path, "2 pedestrian", 0) == [
         (0, "on its way from ego"),
-        (0.5, "listed early"),
+        (0.5, "list from before onset"),
         (pytest.approx(0.95, abs=0.05), "onset"),
         (pytest.approx(0.975, abs=0.025), "onset of the object"),
-        (1, "listed early"),
+        (1, "list from before onset"),
         (1.5, "known"),
     ]
     assert told(path, "late", 0.9)[0] == "2 listed, 0.5 s old"
-    assert told(path, "late", 1.0)[0] == "2 listed, 0.5 s old, onset not known yet"
-    assert told(path, "late", 1.45)[0] == "2 listed, 0.5 s old, onset not known yet"
+    assert told(path, "late", 1.0)[0] == "2 listed, 0.5 s old, from before the onset"
+    assert told(path, "late", 1.45)[0] == "2 listed, 0.5 s old, from before the onset"
     assert told(path, "late", 1.5)[0] == "2 known, 0.5 s old"
     assert labels(path, "late", 0.9) == ["2 listed"]
-    assert labels(path, "late", 1.2) == ["2 listed, onset not known"]
+    assert labels(path, "late", 1.2) == ["2 only in old list"]
     counted = [(row["elapsed"], row["Scalars:scalars"][0]) for row in rows(path, "/plots/known/late")]
     assert [count for elapsed, count in counted if elapsed < 1.55e9] == [0, 1]
 

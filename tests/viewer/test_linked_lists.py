@@ -102,6 +102,7 @@ def test_lost_late_and_overtaken(made: Made, tmp_path: Path) -> None:
     ]  # fmt: skip
     values = static(path, "/lists/2_air/pole")
     assert values["StateConfiguration:values"] == ["lost", "4 lost", "overtaken", "2 late"]
+    assert values["StateConfiguration:labels"] == [" ", "4 lost", " ", "2 late"], "no axis has those of 3 s"
     first, second, *others = values["StateConfiguration:colors"]
     assert first == second
     assert len({first, *others}) == 3

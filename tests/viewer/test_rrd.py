@@ -475,7 +475,12 @@ def test_what_becomes_of_a_conflict_is_told(made: Made, tmp_path: Path) -> None:
         "| PEM | 2.00 s | 60.0 m | **hits** at 4.0 m/s | ego |",
         "| pole | 0.00 s | 80.0 m | **too near**, 0.2 m | pole |",
         "| none | never | – | **hits** at 10.0 m/s | – |",
+        "",
+        "What would help none: pole as units, as in pole: known 0.00 s after the onset, not never, "
+        "with the same draws.",
     ]
+    both = (static(path, entity)["TextDocument:text"] for entity in ("/difference_short", "/difference"))
+    assert next(both) == next(both), "one object is all of it"
     # The strong line on the ground, and in its middle the same in short.
     mark = at(path, "/world/PEM/marks/from", 4.0)
     assert mark["Points3D:labels"] == ["7 detected +2.00 s, 60.0 m, does not stay clear"]
@@ -548,7 +553,7 @@ def test_a_blueprint_inside_and_one_name_per_layout(made: Made, tmp_path: Path) 
         "7 car, onset 2.0 s", "What difference it made",
         "7 car: position error, m", "GOSPA of all measured objects, m", "Measured objects known (grey: there are)",
         "Events", "Legend",
-        "Summary of all runs", "pole: 7 car known 0.00 s after its onset",
+        "Summary of all runs", "pole: known 0.00 s after the onset",
     }  # fmt: skip
     pages = [
         b.column("ContainerBlueprint:display_name")[0].as_py()[0]

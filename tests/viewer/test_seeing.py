@@ -23,15 +23,18 @@ from copem_replay.pipeline.expansion import resolve_for_run
 from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.replay import replay_block
-from copem_replay.results.shown_objects import axis_s
+from copem_replay.results.shown_objects import axis_s, choose_shown_objects
 from copem_replay.viewer import sink as palette
 from copem_replay.viewer import write_rrd
+from copem_replay.viewer.camera import camera_following, camera_on_ego, include_places
 from copem_replay.viewer.curves import break_lines, running_median
 from copem_replay.viewer.lanes import STEADY_S, lanes_axis_s, smooth_status
+from copem_replay.viewer.sensors import watching_places
 from copem_replay.viewer.sink import ABSENT, HIDDEN, KNOWN, STATUSES, show_seconds
 from tests.helpers.report_pages import named
 from tests.oracles.colour import apart_for_a_deuteranope, contrast
-from tests.viewer.test_rrd import SUMMARY, Made
+from tests.viewer.test_camera import corners, origins, picture
+from tests.viewer.test_rrd import SUMMARY, Made, rows, static
 from tests.viewer.test_status import lane
 
 ROOT = Path(__file__).parents[2]
@@ -128,7 +131,7 @@ def test_a_configuration_has_one_colour_everywhere(city: Made) -> None:
             of = dict(zip(batch.column("StateConfiguration:values").to_pylist()[0],
                           batch.column("StateConfiguration:colors").to_pylist()[0], strict=True))  # fmt: skip
             place = int(entity.rsplit("/", 1)[-1].split("_")[0]) - 1
-            known = {colour >> 8 for text, colour in of.items() if text.endswith("known")}
+            known = {colour >> 8 for text, colour in of.items() if "known" in text}
             assert known <= {number[beside[place]]}
     assert found == {name: {number[name]} for name in beside}
 
@@ -181,7 +184,7 @@ def test_at_most_six_labels_a_view(city: Made) -> None:
         elif entity.startswith("/world/") and column is not None:
             labelled[entity] += [(0, batch.column(column).to_pylist()[0])]
     loud = set(labelled) - silent
-    assert {entity.rsplit("/", 1)[-1] for entity in loud} == {"status", "arrows"}, "only objects of interest"
+    assert {entity.rsplit("/", 1)[-1] for entity in loud} == {"status", "status_near", "arrows"}, "of interest"
     wanted = {city.replay.scene.object_ids[k] for k in range(len(city.replay.scene.object_ids))}
     for entity in loud:
         assert max(len(told or ()) for _, told in labelled[entity]) <= MOST_LABELS
@@ -189,6 +192,44 @@ def test_at_most_six_labels_a_view(city: Made) -> None:
         assert who <= wanted
         assert len(who) <= MOST_LABELS
         assert max(len(label) for _, told in labelled[entity] for label in told or ()) <= 30, "short"
+
+
+def test_words_of_status_are_below_the_boxes_they_name(city: Made) -> None:
+    """By projection, around the ego and from near by: below all corners of the box, and not far from it."""
+    numbers, truth = city.replay.scene.object_number, city.replay.truth
+    shown = choose_shown_objects(city.replay.scene, city.replay.truth, city.given, city.table).object_ix
+    episodes = {k: city.table[city.table["object_id"] == city.replay.scene.object_ids[k]] for k in shown}
+    stories = {k: axis_s(of, city.replay.scene.end_s) for k, of in episodes.items()}
+    around = camera_on_ego(city.replay, city.given, stories, aspect=1.5)
+    moving = {round(origin[0], 3): origin for origin in origins(city.path, around)}
+    near = {
+        k: include_places(camera_following(city.replay, city.given, city.table, k), watching_places(city.replay, of))
+        for k, of in episodes.items()
+    }
+    times_s = [round(captured_s, 3) for captured_s in truth.row_captured_s.tolist()]
+    row_of = dict(zip(zip(times_s, truth.row_object_ix.tolist(), strict=True), range(len(times_s)), strict=True))
+    held = {"status": 0, "status_near": 0}
+    for entity in held:
+        for told in rows(city.path, f"/world/masts/{entity}"):
+            at_s = round(told["elapsed"] / 1e9, 3)
+            for place, label in zip(
+                told.get("Points3D:positions") or (), told.get("Points3D:labels") or (), strict=True
+            ):
+                k = numbers[label.split(" ")[0]]
+                if (row := row_of.get((at_s, k))) is None:  # between frames of the truth
+                    continue
+                ground = np.array(
+                    [truth.x_m[0, row], truth.y_m[0, row], truth.z_m[0, row] - truth.height_m[0, row] / 2]
+                )
+                eye, origin = (around, moving[at_s]) if entity == "status" else (near[k], (at_s, ground, 0.0, 1.0))
+                box, [word] = (picture(eye, origin, at_m) for at_m in (corners(city.replay, row), np.array([place])))
+                if np.abs(box).max() > 1:
+                    continue
+                low, high = box.min(axis=0), box.max(axis=0)
+                assert low[1] - 0.1 < word[1] < low[1] + 1e-6, (entity, at_s, label)
+                assert low[0] < word[0] < high[0]
+                held[entity] += 1
+    assert min(held.values()) > 100
 
 
 def test_paths_of_lanes_and_plots_need_no_escapes(city: Made) -> None:
@@ -228,10 +269,21 @@ def test_words_of_lanes_fit_into_their_spans(city: Made) -> None:
     assert told > 48, "names, and when each is known"
 
 
+def test_the_overview_has_the_table_that_fits(city: Made) -> None:
+    """Of all objects, and what would help with the first one; the other page has a table of each, too."""
+    short, whole = (static(city.path, path)["TextDocument:text"][0] for path in ("/difference_short", "/difference"))
+    assert [line.count("|") for line in short.split("\n\n")[0].splitlines()] == [8] * 6, "six objects"
+    assert short.count("| --- |") == 1
+    assert "What would help ego: mast1, mast2 as well" in short
+    assert whole.count("| --- |") == 7
+    assert whole.count("What would help") == 6
+
+
 def test_the_legend_names_statuses_and_what_is_common(city: Made) -> None:
     [names] = [batch for entity, batch in batches(city.path) if entity == "/legend/names"]
     said = set(names.column("Points2D:labels").to_pylist()[0])
     assert {"truth", "ego", "hides it", "field of view", "false, dashed"} <= said
+    assert {"disc: place ± 2σ", "listed, not known"} <= said, "what else is in pictures and lanes"
     assert {"hidden", "out of view", "list lost", "on its way", "unmatched", "not listed"} <= said
     assert set(city.given.configurations) - {"GT"} <= said | {"truth"}
     # A word hangs below its point: on a bar from above its middle, below a line that would strike it through.

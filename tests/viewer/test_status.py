@@ -138,27 +138,28 @@ def test_lanes_say_whose_they_are_and_how_soon(hiding: Made) -> None:
     assert said("4_pedestrian/1_PEM") == ["PEM: behind obstacle 0 (from ego)"]
 
 
-def test_a_flag_without_room_is_told_by_what_follows(tmp_path: Path) -> None:
-    """He is seen for 0.2 s between two trucks, then hidden until the end."""
+def test_a_flag_without_room_is_on_no_other_span(tmp_path: Path) -> None:
+    """He is seen for 0.2 s between two trucks, then hidden until the end. Beside the long name is no room."""
     scene = recording(
         [
             Thing("ego", "car", standing(0, 0)),
-            Thing("2", "pedestrian", standing(-30, 0)),
-            Thing("1", "truck", standing(-15, 0.5), there=lambda t: t < 0.99),
-            Thing("3", "truck", standing(-15, 0.5), there=lambda t: t > 1.19),
+            Thing("2", "pedestrian", standing(-30, 0), there=lambda t: t > 5.99),
+            Thing("1", "truck", standing(-15, 0.5), there=lambda t: t < 6.99),
+            Thing("3", "truck", standing(-15, 0.5), there=lambda t: t > 7.19),
         ],
-        until_s=4.0,
+        until_s=10.0,
     )
     seen = [{"detection": {"kind": "visible_share"}}]
-    only = {"PEM": {"units": ["ego"]}}
-    made = make(tmp_path / "x.rrd", scene, measure=PERSON, pems={"sure": seen}, configurations=only)
-    found = rows(made.path, "/lanes/2_pedestrian/1_PEM")
-    said = [(row["elapsed"] / 1e9, row["StateChange:state"][0]) for row in found]
-    hidden = "behind 3 (from ego)"
-    [known_s] = made.table["detection_s"]
-    flag = f"{known_s:.2f} s known"
-    assert [text for _, text in said] == ["PEM: behind 1 (from ego)", flag, f"{flag}, then {hidden}"]
-    assert said[1][0] == pytest.approx(known_s)
+    both = {"PEM": {"units": ["ego"]}, "PEM of the ego": {"units": ["ego"]}}
+    made = make(tmp_path / "x.rrd", scene, measure=PERSON, pems={"sure": seen}, configurations=both)
+    assert set(made.table["time_to_detection_s"].round(6)) == {1.0}
+    for place, (name, beside) in enumerate([("PEM", "PEM, 1.00 s"), ("PEM of the ego", "PEM of the ego")]):
+        path = f"/lanes/2_pedestrian/{place + 1}_{name.replace(' ', '_')}"
+        style = static(made.path, path)
+        label_of = dict(zip(style["StateConfiguration:values"], style["StateConfiguration:labels"], strict=True))
+        said = [(row["elapsed"] / 1e9, *row["StateChange:state"]) for row in rows(made.path, path)]
+        assert [label_of[text[0]] for _, *text in said if text] == [beside, "behind 1", " ", "behind 3"]
+        assert [at for at, *_ in said[-3:]] == pytest.approx([6.0, 7.0, 7.2])
 
 
 def test_lines_from_units_to_what_they_listed(hiding: Made) -> None:
@@ -230,17 +231,17 @@ def test_lists_under_way_and_what_is_stale(tmp_path: Path) -> None:
     assert told(made.path, "late", 0.3) == ["9 listed by pole, arrives in 0.2 s"]
     assert told(made.path, "late", 0.5) == ["9 known, 0.5 s old"]
     assert told(made.path, "late", 0.7) == ["9 known, 0.7 s old"]
-    # The words are where he is, the box where he was half a second before.
-    assert at(made.path, "/world/late/status", 0.7, "Points3D:positions")["Points3D:positions"][0][:2] == pytest.approx(
-        [30, 1.4]
-    )
+    # The words are below where he is, the box is where he was half a second before. North is up in the picture of a
+    # site that is longer from west to east; he is 0.5 m long and 1.8 m tall.
+    below_m = 0.25 + 1.8 * np.tan(np.deg2rad(27.5 + 78 - 90))
+    [word] = at(made.path, "/world/late/status", 0.7, "Points3D:positions")["Points3D:positions"]
+    assert word == pytest.approx([30, 1.4 - below_m, 0])
     [box] = at(made.path, "/world/late/boxes", 0.7)["Boxes3D:centers"]
     assert box[:2] == pytest.approx([30, 0])
     # Gone at 1.1 s, still believed until the list of 1.25 s, which has him no more, arrives.
     assert told(made.path, "late", 1.5) == ["9 known, 0.5 s old"]
-    assert at(made.path, "/world/late/status", 1.5, "Points3D:positions")["Points3D:positions"][0][:2] == pytest.approx(
-        [30, 2]
-    )
+    [word] = at(made.path, "/world/late/status", 1.5, "Points3D:positions")["Points3D:positions"]
+    assert word == pytest.approx([30, 2 - below_m, 0])
     assert lane(made.path, "9 pedestrian", 0) == [(0, "on its way from pole"), (0.5, "known"), (1.75, None)]
 
 

@@ -23,6 +23,7 @@ from copem_replay.report.html.story_facts import (
 from copem_replay.report.html.story_pictures import draw_story
 from copem_replay.report.html.study import NO_RECORDING, ReportData
 from copem_replay.report.html.why import why_late
+from copem_replay.results.decision import tell_what_helps
 from copem_replay.results.shown_objects import choose_shown_objects
 
 _NAMED = 6
@@ -104,8 +105,10 @@ def _story_element(story: ObjectStory, log: str | None) -> Html:
     figure = make_tag(
         "div", draw_story(story, hider, said), class_="scroll", tabindex="0", role="region", aria_label=story.name
     )
+    helps = tell_what_helps(story.drive.experiment, story.rows)
     late = why_late(story.study.why, story.drive.log, story.object_id, story.onset_s)
     named = dict.fromkeys(str(row["configuration"]) for row in (story.first, story.last))
     lines = [f"{name} {late.get(name, 'is not late')}" for name in named]
     causes = [make_tag("p", "Mean over all runs: ", "; ".join(lines), ".")] if late else []
+    causes = [make_tag("p", helps), *causes] if helps else causes
     return make_tag("div", title, make_tag("p", said, *beside), *causes, figure, class_="told")

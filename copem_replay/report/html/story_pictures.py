@@ -24,6 +24,8 @@ _OBJECT, _HIDER = "var(--object)", "var(--hides)"
 """Set in `page.css`, for either theme."""
 _SPAN_M, _NEAR_M = 30.0, 60.0
 """Least width of a plan, and from how far away the ego and units are in it."""
+_LETTER = 6.5
+"""Width of a letter of the names in plans, in pixels, rounded up."""
 _MARGIN_M = 6.0
 """Bodies whose middle is so far outside a plan may still reach into it."""
 
@@ -129,11 +131,36 @@ def _draw_plan(
             yield make_tag("polygon", points=view.points(corners), fill=fill, stroke=stroke, stroke_width=width)
     yield from _draw_units(story, world, view, row)
     labels = {number: story.object_id, scene.ego_ix: "ego", **({hider[1]: hider[0]} if hider else {})}
-    for k, label in labels.items():
-        for at in _places(world, k) if k >= 0 else ():
-            x, y = map(float, view.points(at[None]).split(","))
-            x, y, anchor = (x, y + 20, "middle") if hider and k == hider[1] else (x + 6, y - 9, "start")
-            yield make_tag("text", label, x=f"{x:.1f}", y=f"{y:.1f}", class_="label", text_anchor=anchor)
+    named = [
+        (label, np.array([[*map(float, pair.split(","))] for pair in view.points(corners).split()]))
+        for k, label in labels.items()
+        for corners in corners_m[world.row_object_ix == k]
+    ]
+    for label, x, y in place_words(named, view.left):
+        yield make_tag("text", label, x=f"{x:.1f}", y=f"{y:.1f}", class_="label", text_anchor="middle")
+
+
+def place_words(bodies: Sequence[tuple[str, Float]], left: float) -> Iterator[tuple[str, float, float]]:
+    """The names of bodies, given by corners (4, 2), and the middles of their base lines, all in pixels.
+
+    Above, below, right or left of its body, a name is clear of all of them and of other names, if there is such a place
+    in the plan.
+    """
+    taken = [(corners.min(axis=0), corners.max(axis=0)) for _, corners in bodies]
+    frame = np.array([left, _TOP]), np.array([left + _PLAN_W, _TOP + _PLAN_H])
+    for (name, _), ((west, north), (east, south)) in zip(bodies, list(taken), strict=True):
+        half, x, y = _LETTER * len(name) / 2, (west + east) / 2, (north + south) / 2
+        spots = [(x, north - 4), (x, south + 12), (east + half + 4, y + 4), (west - half - 4, y + 4)]
+        areas = [(np.array([x - half, y - 10]), np.array([x + half, y + 2])) for x, y in spots]
+        free = [
+            k
+            for k, (low, high) in enumerate(areas)
+            if (low >= frame[0]).all() and (high <= frame[1]).all()
+            and not any((low < other_high).all() and (high > other_low).all() for other_low, other_high in taken)
+        ]  # fmt: skip
+        k = free[0] if free else 0
+        taken.append(areas[k])
+        yield name, *spots[k]
 
 
 def _draw_units(story: ObjectStory, world: Tracks, view: _View, row: Any) -> Iterator[Html]:
@@ -173,7 +200,7 @@ def _draw_lanes(story: ObjectStory) -> Iterator[Html]:
         yield from _draw_lane(story, row, _LANES_TOP + k * each, each - 4, scale)
     y = _LANES_TOP + len(rows) * each + 12
     x = float(_LANE_LEFT)
-    for word, shade in (*_SHADES.items(), ("known (in the colour of the configuration)", None)):
+    for word, shade in (*_SHADES.items(), ("thick: known (in the colour of the configuration)", None)):
         if shade:
             yield make_tag("rect", x=f"{x:.0f}", y=f"{y - 8:.0f}", width="10", height="9", fill=shade)
         yield make_tag("text", word, x=f"{x + 14:.0f}", y=f"{y:.0f}", class_="label")
@@ -181,26 +208,30 @@ def _draw_lanes(story: ObjectStory) -> Iterator[Html]:
 
 
 def _draw_lane(story: ObjectStory, row: Any, y: float, height: float, scale: float) -> Iterator[Html]:
-    """Spans of one configuration from the onset on: hidden, in sight, on its way, known; and its time."""
+    """Spans of one configuration from the onset on: hidden, in sight, on its way, known; and its time.
+
+    Known is thicker: some configurations are as grey as what is before.
+    """
     known_s, name = story.known_s(row), str(row["configuration"])
     stages = (
         [row["in_sight_s"], row["captured_s"], known_s] if row["detected"] else [row["in_sight_s"], known_s, known_s]
     )
     stages[0] = story.onset_s + story.hidden_s(row)
     ends = np.fmin(np.maximum.accumulate(np.nan_to_num(np.array(stages, dtype=float), nan=story.onset_s)), known_s)
-    begin_s, common = story.onset_s, {"y": f"{y:.1f}", "height": f"{height:.1f}"}
+    begin_s = story.onset_s
+    thin, thick = ({"y": f"{y + (height - high) / 2:.1f}", "height": f"{high:.1f}"} for high in (height / 2, height))
     yield make_tag(
         "text", story.short[name], x=f"{_LANE_LEFT - 6}", y=f"{y + height - 2:.1f}", class_="label", text_anchor="end"
     )
     for end_s, shade in zip(ends.tolist(), _SHADES.values(), strict=True):
         if end_s > begin_s:
             x, width = _LANE_LEFT + (begin_s - story.onset_s) * scale, (end_s - begin_s) * scale
-            yield make_tag("rect", x=f"{x:.1f}", width=f"{width:.1f}", fill=shade, **common)
+            yield make_tag("rect", x=f"{x:.1f}", width=f"{width:.1f}", fill=shade, **thin)
             begin_s = end_s
     x = _LANE_LEFT + max(known_s - story.onset_s, 0.0) * scale
     if row["detected"]:
         look = story.study.looks[name]
         width, fill = max(_WIDTH - 60 - x, 2), css_colour(look.colour)
-        yield make_tag("rect", x=f"{x:.1f}", width=f"{width:.1f}", fill=fill, **common)
+        yield make_tag("rect", x=f"{x:.1f}", width=f"{width:.1f}", fill=fill, **thick)
     flag = format_seconds(row["unknown_s"]) if row["detected"] else "✕ never"
     yield make_tag("text", flag, x=f"{_WIDTH - 54}", y=f"{y + height - 2:.1f}", class_="label")

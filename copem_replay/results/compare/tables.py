@@ -246,7 +246,7 @@ def held_cells(comparison: Comparison) -> pd.DataFrame:
     columns["pairs"], columns["frames"] = ([str(count) for count in rows[name]] for name in ("n", "frames"))
     for header, names, shown in (
         ("listed by one only", ("only_configuration", "only_baseline"), str),
-        ("mean age, s", ("age_s", "baseline_age_s"), format_limit),
+        ("mean age, s", ("age_s", "baseline_age_s"), "{:.3f}".format),  # to the millisecond, so that pairs align
         ("no list", ("no_list_share", "baseline_no_list_share"), _format_percent),
         ("no truth", ("without_truth", "baseline_without_truth"), str),
     ):
