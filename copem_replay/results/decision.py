@@ -260,7 +260,7 @@ _MOST_UNITS = 3
 
 
 def tell_what_helps(experiment: Experiment, rows: pd.DataFrame) -> str:
-    """What would help the configuration that knows an object last: “What would help PEM: mast1 as well, as in all: …”.
+    """What would help the configuration that knows an object last: “What would help PEM: the lists of mast1 as well …”.
 
     It is another configuration that knows the object earlier, with the same draws, and differs in one key or has more
     units: of those with the fewest other keys the earliest; “” where there is none. `rows`: of one object and run, a
@@ -280,7 +280,11 @@ def tell_what_helps(experiment: Experiment, rows: pd.DataFrame) -> str:
     if not pairs:
         return ""
     _, best_s, last, best, change = min(pairs, key=itemgetter(0, 1))
-    gain = f"{last_s - best_s:.2f} s earlier" if np.isfinite(last_s) else f"{best_s:.2f} s after the onset, not never"
+    gain = (
+        f"{last_s - best_s:.2f} s earlier"
+        if np.isfinite(last_s)
+        else f"{best_s:.2f} s after the onset instead of never"
+    )
     return f"What would help {last}: {change}, as in {best}: known {gain}, with the same draws."
 
 
@@ -294,16 +298,16 @@ def _value_of(experiment: Experiment, key: str, name: str) -> Any:
 
 
 def _describe_change(experiment: Experiment, keys: Sequence[str], last: str, best: str) -> str:
-    """What is different in the better one: “0 s of latency instead of 1.5 s”, “mast1 as well”; “” for much else."""
+    """What is better in the other one: “0 s of latency instead of 1.5 s”; “” where much is different."""
     values = {key: (_value_of(experiment, key, last), _value_of(experiment, key, best)) for key in keys}
     old_units, new_units = values.pop("units", (frozenset(), frozenset()))
-    rest = f", with another {' and '.join(_KEYS[key] for key in values)}" if values else ""
+    rest = f" (and another {' and '.join(_KEYS[key] for key in values)})" if values else ""
     if new_units > old_units:
-        return f"{_name_units(new_units - old_units)} as well{rest}"
+        return f"the lists of {_name_units(new_units - old_units)} as well{rest}"
     if len(keys) != 1:
         return ""
     if not values:
-        return f"{_name_units(new_units)} as units"
+        return f"the lists of {_name_units(new_units)} instead"
     [(key, (old, new))] = values.items()
     if key == "latency_s" and not isinstance(old, dict) and not isinstance(new, dict):
         return f"{new:g} s of latency instead of {old:g} s"

@@ -274,7 +274,7 @@ def test_the_overview_has_the_table_that_fits(city: Made) -> None:
     short, whole = (static(city.path, path)["TextDocument:text"][0] for path in ("/difference_short", "/difference"))
     assert [line.count("|") for line in short.split("\n\n")[0].splitlines()] == [8] * 6, "six objects"
     assert short.count("| --- |") == 1
-    assert "What would help ego: mast1, mast2 as well" in short
+    assert "What would help ego: the lists of mast1, mast2 as well" in short
     assert whole.count("| --- |") == 7
     assert whole.count("What would help") == 6
 
