@@ -4,7 +4,7 @@ An entity per object and configuration, such as `lanes/6_pedestrian/2_PEM`; the 
 the file. A lane begins with the configuration's name: the viewer's own titles of lanes are paths. Changes too short to
 follow are left out, but known begins exactly at `detection_s`, with how long after the onset, “0.60 s known”. Words
 that do not fit into their span are shortened or left out, and are never on another span; the time of a short one is
-beside the name, “PEM, 0.60 s”, where there is room. A mark ends at the onset, white and black, so that it stands out in
+beside the name, “PEM, 0.60 s, lost”, where there is room. A mark ends at the onset, white and black, so that it stands out in
 any theme. A lane is empty while the object is absent.
 
 An entity per configuration and unit, such as `lists/2_bursts/rsu1`, under the lanes of the objects, shows lists sent by
@@ -66,7 +66,7 @@ ONSET_IS = ("onset", "onset of the object")
 """The two halves of the mark."""
 WIDTH_POINTS, LETTER_POINTS, PADDING_POINTS = 380.0, 7.0, 10.0
 """Width of the narrowest lanes in a window of 1280 × 720, of a letter (rounded up), and of what is beside words."""
-MOST_NAME = 0.42
+MOST_NAME = 0.45
 """Most of a lane's width that is before the onset, for the name."""
 _STEADY_NS = round(STEADY_S * 1e9)
 
@@ -143,7 +143,7 @@ def lanes_axis_s(
     `axis_s`: of the object, from 0.5 s before its onset, or before it is known, to 0.5 s after it is last known.
     `beside`: with room for times beside the names.
     """
-    longest = max(map(len, configurations), default=0) + beside * len(", 0.00 s")
+    longest = max(map(len, configurations), default=0) + beside * len(", 0.00 s, lost")
     name = min((_words_points(longest) + 2) / WIDTH_POINTS + MARK, MOST_NAME)
     flag = _words_points(len("10.00 s known")) / WIDTH_POINTS
     start_s = min(onset_s, axis_s[0] + BEFORE_S)
@@ -198,10 +198,11 @@ def _fit_words(texts: Sequence[str | None], points: Float) -> tuple[list[str | N
 
 
 def _shorten_words(text: str) -> Iterator[str]:
-    """Words of a span, the longest first: “behind 3 (from ego)”, “behind 3”; “PEM, 0.60 s”, “PEM”."""
+    """Words of a span, the longest first: “behind 3 (from ego)”, “behind 3”; “PEM, 0.60 s, lost”, “PEM, 0.60 s”, “PEM”."""
     yield text.removesuffix(": ")
     if ": " in text:
         yield (title := text.partition(": ")[0])
+        yield (title := title.removesuffix(", lost"))
         yield re.sub(r", -?[0-9.]+ s$", "", title)
     yield text.partition(" (from ")[0]
     yield "old list" if text == lane_text(EARLY, "", "") else text.partition(" from ")[0]
@@ -253,12 +254,14 @@ def _span_text(
 def _add_flag(begins: Int, texts: list[str | None], known_ns: int, onset_ns: int, room_ns: int) -> str:
     """Say how long after the onset the object is first known, where that begins: “0.60 s known”.
 
-    Returns what is added to the name, “, 0.60 s”, where that lasts for less than `room_ns`, too short for words.
+    Returns what is added to the name, “, 0.60 s, lost”, where that lasts for less than `room_ns`, too short for words:
+    lost, unless the object is absent then.
     """
     for k in np.flatnonzero(begins == known_ns)[:1].tolist():
         after = f"{show_seconds((known_ns - onset_ns) / 1e9)} s"
         texts[k] = f"{after} {texts[k]}"
-        return f", {after}" if (begins[k + 1 :] - known_ns < room_ns).any() else ""
+        if (begins[k + 1 :] - known_ns < room_ns).any():
+            return f", {after}" if texts[k + 1] is None else f", {after}, lost"
     return ""
 
 

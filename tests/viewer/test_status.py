@@ -139,7 +139,7 @@ def test_lanes_say_whose_they_are_and_how_soon(hiding: Made) -> None:
 
 
 def test_a_flag_without_room_is_on_no_other_span(tmp_path: Path) -> None:
-    """He is seen for 0.2 s between two trucks, then hidden until the end. Beside the long name is no room."""
+    """He is seen for 0.2 s between two trucks, then hidden until the end: lost. Beside the long name is no room."""
     scene = recording(
         [
             Thing("ego", "car", standing(0, 0)),
@@ -153,7 +153,7 @@ def test_a_flag_without_room_is_on_no_other_span(tmp_path: Path) -> None:
     both = {"PEM": {"units": ["ego"]}, "PEM of the ego": {"units": ["ego"]}}
     made = make(tmp_path / "x.rrd", scene, measure=PERSON, pems={"sure": seen}, configurations=both)
     assert set(made.table["time_to_detection_s"].round(6)) == {1.0}
-    for place, (name, beside) in enumerate([("PEM", "PEM, 1.00 s"), ("PEM of the ego", "PEM of the ego")]):
+    for place, (name, beside) in enumerate([("PEM", "PEM, 1.00 s, lost"), ("PEM of the ego", "PEM of the ego")]):
         path = f"/lanes/2_pedestrian/{place + 1}_{name.replace(' ', '_')}"
         style = static(made.path, path)
         label_of = dict(zip(style["StateConfiguration:values"], style["StateConfiguration:labels"], strict=True))
