@@ -4,7 +4,7 @@ An entity per object and configuration, such as `lanes/6_pedestrian/2_PEM`; the 
 the file. A lane begins with the configuration's name: the viewer's own titles of lanes are paths. Changes too short to
 follow are left out, but known begins exactly at `detection_s`, with how long after the onset, “0.60 s known”. Words
 that do not fit into their span are shortened or left out, and are never on another span; the time of a short one is
-beside the name, “PEM, 0.60 s, lost”, where there is room. A mark ends at the onset, white and black, so that it stands out in
+beside the name, “PEM, 0.60 s, lost”, where there is room. A mark ends at the onset, white and black, to stand out in
 any theme. A lane is empty while the object is absent.
 
 An entity per configuration and unit, such as `lists/2_bursts/rsu1`, under the lanes of the objects, shows lists sent by
@@ -25,13 +25,12 @@ import pyarrow as pa
 from copem_replay.communication.arrivals import find_overtaken_lists
 from copem_replay.core.colours import Rgb
 from copem_replay.core.fused_tracks import FusedTracks
-from copem_replay.core.tracks import SAME_INSTANT_S, TRUTH, Float, Int, Scene
+from copem_replay.core.tracks import CLASSES, SAME_INSTANT_S, TRUTH, Float, Int, Scene
 from copem_replay.experiment.schema import Experiment
 from copem_replay.results.shown_objects import AFTER_S, BEFORE_S, LEAST_S
 from copem_replay.viewer.sink import (
     ABSENT,
     CAPTURED,
-    EARLY,
     HIDDEN,
     KNOWN,
     ONSET,
@@ -42,13 +41,12 @@ from copem_replay.viewer.sink import (
     lane_path,
     make_distinct,
     plain_part,
-    short_ids,
     show_seconds,
     status_colour,
     to_nanoseconds,
 )
 from copem_replay.viewer.sink import LOST as LIST_LOST
-from copem_replay.viewer.status import EpisodeClocks, Status, body_name, lane_text
+from copem_replay.viewer.status import EpisodeClocks, Status, lane_text, name_bodies
 
 if TYPE_CHECKING:
     from copem_replay.viewer.line_of_sight import Sight
@@ -90,14 +88,14 @@ def write_lanes(
     """
     import rerun as rr
 
-    ids, units = short_ids(scene), [*experiment.units, TRUTH]
+    bodies, units = name_bodies(scene, sight.solids), [*experiment.units, TRUTH]
     for m, k in enumerate(sight.object_ix.tolist()):
         axis_ns = tuple(to_nanoseconds(axes[k]).tolist())
         for place, (name, status) in enumerate(statuses.items()):
             if not len(status.elapsed_ns):
                 continue
             spans = smooth_status(status.elapsed_ns, status.status[:, m])
-            texts = [_span_text(ids, units, sight, status, m, span) for span in spans]
+            texts = [_span_text(bodies, units, sight, status, m, span) for span in spans]
             begins = status.elapsed_ns[[span.first for span in spans]]
             tints = [status_colour(span.status, colours[name]) if span.status else ONSET[0] for span in spans]
             clock_ns = int(clocks[name].onset_ns[k]), int(clocks[name].known_ns[k])
@@ -198,14 +196,19 @@ def _fit_words(texts: Sequence[str | None], points: Float) -> tuple[list[str | N
 
 
 def _shorten_words(text: str) -> Iterator[str]:
-    """Words of a span, the longest first: “behind 3 (from ego)”, “behind 3”; “PEM, 0.60 s, lost”, “PEM, 0.60 s”, “PEM”."""
+    """Words of a span, the longest first.
+
+    “behind car 3 (from ego)”, “behind car 3”, “behind 3”; “PEM, 0.60 s, lost”, “PEM, 0.60 s”, “PEM”; “old list”, “old”.
+    """
     yield text.removesuffix(": ")
     if ": " in text:
         yield (title := text.partition(": ")[0])
         yield (title := title.removesuffix(", lost"))
         yield re.sub(r", -?[0-9.]+ s$", "", title)
-    yield text.partition(" (from ")[0]
-    yield "old list" if text == lane_text(EARLY, "", "") else text.partition(" from ")[0]
+    yield (short := text.partition(" (from ")[0])
+    yield re.sub(rf"^behind ({'|'.join(CLASSES)}) ", "behind ", short)
+    yield text.partition(" from ")[0]
+    yield text.removesuffix(" list")
     if flag := re.match(r"-?[0-9.]+ s ", text):
         yield flag[0].rstrip()
 
@@ -237,7 +240,7 @@ def smooth_status(elapsed_ns: Int, status: Int) -> list[Span]:
 
 
 def _span_text(
-    ids: Sequence[str], units: Sequence[str], sight: Sight, status: Status, m: int, span: Span
+    bodies: Sequence[str], units: Sequence[str], sight: Sight, status: Status, m: int, span: Span
 ) -> str | None:
     """The text of a span, with its most frequent unit and hiding body; None while the object is absent."""
     if span.status == ABSENT:
@@ -248,7 +251,7 @@ def _span_text(
     body = sight.body_ix[unit, np.maximum(status.frame[rows], 0), m] if span.status == HIDDEN else np.zeros_like(unit)
     pairs, count = np.unique(np.stack([unit, body]), axis=1, return_counts=True)
     by, what = pairs[:, count.argmax()].tolist()
-    return lane_text(span.status, units[by], body_name(ids, sight.solids, what))
+    return lane_text(span.status, units[by], bodies[what])
 
 
 def _add_flag(begins: Int, texts: list[str | None], known_ns: int, onset_ns: int, room_ns: int) -> str:

@@ -32,7 +32,7 @@ from copem_replay.communication.arrivals import fusion_schedule
 from copem_replay.core.colours import Rgb
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.interpolation import interpolate_states
-from copem_replay.core.tracks import SAME_INSTANT_NS, TRUTH, Bool, Float, Int, Scene, Tracks
+from copem_replay.core.tracks import CLASSES, SAME_INSTANT_NS, TRUTH, Bool, Float, Int, Scene, Tracks
 from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.viewer.camera import below_bodies
@@ -290,19 +290,18 @@ def explain_status(
     columns = np.stack([column, status, unit, *whole, body, near, started], axis=-1)
     keys, which = _find_distinct_rows(columns)
     ids, units = short_ids(scene), [*experiment.units, TRUTH]  # index −1: the truth, or no unit
-    details = [
-        (ids[sight.object_ix[key[0]]], units[key[2]], body_name(ids, sight.solids, key[5]), key)
-        for key in keys.tolist()
-    ]
+    bodies = name_bodies(scene, sight.solids)
+    details = [(ids[sight.object_ix[key[0]]], units[key[2]], bodies[key[5]], key) for key in keys.tolist()]
     picked = pa.array(which)
     labels = [_format_label(name, unit, hider, key) for name, unit, hider, key in details]
     sentences = [_format_sentence(name, unit, hider, key) for name, unit, hider, key in details]
     return Reasons(pa.array(labels, pa.string()).take(picked), pa.array(sentences, pa.string()).take(picked), which)
 
 
-def body_name(ids: Sequence[str], solids: Sequence[str], body: int) -> str:
-    """Name of a hiding body: id of the object with this index, or name of the solid k for −1 − k."""
-    return ids[body] if body >= 0 else solids[-1 - body]
+def name_bodies(scene: Scene, solids: Sequence[str]) -> list[str]:
+    """Names of bodies that may hide: “bus 12” of the object with that index, and of the solid k at −1 − k."""
+    objects = [f"{CLASSES[k]} {name}" for name, k in zip(short_ids(scene), scene.object_class, strict=True)]
+    return [*objects, *reversed(solids)]
 
 
 def _find_distinct_rows(columns: Int) -> tuple[Int, Int]:
@@ -315,7 +314,7 @@ def _find_distinct_rows(columns: Int) -> tuple[Int, Int]:
 
 
 def _format_label(name: str, unit: str, hider: str, key: list[int]) -> str:
-    """“58 behind 41”; only the name of a known object."""
+    """“58 behind car 41”; only the name of a known object."""
     _, status, _, _, _, _, near, started = key
     words = {
         KNOWN: "",
@@ -333,7 +332,7 @@ def _format_label(name: str, unit: str, hider: str, key: list[int]) -> str:
 
 
 def _format_sentence(name: str, unit: str, hider: str, key: list[int]) -> str:
-    """“58 hidden from ego by 41 (share 0.21)”."""
+    """“58 hidden from ego by car 41 (share 0.21)”."""
     _, status, _, tenths, hundredths, _, near, started = key
     if status >= EARLY:
         old = "" if tenths * 0.1 <= OLD_S else f", {tenths / 10:.1f} s old"
@@ -356,14 +355,14 @@ def _format_sentence(name: str, unit: str, hider: str, key: list[int]) -> str:
 
 
 def lane_text(status: int, unit: str, hider: str) -> str:
-    """The text of a span in a lane: “behind 41 (from ego)”."""
+    """The text of a span in a lane: “behind car 41 (from ego)”."""
     if status == HIDDEN:
         return f"behind {hider} (from {unit})"
     if status == VISIBLE:
         return "not listed yet" if unit == TRUTH else f"seen by {unit}, not listed"
     if status == CAPTURED:
         return f"on its way from {unit}"
-    return "list from before onset" if status == EARLY else STATUSES[status]
+    return "old list" if status == EARLY else STATUSES[status]
 
 
 # Words below the shown objects, lines to hiding bodies, lines of sight of the units that listed objects first.

@@ -211,10 +211,10 @@ def test_what_was_captured_before_the_onset_is_not_known(tmp_path: Path) -> None
     write_rrd(path, replay, wanted, [tracks_of_run(replay, wanted, 0)], table, SUMMARY, 0)
     assert lane(path, "2 pedestrian", 0) == [
         (0, "on its way from ego"),
-        (0.5, "list from before onset"),
+        (0.5, "old list"),
         (pytest.approx(0.95, abs=0.05), "onset"),
         (pytest.approx(0.975, abs=0.025), "onset of the object"),
-        (1, "list from before onset"),
+        (1, "old list"),
         (1.5, "known"),
     ]
     assert told(path, "late", 0.9)[0] == "2 listed, 0.5 s old"

@@ -84,7 +84,7 @@ def test_a_solid_of_the_log_is_told_by_its_name(tmp_path: Path) -> None:
 
 def test_who_is_hidden_and_by_whom(hiding: Made) -> None:
     assert told(hiding.path, "PEM", 0.5) == [
-        "2 hidden from ego by 3 (share 0.00)",
+        "2 hidden from ego by truck 3 (share 0.00)",
         "4 hidden from ego by obstacle 0 (share 0.00)",
     ]
     # To the middle of the truck, and of the wall, 1 m to 41 m high.
@@ -104,13 +104,13 @@ def test_who_is_hidden_and_by_whom(hiding: Made) -> None:
 
 
 def test_the_labels_are_short(hiding: Made) -> None:
-    assert labels(hiding.path, "PEM", 0.5) == ["2 behind 3", "4 behind obstacle 0"]
+    assert labels(hiding.path, "PEM", 0.5) == ["2 behind truck 3", "4 behind obstacle 0"]
     assert labels(hiding.path, "PEM", 1.2) == ["2", "4 behind obstacle 0"]
     assert labels(hiding.path, "both", 0.5) == ["2", "4"], "what is known is only named"
 
 
 def test_lanes_tell_when_a_configuration_knew(hiding: Made) -> None:
-    assert lane(hiding.path, "2 pedestrian", 0) == [(0, "behind 3 (from ego)"), (1.0, "known"), (1.6, None)]
+    assert lane(hiding.path, "2 pedestrian", 0) == [(0, "behind truck 3 (from ego)"), (1.0, "known"), (1.6, None)]
     assert lane(hiding.path, "4 pedestrian", 0) == [(0, "behind obstacle 0 (from ego)")]
     assert lane(hiding.path, "4 pedestrian", 1) == [(0, "known")]
 
@@ -133,7 +133,7 @@ def test_lanes_say_whose_they_are_and_how_soon(hiding: Made) -> None:
     def said(entity: str) -> list[str | None]:
         return [(row["StateChange:state"] or [None])[0] for row in rows(hiding.path, f"/lanes/{entity}")]
 
-    assert said("2_pedestrian/1_PEM") == ["PEM: behind 3 (from ego)", "1.00 s known", None]
+    assert said("2_pedestrian/1_PEM") == ["PEM: behind truck 3 (from ego)", "1.00 s known", None]
     assert said("2_pedestrian/2_both") == ["both: 0.00 s known", None]
     assert said("4_pedestrian/1_PEM") == ["PEM: behind obstacle 0 (from ego)"]
 
@@ -158,7 +158,7 @@ def test_a_flag_without_room_is_on_no_other_span(tmp_path: Path) -> None:
         style = static(made.path, path)
         label_of = dict(zip(style["StateConfiguration:values"], style["StateConfiguration:labels"], strict=True))
         said = [(row["elapsed"] / 1e9, *row["StateChange:state"]) for row in rows(made.path, path)]
-        assert [label_of[text[0]] for _, *text in said if text] == [beside, "behind 1", " ", "behind 3"]
+        assert [label_of[text[0]] for _, *text in said if text] == [beside, "behind truck 1", " ", "behind 3"]
         assert [at for at, *_ in said[-3:]] == pytest.approx([6.0, 7.0, 7.2])
 
 
