@@ -29,7 +29,7 @@ demo: $(VENV)/.installed
 	@$(BIN)/python tools/paper.py out/tc016d
 
 test: $(VENV)/.rest
-	$(BIN)/python -m pytest -q -n 2
+	$(BIN)/python -m pytest -q -n 3
 
 # Every night: the tests with drawn examples, with others each time. A failure prints the seed of all (to be given as SEED)
 # and what gives its own example again.

@@ -307,11 +307,11 @@ class Tracks:
 
     def take_tracks(self, keep: Bool) -> Tracks:
         """Only the tracks of `keep` (E,). Lists stay: one that held only others is then an empty list."""
-        return self if keep.all() else self.take_rows(np.flatnonzero(keep[self.track_ix]))
+        return self if keep.all() else self.take_rows(np.flatnonzero(np.repeat(keep, np.diff(self.start))))
 
     def take_rows(self, rows: Int) -> Tracks:
         """Only some rows, ascending (K,). Lists stay, tracks without rows do not."""
-        lengths = np.bincount(self.track_ix[rows], minlength=len(self.unit_ix))
+        lengths = np.diff(np.searchsorted(rows, self.start))
         held = lengths > 0
         columns: dict[str, Any] = {
             name: None if (a := getattr(self, name)) is None else a[:, rows]

@@ -271,7 +271,7 @@ def _find_ends(last_s: Float, ego_last_s: float, end_s: float) -> tuple[Float, I
 def _ego_stay(scene: Scene, truth: Tracks) -> _EgoStay:
     if scene.ego_ix < 0:
         return _EgoStay(0.0, scene.end_s, np.ones(len(truth.stamp_ns), dtype=bool))
-    frames = truth.frame_ix[truth.row_object_ix == scene.ego_ix]
+    frames = truth.frame_ix[np.repeat(truth.object_ix == scene.ego_ix, np.diff(truth.start))]
     present = np.zeros(len(truth.stamp_ns), dtype=bool)
     present[frames] = True
     return _EgoStay(float(truth.captured_s[frames[0]]), float(truth.captured_s[frames[-1]]), present)

@@ -151,7 +151,8 @@ class TruthCache:
     def since_s(self, episodes: Episodes) -> Float:
         """(M,) when the object of each episode first is in the log."""
         first = np.full(len(self.scene.object_ids), np.inf)
-        np.minimum.at(first, self.truth.row_object_ix, self.truth.row_captured_s)
+        begins_s = self.truth.captured_s[self.truth.frame_ix[self.truth.start[:-1]]]
+        np.minimum.at(first, self.truth.object_ix, begins_s)
         since: Float = first[episodes.object_ix]
         return since
 

@@ -23,11 +23,14 @@ from copem_replay.perception.sensor_poses import (
 )
 from copem_replay.perception.visibility import Asked, VisibilityModel, find_blockers, visible_shares
 from copem_replay.pipeline.one_run import BY_ANY, BY_EGO, Curve
-from copem_replay.pipeline.prepare import ROWS_A_CHUNK, Replay
+from copem_replay.pipeline.prepare import Replay
 from copem_replay.viewer.sink import stack_float32
 
 CLEAR_ABOVE = 0.5
 """An object counts as visible above this share, as hidden below: the larger part of it decides."""
+
+ROWS_AT_ONCE = 60_000
+"""Rows of the world that are looked at together. It changes time and memory alone."""
 
 
 @dataclass(frozen=True)
@@ -70,8 +73,8 @@ def compute_sight(
     )
     centres = _centres(replay.placed.solids)
     known_shares = _known_shares(sight, experiment, observed, scene.t0_ns)
-    # As many frames at once as have the rows of a time chunk: every present object may hide another one.
-    at_once = max(1, ROWS_A_CHUNK * len(truth.stamp_ns) // max(len(truth.frame_ix), 1))
+    # Frames with so many rows at once: every present object may hide another one.
+    at_once = max(1, ROWS_AT_ONCE * len(truth.stamp_ns) // max(len(truth.frame_ix), 1))
     for first in range(0, len(stamps), at_once):
         _compute_part(replay, experiment, sight, known_shares, slice(first, first + at_once), centres)
     return sight
