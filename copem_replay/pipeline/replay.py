@@ -36,7 +36,7 @@ from copem_replay.pipeline.world import States, Transmission, has_channel
 if TYPE_CHECKING:
     import pandas as pd
 
-BLOCK_BYTES = 200_000_000
+BLOCK_BYTES = 80_000_000
 """Bytes that a block may hold. Larger: fewer blocks, and more memory for each worker."""
 
 STATE_BYTES = 400

@@ -193,7 +193,7 @@ def _is_long(log: StudyLog) -> bool:
 
 # The tables of a study.
 
-HELD_BYTES = 48_000_000
+HELD_BYTES = 32_000_000
 """Bytes of parts that are held in memory; further ones are in a temporary file. No result depends on it."""
 BATCH_ROWS, BATCH_BYTES = 100_000, 16_000_000
 """Rows and bytes that are put together at a time, at least: what is done once per batch then costs nothing."""
