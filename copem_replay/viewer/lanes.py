@@ -64,7 +64,7 @@ ONSET_IS = ("onset", "onset of the object")
 """The two halves of the mark."""
 WIDTH_POINTS, LETTER_POINTS, PADDING_POINTS = 380.0, 7.0, 10.0
 """Width of the narrowest lanes in a window of 1280 × 720, of a letter (rounded up), and of what is beside words."""
-MOST_NAME = 0.45
+MOST_NAME = 0.52
 """Most of a lane's width that is before the onset, for the name."""
 _STEADY_NS = round(STEADY_S * 1e9)
 

@@ -150,15 +150,17 @@ def test_a_flag_without_room_is_on_no_other_span(tmp_path: Path) -> None:
         until_s=10.0,
     )
     seen = [{"detection": {"kind": "visible_share"}}]
-    both = {"PEM": {"units": ["ego"]}, "PEM of the ego": {"units": ["ego"]}}
+    both = {"PEM": {"units": ["ego"]}, "PEM of the ego and nobody": {"units": ["ego"]}}
     made = make(tmp_path / "x.rrd", scene, measure=PERSON, pems={"sure": seen}, configurations=both)
     assert set(made.table["time_to_detection_s"].round(6)) == {1.0}
-    for place, (name, beside) in enumerate([("PEM", "PEM, 1.00 s, lost"), ("PEM of the ego", "PEM of the ego")]):
+    for place, (name, beside) in enumerate(
+        [("PEM", "PEM, 1.00 s, lost"), ("PEM of the ego and nobody", "PEM of the ego and nobody")]
+    ):
         path = f"/lanes/2_pedestrian/{place + 1}_{name.replace(' ', '_')}"
         style = static(made.path, path)
         label_of = dict(zip(style["StateConfiguration:values"], style["StateConfiguration:labels"], strict=True))
         said = [(row["elapsed"] / 1e9, *row["StateChange:state"]) for row in rows(made.path, path)]
-        assert [label_of[text[0]] for _, *text in said if text] == [beside, "behind truck 1", " ", "behind 3"]
+        assert [label_of[text[0]] for _, *text in said if text] == [beside, "behind 1", " ", "behind 3"]
         assert [at for at, *_ in said[-3:]] == pytest.approx([6.0, 7.0, 7.2])
 
 
