@@ -87,6 +87,7 @@ class RecordingContent:
     opens_s: float | None = None
     false: Mapping[str, int] = field(default_factory=dict)
     brief: Collection[int] = ()
+    of_one: bool = True
 
     def id_of(self, object_ix: int) -> str:
         """Id of an object as drawn, with its class."""
@@ -112,10 +113,10 @@ class RecordingContent:
         return f"{configuration}{mark}whole run: {', '.join(counts)}" if counts else configuration
 
     def helps(self, object_ix: int) -> str:
-        """What would help with an object; “” where configurations are of several folders: more than they may differ."""
+        """What would help with an object; “” where configurations are of several experiments: PEMs may differ, too."""
         rows = self.episodes[object_ix]
         rows = rows[rows["configuration"].isin(list(self.configurations))]
-        return tell_what_helps(self.experiment, rows) if self.baseline is None else ""
+        return tell_what_helps(self.experiment, rows) if self.of_one else ""
 
     def under(self, object_ix: int) -> list[str]:
         """Entities of the lanes of lists under those of an object."""

@@ -90,6 +90,7 @@ def write_rrd(
     *,
     run_is: str = "",
     baseline: str | None = None,
+    of_one: bool = True,
     viewer: str | None = None,
 ) -> list[str]:
     """Write one run of one log to a file and, with an address, to a viewer. Returns notes. Raises OutputError.
@@ -101,7 +102,7 @@ def write_rrd(
     `run_tracks`: by time chunk, the receiver's fused tracks of each configuration in this run, with a frame per issued
     list (one unit, values (1, P)). `table`: the rows of `detections.parquet` of this log and run. `summary`: over all
     logs and runs. `run_is`: why this run is shown, part of the recording's name. `baseline`: the configuration to which
-    differences are marked.
+    differences are marked. `of_one`: all configurations are of one experiment, so that nothing but their keys differs.
     """
     later_chunks = iter(run_tracks)
     first = next(later_chunks)
@@ -116,6 +117,7 @@ def write_rrd(
         files = []
         for part in parts:
             content = _build_content(replay, experiment, table, part.configurations, shown, first, baseline)
+            content = replace(content, of_one=of_one)
             panels, appearance = build_blueprint(content)
             identity = (experiment.model_dump_json(), replay.scene.log, str(run), run_is, part.infix)
             # The viewer takes two files of one identity for one recording.

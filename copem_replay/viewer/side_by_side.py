@@ -167,6 +167,7 @@ def write_side_by_side(
         shown_run,
         run_is=f"differences to {labels[0]}",
         baseline=labels[0],
+        of_one=len(used) == 1,
     )
     return [f"{path}: {line}" for line in _note_other_worlds(sides)]
 

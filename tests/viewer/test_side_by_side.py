@@ -165,6 +165,30 @@ def test_the_units_of_that_run(call: Compare, tmp_path: Path) -> None:
     assert seen["replay"] != seen["replay_4"]
 
 
+def test_what_would_help_is_said_of_one_experiment_alone(call: Compare, tmp_path: Path) -> None:
+    """In several folders more than the keys of configurations may differ."""
+    frames = [(0.1 * k, [Obj(id=1, x=0.0), pedestrian(9, 20.0, -5.0 + 0.1 * k, vy=1.0)]) for k in range(31)]
+    write_recording(tmp_path / "square.mcap", frames, host=1)
+    for name in "gh":
+        (tmp_path / f"{name}.yaml").write_text(
+            "version: 1\nlogs: [square.mcap]\npems: {p: [{detection: {kind: constant, probability: 1}}]}\n"
+            "units: {ego: {on: ego, pem: p}}\n"
+            "configurations: {now: {units: all}, late: {units: all, latency_s: 0.5}}\n"
+            "measure: {onset: {kind: appears}, began: [log_start, appeared]}\n"
+        )
+        assert call("run", f"{name}.yaml", "--out", name)[0] == 0
+    told = {}
+    for folders, names in ((("g",), "late"), (("g", "h"), "h:late")):
+        asked = ("--configurations", names, "--baseline", "now" if len(folders) == 1 else "g:now", "--rrd", "x.rrd")
+        assert call("compare", *folders, *asked)[0] == 0
+        told[len(folders)] = static(tmp_path / "x.rrd", "/difference")["TextDocument:text"][0]
+    words = (
+        "What would help late: 0 s of latency instead of 0.5 s, as in now: known 0.50 s earlier, with the same draws."
+    )
+    assert words in told[1]
+    assert "What would help" not in told[2]
+
+
 class TestRefusals:
     """One line, exit code 2, and nothing is written."""
 
