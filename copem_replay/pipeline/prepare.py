@@ -47,7 +47,7 @@ from copem_replay.pipeline.expansion import ExpandedExperiment, expand_experimen
 ROWS_AT_ONCE = 500_000
 """Observation rows up to which a log is one time chunk: with one run shown it takes about 1 GB."""
 ROWS_A_CHUNK = 100_000
-"""Observation rows of a time chunk of a longer log: a few hundred MB."""
+"""Observation rows of a time chunk of a longer log: some hundred MB."""
 ROWS_HELD = 4_000_000
 """Observation rows up to which a log is held at once by what needs all of it: some GB."""
 _AFTER = 0.381966
