@@ -50,9 +50,7 @@ class DecodedObjects:
     object_ix: Int  # (P,) index into object_ids
     class_ix: NDArray[np.int8]  # (P,) index into CLASSES
     values: Float  # (P, len(VALUES))
-    lane_boundaries: tuple[
-        Float, ...
-    ] = ()  # (K, 3) each, for showing only; it and what follows are in the truth's frame of reference
+    lane_boundaries: tuple[Float, ...] = ()  # (K, 3) each, for showing only, in the truth's frame, as what follows
     lanes: tuple[Lane, ...] = ()
     areas: tuple[Area, ...] = ()  # crosswalks
     solids: tuple[Solid, ...] = ()

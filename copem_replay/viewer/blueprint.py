@@ -67,7 +67,7 @@ class RecordingContent:
     Camera `eye` follows the ego, if there is one, `eyes` the objects; `above` looks at the units, of which `named` have
     names. `lists`: lists that units send by a link, by configuration. `too_short`: ids of objects too short to judge.
     `opens_s`: the instant at which the recording opens. `false`: how many false entries each configuration had;
-    `brief`: objects that are known too briefly for words in a lane.
+    `brief`: objects that are known too briefly for words in a lane. `of_one`: all configurations are of one experiment.
     """
 
     replay: Replay

@@ -120,7 +120,8 @@ def write_difference_text(
         tables.insert(0, _overview_table(by_object, replay.scene))
         first = [tables[0], *([f"**{name}** · {helps[0]}"] if helps[0] else [])]
     ids = [short_ids(replay.scene)[replay.scene.object_number[name]] for name in too_short]
-    short = [f"Too short to judge: {_escape_cell(', '.join(ids))}."] if ids else []
+    among = "; what is shown here is among them" if {replay.scene.object_ids[k] for k in shown} & {*too_short} else ""
+    short = [f"Too short to judge: {_escape_cell(', '.join(ids))}{among}."] if ids else []
     for path, parts in ((DIFFERENCE_TEXT, tables), (DIFFERENCE_SHORT, first)):
         text = "\n\n".join([*parts, *short, *_describe_left_out(left_out)])
         out.static(path, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
@@ -193,8 +194,8 @@ LEGEND = """A configuration has one colour in every file and figure of its exper
 - filled in colour: what is believed, where it is believed to be, paler the older it is (0 to 1 s); pale discs: 2σ of
   the position
 - dashed with a cross: believed, but nothing is there; `false: 24 m ahead, 6 m left`: where, seen from the ego
-- words below an object we look at: only its name, it is known; else why it is not: `58 behind 41`; a
-  sentence, when it is selected
+- words below an object we look at: only its name, it is known; else why it is not: `58 behind car 41`;
+  a sentence, when it is selected
 - red lines: from the unit that sees most of an object to what hides it
 - lines of sight: from the unit that listed an object first, where it was at capture, to where it listed the object
 - strong lines on the ground: distance when an object was first known

@@ -116,8 +116,9 @@ def write_rrd(
     with ExitStack() as stack:
         files = []
         for part in parts:
-            content = _build_content(replay, experiment, table, part.configurations, shown, first, baseline)
-            content = replace(content, of_one=of_one)
+            content = replace(
+                _build_content(replay, experiment, table, part.configurations, shown, first, baseline), of_one=of_one
+            )
             panels, appearance = build_blueprint(content)
             identity = (experiment.model_dump_json(), replay.scene.log, str(run), run_is, part.infix)
             # The viewer takes two files of one identity for one recording.

@@ -381,7 +381,7 @@ def write_status_words(
     clock: EpisodeClocks,
     up_rad: Mapping[str, Float],
 ) -> None:
-    """Write below the true place of each object “58 behind 41”, and a sentence that selecting it shows.
+    """Write below the true place of each object “58 behind car 41”, and a sentence that selecting it shows.
 
     `up_rad`: for each entity with the words, what is up in the pictures that show it, to be broadcast to (K, M).
     """

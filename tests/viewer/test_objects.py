@@ -121,3 +121,11 @@ def test_what_is_too_short_is_listed(tmp_path: Path) -> None:
     assert "Too short to judge: 8." in text
     assert "7 car" in text
     assert "8 car" not in text
+
+
+def test_what_is_shown_all_the_same_is_said_to_be_too_short(tmp_path: Path) -> None:
+    scene = recording([Thing("ego", "car", standing(0, 0)), Thing("8", "car", standing(30, -5))], until_s=6.0)
+    made = make(tmp_path / "x.rrd", scene, measure={"onset": {"kind": "appears"}})
+    [text] = static(made.path, "/difference")["TextDocument:text"]
+    assert "8 car" in text
+    assert "Too short to judge: 8; what is shown here is among them." in text

@@ -222,10 +222,7 @@ def _read_tables(folder: Path, _signature: object) -> _Tables:
         where = f"{path}: row {number}"
         if row["instance_token"] not in instances:
             raise InputError(f"{where}: expected an instance of instance.json, found {row['instance_token']!r}")
-        values = [
-            parse_vector(row.get(key), n, f"{where}: {key}")
-            for key, n in (("translation", 3), ("size", 3), ("rotation", 4))
-        ]
+        values = _read_vectors(row, ("translation", "size", "rotation"), where)
         boxes.setdefault(row["sample_token"], []).append((row["instance_token"], np.concatenate(values)))
     category = {instance: categories[token] for instance, token in instances.items()}
     return _Tables(samples, _read_ego_poses(folder, stamp_us), boxes, category, _read_locations(folder))

@@ -25,9 +25,8 @@ ZEBRA: Final = 87  # osi_trafficsign.proto, TrafficSign.MainSign.Classification.
 INCREASING, DECREASING = 2, 3  # osi_logicallane.proto, LogicalLane.MoveDirection
 SUBTYPES: Final[Mapping[LaneKind, int]] = {"driving": 2, "bicycle": 3, "walking": 4, "parking": 5, "other": 1}
 """Lane.Classification.Subtype by kind. LogicalLane.Type has the same numbers."""
-_KINDS: Final = {number: kind for kind, number in SUBTYPES.items()} | dict.fromkeys(
-    range(10, 15), "driving"
-)  # ramps, …
+# Exits, entries and ramps (10 … 14) are driven.
+_KINDS: Final = {number: kind for kind, number in SUBTYPES.items()} | dict.fromkeys(range(10, 15), "driving")
 _NOWHERE: Final = np.empty((0, 3))
 _BESIDE_M: Final = 1.0
 """A part of a border that begins this far before the end of the one before is another line beside it."""
