@@ -216,7 +216,7 @@ class Tracks:
         if self.start[0] != 0 or self.start[-1] != P or (np.diff(self.start) < 1).any():
             raise ValueError("Tracks.start: expected 0 … P, strictly increasing (no empty tracks)")
         runs = {1}
-        for name in ("arrives_s", "valid", *VALUES, *UNCERTAINTIES):
+        for name in ("arrives_s", "valid", *STATES):
             array = getattr(self, name)
             if array is None:
                 continue
@@ -257,7 +257,7 @@ class Tracks:
             columns["object_id"] = np.array([*scene.object_ids, None], dtype=object)[object_ix]
             kinds = np.array([*np.array(CLASSES, dtype=object)[scene.object_class], None], dtype=object)
             columns["object_class"] = kinds[object_ix]
-        stated = {name: getattr(self, name) for name in (*VALUES, *UNCERTAINTIES)}
+        stated = {name: getattr(self, name) for name in STATES}
         return pd.DataFrame(columns | {name: of[0, rows] for name, of in stated.items() if of is not None})
 
     @property
@@ -309,14 +309,18 @@ class Tracks:
         """Only the tracks of `keep` (E,). Lists stay: one that held only others is then an empty list."""
         return self if keep.all() else self.take_rows(np.flatnonzero(np.repeat(keep, np.diff(self.start))))
 
-    def take_rows(self, rows: Int) -> Tracks:
-        """Only some rows, ascending (K,). Lists stay, tracks without rows do not."""
+    def take_rows(self, rows: Int, *, states: bool = True) -> Tracks:
+        """Only some rows, ascending (K,). Lists stay, tracks without rows do not.
+
+        `states=False`: states are not needed and become 0, which takes no memory.
+        """
         lengths = np.diff(np.searchsorted(rows, self.start))
         held = lengths > 0
         columns: dict[str, Any] = {
             name: None if (a := getattr(self, name)) is None else a[:, rows]
-            for name in ("valid", *VALUES, *UNCERTAINTIES)
+            for name in ("valid", *(STATES if states else ()))
         }
+        columns |= {} if states else _stateless(len(rows))
         return replace(
             self,
             start=np.concatenate([[0], np.cumsum(lengths[held])]),
@@ -324,6 +328,16 @@ class Tracks:
             object_ix=self.object_ix[held],
             frame_ix=self.frame_ix[rows],
             **columns,
+        )
+
+    def in_lists_of(self, other: Tracks) -> Tracks:
+        """These rows in the lists of `other`, which are the same: they take memory once."""
+        return replace(
+            self,
+            stamp_ns=other.stamp_ns,
+            captured_s=other.captured_s,
+            frame_unit_ix=other.frame_unit_ix,
+            arrives_s=other.arrives_s,
         )
 
     def captured_between(self, from_s: float, until_s: float) -> Tracks:
@@ -373,7 +387,7 @@ def join_tracks(units: tuple[str, ...], pieces: Sequence[Tracks]) -> Tracks:
         frame_unit_ix=shifted("frame_unit_ix", unit_offset),
         arrives_s=np.concatenate([np.empty((1, 0)), *(p.arrives_s for p in pieces)], axis=1),
         valid=rows("valid").astype(bool),
-        **{name: rows(name) for name in (*VALUES, *UNCERTAINTIES)},
+        **{name: rows(name) for name in STATES},
     )
 
 
@@ -390,25 +404,30 @@ def splice_rows(pieces: Sequence[Tracks], *, states: bool = True) -> tuple[Track
     unit_ix, object_ix = unit_ix[order], object_ix[order]
     new = np.flatnonzero((np.diff(unit_ix, prepend=-1) != 0) | (np.diff(object_ix, prepend=-1) != 0))
 
-    def rows(name: str) -> Any:
-        if not states and name != "valid":
-            return None if name in UNCERTAINTIES else np.broadcast_to(0.0, (1, len(order)))
-        columns = [getattr(piece, name) for piece in pieces]
-        return None if columns[0] is None else np.concatenate(columns, axis=1)[:, order]
-
+    columns: dict[str, Any] = {} if states else _stateless(len(order))
+    for name in ("valid", *(STATES if states else ())):
+        of_pieces = [getattr(piece, name) for piece in pieces]
+        columns[name] = None if of_pieces[0] is None else np.concatenate(of_pieces, axis=1)[:, order]
     tracks = replace(
         pieces[0],
         start=np.append(new, len(order)),
         unit_ix=unit_ix[new],
         object_ix=object_ix[new],
         frame_ix=frame_ix[order],
-        **{name: rows(name) for name in ("valid", *VALUES, *UNCERTAINTIES)},
+        **columns,
     )
     return tracks, order
 
 
+def _stateless(rows: int) -> dict[str, Any]:
+    """The columns of states that are not needed."""
+    return {name: None if name in UNCERTAINTIES else np.broadcast_to(0.0, (1, rows)) for name in STATES}
+
+
 VALUES = ("x_m", "y_m", "z_m", "yaw_rad", "vx_mps", "vy_mps", "length_m", "width_m", "height_m")
 UNCERTAINTIES = tuple(f.name for f in fields(Tracks) if f.default is None)
+STATES = (*VALUES, *UNCERTAINTIES)
+"""The columns of a state."""
 
 
 def append_tracks(tracks: Tracks, others: Tracks) -> Tracks:
@@ -417,7 +436,7 @@ def append_tracks(tracks: Tracks, others: Tracks) -> Tracks:
     Variances that only one of them states are 0 in the other.
     """
     columns: dict[str, Any] = {}
-    for name in ("valid", *VALUES, *UNCERTAINTIES):
+    for name in ("valid", *STATES):
         stated = [getattr(part, name) for part in (tracks, others)]
         if all(column is None for column in stated):
             continue

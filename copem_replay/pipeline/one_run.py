@@ -115,13 +115,18 @@ def select_shown_runs(study: StudyTables, log: str) -> tuple[ShownRun, ...]:
     """
     experiment = study.experiment
     asked = experiment.show.asked() if experiment.show is not None else ()
-    rows = study.rows(log)
-    counted = select_counted(rows, experiment.measure.began)
-    rows = counted if len(counted) else rows
+    rows = _rows_that_count(study, log) if any(isinstance(one, str) for one in asked) else pd.DataFrame()
     return tuple(
         ShownRun(one, "", stem) if isinstance(one, int) else ShownRun(*_rank_run(rows, study.horizon_s, one), stem)
         for one, stem in zip(asked, list_stems(experiment), strict=True)
     )
+
+
+def _rows_that_count(study: StudyTables, log: str) -> pd.DataFrame:
+    """The rows of a log that count; all where none does."""
+    rows = study.rows(log)
+    counted = select_counted(rows, study.experiment.measure.began)
+    return counted if len(counted) else rows
 
 
 def list_stems(experiment: Experiment) -> list[str]:

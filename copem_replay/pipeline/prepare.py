@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -194,8 +195,9 @@ class Replay:
 
     @cached_property
     def measured_truth(self) -> Tracks:
-        """The truth of objects that have an episode; its lists are those of all."""
-        return self.truth.take_tracks(np.isin(self.truth.object_ix, self.episodes.object_ix))
+        """The truth of objects that have an episode, without states; its lists are those of all."""
+        keep = np.repeat(np.isin(self.truth.object_ix, self.episodes.object_ix), np.diff(self.truth.start))
+        return self.truth if keep.all() else self.truth.take_rows(np.flatnonzero(keep), states=False)
 
     def find_episodes_of(self, experiment: Experiment) -> Episodes:
         """The episodes of this log by another `measure`."""
@@ -257,14 +259,7 @@ class Replay:
 
     def rows_of(self, object_ix: Int) -> Observations:
         """The observation rows of some objects, with all visible shares, which are computed anew."""
-        pieces = [
-            observe_objects(
-                self.scene, self.truth, self.expanded, self.placed, from_s=chunk.from_s, until_s=chunk.until_s,
-                only_ix=object_ix,
-            )
-            for chunk in self.chunks
-        ]  # fmt: skip
-        return join_observations(pieces)
+        return join_observations([self._observe(chunk, chunk.from_s, only_ix=object_ix) for chunk in self.chunks])
 
     def observe(self, chunk: TimeChunk, from_s: float | None = None) -> Observations:
         """The observation rows captured in a time chunk, or from `from_s` on. Those of a whole log are kept.
@@ -274,10 +269,15 @@ class Replay:
         if chunk == TimeChunk():
             return self._whole
         begin_s = chunk.from_s if from_s is None else from_s
-        return observe_objects(
-            self.scene, self.truth, self.expanded, self.placed, from_s=begin_s, until_s=chunk.until_s,
-            kept=self._shares, cut_s=chunk.from_s, stretches=self.episodes.number_rows,
-        )  # fmt: skip
+        rows_of_episodes = self.episodes.number_rows
+        return self._observe(chunk, begin_s, kept=self._shares, cut_s=chunk.from_s, stretches=rows_of_episodes)
+
+    def _observe(self, chunk: TimeChunk, from_s: float, **how: Any) -> Observations:
+        """The observation rows of a time chunk; lists, which are those of the whole log, are in memory once."""
+        observed = observe_objects(
+            self.scene, self.truth, self.expanded, self.placed, from_s=from_s, until_s=chunk.until_s, **how
+        )
+        return replace(observed, tracks=observed.tracks.in_lists_of(self.no_rows.tracks))
 
     def observe_listable(self, chunk: TimeChunk, from_s: float, *, complete: bool) -> Observations:
         """The rows that can be listed, captured from `from_s` on; of all objects, or only of those with an episode."""

@@ -171,7 +171,8 @@ def replay_runs(log: Replay, experiment: Experiment, group: RunGroup) -> GroupOu
     judges = {name: Judge(log, experiment, name, receivers.issue_s(name), matches=matched) for name in fused}
     began_s = time.perf_counter()
     for world in receivers.worlds():
-        sightings.append(world.sightings(lists.states))  # perceive
+        seen = world.sightings(lists.states)  # perceive
+        sightings.append(seen.in_lists_of(sightings[0] if sightings else seen))
         around = log.truth_cache_of(world.chunk)
         for name, judge in judges.items():
             output = receivers.fuse(world, name)  # transmit, fuse

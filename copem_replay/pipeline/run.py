@@ -321,9 +321,12 @@ class StudyTables:
         """The rows of `detections.parquet` of all logs."""
         return self.frame(self.parts())
 
-    def rows(self, log: str) -> pd.DataFrame:
-        """The rows of `detections.parquet` of one log."""
-        return self.frame(self.parts(log))
+    def rows(self, log: str, run: int | None = None) -> pd.DataFrame:
+        """The rows of `detections.parquet` of one log, or of one run of it."""
+        if run is None:
+            return self.frame(self.parts(log))
+        chosen = ((part, pa.array(part.rows["run"].to_numpy() == run)) for part in self.parts(log))
+        return self.frame(replace(part, rows=part.rows.filter(of_run)) for part, of_run in chosen)
 
     def frame(self, parts: Iterable[PartTables]) -> pd.DataFrame:
         """The rows of some parts, with the columns and types that those of all parts have."""
@@ -421,6 +424,8 @@ def _gather_study(logs: Sequence[StudyLog], experiment: Experiment, gatherer: Ga
         if measure.metrics:
             for _, rows_of_log in select_counted(rows, measure.began).groupby("log", sort=False):
                 study.own_sums = add_own_sums(study.own_sums, own_sums_by_log(rows_of_log, measure.metrics))
+    if any(map(_is_long, logs)):
+        return_memory()
     study.totals = {key: join_totals(of_log) for key, of_log in nodes.items()}
     study.tally = pd.concat(tallies, ignore_index=True)
     if sliced:

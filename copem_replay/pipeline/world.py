@@ -119,12 +119,16 @@ class WorldChunk:
         return self._sent[states]
 
     def sightings(self, states: States) -> Tracks:
-        """The rows that are listed in the chunk itself, at least those of objects with an episode."""
+        """The rows that are listed in the chunk itself, at least those of objects with an episode.
+
+        Those of time chunks are held until the last one: without states.
+        """
         seen, log = self.listed(states), self.log
         if len(log.chunks) == 1:
             return seen
         own = seen.valid.any(axis=0) & (seen.row_captured_s >= self.chunk.from_s)
-        return seen.take_rows(np.flatnonzero(own & np.isin(seen.row_object_ix, log.episodes.object_ix)))
+        rows = np.flatnonzero(own & np.isin(seen.row_object_ix, log.episodes.object_ix))
+        return seen.take_rows(rows, states=False)
 
     @cached_property
     def words(self) -> Words:

@@ -239,6 +239,7 @@ def _export(place: ResultsPlace, study: StudyTables, exporters: Sequence[Exporte
                     with place.may_fail(names):
                         lines = exporter.write(place.new / f"{stem}{exporter.suffix}", run)
                         notes += [f"{log}: {line}" for line in lines if f"{log}: {line}" not in notes]
+                    return_memory()
         study.find_log(log).drop()
     return notes
 
@@ -285,7 +286,7 @@ def _make_run_to_export(log: str, shown: ShownRun, study: StudyTables) -> RunToE
     experiment = resolve_for_log(study.experiment, log)
     shown_experiment = experiment.model_copy(update={"configurations": experiment.shown()})
     names = list(shown_experiment.configurations)
-    rows = study.rows(log)
+    rows = study.rows(log, shown.run)
     manifest = {
         "copem_replay": version("copem-replay"),
         "experiment": dump_yaml(resolve_sweep(experiment).as_written() | {"logs": [recording.path.name]}),
@@ -298,7 +299,7 @@ def _make_run_to_export(log: str, shown: ShownRun, study: StudyTables) -> RunToE
         shown,
         replay_run(recording, shown_experiment, shown.run, replay),
         experiment.configurations,
-        first_episodes(rows[(rows["run"] == shown.run) & rows["configuration"].isin(names)]),
+        first_episodes(rows[rows["configuration"].isin(names)]),
         study.summary[study.summary["configuration"].isin(names)],
         manifest,
     )

@@ -445,12 +445,8 @@ class TrackCollector:
         of_objects, key = self._is_of_objects(received), self._key(received)
         before = np.concatenate([np.empty(0, dtype=np.int64), *pieces.keys])
         fresh = np.flatnonzero(of_objects & ~np.isin(key, before))
-        rows = received.take_rows(fresh)
-        if pieces.received:  # every time chunk has the lists of the whole log: they are kept once
-            first = pieces.received[0]
-            lists = ("stamp_ns", "captured_s", "frame_unit_ix", "arrives_s")
-            rows = replace(rows, **{column: getattr(first, column) for column in lists})
-        pieces.received.append(rows)
+        rows = received.take_rows(fresh)  # every time chunk has the lists of the whole log: they are kept once
+        pieces.received.append(rows.in_lists_of(pieces.received[0] if pieces.received else rows))
         pieces.keys.append(key[fresh])
 
     def _is_of_objects(self, tracks: Tracks) -> Bool:

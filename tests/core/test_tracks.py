@@ -19,6 +19,7 @@ from copem_replay.core.tracks import (
     Tracks,
     append_tracks,
     class_indices,
+    splice_rows,
 )
 
 Seen = dict[str, list[list[str]]]
@@ -195,6 +196,28 @@ def test_take_tracks(seen: Seen, data: st.DataObject) -> None:
     taken = of.take_tracks(np.array(keep, dtype=bool))
     assert lists(taken) == expected
     assert len(taken.unit_ix) == len(kept)
+
+
+def test_rows_without_states_are_the_same_rows() -> None:
+    """Who is where in which list, and whether it is valid, stay; of states nothing does."""
+    of = tracks(SEEN)
+    rows = np.arange(0, len(of.frame_ix), 2)
+    taken, bare = of.take_rows(rows), of.take_rows(rows, states=False)
+    for name in ("start", "unit_ix", "object_ix", "frame_ix", "valid"):
+        assert getattr(bare, name).tolist() == getattr(taken, name).tolist()
+    assert all((getattr(bare, name) == 0.0).all() and getattr(bare, name).strides[1] == 0 for name in VALUES)
+    assert [getattr(bare, name) for name in UNCERTAINTIES] == [None] * len(UNCERTAINTIES)
+    joined, _ = splice_rows([taken, bare], states=False)
+    assert joined.valid.tolist() == splice_rows([taken, taken])[0].valid.tolist()
+    assert joined.x_m.strides[1] == 0
+
+
+def test_rows_in_the_lists_of_others() -> None:
+    one, other = tracks(SEEN), tracks(SEEN)
+    moved = one.in_lists_of(other)
+    assert (moved.stamp_ns is other.stamp_ns, moved.arrives_s is other.arrives_s) == (True, True)
+    assert (moved.captured_s is other.captured_s, moved.frame_unit_ix is other.frame_unit_ix) == (True, True)
+    assert lists(moved) == lists(one)
 
 
 def test_taking_leaves_the_original_alone() -> None:

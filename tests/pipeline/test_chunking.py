@@ -314,6 +314,24 @@ def test_a_log_of_half_a_million_rows_is_cut() -> None:
     assert chunking.time_chunks(log.scene, log.truth, experiment(ego="0")) == (TimeChunk(),)  # 360 000
 
 
+def test_what_is_held_to_the_end_has_the_lists_once_and_no_states(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else memory would grow with the square of the length: every chunk has all lists of the log."""
+    monkeypatch.setattr(chunking, "ROWS_AT_ONCE", 1)
+    monkeypatch.setattr(chunking, "ROWS_A_CHUNK", 40)
+    replay = prepare_log(traffic(), experiment())
+    for observed in (*map(replay.observe, replay.chunks), replay.rows_of(np.arange(2))):
+        for name in ("stamp_ns", "captured_s", "frame_unit_ix", "arrives_s"):
+            assert getattr(observed.tracks, name) is getattr(replay.no_rows.tracks, name)
+    worlds = [*Receivers(transmitted(replay, experiment())).worlds()]
+    sighted = [world.sightings("sampled") for world in worlds]
+    seen = [world.listed("sampled") for world in worlds]
+    assert sum(len(of.frame_ix) for of in sighted) > 100
+    for of, all_rows in zip(sighted, seen, strict=True):
+        assert [getattr(of, name).strides[1] for name in VALUES] == [0] * len(VALUES)  # one number for all rows
+        held = set(zip(all_rows.row_object_ix.tolist(), all_rows.frame_ix.tolist(), strict=True))
+        assert held >= set(zip(of.row_object_ix.tolist(), of.frame_ix.tolist(), strict=True))
+
+
 @pytest.mark.parametrize("rows_at_once", [10**9, 60])
 def test_what_no_run_lists_is_not_held(rows_at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Seen up to 20 m only: of all others nothing is drawn, fused or kept."""

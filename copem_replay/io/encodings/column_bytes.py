@@ -23,7 +23,7 @@ from copem_replay.core.tracks import Bool, Int
 
 # Blocks of lists.
 
-MOST_ROWS = 10_000
+MOST_ROWS = 5_000
 """Rows of a block, unless one list has more: some MB of records."""
 
 
