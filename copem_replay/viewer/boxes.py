@@ -19,8 +19,8 @@ from copem_replay.viewer.sink import (
     STANDING,
     RecordingSink,
     configuration_part,
+    join_points,
     object_labels,
-    pair_points,
     slice_by_frame,
     stack_float32,
     upright_turns,
@@ -218,7 +218,7 @@ class FalseEntries:
             return
         self._count(fused_tracks, np.flatnonzero(false))
         for rows, counts, available_ns in slice_by_frame(tracks, false):
-            strips = rr.LineStrips3D.columns(strips=pair_points(_dashed_crosses(tracks, rows)))
+            strips = rr.LineStrips3D.columns(strips=join_points(_outline_corners(tracks, rows)))
             self._out.columns(self._path, available_ns, strips.partition(counts * _LINES))
             if self._picture is not None:
                 place_m = np.stack([tracks.x_m[0, rows], tracks.y_m[0, rows], tracks.z_m[0, rows]])
@@ -237,16 +237,16 @@ class FalseEntries:
         self._at_once = max(self._at_once, int(np.bincount(frames).max(initial=0)))
 
 
-_DASHES = np.array([(0.0, 0.2), (0.4, 0.6), (0.8, 1.0)])
-"""Where a side is drawn, as shares of its length: it begins and ends with a dash, so that corners are closed."""
+DASH = 0.3
+"""Which part of a side is drawn from each corner: no side is closed."""
 CROSS_M = 4.0
 """Least length of the lines of a cross: that over a false pedestrian would be 4 pixels wide."""
-_LINES = 4 * len(_DASHES) + 2
-"""Lines of a false entry: dashes of four sides, and two of the cross."""
+_LINES = 6
+"""Lines of a false entry, of three points each: its corners, and two of the cross."""
 
 
-def _dashed_crosses(tracks: Tracks, rows: Int) -> np.ndarray:
-    """(R, `_LINES`, 2, 3) ends of the lines of false entries, at the height of their tops; crosses reach beyond."""
+def _outline_corners(tracks: Tracks, rows: Int) -> np.ndarray:
+    """(R, `_LINES`, 3, 3) points of the lines of false entries, at the height of their tops; crosses reach beyond."""
     along = np.array([1.0, -1.0, -1.0, 1.0]) * tracks.length_m[0, rows, None] / 2
     across = np.array([1.0, 1.0, -1.0, -1.0]) * tracks.width_m[0, rows, None] / 2
     cos, sin = np.cos(tracks.yaw_rad[0, rows, None]), np.sin(tracks.yaw_rad[0, rows, None])
@@ -259,13 +259,13 @@ def _dashed_crosses(tracks: Tracks, rows: Int) -> np.ndarray:
         ],
         axis=-1,
     )  # (R, 4, 3)
-    side = np.roll(corner, -1, axis=1) - corner
-    dashes = corner[:, :, None, None] + side[:, :, None, None] * _DASHES[..., None]  # (R, 4, 3, 2, 3)
-    cross = corner[:, [[0, 2], [1, 3]]]
-    middle = cross.mean(axis=2, keepdims=True)
-    size_m = np.linalg.norm(cross[:, :, 1:] - cross[:, :, :1], axis=-1, keepdims=True)
-    cross = middle + (cross - middle) * np.maximum(1.0, CROSS_M / np.maximum(size_m, 0.1))
-    return np.concatenate([dashes.reshape(len(rows), _LINES - 2, 2, 3), cross], axis=1).astype(np.float32)
+    dashes = [corner + DASH * (np.roll(corner, way, axis=1) - corner) for way in (1, -1)]
+    corners = np.stack([dashes[0], corner, dashes[1]], axis=2)
+    middle = corner.mean(axis=1, keepdims=True)
+    size_m = np.linalg.norm(corner[:, :1] - corner[:, 2:3], axis=-1, keepdims=True)
+    ends = middle + (corner - middle) * np.maximum(1.0, CROSS_M / np.maximum(size_m, 0.1))
+    cross = [np.stack([ends[:, k], middle[:, 0], ends[:, k + 2]], axis=1) for k in (0, 1)]
+    return np.concatenate([corners, np.stack(cross, axis=1)], axis=1).astype(np.float32)
 
 
 def _pack_rgba(colour: tuple[int, int, int, int]) -> int:

@@ -39,7 +39,7 @@ from copem_replay.viewer.sink import (
     configuration_part,
     elapsed_ns,
     entity_names,
-    pair_points,
+    join_points,
     plain_part,
     sort_by_frame,
     stack_float32,
@@ -415,7 +415,7 @@ def _write_ways(
     _, way = np.nonzero(np.arange(len(lines)) < counts[:, None])
     path = ["world", configuration_part(name), "difference", "first"]
     strips = rr.LineStrips3D.columns(
-        strips=pair_points(lines[way]), labels=pa.array(labels, pa.string()).take(pa.array(way))
+        strips=join_points(lines[way]), labels=pa.array(labels, pa.string()).take(pa.array(way))
     )
     out.columns(path, instants, strips.partition(counts))
     out.static(

@@ -27,7 +27,7 @@ from copem_replay.viewer.sink import (
     configuration_part,
     entity_names,
     helps_path,
-    pair_points,
+    join_points,
     short_ids,
     show_seconds,
     stack_float32,
@@ -321,7 +321,7 @@ def _write_reference_lines(
     _, mark = np.nonzero(np.arange(len(rows)) < counts[:, None])
     lines = np.stack(ends, axis=1)[mark]
     if len(rows) <= LINED:
-        out.columns([*path, "line"], instants, rr.LineStrips3D.columns(strips=pair_points(lines)).partition(counts))
+        out.columns([*path, "line"], instants, rr.LineStrips3D.columns(strips=join_points(lines)).partition(counts))
         out.static([*path, "line"], rr.LineStrips3D.from_fields(colors=[colour], radii=rr.Radius.ui_points(1.0)))
     words = pa.array(texts, pa.string()).take(pa.array(rows[mark]))
     out.columns(path, instants, rr.Points3D.columns(positions=lines.mean(axis=1), labels=words).partition(counts))

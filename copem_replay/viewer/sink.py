@@ -410,10 +410,10 @@ def split_into_files(configurations: Sequence[str], baseline: str | None = None)
     return parts
 
 
-def pair_points(ends: np.ndarray) -> pa.Array:
-    """Lines (…, 2, 3) as strips of two points: Rerun itself counts the points of each strip in Python."""
+def join_points(lines: np.ndarray) -> pa.Array:
+    """Lines (…, K, 3) as strips of K points: Rerun itself counts the points of each strip in Python."""
     import rerun as rr
 
-    kind = rr.components.LineStrip3DBatch._ARROW_DATATYPE
-    points = pa.FixedSizeListArray.from_arrays(pa.array(ends.astype(np.float32).ravel()), type=kind.value_type)
-    return pa.ListArray.from_arrays(pa.array(np.arange(0, len(points) + 1, 2, dtype=np.int32)), points, type=kind)
+    kind, bounds = rr.components.LineStrip3DBatch._ARROW_DATATYPE, np.arange(0, lines.size // 3 + 1, lines.shape[-2])
+    points = pa.FixedSizeListArray.from_arrays(pa.array(lines.astype(np.float32).ravel()), type=kind.value_type)
+    return pa.ListArray.from_arrays(pa.array(bounds.astype(np.int32)), points, type=kind)

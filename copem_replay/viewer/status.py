@@ -59,7 +59,7 @@ from copem_replay.viewer.sink import (
     RecordingSink,
     configuration_part,
     elapsed_ns,
-    pair_points,
+    join_points,
     short_ids,
     stack_float32,
     to_nanoseconds,
@@ -427,7 +427,7 @@ def write_hiding_lines(out: RecordingSink, name: str, sight: Sight, statuses: St
     counts = np.bincount(rows, minlength=len(statuses.elapsed_ns))
     instants = np.flatnonzero((counts > 0) | (np.append(0, counts[:-1]) > 0))  # one empty row ends the lines
     path = ["world", configuration_part(name), "hiding"]
-    columns = rr.LineStrips3D.columns(strips=pair_points(lines)).partition(counts[instants])
+    columns = rr.LineStrips3D.columns(strips=join_points(lines)).partition(counts[instants])
     out.columns(path, statuses.elapsed_ns[instants], columns)
     out.static(path, rr.LineStrips3D.from_fields(colors=[HIDES], radii=rr.Radius.ui_points(1.25)))
 
@@ -465,7 +465,7 @@ def write_listing_lines(
     out.columns(
         path,
         to_nanoseconds(schedule.issue_s[instants]),
-        rr.LineStrips3D.columns(strips=pair_points(lines)).partition(counts[instants]),
+        rr.LineStrips3D.columns(strips=join_points(lines)).partition(counts[instants]),
     )
     out.static(path, rr.LineStrips3D.from_fields(colors=[(*colour, RAY_ALPHA)], radii=rr.Radius.ui_points(0.75)))
 

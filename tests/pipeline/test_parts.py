@@ -242,7 +242,7 @@ def test_a_long_log_in_stretches_has_the_parts_of_each_configuration_alone(
     assert (computed, found, again) == (2, 2 * 3, plain)
 
 
-_FUSED = study(LINKS, gnn=True).replace("measure:", RADIO)
+_FUSED = study(LINKS, runs=40, gnn=True).replace("measure:", RADIO)
 _FLEET = study(FLEET, "sweep: {penetration_rate: [0, 0.3]}")
 
 

@@ -64,19 +64,19 @@ watched = pytest.mark.skipif(
 
 @pytest.mark.long
 @watched
-def test_two_thousand_hostile_files_end_well():
+def test_a_thousand_hostile_files_end_well():
     """Recordings of every format, hit in every way: each is read or refused, none for long or with much memory."""
-    found = fuzz.fuzz(2000, 6, most=12, own=True)
+    found = fuzz.fuzz(1000, 6, most=12, own=True)
     assert found["defects"] == []
-    assert found["inputs"] == 2000
-    assert found["outcomes"]["read"] > 500  # not all is refused: what was hit is also read
-    assert found["outcomes"]["refused"] > 300
-    assert found["past_header"] > 1000
+    assert found["inputs"] == 1000
+    assert found["outcomes"]["read"] > 250  # not all is refused: what was hit is also read
+    assert found["outcomes"]["refused"] > 150
+    assert found["past_header"] > 500
 
 
 @pytest.mark.long
 @watched
-@pytest.mark.parametrize(("target", "inputs"), [("experiment", 60), ("results", 16), ("fit", 20), ("convert", 150)])
+@pytest.mark.parametrize(("target", "inputs"), [("experiment", 40), ("results", 8), ("fit", 12), ("convert", 100)])
 def test_commands_on_what_is_hostile_end_well(target, inputs):
     """Each ends well or is refused in lines; a run over damaged results gives what it always gives."""
     found = fuzz.fuzz(inputs, 6, target=target)

@@ -381,16 +381,22 @@ def test_false_entries_are_crossed_and_counted(tmp_path: Path) -> None:
     assert len(drawn) == 6
     for frame, row in enumerate(drawn):
         [entry] = np.flatnonzero((fused.frame_ix == frame) & fused.valid[0])
-        ends = np.array([line.tolist() for line in lines(row)])
-        assert ends.shape == (14, 2, 3), "three dashes a side, two lines across"
+        points = np.array([line.tolist() for line in lines(row)])
+        assert points.shape == (6, 3, 3), "four corners, two lines across"
+        corners, across = points[:4], points[4:]
         middle = [fused.x_m[0, entry], fused.y_m[0, entry], fused.z_m[0, entry] + fused.height_m[0, entry] / 2]
-        assert ends[12:].mean(axis=1).tolist() == [pytest.approx(middle, abs=1e-5)] * 2
-        across = np.linalg.norm(ends[12:, 1] - ends[12:, 0], axis=1)
-        assert np.hypot(fused.length_m[0, entry], fused.width_m[0, entry]) < 4.0
-        assert across.tolist() == [pytest.approx(4.0, abs=1e-5)] * 2, "a pedestrian alone would be too small to be seen"
-        around_m = np.linalg.norm(ends[:12, 1] - ends[:12, 0], axis=1).sum()
-        half_m = fused.length_m[0, entry] + fused.width_m[0, entry]
-        assert around_m == pytest.approx(0.6 * 2 * half_m, abs=1e-5), "three fifths of the outline"
+        assert across[:, 1].tolist() == [pytest.approx(middle, abs=1e-5)] * 2
+        assert across[:, [0, 2]].mean(axis=1).tolist() == [pytest.approx(middle, abs=1e-5)] * 2
+        length_m, width_m = fused.length_m[0, entry], fused.width_m[0, entry]
+        across_m = np.linalg.norm(across[:, 2] - across[:, 0], axis=1)
+        assert np.hypot(length_m, width_m) < 4.0
+        assert across_m.tolist() == [pytest.approx(4.0, abs=1e-5)] * 2, (
+            "a pedestrian alone would be too small to be seen"
+        )
+        from_middle_m = np.linalg.norm(corners[:, 1] - middle, axis=1)
+        assert from_middle_m.tolist() == [pytest.approx(np.hypot(length_m, width_m) / 2, abs=1e-5)] * 4
+        around_m = np.linalg.norm(np.diff(corners, axis=1), axis=2).sum()
+        assert around_m == pytest.approx(0.6 * 2 * (length_m + width_m), abs=1e-5), "three fifths of the outline"
     assert titles(made.path) >= {
         "gnn · whole run: 0 of 1 known, 1 false",
         "ideal · whole run: 1 of 1 known, 0 false",

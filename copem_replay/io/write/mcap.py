@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import heapq
 import struct
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -57,6 +57,8 @@ OSI_RECORD = "net.asam.osi.trace"
 """The one metadata record of an OSI trace file (OSI 3.8, trace file formats)."""
 CHUNK_BYTES = 1 << 20
 """Bytes of a chunk of the file before compression: the default of mcap's writer."""
+CHUNKS_AHEAD = 16
+"""Chunks that may be encoded before they are written: lists are encoded many at once, so that some take long."""
 ROSBAG_RECORD, ROSBAG_COUNTS = "rosbag2", "serialized_metadata"
 """rosbag2's metadata record, and its key that counts messages: wrong in a copy with more of them."""
 
@@ -194,12 +196,15 @@ def _merge_by_time(streams: Sequence[Iterator[Message]]) -> Iterator[Message]:
 
 
 def _encode_ahead(messages: Iterator[Message]) -> Iterator[list[Message]]:
-    """The messages, many at once, encoded in a thread one chunk ahead: compiled code and compression share no lock."""
+    """The messages, many at once, encoded in a thread chunks ahead: compiled code and compression share no lock."""
     with ThreadPoolExecutor(1) as thread:
-        following = thread.submit(_next_messages, messages)
-        while encoded := following.result():
-            following = thread.submit(_next_messages, messages)
-            yield encoded
+        encoding = deque(thread.submit(_next_messages, messages) for _ in range(CHUNKS_AHEAD))
+        try:
+            while encoded := encoding.popleft().result():
+                encoding.append(thread.submit(_next_messages, messages))
+                yield encoded
+        finally:
+            thread.shutdown(cancel_futures=True)
 
 
 def _next_messages(messages: Iterator[Message]) -> list[Message]:
