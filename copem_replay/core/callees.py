@@ -16,9 +16,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import cache
+from itertools import chain
 from types import SimpleNamespace
 from typing import Any
 
+from llvmlite.binding import parse_assembly
 from numba import types
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
@@ -37,7 +39,7 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]  # Numba has no types
 
     def __init__(self, function: Callable[..., Any], options: Mapping[str, Any]) -> None:
         options = {"nopython": True, "boundscheck": None, **options}
-        super().__init__(function, targetoptions={**options, "no_cfunc_wrapper": True})
+        super().__init__(function, targetoptions={**options, "no_cfunc_wrapper": True}, pipeline_class=_EntryCompiler)
         self.callee = _Callee(function, targetoptions={**options, **_NO_WRAPPERS}, pipeline_class=_CalleeCompiler)
         self.enable_caching()
 
@@ -73,11 +75,31 @@ class _Callee(CPUDispatcher):  # type: ignore[misc]
         return super().get_call_template(tuple(unliteral(kind) for kind in args), named)
 
 
-class _CalleeCompiler(Compiler):  # type: ignore[misc]
+class _LibraryCompiler(Compiler):  # type: ignore[misc]
+    library_class: type[JITCodeLibrary]
+
     def _compile_core(self) -> Any:
         state = self.state
-        state.library = _CalleeLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
+        state.library = self.library_class(state.targetctx.codegen(), state.func_id.func_qualname)
         return super()._compile_core()
+
+
+class _EntryLibrary(JITCodeLibrary):  # type: ignore[misc]
+    # The code that Python calls. No compiled function links it: in the cache it is machine code, and the names in it.
+
+    def __init__(self, codegen: Any, name: str) -> None:
+        super().__init__(codegen, name)
+        self.enable_object_caching()
+
+    def serialize_using_object_code(self) -> tuple[str, str, tuple[bytes, bytes]]:
+        self._ensure_finalized()
+        there = chain(self._final_module.functions, self._final_module.global_variables)
+        names = "\n".join(f'@"{one.name}" = global i8 0' for one in there if not one.is_declaration)
+        return self.name, "object", (self._get_compiled_object(), parse_assembly(names).as_bitcode())
+
+
+class _EntryCompiler(_LibraryCompiler):
+    library_class = _EntryLibrary
 
 
 class _CalleeLibrary(JITCodeLibrary):  # type: ignore[misc]
@@ -98,6 +120,10 @@ class _CalleeLibrary(JITCodeLibrary):  # type: ignore[misc]
     def codegen(self) -> Any:
         # Numba puts the environment of a function into its machine code, to no use in nopython mode.
         return SimpleNamespace(set_env=lambda name, environment: None)
+
+
+class _CalleeCompiler(_LibraryCompiler):
+    library_class = _CalleeLibrary
 
 
 # What an operator makes of which types, Numba asks anew at each place in each function. Most implementations refuse,

@@ -209,18 +209,22 @@ def _assume_blas(algebra: Any) -> None:
 
 def _tolerate(caching: Any) -> None:
     """Replace how Numba's caches load: what cannot be loaded is forgotten, and there is nothing."""
-    caches = caching.FunctionCache
+    from numba.core.runtime.nrt import rtsys
+
+    caches, begin = caching.FunctionCache, rtsys.initialize
     load = caches.load_overload
 
     def load_or_forget(self: Any, sig: Any, target_context: Any) -> Any:
-        try:
+        function = self._py_func
+        if not function.__module__.startswith(f"{__package__.partition('.')[0]}."):
             return load(self, sig, target_context)
+        try:
+            begin(target_context)
+            with self._guard_against_spurious_io_errors():
+                return self._load_overload(sig, target_context)
         except MemoryError:
             raise
         except Exception as error:  # whatever unpickling anything raises
-            function = self._py_func
-            if not function.__module__.startswith(f"{__package__.partition('.')[0]}."):
-                raise
             why = " ".join(f"{type(error).__name__}: {error}".split())[:200]
             _unusable.append((f"{function.__module__}.{function.__qualname__}", why))
             with suppress(OSError):  # of a cache that cannot be written nothing is taken, either

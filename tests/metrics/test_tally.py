@@ -18,7 +18,7 @@ REASONS = ("object_left", "ego_left", "log_end")
 @st.composite
 def tables(draw: st.DrawFn) -> pd.DataFrame:
     """Rows of several logs, configurations, objects and runs: ties, gaps of the truth, objects known before."""
-    runs, logs = draw(st.integers(1, 6)), draw(st.integers(1, 6))
+    runs, logs = draw(st.integers(1, 4)), draw(st.integers(1, 4))
     whole = st.integers(-3, 9)
     rows = []
     for log in range(logs):

@@ -145,14 +145,14 @@ def test_check_says_what_a_fit_will_say(
 
 
 def test_numbers_that_were_put_in_are_inside_their_intervals(tmp_path: Path) -> None:
-    """Five seeds; `python tools/check_fit.py` has forty of each, and prints how wide the intervals are."""
+    """Four seeds; `python tools/check_fit.py` has forty of each, and prints how wide the intervals are."""
     found = []
-    for name, seeds in (("camera", (0, 1, 2)), ("radar", (0, 1))):
+    for name, seeds in (("camera", (0, 1)), ("radar", (0, 1))):
         for seed in seeds:
             path = check_fit.write_lists(CROSSING, *check_fit.KNOWN[name], seed, tmp_path / f"{name}.mcap")
             found.append(check_fit.inside(check_fit.fitted_to(path), *check_fit.KNOWN[name]))
     pairs = [pair for one in found for pair in one.values()]
-    assert len(pairs) > 5 * 30
+    assert len(pairs) > 4 * 30
     assert sum(check_fit.holds(*pair) for pair in pairs) >= 0.9 * len(pairs)
     names = (
         "delay_s",
