@@ -208,7 +208,7 @@ def test_a_recording_agrees_with_the_oracle(name: str) -> None:
             assert flat[k] == pytest.approx(flat_share(place[:2], corners[r], [b[0] for b in bodies]), abs=ERROR)
             assert surface[k] == pytest.approx(surface_share(place, target, bodies, azimuths=800), abs=ERROR)
             checked += 1
-    assert checked > 100
+    assert checked > 60
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="shared/data with recordings is not beside the project")
