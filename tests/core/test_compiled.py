@@ -330,3 +330,31 @@ def test_a_kernel_loads_no_linear_algebra_and_products_of_matrices_compile() -> 
     ]
     done = subprocess.run([sys.executable, "-c", "\n".join(lines)], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines() == ["False", "[[7.0, 10.0], [15.0, 22.0]]"]
+
+
+CACHED = """
+import glob, pickle, sys
+import numpy as np
+from copem_replay.core.compiled import watch_numba
+watch_numba()
+from copem_replay.core.geometry import is_in_polygon
+square = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]])
+print(bool(is_in_polygon(1.0, 1.0, square)), bool(is_in_polygon(3.0, 1.0, square)))
+print("numba.np.npyimpl" in sys.modules)
+[file] = glob.glob(sys.argv[1] + "/**/geometry.is_in_polygon*.nbc", recursive=True)
+with open(file, "rb") as opened:
+    (_, kind, (code, names)), *_ = pickle.load(opened)
+print(kind, len(code) > len(names))
+"""
+
+
+def test_what_is_in_the_cache_is_machine_code_and_needs_nothing_of_the_compiler(tmp_path: Path) -> None:
+    """The first process compiles, the second one finds the code: the same answers."""
+    told = [
+        subprocess.run(
+            [sys.executable, "-c", CACHED, str(tmp_path)], cwd=PACKAGE.parent, capture_output=True, text=True,
+            check=True, env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)},
+        ).stdout.splitlines()
+        for _ in range(2)
+    ]  # fmt: skip
+    assert told == [["True False", compiler, "object True"] for compiler in ("True", "False")]
