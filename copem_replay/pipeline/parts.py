@@ -292,7 +292,7 @@ def _find_components(value: object) -> Iterator[Component | MapFile]:
 
 # Parts as files.
 
-STATES_A_PART, MOST_RUNS = 1 << 20, 256
+STATES_A_PART, MOST_RUNS = 1 << 22, 256
 """Object states of the runs of a part, and runs, at most: some MB, and seconds of work. More: an experiment of few runs
 shares fewer parts with a longer one, and more memory is needed; no result changes."""
 

@@ -36,8 +36,9 @@ from copem_replay.pipeline.world import States, Transmission, has_channel
 if TYPE_CHECKING:
     import pandas as pd
 
-BLOCK_BYTES = 80_000_000
-"""Bytes that a block may hold. Larger: fewer blocks, and more memory for each worker."""
+BLOCK_BYTES, CHUNK_BYTES = 80_000_000, 400_000_000
+"""Bytes that a block may hold, and one of a log in time chunks, for each of which its truth and views are made anew.
+Larger: fewer blocks, and more memory for each worker."""
 
 STATE_BYTES = 400
 """Bytes of a row × run cell where states are sampled, fused and measured, else one: about fifty numbers."""
@@ -79,8 +80,9 @@ def cut_blocks(replay: Replay, experiment: Experiment, jobs: int, runs: tuple[in
     """All runs, or those of a range, cut into blocks that are small enough for memory and enough for the workers."""
     begin, end = runs or (0, experiment.runs)
     units = replay.expanded.with_(experiment)
-    rows = ROWS_A_CHUNK
+    rows, room = ROWS_A_CHUNK, CHUNK_BYTES
     if len(replay.chunks) == 1:
+        room = BLOCK_BYTES
         observations = replay.observe(replay.chunks[0]) if _needs_all_rows(units) else replay.measured
         rows = max(len(observations.tracks.frame_ix), 1)
     even = -(-(end - begin) // jobs)
@@ -94,7 +96,7 @@ def cut_blocks(replay: Replay, experiment: Experiment, jobs: int, runs: tuple[in
         cell_bytes = STATE_BYTES
         if not _needs_matches(units):
             cell_bytes = min(cell_bytes, TRACK_BYTES + STATE_BYTES // max(len(replay.expanded.units), 1))
-    at_once = BLOCK_BYTES // (rows * cell_bytes)
+    at_once = room // (rows * cell_bytes)
     size = max(1, min(at_once, even, small))
     return [np.arange(k, min(k + size, end)) for k in range(begin, end, size)]
 

@@ -358,7 +358,7 @@ def test_visible_shares_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr("copem_replay.perception.observation.visible_shares", counted)
     monkeypatch.setattr(chunking, "ROWS_AT_ONCE", 1)
     monkeypatch.setattr(chunking, "ROWS_A_CHUNK", 60)
-    monkeypatch.setattr("copem_replay.pipeline.replay.BLOCK_BYTES", 1)
+    monkeypatch.setattr("copem_replay.pipeline.replay.CHUNK_BYTES", 1)
     plan = experiment(runs=3, configurations={"late": {"units": "all", "latency_s": 0.4}}, pems={"sure": NOISY})
     result = run_experiment(plan, [traffic()])
     [replay] = result.replays
