@@ -208,10 +208,13 @@ def _assume_blas(algebra: Any) -> None:
 
 
 def _tolerate(caching: Any) -> None:
-    """Replace how Numba's caches load: what cannot be loaded is forgotten, and there is nothing."""
+    """Replace how Numba's caches load: what cannot be loaded is forgotten, and there is nothing.
+
+    Numba's own way first loads all that compiling needs, a tenth of a second. Cached code needs the runtime alone.
+    """
     from numba.core.runtime.nrt import rtsys
 
-    caches, begin = caching.FunctionCache, rtsys.initialize
+    caches = caching.FunctionCache
     load = caches.load_overload
 
     def load_or_forget(self: Any, sig: Any, target_context: Any) -> Any:
@@ -219,7 +222,7 @@ def _tolerate(caching: Any) -> None:
         if not function.__module__.startswith(f"{__package__.partition('.')[0]}."):
             return load(self, sig, target_context)
         try:
-            begin(target_context)
+            rtsys.initialize(target_context)
             with self._guard_against_spurious_io_errors():
                 return self._load_overload(sig, target_context)
         except MemoryError:

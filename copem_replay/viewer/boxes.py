@@ -237,7 +237,7 @@ class FalseEntries:
         self._at_once = max(self._at_once, int(np.bincount(frames).max(initial=0)))
 
 
-DASH = 0.3
+_DASH = 0.3
 """Which part of a side is drawn from each corner: no side is closed."""
 CROSS_M = 4.0
 """Least length of the lines of a cross: that over a false pedestrian would be 4 pixels wide."""
@@ -259,7 +259,7 @@ def _outline_corners(tracks: Tracks, rows: Int) -> np.ndarray:
         ],
         axis=-1,
     )  # (R, 4, 3)
-    dashes = [corner + DASH * (np.roll(corner, way, axis=1) - corner) for way in (1, -1)]
+    dashes = [corner + _DASH * (np.roll(corner, way, axis=1) - corner) for way in (1, -1)]
     corners = np.stack([dashes[0], corner, dashes[1]], axis=2)
     middle = corner.mean(axis=1, keepdims=True)
     size_m = np.linalg.norm(corner[:, :1] - corner[:, 2:3], axis=-1, keepdims=True)

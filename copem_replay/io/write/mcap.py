@@ -197,14 +197,14 @@ def _merge_by_time(streams: Sequence[Iterator[Message]]) -> Iterator[Message]:
 
 def _encode_ahead(messages: Iterator[Message]) -> Iterator[list[Message]]:
     """The messages, many at once, encoded in a thread chunks ahead: compiled code and compression share no lock."""
-    with ThreadPoolExecutor(1) as thread:
+    thread = ThreadPoolExecutor(1)
+    try:
         encoding = deque(thread.submit(_next_messages, messages) for _ in range(CHUNKS_AHEAD))
-        try:
-            while encoded := encoding.popleft().result():
-                encoding.append(thread.submit(_next_messages, messages))
-                yield encoded
-        finally:
-            thread.shutdown(cancel_futures=True)
+        while encoded := encoding.popleft().result():
+            encoding.append(thread.submit(_next_messages, messages))
+            yield encoded
+    finally:
+        thread.shutdown(cancel_futures=True)
 
 
 def _next_messages(messages: Iterator[Message]) -> list[Message]:
