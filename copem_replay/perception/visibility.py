@@ -280,7 +280,7 @@ def _compute_views(
     places = Observers(place_m, present, observers.carrier_ix)
     if asked is None:
         asked = Asked(np.ones(out.shape, dtype=bool), np.full(len(order), -1))
-    wanted = Asked(asked.always[:, order], asked.stretch[order])
+    wanted = Asked(np.ascontiguousarray(asked.always[:, order]), asked.stretch[order])
     threads = min(8, os.cpu_count() or 1)
     pieces = max(1, min(4 * threads, n_units * len(order) // _ROWS_PER_THREAD, n_frames))
     # Cuts with about as many rows each, so that threads end together.

@@ -174,9 +174,11 @@ def compute_shares(
     hides any of it, −2 − k for the obstacle k.
     """
     # Bodies of one list: the boxes first, then the static parts. Everything is relative to the observer.
-    most, widest = 0, boxes.corners_m.shape[1]
+    most, widest, stretches = 0, boxes.corners_m.shape[1], 0
     for f in range(f0, f1):
         most = max(most, boxes.bounds[f + 1] - boxes.bounds[f])
+    for stretch in asked.stretch:
+        stretches = max(stretches, stretch + 1)
     most += len(obstacles.body)
     for g in range(len(obstacles.body)):
         widest = max(widest, obstacles.start[g + 1] - obstacles.start[g])
@@ -191,7 +193,7 @@ def compute_shares(
     )  # fmt: skip
     work = _make_workspace(most, widest)
     still = _gather_statics(obstacles, len(places.carrier_ix), widest)
-    shown = np.zeros((len(places.carrier_ix), asked.stretch.max() + 1), np.bool_)  # of each stretch from each unit
+    shown = np.zeros((len(places.carrier_ix), stretches), np.bool_)  # of each stretch from each unit
     for f in range(f0, f1):
         first = boxes.bounds[f]
         n = boxes.bounds[f + 1] - first

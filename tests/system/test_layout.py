@@ -22,8 +22,8 @@ FLOORS = (
     {"cli"},
     {"__init__"},  # the public API: no wing, and no wing imports it
 )
-MOST_ROOMS = 261
-MOST_STATEMENTS = 43_622
+MOST_ROOMS = 262
+MOST_STATEMENTS = 43_663
 """Without docstrings. A change that needs more says what it let go."""
 SMALL_LINES = 60
 VERBS_OF_SEVERAL = {

@@ -1,0 +1,85 @@
+"""A second process that fills the cache of compiled code while the first replay on a machine compiles.
+
+Numba compiles under one lock, so a process compiles on one core. A replay begins with visible shares, which take as
+long to compile as accuracy and fusion, of which it has need at the end. The second process replays a short recording
+in which nothing hides anything: it begins with them, and the first finds them in the cache when it comes to them.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from copem_replay.core.tracks import Float, Tracks
+from copem_replay.perception.visibility import Observers, Statics, VisibilityModel
+
+MODULE = "copem_replay.cli.compile_ahead"
+"""This module by its name, also where it is the main one."""
+
+
+@contextmanager
+def compile_ahead() -> Iterator[None]:
+    """While the block lasts a second process compiles, where nothing is compiled yet and there is a core for it."""
+    if _is_compiled() or _count_cores() < 2 or not sys.executable:
+        yield
+        return
+    nowhere = subprocess.DEVNULL
+    with subprocess.Popen([sys.executable, "-m", MODULE], stdin=nowhere, stdout=nowhere, stderr=nowhere) as process:
+        try:
+            yield
+        finally:
+            process.kill()
+
+
+def _is_compiled() -> bool:
+    """Whether the cache has the kernel that takes longest, compiled for these arguments or for others."""
+    from copem_replay.metrics.accuracy.kernel import add_up
+
+    kernel: Any = add_up
+    return any(Path(kernel.stats.cache_path).glob("*.add_up-*.nbi"))
+
+
+def _count_cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class NothingHidden(VisibilityModel):
+    """Visible shares that take nothing to compile: all is seen from everywhere."""
+
+    def shares(self, world: Tracks, static: Statics, observers: Observers) -> Float:
+        """1 for every row from every unit: (U, P)."""
+        return np.ones((len(observers.carrier_ix), len(world.frame_ix)))
+
+
+def replay_in_advance() -> None:
+    """Replay a short recording, with what most experiments use."""
+    from copem_replay.api.run import run
+
+    error = {"kind": "gaussian", "covariance_m2": [[1.0, 0.0], [0.0, 1.0]]}
+    couple = {"detection": {"kind": "constant", "probability": 0.5}, "error": error}
+    run(
+        {
+            "version": 1,
+            "logs": [f"{Path(__file__).parent}/sample_logs/tc016d.mcap"],
+            "runs": 2,
+            "pems": {"any": [couple]},
+            "units": {
+                "ego": {"on": "ego", "pem": "any"},
+                "mast": {"at": [7.5, 9.0], "yaw_deg": -130, "height_m": 5, "pem": "any"},
+            },
+            "visibility": {"kind": f"{MODULE}:NothingHidden"},
+            "configurations": {"ideal": {"units": "all"}, "gnn": {"units": "all", "fusion": {"kind": "gnn"}}},
+            "measure": {"onset": {"kind": "in_range", "range_m": 50}},
+        }
+    )
+
+
+if __name__ == "__main__":
+    replay_in_advance()
