@@ -126,6 +126,18 @@ class RecordingContent:
         """The units of a configuration, by name."""
         return self.experiment.units_of(self.experiment.configurations[configuration])
 
+    @property
+    def with_map(self) -> bool:
+        """Whether there is a page with a map of the world."""
+        return self.replay.scene.frame is not None and asks_for_map(self.experiment)
+
+    @property
+    def selected_ns(self) -> tuple[int, int]:
+        """The time that is selected, ns since the log's start: from the first onset to the end."""
+        onset_ns = int(to_nanoseconds(self.table["onset_s"].min())) if len(self.table) else 0
+        scene = self.replay.scene
+        return onset_ns, max(scene.end_ns - scene.t0_ns, onset_ns)
+
 
 def make_time_axis(first_s: float, last_s: float) -> rrb.TimeAxis:
     """A time axis that first shows these seconds."""
@@ -408,31 +420,27 @@ LAYOUT = 7
 """Version of the blueprint, raised with every change: a viewer prefers the one it has kept for an application id."""
 
 
-def build_blueprint(content: RecordingContent) -> tuple[rrb.Blueprint, str]:
-    """The blueprint, and a digest of everything that it depends on."""
+def build_blueprint(content: RecordingContent) -> rrb.Blueprint:
+    """The blueprint."""
     import rerun.blueprint as rrb
 
-    scene = content.replay.scene
     pages = [overview_page(content)]
     if content.objects:
         pages += [lanes_page(content), reasons_page(content)]
     pages += [tracks_page(content), errors_page(content)]
     if any(content.received(name) for name in content.configurations):
         pages.append(units_page(content))
-    with_map = scene.frame is not None and asks_for_map(content.experiment)
-    pages += [map_page()] if with_map else []
+    pages += [map_page()] if content.with_map else []
     pages.append(text_page())
-    onset_ns = int(to_nanoseconds(content.table["onset_s"].min())) if len(content.table) else 0
-    end_ns = max(scene.end_ns - scene.t0_ns, onset_ns)
     # A blueprint cannot set the time cursor, but playing begins with the selection: at the first onset.
     panel = rrb.TimePanel(
         timeline=ELAPSED,
         play_state="paused",
         loop_mode="selection",
         state="collapsed",
-        time_selection=rrb.components.AbsoluteTimeRange(onset_ns, end_ns),
+        time_selection=rrb.components.AbsoluteTimeRange(*content.selected_ns),
     )
-    blueprint = rrb.Blueprint(
+    return rrb.Blueprint(
         rrb.Tabs(*pages, active_tab=0),
         panel,
         rrb.SelectionPanel(state="collapsed"),
@@ -440,6 +448,11 @@ def build_blueprint(content: RecordingContent) -> tuple[rrb.Blueprint, str]:
         auto_layout=False,
         auto_views=False,
     )
+
+
+def digest_layout(content: RecordingContent) -> str:
+    """A digest of everything that the blueprint depends on, but for counts in its titles."""
+    scene = content.replay.scene
     eyes = [
         (eye.place_m.tolist(), eye.target_m.tolist(), eye.object_ix)
         for eye in (content.eye, *content.eyes, content.above)
@@ -452,14 +465,13 @@ def build_blueprint(content: RecordingContent) -> tuple[rrb.Blueprint, str]:
         eyes,
         [content.axes_s[k] for k in content.objects],
         list(content.named),
-        onset_ns,
-        end_ns,
+        *content.selected_ns,
         content.baseline,
         [content.title(name) for name in content.configurations],
         *([under] if any(under := [content.under(k) for k in content.objects]) else []),
-        *(["map"] if with_map else []),
+        *(["map"] if content.with_map else []),
     )
-    return blueprint, digest_texts(repr(parts))
+    return digest_texts(repr(parts))
 
 
 def view_aspect(experiment: Experiment, configurations: Sequence[str]) -> float:

@@ -9,7 +9,7 @@ from functools import cached_property
 from importlib.metadata import version
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -25,7 +25,7 @@ from copem_replay.pipeline.prepare import Replay
 from copem_replay.results.shown_objects import ShownObjects, axis_s, choose_shown_objects, find_opening_s
 from copem_replay.results.write import Exporter, RunToExport
 from copem_replay.viewer import boxes, curves, lanes, sensors
-from copem_replay.viewer.blueprint import NEAR_BY, RecordingContent, build_blueprint, view_aspect
+from copem_replay.viewer.blueprint import NEAR_BY, RecordingContent, build_blueprint, digest_layout, view_aspect
 from copem_replay.viewer.camera import (
     MovingPicture,
     camera_above,
@@ -75,9 +75,6 @@ from copem_replay.viewer.status import (
     write_status_words,
 )
 
-if TYPE_CHECKING:
-    from rerun import build_blueprint as rrb
-
 
 def write_rrd(
     path: Path,
@@ -119,14 +116,13 @@ def write_rrd(
             content = replace(
                 _build_content(replay, experiment, table, part.configurations, shown, first, baseline), of_one=of_one
             )
-            panels, appearance = build_blueprint(content)
             identity = (experiment.model_dump_json(), replay.scene.log, str(run), run_is, part.infix)
             # The viewer takes two files of one identity for one recording.
-            ids = f"copem_replay:{appearance}", digest_texts(*identity)
+            ids = f"copem_replay:{digest_layout(content)}", digest_texts(*identity)
             out = stack.enter_context(_open_streams(part.path(path), ids, replay.scene.t0_ns, viewer))
             colours = configuration_colours(experiment.configurations, truths=truths, selected=part.configurations)
             files.append(_RecordingFile(out, content, {name: colours[name] for name in part.configurations}))
-            _begin_file(files[-1], panels, summary, run, run_is, [p.path(path).name for p in parts if p != part])
+            _begin_file(files[-1], summary, run, run_is, [p.path(path).name for p in parts if p != part])
         if baseline is not None:  # of all objects at once: such a log is not long
             for file in files:
                 compared = {name: first[name] for name in file.colours}
@@ -214,16 +210,14 @@ def _open_streams(path: Path, ids: tuple[str, str], t0_ns: int, viewer: str | No
             live.close()
 
 
-def _begin_file(
-    file: _RecordingFile, panels: rrb.Blueprint, summary: pd.DataFrame, run: int, run_is: str, further: Sequence[str]
-) -> None:
+def _begin_file(file: _RecordingFile, summary: pd.DataFrame, run: int, run_is: str, further: Sequence[str]) -> None:
     """Write everything that does not depend on fused tracks; a running viewer gets the layout, too."""
     import rerun as rr
 
     out, content = file.out, file.content
     replay, experiment, scene = content.replay, content.experiment, content.replay.scene
     if out.live is not None:
-        out.live.send(lambda rec: rec.send_blueprint(panels, make_active=True))
+        out.live.send(lambda rec: rec.send_blueprint(build_blueprint(content), make_active=True))
     if file.picture is not None:
         write_moving_origin(out, replay, file.picture)
     for eye in content.eyes:
@@ -260,7 +254,7 @@ def _begin_file(
 def _send_layout(file: _RecordingFile) -> None:
     """Write the layout, whose titles count false entries; active, so that no viewer replaces it by a guess."""
     counts = {name: false.count for name, false in file.false.items()}
-    panels, _ = build_blueprint(replace(file.content, false=counts, brief=file.brief))
+    panels = build_blueprint(replace(file.content, false=counts, brief=file.brief))
     file.out.send(lambda rec: rec.send_blueprint(panels, make_active=True))
 
 

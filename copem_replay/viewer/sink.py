@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from threading import Thread
 from types import SimpleNamespace
@@ -272,8 +273,12 @@ def plain_part(name: str) -> str:
 
 def entity_names(scene: Scene) -> list[str]:
     """(N,) names of objects in entity paths, “6_pedestrian”; equal names get a number."""
-    names = zip(short_ids(scene), scene.object_class, strict=True)
-    return make_distinct([f"{plain_part(name)}_{CLASSES[k]}" for name, k in names])
+    return _name_entities(short_ids(scene), tuple(scene.object_class.tolist()))
+
+
+@lru_cache(maxsize=4)  # asked for object by object
+def _name_entities(ids: tuple[str, ...], classes: tuple[int, ...]) -> list[str]:
+    return make_distinct([f"{plain_part(name)}_{CLASSES[k]}" for name, k in zip(ids, classes, strict=True)])
 
 
 def make_distinct(names: Sequence[str]) -> list[str]:
@@ -311,7 +316,11 @@ def digest_texts(*texts: str) -> str:
 
 def short_ids(scene: Scene) -> tuple[str, ...]:
     """(N,) ids as drawn: long ones cut to the shortest beginning, of four letters or more, that keeps them distinct."""
-    ids = scene.object_ids
+    return _shorten_ids(scene.object_ids)
+
+
+@lru_cache(maxsize=4)
+def _shorten_ids(ids: tuple[str, ...]) -> tuple[str, ...]:
     if max(map(len, ids), default=0) <= LONG_ID:
         return ids
     keep = next(k for k in range(4, max(map(len, ids)) + 1) if len({name[:k] for name in ids}) == len(set(ids)))
