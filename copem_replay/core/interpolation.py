@@ -27,8 +27,10 @@ AROUND_S = 1e-3
 
 def interpolate_at_instants(truth: Tracks, stamps_ns: Int, *, t0_ns: int, max_gap_s: float) -> Tracks:
     """The world at other instants: one list per instant of `stamps_ns (F,)` (ascending), of all objects then there."""
-    if _is_own_frames(truth, stamps_ns):
-        return truth
+    own = _find_own_frames(truth, stamps_ns, max_gap_s)
+    captured_s: Float = (stamps_ns - t0_ns) * np.float64(1e-9)
+    if own is not None:
+        return truth if len(own) == len(truth.stamp_ns) else _take_frames(truth, own, captured_s)
     first, last = _track_ends(truth)
     lo = np.searchsorted(stamps_ns, first - SAME_INSTANT_NS, side="left")
     hi = np.searchsorted(stamps_ns, last + SAME_INSTANT_NS, side="right")
@@ -40,7 +42,6 @@ def interpolate_at_instants(truth: Tracks, stamps_ns: Int, *, t0_ns: int, max_ga
     track, frame = track[present], frame[present]
     lengths = np.bincount(track, minlength=len(counts))
     kept = lengths > 0
-    captured_s: Float = (stamps_ns - t0_ns) * np.float64(1e-9)
     return replace(
         truth,
         start=np.concatenate([[0], np.cumsum(lengths[kept])]),
@@ -124,13 +125,33 @@ def _extrapolate_states(truth: Tracks, world: Tracks, row: Int, frame: Int) -> T
     )
 
 
-def _is_own_frames(truth: Tracks, stamps_ns: Int) -> bool:
-    """Whether these are the truth's own frames, and no object misses one of its stay: nothing is in between."""
-    if not np.array_equal(stamps_ns, truth.stamp_ns) or (np.diff(stamps_ns) <= 2 * SAME_INSTANT_NS).any():
-        return False
+def _find_own_frames(truth: Tracks, stamps_ns: Int, max_gap_s: float) -> Int | None:
+    """Which of the truth's own frames these instants are (F,); None: not all are, or an object is between two then."""
+    frames: Int = np.searchsorted(truth.stamp_ns, stamps_ns)
+    own = np.array_equal(truth.stamp_ns[frames[frames < len(truth.stamp_ns)]], stamps_ns)
+    if not own or (np.diff(frames) < 1).any() or (np.diff(truth.stamp_ns) <= 2 * SAME_INSTANT_NS).any():
+        return None
     missed = np.diff(truth.frame_ix) != 1
     missed[truth.start[1:-1] - 1] = False
-    return not missed.any()
+    before = np.flatnonzero(missed)
+    gap_ns = truth.stamp_ns[truth.frame_ix[before + 1]] - truth.stamp_ns[truth.frame_ix[before]]
+    return None if (gap_ns <= max_gap_s * 1e9 + SAME_INSTANT_NS).any() else frames
+
+
+def _take_frames(truth: Tracks, frames: Int, captured_s: Float) -> Tracks:
+    """Only some of the truth's frames (F,), ascending, and the rows in them."""
+    number = np.full(len(truth.stamp_ns), -1)
+    number[frames] = np.arange(len(frames))
+    of_rows = number[truth.frame_ix]
+    rows = np.flatnonzero(of_rows >= 0)
+    return replace(
+        truth.take_rows(rows),
+        frame_ix=of_rows[rows],
+        stamp_ns=truth.stamp_ns[frames],
+        captured_s=captured_s,
+        frame_unit_ix=np.zeros(len(frames), dtype=np.int64),
+        arrives_s=captured_s[None],
+    )
 
 
 def interpolate_states(

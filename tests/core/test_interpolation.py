@@ -293,6 +293,23 @@ def test_against_the_oracle(seen: dict[int, list[Sighting]], data: st.DataObject
             same({name: float(column[k]) for name, column in columns.items()}, known)
 
 
+@settings(deadline=None)
+@given(st.lists(st.sets(st.integers(0, 11), max_size=8), max_size=3), st.sets(st.integers(0, 11)), st.data())
+def test_some_of_the_truths_own_frames(missed: list[set[int]], asked: set[int], data: st.DataObject) -> None:
+    """Ten frames a second, of which objects miss any or none: up to four in a row are filled, more are a gap."""
+    seen = {
+        o: [Sighting(k * 100 * MS, data.draw(values)) for k in range(12) if k not in frames]
+        for o, frames in enumerate(missed)
+    }
+    world, instants = truth(seen, frames_ns=[k * 100 * MS for k in range(12)]), [k * 100 * MS for k in sorted(asked)]
+    found = interpolate_at_instants(world, T0_NS + np.array(instants, dtype=np.int64), t0_ns=T0_NS, max_gap_s=MAX_GAP_S)
+    for t_ns, held in zip(instants, by_list(found, instants), strict=True):
+        expected = {o: state for o, each in seen.items() if (state := plain(each, t_ns)) is not None}
+        assert held.keys() == expected.keys()
+        for object_ix, state in expected.items():
+            same(held[object_ix], state)
+
+
 @pytest.mark.parametrize("asked", [None, [0, 100, 200, 300]])
 def test_a_frame_that_one_object_misses_is_filled_at_the_truths_own_instants(asked: list[int] | None) -> None:
     """Object 1 is not in the frame of 100 ms, in which object 2 is: it was half way, and so it is there."""
