@@ -154,7 +154,7 @@ class NumberField:
         dtype = np.float64 if self._fixed else np.uint64 if values.dtype.kind == "u" else np.int64
         self._bits = np.ascontiguousarray(values, dtype=dtype).view(np.uint64)
         self._tag = np.uint64(tag)
-        head = int(varint_sizes(np.array([tag], dtype=np.uint64))[0])
+        head = -(-tag.bit_length() // 7)
         sizes = np.full(len(values), head + 8) if self._fixed else varint_sizes(self._bits) + head
         self.sizes: Int = sizes if always else np.where(self._bits != 0, sizes, 0)
 

@@ -20,6 +20,7 @@ from contextlib import contextmanager
 from importlib.metadata import version
 from itertools import chain
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -32,7 +33,7 @@ from mcap.writer import Writer
 from copem_replay.core.colours import Rgb, configuration_colours
 from copem_replay.core.files import atomic_file
 from copem_replay.core.fused_tracks import FusedTracks
-from copem_replay.core.tracks import SAME_INSTANT_S, TRUTH, Scene, Tracks
+from copem_replay.core.tracks import SAME_INSTANT_S, TRUTH, Int, Scene, Tracks
 from copem_replay.io.open import Local
 from copem_replay.io.window import Window
 from copem_replay.io.write.detail import Event, Statuses
@@ -101,7 +102,7 @@ def write_mcap(
         messages = original.messages(original.register(catalogue, without=ours))
         opened = (family or OSI)(catalogue, scene, numbers)
 
-        def streams_of(chunk: Mapping[str, FusedTracks]) -> list[Iterator[Message]]:
+        def streams_of(chunk: Mapping[str, FusedTracks]) -> list[TimedMessages]:
             lists = _encode_chunk_lists(opened, scene, chunk, table, colours)
             return [*lists, *_encode_chunk_extras(opened, scene, chunk, table, colours)]
 
@@ -109,7 +110,7 @@ def write_mcap(
         shown = [] if truth is None or TRUTH in first else [_encode_truth(opened.truth(), truth)]
         del first
         chunks = chain([begun], map(streams_of, rest))
-        added, later_ns = _shift_to_zero(_merge_by_time([chain.from_iterable(map(_merge_by_time, chunks)), *shown]))
+        added, later_ns = _shift_to_zero(_merge_by_time([chain.from_iterable(map(_order_by_time, chunks)), *shown]))
         _add_records(writer, original, opened.osi, {**manifest, **{f"unit.{k}": unit for unit, k in numbers.items()}})
         for encoded in _encode_ahead(_merge_by_time([messages, added])):
             writer.add_messages(encoded)
@@ -159,7 +160,7 @@ def _encode_chunk_lists(
     chunk: Mapping[str, FusedTracks],
     table: pd.DataFrame,
     colours: Mapping[str, Rgb],
-) -> Iterator[Iterator[Message]]:
+) -> Iterator[TimedMessages]:
     """The messages of `objects`, `scene` and `detail` of each configuration in one time chunk."""
     for name, fused_tracks in chunk.items():
         events = _find_events(fused_tracks.fused, table[table["configuration"] == name])
@@ -172,7 +173,7 @@ def _encode_chunk_extras(
     chunk: Mapping[str, FusedTracks],
     table: pd.DataFrame,
     colours: Mapping[str, Rgb],
-) -> Iterator[Iterator[Message]]:
+) -> Iterator[TimedMessages]:
     """The messages of `status` and `uncertainty` of each configuration in one time chunk."""
     for name, fused_tracks in chunk.items():
         statuses = Statuses(scene, fused_tracks, table[table["configuration"] == name])
@@ -193,6 +194,21 @@ def _encode_truth(writer: TruthWriter, truth: TruthScene) -> Iterator[Message]:
 
 def _merge_by_time(streams: Sequence[Iterator[Message]]) -> Iterator[Message]:
     return heapq.merge(*streams, key=lambda m: m.log_time)
+
+
+class TimedMessages(NamedTuple):
+    """Messages in the order of their log times, which are known before the messages are made."""
+
+    log_time_ns: Int
+    messages: Iterator[Message]
+
+
+def _order_by_time(streams: Sequence[TimedMessages]) -> Iterator[Message]:
+    """The messages of all streams by time; of those at one time the first stream's first."""
+    times_ns = [one.log_time_ns for one in streams]
+    stream_ix = np.repeat(np.arange(len(streams)), [len(of_one) for of_one in times_ns])
+    order = np.argsort(np.concatenate(times_ns), kind="stable")
+    return (next(streams[k].messages) for k in stream_ix[order].tolist())
 
 
 def _encode_ahead(messages: Iterator[Message]) -> Iterator[list[Message]]:
@@ -217,12 +233,15 @@ def _next_messages(messages: Iterator[Message]) -> list[Message]:
     return messages_of_chunk
 
 
-def _encode_lists(scene: Scene, fused: Tracks, writers: Mapping[int, ListWriter]) -> Iterator[Message]:
+def _encode_lists(scene: Scene, fused: Tracks, writers: Mapping[int, ListWriter]) -> TimedMessages:
     available_ns = scene.t0_ns + np.rint(fused.common_arrives_s * 1e9).astype(np.int64)
-    streams = zip(*(writer.messages(available_ns) for writer in writers.values()), strict=True)
-    for time_ns, beside in zip(available_ns.tolist(), streams, strict=True):
-        for channel, data in zip(writers, beside, strict=True):
-            yield Message(channel, time_ns, data, time_ns, 0)
+    beside = zip(*(writer.messages(available_ns) for writer in writers.values()), strict=True)
+    messages = (
+        Message(channel, time_ns, data, time_ns, 0)
+        for time_ns, of_list in zip(available_ns.tolist(), beside, strict=True)
+        for channel, data in zip(writers, of_list, strict=True)
+    )
+    return TimedMessages(np.repeat(available_ns, len(writers)), messages)
 
 
 def _find_events(fused: Tracks, table: pd.DataFrame) -> dict[int, list[Event]]:
