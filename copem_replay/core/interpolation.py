@@ -31,6 +31,7 @@ def interpolate_at_instants(truth: Tracks, stamps_ns: Int, *, t0_ns: int, max_ga
     captured_s: Float = (stamps_ns - t0_ns) * np.float64(1e-9)
     if own is not None:
         return truth if len(own) == len(truth.stamp_ns) else _take_frames(truth, own, captured_s)
+    truth = _cut_around(truth, captured_s, max_gap_s)
     first, last = _track_ends(truth)
     lo = np.searchsorted(stamps_ns, first - SAME_INSTANT_NS, side="left")
     hi = np.searchsorted(stamps_ns, last + SAME_INSTANT_NS, side="right")
@@ -66,6 +67,7 @@ def interpolate_at_stated_instants(
     there at the capture, but not at the stated instant, has the first state after it moved back by its velocity, or
     the last state before it moved on, by at most `max_gap_s`. All else is as in `interpolate_at_instants`.
     """
+    truth = _cut_around(truth, (stamps_ns - t0_ns) * np.float64(1e-9), max_gap_s)
     world = interpolate_at_instants(truth, stamps_ns, t0_ns=t0_ns, max_gap_s=max_gap_s)
     if not len(truth.frame_ix):
         return world
@@ -131,27 +133,31 @@ def _find_own_frames(truth: Tracks, stamps_ns: Int, max_gap_s: float) -> Int | N
     own = np.array_equal(truth.stamp_ns[frames[frames < len(truth.stamp_ns)]], stamps_ns)
     if not own or (np.diff(frames) < 1).any() or (np.diff(truth.stamp_ns) <= 2 * SAME_INSTANT_NS).any():
         return None
-    missed = np.diff(truth.frame_ix) != 1
-    missed[truth.start[1:-1] - 1] = False
-    before = np.flatnonzero(missed)
-    gap_ns = truth.stamp_ns[truth.frame_ix[before + 1]] - truth.stamp_ns[truth.frame_ix[before]]
+    after_miss = truth.frame_ix[truth.rows_after_miss]
+    gap_ns = truth.stamp_ns[after_miss] - truth.stamp_ns[truth.frame_ix[truth.rows_after_miss - 1]]
     return None if (gap_ns <= max_gap_s * 1e9 + SAME_INSTANT_NS).any() else frames
 
 
 def _take_frames(truth: Tracks, frames: Int, captured_s: Float) -> Tracks:
     """Only some of the truth's frames (F,), ascending, and the rows in them."""
+    rows = truth.rows_between(frames[0], frames[-1] + 1) if len(frames) else frames
     number = np.full(len(truth.stamp_ns), -1)
     number[frames] = np.arange(len(frames))
-    of_rows = number[truth.frame_ix]
-    rows = np.flatnonzero(of_rows >= 0)
+    rows = rows[number[truth.frame_ix[rows]] >= 0]
     return replace(
         truth.take_rows(rows),
-        frame_ix=of_rows[rows],
+        frame_ix=number[truth.frame_ix[rows]],
         stamp_ns=truth.stamp_ns[frames],
         captured_s=captured_s,
         frame_unit_ix=np.zeros(len(frames), dtype=np.int64),
         arrives_s=captured_s[None],
     )
+
+
+def _cut_around(truth: Tracks, captured_s: Float, max_gap_s: float) -> Tracks:
+    """The part of the truth that interpolation at instants (F,), ascending, needs."""
+    around_s = max_gap_s + AROUND_S
+    return truth.captured_between(captured_s[0] - around_s, captured_s[-1] + around_s) if len(captured_s) else truth
 
 
 def interpolate_states(

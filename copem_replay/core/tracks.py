@@ -305,6 +305,13 @@ class Tracks:
         """(P,) rows list by list, in each from west to east, and at one place the first object first; of one run."""
         return np.lexsort((self.row_object_ix, self.x_m[0], self.frame_ix))
 
+    @cached_property
+    def rows_after_miss(self) -> Int:
+        """(K,) rows whose object is not in the list before theirs, but in an earlier one."""
+        missed = np.diff(self.frame_ix) != 1
+        missed[self.start[1:-1] - 1] = False
+        return np.flatnonzero(missed) + 1
+
     def take_tracks(self, keep: Bool) -> Tracks:
         """Only the tracks of `keep` (E,). Lists stay: one that held only others is then an empty list."""
         return self if keep.all() else self.take_rows(np.flatnonzero(np.repeat(keep, np.diff(self.start))))
@@ -345,8 +352,12 @@ class Tracks:
         first, after = np.searchsorted(self.captured_s, (from_s, until_s))
         if first == 0 and after == len(self.captured_s):
             return self
+        return self.take_rows(self.rows_between(first, after))
+
+    def rows_between(self, first: int, after: int) -> Int:
+        """(K,) the rows of lists from one on and before another, ascending."""
         order, bounds = self.by_frame
-        return self.take_rows(np.sort(order[bounds[first] : bounds[after]]))
+        return np.sort(order[bounds[first] : bounds[after]])
 
 
 def join_tracks(units: tuple[str, ...], pieces: Sequence[Tracks]) -> Tracks:

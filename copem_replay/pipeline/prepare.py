@@ -19,7 +19,7 @@ import numpy as np
 from copem_replay.communication.link import KeptDraws
 from copem_replay.communication.reception import RadioPath
 from copem_replay.core.errors import ExperimentError
-from copem_replay.core.interpolation import AROUND_S, interpolate_at_instants, interpolate_at_stated_instants
+from copem_replay.core.interpolation import interpolate_at_instants, interpolate_at_stated_instants
 from copem_replay.core.object_list import AGREE
 from copem_replay.core.tracks import CLASSES, Bool, Float, Int, Scene, TimeChunk, Tracks, class_indices, join_tracks
 from copem_replay.experiment.schema import Experiment
@@ -100,7 +100,7 @@ class TruthCache:
     def between(self, time_s: Float) -> Tracks:
         """The truth at instants (K,), ascending, which is not kept."""
         return interpolate_at_instants(
-            self._near(time_s), self._stamps(time_s), t0_ns=self.scene.t0_ns, max_gap_s=self.experiment.max_gap_s
+            self.truth, self._stamps(time_s), t0_ns=self.scene.t0_ns, max_gap_s=self.experiment.max_gap_s
         )
 
     def at_stated(self, time_s: Float, captured_s: tuple[Float, Float]) -> Tracks:
@@ -120,19 +120,12 @@ class TruthCache:
     def _at_stated(self, times_s: Float) -> Tracks:
         stamps, earliest, latest = self._stamps(times_s)
         return interpolate_at_stated_instants(
-            self._near(times_s[0]), stamps, (earliest, latest), t0_ns=self.scene.t0_ns,
+            self.truth, stamps, (earliest, latest), t0_ns=self.scene.t0_ns,
             max_gap_s=self.experiment.max_gap_s,
         )  # fmt: skip
 
     def _stamps(self, time_s: Float) -> Int:
         return self.scene.t0_ns + np.rint(time_s * 1e9).astype(np.int64)
-
-    def _near(self, time_s: Float) -> Tracks:
-        """The part of the truth that interpolation at instants (K,) needs."""
-        if not len(time_s):
-            return self.truth
-        gap_s = self.experiment.max_gap_s + AROUND_S
-        return self.truth.captured_between(time_s[0] - gap_s, time_s[-1] + gap_s)
 
     def reference(self, time_s: Float) -> Reference:
         """From where distances are measured, at instants (K,)."""

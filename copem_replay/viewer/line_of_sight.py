@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from copem_replay.core.errors import is_own
-from copem_replay.core.interpolation import AROUND_S, interpolate_at_instants, wrap_angles
+from copem_replay.core.interpolation import interpolate_at_instants, wrap_angles
 from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int, Solid, Tracks
 from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.experiment.schema import Experiment, Unit
@@ -195,10 +195,8 @@ def _keep_near_lines(
 
 def _world_at_frames(replay: Replay, experiment: Experiment, elapsed_ns: Int) -> Tracks:
     """The truth at ascending frames (K,), ns since the log's start."""
-    t0_ns, gap_s = replay.scene.t0_ns, experiment.max_gap_s
-    around_s = gap_s + AROUND_S
-    near = replay.truth.captured_between(elapsed_ns[0] * 1e-9 - around_s, elapsed_ns[-1] * 1e-9 + around_s)
-    return interpolate_at_instants(near, t0_ns + elapsed_ns, t0_ns=t0_ns, max_gap_s=gap_s)
+    t0_ns = replay.scene.t0_ns
+    return interpolate_at_instants(replay.truth, t0_ns + elapsed_ns, t0_ns=t0_ns, max_gap_s=experiment.max_gap_s)
 
 
 def _shown_rows(world: Tracks, shown: Sequence[int]) -> tuple[Int, Int]:

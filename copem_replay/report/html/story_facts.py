@@ -12,7 +12,7 @@ import pandas as pd
 
 from copem_replay.core.errors import CopemError, InputError, count_noun
 from copem_replay.core.fused_tracks import FusedTracks
-from copem_replay.core.interpolation import AROUND_S, interpolate_at_instants
+from copem_replay.core.interpolation import interpolate_at_instants
 from copem_replay.core.tracks import CLASSES, SAME_INSTANT_S, Tracks
 from copem_replay.experiment.schema import Unit
 from copem_replay.perception.sensor_poses import (
@@ -137,8 +137,7 @@ def find_hider(story: ObjectStory) -> tuple[str, int] | None:
 def world_at(drive: Drive, time_s: float) -> Tracks:
     """The truth at an instant, in seconds since the log's start."""
     gap_s, t0_ns = drive.experiment.max_gap_s, drive.scene.t0_ns
-    near = drive.truth.captured_between(time_s - gap_s - AROUND_S, time_s + gap_s + AROUND_S)
-    return interpolate_at_instants(near, np.array([t0_ns + round(time_s * 1e9)]), t0_ns=t0_ns, max_gap_s=gap_s)
+    return interpolate_at_instants(drive.truth, np.array([t0_ns + round(time_s * 1e9)]), t0_ns=t0_ns, max_gap_s=gap_s)
 
 
 def unit_pose(drive: Drive, name: str, unit: Unit, world: Tracks) -> UnitPoses:
