@@ -283,14 +283,22 @@ def encode_messages(descriptor: Descriptor, content: Content, rows: int) -> list
 
 
 def _encode_fields(descriptor: Descriptor, content: Content, rows: int) -> list[RecordPart]:
-    """The parts of a message: its fields in the order of their numbers."""
-    fields = {name: descriptor.fields_by_name[name] for name in content}
-    return [
-        _encode_field(fields[name], content[name], rows) for name in sorted(content, key=lambda n: fields[n].number)
-    ]
+    """The parts of a message: its fields in the order of their numbers; without repeated ones that no row has."""
+    there = {
+        name: value for name, value in content.items() if not isinstance(value, RepeatedMessages) or value.start[-1]
+    }
+    fields = sorted((descriptor.fields_by_name[name] for name in there), key=lambda field: field.number)
+    return [_encode_field(field, there[field.name], rows) for field in fields]
+
+
+def _is_constant(value: Any) -> bool:
+    """Whether a value is the same in all rows."""
+    return all(map(_is_constant, value.values())) if isinstance(value, Mapping) else isinstance(value, int | float)
 
 
 def _encode_field(field: FieldDescriptor, value: Any, rows: int) -> RecordPart:
+    if rows != 1 and _is_constant(value):
+        return repeat_text(encode_records([_encode_field(field, value, 1)], 1)[0], rows)
     number = field.number << 3
     if isinstance(value, RepeatedMessages):
         inside = int(value.start[-1])

@@ -252,13 +252,15 @@ def _find_events(fused: Tracks, table: pd.DataFrame) -> dict[int, list[Event]]:
         return events
     # Detections outside are those of other time chunks.
     here = table["detection_s"].between(issue_s[0] - tolerance_s, issue_s[-1] + tolerance_s)
-    for row in table[table["detected"] & here].to_dict("records"):
+    for row in table.loc[table["detected"] & here, ["object_id", "first_unit", *_EVENT_TIMES]].to_dict("records"):
         frame = int(np.abs(issue_s - row["detection_s"]).argmin())
-        event = {"object": row["object_id"], "first_unit": row["first_unit"]}
-        for name in ("onset_s", "captured_s", "time_to_detection_s", "distance_at_detection_m"):
-            event[name] = None if row[name] != row[name] else float(row[name])
-        events.setdefault(frame, []).append(event)
+        times = {name: None if np.isnan(row[name]) else float(row[name]) for name in _EVENT_TIMES[1:]}
+        events.setdefault(frame, []).append({"object": row["object_id"], "first_unit": row["first_unit"], **times})
     return events
+
+
+_EVENT_TIMES = ("detection_s", "onset_s", "captured_s", "time_to_detection_s", "distance_at_detection_m")
+"""Columns of the detections table; a detection tells of all but the first."""
 
 
 def _keep_metadata(original: RecordingSource) -> dict[str, dict[str, str]]:

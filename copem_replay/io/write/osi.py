@@ -211,6 +211,8 @@ class SensorDataWriter:
             }
             frame = np.repeat(np.arange(len(lists)), lists)
             for name, kind in (("moving_object", self._moving[listed]), ("stationary_object", ~self._moving[listed])):
+                if not kind.any():
+                    continue
                 start = np.searchsorted(frame[kind], np.arange(len(lists) + 1))
                 items = self._items(listed[kind], captured_ns[frame[kind]], name == "moving_object")
                 content[name] = RepeatedMessages(start, items)
