@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import secrets
 import stat
 import sys
 from collections.abc import Callable, Mapping
@@ -162,8 +163,8 @@ def _own_folder() -> tuple[str, str]:
     return own, f" for this process alone ({folder} is not a folder of this user alone)"
 
 
-# Two places of Numba are changed when it is imported, as it offers none for this. The method that reads its cache is
-# replaced, for the functions of this package alone: cached code may be of no use.
+# Two places of Numba are changed when it is imported, as it offers none for this. The methods that read and write its
+# cache are replaced, for the functions of this package alone: cached code may be of no use, or another's.
 
 _CACHING, _ALGEBRA = "numba.core.caching", "numba.np.linalg"
 _unusable: list[tuple[str, str]] = []
@@ -208,18 +209,31 @@ def _assume_blas(algebra: Any) -> None:
 
 
 def _tolerate(caching: Any) -> None:
-    """Replace how Numba's caches load: what cannot be loaded is forgotten, and there is nothing.
+    """Replace how Numba's caches load and save.
 
-    Numba's own way first loads all that compiling needs, a tenth of a second. Cached code needs the runtime alone.
+    What cannot be loaded is forgotten, and there is nothing. Numba's own way first loads all that compiling needs, a
+    tenth of a second. Cached code needs the runtime alone.
+
+    A file of code has a name of its own. Numba numbers the files of a function by its index: where two processes
+    compile it at once for other arguments, one's code would have the name that the other's index gives.
     """
     from numba.core.runtime.nrt import rtsys
 
     caches = caching.FunctionCache
-    load = caches.load_overload
+    load, save = caches.load_overload, caches.save_overload
+
+    def is_ours(function: Any) -> bool:
+        return bool(function.__module__.startswith(f"{__package__.partition('.')[0]}."))
+
+    def save_apart(self: Any, sig: Any, data: Any) -> None:
+        if is_ours(self._py_func):
+            file = self._cache_file
+            file._data_name_pattern = f"{file._index_name.removesuffix('.nbi')}.{secrets.token_hex(4)}.{{number:d}}.nbc"
+        save(self, sig, data)
 
     def load_or_forget(self: Any, sig: Any, target_context: Any) -> Any:
         function = self._py_func
-        if not function.__module__.startswith(f"{__package__.partition('.')[0]}."):
+        if not is_ours(function):
             return load(self, sig, target_context)
         try:
             rtsys.initialize(target_context)
@@ -234,4 +248,4 @@ def _tolerate(caching: Any) -> None:
                 self.flush()
             return None
 
-    caches.load_overload = load_or_forget
+    caches.load_overload, caches.save_overload = load_or_forget, save_apart

@@ -213,6 +213,42 @@ def test_cached_code_that_cannot_be_used_is_compiled_again(tmp_path: Path) -> No
     assert "No module named 'no_such_module'" in found[4][2]
 
 
+AT_ONCE = """
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from copem_replay.core import compiled
+from copem_replay.core.geometry import is_in_polygon
+
+SQUARE = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]])
+one, other, third = (compiled.kernel(is_in_polygon.py_func) for _ in range(3))
+file, file_of_other = one._cache._cache_file, other._cache._cache_file
+write = file._save_data
+
+def write_after_the_other(name, data):
+    # The other process has read the index before this one wrote its own.
+    file_of_other._load_index = dict
+    other(0.5, 0.5, SQUARE)
+    write(name, data)
+
+file._save_data = write_after_the_other
+one(1, 1, SQUARE)
+found = [bool(third(x, 0.5, SQUARE)) for x in (0.5, 2.5)], bool(third(1, 1, SQUARE))
+print(*found, sum(third.stats.cache_hits.values()))
+"""
+
+
+def test_two_processes_that_compile_at_once_do_not_take_the_code_of_one_another(tmp_path: Path) -> None:
+    """Whole numbers, and floats: the index that is written last names the code of floats, which is found."""
+    ended = subprocess.run(
+        [sys.executable, "-c", AT_ONCE], cwd=PACKAGE.parent, capture_output=True, text=True, timeout=100,
+        env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)},
+    )  # fmt: skip
+    assert (ended.returncode, ended.stderr, ended.stdout) == (0, "", "[True, False] True 1\n")
+
+
 @pytest.fixture
 def empty_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("numba.config.CACHE_DIR", str(tmp_path))
