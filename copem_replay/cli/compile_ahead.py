@@ -7,7 +7,6 @@ in which nothing hides anything: it begins with them, and the first finds them i
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -22,12 +21,14 @@ from copem_replay.perception.visibility import Observers, Statics, VisibilityMod
 
 MODULE = "copem_replay.cli.compile_ahead"
 """This module by its name, also where it is the main one."""
+FREE_BYTES = 2 << 30
+"""Memory that has to be free: each of the two processes takes about 600 MB while it compiles."""
 
 
 @contextmanager
 def compile_ahead() -> Iterator[None]:
-    """While the block lasts a second process compiles, where nothing is compiled yet and there is a core for it."""
-    if _is_compiled() or _count_cores() < 2 or not sys.executable:
+    """While the block lasts a second process compiles, where nothing is compiled yet and there is room for it."""
+    if _is_compiled() or not _is_room() or not sys.executable:
         yield
         return
     nowhere = subprocess.DEVNULL
@@ -46,8 +47,13 @@ def _is_compiled() -> bool:
     return any(Path(kernel.stats.cache_path).glob("*.add_up-*.nbi"))
 
 
-def _count_cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+def _is_room() -> bool:
+    """Whether there are a core and memory for one more process."""
+    from copem_replay.api.run import count_workers
+    from copem_replay.pipeline.cost import free_bytes
+
+    free = free_bytes()
+    return count_workers(None) > 1 and (free is None or free > FREE_BYTES)
 
 
 class NothingHidden(VisibilityModel):

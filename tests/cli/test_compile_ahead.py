@@ -45,7 +45,8 @@ def told(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     monkeypatch.setattr(ahead.subprocess, "Popen", start)
     monkeypatch.setattr(ahead, "_is_compiled", lambda: False)
-    monkeypatch.setattr(ahead, "_count_cores", lambda: 2)
+    monkeypatch.setattr("copem_replay.api.run.count_workers", lambda jobs: 2)
+    monkeypatch.setattr("copem_replay.pipeline.cost.free_bytes", lambda: 3 << 30)
     return told
 
 
@@ -60,10 +61,18 @@ def test_it_ends_with_the_first_replay(told: list[str], call: Call, tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("name", "found"), [("_is_compiled", True), ("_count_cores", 1)], ids=["compiled before", "one core"]
+    ("name", "found"),
+    [
+        ("copem_replay.cli.compile_ahead._is_compiled", lambda: True),
+        ("copem_replay.api.run.count_workers", lambda jobs: 1),
+        ("copem_replay.pipeline.cost.free_bytes", lambda: 1 << 30),
+    ],
+    ids=["compiled before", "one core", "little memory"],
 )
-def test_without_need_there_is_none(told: list[str], monkeypatch: pytest.MonkeyPatch, name: str, found: int) -> None:
-    monkeypatch.setattr(ahead, name, lambda: found)
+def test_without_need_or_room_there_is_none(
+    told: list[str], monkeypatch: pytest.MonkeyPatch, name: str, found: object
+) -> None:
+    monkeypatch.setattr(name, found)
     with ahead.compile_ahead():
         pass
     assert told == []
