@@ -262,16 +262,6 @@ class StudyRows:
         lists = None if logs is None or self.lists is None else self.lists[self.lists["log"].isin(logs)]
         return replace(self, tally=rows_of("tally"), exact=rows_of("exact"), sums=rows_of("sums"), lists=lists)
 
-    def without_log(self, log: str) -> StudyRows:
-        """The rows of all other logs."""
-        logs = None if self.lists is None else set(self.lists["log"]) - {log}
-        return self.select((self.episodes["log"] != log).to_numpy(), logs)
-
-    def without_object(self, log: str, object_id: str) -> StudyRows:
-        """The rows of all other objects; false entries stay."""
-        this = (self.episodes["log"] == log) & (self.episodes["object_id"] == object_id)
-        return replace(self.select(~this.to_numpy()), lists=self.lists)
-
     def split(self, by: Slice) -> list[Group]:
         """The groups of an entry, each with at least one episode, in the order in which they are shown.
 

@@ -19,7 +19,6 @@ from copem_replay.metrics.intervals import describe_clusters
 from copem_replay.metrics.slices import (
     KEYS,
     SUMMED_COLUMNS,
-    Group,
     StudyRows,
     describe_chance,
     find_unknown_tag,
@@ -70,11 +69,6 @@ def read_study_rows(results: Results, *, sums: bool = True) -> StudyRows:
     return StudyRows(
         settings, tags, results.tally, results.exact, pd.concat(summed[1:] or summed, ignore_index=True), lists
     )
-
-
-def read_groups(results: Results, by: Slice) -> list[Group]:
-    """The groups of one entry; of several, split the same `read_study_rows`, which reads the tables once."""
-    return read_study_rows(results).split(by)
 
 
 def summarise_slices(results: Results, entries: Sequence[str] | None) -> pd.DataFrame | None:

@@ -10,7 +10,7 @@ import hashlib
 import json
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -326,10 +326,3 @@ def _parse_verdict(number: int, row: Any) -> Verdict:
 def find_verdicts(folder: Path) -> Judgement | None:
     """The verdicts in a results folder; None: there are none. Raises InputError where they are damaged."""
     return read_verdicts(folder / FILE) if (folder / FILE).is_file() else None
-
-
-def describe_failing(verdicts: Sequence[Verdict]) -> Iterator[str]:
-    """A line for each verdict that does not pass."""
-    for one in verdicts:
-        if not one.passes:
-            yield f"{one.name}, {one.configuration}: {one.asked}: {one.verdict}, found {one.found} {one.limits}"

@@ -13,7 +13,7 @@ from copem_replay.core.errors import InputError
 from copem_replay.metrics.config import parse_slice
 from copem_replay.metrics.slices import number_groups
 from copem_replay.results.read import read_results
-from copem_replay.results.slices import read_groups, read_slices
+from copem_replay.results.slices import read_slices, read_study_rows
 from tests.helpers.recordings import Obj, pedestrian, write_recording
 
 ROAD = """<OpenDRIVE><header/><road id="7" length="200" junction="-1"><planView>
@@ -61,7 +61,11 @@ def test_ones_own_come_first_and_a_log_without_a_map_has_none_of_it(study: dict[
     results.save(tmp_path / "out")
     again = read_results(tmp_path / "out")
     assert areas_of(again) == areas_of(results)
-    assert [group.label for group in read_groups(again, parse_slice("area"))] == ["crosswalk", "school", "(no area)"]
+    assert [group.label for group in read_study_rows(again).split(parse_slice("area"))] == [
+        "crosswalk",
+        "school",
+        "(no area)",
+    ]
 
 
 def test_without_areas_there_is_no_such_column_and_no_slice(study: dict[str, Any]) -> None:

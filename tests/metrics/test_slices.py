@@ -185,14 +185,3 @@ def test_how_many_groups_stand_out_is_said_with_how_many_would_by_chance() -> No
     # Where all are detected no group can stand out.
     alike = summarise_groups(study(pd.DataFrame(drive("a", *every) + drive("b", *every))), parse_slices(["log"]))
     assert alike["apart"].tolist() == [None, None]
-
-
-def test_what_is_left_without_a_log_or_an_object() -> None:
-    whole = study(pd.DataFrame(drive("a", 1, 2) + drive("b", 3, 4)))
-
-    def times(rows: StudyRows) -> list[float]:
-        return rows.detections["time_to_detection_s"].tolist()
-
-    assert times(whole.without_log("a")) == [3, 4]
-    assert times(whole.without_object("a", "0")) == [2, 3, 4]
-    assert times(whole.without_object("a", "0").without_log("b")) == [2]
