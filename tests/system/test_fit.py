@@ -31,7 +31,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("fit")
     check_fit.write_lists(CROSSING, *check_fit.KNOWN["radar"], 3, place / "radar.mcap")
     unit = {"rsu": check_fit.PLACE | {"recorded": {"topic": check_fit.TOPIC}}}
-    data = check_fit.experiment_of(unit, {"recorded": {"units": ["rsu"]}}, logs=["radar.mcap"])
+    data = check_fit.experiment_of(unit, {"recorded": {"units": ["rsu"]}}, logs=["radar.mcap"], window_s=[0, 30])
     (place / "radar.yaml").write_text(dump_yaml(data))
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(place)
