@@ -216,8 +216,9 @@ class Checkout:
         """The experiment as `e.yaml` in a folder, its recording beside it: no path outside is in any file."""
         here.mkdir(parents=True)
         if case.recorded is None:
-            for path in (self.folder / "logs").glob("*.mcap"):
-                shutil.copy(path, here)
+            for path in (self.folder / "logs").iterdir():
+                if path.suffix in (".mcap", ".xodr"):
+                    shutil.copy(path, here)
             text = (self.folder / f"logs/{case.source}.yaml").read_text(encoding="utf-8")
         else:
             shutil.copy(DATA / case.recorded, here)
