@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -44,6 +44,8 @@ from copem_replay.perception.sensor_poses import SensorPoses, list_instants, pla
 from copem_replay.pipeline.expansion import ExpandedExperiment, expand_experiment
 
 # Time chunks.
+
+T = TypeVar("T")
 
 ROWS_AT_ONCE = 500_000
 """Observation rows up to which a log is one time chunk: with one run shown it takes about 1 GB."""
@@ -92,10 +94,11 @@ class TruthCache:
     truth: Tracks
     experiment: MetricsSetup
     _worlds: dict[bytes, Tracks] = field(default_factory=dict)
+    _references: dict[bytes, Reference] = field(default_factory=dict)
 
     def at(self, time_s: Float) -> Tracks:
         """The truth at instants (K,), ascending."""
-        return self._cache(time_s, self.between)
+        return self._keep(self._worlds, time_s, self.between)
 
     def between(self, time_s: Float) -> Tracks:
         """The truth at instants (K,), ascending, which is not kept."""
@@ -105,17 +108,17 @@ class TruthCache:
 
     def at_stated(self, time_s: Float, captured_s: tuple[Float, Float]) -> Tracks:
         """The truth at stated instants (K,), ascending; `captured_s`: the earliest and latest true capture of each."""
-        return self._cache(np.stack([time_s, *captured_s]), self._at_stated)
+        return self._keep(self._worlds, np.stack([time_s, *captured_s]), self._at_stated)
 
-    def _cache(self, time_s: Float, compute: Callable[[Float], Tracks]) -> Tracks:
+    def _keep(self, kept: dict[bytes, T], time_s: Float, compute: Callable[[Float], T]) -> T:
         """What is kept of these instants, else what `compute` gives, which replaces the oldest."""
         key = time_s.tobytes()
-        world = self._worlds.get(key)
-        if world is None:
-            world = self._worlds[key] = compute(time_s)
-            for oldest in list(self._worlds)[:-KEPT]:
-                self._worlds.pop(oldest, None)
-        return world
+        found = kept.get(key)
+        if found is None:
+            found = kept[key] = compute(time_s)
+            for oldest in list(kept)[:-KEPT]:
+                kept.pop(oldest, None)
+        return found
 
     def _at_stated(self, times_s: Float) -> Tracks:
         stamps, earliest, latest = self._stamps(times_s)
@@ -129,6 +132,9 @@ class TruthCache:
 
     def reference(self, time_s: Float) -> Reference:
         """From where distances are measured, at instants (K,)."""
+        return self._keep(self._references, time_s, self._locate_reference)
+
+    def _locate_reference(self, time_s: Float) -> Reference:
         return locate_reference(self.scene, self.truth, self.experiment, time_s)
 
     def classes(self, measure: Measure) -> Bool:
@@ -144,11 +150,15 @@ class TruthCache:
 
     def since_s(self, episodes: Episodes) -> Float:
         """(M,) when the object of each episode first is in the log."""
-        first = np.full(len(self.scene.object_ids), np.inf)
-        begins_s = self.truth.captured_s[self.truth.frame_ix[self.truth.start[:-1]]]
-        np.minimum.at(first, self.truth.object_ix, begins_s)
-        since: Float = first[episodes.object_ix]
+        since: Float = self._begins_s[episodes.object_ix]
         return since
+
+    @cached_property
+    def _begins_s(self) -> Float:
+        """(N,) when each object first is in the log."""
+        first = np.full(len(self.scene.object_ids), np.inf)
+        np.minimum.at(first, self.truth.object_ix, self.truth.captured_s[self.truth.frame_ix[self.truth.start[:-1]]])
+        return first
 
 
 @dataclass(frozen=True)
