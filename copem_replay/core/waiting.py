@@ -52,12 +52,12 @@ def await_server(where: str, ask: Callable[[Callable[..., None]], Answer], *, wo
     told = False
     while not ended.wait(max(heard_s[0] + (limit_s if told else min(limit_s, TOLD_AFTER_S)) - time.monotonic(), 0.0)):
         silent_s = time.monotonic() - heard_s[0]
-        if silent_s >= limit_s:
-            raise TimeoutError(f"no byte came for {limit_s:g} s; is it reachable from here?")
         if silent_s >= TOLD_AFTER_S and not told:
             told = True
             for tell in _tell:
                 tell(f"{where}: waiting, no byte for {TOLD_AFTER_S:g} s; given up after {limit_s:g} s")
+        if silent_s >= limit_s:
+            raise TimeoutError(f"no byte came for {limit_s:g} s; is it reachable from here?")
     if failures:
         raise failures[0]
     return answers[0]
