@@ -99,7 +99,7 @@ def _osi_size(message_class: Any) -> Any:
 
 BATCH_BYTES = 4_000_000
 """Bytes of ground truth whose moving objects are decoded at once by the compiled walk: for less it is not loaded."""
-_PLAIN_BATCHES = 10
+_PLAIN_BATCHES = 3
 """Batches that are decoded object by object where Numba is not loaded: importing it takes as long."""
 
 
