@@ -65,26 +65,26 @@ class NothingHidden(VisibilityModel):
 
 
 def replay_in_advance() -> None:
-    """Replay a short recording, with what most experiments use."""
+    """Replay a short recording, with what most experiments use; first what needs no draws and no fusion."""
     from copem_replay.api.run import run
 
     error = {"kind": "gaussian", "covariance_m2": [[1.0, 0.0], [0.0, 1.0]]}
     couple = {"detection": {"kind": "constant", "probability": 0.5}, "error": error}
-    run(
-        {
-            "version": 1,
-            "logs": [f"{Path(__file__).parent}/sample_logs/tc016d.mcap"],
-            "runs": 2,
-            "pems": {"any": [couple]},
-            "units": {
-                "ego": {"on": "ego", "pem": "any"},
-                "mast": {"at": [7.5, 9.0], "yaw_deg": -130, "height_m": 5, "pem": "any"},
-            },
-            "visibility": {"kind": f"{MODULE}:NothingHidden"},
-            "configurations": {"ideal": {"units": "all"}, "gnn": {"units": "all", "fusion": {"kind": "gnn"}}},
-            "measure": {"onset": {"kind": "in_range", "range_m": 50}},
-        }
-    )
+    experiment = {
+        "version": 1,
+        "logs": [f"{Path(__file__).parent}/sample_logs/tc016d.mcap"],
+        "runs": 2,
+        "pems": {"any": [couple]},
+        "units": {
+            "ego": {"on": "ego", "pem": "any"},
+            "mast": {"at": [7.5, 9.0], "yaw_deg": -130, "height_m": 5, "pem": "any"},
+        },
+        "visibility": {"kind": f"{MODULE}:NothingHidden"},
+        "measure": {"onset": {"kind": "in_range", "range_m": 50}},
+    }
+    fused = {"ideal": {"units": "all"}, "gnn": {"units": "all", "fusion": {"kind": "gnn"}}}
+    for configurations in ({"truth": {"units": "truth"}}, fused):
+        run({**experiment, "configurations": configurations})
 
 
 if __name__ == "__main__":
