@@ -31,8 +31,9 @@ def compile_ahead() -> Iterator[None]:
     if _is_compiled() or not _is_room() or not sys.executable:
         yield
         return
+    command = [sys.executable, "-P", "-m", MODULE]  # -P: no module of the folder that the user works in
     nowhere = subprocess.DEVNULL
-    with subprocess.Popen([sys.executable, "-m", MODULE], stdin=nowhere, stdout=nowhere, stderr=nowhere) as process:
+    with subprocess.Popen(command, stdin=nowhere, stdout=nowhere, stderr=nowhere) as process:
         try:
             yield
         finally:

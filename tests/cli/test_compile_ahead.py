@@ -54,7 +54,7 @@ def test_it_ends_with_the_first_replay(told: list[str], call: Call, tmp_path: Pa
     drive(tmp_path / "drive.mcap")
     (tmp_path / "e.yaml").write_text(TEXT)
     assert call("run", "e.yaml")[0] == 0
-    assert told == ["-m copem_replay.cli.compile_ahead", "killed", "waited for"]
+    assert told == ["-P -m copem_replay.cli.compile_ahead", "killed", "waited for"]
     told.clear()
     assert call("run", "e.yaml", "--runs", "x")[0] == 2
     assert told == [], "a command that is wrong starts nothing"
