@@ -28,16 +28,23 @@ FREE_BYTES = 2 << 30
 @contextmanager
 def compile_ahead() -> Iterator[None]:
     """While the block lasts a second process compiles, where nothing is compiled yet and there is room for it."""
-    if _is_compiled() or not _is_room() or not sys.executable:
+    process = None if _is_compiled() or not _is_room() else _start()
+    try:
         yield
-        return
-    command = [sys.executable, "-P", "-m", MODULE]  # -P: no module of the folder that the user works in
-    nowhere = subprocess.DEVNULL
-    with subprocess.Popen(command, stdin=nowhere, stdout=nowhere, stderr=nowhere) as process:
-        try:
-            yield
-        finally:
+    finally:
+        if process is not None:
             process.kill()
+            process.wait()
+
+
+def _start() -> subprocess.Popen[bytes] | None:
+    """The second process; None where none can be started."""
+    command = [sys.executable or "", "-P", "-m", MODULE]  # -P: no module of the folder that the user works in
+    nowhere = subprocess.DEVNULL
+    try:
+        return subprocess.Popen(command, stdin=nowhere, stdout=nowhere, stderr=nowhere)
+    except OSError:  # no program of that name, no more processes: the command needs none
+        return None
 
 
 def _is_compiled() -> bool:

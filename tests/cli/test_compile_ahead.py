@@ -23,14 +23,11 @@ class Process:
     def __init__(self, told: list[str]) -> None:
         self.told = told
 
-    def __enter__(self) -> Process:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.told.append("waited for")
-
     def kill(self) -> None:
         self.told.append("killed")
+
+    def wait(self) -> None:
+        self.told.append("waited for")
 
 
 @pytest.fixture
@@ -76,6 +73,16 @@ def test_without_need_or_room_there_is_none(
     with ahead.compile_ahead():
         pass
     assert told == []
+
+
+def test_where_none_can_be_started_the_command_does_without(told: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise BlockingIOError(11, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(ahead.subprocess, "Popen", refuse)
+    with ahead.compile_ahead():
+        told.append("replayed")
+    assert told == ["replayed"]
 
 
 USED = """

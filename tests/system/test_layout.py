@@ -23,7 +23,7 @@ FLOORS = (
     {"__init__"},  # the public API: no wing, and no wing imports it
 )
 MOST_ROOMS = 262
-MOST_STATEMENTS = 43_701
+MOST_STATEMENTS = 43_704
 """Without docstrings. A change that needs more says what it let go."""
 SMALL_LINES = 60
 VERBS_OF_SEVERAL = {
