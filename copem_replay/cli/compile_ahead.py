@@ -1,8 +1,8 @@
 """A second process that fills the cache of compiled code while the first replay on a machine compiles.
 
-Numba compiles under one lock, so a process compiles on one core. A replay begins with visible shares, which take as
-long to compile as accuracy and fusion, of which it has need at the end. The second process replays a short recording
-in which nothing hides anything: it begins with them, and the first finds them in the cache when it comes to them.
+Numba compiles under one lock, so a process compiles on one core. A replay begins with visible shares, which take about
+as long to compile as accuracy, which it needs last. The second process replays a short recording in which nothing hides
+anything: it begins with accuracy, and the first process finds that in the cache when it comes to it.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def _start() -> subprocess.Popen[bytes] | None:
 
 
 def _is_compiled() -> bool:
-    """Whether the cache has the kernel that takes longest, compiled for these arguments or for others."""
+    """Whether the cache has what takes the second process longest, compiled for these arguments or for others."""
     from copem_replay.metrics.accuracy.kernel import add_up
 
     kernel: Any = add_up
@@ -73,7 +73,7 @@ class NothingHidden(VisibilityModel):
 
 
 def replay_in_advance() -> None:
-    """Replay a short recording, with what most experiments use; first what needs no draws and no fusion."""
+    """Replay a short recording, with what most experiments use; first the truth, for which nothing is drawn."""
     from copem_replay.api.run import run
 
     error = {"kind": "gaussian", "covariance_m2": [[1.0, 0.0], [0.0, 1.0]]}

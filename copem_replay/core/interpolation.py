@@ -67,8 +67,8 @@ def interpolate_at_stated_instants(
     there at the capture, but not at the stated instant, has the first state after it moved back by its velocity, or
     the last state before it moved on, by at most `max_gap_s`. All else is as in `interpolate_at_instants`.
     """
-    truth = _cut_around(truth, (stamps_ns - t0_ns) * np.float64(1e-9), max_gap_s)
     world = interpolate_at_instants(truth, stamps_ns, t0_ns=t0_ns, max_gap_s=max_gap_s)
+    truth = _cut_around(truth, world.captured_s, max_gap_s)
     if not len(truth.frame_ix):
         return world
     row, frame = _select_beyond_stays(truth, stamps_ns, captured_ns, int(max_gap_s * 1e9))

@@ -43,9 +43,9 @@ from copem_replay.perception.observation import KeptShares, Observations, join_o
 from copem_replay.perception.sensor_poses import SensorPoses, list_instants, place_units
 from copem_replay.pipeline.expansion import ExpandedExperiment, expand_experiment
 
-# Time chunks.
-
 T = TypeVar("T")
+
+# Time chunks.
 
 ROWS_AT_ONCE = 500_000
 """Observation rows up to which a log is one time chunk: with one run shown it takes about 1 GB."""

@@ -271,14 +271,14 @@ def plain_part(name: str) -> str:
     return re.sub(r"[^0-9A-Za-z_.-]+", "_", name)
 
 
-def entity_names(scene: Scene) -> list[str]:
+def entity_names(scene: Scene) -> tuple[str, ...]:
     """(N,) names of objects in entity paths, “6_pedestrian”; equal names get a number."""
     return _name_entities(short_ids(scene), tuple(scene.object_class.tolist()))
 
 
 @lru_cache(maxsize=4)  # asked for object by object
-def _name_entities(ids: tuple[str, ...], classes: tuple[int, ...]) -> list[str]:
-    return make_distinct([f"{plain_part(name)}_{CLASSES[k]}" for name, k in zip(ids, classes, strict=True)])
+def _name_entities(ids: tuple[str, ...], classes: tuple[int, ...]) -> tuple[str, ...]:
+    return tuple(make_distinct([f"{plain_part(name)}_{CLASSES[k]}" for name, k in zip(ids, classes, strict=True)]))
 
 
 def make_distinct(names: Sequence[str]) -> list[str]:

@@ -60,6 +60,8 @@ CHUNK_BYTES = 1 << 20
 """Bytes of a chunk of the file before compression: the default of mcap's writer."""
 CHUNKS_AHEAD = 16
 """Chunks that may be encoded before they are written: lists are encoded many at once, so that some take long."""
+_EVENT_TIMES = ("onset_s", "captured_s", "time_to_detection_s", "distance_at_detection_m")
+"""Columns of the detections table that the event of a detection tells of."""
 ROSBAG_RECORD, ROSBAG_COUNTS = "rosbag2", "serialized_metadata"
 """rosbag2's metadata record, and its key that counts messages: wrong in a copy with more of them."""
 
@@ -252,15 +254,13 @@ def _find_events(fused: Tracks, table: pd.DataFrame) -> dict[int, list[Event]]:
         return events
     # Detections outside are those of other time chunks.
     here = table["detection_s"].between(issue_s[0] - tolerance_s, issue_s[-1] + tolerance_s)
-    for row in table.loc[table["detected"] & here, ["object_id", "first_unit", *_EVENT_TIMES]].to_dict("records"):
+    for row in table.loc[table["detected"] & here, ["object_id", "first_unit", "detection_s", *_EVENT_TIMES]].to_dict(
+        "records"
+    ):
         frame = int(np.abs(issue_s - row["detection_s"]).argmin())
-        times = {name: None if np.isnan(row[name]) else float(row[name]) for name in _EVENT_TIMES[1:]}
+        times = {name: None if np.isnan(row[name]) else float(row[name]) for name in _EVENT_TIMES}
         events.setdefault(frame, []).append({"object": row["object_id"], "first_unit": row["first_unit"], **times})
     return events
-
-
-_EVENT_TIMES = ("detection_s", "onset_s", "captured_s", "time_to_detection_s", "distance_at_detection_m")
-"""Columns of the detections table; a detection tells of all but the first."""
 
 
 def _keep_metadata(original: RecordingSource) -> dict[str, dict[str, str]]:
