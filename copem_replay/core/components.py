@@ -13,6 +13,7 @@ import inspect
 from collections.abc import Callable, Mapping
 from copy import deepcopy
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
@@ -27,6 +28,7 @@ from pydantic import (
     GetJsonSchemaHandler,
     Tag,
     ValidationError,
+    ValidationInfo,
     WithJsonSchema,
 )
 from pydantic_core import PydanticCustomError, core_schema
@@ -127,6 +129,15 @@ MOST_RUNS = 10**9
 Count = Annotated[int, Field(strict=True, ge=1, le=MOST_RUNS)]
 Flag = Annotated[bool, Field(strict=True)]
 """True or false; `yes` is text."""
+
+
+def _place_beside(file: str, info: ValidationInfo) -> str:
+    folder = (info.context or {}).get("folder")
+    return file if folder is None else str(Path(folder) / file)
+
+
+FileBeside = Annotated[str, Field(min_length=1), AfterValidator(_place_beside)]
+"""A file, relative to the folder of the experiment file: `folder` in the context, without it to the working folder."""
 
 
 def _id_as_text(value: object) -> object:

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
-from pydantic import Field, PrivateAttr, ValidationError, ValidationInfo, field_validator, model_validator
+from pydantic import Field, PrivateAttr, ValidationError, model_validator
 
 from copem_replay.communication.latency import LatencyModel
-from copem_replay.core.components import error_at_key
+from copem_replay.core.components import FileBeside, error_at_key
 from copem_replay.core.errors import InputError, count_noun
 from copem_replay.core.tracks import Float
 from copem_replay.core.yaml import Key
@@ -186,17 +186,11 @@ class RecordedLatency(LatencyModel):
     """
 
     kind: Literal["recorded"] = "recorded"
-    file: Name
+    file: FileBeside
     column: Name | None = None
     topic: Name | None = None
     stamp: Name = "header.stamp"
     _sorted_s: tuple[float, ...] = PrivateAttr(())
-
-    @field_validator("file")
-    @classmethod
-    def _beside(cls, file: str, info: ValidationInfo) -> str:
-        folder = (info.context or {}).get("folder")
-        return file if folder is None else str(Path(folder) / file)
 
     @model_validator(mode="after")
     def _read(self) -> Self:

@@ -45,9 +45,15 @@ def describe_by_key(
     for part in reversed(above):
         data = {str(part): data}
     above_others = {key[:n] for key in items_by_key for n in range(len(key))}
+    misspelt = {
+        (*key[:-1], *_find_meant_key(key, _list_known_keys(model, key[:-1], data)))
+        for key, items in items_by_key.items()
+        if items[0]["type"] == "extra_forbidden"
+    }
     for key, items in items_by_key.items():
-        if key in above_others:
-            continue  # another alternative fits so far, and its message names the deeper key
+        # Another alternative fits so far, and its message names the deeper key; or the key is told of as it is written.
+        if key in above_others or (key in misspelt and items[0]["type"] == "missing"):
+            continue
         yield key, _problem_message(model, items, key, data)
 
 
@@ -94,11 +100,16 @@ def _unit_hint(written: str, meant: str) -> str:
     return f" (in {right}, not {unit})" if name == other and name else ""
 
 
+def _find_meant_key(key: Key, known: Sequence[str]) -> list[str]:
+    """The known key that is alike an unknown one, if any."""
+    return difflib.get_close_matches(str(key[-1]), known, n=1)
+
+
 def _problem_message(model: type[BaseModel], items: Sequence[Any], key: Key, data: Any) -> str:
     first = items[0]
     if first["type"] == "extra_forbidden":
         known = _list_known_keys(model, key[:-1], data)
-        near = difflib.get_close_matches(str(key[-1]), known, n=1)
+        near = _find_meant_key(key, known)
         hint = (
             f"did you mean {near[0]}?{_unit_hint(str(key[-1]), near[0])}" if near else f"known here: {', '.join(known)}"
         )
@@ -335,9 +346,9 @@ def parse_experiment(source: ExperimentSource) -> tuple[Experiment | None, list[
 
 
 def _logs_missing(source: ExperimentSource) -> list[str]:
-    """The problem of a file that names no logs; they are optional in Python only."""
-    named = "logs" in source.data or isinstance(source, PlainSource)
-    return [] if named else [source.at(("logs",), "missing")]
+    """The problem of a file that names no logs, not even misspelt; they are optional in Python only."""
+    keys = [_find_meant_key((key,), list(Experiment.model_fields)) for key in source.data]
+    return [] if ["logs"] in keys or isinstance(source, PlainSource) else [source.at(("logs",), "missing")]
 
 
 def _list_problems(source: ExperimentSource, error: ValidationError) -> Iterator[str]:

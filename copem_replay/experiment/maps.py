@@ -7,13 +7,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Final, Literal, Self
+from typing import Final, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, PrivateAttr, ValidationInfo, field_validator, model_validator
+from pydantic import PrivateAttr, model_validator
 
-from copem_replay.core.components import Flag, Frozen, Positive, error_at_key
+from copem_replay.core.components import FileBeside, Flag, Frozen, Positive, error_at_key
 from copem_replay.core.errors import InputError, count_noun
 from copem_replay.core.frame import Frame, SaidPlace
 from copem_replay.core.site_map import MapSolid, SiteMap, find_borders, make_polygon, outline_crosswalks
@@ -66,7 +66,7 @@ class MapFile(Frozen):
     `agreement: ignore`: a map whose lanes the traffic does not keep to is not refused.
     """
 
-    file: Annotated[str, Field(min_length=1)]
+    file: FileBeside
     frame: Literal["same"] | None = None
     offset_m: InPlane = (0.0, 0.0)
     lanes: Flag = True
@@ -75,12 +75,6 @@ class MapFile(Frozen):
     within_m: Positive = 200.0
     agreement: Literal["check", "ignore"] = "check"
     _sha256: str = PrivateAttr("")
-
-    @field_validator("file")
-    @classmethod
-    def _beside(cls, file: str, info: ValidationInfo) -> str:
-        folder = (info.context or {}).get("folder")
-        return file if folder is None else str(Path(folder) / file)
 
     @model_validator(mode="after")
     def _read(self) -> Self:

@@ -665,12 +665,15 @@ class TestProblems:
         text = TEXT[: TEXT.index("configurations:")] + "configurations: {}\n"
         assert problems(tmp_path, text) == ["13: configurations: expected at least one, found none"]
 
-    def test_couple_without_detection(self, tmp_path: Path) -> None:
+    def test_a_key_that_must_be_there_and_is_misspelt(self, tmp_path: Path) -> None:
+        """One line, at what is written."""
         text = TEXT.replace("detection:", "detektion:")
-        assert problems(tmp_path, text) == [
-            "7: pems.onboard[0].detection: missing",
-            "8: pems.onboard[0].detektion: unknown key; did you mean detection?",
-        ]
+        line = "8: pems.onboard[0].detektion: unknown key; did you mean detection?"
+        assert problems(tmp_path, text) == [line]
+        both = ["2: log: unknown key; did you mean logs?", line]
+        assert sorted(problems(tmp_path, text.replace("logs:", "log:"))) == both
+        misnamed = TEXT.replace("detection:", "what:")
+        assert problems(tmp_path, misnamed)[0] == "7: pems.onboard[0].detection: missing"
 
     def test_pem_that_is_no_list(self, tmp_path: Path) -> None:
         text = TEXT.replace("    - when:", "      when:")
