@@ -17,8 +17,9 @@ from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from importlib.metadata import version
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -96,22 +97,19 @@ def write_mcap(
     rest = iter(run_tracks)
     first = next(rest)  # names the configurations and the units
     colours = colours or configuration_colours(first)
-    units = dict.fromkeys(unit for fused_tracks in first.values() for unit in fused_tracks.received.units)
-    numbers = {unit: k + 1 for k, unit in enumerate(units)}
+    units = [unit for fused_tracks in first.values() for unit in fused_tracks.received.units]
+    numbers = {unit: k for k, unit in enumerate(dict.fromkeys(units), start=1)}
+    tables = {name: table[table["configuration"] == name] for name in first}
     with atomic_mcap(path, profile=original.profile) as writer:
         catalogue = Catalogue(writer)
         ours = {topic for name in first for topic in (*list_topics(name), *list_extra_topics(name))} | {*TRUTH_TOPICS}
         messages = original.messages(original.register(catalogue, without=ours))
         opened = (family or OSI)(catalogue, scene, numbers)
-
-        def streams_of(chunk: Mapping[str, FusedTracks]) -> list[TimedMessages]:
-            lists = _encode_chunk_lists(opened, scene, chunk, table, colours)
-            return [*lists, *_encode_chunk_extras(opened, scene, chunk, table, colours)]
-
-        begun = streams_of(first)  # registers the channels, those of the lists first
+        encode = partial(_encode_chunk, opened, scene, tables, colours)
+        begun = list(encode(first))  # registers the channels, those of the lists first
         shown = [] if truth is None or TRUTH in first else [_encode_truth(opened.truth(), truth)]
         del first
-        chunks = chain([begun], map(streams_of, rest))
+        chunks = chain([begun], map(list, map(encode, rest)))
         added, later_ns = _shift_to_zero(_merge_by_time([chain.from_iterable(map(_order_by_time, chunks)), *shown]))
         _add_records(writer, original, opened.osi, {**manifest, **{f"unit.{k}": unit for unit, k in numbers.items()}})
         for encoded in _encode_ahead(_merge_by_time([messages, added])):
@@ -135,11 +133,10 @@ def _note_differences(path: Path, original: RecordingSource, ours: Set[str], lat
 
 def _shift_to_zero(messages: Iterator[Message]) -> tuple[Iterator[Message], int]:
     """The messages, in order and none logged before 0, and by how many ns they are logged later."""
-    first = next(messages, None)
-    if first is None or first.log_time >= 0:
-        return chain([] if first is None else [first], messages), 0
-    later_ns = -first.log_time
-    return (_delay_log_times(message, later_ns) for message in chain([first], messages)), later_ns
+    begun = list(islice(messages, 1))
+    later_ns = max([0, *(-message.log_time for message in begun)])
+    whole = chain(begun, messages)
+    return (_delay_log_times(message, later_ns) for message in whole) if later_ns else whole, later_ns
 
 
 def _delay_log_times(m: Message, later_ns: int) -> Message:
@@ -156,29 +153,19 @@ def _add_records(writer: Writer, original: RecordingSource, osi: bool, manifest:
         writer.add_metadata(OSI_RECORD, _osi_record(original, osi_version(), version("protobuf")))
 
 
-def _encode_chunk_lists(
+def _encode_chunk(
     opened: OpenedFamily,
     scene: Scene,
-    chunk: Mapping[str, FusedTracks],
-    table: pd.DataFrame,
+    tables: Mapping[str, pd.DataFrame],
     colours: Mapping[str, Rgb],
+    chunk: Mapping[str, FusedTracks],
 ) -> Iterator[TimedMessages]:
-    """The messages of `objects`, `scene` and `detail` of each configuration in one time chunk."""
+    """The messages of each configuration in one time chunk: the lists of all first, then what is beside them."""
     for name, fused_tracks in chunk.items():
-        events = _find_events(fused_tracks.fused, table[table["configuration"] == name])
+        events = _find_events(fused_tracks.fused, tables[name])
         yield _encode_lists(scene, fused_tracks.fused, opened.channels(name, fused_tracks, events, colours[name]))
-
-
-def _encode_chunk_extras(
-    opened: OpenedFamily,
-    scene: Scene,
-    chunk: Mapping[str, FusedTracks],
-    table: pd.DataFrame,
-    colours: Mapping[str, Rgb],
-) -> Iterator[TimedMessages]:
-    """The messages of `status` and `uncertainty` of each configuration in one time chunk."""
     for name, fused_tracks in chunk.items():
-        statuses = Statuses(scene, fused_tracks, table[table["configuration"] == name])
+        statuses = Statuses(scene, fused_tracks, tables[name])
         yield _encode_lists(scene, fused_tracks.fused, opened.seen_besides(name, fused_tracks, statuses, colours[name]))
 
 
