@@ -15,7 +15,14 @@ from copem_replay.core.errors import ExperimentError, near_name_hint, unknown_na
 from copem_replay.core.tracks import CLASSES, TRUTH
 from copem_replay.core.yaml import Key
 from copem_replay.experiment.criteria import BEFORE, CriteriaFile, Criterion
-from copem_replay.experiment.file import ExperimentSource, describe_by_key, make_plain_source, read_experiment_file
+from copem_replay.experiment.file import (
+    ExperimentSource,
+    describe_by_key,
+    find_meant_key,
+    make_plain_source,
+    read_experiment_file,
+)
+from copem_replay.experiment.schema import Experiment
 from copem_replay.io.ground_truth import MAX_GAP_S
 from copem_replay.metrics.config import BEGAN_BY, CLASS, LONGEST_CHAIN, onset_requirement
 from copem_replay.metrics.figure_limits import JUDGED, PER_MINUTE, SUMMED
@@ -29,14 +36,15 @@ NO_EGO = "none"
 def check_references(source: ExperimentSource) -> Iterator[str]:
     """A line for every undefined name or number and for every key that does not go with the others."""
     data = source.data
-    pems, units = _mapping_names(data.get("pems")), _mapping_names(data.get("units"))
+    # A misspelt key is told of by itself, not by each name below it.
+    meant = {name: data[key] for key in data for name in find_meant_key((key,), list(Experiment.model_fields))} | data
+    pems, units, measure = _mapping_names(meant.get("pems")), _mapping_names(meant.get("units")), data.get("measure")
     for name, unit in _mapping_items(data.get("units")):
         pem = unit.get("pem")
         if _is_name(pem) and str(pem) not in pems:
             yield source.at(("units", name, "pem"), unknown_name_message("PEM", pem, pems))
     for name, configuration in _mapping_items(data.get("configurations")):
         yield from _check_configuration(source, ("configurations", name), configuration, units)
-    measure = data.get("measure")
     if isinstance(measure, dict):
         place = measure.get("distance_to", "ego")
         unit = dict(_mapping_items(data.get("units"))).get(str(place), {})
@@ -57,8 +65,7 @@ def check_references(source: ExperimentSource) -> Iterator[str]:
     yield from _check_sweep(source, data, units)
     yield from _check_settings(source, data, units, pems)
     yield from check_criteria(source, data)
-    show, runs = data.get("show"), data.get("runs", 1)
-    configurations = _mapping_names(data.get("configurations"))
+    show, runs, configurations = data.get("show"), data.get("runs", 1), _mapping_names(meant.get("configurations"))
     shown_names = show.get("configurations") if isinstance(show, dict) else None
     for k, name in enumerate(shown_names if isinstance(shown_names, list) else []):
         if _is_name(name) and str(name) not in configurations:

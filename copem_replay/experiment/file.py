@@ -46,7 +46,7 @@ def describe_by_key(
         data = {str(part): data}
     above_others = {key[:n] for key in items_by_key for n in range(len(key))}
     misspelt = {
-        (*key[:-1], *_find_meant_key(key, _list_known_keys(model, key[:-1], data)))
+        (*key[:-1], *find_meant_key(key, _list_known_keys(model, key[:-1], data)))
         for key, items in items_by_key.items()
         if items[0]["type"] == "extra_forbidden"
     }
@@ -100,7 +100,7 @@ def _unit_hint(written: str, meant: str) -> str:
     return f" (in {right}, not {unit})" if name == other and name else ""
 
 
-def _find_meant_key(key: Key, known: Sequence[str]) -> list[str]:
+def find_meant_key(key: Key, known: Sequence[str]) -> list[str]:
     """The known key that is alike an unknown one, if any."""
     return difflib.get_close_matches(str(key[-1]), known, n=1)
 
@@ -109,7 +109,7 @@ def _problem_message(model: type[BaseModel], items: Sequence[Any], key: Key, dat
     first = items[0]
     if first["type"] == "extra_forbidden":
         known = _list_known_keys(model, key[:-1], data)
-        near = _find_meant_key(key, known)
+        near = find_meant_key(key, known)
         hint = (
             f"did you mean {near[0]}?{_unit_hint(str(key[-1]), near[0])}" if near else f"known here: {', '.join(known)}"
         )
@@ -347,7 +347,7 @@ def parse_experiment(source: ExperimentSource) -> tuple[Experiment | None, list[
 
 def _logs_missing(source: ExperimentSource) -> list[str]:
     """The problem of a file that names no logs, not even misspelt; they are optional in Python only."""
-    keys = [_find_meant_key((key,), list(Experiment.model_fields)) for key in source.data]
+    keys = [find_meant_key((key,), list(Experiment.model_fields)) for key in source.data]
     return [] if ["logs"] in keys or isinstance(source, PlainSource) else [source.at(("logs",), "missing")]
 
 

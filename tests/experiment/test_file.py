@@ -672,6 +672,9 @@ class TestProblems:
         assert problems(tmp_path, text) == [line]
         both = ["2: log: unknown key; did you mean logs?", line]
         assert sorted(problems(tmp_path, text.replace("logs:", "log:"))) == both
+        for section in ("pems", "units", "configurations"):  # the names in it are known all the same
+            (line,) = problems(tmp_path, re.sub(f"^{section}:", f"{section[:-1]}:", TEXT, flags=re.MULTILINE))
+            assert line.endswith(f": {section[:-1]}: unknown key; did you mean {section}?")
         misnamed = TEXT.replace("detection:", "what:")
         assert problems(tmp_path, misnamed)[0] == "7: pems.onboard[0].detection: missing"
 
