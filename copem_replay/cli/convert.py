@@ -131,23 +131,6 @@ def v2xseq(
 
 
 @app.command()
-def scenarionet(
-    source: Source,
-    out: Annotated[Path, typer.Option(metavar="FILE", help="Recording to write; for a folder, a folder.")],
-    overwrite: Overwrite = False,
-    ego_centre_m: Annotated[
-        float | None,
-        typer.Option(
-            metavar="AHEAD", help="Centre of the ego's box ahead of its position [1.385 for nuScenes, else 0]."
-        ),
-    ] = None,
-) -> int:
-    """ScenarioNet (nuScenes, Waymo, …): a pickle, or a folder."""
-    centre_m = None if ego_centre_m is None else _check_finite(ego_centre_m, "--ego-centre-m")
-    return _convert_sources("scenarionet", source, out, overwrite, ego_centre_m=centre_m)
-
-
-@app.command()
 def openlabel(
     source: Source,
     out: Out,

@@ -35,7 +35,7 @@ configurations:
 """
 COMMANDS = ("", "info", "init", "check", "schema", "samples", "convert", "run", "why", "fit", "compare", "verdict",
             "history", "view", "report", "plot", "film", "layout", "export")  # fmt: skip
-FORMATS = ("argoverse2", "nuscenes", "opv2v", "v2xseq", "scenarionet", "openlabel", "commonroad", "sumo", "csv")
+FORMATS = ("argoverse2", "nuscenes", "opv2v", "v2xseq", "openlabel", "commonroad", "sumo", "csv")
 
 
 class Terminal(io.StringIO):

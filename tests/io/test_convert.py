@@ -71,11 +71,11 @@ def test_a_wrong_command_is_one_line(capsys: pytest.CaptureFixture[str]) -> None
         (["kitti", "a", "--out", "b.mcap"], "No such command 'kitti'"),
         (
             [],
-            "expected a format, one of argoverse2, nuscenes, opv2v, v2xseq, scenarionet, openlabel, commonroad, sumo",
+            "expected a format, one of argoverse2, nuscenes, opv2v, v2xseq, openlabel, commonroad, sumo",
         ),
         (["csv", "a"], "Missing option '--out'"),
         (["openlabel", "a", "--out", "b.mcap", "--rate-hz", "0"], "--rate-hz: expected a number above 0, found 0"),
-        (["scenarionet", "a", "--out", "b.mcap", "--ego-centre-m", "nan"], "--ego-centre-m: expected a number, found"),
+        (["nuscenes", "a", "--out", "b", "--ego-centre-m", "nan"], "--ego-centre-m: expected a number, found"),
     ):
         assert convert(*words) == 2
         (line,) = capsys.readouterr().err.splitlines()
@@ -83,7 +83,7 @@ def test_a_wrong_command_is_one_line(capsys: pytest.CaptureFixture[str]) -> None
 
 
 def test_every_format_has_a_command_and_its_help_says_the_defaults() -> None:
-    from copem_replay.io.convert import argoverse2, nuscenes, scenarionet, v2xseq
+    from copem_replay.io.convert import argoverse2, nuscenes, v2xseq
     from copem_replay.io.convert.conversion import FORMATS
 
     commands = typer.main.get_group(convert_command.app).commands
@@ -95,7 +95,6 @@ def test_every_format_has_a_command_and_its_help_says_the_defaults() -> None:
 
     assert default("argoverse2", "ego_size_m") == list(argoverse2.EGO_SIZE_M)
     assert default("argoverse2", "centre_from_rear_axle_m") == list(argoverse2.CENTRE_FROM_REAR_AXLE_M)
-    assert default("scenarionet", "ego_centre_m") == [scenarionet.EGO_CENTRE_M, 0]
     assert default("v2xseq", "ego_size_m") == list(v2xseq.EGO_SIZE_M)
     assert default("nuscenes", "ego_size_m") == list(nuscenes.EGO_SIZE_M)
     assert default("nuscenes", "ego_centre_m") == [nuscenes.EGO_CENTRE_M]

@@ -191,3 +191,33 @@ def test_a_file_that_is_none_is_one_line(run: Runner, text: str, said: str) -> N
     source = write(run.folder / "s", scenario())
     (source / "641/000068.yaml").write_text(text)
     assert said in run.refused("opv2v", source)
+
+
+def test_a_scenario_that_cannot_be_read_leaves_the_others(run: Runner, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in "abc":
+        write(run.folder / "all" / name, scenario())
+    (run.folder / "all/b/641/000068.yaml").write_text("lidar_pose: [")
+    out = run.folder / "out"
+    words = ["opv2v", run.folder / "all", "--out", out]
+    assert convert(*words) == 2
+    printed = capsys.readouterr()
+    first, last = printed.err.splitlines()
+    assert first.startswith(f"{run.folder / 'all/b/641/000068.yaml'}:1: ")
+    assert last == "1 of 3 scenarios not converted"
+    assert [line.split(":")[0] for line in printed.out.splitlines()[:2]] == [str(out / f"{name}.mcap") for name in "ac"]
+    assert "(2 recordings)" in printed.out, "notes count over all recordings"
+    # The same again is refused before anything is read, and done with --overwrite, to the same bytes.
+    before = (out / "a.mcap").read_bytes()
+    assert convert(*words) == 2
+    assert (
+        capsys.readouterr().err
+        == f"{out / 'a.mcap'}: is there already, and 1 other; give another name, or --overwrite\n"
+    )
+    assert convert(*words, "--overwrite") == 2
+    assert (out / "a.mcap").read_bytes() == before
+    # Where nothing can be written, that is said once.
+    place = run.file("place", "") / "out"
+    assert convert("opv2v", run.folder / "all", "--out", place) == 2
+    first, last = capsys.readouterr().err.splitlines()[-2:]
+    assert first.startswith(f"{place / 'a.mcap'}: cannot be written: ")
+    assert last == "3 of 3 scenarios not converted"

@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 import json
 import os
-import pickle
 import random
 import shutil
 import sys
@@ -27,7 +26,7 @@ from typing import Any
 from unittest.mock import patch
 
 from fuzzing.mcap_model import Sample, taken_apart
-from fuzzing.mutators import BYTES, document_hit, hostile, tree_hit, yaml_hit
+from fuzzing.mutators import BYTES, document_hit, hostile, yaml_hit
 
 ROOT = Path(__file__).resolve().parents[2]
 COMMANDS = ("experiment", "results", "fit", "convert")
@@ -220,8 +219,6 @@ def _write_data_sets(folder: Path) -> None:
     argoverse.mkdir()
     pd.DataFrame(sets.BOXES).to_feather(argoverse / "annotations.feather")
     pd.DataFrame(sets.POSES).to_feather(argoverse / "city_SE3_egovehicle.feather")
-    scenario = sets.scenario(ego=sets.ego(), car=sets.track("VEHICLE", "vehicle.car", [[9, k, 0] for k in range(4)]))
-    (folder / "scenarionet.pkl").write_bytes(pickle.dumps(scenario))
 
 
 # ------------------------------------------------------------------------------- what is hit
@@ -342,8 +339,6 @@ def _convert(made: Originals, place: Path, dice: random.Random) -> Case:
         shutil.copytree(source, here)
         hit = dice.choice(_files(here))
         hit.write_bytes(document_hit(hit.name, hit.read_bytes(), dice))
-    elif source.suffix == ".pkl" and dice.random() < 0.8:
-        here.write_bytes(pickle.dumps(tree_hit(pickle.loads(source.read_bytes()), dice)))
     else:
         here.write_bytes(document_hit(source.name, source.read_bytes(), dice))
     command = ["convert", kind, source.name, "--out", "out.mcap", *(["--rate-hz", "10"] if kind == "openlabel" else [])]

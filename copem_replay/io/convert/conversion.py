@@ -323,7 +323,6 @@ FORMATS: Final[Mapping[str, str]] = {
     "nuscenes": "nuscenes",
     "opv2v": "opv2v",
     "v2xseq": "v2xseq",
-    "scenarionet": "scenarionet",
     "openlabel": "openlabel",
     "commonroad": "commonroad",
     "sumo": "sumo",
