@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from copem_replay.io.write.osi import NANOS_PER_SECOND, OsiTrace
-from make_logs import SOURCE, Body, Boundary, Edge, ground_truth
-from make_logs import Kind as Vehicle
+from traffic import SOURCE, Body, Boundary, Edge, ground_truth
+from traffic import Kind as Vehicle
 
 RATE_HZ, FRAMES, EGO = 10, 601, 1
 
