@@ -15,12 +15,13 @@ import importlib as _importlib
 from typing import TYPE_CHECKING
 
 from copem_replay.core.compiled import cache_note as _cache_note
+from copem_replay.core.extras import EXTRAS as _EXTRAS
+from copem_replay.core.extras import load_extra as _load_extra
 
 if TYPE_CHECKING:
     __version__: str
     from copem_replay.api import plot
-    from copem_replay.api.fit import FittedPem, fit
-    from copem_replay.api.plot import write_figures, write_film
+    from copem_replay.api.plot import write_figures
     from copem_replay.api.recordings import (
         draft_experiment,
         inspect_recording,
@@ -28,10 +29,9 @@ if TYPE_CHECKING:
         read_recording,
         read_recordings,
     )
-    from copem_replay.api.results import compare, judge, load_results, view, write_history, write_report
+    from copem_replay.api.results import compare, judge, load_results, view, write_report
     from copem_replay.api.run import fused_tracks, observations, run
     from copem_replay.api.study import load_experiment
-    from copem_replay.api.why import Explanation, why
     from copem_replay.communication.latency import LatencyModel
     from copem_replay.communication.link import LinkModel, SentLists
     from copem_replay.communication.reception import RadioPath, ReceptionModel
@@ -49,6 +49,10 @@ if TYPE_CHECKING:
     from copem_replay.core.tracks import CLASSES, Scene, Tracks
     from copem_replay.core.view_geometry import Errors, ViewGeometry
     from copem_replay.experiment.schema import Configuration, Experiment, Unit
+    from copem_replay.extras.film.film import write_film
+    from copem_replay.extras.fitting.api import FittedPem, fit
+    from copem_replay.extras.history.history import write_history
+    from copem_replay.extras.why.api import Explanation, why
     from copem_replay.fusion.interface import Inbox, ListFusion, StepFusion
     from copem_replay.fusion.testing import FUSION_RULES, NonconformingError, check_fusion
     from copem_replay.io.recording import Recording
@@ -140,13 +144,11 @@ __all__ = [
 
 _PLACES = {
     "api": "plot",
-    "api.fit": "FittedPem fit",
-    "api.plot": "write_figures write_film",
+    "api.plot": "write_figures",
     "api.recordings": "draft_experiment inspect_recording read_lists read_recording read_recordings",
-    "api.results": "compare judge load_results view write_history write_report",
+    "api.results": "compare judge load_results view write_report",
     "api.run": "fused_tracks observations run",
     "api.study": "load_experiment",
-    "api.why": "Explanation why",
     "communication.latency": "LatencyModel",
     "communication.link": "LinkModel SentLists",
     "communication.reception": "RadioPath ReceptionModel",
@@ -184,6 +186,8 @@ if not TYPE_CHECKING:  # with it type checkers would accept every name
     def __getattr__(name: str) -> object:
         if name == "__version__":
             return _importlib.import_module("importlib.metadata").version("copem-replay")
+        if name in _EXTRAS["name of the API"]:
+            return _load_extra("name of the API", name)
         if name not in _MODULE:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         if name == "plot":

@@ -28,16 +28,16 @@ from mcap.writer import Writer
 from osi3.osi_sensordata_pb2 import SensorData
 
 import copem_replay as cr
-from copem_replay.api.fit import read_study_to_fit
 from copem_replay.core.tracks import CLASSES
 from copem_replay.core.yaml import strip_comments
 from copem_replay.experiment.file import make_plain_source
-from copem_replay.fitting.detection import DetectionCouple, DetectionFit, fit_detection
-from copem_replay.fitting.errors import ErrorFit, fit_errors
-from copem_replay.fitting.estimate import Estimate, pool_logs
-from copem_replay.fitting.fit import FitOptions, ReplayChecks, build_pem, build_unit, fit_unit
-from copem_replay.fitting.replay_check import replay_check, simulate_lists
-from copem_replay.fitting.rows import FitLists, FitRows
+from copem_replay.extras.fitting.api import read_study_to_fit
+from copem_replay.extras.fitting.detection import DetectionCouple, DetectionFit, fit_detection
+from copem_replay.extras.fitting.errors import ErrorFit, fit_errors
+from copem_replay.extras.fitting.estimate import Estimate, pool_logs
+from copem_replay.extras.fitting.fit import FitOptions, ReplayChecks, build_pem, build_unit, fit_unit
+from copem_replay.extras.fitting.replay_check import replay_check, simulate_lists
+from copem_replay.extras.fitting.rows import FitLists, FitRows
 from copem_replay.perception.pem.detection import TableDetection
 from copem_replay.perception.pem.model import Pem
 

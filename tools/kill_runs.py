@@ -275,8 +275,8 @@ def commands_of(here: Path, experiment: Path) -> dict[str, Callable[[], Command]
         ]
 
         def load() -> None:
-            from copem_replay.api.fit import fit
-            from copem_replay.fitting.page import fit_page
+            from copem_replay.extras.fitting.api import fit
+            from copem_replay.extras.fitting.page import fit_page
 
             fit_page(fit(here / "fit.yaml", "ego", folds=2).found)
 
@@ -291,7 +291,7 @@ def commands_of(here: Path, experiment: Path) -> dict[str, Callable[[], Command]
             both[k] = ["convert", "csv", str(here / f"{k}.csv"), "--out", str(here / "out/c.mcap"), "--overwrite"]
 
         def load() -> None:
-            from copem_replay.io.convert.conversion import convert_source
+            from copem_replay.extras.convert.conversion import convert_source
 
             convert_source(here / "1.csv", here / "warm.mcap", format="csv")
 

@@ -1,5 +1,5 @@
 """Figures of results, as matplotlib Figures: `cr.plot.detection_curves(results)`; all that `copem-replay plot` writes.
-`cr.write_figures` makes the files, `cr.write_film` a film.
+`cr.write_figures` makes the files.
 """
 
 from __future__ import annotations
@@ -222,45 +222,6 @@ def write_figures(
     read = take_results(results)
     selection = Selection(configurations, log, object_id, run, sliced=summarise_slices(read, by))
     return write_figure_files(read, None if folder is None else Path(folder), selection)
-
-
-def write_film(
-    results: AnyResults,
-    file: str | PathLike[str] | None = None,
-    *,
-    configurations: Sequence[str] | None = None,
-    log: str | None = None,
-    object_id: str | None = None,
-    run: int | None = None,
-) -> Path:
-    """Write ten seconds of one object in one run as a GIF, and return its path.
-
-    A plan for each of up to six configurations shows what it believes, and says whether the object is known, or why
-    not. `file`: None: `film.gif` in the results folder. `configurations`: None: four, from worst to best. `log`,
-    `object_id`, `run` as in `single_runs`. The recording is replayed again.
-
-    Raises InputError for what is not among the results and for more configurations, RecordingError where the recording
-    is gone or has changed, OutputError where the file is not writable.
-
-    >>> cr.write_film("out/tc016d", "film.gif", configurations=["PEM", "coPEM:0s"]).name
-    'film.gif'
-    """
-    from copem_replay.core.colours import configuration_colours
-    from copem_replay.metrics.detections_table import first_episodes
-    from copem_replay.report.figures.selection import Selection, choose_object_and_run
-    from copem_replay.results.again import replay_again
-    from copem_replay.viewer.film import check_film, draw_film
-
-    read = take_results(results)
-    path = read.require_folder() / "film.gif" if file is None else Path(file)
-    check_film(path, configurations)
-    choice = choose_object_and_run(read, Selection(configurations, log, object_id, run))
-    replayed, rows = replay_again(read, choice.log, choice.run, read.experiment.configurations)
-    table = first_episodes(rows)
-    read.check_unchanged()
-    every = configuration_colours(read.experiment.configurations)
-    colours = {name: every[name] for name in choice.configurations}
-    return draw_film(path, replayed, table, choice.object_id, colours, read.place)
 
 
 def __dir__() -> list[str]:

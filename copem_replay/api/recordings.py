@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from copem_replay.api.study import AnyExperiment, AnyPath
+    from copem_replay.core.site_map import SiteMap
     from copem_replay.experiment.draft.findings import RecordingSurvey
     from copem_replay.io.config import EgoTopic
 
@@ -85,11 +86,11 @@ def compare_with_map(path: AnyPath, map_path: AnyPath) -> list[str]:
     import numpy as np
 
     from copem_replay.core.errors import InputError, count_noun
-    from copem_replay.io.maps.registry import read_map
+    from copem_replay.core.extras import load_extra
     from copem_replay.metrics.agreement import estimate_shift, find_agreement
 
     recording, name = read_recording(path), os.path.basename(map_path)
-    site = read_map(Path(map_path))
+    site: SiteMap = load_extra("reader", "map")(Path(map_path))
     how = "taken as in the frame of the log"
     if site.degrees:
         if recording.place_said is None:

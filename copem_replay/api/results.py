@@ -129,22 +129,6 @@ def write_report(
     return write_html_report(_results_or_path(results), path, baseline=baseline, by=by)
 
 
-def write_history(folders: Sequence[str | PathLike[str]], file: str | PathLike[str] = "history.html") -> Path:
-    """Write what became of criteria over many results folders as one HTML file that opens offline. Returns its path.
-
-    `folders`: results folders with their verdicts, the oldest first.
-
-    Raises InputError where a folder has no verdicts or damaged ones, OutputError where the file is not writable.
-
-    >>> cr.write_history([])
-    Traceback (most recent call last):
-    copem_replay.core.errors.InputError: history: expected results folders, found none
-    """
-    from copem_replay.report.html.history import write_history_page
-
-    return write_history_page([Path(folder) for folder in folders], Path(file))
-
-
 def view(results: AnyResults, *, web: bool = False, object_id: str | None = None, log: str | None = None) -> None:
     """Open the recordings of a results folder in the Rerun viewer, just before the first onset, and wait until it ends.
 

@@ -6,7 +6,7 @@ import importlib
 import os
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -20,11 +20,11 @@ from copem_replay.api.study import (
     AnyPath,
     AnyRecordings,
     LoadedStudy,
-    check_any_counted,
     make_study,
     prepare_study,
 )
 from copem_replay.core.errors import InputError
+from copem_replay.core.extras import load_extra
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import CLASSES
 from copem_replay.experiment.drive import resolve_for_log
@@ -33,7 +33,6 @@ from copem_replay.pipeline.run import Progress
 from copem_replay.results.read import Results
 
 if TYPE_CHECKING:
-    from copem_replay.pipeline.crew import Crew, CrewProgress
     from copem_replay.pipeline.parts import PartCache
     from copem_replay.pipeline.prepare import Replay
     from copem_replay.results.write import Exporter
@@ -82,14 +81,8 @@ def run(
     elif cache is None:
         raise InputError("crew: expected `pieces`, too: a folder or a URL that all its workers see")
     else:
-        from copem_replay.pipeline.crew import Crew
-
-        def show(reached: CrewProgress) -> None:
-            if progress is not None:
-                progress(reached.done if reached.what == "replaying" else 0, reached.total)
-
-        workers = Crew(crew, cache, show)
-        study = read_with_crew(lambda: make_study(experiment, recordings, LogSurvey(cache), workers), workers)
+        workers = load_extra("workers", "executor")(crew, cache, progress)
+        study = workers.read_study(lambda: make_study(experiment, recordings, LogSurvey(cache), workers))
     return replay_study(study, prepare_study(study)[0], jobs, progress, cache)
 
 
@@ -119,14 +112,6 @@ def show_below_cell() -> Progress | None:
             shown.append(display(words, raw=True, display_id=True))
 
     return show
-
-
-def read_with_crew(read: Callable[[], LoadedStudy], crew: Crew) -> LoadedStudy:
-    """The study that `read` returns, with all parts computed; it is read again after a log that killed workers."""
-    check_any_counted(study := read())
-    while crew.fill(study.experiment, study.recordings):
-        study = read()
-    return study
 
 
 def replay_study(

@@ -6,9 +6,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 from copem_replay.core.errors import ExperimentError, InputError, is_url
+from copem_replay.core.yaml import Key
 from copem_replay.experiment.cross_references import NO_EGO, check_references
 from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.experiment.file import (
@@ -32,11 +33,10 @@ from copem_replay.experiment.validate import (
     read_logs,
     take_lanes,
 )
-from copem_replay.io.open import File, first_recording, list_recordings
+from copem_replay.io.open import File, Place, first_recording, list_recordings
 from copem_replay.io.recording import Recording
 
 if TYPE_CHECKING:
-    from copem_replay.pipeline.crew import Crew
     from copem_replay.pipeline.prepare import Replay
     from copem_replay.pipeline.study_log import LogSurvey
 
@@ -46,6 +46,20 @@ AnyExperiment: TypeAlias = Experiment | Mapping[str, Any] | AnyPath
 """An experiment, its keys and values, or the path of its file."""
 AnyRecordings: TypeAlias = Recording | AnyPath | Sequence[Recording] | Sequence[AnyPath]
 """Recordings, or their paths; one or several."""
+
+
+class SurveyingCrew(Protocol):
+    """Workers elsewhere that read and check logs (`extras/cluster`)."""
+
+    def survey(
+        self,
+        experiment: Experiment,
+        places: Mapping[Place, Key | None],
+        source: ExperimentSource,
+        *,
+        skip_unreadable: bool,
+    ) -> dict[str, list[RefusedLog]]:
+        """Logs that cannot be replayed, by the identity of their place."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +123,7 @@ def make_study(
     experiment: AnyExperiment,
     recordings: AnyRecordings | None = None,
     survey: LogSurvey | None = None,
-    crew: Crew | None = None,
+    crew: SurveyingCrew | None = None,
 ) -> LoadedStudy:
     """An experiment with its recordings: those it names (None), those at the paths, or Recordings as they are.
 
@@ -145,7 +159,7 @@ def read_study(
     *,
     skip_unreadable: bool = False,
     survey: LogSurvey | None = None,
-    crew: Crew | None = None,
+    crew: SurveyingCrew | None = None,
 ) -> LoadedStudy:
     """Read the recordings of an experiment; a log that the survey knows from its parts is not read again.
 

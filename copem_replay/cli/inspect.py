@@ -26,6 +26,7 @@ from copem_replay.cli.terminal import (
     width_of,
 )
 from copem_replay.core.errors import InputError
+from copem_replay.core.extras import has_extra, load_extra
 from copem_replay.core.files import atomic_files
 
 if TYPE_CHECKING:
@@ -132,10 +133,8 @@ def check(
     for line in list_began(replays, study.experiment):
         print_line(line)
     print_line(f"{experiment}: no problem found; logs: {', '.join(r.scene.log for r in study.recordings)}")
-    for unit in study.experiment.recorded:
-        from copem_replay.fitting.fit import preview_fit
-
-        for line in preview_fit(study.experiment, study.recordings, unit):
+    for unit in study.experiment.recorded if has_extra("preview", "fit") else ():
+        for line in load_extra("preview", "fit")(study.experiment, study.recordings, unit):
             print_line(line)
     return 0
 

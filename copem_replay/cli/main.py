@@ -15,15 +15,17 @@ try:  # an interrupt during the imports, too, ends without a traceback
     import signal
     import traceback
     from contextlib import suppress
+    from itertools import chain
     from typing import Annotated, Any
 
     import typer
     import typer.core
 
-    from copem_replay.cli import convert, fit, inspect, results, run
+    from copem_replay.cli import inspect, results, run
     from copem_replay.cli.terminal import print_problems
     from copem_replay.core.compiled import cache_note, recompiled_note
     from copem_replay.core.errors import CopemError, InputError
+    from copem_replay.core.extras import EXTRAS, has_extra, load_extra
     from copem_replay.core.waiting import tell_waits
 except KeyboardInterrupt:
     print("interrupted", file=sys.stderr)
@@ -35,7 +37,7 @@ class _Grouped(typer.core.TyperGroup):
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the names and the first line of each."""
-        named = [[command.__name__ for command in commands] for commands in GROUPS.values()]
+        named = [[c if isinstance(c, str) else c.__name__ for c in commands] for commands in GROUPS.values()]
         named[0] += [name for name in self.commands if not any(name in group for group in named)]
         width = formatter.width - max(map(len, self.commands)) - 6
         for title, names in zip(GROUPS, named, strict=True):
@@ -71,15 +73,35 @@ def version(
 
 GROUPS = {
     "From a recording to an experiment": (inspect.info, inspect.init, inspect.check, inspect.schema, inspect.samples),
-    "Replay": (run.run, run.why, fit.fit),
-    "Judge": (results.compare, results.verdict, results.history),
-    "Look": (results.view, results.report, results.plot, results.film, results.layout, results.export),
+    "Replay": (run.run, "why", "fit"),
+    "Judge": (results.compare, results.verdict, "history"),
+    "Look": (results.view, results.report, results.plot, "film", "layout", "export"),
 }
-"""All commands but `convert`, by what they are for."""
-for commands_of_group in GROUPS.values():
+"""Commands by what they are for: functions of the core, names of extras. Extras of no group are of the first."""
+
+
+def _add_extra(name: str) -> None:
+    """Add the command of an extra; where the extra is not installed, one that says so."""
+    if not has_extra("command", name):
+
+        @app.command(name, add_help_option=False, context_settings={"ignore_unknown_options": True})
+        def say_missing(arguments: Annotated[list[str] | None, typer.Argument(hidden=True)] = None) -> None:
+            """Not installed: `copem_replay/extras` lacks it."""
+            load_extra("command", name)
+
+    elif isinstance(found := load_extra("command", name), typer.Typer):
+        app.add_typer(found, name=name)
+    else:
+        app.command(name)(found)
+
+
+_OF_NO_GROUP = tuple(name for name in EXTRAS["command"] if name not in chain(*GROUPS.values()))
+for commands_of_group in (*GROUPS.values(), _OF_NO_GROUP):
     for command in commands_of_group:
-        app.command()(command)
-app.add_typer(convert.app, name="convert")
+        if isinstance(command, str):
+            _add_extra(command)
+        else:
+            app.command()(command)
 
 
 def main() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -183,22 +182,6 @@ def verdict(
     return 0 if verdicts.passes else 1
 
 
-def history(
-    folders: Annotated[list[Path], typer.Argument(metavar="FOLDER", help="Results folders, the oldest first.")],
-    out: Annotated[Path, typer.Option(metavar="FILE", help="Name of the page.")] = Path("history.html"),
-) -> int:
-    """Write the verdicts of many results folders, as one HTML file.
-
-    Each criterion is a strip of verdicts, and its figure with its interval.
-    """
-    from copem_replay.api.results import write_history
-
-    path = write_history(folders, out)
-    tidy_leftovers(path)
-    print_line(f"history in {path}")
-    return 0
-
-
 def plot(
     folder: ResultsFolder,
     out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="Folder of the figures [FOLDER/figures].")] = None,
@@ -234,29 +217,6 @@ def plot(
     return 0
 
 
-def film(
-    folder: ResultsFolder,
-    object: Annotated[str | None, typer.Option(metavar="ID", help="Object to follow [the first in conflict].")] = None,
-    configurations: Annotated[
-        str | None, typer.Option(metavar="A,B,…", help="Only these, six at most [four, from worst to best].")
-    ] = None,
-    run: Annotated[int | None, typer.Option(metavar="N", help="Run to show [as in replay.rrd].")] = None,
-    log: Annotated[str | None, typer.Option(metavar="NAME", help="Log to show [the first].")] = None,
-    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Name of the film [FOLDER/film.gif].")] = None,
-) -> int:
-    """Write ten seconds of an object as a GIF, for slides.
-
-    Plans side by side show what configurations believe, and say whether the object is known, or why it is not.
-    """
-    from copem_replay.api.plot import write_film
-
-    names = split_names(configurations)
-    path = write_film(folder, out, configurations=names, log=log, object_id=object, run=run)
-    tidy_leftovers(path)
-    print_line(f"film in {path}")
-    return 0
-
-
 def report(
     folder: ResultsFolder,
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="Name of the file [FOLDER/report.html].")] = None,
@@ -272,77 +232,6 @@ def report(
     path = write_report(folder, out, baseline=baseline, by=split_entries(by))
     tidy_leftovers(path)
     print_line(f"report in {path}")
-    return 0
-
-
-def export(
-    folder: ResultsFolder,
-    geojson: Annotated[
-        bool, typer.Option("--geojson", help="Units, paths of objects, lanes and houses, for maps of cities.")
-    ] = False,
-    trackeval: Annotated[
-        bool, typer.Option("--trackeval", help="Truth and what is held, as MOTChallenge files for TrackEval.")
-    ] = False,
-    nuscenes: Annotated[
-        bool, typer.Option("--nuscenes", help="Truth and what is held, as nuScenes tracking results.")
-    ] = False,
-    run: Annotated[int | None, typer.Option(metavar="N", help="Run that is tracked [as in replay.mcap].")] = None,
-    out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Folder of the files [FOLDER/geojson, …/trackeval, …/nuscenes].")
-    ] = None,
-) -> int:
-    """Write results in formats of other tools.
-
-    GeoJSON has longitudes and latitudes: only of logs whose place on earth is known (`frame`).
-    """
-    from copem_replay.results.geojson import write_geojson
-    from copem_replay.results.track_files import write_nuscenes, write_trackeval
-
-    if geojson + trackeval + nuscenes != 1:
-        found = "none" if geojson + trackeval + nuscenes == 0 else "several"
-        raise InputError(f"export: expected one format, --geojson, --trackeval or --nuscenes, found {found}")
-    if geojson and run is not None:
-        raise InputError("--run: expected --trackeval or --nuscenes with it, found --geojson")
-    if geojson:
-        files, notes = write_geojson(folder, out)
-    else:
-        files, notes = (write_trackeval if trackeval else write_nuscenes)(folder, out, run=run)
-    print_notes(notes)
-    for place in dict.fromkeys(file.parent for file in files):
-        tidy_leftovers(place, place)
-    print_blocks([[str(file) for file in files]])
-    return 0
-
-
-def layout(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Results folder, or a replay.mcap.")],
-    configurations: Annotated[
-        str | None, typer.Option("--compare", metavar="A,B,…", help="Show these over each other, and each alone.")
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Name of the layout [beside each replay, as .foxglove.json].")
-    ] = None,
-) -> int:
-    """Write a layout of a replay, for Foxglove and Lichtblick.
-
-    It shows the configurations side by side over the truth, with linked cameras, and when each knows an object.
-    """
-    from copem_replay.core.files import atomic_file
-    from copem_replay.io.write.foxglove_layout import build_layout, list_replays
-    from copem_replay.results.folder import MARK, add_to_made_list
-
-    replays = list_replays(folder)
-    if out is not None and len(replays) > 1:
-        raise InputError(f"--out: expected one replay, found {len(replays)} of several logs; name one: {replays[0]}")
-    layouts = [build_layout(replay, split_names(configurations) or ()) for replay in replays]
-    for replay, foxglove_layout in zip(replays, layouts, strict=True):
-        path = out or replay.with_suffix(".foxglove.json")
-        results_folder = next((place for place in replay.absolute().parents if (place / MARK).is_file()), replay.parent)
-        with atomic_file(path) as scratch:
-            scratch.write_text(json.dumps(foxglove_layout, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-            add_to_made_list(results_folder, [path])
-        tidy_leftovers(path)
-        print_line(f"layout in {path}")
     return 0
 
 

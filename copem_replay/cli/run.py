@@ -1,12 +1,12 @@
-"""`copem-replay run` and `why`: replay an experiment into a results folder; explain by replays why objects are late."""
+"""`copem-replay run`: replay an experiment into a results folder."""
 
 from __future__ import annotations
 
 import shlex
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
@@ -21,20 +21,17 @@ from copem_replay.cli.terminal import (
     Logs,
     ToS,
     print_answer,
-    print_blocks,
     print_line,
     print_notes,
     print_problems,
     print_table,
     print_verdicts,
-    show_crew_progress,
     show_progress,
     split_entries,
-    split_names,
-    tidy_outputs,
     width_of,
 )
 from copem_replay.core.errors import InputError
+from copem_replay.core.extras import load_extra
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -42,7 +39,6 @@ if TYPE_CHECKING:
     from copem_replay.api.study import LoadedStudy
     from copem_replay.experiment.file import ExperimentSource
     from copem_replay.experiment.schema import Experiment
-    from copem_replay.pipeline.crew import Crew
     from copem_replay.pipeline.parts import PartCache
     from copem_replay.results.decision import Decision
     from copem_replay.results.folder import ResultsPlace
@@ -99,9 +95,7 @@ def run(
     )
     out = out or Path("out") / experiment.stem
     if cluster is not None:
-        from copem_replay.pipeline.dask_workers import check_address
-
-        check_address(cluster)
+        load_extra("workers", "address")(cluster)
         pieces = pieces or f"{out}.pieces"
     with compile_ahead(), take_place(out, overwrite=overwrite) as place:
         print_notes(place.notes)
@@ -150,13 +144,13 @@ def _read_study(
     cluster: str | None,
 ) -> LoadedStudy:  # fmt: skip
     """The experiment and its recordings; with `cluster` every part is computed when this returns."""
-    from copem_replay.api.run import list_exporters, read_with_crew
+    from copem_replay.api.run import list_exporters
     from copem_replay.api.study import read_study
     from copem_replay.pipeline.study_log import LogSurvey
     from copem_replay.results.folder import check_inputs
     from copem_replay.results.write import check_own_files
 
-    with connect_crew(cluster, cache) as crew:
+    with nullcontext() if cluster is None else load_extra("workers", "cluster")(cluster, cache) as crew:
 
         def read() -> LoadedStudy:
             study = read_study(source, skip_unreadable=skip_unreadable, survey=LogSurvey(cache), crew=crew)
@@ -164,7 +158,7 @@ def _read_study(
             check_own_files(place, study.experiment, study.recordings, list_exporters())
             return study
 
-        return read() if crew is None else read_with_crew(read, crew)
+        return read() if crew is None else crew.read_study(read)
 
 
 def _replay_study(
@@ -248,90 +242,8 @@ def _check_viewer(experiment: Experiment, url: str | None) -> str:
     return url or VIEWER
 
 
-# `--cluster`: Dask processes as a crew of workers, for as long as the study is read and computed.
-
-
-@contextmanager
-def connect_crew(address: str | None, parts: PartCache | None) -> Iterator[Crew | None]:
-    """The crew at an address; None without an address. Prints what became of its workers, also after an interrupt.
-
-    Raises CopemError: no scheduler at the address, workers of another version, or workers that do not see the parts.
-    """
-    if address is None or parts is None:
-        yield None
-        return
-    from copem_replay.api.run import count_workers
-    from copem_replay.pipeline.crew import Crew
-    from copem_replay.pipeline.dask_workers import connect_workers
-
-    with connect_workers(address, parts, count_workers(None)) as workers:
-        try:
-            with show_crew_progress() as show:
-                crew = Crew(workers, parts, show)
-                yield crew
-            print_notes(crew.notes)
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt(crew.interrupted) from None
-        except SystemExit:  # of a signal
-            print_problems([crew.interrupted])
-            raise
-
-
 def advise_cluster(took_s: float, cores: int) -> list[str]:
     """A line that recommends `--cluster` after a long replay in threads on many cores; else no line."""
     if took_s <= ADVICE_AFTER_S or cores <= ADVICE_CORES:
         return []
     return [f"replaying took {took_s:.0f} s; `--cluster local` makes more of {cores} cores: its workers are processes"]
-
-
-# The same draws without something: why objects are known late.
-
-
-def why(
-    experiment: ExperimentFile,
-    configuration: Annotated[
-        list[str] | None,
-        typer.Option("--configuration", metavar="NAME", help="Only this one. May be repeated [all with units]."),
-    ] = None,
-    causes: Annotated[bool, typer.Option("--causes", help="Seconds by cause.")] = False,
-    units: Annotated[bool, typer.Option("--units", help="Seconds that each unit spares.")] = False,
-    triage: Annotated[bool, typer.Option("--triage", help="Late episodes in groups.")] = False,
-    sensitivity: Annotated[bool, typer.Option("--sensitivity", help="How much the order hangs on the PEMs.")] = False,
-    unit: Annotated[
-        str | None, typer.Option(metavar="A,B,…", help="Units whose worth is asked for [all but the ego's].")
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(metavar="FOLDER", help="Folder of the tables [out/<experiment>_why, FOLDER/why]."),
-    ] = None,
-) -> int:
-    """Explain lateness: causes, worth of units, triage, sensitivity.
-
-    Each is a replay on the same draws without something. Without any of the four, all are computed. Of a results folder
-    the tables are put into it, and its report shows them.
-    """
-    from copem_replay.api.why import PARTS
-    from copem_replay.api.why import why as explain
-
-    folder = out or Path("out") / f"{experiment.stem}_why"
-    if experiment.is_dir():
-        folder, experiment = out or experiment / "why", experiment / "experiment.yaml"
-    asked = [part for part, on in zip(PARTS, (causes, units, triage, sensitivity), strict=True) if on]
-    if asked and unit is not None and "units" not in asked:
-        asked.append("units")
-    found = show_progress(
-        "explaining",
-        lambda progress: explain(
-            experiment,
-            configurations=configuration,
-            parts=asked or None,
-            units=split_names(unit),
-            progress=progress,
-        ),
-    )
-    print_notes(found.notes)
-    print_blocks(list(found.blocks(width_of(sys.stdout))))
-    written = found.save(folder)
-    tidy_outputs(written)
-    print_line(f"{', '.join(path.name for path in written)} in {folder}")
-    return 0

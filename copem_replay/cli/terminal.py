@@ -9,8 +9,7 @@ import shutil
 import sys
 import time
 import unicodedata
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TextIO, TypeAlias, TypeVar
 
@@ -20,7 +19,6 @@ from copem_replay.core.compiled import compiling
 from copem_replay.core.errors import InputError, count_noun, is_url, local_path, strip_credentials, wrap_line
 
 if TYPE_CHECKING:
-    from copem_replay.pipeline.crew import CrewProgress
     from copem_replay.results.verdicts import Judgement
 
 
@@ -211,7 +209,7 @@ COMPILING = "compiling (once)"
 """Stands in place of the time left while code is compiled, which is then in the cache."""
 
 
-class _TimeLeft:
+class TimeLeft:
     """How long the rest takes, by how long what was done since the first report took.
 
     What comes before the first report is no measure of the rest: logs are read in it. Nor is what comes before the last
@@ -240,7 +238,7 @@ class ProgressLines:
     """Progress for logs and pipes: `replaying: 37 %, 4 minutes left`. `clock`: monotonic seconds."""
 
     def __init__(self, what: str, clock: Callable[[], float] = time.monotonic) -> None:
-        self._what, self._clock, self._left = what, clock, _TimeLeft()
+        self._what, self._clock, self._left = what, clock, TimeLeft()
         self._printed_s = clock()
 
     def __call__(self, done: int, total: int) -> None:
@@ -253,52 +251,6 @@ class ProgressLines:
     def words(self, done: int, total: int) -> str:
         """The progress in one line."""
         return ", ".join([f"{self._what}: {100 * done // total} %", *self._left.words(self._clock(), done, total)])
-
-
-@contextmanager
-def show_crew_progress() -> Iterator[Callable[[CrewProgress], None]]:
-    """A function that shows a crew's progress on stderr: as a bar in a terminal, else as lines."""
-    if sys.stderr is None or not sys.stderr.isatty():
-        yield CrewProgressLines()
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, TextColumn
-    from rich.progress import Progress as Bar
-
-    lines = CrewProgressLines()
-    with Bar(BarColumn(), TextColumn("{task.description}"), console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("", total=None)
-
-        def show(progress: CrewProgress) -> None:
-            words = lines.words(progress)
-            bar.update(task, completed=progress.done, total=progress.total, description=words)
-
-        yield show
-
-
-class CrewProgressLines:
-    """Progress of a crew in lines: `replaying: 412 of 5000 logs, 9 minutes left, 1 worker lost`."""
-
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock, self._what, self._left = clock, "", _TimeLeft()
-        self._printed_s = clock()
-
-    def __call__(self, progress: CrewProgress) -> None:
-        """Print a line if the last one is at least `EVERY_S` old."""
-        words = self.words(progress)
-        if self._clock() - self._printed_s >= EVERY_S and progress.done < progress.total:
-            self._printed_s = self._clock()
-            print_problems([words])
-
-    def words(self, progress: CrewProgress) -> str:
-        """The progress in one line; the time left is that of this kind of work."""
-        if progress.what != self._what:
-            self._what, self._left = progress.what, _TimeLeft()
-        parts = [f"{progress.what}: {progress.done} of {count_noun(progress.total, 'log')}"]
-        parts += self._left.words(self._clock(), progress.done, progress.total)
-        if progress.lost:
-            parts.append(f"{count_noun(progress.lost, 'worker')} lost")
-        return ", ".join(parts)
 
 
 def format_duration(time_s: float) -> str:

@@ -15,12 +15,11 @@ from pydantic import PrivateAttr, model_validator
 
 from copem_replay.core.components import FileBeside, Flag, Frozen, Positive, error_at_key
 from copem_replay.core.errors import InputError, count_noun
+from copem_replay.core.extras import load_extra
 from copem_replay.core.frame import Frame, SaidPlace
 from copem_replay.core.site_map import MapSolid, SiteMap, find_borders, make_polygon, outline_crosswalks
 from copem_replay.core.tracks import FROM_MAP, Solid, make_outlines, outline_solids
 from copem_replay.core.yaml import Key
-from copem_replay.io.maps.registry import read_map
-from copem_replay.io.maps.solids import DEFAULT_HEIGHTS_M
 from copem_replay.io.open import sha256_of
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.agreement import (
@@ -44,6 +43,12 @@ _KINDS_OF: Final[Mapping[SolidKind, tuple[str, ...]]] = {
 """Kinds of maps by those that are asked for; others by their own name."""
 _MOST_PARTS: Final = 50_000
 """Convex parts of the solids of one log: each is looked at from each unit in each list."""
+
+
+DEFAULT_HEIGHTS_M: Final[Mapping[str, float]] = {
+    "building": 8.0, "wall": 2.0, "hedge": 1.5, "retaining_wall": 2.0, "city_wall": 5.0, "level": 3.0,
+}  # fmt: skip
+"""By kind, where the map does not say; `level`: of one storey."""
 
 
 class MapHeights(Frozen):
@@ -129,7 +134,8 @@ class MapFile(Frozen):
 
 @lru_cache(maxsize=4)
 def _read_map_once(file: str, _sha256: str, heights_m: tuple[tuple[str, float], ...]) -> SiteMap:
-    return read_map(Path(file), dict(heights_m))
+    site: SiteMap = load_extra("reader", "map")(Path(file), dict(heights_m))
+    return site
 
 
 def add_maps(

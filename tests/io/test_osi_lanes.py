@@ -16,7 +16,7 @@ from osi3.osi_groundtruth_pb2 import GroundTruth
 from osi3.osi_logicallane_pb2 import LogicalLane
 
 from copem_replay.core.site_map import Lane
-from copem_replay.io.maps.opendrive import read_opendrive
+from copem_replay.extras.maps.opendrive import read_opendrive
 from copem_replay.io.recording import read_log
 from copem_replay.io.schemas.osi_lanes import OsiRoad, read_road
 from copem_replay.metrics.agreement import find_agreement

@@ -10,7 +10,7 @@ import pytest
 
 from copem_replay.core.site_map import Lane, SiteMap
 from copem_replay.core.tracks import Float
-from copem_replay.io.maps.registry import read_map
+from copem_replay.extras.maps.registry import read_map
 from copem_replay.io.recording import Recording, read_log
 from copem_replay.metrics.agreement import Agreement, DirectedLanes, estimate_shift, find_agreement
 

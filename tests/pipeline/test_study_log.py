@@ -24,10 +24,10 @@ from copem_replay.pipeline import run as gather
 from copem_replay.pipeline import study_log
 from copem_replay.pipeline import study_log as log_survey
 from tests.cli.test_api import cr
+from tests.extras.test_crew import Shuffled
 from tests.helpers.experiments import changed
 from tests.helpers.object_storage import Bucket
 from tests.helpers.recordings import Obj, write_recording
-from tests.pipeline.test_crew import Shuffled
 from tests.system.test_cli import Call, call
 
 __all__ = ["call"]  # a fixture

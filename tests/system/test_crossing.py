@@ -29,7 +29,7 @@ from shapely import LineString, Point, Polygon, affinity
 import copem_replay as cr
 from copem_replay.experiment.file import log_paths, read_experiment_file
 from copem_replay.experiment.validate import check_across_logs, find_problems, read_logs
-from copem_replay.io.maps.registry import read_map
+from copem_replay.extras.maps.registry import read_map
 from copem_replay.io.write.osi import write_osi_trace
 from copem_replay.pipeline.run import run_experiment
 

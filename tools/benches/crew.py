@@ -70,10 +70,10 @@ _ONE_WAY = "import sys; sys.path.insert(0, sys.argv[1]); from benches.crew impor
 def go(way: str, folder: str) -> None:
     """Print seconds of one way, of its start, megabytes of a worker at most, rows: in a process of its own."""
     import copem_replay as cr
-    from copem_replay.api.run import read_with_crew, replay_study
+    from copem_replay.api.run import replay_study
     from copem_replay.api.study import make_study, prepare_study
-    from copem_replay.pipeline.crew import Crew
-    from copem_replay.pipeline.dask_workers import connect_workers
+    from copem_replay.extras.cluster.crew import Crew
+    from copem_replay.extras.cluster.dask_workers import connect_workers
     from copem_replay.pipeline.parts import PartCache
     from copem_replay.pipeline.study_log import LogSurvey
 
@@ -87,10 +87,10 @@ def go(way: str, folder: str) -> None:
     began_s = time.perf_counter()
     with connect_workers(way, PartCache("warm"), 2) as workers:
         warm = Crew(workers, parts := PartCache("warm"))  # kernels are loaded in the workers, too
-        read_with_crew(lambda: make_study("e.yaml", ["drive00.mcap", "drive01.mcap"], LogSurvey(parts), warm), warm)
+        warm.read_study(lambda: make_study("e.yaml", ["drive00.mcap", "drive01.mcap"], LogSurvey(parts), warm))
         start_s, began_s = time.perf_counter() - began_s, time.perf_counter()
         hands = Crew(workers, parts := PartCache("kept"))
-        study = read_with_crew(lambda: make_study("e.yaml", None, LogSurvey(parts), hands), hands)
+        study = hands.read_study(lambda: make_study("e.yaml", None, LogSurvey(parts), hands))
         computed_s = time.perf_counter() - began_s
         result = replay_study(study, prepare_study(study)[0], 1, None, parts)
         took_s = time.perf_counter() - began_s

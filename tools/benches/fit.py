@@ -11,9 +11,9 @@ import numpy as np
 
 from benches import common
 from copem_replay.core.view_geometry import ViewGeometry
-from copem_replay.fitting.detection import fit_detection
-from copem_replay.fitting.replay_check import replay_check, simulate_lists
-from copem_replay.fitting.rows import FitLists, FitRows
+from copem_replay.extras.fitting.detection import fit_detection
+from copem_replay.extras.fitting.replay_check import replay_check, simulate_lists
+from copem_replay.extras.fitting.rows import FitLists, FitRows
 from copem_replay.perception.pem.model import Pem
 
 PASSES, LISTS, PERIOD_S = 1000, 100, 0.1

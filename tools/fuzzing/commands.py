@@ -199,8 +199,8 @@ def _without_viewer() -> None:
 def _write_data_sets(folder: Path) -> None:
     import pandas as pd
 
-    from tests.io import test_convert as tables
-    from tests.io import test_convert_data_sets as sets
+    from tests.extras import test_convert as tables
+    from tests.extras import test_convert_data_sets as sets
 
     (folder / "csv.csv").write_text(f"{tables.HEADER}\n{tables.CAR}\n0.1,1,car,1,0,0,4,2\n0.1,2,pedestrian,5,5,0,1,1\n")
     vehicles = [f'<vehicle id="e" x="{k}" y="2" angle="90" speed="5" type="mix" z="1"/>' for k in range(4)]

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from copem_replay.core.errors import OutputError, RecordingError
+from copem_replay.core.extras import EXTRAS, has_extra, load_extra
 from copem_replay.core.files import atomic_file
 from copem_replay.report.figures.answer import answer_figure
 from copem_replay.report.figures.registry import FIGURES
@@ -27,7 +28,6 @@ from copem_replay.report.html.markup import (
     replace_colours,
     replace_greys,
 )
-from copem_replay.report.html.player import player_section
 from copem_replay.report.html.setup import (
     describe_configurations,
     describe_question,
@@ -35,7 +35,6 @@ from copem_replay.report.html.setup import (
     provenance_tables,
 )
 from copem_replay.report.html.slices import group_tables
-from copem_replay.report.html.stories import story_parts
 from copem_replay.report.html.study import NO_RECORDING, ReportData, load_study
 from copem_replay.report.html.tables import (
     baseline_words,
@@ -46,7 +45,6 @@ from copem_replay.report.html.tables import (
     summary_tables,
     verdicts_table,
 )
-from copem_replay.report.html.why import why_parts
 from copem_replay.results.folder import add_to_made_list
 from copem_replay.results.read import Results
 
@@ -162,9 +160,7 @@ def build_page(study: ReportData) -> str:
     sections = [
         *_verdict_sections(study),
         _Section("differences-of-it", "Differences", _difference_parts(study)),
-        *([_Section("stories", "Stories of single objects", story_parts(study))] if measured else []),
-        *([_Section("play", "One run, side by side", [player])] if (player := player_section(study)) else []),
-        *([_Section("why", "Why it is late", [*why_parts(study.why)])] if study.why else []),
+        *_extra_sections(study),
         *_figure_sections(study, ("late_paths", "trade_off")),
         _Section(
             "configurations-of-it",
@@ -193,6 +189,15 @@ def build_page(study: ReportData) -> str:
     return whole_page(
         title, join_html([head, *(make_tag("section", make_tag("h2", s.title), *s.parts, id_=s.id) for s in sections)])
     )
+
+
+def _extra_sections(study: ReportData) -> Iterator[_Section]:
+    """The sections of extras that are installed and have something to show."""
+    for name in EXTRAS["section of the report"]:
+        if has_extra("section of the report", name):
+            section = load_extra("section of the report", name)(study)
+            if section is not None:
+                yield _Section(name, *section)
 
 
 def _verdict_sections(study: ReportData) -> list[_Section]:

@@ -23,7 +23,6 @@ from copem_replay.report.figures.style import (
     find_contenders,
     sort_soonest_first,
 )
-from copem_replay.report.html.why import read_why
 from copem_replay.results.compare import Comparison, compare_folders
 from copem_replay.results.judge import judge_own_criteria
 from copem_replay.results.read import Results, read_results
@@ -86,11 +85,6 @@ class ReportData:
     def provenance(self) -> Mapping[str, Any]:
         """The whole of `provenance.json`."""
         return self.results.provenance.data
-
-    @cached_property
-    def why(self) -> Mapping[str, pd.DataFrame]:
-        """What `copem-replay why` left in the folder, by the names of files."""
-        return read_why(self.results.folder)
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -1,0 +1,1 @@
+"""Ten seconds of an object in one run, as a GIF for slides."""

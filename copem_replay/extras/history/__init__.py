@@ -1,0 +1,1 @@
+"""Verdicts of many results folders on one page."""

@@ -1,0 +1,1 @@
+"""Layouts of a replay for Foxglove and Lichtblick."""

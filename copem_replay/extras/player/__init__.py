@@ -1,0 +1,1 @@
+"""A player of one run on the page of the report."""

@@ -1,0 +1,1 @@
+"""Stories of single objects in the report: plans, lanes and a sentence."""

@@ -1,0 +1,1 @@
+"""Why objects are known late: causes, worth of units, triage, sensitivity (docs/guide/why.md)."""

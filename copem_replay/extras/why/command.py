@@ -1,0 +1,70 @@
+"""`copem-replay why`: why objects are known late, by replays on the same draws without something."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from copem_replay.cli.terminal import (
+    ExperimentFile,
+    print_blocks,
+    print_line,
+    print_notes,
+    show_progress,
+    split_names,
+    tidy_outputs,
+    width_of,
+)
+
+
+def why(
+    experiment: ExperimentFile,
+    configuration: Annotated[
+        list[str] | None,
+        typer.Option("--configuration", metavar="NAME", help="Only this one. May be repeated [all with units]."),
+    ] = None,
+    causes: Annotated[bool, typer.Option("--causes", help="Seconds by cause.")] = False,
+    units: Annotated[bool, typer.Option("--units", help="Seconds that each unit spares.")] = False,
+    triage: Annotated[bool, typer.Option("--triage", help="Late episodes in groups.")] = False,
+    sensitivity: Annotated[bool, typer.Option("--sensitivity", help="How much the order hangs on the PEMs.")] = False,
+    unit: Annotated[
+        str | None, typer.Option(metavar="A,B,…", help="Units whose worth is asked for [all but the ego's].")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Folder of the tables [out/<experiment>_why, FOLDER/why]."),
+    ] = None,
+) -> int:
+    """Explain lateness: causes, worth of units, triage, sensitivity.
+
+    Each is a replay on the same draws without something. Without any of the four, all are computed. Of a results folder
+    the tables are put into it, and its report shows them.
+    """
+    from copem_replay.extras.why.api import PARTS
+    from copem_replay.extras.why.api import why as explain
+
+    folder = out or Path("out") / f"{experiment.stem}_why"
+    if experiment.is_dir():
+        folder, experiment = out or experiment / "why", experiment / "experiment.yaml"
+    asked = [part for part, on in zip(PARTS, (causes, units, triage, sensitivity), strict=True) if on]
+    if asked and unit is not None and "units" not in asked:
+        asked.append("units")
+    found = show_progress(
+        "explaining",
+        lambda progress: explain(
+            experiment,
+            configurations=configuration,
+            parts=asked or None,
+            units=split_names(unit),
+            progress=progress,
+        ),
+    )
+    print_notes(found.notes)
+    print_blocks(list(found.blocks(width_of(sys.stdout))))
+    written = found.save(folder)
+    tidy_outputs(written)
+    print_line(f"{', '.join(path.name for path in written)} in {folder}")
+    return 0
