@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import dask
+import distributed
 import pandas as pd
 import pytest
 
@@ -335,6 +336,41 @@ def test_a_client_that_has_closed_itself_is_said(connected: Callable[..., Any]) 
     with pytest.raises(CopemError, match=r"^crew: the .*gone; [12] of 2 logs are in kept; the same command goes on$"):
         replayed(study(), "dask", pieces="kept", crew=workers, progress=close)
     assert replayed(study(), "again", pieces="kept", crew=connected())[0] == plain
+
+
+@pytest.mark.parametrize("asked", ["submit", "nthreads"])
+def test_a_client_that_closes_itself_while_it_is_asked_is_said(
+    asked: str, connected: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Between a look at its state and the next task: the client has an error of its own for it."""
+    workers = connected()
+    client, ask = workers._client, getattr(workers._client, asked)
+
+    def close_first(*given: Any, **keys: Any) -> Any:
+        client.close()
+        return ask(*given, **keys)
+
+    monkeypatch.setattr(client, asked, close_first)
+    with pytest.raises(
+        CopemError, match=r"^crew: the scheduler is gone; 0 of 2 logs are in kept; the same command goe"
+    ):
+        replayed(study(), "dask", pieces="kept", crew=workers)
+    assert "Traceback" not in caplog.text
+
+
+@pytest.mark.parametrize("asked", ["wait_for_workers", "run", "subscribe_topic"])
+def test_a_scheduler_that_goes_while_workers_are_greeted_is_said(
+    asked: str, connected: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ask = getattr(distributed.Client, asked)
+
+    def close_first(client: Any, *given: Any, **keys: Any) -> Any:
+        client.close()
+        return ask(client, *given, **keys)
+
+    monkeypatch.setattr(distributed.Client, asked, close_first)
+    with pytest.raises(CopemError, match=r"^--cluster: tcp://127.0.0.1:\d+: its scheduler is gone$"):
+        connected()
 
 
 def test_what_a_crew_needs(here: Path) -> None:

@@ -15,7 +15,7 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -349,7 +349,8 @@ class Crew:
                 while source and len(flying) < at_once:
                     task = source.popleft()
                     if place_identity(task.place) not in self._lost:
-                        flying[self._executor.submit(do_task, task)] = task, at_once == 1
+                        with self._say_where_it_ends():
+                            flying[self._executor.submit(do_task, task)] = task, at_once == 1
                 finished, _ = wait(flying, TICK_S, FIRST_COMPLETED)
                 self._report()
                 for future in finished:
@@ -374,20 +375,36 @@ class Crew:
         client = getattr(self._executor, "_client", None)  # Dask's
         if client is None:
             return int(getattr(self._executor, "_max_workers", None) or os.cpu_count() or 1)
-        if client.status in ("closing", "closed"):  # its futures might not tell of it
-            raise self._end("the scheduler is gone")
-        with suppress(OSError, RuntimeError):  # futures tell of a lost scheduler
-            return int(max(sum(client.nthreads().values()), 1))
+        with self._say_where_it_ends():
+            if self._is_gone():  # its futures might not tell of it
+                raise CancelledError
+            with suppress(OSError, RuntimeError):  # futures tell of a lost scheduler
+                return int(max(sum(client.nthreads().values()), 1))
         return 1
+
+    def _is_gone(self) -> bool:
+        """Whether Dask's client has closed itself, as it does some time after its scheduler is gone."""
+        return getattr(getattr(self._executor, "_client", None), "status", None) in ("closing", "closed")
+
+    @contextmanager
+    def _say_where_it_ends(self) -> Iterator[None]:
+        """Raise CopemError in place of what an executor raises that takes no more tasks, or tells no more of them."""
+        try:
+            yield
+        except BrokenExecutor as error:
+            raise self._end(f"a worker died, and its executor with it ({type(error).__name__})") from None
+        except Exception as error:
+            if self._is_gone():  # whatever is asked of a closed client, and it has more than one error for it
+                raise self._end("the scheduler is gone") from None
+            if isinstance(error, CancelledError):
+                raise self._end("the executor has cancelled what it was given: its scheduler is gone") from None
+            raise
 
     def _receive(self, future: Future[Receipt], task: Task) -> Receipt:
         """The receipt. Raises WorkerDiedError, CopemError, TaskFailedError, and what the executor raises."""
         try:
-            receipt = future.result()
-        except BrokenExecutor as error:
-            raise self._end(f"a worker died, and its executor with it ({type(error).__name__})") from None
-        except CancelledError:
-            raise self._end("the executor has cancelled what it was given: its scheduler is gone") from None
+            with self._say_where_it_ends():
+                receipt = future.result()
         except Exception as error:
             if type(error).__name__ != "KilledWorker":  # Dask's, which need not be installed
                 raise

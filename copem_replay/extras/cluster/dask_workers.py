@@ -70,19 +70,32 @@ def connect_workers(address: str, parts: PartCache, cores: int, wait_s: float = 
         except (OSError, ValueError) as error:  # no answer; no address in the file
             raise CopemError(f"--cluster: {address}: no scheduler answers there ({_format_error(error)})") from None
         stack.callback(_close, client.close, 1)
-        try:
-            client.wait_for_workers(1, timeout=max(wait_s, 1))
-        except TimeoutError:
-            raise CopemError(f"--cluster: {address}: there is no worker, after {wait_s:g} s") from None
-        _check_workers(client, address, parts)
+        with _say_where_it_ends(client, address):
+            try:
+                client.wait_for_workers(1, timeout=max(wait_s, 1))
+            except TimeoutError:
+                raise CopemError(f"--cluster: {address}: there is no worker, after {wait_s:g} s") from None
+            _check_workers(client, address, parts)
         executor = client.get_executor(pure=False)
         executor.lost = 0
 
         def count_lost(event: tuple[float, dict[str, Any]]) -> None:
             executor.lost += event[1].get("action") == "remove-worker" and not event[1].get("expected")
 
-        client.subscribe_topic("all", count_lost)
+        with _say_where_it_ends(client, address):
+            client.subscribe_topic("all", count_lost)
         yield executor
+
+
+@contextmanager
+def _say_where_it_ends(client: Any, address: str) -> Iterator[None]:
+    """Raise CopemError in place of what a client raises that has closed itself: its scheduler is gone."""
+    try:
+        yield
+    except Exception as error:
+        if isinstance(error, CopemError) or client.status not in ("closing", "closed"):
+            raise
+        raise CopemError(f"--cluster: {address}: its scheduler is gone") from None
 
 
 def _close(close: Callable[..., None], timeout_s: float) -> None:
