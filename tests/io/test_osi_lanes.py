@@ -80,9 +80,11 @@ def test_lanes_without_borders_are_left_out_and_said() -> None:
     add_lane(truth, 10, [4], [2])
     add_lane(truth, 11, [77], [2])
     add_lane(truth, 12, [], [], type=Of.TYPE_INTERSECTION)
+    add_boundary(truth, 5, [(7.0, 9.0), (7.0, 9.0)])
+    add_lane(truth, 13, [5], [2])
     road = read_road(truth)
     assert [lane.id for lane in road.lanes] == ["8", "9"]
-    assert road.notes == ["2 lanes without a left and a right border: left out"]
+    assert road.notes == ["3 lanes without a left and a right border: left out"]
     assert not OsiRoad()
     assert OsiRoad(notes=road.notes)
 

@@ -84,7 +84,7 @@ def _read_lane(lane: Any, boundaries: Mapping[int, Float]) -> list[Lane]:
         _join_along([line for i in ids if len(line := boundaries.get(i.value, _NOWHERE)) > 1], centre)
         for ids in (of.left_lane_boundary_id, of.right_lane_boundary_id)
     )
-    if not len(left) or not len(right):
+    if min(len(left), len(right)) < 2:  # points that are all at one place are one
         return []
     found = Lane(str(lane.id.value), kind, left, right)
     return [found if of.centerline_is_driving_direction or kind != "driving" else found.turned()]
