@@ -1,5 +1,5 @@
-# make demo | test | test-random | bench | check | notebooks | pictures | site | release: each sets up .venv on its first call and
-# never again while pyproject and requirements stay.
+# make demo | quick | test | test-long | test-random | bench | check | notebooks | pictures | site | release: each sets up .venv on
+# its first call and never again while pyproject and requirements stay.
 # Another Python beside it: make test PYTHON=python3.13 VENV=.venv-3.13
 PYTHON ?= python3
 VENV ?= .venv
@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 # Modules are kept compiled, wherever this runs: else every command compiles two hundred of them anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-random bench check notebooks pictures site release requirements clean
+.PHONY: demo quick test test-long test-random kernels bench check notebooks pictures site release requirements clean
 
 # Packages come by hash, through uv where it is there: what runs need, and for all but `demo` the rest. As with uv, modules
 # are compiled when they are first imported: most never are, and compiling all takes two fifths of the time.
@@ -29,15 +29,28 @@ demo: $(VENV)/.installed
 	@echo
 	@$(BIN)/python tools/paper.py out/tc016d
 
-test: $(VENV)/.rest
-	$(BIN)/python -m pytest -q -n 3
+# Fills the cache of compiled code with what most tests need, before workers start that would each compile it.
+kernels: $(VENV)/.rest
+	$(BIN)/copem-replay run logs/crossing.yaml --runs 1 --out out/kernels --overwrite > /dev/null
+
+# Under two minutes on two cores: every room, but not the tests in tests/slow.txt, which tools/slow_tests.py measures.
+quick: kernels
+	$(BIN)/python -m pytest -q -n 3 --dist loadfile -m "not slow and not long"
+
+# All that guards core and extras; 50 drawn examples.
+test: kernels
+	$(BIN)/python -m pytest -q -n 3 --dist loadfile -m "not long"
+
+# The rest: commands that are killed, what pages and notebooks print, browsers, other processors; 200 drawn examples.
+test-long: kernels
+	ALL_EXAMPLES=1 $(BIN)/python -m pytest -q -n 3 --dist loadfile -m "long or hypothesis"
 
 # Every night: the tests with drawn examples, with others each time. A failure prints the seed of all (to be given as SEED)
 # and what gives its own example again.
 SEED := $(or $(SEED),$(shell date +%s))
 test-random: $(VENV)/.rest
 	@echo "seed $(SEED)"
-	RANDOM_EXAMPLES=1 $(BIN)/python -m pytest -q -n 2 -m hypothesis --hypothesis-seed=$(SEED)
+	ALL_EXAMPLES=1 RANDOM_EXAMPLES=1 $(BIN)/python -m pytest -q -n 2 -m hypothesis --hypothesis-seed=$(SEED)
 
 bench: $(VENV)/.rest
 	$(BIN)/python tools/bench.py

@@ -130,7 +130,7 @@ def killed_by(mutant: Mutant, copy: Path, *, near: bool) -> tuple[str, str]:
     place = copy / mutant.path.relative_to(ROOT)
     kernel = _COMPILED.search(mutant.text) is not None
     stale = _compiled_with(mutant, copy) if kernel else []
-    env = {**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1", "CI": "true"}
+    env = {"ALL_EXAMPLES": "1", **os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1", "CI": "true"}
     place.write_text(mutant.text, encoding="utf-8")
     _forget(stale)
     try:

@@ -8,7 +8,7 @@ import sys
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from copem_replay.core.errors import InputError
@@ -28,7 +28,6 @@ from tests.oracles import krueger
 LAT, ZONE = st.floats(-80, 84), st.integers(1, 60)
 
 
-@settings(max_examples=200)
 @given(LAT, ZONE, st.floats(-3.5, 3.5))
 def test_utm_is_kruegers_series_in_every_zone_of_both_hemispheres(lat: float, zone: int, east_deg: float) -> None:
     meridian = 6 * zone - 183
@@ -41,7 +40,6 @@ def test_utm_is_kruegers_series_in_every_zone_of_both_hemispheres(lat: float, zo
     assert notes == []
 
 
-@settings(max_examples=200)
 @given(
     LAT, st.floats(-180, 180), st.floats(-10, 10), st.tuples(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6)),
     st.tuples(st.floats(-3000, 3000), st.floats(-3000, 3000)),
@@ -99,7 +97,6 @@ def test_a_square_of_mgrs() -> None:
     assert read_mgrs("56HLH") == ("+proj=utm +zone=56 +south +datum=WGS84 +units=m", (300_000.0, 6_200_000.0))  # Sydney
 
 
-@settings(max_examples=200)
 @given(st.floats(-79.9, -0.01) | st.floats(0, 83.9), ZONE, st.floats(-2.9, 2.9))
 def test_every_place_is_in_a_square_of_its_own_zone(lat: float, zone: int, east_deg: float) -> None:
     """Letters counted plainly: columns by zone, 20 rows by zone, bands of 8° from 80° S."""

@@ -19,6 +19,8 @@ from tests.cli.test_api import cr
 from tests.extras.test_crew import at_45_m_and_a_half
 from tests.helpers.experiments import changed, drive, files
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).parents[2]
 BIN = Path(sys.executable).parent
 Start = Callable[..., "subprocess.Popen[str]"]

@@ -146,6 +146,7 @@ def at_45_m_and_a_half(kind: str, **keys: Any) -> str:
     return text.replace("{kind: constant, probability: 0.5}", model)
 
 
+@pytest.mark.long
 def test_the_same_bytes_where_workers_are_killed(connected: Callable[..., Any]) -> None:
     many(10)
     text = study("logs: ['*.mcap']")
@@ -164,6 +165,7 @@ def test_the_same_bytes_where_workers_are_killed(connected: Callable[..., Any]) 
     assert replayed(text, "again", pieces="kept") == (plain, 0, computed)
 
 
+@pytest.mark.long
 def test_a_log_that_workers_die_of_is_named_and_the_others_are_done(connected: Callable[..., Any]) -> None:
     text, workers = at_45_m_and_a_half("Deadly"), connected()
     where = r"died 3 times, last on 127.0.0.1:\d+ \(out of memory\?\); more memory per worker, or --skip-unreadable"
@@ -179,6 +181,7 @@ def test_a_log_that_workers_die_of_is_named_and_the_others_are_done(connected: C
     assert len(list(Path("kept/logs").iterdir())) == surveyed
 
 
+@pytest.mark.long
 def test_a_log_that_workers_die_of_is_skipped_where_that_is_asked_for(
     cluster: Any, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -29,6 +29,8 @@ from tests.helpers.experiments import changed, drive, files
 from tests.helpers.page import blocks, spans
 from tests.viewer.test_rrd import rerun
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs/guide/scale.md"
 BIN = Path(sys.executable).parent
@@ -136,7 +138,6 @@ def test_packages_are_those_of_the_project(here: Path) -> None:
         assert "does not provide" not in typed(command, here)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("mark", ["tcp://", "srun", "tls://"])
 def test_other_machines(mark: str, here: Path) -> None:
     """All of them are this one: what listens does so at 127.0.0.1 and a port that is free, `srun` runs its words."""

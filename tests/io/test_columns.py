@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, json_format, message_factory
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from copem_replay.io.encodings.columns import (
@@ -223,7 +223,6 @@ def test_json_is_judged_by_messages_that_say_something() -> None:
     ),
     st.data(),
 )
-@settings(max_examples=200)
 def test_any_json(value: Any, data: st.DataObject) -> None:
     payloads = [*encoded(value), b'{"a": 1}', b"[[1]]"]
     definition = JsonDefinition(payloads)
@@ -262,7 +261,6 @@ def oracle(message: Any, path: str) -> list[Any]:
 
 
 @given(st.lists(st.lists(st.lists(st.integers(0, 99), max_size=3), max_size=3), max_size=3), st.data())
-@settings(max_examples=200)
 def test_one_item_of_a_list(content: list[Any], data: st.DataObject) -> None:
     message = {"a": [{"b": [{"c": c} for c in b]} for b in content]}
     other = {"a": [{"b": [{"c": [5, 6, 7]}]}] * 2}

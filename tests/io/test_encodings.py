@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from google.protobuf import descriptor_pb2
 from google.protobuf.message import DecodeError
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from copem_replay.io.encodings import json as json_messages
@@ -190,7 +190,6 @@ JSON = st.recursive(
 
 
 @given(st.lists(JSON, min_size=1, max_size=4), st.data())
-@settings(max_examples=200, deadline=None)
 def test_any_json(values: list[Any], data: st.DataObject) -> None:
     payloads = [json.dumps({"a": v}).encode() for v in values]
     definition = JsonDefinition(payloads)

@@ -48,6 +48,7 @@ def test_the_offset_is_as_certain_as_mean_places_at_that_speed() -> None:
     assert np.std(found) == pytest.approx(1.06 * 0.5 * np.sqrt(1 / 90 + 1 / 60) / SPEED_MPS, rel=0.15)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("lasting_s", [0.0, 1.0])
 def test_intervals_hold_the_offset_whether_errors_last_or_not(lasting_s: float) -> None:
     """Four cars for a minute against the truth; errors are an Ornstein-Uhlenbeck process or new in every list."""

@@ -59,6 +59,7 @@ def test_exact_lists_give_the_offset_that_was_put_in(offset_s: float, first_hz: 
     assert turned.offset_s == pytest.approx(-offset_s, abs=0.003)
 
 
+@pytest.mark.long
 def test_pairs_of_lists_with_errors_of_half_a_metre() -> None:
     """A few seeds of what the tool tries forty of: rates, misses, ids or none, offsets from -1 to 1 s."""
     from copem_replay.io.recording import read_log

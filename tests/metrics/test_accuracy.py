@@ -30,6 +30,7 @@ from copem_replay.metrics.gospa import gospa, ospa
 from copem_replay.metrics.matching import Matches, match_at_both_times, match_entries
 from copem_replay.metrics.summary_metrics import METRIC
 from tests.helpers.at_once import assess
+from tests.helpers.drawn import examples
 from tests.helpers.reports import between, chunks, entry, lists_of
 from tests.helpers.reports import joined as one_list
 from tests.oracles.accuracy import (
@@ -240,7 +241,7 @@ def test_the_gate_cuts_the_mean_and_the_spread_of_true_covariances() -> None:
     assert (high - low) / 2 / 1.96 == pytest.approx(nees.std() / math.sqrt(len(nees)), rel=0.03)
 
 
-@settings(max_examples=60)  # each integrates over a plane by quadrature
+@settings(max_examples=examples(60))  # each integrates over a plane by quadrature
 @given(st.floats(-9, 4), st.floats(0, 4), st.sampled_from([0.3, 3.0, 50.0]))
 @example(4.0, 0.5, 0.3)  # next to nothing is within
 def test_what_is_expected_within_the_gate_as_integrals_have_it(large: float, less: float, gate_m: float) -> None:

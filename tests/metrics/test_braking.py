@@ -46,11 +46,12 @@ from copem_replay.metrics.braking.verdict import (
 from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.replay import replay_block
 from copem_replay.pipeline.run import run_experiment
+from tests.helpers.drawn import examples
 from tests.helpers.scenes import EGO_UNIT, SEES_ALL, Thing, driving, experiment, recording, standing
 from tests.oracles.braking import Motion, corners, outcome
 
 SOME = settings(
-    max_examples=60, suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much]
+    max_examples=examples(60), suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much]
 )  # an example prepares a log and judges it
 BRAKES_8 = {"kind": "constant_deceleration", "a_max_mps2": 8.0}
 NEVER = math.inf
@@ -266,7 +267,7 @@ def in_shapely(a: Box, b: Box) -> float:
     return float(one.distance(two))
 
 
-@settings(max_examples=400)
+@settings(max_examples=examples(400))
 @given(a=BOX, b=BOX)
 def test_distance_of_boxes_as_in_shapely(a: Box, b: Box) -> None:
     assert box_distance(*a, *b) == pytest.approx(in_shapely(a, b), abs=1e-9)
@@ -613,7 +614,7 @@ def agree(case: Case, driver: ConstantDeceleration, margin_m: float, brake_s: Fl
 
 
 @pytest.mark.long
-@settings(SOME, max_examples=100)  # each judges a log several times
+@settings(SOME, max_examples=examples(100))  # each judges a log several times
 @given(
     case=cases(),
     a_max=st.floats(1, 10),
@@ -762,7 +763,7 @@ DECADES = st.floats(-300, -0.01)
 """Of a probability: where on the way from 1 to 10⁻³⁰⁰."""
 
 
-@settings(SOME, max_examples=200)
+@settings(SOME, max_examples=examples())
 @given(shape=st.floats(0.01, 500), mean_s=st.floats(0.01, 10), decades=DECADES)
 def test_survival_of_gamma_to_the_far_tail(shape: float, mean_s: float, decades: float) -> None:
     """P(D > d) < e^(shape − x) (x / shape)^shape beyond the mean: some d at which it is about 10^decades."""
@@ -774,7 +775,7 @@ def test_survival_of_gamma_to_the_far_tail(shape: float, mean_s: float, decades:
     assert found == pytest.approx(float(expected), rel=1e-10, abs=1e-305)
 
 
-@settings(SOME, max_examples=200)
+@settings(SOME, max_examples=examples())
 @given(median_s=st.floats(0.01, 10), sigma=st.floats(0.01, 10), deviations=st.floats(-5, 37))
 def test_survival_of_lognormal_to_the_far_tail(median_s: float, sigma: float, deviations: float) -> None:
     delay_s = median_s * math.exp(sigma * deviations)
@@ -821,7 +822,7 @@ def test_probability_to_fail_between_and_before_what_passes() -> None:
     assert fail_probability(between_s[:0], known_s, gamma).tolist() == [1] * 5
 
 
-@settings(SOME, max_examples=200)
+@settings(SOME, max_examples=examples())
 @given(
     reaction=st.one_of(
         st.builds(ConstantReaction, delay_s=st.floats(0, 3)),

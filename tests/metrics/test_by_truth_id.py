@@ -17,6 +17,7 @@ from copem_replay.fusion.ideal import fuse_ideal
 from copem_replay.metrics.config import Confirm
 from copem_replay.metrics.detection.by_truth_id import capture_instants, detect_by_truth_id
 from copem_replay.metrics.episodes import Episodes
+from tests.helpers.drawn import examples
 from tests.oracles.accuracy import episodes_of
 
 NEVER = None
@@ -371,7 +372,7 @@ def worlds(draw: st.DrawFn, confirm: bool = True) -> World:
     )
 
 
-@settings(max_examples=600, deadline=None)
+@settings(max_examples=examples(600), deadline=None)
 @given(worlds())
 def test_against_the_oracle(world: World) -> None:
     assert detected(world) == plainly(world)
@@ -385,7 +386,7 @@ def test_capture_instants_against_the_oracle(world: World) -> None:
     assert capture_instants(tracks(world)).tolist() == [expected[frame] for frame in frames]
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=examples(300), deadline=None)
 @given(worlds(confirm=False))
 def test_detected_when_the_ideal_fusion_first_lists_it(world: World) -> None:
     """From what was captured at or after the onset, as long as we look; nothing is left to confirm."""
@@ -403,7 +404,7 @@ def test_detected_when_the_ideal_fusion_first_lists_it(world: World) -> None:
                 assert found.at / 1000 == pytest.approx(times.min())
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=examples(300), deadline=None)
 @given(worlds(), st.data())
 def test_another_unit_never_delays(world: World, data: st.DataObject) -> None:
     """What one unit alone confirms is confirmed with others too, and not later: with equal latencies or any."""

@@ -37,6 +37,7 @@ from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.replay import replay_block
 from copem_replay.pipeline.run import run_experiment
 from tests.helpers import scenes
+from tests.helpers.drawn import examples
 from tests.helpers.experiments import changed, source_of
 from tests.helpers.recordings import Obj, pedestrian, write_recording
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
@@ -308,7 +309,7 @@ class TestOracle:
     )
     @example((3.0, 0.0), (0.0, 0.0), (0.0, 0.0), (2.0, 2.0), (3.9, 2.0), 3.0, 0.0)
     @example((3.0, 0.0), (0.0, 0.0), (-0.34, 0.0), (2.0, 2.0), (2.0, 2.0), 3.0, 0.0)
-    @settings(max_examples=300, deadline=None)
+    @settings(max_examples=examples(300), deadline=None)
     def test_box_moved_in_fine_steps(
         self,
         place: tuple[float, float],
@@ -338,7 +339,7 @@ class TestOracle:
         assert will_enter(0.0, y_m, 0.0, 0.0, 0.0, 4.0, 2.0, np.array([0.0, 0.0, 0.0, 4.0, 2.0]), 3.0) is expected
 
     @given(drawn=logs(), horizon_s=st.floats(0.1, 4), margin_m=st.floats(0, 1.5))
-    @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])  # an example replays a log
+    @settings(max_examples=examples(60), suppress_health_check=[HealthCheck.too_slow])  # an example replays a log
     def test_corridor_is_what_the_ego_sweeps(self, drawn: Drawn, horizon_s: float, margin_m: float) -> None:
         ready = prepare_log(drawn.log, plan())
         now_s = np.array([-0.1, 0.0, 0.33, 1.2, 2.0, 2.95, 3.0, 3.1])
@@ -871,7 +872,7 @@ class TestOnset:
         onset=st.integers(0, 12),
         count_earlier=st.booleans(),
     )
-    @settings(max_examples=60, deadline=None)  # an example replays a log
+    @settings(max_examples=examples(60), deadline=None)  # an example replays a log
     def test_hits_of_the_last_lists(
         self, says: list[str], hits: int, more: int, onset: int, count_earlier: bool
     ) -> None:

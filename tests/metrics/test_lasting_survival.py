@@ -14,6 +14,7 @@ from mpmath import mp, mpf
 
 from copem_replay.core.tracks import Float
 from copem_replay.metrics.exact_survival import LastingDetection, first_known, log_sequence, scale_odds
+from tests.helpers.drawn import examples
 
 P = np.array([0.2, 0.5, 0.3, 0.6])
 GAP = np.array([0.0, 0.1, 0.1, 0.1])
@@ -78,7 +79,7 @@ def brute(p: Float, held: Any, gap_s: Float, share: float, tau_s: float) -> Any:
     tau_s=st.sampled_from([0.01, 0.7, 300.0, math.inf]),
     data=st.data(),
 )
-@settings(max_examples=120, deadline=None)  # each counts all ways with 60 digits
+@settings(max_examples=examples(120), deadline=None)  # each counts all ways with 60 digits
 def test_against_all_ways_to_60_digits(p: list[float], share: float, tau_s: float, data: Any) -> None:
     held = data.draw(st.lists(st.booleans(), min_size=len(p), max_size=len(p)))
     gap = np.array(

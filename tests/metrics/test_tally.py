@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from copem_replay.metrics.summary import summarise_rows, tally_rows
+from tests.helpers.drawn import examples
 from tests.oracles.intervals import exact
 from tests.oracles.summary import figures
 
@@ -47,7 +48,7 @@ def tables(draw: st.DrawFn) -> pd.DataFrame:
     return table.assign(braking_pass=passes)
 
 
-@settings(max_examples=100)  # each is a table of many rows
+@settings(max_examples=examples(100))  # each is a table of many rows
 @given(tables())
 def test_the_summary_of_the_tally_is_that_of_the_rows(table: pd.DataFrame) -> None:
     found, _ = summarise_rows(table, ["a", "b"], {"a": 1.0, "b": 2.0}, horizon_s=7.3)
@@ -66,7 +67,7 @@ def test_the_summary_of_the_tally_is_that_of_the_rows(table: pd.DataFrame) -> No
             )
 
 
-@settings(max_examples=100)
+@settings(max_examples=examples(100))
 @given(tables(), st.randoms(use_true_random=False))
 def test_counts_are_those_of_the_rows_in_whatever_order(table: pd.DataFrame, random: object) -> None:
     found = tally_rows(table)

@@ -41,13 +41,14 @@ from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_i
 from copem_replay.pipeline.closed_form import compute_distributions, exact_table
 from copem_replay.pipeline.prepare import Replay, prepare_log
 from copem_replay.pipeline.run import StudyTables, run_experiment
+from tests.helpers.drawn import examples
 from tests.helpers.experiments import changed, drive, source_of
 from tests.helpers.replays import transmitted
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
 
 ROOT = Path(__file__).parents[2]
 SOME = settings(
-    max_examples=80, suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much]
+    max_examples=examples(80), suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much]
 )  # an example replays a log
 NEVER = None
 Times = dict[int | None, float]

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from copem_replay.communication.arrivals import FusionSchedule, find_out_of_sequence, fusion_schedule
@@ -96,7 +96,6 @@ class TestInstants:
         assert (len(at.issue_s), len(at.arrived), at.newest.shape) == (0, 0, (0, 2))
 
     @given(st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 12), st.integers(0, 9)), min_size=1), st.data())
-    @settings(max_examples=200)
     def test_as_the_words_say(self, drawn: list[tuple[str, int, int]], data: st.DataObject) -> None:
         """Against lists of Python; the last of ten delays is never."""
         sent = [(u, c / 10, (c + late) / 10 if late < 9 else np.inf) for u, c, late in drawn]

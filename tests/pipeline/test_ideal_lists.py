@@ -25,6 +25,7 @@ from copem_replay.io.recording import Recording
 from copem_replay.metrics.config import Confirm
 from copem_replay.metrics.detection.by_truth_id import detect_by_truth_id
 from copem_replay.pipeline.run import run_experiment
+from tests.helpers.drawn import examples
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
 from tests.oracles import ideal
 from tests.oracles.accuracy import episodes_of
@@ -85,7 +86,7 @@ def sent(draw: st.DrawFn) -> tuple[list[list[SentList]], int]:
     return [[SentList(*one, draw(held)) for one in common] for _ in range(2)], units
 
 
-@settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.too_slow])  # an example replays a log
+@settings(max_examples=examples(400), suppress_health_check=[HealthCheck.too_slow])  # an example replays a log
 @given(sent(), st.sampled_from([None, 10, 70, 200]), st.sampled_from([30, 200, 1000]), st.integers(0, 40))
 def test_states_and_detections_are_those_of_the_oracle(
     drawn: tuple[list[list[SentList]], int], tick: int | None, max_age: int, onset: int
@@ -118,7 +119,7 @@ def test_states_and_detections_are_those_of_the_oracle(
             assert np.isnan(when).all() if at is None else when == pytest.approx(np.array(at) / 1000, abs=2e-9)
 
 
-@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(suppress_health_check=[HealthCheck.too_slow])
 @given(sent(), st.sampled_from([None, 70, 200]))
 def test_in_one_run_a_fused_entry_is_made_of_one_entry_of_each_unit(
     drawn: tuple[list[list[SentList]], int], tick: int | None
@@ -135,7 +136,6 @@ def test_in_one_run_a_fused_entry_is_made_of_one_entry_of_each_unit(
         assert entries == expected[made.fused.frame_ix[p]][int(made.fused.row_object_ix[p])]
 
 
-@settings(max_examples=200, deadline=None)
 @given(sent(), st.sampled_from([None, 70]))
 def test_overtaken_is_what_arrives_later_than_a_newer_list(
     drawn: tuple[list[list[SentList]], int], tick: int | None

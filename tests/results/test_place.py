@@ -25,18 +25,17 @@ from copem_replay.results import folder as belongings
 from copem_replay.results import folder as lock
 from copem_replay.results import folder as place
 from tests.helpers.experiments import TEXT, changed, drive
-from tests.system.test_cli import ROOT, Call, Ended, call, here, installed, written
+from tests.system.test_cli import ROOT, Call, Ended, call, here, installed, made_once, ran, written
 
-__all__ = ["call", "here"]  # fixtures
+__all__ = ["call", "here", "made_once", "ran"]  # fixtures
 
 SHOWN = changed("show: {run: 0}")
 
 
 @pytest.fixture
-def old(here: Path, call: Call) -> Path:
+def old(ran: Path) -> Path:
     """Results of seed 1, with files in it that are the user's."""
-    assert call("run", "e.yaml").code == 0
-    folder = here / "out/e"
+    folder = ran
     (folder / "notes.txt").write_text("mine\n")
     (folder / "figures/more").mkdir(parents=True)
     (folder / "figures/more/mine.svg").write_text("<svg/>")
@@ -299,8 +298,7 @@ class TestMade:
         assert set(belongings.list_names(old)) == MINE | set(json.loads((old / "provenance.json").read_text())["files"])
 
     @pytest.mark.parametrize("kind", ["link", "folder", "pipe"])
-    def test_something_else_in_the_place_of_the_list(self, here: Path, call: Call, kind: str) -> None:
-        assert call("run", "e.yaml").code == 0
+    def test_something_else_in_the_place_of_the_list(self, here: Path, ran: Path, call: Call, kind: str) -> None:
         place, outside = here / "out/e/made.jsonl", here / "outside.txt"
         outside.write_text('"summary.csv"\n')
         if kind == "link":
@@ -336,11 +334,10 @@ class TestMade:
         "command", [["plot"], ["film"], ["report"], ["compare", "--baseline", "PEM", "--out", "out/e/c.csv"]]
     )
     def test_a_file_is_listed_before_it_is_there(
-        self, here: Path, call: Call, monkeypatch: pytest.MonkeyPatch, command: list[str]
+        self, ran: Path, call: Call, monkeypatch: pytest.MonkeyPatch, command: list[str]
     ) -> None:
         """So that a process that is killed at any instant leaves none that outlives its results."""
-        assert call("run", "e.yaml").code == 0
-        folder, before = here / "out/e", set(belongings.list_names(here / "out/e"))
+        folder, before = ran, set(belongings.list_names(ran))
         replace_ = os.replace
 
         def watched(source: Any, target: Any) -> None:

@@ -18,6 +18,8 @@ from copem_replay.core.yaml import parse_yaml
 from copem_replay.experiment.criteria import CriteriaFile
 from copem_replay.experiment.cross_references import read_criteria
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs/guide/ci.md").read_text(encoding="utf-8")
 YAML, SHELL = (re.findall(rf"```{kind}\n(.*?)```", PAGE, re.DOTALL) for kind in ("yaml", "sh"))

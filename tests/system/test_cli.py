@@ -2,15 +2,18 @@ from __future__ import annotations
 
 import csv
 import errno
+import io
 import json
 import math
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -76,6 +79,25 @@ def here(tmp_path: Path) -> Path:
     drive(tmp_path / "drive.mcap")
     (tmp_path / "e.yaml").write_text(TEXT)
     return tmp_path
+
+
+@pytest.fixture(scope="session")
+def made_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of results of that experiment, made once for all who copy it."""
+    folder = tmp_path_factory.mktemp("made")
+    drive(folder / "drive.mcap")
+    (folder / "e.yaml").write_text(TEXT)
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(io.StringIO()):
+        patch.chdir(folder)
+        patch.setattr(sys, "argv", ["copem-replay", "run", "e.yaml"])
+        assert cli._run_to_exit_code() == 0
+    return folder / "out/e"
+
+
+@pytest.fixture
+def ran(here: Path, made_once: Path) -> Path:
+    """That folder where `copem-replay run e.yaml` has put its results, `out/e`. The results are returned."""
+    return shutil.copytree(made_once, here / "out/e")
 
 
 def installed(*arguments: str | Path, folder: Path, **more: Any) -> subprocess.CompletedProcess[str]:
@@ -801,11 +823,10 @@ class TestWrittenExperiment:
         assert "jobs" not in text
         assert str(here) not in "".join(map(str, written(here / "out/e").values()))
 
-    def test_may_be_replaced_by_its_own_results(self, here: Path, call: Call) -> None:
-        assert call("run", "e.yaml").code == 0
-        before = written(here / "out/e")
+    def test_may_be_replaced_by_its_own_results(self, ran: Path, call: Call) -> None:
+        before = written(ran)
         assert call("run", "out/e/experiment.yaml", "--out", "out/e", "--overwrite").code == 0
-        assert written(here / "out/e") == before
+        assert written(ran) == before
 
     def test_two_runs_give_the_same_bytes(self, here: Path, call: Call) -> None:
         for out in ("one", "two"):
@@ -920,9 +941,8 @@ class TestNamesOfConfigurations:
 
 
 class TestTarget:
-    def test_results_are_not_replaced_unasked(self, here: Path, call: Call) -> None:
-        assert call("run", "e.yaml").code == 0
-        before = written(here / "out/e")
+    def test_results_are_not_replaced_unasked(self, here: Path, ran: Path, call: Call) -> None:
+        before = written(ran)
         ended = call("run", "e.yaml", "--seed", "5")
         assert ended.code == 2
         assert ended.lines == [
@@ -1085,7 +1105,7 @@ class TestFailure:
     @pytest.fixture(params=[False, True], ids=["first", "overwrite"])
     def arguments(self, request: pytest.FixtureRequest, here: Path, call: Call) -> list[str]:
         if request.param:
-            assert call("run", "e.yaml").code == 0
+            request.getfixturevalue("ran")
         return ["run", "e.yaml", "--seed", "5", *(["--overwrite"] if request.param else [])]
 
     def fails(self, here: Path, call: Call, arguments: list[str], failure: Failure) -> None:

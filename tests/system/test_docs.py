@@ -46,6 +46,7 @@ def test_the_readme_begins_with_what_it_is_and_how_it_looks() -> None:
     assert picture < headings[1] < 20, "on the first screen"
 
 
+@pytest.mark.long
 @on_x86
 @pytest.mark.parametrize(
     ("page", "runs_before", "shown"),

@@ -102,6 +102,7 @@ def test_the_committed_log_is_what_the_tool_makes(tmp_path: Path) -> None:
     assert (tmp_path / LOG.name).read_bytes() == LOG.read_bytes(), "run python tools/make_logs.py tc016d"
 
 
+@pytest.mark.long
 def test_two_makes_of_the_bags_give_the_same_bytes(tmp_path: Path) -> None:
     """The stack's lists are logged after their stamps, the unit's have another clock."""
     tool = [sys.executable, str(ROOT / "tools" / "make_logs.py"), "--bags", "--out"]

@@ -12,6 +12,8 @@ from copem_replay.cli import main as cli
 from tests.helpers.experiments import changed, drive
 from tests.helpers.object_storage import Bucket
 
+pytestmark = pytest.mark.long
+
 PAGE = Path(__file__).parents[2] / "docs/guide/scale.md"
 
 

@@ -15,6 +15,8 @@ from copem_replay.results.table_files import table_file
 from copem_replay.viewer.open import list_rrd_files, opening_s
 from tests.helpers.experiments import changed, drive
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).parents[2]
 
 POOR = """

@@ -18,6 +18,8 @@ from tests.helpers.browser import Browser, opened_browser
 from tests.helpers.replays import save_run
 from tests.helpers.report_pages import eighteen, replayed
 
+pytestmark = pytest.mark.long
+
 axe = pytest.importorskip("selenium_axe_python", reason="needs selenium-axe-python, which `pip install .[dev]` brings")
 DEMO = Path(__file__).parents[2] / "logs/tc016d.yaml"
 GRAVE = ("serious", "critical")

@@ -14,6 +14,8 @@ from copem_replay.report import write_html_report
 from tests.helpers.browser import Browser, opened_browser
 from tests.helpers.report_pages import ONE, changed, replayed
 
+pytestmark = pytest.mark.long
+
 NAMES = ["GT", "<img src=x onerror=alert(1)>", "half", "hit", "never"]
 SIZES = """
 return [...document.querySelectorAll(".plot")].filter((plot) => plot.checkVisibility()).map((plot) => {

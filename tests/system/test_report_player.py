@@ -15,6 +15,8 @@ from copem_replay.report import write_html_report
 from tests.helpers.browser import Browser, opened_browser
 from tests.helpers.report_pages import changed, replayed
 
+pytestmark = pytest.mark.long
+
 PIXELS = """
 const [panel, red, green, blue] = arguments, canvas = document.querySelectorAll("#player canvas")[panel];
 const found = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height - 24).data;

@@ -77,6 +77,7 @@ def test_bench_of_memory_remembers_all_that_the_crossing_draws(monkeypatch: pyte
     assert lasting.configurations == plain.configurations
 
 
+@pytest.mark.long
 def test_bench_of_fitting_finds_what_it_put_in(monkeypatch: pytest.MonkeyPatch) -> None:
     """60 of its drives: all rungs, and the share .6 of what lasts."""
     monkeypatch.setattr(fit, "PASSES", 60)
@@ -123,12 +124,13 @@ def test_lidar_visibility_says_what_is_wrong() -> None:
     assert done.stderr.splitlines() == ["nowhere.mcap: no such file"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "keys"),
     [
         ("paper", {"paper_draw_ratio"}),
         ("reading", {"read_ratio"}),
-        pytest.param("writing", {"mcap_objects_per_s", "rrd_boxes_per_s"}, marks=pytest.mark.long),
+        ("writing", {"mcap_objects_per_s", "rrd_boxes_per_s"}),
     ],
 )
 def test_benchmarks_print_json_lines(

@@ -117,6 +117,7 @@ def test_nodes() -> None:
     np.testing.assert_allclose(choose_nodes(share, 4, 20, 2), [0, 0.1, 0.9, 1])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("count", "length", "memory"), [(30, 50, (0.6, 0.8)), (12, 100, (0.6, 0.8)), (24, 40, (0.0, 1.0))]
 )
@@ -211,6 +212,7 @@ def together(seed: int) -> FitRows:
     return replace(rows, log=log, list=log * 80 + number, listed=u < 0.6)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("drawn", "name"), [(walkers, "class"), (sides, "azimuth")])
 def test_what_it_was_not_given_is_not_memory(drawn: Callable[[int], FitRows], name: str) -> None:
     """By range and visible share alone either looks like misses that last for seconds. One seed in twenty may fail."""
@@ -226,6 +228,7 @@ def test_what_it_was_not_given_is_not_memory(drawn: Callable[[int], FitRows], na
         assert note.endswith("nats per list, but --by does not name it")
 
 
+@pytest.mark.long
 def test_misses_of_all_objects_at_once_are_the_units() -> None:
     held = []
     for seed in range(6):
@@ -245,6 +248,7 @@ def test_misses_of_all_objects_at_once_are_the_units() -> None:
     assert "of" not in own.memory_keys()["detection"][0]
 
 
+@pytest.mark.long
 def test_few_numbers_of_all_objects_leave_the_probability_open() -> None:
     """A number held for 5 s is a few in a drive: given the probability that these show, half of the intervals miss."""
     held = []

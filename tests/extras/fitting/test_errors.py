@@ -107,6 +107,7 @@ def test_a_single_smooth_series_has_intervals_of_some_width(period_s: float) -> 
         assert one.high - one.low > 1e-6
 
 
+@pytest.mark.long
 def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
     held = []
     for seed in range(20):

@@ -144,6 +144,7 @@ def test_check_says_what_a_fit_will_say(
     assert set(lines[1:]) <= set(fitted["notes"])
 
 
+@pytest.mark.long
 def test_numbers_that_were_put_in_are_inside_their_intervals(tmp_path: Path) -> None:
     """Four seeds; `python tools/check_fit.py` has forty of each, and prints how wide the intervals are."""
     found = []
