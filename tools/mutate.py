@@ -180,7 +180,7 @@ def _stages(mutant: Mutant, copy: Path) -> Iterator[tuple[str, list[str]]]:
     module = ".".join(mutant.path.relative_to(ROOT).with_suffix("").parts)
     wing = mutant.path.relative_to(ROOT).parts[1]
     name = re.compile(rf"\b{re.escape(module)}\b")
-    near = [p for p in sorted(copy.glob("tests/*/test_*.py")) if not str(p.relative_to(copy)).startswith(_FAR)]
+    near = [p for p in sorted(copy.glob("tests/**/test_*.py")) if not str(p.relative_to(copy)).startswith(_FAR)]
     near = [str(p.relative_to(copy)) for p in near if name.search(p.read_text(encoding="utf-8"))]
     if near:
         yield "module", near
