@@ -15,8 +15,6 @@ import importlib as _importlib
 from typing import TYPE_CHECKING
 
 from copem_replay.core.compiled import cache_note as _cache_note
-from copem_replay.core.extras import EXTRAS as _EXTRAS
-from copem_replay.core.extras import load_extra as _load_extra
 
 if TYPE_CHECKING:
     __version__: str
@@ -186,8 +184,9 @@ if not TYPE_CHECKING:  # with it type checkers would accept every name
     def __getattr__(name: str) -> object:
         if name == "__version__":
             return _importlib.import_module("importlib.metadata").version("copem-replay")
-        if name in _EXTRAS["name of the API"]:
-            return _load_extra("name of the API", name)
+        extras = _importlib.import_module("copem_replay.core.extras")
+        if name in extras.EXTRAS["name of the API"]:
+            return extras.load_extra("name of the API", name)
         if name not in _MODULE:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         if name == "plot":
