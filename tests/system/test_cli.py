@@ -84,9 +84,13 @@ def here(tmp_path: Path) -> Path:
 @pytest.fixture(scope="session")
 def made_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of results of that experiment, made once for all who copy it."""
-    folder = tmp_path_factory.mktemp("made")
+    return run_in(tmp_path_factory.mktemp("made"), TEXT)
+
+
+def run_in(folder: Path, text: str) -> Path:
+    """The results of an experiment of that recording, as `run` puts them into a folder."""
     drive(folder / "drive.mcap")
-    (folder / "e.yaml").write_text(TEXT)
+    (folder / "e.yaml").write_text(text)
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(io.StringIO()):
         patch.chdir(folder)
         patch.setattr(sys, "argv", ["copem-replay", "run", "e.yaml"])
@@ -174,9 +178,7 @@ class TestUsage:
 
 
 class TestInstalled:
-    @pytest.mark.parametrize(
-        "arguments", [["--help"], ["info", "drive.mcap"], ["info", "drive.mcap", "--json"], ["init", "drive.mcap"]]
-    )
+    @pytest.mark.parametrize("arguments", [["--help"], ["info", "drive.mcap"], ["init", "drive.mcap"]])
     def test_heavy_imports_happen_where_they_are_used(self, here: Path, arguments: list[str]) -> None:
         code = (
             "import sys; from copem_replay.cli import main as cli; code = cli._run_to_exit_code(); "
@@ -206,14 +208,13 @@ class TestInstalled:
         assert re.search(r"\nresults in out/e\nnext: copem-replay report out/e\n\n[A-Z].*\.\n$", done.stdout)
         assert table(here / "out" / "e").shape[0] == 12
 
-    def test_wrong_input(self, here: Path) -> None:
+    def test_wrong_input(self, here: Path, call: Call) -> None:
         (here / "e.yaml").write_text(changed("runs: no", "unit: " + "x" * 200))
-        done = installed("check", "e.yaml", folder=here)
-        assert done.returncode == 2
-        assert done.stdout == ""
-        assert done.stderr == (
-            "e.yaml:3: runs: expected a whole number, found 'no'\ne.yaml:19: unit: unknown key; did you mean units?\n"
-        )
+        said = [
+            "e.yaml:3: runs: expected a whole number, found 'no'",
+            "e.yaml:19: unit: unknown key; did you mean units?",
+        ]
+        assert call("check", "e.yaml") == (2, "", said)
 
     def test_interrupt(self, here: Path) -> None:
         """Ctrl-C in the middle of a replay: nothing is left, not even a temporary folder."""
@@ -276,7 +277,7 @@ class TestInstalled:
             words = [sys.executable, "-c", close, stream, str(COMMAND), "run", "e.yaml", "--out", stream]
             assert subprocess.run(words, cwd=here, timeout=100).returncode == 0
 
-    @pytest.mark.parametrize("module", ["typer", "copem_replay.core.errors", "numpy", "pydantic", "ruamel.yaml"])
+    @pytest.mark.parametrize("module", ["typer", "copem_replay.core.errors", "pydantic"])
     def test_an_interrupt_while_modules_are_imported(self, here: Path, module: str) -> None:
         """Whenever it comes: here as a module is looked for, before `main` is there to catch it and after."""
         (here / "sitecustomize.py").write_text(
@@ -1416,39 +1417,45 @@ def wrong(value: Any, schema: Any, root: dict[str, Any]) -> Iterator[str]:
             yield from [] if word not in fine or fine[word](value, rule) else [f"{value}: {word} {rule}"]
 
 
+EXTREMES = [
+    "  coPEM: {units: all, latency_s: 86400}",
+    "  coPEM: {units: all, latency_s: 1e-300, max_age_s: 1e-300}",
+    "  coPEM: {units: all, max_age_s: 1e12}",
+    "  mast: {at: [1e12, -1e12], height_m: 1e12, pem: onboard}",
+    "  mast: {at: [0, 0], height_m: 0, pem: onboard, ground_z_m: -1e12, yaw_deg: 1e12}",
+    "  mast: {at: [0, 0], height_m: 1, pem: onboard, rate_hz: 1000, phase_s: 1e12}",
+    "  mast: {at: [0, 0], height_m: 1, pem: onboard, rate_hz: 0.001}",
+    "  mast: {at: [0, 0], height_m: 1, pem: onboard, rate_hz: 999.9, phase_s: 1e-300}",
+    "  ego: {on: ego, height_m: 1, pem: onboard, offset_m: [1e12, -1e12]}",
+    "    - when: {range_m: [0, 1e12], azimuth_deg: [-360, 360], visible_share: [1, 1]}",
+    "      error: {kind: gaussian, covariance_m2: [[1e12, 0], [0, 1e12]], mean_m: [1e12, 1e12]}",
+    "      error: {kind: gaussian, covariance_m2: [[1e-300, 0], [0, 0]], yaw_sigma_deg: 1e12}",
+    "      error: {kind: gaussian, covariance_m2: [[0, 0], [0, 0]], speed_sigma_mps: 1e12}",
+    "      error: {kind: gaussian, covariance_m2: [[1, 0], [0, 1]], size_sigma_m: 1e12}",
+    "measure: {onset: {kind: in_range, range_m: 1e12}, began: [log_start, crossed, appeared]"
+    ", horizon_s: 1e12, confirm: {hits: 1000, of: 1000}}",
+    "measure: {onset: {kind: in_range, range_m: 1e12}, began: [log_start, crossed, appeared], horizon_s: 1e-300}",
+    "measure: {onset: {kind: at, time_s: 1e12}}",
+    "measure: {onset: {kind: starts_moving, speed_mps: 1e-300, within_m: 1e12}, began: [log_start]}",
+    "max_gap_s: 1e12",
+    "max_gap_s: 1e-300",
+    "obstacles: [{polygon_m: [[-1e12, -1e12], [1e12, -1e12], [0, 1e12]], height_m: 1e12, ground_z_m: 1e12}]",
+    "obstacles: [{polygon_m: [[0, 0], [1e-9, 0], [0, 1e-9]], height_m: 1e-300}]",
+]
+SEEN = {"  mast", "  ego:", "    - ", "obstac"}
+"""How those begin that say who sees what: the others are all one to what hides."""
+
+
 class TestExtremes:
     """Numbers that are allowed, and that nobody needs: no warning, no traceback."""
 
     @pytest.mark.parametrize(
-        "change",
+        ("visibility", "change"),
         [
-            "  coPEM: {units: all, latency_s: 86400}",
-            "  coPEM: {units: all, latency_s: 1e-300, max_age_s: 1e-300}",
-            "  coPEM: {units: all, max_age_s: 1e12}",
-            "  mast: {at: [1e12, -1e12], height_m: 1e12, pem: onboard}",
-            "  mast: {at: [0, 0], height_m: 0, pem: onboard, ground_z_m: -1e12, yaw_deg: 1e12}",
-            "  mast: {at: [0, 0], height_m: 1, pem: onboard, rate_hz: 1000, phase_s: 1e12}",
-            "  mast: {at: [0, 0], height_m: 1, pem: onboard, rate_hz: 0.001}",
-            "  mast: {at: [0, 0], height_m: 1, pem: onboard, rate_hz: 999.9, phase_s: 1e-300}",
-            "  ego: {on: ego, height_m: 1, pem: onboard, offset_m: [1e12, -1e12]}",
-            "    - when: {range_m: [0, 1e12], azimuth_deg: [-360, 360], visible_share: [1, 1]}",
-            "      error: {kind: gaussian, covariance_m2: [[1e12, 0], [0, 1e12]], mean_m: [1e12, 1e12]}",
-            "      error: {kind: gaussian, covariance_m2: [[1e-300, 0], [0, 0]], yaw_sigma_deg: 1e12}",
-            "      error: {kind: gaussian, covariance_m2: [[0, 0], [0, 0]], speed_sigma_mps: 1e12}",
-            "      error: {kind: gaussian, covariance_m2: [[1, 0], [0, 1]], size_sigma_m: 1e12}",
-            "measure: {onset: {kind: in_range, range_m: 1e12}, began: [log_start, crossed, appeared]"
-            ", horizon_s: 1e12, confirm: {hits: 1000, of: 1000}}",
-            "measure: {onset: {kind: in_range, range_m: 1e12}, began: [log_start, crossed, appeared]"
-            ", horizon_s: 1e-300}",
-            "measure: {onset: {kind: at, time_s: 1e12}}",
-            "measure: {onset: {kind: starts_moving, speed_mps: 1e-300, within_m: 1e12}, began: [log_start]}",
-            "max_gap_s: 1e12",
-            "max_gap_s: 1e-300",
-            "obstacles: [{polygon_m: [[-1e12, -1e12], [1e12, -1e12], [0, 1e12]], height_m: 1e12, ground_z_m: 1e12}]",
-            "obstacles: [{polygon_m: [[0, 0], [1e-9, 0], [0, 1e-9]], height_m: 1e-300}]",
+            *(("surface", change) for change in EXTREMES),
+            *(("flat", change) for change in EXTREMES if change[:6] in SEEN),
         ],
     )
-    @pytest.mark.parametrize("visibility", ["surface", "flat"])
     def test_run(self, here: Path, call: Call, change: str, visibility: str) -> None:
         (here / "e.yaml").write_text(changed(change, "show: {run: 0}", f"visibility: {visibility}"))
         ended = call("run", "e.yaml")
