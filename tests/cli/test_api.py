@@ -41,6 +41,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 class TestNames:
+    @pytest.mark.extras
     def test_every_name_is_there_and_for_editors_too(self) -> None:
         ifs = (node for node in ast.parse(INIT.read_text()).body if isinstance(node, ast.If))
         (block,) = (node for node in ifs if ast.unparse(node.test) == "TYPE_CHECKING")
@@ -320,6 +321,7 @@ class TestFolders:
         assert comparison.configurations == (f"{one.name}:PEM", f"{other.name}:PEM")
         assert comparison.overall["difference"].notna().any()
 
+    @pytest.mark.extras
     def test_what_is_not_in_a_folder_is_said(self, here: Path) -> None:
         result = cr.run("e.yaml")
         for call in (cr.view, cr.write_report, cr.write_figures, cr.write_film):

@@ -225,6 +225,7 @@ XODR = """<OpenDRIVE><header><geoReference><![CDATA[EPSG:25832]]></geoReference>
 </laneSection></lanes></road></OpenDRIVE>"""
 
 
+@pytest.mark.extras
 def test_a_map_by_its_own_reference(tmp_path: Path) -> None:
     """A map in projected metres comes to the log; one with the log's metres tells where the log is."""
     write_drive(tmp_path)
@@ -258,6 +259,7 @@ def test_info_prints_the_place(tmp_path: Path) -> None:
     assert "place: none (the recording does not say where on earth it is)" in printed
 
 
+@pytest.mark.extras
 def test_a_map_in_degrees_beside_a_recording_with_a_place(tmp_path: Path) -> None:
     write_drive(tmp_path, SAID)
     ring = [[lon, lat] for lat, lon in degrees(*HOUSE, HOUSE[0])]
@@ -274,6 +276,7 @@ def test_a_map_in_degrees_beside_a_recording_with_a_place(tmp_path: Path) -> Non
     assert "1 solid; placed by what the recording says" in printed.output
 
 
+@pytest.mark.extras
 def test_geojson(tmp_path: Path) -> None:
     """Read back with shapely: the mast and its field, paths from onset to end, the house; rings against the clock."""
     write_drive(tmp_path, SAID)
@@ -308,6 +311,7 @@ def test_geojson(tmp_path: Path) -> None:
         assert said["detected_share PEM"] == pytest.approx(weight[row["time_to_detection_s"].notna()].sum())
 
 
+@pytest.mark.extras
 def test_geojson_needs_a_place(tmp_path: Path) -> None:
     write_drive(tmp_path)
     replayed(experiment(tmp_path), tmp_path / "out")

@@ -26,6 +26,8 @@ from tests.helpers.experiments import changed
 from tests.helpers.recordings import Obj, Topic, ground_truth, write_mcap, write_recording
 from tests.helpers.roads import add_marking, two_lanes
 
+pytestmark = pytest.mark.extras  # maps are read by one
+
 ROAD = """<OpenDRIVE><header/><road id="7" length="200" junction="-1"><planView>
 <geometry s="0" x="-50" y="0" hdg="0" length="200"><line/></geometry></planView><lanes><laneSection s="0">
 <left><lane id="1" type="driving"><width sOffset="0" a="4" b="0" c="0" d="0"/></lane></left>

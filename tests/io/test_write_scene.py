@@ -134,6 +134,7 @@ class TestTruth:
         top = found["obstacle 0:0"].lines[1]
         assert {(point.x, point.y) for point in top.points} == {(10, 10), (20, 10), (20, 20)}
 
+    @pytest.mark.extras
     def test_houses_of_a_map_are_one_entity(self, tmp_path: Path) -> None:
         drive(tmp_path / "drive.mcap")
         houses = "".join(

@@ -48,6 +48,7 @@ def areas_of(results: cr.Results) -> dict[tuple[str, str], str | None]:
     return {(str(log), str(key)): area for log, key, area in named}
 
 
+@pytest.mark.extras
 def test_ones_own_come_first_and_a_log_without_a_map_has_none_of_it(study: dict[str, Any], tmp_path: Path) -> None:
     given = study | {"areas": {"school": SCHOOL}, "measure": study["measure"] | {"by": ["area"]}}
     results = cr.run(cr.load_experiment(given), jobs=1)

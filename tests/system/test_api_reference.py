@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import copem_replay as cr
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
@@ -15,6 +17,7 @@ from api_reference import GROUPS, PAGE, entry, page, signature
 TOOLS = Path(__file__).parents[2] / "tools"
 
 
+@pytest.mark.extras
 def test_the_page_is_current() -> None:
     assert PAGE.read_text(encoding="utf-8") == page(), "run python tools/api_reference.py"
 

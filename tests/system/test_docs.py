@@ -246,6 +246,7 @@ def test_components_of_the_adding_page_work(monkeypatch: pytest.MonkeyPatch) -> 
     assert summary["late_share"].to_dict() == {"GT": 0.0, "PEM": 1.0}  # 10 m/s from the first frame on, seen at 4 s
 
 
+@pytest.mark.extras
 def test_the_adding_page_names_what_is_there() -> None:
     text = (ROOT / "docs/develop/adding.md").read_text(encoding="utf-8")
     assert re.findall(r"^## (\d+) ", text, re.MULTILINE) == [str(k) for k in range(1, 12)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import sys
@@ -39,6 +40,21 @@ def core(tmp_path_factory: pytest.TempPathFactory) -> Core:
         return done.returncode, [line for line in done.stderr.splitlines() if not line.startswith(passing)]
 
     return call
+
+
+@pytest.mark.long
+def test_the_quick_tests_pass_without_extras(tmp_path: Path) -> None:
+    """In a copy of the project: those of extras are not collected, those of the core that use one are skipped."""
+    copy = tmp_path / "copy"
+    ignored = shutil.ignore_patterns(".git", ".venv*", ".*_cache", ".hypothesis", "out", "*.egg-info")
+    shutil.copytree(ROOT, copy, ignore=ignored)  # with what is compiled
+    shutil.rmtree(copy / "copem_replay/extras")
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
+    command = [sys.executable, "-m", "pytest", "-q", "-n", "2", "--dist", "loadfile", "-m", "not slow and not long"]
+    done = subprocess.run(
+        command, cwd=copy, env=environment | {"PYTHONPATH": str(copy)}, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout[-5000:]
 
 
 @pytest.mark.extras

@@ -126,6 +126,7 @@ def names_of_several(root: Path) -> dict[str, set[str]]:
     return {name: modules for name, modules in places.items() if len(modules) > 1}
 
 
+@pytest.mark.extras
 def test_there_are_fourteen_wings_and_nothing_else() -> None:
     entries = {path.name for path in PACKAGE.iterdir() if path.name != "__pycache__"}
     assert entries == set(FLOOR) - {"__init__"} | {"__init__.py", "py.typed"}
@@ -151,6 +152,7 @@ def test_no_circle_among_tools() -> None:
     assert circles(edge for edge in edges if edge[1] in files) == []
 
 
+@pytest.mark.extras
 def test_no_room_is_a_piece_of_its_only_user() -> None:
     assert small_rooms(PACKAGE) == []
 
@@ -162,6 +164,7 @@ def test_no_wing_outgrows_its_budget() -> None:
     assert {wing: lines[wing] for wing, most in MOST_LINES.items() if lines[wing] > most} == {}
 
 
+@pytest.mark.extras
 def test_the_public_api_alone_names_extras_and_for_types_alone() -> None:
     edges = {(a, tuple(sorted(at))) for (a, b), at in graph(PACKAGE).items() if wing_of(b) == "extras" != wing_of(a)}
     assert edges == {("copem_replay", ("typing",))}
