@@ -28,8 +28,10 @@ from copem_replay.io.ground_truth import MAX_GAP_S, DecodedObjects
 from copem_replay.io.log import Log, gather_messages
 from copem_replay.io.schemas.description import VX, VY, YAW, X, Z
 from copem_replay.io.schemas.object_lists import DecodedLists, Description, Fields, FieldsError, decode_lists
-from copem_replay.io.schemas.poses import ODOMETRY, Poses, decode_poses, is_pose
+from copem_replay.io.schemas.poses import ODOMETRY, Poses, decode_poses, is_pose, is_static
 from copem_replay.io.schemas.registry import describe_channel
+from copem_replay.io.stamps import find_runs
+from copem_replay.io.window import Window
 
 if TYPE_CHECKING:
     from copem_replay.io.config import EgoTopic
@@ -100,7 +102,11 @@ class FrameTree:
         for child in dict.fromkeys(poses.child):
             if not child or child in self.pose_tracks:
                 continue
-            course = make_pose_track(poses, np.asarray(children == child))
+            chosen = np.asarray(children == child)
+            if static:  # as in tf2 the last one that was sent holds
+                rows = np.flatnonzero(chosen)
+                chosen = np.arange(len(chosen)) == rows[np.argsort(poses.log_time_ns[rows], kind="stable")[-1]]
+            course = make_pose_track(poses, chosen)
             if course is not None and course.parent != child:
                 self.pose_tracks[child] = course
                 if static:
@@ -283,13 +289,14 @@ def read_log_context(log: Log, asked: EgoTopic | None, *, seek_ego: bool) -> Log
         except (DefinitionError, KeyError) as error:
             notes.append(f"topic {channel.topic} ({channel.schema}) not read: {error}")
             continue
-        of_channel[channel.number] = poses
+        notes += [note.within(f"topic {channel.topic}") for note in poses.notes]
+        of_channel[channel.number] = _keep_run(poses, log.window)
     part_of = {channel.number: channel.part for channel in channels}
     own = _own_frame_names({(part_of[number], child) for number, poses in of_channel.items() for child in poses.child})
     for channel in channels:
         if channel.number in of_channel:
             of_channel[channel.number] = _rename_frames(of_channel[channel.number], channel.part, own)
-            frames.add(of_channel[channel.number], static=channel.topic.endswith("tf_static"))
+            frames.add(of_channel[channel.number], static=is_static(channel))
     chosen = ego_channel(log, channels, asked, seek_ego)
     if chosen is None:
         return LogContext(frames, None, asked, tuple(notes), own)
@@ -301,6 +308,20 @@ def read_log_context(log: Log, asked: EgoTopic | None, *, seek_ego: bool) -> Log
         asked = asked.model_copy(update={"frame": own.get((chosen.part, asked.frame.lstrip("/")), asked.frame)})
     course = ego_course(log, chosen.topic, of_channel[chosen.number], asked)
     return LogContext(frames, course, asked, (*notes, *ego_notes(chosen, asked)), own)
+
+
+def _keep_run(poses: Poses, window: Window | None) -> Poses:
+    """The poses without those of another run than that of the window: its margin reaches into the one before."""
+    if window is None:
+        return poses
+    kept, frames = np.ones(len(poses.stamp_ns), dtype=bool), np.array(poses.child, dtype=object)
+    for child in set(poses.child):
+        rows = np.flatnonzero(frames == child)
+        run = find_runs(poses.stamp_ns[rows], poses.log_time_ns[rows])
+        inside = [window.from_ns <= logged_ns <= window.to_ns for logged_ns in poses.log_time_ns[rows].tolist()]
+        if any(inside):
+            kept[rows] = np.isin(run, run[inside])
+    return poses if kept.all() else poses.take(np.flatnonzero(kept))
 
 
 def _strip_slashes(poses: Poses) -> Poses:
@@ -333,14 +354,11 @@ def read_decoded_lists(log: Log, channels: Sequence[Channel], fields: Fields | N
     try:
         definition = make_definition(channel, payloads)
         description = Description(fields) if fields is not None else describe_channel(channel, definition.offers())
-        lists = decode_lists(definition, description, payloads, times)
+        lists = decode_lists(definition, description, payloads, times, channel.ahead_ns)
     except (DefinitionError, FieldsError) as error:
         raise RecordingError(str(error), path=log.path, topic=channel.topic) from None
-    columns = lists.columns
-    stamp_ns = columns.stamp_ns - np.where(columns.stamped, channel.ahead_ns, 0)
-    return replace(
-        lists, part=channel.part, columns=replace(columns, stamp_ns=stamp_ns, notes=(*columns.notes, *messages.notes()))
-    )
+    columns = replace(lists.columns, notes=(*lists.columns.notes, *messages.notes()))
+    return replace(lists, part=channel.part, columns=columns)
 
 
 def _transform_rows(values: Float, covariance: Float, placed: SampledPoses, instant: Int) -> tuple[Float, Float]:

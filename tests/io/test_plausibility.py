@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from copem_replay.core.tracks import CLASSES
-from copem_replay.io.ground_truth import HEIGHTS_M, correct_heights, correct_velocities
+from copem_replay.io.findings import HEIGHTS_M
+from copem_replay.io.ground_truth import correct_heights, correct_velocities
 
 NAN = float("nan")
 
