@@ -7,14 +7,14 @@ what cannot be without them is left out and counted, what can be is completed, a
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from copem_replay.core.errors import count_noun
+from copem_replay.core.errors import count_noun, escape_unprintable
 from copem_replay.core.tracks import CLASSES, VALUES, Bool, Float, Int
 
 FARTHEST_M = 1e7
@@ -79,12 +79,18 @@ RULES: Final = {
     "stamp odd": Rule("message", "stamped by another clock than those before and after: the time of logging taken"),
     "stamp impossible": Rule("message", "with an impossible time stamp: the time of logging taken"),
     "stamp lost": Rule("message", "without timestamp, and logged at another time: skipped"),
+    "two clocks": Rule(
+        "",
+        "poses on {topic} are from {first:.10g} to {last:.10g} s, the lists from {start:.10g} to {end:.10g} s: "
+        "{apart:.6g} s apart, of two clocks",
+    ),
     "late": Rule("message", "stamped earlier than the one before: sorted by time", changes=False),
     "again": Rule("message", "with the time stamp of another: the first kept"),
     # Objects.
     "twice": Rule(_STATE, "of an id twice in a message: the first kept"),
     "class changes": Rule("object", "of changing class: the most frequent taken", changes=False),
     "no id": Rule(_STATE, "without an id: skipped"),
+    "stands": Rule(_STATE, "of what stands, not sent again: where it was"),
     # Sizes.
     "size negative": Rule(_STATE, "with a negative size: its amount taken"),
     "size lost": Rule(_STATE, "whose size is none: that of the same object at other times taken"),
@@ -116,6 +122,18 @@ class Finding(str):
     def within(self, label: str) -> Finding:
         """The same, of what `label` names: `unit rsu: …`."""
         return Finding(f"{label}: {self}", self.rule, self.number)
+
+
+def as_finding(line: str) -> Finding:
+    """A line as a finding, on one line that can be printed."""
+    if isinstance(line, Finding):
+        return Finding(escape_unprintable(line), line.rule, line.number)
+    return Finding(escape_unprintable(line))
+
+
+def find_rule(notes: Iterable[str], rule: str) -> str | None:
+    """The first finding of a rule among notes; None: there is none."""
+    return next((note for note in notes if isinstance(note, Finding) and note.rule == rule), None)
 
 
 def find(rule: str, count: int, *, noun: str = "", **words: Any) -> Iterator[Finding]:

@@ -254,6 +254,7 @@ class LogContext:
     asked: EgoTopic | None
     notes: tuple[str, ...]
     own: Mapping[tuple[str, str], str] = field(default_factory=dict)  # `_own_frame_names`
+    ego_topic: str = ""
 
     def named(self, lists: DecodedLists) -> list[str]:
         """The frames of the lists by their names in `frames`."""
@@ -307,7 +308,7 @@ def read_log_context(log: Log, asked: EgoTopic | None, *, seek_ego: bool) -> Log
     if asked is not None and asked.frame is not None:
         asked = asked.model_copy(update={"frame": own.get((chosen.part, asked.frame.lstrip("/")), asked.frame)})
     course = ego_course(log, chosen.topic, of_channel[chosen.number], asked)
-    return LogContext(frames, course, asked, (*notes, *ego_notes(chosen, asked)), own)
+    return LogContext(frames, course, asked, (*notes, *ego_notes(chosen, asked)), own, chosen.topic)
 
 
 def _keep_run(poses: Poses, window: Window | None) -> Poses:

@@ -76,6 +76,13 @@ def take_messages(columns: DecodedObjects, kept: Bool) -> DecodedObjects:
     return replace(columns, **of_message, **{n: getattr(columns, n)[rows] for n in ("object_ix", "class_ix", "values")})
 
 
+def list_contents(columns: DecodedObjects) -> list[bytes]:
+    """What each message (F,) says of its objects, as bytes: equal for equal lists."""
+    ends = np.cumsum(columns.rows).tolist()
+    spans = [slice(end - number, end) for end, number in zip(ends, columns.rows.tolist(), strict=True)]
+    return [columns.object_ix[rows].tobytes() + columns.values[rows].tobytes() for rows in spans]
+
+
 # Corrections of velocities and heights. Rows are those of the truth (P,), track by track (`start (E + 1,)`). Each
 # function returns new columns and a note for everything that it changed.
 

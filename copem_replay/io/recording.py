@@ -11,19 +11,19 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from copem_replay.core.errors import EgoError, RecordingError, RemoteFile, count_noun, escape_unprintable
+from copem_replay.core.errors import EgoError, RecordingError, RemoteFile, count_noun
 from copem_replay.core.frame import SaidPlace
 from copem_replay.core.site_map import Lane
 from copem_replay.core.tracks import CLASSES, Float, Scene, Tracks
 from copem_replay.io.channel import Channel
 from copem_replay.io.decoded_size import DecodeAllowance, OversizeError
-from copem_replay.io.ground_truth import DecodedObjects, assemble_truth
+from copem_replay.io.findings import as_finding, find
+from copem_replay.io.ground_truth import DecodedObjects, assemble_truth, list_contents
 from copem_replay.io.log import BrokenIndexError, Log, cut_window, window_notes
 from copem_replay.io.open import (
     DriveRecordings,
@@ -38,6 +38,7 @@ from copem_replay.io.open import (
 from copem_replay.io.schemas import osi_ground_truth as osi
 from copem_replay.io.schemas.poses import is_pose
 from copem_replay.io.schemas.registry import is_list, known_lists, names_objects
+from copem_replay.io.stamps import refuse_second_run
 from copem_replay.io.window import Window, WindowSeconds
 
 if TYPE_CHECKING:
@@ -165,6 +166,7 @@ def _read(
     except BrokenIndexError as error:
         log = cut_window(log.from_start(error), topic, window_s)
         columns, around, world = _decode_world(log, topic, fields, asked, seek_ego=ego is None)
+    refuse_second_run(columns.stamp_ns, columns.log_time_ns, partial(list_contents, columns), log.path, topic)
     scene, truth, truth_notes = assemble_truth(columns, name)
     notes = [*columns.notes, *truth_notes]
     if scene is None or truth is None:
@@ -174,13 +176,17 @@ def _read(
         why = "".join(f"; {note}" for note in ([damage] if damage else []) + notes)
         raise RecordingError(f"no usable object in {inside}{why}", path=log.path, topic=topic)
     host, host_notes = _find_host(columns.hosts)
+    if apart := _find_apart(around, truth):
+        if asked is not None:
+            raise EgoError(f"{apart[0]}; `ego: none` replays without it", path=log.path)
+        host, host_notes = None, apart
     ego_ix, ego_notes = _find_ego(log.path, scene, ego if isinstance(ego, str) else None, host)
     damage = _describe_damage(log, topic, scene.end_s)
     window_lines = window_notes(window_s)
     notes = [*([damage] if damage else []), *window_lines, *log.notes, *ignored, *notes, *host_notes, *ego_notes]
     sized = around is None or around.ego is None or (asked is not None and asked.size_m is not None)
     scene = replace(scene, ego_ix=ego_ix, ego_sized=sized, tags=dict(log.tags), areas=columns.areas)
-    all_notes = tuple(escape_unprintable(note) for note in notes)
+    all_notes = tuple(map(as_finding, notes))
     encoding = next(c.encoding for c in log.channels if c.topic == topic and c.messages)
     return Recording(
         scene, truth, log.path, topic, all_notes, host, damage,
@@ -334,13 +340,16 @@ def _decode_topic(log: Log, topic: str) -> DecodedObjects:
     channels = {c.number: c for c in log.channels if c.topic == topic and is_truth(c)}
     decoder = osi.GroundTruthDecoder(DecodeAllowance(log.file_bytes()))
     try:
+        if log.window is not None:  # simulators write the road, and what stands, in the first message alone
+            for number, log_time_ns, payload in log.within(None).payloads(frozenset(channels)):
+                if log_time_ns >= log.window.from_ns and log.indexed:
+                    break
+                if log_time_ns < log.window.from_ns:
+                    decoder.add_earlier(payload, channels[number].schema)
         for number, log_time_ns, payload in log.payloads(frozenset(channels)):
             decoder.add(
                 payload, schema=channels[number].schema, log_time_ns=log_time_ns, ahead_ns=channels[number].ahead_ns
             )
-        if log.window is not None:  # simulators write the road in the first message alone
-            for number, _, payload in islice(log.within(None).payloads(frozenset(channels)), 1):
-                decoder.add_road(payload, channels[number].schema)
         return decoder.columns()
     except OversizeError as error:
         raise RecordingError(str(error), path=log.path, topic=topic) from None
@@ -371,6 +380,16 @@ def _find_host(hosts: Sequence[str]) -> tuple[str | None, list[str]]:
         return counts[0][0], []
     ids = ", ".join(f"{ident} in {count_noun(number, 'message')}" for ident, number in counts[:_SHOWN])
     return counts[0][0], [f"the host vehicle changes ({ids}): the most frequent taken"]
+
+
+def _find_apart(around: LogContext | None, truth: Tracks) -> list[str]:
+    """The finding that the ego's poses and the lists have no instant in common; none: they have."""
+    if around is None or around.ego is None:
+        return []
+    (first, last), (start, end) = ((ns[0] * 1e-9, ns[-1] * 1e-9) for ns in (around.ego.stamp_ns, truth.stamp_ns))
+    apart = max(first - end, start - last)
+    topic = around.ego_topic
+    return [*find("two clocks", int(apart > 0), topic=topic, first=first, last=last, start=start, end=end, apart=apart)]
 
 
 def _find_ego(path: Path, scene: Scene, ego: str | None, host: str | None) -> tuple[int, list[str]]:

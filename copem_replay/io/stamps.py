@@ -7,7 +7,7 @@ clock of the other stamps. A stamp that falls while log time rises begins a new 
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from datetime import UTC, datetime, timedelta
 from decimal import Decimal
 from pathlib import Path
@@ -176,16 +176,16 @@ def find_runs(stamp_ns: Int, log_time_ns: Int) -> Int:
 
 
 def refuse_second_run(
-    stamp_ns: Int, log_time_ns: Int, contents: Sequence[bytes], path: Path, topic: str, since_ns: int | None = None
+    stamp_ns: Int, log_time_ns: Int, list_contents: Callable[[], Sequence[bytes]], path: Path, topic: str
 ) -> None:
     """Raises RecordingError: messages are of several runs. Repeats of a run, message by message, are none.
 
-    `contents`: what each message says, as bytes. `since_ns`: the log time that windows count from; None: the first.
+    `list_contents`: gives what each message says, as bytes.
     """
     run = find_runs(stamp_ns, log_time_ns)
     if not run.any():
         return
-    start_ns = int(log_time_ns.min()) if since_ns is None else since_ns
+    start_ns, contents = int(log_time_ns.min()), list_contents()
     said = {(int(stamp_ns[k]), contents[k]) for k in np.flatnonzero(run == 0).tolist()}
     latest_ns = int(stamp_ns[run == 0].max())
     for number in range(1, int(run.max()) + 1):

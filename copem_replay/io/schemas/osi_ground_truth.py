@@ -191,6 +191,8 @@ class GroundTruthDecoder:
         self._waiting_bytes, self._waiting_objects, self._batches, self._walk = 0, 0, 0, False
         self._road = OsiRoad()  # of the first message that has one: the lanes of one message are those of all
         self._place: SaidPlace | None = None
+        self._earlier: list[tuple[OsiRoad, Any]] = []  # the first road or place on earth before the window
+        self._standing: dict[int, tuple[float, ...]] = {}  # values of stationary objects by OSI id, as last sent
         self._solids: dict[int, Solid | None] = {}  # of stationary objects by OSI id; None: a box
         self._notes: dict[str, tuple[int, _Place]] = {}  # by rule: how many, and where the first is
         self._messages = 0
@@ -232,20 +234,27 @@ class GroundTruthDecoder:
         self._allowance.spend(0, self._stationary.of_message[-1])
         self._wait(truth)
 
-    def add_road(self, payload: bytes, schema: str) -> None:
-        """Take the road of a message that is not read otherwise, where none has had one. Raises OversizeError."""
-        if not self._road:
-            check_osi(self._message_of[schema], payload)
-            with suppress(DecodeError):
-                message = self._message_of[schema].FromString(payload)
-                truth = message.global_ground_truth if schema == SENSOR_VIEW else message
-                self._road = read_road(truth)
-                if truth.proj_string and self._place is None:
-                    self._add_place(truth, 0)
+    def add_earlier(self, payload: bytes, schema: str) -> None:
+        """Take what stays of a message before those that are read: its road, its place on earth, what stands.
+
+        Raises OversizeError.
+        """
+        check_osi(self._message_of[schema], payload)
+        with suppress(DecodeError):
+            message = self._message_of[schema].FromString(payload)
+            truth = message.global_ground_truth if schema == SENSOR_VIEW else message
+            if not self._earlier and ((road := read_road(truth)) or truth.proj_string):
+                self._earlier.append((road, truth))
+            check_objects(len(truth.stationary_object))
+            self._find_standing(truth.stationary_object, told=False)
 
     def columns(self) -> DecodedObjects:
         """The columns of all messages that were added; none can be added after. Raises OversizeError."""
         self._add_waiting()
+        for road, truth in self._earlier:
+            self._road = self._road or road
+            if truth.proj_string and self._place is None:
+                self._add_place(truth, 0)
         ids, moving = self._names()
         solids = tuple(solid for solid in self._solids.values() if solid is not None)
         counts = [(rule, number) for rule, (number, _) in sorted(self._notes.items(), key=lambda item: item[1][1])]
@@ -397,28 +406,46 @@ class GroundTruthDecoder:
         self._moving.of_message.append(len(self._moving.object_ix) - before)
 
     def _add_stationary(self, objects: Any) -> None:
-        """Add a row of class `other`, at rest, for each; none for those with a base polygon, which become solids."""
-        number_of, rows, before = self._stationary_number, self._stationary, len(self._stationary.object_ix)
-        for k, stationary in enumerate(objects):
-            at = (self._messages, 1, k)
-            ident = stationary.id.value
-            if ident == 0 and not stationary.HasField("id"):
-                self._note("no id", at)
-                continue
-            base = stationary.base
-            if ident not in self._solids:
-                self._solids[ident] = self._solid(ident, base, at)
-            if self._solids[ident] is not None:
-                continue
-            position, size, yaw = base.position, base.dimension, base.orientation.yaw
-            (x, y, z, yaw), rules = check_zeros(base, (position.x, position.y, position.z, yaw))
-            for rule in rules:
-                self._note(rule, at)
+        """Add a row of class `other`, at rest, for each that stands; those with a base polygon become solids.
+
+        Many writers send them once. They stay until a message that repeats some of them leaves them out.
+        """
+        self._find_standing(objects)
+        number_of, rows = self._stationary_number, self._stationary
+        for ident, values in self._standing.items():
             number = number_of.get(ident)
             rows.object_ix.append(self._next_number(number_of, ident) if number is None else number)
             rows.class_ix.append(OTHER)
-            rows.values.extend((x, y, z, yaw, 0.0, 0.0, size.length, size.width, size.height))
-        rows.of_message.append(len(rows.object_ix) - before)
+            rows.values.extend(values)
+        rows.of_message.append(len(self._standing))
+
+    def _find_standing(self, objects: Any, *, told: bool = True) -> None:
+        """Take the stationary objects of a message, with findings if they are `told`."""
+        sent: dict[int, tuple[float, ...]] = {}
+        for k, stationary in enumerate(objects):
+            at, rules = (self._messages, 1, k), list[str]()
+            ident = stationary.id.value
+            if ident == 0 and not stationary.HasField("id"):
+                rules.append("no id")
+            else:
+                if ident not in self._solids:
+                    self._solids[ident] = self._solid(ident, stationary.base, at)
+                if self._solids[ident] is None:
+                    base = stationary.base
+                    position, size = base.position, base.dimension
+                    state: tuple[float, ...] = (position.x, position.y, position.z, base.orientation.yaw)
+                    state, rules = check_zeros(base, state) if 0.0 in state else (state, rules)
+                    if ident in sent:
+                        rules.append("twice")
+                    sent.setdefault(ident, (*state, 0.0, 0.0, size.length, size.width, size.height))
+            for rule in rules if told else ():
+                self._note(rule, at)
+        lasting = len(self._standing.keys() - sent.keys())
+        if self._standing.keys().isdisjoint(sent):
+            if lasting and told:
+                self._note("stands", (self._messages, 1, 0), lasting)
+            sent = self._standing | sent
+        self._standing = sent
 
     def _note(self, rule: str, at: _Place, number: int = 1) -> None:
         """Count a finding; `at`: the message, whether the object is stationary, its place in the list."""
