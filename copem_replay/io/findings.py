@@ -91,6 +91,31 @@ RULES: Final = {
     "class changes": Rule("object", "of changing class: the most frequent taken", changes=False),
     "no id": Rule(_STATE, "without an id: skipped"),
     "stands": Rule(_STATE, "of what stands, not sent again: where it was"),
+    "jump": Rule(
+        "",
+        "object {id} jumps by {far:.3g} m at {at:.3f} s: its track is cut there, {share:.0%} of its states are "
+        "another object's or none",
+    ),
+    "places": Rule("object", "jump: ids look like places in the list, which no object keeps"),
+    "twist": Rule(
+        "",
+        "object {id}: its velocity points across its path in {share:.0%} of the states in which it moves, first at "
+        "{at:.3f} s (along the map, where the schema says along the object?): taken from the positions",
+    ),
+    "heading": Rule(
+        "",
+        "object {id}: its heading points across its path in {share:.0%} of the states in which it moves, first at "
+        "{at:.3f} s: as it is",
+    ),
+    "flip": Rule(
+        "",
+        "object {id}: its heading turns by half a turn at once in {share:.0%} of its states, first at "
+        "{at:.3f} s: as it is",
+    ),
+    "frameless": Rule(_STATE, "in no named frame: taken as in {frame}"),
+    "ego listed": Rule(
+        "", "object {id} is where {topic} says, in all lists that it is in: it is the ego, which it gives the size"
+    ),
     # Sizes.
     "size negative": Rule(_STATE, "with a negative size: its amount taken"),
     "size lost": Rule(_STATE, "whose size is none: that of the same object at other times taken"),

@@ -24,6 +24,7 @@ from copem_replay.core.tracks import CLASSES, VALUES, Bool, Float, Int
 from copem_replay.io.channel import Channel, schema_name
 from copem_replay.io.encodings import make_definition
 from copem_replay.io.encodings.columns import DefinitionError
+from copem_replay.io.findings import find
 from copem_replay.io.ground_truth import MAX_GAP_S, DecodedObjects
 from copem_replay.io.log import Log, gather_messages
 from copem_replay.io.schemas.description import VX, VY, YAW, X, Z
@@ -213,10 +214,39 @@ def ego_notes(chosen: Channel, asked: EgoTopic | None) -> Iterator[str]:
         yield f"ego: no size is said (`size_m: [length, width, height]`): {size} m taken to hide others, gaps are null"
 
 
-def add_ego(columns: DecodedObjects, course: PoseTrack | None, asked: EgoTopic | None) -> DecodedObjects:
-    """The columns with the ego added to every list at whose instant it has a pose; unchanged without a course."""
+_SAME_BODY_M = 2.5
+"""A vehicle whose centre is so near to the poses of the ego (of its rear axle, often) is the ego: no other has room."""
+
+
+def find_listed_ego(columns: DecodedObjects, course: PoseTrack) -> int | None:
+    """Index of the listed object that is the ego, by its place; None: the lists do not hold it."""
+    placed = course.at(columns.stamp_ns)
+    message = np.repeat(np.arange(len(columns.rows)), columns.rows)
+    away_m = np.hypot(*(columns.values[:, k] - placed.position_m[message, k] for k in range(2)))
+    driven = columns.class_ix != CLASSES.index("pedestrian")
+    of, near = (
+        np.bincount(columns.object_ix[rows], minlength=len(columns.object_ids))
+        for rows in (placed.there[message], placed.there[message] & (away_m < _SAME_BODY_M) & driven)
+    )
+    found = np.flatnonzero((near > _ALWAYS * of) & (of > _ALWAYS * placed.there.sum()) & columns.moving)
+    return int(found[0]) if len(found) == 1 else None
+
+
+_ALWAYS = 0.9  # share of the lists in which the ego is where its poses are
+
+
+def add_ego(
+    columns: DecodedObjects, course: PoseTrack | None, asked: EgoTopic | None, topic: str = ""
+) -> DecodedObjects:
+    """The columns with the ego added to every list at whose instant it has a pose; unchanged without a course.
+
+    A listed object that is where the ego is, is the ego.
+    """
     if course is None:
         return columns
+    if (listed := find_listed_ego(columns, course)) is not None:
+        name = columns.object_ids[listed]
+        return replace(columns, hosts=(name,), notes=(*columns.notes, *find("ego listed", 1, id=name, topic=topic)))
     placed = course.at(columns.stamp_ns)
     length, width, height = asked.size_m if asked is not None and asked.size_m is not None else NOMINAL_M
     ahead = (asked.centre_from_rear_axle_m if asked is not None else None) or 0.0
@@ -380,11 +410,25 @@ def _transform_rows(values: Float, covariance: Float, placed: SampledPoses, inst
     return values, np.stack(turned, axis=1)
 
 
+def _name_frames(lists: DecodedLists, around: LogContext) -> DecodedLists:
+    """The lists with entries of no named frame as of that which the others name, else of the ego's world."""
+    nameless = np.array([not name.strip("/") for name in lists.frames] + [True])[lists.frame_code]
+    if not nameless.any() or (around.ego is None and nameless.all()):
+        return lists
+    named = lists.frame_code[~nameless]
+    code = int(np.bincount(named).argmax()) if len(named) else len(lists.frames)
+    frames = lists.frames if len(named) or around.ego is None else (*lists.frames, around.ego.parent)
+    findings = find("frameless", int(nameless.sum()), frame=frames[code])
+    columns = replace(lists.columns, notes=(*lists.columns.notes, *findings))
+    return replace(lists, columns=columns, frames=frames, frame_code=np.where(nameless, code, lists.frame_code))
+
+
 def transform_to_world(lists: DecodedLists, around: LogContext, path: Path, topic: str) -> DecodedLists:
     """The lists in the world, without the states at instants at which their frame has no place; notes tell of both.
 
     Raises RecordingError, naming `path` and `topic`: no transforms connect a list's frame with the world.
     """
+    lists = _name_frames(lists, around)
     names = around.named(lists)
     if not len(lists.frame_code) or not names:
         return lists

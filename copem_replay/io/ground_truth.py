@@ -39,6 +39,7 @@ from copem_replay.io.findings import (
     find,
     sift_states,
 )
+from copem_replay.io.truth_checks import TrackRows, are_places, check_truth
 
 
 @dataclass(frozen=True)
@@ -212,16 +213,21 @@ def assemble_truth(
     object_ix, first_seen = _number_by_appearance(columns.object_ix[row])
     order = np.argsort(object_ix, kind="stable")  # rows are in order of capture: so are those of each track
     row, object_ix = row[order], object_ix[order]
+    time_s = (stamp_ns[frame[row]] - stamp_ns[0]) * np.float64(1e-9)
+    ids = tuple(columns.object_ids[k] for k in first_seen)
+    rows = TrackRows(ids, object_ix, time_s, columns.class_ix[row], values[row], columns.moving[first_seen])
+    rows, states = check_truth(rows, _are_places(columns), notes)
+    row, object_ix, values = row[states], rows.object_ix, rows.values
     object_class = _most_frequent_class(object_ix, columns.class_ix[row], notes)
     scene = Scene(
         log=log,
         t0_ns=int(stamp_ns[0]),
         end_ns=int(stamp_ns[-1]),
-        object_ids=tuple(columns.object_ids[k] for k in first_seen),
+        object_ids=rows.ids,
         object_class=object_class,
-        moving=columns.moving[first_seen],
+        moving=rows.moving,
     )
-    values = complete_sizes(values[row], object_class[object_ix], object_ix, notes)
+    values = complete_sizes(values, object_class[object_ix], object_ix, notes)
     column = {name: values[:, k] for k, name in enumerate(VALUES)}
     tracks = _build_tracks(scene, stamp_ns, frame[row], object_ix, column, notes)
     return (
@@ -229,6 +235,14 @@ def assemble_truth(
         tracks,
         tuple(notes),
     )
+
+
+def _are_places(columns: DecodedObjects) -> bool:
+    """Whether the ids of listed objects are places in the list."""
+    ego = [columns.object_ids.index(host) for host in set(columns.hosts) if host in columns.object_ids]
+    listed = np.flatnonzero(~np.isin(columns.object_ix, ego))
+    message = np.repeat(np.arange(len(columns.rows)), columns.rows)
+    return are_places(columns.object_ids, columns.object_ix[listed], message[listed])
 
 
 def _stand_solids_on_ground(solids: tuple[Solid, ...], stated_z_m: Float, z_m: Float) -> tuple[Solid, ...]:

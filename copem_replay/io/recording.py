@@ -22,7 +22,7 @@ from copem_replay.core.site_map import Lane
 from copem_replay.core.tracks import CLASSES, Float, Scene, Tracks
 from copem_replay.io.channel import Channel
 from copem_replay.io.decoded_size import DecodeAllowance, OversizeError
-from copem_replay.io.findings import as_finding, find
+from copem_replay.io.findings import as_finding, find, find_rule
 from copem_replay.io.ground_truth import DecodedObjects, assemble_truth, list_contents
 from copem_replay.io.log import BrokenIndexError, Log, cut_window, window_notes
 from copem_replay.io.open import (
@@ -39,6 +39,7 @@ from copem_replay.io.schemas import osi_ground_truth as osi
 from copem_replay.io.schemas.poses import is_pose
 from copem_replay.io.schemas.registry import is_list, known_lists, names_objects
 from copem_replay.io.stamps import refuse_second_run
+from copem_replay.io.truth_checks import HeadingUnitError
 from copem_replay.io.window import Window, WindowSeconds
 
 if TYPE_CHECKING:
@@ -49,6 +50,7 @@ if TYPE_CHECKING:
 
 
 _TOPIC = ("read", "topic")  # the key of an experiment that names the topic of the truth
+_NO_TRUTH = "lists of a unit they can be, not the truth"
 _SHOWN = 12  # ids or topics named in an error; the rest is counted
 
 
@@ -167,7 +169,10 @@ def _read(
         log = cut_window(log.from_start(error), topic, window_s)
         columns, around, world = _decode_world(log, topic, fields, asked, seek_ego=ego is None)
     refuse_second_run(columns.stamp_ns, columns.log_time_ns, partial(list_contents, columns), log.path, topic)
-    scene, truth, truth_notes = assemble_truth(columns, name)
+    try:
+        scene, truth, truth_notes = assemble_truth(columns, name)
+    except HeadingUnitError as error:
+        raise RecordingError(str(error), path=log.path, topic=topic) from None
     notes = [*columns.notes, *truth_notes]
     if scene is None or truth is None:
         messages = count_noun(sum(c.messages for c in log.channels if c.topic == topic), "message")
@@ -185,6 +190,7 @@ def _read(
     window_lines = window_notes(window_s)
     notes = [*([damage] if damage else []), *window_lines, *log.notes, *ignored, *notes, *host_notes, *ego_notes]
     sized = around is None or around.ego is None or (asked is not None and asked.size_m is not None)
+    sized = sized or find_rule(columns.notes, "ego listed") is not None
     scene = replace(scene, ego_ix=ego_ix, ego_sized=sized, tags=dict(log.tags), areas=columns.areas)
     all_notes = tuple(map(as_finding, notes))
     encoding = next(c.encoding for c in log.channels if c.topic == topic and c.messages)
@@ -316,23 +322,24 @@ def _decode_world(
         from copem_replay.io.frames import add_ego, read_log_context
 
         around = read_log_context(log, asked, seek_ego=False)
-        return _add_notes(add_ego(columns, around.ego, around.asked), around), around, ""
+        return _add_notes(add_ego(columns, around.ego, around.asked, around.ego_topic), around), around, ""
     from copem_replay.io.frames import add_ego, read_decoded_lists, read_log_context, transform_to_world
 
     around = read_log_context(log, asked, seek_ego=seek_ego)
     same_schema = [c for c in channels if (c.schema, c.encoding) == (channels[0].schema, channels[0].encoding)]
     lists = read_decoded_lists(log, same_schema, fields)
     if (fields is None and not names_objects(same_schema[0])) or (fields is not None and fields.id is None):
-        raise RecordingError(
-            "its objects have no ids; lists of a unit they can be, not the truth", path=log.path, topic=topic
-        )
+        raise RecordingError("its objects have no ids; " + _NO_TRUTH, path=log.path, topic=topic)
+    if not lists.named and len(lists.columns.object_ix):
+        raise RecordingError("its objects have no ids, all are empty; " + _NO_TRUTH, path=log.path, topic=topic)
     world = around.world_of(lists)
     lists = transform_to_world(lists, around, log.path, topic)
-    return _add_notes(add_ego(lists.columns, around.ego, around.asked), around), around, world
+    return _add_notes(add_ego(lists.columns, around.ego, around.asked, around.ego_topic), around), around, world
 
 
 def _add_notes(columns: DecodedObjects, around: LogContext) -> DecodedObjects:
-    return replace(columns, notes=(*columns.notes, *around.notes))
+    assumed = find_rule(columns.notes, "ego listed") is None  # of a listed ego nothing is
+    return replace(columns, notes=(*columns.notes, *(n for n in around.notes if assumed or not n.startswith("ego: "))))
 
 
 def _decode_topic(log: Log, topic: str) -> DecodedObjects:
