@@ -362,7 +362,7 @@ def _read_local_recording(experiment: Experiment, place: Local) -> tuple[Recordi
     beside = {asked.topic for asked in (*experiment.recorded.values(), *experiment.outputs.values())}
     read = partial(
         read_log, place, name=name_log(path), topic=experiment.read.topic, fields=fields, beside=beside,
-        window_s=experiment.window_s,
+        window_s=experiment.window_s, max_gap_s=experiment.max_gap_s, classes=experiment.read.classes,
     )  # fmt: skip
     try:
         recording = read(ego=ego)

@@ -89,6 +89,10 @@ RULES: Final = {
     # Objects.
     "twice": Rule(_STATE, "of an id twice in a message: the first kept"),
     "class changes": Rule("object", "of changing class: the most frequent taken", changes=False),
+    "class name": Rule(
+        "object state",
+        "with a class name that says nothing ({which}): read as other; `read: {{classes: {{NAME: car}}}}` says what it is",
+    ),
     "no id": Rule(_STATE, "without an id: skipped"),
     "stands": Rule(_STATE, "of what stands, not sent again: where it was"),
     "jump": Rule(

@@ -28,7 +28,14 @@ from copem_replay.io.findings import find
 from copem_replay.io.ground_truth import MAX_GAP_S, DecodedObjects
 from copem_replay.io.log import Log, gather_messages
 from copem_replay.io.schemas.description import VX, VY, YAW, X, Z
-from copem_replay.io.schemas.object_lists import DecodedLists, Description, Fields, FieldsError, decode_lists
+from copem_replay.io.schemas.object_lists import (
+    ClassField,
+    DecodedLists,
+    Description,
+    Fields,
+    FieldsError,
+    decode_lists,
+)
 from copem_replay.io.schemas.poses import ODOMETRY, Poses, decode_poses, is_pose, is_static
 from copem_replay.io.schemas.registry import describe_channel
 from copem_replay.io.stamps import find_runs
@@ -285,6 +292,7 @@ class LogContext:
     notes: tuple[str, ...]
     own: Mapping[tuple[str, str], str] = field(default_factory=dict)  # `_own_frame_names`
     ego_topic: str = ""
+    classes: Mapping[str, str] = field(default_factory=dict)  # of names, beside those that are known
 
     def named(self, lists: DecodedLists) -> list[str]:
         """The frames of the lists by their names in `frames`."""
@@ -376,7 +384,19 @@ def _rename_frames(poses: Poses, part: str, own: Mapping[tuple[str, str], str]) 
     return replace(poses, frame=frame, child=child)
 
 
-def read_decoded_lists(log: Log, channels: Sequence[Channel], fields: Fields | None) -> DecodedLists:
+def _add_classes(description: Description, classes: Mapping[str, str]) -> Description:
+    """The description with classes of further names."""
+    of = description.fields.class_
+    if not classes or of is None:
+        return description
+    of = ClassField(path=of) if isinstance(of, str) else of
+    of = of.model_copy(update={"map": {**of.map, **classes}})
+    return replace(description, fields=description.fields.model_copy(update={"class_": of}))
+
+
+def read_decoded_lists(
+    log: Log, channels: Sequence[Channel], fields: Fields | None, classes: Mapping[str, str]
+) -> DecodedLists:
     """The lists on channels of one topic and schema. Raises RecordingError, BrokenIndexError."""
     messages = gather_messages(log, frozenset(c.number for c in channels))
     payloads = [p for c in channels for p in messages.payloads[c.number]]
@@ -385,6 +405,7 @@ def read_decoded_lists(log: Log, channels: Sequence[Channel], fields: Fields | N
     try:
         definition = make_definition(channel, payloads)
         description = Description(fields) if fields is not None else describe_channel(channel, definition.offers())
+        description = _add_classes(description, classes)
         lists = decode_lists(definition, description, payloads, times, channel.ahead_ns)
     except (DefinitionError, FieldsError) as error:
         raise RecordingError(str(error), path=log.path, topic=channel.topic) from None

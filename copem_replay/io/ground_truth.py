@@ -18,6 +18,7 @@ from copem_replay.core.site_map import Lane
 from copem_replay.core.tracks import (
     CLASSES,
     SAME_INSTANT_NS,
+    SAME_INSTANT_S,
     TRUTH,
     VALUES,
     Area,
@@ -95,7 +96,14 @@ MOVING_MPS = 0.5
 
 
 def correct_velocities(
-    start: Int, time_s: Float, x_m: Float, y_m: Float, vx_mps: Float, vy_mps: Float, moving: Bool
+    start: Int,
+    time_s: Float,
+    x_m: Float,
+    y_m: Float,
+    vx_mps: Float,
+    vy_mps: Float,
+    moving: Bool,
+    max_gap_s: float = MAX_GAP_S,
 ) -> tuple[Float, Float, list[Finding]]:
     """Velocities (P,) and findings, from those of the messages (NaN: not given); all columns are (P,).
 
@@ -109,17 +117,17 @@ def correct_velocities(
         here = slice(start[first], start[last])
         columns = (column[here] for column in (time_s, x_m, y_m, vx_mps, vy_mps))
         begin = start[first : last + 1] - start[first]
-        vx[here], vy[here], of_tracks = _derive_velocities(begin, moving[here], *columns)
+        vx[here], vy[here], of_tracks = _derive_velocities(begin, moving[here], max_gap_s, *columns)
         counts += of_tracks
     rules = ("velocity unset", "velocity frozen", "velocity fast", "velocity alone")
     return vx, vy, [note for rule, n in zip(rules, counts.tolist(), strict=True) for note in find(rule, n)]
 
 
 def _derive_velocities(
-    start: Int, moving: Bool, time_s: Float, x_m: Float, y_m: Float, vx_mps: Float, vy_mps: Float
+    start: Int, moving: Bool, max_gap_s: float, time_s: Float, x_m: Float, y_m: Float, vx_mps: Float, vy_mps: Float
 ) -> tuple[Float, Float, Int]:
     """Velocities of some tracks (P,), and how many are not given, 0, too fast, and without a neighbour."""
-    before, after = _find_neighbours(start, time_s)
+    before, after = _find_neighbours(start, time_s, max_gap_s)
     dx, dy, apart_s = (a[after] - a[before] for a in (x_m, y_m, time_s))
     with_both = np.maximum(apart_s, np.finfo(float).tiny)  # lone rows: 0 / tiny = 0
     speed = np.hypot(vx_mps, vy_mps)
@@ -159,10 +167,10 @@ def correct_heights(
     )
 
 
-def _find_neighbours(start: Int, time_s: Float) -> tuple[Int, Int]:
+def _find_neighbours(start: Int, time_s: Float, max_gap_s: float) -> tuple[Int, Int]:
     """(P,) row before and row after each in its track; itself at the end of the track and beside a gap."""
     row = np.arange(len(time_s))
-    joined = np.diff(time_s) <= MAX_GAP_S  # row k and k + 1
+    joined = np.diff(time_s) <= max_gap_s + SAME_INSTANT_S  # row k and k + 1
     joined[start[1:-1] - 1] = False
     before, after = row.copy(), row.copy()
     before[1:] -= joined
@@ -196,7 +204,7 @@ def _count_by_class(object_ix: Int, object_class: Int, rows: Bool) -> str:
 
 
 def assemble_truth(
-    columns: DecodedObjects, log: str
+    columns: DecodedObjects, log: str, max_gap_s: float = MAX_GAP_S
 ) -> tuple[Scene, Tracks, tuple[str, ...]] | tuple[None, None, tuple[str, ...]]:
     """Scene (without ego), truth and notes of the log named `log`. No scene where no object is usable."""
     notes = list[str]()
@@ -229,7 +237,7 @@ def assemble_truth(
     )
     values = complete_sizes(values, object_class[object_ix], object_ix, notes)
     column = {name: values[:, k] for k, name in enumerate(VALUES)}
-    tracks = _build_tracks(scene, stamp_ns, frame[row], object_ix, column, notes)
+    tracks = _build_tracks(scene, stamp_ns, frame[row], object_ix, column, max_gap_s, notes)
     return (
         replace(scene, solids=_stand_solids_on_ground(columns.solids, values[:, Z], tracks.z_m)),
         tracks,
@@ -294,7 +302,13 @@ def _most_frequent_class(object_ix: Int, class_ix: NDArray[np.int8], notes: list
 
 
 def _build_tracks(
-    scene: Scene, stamp_ns: Int, frame: Int, object_ix: Int, column: dict[str, Float], notes: list[str]
+    scene: Scene,
+    stamp_ns: Int,
+    frame: Int,
+    object_ix: Int,
+    column: dict[str, Float],
+    max_gap_s: float,
+    notes: list[str],
 ) -> Tracks:
     """The truth of rows that are in order of tracks, velocities and heights corrected; `notes` gets the corrections."""
     number = len(scene.object_ids)
@@ -302,7 +316,9 @@ def _build_tracks(
     captured_s = ((stamp_ns - scene.t0_ns) * 1e-9).astype(np.float64)
     moving, class_ix = scene.moving[object_ix], scene.object_class[object_ix].astype(np.int64)
     x, y = column["x_m"], column["y_m"]
-    vx, vy, corrections = correct_velocities(start, captured_s[frame], x, y, column["vx_mps"], column["vy_mps"], moving)
+    vx, vy, corrections = correct_velocities(
+        start, captured_s[frame], x, y, column["vx_mps"], column["vy_mps"], moving, max_gap_s
+    )
     notes += corrections
     z, height, corrections = correct_heights(
         object_ix, class_ix, moving, column["z_m"], column["width_m"], column["height_m"]

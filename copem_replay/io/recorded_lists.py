@@ -414,7 +414,7 @@ def _read_described(log: Log, topic: str, scene: Scene, around: LogContext | Non
     if log.window is not None and next(log.payloads(frozenset(c.number for c in same_schema)), None) is None:
         raise RecordingError("holds no list in the window", path=log.path, topic=topic)
     around = around or read_log_context(log, None, seek_ego=False)
-    lists = transform_to_world(read_decoded_lists(log, same_schema, None), around, log.path, topic)
+    lists = transform_to_world(read_decoded_lists(log, same_schema, None, around.classes), around, log.path, topic)
     return _make_recorded_lists(lists, _read_details(log, topic), topic, scene)
 
 

@@ -23,7 +23,7 @@ from copem_replay.core.tracks import CLASSES, Float, Scene, Tracks
 from copem_replay.io.channel import Channel
 from copem_replay.io.decoded_size import DecodeAllowance, OversizeError
 from copem_replay.io.findings import as_finding, find, find_rule
-from copem_replay.io.ground_truth import DecodedObjects, assemble_truth, list_contents
+from copem_replay.io.ground_truth import MAX_GAP_S, DecodedObjects, assemble_truth, list_contents
 from copem_replay.io.log import BrokenIndexError, Log, cut_window, window_notes
 from copem_replay.io.open import (
     DriveRecordings,
@@ -123,6 +123,8 @@ def read_log(
     fields: Fields | None = None,
     beside: Collection[str] = (),
     window_s: WindowSeconds = None,
+    max_gap_s: float = MAX_GAP_S,
+    classes: Mapping[str, str] | None = None,
 ) -> Recording:
     """Read the truth of the recording at a place, or of an opened log, as the log called `name`.
 
@@ -130,11 +132,22 @@ def read_log(
     the only odometry. `topic`: that of the truth, None where there is only one candidate; `fields`: which fields of its
     messages hold what, None where the schema is known. `beside`: topics that recorded units read.
     `window_s`: read only what was logged from one instant to another, both included, in seconds since the first message
-    on the topic of the truth was logged; None: from the beginning, to the end.
+    on the topic of the truth was logged; None: from the beginning, to the end. `max_gap_s`: velocities that messages do
+    not state are derived across no longer gap. `classes`: of names, beside those that are known.
     Raises RecordingError, one line: no such file, no MCAP file, no truth, no usable object, no such ego, no such topic,
     or several, a file that changes while it is read; EmptyWindowError.
     """
-    read = partial(_read, name=name, ego=ego, topic=topic, fields=fields, beside=beside, window_s=window_s)
+    read = partial(
+        _read,
+        name=name,
+        ego=ego,
+        topic=topic,
+        fields=fields,
+        beside=beside,
+        window_s=window_s,
+        max_gap_s=max_gap_s,
+        classes=classes or {},
+    )
     if isinstance(source, Log):
         return read(source)
     place, stamps = Path(source) if isinstance(source, str) else source, None
@@ -159,18 +172,20 @@ def _read(
     fields: Fields | None,
     beside: Collection[str],
     window_s: WindowSeconds,
+    max_gap_s: float,
+    classes: Mapping[str, str],
 ) -> Recording:
     asked = None if isinstance(ego, str) else ego
     topic, ignored = choose_topic(log, topic, beside, fields, asked)
     try:
         log = cut_window(log, topic, window_s)
-        columns, around, world = _decode_world(log, topic, fields, asked, seek_ego=ego is None)
+        columns, around, world = _decode_world(log, topic, fields, asked, classes, seek_ego=ego is None)
     except BrokenIndexError as error:
         log = cut_window(log.from_start(error), topic, window_s)
-        columns, around, world = _decode_world(log, topic, fields, asked, seek_ego=ego is None)
+        columns, around, world = _decode_world(log, topic, fields, asked, classes, seek_ego=ego is None)
     refuse_second_run(columns.stamp_ns, columns.log_time_ns, partial(list_contents, columns), log.path, topic)
     try:
-        scene, truth, truth_notes = assemble_truth(columns, name)
+        scene, truth, truth_notes = assemble_truth(columns, name, max_gap_s)
     except HeadingUnitError as error:
         raise RecordingError(str(error), path=log.path, topic=topic) from None
     notes = [*columns.notes, *truth_notes]
@@ -301,7 +316,7 @@ def _describe_ignored(
 
 
 def _decode_world(
-    log: Log, topic: str, fields: Fields | None, asked: EgoTopic | None, *, seek_ego: bool
+    log: Log, topic: str, fields: Fields | None, asked: EgoTopic | None, classes: Mapping[str, str], *, seek_ego: bool
 ) -> tuple[DecodedObjects, LogContext | None, str]:
     """The objects on a topic and the ego in the world, the frames of the log, and the name of the world's frame.
 
@@ -327,7 +342,8 @@ def _decode_world(
 
     around = read_log_context(log, asked, seek_ego=seek_ego)
     same_schema = [c for c in channels if (c.schema, c.encoding) == (channels[0].schema, channels[0].encoding)]
-    lists = read_decoded_lists(log, same_schema, fields)
+    around = replace(around, classes=classes)
+    lists = read_decoded_lists(log, same_schema, fields, classes)
     if (fields is None and not names_objects(same_schema[0])) or (fields is not None and fields.id is None):
         raise RecordingError("its objects have no ids; " + _NO_TRUTH, path=log.path, topic=topic)
     if not lists.named and len(lists.columns.object_ix):

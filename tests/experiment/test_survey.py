@@ -235,7 +235,7 @@ def test_info_of_a_bag_of_lists_alone_is_no_error(path):
     write_mcap(path, [Topic("rsu", "osi3.SensorData", [(0, b"\xff")])])
     ended = CliRunner().invoke(app, ["info", str(path)], standalone_mode=False)
     assert ended.return_value == 2
-    assert "unit rsu: a message cannot be decoded" in ended.output
+    assert "unit rsu: none of its 1 messages can be decoded" in ended.output
 
 
 def test_every_topic_has_a_role(path):

@@ -7,7 +7,6 @@ gives one with `read:`.
 from __future__ import annotations
 
 import difflib
-import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -15,6 +14,7 @@ from typing import Literal
 import numpy as np
 
 from copem_replay.core.tracks import CLASSES, VALUES, Bool, Float, Int
+from copem_replay.io.class_names import class_from_name
 from copem_replay.io.decoded_size import check_objects
 from copem_replay.io.encodings.columns import (
     Definition,
@@ -329,8 +329,10 @@ class _BatchReader:
             shared = common_level(level, self._fields.objects)
             texts = self._found.levels[level].texts[whole]
             known_as = self._by_name(any_item_path(whole), class_field.map)
-            of_word = np.array([_class_ix(word, known_as) for word in texts.words] + [-1])
+            names = [known_as.get(word) or class_from_name(word) for word in texts.words]
+            of_word = np.array([CLASSES.index(name or "other") for name in names] + [-1])
             code = of_word[texts.code]
+            self._note_unknown_names(texts, names)
             share = np.ones(len(code))
             if class_field.probability is not None:
                 share = self._found.levels[list_level(self._wanted.path(class_field.probability))].numbers[
@@ -355,6 +357,14 @@ class _BatchReader:
         probability[none, CLASSES.index("other")] = 1.0
         normed: Float = probability / probability.sum(axis=1, keepdims=True)
         return normed
+
+    def _note_unknown_names(self, texts: DistinctTexts, names: Sequence[str | None]) -> None:
+        """Note the names of classes that say nothing, the most frequent first."""
+        counts = np.bincount(texts.code[texts.code >= 0], minlength=len(texts.words))
+        unknown = [(-int(counts[k]), word) for k, word in enumerate(texts.words) if names[k] is None and word.strip()]
+        which = ", ".join(f"{word} {-number}" for number, word in sorted(unknown)[:_SHOWN] if number)
+        if which:
+            self._notes += find("class name", sum(-number for number, _ in unknown), which=which)
 
     def _by_name(self, path: str, meant: Mapping[str, str]) -> Mapping[str, str]:
         """The class of each value, for values of an enumeration also by their names."""
@@ -514,39 +524,3 @@ def _join_id(spaces: DistinctTexts, space: int, ids: DistinctTexts, ident: int) 
         return ""
     namespace = spaces.words[space] if space >= 0 else ""
     return f"{namespace}/{ids.words[ident]}" if namespace else ids.words[ident]
-
-
-def _class_ix(word: str, known: Mapping[str, str]) -> int:
-    name = known.get(word) or class_from_name(word)
-    return CLASSES.index(name) if name is not None else CLASSES.index("other")
-
-
-# What names of classes mean, as data sets and drivers write them.
-
-_WORDS = {
-    "pedestrian": ("pedestrian", "person", "people", "human", "walker", "adult", "child", "wheelchair", "stroller"),
-    "bicycle": ("bicycle", "bicyclist", "bike", "cyclist", "cycle", "scooter", "rider"),
-    "motorcycle": ("motorcycle", "motorbike", "motorcyclist", "moped"),
-    "van": ("van", "minivan", "pickup"),
-    "truck": ("truck", "lorry", "semi"),
-    "bus": ("bus", "coach", "minibus"),
-    "trailer": ("trailer", "caravan"),
-    "animal": ("animal", "dog", "cat", "deer"),
-    "car": ("car", "sedan", "taxi", "passenger"),
-    "vehicle": ("vehicle", "ego"),
-    "other": ("other", "unknown", "misc", "object", "barrier", "cone", "sign", "tram", "train"),
-}
-"""Words by class. Of several classes that a name fits the first in `_ORDER` counts."""
-assert set(_WORDS) == set(CLASSES)
-_ORDER = ("motorcycle", *(name for name in _WORDS if name != "motorcycle"))
-"""In order of preference: `vehicle.bus` is a bus, `motorcycle rider` no bicycle."""
-
-
-def class_from_name(text: str) -> str | None:
-    """The class that a name means, None where it says nothing: `Car`, `vehicle.bus.rigid`, `TYPE_PEDESTRIAN`."""
-    words = set(re.split(r"[^a-z]+", re.sub(r"([a-z])([A-Z])", r"\1 \2", text).lower()))
-    words |= {word.removesuffix("s") for word in words}
-    for name in _ORDER:
-        if words & set(_WORDS[name]):
-            return name
-    return None
