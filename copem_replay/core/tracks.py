@@ -54,6 +54,21 @@ CLASS_GROUPS = {
 }
 """Names that stand for several classes (`vru`: vulnerable road users)."""
 
+
+def _build_agreement() -> Bool:
+    agree = np.eye(len(CLASSES), dtype=np.bool_)
+    other, vehicle = CLASSES.index("other"), CLASSES.index("vehicle")
+    agree[other] = agree[:, other] = True
+    for name in CLASS_GROUPS["vehicles"]:
+        agree[vehicle, CLASSES.index(name)] = agree[CLASSES.index(name), vehicle] = True
+    return agree
+
+
+AGREE: Bool = _build_agreement()
+"""(C, C) by indices into CLASSES: the classes are equal, or one is `other`, which says nothing, or one is `vehicle`
+(not said which) and the other one of the vehicles. Symmetric, not transitive: a car and a bicycle both agree with
+`other`."""
+
 NO_CAPTURE_NS = np.iinfo(np.int64).min
 """Stamp of a fused list at an instant at which no list is recent enough."""
 

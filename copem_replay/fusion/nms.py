@@ -9,8 +9,8 @@ import numpy as np
 from copem_replay.core.compiled import kernel
 from copem_replay.core.components import Positive, Share
 from copem_replay.core.geometry import rotated_iou
-from copem_replay.core.object_list import AGREE, Entries, Inputs, ObjectLists, most_probable_classes, view_as_numbers
-from copem_replay.core.tracks import Bool, Float, Int
+from copem_replay.core.object_list import Entries, Inputs, ObjectLists, most_probable_classes, view_as_numbers
+from copem_replay.core.tracks import AGREE, Bool, Float, Int
 from copem_replay.fusion.inputs import WIDTH, sort_rows
 from copem_replay.fusion.interface import ListFusion
 from copem_replay.fusion.union import gather_newest_rows, join_runs

@@ -91,7 +91,8 @@ RULES: Final = {
     "class changes": Rule("object", "of changing class: the most frequent taken", changes=False),
     "class name": Rule(
         "object state",
-        "with a class name that says nothing ({which}): read as other; `read: {{classes: {{NAME: car}}}}` says what it is",
+        "with a class name that says nothing ({which}): read as other; "
+        "`read: {{classes: {{NAME: car}}}}` says what it is",
     ),
     "no id": Rule(_STATE, "without an id: skipped"),
     "stands": Rule(_STATE, "of what stands, not sent again: where it was"),

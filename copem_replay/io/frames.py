@@ -292,6 +292,7 @@ class LogContext:
     notes: tuple[str, ...]
     own: Mapping[tuple[str, str], str] = field(default_factory=dict)  # `_own_frame_names`
     ego_topic: str = ""
+    static_missing: str = ""  # why there may be no static transforms
     classes: Mapping[str, str] = field(default_factory=dict)  # of names, beside those that are known
 
     def named(self, lists: DecodedLists) -> list[str]:
@@ -337,8 +338,10 @@ def read_log_context(log: Log, asked: EgoTopic | None, *, seek_ego: bool) -> Log
             of_channel[channel.number] = _rename_frames(of_channel[channel.number], channel.part, own)
             frames.add(of_channel[channel.number], static=is_static(channel))
     chosen = ego_channel(log, channels, asked, seek_ego)
+    empty = [c.topic for c in log.channels if is_pose(c) and is_static(c) and not c.messages]
+    missing = f"; {empty[0]} is empty: of a split bag the first part alone has it, so give the folder" if empty else ""
     if chosen is None:
-        return LogContext(frames, None, asked, tuple(notes), own)
+        return LogContext(frames, None, asked, tuple(notes), own, static_missing=missing)
     if not messages.payloads[chosen.number]:
         raise EgoError(f"no pose on topic {chosen.topic!r}{window_hint(log)}", path=log.path)
     if chosen.number not in of_channel:  # not decoded, which a note tells
@@ -346,7 +349,7 @@ def read_log_context(log: Log, asked: EgoTopic | None, *, seek_ego: bool) -> Log
     if asked is not None and asked.frame is not None:
         asked = asked.model_copy(update={"frame": own.get((chosen.part, asked.frame.lstrip("/")), asked.frame)})
     course = ego_course(log, chosen.topic, of_channel[chosen.number], asked)
-    return LogContext(frames, course, asked, (*notes, *ego_notes(chosen, asked)), own, chosen.topic)
+    return LogContext(frames, course, asked, (*notes, *ego_notes(chosen, asked)), own, chosen.topic, missing)
 
 
 def _keep_run(poses: Poses, window: Window | None) -> Poses:
@@ -467,7 +470,7 @@ def transform_to_world(lists: DecodedLists, around: LogContext, path: Path, topi
         if placed is None:
             raise RecordingError(
                 f"lists are in the frame {name!r}, the ego in {world!r}, and no transform of the recording "
-                "says how they lie",
+                f"says how they lie{around.static_missing}",
                 path=path,
                 topic=topic,
             )

@@ -18,8 +18,7 @@ import numpy as np
 from copem_replay.core.assignment import assign
 from copem_replay.core.errors import RecordingError, count_noun
 from copem_replay.core.interpolation import interpolate_at_instants
-from copem_replay.core.object_list import AGREE
-from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int, Scene, Tracks, join_tracks
+from copem_replay.core.tracks import AGREE, SAME_INSTANT_NS, Bool, Float, Int, Scene, Tracks, join_tracks
 from copem_replay.io.clock_offset import TimeOffset, estimate_time_offset
 from copem_replay.io.config import RecordedOutput, RecordedTopic
 from copem_replay.io.findings import Finding

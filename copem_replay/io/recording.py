@@ -6,6 +6,7 @@ derived or corrected.
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
@@ -20,7 +21,7 @@ from copem_replay.core.errors import EgoError, RecordingError, RemoteFile, count
 from copem_replay.core.frame import SaidPlace
 from copem_replay.core.site_map import Lane
 from copem_replay.core.tracks import CLASSES, Float, Scene, Tracks
-from copem_replay.io.channel import Channel
+from copem_replay.io.channel import ENCODINGS, Channel
 from copem_replay.io.decoded_size import DecodeAllowance, OversizeError
 from copem_replay.io.findings import as_finding, find, find_rule
 from copem_replay.io.ground_truth import MAX_GAP_S, DecodedObjects, assemble_truth, list_contents
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
 
 
 _TOPIC = ("read", "topic")  # the key of an experiment that names the topic of the truth
+_GUIDE = "(docs/guide/recordings.md)"
 _NO_TRUTH = "lists of a unit they can be, not the truth"
 _SHOWN = 12  # ids or topics named in an error; the rest is counted
 
@@ -270,8 +272,7 @@ def choose_topic(
         raise RecordingError(
             f"no list of true objects; it holds {_describe_channels(log.channels)}; "
             + "beside a recording that has one its lists replay by `together: [THAT, THIS]`; " * units
-            + "`read: {topic: …, objects: …, id: …}` names the fields of a list of any schema "
-            "(docs/guide/recordings.md)",
+            + _advise_reading(log),
             path=log.path,
         )
     if topic is not None and topic not in topics:
@@ -290,9 +291,27 @@ def choose_topic(
     return chosen, _describe_ignored(log, chosen, topics, beside, poses_read=poses_read)
 
 
+def _advise_reading(log: Log) -> str:
+    """What to do with a recording without truth: name fields, where a topic has an encoding that is read."""
+    encodings = {c.encoding for c in log.channels if c.messages}
+    if encodings & {*ENCODINGS}:
+        return (
+            "`read: {topic: …, objects: …, id: …}` names the fields of a list of any schema (docs/guide/recordings.md)"
+        )
+    return f"messages encoded as {', '.join(sorted(encodings))} are not read; {', '.join(ENCODINGS)} are"
+
+
+_SAYS_TRUTH = re.compile(r"ground[_-]?truth|(^|/)gt(/|$)", re.IGNORECASE)
+"""A topic that says that it is the truth is taken before those that a tracker or a prediction writes."""
+
+
 def _only_topic(topics: dict[str, str]) -> str | None:
-    """The topic to read where none is named: the only one, or the only GroundTruth beside SensorViews; else None."""
+    """The topic to read where none is named: the only one, the only GroundTruth beside SensorViews, the only one whose
+    name says ground truth; else None.
+    """
     truths = [t for t, schema in topics.items() if schema == osi.GROUND_TRUTH]
+    if len(truths or topics) != 1:
+        truths = [t for t in topics if _SAYS_TRUTH.search(t)] or truths
     candidates = truths or list(topics)
     return candidates[0] if len(candidates) == 1 else None
 

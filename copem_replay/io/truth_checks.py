@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from copem_replay.core.interpolation import wrap_angles
-from copem_replay.core.object_list import AGREE
-from copem_replay.core.tracks import CLASSES, Bool, Float, Int
+from copem_replay.core.tracks import AGREE, CLASSES, Bool, Float, Int
 from copem_replay.io.findings import VX, VY, YAW, X, Y, find
 
 _SLACK_M = 3.0

@@ -31,8 +31,8 @@ from numpy.typing import NDArray
 
 from copem_replay.core.compiled import borrowing, kernel
 from copem_replay.core.geometry import count_below
-from copem_replay.core.object_list import AGREE, Entries, ObjectLists, TellsOf, most_probable_class
-from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int, Scene, Tracks
+from copem_replay.core.object_list import Entries, ObjectLists, TellsOf, most_probable_class
+from copem_replay.core.tracks import AGREE, SAME_INSTANT_S, Bool, Float, Int, Scene, Tracks
 
 MATCH, DUPLICATE, GHOST = 0, 1, 2
 """Roles of entries."""

@@ -20,8 +20,18 @@ from copem_replay.communication.link import KeptDraws
 from copem_replay.communication.reception import RadioPath
 from copem_replay.core.errors import ExperimentError
 from copem_replay.core.interpolation import interpolate_at_instants, interpolate_at_stated_instants
-from copem_replay.core.object_list import AGREE
-from copem_replay.core.tracks import CLASSES, Bool, Float, Int, Scene, TimeChunk, Tracks, class_indices, join_tracks
+from copem_replay.core.tracks import (
+    AGREE,
+    CLASSES,
+    Bool,
+    Float,
+    Int,
+    Scene,
+    TimeChunk,
+    Tracks,
+    class_indices,
+    join_tracks,
+)
 from copem_replay.experiment.schema import Experiment
 from copem_replay.fusion.interface import ListFusion
 from copem_replay.io.recorded_units import RecordedUnits, join_recorded_units

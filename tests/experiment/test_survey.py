@@ -273,10 +273,10 @@ def test_every_topic_has_a_role(path):
 
 
 def test_truth_without_usable_objects(path):
-    write_recording(path, [(0, [Obj(length=0)])])
+    write_recording(path, [(0, [Obj(x=None)])])
     found = survey_recording(path)
     assert not found.readable
-    assert found.reason.startswith(f"{path}: truth: no usable object in 1 message; 1 object state whose length")
+    assert found.reason.startswith(f"{path}: truth: no usable object in 1 message; 1 object state without a pos")
     assert found.topics[0].role == "truth"
 
 

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from copem_replay.core.object_list import AGREE, Entries
-from copem_replay.core.tracks import CLASSES
+from copem_replay.core.object_list import Entries
+from copem_replay.core.tracks import AGREE, CLASSES
 from copem_replay.metrics.matching import DUPLICATE, GHOST, MATCH, Matches, match_entries
 from tests.helpers.reports import entry, joined, lists_of
 from tests.oracles.accuracy import likely, one_run, permuted, scene_of, truth_of

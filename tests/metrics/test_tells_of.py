@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from copem_replay.core.errors import InputError
-from copem_replay.core.object_list import AGREE, Entries, TellsOf
-from copem_replay.core.tracks import CLASSES
+from copem_replay.core.object_list import Entries, TellsOf
+from copem_replay.core.tracks import AGREE, CLASSES
 from copem_replay.fusion.gnn import Gnn
 from copem_replay.fusion.interface import Inbox, StepFusion, ask_fusion
 from copem_replay.fusion.nms import Nms

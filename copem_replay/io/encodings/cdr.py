@@ -34,6 +34,7 @@ from copem_replay.io.encodings.columns import (
     shred_columns,
     split_batches,
 )
+from copem_replay.io.encodings.ros2_types import known_types
 
 # The kernel.
 
@@ -341,7 +342,11 @@ class CdrDefinition(Definition):
         super().__init__()
         self._name = name if name.count("/") == 2 else name.replace("/", "/msg/")
         try:
-            self._types = {**_EVERYWHERE, **_parse_definition(text.decode().replace("\r", ""), self._name, encoding)}
+            content = text.decode().replace("\r", "")
+            parsed = _parse_definition(content, self._name, encoding) if content.strip() else known_types(self._name)
+            self._types = {**_EVERYWHERE, **parsed}
+        except DefinitionError:
+            raise
         except Exception as error:  # whatever a parser raises at what is no definition
             why = " ".join(str(error).split())[:200] or type(error).__name__
             raise DefinitionError(f"the definition of {name} cannot be parsed: {why}") from None

@@ -34,6 +34,7 @@ from copem_replay.io.containers.mcap_records import (
     read_summary,
     renumber_message,
 )
+from copem_replay.io.encodings.ros2_types import message_definition
 from copem_replay.io.log import Log, open_file
 from copem_replay.io.recording import Recording
 from copem_replay.io.schemas.osi_ground_truth import SENSOR_DATA, load_sensor_data_class
@@ -64,7 +65,6 @@ from copem_replay.io.write.ros2 import (
     encode_ros2_scene,
     encode_ros2_transform,
     encode_string,
-    message_definition,
 )
 from copem_replay.io.write.scene import (
     FOXGLOVE_SCENE_SCHEMA,
