@@ -21,6 +21,7 @@ from copem_replay.cli.terminal import (
     Logs,
     ToS,
     print_answer,
+    print_first_notes,
     print_line,
     print_notes,
     print_problems,
@@ -190,7 +191,9 @@ def _write_results(
         print_problems([f"pieces: {cache.computed} computed, {cache.found} found in {cache.store.where}"])
     skipped = [f"{path}: skipped: {reason}" for path, reason in study.skipped]
     costs = () if result.study is None else result.study.costs
-    print_notes([*place.notes, *skipped, *notes, *costs, *advice])
+    print_notes([*place.notes, *skipped])
+    print_first_notes(notes)
+    print_notes([*costs, *advice])
     print_problems(place.failed)
     decision = decide(result)
     print_table(format_summary(result.summary, width_of(sys.stdout)), decision.best)

@@ -143,6 +143,17 @@ def print_notes(lines: Iterable[str]) -> None:
     print_problems(f"note: {line}" for line in lines)
 
 
+MOST_NOTES = 8
+"""More lines are not read: the rest is in `info` and in the results."""
+
+
+def print_first_notes(lines: Sequence[str]) -> None:
+    """Print the first notes on stderr, and how many more there are."""
+    print_notes(lines[:MOST_NOTES])
+    if (more := len(lines) - MOST_NOTES) > 0:
+        print_notes([f"{more} more: `copem-replay info LOG`, and `notes` in provenance.json of the results"])
+
+
 def print_verdicts(verdicts: Judgement) -> None:
     """Print verdicts on stdout: the table, what is undecided and why, and how many pass."""
     from copem_replay.results.verdicts import verdicts_text

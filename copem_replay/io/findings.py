@@ -149,6 +149,15 @@ class Finding(str):
         made.rule, made.number = rule, number
         return made
 
+    @property
+    def changes(self) -> bool:
+        """Whether figures may depend on it."""
+        return self.rule in RULES and RULES[self.rule].changes
+
+    def as_json(self) -> list[str | int]:
+        """As plain data, of which `Finding(*data)` makes the same."""
+        return [str(self), self.rule, self.number]
+
     def within(self, label: str) -> Finding:
         """The same, of what `label` names: `unit rsu: …`."""
         return Finding(f"{label}: {self}", self.rule, self.number)

@@ -305,7 +305,8 @@ _PROVENANCE = (
     Column("runs", "whole number", "runs of the experiment"),
     Column("logs", "list",
            "of each log: its name `log`, the `topic` of its truth, the file's `sha256`, `truth`, the SHA-256 of what "
-           "was read of it, and its `tags`"),
+           "was read of it, its `tags`, and what was left out or mended of it, `read`: `number`, `what`, and whether "
+           "it `changes` figures"),
     Column("logs_skipped", "list", "recordings that were left out: `log` and `reason`"),
     Column("visibility", "text", "how visible shares are worked out"),
     Column("max_gap_s", "number", "longest gap of the truth that is interpolated"),
