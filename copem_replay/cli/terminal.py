@@ -148,10 +148,10 @@ MOST_NOTES = 8
 
 
 def print_first_notes(lines: Sequence[str]) -> None:
-    """Print the first notes on stderr, and how many more there are."""
+    """Print the first notes on stderr, and where the others are."""
     print_notes(lines[:MOST_NOTES])
-    if (more := len(lines) - MOST_NOTES) > 0:
-        print_notes([f"{more} more: `copem-replay info LOG`, and `notes` in provenance.json of the results"])
+    if len(lines) > MOST_NOTES:
+        print_notes(["further notes: `copem-replay info LOG`, and provenance.json of the results"])
 
 
 def print_verdicts(verdicts: Judgement) -> None:

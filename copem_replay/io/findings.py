@@ -203,11 +203,8 @@ def sift_states(values: Float, kept: Bool, findings: list[str]) -> tuple[Float, 
             values[:, column] = 0.0
             findings += find(rule, int(kept.sum()))
     usable = kept.copy()
-    for rule, rows in (
-        ("position", np.isnan(values[:, : Z + 1]).any(axis=1) & ~far),
-        ("far", far),
-        ("yaw", np.isnan(values[:, YAW])),
-    ):
+    nowhere = np.isnan(values[:, : Z + 1]).any(axis=1)
+    for rule, rows in (("position", nowhere & ~far), ("far", far), ("yaw", np.isnan(values[:, YAW]))):
         findings += find(rule, int((usable & rows).sum()))
         usable &= ~rows
     return values, usable
@@ -322,4 +319,4 @@ def sift_shares(share: Float, rule: str, findings: list[str], most: float = 1.0)
 
 
 _ROUNDING = 1e-3
-"""A probability that is as little above 1 is 1: numbers of 16 bits, and sums of shares."""
+"""A probability as little above 1 is 1: numbers of 16 bits, sums of shares."""

@@ -24,10 +24,9 @@ from copem_replay.core.tracks import CLASSES, VALUES, Bool, Float, Int
 from copem_replay.io.channel import Channel, schema_name
 from copem_replay.io.encodings import make_definition
 from copem_replay.io.encodings.columns import DefinitionError
-from copem_replay.io.findings import find
+from copem_replay.io.findings import VX, VY, YAW, X, Z, find
 from copem_replay.io.ground_truth import MAX_GAP_S, DecodedObjects
 from copem_replay.io.log import Log, gather_messages
-from copem_replay.io.schemas.description import VX, VY, YAW, X, Z
 from copem_replay.io.schemas.object_lists import (
     ClassField,
     DecodedLists,

@@ -43,7 +43,7 @@ from copem_replay.io.log import BrokenIndexError, Log, gather_messages
 from copem_replay.io.open import Local, open_log
 from copem_replay.io.schemas import osi_ground_truth as osi
 from copem_replay.io.schemas.object_lists import DecodedLists
-from copem_replay.io.schemas.osi_ground_truth import SENSOR_DATA, check_osi, load_sensor_data_class, osi_id
+from copem_replay.io.schemas.osi_ground_truth import SENSOR_DATA, check_osi, load_message_class, osi_id
 from copem_replay.io.schemas.registry import DETAIL_SCHEMA, known_lists
 from copem_replay.io.stamps import settle_stamps
 from copem_replay.io.window import Window
@@ -228,7 +228,7 @@ def _read_messages(log: Log, topic: str) -> tuple[_EntryRows, dict[int, dict[str
                 details[content["available_ns"]] = {item["id"]: item for item in content["objects"]}
         else:
             try:
-                message_class = load_sensor_data_class()
+                message_class = load_message_class(SENSOR_DATA)
                 check_osi(message_class, payload)
                 message = message_class.FromString(payload)
                 check_objects(len(message.moving_object))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -51,7 +51,6 @@ if TYPE_CHECKING:
 
 
 _TOPIC = ("read", "topic")  # the key of an experiment that names the topic of the truth
-_GUIDE = "(docs/guide/recordings.md)"
 _NO_TRUTH = "lists of a unit they can be, not the truth"
 _SHOWN = 12  # ids or topics named in an error; the rest is counted
 
@@ -382,12 +381,8 @@ def _decode_topic(log: Log, topic: str) -> DecodedObjects:
     channels = {c.number: c for c in log.channels if c.topic == topic and is_truth(c)}
     decoder = osi.GroundTruthDecoder(DecodeAllowance(log.file_bytes()))
     try:
-        if log.window is not None:  # simulators write the road, and what stands, in the first message alone
-            for number, log_time_ns, payload in log.within(None).payloads(frozenset(channels)):
-                if log_time_ns >= log.window.from_ns and log.indexed:
-                    break
-                if log_time_ns < log.window.from_ns:
-                    decoder.add_earlier(payload, channels[number].schema)
+        for number, payload in _find_earlier(log, channels):
+            decoder.add_earlier(payload, channels[number].schema)
         for number, log_time_ns, payload in log.payloads(frozenset(channels)):
             decoder.add(
                 payload, schema=channels[number].schema, log_time_ns=log_time_ns, ahead_ns=channels[number].ahead_ns
@@ -395,6 +390,23 @@ def _decode_topic(log: Log, topic: str) -> DecodedObjects:
         return decoder.columns()
     except OversizeError as error:
         raise RecordingError(str(error), path=log.path, topic=topic) from None
+
+
+def _find_earlier(log: Log, channels: Mapping[int, Channel]) -> Iterator[tuple[int, bytes]]:
+    """Channel number and payload of messages before the window: simulators write the road, and what stands, once.
+
+    After the first one they are read where that has things that stand, and the window begins without.
+    """
+    if log.window is None or log.window.from_ns <= 0:
+        return
+    numbers, before = frozenset(channels), log.within(Window(to_ns=log.window.from_ns - 1))
+    earlier = ((number, payload) for number, _, payload in before.payloads(numbers))
+    if (first := next(earlier, None)) is not None:
+        yield first
+        _, _, begins = next(log.payloads(numbers), (*first[:1], 0, first[1]))
+        schema = channels[first[0]].schema
+        if osi.sends_standing(first[1], schema) and not osi.sends_standing(begins, schema):
+            yield from earlier
 
 
 def _describe_damage(log: Log, topic: str, end_s: float | None) -> str | None:

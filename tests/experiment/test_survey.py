@@ -216,7 +216,7 @@ def test_no_truth_says_what_there_is(path):
     assert reason == (
         f"{path}: no list of true objects; it holds nav_msgs/msg/Odometry (cdr) on /odom, osi3.SensorData on rsu; "
         "beside a recording that has one its lists replay by `together: [THAT, THIS]`; "
-        "`read: {topic: …, objects: …, id: …}` names the fields of a list of any schema (docs/guide/recordings.md)"
+        "`read: {topic: …, objects: …, id: …}` names the fields of any list (docs/guide/recordings.md)"
     )
     assert describe_survey(found) == [
         "log.mcap",

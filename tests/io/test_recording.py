@@ -230,7 +230,7 @@ def test_no_channel_with_objects(path):
         "no list of true objects; it holds nav_msgs/msg/Odometry (cdr) on /odom, osi3.SensorData on rsu, "
         "osi3.GroundTruth (json) on truth; "
         "beside a recording that has one its lists replay by `together: [THAT, THIS]`; "
-        "`read: {topic: …, objects: …, id: …}` names the fields of a list of any schema (docs/guide/recordings.md)"
+        "`read: {topic: …, objects: …, id: …}` names the fields of any list (docs/guide/recordings.md)"
     )
 
 

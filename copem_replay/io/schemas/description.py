@@ -114,10 +114,3 @@ class Description:
     solid: SolidField | None = None
     largest_of: str | None = None
     stays: str | None = None
-
-
-# Decoded lists of one topic as flat columns: not corrected, and in the order of the messages.
-
-
-X, Y, Z, YAW, VX, VY = range(6)
-"""Columns of `values`, the first of `tracks.VALUES`."""

@@ -13,6 +13,7 @@ import sys
 from array import array
 from contextlib import suppress
 from functools import cache
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -174,11 +175,7 @@ class GroundTruthDecoder:
     """
 
     def __init__(self, allowance: DecodeAllowance) -> None:
-        # Imported here: 0.03 s that `--help` need not pay.
-        from osi3.osi_groundtruth_pb2 import GroundTruth
-        from osi3.osi_sensorview_pb2 import SensorView
-
-        self._message_of = {GROUND_TRUTH: GroundTruth, SENSOR_VIEW: SensorView}
+        self._message_of = {schema: load_message_class(schema) for schema in TRUTH_SCHEMAS}
         self._allowance = allowance
         self._stamp_ns = array("q")
         self._stamped = array("b")
@@ -518,8 +515,15 @@ def osi_id(object_id: str) -> int:
     return int(object_words([object_id])[0])
 
 
-def load_sensor_data_class() -> Any:
-    """The SensorData class, imported when first needed."""
-    from osi3.osi_sensordata_pb2 import SensorData
+def sends_standing(payload: bytes, schema: str) -> bool:
+    """Whether a message of ground truth has stationary objects."""
+    with suppress(DecodeError):
+        message = load_message_class(schema).FromString(payload)
+        return bool((message.global_ground_truth if schema == SENSOR_VIEW else message).stationary_object)
+    return False
 
-    return SensorData
+
+def load_message_class(schema: str) -> Any:
+    """The class of a schema's messages, imported when first needed."""
+    name = schema.removeprefix("osi3.")
+    return getattr(import_module(f"osi3.osi_{name.lower()}_pb2"), name)
