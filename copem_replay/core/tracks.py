@@ -316,6 +316,17 @@ class Tracks:
         return order, bounds
 
     @cached_property
+    def by_object(self) -> tuple[Int, Int]:
+        """Rows (P,) unit by unit, then object by object, those of no object first, then in order of capture.
+
+        And where those of each unit and object begin, (U · (O + 1) + 1,), O the highest object index + 1.
+        """
+        objects = int(self.object_ix.max(initial=-1)) + 2
+        key = self.row_unit_ix * objects + self.row_object_ix + 1
+        order = np.lexsort((self.row_captured_s, key))
+        return order, np.searchsorted(key[order], np.arange(len(self.units) * objects + 1))
+
+    @cached_property
     def west_to_east(self) -> Int:
         """(P,) rows list by list, in each from west to east, and at one place the first object first; of one run."""
         return np.lexsort((self.row_object_ix, self.x_m[0], self.frame_ix))

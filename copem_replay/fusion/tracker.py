@@ -79,6 +79,7 @@ class Tracker(ListFusion):
         return self
 
     resumable: ClassVar[bool] = True
+    remembers: ClassVar[bool] = True
     # `stale`, too: it takes late lists for the present, so it claims to show that.
     tells_of: ClassVar[TellsOf] = "now"
 

@@ -33,7 +33,7 @@ from copem_replay.pipeline.study_log import compute_log_digests, read_content_di
 from copem_replay.results.folder import MARK
 from copem_replay.results.table_files import AGAIN
 
-FORMAT = 4
+FORMAT = 5
 """The format of results folders: raised when columns, files or their meaning change so that readers have to know."""
 
 _LIBRARIES = (

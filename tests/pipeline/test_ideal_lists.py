@@ -272,7 +272,7 @@ def test_overtaken_lists_count_in_exact_times_and_in_runs(tmp_path: Path, monkey
     twice = plan.model_copy(
         update={"measure": plan.measure.model_copy(update={"confirm": Confirm(hits=2, of=3), "exact": True})}
     )
-    with pytest.raises(ExperimentError, match=r"lists arrive up to 0\.35 s after lists captured later, and confirm"):
+    with pytest.raises(ExperimentError, match=r"lists that count as one hit arrive up to 0\.35 s apart, and confirm"):
         run_experiment(twice, [parked(3)])
 
 

@@ -18,7 +18,7 @@ def older(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (place / "e.yaml").write_text(changed("show: {run: 0}"))
     folder = cr.run(place / "e.yaml").save(place / "old")
     said = json.loads((folder / "provenance.json").read_text())
-    assert said.pop("format") == 4
+    assert said.pop("format") == 5
     (folder / "provenance.json").write_text(json.dumps(said))
     return folder
 
@@ -34,7 +34,7 @@ def test_an_older_format_is_refused(older: Path, name: str) -> None:
     with pytest.raises(cr.InputError) as failure:
         getattr(cr, name)(older)
     again = "run the experiment again with --overwrite"
-    assert failure.value.problems == (f"{older}: expected results of format 4, found format 1; {again}",)
+    assert failure.value.problems == (f"{older}: expected results of format 5, found format 1; {again}",)
 
 
 @pytest.mark.parametrize("read", [cr.load_results, cr.compare])
