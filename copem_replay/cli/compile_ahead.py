@@ -12,10 +12,10 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from copem_replay.core.kernel_cache import is_cached
 from copem_replay.core.tracks import Float, Tracks
 from copem_replay.perception.visibility import Observers, Statics, VisibilityModel
 
@@ -51,8 +51,7 @@ def _is_compiled() -> bool:
     """Whether the cache has what takes the second process longest, compiled for these arguments or for others."""
     from copem_replay.metrics.accuracy.kernel import add_up
 
-    kernel: Any = add_up
-    return any(Path(kernel.stats.cache_path).glob("*.add_up-*.nbi"))
+    return is_cached(add_up)
 
 
 def _is_room() -> bool:

@@ -107,6 +107,11 @@ class ObjectLists:
         one: Entries = self.entries[self.start[run, number] : self.start[run, number + 1]]
         return one
 
+    @property
+    def longest(self) -> int:
+        """The number of entries in the longest list."""
+        return int(np.diff(self.start, axis=1).max(initial=0))
+
 
 @dataclass(frozen=True)
 class Inputs:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from copem_replay.core.compiled import kernel
+from copem_replay.core.compiled import callee, kernel
 from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int, Tracks
 from copem_replay.fusion.ideal import floor_covariances
 from copem_replay.fusion.interface import ConstantVelocity
@@ -89,7 +89,7 @@ def _filter_objects(heard: _Heard, listed: _Listed, q_m2ps3: float, speed_var_m2
                 out[7, s, p] = (P_now[2, 2] + P_now[3, 3]) / 2
 
 
-@kernel
+@callee
 def _insert(sequence: Int, n: int, row: int, captured_s: Float) -> int:
     # Puts a row into the first n, which are in order of capture, after those of its own; the place.
     place = n
@@ -100,7 +100,7 @@ def _insert(sequence: Int, n: int, row: int, captured_s: Float) -> int:
     return place
 
 
-@kernel
+@callee
 def _filter(
     heard: _Heard, s: int, sequence: Int, changed: int, q_m2ps3: float, speed_var_m2ps2: float, states: Float, P: Float
 ) -> None:

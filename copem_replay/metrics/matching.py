@@ -30,7 +30,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from copem_replay.core.compiled import borrowing, kernel
+from copem_replay.core.compiled import borrowing, borrowing_kernel
 from copem_replay.core.geometry import count_below
 from copem_replay.core.object_list import Entries, ObjectLists, TellsOf, most_probable_class
 from copem_replay.core.tracks import AGREE, SAME_INSTANT_S, Bool, Float, Int, Scene, Tracks
@@ -64,7 +64,9 @@ def match_entries(
     """
     out = _allocate_matches(lists)
     rows = _sort_truth_rows(world, scene, by_frame=tells_of == "now")
-    _match_lists(lists.start, lists.entries, origins, rows, rows, AGREE, gate_m + _TOLERANCE_M, out, out)
+    _match_lists(
+        lists.start, lists.entries, origins, rows, rows, AGREE, gate_m + _TOLERANCE_M, out, out, _make_scratch(lists)
+    )
     return Matches(*out)
 
 
@@ -78,8 +80,14 @@ def match_at_both_times(
     about = _allocate_matches(lists)
     at_once = _allocate_matches(lists)._replace(class_ix=about.class_ix)
     rows = _sort_truth_rows(then, scene, by_frame=False), _sort_truth_rows(now, scene, by_frame=True)
-    _match_lists(lists.start, lists.entries, origins, *rows, AGREE, gate_m + _TOLERANCE_M, about, at_once)
+    scratch = _make_scratch(lists)
+    _match_lists(lists.start, lists.entries, origins, *rows, AGREE, gate_m + _TOLERANCE_M, about, at_once, scratch)
     return Matches(*about), Matches(*at_once)
+
+
+def _make_scratch(lists: ObjectLists) -> Int:
+    # Two rows as long as the longest list.
+    return np.empty((2, lists.longest), dtype=np.int64)
 
 
 class _MatchColumns(NamedTuple):
@@ -125,34 +133,14 @@ def most_probable_entry_class(entries: Entries, i: int) -> int:
     return most_probable_class(entries[i].class_probability)
 
 
-@kernel
+@borrowing_kernel
 def _match_lists(
-    start: Int,
-    entries: Entries,
-    origins: Origins,
-    rows: _TruthRows,
-    now: _TruthRows,
-    agree: Bool,
-    gate_m: float,
-    about: _MatchColumns,
-    at_once: _MatchColumns,
-) -> None:
-    # `now`, `at_once`: truth and matches of the second question; those of the first one where there is no second.
-    longest = 0
-    for s in range(len(start)):
-        for k in range(start.shape[1] - 1):
-            longest = max(longest, start[s, k + 1] - start[s, k])
-    # Of the list at hand: the frame each entry is compared with, and the entries that go through step 2.
-    frame, others = np.empty(longest, np.int64), np.empty(longest, np.int64)
-    _match_each_list(start, entries, origins, rows, now, agree, gate_m, about, at_once, (frame, others))
-
-
-@borrowing
-def _match_each_list(
     start: Int, entries: Entries, origins: Origins, rows: _TruthRows, now: _TruthRows, agree: Bool, gate_m: float,
-    about: _MatchColumns, at_once: _MatchColumns, scratch: tuple[Int, Int],
+    about: _MatchColumns, at_once: _MatchColumns, scratch: Int,
 ) -> None:  # fmt: skip
-    frame, others = scratch
+    # `now`, `at_once`: truth and matches of the second question; those of the first one where there is no second.
+    # Of the list at hand: the frame each entry is compared with, and the entries that go through step 2.
+    frame, others = scratch[0], scratch[1]
     both = rows.by_frame != now.by_frame
     for s in range(len(start)):
         for k in range(start.shape[1] - 1):

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from copem_replay.communication.arrivals import FusionSchedule, SentEntries, fusion_schedule, keep_entries
-from copem_replay.core.compiled import borrowing
+from copem_replay.core.compiled import borrowing_kernel
 from copem_replay.core.fused_tracks import EntrySources, FusedTracks, find_newest_and_first
 from copem_replay.core.interpolation import AROUND_S
 from copem_replay.core.object_list import COVARIANCES, ENTRY, ObjectLists, TellsOf
@@ -110,7 +110,7 @@ _CLASS = _EXISTENCE + 1
 """Places in an entry, in words of eight bytes; states and covariances stand before them."""
 
 
-@borrowing
+@borrowing_kernel
 def _fill_words(
     valid: Bool, order: Int, bounds: Int, states: Float, classes: NDArray[np.int8], source: EntrySources,
     start: Int, words: Float, ids: Int, row_object_ix: Int, object_ix: Int,

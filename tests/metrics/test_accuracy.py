@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from numba import njit
 
 from copem_replay.core.object_list import Entries, ObjectLists
 from copem_replay.core.tracks import CLASSES
@@ -47,6 +48,8 @@ from tests.oracles.accuracy import (
     truth_of,
 )
 from tests.oracles.origin import unknown_origins
+
+expect_gated_nees = njit(expect_gated_nees)  # as kernels call it
 
 EGO, CAR, OTHER_CAR = 0, 1, 2
 NOTHING = one_list()

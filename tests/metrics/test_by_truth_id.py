@@ -20,10 +20,10 @@ from copem_replay.metrics.detection.by_match import FirstMatches
 from copem_replay.metrics.detection.by_truth_id import FirstDetections, detect_by_truth_id
 from copem_replay.metrics.detection.turns import number_turns
 from copem_replay.metrics.episodes import Episodes
-from tests.helpers.drawn import examples
 from copem_replay.metrics.matching import MATCH
 from copem_replay.metrics.origin import GoesBack, OriginLists, Origins
 from copem_replay.pipeline.receiver import convert_to_lists
+from tests.helpers.drawn import examples
 from tests.oracles.accuracy import episodes_of, matches_of, scene_of
 from tests.oracles.origin import Heard, numbered
 

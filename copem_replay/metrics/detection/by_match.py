@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from copem_replay.core.compiled import borrowing, kernel
+from copem_replay.core.compiled import borrowing, callee, kernel
 from copem_replay.core.object_list import Entries, ObjectLists
 from copem_replay.core.tracks import SAME_INSTANT_S, Float, Int
 from copem_replay.metrics.config import Confirm
@@ -156,7 +156,7 @@ def _is_newer(holdings: Holdings, a: int, b: int) -> bool:
     return bool(later_s > SAME_INSTANT_S or (later_s >= -SAME_INSTANT_S and a < b))
 
 
-@kernel
+@callee
 def _sort_by_episode(
     s: int, lists: MatchedLists, stays: EpisodeWindows, episode: Int, first: Int, row: Int, number: Int
 ) -> None:

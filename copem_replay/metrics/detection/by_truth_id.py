@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from copem_replay.communication.arrivals import first_newer_arrival_s
-from copem_replay.core.compiled import borrowing, kernel
+from copem_replay.core.compiled import borrowing, callee, kernel
 from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int, Tracks
 from copem_replay.metrics.config import Confirm
 from copem_replay.metrics.detection.turns import number_turns
@@ -178,7 +178,7 @@ def _is_newer(rows: _ListedRows, p: int, q: int) -> bool:
     return bool(later_s > SAME_INSTANT_S or (later_s >= -SAME_INSTANT_S and rows.unit_ix[p] < rows.unit_ix[q]))
 
 
-@kernel
+@callee
 def _is_confirmed(marks: Int, token: int, instant: int, hits: int, of: int, group: Int) -> bool:
     # Whether `hits` of `of` consecutive instants or turns of one group, this one among them, hold the object.
     for start in range(instant - of + 1, instant + 1):
