@@ -294,9 +294,7 @@ def _advise_reading(log: Log) -> str:
     """What to do with a recording without truth: name fields, where a topic has an encoding that is read."""
     encodings = {c.encoding for c in log.channels if c.messages}
     if encodings & {*ENCODINGS}:
-        return (
-            "`read: {topic: …, objects: …, id: …}` names the fields of a list of any schema (docs/guide/recordings.md)"
-        )
+        return "`read: {topic: …, objects: …, id: …}` names the fields of any list (docs/guide/recordings.md)"
     return f"messages encoded as {', '.join(sorted(encodings))} are not read; {', '.join(ENCODINGS)} are"
 
 
