@@ -86,7 +86,6 @@ def run(
     viewer: Annotated[str | None, typer.Option(metavar="URL", help="Address of that viewer [on this machine].")] = None,
 ) -> int:
     """Replay an experiment, write its results, print the summary."""
-    from copem_replay.cli.compile_ahead import compile_ahead
     from copem_replay.pipeline.parts import PartCache
     from copem_replay.results.decision import describe_verdicts
     from copem_replay.results.folder import take_place
@@ -98,7 +97,7 @@ def run(
     if cluster is not None:
         load_extra("workers", "address")(cluster)
         pieces = pieces or f"{out}.pieces"
-    with compile_ahead(), take_place(out, overwrite=overwrite) as place:
+    with take_place(out, overwrite=overwrite) as place:
         print_notes(place.notes)
         place.notes.clear()
         cache = None if pieces is None else PartCache(pieces)

@@ -46,13 +46,6 @@ def cache_note() -> str | None:
         return None
 
 
-def is_cached(kernel: Any) -> bool:
-    """Whether a kernel's code of today's sources is in the cache, for whichever arguments."""
-    function = kernel.py_func
-    digest = _digest(function.__code__.co_filename)
-    return any(Path(kernel.stats.cache_path).glob(f"*.{function.__qualname__}-*-{digest}.*.nbi"))
-
-
 _naming = Lock()
 
 
@@ -129,19 +122,24 @@ class KernelLocator:
         os.replace(new, self._sums)
 
     def _forget_damaged(self) -> None:
-        # Without its index Numba finds no code of a function.
+        # Without its index Numba finds no code of a function. While a process writes, index and checksums differ.
         index = self._folder / f"{self._files}.nbi"
-        if not index.exists():
-            return
+        if index.exists() and not self._is_whole(index.name):
+            _writing.begin(self)
+            try:
+                if not self._is_whole(index.name):
+                    index.unlink(missing_ok=True)
+            finally:
+                _writing.end()
+
+    def _is_whole(self, index: str) -> bool:
         try:
             sums = json.loads(self._sums.read_bytes())
-            whole = index.name in sums and all(
+            return index in sums and all(
                 zlib.crc32((self._folder / name).read_bytes()) == crc for name, crc in sums.items()
             )
         except (OSError, ValueError, TypeError, AttributeError):  # missing, or damaged itself
-            whole = False
-        if not whole:
-            index.unlink(missing_ok=True)
+            return False
 
 
 # Numba names files of code by number: the first that its index does not have. Where two processes wrote code of one

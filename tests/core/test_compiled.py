@@ -272,9 +272,6 @@ from copem_replay.core import kernel_cache
 from copem_replay.core.compiled import kernel
 from copem_replay.core.geometry import is_in_polygon
 
-one, which = kernel(is_in_polygon), sys.argv[2]
-write = one._cache._cache_file._save_data
-
 def write_when_told(name, data):
     print("writes", flush=True)
     sys.stdin.readline()
@@ -287,29 +284,42 @@ def sleep(seconds):
 
 sleep.told = False
 kernel_cache.time.sleep = sleep
-if which == "whole numbers":
+one, which = kernel(is_in_polygon), sys.argv[2]
+write = one._cache._cache_file._save_data
+if which == "first":
     one._cache._cache_file._save_data = write_when_told
-x, y = (1, 1) if which == "whole numbers" else (0.5, 0.5)
+if which == "second":
+    print("ready", flush=True)
+    sys.stdin.readline()
+x, y = (1, 1) if which in ("first", "whole numbers") else (0.5, 0.5)
 print(bool(one(x, y, np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]]))), sum(one.stats.cache_hits.values()))
 """
 
 
 def test_two_processes_that_compile_at_once_do_not_take_the_code_of_one_another(tmp_path: Path) -> None:
-    """For whole numbers, and for floats: the second one waits while the first one writes, and both codes are found."""
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
-    first, second = (
-        subprocess.Popen(
-            [sys.executable, "-c", WRITES, str(tmp_path), which], cwd=PACKAGE.parent, env=environment, text=True,
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-        )
-        for which in ("whole numbers", "floats")
-    )  # fmt: skip
-    with first, second:
-        for process, said in ((first, "writes\n"), (second, "waits\n")):
-            assert process.stdout is not None
-            assert process.stdout.readline() == said
-        assert first.communicate("\n", timeout=100)[0] == "True 0\n"
-        assert second.communicate(timeout=100)[0] == "True 0\n"
+    """For whole numbers, and for floats: others wait while the first one writes, and both codes are found."""
+
+    def begin(which: str) -> subprocess.Popen[str]:
+        return subprocess.Popen(
+            [sys.executable, "-c", WRITES, str(tmp_path), which], cwd=PACKAGE.parent, text=True,
+            env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        )  # fmt: skip
+
+    with begin("second") as second:
+        assert second.stdout is not None
+        assert second.stdout.readline() == "ready\n", "its kernel is decorated: the cache is empty"
+        first = begin("first")
+        assert first.stdout is not None
+        assert first.stdout.readline() == "writes\n"
+        assert second.stdin is not None
+        print(file=second.stdin, flush=True)
+        assert second.stdout.readline() == "waits\n"
+        with first, begin("whole numbers") as late:
+            assert late.stdout is not None
+            assert late.stdout.readline() == "waits\n", "what is half written is not taken for damaged"
+            assert first.communicate("\n", timeout=100)[0] == "True 0\n"
+            assert second.communicate(timeout=100)[0] == "True 0\n"
+            assert late.communicate(timeout=100)[0] == "True 1\n"
     for which in ("whole numbers", "floats"):
         assert python(WRITES, tmp_path, which) == "True 1\n"
 
