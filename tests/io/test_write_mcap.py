@@ -543,6 +543,7 @@ Written(folder)
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("stop", [1, 300, 1200])
 def test_killed_at_any_moment_no_half_written_file_has_the_name(tmp_path: Path, stop: int) -> None:
     code = KILLED.format(tests=str(Path(__file__).parents[2]), folder=str(tmp_path), stop=stop)

@@ -467,6 +467,7 @@ def test_a_recording_of_foxglove_gets_scene_updates_in_its_own_frame(tmp_path: P
     assert {entity.frame_id for update in updates for entity in update.entities} == {"odom"}
 
 
+@pytest.mark.long
 def test_a_real_recording_of_autoware(tmp_path: Path) -> None:
     source = SHARED / "nuscenes_scene0916_autoware_ros2.mcap"
     if not source.exists():
