@@ -147,6 +147,8 @@ def draw_experiment(path: Path, rng: np.random.Generator, *, recorded: bool) -> 
     units |= {n: {"recorded": {"topic": n, "covariance_m2": covariance}} for n in ("in0", "in1") if recorded}
     gamma = {"kind": "gamma", "min_s": 0.01, "mean_s": float(rng.choice([0.05, 0.3])), "shape": 1.0}
     lost = {"kind": "constant", "probability": float(rng.choice([0.5, 0.8, 1.0]))}
+    link = {"latency": gamma, "order": str(rng.choice(["kept", "free"])), "reception": lost}
+    link |= {"channel": {"kbps": float(rng.choice([20, 200]))}} if rng.random() < 0.3 else {}
     common = {"units": list(units)} | draw_receiver(rng)
     tracker = {"kind": "tracker", "late": str(rng.choice(["stale", "predict", "replay"]))}
     configurations = {"ideal": common} | {
@@ -165,8 +167,7 @@ def draw_experiment(path: Path, rng: np.random.Generator, *, recorded: bool) -> 
     }  # fmt: skip
     return Experiment.model_validate({
         "version": 1, "logs": [str(path)], "runs": 2, "seed": int(rng.integers(1, 99)), "pems": pems, "units": units,
-        "links": {"l": {"latency": gamma, "order": str(rng.choice(["kept", "free"])), "reception": lost}},
-        "configurations": configurations, "measure": measure,
+        "links": {"l": link}, "configurations": configurations, "measure": measure,
     })  # fmt: skip
 
 
