@@ -19,7 +19,6 @@ from copem_replay.cli.terminal import (
     OneDrive,
     ToS,
     print_blocks,
-    print_first_notes,
     print_line,
     print_notes,
     print_problems,
@@ -130,8 +129,7 @@ def check(
     replays, warnings = prepare_study(study)
     counted = [count_counted(one.episodes.count_began(), study.experiment.measure.began) for one in replays]
     undecided = note_undecidable(study.experiment.criteria, counted)
-    print_first_notes(list_notes(study.recordings, replays, study.experiment, replayed=False))
-    print_notes([*warnings, *undecided])
+    print_notes([*list_notes(study.recordings, replays, study.experiment, replayed=False), *warnings, *undecided])
     for line in list_began(replays, study.experiment):
         print_line(line)
     print_line(f"{experiment}: no problem found; logs: {', '.join(r.scene.log for r in study.recordings)}")
