@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from copem_replay.api.results import AnyResults, take_results
 from copem_replay.core.errors import InputError
+from copem_replay.core.extras import load_extra
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -222,6 +223,14 @@ def write_figures(
     read = take_results(results)
     selection = Selection(configurations, log, object_id, run, sliced=summarise_slices(read, by))
     return write_figure_files(read, None if folder is None else Path(folder), selection)
+
+
+if not TYPE_CHECKING:  # with it type checkers would accept every name
+
+    def __getattr__(name: str) -> object:
+        if name == "write_film":  # its name of before; now `cr.write_film`, of an extra
+            return load_extra("name of the API", name)
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:

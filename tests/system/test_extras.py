@@ -75,6 +75,7 @@ def test_names_of_the_api_are_those_of_the_table() -> None:
         module, _, attribute = place.partition(":")
         assert getattr(cr, name) is getattr(import_module(f"copem_replay.extras.{module}"), attribute)
         assert name in cr.__all__
+    assert cr.plot.write_film is cr.write_film, "its name of before"
 
 
 def test_the_core_replays_compares_and_reports_without_extras(core: Core, tmp_path: Path) -> None:
