@@ -12,11 +12,11 @@ from mcap.writer import Writer
 
 import copem_replay as cr
 from copem_replay.cli import main as cli
-from copem_replay.cli.results import layout
 from copem_replay.core.colours import configuration_colours
 from copem_replay.core.errors import InputError
 from copem_replay.experiment.file import log_paths, read_experiment_file
 from copem_replay.experiment.validate import find_problems, read_logs
+from copem_replay.extras.layout.command import layout
 from copem_replay.extras.layout.layout import build_layout, quote_topic, split_panels
 from copem_replay.results.folder import read_made_names
 from tests.helpers import experiments
