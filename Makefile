@@ -41,7 +41,7 @@ quick: kernels
 test: kernels
 	$(BIN)/python -m pytest -q -n 3 --dist loadfile -m "not long"
 
-# The rest: commands that are killed, what pages and notebooks print, browsers, other processors; 200 drawn examples.
+# The rest: commands that are killed, what pages print, real recordings, browsers, other processors; 200 drawn examples.
 test-long: kernels
 	ALL_EXAMPLES=1 $(BIN)/python -m pytest -q -n 3 --dist loadfile -m "long or hypothesis"
 

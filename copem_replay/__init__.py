@@ -14,8 +14,6 @@ from __future__ import annotations
 import importlib as _importlib
 from typing import TYPE_CHECKING
 
-from copem_replay.core.compiled import cache_note as _cache_note
-
 if TYPE_CHECKING:
     __version__: str
     from copem_replay.api import plot
@@ -175,8 +173,6 @@ _PLACES = {
 }
 """Exported names by the module that defines them."""
 _MODULE = {name: f"{__name__}.{module}" for module, names in _PLACES.items() for name in names.split()}
-
-_cache_note()  # before Numba is imported
 
 
 if not TYPE_CHECKING:  # with it type checkers would accept every name

@@ -34,8 +34,8 @@ _COMPUTED = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast
              ast.BitOr: ast.BitAnd, ast.FloorDiv: ast.Mult, ast.Mod: ast.Mult}  # fmt: skip
 _CALLED = {"min": "max", "minimum": "maximum", "any": "all", "sin": "cos", "argmin": "argmax", "floor": "ceil",
            "cumsum": "sort", "ones": "zeros"}  # fmt: skip
-_COMPILED = re.compile(r"\b(njit|borrowing|making)\b")
-"""What names compiled functions in a module (`core/compiled.py`)."""
+_COMPILED = "copem_replay.core.compiled import"
+"""What a module with compiled functions has; its mutants are compiled, which takes time."""
 _CALLED |= {after: before for before, after in _CALLED.items() if before != "cumsum"}
 
 
@@ -128,11 +128,9 @@ def chosen(count: int, seed: int) -> list[Mutant]:
 def killed_by(mutant: Mutant, copy: Path, *, near: bool) -> tuple[str, str]:
     """Among which tests (`module`, `wing`, `all`) one tells a mutant, and its name; ("", "") where none does."""
     place = copy / mutant.path.relative_to(ROOT)
-    kernel = _COMPILED.search(mutant.text) is not None
-    stale = _compiled_with(mutant, copy) if kernel else []
+    slower = 3 if _COMPILED in mutant.text else 1
     env = {"ALL_EXAMPLES": "1", **os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1", "CI": "true"}
     place.write_text(mutant.text, encoding="utf-8")
-    _forget(stale)
     try:
         for stage, tests in _stages(mutant, copy):
             if near and stage == "all":
@@ -140,9 +138,8 @@ def killed_by(mutant: Mutant, copy: Path, *, near: bool) -> tuple[str, str]:
             workers = "-n0" if len(tests) < 4 and stage == "module" else "-n2"
             command = [sys.executable, "-m", "pytest", "-x", "-q", workers, "-p", "no:cacheprovider", *tests]
             try:
-                done = subprocess.run(
-                    command, cwd=copy, env=env, capture_output=True, timeout=_LONGEST_S[stage] * (3 if kernel else 1)
-                )
+                longest_s = _LONGEST_S[stage] * slower
+                done = subprocess.run(command, cwd=copy, env=env, capture_output=True, timeout=longest_s)
             except subprocess.TimeoutExpired:
                 return stage, "no end"
             if done.returncode not in (0, 5):
@@ -150,30 +147,7 @@ def killed_by(mutant: Mutant, copy: Path, *, near: bool) -> tuple[str, str]:
                 return stage, failed[0] if failed else "no test began"
     finally:
         shutil.copy2(mutant.path, place)
-        _forget(stale)
     return "", ""
-
-
-def _compiled_with(mutant: Mutant, copy: Path) -> list[Path]:
-    """The modules whose compiled code may hold the mutant's: itself and what imports it, however far away.
-
-    Numba tells a change by the file that a function stands in, and does not notice one in a file it imports.
-    """
-    texts = {path: path.read_text(encoding="utf-8") for path in sorted((copy / "copem_replay").rglob("*.py"))}
-    found = [copy / mutant.path.relative_to(ROOT)]
-    for path in found:
-        name = ".".join(path.relative_to(copy).with_suffix("").parts)
-        imports = re.compile(
-            rf"\b{re.escape(name)} import|from {re.escape(name.rpartition('.')[0])} import .*\b{path.stem}\b"
-        )
-        found += [other for other, text in texts.items() if other not in found and imports.search(text)]
-    return found
-
-
-def _forget(modules: list[Path]) -> None:
-    for path in modules:
-        for cached in (path.parent / "__pycache__").glob(f"{path.stem}.*.nb[ic]"):
-            cached.unlink()
 
 
 def _stages(mutant: Mutant, copy: Path) -> Iterator[tuple[str, list[str]]]:

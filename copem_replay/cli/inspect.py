@@ -19,6 +19,7 @@ from copem_replay.cli.terminal import (
     OneDrive,
     ToS,
     print_blocks,
+    print_first_notes,
     print_line,
     print_notes,
     print_problems,
@@ -129,7 +130,8 @@ def check(
     replays, warnings = prepare_study(study)
     counted = [count_counted(one.episodes.count_began(), study.experiment.measure.began) for one in replays]
     undecided = note_undecidable(study.experiment.criteria, counted)
-    print_notes([*list_notes(study.recordings, replays, study.experiment, replayed=False), *warnings, *undecided])
+    print_first_notes(list_notes(study.recordings, replays, study.experiment, replayed=False))
+    print_notes([*warnings, *undecided])
     for line in list_began(replays, study.experiment):
         print_line(line)
     print_line(f"{experiment}: no problem found; logs: {', '.join(r.scene.log for r in study.recordings)}")

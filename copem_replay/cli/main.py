@@ -23,9 +23,10 @@ try:  # an interrupt during the imports, too, ends without a traceback
 
     from copem_replay.cli import inspect, results, run
     from copem_replay.cli.terminal import print_problems
-    from copem_replay.core.compiled import cache_note, recompiled_note
+    from copem_replay.core.compiled import call_in_room
     from copem_replay.core.errors import CopemError, InputError
     from copem_replay.core.extras import EXTRAS, has_extra, load_extra
+    from copem_replay.core.kernel_cache import cache_note
     from copem_replay.core.waiting import tell_waits
 except KeyboardInterrupt:
     print("interrupted", file=sys.stderr)
@@ -113,8 +114,8 @@ def main() -> None:
     exit_on_signals()
     tell_waits(lambda words: print_problems([words]))
     code = _run_to_exit_code()
-    if "numba" in sys.modules:  # something may have been compiled
-        print_problems(f"note: {note}" for note in (cache_note(), recompiled_note()) if note is not None)
+    if (note := cache_note()) is not None:
+        print_problems([f"note: {note}"])
     gc.freeze()  # else Python looks through all objects once more as it ends: up to half a second
     sys.exit(code)
 
@@ -128,7 +129,7 @@ def exit_on_signals() -> None:
 
 def _run_to_exit_code() -> int:
     try:
-        code = _call_command(sys.argv[1:])
+        code = call_in_room(_call_command, sys.argv[1:])
         if sys.stdout is not None:
             sys.stdout.flush()
         return code

@@ -21,6 +21,7 @@ from copem_replay.cli.terminal import (
     Logs,
     ToS,
     print_answer,
+    print_first_notes,
     print_line,
     print_notes,
     print_problems,
@@ -85,7 +86,6 @@ def run(
     viewer: Annotated[str | None, typer.Option(metavar="URL", help="Address of that viewer [on this machine].")] = None,
 ) -> int:
     """Replay an experiment, write its results, print the summary."""
-    from copem_replay.cli.compile_ahead import compile_ahead
     from copem_replay.pipeline.parts import PartCache
     from copem_replay.results.decision import describe_verdicts
     from copem_replay.results.folder import take_place
@@ -97,7 +97,7 @@ def run(
     if cluster is not None:
         load_extra("workers", "address")(cluster)
         pieces = pieces or f"{out}.pieces"
-    with compile_ahead(), take_place(out, overwrite=overwrite) as place:
+    with take_place(out, overwrite=overwrite) as place:
         print_notes(place.notes)
         place.notes.clear()
         cache = None if pieces is None else PartCache(pieces)
@@ -190,7 +190,9 @@ def _write_results(
         print_problems([f"pieces: {cache.computed} computed, {cache.found} found in {cache.store.where}"])
     skipped = [f"{path}: skipped: {reason}" for path, reason in study.skipped]
     costs = () if result.study is None else result.study.costs
-    print_notes([*place.notes, *skipped, *notes, *costs, *advice])
+    print_notes([*place.notes, *skipped])
+    print_first_notes(notes)
+    print_notes([*costs, *advice])
     print_problems(place.failed)
     decision = decide(result)
     print_table(format_summary(result.summary, width_of(sys.stdout)), decision.best)

@@ -143,6 +143,17 @@ def print_notes(lines: Iterable[str]) -> None:
     print_problems(f"note: {line}" for line in lines)
 
 
+MOST_NOTES = 8
+"""More lines are not read: the rest is in `info` and in the results."""
+
+
+def print_first_notes(lines: Sequence[str]) -> None:
+    """Print the first notes on stderr, and where the others are."""
+    print_notes(lines[:MOST_NOTES])
+    if len(lines) > MOST_NOTES:
+        print_notes(["further notes: `copem-replay info LOG`, and provenance.json of the results"])
+
+
 def print_verdicts(verdicts: Judgement) -> None:
     """Print verdicts on stdout: the table, what is undecided and why, and how many pass."""
     from copem_replay.results.verdicts import verdicts_text

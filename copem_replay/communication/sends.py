@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from copem_replay.core.compiled import kernel
+from copem_replay.core.compiled import callee, kernel
 from copem_replay.core.components import Count, Frozen
 from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int
 
@@ -130,7 +130,7 @@ def _choose_objects(
                 objects[listed.slot[r], 1:] = listed.state[r]
 
 
-@kernel
+@callee
 def _keep_most(listed: ListedObjects, differences: Float, first: int, after: int, most: int, included: Bool) -> None:
     """Of the rows `first` … `after` − 1 that are `included`, keep the `most` that are worth most, in place.
 

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from copem_replay.core.compiled import kernel, making
+from copem_replay.core.compiled import callee, kernel, making
 from copem_replay.core.tracks import Float, Int
 
 
@@ -82,7 +82,7 @@ def assign_pairs(row: Int, col: Int, cost: Float, n: int, m: int, partner: Int) 
     _augment_rows(start, choice, price, n, m, partner)
 
 
-@kernel
+@callee
 def spread_component_maximum(row: Int, col: Int, value: Float, n: int, m: int) -> None:
     """Puts the largest `value (P,)` of its connected component in the place of each pair's own."""
     parent, top = np.empty(n, np.int64), np.empty(n)
@@ -104,7 +104,7 @@ def spread_component_maximum(row: Int, col: Int, value: Float, n: int, m: int) -
         value[k] = top[_find_root(parent, row[k])]
 
 
-@kernel
+@callee
 def _find_root(parent: Int, i: int) -> int:
     """The row that stands for the component of row i; the way there gets shorter."""
     while parent[i] != i:

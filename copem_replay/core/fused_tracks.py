@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from copem_replay.core.compiled import borrowing
+from copem_replay.core.compiled import borrowing, borrowing_kernel
 from copem_replay.core.object_list import Entries, most_probable_classes
 from copem_replay.core.tracks import CLASSES, SAME_INSTANT_S, VALUES, Bool, Float, Int, Scene, Tracks, UnitFaults
 from copem_replay.core.view_geometry import ViewGeometry
@@ -186,7 +186,7 @@ def find_newest_and_first(sources: EntrySources, s: int, p: int) -> tuple[float,
     return newest_s, first
 
 
-@borrowing
+@borrowing_kernel
 def _find_of_each_row(sources: EntrySources, newest_s: Float, first: Int) -> None:
     """Fill `newest_s (S, P)` and `first (S, P)` with what `find_newest_and_first` gives of each row."""
     for s in range(newest_s.shape[0]):

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
-from copem_replay.core.compiled import borrowing, kernel
+from copem_replay.core.compiled import borrowing, borrowing_kernel, callee, kernel
 from copem_replay.core.tracks import Bool, Float, Int
 
 _TOUCH_M = 1e-9
@@ -21,7 +21,7 @@ _FINE_M = 1e-6
 """The search ends where the distance could be smaller by no more than this: far below what is known of positions."""
 
 
-@nb.njit(cache=True, inline="always")
+@nb.njit(inline="always")
 def _corner_distance2(
     x: float, y: float, c: float, s: float, al: float, aw: float, bl: float, bw: float
 ) -> tuple[float, bool]:
@@ -80,7 +80,7 @@ def pose_on_path(path: Float, s: float) -> tuple[float, float, float]:
     )
 
 
-@nb.njit(cache=True, inline="always")
+@nb.njit(inline="always")
 def _value_between(values: Float, place: float) -> float:
     """Value at a place between the instants: 2.5 is half way from instant 2 to instant 3."""
     k = int(place)
@@ -247,7 +247,7 @@ _MOST_CORNERS = 20
 there were: 4, 6, 9, 13, 19."""
 
 
-@kernel
+@callee
 def rotated_iou(
     x0: float, y0: float, yaw0: float, l0: float, w0: float,
     x1: float, y1: float, yaw1: float, l1: float, w1: float,
@@ -270,7 +270,7 @@ def rotated_iou(
     return float(both / (area0 + area1 - both))
 
 
-@kernel
+@callee
 def _intersection_area(
     dx: float, dy: float, yaw: float, length: float, width: float, by_yaw: float, by_length: float, by_width: float
 ) -> float:
@@ -297,7 +297,7 @@ def _intersection_area(
     return float(max(twice / 2, 0.0))
 
 
-@kernel
+@callee
 def _clip_polygon(polygon: Float, count: int, axis: int, side: float, reach: float, out: Float) -> int:
     """What of a polygon lies where side · coordinate ≤ reach; how many corners that has."""
     kept = 0
@@ -339,7 +339,7 @@ def is_in_polygon(x_m: float, y_m: float, corners_m: Float) -> bool:
     return inside
 
 
-@borrowing
+@borrowing_kernel
 def is_in_area(x_m: float, y_m: float, from_x_m: float, from_y_m: float, corners_m: Float, range_m: float) -> bool:
     """Whether a place is within a range of another one, and in a polygon; `corners_m` without corners: anywhere."""
     if np.hypot(x_m - from_x_m, y_m - from_y_m) > range_m + _EDGE_M:

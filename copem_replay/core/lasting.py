@@ -20,7 +20,7 @@ from typing import Literal
 import numba as nb
 import numpy as np
 
-from copem_replay.core.compiled import kernel
+from copem_replay.core.compiled import callee, kernel, vectorised_kernel
 from copem_replay.core.random import CounterRng, RandomKey, Words, normal_quantile, philox4x32, stable_hash
 from copem_replay.core.tracks import Bool, Float, Int
 
@@ -313,7 +313,7 @@ _AT_ONCE = 4
 """Renewals of a cell that are drawn in advance; a cell has 1 to 2 on average."""
 
 
-@kernel
+@callee
 def _advance_renewal(
     key: np.uint64,
     word: np.uint64,
@@ -334,7 +334,7 @@ def _advance_renewal(
         number, value = number + 1, v
 
 
-@kernel
+@callee
 def _find_last_renewal(
     key: np.uint64, word: np.uint64, run: np.uint64, cell: int, tau_ns: float, shift: int
 ) -> tuple[int, float]:
@@ -349,7 +349,7 @@ def _find_last_renewal(
         cell -= 1
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")  # a division that may raise is not compiled to vectors
+@vectorised_kernel
 def fill_held_rows(
     cells: tuple[Words, Words, Int, Int],
     stamp: Int,

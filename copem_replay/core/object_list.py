@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from copem_replay.core.compiled import borrowing, kernel
-from copem_replay.core.tracks import CLASS_GROUPS, CLASSES, Bool, Float, Int
+from copem_replay.core.tracks import CLASSES, Float, Int
 
 ENTRY = np.dtype(
     [
@@ -107,6 +107,11 @@ class ObjectLists:
         one: Entries = self.entries[self.start[run, number] : self.start[run, number + 1]]
         return one
 
+    @property
+    def longest(self) -> int:
+        """The number of entries in the longest list."""
+        return int(np.diff(self.start, axis=1).max(initial=0))
+
 
 @dataclass(frozen=True)
 class Inputs:
@@ -141,21 +146,6 @@ class Inputs:
 # The classes of entries.
 
 _OTHER = CLASSES.index("other")
-
-
-def _build_agreement() -> Bool:
-    agree = np.eye(len(CLASSES), dtype=np.bool_)
-    vehicle = CLASSES.index("vehicle")
-    agree[_OTHER] = agree[:, _OTHER] = True
-    for name in CLASS_GROUPS["vehicles"]:
-        agree[vehicle, CLASSES.index(name)] = agree[CLASSES.index(name), vehicle] = True
-    return agree
-
-
-AGREE: Bool = _build_agreement()
-"""(C, C) by indices into CLASSES: the classes are equal, or one is `other`, which says nothing, or one is `vehicle`
-(not said which) and the other one of the vehicles. Symmetric, not transitive: a car and a bicycle both agree with
-`other`."""
 
 
 @borrowing

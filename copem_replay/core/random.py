@@ -22,7 +22,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from copem_replay.core.compiled import kernel
+from copem_replay.core.compiled import callee, kernel, vectorised_kernel
 from copem_replay.core.tracks import Bool, Float, Int
 
 Words = NDArray[np.uint64]
@@ -137,7 +137,7 @@ def _draw_bernoulli(key: Words, word: Words, stamp: Words, runs: Words, probabil
             out[s, p] = _unit_interval(key[p], word[p], stamp[p], runs[s]) < probability[p]
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")  # else a division is a branch, and loops are not vectorised
+@vectorised_kernel
 def _draw_normal(key: Words, word: Words, stamp: Words, runs: Words, where: Bool, out: Float) -> None:
     everywhere = where.shape[0] == 1 and where.shape[1] == 1
     uniform = np.empty(out.shape[1])
@@ -181,7 +181,7 @@ def _central_quantile(q: float) -> float:
     return q * num / (den * r + 1.0)
 
 
-@kernel
+@callee
 def normal_quantile(u: float) -> float:
     """Inverse of the standard normal distribution, u in (0, 1); relative error about 1e-16.
 

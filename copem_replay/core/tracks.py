@@ -54,6 +54,21 @@ CLASS_GROUPS = {
 }
 """Names that stand for several classes (`vru`: vulnerable road users)."""
 
+
+def _build_agreement() -> Bool:
+    agree = np.eye(len(CLASSES), dtype=np.bool_)
+    other, vehicle = CLASSES.index("other"), CLASSES.index("vehicle")
+    agree[other] = agree[:, other] = True
+    for name in CLASS_GROUPS["vehicles"]:
+        agree[vehicle, CLASSES.index(name)] = agree[CLASSES.index(name), vehicle] = True
+    return agree
+
+
+AGREE: Bool = _build_agreement()
+"""(C, C) by indices into CLASSES: the classes are equal, or one is `other`, which says nothing, or one is `vehicle`
+(not said which) and the other one of the vehicles. Symmetric, not transitive: a car and a bicycle both agree with
+`other`."""
+
 NO_CAPTURE_NS = np.iinfo(np.int64).min
 """Stamp of a fused list at an instant at which no list is recent enough."""
 
@@ -299,6 +314,17 @@ class Tracks:
         order = np.argsort(self.frame_ix, kind="stable")
         bounds = np.searchsorted(self.frame_ix[order], np.arange(len(self.stamp_ns) + 1))
         return order, bounds
+
+    @cached_property
+    def by_object(self) -> tuple[Int, Int]:
+        """Rows (P,) unit by unit, then object by object, those of no object first, then in order of capture.
+
+        And where those of each unit and object begin, (U · (O + 1) + 1,), O the highest object index + 1.
+        """
+        objects = int(self.object_ix.max(initial=-1)) + 2
+        key = self.row_unit_ix * objects + self.row_object_ix + 1
+        order = np.lexsort((self.row_captured_s, key))
+        return order, np.searchsorted(key[order], np.arange(len(self.units) * objects + 1))
 
     @cached_property
     def west_to_east(self) -> Int:

@@ -103,9 +103,6 @@ def _check_braking(source: ExperimentSource, data: dict[str, Any]) -> Iterator[s
     measure = measure if isinstance(measure, dict) else {}
     confirm = measure.get("confirm")
     if measure.get("exact") is True:
-        match = measure.get("match")
-        if isinstance(match, dict) and match.get("always") is True:
-            yield source.at(("measure", "exact"), "matches depend on sampled errors and have no closed form")
         recorded = [name for name, unit in _mapping_items(data.get("units")) if unit.get("recorded") is not None]
         if recorded:
             yield source.at(

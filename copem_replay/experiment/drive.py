@@ -25,7 +25,7 @@ from copem_replay.io.encodings import make_definition
 from copem_replay.io.encodings.columns import DefinitionError, shred_messages
 from copem_replay.io.log import gather_messages
 from copem_replay.io.open import open_log
-from copem_replay.io.schemas.description import find_stamp_paths, parse_nanoseconds
+from copem_replay.io.stamps import find_stamp_paths, parse_nanoseconds
 from copem_replay.metrics.config import Measure, Objects
 
 T = TypeVar("T")

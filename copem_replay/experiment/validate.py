@@ -43,6 +43,7 @@ from copem_replay.experiment.frame import find_frame, write_frame
 from copem_replay.experiment.maps import add_maps, list_far_units
 from copem_replay.experiment.schema import Experiment, LogSettings, output_unit
 from copem_replay.io.config import TruthFields
+from copem_replay.io.findings import find_rule
 from copem_replay.io.open import (
     File,
     Local,
@@ -128,6 +129,8 @@ def _check_units_in_solids(experiment: Experiment, recording: Recording) -> Iter
 
 
 def _describe_host(recording: Recording) -> str:
+    if (apart := find_rule(recording.notes, "two clocks")) is not None:
+        return f" ({apart})"
     if recording.host_id is None:
         return " (host_vehicle_id is not set)"
     return f" (its host_vehicle_id {recording.host_id!r} is no moving object of it)"
@@ -359,7 +362,7 @@ def _read_local_recording(experiment: Experiment, place: Local) -> tuple[Recordi
     beside = {asked.topic for asked in (*experiment.recorded.values(), *experiment.outputs.values())}
     read = partial(
         read_log, place, name=name_log(path), topic=experiment.read.topic, fields=fields, beside=beside,
-        window_s=experiment.window_s,
+        window_s=experiment.window_s, max_gap_s=experiment.max_gap_s, classes=experiment.read.classes,
     )  # fmt: skip
     try:
         recording = read(ego=ego)

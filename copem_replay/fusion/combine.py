@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from copem_replay.core.compiled import kernel
+from copem_replay.core.compiled import callee, kernel
 from copem_replay.core.geometry import rotated_iou
 from copem_replay.core.object_list import Entries, most_probable_class
 from copem_replay.core.tracks import CLASSES, Bool, Float, Int
@@ -32,7 +32,7 @@ _UNION_ROUNDS = 60
 """Golden sections, and halvings: .618⁶⁰ = 3e-13 of the distance between the two estimates."""
 
 
-@kernel
+@callee
 def covariance_union(a: Float, A: Float, b: Float, B: Float) -> tuple[Float, Float]:
     """Mean x (2,) and covariance P (2, 2) of least trace with P ⪰ A + (x − a)(x − a)ᵀ and P ⪰ B + (x − b)(x − b)ᵀ.
 
@@ -64,13 +64,13 @@ def covariance_union(a: Float, A: Float, b: Float, B: Float) -> tuple[Float, Flo
     return mean, P
 
 
-@kernel
+@callee
 def _covers(a: float, b: float, d: float) -> bool:
     """Whether (a, b; b, d) is positive semi-definite."""
     return a >= 0 and d >= 0 and a * d >= b * b
 
 
-@kernel
+@callee
 def _find_least_trace(along: float, both: float, across: float, apart: float) -> tuple[float, float]:
     """The place of least trace from the middle: towards b (by golden sections), and to the left of that way."""
     if apart == 0:
@@ -92,7 +92,7 @@ def _find_least_trace(along: float, both: float, across: float, apart: float) ->
     return u, _minimise_across(u, along, both, across, apart)[0]
 
 
-@kernel
+@callee
 def _minimise_across(u: float, along: float, both: float, across: float, apart: float) -> tuple[float, float]:
     """The best v for this u, by halvings, and u² + v² + ‖V − U‖₁/2 there.
 
@@ -114,7 +114,7 @@ def _minimise_across(u: float, along: float, both: float, across: float, apart: 
     return v, u * u + v * v + norm / 2
 
 
-@kernel
+@callee
 def _positive_part(a: float, b: float, d: float) -> tuple[float, float, float]:
     """(a, b; b, d) with its negative eigenvalues replaced by 0, as (a, b, d)."""
     middle, half = (a + d) / 2, math.hypot((a - d) / 2, b)
@@ -174,7 +174,7 @@ def unite_conflicting(
     return EntryClusters(start, begin[: joined + 1], member, clusters.points), out[:joined]
 
 
-@kernel
+@callee
 def _find_host_clusters(clusters: EntryClusters, fused: Entries, agree: Bool) -> Int:
     """(clusters,) the cluster that each becomes part of; its own index: none."""
     host, kind = np.arange(len(fused)), np.empty(len(fused), np.int64)
@@ -199,7 +199,7 @@ def _find_host_clusters(clusters: EntryClusters, fused: Entries, agree: Bool) ->
     return host
 
 
-@kernel
+@callee
 def _share_a_list(clusters: EntryClusters, host: Int, c: int, into: int, first: int) -> bool:
     """Whether a list has an entry in cluster c and in any that is part of `into`."""
     for other in range(first, c):
@@ -212,7 +212,7 @@ def _share_a_list(clusters: EntryClusters, host: Int, c: int, into: int, first: 
     return False
 
 
-@kernel
+@callee
 def _take_in_member(state: Any, point: Any, gate: float) -> None:
     """Takes a member into the state so far, in place: by inverse variance within the gate, else by union."""
     ee, en, nn = state.ee + point.ee, state.en + point.en, state.nn + point.nn
@@ -232,7 +232,7 @@ def _take_in_member(state: Any, point: Any, gate: float) -> None:
 # IEEE T-AES 22 (1986) 803–805; for n inputs the best linear unbiased estimate with their joint covariance.
 
 
-@kernel
+@callee
 def combine_by_cross_covariance(x: Float, cov: Float, correlation: float) -> tuple[Float, Float]:
     """Mean (2,) and covariance (2, 2) of positions `x (n, 2)`, `cov (n, 2, 2)` with errors correlated 0 ≤ ρ < 1.
 
@@ -276,7 +276,7 @@ def combine_by_cross_covariance(x: Float, cov: Float, correlation: float) -> tup
     return mean, P
 
 
-@kernel
+@callee
 def _inverse_root(cov: Float, out: Float) -> None:
     """The inverse of the symmetric square root, itself symmetric: √A = (A + √det·1)/√(tr + 2√det) in the plane."""
     ee, en, nn = cov[0, 0], (cov[0, 1] + cov[1, 0]) / 2, cov[1, 1]
@@ -296,7 +296,7 @@ _INTERSECTION_ROUNDS = 100
 """A bound of the search, far above the halvings that a number in [0, 1] can take; it ends long before."""
 
 
-@kernel
+@callee
 def inverse_covariance_intersection(x: Float, cov: Float, by_determinant: bool) -> tuple[Float, Float]:
     """Mean (d,) and covariance (d, d) of estimates `x (n, d)`, `cov (n, d, d)`, one after the other as they stand.
 
@@ -339,7 +339,7 @@ def inverse_covariance_intersection(x: Float, cov: Float, by_determinant: bool) 
     return mean, P
 
 
-@kernel
+@callee
 def _combine_pair(omega: float, A: Float, B: Float, inverse_a: Float, inverse_b: Float, G: Float, P: Float) -> None:
     """Writes G = (ωA + (1 − ω)B)⁻¹ and P."""
     d = len(A)
@@ -354,7 +354,7 @@ def _combine_pair(omega: float, A: Float, B: Float, inverse_a: Float, inverse_b:
     invert_matrix(information, P)
 
 
-@kernel
+@callee
 def _omega_slope(omega: float, A: Float, B: Float, inverse_a: Float, inverse_b: Float, by_determinant: bool) -> float:
     """Derivative of the criterion by ω over its value (of the determinant: of its logarithm).
 
@@ -384,7 +384,7 @@ def _omega_slope(omega: float, A: Float, B: Float, inverse_a: Float, inverse_b: 
     return total if by_determinant else total / trace
 
 
-@kernel
+@callee
 def _find_omega(
     low: float, high: float, A: Float, B: Float, inverse_a: Float, inverse_b: Float, by_determinant: bool
 ) -> float:
@@ -433,7 +433,7 @@ def combine_members(clusters: EntryClusters, method: int, setting: float, by_det
         fused[c].cov_ee_m2, fused[c].cov_en_m2, fused[c].cov_nn_m2 = P[0, 0], P[0, 1], P[1, 1]
 
 
-@kernel
+@callee
 def _combine_split(x: Float, cov: Float, method: int, setting: float, by_determinant: bool) -> tuple[Float, Float]:
     """Split covariance intersection; without independent parts the plain one, where equal inputs share their weight."""
     if method == SPLIT_BY_SHARE:

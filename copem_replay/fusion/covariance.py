@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from copem_replay.core.compiled import kernel
+from copem_replay.core.compiled import callee
 from copem_replay.core.tracks import Bool, Float
 
 SMALLEST_VARIANCE_M2 = 1e-9
@@ -23,7 +23,7 @@ FLATTEST = 1e-12
 """No eigenvalue counts as less than this share of the other, as rounding could make it negative."""
 
 
-@kernel
+@callee
 def floor_eigenvalues(ee: float, en: float, nn: float) -> tuple[float, float, float]:
     """The covariance (ee, en; en, nn) with its axes kept and eigenvalues that are too small raised."""
     middle, half = (ee + nn) / 2, math.hypot((ee - nn) / 2, en)
@@ -50,14 +50,14 @@ _TIE = 1e-12
 """Traces that differ by less than this share are equal: it is rounding."""
 
 
-@kernel
+@callee
 def inverse_variance(x: Float, cov: Float) -> tuple[Float, Float]:
     """Mean (d,) and covariance (d, d) of the summed information: optimal if and only if the errors are independent."""
     information = invert_all(cov)
     return _combine_weighted(x, cov, information, np.ones(len(x)))
 
 
-@kernel
+@callee
 def covariance_intersection(x: Float, cov: Float, by_determinant: bool) -> tuple[Float, Float, Float]:
     """Mean (d,), covariance P (d, d) and weights (n,) of P⁻¹ = Σ wᵢIᵢ: never too sure, however errors are correlated.
 
@@ -74,7 +74,7 @@ def covariance_intersection(x: Float, cov: Float, by_determinant: bool) -> tuple
     return mean, covariance, weight
 
 
-@kernel
+@callee
 def fast_covariance_intersection(x: Float, cov: Float, keep_best: bool) -> tuple[Float, Float, Float]:
     """Covariance intersection with weights in closed form: mean (d,), covariance (d, d), weights (n,).
 
@@ -106,7 +106,7 @@ def fast_covariance_intersection(x: Float, cov: Float, keep_best: bool) -> tuple
     return mean, covariance, weight
 
 
-@kernel
+@callee
 def _combine_weighted(x: Float, cov: Float, information: Float, weight: Float) -> tuple[Float, Float]:
     """Mean and covariance where input i counts `weight` times."""
     n, d = x.shape
@@ -156,7 +156,7 @@ def _combine_weighted(x: Float, cov: Float, information: Float, weight: Float) -
 # curvatures ⟨IᵢB, IⱼB⟩, twice for the trace.
 
 
-@kernel
+@callee
 def _best_weights(information: Float, by_determinant: bool) -> Float:
     """Weights (n,) that minimise the determinant or the trace of (Σ wᵢIᵢ)⁻¹."""
     n, d = information.shape[:2]
@@ -207,7 +207,7 @@ def _best_weights(information: Float, by_determinant: bool) -> Float:
     return weight
 
 
-@kernel
+@callee
 def _share_weight(info: Float, weight: Float, among: Bool) -> None:
     """Of all weights `among` these inputs that give the same Σ wᵢIᵢ, take those with the least Σ wᵢ², in place.
 
@@ -259,7 +259,7 @@ def _share_weight(info: Float, weight: Float, among: Bool) -> None:
             return
 
 
-@kernel
+@callee
 def _whiten(info: Float, weight: Float, B: Float, by_determinant: bool) -> None:
     """Change to coordinates in which Σ wᵢIᵢ = 1, in place."""
     n, d = info.shape[:2]
@@ -295,7 +295,7 @@ def _whiten(info: Float, weight: Float, B: Float, by_determinant: bool) -> None:
                 B[i, j] /= np.sqrt(norm)
 
 
-@kernel
+@callee
 def _newton_step(lever: Float, score: Float, has: Bool, times: float) -> Float:
     """Newton's change of the weights (n,), its sum 0; inputs without weight keep none."""
     active = np.flatnonzero(has)
@@ -318,7 +318,7 @@ def _newton_step(lever: Float, score: Float, has: Bool, times: float) -> Float:
     return change
 
 
-@kernel
+@callee
 def _search_line(along: Float, B: Float, by_determinant: bool, longest: float) -> float:
     """How far to go from J = 1 along `along` until the criterion hardly falls any more: at most `longest`."""
     first = _criterion_slope(0.0, along, B, by_determinant)
@@ -335,7 +335,7 @@ def _search_line(along: Float, B: Float, by_determinant: bool, longest: float) -
     return low
 
 
-@kernel
+@callee
 def _criterion_slope(step: float, along: Float, B: Float, by_determinant: bool) -> float:
     """Derivative of the criterion by `step` at J = 1 + step · along, over its value at J = 1 (of the logarithm: /d)."""
     d = len(along)
@@ -365,7 +365,7 @@ def _criterion_slope(step: float, along: Float, B: Float, by_determinant: bool) 
 # Small symmetric positive definite matrices.
 
 
-@kernel
+@callee
 def invert_all(cov: Float) -> Float:
     """Inverses (n, d, d) of covariances (n, d, d)."""
     information = np.empty(cov.shape)
@@ -374,7 +374,7 @@ def invert_all(cov: Float) -> Float:
     return information
 
 
-@kernel
+@callee
 def invert_matrix(matrix: Float, out: Float) -> None:
     """Writes the inverse of a matrix (d, d) into `out`, exactly symmetric."""
     d = len(matrix)
@@ -394,7 +394,7 @@ def invert_matrix(matrix: Float, out: Float) -> None:
             out[i, j] = out[j, i] = total
 
 
-@kernel
+@callee
 def invert_root(matrix: Float, out: Float) -> None:
     """Writes L⁻¹ into `out`, where LLᵀ is the matrix, of which only the lower triangle is read (Cholesky)."""
     d = len(matrix)
@@ -414,7 +414,7 @@ def invert_root(matrix: Float, out: Float) -> None:
             out[i, j] = total / out[i, i]
 
 
-@kernel
+@callee
 def solve_with_root(root: Float, right: Float) -> Float:
     """The solution (d,) of M y = `right`, given L⁻¹ of M = LLᵀ."""
     solution = np.zeros(len(right))
@@ -427,7 +427,7 @@ def solve_with_root(root: Float, right: Float) -> Float:
     return solution
 
 
-@kernel
+@callee
 def _safe_determinant(matrix: Float) -> float:
     """The determinant; 0 where rounding leaves a matrix that is not positive definite."""
     d = len(matrix)

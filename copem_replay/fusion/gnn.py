@@ -8,7 +8,8 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from copem_replay.core.components import NotNegative, Share
-from copem_replay.core.object_list import AGREE, Entries, Inputs, ObjectLists, view_as_numbers
+from copem_replay.core.object_list import Entries, Inputs, ObjectLists, view_as_numbers
+from copem_replay.core.tracks import AGREE
 from copem_replay.fusion.combine import (
     CROSS,
     INVERSE,

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from copem_replay.core.assignment import assign_pairs, spread_component_maximum
-from copem_replay.core.compiled import kernel
+from copem_replay.core.compiled import callee, kernel
 from copem_replay.core.object_list import Entries, most_probable_class
 from copem_replay.core.tracks import CLASSES, Bool, Float, Int
 from copem_replay.fusion.covariance import covariance_intersection, fast_covariance_intersection, floor_eigenvalues
@@ -127,7 +127,7 @@ def intersect_clusters(clusters: EntryClusters, by_determinant: bool, fast: bool
         fused[c].cov_ee_m2, fused[c].cov_en_m2, fused[c].cov_nn_m2 = P[0, 0], P[0, 1], P[1, 1]
 
 
-@kernel
+@callee
 def _collect_points(
     entries: Entries, content: Float, bounds: Int, newest: Int, min_existence: float
 ) -> tuple[Points, Int]:
@@ -156,7 +156,7 @@ def _collect_points(
     return points, first
 
 
-@kernel
+@callee
 def _order_lists(
     newest: Int, captured_s: Float, arrives_s: Float, points: Points, first: Int, content: Float, lists: Int
 ) -> int:
@@ -174,7 +174,7 @@ def _order_lists(
     return n
 
 
-@kernel
+@callee
 def _list_before(
     f: Any, g: Any, captured_s: Float, arrives_s: Float, points: Points, first: Int, content: Float
 ) -> bool:
@@ -194,7 +194,7 @@ def _list_before(
 # Association.
 
 
-@kernel
+@callee
 def _find_allowed_pairs(
     here: Points, clusters: Points, by_x: Int, agree: Bool, gate: float, row: Int, col: Int, cost: Float, spread: Float
 ) -> tuple[Int, Int, Float, Float, int]:
@@ -238,7 +238,7 @@ def _find_allowed_pairs(
     return row, col, cost, spread, n
 
 
-@kernel
+@callee
 def join_entry(cluster: Any, entry: Any, informed: bool) -> None:
     """Takes an entry into a cluster's running state: P⁻¹ = αA⁻¹ + βB⁻¹, x = a + PβB⁻¹(b − a).
 
@@ -259,7 +259,7 @@ def join_entry(cluster: Any, entry: Any, informed: bool) -> None:
     cluster.y_m += cluster.en * u + cluster.nn * v
 
 
-@kernel
+@callee
 def _sort_by_x(clusters: Points, by_x: Int) -> None:
     """Sorts the clusters `by_x`, in place, by insertion: little has moved since the last time."""
     for p in range(1, len(by_x)):
@@ -270,7 +270,7 @@ def _sort_by_x(clusters: Points, by_x: Int) -> None:
         by_x[place] = c
 
 
-@kernel
+@callee
 def _group_members(joining: Int, claimed: Int, member: Int, begin: Int) -> None:
     """Writes joined entries into `member`, those of cluster c from `begin[c]` on; `begin[0]` is set before."""
     count = len(begin) - 1
@@ -286,7 +286,7 @@ def _group_members(joining: Int, claimed: Int, member: Int, begin: Int) -> None:
         fill[claimed[p]] += 1
 
 
-@kernel
+@callee
 def _lengthen_entries(entries: Entries, used: int, needed: int) -> Entries:
     """The entries, copied where there is no room for `needed` of them; the first `used` are kept."""
     if needed <= len(entries):
@@ -300,7 +300,7 @@ def _lengthen_entries(entries: Entries, used: int, needed: int) -> Entries:
 # The entry of a cluster.
 
 
-@kernel
+@callee
 def write_entry(
     out: Any, state: Any, class_sum: Float, members: Int, points: Points, entries: Entries, arrives_s: Float
 ) -> None:

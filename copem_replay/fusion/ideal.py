@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from copem_replay.communication.arrivals import FusionSchedule, KeptEntries, SentEntries, fusion_schedule, keep_entries
-from copem_replay.core.compiled import borrowing
+from copem_replay.core.compiled import borrowing_kernel
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.random import CounterRng, RandomKey, object_words
 from copem_replay.core.tracks import NO_CAPTURE_NS, Bool, Float, Int, Scene, Tracks
@@ -189,7 +189,7 @@ def _select_newest_entries(received: Tracks, rows: Int, start: Int) -> tuple[Boo
     return counts, rows[stay], np.append(0, np.cumsum(stay))[start]
 
 
-@borrowing
+@borrowing_kernel
 def _drop_older_entries(valid: Bool, rows: Int, start: Int, unit_ix: Int, counts: Bool) -> None:
     """Sets `counts` False at detected rows behind a newer detected one of their unit and object.
 
@@ -308,7 +308,7 @@ def _any_valid(valid: Bool, rows: Int, start: Int) -> Bool:
     return out
 
 
-@borrowing
+@borrowing_kernel
 def _fill_any_valid(valid: Bool, rows: Int, start: Int, out: Bool) -> None:
     for s in range(out.shape[0]):
         for p in range(out.shape[1]):
@@ -336,7 +336,7 @@ class PositionInformation(NamedTuple):
     nn: Float
 
 
-@borrowing
+@borrowing_kernel
 def _combine_position(
     valid: Bool, given: Positions, information: PositionInformation, rows: Int, start: Int, out: Positions
 ) -> None:
@@ -369,7 +369,7 @@ def _combine_position(
                 out_x[s, p], out_y[s, p] = x0 + (d * u - b * v) / det, y0 + (a * v - b * u) / det
 
 
-@borrowing
+@borrowing_kernel
 def _sum_scalars(
     valid: Bool, values: Float, weights: Float, weighed_by: Int, rows: Int, start: Int, means: Float, spreads: Float,
     scratch: tuple[Int, Bool],

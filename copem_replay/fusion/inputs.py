@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from copem_replay.communication.arrivals import FusionSchedule, KeptEntries, fusion_schedule
-from copem_replay.core.compiled import kernel
+from copem_replay.core.compiled import callee, kernel
 from copem_replay.core.object_list import COVARIANCES, ENTRY, Inputs, ObjectLists, join_entries, take_entries
 from copem_replay.core.tracks import CLASSES, VALUES, Bool, Float, Int, Tracks
 from copem_replay.fusion.ideal import floor_covariances
@@ -159,7 +159,7 @@ def sort_rows(values: Float, order: Int) -> None:
         block *= 2
 
 
-@kernel
+@callee
 def compare_rows(values: Float, a: int, b: int) -> int:
     """−1, 0 or 1: row a comes before row b, equals it, or comes after it."""
     for v in range(values.shape[1]):

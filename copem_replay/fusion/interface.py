@@ -7,12 +7,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, get_args
+from typing import Any, ClassVar, Literal, Self, get_args
 
 import numpy as np
+from pydantic import Field, model_validator
 
 from copem_replay.core.compiled import kernel
-from copem_replay.core.components import Component, GivenError, ask_component, wrong_answer_error
+from copem_replay.core.components import Component, Frozen, GivenError, Positive, ask_component, wrong_answer_error
 from copem_replay.core.object_list import (
     COVARIANCES,
     ENTRY,
@@ -30,15 +31,36 @@ class Fusion(Component, ABC):
     """Base of everything that `fusion:` may name."""
 
 
+class ConstantVelocity(Frozen):
+    """What ideal fusion remembers: a constant-velocity Kalman filter per object, with the motion model of `tracker`."""
+
+    kind: Literal["constant_velocity"] = "constant_velocity"
+    acceleration_psd_m2ps3: Positive = 1.0
+    speed_sigma_mps: Positive = 3.0
+
+
 class IdealFusion(Fusion):
     """The paper's Ideal Fusion Model: matching by truth id, inverse-variance combination (fusion/ideal.py).
 
     `combine: samples` weighs the units' sampled errors (with random numbers common to all configurations), `combine:
-    posterior` draws once from N(μ, Σ); both have the same distribution.
+    posterior` draws once from N(μ, Σ); both have the same distribution. `memory`: it lists the same objects, each as
+    all entries so far have it, at the instant of the list (fusion/ideal_memory.py); None: nothing is remembered.
     """
 
     kind: Literal["ideal"] = "ideal"
     combine: Literal["samples", "posterior"] = "samples"
+    memory: ConstantVelocity | None = Field(default=None, exclude_if=lambda value: value is None)
+
+    @model_validator(mode="after")
+    def _samples(self) -> Self:
+        if self.memory is not None and self.combine == "posterior":
+            raise ValueError("memory: expected combine: samples, for a filter takes in sampled errors")
+        return self
+
+    @property
+    def tells_of(self) -> TellsOf:
+        """Whether an entry shows the object at its newest capture, or, with memory, at the instant of the list."""
+        return "capture" if self.memory is None else "now"
 
 
 class ListFusion(Fusion):
@@ -55,6 +77,10 @@ class ListFusion(Fusion):
     resumable: ClassVar[bool] = False
     """Whether `resume` gives, chunk after chunk of the instants, the very lists of `fuse`; if not, all instants are
     handed over at once. A class that overrides `fuse` has to declare it anew."""
+
+    remembers: ClassVar[bool] = False
+    """Whether a list depends on lists before those in use, as a tracker's: `compare` then holds accuracy against ideal
+    fusion with memory, where there is one."""
 
     tells_of: ClassVar[TellsOf] = "capture"
     """Whether an entry shows the object as it was at its newest capture, or brought to the instant of the list (`now`).

@@ -6,11 +6,11 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from copem_replay.core.compiled import kernel
+from copem_replay.core.compiled import callee, kernel
 from copem_replay.core.components import Positive, Share
 from copem_replay.core.geometry import rotated_iou
-from copem_replay.core.object_list import AGREE, Entries, Inputs, ObjectLists, most_probable_classes, view_as_numbers
-from copem_replay.core.tracks import Bool, Float, Int
+from copem_replay.core.object_list import Entries, Inputs, ObjectLists, most_probable_classes, view_as_numbers
+from copem_replay.core.tracks import AGREE, Bool, Float, Int
 from copem_replay.fusion.inputs import WIDTH, sort_rows
 from copem_replay.fusion.interface import ListFusion
 from copem_replay.fusion.union import gather_newest_rows, join_runs
@@ -111,7 +111,7 @@ def _suppress_overlapping(
     return kept_start, kept[:n].copy()
 
 
-@kernel
+@callee
 def _iou_of_entries(a: Any, b: Any) -> float:
     share: float = rotated_iou(
         a.x_m, a.y_m, a.yaw_rad, a.length_m, a.width_m, b.x_m, b.y_m, b.yaw_rad, b.length_m, b.width_m

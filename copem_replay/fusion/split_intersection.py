@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from copem_replay.core.compiled import kernel
+from copem_replay.core.compiled import callee
 from copem_replay.core.tracks import Bool, Float
 from copem_replay.fusion.covariance import FLATTEST, invert_matrix, invert_root, solve_with_root
 
@@ -27,7 +27,7 @@ _RIDGE = 1e-12
 """Added to the curvature, relative, so that it can be inverted where weights change next to nothing."""
 
 
-@kernel
+@callee
 def split_covariance_intersection(
     x: Float, dependent: Float, independent: Float, by_determinant: bool
 ) -> tuple[Float, Float, Float, Float]:
@@ -62,13 +62,13 @@ def split_covariance_intersection(
     return mean, P, independent_part, weight
 
 
-@kernel
+@callee
 def split_by_share(cov: Float, share: float) -> tuple[Float, Float]:
     """Dependent and independent parts of covariances (n, d, d): `share` of each, and the rest."""
     return share * cov, (1 - share) * cov
 
 
-@kernel
+@callee
 def split_by_variance(cov: Float, dependent_m2: float) -> tuple[Float, Float]:
     """Dependent and independent parts of covariances (n, 2, 2): `dependent_m2` on every axis at most; the rest."""
     dependent, independent = np.zeros(cov.shape), np.zeros(cov.shape)
@@ -100,7 +100,7 @@ def split_by_variance(cov: Float, dependent_m2: float) -> tuple[Float, Float]:
 # make a valid P, so where the steps end before that is a matter of size, never of validity.
 
 
-@kernel
+@callee
 def _best_weights(dependent: Float, independent: Float, by_determinant: bool) -> Float:
     """Weights (n,) that minimise the determinant or the trace of P."""
     n, d = dependent.shape[:2]
@@ -152,7 +152,7 @@ def _best_weights(dependent: Float, independent: Float, by_determinant: bool) ->
     return weight
 
 
-@kernel
+@callee
 def _evaluate_criterion(
     dependent: Float, independent: Float, weight: Float, by_determinant: bool, information: Float, total: Float,
     P: Float,
@@ -182,7 +182,7 @@ def _evaluate_criterion(
     return value
 
 
-@kernel
+@callee
 def _derive_terms(
     dependent: Float, independent: Float, weight: Float, by_determinant: bool, P: Float, lever: Float, score: Float,
     bend: Float,
@@ -216,7 +216,7 @@ def _derive_terms(
                 bend[k] += 2 * spread[i, j] * P[j, i]
 
 
-@kernel
+@callee
 def _newton_step(
     lever: Float, score: Float, bend: Float, has: Bool, P: Float, mean: float, by_determinant: bool
 ) -> Float:
@@ -248,7 +248,7 @@ def _newton_step(
     return change
 
 
-@kernel
+@callee
 def _multiply_matrices(a: Float, b: Float, out: Float) -> None:
     """Writes a · b into `out`."""
     d = len(a)

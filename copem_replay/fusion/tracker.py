@@ -11,8 +11,8 @@ from pydantic import Field, model_validator
 
 from copem_replay.core.components import NotNegative, Positive, Share
 from copem_replay.core.interpolation import wrap_angles
-from copem_replay.core.object_list import AGREE, Inputs, ObjectLists, TellsOf, view_as_numbers
-from copem_replay.core.tracks import Int
+from copem_replay.core.object_list import Inputs, ObjectLists, TellsOf, view_as_numbers
+from copem_replay.core.tracks import AGREE, Int
 from copem_replay.fusion.inputs import WIDTH, order_by_content
 from copem_replay.fusion.interface import ListFusion
 from copem_replay.fusion.tracker_kernel import (
@@ -79,6 +79,7 @@ class Tracker(ListFusion):
         return self
 
     resumable: ClassVar[bool] = True
+    remembers: ClassVar[bool] = True
     # `stale`, too: it takes late lists for the present, so it claims to show that.
     tells_of: ClassVar[TellsOf] = "now"
 

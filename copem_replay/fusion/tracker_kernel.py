@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from copem_replay.core.assignment import assign_pairs, spread_component_maximum
-from copem_replay.core.compiled import kernel
+from copem_replay.core.compiled import callee, kernel
 from copem_replay.core.object_list import ENTRY, Entries, most_probable_class
 from copem_replay.core.tracks import CLASSES, SAME_INSTANT_S, Bool, Float, Int
 from copem_replay.fusion.covariance import floor_eigenvalues
@@ -78,7 +78,7 @@ def empty_memory(units: int) -> StoredMemory:
     return StoredMemory(memory, none, none, memory.tracks, memory.claims, np.empty(0))
 
 
-@kernel
+@callee
 def recall_memory(so_far: StoredMemory, captured_s: Float) -> tuple[TrackerMemory, list[TrackerMemory], Int]:
     """A copy of the memory, the memory before each of the lists received of late, and these lists."""
     memory = _copy_memory(so_far.memory)
@@ -98,7 +98,7 @@ def recall_memory(so_far: StoredMemory, captured_s: Float) -> tuple[TrackerMemor
     return memory, before, so_far.received.copy()
 
 
-@kernel
+@callee
 def store_memory(memory: TrackerMemory, before: list[TrackerMemory], received: Int, captured_s: Float) -> StoredMemory:
     """What `recall_memory` gives, in the form in which it is stored."""
     first = np.empty(len(received), np.int64)
@@ -123,7 +123,7 @@ def store_memory(memory: TrackerMemory, before: list[TrackerMemory], received: I
     return kept
 
 
-@kernel
+@callee
 def _copy_memory(memory: TrackerMemory) -> TrackerMemory:
     return TrackerMemory(memory.tracks.copy(), memory.claims.copy(), memory.together_s.copy())
 
@@ -138,7 +138,7 @@ def _copy_memory(memory: TrackerMemory) -> TrackerMemory:
 # 2001 (Kalman filter and its Joseph form, continuous white noise acceleration, gate).
 
 
-@kernel
+@callee
 def propagate_covariance(P: Float, dt_s: float) -> None:
     """Lets `dt_s` ≥ 0 pass: P ← F P Fᵀ, in place, without acceleration."""
     for i in range(2):
@@ -150,7 +150,7 @@ def propagate_covariance(P: Float, dt_s: float) -> None:
             P[2 + j, i] = P[i, 2 + j]
 
 
-@kernel
+@callee
 def predict_state(state: Float, P: Float, dt_s: float, q_m2ps3: float) -> None:
     """Lets `dt_s` ≥ 0 pass: x ← F x, P ← F P Fᵀ + Q."""
     for i in range(2):
@@ -163,7 +163,7 @@ def predict_state(state: Float, P: Float, dt_s: float, q_m2ps3: float) -> None:
         P[2 + i, 2 + i] += q_m2ps3 * dt_s
 
 
-@kernel
+@callee
 def update_state(state: Float, P: Float, x_m: float, y_m: float, ee: float, en: float, nn: float) -> None:
     """Takes in a measured position: x ← x + K ν, P ← (I − K H) P (I − K H)ᵀ + K R Kᵀ."""
     a, b, d = P[0, 0] + ee, P[0, 1] + en, P[1, 1] + nn
@@ -194,7 +194,7 @@ def update_state(state: Float, P: Float, x_m: float, y_m: float, ee: float, en: 
             P[i, j] = P[j, i] = (P[i, j] + P[j, i]) / 2
 
 
-@kernel
+@callee
 def _gain_column(P: Float, a: float, b: float) -> tuple[float, float, float, float]:
     """A column of K = P Hᵀ S⁻¹, (a, b) being that column of S⁻¹."""
     return (
@@ -205,7 +205,7 @@ def _gain_column(P: Float, a: float, b: float) -> tuple[float, float, float, flo
     )
 
 
-@kernel
+@callee
 def mahalanobis2(dx_m: float, dy_m: float, a: float, b: float, d: float) -> float:
     """Mahalanobis distance d² = νᵀ S⁻¹ ν of ν = (dx, dy), S = (a, b; b, d)."""
     return (d * dx_m * dx_m - 2 * b * dx_m * dy_m + a * dy_m * dy_m) / (a * d - b * b)
@@ -229,7 +229,7 @@ _ROUNDS = 30
 _GOLDEN = (math.sqrt(5) - 1) / 2
 
 
-@kernel
+@callee
 def update_split(state: Float, P: Float, common: Float, seen: Float, share: float, grown: float) -> None:
     """Takes in a measured position, in place. `seen`: x, y, ee, en, nn; the independent part of R counts `grown` times.
 
@@ -270,7 +270,7 @@ def update_split(state: Float, P: Float, common: Float, seen: Float, share: floa
             common[i, j] = whole[i, j] - left_over[i, j]
 
 
-@kernel
+@callee
 def _updated_determinant(omega: float, P: Float, common: Float, seen: Float, share: float, own: float) -> float:
     """The determinant of P after the update: |P₁| |R₁| / |HP₁Hᵀ + R₁|, P₁ by blocks of position and velocity."""
     more, scale = 1.0 / omega - 1.0, share / (1.0 - omega) + own
@@ -286,7 +286,7 @@ def _updated_determinant(omega: float, P: Float, common: Float, seen: Float, sha
     return float(det * (xx * yy - xy * xy) * measured)
 
 
-@kernel
+@callee
 def _split_gain(whole: Float, ee: float, en: float, nn: float) -> Float:
     """The gain K = P₁Hᵀ(HP₁Hᵀ + R₁)⁻¹, (4, 2), of P₁ `whole` and R₁ = (ee, en; en, nn)."""
     a, b, d = whole[0, 0] + ee, whole[0, 1] + en, whole[1, 1] + nn
@@ -298,7 +298,7 @@ def _split_gain(whole: Float, ee: float, en: float, nn: float) -> Float:
     return gain
 
 
-@kernel
+@callee
 def _update_covariance(independent: Float, gain: Float, ee: float, en: float, nn: float) -> Float:
     """(1 − KH) N (1 − KH)ᵀ + K R Kᵀ, symmetric."""
     half, out = np.empty((4, 4)), np.empty((4, 4))
@@ -382,7 +382,7 @@ def track_run(
     return start, entries[: start[-1]].copy(), store_memory(memory, before, received, unit_lists.captured_s)
 
 
-@kernel
+@callee
 def _replay_memory(
     memory: TrackerMemory,
     before: list[TrackerMemory],
@@ -423,7 +423,7 @@ def _replay_memory(
     return memory, before[done:], received[done:]
 
 
-@kernel
+@callee
 def _publish_tracks(memory: TrackerMemory, rules: TrackerRules, now_s: float, out: Entries) -> int:
     """Writes the tracks that are published now to the front of `out`; returns their number."""
     state, P = np.empty(4), np.empty((4, 4))
@@ -452,7 +452,7 @@ def _publish_tracks(memory: TrackerMemory, rules: TrackerRules, now_s: float, ou
 # One list.
 
 
-@kernel
+@callee
 def _hear_list(
     memory: TrackerMemory, unit_lists: HeardLists, rules: TrackerRules, f: int, now_s: float
 ) -> TrackerMemory:
@@ -508,7 +508,7 @@ def _hear_list(
     return memory
 
 
-@kernel
+@callee
 def _entry_positions(unit_lists: HeardLists, rules: TrackerRules, f: int, now_s: float) -> Float:
     """Places and their covariances (n, 5): x, y, ee, en, nn of the entries of list f as of `now_s`."""
     rows = unit_lists.rows[unit_lists.start[f] : unit_lists.start[f + 1]]
@@ -526,7 +526,7 @@ def _entry_positions(unit_lists: HeardLists, rules: TrackerRules, f: int, now_s:
     return seen
 
 
-@kernel
+@callee
 def _assign_entries(tracks: NDArray[Any], unit_lists: HeardLists, rules: TrackerRules, rows: Int, seen: Float) -> Int:
     """The track of each entry (n,), −1: none. Least sum of d² + ln|S| over the pairs within the gate."""
     n, m = len(rows), len(tracks)
@@ -562,7 +562,7 @@ def _assign_entries(tracks: NDArray[Any], unit_lists: HeardLists, rules: Tracker
     return partner
 
 
-@kernel
+@callee
 def _make_room(memory: TrackerMemory, more: int) -> TrackerMemory:
     """The memory with `more` tracks at its end, which are empty."""
     if more == 0:
@@ -576,7 +576,7 @@ def _make_room(memory: TrackerMemory, more: int) -> TrackerMemory:
     return TrackerMemory(tracks, claims, together_s)
 
 
-@kernel
+@callee
 def _start_track(
     track: Any, entry: Any, x: float, y: float, ee: float, en: float, nn: float, rules: TrackerRules
 ) -> None:
@@ -589,7 +589,7 @@ def _start_track(
             track.common[a, b] = rules.common_share * track.P[a, b]
 
 
-@kernel
+@callee
 def _describe_track(track: Any, entry: Any, captured_s: float) -> None:
     """Takes in what the filter leaves out; of lists captured together the last one received counts as the newest."""
     if captured_s >= track.last_s:
@@ -607,7 +607,7 @@ def _describe_track(track: Any, entry: Any, captured_s: float) -> None:
 # Existence and ends of tracks.
 
 
-@kernel
+@callee
 def _track_existence(claims: NDArray[Any], rules: TrackerRules, now_s: float) -> float:
     """1 − Πᵤ (1 − cᵤ e^(−(now − tᵤ)/forget)) of one track, `claims (U,)`."""
     none = 1.0
@@ -619,7 +619,7 @@ def _track_existence(claims: NDArray[Any], rules: TrackerRules, now_s: float) ->
     return 1.0 - none
 
 
-@kernel
+@callee
 def _settle_tracks(memory: TrackerMemory, rules: TrackerRules, now_s: float) -> TrackerMemory:
     """The memory without tracks that have faded, and without the younger of two tracks of one object, as of `now_s`."""
     n, units = memory.claims.shape
@@ -641,7 +641,7 @@ def _settle_tracks(memory: TrackerMemory, rules: TrackerRules, now_s: float) -> 
     return TrackerMemory(tracks, claims, together_s)
 
 
-@kernel
+@callee
 def _is_one_object(memory: TrackerMemory, rules: TrackerRules, i: int, j: int, now_s: float) -> bool:
     """Whether classes agree, no list held both of late, and the tracks are as close as two entries of one object."""
     a, b = memory.tracks[i], memory.tracks[j]
@@ -655,7 +655,7 @@ def _is_one_object(memory: TrackerMemory, rules: TrackerRules, i: int, j: int, n
     return mahalanobis2(dx, dy, ee, a.P[0, 1] + a.en + b.P[0, 1] + b.en, nn) <= SAME_OBJECT
 
 
-@kernel
+@callee
 def _younger_track(tracks: NDArray[Any], i: int, j: int) -> int:
     """Of tracks i < j the one with the later first capture, else with fewer entries, else founded later."""
     a, b = tracks[i], tracks[j]
@@ -667,7 +667,7 @@ def _younger_track(tracks: NDArray[Any], i: int, j: int) -> int:
 # An order of lists that depends on their content only.
 
 
-@kernel
+@callee
 def _comes_before(unit_lists: HeardLists, f: int, g: int) -> bool:
     """Whether list f comes before list g: see `_order_by_capture`."""
     if unit_lists.captured_s[f] != unit_lists.captured_s[g]:
@@ -687,7 +687,7 @@ def _comes_before(unit_lists: HeardLists, f: int, g: int) -> bool:
     )
 
 
-@kernel
+@callee
 def _order_by_capture(unit_lists: HeardLists, lists: Int) -> Int:
     """Lists ordered by capture, of equal ones those with more entries first, then by content."""
     lists = lists.copy()

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Discriminator, Tag
+from pydantic import AfterValidator, Discriminator, Field, Tag
 
 from copem_replay.core.components import Covariance, Either, Frozen, Id, Latency, NotNegative, Number, Positive, Share
+from copem_replay.core.tracks import CLASSES
 from copem_replay.io.schemas.object_lists import Fields
 
 
@@ -33,16 +34,30 @@ class RecordedOutput(RecordedTopic):
     tells_of: Literal["stamp", "available"] = "stamp"
 
 
+def _check_class(name: str) -> str:
+    if name not in CLASSES:
+        raise ValueError(f"expected one of {', '.join(CLASSES)}, found {name!r}")
+    return name
+
+
+ClassName = Annotated[str, AfterValidator(_check_class)]
+
+
 class TruthTopic(Frozen):
-    """The topic of the truth in a recording that holds several object lists."""
+    """The topic of the truth in a recording that holds several object lists.
+
+    `classes`: the class that a name of one stands for, beside those that are known: `{Barrowlist: bicycle}`.
+    """
 
     topic: str | None = None
+    classes: dict[Id, ClassName] = Field(default_factory=dict)
 
 
 class TruthFields(Fields):
     """The truth on a topic whose schema is not known by name: which of its fields hold what."""
 
     topic: str
+    classes: dict[Id, ClassName] = Field(default_factory=dict)
 
 
 class EgoTopic(Frozen):
@@ -59,7 +74,7 @@ class EgoTopic(Frozen):
 
 
 def _truth_key_form(value: object) -> str:
-    named = isinstance(value, TruthFields) or (isinstance(value, dict) and len(value.keys() - {"topic"}) > 0)
+    named = isinstance(value, TruthFields) or (isinstance(value, dict) and len(value.keys() - {"topic", "classes"}) > 0)
     return "fields" if named else "topic"
 
 

@@ -138,7 +138,7 @@ def _read_fixes(log: Log) -> Iterator[Fixes]:
 
 def decode_fixes(channel: Channel, payloads: Sequence[bytes], log_time_ns: Int) -> Fixes:
     """The fixes of a channel, without those that are none or at 0° N 0° E. Raises DefinitionError, KeyError."""
-    from copem_replay.io.schemas.description import find_stamp_paths, parse_nanoseconds
+    from copem_replay.io.stamps import find_stamp_paths, parse_nanoseconds
 
     where, definition = FIXES[schema_name(channel)], make_definition(channel, payloads)
     numbers = [f"{where.place}latitude", f"{where.place}longitude", *([where.status] if where.status else [])]

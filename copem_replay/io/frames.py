@@ -24,12 +24,21 @@ from copem_replay.core.tracks import CLASSES, VALUES, Bool, Float, Int
 from copem_replay.io.channel import Channel, schema_name
 from copem_replay.io.encodings import make_definition
 from copem_replay.io.encodings.columns import DefinitionError
+from copem_replay.io.findings import VX, VY, YAW, X, Z, find
 from copem_replay.io.ground_truth import MAX_GAP_S, DecodedObjects
 from copem_replay.io.log import Log, gather_messages
-from copem_replay.io.schemas.description import VX, VY, YAW, X, Z
-from copem_replay.io.schemas.object_lists import DecodedLists, Description, Fields, FieldsError, decode_lists
-from copem_replay.io.schemas.poses import ODOMETRY, Poses, decode_poses, is_pose
+from copem_replay.io.schemas.object_lists import (
+    ClassField,
+    DecodedLists,
+    Description,
+    Fields,
+    FieldsError,
+    decode_lists,
+)
+from copem_replay.io.schemas.poses import ODOMETRY, Poses, decode_poses, is_pose, is_static
 from copem_replay.io.schemas.registry import describe_channel
+from copem_replay.io.stamps import find_runs
+from copem_replay.io.window import Window
 
 if TYPE_CHECKING:
     from copem_replay.io.config import EgoTopic
@@ -100,7 +109,11 @@ class FrameTree:
         for child in dict.fromkeys(poses.child):
             if not child or child in self.pose_tracks:
                 continue
-            course = make_pose_track(poses, np.asarray(children == child))
+            chosen = np.asarray(children == child)
+            if static:  # as in tf2 the last one that was sent holds
+                rows = np.flatnonzero(chosen)
+                chosen = np.arange(len(chosen)) == rows[np.argsort(poses.log_time_ns[rows], kind="stable")[-1]]
+            course = make_pose_track(poses, chosen)
             if course is not None and course.parent != child:
                 self.pose_tracks[child] = course
                 if static:
@@ -207,10 +220,39 @@ def ego_notes(chosen: Channel, asked: EgoTopic | None) -> Iterator[str]:
         yield f"ego: no size is said (`size_m: [length, width, height]`): {size} m taken to hide others, gaps are null"
 
 
-def add_ego(columns: DecodedObjects, course: PoseTrack | None, asked: EgoTopic | None) -> DecodedObjects:
-    """The columns with the ego added to every list at whose instant it has a pose; unchanged without a course."""
+_SAME_BODY_M = 2.5
+"""A vehicle whose centre is so near to the poses of the ego (of its rear axle, often) is the ego: no other has room."""
+
+
+def find_listed_ego(columns: DecodedObjects, course: PoseTrack) -> int | None:
+    """Index of the listed object that is the ego, by its place; None: the lists do not hold it."""
+    placed = course.at(columns.stamp_ns)
+    message = np.repeat(np.arange(len(columns.rows)), columns.rows)
+    away_m = np.hypot(*(columns.values[:, k] - placed.position_m[message, k] for k in range(2)))
+    driven = columns.class_ix != CLASSES.index("pedestrian")
+    of, near = (
+        np.bincount(columns.object_ix[rows], minlength=len(columns.object_ids))
+        for rows in (placed.there[message], placed.there[message] & (away_m < _SAME_BODY_M) & driven)
+    )
+    found = np.flatnonzero((near > _ALWAYS * of) & (of > _ALWAYS * placed.there.sum()) & columns.moving)
+    return int(found[0]) if len(found) == 1 else None
+
+
+_ALWAYS = 0.9  # share of the lists in which the ego is where its poses are
+
+
+def add_ego(
+    columns: DecodedObjects, course: PoseTrack | None, asked: EgoTopic | None, topic: str = ""
+) -> DecodedObjects:
+    """The columns with the ego added to every list at whose instant it has a pose; unchanged without a course.
+
+    A listed object that is where the ego is, is the ego.
+    """
     if course is None:
         return columns
+    if (listed := find_listed_ego(columns, course)) is not None:
+        name = columns.object_ids[listed]
+        return replace(columns, hosts=(name,), notes=(*columns.notes, *find("ego listed", 1, id=name, topic=topic)))
     placed = course.at(columns.stamp_ns)
     length, width, height = asked.size_m if asked is not None and asked.size_m is not None else NOMINAL_M
     ahead = (asked.centre_from_rear_axle_m if asked is not None else None) or 0.0
@@ -248,6 +290,9 @@ class LogContext:
     asked: EgoTopic | None
     notes: tuple[str, ...]
     own: Mapping[tuple[str, str], str] = field(default_factory=dict)  # `_own_frame_names`
+    ego_topic: str = ""
+    static_missing: str = ""  # why there may be no static transforms
+    classes: Mapping[str, str] = field(default_factory=dict)  # of names, beside those that are known
 
     def named(self, lists: DecodedLists) -> list[str]:
         """The frames of the lists by their names in `frames`."""
@@ -283,16 +328,19 @@ def read_log_context(log: Log, asked: EgoTopic | None, *, seek_ego: bool) -> Log
         except (DefinitionError, KeyError) as error:
             notes.append(f"topic {channel.topic} ({channel.schema}) not read: {error}")
             continue
-        of_channel[channel.number] = poses
+        notes += [note.within(f"topic {channel.topic}") for note in poses.notes]
+        of_channel[channel.number] = _keep_run(poses, log.window)
     part_of = {channel.number: channel.part for channel in channels}
     own = _own_frame_names({(part_of[number], child) for number, poses in of_channel.items() for child in poses.child})
     for channel in channels:
         if channel.number in of_channel:
             of_channel[channel.number] = _rename_frames(of_channel[channel.number], channel.part, own)
-            frames.add(of_channel[channel.number], static=channel.topic.endswith("tf_static"))
+            frames.add(of_channel[channel.number], static=is_static(channel))
     chosen = ego_channel(log, channels, asked, seek_ego)
+    empty = [c.topic for c in log.channels if is_pose(c) and is_static(c) and not c.messages]
+    missing = f"; {empty[0]} is empty: of a split bag the first part alone has it, so give the folder" if empty else ""
     if chosen is None:
-        return LogContext(frames, None, asked, tuple(notes), own)
+        return LogContext(frames, None, asked, tuple(notes), own, static_missing=missing)
     if not messages.payloads[chosen.number]:
         raise EgoError(f"no pose on topic {chosen.topic!r}{window_hint(log)}", path=log.path)
     if chosen.number not in of_channel:  # not decoded, which a note tells
@@ -300,7 +348,21 @@ def read_log_context(log: Log, asked: EgoTopic | None, *, seek_ego: bool) -> Log
     if asked is not None and asked.frame is not None:
         asked = asked.model_copy(update={"frame": own.get((chosen.part, asked.frame.lstrip("/")), asked.frame)})
     course = ego_course(log, chosen.topic, of_channel[chosen.number], asked)
-    return LogContext(frames, course, asked, (*notes, *ego_notes(chosen, asked)), own)
+    return LogContext(frames, course, asked, (*notes, *ego_notes(chosen, asked)), own, chosen.topic, missing)
+
+
+def _keep_run(poses: Poses, window: Window | None) -> Poses:
+    """The poses without those of another run than that of the window: its margin reaches into the one before."""
+    if window is None:
+        return poses
+    kept, frames = np.ones(len(poses.stamp_ns), dtype=bool), np.array(poses.child, dtype=object)
+    for child in set(poses.child):
+        rows = np.flatnonzero(frames == child)
+        run = find_runs(poses.stamp_ns[rows], poses.log_time_ns[rows])
+        inside = [window.from_ns <= logged_ns <= window.to_ns for logged_ns in poses.log_time_ns[rows].tolist()]
+        if any(inside):
+            kept[rows] = np.isin(run, run[inside])
+    return poses if kept.all() else poses.take(np.flatnonzero(kept))
 
 
 def _strip_slashes(poses: Poses) -> Poses:
@@ -324,7 +386,19 @@ def _rename_frames(poses: Poses, part: str, own: Mapping[tuple[str, str], str]) 
     return replace(poses, frame=frame, child=child)
 
 
-def read_decoded_lists(log: Log, channels: Sequence[Channel], fields: Fields | None) -> DecodedLists:
+def _add_classes(description: Description, classes: Mapping[str, str]) -> Description:
+    """The description with classes of further names."""
+    of = description.fields.class_
+    if not classes or of is None:
+        return description
+    of = ClassField(path=of) if isinstance(of, str) else of
+    of = of.model_copy(update={"map": {**of.map, **classes}})
+    return replace(description, fields=description.fields.model_copy(update={"class_": of}))
+
+
+def read_decoded_lists(
+    log: Log, channels: Sequence[Channel], fields: Fields | None, classes: Mapping[str, str]
+) -> DecodedLists:
     """The lists on channels of one topic and schema. Raises RecordingError, BrokenIndexError."""
     messages = gather_messages(log, frozenset(c.number for c in channels))
     payloads = [p for c in channels for p in messages.payloads[c.number]]
@@ -333,14 +407,12 @@ def read_decoded_lists(log: Log, channels: Sequence[Channel], fields: Fields | N
     try:
         definition = make_definition(channel, payloads)
         description = Description(fields) if fields is not None else describe_channel(channel, definition.offers())
-        lists = decode_lists(definition, description, payloads, times)
+        description = _add_classes(description, classes)
+        lists = decode_lists(definition, description, payloads, times, channel.ahead_ns)
     except (DefinitionError, FieldsError) as error:
         raise RecordingError(str(error), path=log.path, topic=channel.topic) from None
-    columns = lists.columns
-    stamp_ns = columns.stamp_ns - np.where(columns.stamped, channel.ahead_ns, 0)
-    return replace(
-        lists, part=channel.part, columns=replace(columns, stamp_ns=stamp_ns, notes=(*columns.notes, *messages.notes()))
-    )
+    columns = replace(lists.columns, notes=(*lists.columns.notes, *messages.notes()))
+    return replace(lists, part=channel.part, columns=columns)
 
 
 def _transform_rows(values: Float, covariance: Float, placed: SampledPoses, instant: Int) -> tuple[Float, Float]:
@@ -361,11 +433,25 @@ def _transform_rows(values: Float, covariance: Float, placed: SampledPoses, inst
     return values, np.stack(turned, axis=1)
 
 
+def _name_frames(lists: DecodedLists, around: LogContext) -> DecodedLists:
+    """The lists with entries of no named frame as of that which the others name, else of the ego's world."""
+    nameless = np.array([not name.strip("/") for name in lists.frames] + [True])[lists.frame_code]
+    if not nameless.any() or (around.ego is None and nameless.all()):
+        return lists
+    named = lists.frame_code[~nameless]
+    code = int(np.bincount(named).argmax()) if len(named) else len(lists.frames)
+    frames = lists.frames if len(named) or around.ego is None else (*lists.frames, around.ego.parent)
+    findings = find("frameless", int(nameless.sum()), frame=frames[code])
+    columns = replace(lists.columns, notes=(*lists.columns.notes, *findings))
+    return replace(lists, columns=columns, frames=frames, frame_code=np.where(nameless, code, lists.frame_code))
+
+
 def transform_to_world(lists: DecodedLists, around: LogContext, path: Path, topic: str) -> DecodedLists:
     """The lists in the world, without the states at instants at which their frame has no place; notes tell of both.
 
     Raises RecordingError, naming `path` and `topic`: no transforms connect a list's frame with the world.
     """
+    lists = _name_frames(lists, around)
     names = around.named(lists)
     if not len(lists.frame_code) or not names:
         return lists
@@ -383,7 +469,7 @@ def transform_to_world(lists: DecodedLists, around: LogContext, path: Path, topi
         if placed is None:
             raise RecordingError(
                 f"lists are in the frame {name!r}, the ego in {world!r}, and no transform of the recording "
-                "says how they lie",
+                f"says how they lie{around.static_missing}",
                 path=path,
                 topic=topic,
             )

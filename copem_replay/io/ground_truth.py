@@ -13,12 +13,12 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from copem_replay.core.errors import count_noun
 from copem_replay.core.frame import SaidPlace
 from copem_replay.core.site_map import Lane
 from copem_replay.core.tracks import (
     CLASSES,
     SAME_INSTANT_NS,
+    SAME_INSTANT_S,
     TRUTH,
     VALUES,
     Area,
@@ -29,9 +29,18 @@ from copem_replay.core.tracks import (
     Solid,
     Tracks,
 )
-
-FARTHEST_M = 1e7
-"""A larger coordinate is no position: UTM northings end at 1e7."""
+from copem_replay.io.findings import (
+    FASTEST_MPS,
+    HEIGHTS_M,
+    LEAST_HEIGHT_M,
+    TYPICAL_M,
+    Finding,
+    Z,
+    complete_sizes,
+    find,
+    sift_states,
+)
+from copem_replay.io.truth_checks import TrackRows, are_places, check_truth
 
 
 @dataclass(frozen=True)
@@ -43,7 +52,8 @@ class DecodedObjects:
     """
 
     stamp_ns: Int  # (F,)
-    stamped: Bool  # (F,) False: the message has no time stamp, `stamp_ns` is its log time
+    stamped: Bool  # (F,) False: the message has no time stamp, `stamp_ns` is its log time, by the clock of the others
+    log_time_ns: Int  # (F,)
     rows: Int  # (F,) number of rows of each message
     object_ids: tuple[str, ...]  # N
     moving: Bool  # (N,)
@@ -59,6 +69,22 @@ class DecodedObjects:
     notes: tuple[str, ...] = ()  # a line for each kind of state that was skipped or completed
 
 
+def take_messages(columns: DecodedObjects, kept: Bool) -> DecodedObjects:
+    """The lists of the messages `kept` (F,)."""
+    if kept.all():
+        return columns
+    rows = np.repeat(kept, columns.rows)
+    of_message = {name: getattr(columns, name)[kept] for name in ("stamp_ns", "stamped", "log_time_ns", "rows")}
+    return replace(columns, **of_message, **{n: getattr(columns, n)[rows] for n in ("object_ix", "class_ix", "values")})
+
+
+def list_contents(columns: DecodedObjects) -> list[bytes]:
+    """What each message (F,) says of its objects, as bytes: equal for equal lists."""
+    ends = np.cumsum(columns.rows).tolist()
+    spans = [slice(end - number, end) for end, number in zip(ends, columns.rows.tolist(), strict=True)]
+    return [columns.object_ix[rows].tobytes() + columns.values[rows].tobytes() for rows in spans]
+
+
 # Corrections of velocities and heights. Rows are those of the truth (P,), track by track (`start (E + 1,)`). Each
 # function returns new columns and a note for everything that it changed.
 
@@ -67,31 +93,19 @@ MAX_GAP_S = 0.5
 """No difference is taken across a longer gap: the default of an experiment's `max_gap_s`."""
 MOVING_MPS = 0.5
 """An object that is faster by its positions moves: jitter of the positions of a standing one is slower."""
-FASTEST_MPS = 100.0
-"""A higher velocity is an error of the recording: no road user drives 360 km/h."""
-
-HEIGHTS_M = {
-    "pedestrian": (0.8, 1.75),
-    "bicycle": (0.8, 1.7),
-    "motorcycle": (0.8, 1.6),
-    "car": (1.0, 1.5),
-    "van": (1.4, 2.0),
-    "truck": (1.5, 3.2),
-    "bus": (2.0, 3.0),
-    "trailer": (0.5, 3.0),
-    "animal": (0.2, 0.7),
-    "other": (0.05, 1.0),
-    "vehicle": (0.5, 1.5),
-}
-"""The least plausible height and the typical one of each class, in m, rounded from those of real road users."""
-_LEAST_M = np.array([HEIGHTS_M[name][0] for name in CLASSES])
-_TYPICAL_M = np.array([HEIGHTS_M[name][1] for name in CLASSES])
 
 
 def correct_velocities(
-    start: Int, time_s: Float, x_m: Float, y_m: Float, vx_mps: Float, vy_mps: Float, moving: Bool
-) -> tuple[Float, Float, list[str]]:
-    """Velocities (P,) and notes, from those of the messages (NaN: not given); all columns are (P,).
+    start: Int,
+    time_s: Float,
+    x_m: Float,
+    y_m: Float,
+    vx_mps: Float,
+    vy_mps: Float,
+    moving: Bool,
+    max_gap_s: float = MAX_GAP_S,
+) -> tuple[Float, Float, list[Finding]]:
+    """Velocities (P,) and findings, from those of the messages (NaN: not given); all columns are (P,).
 
     A velocity is replaced by the central difference of the positions, one-sided at the ends of tracks and beside gaps,
     if it is not given, above `FASTEST_MPS`, or exactly 0 although the way to every neighbour is faster than
@@ -103,28 +117,17 @@ def correct_velocities(
         here = slice(start[first], start[last])
         columns = (column[here] for column in (time_s, x_m, y_m, vx_mps, vy_mps))
         begin = start[first : last + 1] - start[first]
-        vx[here], vy[here], of_tracks = _derive_velocities(begin, moving[here], *columns)
+        vx[here], vy[here], of_tracks = _derive_velocities(begin, moving[here], max_gap_s, *columns)
         counts += of_tracks
-    unset, frozen, too_fast, lone = counts.tolist()
-    notes = [
-        f"velocity of {count_noun(number, 'object state')} {what}: derived from the positions"
-        for number, what in (
-            (unset, "is not given"),
-            (frozen, "is 0 though the object moves"),
-            (too_fast, f"exceeds {FASTEST_MPS:g} m/s"),
-        )
-        if number
-    ]
-    if lone:
-        notes.append(f"velocity of {count_noun(lone, 'object state')} cannot be derived (no neighbour): 0 taken")
-    return vx, vy, notes
+    rules = ("velocity unset", "velocity frozen", "velocity fast", "velocity alone")
+    return vx, vy, [note for rule, n in zip(rules, counts.tolist(), strict=True) for note in find(rule, n)]
 
 
 def _derive_velocities(
-    start: Int, moving: Bool, time_s: Float, x_m: Float, y_m: Float, vx_mps: Float, vy_mps: Float
+    start: Int, moving: Bool, max_gap_s: float, time_s: Float, x_m: Float, y_m: Float, vx_mps: Float, vy_mps: Float
 ) -> tuple[Float, Float, Int]:
     """Velocities of some tracks (P,), and how many are not given, 0, too fast, and without a neighbour."""
-    before, after = _find_neighbours(start, time_s)
+    before, after = _find_neighbours(start, time_s, max_gap_s)
     dx, dy, apart_s = (a[after] - a[before] for a in (x_m, y_m, time_s))
     with_both = np.maximum(apart_s, np.finfo(float).tiny)  # lone rows: 0 / tiny = 0
     speed = np.hypot(vx_mps, vy_mps)
@@ -138,25 +141,25 @@ def _derive_velocities(
 
 def correct_heights(
     object_ix: Int, object_class: Int, moving: Bool, z_m: Float, width_m: Float, height_m: Float
-) -> tuple[Float, Float, list[str]]:
+) -> tuple[Float, Float, list[Finding]]:
     """Heights of centres and of boxes (P,), and notes; all columns are (P,).
 
     A height below the least plausible one of its class, or none (0), becomes the typical one; the bottom
     of the box stays. If all boxes are centred on z = 0, they are stood on z = 0.
     """
-    notes = []
+    notes = list[Finding]()
     height, z = height_m, z_m
     if not z.any() and len(np.unique(height)) > 1:
         z = height / 2.0
-        notes.append("every box is centred on z = 0: stood on z = 0")
+        notes += find("flat", len(z))
     of_moving = height[moving]
     if len(np.unique(object_ix[moving])) >= 3 and (of_moving == width_m[moving]).all():
-        notes.append("the height of every moving object equals its width, a known defect of exporters")
-    low = height < _LEAST_M[object_class]
+        notes += find("height is width", len(of_moving))
+    low = height < LEAST_HEIGHT_M[object_class]
     if not low.any():
         return z, height, notes
-    notes.append(f"height implausible or missing: {_count_by_class(object_ix, object_class, low)}")
-    typical = _TYPICAL_M[object_class]
+    notes += find("height", int(low.sum()), which=_count_by_class(object_ix, object_class, low))
+    typical = TYPICAL_M[object_class, 2]
     return (
         np.where(low, z + (typical - height) / 2.0, z),
         np.where(low, typical, height),
@@ -164,10 +167,10 @@ def correct_heights(
     )
 
 
-def _find_neighbours(start: Int, time_s: Float) -> tuple[Int, Int]:
+def _find_neighbours(start: Int, time_s: Float, max_gap_s: float) -> tuple[Int, Int]:
     """(P,) row before and row after each in its track; itself at the end of the track and beside a gap."""
     row = np.arange(len(time_s))
-    joined = np.diff(time_s) <= MAX_GAP_S  # row k and k + 1
+    joined = np.diff(time_s) <= max_gap_s + SAME_INSTANT_S  # row k and k + 1
     joined[start[1:-1] - 1] = False
     before, after = row.copy(), row.copy()
     before[1:] -= joined
@@ -199,24 +202,18 @@ def _count_by_class(object_ix: Int, object_class: Int, rows: Bool) -> str:
 
 # Assembly: messages in order, usable rows, tracks.
 
-LONGEST_M = 1000.0
-"""A longer, wider or higher object is an error of the recording: no wall, train or building is."""
-_CLOCK_SLACK_NS = (
-    1_000_000_000  # log times this far outside the stamps may still be of their clock: latencies are shorter
-)
-_X, _Y, _Z, _YAW, _VX, _VY, _LENGTH, _WIDTH, _HEIGHT = range(len(VALUES))
-
 
 def assemble_truth(
-    columns: DecodedObjects, log: str
+    columns: DecodedObjects, log: str, max_gap_s: float = MAX_GAP_S
 ) -> tuple[Scene, Tracks, tuple[str, ...]] | tuple[None, None, tuple[str, ...]]:
     """Scene (without ego), truth and notes of the log named `log`. No scene where no object is usable."""
-    notes: list[str] = []
+    notes = list[str]()
     kept_list, stamp_ns = _order_messages(columns, notes)
     frame_of_list = np.full(len(columns.stamp_ns), -1)
     frame_of_list[kept_list] = np.arange(len(kept_list))
     frame = np.repeat(frame_of_list, columns.rows)
-    row = np.flatnonzero(_find_usable(columns.values, frame >= 0, notes))
+    values, usable = sift_states(columns.values, frame >= 0, notes)
+    row = np.flatnonzero(usable)
     row = _drop_repeated_objects(row, frame, columns.object_ix, notes)
     if not len(row):
         return None, None, tuple(notes)
@@ -224,22 +221,36 @@ def assemble_truth(
     object_ix, first_seen = _number_by_appearance(columns.object_ix[row])
     order = np.argsort(object_ix, kind="stable")  # rows are in order of capture: so are those of each track
     row, object_ix = row[order], object_ix[order]
+    time_s = (stamp_ns[frame[row]] - stamp_ns[0]) * np.float64(1e-9)
+    ids = tuple(columns.object_ids[k] for k in first_seen)
+    rows = TrackRows(ids, object_ix, time_s, columns.class_ix[row], values[row], columns.moving[first_seen])
+    rows, states = check_truth(rows, _are_places(columns), notes)
+    row, object_ix, values = row[states], rows.object_ix, rows.values
     object_class = _most_frequent_class(object_ix, columns.class_ix[row], notes)
     scene = Scene(
         log=log,
         t0_ns=int(stamp_ns[0]),
         end_ns=int(stamp_ns[-1]),
-        object_ids=tuple(columns.object_ids[k] for k in first_seen),
+        object_ids=rows.ids,
         object_class=object_class,
-        moving=columns.moving[first_seen],
+        moving=rows.moving,
     )
-    column = {name: columns.values[row, k] for k, name in enumerate(VALUES)}
-    tracks = _build_tracks(scene, stamp_ns, frame[row], object_ix, column, notes)
+    values = complete_sizes(values, object_class[object_ix], object_ix, notes)
+    column = {name: values[:, k] for k, name in enumerate(VALUES)}
+    tracks = _build_tracks(scene, stamp_ns, frame[row], object_ix, column, max_gap_s, notes)
     return (
-        replace(scene, solids=_stand_solids_on_ground(columns.solids, columns.values[row, _Z], tracks.z_m)),
+        replace(scene, solids=_stand_solids_on_ground(columns.solids, values[:, Z], tracks.z_m)),
         tracks,
         tuple(notes),
     )
+
+
+def _are_places(columns: DecodedObjects) -> bool:
+    """Whether the ids of listed objects are places in the list."""
+    ego = [columns.object_ids.index(host) for host in set(columns.hosts) if host in columns.object_ids]
+    listed = np.flatnonzero(~np.isin(columns.object_ix, ego))
+    message = np.repeat(np.arange(len(columns.rows)), columns.rows)
+    return are_places(columns.object_ids, columns.object_ix[listed], message[listed])
 
 
 def _stand_solids_on_ground(solids: tuple[Solid, ...], stated_z_m: Float, z_m: Float) -> tuple[Solid, ...]:
@@ -251,49 +262,13 @@ def _stand_solids_on_ground(solids: tuple[Solid, ...], stated_z_m: Float, z_m: F
 
 def _order_messages(columns: DecodedObjects, notes: list[str]) -> tuple[Int, Int]:
     """(F,) indices of the messages that are kept, in order of time, and (F,) their stamps."""
-    stamp_ns, use = columns.stamp_ns, np.ones(len(columns.stamp_ns), dtype=bool)
-    if not columns.stamped.all():
-        if columns.stamped.any():
-            # Log times may run on another clock: one of 2026 in a simulation would be a gap of decades.
-            stamped = stamp_ns[columns.stamped]
-            earliest_ns, latest_ns = stamped.min() - _CLOCK_SLACK_NS, stamped.max() + _CLOCK_SLACK_NS
-            use = columns.stamped | ((stamp_ns >= earliest_ns) & (stamp_ns <= latest_ns))
-        if log_timed := int((use & ~columns.stamped).sum()):
-            notes.append(f"{count_noun(log_timed, 'message')} without timestamp: the time of logging taken")
-        if dropped := int((~use).sum()):
-            notes.append(f"{count_noun(dropped, 'message')} without timestamp, and logged at another time: skipped")
-    kept = np.flatnonzero(use)
-    if late := int((np.diff(stamp_ns[kept]) < 0).sum()):
-        notes.append(f"{count_noun(late, 'message')} stamped earlier than the one before: sorted by time")
-    kept = kept[np.argsort(stamp_ns[kept], kind="stable")]
+    stamp_ns = columns.stamp_ns
+    notes += find("late", int((np.diff(stamp_ns) < 0).sum()))
+    kept = np.argsort(stamp_ns, kind="stable")
     again = np.diff(stamp_ns[kept], prepend=stamp_ns[kept[:1]] - SAME_INSTANT_NS) < SAME_INSTANT_NS
-    if again.any():
-        notes.append(f"{count_noun(int(again.sum()), 'message')} with the time stamp of another: the first kept")
+    notes += find("again", int(again.sum()))
     kept = kept[~again]
     return kept, stamp_ns[kept]
-
-
-def _find_usable(values: Float, kept: Bool, notes: list[str]) -> Bool:
-    """(P,) which of the rows `kept` so far have a position, a yaw and a size; `notes` gets the others."""
-    usable = kept.copy()
-    place, size = values.T[_X : _Z + 1], values.T[_LENGTH : _WIDTH + 1]
-    with np.errstate(invalid="ignore"):
-        defects = {
-            "without a position, or with one that is no number": ~np.isfinite(place).all(axis=0),
-            f"farther than {FARTHEST_M:g} m from the origin": (np.abs(place) > FARTHEST_M).any(axis=0),
-            "whose yaw is no number": ~np.isfinite(values[:, _YAW]),
-            f"whose length or width is not between 0 and {LONGEST_M:g} m": ~((size > 0.0) & (size <= LONGEST_M)).all(
-                axis=0
-            ),
-            f"whose height is negative, above {LONGEST_M:g} m or no number": ~(
-                (values[:, _HEIGHT] >= 0.0) & (values[:, _HEIGHT] <= LONGEST_M)
-            ),
-        }
-    for what, rows in defects.items():
-        if number := int((usable & rows).sum()):
-            notes.append(f"{count_noun(number, 'object state')} {what}: skipped")
-        usable &= ~rows
-    return usable
 
 
 def _drop_repeated_objects(row: Int, frame: Int, object_ix: Int, notes: list[str]) -> Int:
@@ -302,8 +277,7 @@ def _drop_repeated_objects(row: Int, frame: Int, object_ix: Int, notes: list[str
     by_object = np.lexsort((frame[row], object_ix[row]))  # stable: the first of two stays the first
     same = np.zeros(len(row), dtype=bool)
     same[by_object[1:]] = (np.diff(object_ix[row][by_object]) == 0) & (np.diff(frame[row][by_object]) == 0)
-    if same.any():
-        notes.append(f"{count_noun(int(same.sum()), 'object state')} of an id twice in a message: the first kept")
+    notes += find("twice", int(same.sum()))
     return row[~same]
 
 
@@ -322,14 +296,19 @@ def _most_frequent_class(object_ix: Int, class_ix: NDArray[np.int8], notes: list
     owner, candidate = pairs // len(CLASSES), pairs % len(CLASSES)
     best_first = np.lexsort((first, -counts, owner))
     _, top = np.unique(owner[best_first], return_index=True)
-    if changing := int((np.bincount(owner) > 1).sum()):
-        notes.append(f"{count_noun(changing, 'object')} of changing class: the most frequent taken")
+    notes += find("class changes", int((np.bincount(owner) > 1).sum()))
     majority: NDArray[np.int8] = candidate[best_first][top].astype(np.int8)
     return majority
 
 
 def _build_tracks(
-    scene: Scene, stamp_ns: Int, frame: Int, object_ix: Int, column: dict[str, Float], notes: list[str]
+    scene: Scene,
+    stamp_ns: Int,
+    frame: Int,
+    object_ix: Int,
+    column: dict[str, Float],
+    max_gap_s: float,
+    notes: list[str],
 ) -> Tracks:
     """The truth of rows that are in order of tracks, velocities and heights corrected; `notes` gets the corrections."""
     number = len(scene.object_ids)
@@ -337,7 +316,9 @@ def _build_tracks(
     captured_s = ((stamp_ns - scene.t0_ns) * 1e-9).astype(np.float64)
     moving, class_ix = scene.moving[object_ix], scene.object_class[object_ix].astype(np.int64)
     x, y = column["x_m"], column["y_m"]
-    vx, vy, corrections = correct_velocities(start, captured_s[frame], x, y, column["vx_mps"], column["vy_mps"], moving)
+    vx, vy, corrections = correct_velocities(
+        start, captured_s[frame], x, y, column["vx_mps"], column["vy_mps"], moving, max_gap_s
+    )
     notes += corrections
     z, height, corrections = correct_heights(
         object_ix, class_ix, moving, column["z_m"], column["width_m"], column["height_m"]

@@ -11,6 +11,7 @@ captures and full covariances, and these are taken from there.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -27,13 +28,24 @@ from copem_replay.io.channel import LAST_NS, schema_name
 from copem_replay.io.decoded_size import DecodeAllowance, OversizeError, check_objects
 from copem_replay.io.encodings import make_definition
 from copem_replay.io.encodings.columns import DefinitionError, shred_messages
+from copem_replay.io.findings import (
+    MOST_SHARE,
+    Finding,
+    complete_entries,
+    complete_sizes,
+    find,
+    sift_covariances,
+    sift_shares,
+    sift_states,
+)
 from copem_replay.io.frames import LogContext, read_decoded_lists, read_log_context, transform_to_world
 from copem_replay.io.log import BrokenIndexError, Log, gather_messages
 from copem_replay.io.open import Local, open_log
 from copem_replay.io.schemas import osi_ground_truth as osi
 from copem_replay.io.schemas.object_lists import DecodedLists
-from copem_replay.io.schemas.osi_ground_truth import SENSOR_DATA, check_osi, load_sensor_data_class, osi_id
+from copem_replay.io.schemas.osi_ground_truth import SENSOR_DATA, check_osi, load_message_class, osi_id
 from copem_replay.io.schemas.registry import DETAIL_SCHEMA, known_lists
+from copem_replay.io.stamps import settle_stamps
 from copem_replay.io.window import Window
 
 _LARGEST_ID = 2**63 - 1
@@ -44,7 +56,13 @@ _LARGEST_ID = 2**63 - 1
 class _EntryRows:
     """Entries of all lists, in the order of the messages."""
 
-    stamps: list[tuple[int, int]] = field(default_factory=list)  # captured, arrives
+    captured: list[int | None] = field(default_factory=list)  # in ns, None: not said; of every list, as the next three
+    arrives: list[int | None] = field(default_factory=list)
+    logged: list[int] = field(default_factory=list)
+    ahead: list[int] = field(default_factory=list)  # of the clock of the stamps against that of log times
+    undecoded: int = 0
+    impossible: int = 0  # stamps that are none
+    rules: Counter[str] = field(default_factory=Counter)  # findings on entries, by rule
     frame: list[int] = field(default_factory=list)
     ident: list[int] = field(default_factory=list)  # ground truth id, −1: none
     track: list[int] = field(default_factory=list)  # −1: none
@@ -52,10 +70,33 @@ class _EntryRows:
     variances: list[tuple[float, ...]] = field(default_factory=list)
     existence: list[float] = field(default_factory=list)  # NaN: not said
     likely: list[dict[int, float]] = field(default_factory=list)  # probability by class, as far as stated
-    spread_said: list[bool] = field(default_factory=list)
-    capture_said: list[bool] = field(default_factory=list)  # of every list, as the next two
-    stamped: list[bool] = field(default_factory=list)
-    logged: list[int] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class _ListTimes:
+    """When F lists were captured and arrive, in ns, and which of it they state."""
+
+    stamps_ns: Int  # (F, 2)
+    capture_said: Bool
+    stamped: Bool
+    logged_ns: Int
+
+
+def _settle_times(rows: _EntryRows, findings: list[str]) -> _ListTimes:
+    """The times of the lists, those that are not set replaced by the time of logging."""
+    logged_ns, ahead_ns = np.array(rows.logged, dtype=np.int64), np.array(rows.ahead, dtype=np.int64)
+    findings += find("stamp impossible", rows.impossible)
+    settled = list[tuple[Int, Bool]]()
+    for stated in (rows.arrives, rows.captured):
+        said = np.array([stamp is not None for stamp in stated], dtype=bool)
+        moved_ns = np.array([log if stamp is None else stamp for stamp, log in zip(stated, rows.logged, strict=True)])
+        moved_ns = moved_ns.astype(np.int64) - np.where(said, ahead_ns, 0)
+        stamp_ns, known, _, found = settle_stamps(moved_ns, said, logged_ns, ahead_ns=ahead_ns, told=rows.impossible)
+        findings += [] if settled else found  # a capture that is not set is that of the stamp
+        settled.append((stamp_ns, known))
+    (arrives_ns, stamped), (captured_ns, capture_said) = settled
+    captured_ns = np.where(capture_said, captured_ns, arrives_ns)
+    return _ListTimes(np.stack([captured_ns, arrives_ns], axis=1), capture_said, stamped, logged_ns)
 
 
 def read_sensor_data(path: Local, topic: str, scene: Scene) -> Tracks:
@@ -83,7 +124,7 @@ class RecordedLists:
     capture_said: Bool
     stamped: Bool
     logged_ns: Int
-    dropped: int  # entries without a position
+    notes: tuple[str, ...]  # entries that were left out or completed
 
 
 @np.errstate(over="ignore", invalid="ignore")
@@ -93,40 +134,61 @@ def read_recorded(path: Local, topic: str, scene: Scene, window: Window | None =
     Raises RecordingError: no such topic of osi3.SensorData, or a message of it cannot be decoded.
     """
     rows, _ = _read_rows(path, topic, window)
-    stamps = np.array(rows.stamps, dtype=np.int64).reshape(-1, 2)
-    by_time, frame = order_by_time(stamps[:, 1], np.array(rows.frame, dtype=np.int64))
-    values = np.array(rows.values, dtype=float).reshape(-1, len(VALUES))
-    variances = np.array(rows.variances, dtype=float).reshape(-1, len(UNCERTAINTIES))
-    placed = np.isfinite(values[:, :2]).all(axis=1)
-    order = np.flatnonzero(placed)[np.argsort(frame[placed], kind="stable")]
-    values, variances = np.nan_to_num(values[order]), np.nan_to_num(variances[order])
-    probability = np.zeros((len(order), len(CLASSES)))
-    for p, k in enumerate(order):
-        for index, share in rows.likely[k].items():
+    findings: list[str] = [*find("undecoded", rows.undecoded)]
+    findings += [line for rule, number in sorted(rows.rules.items()) for line in find(rule, number)]
+    times = _settle_times(rows, findings)
+    probability = np.zeros((len(rows.frame), len(CLASSES)))
+    for p, likely in enumerate(rows.likely):
+        for index, share in likely.items():
             probability[p, index] += share
-    none = probability.sum(axis=1) <= 0
-    probability[none, osi.OTHER] = 1.0
-    tracks = build_unit_tracks(
-        topic,
-        scene,
-        stamps[by_time],
-        np.arange(len(order) + 1),
-        np.full(len(order), -1),
-        frame[order],
-        values,
-        variances,
-    )
-    return RecordedLists(
-        tracks,
-        np.array(rows.existence, dtype=float)[order],
+    probability[probability.sum(axis=1) <= 0, osi.OTHER] = 1.0
+    entries = _Entries(
+        np.array(rows.frame, dtype=np.int64),
+        np.array(rows.values, dtype=float).reshape(-1, len(VALUES)),
+        np.array(rows.variances, dtype=float).reshape(-1, len(UNCERTAINTIES)),
+        np.array(rows.existence, dtype=float),
         probability / probability.sum(axis=1, keepdims=True),
-        np.array(rows.track, dtype=np.int64)[order],
-        np.array(rows.spread_said, dtype=bool)[order],
-        np.array(rows.capture_said, dtype=bool)[by_time],
-        np.array(rows.stamped, dtype=bool)[by_time],
-        np.array(rows.logged, dtype=np.int64)[by_time],
-        int((~placed).sum()),
+        np.array(rows.track, dtype=np.int64),
     )
+    return _make_recorded(entries, times, topic, scene, findings)
+
+
+@dataclass(frozen=True)
+class _Entries:
+    """Entries (P,) of lists, in the order of the messages, with what is not stated, or none, as NaN."""
+
+    frame: Int  # the list of each
+    values: Float
+    variances: Float  # (P, uncertainties)
+    existence: Float
+    probability: Float  # (P, C)
+    track: Int
+
+
+def _make_recorded(
+    entries: _Entries, times: _ListTimes, topic: str, scene: Scene, findings: list[str]
+) -> RecordedLists:
+    """The lists as tracks, with what is none left out or completed, which `findings` get."""
+    by_time, frame = order_by_time(times.stamps_ns[:, 1], entries.frame)
+    values, usable = sift_states(entries.values, np.ones(len(frame), dtype=bool), findings)
+    order = np.flatnonzero(usable)[np.argsort(frame[usable], kind="stable")]
+    values = complete_sizes(values[order], entries.probability[order].argmax(axis=1), None, findings)
+    variances = entries.variances[order]
+    variances[:, :3], spread_said = sift_covariances(variances[:, :3], findings)
+    return RecordedLists(
+        build_unit_tracks(
+            topic, scene, times.stamps_ns[by_time], np.arange(len(order) + 1), np.full(len(order), -1), frame[order],
+            complete_entries(values, findings), variances,
+        ),
+        sift_shares(entries.existence[order], "existence", findings),
+        entries.probability[order],
+        entries.track[order],
+        spread_said,
+        times.capture_said[by_time],
+        times.stamped[by_time],
+        times.logged_ns[by_time],
+        tuple(findings),
+    )  # fmt: skip
 
 
 def _read_rows(path: Local, topic: str, window: Window | None = None) -> tuple[_EntryRows, dict[int, dict[str, Any]]]:
@@ -166,37 +228,30 @@ def _read_messages(log: Log, topic: str) -> tuple[_EntryRows, dict[int, dict[str
                 details[content["available_ns"]] = {item["id"]: item for item in content["objects"]}
         else:
             try:
-                message_class = load_sensor_data_class()
+                message_class = load_message_class(SENSOR_DATA)
                 check_osi(message_class, payload)
                 message = message_class.FromString(payload)
                 check_objects(len(message.moving_object))
                 allowance.spend(0, len(message.moving_object))
             except OversizeError as error:
                 raise RecordingError(str(error), path=log.path, topic=topic) from None
-            except DecodeError as error:
-                raise RecordingError(f"a message cannot be decoded: {error}", path=log.path, topic=topic) from None
-            _add_message(rows, message, log_time_ns)
-            if chosen[number].ahead_ns:  # by the clock of the log times
-                by_message = message.HasField("timestamp"), message.HasField("last_measurement_time")
-                captured_ns, arrives_ns = rows.stamps[-1]
-                captured_ns -= chosen[number].ahead_ns * any(by_message)
-                rows.stamps[-1] = captured_ns, arrives_ns - chosen[number].ahead_ns * by_message[0]
-            if max(map(abs, rows.stamps[-1])) > LAST_NS:
-                raise RecordingError("a message has an impossible time stamp", path=log.path, topic=topic)
+            except DecodeError:
+                rows.undecoded += 1
+                continue
+            _add_message(rows, message, log_time_ns, chosen[number].ahead_ns)
+    if rows.undecoded and not rows.logged:
+        raise RecordingError(f"none of its {rows.undecoded} messages can be decoded", path=log.path, topic=topic)
     return rows, details
 
 
-def _add_message(rows: _EntryRows, message: Any, log_time_ns: int) -> None:
+def _add_message(rows: _EntryRows, message: Any, log_time_ns: int, ahead_ns: int) -> None:
     """Append one osi3.SensorData and its entries."""
-    stamp = message.timestamp
-    arrives_ns = stamp.seconds * 10**9 + stamp.nanos if message.HasField("timestamp") else log_time_ns
-    last = message.last_measurement_time
-    captured_ns = last.seconds * 10**9 + last.nanos if message.HasField("last_measurement_time") else arrives_ns
-    frame = len(rows.stamps)
-    rows.stamps.append((captured_ns, arrives_ns))
-    rows.capture_said.append(message.HasField("last_measurement_time"))
-    rows.stamped.append(message.HasField("timestamp"))
+    frame = len(rows.logged)
     rows.logged.append(min(log_time_ns, LAST_NS))
+    rows.ahead.append(ahead_ns)
+    for name, times in (("timestamp", rows.arrives), ("last_measurement_time", rows.captured)):
+        times.append(osi.osi_stamp_ns(getattr(message, name)) if message.HasField(name) else None)
+        rows.impossible += message.HasField(name) and times[-1] is None
     for item in [*message.moving_object, *message.stationary_object]:
         base, spread = item.base, item.base_rmse
         place, size, speed = base.position, base.dimension, getattr(base, "velocity", None)
@@ -205,14 +260,18 @@ def _add_message(rows: _EntryRows, message: Any, log_time_ns: int) -> None:
         rows.ident.append(truth_ids[0].value if truth_ids else -1)
         tracked = item.header.HasField("tracking_id")
         rows.track.append(item.header.tracking_id.value & _LARGEST_ID if tracked else -1)
-        vx, vy = (speed.x, speed.y) if speed is not None else (0.0, 0.0)
-        x, y, z, yaw, vx, vy = _transform_entry(message, place.x, place.y, place.z, base.orientation.yaw, vx, vy)
-        if not base.HasField("position"):  # nowhere is not the origin
-            x = y = np.nan
+        at = (place.x, place.y, place.z, base.orientation.yaw)
+        state, rules = osi.check_zeros(base, at if speed is None else (*at, speed.x, speed.y))
+        rows.rules.update(rules)
+        x, y, z, yaw, vx, vy = _transform_entry(message, *state, *((0.0, 0.0) if speed is None else ()))
         rows.values.append((x, y, z, yaw, vx, vy, size.length, size.width, size.height))
-        fast = spread.velocity.x if speed is not None else 0.0
-        beside = (spread.orientation.yaw, spread.dimension.length, fast)
-        along, across, turn = spread.position.x**2, spread.position.y**2, _frame_yaw(message)
+        stated = [(spread.orientation, "yaw"), (spread.dimension, "length")]
+        stated += [(spread.velocity, "x")] if speed is not None else []
+        beside = [getattr(of, name) if of.HasField(name) else np.nan for of, name in stated]
+        beside += [0.0] if speed is None else []
+        said = spread.position.HasField("x") and spread.position.HasField("y")
+        along, across = (each * each if said else 0.0 for each in (spread.position.x, spread.position.y))
+        turn = _frame_yaw(message)
         cos, sin = np.cos(turn), np.sin(turn)
         rows.variances.append(
             (
@@ -225,11 +284,10 @@ def _add_message(rows: _EntryRows, message: Any, log_time_ns: int) -> None:
         header = item.header
         has_existence = header.HasField("existence_probability")
         rows.existence.append(header.existence_probability if has_existence else np.nan)
-        rows.likely.append(_class_probabilities(item))
-        rows.spread_said.append(spread.position.HasField("x") and spread.position.HasField("y"))
+        rows.likely.append(_class_probabilities(item, rows))
 
 
-def _class_probabilities(item: Any) -> dict[int, float]:
+def _class_probabilities(item: Any, rows: _EntryRows) -> dict[int, float]:
     """Probability by index of class, as the unit states it for a moving object; empty for a stationary one."""
     likely: dict[int, float] = {}
     for candidate in getattr(item, "candidate", ()):
@@ -239,8 +297,14 @@ def _class_probabilities(item: Any) -> dict[int, float]:
         kind = osi.osi_class_index(
             candidate.type, vehicle.type if candidate.HasField("vehicle_classification") else None
         )
-        share = candidate.probability if candidate.HasField("probability") else 1.0
-        likely[kind] = likely.get(kind, 0.0) + max(share, 0.0)
+        stated = candidate.HasField("probability")
+        share = candidate.probability if stated else 1.0
+        if not stated and any(other.HasField("probability") for other in item.candidate):
+            rows.rules["class share"] += 1
+        if not 0.0 <= share <= MOST_SHARE:
+            rows.rules["class share"] += 1
+            share = 0.0
+        likely[kind] = likely.get(kind, 0.0) + share
     return likely
 
 
@@ -270,7 +334,7 @@ def _transform_entry(
 
 def _make_tracks(rows: _EntryRows, details: dict[int, dict[str, Any]], topic: str, scene: Scene) -> Tracks:
     """Tracks by object of `scene` and track id, with the full covariances of `details` where there are any."""
-    stamps = np.array(rows.stamps, dtype=np.int64).reshape(-1, 2)
+    stamps = _settle_times(rows, []).stamps_ns
     by_time, frame = order_by_time(stamps[:, 1], np.array(rows.frame, dtype=np.int64))
     object_by_id = {osi_id(name): k for k, name in enumerate(scene.object_ids)}
     object_ix = np.array([object_by_id.get(i, -1) for i in rows.ident], dtype=np.int64)
@@ -350,7 +414,7 @@ def _read_described(log: Log, topic: str, scene: Scene, around: LogContext | Non
     if log.window is not None and next(log.payloads(frozenset(c.number for c in same_schema)), None) is None:
         raise RecordingError("holds no list in the window", path=log.path, topic=topic)
     around = around or read_log_context(log, None, seek_ego=False)
-    lists = transform_to_world(read_decoded_lists(log, same_schema, None), around, log.path, topic)
+    lists = transform_to_world(read_decoded_lists(log, same_schema, None, around.classes), around, log.path, topic)
     return _make_recorded_lists(lists, _read_details(log, topic), topic, scene)
 
 
@@ -412,35 +476,21 @@ def _get_number(item: Any, name: str, otherwise: float) -> float:
 def _make_recorded_lists(
     lists: DecodedLists, details: Mapping[int, Mapping[str, Any]], topic: str, scene: Scene
 ) -> RecordedLists:
-    lists, beside = _add_details(lists, details)
-    columns = lists.columns
-    by_time, frame = order_by_time(columns.stamp_ns, np.repeat(np.arange(len(columns.rows)), columns.rows))
-    placed = np.isfinite(columns.values[:, :2]).all(axis=1)
-    order = np.flatnonzero(placed)[np.argsort(frame[placed], kind="stable")]
-    covariance = lists.covariance_m2[order]
-    spread_said = np.isfinite(covariance).all(axis=1) & (covariance[:, 0] > 0) & (covariance[:, 2] > 0)
-    variances = np.nan_to_num(beside[order])
-    variances[:, :3] = np.where(spread_said[:, None], covariance, 0.0)  # turned with its list
-    stamps = columns.stamp_ns[by_time]
-    captured, capture_said = _find_captures(stamps, details)
-    tracks = build_unit_tracks(
-        topic,
-        scene,
-        np.stack([captured, stamps], axis=1),
-        np.arange(len(order) + 1),
-        np.full(len(order), -1),
-        frame[order],
-        np.nan_to_num(columns.values[order]),
+    lists, variances = _add_details(lists, details)
+    columns, findings = lists.columns, list[str]()
+    turned = ~np.isnan(lists.covariance_m2).all(axis=1)
+    variances[:, :3] = np.where(np.asarray(turned)[:, None], lists.covariance_m2, 0.0)  # turned with its list
+    captured, capture_said = _find_captures(columns.stamp_ns, details)
+    entries = _Entries(
+        np.repeat(np.arange(len(columns.rows)), columns.rows),
+        columns.values,
         variances,
+        lists.existence,
+        lists.probability,
+        columns.object_ix if lists.named else np.full(len(columns.object_ix), -1),
     )
-    return RecordedLists(
-        tracks,
-        lists.existence[order],
-        lists.probability[order],
-        columns.object_ix[order] if lists.named else np.full(len(order), -1),
-        spread_said,
-        capture_said,
-        columns.stamped[by_time],
-        lists.log_time_ns[by_time],
-        int((~placed).sum()),
+    times = _ListTimes(
+        np.stack([captured, columns.stamp_ns], axis=1), capture_said, columns.stamped, columns.log_time_ns
     )
+    made = _make_recorded(entries, times, topic, scene, findings)
+    return replace(made, notes=(*(n for n in columns.notes if isinstance(n, Finding)), *made.notes))

@@ -18,10 +18,10 @@ import numpy as np
 from copem_replay.core.assignment import assign
 from copem_replay.core.errors import RecordingError, count_noun
 from copem_replay.core.interpolation import interpolate_at_instants
-from copem_replay.core.object_list import AGREE
-from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int, Scene, Tracks, join_tracks
+from copem_replay.core.tracks import AGREE, SAME_INSTANT_NS, Bool, Float, Int, Scene, Tracks, join_tracks
 from copem_replay.io.clock_offset import TimeOffset, estimate_time_offset
 from copem_replay.io.config import RecordedOutput, RecordedTopic
+from copem_replay.io.findings import Finding
 from copem_replay.io.ground_truth import MAX_GAP_S
 from copem_replay.io.recorded_lists import RecordedLists, read_unit_lists
 from copem_replay.io.recording import Recording
@@ -197,7 +197,7 @@ def read_recorded_unit(
         )
     columns = _covariance_columns(lists, asked, path)
     label = f"{called} {name}"
-    notes = [f"{label}: {lists.dropped} of its entries have no position and are left out"] if lists.dropped else []
+    notes = [note.within(label) if isinstance(note, Finding) else f"{label}: {note}" for note in lists.notes]
     late_ns = np.where(lists.capture_said, 0, round(asked.delay_s * 1e9))
     arrives_ns = scene.t0_ns + np.rint(tracks.common_arrives_s * 1e9).astype(np.int64)
     stamp_ns = np.minimum(tracks.stamp_ns - late_ns, arrives_ns)

@@ -6,24 +6,25 @@ derived or corrected.
 
 from __future__ import annotations
 
+import re
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from copem_replay.core.errors import EgoError, RecordingError, RemoteFile, count_noun, escape_unprintable
+from copem_replay.core.errors import EgoError, RecordingError, RemoteFile, count_noun
 from copem_replay.core.frame import SaidPlace
 from copem_replay.core.site_map import Lane
 from copem_replay.core.tracks import CLASSES, Float, Scene, Tracks
-from copem_replay.io.channel import Channel
+from copem_replay.io.channel import ENCODINGS, Channel
 from copem_replay.io.decoded_size import DecodeAllowance, OversizeError
-from copem_replay.io.ground_truth import DecodedObjects, assemble_truth
+from copem_replay.io.findings import as_finding, find, find_rule
+from copem_replay.io.ground_truth import MAX_GAP_S, DecodedObjects, assemble_truth, list_contents
 from copem_replay.io.log import BrokenIndexError, Log, cut_window, window_notes
 from copem_replay.io.open import (
     DriveRecordings,
@@ -38,6 +39,8 @@ from copem_replay.io.open import (
 from copem_replay.io.schemas import osi_ground_truth as osi
 from copem_replay.io.schemas.poses import is_pose
 from copem_replay.io.schemas.registry import is_list, known_lists, names_objects
+from copem_replay.io.stamps import refuse_second_run
+from copem_replay.io.truth_checks import HeadingUnitError
 from copem_replay.io.window import Window, WindowSeconds
 
 if TYPE_CHECKING:
@@ -48,6 +51,7 @@ if TYPE_CHECKING:
 
 
 _TOPIC = ("read", "topic")  # the key of an experiment that names the topic of the truth
+_NO_TRUTH = "lists of a unit they can be, not the truth"
 _SHOWN = 12  # ids or topics named in an error; the rest is counted
 
 
@@ -120,6 +124,8 @@ def read_log(
     fields: Fields | None = None,
     beside: Collection[str] = (),
     window_s: WindowSeconds = None,
+    max_gap_s: float = MAX_GAP_S,
+    classes: Mapping[str, str] | None = None,
 ) -> Recording:
     """Read the truth of the recording at a place, or of an opened log, as the log called `name`.
 
@@ -127,11 +133,22 @@ def read_log(
     the only odometry. `topic`: that of the truth, None where there is only one candidate; `fields`: which fields of its
     messages hold what, None where the schema is known. `beside`: topics that recorded units read.
     `window_s`: read only what was logged from one instant to another, both included, in seconds since the first message
-    on the topic of the truth was logged; None: from the beginning, to the end.
+    on the topic of the truth was logged; None: from the beginning, to the end. `max_gap_s`: velocities that messages do
+    not state are derived across no longer gap. `classes`: of names, beside those that are known.
     Raises RecordingError, one line: no such file, no MCAP file, no truth, no usable object, no such ego, no such topic,
     or several, a file that changes while it is read; EmptyWindowError.
     """
-    read = partial(_read, name=name, ego=ego, topic=topic, fields=fields, beside=beside, window_s=window_s)
+    read = partial(
+        _read,
+        name=name,
+        ego=ego,
+        topic=topic,
+        fields=fields,
+        beside=beside,
+        window_s=window_s,
+        max_gap_s=max_gap_s,
+        classes=classes or {},
+    )
     if isinstance(source, Log):
         return read(source)
     place, stamps = Path(source) if isinstance(source, str) else source, None
@@ -156,16 +173,22 @@ def _read(
     fields: Fields | None,
     beside: Collection[str],
     window_s: WindowSeconds,
+    max_gap_s: float,
+    classes: Mapping[str, str],
 ) -> Recording:
     asked = None if isinstance(ego, str) else ego
     topic, ignored = choose_topic(log, topic, beside, fields, asked)
     try:
         log = cut_window(log, topic, window_s)
-        columns, around, world = _decode_world(log, topic, fields, asked, seek_ego=ego is None)
+        columns, around, world = _decode_world(log, topic, fields, asked, classes, seek_ego=ego is None)
     except BrokenIndexError as error:
         log = cut_window(log.from_start(error), topic, window_s)
-        columns, around, world = _decode_world(log, topic, fields, asked, seek_ego=ego is None)
-    scene, truth, truth_notes = assemble_truth(columns, name)
+        columns, around, world = _decode_world(log, topic, fields, asked, classes, seek_ego=ego is None)
+    refuse_second_run(columns.stamp_ns, columns.log_time_ns, partial(list_contents, columns), log.path, topic)
+    try:
+        scene, truth, truth_notes = assemble_truth(columns, name, max_gap_s)
+    except HeadingUnitError as error:
+        raise RecordingError(str(error), path=log.path, topic=topic) from None
     notes = [*columns.notes, *truth_notes]
     if scene is None or truth is None:
         messages = count_noun(sum(c.messages for c in log.channels if c.topic == topic), "message")
@@ -174,13 +197,18 @@ def _read(
         why = "".join(f"; {note}" for note in ([damage] if damage else []) + notes)
         raise RecordingError(f"no usable object in {inside}{why}", path=log.path, topic=topic)
     host, host_notes = _find_host(columns.hosts)
+    if apart := _find_apart(around, truth):
+        if asked is not None:
+            raise EgoError(f"{apart[0]}; `ego: none` replays without it", path=log.path)
+        host, host_notes = None, apart
     ego_ix, ego_notes = _find_ego(log.path, scene, ego if isinstance(ego, str) else None, host)
     damage = _describe_damage(log, topic, scene.end_s)
     window_lines = window_notes(window_s)
     notes = [*([damage] if damage else []), *window_lines, *log.notes, *ignored, *notes, *host_notes, *ego_notes]
     sized = around is None or around.ego is None or (asked is not None and asked.size_m is not None)
+    sized = sized or find_rule(columns.notes, "ego listed") is not None
     scene = replace(scene, ego_ix=ego_ix, ego_sized=sized, tags=dict(log.tags), areas=columns.areas)
-    all_notes = tuple(escape_unprintable(note) for note in notes)
+    all_notes = tuple(map(as_finding, notes))
     encoding = next(c.encoding for c in log.channels if c.topic == topic and c.messages)
     return Recording(
         scene, truth, log.path, topic, all_notes, host, damage,
@@ -243,8 +271,7 @@ def choose_topic(
         raise RecordingError(
             f"no list of true objects; it holds {_describe_channels(log.channels)}; "
             + "beside a recording that has one its lists replay by `together: [THAT, THIS]`; " * units
-            + "`read: {topic: …, objects: …, id: …}` names the fields of a list of any schema "
-            "(docs/guide/recordings.md)",
+            + _advise_reading(log),
             path=log.path,
         )
     if topic is not None and topic not in topics:
@@ -263,9 +290,25 @@ def choose_topic(
     return chosen, _describe_ignored(log, chosen, topics, beside, poses_read=poses_read)
 
 
+def _advise_reading(log: Log) -> str:
+    """What to do with a recording without truth: name fields, where a topic has an encoding that is read."""
+    encodings = {c.encoding for c in log.channels if c.messages}
+    if encodings & {*ENCODINGS}:
+        return "`read: {topic: …, objects: …, id: …}` names the fields of any list (docs/guide/recordings.md)"
+    return f"messages encoded as {', '.join(sorted(encodings))} are not read; {', '.join(ENCODINGS)} are"
+
+
+_SAYS_TRUTH = re.compile(r"ground[_-]?truth|(^|/)gt(/|$)", re.IGNORECASE)
+"""A topic that says that it is the truth is taken before those that a tracker or a prediction writes."""
+
+
 def _only_topic(topics: dict[str, str]) -> str | None:
-    """The topic to read where none is named: the only one, or the only GroundTruth beside SensorViews; else None."""
+    """The topic to read where none is named: the only one, the only GroundTruth beside SensorViews, the only one whose
+    name says ground truth; else None.
+    """
     truths = [t for t, schema in topics.items() if schema == osi.GROUND_TRUTH]
+    if len(truths or topics) != 1:
+        truths = [t for t in topics if _SAYS_TRUTH.search(t)] or truths
     candidates = truths or list(topics)
     return candidates[0] if len(candidates) == 1 else None
 
@@ -289,7 +332,7 @@ def _describe_ignored(
 
 
 def _decode_world(
-    log: Log, topic: str, fields: Fields | None, asked: EgoTopic | None, *, seek_ego: bool
+    log: Log, topic: str, fields: Fields | None, asked: EgoTopic | None, classes: Mapping[str, str], *, seek_ego: bool
 ) -> tuple[DecodedObjects, LogContext | None, str]:
     """The objects on a topic and the ego in the world, the frames of the log, and the name of the world's frame.
 
@@ -310,23 +353,25 @@ def _decode_world(
         from copem_replay.io.frames import add_ego, read_log_context
 
         around = read_log_context(log, asked, seek_ego=False)
-        return _add_notes(add_ego(columns, around.ego, around.asked), around), around, ""
+        return _add_notes(add_ego(columns, around.ego, around.asked, around.ego_topic), around), around, ""
     from copem_replay.io.frames import add_ego, read_decoded_lists, read_log_context, transform_to_world
 
     around = read_log_context(log, asked, seek_ego=seek_ego)
     same_schema = [c for c in channels if (c.schema, c.encoding) == (channels[0].schema, channels[0].encoding)]
-    lists = read_decoded_lists(log, same_schema, fields)
+    around = replace(around, classes=classes)
+    lists = read_decoded_lists(log, same_schema, fields, classes)
     if (fields is None and not names_objects(same_schema[0])) or (fields is not None and fields.id is None):
-        raise RecordingError(
-            "its objects have no ids; lists of a unit they can be, not the truth", path=log.path, topic=topic
-        )
+        raise RecordingError("its objects have no ids; " + _NO_TRUTH, path=log.path, topic=topic)
+    if not lists.named and len(lists.columns.object_ix):
+        raise RecordingError("its objects have no ids, all are empty; " + _NO_TRUTH, path=log.path, topic=topic)
     world = around.world_of(lists)
     lists = transform_to_world(lists, around, log.path, topic)
-    return _add_notes(add_ego(lists.columns, around.ego, around.asked), around), around, world
+    return _add_notes(add_ego(lists.columns, around.ego, around.asked, around.ego_topic), around), around, world
 
 
 def _add_notes(columns: DecodedObjects, around: LogContext) -> DecodedObjects:
-    return replace(columns, notes=(*columns.notes, *around.notes))
+    assumed = find_rule(columns.notes, "ego listed") is None  # of a listed ego nothing is
+    return replace(columns, notes=(*columns.notes, *(n for n in around.notes if assumed or not n.startswith("ego: "))))
 
 
 def _decode_topic(log: Log, topic: str) -> DecodedObjects:
@@ -334,16 +379,32 @@ def _decode_topic(log: Log, topic: str) -> DecodedObjects:
     channels = {c.number: c for c in log.channels if c.topic == topic and is_truth(c)}
     decoder = osi.GroundTruthDecoder(DecodeAllowance(log.file_bytes()))
     try:
+        for number, payload in _find_earlier(log, channels):
+            decoder.add_earlier(payload, channels[number].schema)
         for number, log_time_ns, payload in log.payloads(frozenset(channels)):
             decoder.add(
                 payload, schema=channels[number].schema, log_time_ns=log_time_ns, ahead_ns=channels[number].ahead_ns
             )
-        if log.window is not None:  # simulators write the road in the first message alone
-            for number, _, payload in islice(log.within(None).payloads(frozenset(channels)), 1):
-                decoder.add_road(payload, channels[number].schema)
         return decoder.columns()
     except OversizeError as error:
         raise RecordingError(str(error), path=log.path, topic=topic) from None
+
+
+def _find_earlier(log: Log, channels: Mapping[int, Channel]) -> Iterator[tuple[int, bytes]]:
+    """Channel number and payload of messages before the window: simulators write the road, and what stands, once.
+
+    After the first one they are read where that has things that stand, and the window begins without.
+    """
+    if log.window is None or log.window.from_ns <= 0:
+        return
+    numbers, before = frozenset(channels), log.within(Window(to_ns=log.window.from_ns - 1))
+    earlier = ((number, payload) for number, _, payload in before.payloads(numbers))
+    if (first := next(earlier, None)) is not None:
+        yield first
+        _, _, begins = next(log.payloads(numbers), (*first[:1], 0, first[1]))
+        schema = channels[first[0]].schema
+        if osi.sends_standing(first[1], schema) and not osi.sends_standing(begins, schema):
+            yield from earlier
 
 
 def _describe_damage(log: Log, topic: str, end_s: float | None) -> str | None:
@@ -371,6 +432,16 @@ def _find_host(hosts: Sequence[str]) -> tuple[str | None, list[str]]:
         return counts[0][0], []
     ids = ", ".join(f"{ident} in {count_noun(number, 'message')}" for ident, number in counts[:_SHOWN])
     return counts[0][0], [f"the host vehicle changes ({ids}): the most frequent taken"]
+
+
+def _find_apart(around: LogContext | None, truth: Tracks) -> list[str]:
+    """The finding that the ego's poses and the lists have no instant in common; none: they have."""
+    if around is None or around.ego is None:
+        return []
+    (first, last), (start, end) = ((ns[0] * 1e-9, ns[-1] * 1e-9) for ns in (around.ego.stamp_ns, truth.stamp_ns))
+    apart = max(first - end, start - last)
+    topic = around.ego_topic
+    return [*find("two clocks", int(apart > 0), topic=topic, first=first, last=last, start=start, end=end, apart=apart)]
 
 
 def _find_ego(path: Path, scene: Scene, ego: str | None, host: str | None) -> tuple[int, list[str]]:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from copem_replay.io.channel import Channel
-from copem_replay.io.schemas.poses import is_pose
+from copem_replay.io.schemas.poses import is_pose, is_static
 
 Span = tuple[int, int]
 """First and last log time in ns, both included."""
@@ -29,7 +29,7 @@ class Window:
         """The log time that is read of a channel: with a margin of poses, without limits of static transforms."""
         if not is_pose(channel):
             return self.from_ns, self.to_ns
-        if channel.topic.endswith("tf_static"):
+        if is_static(channel):
             return ALWAYS
         return self.from_ns - POSE_MARGIN_NS, self.to_ns + POSE_MARGIN_NS
 

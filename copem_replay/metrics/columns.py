@@ -161,8 +161,8 @@ _DETECTIONS = (
            "truth and with recorded units)"),
     _TIME, *_DISTANCES, *_ENDED,
     Column("first_unit", "text or null",
-           "the unit whose list held the object first (earliest arrival, then the order of the experiment); `truth` "
-           "for GT"),
+           "the unit of the newest list that makes the object known (of lists captured together the first of the "
+           "experiment); null for a stack's output, `truth` for GT"),
     Column("conflict_detected", "true or false", "whether a fused list implied a collision", "conflict"),
     Column("conflict_detection_s", "numbers", "when the first list that implied one was available", "conflict"),
     Column("time_to_conflict_detection_s", "numbers", "`conflict_detection_s − onset_s`", "conflict"),
@@ -305,7 +305,8 @@ _PROVENANCE = (
     Column("runs", "whole number", "runs of the experiment"),
     Column("logs", "list",
            "of each log: its name `log`, the `topic` of its truth, the file's `sha256`, `truth`, the SHA-256 of what "
-           "was read of it, and its `tags`"),
+           "was read of it, its `tags`, and what was left out or mended of it, `read`: `number`, `what`, and whether "
+           "it `changes` figures"),
     Column("logs_skipped", "list", "recordings that were left out: `log` and `reason`"),
     Column("visibility", "text", "how visible shares are worked out"),
     Column("max_gap_s", "number", "longest gap of the truth that is interpolated"),
@@ -315,8 +316,8 @@ _PROVENANCE = (
     Column("braking", "by name", "section `braking` with every default"),
     Column("configurations", "by name",
            "what each configuration is: the `truth`, `recorded`, `by_truth_id`, `fixed` (equal in every run) and "
-           "`fixed_verdicts`, `needs_visibility` (of its onset), and its `ideal`, ideal fusion of its inputs or units "
-           "(`ideal_of`)"),
+           "`fixed_verdicts`, `needs_visibility` (of its onset), its `ideal`, ideal fusion of its inputs or units "
+           "(`ideal_of`), and `remembering`, the one with memory that its accuracy is held against"),
     Column("run_shown", "by name", "by log the number of the run in `replay.mcap`"),
     Column("runs_shown", "by name",
            "by log every run that is written: `file`, `run`, and `run_is`, why it is this one"),

@@ -144,7 +144,7 @@ def onset_requirement(kind: str) -> Requires | None:
 
 
 class Confirm(Frozen):
-    """Detected when `hits` of the last `of` capture instants hold the object."""
+    """Detected when `hits` of `of` consecutive turns of a unit, or instants of all, hold the object."""
 
     hits: Captures = 1
     of: Captures = 1
@@ -172,10 +172,9 @@ class Conflict(Frozen):
 
 
 class Match(Frozen):
-    """How entries of fused lists are matched to true objects; `always`: also those of ideal fusion and of the truth."""
+    """How entries of fused lists are matched to true objects."""
 
     gate_m: Positive = 3.0
-    always: Flag = False
 
 
 class Gospa(Frozen):

@@ -191,7 +191,8 @@ def find_episodes(scene: Scene, truth: Tracks, static: Statics, experiment: Metr
     ended_s, ended_by = _find_ends(last_s, stay.last_s, scene.end_s)
     leaves = np.isfinite(found.held_until_s)
     ended_s = np.where(leaves, found.held_until_s, ended_s)
-    ended_by = np.where(leaves, END_REASONS.index(EndReason.OBJECT_LEFT), ended_by)
+    left, ego_left = END_REASONS.index(EndReason.OBJECT_LEFT), END_REASONS.index(EndReason.EGO_LEFT)
+    ended_by = np.where(leaves, np.where(found.ego_left, ego_left, left), ended_by)
     number = np.arange(len(found.track)) - np.searchsorted(found.track, found.track)
     before_s = np.where(number > 0, np.append(-np.inf, ended_s)[:-1], -np.inf)
     object_ix = world.object_ix[found.track]
@@ -202,12 +203,16 @@ def find_episodes(scene: Scene, truth: Tracks, static: Statics, experiment: Metr
 
 
 class _Begun(NamedTuple):
-    """Where episodes begin, track by track. All (M,). `held_until_s`: end of those before a return; inf: the others."""
+    """Where episodes begin, track by track. All (M,). `held_until_s`: end of those before a return; inf: the others.
+
+    `ego_left`: whether these end because the ego is absent, while the object is there.
+    """
 
     track: Int
     onset_s: Float
     began: Int
     held_until_s: Float
+    ego_left: Bool
     returns: Int
 
 
@@ -227,7 +232,8 @@ def _begin_at(instant_s: float, world: Tracks, stay: _EgoStay) -> _Begun:
         track = track[:0]
     count = len(track)
     none = np.zeros(count, dtype=np.int64)
-    return _Begun(track, np.full(count, instant_s), np.full(count, CROSSED), np.full(count, np.inf), none)
+    begun = np.full(count, instant_s), np.full(count, CROSSED)
+    return _Begun(track, *begun, np.full(count, np.inf), np.zeros(count, dtype=bool), none)
 
 
 def _begin_holding(
@@ -246,16 +252,20 @@ def _begin_holding(
     asked_from_s = frames_s[np.argmax(stay.there)] if stay.there.any() else np.inf
     earlier, _ = _find_first_true(possible, world.start)
     own_first = earlier[track[begins]] == onset_row
-    # Who comes back crosses if it was followed up to then, else it appears again.
+    # Who comes back crosses if it, and the ego, was there up to then, else it appears again.
     followed = (onset_row > 0) & (world.frame_ix[onset_row] - world.frame_ix[onset_row - 1] == 1)
+    followed &= possible[onset_row - 1]
     began = np.where(np.where(onset_first, own_first, ~followed), APPEARED, CROSSED)
     began = np.where(onset_first & own_first & (time_s[begins] <= asked_from_s + SAME_INSTANT_S), LOG_START, began)
     held_until_s = np.full(len(begins), np.inf)
     again = np.flatnonzero(~onset_first)
     held_until_s[again - 1] = time_s[begins[again] - 1]
+    held_row, ego_left = rows[begins[again] - 1], np.zeros(len(begins), dtype=bool)
+    stays = world.frame_ix[held_row + 1] - world.frame_ix[held_row] == 1
+    ego_left[again - 1] = stays & ~possible[held_row + 1]
     count = np.append(0, np.cumsum(returned & ~np.isin(np.arange(len(rows)), begins)))
     returns = np.diff(count[np.append(begins, len(rows))])
-    return _Begun(track[begins], time_s[begins], began, held_until_s, returns)
+    return _Begun(track[begins], time_s[begins], began, held_until_s, ego_left, returns)
 
 
 def _find_ends(last_s: Float, ego_last_s: float, end_s: float) -> tuple[Float, Int]:

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from copem_replay.core.compiled import kernel
+from copem_replay.core.compiled import callee, kernel
 from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int
 
 # Where detection lasts: the probability of a sequence of lists with and without the object, by a filter.
@@ -357,7 +357,7 @@ def _run_chain(step: Float, listed: Float, without: Int, hits: int, of: int, pro
     return rest, rest_slope
 
 
-@kernel
+@callee
 def _advance_chain(
     mass: Float, slope: Float, held: Int, hits: int, miss: float, miss_slope: float, hit: float, hit_slope: float
 ) -> tuple[Float, Float]:
@@ -376,7 +376,7 @@ def _advance_chain(
     return new, new_slope
 
 
-@kernel
+@callee
 def _add_logs(a: float, a_slope: float, b: float, b_slope: float) -> tuple[float, float]:
     """ln(eᵃ + eᵇ), and its derivative from those of a and b."""
     if b == -np.inf:

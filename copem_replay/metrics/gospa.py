@@ -22,7 +22,7 @@ import numba as nb
 import numpy as np
 
 from copem_replay.core.assignment import assign_pairs
-from copem_replay.core.compiled import kernel, making
+from copem_replay.core.compiled import kernel, making_kernel
 from copem_replay.core.tracks import Float, Int
 
 
@@ -80,7 +80,7 @@ def ospa(truth: Float, estimates: Float, *, cutoff_m: float, power: float) -> fl
     return float(((result.localisation + alone) / max(n, m)) ** (1 / power))
 
 
-@making
+@making_kernel
 def gospa_pairs(
     tx: Float, ty: Float, bx: Float, by: Float, cutoff_m: float, power: float, partner: Int
 ) -> tuple[float, int]:
@@ -143,7 +143,7 @@ def _sum_gospa(
         total[k] = localisation + unit / 2 * ((j - i - pairs) + (n - m - pairs))
 
 
-@nb.njit(cache=True, inline="always")
+@nb.njit(inline="always")
 def _raise_to_power(power: float, squared: float) -> float:
     """A distance to the power p, from its square."""
     if power == 2.0:

@@ -1,17 +1,18 @@
 """Matches of fused entries with true objects, list by list, for every fusion without truth ids.
 
 An entry *tells of* one instant: of its newest capture, or, where the fusion brings its entries to the present, of the
-instant the list is available (`ListFusion.tells_of`). An object is *within the gate* of an entry when it is there at
-that instant, the horizontal distance of their centres is at most the gate, and their classes agree
-(`AGREE` in `core/object_list.py`; of the entry the most probable one). In a gap of the truth the object is absent; but
-where a clock states another instant than that of the capture, an object that was there at the capture is there. All
-true objects of the instant count, measured or not, moving or not, the ego too: an entry at one of them is no ghost.
+instant the list is available (`ListFusion.tells_of`). An object is *within the gate* of an entry when the entry may be
+about it (`metrics/origin.py`), it is there at that instant, the horizontal distance of their centres is at most the
+gate, and their classes agree (`AGREE` in `core/object_list.py`; of the entry the most probable one). In a gap of the
+truth the object is absent; but where a clock states another instant than that of the capture, an object that was there
+at the capture is there. Objects count measured or not, moving or not: an entry at one that a list holds is no ghost.
 
 1. Every entry belongs to the nearest object within its gate. Of several at one object the *preferred* one is its
-   match: the highest existence, then the first unit's (last where it is not said), then the smaller x, the smaller y;
-   never the one that happens to be closest.
+   match: the highest existence, the newest capture, the smallest variance stated (of both axes together), then by a
+   number scattered from its place; never the one that happens to be closest, outermost, or first in an experiment.
 2. Of the others, the preferred first, each becomes the match of the nearest object within its gate that has none yet:
-   of two pedestrians side by side the entries of both may lie nearer to one of them.
+   of two pedestrians side by side the entries of both may lie nearer to one of them. An entry at the very place of a
+   preferred one is a copy of it, and becomes no match.
 3. What is then left is a duplicate of its nearest object, or a ghost where there is none within the gate.
 
 Entries of one list may tell of different instants; an object has one match in a list, whichever they are. The order of
@@ -29,10 +30,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from copem_replay.core.compiled import borrowing, kernel
+from copem_replay.core.compiled import borrowing, borrowing_kernel
 from copem_replay.core.geometry import count_below
-from copem_replay.core.object_list import AGREE, Entries, ObjectLists, TellsOf, most_probable_class
-from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int, Scene, Tracks
+from copem_replay.core.object_list import Entries, ObjectLists, TellsOf, most_probable_class
+from copem_replay.core.tracks import AGREE, SAME_INSTANT_S, Bool, Float, Int, Scene, Tracks
+from copem_replay.metrics.origin import Origins, may_be_about
 
 MATCH, DUPLICATE, GHOST = 0, 1, 2
 """Roles of entries."""
@@ -53,7 +55,7 @@ class Matches:
 
 
 def match_entries(
-    lists: ObjectLists, world: Tracks, scene: Scene, *, gate_m: float, tells_of: TellsOf = "now"
+    lists: ObjectLists, world: Tracks, scene: Scene, origins: Origins, *, gate_m: float, tells_of: TellsOf = "now"
 ) -> Matches:
     """What the entries of K lists in S runs are about, at the instants they tell of.
 
@@ -62,12 +64,14 @@ def match_entries(
     """
     out = _allocate_matches(lists)
     rows = _sort_truth_rows(world, scene, by_frame=tells_of == "now")
-    _match_lists(lists.start, lists.entries, rows, rows, AGREE, gate_m + _TOLERANCE_M, out, out)
+    _match_lists(
+        lists.start, lists.entries, origins, rows, rows, AGREE, gate_m + _TOLERANCE_M, out, out, _make_scratch(lists)
+    )
     return Matches(*out)
 
 
 def match_at_both_times(
-    lists: ObjectLists, then: Tracks, now: Tracks, scene: Scene, *, gate_m: float
+    lists: ObjectLists, then: Tracks, now: Tracks, scene: Scene, origins: Origins, *, gate_m: float
 ) -> tuple[Matches, Matches]:
     """What entries that tell of their `capture` are about; and what they would be about if they told of `now`.
 
@@ -76,8 +80,14 @@ def match_at_both_times(
     about = _allocate_matches(lists)
     at_once = _allocate_matches(lists)._replace(class_ix=about.class_ix)
     rows = _sort_truth_rows(then, scene, by_frame=False), _sort_truth_rows(now, scene, by_frame=True)
-    _match_lists(lists.start, lists.entries, *rows, AGREE, gate_m + _TOLERANCE_M, about, at_once)
+    scratch = _make_scratch(lists)
+    _match_lists(lists.start, lists.entries, origins, *rows, AGREE, gate_m + _TOLERANCE_M, about, at_once, scratch)
     return Matches(*about), Matches(*at_once)
+
+
+def _make_scratch(lists: ObjectLists) -> Int:
+    # Two rows as long as the longest list.
+    return np.empty((2, lists.longest), dtype=np.int64)
 
 
 class _MatchColumns(NamedTuple):
@@ -123,33 +133,14 @@ def most_probable_entry_class(entries: Entries, i: int) -> int:
     return most_probable_class(entries[i].class_probability)
 
 
-@kernel
+@borrowing_kernel
 def _match_lists(
-    start: Int,
-    entries: Entries,
-    rows: _TruthRows,
-    now: _TruthRows,
-    agree: Bool,
-    gate_m: float,
-    about: _MatchColumns,
-    at_once: _MatchColumns,
-) -> None:
-    # `now`, `at_once`: truth and matches of the second question; those of the first one where there is no second.
-    longest = 0
-    for s in range(len(start)):
-        for k in range(start.shape[1] - 1):
-            longest = max(longest, start[s, k + 1] - start[s, k])
-    # Of the list at hand: the frame each entry is compared with, and the entries that go through step 2.
-    frame, others = np.empty(longest, np.int64), np.empty(longest, np.int64)
-    _match_each_list(start, entries, rows, now, agree, gate_m, about, at_once, (frame, others))
-
-
-@borrowing
-def _match_each_list(
-    start: Int, entries: Entries, rows: _TruthRows, now: _TruthRows, agree: Bool, gate_m: float,
-    about: _MatchColumns, at_once: _MatchColumns, scratch: tuple[Int, Int],
+    start: Int, entries: Entries, origins: Origins, rows: _TruthRows, now: _TruthRows, agree: Bool, gate_m: float,
+    about: _MatchColumns, at_once: _MatchColumns, scratch: Int,
 ) -> None:  # fmt: skip
-    frame, others = scratch
+    # `now`, `at_once`: truth and matches of the second question; those of the first one where there is no second.
+    # Of the list at hand: the frame each entry is compared with, and the entries that go through step 2.
+    frame, others = scratch[0], scratch[1]
     both = rows.by_frame != now.by_frame
     for s in range(len(start)):
         for k in range(start.shape[1] - 1):
@@ -159,7 +150,7 @@ def _match_each_list(
             frame[:n] = k
             if not rows.by_frame:
                 _find_frames(entries, first, rows.frame_s, frame[:n])
-            _match_list(entries, first, frame[:n], others, rows, agree, gate_m, about)
+            _match_list(entries, origins, (s, k), first, frame[:n], others, rows, agree, gate_m, about)
             if not both:
                 continue
             # At one instant the truths may differ: a clock that is fast tells of an object that has left.
@@ -168,7 +159,7 @@ def _match_each_list(
                 late |= f < 0 or rows.frame_s[f] != now.frame_s[k] or rows.bounds[f + 1] - rows.bounds[f] != objects
             if late:
                 frame[:n] = k
-                _match_list(entries, first, frame[:n], others, now, agree, gate_m, at_once)
+                _match_list(entries, origins, (s, k), first, frame[:n], others, now, agree, gate_m, at_once)
             else:
                 for i in range(first, first + n):
                     at_once.object_ix[i], at_once.role[i] = about.object_ix[i], about.role[i]
@@ -191,6 +182,8 @@ def _find_frames(entries: Entries, first: int, frame_s: Float, out: Int) -> None
 @borrowing
 def _match_list(
     entries: Entries,
+    origins: Origins,
+    which: tuple[int, int],
     first: int,
     frame: Int,
     others: Int,
@@ -208,13 +201,13 @@ def _match_list(
         # object near, and only those that have one are sorted.
         for j in range(len(frame)):
             i = first + j
-            if again and (role[i] != DUPLICATE or match_of[object_ix[i]] == i):
+            if again and (role[i] != DUPLICATE or _are_at_one_place(entries, i, match_of[object_ix[i]])):
                 continue
             p = -1
             if frame[j] >= 0:
                 p = _find_nearest(
                     entries[i].x_m, entries[i].y_m, class_ix[i], bounds[frame[j]], bounds[frame[j] + 1], gate_m, agree,
-                    row_object_ix, row_class_ix, row_x_m, row_y_m, match_of, again == 1,
+                    row_object_ix, row_class_ix, row_x_m, row_y_m, match_of, again == 1, origins, which, i,
                 )  # fmt: skip
             if p < 0:
                 continue
@@ -230,13 +223,14 @@ def _match_list(
         if role[i] == DUPLICATE and match_of[object_ix[i]] == i:
             role[i] = MATCH
     _sort_by_preference(entries, others, n)
-    for i in others[:n]:
+    for j in range(n):
+        i = others[j]
         f = frame[i - first]
         p = _find_nearest(
             entries[i].x_m, entries[i].y_m, class_ix[i], bounds[f], bounds[f + 1], gate_m, agree,
-            row_object_ix, row_class_ix, row_x_m, row_y_m, match_of, True,
+            row_object_ix, row_class_ix, row_x_m, row_y_m, match_of, True, origins, which, i,
         )  # fmt: skip
-        if p >= 0:
+        if p >= 0 and not _is_copy(entries, i, others[:j]):
             o = row_object_ix[p]
             object_ix[i], role[i], out.x_m[i], out.y_m[i] = o, MATCH, row_x_m[p], row_y_m[p]
             match_of[o] = i
@@ -248,10 +242,11 @@ def _match_list(
 @borrowing
 def _find_nearest(
     x: float, y: float, entry_class_ix: int, first: int, high: int, gate_m: float, agree: Bool, object_ix: Int,
-    class_ix: NDArray[np.int8], x_m: Float, y_m: Float, match_of: Int, only_free: bool,
+    class_ix: NDArray[np.int8], x_m: Float, y_m: Float, match_of: Int, only_free: bool, origins: Origins,
+    which: tuple[int, int], i: int,
 ) -> int:  # fmt: skip
     # The row, of first … high − 1, nearest to a place and within the gate (at a tie the western), of a class that
-    # agrees with the entry's; −1: none.
+    # agrees with the entry's and of an object that entry i of the list of a run may be about; −1: none.
     least, best, west_m = gate_m * gate_m, -1, x - gate_m
     left = high - first
     while left > 0:  # the first row that is not too far west; without branches, which cannot be predicted
@@ -265,7 +260,8 @@ def _find_nearest(
         if not agree[entry_class_ix, class_ix[p]] or (only_free and match_of[object_ix[p]] >= 0):
             continue
         square = (x_m[p] - x) ** 2 + (y_m[p] - y) ** 2
-        if square < least or (square == least and best < 0):
+        nearer = square < least or (square == least and best < 0)
+        if nearer and may_be_about(origins, which[0], which[1], i, object_ix[p]):
             least, best = square, p
     return best
 
@@ -275,18 +271,40 @@ def _is_preferred(entries: Entries, i: int, j: int) -> bool:
     a, b = entries[i], entries[j]
     if a.existence != b.existence:
         return bool(a.existence > b.existence)
-    if a.unit_ix != b.unit_ix:
-        return bool(a.unit_ix >= 0 and (b.unit_ix < 0 or a.unit_ix < b.unit_ix))
-    if a.x_m != b.x_m:
-        return bool(a.x_m < b.x_m)
-    if a.y_m != b.y_m:
-        return bool(a.y_m < b.y_m)
-    # At the very same place the rest decides, so that the order in the list never does.
     if a.captured_s != b.captured_s:
         return bool(a.captured_s > b.captured_s)
+    variance_a, variance_b = a.cov_ee_m2 + a.cov_nn_m2, b.cov_ee_m2 + b.cov_nn_m2
+    if variance_a != variance_b:
+        return bool(variance_a < variance_b)
+    scattered_a, scattered_b = _scatter(a.x_m, a.y_m), _scatter(b.x_m, b.y_m)
+    if scattered_a != scattered_b:
+        return bool(scattered_a < scattered_b)
+    # At the very same place the rest decides, so that the order in the list never does.
     if a.track_id != b.track_id:
         return bool(a.track_id < b.track_id)
-    return most_probable_entry_class(entries, i) < most_probable_entry_class(entries, j)
+    class_a, class_b = most_probable_entry_class(entries, i), most_probable_entry_class(entries, j)
+    return bool(class_a < class_b or (class_a == class_b and a.unit_ix < b.unit_ix))
+
+
+@borrowing
+def _scatter(x: float, y: float) -> float:
+    # A number in [0, 1) of a place that tells nothing of where it is: of several entries of one object the western one
+    # errs most.
+    number = x * 7919.7182818 + y * 104729.3141593
+    return float(number - np.floor(number))
+
+
+@borrowing
+def _are_at_one_place(entries: Entries, i: int, j: int) -> bool:
+    return bool(entries[i].x_m == entries[j].x_m and entries[i].y_m == entries[j].y_m)
+
+
+@borrowing
+def _is_copy(entries: Entries, i: int, preferred: Int) -> bool:
+    copy = False
+    for j in preferred:
+        copy |= _are_at_one_place(entries, i, j)
+    return copy
 
 
 @borrowing

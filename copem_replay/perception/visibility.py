@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, PlainSerializer, WithJsonSchema
 from pydantic_core import PydanticKnownError
 
+from copem_replay.core.compiled import call_in_room
 from copem_replay.core.components import Component, Slot, ask_component, wrong_answer_error
 from copem_replay.core.errors import is_own
 from copem_replay.core.tracks import Float, Int, Tracks
@@ -289,7 +290,9 @@ def _compute_views(
     with ThreadPoolExecutor(threads) as pool:
         list(
             pool.map(
-                lambda k: compute_shares(edges[k], edges[k + 1], boxes, static, places, wanted, flat, out, blocker),
+                lambda k: call_in_room(
+                    compute_shares, edges[k], edges[k + 1], boxes, static, places, wanted, flat, out, blocker
+                ),
                 range(pieces),
             )
         )

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numba as nb
 import numpy as np
 
-from copem_replay.core.compiled import borrowing, kernel
+from copem_replay.core.compiled import borrowing, borrowing_kernel, callee
 from copem_replay.core.tracks import Bool, Float, Int
 
 
@@ -163,7 +163,6 @@ class _Found(NamedTuple):
     kept_span: Float
 
 
-@kernel
 def compute_shares(
     f0: int, f1: int, boxes: Boxes, obstacles: Statics, places: Observers, asked: Asked, flat: bool, out: Float,
     blocker: Int,
@@ -173,16 +172,10 @@ def compute_shares(
     `blocker (U, P)`, unless empty, becomes the row of the body that alone would hide most of each row, −1 where none
     hides any of it, −2 − k for the obstacle k.
     """
-    # Bodies of one list: the boxes first, then the static parts. Everything is relative to the observer.
-    most, widest, stretches = 0, boxes.corners_m.shape[1], 0
-    for f in range(f0, f1):
-        most = max(most, boxes.bounds[f + 1] - boxes.bounds[f])
-    for stretch in asked.stretch:
-        stretches = max(stretches, stretch + 1)
-    most += len(obstacles.body)
-    for g in range(len(obstacles.body)):
-        widest = max(widest, obstacles.start[g + 1] - obstacles.start[g])
-    xy, of = np.empty((most, widest, 2)), np.empty(most, BODY)
+    units, count = len(places.carrier_ix), len(obstacles.body)
+    most = int(np.diff(boxes.bounds[f0 : f1 + 1]).max(initial=0)) + count
+    widest = max(boxes.corners_m.shape[1], int(np.diff(obstacles.start).max(initial=0)))
+    room = np.empty((most, widest, 2)), np.empty(most, BODY)
     index = _Index(
         np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most + 1, np.int64),
         np.empty((_MOST_SECTORS, most // _WORD + 1), np.int64), np.empty(1),
@@ -191,9 +184,26 @@ def compute_shares(
         np.empty(most, np.int64), np.empty((most, 2)), np.empty((most + 1, 2)), np.empty(most, np.int64),
         np.empty((most, 2)),
     )  # fmt: skip
-    work = _make_workspace(most, widest)
-    still = _gather_statics(obstacles, len(places.carrier_ix), widest)
-    shown = np.zeros((len(places.carrier_ix), stretches), np.bool_)  # of each stretch from each unit
+    kept = min(units, _MOST_KEPT // max(count, 1))
+    still = _Still(
+        np.empty((count, widest, 2)), np.empty(count, BODY), np.full((kept, 3), np.nan), np.zeros(kept, np.bool_),
+        np.empty((kept, count), BODY), np.empty((kept, count, widest)),
+    )  # fmt: skip
+    shown = np.zeros((units, int(asked.stretch.max(initial=-1)) + 1), np.bool_)  # of each stretch from each unit
+    _view_lists(
+        f0, f1, boxes, obstacles, places, asked, flat, out, blocker, room, still, index, found,
+        _make_workspace(most, widest), shown,
+    )  # fmt: skip
+
+
+@borrowing_kernel
+def _view_lists(
+    f0: int, f1: int, boxes: Boxes, obstacles: Statics, places: Observers, asked: Asked, flat: bool, out: Float,
+    blocker: Int, room: tuple[Float, Any], still: _Still, index: _Index, found: _Found, work: _Work, shown: Bool,
+) -> None:  # fmt: skip
+    # Bodies of one list: the boxes first, then the static parts. Everything is relative to the observer.
+    xy, of = room
+    _gather_statics(obstacles, still)
     for f in range(f0, f1):
         first = boxes.bounds[f]
         n = boxes.bounds[f + 1] - first
@@ -235,23 +245,16 @@ def _find_next(t: int, u: int, first: int, n: int, asked: Asked, shown: Bool) ->
     return t
 
 
-@nb.njit
-def _gather_statics(obstacles: Statics, units: int, widest: int) -> _Still:
-    # The static bodies, and room for what the first units see of them.
-    count = len(obstacles.body)
-    units = min(units, _MOST_KEPT // max(count, 1))
-    still = _Still(
-        np.empty((count, widest, 2)), np.empty(count, BODY), np.full((units, 3), np.nan),
-        np.zeros(units, np.bool_), np.empty((units, count), BODY), np.empty((units, count, widest)),
-    )  # fmt: skip
-    for g in range(count):
+@borrowing
+def _gather_statics(obstacles: Statics, still: _Still) -> None:
+    # Out: the static bodies.
+    for g in range(len(obstacles.body)):
         still.of[g].size, still.of[g].owner = obstacles.start[g + 1] - obstacles.start[g], obstacles.body[g]
         still.of[g].bottom_m, still.of[g].top_m = obstacles.bottom_m[g], obstacles.top_m[g]
         for k in range(still.of[g].size):
             v = obstacles.start[g] + k
             still.xy[g, k, 0], still.xy[g, k, 1] = obstacles.xy_m[v, 0], obstacles.xy_m[v, 1]
         _enclose(still.xy[g], still.of[g])
-    return still
 
 
 @borrowing
@@ -568,7 +571,7 @@ def _contains(polygon: Float, size: int, px: float, py: float, depth_m: float) -
     return True
 
 
-@kernel
+@callee
 def _are_separated(a: Float, na: int, b: Float, nb_: int) -> bool:
     # Whether some edge of a has all of b on its outer side (or touching it).
     for k in range(na):
@@ -613,7 +616,6 @@ class _Work(NamedTuple):
     high: Float
 
 
-@kernel
 def _make_workspace(most: int, widest: int) -> _Work:
     return _Work(
         np.empty((most, widest)), np.empty((most + 1, widest, 2)), np.empty((most + 1, widest, 4)),
@@ -659,7 +661,7 @@ def _crossing_distances(edge: Float, size: int, ux: float, uy: float) -> tuple[b
     return True, enter, nx, ny, fx, fy
 
 
-@kernel
+@callee
 def _insert_sorted(values: Float, count: int, value: float) -> int:
     # Keeps values[:count] ascending.
     k = count
@@ -670,7 +672,7 @@ def _insert_sorted(values: Float, count: int, value: float) -> int:
     return count + 1
 
 
-@kernel
+@callee
 def _insert_crossings(a: Float, na: int, b: Float, nb_: int, lo: float, hi: float, breaks: Float, count: int) -> int:
     # The azimuths between lo and hi at which an edge of a crosses one of b go to the ascending breaks[:count].
     for k in range(na):
@@ -704,7 +706,7 @@ def _equal_at(
     return float(min(max(angle, a), b))
 
 
-@kernel
+@callee
 def _visible_share(
     t: int, near: Int, span: Float, covered: Float, xy: Float, of: Any, eye_m: tuple[float, float, float], flat: bool,
     work: _Work,

@@ -28,7 +28,7 @@ from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.braking.driver import Reaction
 from copem_replay.metrics.braking.verdict import fail_probability, pass_probability
-from copem_replay.metrics.detection.by_truth_id import capture_instants
+from copem_replay.metrics.detection.turns import number_turns
 from copem_replay.metrics.detections_table import measure_distances
 from copem_replay.metrics.exact_survival import FirstKnown, LastingDetection, first_confirmed, first_known
 from copem_replay.metrics.onset import began_texts
@@ -341,7 +341,7 @@ def _number_shared_instants(replay: Replay, received: Tracks, name: str) -> Int:
             f"{replay.scene.log}: exact: configuration {name}: some units are only in some runs, and "
             "confirmation by several hits then has no closed form; confirm with one hit, or leave `exact` out"
         )
-    instants = capture_instants(received)
+    instants = number_turns(received).list_instant
     instants_of_all = np.unique(instants[arrived])
     for unit in np.unique(received.frame_unit_ix[arrived]):
         of_unit = arrived & (received.frame_unit_ix == unit)
@@ -351,20 +351,14 @@ def _number_shared_instants(replay: Replay, received: Tracks, name: str) -> Int:
                 "every instant at which another does, and confirmation over such lists has no closed form; give all "
                 "units one rate_hz and phase_s, confirm with one hit, or leave `exact` out"
             )
-    latest_s = -np.inf
     for instant in instants_of_all:
         arrivals = received.common_arrives_s[arrived & (instants == instant)]
         if np.ptp(arrivals) > SAME_INSTANT_S:
-            how = f"lists captured together arrive up to {np.ptp(arrivals):g} s apart"
-        elif arrivals.min() < latest_s - SAME_INSTANT_S:
-            how = f"lists arrive up to {latest_s - arrivals.min():g} s after lists captured later"
-        else:
-            latest_s = max(latest_s, arrivals.max())
-            continue
-        raise ExperimentError(
-            f"{replay.scene.log}: exact: configuration {name}: {how}, and confirmation over such lists has no closed "
-            "form; give all units one latency, confirm with one hit, or leave `exact` out"
-        )
+            raise ExperimentError(
+                f"{replay.scene.log}: exact: configuration {name}: lists that count as one hit arrive up to "
+                f"{np.ptp(arrivals):g} s apart, and confirmation over such lists has no closed form; give all units "
+                "one latency, confirm with one hit, or leave `exact` out"
+            )
     return instants
 
 

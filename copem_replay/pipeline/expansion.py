@@ -42,7 +42,8 @@ class ConfigurationFacts:
     `truth`: its lists are the truth; `recorded`: they are the output of a stack. `by_truth_id`: objects are detected by
     truth id, not by match. `fixed`: detections are equal in every run; `fixed_verdicts`: and whether the ego passes.
     `needs_visibility`: its episodes depend on which body hides which. `ideal`: the ideal fusion of its `ideal_of`: of
-    its inputs, whose lists come alike, or of its units; None: it is ideal itself, or there is none.
+    its inputs, whose lists come alike, or of its units; None: it is ideal itself, or there is none. `remembering`: the
+    ideal fusion with memory of its inputs, if its own fusion remembers.
     """
 
     truth: bool
@@ -53,6 +54,7 @@ class ConfigurationFacts:
     needs_visibility: bool
     ideal: str | None
     ideal_of: str | None
+    remembering: str | None
 
 
 def find_facts(experiment: Experiment) -> dict[str, ConfigurationFacts]:
@@ -73,12 +75,13 @@ def find_facts(experiment: Experiment) -> dict[str, ConfigurationFacts]:
         facts[name] = ConfigurationFacts(
             truth=configuration.units == TRUTH,
             recorded=recorded,
-            by_truth_id=_has_truth_ids(configuration) and not experiment.measure.match.always,
+            by_truth_id=_has_truth_ids(configuration),
             fixed=fixed,
             fixed_verdicts=fixed and reacts_alike,
             needs_visibility=in_sight,
             ideal=ideal,
             ideal_of=ideal_of,
+            remembering=_find_remembering(experiment, configuration),
         )
     return facts
 
@@ -111,6 +114,19 @@ def _find_ideal(experiment: Experiment, configuration: Configuration) -> tuple[s
                 same[name] = inputs == own
     alike = next((name for name, is_alike in same.items() if is_alike), None)
     return alike or next(iter(same), None), None if not same else "units" if alike is None else "inputs"
+
+
+def _find_remembering(experiment: Experiment, configuration: Configuration) -> str | None:
+    """The ideal fusion with memory of the inputs of a configuration whose fusion remembers."""
+    fusion = configuration.fusion
+    if configuration.recorded is not None or not (isinstance(fusion, ListFusion) and fusion.remembers):
+        return None
+    own = _list_inputs(experiment, configuration)
+    for name, other in experiment.configurations.items():
+        remembers = isinstance(other.fusion, IdealFusion) and other.fusion.memory is not None
+        if other.recorded is None and remembers and _list_inputs(experiment, other) == own:
+            return name
+    return None
 
 
 def _list_inputs(experiment: Experiment, configuration: Configuration) -> tuple[frozenset[str], object]:

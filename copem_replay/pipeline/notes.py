@@ -38,6 +38,7 @@ from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.experiment.drive import resolve_for_log, settings_notes
 from copem_replay.experiment.schema import Experiment, output_unit
 from copem_replay.fusion.interface import IdealFusion
+from copem_replay.io.findings import as_finding
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.detection.conflict import describe_excluded
 from copem_replay.metrics.episodes import AGAIN_AFTER_S, measured_objects
@@ -191,9 +192,14 @@ def list_notes(
 def study_notes(
     recordings: Sequence[Recording], oddities_of: Mapping[str, Iterable[str]], experiment: Experiment
 ) -> list[str]:
-    """Notes on the recordings and on the experiment over them; `oddities_of`: the lines of `list_oddities` by log."""
-    notes = _group_by_log((recording.scene.log, note) for recording in recordings for note in recording.notes)
+    """Notes on the recordings and on the experiment over them; `oddities_of`: the lines of `list_oddities` by log.
+
+    What changes figures comes first: what was mended or left out of a recording, then what is odd about the experiment.
+    """
+    of_logs = [(recording.scene.log, as_finding(note)) for recording in recordings for note in recording.notes]
+    notes = _group_by_log((log, str(note)) for log, note in of_logs if note.changes)
     notes += _group_by_log((log, note) for log, odd in oddities_of.items() for note in odd)
+    notes += _group_by_log((log, str(note)) for log, note in of_logs if not note.changes)
     notes += settings_notes(experiment)
     notes += describe_unswept(experiment)
     notes += _find_unused_memory(experiment)

@@ -20,10 +20,20 @@ from copem_replay.communication.link import KeptDraws
 from copem_replay.communication.reception import RadioPath
 from copem_replay.core.errors import ExperimentError
 from copem_replay.core.interpolation import interpolate_at_instants, interpolate_at_stated_instants
-from copem_replay.core.object_list import AGREE
-from copem_replay.core.tracks import CLASSES, Bool, Float, Int, Scene, TimeChunk, Tracks, class_indices, join_tracks
+from copem_replay.core.tracks import (
+    AGREE,
+    CLASSES,
+    Bool,
+    Float,
+    Int,
+    Scene,
+    TimeChunk,
+    Tracks,
+    class_indices,
+    join_tracks,
+)
 from copem_replay.experiment.schema import Experiment
-from copem_replay.fusion.interface import ListFusion
+from copem_replay.fusion.interface import IdealFusion, ListFusion
 from copem_replay.io.recorded_units import RecordedUnits, join_recorded_units
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.accuracy.held import HeldFrames, make_held_frames
@@ -61,7 +71,8 @@ def time_chunks(scene: Scene, truth: Tracks, experiment: ExpandedExperiment) -> 
     """A log in time chunks of about as many observation rows each."""
     rows = observation_rows(scene, truth, experiment)
     fusions = [one.fusion for one in experiment.configurations.values()]
-    if rows <= ROWS_AT_ONCE or not all(one.resumable for one in fusions if isinstance(one, ListFusion)):
+    whole = any(isinstance(one, IdealFusion) and one.memory is not None for one in fusions)
+    if rows <= ROWS_AT_ONCE or whole or not all(one.resumable for one in fusions if isinstance(one, ListFusion)):
         return (TimeChunk(),)
     _, bounds = truth.by_frame
     pieces = int(-(-rows // ROWS_A_CHUNK))
@@ -329,9 +340,14 @@ class Replay:
         return RadioPath(distance_m, visible_share)
 
     @cached_property
+    def recorded_lists(self) -> Tracks:
+        """The lists (F,) of all units, with the rows of recorded ones alone."""
+        return self.add_recorded(self.no_rows.tracks, self.recorded)
+
+    @cached_property
     def senders(self) -> np.ndarray:
         """(F,) the unit of each list of all units, by name; the modelled ones' first."""
-        lists = self.add_recorded(self.no_rows.tracks, self.recorded)
+        lists = self.recorded_lists
         return np.array(lists.units, dtype=str)[lists.frame_unit_ix]
 
 

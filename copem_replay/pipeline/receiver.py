@@ -10,13 +10,13 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from copem_replay.communication.arrivals import FusionSchedule, SentEntries, fusion_schedule, keep_entries
-from copem_replay.core.compiled import borrowing
+from copem_replay.core.compiled import borrowing_kernel
 from copem_replay.core.fused_tracks import EntrySources, FusedTracks, find_newest_and_first
 from copem_replay.core.interpolation import AROUND_S
 from copem_replay.core.object_list import COVARIANCES, ENTRY, ObjectLists, TellsOf
@@ -42,9 +42,23 @@ from copem_replay.fusion.ideal import (
     fuse_ideal,
     keep_by_object,
 )
+from copem_replay.fusion.ideal_memory import remember_states
 from copem_replay.fusion.inputs import add_kept_entries, listed_rows, make_entry_lists, make_inputs
-from copem_replay.fusion.interface import IdealFusion, ListFusion, ask_fusion, ask_resumed_fusion
+from copem_replay.fusion.interface import (
+    IdealFusion,
+    ListFusion,
+    RecordedFusion,
+    ask_fusion,
+    ask_resumed_fusion,
+)
 from copem_replay.metrics.matching import MATCH, Matches
+from copem_replay.metrics.origin import (
+    GoesBack,
+    OriginLists,
+    Origins,
+    find_earliest_origin_s,
+    find_longest_way_s,
+)
 from copem_replay.perception.ghosts import GhostRows
 from copem_replay.perception.perceive import EntryClaims, clock_errors_s
 from copem_replay.pipeline.expansion import ExpandedExperiment
@@ -53,7 +67,14 @@ from copem_replay.pipeline.world import States, Transmission, WorldChunk
 # Tracks with truth ids ↔ lists without: every fusion is measured, written and shown alike.
 
 
-def convert_to_lists(fused_tracks: FusedTracks, scene: Scene) -> ObjectLists:
+class ListsWithIds(NamedTuple):
+    """Lists, and the truth ids of their entries (N,); empty: they have none."""
+
+    lists: ObjectLists
+    object_ix: Int
+
+
+def convert_to_lists(fused_tracks: FusedTracks, scene: Scene) -> ListsWithIds:
     """Fused tracks of ideal fusion, or of the truth itself, as lists: existence is 1 and the class is certain.
 
     No entry has a track id (−1): truth ids are no tracks, and such fusion confuses no two objects.
@@ -62,6 +83,7 @@ def convert_to_lists(fused_tracks: FusedTracks, scene: Scene) -> ObjectLists:
     order, bounds = fused.by_frame
     start = np.zeros((len(fused.valid), len(bounds)), dtype=np.int64)
     entries = np.empty(int(fused.valid.sum()), dtype=ENTRY)
+    object_ix = np.empty(len(entries), dtype=np.int64)
     states = np.stack(np.broadcast_arrays(*(getattr(fused, name) for name in VALUES), *floor_covariances(fused)))
     words = entries.view(np.float64).reshape(len(entries), ENTRY.itemsize // 8)
     ids = entries.view(np.int64).reshape(words.shape)
@@ -75,8 +97,10 @@ def convert_to_lists(fused_tracks: FusedTracks, scene: Scene) -> ObjectLists:
         start,
         words,
         ids,
+        fused.row_object_ix,
+        object_ix,
     )
-    return ObjectLists(start, entries)
+    return ListsWithIds(ObjectLists(start, entries), object_ix)
 
 
 _CAPTURED = ENTRY.itemsize // 8 - 3
@@ -86,13 +110,13 @@ _CLASS = _EXISTENCE + 1
 """Places in an entry, in words of eight bytes; states and covariances stand before them."""
 
 
-@borrowing
+@borrowing_kernel
 def _fill_words(
     valid: Bool, order: Int, bounds: Int, states: Float, classes: NDArray[np.int8], source: EntrySources,
-    start: Int, words: Float, ids: Int,
+    start: Int, words: Float, ids: Int, row_object_ix: Int, object_ix: Int,
 ) -> None:  # fmt: skip
-    # Fills `words` (N, words of an entry) and `ids`, integers over the same memory, run by run and list by list, and
-    # `start`. `states` are (12, S | 1, P).
+    # Fills `words` (N, words of an entry) and `ids`, integers over the same memory, `object_ix`, run by run and list by
+    # list, and `start`. `states` are (12, S | 1, P).
     n = 0
     for s in range(valid.shape[0]):
         start[s, 0] = n
@@ -106,7 +130,7 @@ def _fill_words(
                 words[n, _CLASS:_CAPTURED] = 0.0
                 words[n, _CLASS + classes[p]] = 1.0
                 words[n, _CAPTURED], ids[n, _UNIT] = find_newest_and_first(source, s, p)
-                ids[n, _TRACK] = -1
+                ids[n, _TRACK], object_ix[n] = -1, row_object_ix[p]
                 n += 1
             start[s, f + 1] = n
 
@@ -120,12 +144,12 @@ class FusedOnce:
     fused_tracks: FusedTracks
 
     @cached_property
-    def _lists(self) -> ObjectLists:
+    def _lists(self) -> ListsWithIds:
         assert self.fused_tracks.scene is not None
         return convert_to_lists(self.fused_tracks, self.fused_tracks.scene)
 
-    def lists_arriving(self, received: Tracks) -> ObjectLists | None:
-        """These as lists without truth ids, for lists received at other times; None: an entry's first unit may differ.
+    def lists_arriving(self, received: Tracks) -> ListsWithIds | None:
+        """These as lists, for lists received at other times; None: an entry's first unit may differ.
 
         Which list of two arrived first stays the same where all are later by one latency.
         """
@@ -244,11 +268,13 @@ class ReceiverOutput:
     agree. `tells_of`: of which instant entries tell. `whole`: the instants are those of the whole log, not of a time
     chunk. `fused_once`: what `fused_tracks` are of. `stated`: the captures that a fusion is told of, in one run; None:
     the true ones. `faults`: ghosts and lists that outages leave out, in one run; None: units have neither.
+    `origin`: the lists that entries may go back to.
     """
 
     received: Tracks
     sent: Tracks
     instants: FusionSchedule
+    origin: OriginLists
     fused_tracks: FusedTracks | None
     scene: Scene
     fused: ObjectLists | None
@@ -263,14 +289,24 @@ class ReceiverOutput:
         """The fused lists without truth ids; their entries go back to true captures."""
         return self.told if self.stated is None else self.stated.true_lists(self.told, self.instants.issue_s)
 
-    @cached_property
+    @property
     def told(self) -> ObjectLists:
         """The fused lists without truth ids; their entries have the captures that the fusion was told of."""
+        return self._lists_with_ids.lists
+
+    @cached_property
+    def origins(self) -> Origins:
+        """What the entries of the fused lists go back to."""
+        holdings = self.origin.find_holdings(self.instants.issue_s)
+        return Origins(self.lists.entries, self._lists_with_ids.object_ix, holdings)
+
+    @cached_property
+    def _lists_with_ids(self) -> ListsWithIds:
         if self.fused is not None:
-            return self.fused
+            return ListsWithIds(self.fused, np.empty(0, dtype=np.int64))
         assert self.fused_tracks is not None
         shared = None if self.fused_once is None else self.fused_once.lists_arriving(self.received)
-        return convert_to_lists(self.fused_tracks, self.scene) if shared is None else shared
+        return shared or convert_to_lists(self.fused_tracks, self.scene)
 
     def tracks_by_run(self, matches: Matches | None) -> Iterator[tuple[int, FusedTracks]]:
         """The fused tracks, and the first of the runs that they are of: of all, or where they have no truth ids of one.
@@ -344,15 +380,34 @@ class Receivers:
         output = ReceiverOutput(
             received=received, sent=sent,
             instants=self._schedules[name].between(world.chunk.from_s, world.chunk.until_s),
-            fused_tracks=None, scene=world.scene, fused=None, whole=len(world.log.chunks) == 1, faults=faults,
+            origin=self._find_origin(world, name, received, sent), fused_tracks=None, scene=world.scene, fused=None,
+            whole=len(world.log.chunks) == 1, faults=faults,
         )  # fmt: skip
         if isinstance(fusion, ListFusion):
             return self._fuse_lists(world, name, fusion, output)
         fused_tracks, fused_once = self._fuse_by_truth_id(world, name, output)
+        if isinstance(fusion, IdealFusion) and fusion.memory is not None:
+            fused = remember_states(received, fused_tracks.fused, fusion.memory)
+            return replace(output, fused_tracks=replace(fused_tracks, fused=fused), tells_of=fusion.tells_of)
         if states == "expected":
             fused_tracks = draw_posterior(fused_tracks, world.scene, world.experiment.seed, world.group.runs)
             return replace(output, fused_tracks=fused_tracks)
         return replace(output, fused_tracks=fused_tracks, fused_once=fused_once)
+
+    def _find_origin(self, world: WorldChunk, name: str, received: Tracks, sent: Tracks) -> OriginLists:
+        """The lists that entries of a configuration may go back to: those that it receives, of a stack its inputs."""
+        configuration = world.experiment.configurations[name]
+        age_s, partial = configuration.max_age_s, _mark_partial(world.experiment, received)
+        if not isinstance(configuration.fusion, RecordedFusion):
+            return OriginLists(received, sent, GoesBack.TO_NEWEST, age_s, partial, world.scene.ego_ix)
+        if configuration.inputs is None:
+            return OriginLists(received, sent, GoesBack.UNKNOWN, age_s, partial, -1)
+        inputs = self._lists.log.recorded_lists
+        of_input = np.isin(np.array(inputs.units), list(configuration.inputs))[inputs.frame_unit_ix]
+        arrives_s = np.where(of_input, self._lists.lists.common_arrives_s, np.inf)
+        issue_s = np.append(self.issue_s(name), np.inf)  # they are taken in when the stack issues its next list
+        taken_s = issue_s[np.searchsorted(issue_s, arrives_s - SAME_INSTANT_S)]
+        return OriginLists(replace(inputs, arrives_s=taken_s[None]), inputs, GoesBack.TO_ALL, age_s, partial, -1)
 
     def _fuse_lists(self, world: WorldChunk, name: str, fusion: ListFusion, output: ReceiverOutput) -> ReceiverOutput:
         """Fusion of lists without truth ids, told of the captures that units state."""
@@ -374,7 +429,18 @@ class Receivers:
             fused, self._memory[name] = ask_resumed_fusion(fusion, inputs, self._memory.get(name), where)
         else:  # a log with such a fusion is one time chunk
             fused = ask_fusion(fusion, inputs, where)
-        return replace(output, fused=fused, tells_of=fusion.tells_of, stated=stated)
+        return self._reach_origin(world, replace(output, fused=fused, tells_of=fusion.tells_of, stated=stated))
+
+    def _reach_origin(self, world: WorldChunk, output: ReceiverOutput) -> ReceiverOutput:
+        """The output, its origin reaching back to the lists of its oldest entries: a track may coast for long."""
+        origin, captured_s = output.origin, output.lists.entries["captured_s"]
+        if origin.goes_back != GoesBack.TO_NEWEST or np.isneginf(world.earliest_s) or not len(captured_s):
+            return output
+        earliest_s = find_earliest_origin_s(origin.lists, captured_s.min()[None], origin.max_age_s, origin.partial)[0]
+        if earliest_s >= world.earliest_s:
+            return output
+        rows = self._lists.world(world.chunk, float(earliest_s) - SAME_INSTANT_S).sent("sampled")
+        return replace(output, origin=replace(origin, rows=rows))
 
     def _state_captures(self, received: Tracks) -> StatedCaptures | None:
         """What a fusion is told of captures, in a group of one run; None: the truth."""
@@ -438,10 +504,11 @@ class Reach:
             # The lists that arrive at an instant, and those that are fused beside them.
             oldest_s = np.minimum.reduceat(lists.captured_s[schedule.arrived], schedule.arrived_start[:-1])
             used_s = np.where(schedule.newest >= 0, lists.captured_s[schedule.newest], np.inf).min(axis=1)
-            of_partial = _mark_partial(experiment, lists)[lists.frame_unit_ix] & np.isfinite(lists.common_arrives_s)
-            if of_partial.any():  # entries are kept for max_age_s after a message that leaves them out
-                way_s = (lists.common_arrives_s - lists.captured_s)[of_partial].max(initial=0.0)
-                used_s = np.minimum(used_s, schedule.issue_s - configuration.max_age_s - way_s)
+            max_age_s, partial = configuration.max_age_s, _mark_partial(experiment, lists)
+            if partial.any():  # entries are kept for max_age_s after a message that leaves them out
+                used_s = np.minimum(used_s, schedule.issue_s - max_age_s - find_longest_way_s(lists))
+            if isinstance(configuration.fusion, ListFusion):  # ideal fusion has truth ids
+                used_s = np.minimum(used_s, find_earliest_origin_s(lists, used_s, max_age_s, partial))
             self._oldest.append((schedule.issue_s, np.minimum(oldest_s, used_s)))
             fusion = configuration.fusion
             if isinstance(fusion, ListFusion) and fusion.looks_back_s > 0:

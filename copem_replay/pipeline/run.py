@@ -22,6 +22,7 @@ from typing import IO, Any, NamedTuple
 import pandas as pd
 import pyarrow as pa
 
+from copem_replay.core.compiled import call_in_room
 from copem_replay.core.errors import OutputError, is_url
 from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.experiment.schema import Experiment
@@ -125,7 +126,7 @@ class Gatherer:
                 if names:
                     replay, workers = log.replay(), -(-self._jobs // len(blocks))
                     outcomes = [
-                        pool.submit(replay_outcomes, replay, missing, some)
+                        pool.submit(call_in_room, replay_outcomes, replay, missing, some)
                         for some in cut_blocks(replay, missing, workers, runs)
                     ]
                 yield _Computing(log, runs, runs == blocks[-1], kept, missing, outcomes)

@@ -8,7 +8,7 @@ object's first frame, or after its last: it is compared with the state moved the
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,10 +18,11 @@ from copem_replay.metrics.accuracy.aggregator import Aggregator
 from copem_replay.metrics.accuracy.held import HeldAccuracy, HeldErrors
 from copem_replay.metrics.accuracy.statistics import Accuracy, AccuracySettings, repeat_for_runs
 from copem_replay.metrics.config import AnnotatedArea, Measure
-from copem_replay.metrics.detection.by_match import DetectionSteps, FirstMatches, collect_captures
+from copem_replay.metrics.detection.by_match import DetectionSteps, FirstMatches
 from copem_replay.metrics.detection.by_truth_id import FirstDetections
 from copem_replay.metrics.detection.conflict import ConflictDetector
-from copem_replay.metrics.matching import Matches, match_at_both_times, match_entries
+from copem_replay.metrics.detection.turns import number_turns
+from copem_replay.metrics.matching import MATCH, Matches, match_at_both_times, match_entries
 from copem_replay.pipeline.prepare import Replay, TruthCache
 from copem_replay.pipeline.receiver import ReceiverOutput
 
@@ -44,7 +45,8 @@ class ConfigurationScores:
 def match_lists(around: TruthCache, output: ReceiverOutput, measure: Measure) -> Matches:
     """Which true object each entry of the fused lists is about, at the instant it tells of."""
     world = around.at(output.instants.issue_s) if output.tells_of == "now" else _interpolate_told_world(around, output)
-    return match_entries(output.told, world, around.scene, gate_m=measure.match.gate_m, tells_of=output.tells_of)
+    gate_m = measure.match.gate_m
+    return match_entries(output.told, world, around.scene, output.origins, gate_m=gate_m, tells_of=output.tells_of)
 
 
 def _match_at_both_times(around: TruthCache, output: ReceiverOutput, measure: Measure) -> tuple[Matches, Matches]:
@@ -53,7 +55,7 @@ def _match_at_both_times(around: TruthCache, output: ReceiverOutput, measure: Me
         matches = match_lists(around, output, measure)
         return matches, matches
     then, now = _interpolate_told_world(around, output), around.at(output.instants.issue_s)
-    return match_at_both_times(output.told, then, now, around.scene, gate_m=measure.match.gate_m)
+    return match_at_both_times(output.told, then, now, around.scene, output.origins, gate_m=measure.match.gate_m)
 
 
 def _interpolate_told_world(around: TruthCache, output: ReceiverOutput) -> Tracks:
@@ -123,8 +125,10 @@ class Judge:
                 self._aggregator.add(lists, matches, now, around.at(issue_s))
                 self._held.add(lists, matches)
                 self.accuracy_s += time.perf_counter() - began_s
+            if len(object_ix := output.origins.own_ix):  # known by truth ids, however far off
+                matches = replace(matches, object_ix=object_ix, role=np.full(len(object_ix), MATCH, dtype=np.int8))
             for known in self._known:
-                known.add(lists, matches, issue_s)
+                known.add(lists, matches, issue_s, output.origins)
         if self._conflicts is not None:
             for s, fused_tracks in output.tracks_by_run(both and both[0]):
                 self._conflicts.add(fused_tracks, s)
@@ -133,11 +137,9 @@ class Judge:
     def _begin(self, around: TruthCache, output: ReceiverOutput) -> None:
         """Begin with the first lists, which have the runs of all."""
         measure, episodes, runs = self._measure, self._log.episodes, len(output.lists.start)
-        captures = collect_captures(output.received, instants=measure.confirm.hits > 1)
+        turns = number_turns(output.origin.lists) if measure.confirm.hits > 1 else None
         self._known = [
-            FirstMatches(
-                one, runs=runs, confirm=measure.confirm, count_earlier=measure.count_earlier, captures=captures
-            )
+            FirstMatches(one, runs=runs, confirm=measure.confirm, count_earlier=measure.count_earlier, turns=turns)
             for _, one in episodes.passes
         ]
         if not measure.accuracy:

@@ -20,6 +20,7 @@ from copem_replay.core.tracks import TRUTH, VALUES, Tracks
 from copem_replay.experiment.drive import cache_last_experiment, resolve_for_log
 from copem_replay.experiment.maps import MapFile
 from copem_replay.experiment.schema import Experiment
+from copem_replay.io.findings import Finding, as_finding
 from copem_replay.io.ground_truth import truth_digest
 from copem_replay.io.open import (
     DriveRecordings,
@@ -136,8 +137,9 @@ class StudyLog:
             return LogFacts.read(kept["facts"])
         replay = self.replay()
         facts = LogFacts.of(self.whole(), replay, alone)
+        notes = [as_finding(note).as_json() for note in recording.notes]
         said = {
-            "scene": scene_as_json(recording.scene), "topic": recording.topic, "notes": list(recording.notes),
+            "scene": scene_as_json(recording.scene), "topic": recording.topic, "notes": notes,
             "host": recording.host_id, **self.digests, "states": self.object_states, "facts": facts.as_json(),
         }  # fmt: skip
         self.parts.keep(about, said)
@@ -215,7 +217,7 @@ def recall_log(
         _empty_tracks(),
         Path(first.name) if isinstance(first, RemoteFile) else first,
         kept["topic"],
-        tuple(kept["notes"]),
+        tuple(Finding(*note) if isinstance(note, list) else note for note in kept["notes"]),
         kept["host"],
         together=place if isinstance(place, DriveRecordings) else None,
         remote=place if isinstance(place, RemoteFile) else None,

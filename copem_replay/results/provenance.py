@@ -21,6 +21,7 @@ from copem_replay.core.files import parse_json
 from copem_replay.experiment.file import relocate_settings
 from copem_replay.experiment.schema import Experiment, LogSettings
 from copem_replay.experiment.validate import read_logs, resolve_place
+from copem_replay.io.findings import Finding
 from copem_replay.io.open import File, Place, fetch_place, first_recording, read_file_stamps, sha256_of
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.columns import TABLES
@@ -32,7 +33,7 @@ from copem_replay.pipeline.study_log import compute_log_digests, read_content_di
 from copem_replay.results.folder import MARK
 from copem_replay.results.table_files import AGAIN
 
-FORMAT = 4
+FORMAT = 5
 """The format of results folders: raised when columns, files or their meaning change so that readers have to know."""
 
 _LIBRARIES = (
@@ -196,6 +197,7 @@ def build_provenance(
         "logs": [
             {"log": log.name, "topic": log.recording.topic, **{n: log.digests[n] for n in ("sha256", "truth")}}
             | ({"tags": dict(log.recording.scene.tags)} if log.recording.scene.tags else {})
+            | ({"read": found} if (found := _list_read(log.recording)) else {})
             for log in study.logs
         ],
         "logs_skipped": [{"log": escape_name(path.name), "reason": reason} for path, reason in skipped],
@@ -212,6 +214,15 @@ def build_provenance(
         },
         "notes": list(notes),
     }  # fmt: skip
+
+
+def _list_read(recording: Recording) -> list[dict[str, object]]:
+    """What was left out or mended of a recording: how many, and the line that says what and why."""
+    return [
+        {"number": note.number, "what": str(note), "changes": note.changes}
+        for note in recording.notes
+        if isinstance(note, Finding) and note.rule
+    ]
 
 
 def escape_name(name: str) -> str:

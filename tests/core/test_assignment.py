@@ -7,10 +7,13 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numba import njit
 from scipy.optimize import linear_sum_assignment
 
 from copem_replay.core.assignment import assign, assign_pairs, spread_component_maximum
 from tests.oracles.gnn import largest_around as largest_by_scipy
+
+assign_pairs, spread_component_maximum = map(njit, (assign_pairs, spread_component_maximum))  # as kernels call them
 
 Cost = npt.NDArray[np.float64]
 NOT = np.inf

@@ -7,8 +7,11 @@ import pytest
 import shapely
 from hypothesis import given
 from hypothesis import strategies as st
+from numba import njit
 
 from copem_replay.core.geometry import count_below, rotated_iou
+
+count_below, rotated_iou = map(njit, (count_below, rotated_iou))  # as kernels call them
 
 Box = tuple[float, float, float, float, float]
 """x, y, yaw, length, width."""

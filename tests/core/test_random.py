@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from numba import njit
 from scipy import stats
 from scipy.special import ndtri
 
@@ -21,6 +22,8 @@ from copem_replay.pipeline.replay import cut_blocks, replay_outcomes
 from copem_replay.pipeline.run import run_experiment
 from copem_replay.pipeline.tables import add_row_accuracy
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
+
+normal_quantile = njit(normal_quantile)  # as kernels call it
 
 
 def words(*hexadecimal: str) -> tuple[np.uint64, ...]:

@@ -554,8 +554,8 @@ CASES = [
     (COPEM, "fusion: {kind: real}",
      f".fusion: kind: expected one of {FUSIONS}, or package.module:Class; found 'real'; did you mean ideal?"),
     (COPEM, "fusion: {combine: mean}", ".fusion.combine: expected 'samples' or 'posterior', found 'mean'"),
-    (COPEM, "fusion: {colour: red}", ".fusion.colour: unknown key; known here: combine, kind"),
-    (COPEM, "fusion: {kind: ideal, colour: red}", ".fusion.colour: unknown key; known here: combine, kind"),
+    (COPEM, "fusion: {colour: red}", ".fusion.colour: unknown key; known here: combine, kind, memory"),
+    (COPEM, "fusion: {kind: ideal, colour: red}", ".fusion.colour: unknown key; known here: combine, kind, memory"),
     (COPEM, "fusion: {kind: 5}", f".fusion: expected {{kind: …}}, kind one of {FUSIONS}; found {{'kind': 5}}"),
     (COPEM, "fusion: null", f".fusion: expected {{kind: …}}, kind one of {FUSIONS}; found nothing"),
     (COPEM, "fusion: {kind: union, combine: samples}",
@@ -607,7 +607,7 @@ CASES = [
     (MEASURE, "match: 3", ".match: expected keys and values, found 3"),
     (MEASURE, "match: {gate_m: 0}", ".match.gate_m: expected more than 0, found 0"),
     (MEASURE, "match: {gate: 3}", ".match.gate: unknown key; did you mean gate_m?"),
-    (MEASURE, "match: {always: 1}", ".match.always: expected true or false, found 1"),
+    (MEASURE, "match: {always: true}", ".match.always: unknown key; known here: gate_m"),
     (MEASURE, "accuracy: yes", ".accuracy: expected true or false, found 'yes'"),
     (MEASURE, "gospa: {power: 0.5}", ".gospa.power: expected at least 1, found 0.5"),
     (MEASURE, "gospa: {power: 11, cutoff_m: 0}",
@@ -896,7 +896,7 @@ class TestRoundTrip:
         own_rate = "offset_m: [2, -0.5], rate_hz: 12.5, phase_s: 0.01, yaw_deg: -90"
         late = "fusion: {combine: posterior}, latency_s: {ego: 0, default: 0.25}, max_age_s: 3"
         onset = "onset: {kind: starts_moving, from: front, within_m: 20}"
-        matched = "match: {gate_m: 2.5, always: true}, accuracy: false, gospa: {cutoff_m: 7, power: 1}"
+        matched = "match: {gate_m: 2.5}, accuracy: false, gospa: {cutoff_m: 7, power: 1}"
         recorded = "topic: /lists, delay_s: 0.07, covariance_m2: [[0.5, 0.1], [0.1, 0.5]], existence: 0.8"
         tracker = "{kind: tracker, late: replay, buffer_s: 1.5, publish: 0.6}"
         text = changed(

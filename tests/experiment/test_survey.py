@@ -216,7 +216,7 @@ def test_no_truth_says_what_there_is(path):
     assert reason == (
         f"{path}: no list of true objects; it holds nav_msgs/msg/Odometry (cdr) on /odom, osi3.SensorData on rsu; "
         "beside a recording that has one its lists replay by `together: [THAT, THIS]`; "
-        "`read: {topic: …, objects: …, id: …}` names the fields of a list of any schema (docs/guide/recordings.md)"
+        "`read: {topic: …, objects: …, id: …}` names the fields of any list (docs/guide/recordings.md)"
     )
     assert describe_survey(found) == [
         "log.mcap",
@@ -235,7 +235,7 @@ def test_info_of_a_bag_of_lists_alone_is_no_error(path):
     write_mcap(path, [Topic("rsu", "osi3.SensorData", [(0, b"\xff")])])
     ended = CliRunner().invoke(app, ["info", str(path)], standalone_mode=False)
     assert ended.return_value == 2
-    assert "unit rsu: a message cannot be decoded" in ended.output
+    assert "unit rsu: none of its 1 messages can be decoded" in ended.output
 
 
 def test_every_topic_has_a_role(path):
@@ -273,10 +273,10 @@ def test_every_topic_has_a_role(path):
 
 
 def test_truth_without_usable_objects(path):
-    write_recording(path, [(0, [Obj(length=0)])])
+    write_recording(path, [(0, [Obj(x=None)])])
     found = survey_recording(path)
     assert not found.readable
-    assert found.reason.startswith(f"{path}: truth: no usable object in 1 message; 1 object state whose length")
+    assert found.reason.startswith(f"{path}: truth: no usable object in 1 message; 1 object state without a pos")
     assert found.topics[0].role == "truth"
 
 

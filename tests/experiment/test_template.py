@@ -569,6 +569,7 @@ def test_every_example_in_a_comment_holds_as_it_stands(tmp_path: Path, call: Cal
 OF_EACH_SOURCE = {path.stem.split("_")[0]: path for path in sorted(SHARED.glob("*.mcap"), reverse=True)}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("path", OF_EACH_SOURCE.values() or [None], ids=lambda p: p.stem if p else "absent")
 def test_every_example_holds_on_real_recordings(tmp_path: Path, call: Call, path: Path | None) -> None:
     if path is None:
@@ -594,6 +595,7 @@ def test_quoted_text_reads_as_the_same_text(text: str) -> None:
         assert (value if isinstance(value, str) else str(value)) == text
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("path", sorted(SHARED.glob("*.mcap")) or [None], ids=lambda p: p.stem if p else "absent")
 def test_real_recordings(replayed: Callable[..., Any], path: Path | None) -> None:
     if path is None:

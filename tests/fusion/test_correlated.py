@@ -8,11 +8,36 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numba import njit
 
 from copem_replay.fusion.combine import combine_by_cross_covariance, covariance_union, inverse_covariance_intersection
 from copem_replay.fusion.covariance import covariance_intersection, inverse_variance
 from copem_replay.fusion.split_intersection import split_by_share, split_by_variance, split_covariance_intersection
 from tests.oracles import correlated as oracle
+
+# As kernels call them:
+(
+    combine_by_cross_covariance,
+    covariance_intersection,
+    covariance_union,
+    inverse_covariance_intersection,
+    inverse_variance,
+    split_by_share,
+    split_by_variance,
+    split_covariance_intersection,
+) = map(
+    njit,
+    (
+        combine_by_cross_covariance,
+        covariance_intersection,
+        covariance_union,
+        inverse_covariance_intersection,
+        inverse_variance,
+        split_by_share,
+        split_by_variance,
+        split_covariance_intersection,
+    ),
+)
 
 Array = npt.NDArray[np.float64]
 

@@ -11,9 +11,16 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numba import njit
 from scipy.optimize import minimize, minimize_scalar
 
 from copem_replay.fusion.covariance import covariance_intersection, fast_covariance_intersection, inverse_variance
+
+# As kernels call them:
+covariance_intersection, fast_covariance_intersection, inverse_variance = map(
+    njit,
+    (covariance_intersection, fast_covariance_intersection, inverse_variance),
+)
 
 Array = npt.NDArray[np.float64]
 Estimates = tuple[Array, Array]

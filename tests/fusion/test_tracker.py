@@ -14,7 +14,6 @@ from pydantic import ValidationError
 from scipy.optimize import linear_sum_assignment
 
 from copem_replay.core.object_list import (
-    AGREE,
     Entries,
     Inputs,
     ObjectLists,
@@ -22,7 +21,7 @@ from copem_replay.core.object_list import (
     most_probable_class,
     most_probable_classes,
 )
-from copem_replay.core.tracks import CLASSES
+from copem_replay.core.tracks import AGREE, CLASSES
 from copem_replay.fusion.interface import ask_fusion
 from copem_replay.fusion.tracker import Tracker
 from tests.helpers.reports import entry, inputs_of, joined, lists_of

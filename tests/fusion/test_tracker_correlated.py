@@ -10,6 +10,7 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numba import njit
 from pydantic import ValidationError
 from scipy.optimize import minimize_scalar
 
@@ -18,6 +19,8 @@ from copem_replay.fusion.tracker import Tracker
 from copem_replay.fusion.tracker_kernel import propagate_covariance, update_split
 from tests.fusion.test_tracker import LATE, fuse, fuse_one, street
 from tests.helpers.reports import entry, inputs_of
+
+propagate_covariance, update_split = map(njit, (propagate_covariance, update_split))  # as kernels call them
 
 Array = npt.NDArray[Any]
 STILL: dict[str, Any] = {

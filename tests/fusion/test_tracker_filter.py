@@ -9,9 +9,16 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numba import njit
 
 from copem_replay.fusion.covariance import floor_eigenvalues
 from copem_replay.fusion.tracker_kernel import mahalanobis2, predict_state, update_state
+
+# As kernels call them:
+floor_eigenvalues, mahalanobis2, predict_state, update_state = map(
+    njit,
+    (floor_eigenvalues, mahalanobis2, predict_state, update_state),
+)
 
 Array = npt.NDArray[np.float64]
 H = np.eye(2, 4)

@@ -7,10 +7,12 @@ from copem_replay.core.tracks import Bool, Float, Scene, Tracks
 from copem_replay.metrics.accuracy.aggregator import Aggregator
 from copem_replay.metrics.accuracy.statistics import Accuracy, AccuracySettings
 from copem_replay.metrics.config import Confirm
-from copem_replay.metrics.detection.by_match import CaptureInstants, DetectionSteps, FirstMatches
+from copem_replay.metrics.detection.by_match import DetectionSteps, FirstMatches
 from copem_replay.metrics.detection.by_truth_id import FirstDetections
+from copem_replay.metrics.detection.turns import Turns
 from copem_replay.metrics.episodes import Episodes, Reference
 from copem_replay.metrics.matching import Matches
+from copem_replay.metrics.origin import Origins
 
 
 def assess(
@@ -43,11 +45,10 @@ def first_matches(
     *,
     confirm: Confirm,
     count_earlier: bool,
-    captures: CaptureInstants,
+    turns: Turns | None,
+    origins: Origins,
 ) -> tuple[FirstDetections, DetectionSteps]:
     """The same of all lists at once."""
-    whole = FirstMatches(
-        episodes, runs=len(lists.start), confirm=confirm, count_earlier=count_earlier, captures=captures
-    )
-    whole.add(lists, matches, issue_s)
+    whole = FirstMatches(episodes, runs=len(lists.start), confirm=confirm, count_earlier=count_earlier, turns=turns)
+    whole.add(lists, matches, issue_s, origins)
     return whole.result()

@@ -42,7 +42,7 @@ MEASURE = {
     "began": ["crossed", "appeared"],
     "count_earlier": False,
     "confirm": {"hits": 1, "of": 1},
-    "match": {"gate_m": 3.0, "always": False},
+    "match": {"gate_m": 3.0},
     "distance_to": "ego",
     "horizon_s": 10.0,
     "conflict": None,
@@ -53,7 +53,7 @@ MEASURE = {
 }
 UNREMARKABLE = dict.fromkeys(
     ("truth", "recorded", "by_truth_id", "fixed", "fixed_verdicts", "needs_visibility"), False
-) | {"ideal": None, "ideal_of": None}
+) | {"ideal": None, "ideal_of": None, "remembering": None}
 """A configuration of which nothing is known but its rows."""
 LINKS = {"radio": {"latency": 0.1}}
 BRAKING = {"driver": {"kind": "constant_deceleration", "a_max_mps2": 8.0}, "margin_m": 0.5, "brakes_for": "object"}
@@ -130,7 +130,7 @@ def write_folder(
     names = list(dict.fromkeys(r["log"] for r in rows))
     logs = logs or {name: f"content of {name}" for name in names}
     said = {
-        "format": 4,
+        "format": 5,
         "seed": 1,
         "runs": max(r["run"] for r in rows) + 1,
         "logs": [{"log": name, "topic": "ground_truth", "sha256": content} for name, content in logs.items()],

@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from copem_replay.core.tracks import CLASSES
-from copem_replay.io.ground_truth import HEIGHTS_M, correct_heights, correct_velocities
+from copem_replay.io.findings import HEIGHTS_M
+from copem_replay.io.ground_truth import correct_heights, correct_velocities
 
 NAN = float("nan")
 
@@ -201,3 +202,13 @@ def test_height_equal_to_width_of_three_objects_is_an_exporters_defect():
     assert stand(rows)[1] == ["the height of every moving object equals its width, a known defect of exporters"]
     assert stand(rows[:2])[1] == []
     assert stand([*rows, (3, "car", 1, 1.8, 1.5)])[1] == []
+
+
+def test_a_drive_of_2_hz_has_velocities_in_every_list() -> None:
+    """Lists come every 0.5 s, some a little later: with `max_gap_s` of 0.8 s there is a way to each neighbour."""
+    time_s = np.array([0, 0.5, 1.02, 1.5, 2.03])
+    start, nan, moving = np.array([0, 5]), np.full(5, NAN), np.full(5, True)
+    vx, vy, _ = correct_velocities(start, time_s, 6 * time_s, 0 * time_s, nan, nan, moving, 0.8)
+    assert vx == pytest.approx(np.full(5, 6.0))
+    assert not vy.any()
+    assert correct_velocities(start, time_s, 6 * time_s, 0 * time_s, nan, nan, moving)[0][4] == 0

@@ -16,12 +16,12 @@ import copem_replay as cr
 from copem_replay.cli.main import app
 from copem_replay.experiment.draft.survey import ClockFound, compare_clocks
 from copem_replay.io.clock_offset import TimeOffset
+from copem_replay.io.findings import X, Y
 from copem_replay.io.frames import read_decoded_lists, read_log_context, transform_to_world
 from copem_replay.io.log import Log
 from copem_replay.io.open import DriveRecordings, label_files, open_log
 from copem_replay.io.recorded_lists import read_recorded
 from copem_replay.io.recording import read_log
-from copem_replay.io.schemas.description import X, Y
 from copem_replay.io.window import Window
 from tests.experiment.test_validate import against_logs, without_logs
 from tests.helpers.experiments import changed
@@ -327,7 +327,9 @@ class TestFrames:
         found = {}
         for channel in log.channels:
             if channel.schema == "foxglove.SceneUpdate":
-                lists = transform_to_world(read_decoded_lists(log, [channel], None), around, log.path, channel.topic)
+                lists = transform_to_world(
+                    read_decoded_lists(log, [channel], None, {}), around, log.path, channel.topic
+                )
                 at = lists.columns.values[5]
                 found[channel.topic] = (round(float(at[X]), 6), round(float(at[Y]), 6))
         return found

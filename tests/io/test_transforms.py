@@ -27,6 +27,7 @@ def poses(parent: str, child: str, *samples: Sample) -> Poses:
         velocity_mps=np.full((len(samples), 2), np.nan),
         frame=(parent,) * len(samples),
         child=(child,) * len(samples),
+        log_time_ns=np.array([round(s[0] * 1e9) for s in samples], dtype=np.int64),
     )
 
 

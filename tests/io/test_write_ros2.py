@@ -352,7 +352,8 @@ def test_read_back_as_the_lists_of_a_unit(written: Written, configuration: str) 
     np.testing.assert_array_equal(back.tracks.frame_ix, fused.frame_ix[rows])
     for name in (*VALUES, *UNCERTAINTIES):  # round ones have their length and width beside the list
         column = getattr(fused, name)
-        expected = np.zeros(len(rows)) if column is None else np.nan_to_num(column[0, rows])
+        unsaid = 0.0 if name in (*VALUES, *UNCERTAINTIES[:3]) else np.nan
+        expected = np.full(len(rows), unsaid) if column is None else np.nan_to_num(column[0, rows], nan=unsaid)
         found = getattr(back.tracks, name)[0]
         if name == "yaw_rad":
             expected, found = np.cos(expected - found), np.ones(len(rows))
@@ -466,6 +467,7 @@ def test_a_recording_of_foxglove_gets_scene_updates_in_its_own_frame(tmp_path: P
     assert {entity.frame_id for update in updates for entity in update.entities} == {"odom"}
 
 
+@pytest.mark.long
 def test_a_real_recording_of_autoware(tmp_path: Path) -> None:
     source = SHARED / "nuscenes_scene0916_autoware_ros2.mcap"
     if not source.exists():

@@ -18,12 +18,13 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.reader import make_reader
 
 import copem_replay as cr
+from copem_replay.io.encodings.ros2_types import message_definition
 from copem_replay.io.recording import read_log
 from copem_replay.io.write import ros2 as foxglove_scene_ros2
 from copem_replay.io.write import scene as foxglove_scene
 from copem_replay.io.write.detail import KNOWN, LISTED, NOT_LISTED
 from copem_replay.io.write.message_family import STATUS, TRANSFORM
-from copem_replay.io.write.ros2 import SCENE_UPDATE, message_definition
+from copem_replay.io.write.ros2 import SCENE_UPDATE
 from copem_replay.io.write.scene import (
     Ellipse,
     Entity,

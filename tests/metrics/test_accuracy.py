@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from numba import njit
 
 from copem_replay.core.object_list import Entries, ObjectLists
 from copem_replay.core.tracks import CLASSES
@@ -46,6 +47,9 @@ from tests.oracles.accuracy import (
     taken,
     truth_of,
 )
+from tests.oracles.origin import unknown_origins
+
+expect_gated_nees = njit(expect_gated_nees)  # as kernels call it
 
 EGO, CAR, OTHER_CAR = 0, 1, 2
 NOTHING = one_list()
@@ -68,9 +72,11 @@ def assessed(
     at_ego = [(0.0, 0.0)] * K if ego is None else list(ego)
     truth = {EGO: at_ego, **places}
     world, scene, lists = truth_of(truth, times.tolist(), velocity), scene_of(*of), lists_of(runs)
-    about = now = match_entries(lists, world, scene, gate_m=GATE_M)
+    about = now = match_entries(lists, world, scene, unknown_origins(lists), gate_m=GATE_M)
     if captures is not None:
-        about, now = match_at_both_times(lists, truth_of(captures[1], captures[0]), world, scene, gate_m=GATE_M)
+        about, now = match_at_both_times(
+            lists, truth_of(captures[1], captures[0]), world, scene, unknown_origins(lists), gate_m=GATE_M
+        )
     settings = AccuracySettings(**({"cutoff_m": 3.0, "gate_m": GATE_M} | given))
     return assess(
         lists, about, now, times, world, scene, episodes_of(episodes), np.full(len(episodes), since_s),
@@ -582,9 +588,9 @@ class Scenery:
 
     def matched(self, lists: ObjectLists) -> tuple[Matches, Matches]:
         if self.tells_of_now:
-            found = match_entries(lists, self.world, self.scene, gate_m=2.0)
+            found = match_entries(lists, self.world, self.scene, unknown_origins(lists), gate_m=2.0)
             return found, found
-        return match_at_both_times(lists, self.captured, self.world, self.scene, gate_m=2.0)
+        return match_at_both_times(lists, self.captured, self.world, self.scene, unknown_origins(lists), gate_m=2.0)
 
     def _list(self, rng: np.random.Generator, k: int, way: Any) -> Entries:
         found = [place for o in self.places if (place := self.places[o][k]) is not None and rng.uniform() < 0.8]

@@ -9,8 +9,11 @@ import pytest
 import shapely
 from hypothesis import given
 from hypothesis import strategies as st
+from numba import njit
 
 from copem_replay.core.geometry import are_in_area, is_in_area, is_in_polygon, polygon_corners
+
+is_in_polygon = njit(is_in_polygon)  # as kernels call it
 
 L_SHAPE = ((0.0, 0.0), (10.0, 0.0), (10.0, 4.0), (4.0, 4.0), (4.0, 10.0), (0.0, 10.0))
 

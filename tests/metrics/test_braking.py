@@ -21,6 +21,7 @@ import shapely
 from hypothesis import HealthCheck, assume, example, given, settings
 from hypothesis import strategies as st
 from mpmath import mpf
+from numba import njit
 
 from copem_replay.core.errors import InputError
 from copem_replay.core.geometry import box_distance, corner_travel, find_smallest_distances, pose_on_path
@@ -49,6 +50,12 @@ from copem_replay.pipeline.run import run_experiment
 from tests.helpers.drawn import examples
 from tests.helpers.scenes import EGO_UNIT, SEES_ALL, Thing, driving, experiment, recording, standing
 from tests.oracles.braking import Motion, corners, outcome
+
+# As kernels call them:
+box_distance, corner_travel, pose_on_path = map(
+    njit,
+    (box_distance, corner_travel, pose_on_path),
+)
 
 SOME = settings(
     max_examples=examples(60), suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much]

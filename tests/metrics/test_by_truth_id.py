@@ -12,13 +12,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from copem_replay.communication.arrivals import fusion_schedule
 from copem_replay.core.tracks import VALUES, Tracks
 from copem_replay.fusion.ideal import fuse_ideal
 from copem_replay.metrics.config import Confirm
-from copem_replay.metrics.detection.by_truth_id import capture_instants, detect_by_truth_id
+from copem_replay.metrics.detection.by_match import FirstMatches
+from copem_replay.metrics.detection.by_truth_id import FirstDetections, detect_by_truth_id
+from copem_replay.metrics.detection.turns import number_turns
 from copem_replay.metrics.episodes import Episodes
+from copem_replay.metrics.matching import MATCH
+from copem_replay.metrics.origin import GoesBack, OriginLists, Origins
+from copem_replay.pipeline.receiver import convert_to_lists
 from tests.helpers.drawn import examples
-from tests.oracles.accuracy import episodes_of
+from tests.oracles.accuracy import episodes_of, matches_of, scene_of
+from tests.oracles.origin import Heard, numbered
 
 NEVER = None
 Held = frozenset[tuple[int, int]]
@@ -163,11 +170,12 @@ def plainly(world: World) -> dict[tuple[int, int], Found | None]:
                 if not (together or alone):
                     continue
                 contributing = []
-                for unit in world.units.values():
+                for u, (name, unit) in enumerate(world.units.items()):
                     arrived = [(t, held) for t, held in unit.lists if t + unit.latency <= now]
                     if arrived and now - arrived[-1][0] <= world.max_age + unit.latency and (run, o) in arrived[-1][1]:
-                        contributing.append(arrived[-1][0])
-                result[run, o] = Found(now, max(contributing), min(holding)[2])
+                        contributing.append((-arrived[-1][0], u, name))
+                newest, _, first = min(contributing)
+                result[run, o] = Found(now, -newest, first)
                 break
     return result
 
@@ -211,12 +219,14 @@ class TestByHand:
         world = World({"ego": at_rate(100, ".xx...", latency=50)}, {0: (120, 900)})
         assert detected(world) == {(0, 0): Found(250, 200, "ego")}
 
-    def test_the_first_unit_is_by_arrival_then_by_order(self) -> None:
+    def test_the_first_unit_is_that_of_the_newest_list_then_by_order(self) -> None:
         ego, mast = at_rate(100, "..x...", latency=100), at_rate(100, "...x..")
-        assert detected(World({"ego": ego, "mast": mast}, {0: (0, 900)})) == {(0, 0): Found(300, 300, "ego")}
-        assert detected(World({"mast": mast, "ego": ego}, {0: (0, 900)})) == {(0, 0): Found(300, 300, "mast")}
+        for order in ({"ego": ego, "mast": mast}, {"mast": mast, "ego": ego}):
+            assert detected(World(order, {0: (0, 900)})) == {(0, 0): Found(300, 300, "mast")}
         early = replace(mast, latency=99)
         assert detected(World({"mast": early, "ego": ego}, {0: (0, 900)})) == {(0, 0): Found(300, 200, "ego")}
+        also = at_rate(100, "..x...", latency=100)
+        assert detected(World({"van": also, "ego": ego}, {0: (0, 900)})) == {(0, 0): Found(300, 200, "van")}
 
     @pytest.mark.parametrize("offset_us", [0.0, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8])
     def test_arrivals_within_a_microsecond_are_one_instant(self, offset_us: float) -> None:
@@ -273,25 +283,25 @@ class TestConfirmed:
         world = World(both, {0: (0, 900)}, hits=2, of=2)
         assert detected(world) == {(0, 0): NEVER}
         world = replace(world, units=world.units | {"mast": at_rate(100, "...x..", first=20)})
-        assert detected(world) == {(0, 0): Found(320, 320, "ego")}
+        assert detected(world) == {(0, 0): Found(320, 320, "mast")}
 
     @pytest.mark.parametrize(("apart", "of_b"), [(0, [0, 1, 2]), (49, [0, 1, 2]), (50, [0, 1, 2]), (51, [1, 2, 3])])
     def test_half_a_list_period(self, apart: int, of_b: list[int]) -> None:
         """51 ms after one list of the other is 49 ms before its next."""
         world = World({"a": at_rate(100, "...."), "b": at_rate(100, "...", first=apart)}, {})
-        a, b = np.split(capture_instants(tracks(world)), [4])
+        a, b = np.split(number_turns(tracks(world)).list_instant, [4])
         assert (a.tolist(), b.tolist()) == ([0, 1, 2, 3], of_b)
 
     def test_the_shortest_period_decides(self) -> None:
         """Every 0.1 s and every 1 s: within 50 ms is one."""
         world = World({"a": at_rate(100, "." * 11), "b": at_rate(1000, "..", first=30)}, {})
-        a, b = np.split(capture_instants(tracks(world)), [11])
+        a, b = np.split(number_turns(tracks(world)).list_instant, [11])
         assert (a.tolist(), b.tolist()) == ([*range(11)], [0, 10])
 
     def test_two_captures_of_one_unit_are_two(self) -> None:
         """Its lists jitter: 30 ms instead of 100. Still each list is a capture of its own."""
         lists = tuple((t, holds()) for t in (0, 100, 200, 230, 300, 400, 500))
-        assert len(set(capture_instants(tracks(World({"a": Unit(0, lists)}, {}))))) == 7
+        assert len(set(number_turns(tracks(World({"a": Unit(0, lists)}, {}))).list_instant.tolist())) == 7
 
     def test_jitter_does_not_confirm_for_one_what_it_does_not_for_two(self) -> None:
         """Held at 0 and 0.13 s but not at 0.1 s: no two in a row, with a second unit that sees nothing or without."""
@@ -304,7 +314,7 @@ class TestConfirmed:
         """The ego holds it at 0.3 s; the mast's list of 0.2 s, late, at 0.6 s makes two of two in a row."""
         world = World({"ego": at_rate(100, "...x......"), "mast": at_rate(100, "..x.......", 400)}, {0: (0, 900)},
                       hits=2, of=2)  # fmt: skip
-        assert detected(world) == {(0, 0): Found(600, 200, "ego")}
+        assert detected(world) == {(0, 0): Found(600, 200, "mast")}
 
     def test_of_a_unit_alone_a_list_that_never_arrives_is_no_capture(self) -> None:
         """The ego's list of 0.2 s is lost: those of 0.0, 0.1 and 0.3 s are three in a row, and two of them hold it.
@@ -326,20 +336,21 @@ class TestConfirmed:
         after = replace(world, episodes={0: (250, 900)})
         assert detected(after, replace(received, arrives_s=late_s)) == {(0, 0): Found(900, 600, "ego")}
 
-    @pytest.mark.parametrize(("held", "captured"), [("..x.x...", 400), ("..xx....", 300)])
-    def test_what_confirms_at_one_instant_contributes_though_a_newer_list_came_with_it(
-        self, held: str, captured: int
-    ) -> None:
-        world = World({"ego": at_rate(100, held)}, {0: (0, 900)}, hits=2, of=3)
+    def test_what_is_taken_in_together_is_one_turn(self) -> None:
+        """Lists of 0.1 to 0.5 s come in at 0.5 s, those of 0.6 and 0.7 s at 0.9 s: the third of three is the first."""
+        world = World({"ego": at_rate(100, "..x.x..x")}, {0: (0, 900)}, hits=2, of=2)
         at_once_s = np.array([[0.0, 0.5, 0.5, 0.5, 0.5, 0.5, 0.9, 0.9]])
-        assert detected(world, replace(tracks(world), arrives_s=at_once_s)) == {(0, 0): Found(500, captured, "ego")}
+        received = replace(tracks(world), arrives_s=at_once_s)
+        assert number_turns(received).turn.tolist() == [0, 1, 1, 1, 1, 1, 2, 2]
+        assert detected(world, received) == {(0, 0): Found(900, 700, "ego")}
+        assert detected(replace(world, hits=1, of=1), received) == {(0, 0): Found(500, 400, "ego")}
 
     def test_a_list_exactly_at_its_greatest_age_still_contributes(self) -> None:
         """The ego's only list, of 0.5 s, is 0.4 s old when the mast's of 0.4 s arrives at 0.9 s: not too old."""
         ego = Unit(0, ((500, holds(0)),))
         world = World({"ego": ego, "mast": at_rate(100, "....x.....", 500)}, {0: (0, 5000)}, hits=2, of=2, max_age=400)
         assert detected(world) == {(0, 0): Found(900, 500, "ego")}
-        assert detected(replace(world, max_age=399)) == {(0, 0): Found(900, 400, "ego")}
+        assert detected(replace(world, max_age=399)) == {(0, 0): Found(900, 400, "mast")}
 
 
 TICK = 10
@@ -383,7 +394,7 @@ def test_against_the_oracle(world: World) -> None:
 def test_capture_instants_against_the_oracle(world: World) -> None:
     expected = instants_of(world)
     frames = [(name, k) for name, unit in world.units.items() for k in range(len(unit.lists))]
-    assert capture_instants(tracks(world)).tolist() == [expected[frame] for frame in frames]
+    assert number_turns(tracks(world)).list_instant.tolist() == [expected[frame] for frame in frames]
 
 
 @settings(max_examples=examples(300), deadline=None)
@@ -402,6 +413,56 @@ def test_detected_when_the_ideal_fusion_first_lists_it(world: World) -> None:
             assert (found is None) == (len(times) == 0)
             if found is not None:
                 assert found.at / 1000 == pytest.approx(times.min())
+
+
+def by_match(world: World, received: Tracks) -> FirstDetections:
+    """The detections in the lists of ideal fusion, read like those of any other fusion."""
+    max_age_s, nobody = world.max_age / 1000, np.zeros(len(received.units), dtype=bool)
+    scene = scene_of("car", "car", "car")
+    fused, own = convert_to_lists(fuse_ideal(received, max_age_s=max_age_s), scene)
+    of = OriginLists(received, received, GoesBack.TO_NEWEST, max_age_s, nobody, -1)
+    issue_s = fusion_schedule(received, max_age_s=max_age_s).issue_s
+    known = FirstMatches(
+        episodes(world), runs=world.runs, confirm=Confirm(hits=world.hits, of=world.of),
+        count_earlier=world.count_earlier, turns=number_turns(received),
+    )  # fmt: skip
+    matches = matches_of(own.tolist(), [MATCH] * len(own))
+    known.add(fused, matches, issue_s, Origins(fused.entries, own, of.find_holdings(issue_s)))
+    return known.result()[0]
+
+
+@settings(max_examples=examples(600), deadline=None)
+@given(worlds(), st.data())
+def test_the_fast_path_finds_what_is_in_the_lists_of_ideal_fusion(world: World, data: st.DataObject) -> None:
+    """However lists are late, lost, overtaken, or taken in together."""
+    received = tracks(world)
+    late = st.sampled_from([0, 0, TICK, 3 * TICK, 12 * TICK, np.inf])
+    later_s = np.array([[data.draw(late) / 1000 for _ in received.stamp_ns]]).reshape(1, -1)
+    tick_s = data.draw(st.sampled_from([0, 5, 20])) * TICK / 1000
+    arrives_s = received.arrives_s + later_s
+    if tick_s:
+        arrives_s = np.ceil(arrives_s / tick_s - 1e-9) * tick_s
+    received = replace(received, arrives_s=arrives_s)
+    fast = detect_by_truth_id(
+        received, episodes(world), confirm=Confirm(hits=world.hits, of=world.of), count_earlier=world.count_earlier,
+        max_age_s=world.max_age / 1000,
+    )  # fmt: skip
+    for column, of_lists in zip(fast, by_match(world, received), strict=True):
+        np.testing.assert_allclose(column, of_lists, rtol=0, atol=1e-6)  # arrivals within 1 µs are one instant
+
+
+@settings(max_examples=examples(), deadline=None)
+@given(worlds(), st.data())
+def test_turns_against_the_oracle(world: World, data: st.DataObject) -> None:
+    received = tracks(world)
+    late = st.sampled_from([0, 0, TICK, 3 * TICK, 12 * TICK, np.inf])
+    arrives_s = received.arrives_s + np.array([[data.draw(late) / 1000 for _ in received.stamp_ns]]).reshape(1, -1)
+    turns = number_turns(replace(received, arrives_s=arrives_s))
+    columns = zip(received.frame_unit_ix.tolist(), received.captured_s.tolist(), arrives_s[0].tolist(), strict=True)
+    turn, instant = numbered([Heard(*column, (frozenset(),)) for column in columns])
+    first = {u: int(np.searchsorted(turns.unit_ix, u)) for u, _ in turn}
+    for f in np.flatnonzero(np.isfinite(arrives_s[0])):
+        assert (turns.turn[f], turns.list_instant[f]) == (first[turn[f][0]] + turn[f][1], instant[f])
 
 
 @settings(max_examples=examples(300), deadline=None)

@@ -21,6 +21,7 @@ import pytest
 import shapely
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
+from numba import njit
 from pyarrow import parquet
 
 from copem_replay.cli import main as cli
@@ -41,6 +42,8 @@ from tests.helpers.drawn import examples
 from tests.helpers.experiments import changed, source_of
 from tests.helpers.recordings import Obj, pedestrian, write_recording
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
+
+will_enter = njit(will_enter)  # as kernels call it
 
 SOME = settings(
     max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow]

@@ -33,6 +33,7 @@ from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording
 from tests.metrics.test_accuracy import Scenery, classes
 from tests.oracles.accuracy import Places, episodes_of, matches_of, reference_of, scene_of, taken, truth_of
 from tests.oracles.held import held_plainly, list_at
+from tests.oracles.origin import unknown_origins
 
 # Frames.
 
@@ -92,7 +93,7 @@ def measured(
         return truth_of({o: [way[f] for f in k] for o, way in places.items()}, time_s)
 
     if about is None:
-        about = match_entries(lists, at(issue_s), scene, gate_m=3.0)
+        about = match_entries(lists, at(issue_s), scene, unknown_origins(lists), gate_m=3.0)
     frames = make_held_frames(np.array(frame_s), given_episodes, at, lambda _: reference)
     errors = HeldErrors(
         frames, np.array(issue_s, dtype=float), max_age_s, scene, given_episodes, classes("car"),

@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from copem_replay.core.errors import InputError
-from copem_replay.core.object_list import AGREE, Entries, TellsOf
-from copem_replay.core.tracks import CLASSES
+from copem_replay.core.object_list import Entries, TellsOf
+from copem_replay.core.tracks import AGREE, CLASSES
 from copem_replay.fusion.gnn import Gnn
 from copem_replay.fusion.interface import Inbox, StepFusion, ask_fusion
 from copem_replay.fusion.nms import Nms
@@ -27,8 +27,9 @@ from copem_replay.metrics.matching import DUPLICATE, GHOST, MATCH, match_at_both
 from copem_replay.pipeline.run import run_experiment
 from tests.helpers.reports import entry, inputs_of, joined, lists_of
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
-from tests.metrics.test_matching import preference
+from tests.metrics.test_matching import by_the_rules
 from tests.oracles.accuracy import permuted, scene_of, truth_of
+from tests.oracles.origin import unknown_origins
 
 # ------------------------------------------------------------------------------------------------- the property
 
@@ -134,20 +135,7 @@ def plainly(entries: Entries, places: Sequence[dict[int, tuple[float, float]]], 
         near = [o for o, d in away.items() if d <= 2.0 + 1e-9 and AGREE[said, CLASSES.index(classes[o])]]
         return sorted(near, key=lambda o: (away[o], places[i][o][0], o))
 
-    order = sorted(range(len(entries)), key=lambda i: preference(entries[i]))
-    everybody = set(range(len(classes)))
-    about = {i: near[0] for i in order if (near := within(i, everybody))}
-    matched: dict[int, int] = {}
-    for i in order:
-        if i in about and about[i] not in matched.values():
-            matched[i] = about[i]
-    for i in order:
-        if i not in matched and (near := within(i, everybody - set(matched.values()))):
-            matched[i] = near[0]
-    return [
-        (matched[i], MATCH) if i in matched else (about[i], DUPLICATE) if i in about else (-1, GHOST)
-        for i in range(len(entries))
-    ]
+    return by_the_rules(entries, within, set(range(len(classes))))
 
 
 PLACE = st.tuples(st.integers(-3, 3), st.integers(-3, 3))
@@ -176,7 +164,7 @@ def test_entries_of_one_list_may_tell_of_different_instants(things: Any, runs: A
     )  # fmt: skip
     then, now = truth_of(places([0, 1, 2]), [0.0, 1.0, 2.0]), truth_of(places([1, 2]), [1.0, 2.0])
     scene = scene_of(*classes)
-    about, at_once = match_at_both_times(lists, then, now, scene, gate_m=2.0)
+    about, at_once = match_at_both_times(lists, then, now, scene, unknown_origins(lists), gate_m=2.0)
     for s in range(len(runs)):
         for k in (0, 1):
             of_list, one = slice(lists.start[s, k], lists.start[s, k + 1]), lists.of(s, k)
@@ -186,11 +174,11 @@ def test_entries_of_one_list_may_tell_of_different_instants(things: Any, runs: A
                 for (o, role), t, x, y in zip(got, asked, found.x_m[of_list], found.y_m[of_list], strict=True):
                     assert role == GHOST or (x, y) == there(t)[o]
     for one, world, tells_of in ((about, then, "capture"), (at_once, now, "now")):
-        alone = match_entries(lists, world, scene, gate_m=2.0, tells_of=tells_of)  # type: ignore[arg-type]
+        alone = match_entries(lists, world, scene, unknown_origins(lists), gate_m=2.0, tells_of=tells_of)  # type: ignore[arg-type]
         np.testing.assert_array_equal(alone.object_ix, one.object_ix)
         np.testing.assert_array_equal(alone.role, one.role)
     shuffled, _, to = permuted(lists, None, np.random.default_rng(seed))
-    again, _ = match_at_both_times(shuffled, then, now, scene, gate_m=2.0)
+    again, _ = match_at_both_times(shuffled, then, now, scene, unknown_origins(shuffled), gate_m=2.0)
     assert sorted(again.role[np.argsort(to)].tolist()) == sorted(about.role.tolist())
 
 
@@ -199,7 +187,7 @@ def test_at_the_instant_an_object_has_one_match_whichever_instants_its_entries_t
     world = truth_of({0: [(0, 0), (10, 0)]}, [0.0, 1.0])
     now = truth_of({0: [(10, 0)]}, [1.0])
     lists = lists_of([[joined(entry(0.5, captured_s=0.0, existence=0.9), entry(10, captured_s=1.0, existence=0.5))]])
-    about, at_once = match_at_both_times(lists, world, now, scene_of("car"), gate_m=3.0)
+    about, at_once = match_at_both_times(lists, world, now, scene_of("car"), unknown_origins(lists), gate_m=3.0)
     assert about.role.tolist() == [MATCH, DUPLICATE]
     assert at_once.role.tolist() == [GHOST, MATCH]
 
@@ -235,11 +223,6 @@ def test_latency_costs_its_length_by_match_as_by_truth_id() -> None:
     of = {name: part.set_index(["run", "object_id"])["detection_s"] for name, part in result.groupby("configuration")}
     for name in ("union", "gnn"):
         pd.testing.assert_series_equal(of[name], of["ideal"], check_names=False)
-
-
-def test_matched_all_alike_the_ideal_agrees_with_itself() -> None:
-    by_id, always = late(0.5, "ideal", "GT").table, late(0.5, "ideal", "GT", match={"always": True}).table
-    pd.testing.assert_series_equal(by_id["detection_s"], always["detection_s"])
 
 
 def test_no_row_depends_on_other_configurations() -> None:

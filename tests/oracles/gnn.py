@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 import shapely.affinity
+from numba import njit
 from scipy.optimize import linear_sum_assignment, minimize
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -22,6 +23,8 @@ from copem_replay.core.tracks import CLASS_GROUPS, CLASSES
 from copem_replay.fusion.combine import covariance_union
 from tests.helpers.reports import inputs_of
 from tests.oracles import correlated
+
+covariance_union = njit(covariance_union)  # as kernels call it
 
 Array = npt.NDArray[Any]
 

@@ -131,6 +131,7 @@ def agree_with_the_oracle(
 KINDS = ((4.5, 1.9, 1.5), (10.0, 2.5, 3.5), (0.5, 0.5, 1.8))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("seed", "height_m"), [(0, 1.8), (1, 5.0), (2, 5.0), (3, 12.0)])
 def test_hundreds_in_a_disc_agree_with_the_oracle(seed: int, height_m: float) -> None:
     """Many hide one: most are hidden by several together, some stand in one another, the unit is among them."""
@@ -173,6 +174,7 @@ def test_a_parking_lot_agrees_with_the_oracle() -> None:
         agree_with_the_oracle(boxes, observer, range(0, len(boxes), 22))
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not DATA.is_dir(), reason="shared/data with recordings is not beside the project")
 @pytest.mark.parametrize("name", ["nuscenes_scene0061", "av2_3b3570b4"])
 def test_a_recording_agrees_with_the_oracle(name: str) -> None:

@@ -90,6 +90,35 @@ def test_off_by_default_and_then_said() -> None:
     assert not any("comes back" in note for note in run_experiment(plan(), [site()]).notes)
 
 
+ONSETS = [
+    {"kind": "in_range", "range_m": 50}, {"kind": "appears"}, {"kind": "line_of_sight"}, {"kind": "line_of_sight_any"},
+]  # fmt: skip
+"""Those that can cease to hold while an object is there."""
+
+
+@pytest.mark.parametrize("onset", ONSETS, ids=lambda onset: onset["kind"])
+@pytest.mark.parametrize(("gone", "ended_by"), [("ego", "ego_left"), ("car", "object_left")])
+def test_a_gap_of_the_ego_is_the_egos(onset: dict[str, Any], gone: str, ended_by: str) -> None:
+    """Ego and car stand 20 m apart; one of them is missing from 3 to 7 s. Whose track it is says why it ended."""
+    there = {gone: lambda t: not 3.01 < t < 6.99}
+    places = {"ego": standing(0, 0), "car": standing(20, 0)}
+    things = [Thing(name, "car", at, there=there.get(name, lambda t: True)) for name, at in places.items()]
+    log = recording(things, until_s=10.0)
+    found = find_episodes(log.scene, log.truth, NO_STATICS, plan(measure={"onset": onset | {"again_after_s": 3.0}}))
+    assert found.onset_s.tolist() == pytest.approx([0.0, 7.0])
+    assert found.ended_s.tolist() == pytest.approx([3.0, 10.0])
+    assert end_reason_texts(found.ended_by).tolist() == [ended_by, "log_end"]
+    assert began_texts(found.began).tolist() == ["log_start", "appeared"]
+
+
+def test_who_leaves_while_the_ego_is_there_has_left() -> None:
+    """It leaves the range at 3 s; the ego is missing from 5 to 9 s, when the car is back."""
+    car = Thing("car", "car", lambda t: (20.0 if t < 3.01 or t > 8.99 else 80.0, 0.0))
+    ego = Thing("ego", "car", standing(0, 0), there=lambda t: not 5.01 < t < 8.99)
+    found = episodes_of(recording([ego, car], until_s=12.0), 3.0)
+    assert end_reason_texts(found.ended_by).tolist() == ["object_left", "log_end"]
+
+
 @pytest.mark.parametrize(("again_after_s", "episodes"), [(19.0, 10), (20.1, 10), (20.5, 1)])
 def test_who_is_out_for_less_is_still_there(again_after_s: float, episodes: int) -> None:
     """Out from 8.4 s, the last frame within, to 28.6 s: 20.2 s."""

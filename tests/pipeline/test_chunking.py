@@ -152,7 +152,6 @@ def plans(draw: st.DrawFn) -> Experiment:
         "onset": draw(st.sampled_from([{"kind": "appears"}, {"kind": "in_range", "range_m": 40}])),
         "count_earlier": draw(st.booleans()),
         "confirm": draw(st.sampled_from([{"hits": 1, "of": 1}, {"hits": 2, "of": 3}])),
-        "match": {"gate_m": 3.0, "always": draw(st.booleans())},
     }
     if draw(st.booleans()):
         measure["conflict"] = {"horizon_s": 3.0, "margin_m": 0.5}
@@ -213,7 +212,7 @@ def test_all_that_units_get_wrong(rows: int) -> None:
             **{kind["kind"]: {"units": "all", "fusion": kind, "latency_s": late} for kind in kinds},
         },
         measure={
-            "onset": {"kind": "in_range", "range_m": 40}, "confirm": {"hits": 2, "of": 3}, "match": {"always": True},
+            "onset": {"kind": "in_range", "range_m": 40}, "confirm": {"hits": 2, "of": 3},
         },
     )  # fmt: skip
     whole, pieces = both_ways(plan, [traffic()], rows)

@@ -232,7 +232,7 @@ class TestBackToTracks:
         roles: Counter[int] = Counter()
         for name, told in outputs_of(replay, plan, np.arange(3)).items():
             issue_s = told.instants.issue_s
-            matches = match_entries(told.lists, replay.truth_cache.at(issue_s), replay.scene, gate_m=3.0)
+            matches = match_entries(told.lists, replay.truth_cache.at(issue_s), replay.scene, told.origins, gate_m=3.0)
             for s in range(3):
                 fused_tracks = convert_to_tracks(told, s, matches)
                 fused, said = fused_tracks.fused, fused_tracks.said
@@ -256,7 +256,9 @@ class TestBackToTracks:
         plan = experiment(pems=pem([[1, 0], [0, 1]]), units=TWO_UNITS, configurations=self.configurations())
         replay = prepare_log(crowd(), plan)
         for name, told in outputs_of(replay, plan).items():
-            matches = match_entries(told.lists, replay.truth_cache.at(told.instants.issue_s), replay.scene, gate_m=1e-6)
+            matches = match_entries(
+                told.lists, replay.truth_cache.at(told.instants.issue_s), replay.scene, told.origins, gate_m=1e-6
+            )
             fused_tracks = convert_to_tracks(told, 0, matches)
             assert set(fused_tracks.fused.object_ix) == {-1}
             ids = entries_in(told.lists, 0)["track_id"]
@@ -287,7 +289,9 @@ def test_a_belief_of_a_run_without_entries_is_empty() -> None:
     plan = experiment(pems=pem(probability=0.0), configurations=union, units=TWO_UNITS)
     replay = prepare_log(crowd(), plan)
     [told] = outputs_of(replay, plan).values()
-    matches = match_entries(told.lists, replay.truth_cache.at(told.instants.issue_s), replay.scene, gate_m=3.0)
+    matches = match_entries(
+        told.lists, replay.truth_cache.at(told.instants.issue_s), replay.scene, told.origins, gate_m=3.0
+    )
     fused_tracks = convert_to_tracks(told, 0, matches)
     assert (len(fused_tracks.fused.frame_ix), len(fused_tracks.fused.object_ix)) == (0, 0)
     assert len(fused_tracks.fused.stamp_ns) == 11, "its lists are there, and empty"

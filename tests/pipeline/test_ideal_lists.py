@@ -19,14 +19,12 @@ from copem_replay.communication.link import sample_arrivals
 from copem_replay.core.errors import ExperimentError
 from copem_replay.core.tracks import UNCERTAINTIES, VALUES, Float, Tracks
 from copem_replay.experiment.schema import Experiment
-from copem_replay.fusion import FUSIONS
 from copem_replay.fusion.ideal import fuse_ideal
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.config import Confirm
 from copem_replay.metrics.detection.by_truth_id import detect_by_truth_id
 from copem_replay.pipeline.run import run_experiment
-from tests.helpers.drawn import examples
-from tests.helpers.scenes import Thing, driving, experiment, recording, standing
+from tests.helpers.scenes import Thing, experiment, recording, standing
 from tests.oracles import ideal
 from tests.oracles.accuracy import episodes_of
 from tests.oracles.ideal import SentList
@@ -86,7 +84,7 @@ def sent(draw: st.DrawFn) -> tuple[list[list[SentList]], int]:
     return [[SentList(*one, draw(held)) for one in common] for _ in range(2)], units
 
 
-@settings(max_examples=examples(400), suppress_health_check=[HealthCheck.too_slow])  # an example replays a log
+@settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.too_slow])  # an example replays a log
 @given(sent(), st.sampled_from([None, 10, 70, 200]), st.sampled_from([30, 200, 1000]), st.integers(0, 40))
 def test_states_and_detections_are_those_of_the_oracle(
     drawn: tuple[list[list[SentList]], int], tick: int | None, max_age: int, onset: int
@@ -119,7 +117,7 @@ def test_states_and_detections_are_those_of_the_oracle(
             assert np.isnan(when).all() if at is None else when == pytest.approx(np.array(at) / 1000, abs=2e-9)
 
 
-@settings(suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(sent(), st.sampled_from([None, 70, 200]))
 def test_in_one_run_a_fused_entry_is_made_of_one_entry_of_each_unit(
     drawn: tuple[list[list[SentList]], int], tick: int | None
@@ -136,6 +134,7 @@ def test_in_one_run_a_fused_entry_is_made_of_one_entry_of_each_unit(
         assert entries == expected[made.fused.frame_ix[p]][int(made.fused.row_object_ix[p])]
 
 
+@settings(max_examples=200, deadline=None)
 @given(sent(), st.sampled_from([None, 70]))
 def test_overtaken_is_what_arrives_later_than_a_newer_list(
     drawn: tuple[list[list[SentList]], int], tick: int | None
@@ -272,85 +271,8 @@ def test_overtaken_lists_count_in_exact_times_and_in_runs(tmp_path: Path, monkey
     twice = plan.model_copy(
         update={"measure": plan.measure.model_copy(update={"confirm": Confirm(hits=2, of=3), "exact": True})}
     )
-    with pytest.raises(ExperimentError, match=r"lists arrive up to 0\.35 s after lists captured later, and confirm"):
+    with pytest.raises(ExperimentError, match=r"lists that count as one hit arrive up to 0\.35 s apart, and confirm"):
         run_experiment(twice, [parked(3)])
-
-
-# ------------------------------------------------------------------------------- no fusion knows sooner than the ideal
-
-FUSED: dict[str, dict[str, Any]] = {
-    **{kind: {"kind": kind} for kind in FUSIONS if kind not in ("ideal", "tracker")},
-    **{
-        f"tracker {late}": {"kind": "tracker", "late": late, "confirm_s": 0.0, "publish": 0.1}
-        for late in ("predict", "stale", "replay")
-    },
-}
-
-
-def latencies() -> st.SearchStrategy[Any]:
-    return st.one_of(
-        st.sampled_from([0.0, 0.15]),
-        st.builds(
-            lambda mean_s, shape: {"kind": "gamma", "mean_s": mean_s, "shape": shape},
-            st.sampled_from([0.1, 0.5]), st.sampled_from([0.5, 2]),
-        ),
-    )  # fmt: skip
-
-
-@st.composite
-def links(draw: st.DrawFn) -> dict[str, Any]:
-    link: dict[str, Any] = {"latency": draw(latencies()), "order": draw(st.sampled_from(["free", "kept"]))}
-    if draw(st.booleans()):
-        link["reception"] = {"kind": "constant", "probability": 0.7}
-    if draw(st.booleans()):
-        link["channel"] = {"kbps": draw(st.sampled_from([20, 200]))}
-    return link
-
-
-@settings(
-    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True
-)  # an example replays a log
-@given(
-    links(), st.sampled_from([None, 0.7, 2, 4]), st.integers(1, 3), st.sampled_from([(1, 1), (2, 3)]),
-    st.sampled_from([None, "cpm"]), st.sampled_from([0.3, 1.0]), st.integers(0, 99),
-)  # fmt: skip
-def test_no_fusion_knows_an_object_sooner_than_the_ideal_of_the_same_lists(
-    link: dict[str, Any], issue_hz: float | None, units: int, confirm: tuple[int, int], sends: str | None,
-    max_age_s: float, seed: int,
-) -> None:  # fmt: skip
-    """Cars far apart, small errors: what a fusion lists is matched with the object that it is.
-
-    For several hits all units list at one rate and no list is lost: by match, the newest capture of an entry counts for
-    the list that its first unit made then, if it made one, whether that list has the object or not.
-    """
-    made = masts([0.2, 0.15, 0.1][:units])
-    if confirm != (1, 1):
-        link = {key: value for key, value in link.items() if key != "reception"}
-        made["units"] = {name: unit | AT_10_HZ for name, unit in made["units"].items()}
-    elif sends is not None:
-        made["units"]["u0"]["sends"] = {"kind": sends}
-    common = {"units": "all", "link": "air", "max_age_s": max_age_s}
-    common |= {} if issue_hz is None else {"issue_hz": issue_hz}
-    plan = experiment(
-        **made, runs=2, seed=seed, show=None, links={"air": link},
-        configurations={"ideal": common, **{name: common | {"fusion": fusion} for name, fusion in FUSED.items()}},
-        measure={
-            "onset": {"kind": "appears"}, "accuracy": False, "confirm": {"hits": confirm[0], "of": confirm[1]},
-        },
-    )  # fmt: skip
-    moving = [Thing("m", "car", driving(-20, 30, 4))]
-    log = recording([Thing("ego", "car", standing(0, 0)), *moving, *_standing(4)], until_s=4.0)
-    table = run_experiment(plan, [log]).table
-    known = table.pivot_table(
-        index=["object_id", "run"], columns="configuration", values="detection_s", dropna=False
-    ).fillna(np.inf)
-    for name in FUSED:
-        sooner = known[known[name] < known["ideal"] - 1e-6]
-        assert not len(sooner), (name, sooner[[name, "ideal"]])
-
-
-def _standing(count: int) -> list[Thing]:
-    return [Thing(f"c{k}", "car", standing(20 + 15 * k, -10)) for k in range(count)]
 
 
 def test_lists_that_are_released_together_are_not_overtaken() -> None:

@@ -68,6 +68,7 @@ LASTING: dict[str, tuple[Parts, Parts | None]] = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", LASTING)
 def test_the_runs_are_within_the_band_of_the_exact_distribution(case: str) -> None:
     """20 000 runs of each; without memory in the closed form they are outside."""

@@ -231,7 +231,6 @@ class TestNumbers:
             "measure.onset.kind": "at",
             "measure.objects.ids": "2",
             "measure.match.gate_m": "3",
-            "measure.match.always": "false",
             "measure.horizon_used_s": "4.5",
             "braking.driver.reaction.delay_s": "0.2",
         }

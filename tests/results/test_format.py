@@ -18,7 +18,7 @@ def older(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (place / "e.yaml").write_text(changed("show: {run: 0}"))
     folder = cr.run(place / "e.yaml").save(place / "old")
     said = json.loads((folder / "provenance.json").read_text())
-    assert said.pop("format") == 4
+    assert said.pop("format") == 5
     (folder / "provenance.json").write_text(json.dumps(said))
     return folder
 
@@ -34,7 +34,7 @@ def test_an_older_format_is_refused(older: Path, name: str) -> None:
     with pytest.raises(cr.InputError) as failure:
         getattr(cr, name)(older)
     again = "run the experiment again with --overwrite"
-    assert failure.value.problems == (f"{older}: expected results of format 4, found format 1; {again}",)
+    assert failure.value.problems == (f"{older}: expected results of format 5, found format 1; {again}",)
 
 
 @pytest.mark.parametrize("read", [cr.load_results, cr.compare])
@@ -48,7 +48,7 @@ def test_results_that_do_not_say_what_configurations_are_are_refused(
     facts = said.pop("configurations")
     assert facts["GT"] == {
         "truth": True, "recorded": False, "by_truth_id": True, "fixed": True, "fixed_verdicts": False,
-        "needs_visibility": False, "ideal": None, "ideal_of": None,
+        "needs_visibility": False, "ideal": None, "ideal_of": None, "remembering": None,
     }  # fmt: skip
     (folder / "provenance.json").write_text(json.dumps(said))
     with pytest.raises(cr.InputError, match=r"no 'configurations'; run the experiment again with --overwrite$"):

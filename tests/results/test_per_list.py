@@ -437,25 +437,3 @@ def test_the_same_folder_again_differs_in_nothing(tmp_path):
     assert (others["interval"] == "all clusters alike").all()
     assert others[["low", "high", "interval_over"]].isna().all(axis=None)
     assert comparison.notes == ()
-
-
-@pytest.mark.parametrize(("always", "said"), [(False, 1), (True, 0)])
-def test_who_detects_by_truth_id_is_said(tmp_path, always, said):
-    rows = [row(name, 1.0, 30.0) for name in ("ideal", "GT", "gnn")]
-    every = {"units": {"ego": {"on": "ego", "pem": "p"}}, "measure": {"match": {"always": always}}}
-    every["configurations"] = {
-        "GT": {"units": "truth"}, "ideal": {"units": "all"}, "gnn": {"units": "all", "fusion": {"kind": "gnn"}},
-    }  # fmt: skip
-    path = write_folder(
-        tmp_path / "study", rows, measure={"match": {"gate_m": 3.0, "always": always}}, experiment=every
-    )
-    notes = [note for note in compare_folders([path]).notes if "by truth id" in note]
-    assert (
-        notes
-        == [
-            "ideal, GT: detected by truth id, the others by match within the gate (`match: {always: true}` matches all "
-            "alike)"
-        ]
-        * said
-    )
-    assert not [note for note in compare_folders([path], configurations=["GT"]).notes if "by truth id" in note]

@@ -41,7 +41,7 @@ configurations:
   ideal: {{units: all, link: {{default: v2x, ego: none}}}}
   gnn: {{units: all, link: {{default: v2x, ego: none}}, fusion: {{kind: gnn}}}}
   ticks: {{units: [mast], link: v2x, fusion: {{kind: union}}, issue_hz: 7}}
-measure: {{onset: {{kind: in_range, range_m: 60}}, match: {{gate_m: {GATE_M}, always: true}}}}
+measure: {{onset: {{kind: in_range, range_m: 60}}, match: {{gate_m: {GATE_M}}}}}
 show: {{run: {list(range(RUNS))}}}
 """
 

@@ -817,7 +817,7 @@ class TestWrittenExperiment:
             "pem": "onboard", "recorded": None, "rate_hz": None, "phase_s": 0.0,
         }  # fmt: skip
         assert data["measure"]["confirm"] == {"hits": 1, "of": 1}
-        assert data["measure"]["match"] == {"gate_m": 3.0, "always": False}
+        assert data["measure"]["match"] == {"gate_m": 3.0}
         assert data["measure"]["gospa"] == {"cutoff_m": None, "power": 2.0}
         assert data["measure"]["accuracy"] is True
         assert data["configurations"]["PEM"]["fusion"] == {"kind": "ideal", "combine": "samples"}

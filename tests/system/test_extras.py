@@ -25,9 +25,8 @@ Core = Callable[..., tuple[int, list[str]]]
 def core(tmp_path_factory: pytest.TempPathFactory) -> Core:
     """The command of a copy of the package without its extras, in a folder with a drive: exit code, lines of errors."""
     place = tmp_path_factory.mktemp("core")
-    shutil.copytree(
-        ROOT / "copem_replay", place / "copem_replay", ignore=shutil.ignore_patterns("extras", "__pycache__")
-    )
+    copied = shutil.ignore_patterns("extras")  # with what is compiled
+    shutil.copytree(ROOT / "copem_replay", place / "copem_replay", ignore=copied)
     here = place / "here"
     here.mkdir()
     drive(here / "drive.mcap")

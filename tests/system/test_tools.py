@@ -302,6 +302,7 @@ def test_the_table_is_the_papers() -> None:
     assert (np.diff([exact[name] for name in order]) <= 1e-12).all()
 
 
+@pytest.mark.long
 def test_a_long_recording_is_timed(tmp_path: Path) -> None:
     """Here it is short: what grows how is for the benchmark to say."""
     short, longer, slope = long.grown(tmp_path, minutes=(0.05, 0.1), objects=8)
@@ -313,6 +314,7 @@ def test_a_long_recording_is_timed(tmp_path: Path) -> None:
     assert all(value > 0 for value in long.stayed(tmp_path, 0.02, 3).values())
 
 
+@pytest.mark.long
 def test_a_crowd_is_timed(tmp_path: Path) -> None:
     common.write_truth(tmp_path / "crowd.mcap", common.boxes(5, 4))
     line = long.crowded(tmp_path, 5, 4)

@@ -145,6 +145,7 @@ def test_nine_of_ten_boxes_of_the_samples_are_in_the_picture(name: str, tmp_path
         assert len(choose_shown_objects(replay.scene, replay.truth, given, table).object_ix) == 6
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", RECORDINGS)
 def test_nine_of_ten_boxes_of_recordings_are_in_the_picture(name: str, tmp_path: Path) -> None:
     if not (SHARED / f"{name}.mcap").exists():

@@ -78,7 +78,6 @@ MEASURES: dict[str, dict[str, Any]] = {
     "2 of 3": {"confirm": {"hits": 2, "of": 3}},
     "3 of 5, earlier": {"confirm": {"hits": 3, "of": 5}, "count_earlier": True},
     "on the way": {"onset": {"kind": "in_range", "range_m": 12}},
-    "all by match": {"match": {"always": True}},
 }
 
 

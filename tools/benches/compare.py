@@ -14,6 +14,7 @@ import pandas as pd
 
 from benches import common
 from copem_replay.pipeline.expansion import ConfigurationFacts
+from copem_replay.results.provenance import FORMAT
 from copem_replay.results.table_files import table_file, write_parquet
 
 RUNS, OBJECTS, CONFIGURATIONS = 500, 20, ("ideal", "late", "later")
@@ -108,10 +109,10 @@ def write_tally(folder: Path) -> int:
 
 def write_provenance(folder: Path, names: Sequence[str], logs: Sequence[str]) -> None:
     """What made the results: nothing that is fixed."""
-    said = {"format": 4, "seed": 1, "runs": RUNS, "measure": {"horizon_used_s": 10.0}, "braking": None}
+    said = {"format": FORMAT, "seed": 1, "runs": RUNS, "measure": {"horizon_used_s": 10.0}, "braking": None}
     drawn = ConfigurationFacts(
         truth=False, recorded=False, by_truth_id=True, fixed=False, fixed_verdicts=False, needs_visibility=False,
-        ideal=None, ideal_of=None,
+        ideal=None, ideal_of=None, remembering=None,
     )  # fmt: skip
     said["configurations"] = dict.fromkeys(names, asdict(drawn))
     said["logs"] = [{"log": log, "topic": None, "sha256": log} for log in logs]

@@ -25,6 +25,7 @@ from copem_replay.core.tracks import CLASSES, TRUTH, Float, Scene, Tracks
 from copem_replay.fusion.tracker import Tracker
 from copem_replay.metrics.gospa import gospa, gospa_pairs
 from copem_replay.metrics.matching import GHOST, MATCH, Matches, match_entries
+from copem_replay.metrics.origin import GoesBack, OriginLists, Origins
 
 _VAGUE_M2 = 1e6  # prior of a founding position: as good as none
 _NEAR_M = 3.0  # of an object: farther entries are false
@@ -331,8 +332,11 @@ def matches_vs_trackeval(count: int = 60) -> Iterator[common.Line]:
 def _compare_matches(
     peer: str, lists: ObjectLists, truth: Float, world: Tracks, around: Scene, theirs: Callable[[], tuple[int, int]]
 ) -> Iterator[common.Line]:
+    of = OriginLists(world, world, GoesBack.UNKNOWN, 1.0, np.zeros(1, dtype=bool), -1)
+    anywhere = Origins(lists.entries, np.empty(0, dtype=np.int64), of.find_holdings(world.common_arrives_s))
+
     def ours() -> Matches:
-        return match_entries(lists, world, around, gate_m=_NEAR_M)
+        return match_entries(lists, world, around, anywhere, gate_m=_NEAR_M)
 
     objects = truth.shape[0] * truth.shape[1]
     (missed, false), (missed_there, false_there) = _counted(ours(), objects), theirs()

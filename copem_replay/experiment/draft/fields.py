@@ -17,9 +17,10 @@ from copem_replay.io.encodings import make_definition
 from copem_replay.io.encodings.columns import DefinitionError, list_level, list_levels, shred_messages
 from copem_replay.io.log import BrokenIndexError, Log
 from copem_replay.io.recording import Recording, foreign_channels, read_log
-from copem_replay.io.schemas.description import UNIT_NS, Fields, find_stamp_paths
+from copem_replay.io.schemas.description import Fields
 from copem_replay.io.schemas.poses import is_pose
 from copem_replay.io.schemas.registry import is_list
+from copem_replay.io.stamps import UNIT_NS, find_stamp_paths
 
 NEEDED = ("id", "x_m", "y_m", "length_m", "width_m")
 """Keys without which no true object can be read."""

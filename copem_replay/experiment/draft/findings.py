@@ -15,7 +15,7 @@ from copem_replay.core.tracks import CLASSES, Bool, Float, Int, Scene, Tracks, c
 from copem_replay.io.channel import schema_name
 from copem_replay.io.log import BrokenIndexError, Log
 from copem_replay.io.recording import Recording, foreign_channels, read_log
-from copem_replay.io.schemas.poses import ODOMETRY, is_pose
+from copem_replay.io.schemas.poses import ODOMETRY, is_pose, is_static
 
 if TYPE_CHECKING:
     from copem_replay.io.schemas.description import Fields
@@ -255,7 +255,7 @@ def _find_poses(log: Log) -> list[dict[str, str]]:
 
     ranked: list[tuple[int, dict[str, str]]] = []
     for channel in foreign_channels(log):
-        if not is_pose(channel) or channel.topic.endswith("tf_static"):
+        if not is_pose(channel) or is_static(channel):
             continue
         if schema_name(channel) == ODOMETRY:
             ranked.append((0, {"topic": channel.topic}))

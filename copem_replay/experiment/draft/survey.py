@@ -25,6 +25,7 @@ from copem_replay.experiment.draft.findings import (
     suggest_experiment,
 )
 from copem_replay.io.channel import Channel, schema_name
+from copem_replay.io.findings import find_rule
 from copem_replay.io.frame_fit import FIXES, fit_fixes
 from copem_replay.io.ground_truth import MAX_GAP_S
 from copem_replay.io.log import Log
@@ -290,6 +291,7 @@ def _list_missing(recording: Recording, poses: Sequence[str]) -> list[str]:
         return []
     host = recording.host_id
     who = "the log names no host vehicle" if host is None else f"the host vehicle {host} is no moving object"
+    who = find_rule(recording.notes, "two clocks") or who
     line = f"no ego vehicle: {who}; {_EGO_HINT}, of {moving_ids(scene, shown=6)}"
     if poses:
         line += f"; or `ego: {{topic: {poses[0]}}}` (poses are on {', '.join(poses)})"

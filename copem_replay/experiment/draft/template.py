@@ -83,6 +83,7 @@ def format_draft(*surveys: RecordingSurvey) -> str:
         *_draft_outputs(outputs, [name for name, _ in recorded]),
         "",
         *_draft_measure(_merge_measured(drives), ego=ego),
+        *_draft_gap(drives),
         "show: {run: 0}   # the run that replay.mcap and replay.rrd show; {run: null} writes none",
     ]
     return "\n".join(lines) + "\n"
@@ -363,6 +364,14 @@ def _draft_measure(guess: Suggestion, *, ego: bool) -> Iterator[str]:
     if not ego:
         yield "  distance_to: roadside   # there is no ego: ranges and distances are from here"
     yield "  confirm: {hits: 1, of: 1}   # known when so many of the last lists hold it"
+
+
+def _draft_gap(drives: Sequence[_Drive]) -> Iterator[str]:
+    """`max_gap_s` where lists come so seldom that the default would leave holes between them; half a list to spare."""
+    slowest_hz = min((rate for drive in drives if (rate := drive.truth.rate_hz) is not None), default=math.inf)
+    gap_s = math.ceil(15 / slowest_hz) / 10
+    if gap_s > MAX_GAP_S:
+        yield f"max_gap_s: {gap_s:g}   # lists come every {1 / slowest_hz:.3g} s: over longer gaps nothing is known"
 
 
 def _draft_began(guess: Suggestion) -> str:

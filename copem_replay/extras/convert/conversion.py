@@ -24,7 +24,7 @@ from copem_replay.core.errors import InputError, OutputError, count_noun, quote_
 from copem_replay.core.frame import SaidPlace
 from copem_replay.core.site_map import SiteMap
 from copem_replay.core.tracks import Float
-from copem_replay.io.ground_truth import HEIGHTS_M
+from copem_replay.io.findings import HEIGHTS_M
 from copem_replay.io.write.osi import NANOS_PER_SECOND, OsiTrace, add_road, empty_ground_truth, write_osi_trace
 
 # Kinds of objects in OSI. Each format maps its own names onto these.

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import betaincinv, betaln
 from scipy.stats import t
 
-from copem_replay.core.compiled import kernel
+from copem_replay.core.compiled import callee, kernel
 from copem_replay.core.tracks import Bool, Float, Int
 from copem_replay.extras.fitting.estimate import PASSES_ALONE, Estimate
 from copem_replay.extras.fitting.rows import NodeWeights, PooledRows
@@ -56,7 +56,7 @@ def fit_em(
     return here, counts - prior
 
 
-@kernel
+@callee
 def _share_out(theta: Float, node: Int, weight: Float, hit: Bool, count: Float, prior: Float, counts: Float) -> float:
     """Fill `counts (2, K)` with hits and misses of each node and its prior; the penalised log-likelihood of `theta`."""
     counts[:] = prior
@@ -82,14 +82,14 @@ def _share_out(theta: Float, node: Int, weight: Float, hit: Bool, count: Float, 
     return total
 
 
-@kernel
+@callee
 def _divide_counts(counts: Float, shape: Int, monotone: bool) -> Float:
     total = np.maximum(counts[0] + counts[1], _LEAST)
     share = np.minimum(np.maximum(counts[0] / total, _LEAST), 1 - _LEAST)
     return monotone_tables(share, total, shape) if monotone else share
 
 
-@kernel
+@callee
 def monotone_tables(value: Float, weight: Float, shape: Int) -> Float:
     """The nearest tables (K,) in weighted squares that do not rise with range nor fall with visible share.
 
@@ -119,7 +119,7 @@ def monotone_tables(value: Float, weight: Float, shape: Int) -> Float:
     return out
 
 
-@kernel
+@callee
 def _fit_ascending(value: Float, weight: Float) -> Float:
     """The nearest ascending values in weighted squares: neighbours that are out of order are pooled."""
     n = len(value)

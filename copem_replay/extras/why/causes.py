@@ -149,11 +149,6 @@ def _widen_channel(experiment: Experiment) -> Experiment:
     return _change_links(experiment, lambda link: link.model_copy(update={"channel": None}))
 
 
-def _fuse_ideally(experiment: Experiment) -> Experiment:
-    match = experiment.measure.match.model_copy(update={"always": False})
-    return _change_measure(_change_configuration(experiment, fusion=IdealFusion()), match=match)
-
-
 @dataclass(frozen=True)
 class Cause:
     """Something that makes an object known later; `remove`: an experiment without it, of one configuration."""
@@ -177,7 +172,8 @@ CAUSES = (
     Cause("latency", "radio", "latency", _send_at_once),
     Cause("loss", "radio", "lists lost", _lose_nothing),
     Cause("ticks", "fusion", "waiting for the next fused list", lambda e: _change_configuration(e, issue_hz=None)),
-    Cause("fusion", "fusion", "fusion: association and its own confirmation", _fuse_ideally),
+    Cause("fusion", "fusion", "fusion: association and its own confirmation",
+          lambda e: _change_configuration(e, fusion=IdealFusion())),
     Cause("confirmation", "fusion", "confirmation by several lists", lambda e: _change_measure(e, confirm=Confirm())),
     Cause("pose", "unit", "errors of pose and clock", lambda e: _change_units(e, placed=None, clock=None)),
     Cause("ghosts", "fusion", "ghosts", lambda e: change_pems(e, lambda pem: pem.model_copy(update={"ghosts": ()}))),

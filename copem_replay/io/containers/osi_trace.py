@@ -14,7 +14,6 @@ from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass, field
-from importlib import import_module
 from itertools import islice
 from pathlib import Path
 from typing import IO, Any
@@ -28,7 +27,13 @@ from copem_replay.io.channel import LAST_NS, Channel
 from copem_replay.io.containers.mcap_records import CHUNK_LIMIT_BYTES, MAGIC
 from copem_replay.io.decoded_size import OversizeError
 from copem_replay.io.log import Log, open_file, unsupported_file_error
-from copem_replay.io.schemas.osi_ground_truth import GROUND_TRUTH, SENSOR_DATA, SENSOR_VIEW, check_osi
+from copem_replay.io.schemas.osi_ground_truth import (
+    GROUND_TRUTH,
+    SENSOR_DATA,
+    SENSOR_VIEW,
+    check_osi,
+    load_message_class,
+)
 
 _LENGTH_BYTES = 4
 _TRIED = 10  # messages by which the kind is told; more make opening slower
@@ -125,12 +130,6 @@ def open_trace(path: Path) -> TraceLog:
         lengths=np.array(lengths)[order].tolist(),
         times_ns=np.array(times_ns)[order].tolist(),
     )
-
-
-def load_message_class(schema: str) -> Any:
-    """The class of a schema's messages, imported when first needed."""
-    name = schema.removeprefix("osi3.")
-    return getattr(import_module(f"osi3.osi_{name.lower()}_pb2"), name)
 
 
 def _read_payloads(file: IO[bytes], cut: list[str]) -> Iterator[tuple[int, bytes]]:

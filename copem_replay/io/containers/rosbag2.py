@@ -98,6 +98,8 @@ def _bag_file_path(folder: Path, name: str) -> Path:
         if advice is not None and path.with_suffix("").is_file():  # it was unpacked, and its description left as it was
             return path.with_suffix("")
         exists = path.exists()
+        if not exists and (folder / PurePosixPath(name).name).exists():  # before Foxy names began with the folder's
+            return _bag_file_path(folder, PurePosixPath(name).name)
     except OSError:  # a name that no file can have
         exists = False
     if not exists:

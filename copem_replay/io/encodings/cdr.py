@@ -16,8 +16,9 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numba import njit
+from numpy.typing import NDArray
 
+from copem_replay.core.compiled import callee, kernel
 from copem_replay.core.tracks import Bool, Int
 from copem_replay.io.decoded_size import check_decoded_bytes
 from copem_replay.io.encodings.columns import (
@@ -34,6 +35,7 @@ from copem_replay.io.encodings.columns import (
     shred_columns,
     split_batches,
 )
+from copem_replay.io.encodings.ros2_types import known_types
 
 # The kernel.
 
@@ -51,8 +53,8 @@ _HEADER = 4  # bytes of the encapsulation; alignment counts from their end
 _SPARE = 8  # bytes that may be left over at the end: padding
 
 
-@njit(cache=True)
-def _read_number(data, offset, size, swapped):  # type: ignore[no-untyped-def]
+@callee
+def _read_number(data: NDArray[np.uint8], offset: int, size: int, swapped: bool) -> np.uint64:
     """The bits of a number."""
     bits = np.uint64(0)
     for k in range(size):
@@ -61,8 +63,18 @@ def _read_number(data, offset, size, swapped):  # type: ignore[no-untyped-def]
     return bits
 
 
-@njit(cache=True)
-def walk_cdr(data, bounds, program, first, room, bits, lengths, parent, decoded):  # type: ignore[no-untyped-def]
+@kernel
+def walk_cdr(
+    data: NDArray[np.uint8],
+    bounds: Int,
+    program: Int,
+    first: Int,
+    room: Int,
+    bits: Any,
+    lengths: Int,
+    parent: Int,
+    decoded: Bool,
+) -> Int:
     """(L,) number of rows of each level. `room (L,)`: rows there is room for; those beyond are counted and not kept.
 
     Message m is `data[bounds[m]:bounds[m + 1]]`. The value of column c in row r of its level goes to
@@ -341,7 +353,11 @@ class CdrDefinition(Definition):
         super().__init__()
         self._name = name if name.count("/") == 2 else name.replace("/", "/msg/")
         try:
-            self._types = {**_EVERYWHERE, **_parse_definition(text.decode().replace("\r", ""), self._name, encoding)}
+            content = text.decode().replace("\r", "")
+            parsed = _parse_definition(content, self._name, encoding) if content.strip() else known_types(self._name)
+            self._types = {**_EVERYWHERE, **parsed}
+        except DefinitionError:
+            raise
         except Exception as error:  # whatever a parser raises at what is no definition
             why = " ".join(str(error).split())[:200] or type(error).__name__
             raise DefinitionError(f"the definition of {name} cannot be parsed: {why}") from None

@@ -16,9 +16,9 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 import orjson
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
-from numba import njit
 from numpy.typing import NDArray
 
+from copem_replay.core.compiled import callee, kernel
 from copem_replay.core.tracks import Bool, Int
 
 # Blocks of lists.
@@ -46,8 +46,8 @@ def expand_ranges(start: Int, rows: Int) -> tuple[Int, Int]:
 # Kernels that put a column's bytes to their places.
 
 
-@njit(cache=True, nogil=True)
-def _put_varint(out, offset, value):  # type: ignore[no-untyped-def]
+@callee
+def _put_varint(out: Bytes, offset: int, value: Any) -> int:
     """Put a number in groups of seven bits; returns the place after it."""
     while value >= np.uint64(128):
         out[offset] = np.uint8(value & np.uint64(127)) | np.uint8(128)
@@ -57,8 +57,8 @@ def _put_varint(out, offset, value):  # type: ignore[no-untyped-def]
     return offset + 1
 
 
-@njit(cache=True, nogil=True)
-def varint_sizes(values):  # type: ignore[no-untyped-def]
+@kernel
+def varint_sizes(values: NDArray[np.uint64]) -> Int:
     """(N,) sizes of numbers (N,) as varints, in bytes."""
     sizes = np.empty(len(values), dtype=np.int64)
     for k in range(len(values)):
@@ -70,16 +70,16 @@ def varint_sizes(values):  # type: ignore[no-untyped-def]
     return sizes
 
 
-@njit(cache=True, nogil=True)
-def put_varints(out, offset, sizes, tag, values):  # type: ignore[no-untyped-def]
+@kernel
+def put_varints(out: Bytes, offset: Int, sizes: Int, tag: Any, values: NDArray[np.uint64]) -> None:
     """Put tags and varints at places `offset` (N,), except where the size is 0."""
     for k in range(len(offset)):
         if sizes[k]:
             _put_varint(out, _put_varint(out, offset[k], tag), values[k])
 
 
-@njit(cache=True, nogil=True)
-def put_fixed(out, offset, sizes, tag, bits):  # type: ignore[no-untyped-def]
+@kernel
+def put_fixed(out: Bytes, offset: Int, sizes: Int, tag: Any, bits: NDArray[np.uint64]) -> None:
     """Put tags and eight bytes each, the lowest first, except where the size is 0."""
     for k in range(len(offset)):
         if sizes[k]:
@@ -88,8 +88,8 @@ def put_fixed(out, offset, sizes, tag, bits):  # type: ignore[no-untyped-def]
                 out[place + i] = np.uint8((bits[k] >> np.uint64(8 * i)) & np.uint64(255))
 
 
-@njit(cache=True, nogil=True)
-def put_pieces(out, offset, pool, first, sizes):  # type: ignore[no-untyped-def]
+@kernel
+def put_pieces(out: Bytes, offset: Int, pool: Bytes, first: Int, sizes: Int) -> None:
     """Put `pool[first[k]:first[k] + sizes[k]]` at `offset[k]`."""
     for k in range(len(offset)):
         for i in range(sizes[k]):

@@ -15,8 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.message import DecodeError, EncodeError
-from numba import njit
+from numpy.typing import NDArray
 
+from copem_replay.core.compiled import callee, kernel
 from copem_replay.core.tracks import Bool, Int
 from copem_replay.io.decoded_size import MESSAGE_LIMIT_BYTES, check_decoded_bytes
 from copem_replay.io.encodings.columns import (
@@ -47,8 +48,8 @@ DEEPEST = 32
 """Messages within messages, at most; no path leads deeper."""
 
 
-@njit(cache=True)
-def _read_varint(data, offset, end):  # type: ignore[no-untyped-def]
+@callee
+def _read_varint(data: NDArray[np.uint8], offset: Any, end: Any) -> tuple[np.uint64, Any]:
     """A number and the place after it, which is beyond `end` if the number does not end before."""
     value, shift = np.uint64(0), 0
     while offset < end and shift < 70:
@@ -61,16 +62,16 @@ def _read_varint(data, offset, end):  # type: ignore[no-untyped-def]
     return value, end + 1
 
 
-@njit(cache=True)
-def _read_fixed(data, offset, size):  # type: ignore[no-untyped-def]
+@callee
+def _read_fixed(data: NDArray[np.uint8], offset: Any, size: Any) -> np.uint64:
     value = np.uint64(0)
     for k in range(size):
         value |= np.uint64(data[offset + k]) << np.uint64(8 * k)
     return value
 
 
-@njit(cache=True)
-def _skip_value(data, offset, end, wire):  # type: ignore[no-untyped-def]
+@callee
+def _skip_value(data: NDArray[np.uint8], offset: Any, end: Any, wire: Any) -> Any:
     """The end of a value that begins at `offset`, of a group the place of its end tag; beyond `end`: it has no end."""
     if wire == VARINT:
         return _read_varint(data, offset, end)[1]
@@ -99,8 +100,8 @@ def _skip_value(data, offset, end, wire):  # type: ignore[no-untyped-def]
     return end + 1
 
 
-@njit(cache=True)
-def _skip_plain_value(data, offset, end, wire):  # type: ignore[no-untyped-def]
+@callee
+def _skip_plain_value(data: NDArray[np.uint8], offset: Any, end: Any, wire: Any) -> Any:
     """The end of a value other than a group that begins at `offset`; beyond `end`: it has no end."""
     value, after = _read_varint(data, offset, end)
     if wire == VARINT:
@@ -110,10 +111,11 @@ def _skip_plain_value(data, offset, end, wire):  # type: ignore[no-untyped-def]
     return offset + (8 if wire == FIXED64 else 4)
 
 
-@njit(cache=True)
-def walk_protobuf(  # type: ignore[no-untyped-def]
-    data, bounds, fields, node_first, node_level, blank, blank_first, first, room, bits, lengths, said, parent
-):
+@kernel
+def walk_protobuf(
+    data: NDArray[np.uint8], bounds: Int, fields: Int, node_first: Int, node_level: Int, blank: Int, blank_first: Int,
+    first: Int, room: Int, bits: Any, lengths: Int, said: Bool, parent: Int,
+) -> Int:  # fmt: skip
     """(L,) number of rows of each level. `room (L,)`: rows there is room for; those beyond are counted and not kept.
 
     Message m is `data[bounds[m]:bounds[m + 1]]`. A message of kind n has `fields[node_first[n]:node_first[n + 1]]` and
@@ -215,8 +217,8 @@ _PARSED_DEEPEST = 100
 """Messages within messages that Google's parser takes."""
 
 
-@njit(cache=True)
-def estimate_decoded_bytes(data, fields, first, sizes, limit):  # type: ignore[no-untyped-def]
+@kernel
+def estimate_decoded_bytes(data: NDArray[np.uint8], fields: Int, first: Int, sizes: Int, limit: int) -> Any:
     """Memory that a message takes once parsed, from above; beyond `limit` it is not counted on.
 
     Type n has the rows `fields[first[n]:first[n + 1]]`, by number: the field's number, what it is (0 a message of the

@@ -7,16 +7,14 @@ gives one with `read:`.
 from __future__ import annotations
 
 import difflib
-import re
-from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from copem_replay.core.errors import count_noun
 from copem_replay.core.tracks import CLASSES, VALUES, Bool, Float, Int
+from copem_replay.io.class_names import class_from_name
 from copem_replay.io.decoded_size import check_objects
 from copem_replay.io.encodings.columns import (
     Definition,
@@ -29,6 +27,7 @@ from copem_replay.io.encodings.columns import (
     list_levels,
     shred_messages,
 )
+from copem_replay.io.findings import LONGEST_M, MOST_SHARE, find, sift_shares
 from copem_replay.io.ground_truth import DecodedObjects
 from copem_replay.io.schemas.description import (
     Amount,
@@ -37,12 +36,13 @@ from copem_replay.io.schemas.description import (
     Fields,
     Stamp,
     Yaw,
-    find_stamp_paths,
-    parse_nanoseconds,
 )
+from copem_replay.io.stamps import find_stamp_paths, parse_nanoseconds, settle_stamps
 
 # The columns of messages that a description needs.
 
+_LONGEST_QUATERNION = 1e3
+"""A rotation as a quaternion has the length 1; writers are known that do not norm it, but a longer one is none."""
 _COMPARED = 2000  # fields that are compared with a missing one for an error: more make it slow
 _SHOWN = 12  # fields named in an error, at most
 
@@ -171,6 +171,7 @@ def fit_outlines(values: Float, found: ShreddedMessages, objects: str, footprint
     least, most = (np.full((len(values), 2), end) for end in (np.inf, -np.inf))
     for k, axis in enumerate("xy"):
         along = points.numbers[f"{footprint}.{axis}"]
+        along = np.where(np.abs(along) <= LONGEST_M, along, np.nan)  # with a point that is none there is no box
         np.minimum.at(least[:, k], owner, along)
         np.maximum.at(most[:, k], owner, along)
     size = values[:, _SIZE]
@@ -196,7 +197,8 @@ def fit_solids(values: Float, kind: Float, first: Float, second: Float) -> None:
 def find_largest(values: Float, meant: Bool, found: ShreddedMessages, objects: str, of: str) -> Bool:
     """(P,) which objects `meant (P,)` are the largest of their thing in the list `of`; of equal ones the first."""
     owner = ancestor_rows(found, objects, of)
-    volume = np.where(meant, np.nan_to_num(values[:, _SIZES]).prod(axis=1), -np.inf)
+    sizes = np.where(np.abs(values[:, _SIZES]) <= LONGEST_M, np.abs(values[:, _SIZES]), 0.0)
+    volume = np.where(meant, sizes.prod(axis=1), -np.inf)
     order = np.lexsort((-volume, owner))
     first = np.ones(len(order), dtype=bool)
     first[1:] = np.diff(owner[order]) != 0
@@ -224,17 +226,19 @@ class DecodedLists:
     existence: Float
     covariance_m2: Float
     probability: Float
-    log_time_ns: Int  # (F,)
     named: bool  # whether its objects have ids
     part: str = ""  # the recording they are from, of several of one drive
 
 
 def decode_lists(
-    definition: Definition, description: Description, payloads: Sequence[bytes], log_time_ns: Int
+    definition: Definition, description: Description, payloads: Sequence[bytes], log_time_ns: Int, ahead_ns: int = 0
 ) -> DecodedLists:
-    """The lists in messages that were logged at `log_time_ns (F,)`. Raises FieldsError, OversizeError."""
+    """The lists in messages that were logged at `log_time_ns (F,)`; `ahead_ns`: their clock against that of log times.
+
+    Raises FieldsError, OversizeError.
+    """
     with np.errstate(over="ignore", invalid="ignore"):  # states that are not finite are left out later
-        return _BatchReader(definition, description, payloads).listed(log_time_ns)
+        return _BatchReader(definition, description, payloads).listed(log_time_ns, ahead_ns)
 
 
 class _BatchReader:
@@ -243,7 +247,7 @@ class _BatchReader:
     def __init__(self, definition: Definition, description: Description, payloads: Sequence[bytes]) -> None:
         self._fields = description.fields
         self._description = description
-        self._notes: Counter[tuple[str, str]] = Counter()
+        self._notes: list[str] = []
         self._wanted = WantedPaths(description, definition.offers())
         self._found: ShreddedMessages = shred_messages(definition, payloads, self._wanted.numbers, self._wanted.texts)
         self._names = definition.names
@@ -279,11 +283,23 @@ class _BatchReader:
         message = self._found.levels[""].parent[ancestor_rows(self._found, level, "")]
         unit = stamp.unit if isinstance(stamp, Stamp) else "s"
         stated_ns, has_stamp, impossible = parse_nanoseconds([rows.texts[p] for p in paths], unit)
-        if impossible:
-            self._notes["message", "with an impossible time stamp: the time of logging taken"] += impossible
+        self._impossible = impossible
         first = np.flatnonzero(has_stamp)[::-1]  # of several in one message the first
         stamp_ns[message[first]], stamped[message[first]] = stated_ns[first], True
         return stamp_ns, stamped
+
+    def _settled_stamps(self, log_time_ns: Int, ahead_ns: int) -> tuple[Int, Int, Bool]:
+        """The messages that are decoded and kept (K,), their stamps by the clock of log times, and whether stated."""
+        self._impossible = 0
+        stamp_ns, stamped = self._stamps(log_time_ns)
+        self._notes += find("stamp impossible", self._impossible)
+        rows = np.flatnonzero(self._found.decoded)
+        moved_ns = stamp_ns - np.where(stamped, ahead_ns, 0)
+        stamp_ns, stamped, kept, findings = settle_stamps(
+            moved_ns[rows], stamped[rows], log_time_ns[rows], ahead_ns=ahead_ns, told=self._impossible
+        )
+        self._notes += findings
+        return rows[kept], stamp_ns[kept], stamped[kept]
 
     def _amount(self, amount: Amount | None, otherwise: float) -> Float:
         if isinstance(amount, str):
@@ -298,10 +314,9 @@ class _BatchReader:
             return np.deg2rad(self.number(yaw_field.degrees))
         x, y, z, w = (self.number(f"{yaw_field.quaternion}.{axis}") for axis in "xyzw")
         empty = (x == 0.0) & (y == 0.0) & (z == 0.0) & (w == 0.0)
-        if empty.any():
-            self._notes["object state", "without orientation: yaw 0 taken"] += int(empty.sum())
-        yaw: Float = np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)  # of any length
-        return yaw
+        self._notes += find("yaw unset", int(empty.sum()))
+        yaw: Float = np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)  # of any usual length
+        return np.where(np.hypot(np.hypot(x, y), np.hypot(z, w)) <= _LONGEST_QUATERNION, yaw, np.nan)
 
     def _classes(self) -> Float:
         """(P, C) probability of each class, sums to 1."""
@@ -314,16 +329,19 @@ class _BatchReader:
             shared = common_level(level, self._fields.objects)
             texts = self._found.levels[level].texts[whole]
             known_as = self._by_name(any_item_path(whole), class_field.map)
-            of_word = np.array([_class_ix(word, known_as) for word in texts.words] + [-1])
+            names = [known_as.get(word) or class_from_name(word) for word in texts.words]
+            of_word = np.array([CLASSES.index(name or "other") for name in names] + [-1])
             code = of_word[texts.code]
+            self._note_unknown_names(texts, names)
             share = np.ones(len(code))
             if class_field.probability is not None:
                 share = self._found.levels[list_level(self._wanted.path(class_field.probability))].numbers[
                     self._wanted.path(class_field.probability)
                 ]
                 share = share[ancestor_rows(self._found, level, list_level(self._wanted.path(class_field.probability)))]
-                # A class with probability 0 or NaN is still stated; more than 1 counts as 1.
-                share = np.clip(np.nan_to_num(share), 1e-9, 1.0)
+                # A class with probability 0 or none is still stated; more than 1 counts as 1.
+                share = sift_shares(share, "class share", self._notes, most=MOST_SHARE)
+                share = np.clip(np.where(np.isnan(share), 0.0, share), 1e-9, 1.0)
             counted = code >= 0
             if class_field.key is not None:
                 keys = self._found.levels[list_level(self._wanted.path(class_field.key))].texts[
@@ -339,6 +357,14 @@ class _BatchReader:
         probability[none, CLASSES.index("other")] = 1.0
         normed: Float = probability / probability.sum(axis=1, keepdims=True)
         return normed
+
+    def _note_unknown_names(self, texts: DistinctTexts, names: Sequence[str | None]) -> None:
+        """Note the names of classes that say nothing, the most frequent first."""
+        counts = np.bincount(texts.code[texts.code >= 0], minlength=len(texts.words))
+        unknown = [(-int(counts[k]), word) for k, word in enumerate(texts.words) if names[k] is None and word.strip()]
+        which = ", ".join(f"{word} {-number}" for number, word in sorted(unknown)[:_SHOWN] if number)
+        if which:
+            self._notes += find("class name", sum(-number for number, _ in unknown), which=which)
 
     def _by_name(self, path: str, meant: Mapping[str, str]) -> Mapping[str, str]:
         """The class of each value, for values of an enumeration also by their names."""
@@ -396,8 +422,7 @@ class _BatchReader:
         if described.largest_of is None:
             return meant
         chosen = find_largest(values, meant, self._found, objects, described.largest_of)
-        if beside := int((meant & ~chosen).sum()):
-            self._notes["cube", "beside a larger one of the same entity: left out"] += beside
+        self._notes += find("cube", int((meant & ~chosen).sum()))
         return chosen
 
     def _velocity(self, yaw: Float) -> tuple[Float, Float]:
@@ -431,11 +456,9 @@ class _BatchReader:
         if ids is not None:
             nameless = (ids.code < 0) & meant
             meant = meant & ~nameless
-            if nameless.any():
-                self._notes["object state", "without an id: skipped"] += int(nameless.sum())
+            self._notes += find("no id", int(nameless.sum()))
         keep = np.flatnonzero(meant)
-        if unsaid := int((~self._said("yaw")[keep]).sum()):
-            self._notes["object state", "that does not say its heading: as written"] += unsaid
+        self._notes += find("yaw unsaid", int((~self._said("yaw")[keep]).sum()))
         return keep
 
     def _covariance(self, keep: Int) -> Float:
@@ -456,35 +479,32 @@ class _BatchReader:
         code, message = np.unique(np.stack([code, message])[:, code >= 0], axis=1)
         return int((np.diff(message) - 1)[np.diff(code) == 0].sum())
 
-    def listed(self, log_time_ns: Int) -> DecodedLists:
+    def listed(self, log_time_ns: Int, ahead_ns: int) -> DecodedLists:
         """The columns of the objects that are kept. The order of the steps is that of the notes."""
         found, meant = self._found, self._meant()
-        if lost := int((~found.decoded).sum()):
-            self._notes["message", "cannot be decoded: skipped"] += lost
-        stamp_ns, stamped = self._stamps(log_time_ns)
+        self._notes += find("undecoded", int((~found.decoded).sum()))
+        kept_message, stamp_ns, stamped = self._settled_stamps(log_time_ns, ahead_ns)
         values = self._values()
         meant = self._shaped(values, meant)
         ids = self._ids()
         keep = self._kept(meant, ids)
+        message = found.levels[""].parent[ancestor_rows(found, self._fields.objects, "")]
+        keep = keep[np.isin(message[keep], kept_message)]
         number = np.arange(len(keep)) if ids is None else ids.code[keep]
         names = tuple(str(k) for k in range(len(keep))) if ids is None else ids.words
-        message = found.levels[""].parent[ancestor_rows(found, self._fields.objects, "")]
-        kept_message = np.flatnonzero(found.decoded)
         probability = self._classes()[keep]
-        if unsaid := self._unsaid():
-            self._notes[
-                "state", "in between that no message repeats: not taken, a list holds what its message says"
-            ] += unsaid
+        self._notes += find("stays unsaid", self._unsaid())
         columns = DecodedObjects(
-            stamp_ns=stamp_ns[kept_message],
-            stamped=stamped[kept_message],
+            stamp_ns=stamp_ns,
+            stamped=stamped,
+            log_time_ns=log_time_ns[kept_message],
             rows=np.bincount(message[keep], minlength=self._messages)[kept_message],
             object_ids=names,
             moving=np.ones(len(names), dtype=bool),
             object_ix=number.astype(np.int64),
             class_ix=probability.argmax(axis=1).astype(np.int8),
             values=values[keep],
-            notes=tuple(f"{count_noun(n, noun)} {what}" for (noun, what), n in self._notes.items()),
+            notes=tuple(self._notes),
         )
         frame, frames = self._frame_of()
         return DecodedLists(
@@ -494,7 +514,6 @@ class _BatchReader:
             self._amount(self._fields.existence, np.nan)[keep],
             self._covariance(keep),
             probability,
-            log_time_ns[kept_message],
             ids is not None,
         )
 
@@ -505,39 +524,3 @@ def _join_id(spaces: DistinctTexts, space: int, ids: DistinctTexts, ident: int) 
         return ""
     namespace = spaces.words[space] if space >= 0 else ""
     return f"{namespace}/{ids.words[ident]}" if namespace else ids.words[ident]
-
-
-def _class_ix(word: str, known: Mapping[str, str]) -> int:
-    name = known.get(word) or class_from_name(word)
-    return CLASSES.index(name) if name is not None else CLASSES.index("other")
-
-
-# What names of classes mean, as data sets and drivers write them.
-
-_WORDS = {
-    "pedestrian": ("pedestrian", "person", "people", "human", "walker", "adult", "child", "wheelchair", "stroller"),
-    "bicycle": ("bicycle", "bicyclist", "bike", "cyclist", "cycle", "scooter", "rider"),
-    "motorcycle": ("motorcycle", "motorbike", "motorcyclist", "moped"),
-    "van": ("van", "minivan", "pickup"),
-    "truck": ("truck", "lorry", "semi"),
-    "bus": ("bus", "coach", "minibus"),
-    "trailer": ("trailer", "caravan"),
-    "animal": ("animal", "dog", "cat", "deer"),
-    "car": ("car", "sedan", "taxi", "passenger"),
-    "vehicle": ("vehicle", "ego"),
-    "other": ("other", "unknown", "misc", "object", "barrier", "cone", "sign", "tram", "train"),
-}
-"""Words by class. Of several classes that a name fits the first in `_ORDER` counts."""
-assert set(_WORDS) == set(CLASSES)
-_ORDER = ("motorcycle", *(name for name in _WORDS if name != "motorcycle"))
-"""In order of preference: `vehicle.bus` is a bus, `motorcycle rider` no bicycle."""
-
-
-def class_from_name(text: str) -> str | None:
-    """The class that a name means, None where it says nothing: `Car`, `vehicle.bus.rigid`, `TYPE_PEDESTRIAN`."""
-    words = set(re.split(r"[^a-z]+", re.sub(r"([a-z])([A-Z])", r"\1 \2", text).lower()))
-    words |= {word.removesuffix("s") for word in words}
-    for name in _ORDER:
-        if words & set(_WORDS[name]):
-            return name
-    return None

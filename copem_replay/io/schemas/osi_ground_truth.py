@@ -13,19 +13,21 @@ import sys
 from array import array
 from contextlib import suppress
 from functools import cache
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
-from copem_replay.core.errors import count_noun
 from copem_replay.core.frame import SaidPlace
 from copem_replay.core.tracks import CLASSES, VALUES, Bool, Float, Int, Solid
 from copem_replay.io.channel import LAST_NS
 from copem_replay.io.decoded_size import MOST_OBJECTS, STATE_BYTES, DecodeAllowance, check_objects
-from copem_replay.io.ground_truth import FARTHEST_M, DecodedObjects
+from copem_replay.io.findings import FARTHEST_M, find
+from copem_replay.io.ground_truth import DecodedObjects, take_messages
 from copem_replay.io.schemas.osi_lanes import OsiRoad, read_road
+from copem_replay.io.stamps import settle_stamps
 
 if TYPE_CHECKING:
     from copem_replay.io.encodings.protobuf import WalkedMessages
@@ -69,8 +71,13 @@ _NAME_OF_VEHICLE = {
 _CLASS_OF_VEHICLE = {number: CLASSES.index(name) for number, name in _NAME_OF_VEHICLE.items()}
 
 _MOST_CORNERS = 1000  # of a base polygon: visibility computes with each of them
-_LAST_SECOND = LAST_NS // 10**9
 _NAN = float("nan")
+
+
+def osi_stamp_ns(stamp: Any) -> int | None:
+    """An osi3.Timestamp in ns; None: impossible, beyond `LAST_NS` or with more nanoseconds than a second has."""
+    whole_ns = int(stamp.seconds) * 10**9
+    return whole_ns + stamp.nanos if abs(whole_ns) <= LAST_NS and stamp.nanos <= 10**9 else None
 
 
 def osi_class_index(kind: int, vehicle: int | None) -> int:
@@ -105,8 +112,6 @@ _PLAIN_BATCHES = 3
 
 _Place = tuple[int, int, int]
 """Of a note: the message, whether the object is stationary, its place in the list."""
-_WITHOUT_ID = ("object state", "without an id: skipped")
-_WITHOUT_YAW = ("object state", "without orientation: yaw 0 taken")
 
 # Of a moving object: what has to be there; what is read as bits, the fields in the order of VALUES first.
 _MARKS = ("id", "base.position", "base.orientation", "base.velocity")
@@ -170,14 +175,11 @@ class GroundTruthDecoder:
     """
 
     def __init__(self, allowance: DecodeAllowance) -> None:
-        # Imported here: 0.03 s that `--help` need not pay.
-        from osi3.osi_groundtruth_pb2 import GroundTruth
-        from osi3.osi_sensorview_pb2 import SensorView
-
-        self._message_of = {GROUND_TRUTH: GroundTruth, SENSOR_VIEW: SensorView}
+        self._message_of = {schema: load_message_class(schema) for schema in TRUTH_SCHEMAS}
         self._allowance = allowance
         self._stamp_ns = array("q")
         self._stamped = array("b")
+        self._log_time_ns, self._ahead_ns = array("q"), array("q")
         self._hosts: list[str] = []
         self._moving_number: dict[int, int] = {}  # OSI id → number of the object
         self._stationary_number: dict[int, int] = {}
@@ -186,9 +188,10 @@ class GroundTruthDecoder:
         self._waiting_bytes, self._waiting_objects, self._batches, self._walk = 0, 0, 0, False
         self._road = OsiRoad()  # of the first message that has one: the lanes of one message are those of all
         self._place: SaidPlace | None = None
+        self._earlier: list[tuple[OsiRoad, Any]] = []  # the first road or place on earth before the window
+        self._standing: dict[int, tuple[float, ...]] = {}  # values of stationary objects by OSI id, as last sent
         self._solids: dict[int, Solid | None] = {}  # of stationary objects by OSI id; None: a box
-        # What is counted and what is the matter with it: how many, and where the first is.
-        self._notes: dict[tuple[str, str], tuple[int, _Place]] = {}
+        self._notes: dict[str, tuple[int, _Place]] = {}  # by rule: how many, and where the first is
         self._messages = 0
 
     def add(self, payload: bytes, *, schema: str, log_time_ns: int, ahead_ns: int = 0) -> None:
@@ -202,24 +205,23 @@ class GroundTruthDecoder:
         try:
             message = message_class.FromString(payload)
         except DecodeError:
-            self._note("message", "cannot be decoded: skipped", (self._messages, 0, 0))
+            self._note("undecoded", (self._messages, 0, 0))
             return
         truth = message
         if schema == SENSOR_VIEW:
             if not message.HasField("global_ground_truth"):
-                self._note("message", "without global_ground_truth: skipped", (self._messages, 0, 0))
+                self._note("no ground truth", (self._messages, 0, 0))
                 return
             truth = message.global_ground_truth
         stamped = next((m for m in (message, truth) if m.HasField("timestamp")), None)
-        if stamped is not None:
-            seconds, nanos = stamped.timestamp.seconds, stamped.timestamp.nanos
-        else:
-            seconds, nanos = divmod(log_time_ns, 1_000_000_000)
-        if abs(seconds) > _LAST_SECOND:
-            self._note("message", "with an impossible time stamp: skipped", (self._messages, 0, 0))
-            return
-        self._stamp_ns.append(seconds * 1_000_000_000 + nanos - (0 if stamped is None else ahead_ns))
-        self._stamped.append(stamped is not None)
+        stamp_ns = None if stamped is None else osi_stamp_ns(stamped.timestamp)
+        if stamped is not None and stamp_ns is None:
+            self._note("stamp impossible", (self._messages, 0, 0))
+        log_time_ns = min(log_time_ns, LAST_NS)
+        self._stamp_ns.append(log_time_ns if stamp_ns is None else stamp_ns - ahead_ns)
+        self._stamped.append(stamp_ns is not None)
+        self._log_time_ns.append(log_time_ns)
+        self._ahead_ns.append(ahead_ns)
         self._add_host(message, truth)
         if truth.proj_string:
             self._add_place(truth, self._stamp_ns[-1])
@@ -229,28 +231,43 @@ class GroundTruthDecoder:
         self._allowance.spend(0, self._stationary.of_message[-1])
         self._wait(truth)
 
-    def add_road(self, payload: bytes, schema: str) -> None:
-        """Take the road of a message that is not read otherwise, where none has had one. Raises OversizeError."""
-        if not self._road:
-            check_osi(self._message_of[schema], payload)
-            with suppress(DecodeError):
-                message = self._message_of[schema].FromString(payload)
-                truth = message.global_ground_truth if schema == SENSOR_VIEW else message
-                self._road = read_road(truth)
-                if truth.proj_string and self._place is None:
-                    self._add_place(truth, 0)
+    def add_earlier(self, payload: bytes, schema: str) -> None:
+        """Take what stays of a message before those that are read: its road, its place on earth, what stands.
+
+        Raises OversizeError.
+        """
+        check_osi(self._message_of[schema], payload)
+        with suppress(DecodeError):
+            message = self._message_of[schema].FromString(payload)
+            truth = message.global_ground_truth if schema == SENSOR_VIEW else message
+            if not self._earlier and ((road := read_road(truth)) or truth.proj_string):
+                self._earlier.append((road, truth))
+            check_objects(len(truth.stationary_object))
+            self._find_standing(truth.stationary_object, told=False)
 
     def columns(self) -> DecodedObjects:
         """The columns of all messages that were added; none can be added after. Raises OversizeError."""
         self._add_waiting()
+        for road, truth in self._earlier:
+            self._road = self._road or road
+            if truth.proj_string and self._place is None:
+                self._add_place(truth, 0)
         ids, moving = self._names()
         solids = tuple(solid for solid in self._solids.values() if solid is not None)
-        notes = {key: number for key, (number, _) in sorted(self._notes.items(), key=lambda item: item[1][1])}
-        if solids:
-            notes["stationary object", "with a base_polygon: hides as that prism, and is no object"] = len(solids)
-        return DecodedObjects(
-            stamp_ns=np.array(self._stamp_ns, dtype=np.int64),
-            stamped=np.array(self._stamped, dtype=bool),
+        counts = [(rule, number) for rule, (number, _) in sorted(self._notes.items(), key=lambda item: item[1][1])]
+        notes = [note for rule, number in (*counts, ("prism", len(solids))) for note in find(rule, number)]
+        logged_ns, ahead_ns = (np.array(times, dtype=np.int64) for times in (self._log_time_ns, self._ahead_ns))
+        stamp_ns, stamped, kept, findings = settle_stamps(
+            np.array(self._stamp_ns, dtype=np.int64),
+            np.array(self._stamped, dtype=bool),
+            logged_ns,
+            ahead_ns=ahead_ns,
+            told=self._notes.get("stamp impossible", (0,))[0],
+        )
+        columns = DecodedObjects(
+            stamp_ns=stamp_ns,
+            stamped=stamped,
+            log_time_ns=logged_ns,
             object_ids=ids,
             moving=np.array(moving, dtype=bool),
             **_join_rows(self._moving, self._stationary),
@@ -260,11 +277,9 @@ class GroundTruthDecoder:
             place=self._place,
             solids=solids,
             hosts=tuple(self._hosts),
-            notes=(
-                *(f"{count_noun(number, noun)} {what}" for (noun, what), number in notes.items()),
-                *self._road.notes,
-            ),
+            notes=(*notes, *findings, *self._road.notes),
         )
+        return take_messages(columns, kept)
 
     def _add_host(self, message: Any, truth: Any) -> None:
         """Add the host's id: that of the ground truth, else of the sensor view around it. An id of 0 is an id."""
@@ -312,13 +327,17 @@ class GroundTruthDecoder:
         """As `_add_moving`, for all messages that wait."""
         walked = self._walk_waiting()
         bits = {path: taken[0] for path, taken in zip((*_MARKS, *_FIELDS), walked.columns, strict=True)}
-        named, placed, turned, moved = (there for *_, there in walked.columns[: len(_MARKS)])
+        there = {path: taken[-1] for path, taken in zip((*_MARKS, *_FIELDS), walked.columns, strict=True)}
         values = np.array([bits[path].view(np.float64) for path in _VALUE_FIELDS]).T  # columns lie together
-        values[~placed & (values[:, 0] == 0.0) & (values[:, 1] == 0.0), 0] = _NAN
-        values[~moved & (values[:, 4] == 0.0) & (values[:, 5] == 0.0), 4:6] = _NAN
+        named, placed, turned, moved = (there[path] for path in _MARKS)
+        unset = np.array([~there[path] for path in _VALUE_FIELDS[:6]]).T & (values[:, :6] == 0.0)
+        unset &= np.array([placed, placed, placed, turned, moved, moved]).T
+        values[~placed, 0] = _NAN  # nowhere is not the origin
+        values[~moved, 4:6] = _NAN
         of_message = walked.parent[1, : walked.rows[1]]
-        self._note_rows(of_message, ~named, _WITHOUT_ID)
-        self._note_rows(of_message, named & ~turned & (values[:, 3] == 0.0), _WITHOUT_YAW)
+        self._note_rows(of_message, ~named, "no id")
+        self._note_rows(of_message, named & ~turned, "yaw unset")
+        self._note_rows(of_message, named & unset.any(axis=1), "zero unset")
         kind, vehicle = (bits[path].astype(np.uint32) for path in ("type", "vehicle_classification.type"))
         of_vehicle = _VEHICLES[np.minimum(vehicle, len(_VEHICLES) - 1)]
         class_ix = np.where(kind == _IS_VEHICLE, of_vehicle, _KINDS[np.minimum(kind, len(_KINDS) - 1)])
@@ -346,13 +365,13 @@ class GroundTruthDecoder:
             message.DiscardUnknownFields()  # such a one may hide one that is known
         return walk_messages([message.SerializePartialToString() for message in messages], table, rows)
 
-    def _note_rows(self, of_message: Int, rows: Bool, note: tuple[str, str]) -> None:
-        """Count a note for some rows (P,) of the messages that wait; `of_message` (P,): their numbers among these."""
+    def _note_rows(self, of_message: Int, rows: Bool, rule: str) -> None:
+        """Count a finding for some rows (P,) of the messages that wait; `of_message` (P,): their numbers."""
         found = np.flatnonzero(rows)
         if len(found):
             first = of_message[found[0]]
             place = int(found[0] - np.searchsorted(of_message, first))
-            self._note(*note, (self._waiting[first][0], 0, place), len(found))
+            self._note(rule, (self._waiting[first][0], 0, place), len(found))
 
     def _add_moving(self, message: int, objects: Any) -> None:
         """Add a row for each. Reading fields costs most: each is read once, its presence only where it is 0."""
@@ -362,18 +381,16 @@ class GroundTruthDecoder:
         for k, moving in enumerate(objects):
             ident = moving.id.value
             if ident == 0 and not moving.HasField("id"):
-                self._note(*_WITHOUT_ID, (message, 0, k))
+                self._note("no id", (message, 0, k))
                 continue
             base = moving.base
             position, size, velocity = base.position, base.dimension, base.velocity
             x, y, z, yaw = position.x, position.y, position.z, base.orientation.yaw
             vx, vy = velocity.x, velocity.y
-            if x == 0.0 and y == 0.0 and not base.HasField("position"):
-                x = _NAN
-            if yaw == 0.0 and not base.HasField("orientation"):
-                self._note(*_WITHOUT_YAW, (message, 0, k))
-            if vx == 0.0 and vy == 0.0 and not base.HasField("velocity"):
-                vx = vy = _NAN
+            if 0.0 in (x, y, z, yaw, vx, vy):
+                (x, y, z, yaw, vx, vy), rules = check_zeros(base, (x, y, z, yaw, vx, vy))
+                for rule in rules:
+                    self._note(rule, (message, 0, k))
             kind = moving.type
             if kind == _IS_VEHICLE:
                 # Only here: writers are known that classify pedestrians as some vehicle.
@@ -386,35 +403,51 @@ class GroundTruthDecoder:
         self._moving.of_message.append(len(self._moving.object_ix) - before)
 
     def _add_stationary(self, objects: Any) -> None:
-        """Add a row of class `other`, at rest, for each; none for those with a base polygon, which become solids."""
-        number_of, rows, before = self._stationary_number, self._stationary, len(self._stationary.object_ix)
-        for k, stationary in enumerate(objects):
-            at = (self._messages, 1, k)
-            ident = stationary.id.value
-            if ident == 0 and not stationary.HasField("id"):
-                self._note(*_WITHOUT_ID, at)
-                continue
-            base = stationary.base
-            if ident not in self._solids:
-                self._solids[ident] = self._solid(ident, base, at)
-            if self._solids[ident] is not None:
-                continue
-            position, size, yaw = base.position, base.dimension, base.orientation.yaw
-            x, y = position.x, position.y
-            if x == 0.0 and y == 0.0 and not base.HasField("position"):
-                x = _NAN
-            if yaw == 0.0 and not base.HasField("orientation"):
-                self._note(*_WITHOUT_YAW, at)
+        """Add a row of class `other`, at rest, for each that stands; those with a base polygon become solids.
+
+        Many writers send them once. They stay until a message that repeats some of them leaves them out.
+        """
+        self._find_standing(objects)
+        number_of, rows = self._stationary_number, self._stationary
+        for ident, values in self._standing.items():
             number = number_of.get(ident)
             rows.object_ix.append(self._next_number(number_of, ident) if number is None else number)
             rows.class_ix.append(OTHER)
-            rows.values.extend((x, y, position.z, yaw, 0.0, 0.0, size.length, size.width, size.height))
-        rows.of_message.append(len(rows.object_ix) - before)
+            rows.values.extend(values)
+        rows.of_message.append(len(self._standing))
 
-    def _note(self, noun: str, what: str, at: _Place, number: int = 1) -> None:
-        """Count a note; `at`: the message, whether the object is stationary, its place in the list."""
-        before, first = self._notes.get((noun, what), (0, at))
-        self._notes[noun, what] = before + number, min(first, at)
+    def _find_standing(self, objects: Any, *, told: bool = True) -> None:
+        """Take the stationary objects of a message, with findings if they are `told`."""
+        sent: dict[int, tuple[float, ...]] = {}
+        for k, stationary in enumerate(objects):
+            at, rules = (self._messages, 1, k), list[str]()
+            ident = stationary.id.value
+            if ident == 0 and not stationary.HasField("id"):
+                rules.append("no id")
+            else:
+                if ident not in self._solids:
+                    self._solids[ident] = self._solid(ident, stationary.base, at)
+                if self._solids[ident] is None:
+                    base = stationary.base
+                    position, size = base.position, base.dimension
+                    state: tuple[float, ...] = (position.x, position.y, position.z, base.orientation.yaw)
+                    state, rules = check_zeros(base, state) if 0.0 in state else (state, rules)
+                    if ident in sent:
+                        rules.append("twice")
+                    sent.setdefault(ident, (*state, 0.0, 0.0, size.length, size.width, size.height))
+            for rule in rules if told else ():
+                self._note(rule, at)
+        lasting = len(self._standing.keys() - sent.keys())
+        if self._standing.keys().isdisjoint(sent):
+            if lasting and told:
+                self._note("stands", (self._messages, 1, 0), lasting)
+            sent = self._standing | sent
+        self._standing = sent
+
+    def _note(self, rule: str, at: _Place, number: int = 1) -> None:
+        """Count a finding; `at`: the message, whether the object is stationary, its place in the list."""
+        before, first = self._notes.get(rule, (0, at))
+        self._notes[rule] = before + number, min(first, at)
 
     def _solid(self, ident: int, base: Any, at: _Place) -> Solid | None:
         """The prism over an object's base polygon, as high as its box; None: no base polygon, or no simple one."""
@@ -431,7 +464,7 @@ class GroundTruthDecoder:
         somewhere = all(abs(value) <= FARTHEST_M for value in (*itertools.chain(*corners), position.z))
         outline = shapely.Polygon(corners) if somewhere and 3 <= len(corners) <= _MOST_CORNERS else None
         if outline is None or not outline.is_valid or not outline.area > 0.0:
-            self._note("stationary object", "whose base_polygon is no simple polygon: its box taken", at)
+            self._note("polygon", at)
             return None
         if not 0.0 < height_m <= FARTHEST_M:  # a note tells of it when its box is assembled
             return None
@@ -453,6 +486,25 @@ class GroundTruthDecoder:
         return tuple(ids), moving
 
 
+_PARTS = ("position", "position", "position", "orientation", "velocity", "velocity")
+_LEAVES = ("x", "y", "z", "yaw", "x", "y")
+
+
+def check_zeros(base: Any, values: tuple[float, ...]) -> tuple[tuple[float, ...], list[str]]:
+    """x, y, z, yaw (vx, vy) of an object, NaN for a place and a velocity that are not said, and the rules that apply.
+
+    Some writers leave a number out where it is 0. Presence costs, so it is asked only of zeros.
+    """
+    rules, said = [], {name: base.HasField(name) for name in dict.fromkeys(_PARTS[: len(values)])}
+    if not said["orientation"]:
+        rules.append("yaw unset")
+    zeros = [k for k, value in enumerate(values) if value == 0.0 and said[_PARTS[k]]]
+    if any(not getattr(base, _PARTS[k]).HasField(_LEAVES[k]) for k in zeros):
+        rules.append("zero unset")
+    x = values[0] if said["position"] else _NAN
+    return (x, *values[1:4], *(values[4:] if said.get("velocity", True) else (_NAN, _NAN))), rules
+
+
 def osi_id(object_id: str) -> int:
     """The number OSI has for an object: its id where that is a number, else a stable hash of it."""
     number = object_id.removeprefix("stationary:")
@@ -463,8 +515,15 @@ def osi_id(object_id: str) -> int:
     return int(object_words([object_id])[0])
 
 
-def load_sensor_data_class() -> Any:
-    """The SensorData class, imported when first needed."""
-    from osi3.osi_sensordata_pb2 import SensorData
+def sends_standing(payload: bytes, schema: str) -> bool:
+    """Whether a message of ground truth has stationary objects."""
+    with suppress(DecodeError):
+        message = load_message_class(schema).FromString(payload)
+        return bool((message.global_ground_truth if schema == SENSOR_VIEW else message).stationary_object)
+    return False
 
-    return SensorData
+
+def load_message_class(schema: str) -> Any:
+    """The class of a schema's messages, imported when first needed."""
+    name = schema.removeprefix("osi3.")
+    return getattr(import_module(f"osi3.osi_{name.lower()}_pb2"), name)

@@ -17,7 +17,7 @@ import numpy as np
 from copem_replay.core.errors import count_noun
 from copem_replay.core.site_map import Lane, LaneKind, make_area
 from copem_replay.core.tracks import Area, Float
-from copem_replay.io.ground_truth import FARTHEST_M
+from copem_replay.io.findings import FARTHEST_M
 
 INTERSECTION: Final = 4  # osi_lane.proto, Lane.Classification.Type
 DRIVING: Final = 2

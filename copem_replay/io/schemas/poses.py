@@ -6,15 +6,18 @@ PoseInFrame.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from copem_replay.core.tracks import Float, Int
-from copem_replay.io.channel import ENCODINGS, LAST_NS, Channel, schema_name
+from copem_replay.core.tracks import Bool, Float, Int
+from copem_replay.io.channel import ENCODINGS, Channel, schema_name
 from copem_replay.io.encodings import make_definition
 from copem_replay.io.encodings.columns import list_level, shred_messages
+from copem_replay.io.findings import FARTHEST_M, FASTEST_MPS, Finding, find
+from copem_replay.io.stamps import find_stamp_paths, parse_nanoseconds, settle_stamps
 
 
 @dataclass(frozen=True)
@@ -70,13 +73,14 @@ POSES = _ROS | {
 ODOMETRY = "nav_msgs/msg/Odometry"
 
 
+def is_static(channel: Channel) -> bool:
+    """Whether the channel holds static transforms: each holds for ever, as in tf2, until it is sent again."""
+    return channel.topic.endswith("tf_static")
+
+
 def is_pose(channel: Channel) -> bool:
     """Whether the channel holds poses of a schema in `POSES`, in an encoding that is read."""
     return schema_name(channel) in POSES and channel.encoding in ENCODINGS
-
-
-_FARTHEST_M = 1e9
-"""A larger coordinate is no position: it is far more than the diameter of the earth."""
 
 
 @dataclass(frozen=True)
@@ -89,15 +93,21 @@ class Poses:
     velocity_mps: Float  # (K, 2) ahead and to the left, NaN: not stated
     frame: tuple[str, ...]
     child: tuple[str, ...]
+    log_time_ns: Int
+    notes: tuple[Finding, ...] = ()  # what was left out, or is not stated
+
+    def take(self, rows: Int) -> Poses:
+        """Some of the poses."""
+        names = ("stamp_ns", "position_m", "rotation", "velocity_mps", "log_time_ns")
+        frame, child = (tuple(np.array(texts, dtype=object)[rows]) for texts in (self.frame, self.child))
+        return replace(self, frame=frame, child=child, **{name: getattr(self, name)[rows] for name in names})
 
 
 def decode_poses(channel: Channel, payloads: Sequence[bytes], log_time_ns: Int) -> Poses:
-    """The poses of a channel, without those that are not finite, too far or no rotation.
+    """The poses of a channel, without those that are none: not finite, too far, or no rotation.
 
     Raises DefinitionError, KeyError.
     """
-    from copem_replay.io.schemas.description import find_stamp_paths  # pydantic, which no recording without poses needs
-
     where = POSES[schema_name(channel)]
     definition = make_definition(channel, payloads)
     p = where.inside
@@ -112,33 +122,46 @@ def decode_poses(channel: Channel, payloads: Sequence[bytes], log_time_ns: Int) 
     message = shredded.levels[""].parent[message]
     columns = np.stack([level.numbers[n] for n in numbers], axis=1)
     texts = [np.array([*level.texts[n].words, ""], dtype=object)[level.texts[n].code] for n in names]
-    parts = [level.texts[s] for s in stamps]
-    seconds = [np.array([*(_whole_number(w) for w in part.words), 0], dtype=np.int64)[part.code] for part in parts]
-    has_stamps = len(seconds) == 2
-    stamp_ns = seconds[0] * 1_000_000_000 + seconds[1] - channel.ahead_ns if has_stamps else log_time_ns[message]
+    notes = list(find("undecoded", int((~shredded.decoded).sum())))
+    logged_ns, stamp_ns, stamped = log_time_ns[message], log_time_ns[message], np.zeros(len(message), dtype=bool)
+    if stamps:
+        stated_ns, stamped, impossible = parse_nanoseconds([level.texts[s] for s in stamps], "s")
+        stamp_ns = np.where(stamped, stated_ns - channel.ahead_ns, logged_ns)
+        notes += find("stamp impossible", impossible, noun="pose")
+    if stamps and not is_static(channel):  # of static ones stamps say nothing: the last one logged holds
+        stamp_ns, findings = _settle_each(stamp_ns, stamped, logged_ns, level.texts[names[-1]].code, channel.ahead_ns)
+        notes += findings
     with np.errstate(invalid="ignore", over="ignore"):
         length = np.linalg.norm(columns[:, 3:7], axis=1)
-        near = (np.abs(columns[:, :3]) <= _FARTHEST_M).all(axis=1)
-    good = np.isfinite(columns[:, :7]).all(axis=1) & near & (length > 0.5) & (length < 2.0)
-    velocity = columns[:, 7:9] if where.velocity is not None else np.full((len(columns), 2), np.nan)
-    return Poses(
-        stamp_ns[good],
-        columns[good, :3],
-        columns[good, 3:7] / length[good, None],
-        velocity[good],
-        tuple(texts[0][good]),
-        tuple(texts[1][good]) if where.child else ("",) * int(good.sum()),
+        near = (np.abs(columns[:, :3]) <= FARTHEST_M).all(axis=1)
+        velocity = columns[:, 7:9] if where.velocity is not None else np.full((len(columns), 2), np.nan)
+        moves = np.abs(velocity).max(axis=1, initial=0.0) <= FASTEST_MPS
+    good = near & (length > 0.5) & (length < 2.0)
+    notes += find("pose", int((~good).sum()))
+    notes += find("pose velocity", int((good & ~moves).sum()) if where.velocity is not None else 0)
+    poses = Poses(
+        stamp_ns,
+        columns[:, :3],
+        columns[:, 3:7] / np.where(good, length, 1.0)[:, None],
+        np.where(moves[:, None], velocity, np.nan),
+        tuple(texts[0]),
+        tuple(texts[1]) if where.child else ("",) * len(columns),
+        logged_ns,
+        tuple(notes),
     )
+    return poses if good.all() else poses.take(np.flatnonzero(good))
 
 
-_LAST_SECOND = LAST_NS // 10**9
-"""A larger number of seconds is read as 0."""
-
-
-def _whole_number(word: str) -> int:
-    """Seconds or nanoseconds of a time stamp; 0 for a text that is none."""
-    try:
-        number = int(word)
-    except ValueError:
-        return 0
-    return number if abs(number) < _LAST_SECOND else 0
+def _settle_each(
+    stamp_ns: Int, stamped: Bool, log_time_ns: Int, frame: Int, ahead_ns: int
+) -> tuple[Int, Iterator[Finding]]:
+    """The stamps (K,) of the poses, of each frame (K,) by themselves: transforms are stamped by who sends them."""
+    settled_ns, counts = stamp_ns.copy(), Counter[str]()
+    for number in np.unique(frame):
+        rows = np.flatnonzero(frame == number)
+        settled_ns[rows], _, _, findings = settle_stamps(
+            stamp_ns[rows], stamped[rows], log_time_ns[rows], ahead_ns=ahead_ns
+        )
+        for finding in findings:
+            counts[finding.rule] += finding.number
+    return settled_ns, (line for rule, count in counts.items() for line in find(rule, count, noun="pose"))

@@ -34,9 +34,10 @@ from copem_replay.io.containers.mcap_records import (
     read_summary,
     renumber_message,
 )
+from copem_replay.io.encodings.ros2_types import message_definition
 from copem_replay.io.log import Log, open_file
 from copem_replay.io.recording import Recording
-from copem_replay.io.schemas.osi_ground_truth import SENSOR_DATA, load_sensor_data_class
+from copem_replay.io.schemas.osi_ground_truth import SENSOR_DATA, load_message_class
 from copem_replay.io.schemas.registry import DETAIL_SCHEMA
 from copem_replay.io.window import is_kept
 from copem_replay.io.write.detail import (
@@ -64,7 +65,6 @@ from copem_replay.io.write.ros2 import (
     encode_ros2_scene,
     encode_ros2_transform,
     encode_string,
-    message_definition,
 )
 from copem_replay.io.write.scene import (
     FOXGLOVE_SCENE_SCHEMA,
@@ -306,7 +306,7 @@ class _OsiFamily:
 
     def __init__(self, catalogue: Catalogue, scene: Scene, units: Mapping[str, int], frame_id: str = FRAME_ID) -> None:
         self._catalogue, self._scene, self._units, self._frame_id = catalogue, scene, units, frame_id
-        self._objects = _add_protobuf_channel(catalogue, load_sensor_data_class(), SENSOR_DATA)
+        self._objects = _add_protobuf_channel(catalogue, load_message_class(SENSOR_DATA), SENSOR_DATA)
         self._scenes = _add_protobuf_channel(catalogue, load_scene_class(), FOXGLOVE_SCENE_SCHEMA)
         self._details = catalogue.schema(DETAIL_SCHEMA, "jsonschema", json.dumps(DETAIL_JSON).encode())
 

@@ -36,7 +36,7 @@ from copem_replay.io.encodings.column_bytes import (
     split_into_blocks,
     start_offsets,
 )
-from copem_replay.io.schemas.osi_ground_truth import load_sensor_data_class, osi_id
+from copem_replay.io.schemas.osi_ground_truth import SENSOR_DATA, load_message_class, osi_id
 from copem_replay.io.schemas.osi_lanes import SUBTYPES, ZEBRA
 
 if TYPE_CHECKING:
@@ -216,7 +216,7 @@ class SensorDataWriter:
                 start = np.searchsorted(frame[kind], np.arange(len(lists) + 1))
                 items = self._items(listed[kind], captured_ns[frame[kind]], name == "moving_object")
                 content[name] = RepeatedMessages(start, items)
-            yield from encode_messages(load_sensor_data_class().DESCRIPTOR, content, last - first)
+            yield from encode_messages(load_message_class(SENSOR_DATA).DESCRIPTOR, content, last - first)
 
     def _items(self, rows: Int, captured_ns: Int, moving: bool) -> Content:
         """The content of detected objects; `captured_ns`: the newest capture of their lists."""

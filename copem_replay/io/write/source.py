@@ -16,7 +16,7 @@ from mcap.records import Channel, Message
 
 from copem_replay.io.channel import AHEAD, PART
 from copem_replay.io.containers.mcap_records import renumber_message
-from copem_replay.io.containers.osi_trace import TraceLog, load_message_class
+from copem_replay.io.containers.osi_trace import TraceLog
 from copem_replay.io.containers.rosbag2 import BagLog, merge_streams
 from copem_replay.io.log import Log
 from copem_replay.io.open import (
@@ -28,6 +28,7 @@ from copem_replay.io.open import (
     open_log,
     recording_label,
 )
+from copem_replay.io.schemas.osi_ground_truth import load_message_class
 from copem_replay.io.window import Window
 from copem_replay.io.write.message_family import OSI_CHANNEL, Catalogue, OriginalMcap, osi_version
 

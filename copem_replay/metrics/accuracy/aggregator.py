@@ -18,6 +18,9 @@ from copem_replay.metrics.accuracy.kernel import (
     TruthByList,
     add_up,
     close_episodes,
+    make_estimates,
+    make_list_scratch,
+    make_targets,
 )
 from copem_replay.metrics.accuracy.statistics import (
     BAND,
@@ -78,6 +81,7 @@ class Aggregator:
         )
         self._out.by_run["lists"] = reference.present.sum()
         self._out.by_run["time_s"] = _time_s(issue_s, reference.present)
+        self._scratch = make_list_scratch(M), make_targets(M)
         self._states = EpisodeStates(np.full((S, M), -1), np.tile(episodes.onset_s, (S, 1)))
         self._added = 0
 
@@ -100,7 +104,7 @@ class Aggregator:
             sort_truth_by_list(world),
             self._stays._replace(first_list=self._stays.first_list - self._added),
             reference.x_m[chunk], reference.y_m[chunk], reference.present[chunk],
-            self._parameters, self._states, self._out,
+            self._parameters, self._states, self._out, *self._scratch, make_estimates(lists),
         )  # fmt: skip
         self._added += count
 

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from copem_replay.core.compiled import borrowing, kernel
+from copem_replay.core.compiled import borrowing, borrowing_kernel
 from copem_replay.core.geometry import is_in_area
 from copem_replay.core.object_list import Entries, ObjectLists
 from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int, Scene, Tracks
@@ -39,6 +39,7 @@ from copem_replay.metrics.accuracy.kernel import (
     Targets,
     TruthByList,
     divide_gospa,
+    make_estimates,
     make_targets,
 )
 from copem_replay.metrics.accuracy.statistics import AccuracySettings
@@ -166,10 +167,11 @@ class HeldErrors:
         after = self._added + lists.start.shape[1] - 1
         chunk = slice(self._measured, int(np.searchsorted(newest, after, side="left")))
         number = np.where(is_held, newest - self._added, -1)[chunk]
-        reference = frames.reference
+        reference, M = frames.reference, len(self._episodes.first)
         _measure_frames(
             lists.start, lists.entries, take_match_columns(about), number, self._measured, frames.time_s, frames.truth,
             self._episodes, (reference.x_m, reference.y_m, reference.present), self._parameters, self._out,
+            make_targets(M), make_estimates(lists), _FrameScratch(np.full(M, -1), np.zeros(M, dtype=bool)),
         )  # fmt: skip
         self._added, self._measured = after, chunk.stop
 
@@ -205,32 +207,14 @@ class _FrameScratch(NamedTuple):
     present: Bool  # (M,) whether the truth has it
 
 
-@kernel
+@borrowing_kernel
 def _measure_frames(
     start: Int, entries: Entries, about: EntryMatches, number: Int, first: int, time_s: Float, truth: TruthByList,
     episodes: _EpisodeFrames, reference: tuple[Float, Float, Bool], asked: AccuracyParameters, out: _HeldColumns,
+    targets: Targets, estimates: Estimates, here: _FrameScratch,
 ) -> None:  # fmt: skip
     # Frames `first`, `first + 1`, …, at which the lists `number` are held, −1: none.
-    longest, M = 0, len(episodes.first)
-    for s in range(len(start)):
-        for k in range(start.shape[1] - 1):
-            longest = max(longest, start[s, k + 1] - start[s, k])
-    estimates = Estimates(np.empty(longest), np.empty(longest), np.empty(longest, np.bool_))
-    scratch = _FrameScratch(np.full(M, -1), np.zeros(M, np.bool_))
-    _measure_each_frame(
-        start, entries, about, number, first, time_s, truth, episodes, reference, asked, out,
-        (make_targets(M), estimates, scratch),
-    )  # fmt: skip
-
-
-@borrowing
-def _measure_each_frame(
-    start: Int, entries: Entries, about: EntryMatches, number: Int, first: int, time_s: Float, truth: TruthByList,
-    episodes: _EpisodeFrames, reference: tuple[Float, Float, Bool], asked: AccuracyParameters, out: _HeldColumns,
-    scratch: tuple[Targets, Estimates, _FrameScratch],
-) -> None:  # fmt: skip
     reference_x_m, reference_y_m, is_placed = reference
-    targets, estimates, here = scratch
     for q in range(len(number)):
         g, k = first + q, number[q]
         if not is_placed[g]:
@@ -243,13 +227,21 @@ def _measure_each_frame(
                     s, start[s, k], start[s, k + 1], entries, about, time_s[g], episodes,
                     (reference_x_m[g], reference_y_m[g]), asked, targets, estimates, here, out,
                 )  # fmt: skip
-            if wanted > 0:
-                divide_gospa(targets, wanted, estimates, count, asked.cutoff_m, asked.power)
-                for t in range(wanted):
-                    out.gospa[s, targets.column[t]] = targets.located[t] + targets.missed[t] + targets.false[t]
+            _fill_gospa(targets, wanted, estimates, count, asked, out.gospa[s])
         for p in range(truth.start[g], truth.start[g + 1]):
             m = episodes.episode_of[truth.object_ix[p]]
             here.target_of[m], here.present[m] = -1, False
+
+
+@borrowing
+def _fill_gospa(
+    targets: Targets, wanted: int, estimates: Estimates, count: int, asked: AccuracyParameters, out: NDArray[np.float32]
+) -> None:
+    # Out: GOSPAᵖ of each target.
+    if wanted > 0:
+        divide_gospa(targets, wanted, estimates, count, asked.cutoff_m, asked.power)
+        for t in range(wanted):
+            out[targets.column[t]] = targets.located[t] + targets.missed[t] + targets.false[t]
 
 
 @borrowing

@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from copem_replay.core.compiled import borrowing, kernel
+from copem_replay.core.compiled import borrowing, borrowing_kernel
 from copem_replay.core.geometry import is_in_area
-from copem_replay.core.object_list import Entries
+from copem_replay.core.object_list import Entries, ObjectLists
 from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int
 from copem_replay.metrics.gospa import gospa_pairs
 from copem_replay.metrics.matching import DUPLICATE, GHOST, MATCH
@@ -154,8 +154,9 @@ class EpisodeStates(NamedTuple):
     unknown_since_s: Float  # NaN: known
 
 
-class _ListScratch(NamedTuple):
-    # The objects whose stay includes the list at hand, and their matches in the run at hand.
+class ListScratch(NamedTuple):
+    """The objects whose stay includes the list at hand, and their matches in the run at hand."""
+
     episode: Int
     row: Int  # of the truth, −1: it has a gap there
     distance_band: Int
@@ -186,48 +187,35 @@ class Estimates(NamedTuple):
     paired: Bool
 
 
-@kernel
 def make_targets(most: int) -> Targets:
     """Room for so many objects."""
     whole, real = np.empty((3, most), dtype=np.int64), np.empty((5, most))
     return Targets(whole[0], whole[1], real[0], real[1], whole[2], real[2], real[3], real[4])
 
 
-@kernel
+def make_estimates(lists: ObjectLists) -> Estimates:
+    """Room for the entries of any of the lists."""
+    x_m, y_m = np.empty((2, lists.longest))
+    return Estimates(x_m, y_m, np.empty(lists.longest, dtype=bool))
+
+
+def make_list_scratch(most: int) -> ListScratch:
+    """Room for so many objects."""
+    episode, row, distance_band, pair, match, target = np.empty((6, most), dtype=np.int64)
+    return ListScratch(episode, row, distance_band, pair, match, target, np.full(most, -1))
+
+
+@borrowing_kernel
 def add_up(
     start: Int, entries: Entries, about: EntryMatches, now: EntryMatches, issue_s: Float, world: TruthByList,
     stays: EpisodeLists, reference_x_m: Float, reference_y_m: Float, present: Bool, asked: AccuracyParameters,
-    so_far: EpisodeStates, out: AccuracySums,
+    so_far: EpisodeStates, out: AccuracySums, here: ListScratch, targets: Targets, estimates: Estimates,
 ) -> None:  # fmt: skip
     """Add the next K lists of S runs to `out`. Numbers of lists in `stays` count from the first of them.
 
-    `about`: matches at the instants the entries tell of; `now`: at those the lists are available.
+    `about`: matches at the instants the entries tell of; `now`: at those the lists are available. The last three: room
+    for what is known of the list at hand.
     """
-    S, M = out.by_object.shape
-    longest = 0
-    for s in range(S):
-        for k in range(len(issue_s)):
-            longest = max(longest, start[s, k + 1] - start[s, k])
-    here = _ListScratch(
-        np.empty(M, np.int64), np.empty(M, np.int64), np.empty(M, np.int64), np.empty(M, np.int64),
-        np.empty(M, np.int64), np.empty(M, np.int64), np.full(M, -1),
-    )  # fmt: skip
-    targets = make_targets(M)
-    estimates = Estimates(np.empty(longest), np.empty(longest), np.empty(longest, np.bool_))
-    _add_each_list(
-        start, entries, about, now, issue_s, world, stays, (reference_x_m, reference_y_m, present), asked, so_far, out,
-        (here, targets, estimates),
-    )  # fmt: skip
-
-
-@borrowing
-def _add_each_list(
-    start: Int, entries: Entries, about: EntryMatches, now: EntryMatches, issue_s: Float, world: TruthByList,
-    stays: EpisodeLists, reference: tuple[Float, Float, Bool], asked: AccuracyParameters, so_far: EpisodeStates,
-    out: AccuracySums, scratch: tuple[_ListScratch, Targets, Estimates],
-) -> None:  # fmt: skip
-    reference_x_m, reference_y_m, present = reference
-    here, targets, estimates = scratch
     S = len(out.by_object)
     # The expected moments are kept while the covariance stays the same, which it mostly does from list to list.
     large_m2 = small_m2 = np.nan
@@ -282,7 +270,7 @@ def _add_each_list(
             here.place_of[here.episode[h]] = -1
 
 
-@borrowing
+@borrowing_kernel
 def close_episodes(stays: EpisodeLists, so_far: EpisodeStates, out: AccuracySums) -> None:
     """Add the gaps that last until the episodes end, after all lists."""
     S, M = out.by_object.shape
@@ -296,7 +284,7 @@ def close_episodes(stays: EpisodeLists, so_far: EpisodeStates, out: AccuracySums
 @borrowing
 def _gather_targets(
     k: int, issue_s: float, world: TruthByList, stays: EpisodeLists, from_m: tuple[float, float],
-    asked: AccuracyParameters, here: _ListScratch, targets: Targets,
+    asked: AccuracyParameters, here: ListScratch, targets: Targets,
 ) -> tuple[int, int]:  # fmt: skip
     # Out: the objects whose stay includes list k, those in a gap of the truth last. Returns their number, and the
     # number of those that are looked at.
@@ -325,7 +313,7 @@ def _gather_targets(
 @borrowing
 def _add_entries(
     s: int, first: int, after: int, entries: Entries, about: EntryMatches, now: EntryMatches, stays: EpisodeLists,
-    from_m: tuple[float, float], time_band: int, asked: AccuracyParameters, here: _ListScratch, targets: Targets,
+    from_m: tuple[float, float], time_band: int, asked: AccuracyParameters, here: ListScratch, targets: Targets,
     wanted: int, estimates: Estimates, out: AccuracySums,
 ) -> int:  # fmt: skip
     # Find the matches in a list of run s and count its other entries. Returns the number of entries in GOSPA.

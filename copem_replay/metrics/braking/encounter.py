@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from copem_replay.core.compiled import borrowing, kernel
+from copem_replay.core.compiled import borrowing, borrowing_kernel, kernel
 from copem_replay.core.geometry import (
     box_distance,
     corner_travel,
@@ -140,7 +140,7 @@ _INSIDE_M = 0.1
 """The step along a path in search of the end of a contact: a shorter gap may be missed."""
 
 
-@borrowing
+@borrowing_kernel
 def find_blocked_stretches(
     path: Float, size: Float, other: Float, other_size: Float, margin_m: float, from_m: float, to_m: Float, out: Float
 ) -> None:
@@ -193,7 +193,7 @@ def _find_border(
     return within
 
 
-@borrowing
+@borrowing_kernel
 def find_required_deceleration(
     time_s: Float, stretch_m: Float, begin_s: Float, begin_m: Float, speed_mps: Float, out: Float
 ) -> None:

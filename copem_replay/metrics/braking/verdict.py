@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from copem_replay.core.compiled import borrowing
+from copem_replay.core.compiled import borrowing_kernel
 from copem_replay.core.geometry import find_smallest_distances
 from copem_replay.core.tracks import Bool, Float
 from copem_replay.metrics.braking.driver import (
@@ -111,7 +111,7 @@ def simulate_braking(encounter: Encounter, driver: Driver, brake_s: Float) -> tu
     return way, speed
 
 
-@borrowing
+@borrowing_kernel
 def _drive_braking(
     time_s: Float, along_m: Float, bound_m: Float, recorded_mps: Float, begin_s: Float, begin_m: Float,
     begin_mps: Float, deceleration: Float, way: Float, speed: Float,

@@ -1,10 +1,10 @@
-"""First detections by match: for fusions without truth ids.
+"""First detections by match: of fused lists whose entries have been matched with the truth, whatever the fusion.
 
-An object is detected by the first list, available before its episode ends, with an entry about the object
-(`metrics/matching.py`) that was captured at or after the onset: its match, or a duplicate, for the match of a union may
-be a unit's older entry.
-`confirm` counts captures, not messages, by the rules of `metrics/detection/by_truth_id.py`: an entry about the object
-says that the capture it goes back to holds it, however often it is issued again.
+An object is detected by the first list, available before its episode ends, with an entry about the object, its match or
+a duplicate (`metrics/matching.py`), that goes back to a list which holds the object and was captured at or after the
+onset (`metrics/origin.py`).
+`confirm` counts turns of units, and instants of all (`metrics/detection/turns.py`): of the lists that an entry about
+the object goes back to, those that hold it have their turn counted, once, however often the entry is issued.
 
 If only entries of at least some existence were listed, the detection would come later, or never: `DetectionSteps` says
 when, for every existence.
@@ -18,19 +18,21 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from copem_replay.core.compiled import kernel
+from copem_replay.core.compiled import borrowing, callee, kernel
 from copem_replay.core.object_list import Entries, ObjectLists
-from copem_replay.core.tracks import SAME_INSTANT_S, Float, Int, Tracks
+from copem_replay.core.tracks import SAME_INSTANT_S, Float, Int
 from copem_replay.metrics.config import Confirm
-from copem_replay.metrics.detection.by_truth_id import FirstDetections, capture_instants
+from copem_replay.metrics.detection.by_truth_id import FirstDetections
+from copem_replay.metrics.detection.turns import Turns
 from copem_replay.metrics.matching import DUPLICATE, MATCH, Matches
+from copem_replay.metrics.origin import GoesBack, Holdings, Origins, find_holding_lists
 
 if TYPE_CHECKING:
     from copem_replay.metrics.episodes import Episodes
 
 
-HELD = np.dtype([("run_ix", "i8"), ("episode_ix", "i8"), ("capture", "i8"), ("existence", "f8")])
-"""The highest existence with which a capture holds the object of an episode."""
+HELD = np.dtype([("run_ix", "i8"), ("episode_ix", "i8"), ("turn", "i8"), ("existence", "f8")])
+"""The highest existence with which a turn, or an instant, holds the object of an episode."""
 
 
 class MatchedLists(NamedTuple):
@@ -51,62 +53,50 @@ class EpisodeWindows(NamedTuple):
     until_s: Float  # (M,)
 
 
+class Confirming(NamedTuple):
+    """What `hits` of `of` are counted of: first the instants, group −1, then the turns, group the unit of each."""
+
+    hits: int
+    of: int
+    group: Int  # (C,)
+    counts: Int  # (F, 2) instant and turn of each list
+
+
 @kernel
 def find_existence_levels(
-    lists: MatchedLists, stays: EpisodeWindows, source: Int, group: Int, hits: int, of: int, best: Float,
-    held: NDArray[Any], level: Float,
+    lists: MatchedLists, stays: EpisodeWindows, origins: Origins, confirming: Confirming, best: Float,
+    held: NDArray[Any], level: Float, by_list: Int,
 ) -> NDArray[Any]:  # fmt: skip
-    """Write, at each entry that makes an object known at a higher existence than before, that existence to `level
-    (N,)`.
+    """Write, at an entry of each list that makes an object known at a higher existence than before, that existence to
+    `level (N,)`, and to `by_list (N,)` the newest list that entries about it go back to and that holds it.
 
-    `source (N, 2)`: captures an entry goes back to, −1: none; `group (captures,)`: the unit of each capture.
     Carried over: `best (S, M)`, the existence at which each object is known; `held`, by run and episode, returned as it
-    is after these lists. A capture that holds an object with no higher existence than it is known at is dropped:
-    whatever it would confirm, as many hits have confirmed already.
+    is after these lists. A turn that holds an object with no higher existence than it is known at is dropped: whatever
+    it would confirm, as many hits have confirmed already.
     """
-    start, entries, role = lists.start, lists.entries, lists.role
     S, M = best.shape
     most = 0
     for s in range(S):
-        most = max(most, start[s, -1] - start[s, 0])
+        most = max(most, lists.start[s, -1] - lists.start[s, 0])
     episode, first = np.empty(most, np.int64), np.empty(M + 1, np.int64)
     row, number = np.empty(most, np.int64), np.empty(most, np.int64)
-    holds = np.full(len(group) if hits > 1 else 0, -np.inf)  # by capture, of the episode at hand
-    used = np.empty(len(held) + 2 * most if hits > 1 else 0, np.int64)
-    within = np.empty(of)
+    holds = np.full(len(confirming.group), -np.inf)  # by turn, of the episode at hand
+    used, within = np.empty(len(holds), np.int64), np.empty(confirming.of)
     carried, kept, h = np.empty(len(held), HELD), 0, 0
     for s in range(S):
         _sort_by_episode(s, lists, stays, episode, first, row, number)
         for m in range(M):
             n = 0
             while h < len(held) and held[h].run_ix == s and held[h].episode_ix == m:
-                used[n] = held[h].capture
+                used[n] = held[h].turn
                 holds[used[n]] = held[h].existence
                 n += 1
                 h += 1
-            place = first[m]
-            while place < first[m + 1]:
-                # What one list says of the object, and the entry that stands for it.
-                k, standing, reached = number[place], row[place], -np.inf
-                while place < first[m + 1] and number[place] == k:
-                    i = row[place]
-                    place += 1
-                    if _is_preferred(entries, role, i, standing):
-                        standing = i
-                    existence = entries[i].existence
-                    if hits == 1:
-                        reached = max(reached, existence)
-                        continue
-                    for c in source[i]:
-                        if c < 0 or existence <= max(holds[c], best[s, m]):
-                            continue
-                        if holds[c] == -np.inf:
-                            used[n] = c
-                            n += 1
-                        holds[c] = existence
-                        reached = max(reached, _find_confirming_existence(holds, c, hits, of, group, within))
-                if reached > best[s, m]:
-                    best[s, m] = level[standing] = reached
+            rows, numbers = row[first[m] : first[m + 1]], number[first[m] : first[m + 1]]
+            n = _take_in(
+                s, rows, numbers, lists, stays.not_before_s[m], origins, confirming, best[s, m : m + 1], holds, used, n,
+                within, level, by_list,
+            )  # fmt: skip
             if kept + n > len(carried):
                 grown = np.empty(2 * (kept + n), HELD)
                 for c in range(kept):
@@ -115,26 +105,71 @@ def find_existence_levels(
             for c in used[:n]:
                 if holds[c] > best[s, m]:
                     record = carried[kept]
-                    record.run_ix, record.episode_ix, record.capture, record.existence = s, m, c, holds[c]
+                    record.run_ix, record.episode_ix, record.turn, record.existence = s, m, c, holds[c]
                     kept += 1
                 holds[c] = -np.inf
     return carried[:kept].copy()
 
 
-@kernel
+@borrowing
+def _take_in(
+    s: int, rows: Int, numbers: Int, lists: MatchedLists, not_before_s: float, origins: Origins,
+    confirming: Confirming, best: Float, holds: Float, used: Int, n: int, within: Float, level: Float, by_list: Int,
+) -> int:  # fmt: skip
+    # Takes in the entries about one object, list by list; `best (1,)`. The number of turns that are `used` then.
+    place = 0
+    while place < len(rows):
+        k, standing, reached, newest = numbers[place], rows[place], best[0], -1
+        while place < len(rows) and numbers[place] == k:
+            i = rows[place]
+            place += 1
+            existence = lists.entries[i].existence
+            if existence <= best[0]:
+                continue
+            count = find_holding_lists(origins, s, k, i, lists.object_ix[i], not_before_s, False)
+            for a in origins.holdings.holding[:count]:
+                if _is_newer(origins.holdings, a, newest):
+                    newest = a
+                if confirming.hits == 1:
+                    reached = max(reached, existence)
+                    continue
+                for c in confirming.counts[origins.holdings.frame[a]]:
+                    if existence <= max(holds[c], best[0]):
+                        continue
+                    if holds[c] == -np.inf:
+                        used[n] = c
+                        n += 1
+                    holds[c] = existence
+                    reached = max(reached, _find_confirming_existence(holds, c, confirming, within))
+        if reached > best[0]:
+            best[0] = level[standing] = reached
+            by_list[standing] = newest
+    return n
+
+
+@borrowing
+def _is_newer(holdings: Holdings, a: int, b: int) -> bool:
+    # Whether list a was captured after list b, −1: none; of lists captured together the first unit's is the newer.
+    if b < 0:
+        return True
+    later_s = holdings.captured_s[a] - holdings.captured_s[b]
+    return bool(later_s > SAME_INSTANT_S or (later_s >= -SAME_INSTANT_S and a < b))
+
+
+@callee
 def _sort_by_episode(
     s: int, lists: MatchedLists, stays: EpisodeWindows, episode: Int, first: Int, row: Int, number: Int
 ) -> None:
     # Out: the entries of run s that count, episode by episode and in each list by list: `row`, and `number` of the
     # list.
-    start, entries, object_ix, role, issue_s = lists.start[s], lists.entries, lists.object_ix, lists.role, lists.issue_s
-    episode_of, not_before_s, until_s = stays.episode_of, stays.not_before_s, stays.until_s
+    start, object_ix, role, issue_s = lists.start[s], lists.object_ix, lists.role, lists.issue_s
+    episode_of, until_s = stays.episode_of, stays.until_s
     first[:] = 0
     for k in range(len(issue_s)):
         for i in range(start[k], start[k + 1]):
             about = role[i] == MATCH or role[i] == DUPLICATE
             m = episode_of[object_ix[i]] if about and object_ix[i] < len(episode_of) else -1
-            if m >= 0 and (issue_s[k] > until_s[m] or entries[i].captured_s < not_before_s[m]):
+            if m >= 0 and issue_s[k] > until_s[m]:
                 m = -1
             episode[i - start[0]] = m
             if m >= 0:
@@ -154,28 +189,15 @@ def _sort_by_episode(
     first[0] = 0
 
 
-@kernel
-def _is_preferred(entries: Entries, role: NDArray[np.int8], i: int, j: int) -> bool:
-    # Of two entries about one object: the match, the higher existence, the newer capture, the first unit's.
-    one, other = entries[i], entries[j]
-    if role[i] != role[j]:
-        return bool(role[i] < role[j])
-    if one.existence != other.existence:
-        return bool(one.existence > other.existence)
-    if one.captured_s != other.captured_s:
-        return bool(one.captured_s > other.captured_s)
-    return bool(one.unit_ix < other.unit_ix)
-
-
-@kernel
-def _find_confirming_existence(existence: Float, capture: int, hits: int, of: int, group: Int, held: Float) -> float:
-    # The highest existence with which `hits` of `of` consecutive captures of a group, this one among them, hold the
+@borrowing
+def _find_confirming_existence(existence: Float, turn: int, confirming: Confirming, held: Float) -> float:
+    # The highest existence with which `hits` of `of` consecutive turns of a group, this one among them, hold the
     # object.
-    highest = -np.inf
-    for first in range(max(capture - of + 1, 0), capture + 1):
+    highest, hits, of, group = -np.inf, confirming.hits, confirming.of, confirming.group
+    for first in range(max(turn - of + 1, 0), turn + 1):
         n = 0
         for q in range(first, min(first + of, len(existence))):
-            if group[q] == group[capture] and existence[q] > -np.inf:
+            if group[q] == group[turn] and existence[q] > -np.inf:
                 place = n
                 while place > 0 and held[place - 1] > existence[q]:  # ascending
                     held[place] = held[place - 1]
@@ -193,7 +215,7 @@ _STEP = np.dtype(
         ("unit_ix", "i8"),
     ]
 )  # fmt: skip
-"""A step of `DetectionSteps`, with capture and unit of the entry that makes it."""
+"""A step of `DetectionSteps`, with capture and unit of the list that it goes back to."""
 
 
 @dataclass(frozen=True)
@@ -210,58 +232,33 @@ class DetectionSteps:
     detection_s: Float
 
 
-@dataclass(frozen=True)
-class CaptureInstants:
-    """Captures of lists (F,), unit by unit and in order of time; `instant`: number of the capture instant."""
-
-    captured_s: Float
-    unit_ix: Int
-    instant: Int
-
-
-def collect_captures(received: Tracks, *, instants: bool = True) -> CaptureInstants:
-    """The captures of the lists that arrive. `instants`: whether capture instants are needed; else all are 0."""
-    arrives = np.isfinite(received.common_arrives_s)
-    order = np.flatnonzero(arrives)
-    order = order[np.lexsort((received.captured_s[order], received.frame_unit_ix[order]))]
-    instant = capture_instants(received)[order] if instants else np.zeros(len(order), dtype=np.int64)
-    return CaptureInstants(received.captured_s[order], received.frame_unit_ix[order], instant)
-
-
 class FirstMatches:
     """First detection of each of M episodes in S runs; lists are added in time chunks of any size.
 
-    `captures`: those of all lists, to which entries go back. Beside the detections so far, the captures that hold an
-    object with a higher existence than it is known at are kept from one time chunk to the next.
+    `turns`: of all lists that entries go back to; None: one hit confirms, whatever the turns. Beside the detections so
+    far, the turns that hold an object with a higher existence than it is known at are kept from one time chunk to the
+    next.
     """
 
     def __init__(
-        self, episodes: Episodes, *, runs: int, confirm: Confirm, count_earlier: bool, captures: CaptureInstants
+        self, episodes: Episodes, *, runs: int, confirm: Confirm, count_earlier: bool, turns: Turns | None
     ) -> None:
         count = len(episodes.object_ix)
         episode_of = np.full(int(episodes.object_ix.max(initial=-1)) + 1, -1)
         episode_of[episodes.object_ix] = np.arange(count)
         not_before_s = episodes.counts_from_s(count_earlier=count_earlier)
         self._stays = EpisodeWindows(episode_of, not_before_s, episodes.ended_s + SAME_INSTANT_S)
-        self._confirm, self._captures = confirm, captures
-        # Captures are numbered: first the capture instants, without a unit, then the lists of the units.
-        self._instants = int(captures.instant.max(initial=-1)) + 1
-        self._group = np.concatenate([np.full(self._instants, -1), captures.unit_ix])
+        self._confirming = Confirming(confirm.hits, confirm.of, *_number_counts(turns if confirm.hits > 1 else None))
         self._best = np.full((runs, count), -np.inf)
         self._held = np.empty(0, dtype=HELD)
         self._steps: list[Entries] = [np.empty(0, dtype=_STEP)]
 
-    def add(self, lists: ObjectLists, matches: Matches, issue_s: Float) -> None:
+    def add(self, lists: ObjectLists, matches: Matches, issue_s: Float, origins: Origins) -> None:
         """Take in the lists that come next. `issue_s (K,)`: when each is available, ascending."""
-        # One hit confirms at once, whatever the captures.
-        source = np.zeros((0, 2), dtype=np.int64)
-        if self._confirm.hits > 1:
-            source = _trace_sources(lists.entries, self._captures)
-            source[source[:, 1] >= 0, 1] += self._instants
-        level = np.full(len(lists.entries), np.nan)
+        level, by_list = np.full(len(lists.entries), np.nan), np.full(len(lists.entries), -1)
         self._held = find_existence_levels(
-            MatchedLists(lists.start, lists.entries, matches.object_ix, matches.role, issue_s), self._stays,
-            source, self._group, self._confirm.hits, self._confirm.of, self._best, self._held, level,
+            MatchedLists(lists.start, lists.entries, matches.object_ix, matches.role, issue_s), self._stays, origins,
+            self._confirming, self._best, self._held, level, by_list,
         )  # fmt: skip
         entry = np.flatnonzero(~np.isnan(level))
         # Of empty lists, which begin where the next does, the last is the one that holds the entry.
@@ -269,13 +266,18 @@ class FirstMatches:
         steps = np.empty(len(entry), dtype=_STEP)
         steps["run_ix"], steps["episode_ix"] = run_ix, self._stays.episode_of[matches.object_ix[entry]]
         steps["existence"], steps["detection_s"] = level[entry], issue_s[number]
-        steps["captured_s"], steps["unit_ix"] = lists.entries["captured_s"][entry], lists.entries["unit_ix"][entry]
+        if origins.holdings.goes_back == GoesBack.TO_NEWEST:
+            steps["captured_s"] = origins.holdings.captured_s[by_list[entry]]
+            steps["unit_ix"] = origins.holdings.unit_ix[by_list[entry]]
+        else:  # a stack does not say whose lists contribute
+            steps["captured_s"], steps["unit_ix"] = lists.entries["captured_s"][entry], -1
         self._steps.append(steps)
 
     def result(self) -> tuple[FirstDetections, DetectionSteps]:
         """The detections of the lists so far, and their steps by existence.
 
-        Captured instant and first unit are those of the entry that makes the detection.
+        Captured instant and first unit are those of the newest list that makes the detection; of a stack's output the
+        capture of its entry, and no unit.
         """
         steps = np.concatenate(self._steps)
         # The sort is stable: within an episode the steps stay in order of time.
@@ -292,26 +294,10 @@ class FirstMatches:
         return detections, DetectionSteps(*map(np.ascontiguousarray, columns))
 
 
-def _trace_sources(entries: Entries, captures: CaptureInstants) -> Int:
-    """(N, 2) the capture instant and the list that each entry goes back to, −1: none.
-
-    The list is that of the entry's unit at its capture, else that of the first unit with a list then; an entry with
-    another capture goes back to the instant before it, and to no list.
-    """
-    captured_s = entries["captured_s"]
-    by_time = np.argsort(captures.captured_s, kind="stable")
-    ordered_s = captures.captured_s[by_time]
-    before = np.searchsorted(ordered_s, captured_s + SAME_INSTANT_S, side="right") - 1
-    instant = np.where(before >= 0, captures.instant[by_time[before]], -1) if len(by_time) else before
-    list_ix = np.full(len(entries), -1)
-    units = np.unique(captures.unit_ix)
-    for own in (True, False):
-        for unit in units:
-            first, last = np.searchsorted(captures.unit_ix, (unit, unit + 1))
-            rows = np.flatnonzero((list_ix < 0) & (entries["unit_ix"] == unit)) if own else np.flatnonzero(list_ix < 0)
-            place = np.searchsorted(captures.captured_s[first:last], captured_s[rows] - SAME_INSTANT_S) + first
-            matches = place < last
-            matches[matches] = captures.captured_s[place[matches]] <= captured_s[rows[matches]] + SAME_INSTANT_S
-            list_ix[rows[matches]] = place[matches]
-    instant = np.where(list_ix >= 0, captures.instant[list_ix], instant) if len(by_time) else instant
-    return np.stack([instant, list_ix], axis=1)
+def _number_counts(turns: Turns | None) -> tuple[Int, Int]:
+    """(C,) the groups of instants and turns, and (F, 2) the instant and the turn of each list, as `Confirming` says."""
+    if turns is None:
+        return np.zeros(0, dtype=np.int64), np.zeros((0, 2), dtype=np.int64)
+    instants = int(turns.instant.max(initial=-1)) + 1
+    counts = np.stack([turns.list_instant, turns.turn + instants], axis=1)
+    return np.concatenate([np.full(instants, -1), turns.unit_ix]), counts

@@ -1,11 +1,8 @@
-"""First detections by truth id: for ideal fusion and the truth, whose lists say which objects they hold.
+"""First detections by truth id: the fast path for ideal fusion and the truth, where no list has to be made.
 
 With ideal fusion an object is in the fused list whenever the receiver takes in a list that holds it, so the first
-detection is read off the units' lists; every other fusion is judged by its own lists (`by_match.py`).
-
-`confirm` counts captures, not messages: the object is confirmed when `hits` of `of` consecutive capture instants hold
-it, by the lists that have arrived. Captures of several units within half a list period are one instant. What confirms
-in the lists of one unit alone confirms also where others have joined it, whatever their rates.
+detection is read off the units' lists. It is what `by_match.py` finds in the fused lists: an object is confirmed when
+`hits` of `of` consecutive turns of a unit, or instants of all, hold it (`turns.py`), by the lists that have arrived.
 """
 
 from __future__ import annotations
@@ -15,9 +12,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from copem_replay.communication.arrivals import first_newer_arrival_s
-from copem_replay.core.compiled import kernel
+from copem_replay.core.compiled import borrowing, callee, kernel
 from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int, Tracks
 from copem_replay.metrics.config import Confirm
+from copem_replay.metrics.detection.turns import number_turns
 
 if TYPE_CHECKING:
     from copem_replay.metrics.episodes import Episodes
@@ -26,8 +24,8 @@ if TYPE_CHECKING:
 class FirstDetections(NamedTuple):
     """The first detection of each episode, run by run. All (S, M), NaN and −1 where not detected.
 
-    `detection_s`: when the list that confirms the object is available; `captured_s`: the newest capture that
-    contributed; `first_unit_ix`: the unit of the first list that holds the object.
+    `detection_s`: when the list that confirms the object is available; `captured_s`, `first_unit_ix`: capture and unit
+    of the newest list that contributes, of lists captured together the first unit's.
     """
 
     detection_s: Float
@@ -66,62 +64,18 @@ def _detect_first(
     out = FirstDetections(np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, -1))
     # The instant from which on a list is no longer used: at its greatest age, within a microsecond, it still is.
     arrives_s = received.common_arrives_s
-    outdated_s, cluster = arrives_s + max_age_s + 2 * SAME_INSTANT_S, np.zeros(len(received.stamp_ns), dtype=np.int64)
-    place, units_in_place = cluster, received.frame_unit_ix
-    if confirm.hits > 1:  # one hit confirms at once, whatever the instants and the lists before
-        outdated_s, cluster = np.minimum(first_newer_arrival_s(received), outdated_s), capture_instants(received)
-        place, units_in_place = _sort_by_unit(received)
+    outdated_s, instant = arrives_s + max_age_s + 2 * SAME_INSTANT_S, np.zeros(len(received.stamp_ns), dtype=np.int64)
+    turn, unit_of_turn = instant, received.frame_unit_ix
+    if confirm.hits > 1:  # one hit confirms at once, whatever the turns and the lists before
+        turns, outdated_s = number_turns(received), np.minimum(first_newer_arrival_s(received), outdated_s)
+        turn, instant, unit_of_turn = turns.turn, turns.list_instant, turns.unit_ix
     rows = _ListedRows(
         received.valid, arrives_s[received.frame_ix], captured_s, outdated_s[received.frame_ix], received.row_unit_ix,
-        cluster[received.frame_ix], place[received.frame_ix],
+        instant[received.frame_ix], turn[received.frame_ix],
     )  # fmt: skip
     stays = _EpisodeRows(order, bounds, not_before_s, episodes.ended_s + SAME_INSTANT_S)
-    _find_first(rows, units_in_place, stays, confirm.hits, confirm.of, out)
+    _find_first(rows, unit_of_turn, stays, confirm.hits, confirm.of, out)
     return out
-
-
-def capture_instants(received: Tracks) -> Int:
-    """(F,) the capture instant each list belongs to, counted from the first; 0 for lists that never arrive.
-
-    Captures of several units within half the shortest list period of the first one are one instant; two captures of
-    one unit never are.
-    """
-    arrives = np.isfinite(received.common_arrives_s)  # what never arrives is no capture to the receiver
-    reach_s = shortest_period_s(received) / 2 + SAME_INSTANT_S
-    order = np.flatnonzero(arrives)
-    order = order[np.argsort(received.captured_s[order], kind="stable")]
-    cluster = np.zeros(len(arrives), dtype=np.int64)
-    _cluster_captures(
-        received.captured_s, received.frame_unit_ix, np.full(len(received.units), -1), reach_s, order, cluster
-    )
-    return cluster
-
-
-def shortest_period_s(received: Tracks) -> float:
-    """The shortest of the units' list periods in seconds, each the median between two captures; 0 without any."""
-    lists = np.flatnonzero(np.isfinite(received.common_arrives_s))
-    lists = lists[np.lexsort((received.captured_s[lists], received.frame_unit_ix[lists]))]
-    unit = received.frame_unit_ix[lists]
-    same = unit[1:] == unit[:-1]
-    steps_s, unit_of_step = np.diff(received.captured_s[lists])[same], unit[1:][same]
-    steps_s = steps_s[np.lexsort((steps_s, unit_of_step))]
-    _, first, count = np.unique(unit_of_step, return_index=True, return_counts=True)
-    medians_s = (steps_s[first + (count - 1) // 2] + steps_s[first + count // 2]) / 2
-    return min(medians_s.tolist(), default=0.0)
-
-
-def _sort_by_unit(received: Tracks) -> tuple[Int, Int]:
-    """(F,) the place of each list, unit by unit in order of capture, lists that never arrive last; (F,) the unit at
-    each.
-    """
-    arrives = np.isfinite(received.common_arrives_s)
-    unit = np.where(
-        arrives, received.frame_unit_ix, len(received.units)
-    )  # what never arrives is no capture to the receiver
-    order = np.lexsort((received.captured_s, unit))
-    place = np.empty(len(order), dtype=np.int64)
-    place[order] = np.arange(len(order))
-    return place, unit[order]
 
 
 def _group_by_episode(received: Tracks, episodes: Episodes) -> tuple[Int, Int]:
@@ -147,15 +101,6 @@ def _group_by_episode(received: Tracks, episodes: Episodes) -> tuple[Int, Int]:
     return rows, np.searchsorted(episode[rows], np.arange(len(episodes.object_ix) + 1))
 
 
-@kernel
-def _cluster_captures(captured_s: Float, unit_ix: Int, last_of: Int, reach_s: float, order: Int, out: Int) -> None:
-    current, first = -1, -np.inf
-    for k in order:
-        if captured_s[k] > first + reach_s or last_of[unit_ix[k]] == current:
-            current, first = current + 1, captured_s[k]
-        out[k] = last_of[unit_ix[k]] = current
-
-
 class _ListedRows(NamedTuple):
     # Rows (P,) of the lists that are received; `outdated_s`: from then on the row no longer counts.
     valid: Bool  # (S, P)
@@ -163,8 +108,8 @@ class _ListedRows(NamedTuple):
     captured_s: Float
     outdated_s: Float
     unit_ix: Int
-    cluster: Int  # the capture instant
-    place: Int  # of its list among those of its unit
+    instant: Int  # of its list's turn
+    turn: Int  # of its list
 
 
 class _EpisodeRows(NamedTuple):
@@ -177,15 +122,15 @@ class _EpisodeRows(NamedTuple):
 
 @kernel
 def _find_first(
-    rows: _ListedRows, units_in_place: Int, stays: _EpisodeRows, hits: int, of: int, out: FirstDetections
+    rows: _ListedRows, unit_of_turn: Int, stays: _EpisodeRows, hits: int, of: int, out: FirstDetections
 ) -> None:
-    valid, arrives_s, captured_s, outdated_s, unit_ix, cluster, place = rows
+    valid, arrives_s, captured_s, outdated_s, unit_ix, instant, turn = rows
     order, bounds, not_before_s, until_s = stays
     detection_s, newest_s, first_unit_ix = out
     held = np.empty(len(order), dtype=np.int64)  # rows that hold the object, in order of arrival
-    no_group = np.zeros(len(units_in_place), dtype=np.int64)
-    # The instants that hold the object bear the token of the episode and run, which spares clearing them.
-    by_instant, by_list = no_group.copy(), no_group.copy()
+    no_group = np.zeros(len(unit_of_turn), dtype=np.int64)  # instants are no more than turns
+    # What holds the object bears the token of the episode and run, which spares clearing them.
+    by_instant, by_turn = no_group.copy(), no_group.copy()
     token = 0
     for m in range(len(bounds) - 1):
         for s in range(valid.shape[0]):
@@ -200,33 +145,42 @@ def _find_first(
                 held[n] = p
                 n += 1
                 if hits > 1:
-                    by_instant[cluster[p]] = by_list[place[p]] = token
+                    by_instant[instant[p]] = by_turn[turn[p]] = token
                     if not (
-                        _is_confirmed(by_instant, token, cluster[p], hits, of, no_group)
-                        or _is_confirmed(by_list, token, place[p], hits, of, units_in_place)
+                        _is_confirmed(by_instant, token, instant[p], hits, of, no_group)
+                        or _is_confirmed(by_turn, token, turn[p], hits, of, unit_of_turn)
                     ):
                         continue
-                detection_s[s, m] = arrives_s[p]
-                first_unit_ix[s, m] = unit_ix[held[0]]
-                # The newest capture that contributes: lists that arrive at this very instant, older ones still in use.
-                newest = captured_s[p]
+                # The newest list that contributes: of those that arrive at this very instant, and older ones in use.
+                newest = p
                 for j in range(k + 1, bounds[m + 1]):
                     q = order[j]
                     if arrives_s[q] > arrives_s[p] + SAME_INSTANT_S:
                         break
-                    if valid[s, q]:
-                        newest = max(newest, captured_s[q])
+                    if valid[s, q] and _is_newer(rows, q, newest):
+                        newest = q
                 for j in range(n):
                     q = held[j]
-                    if outdated_s[q] > arrives_s[p] + SAME_INSTANT_S or arrives_s[q] > arrives_s[p] - SAME_INSTANT_S:
-                        newest = max(newest, captured_s[q])
-                newest_s[s, m] = newest
+                    in_use = (
+                        outdated_s[q] > arrives_s[p] + SAME_INSTANT_S or arrives_s[q] > arrives_s[p] - SAME_INSTANT_S
+                    )
+                    if in_use and _is_newer(rows, q, newest):
+                        newest = q
+                detection_s[s, m], newest_s[s, m] = arrives_s[p], captured_s[newest]
+                first_unit_ix[s, m] = unit_ix[newest]
                 break
 
 
-@kernel
+@borrowing
+def _is_newer(rows: _ListedRows, p: int, q: int) -> bool:
+    # Whether row p was captured after row q; of rows captured together the first unit's is the newer.
+    later_s = rows.captured_s[p] - rows.captured_s[q]
+    return bool(later_s > SAME_INSTANT_S or (later_s >= -SAME_INSTANT_S and rows.unit_ix[p] < rows.unit_ix[q]))
+
+
+@callee
 def _is_confirmed(marks: Int, token: int, instant: int, hits: int, of: int, group: Int) -> bool:
-    # Whether `hits` of `of` consecutive instants of one group, this instant among them, hold the object.
+    # Whether `hits` of `of` consecutive instants or turns of one group, this one among them, hold the object.
     for start in range(instant - of + 1, instant + 1):
         holding = 0
         for i in range(max(start, 0), min(start + of, len(marks))):

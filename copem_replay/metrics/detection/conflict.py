@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from copem_replay.core.compiled import kernel
+from copem_replay.core.compiled import callee, kernel
 from copem_replay.core.errors import ExperimentError
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.geometry import are_in_area, polygon_corners, pose_on_path
@@ -163,7 +163,7 @@ def _mark_conflicts(
                     break
 
 
-@kernel
+@callee
 def will_enter(
     x: float, y: float, yaw: float, vx: float, vy: float, length: float, width: float, piece: Float, horizon_s: float
 ) -> bool:

@@ -47,6 +47,7 @@ def provenance_tables(study: ReportData) -> Html:
             make_table(
                 ["log", "topic of the truth", "SHA-256"], logs, caption="Recordings that were replayed", id_="logs"
             ),
+            *_read_table(data["logs"]),
             make_tag("p", "Skipped, and not in any figure:" if skipped else "No recording was skipped."),
             make_list(skipped),
             make_tag("h3", "Notes"),
@@ -55,6 +56,24 @@ def provenance_tables(study: ReportData) -> Html:
             fold_parts("Libraries", _pairs_table(data.get("libraries", {}), "Versions of libraries", "libraries")),
         ]
     )
+
+
+def _read_table(logs: Sequence[Any]) -> Iterator[Html]:
+    """What was left out or mended of each recording; nothing where all was as it should be."""
+    rows = [
+        make_tag(
+            "tr",
+            make_tag("th", str(log["log"]), scope="row"),
+            make_tag("td", str(found["number"])),
+            make_tag("td", str(found["what"]), class_="text"),
+            make_tag("td", "may change figures" if found["changes"] else "–", class_="text"),
+        )
+        for log in logs
+        for found in log.get("read", ())
+    ]
+    if rows:
+        caption = "What was left out or mended when recordings were read"
+        yield make_table(["log", "how many", "what", "why it matters"], rows, caption=caption, id_="read")
 
 
 def _pairs_table(data: dict[str, Any], caption: str, id_: str) -> Html:

@@ -34,11 +34,12 @@ from copem_replay.results.compare.labels import (
     check_log_names,
     choose_baseline,
     choose_configurations,
+    find_remembering,
     label_configurations,
-    note_on_measuring,
     notes_on_differences,
     notes_on_folders,
     notes_on_output_baseline,
+    notes_on_remembering,
     rename_logs,
 )
 from copem_replay.results.compare.limits import (
@@ -48,6 +49,7 @@ from copem_replay.results.compare.limits import (
     mcnemar_p_value,
 )
 from copem_replay.results.compare.metrics import (
+    HELD_METRICS,
     GhostTotals,
     PairSettings,
     Regret,
@@ -298,7 +300,8 @@ def compare_folders(
     settings, reasons = _settle_ghosts(setting, against, others, totals, false_positives_per_min, asked=not own_rate)
     groups = EpisodeGroups(read[0], by or ())
     names = ClusterNames(logs, [], runs)
-    pairs, rows, of_groups = _compare_each_log(against, settings, names, metrics, groups, asked)
+    remembering = find_remembering(known, against, others) if baseline is None else {}
+    pairs, rows, of_groups = _compare_each_log(against, settings, names, metrics, groups, asked, remembering)
     table = COMPARISON.frame(rows)
     return Comparison(
         table=table,
@@ -307,15 +310,15 @@ def compare_folders(
         configurations=tuple(labelled.label for labelled in others),
         horizon_s=setting.horizon_s,
         false_positives_per_min=false_positives_per_min,
-        groups=_tabulate_groups(against, of_groups, names, groups) if by else None,
+        groups=_tabulate_groups(against, remembering, of_groups, names, groups) if by else None,
         truths=tuple(labelled.label for labelled in (against, *others) if labelled.facts.truth),
         notes=(
             *notes_on_folders(used),
             *horizon_notes,
             *notes_on_differences(used, renames),
             *notes_on_pairs(against, pairs),
-            *note_on_measuring(against, others),
             *notes_on_output_baseline(against, others),
+            *notes_on_remembering(remembering),
             *notes_on_frames(table),
             *notes_on_equal_ghosts(reasons),
             *notes_on_rows(table, pairs.values(), false_positives_per_min),
@@ -360,6 +363,7 @@ def _compare_each_log(
     metrics: Sequence[str] | None,
     groups: EpisodeGroups,
     asked: PairsAsked,
+    remembering: Remembering,
 ) -> tuple[dict[LabelledConfiguration, AllLogs], list[dict[str, object]], GroupPairs]:
     """The sums of each pair over the logs of `names`; rows of all logs, then of each log where there are several; the
     sums of each group.
@@ -376,23 +380,58 @@ def _compare_each_log(
         detections = (of_folder["detections.parquet"] for of_folder in tables.values())
         grid = build_grid(k, detections, names.runs, len(names.objects))
         names.objects.extend(f"{log}\n{name}" for name in grid.objects)
-        second = asked.restrict(log, grid, lay_out_configuration(against, tables[against.results], grid))
+        second, *remembered = (
+            asked.restrict(log, grid, lay_out_configuration(one, tables[one.results], grid))
+            for one in (against, *remembering.values())
+        )
+        held_against = dict(zip(remembering, remembered, strict=True))
         for labelled, pair in pairs.items():
             first = asked.restrict(log, grid, lay_out_configuration(labelled, tables[labelled.results], grid))
             _check_same_episodes(labelled, first, against, second, log, grid)
             _check_same_frames(labelled, first, against, second, log)
-            regrets = list(compute_regrets(first, second, grid, settings[labelled], metrics))
+            regrets = _compute_regrets(first, second, held_against.get(labelled), grid, settings[labelled], metrics)
             pair.add(first, second, regrets, more=len(logs) > 1, over_runs=asked.over_runs)
             for regret in regrets if len(logs) > 1 else ():
                 values = regret.figure.values()
                 pair.differences.setdefault(regret.metric, []).append(values[2])
-                rows.append({"log": log, **_make_row(regret, values, labelled, against, names, asked)})
+                baseline = _baseline_of(regret.metric, labelled, against, remembering)
+                rows.append({"log": log, **_make_row(regret, values, labelled, baseline, names, asked)})
             for group, kept in groups.select(log, grid):
                 one, other = (groups.restrict(group, kept, side) for side in (first, second))
-                regrets = list(compute_regrets(one, other, grid, settings[labelled], metrics))
+                held = held_against.get(labelled)
+                held = None if held is None else groups.restrict(group, kept, held)
+                regrets = _compute_regrets(one, other, held, grid, settings[labelled], metrics)
                 of_pair = of_groups.setdefault(group, {}).setdefault(labelled, AllLogs())
                 of_pair.add(one, other, regrets, more=len(logs) > 1)
-    return pairs, [*_overall_rows(against, pairs, names, asked), *rows], of_groups
+    return pairs, [*_overall_rows(against, remembering, pairs, names, asked), *rows], of_groups
+
+
+Remembering = Mapping[LabelledConfiguration, LabelledConfiguration]
+"""The ideal fusions with memory that accuracy is held against, by configuration."""
+
+
+def _compute_regrets(
+    first: PairSide,
+    second: PairSide,
+    remembered: PairSide | None,
+    grid: PairingGrid,
+    setting: PairSettings,
+    metrics: Sequence[str] | None,
+) -> list[Regret]:
+    """The metrics of a log; what is held against what is `remembered`, None: as all others against the second side."""
+    regrets = list(compute_regrets(first, second, grid, setting, metrics))
+    if remembered is None:
+        return regrets
+    asked = [name for name in HELD_METRICS if metrics is None or name in metrics]
+    held = {regret.metric: regret for regret in compute_regrets(first, remembered, grid, setting, asked)}
+    return [held.get(regret.metric, regret) for regret in regrets]
+
+
+def _baseline_of(
+    metric: str, labelled: LabelledConfiguration, against: LabelledConfiguration, remembering: Remembering
+) -> LabelledConfiguration:
+    """What a configuration is held against in a metric."""
+    return remembering.get(labelled, against) if metric in HELD_METRICS else against
 
 
 GroupPairs = dict[int, dict[LabelledConfiguration, AllLogs]]
@@ -400,13 +439,17 @@ GroupPairs = dict[int, dict[LabelledConfiguration, AllLogs]]
 
 
 def _tabulate_groups(
-    against: LabelledConfiguration, of_groups: GroupPairs, names: ClusterNames, groups: EpisodeGroups
+    against: LabelledConfiguration,
+    remembering: Remembering,
+    of_groups: GroupPairs,
+    names: ClusterNames,
+    groups: EpisodeGroups,
 ) -> pd.DataFrame:
     """The rows of `Comparison.groups`."""
     rows = [
         {"by": by.label, "group": group, **without_limits_over_runs(row)}
         for k, (by, group) in enumerate(groups.named)
-        for row in _overall_rows(against, of_groups.get(k, {}), names)
+        for row in _overall_rows(against, remembering, of_groups.get(k, {}), names)
     ]
     table = COMPARISON.frame(rows).drop(columns="log")
     for place, name in enumerate(("by", "group")):
@@ -416,6 +459,7 @@ def _tabulate_groups(
 
 def _overall_rows(
     against: LabelledConfiguration,
+    remembering: Remembering,
     pairs: Mapping[LabelledConfiguration, AllLogs],
     names: ClusterNames,
     asked: PairsAsked = PairsAsked(),
@@ -424,7 +468,8 @@ def _overall_rows(
     for labelled, pair in pairs.items():
         for regret in pair.regrets():
             values = regret.figure.values()
-            row = {"log": ALL, **_make_row(regret, values, labelled, against, names, asked)}
+            baseline = _baseline_of(regret.metric, labelled, against, remembering)
+            row = {"log": ALL, **_make_row(regret, values, labelled, baseline, names, asked)}
             if row.get("interval_over") == "logs":
                 row["logs_better"] = pair.count_better(regret.metric)
                 if (decisive := find_decisive_log(regret.figure, values[2], names)) is not None:

@@ -280,14 +280,25 @@ def notes_on_output_baseline(baseline: LabelledConfiguration, others: Sequence[L
             yield f"{labelled.label}: its regret is to {ideal}, ideal fusion of its inputs (--baseline {ideal})"
 
 
-def note_on_measuring(baseline: LabelledConfiguration, others: Sequence[LabelledConfiguration]) -> Iterator[str]:
-    """A note on configurations that detect by truth id while others detect by match."""
-    by_id = [labelled for labelled in (baseline, *others) if labelled.facts.by_truth_id]
-    if by_id and len(by_id) <= len(others):
-        yield (
-            f"{', '.join(labelled.label for labelled in by_id)}: detected by truth id, the others by match within the "
-            "gate (`match: {always: true}` matches all alike)"
-        )
+def find_remembering(
+    known: Sequence[LabelledConfiguration], baseline: LabelledConfiguration, others: Sequence[LabelledConfiguration]
+) -> dict[LabelledConfiguration, LabelledConfiguration]:
+    """The ideal fusions with memory that accuracy is held against, of configurations that remember.
+
+    Those whose baseline is their own ideal.
+    """
+    named = {(labelled.results, labelled.configuration): labelled for labelled in known}
+    pairs = ((labelled, named.get((labelled.results, str(labelled.facts.remembering)))) for labelled in others)
+    own = ((labelled.results, labelled.facts.ideal) for labelled in others)
+    is_own = [one == (baseline.results, baseline.configuration) for one in own]
+    return {one: other for (one, other), mine in zip(pairs, is_own, strict=True) if mine and other is not None}
+
+
+def notes_on_remembering(pairs: Mapping[LabelledConfiguration, LabelledConfiguration]) -> Iterator[str]:
+    """A note on each ideal fusion with memory that accuracy is held against."""
+    for ideal in dict.fromkeys(pairs.values()):
+        names = ", ".join(labelled.label for labelled, other in pairs.items() if other == ideal)
+        yield f"{names}: accuracy held against {ideal.label}, ideal fusion of the same lists that remembers, too"
 
 
 # Labels, and the configurations that are meant.

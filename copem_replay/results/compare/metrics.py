@@ -425,6 +425,10 @@ def _distances(pair: _Pair) -> MedianStatistic:
     return MedianStatistic(parts=(pair.items(pair.cells[placed], first=first[placed], second=second[placed]),))
 
 
+HELD_METRICS = ("position_rmse_held_m", "gospa_held_m")
+"""The metrics of what both sides hold."""
+
+
 def _held_errors(pair: _Pair) -> SumStatistic | None:
     if (both := pair.held) is None:
         return None

@@ -189,15 +189,15 @@ def comparison_lines(comparison: Comparison) -> Iterator[str]:
 
 def _describe_better(comparison: Comparison) -> Iterator[str]:
     """Lines on the configurations that are better than the baseline; metrics with the same ones share a line."""
-    metrics: dict[str, list[str]] = {}
+    metrics: dict[tuple[str, str], list[str]] = {}
     for metric, row in COMPARED.items():
         of_metric = comparison.overall[comparison.overall["metric"] == metric]
         beyond = of_metric["low"] > NOTHING if row.better > 0 else of_metric["high"] < -NOTHING
-        if beyond.any():
-            names = ", ".join(map(_name_with_logs, of_metric[beyond].itertuples(index=False)))
-            metrics.setdefault(names, []).append(metric)
-    for names, of_names in metrics.items():
-        yield f"better than {comparison.baseline} in {', '.join(of_names)}, the interval excluding 0: {names}"
+        for baseline, rows in of_metric[beyond].groupby("baseline", sort=False):
+            names = ", ".join(map(_name_with_logs, rows.itertuples(index=False)))
+            metrics.setdefault((names, str(baseline)), []).append(metric)
+    for (names, baseline), of_names in metrics.items():
+        yield f"better than {baseline} in {', '.join(of_names)}, the interval excluding 0: {names}"
 
 
 def _describe_logs(limited: pd.DataFrame) -> Iterator[str]:

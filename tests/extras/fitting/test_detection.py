@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numba import njit
 from scipy.optimize import minimize
 from scipy.stats import beta, t
 
@@ -22,6 +23,8 @@ from copem_replay.perception.pem.condition import find_couples
 from copem_replay.perception.pem.model import Pem
 from tests.extras.fitting.detection_rows import held_uniforms, passes, rows_of, view_of
 from tools import check_fit
+
+monotone_tables = njit(monotone_tables)  # as kernels call it
 
 AXES = np.array([0.0, 20.0, 60.0]), np.array([0.0, 0.5, 1.0])
 

@@ -89,6 +89,7 @@ def test_rows_have_a_list_and_a_true_object_each(folder: Path) -> None:
     assert rows["range_m"].max() <= 70.0
 
 
+@pytest.mark.long
 def test_it_is_replaced_only_when_asked_and_by_the_same_bytes(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -165,6 +166,7 @@ def test_numbers_that_were_put_in_are_inside_their_intervals(tmp_path: Path) -> 
     assert all(name in one for one in found for name in names)
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not (SHARED / "msight_trial14.mcap").exists(), reason="no shared/data beside the project")
 def test_a_real_roadside_unit() -> None:
     """Its delay is told, its traffic is not taken for ghosts, and its misses come in runs: without memory it fails."""
@@ -181,6 +183,7 @@ def test_a_real_roadside_unit() -> None:
     assert all(one.inside < len(one.pit) for one in checks.memoryless)
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not (SHARED / "msight_trial14.mcap").exists(), reason="no shared/data beside the project")
 def test_few_passes_of_a_real_unit_are_no_thousand_rows() -> None:
     """Neighbours correlate by .84 to .99 in four drives: a mean is that of a handful of errors, which last."""
@@ -192,6 +195,7 @@ def test_few_passes_of_a_real_unit_are_no_thousand_rows() -> None:
         assert mean.high - mean.low > 0.2
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not (SHARED / "msight_trial14.mcap").exists(), reason="no shared/data beside the project")
 def test_a_delay_of_each_log(tmp_path: Path) -> None:
     """Three drives say .12 to .15 s, a fourth .47 s: said with their values, and by log each is read at its own."""
@@ -206,6 +210,7 @@ def test_a_delay_of_each_log(tmp_path: Path) -> None:
     assert delays == pytest.approx([0.147, 0.137, 0.119, 0.469], abs=1e-3)
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not (SHARED / "msight_trial14.mcap").exists(), reason="no shared/data beside the project")
 def test_a_delay_of_each_class(tmp_path: Path) -> None:
     """Three drives have a car, a fourth a pedestrian: each is read at the delay of its class, one is replayed."""

@@ -1,0 +1,95 @@
+"""Names of classes, as data sets, drivers and simulators write them: one table for all readers and converters.
+
+A name is cut into words, `vehicle.carlamotors.firetruck` and `MotorcycleRider` alike. Words of things that stand win
+over the road user they contain (`bicycle_rack`), persons over what they work on, and of the others the most special.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from itertools import pairwise
+from typing import Final
+
+from copem_replay.core.tracks import CLASSES
+
+_STATIC: Final = (
+    "rack", "sign", "stop", "crossing", "lane", "door", "cone", "trafficcone", "pylon", "pylons", "barrier", "bollard",
+    "signal", "marking", "parking", "shelter", "pole", "post", "hydrant", "fence", "wall",
+    "building", "guardrail", "debris", "wheel", "window", "plate", "stand", "path", "side", "roadside", "tree",
+    "bench", "bin", "board", "mirror", "bridge", "tunnel", "area", "zone", "rail", "track", "tracks",
+)  # fmt: skip
+"""Words that make of a road user a thing that stands beside the road, or a part of something."""
+_WORDS: Final = {
+    "pedestrian": (
+        "pedestrian", "ped", "person", "people", "human", "walker", "adult", "child", "children", "kid", "man", "woman",
+        "men", "women", "wheelchair", "stroller", "worker", "workers", "roadworker", "officer", "policeman", "signaler",
+        "jogger", "runner", "skater", "vru",
+    ),
+    "motorcycle": (
+        "motorcycle", "motorbike", "motorcyclist", "motor_cycle", "motorcyle", "motorscooter", "moped", "vespa",
+        "harley", "davidson", "kawasaki", "yamaha", "ducati", "powered_two_wheeler", "ptw",
+    ),
+    "bicycle": (
+        "bicycle", "bicyclist", "bike", "biker", "cyclist", "cycle", "scooter", "kickscooter", "escooter", "rider",
+        "tricycle", "unicycle", "pedicab", "rickshaw", "barrow", "barrowlist", "pedelec", "diamondback", "gazelle",
+        "crossbike", "segway", "kickboard",
+    ),
+    "animal": ("animal", "dog", "cat", "deer", "horse", "cow", "bird", "sheep", "boar"),
+    "trailer": ("trailer", "semitrailer", "caravan", "caravantransporter"),
+    "bus": ("bus", "coach", "minibus", "autobus", "trolleybus", "busses", "buses"),
+    "truck": (
+        "truck", "lorry", "lorries", "semi", "semitractor", "firetruck", "boxtruck", "truckcab", "hgv", "tractor",
+        "excavator", "bulldozer", "crane", "forklift", "tanker", "carlacola", "machine",
+    ),
+    "van": ("van", "minivan", "pickup", "delivery", "sprinter"),
+    "car": (
+        "car", "sedan", "taxi", "passenger", "hatchback", "suv", "coupe", "cabrio", "convertible", "wagon", "limousine",
+        "police", "passengercar", "audi", "bmw", "tesla", "toyota", "nissan", "jeep", "seat", "lincoln", "dodge",
+        "micro", "chevrolet", "citroen", "mini", "ambulance",
+    ),
+    "vehicle": ("vehicle", "vehicles", "veh", "ego", "emergency", "regular"),
+    "other": (
+        "other", "unknown", "misc", "object", "tram", "subway", "train", "streetcar", "movable", "static", "device",
+        "ship", "boat", "aircraft", "airplane",
+    ),
+}  # fmt: skip
+"""Words by class, the most special class first: `vehicle.bus` is a bus, `motorcycle rider` no bicycle."""
+assert set(_WORDS) == set(CLASSES)
+_JOINED: Final = {
+    "two_wheeler": "motorcycle", "other_vehicle": "vehicle", "pickup_truck": "truck", "train_car": "other",
+    "motor_cycle": "motorcycle", "police_officer": "pedestrian", "construction_worker": "pedestrian",
+    "tractor_trailer": "trailer", "trailer_truck": "truck", "truck_bus": "bus", "e_scooter": "bicycle",
+    "electric_scooter": "bicycle", "motorized_scooter": "motorcycle", "medium_car": "car", "wheeled_device": "other",
+    "traffic_light": "other", "emergency_vehicle": "vehicle", "mini_bus": "bus", "school_bus": "bus", "mini_van": "van",
+    "wheel_chair": "pedestrian", "wheeled_pedestrian": "pedestrian", "personal_mobility": "pedestrian",
+    "station_wagon": "car", "street_light": "other", "bus_station": "other",
+    **{f"{size}_vehicle": "truck" for size in ("long", "large", "heavy", "special", "utility", "construction")},
+    "delivery_truck": "truck", "cargo_bike": "bicycle", "low_rider": "motorcycle",
+}  # fmt: skip
+"""Words that mean something else together than each by itself."""
+
+
+@cache
+def class_from_name(text: str) -> str | None:
+    """The class that a name means, None where it says nothing: `Car`, `vehicle.bus.rigid`, `TYPE_PEDESTRIAN`."""
+    spaced = re.sub(r"([a-z])([A-Z])", r"\1 \2", text)
+    words = [word for word in re.split(r"[^a-z]+", spaced.lower()) if word not in ("", "type")]
+    pairs = ["_".join(pair).removesuffix("s") for pair in pairwise(words)]
+    if "with" in words:  # `Pedestrian with Object`, `person with bicycle`
+        words = words[: words.index("with")]
+    if "on" in words:  # `person on bicycle`
+        words = words[words.index("on") + 1 :]
+    for pair in pairs:
+        if pair in _JOINED:
+            return _JOINED[pair]
+    known = {*words, *(word.removesuffix("s") for word in words), "_".join(words), "".join(words)}
+    found = next((name for name, meant in _WORDS.items() if known & set(meant)), None)
+    if known & set(_STATIC) and not known & {"worker", "officer", "person"}:
+        return "other"
+    if found is None:  # `MyFiretruckModel`: words that are written together
+        found = next(
+            (name for name, meant in _WORDS.items() for one in meant if len(one) > 4 and any(one in w for w in words)),
+            None,
+        )
+    return found
