@@ -49,22 +49,22 @@ def av2_log(run: Runner, boxes: list[dict[str, Any]], poses: list[dict[str, Any]
 
 BOXES = [
     box(T0, "car-uuid", "REGULAR_VEHICLE", WEST_TO_NORTH, 10, 1, 0.5),
-    box(T0 + 10**8, "car-uuid", "REGULAR_VEHICLE", NO_TURN, 10, 1, 0.5),
-    box(T0 + 10**8, "cone-uuid", "CONSTRUCTION_CONE", NO_TURN, 5, -3, 0),
-    box(T0 + 10**8, "odd-uuid", "HOVERCRAFT", NO_TURN, 20, 0, 0),
-    box(T0 + 10**8, "ego-uuid", "EGO_VEHICLE", NO_TURN, 0, 0, 0),
-    box(T0 + 2 * 10**8, "car-uuid", "REGULAR_VEHICLE", NO_TURN, 10, 1, 0.5),
+    box(T0 + 10**9, "car-uuid", "REGULAR_VEHICLE", NO_TURN, 10, 1, 0.5),
+    box(T0 + 10**9, "cone-uuid", "CONSTRUCTION_CONE", NO_TURN, 5, -3, 0),
+    box(T0 + 10**9, "odd-uuid", "HOVERCRAFT", NO_TURN, 20, 0, 0),
+    box(T0 + 10**9, "ego-uuid", "EGO_VEHICLE", NO_TURN, 0, 0, 0),
+    box(T0 + 2 * 10**9, "car-uuid", "REGULAR_VEHICLE", NO_TURN, 10, 1, 0.5),
 ]
 POSES = [
     pose(T0, WEST_TO_NORTH, 100, 200, 20),
     pose(T0 + 50, WEST_TO_NORTH, 999, 999, 99),  # poses are at the rates of all sensors
-    pose(T0 + 10**8, NO_TURN, 100, 201, 20),
+    pose(T0 + 10**9, NO_TURN, 100, 201, 20),
 ]
 
 
 def test_argoverse2_from_the_rear_axle_to_the_city(run: Runner) -> None:
     found = run("argoverse2", av2_log(run, BOXES, POSES))
-    assert found.stamps_ns == [T0, T0 + 10**8]
+    assert found.stamps_ns == [T0, T0 + 10**9]
     assert found.names == {"1": "EGO_VEHICLE", "2": "car-uuid", "3": "cone-uuid", "4": "odd-uuid"}
     # The ego faces north: 10 m ahead and 1 m to the left is 10 m north and 1 m west; north + 90° is west.
     names = ("x_m", "y_m", "z_m", "yaw_rad", "length_m", "width_m", "height_m")
@@ -239,8 +239,8 @@ def kitti() -> dict[str, Any]:
 
 
 def test_openlabel_as_kitti_has_it(run: Runner) -> None:
-    found = run("openlabel", run.file("k.json", labels(**kitti())), "--rate-hz", "10")
-    assert found.stamps_ns == [0, 100_000_000]
+    found = run("openlabel", run.file("k.json", labels(**kitti())), "--rate-hz", "1")
+    assert found.stamps_ns == [0, 1_000_000_000]
     assert found.names == {"4": "7"}  # −1 is no OSI id: numbered as they come
     names = ("x_m", "y_m", "z_m", "yaw_rad", "length_m", "width_m", "height_m")
     first, second = found.values("4", *names)

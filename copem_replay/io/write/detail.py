@@ -54,24 +54,18 @@ if TYPE_CHECKING:
 
 STATUS_SCHEMA = "copem_replay.Status"
 STATUSES = NOT_LISTED, LISTED, KNOWN = "not listed", "listed, not known", "known"
-STATUS_JSON = {
-    "title": STATUS_SCHEMA,
-    "type": "object",
-    "properties": {
-        "available_ns": {"type": "integer"},
-        "objects": {
-            "type": "array",
-            "items": {
-                "type": "object",
-                "properties": {
-                    "id": {"type": "string"},
-                    "status": {"type": "string"},
-                    "age_s": {"type": ["number", "null"]},
-                },
-            },
-        },
-    },
-}
+
+
+def _describe_messages(title: str, **fields: dict[str, Any]) -> dict[str, Any]:
+    return {"title": title, "type": "object", "properties": {"available_ns": _INTEGER, **fields}}
+
+
+def _list_of(**fields: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "array", "items": {"type": "object", "properties": fields}}
+
+
+_INTEGER, _TEXT, _NUMBER = {"type": "integer"}, {"type": "string"}, {"type": ["number", "null"]}
+STATUS_JSON = _describe_messages(STATUS_SCHEMA, objects=_list_of(id=_TEXT, status=_TEXT, age_s=_NUMBER))
 
 
 class Statuses:
@@ -183,33 +177,22 @@ def faults_by_list(fused_tracks: FusedTracks) -> list[dict[str, Any]]:
 Event = Mapping[str, Any]
 """A detection: `object`, `first_unit`, `onset_s`, `captured_s`, `time_to_detection_s`, `distance_at_detection_m`."""
 
-_NUMBER = {"type": ["number", "null"]}
-DETAIL_JSON = {
-    "title": DETAIL_SCHEMA,
-    "type": "object",
-    "properties": {
-        "available_ns": {"type": "integer"},
-        "captured_ns": {"type": ["integer", "null"]},
-        "objects": {
-            "type": "array",
-            "items": {
-                "type": "object",
-                "properties": {
-                    "id": {"type": "string"},
-                    "existence": {"type": "number"},
-                    **dict.fromkeys(UNCERTAINTIES, _NUMBER),
-                    "newest_captured_ns": {"type": ["integer", "null"]},
-                    "stated_captured_ns": {"type": "integer"},
-                    "units": {"type": "array", "items": {"type": "string"}},
-                    "captured_ns": {"type": "array", "items": {"type": "integer"}},
-                    "range_m": {"type": "array", "items": _NUMBER},
-                    "visible_share": {"type": "array", "items": _NUMBER},
-                },
-            },
-        },
-        "events": {"type": "array", "items": {"type": "object"}},
-    },
-}
+DETAIL_JSON = _describe_messages(
+    DETAIL_SCHEMA,
+    captured_ns={"type": ["integer", "null"]},
+    objects=_list_of(
+        id=_TEXT,
+        existence={"type": "number"},
+        **dict.fromkeys(UNCERTAINTIES, _NUMBER),
+        newest_captured_ns={"type": ["integer", "null"]},
+        stated_captured_ns=_INTEGER,
+        units={"type": "array", "items": _TEXT},
+        captured_ns={"type": "array", "items": _INTEGER},
+        range_m={"type": "array", "items": _NUMBER},
+        visible_share={"type": "array", "items": _NUMBER},
+    ),
+    events={"type": "array", "items": {"type": "object"}},
+)
 
 
 def _encode_captures(captured_ns: Int) -> list[RecordPart]:
