@@ -102,6 +102,7 @@ def test_the_lists_an_entry_goes_back_to(
         origins = origins_of(
             lists, issue_s, heard, max_age_s=max_age_s, partial=partial, to=to, own_ix=own_ix, own_body_ix=3
         )
+        origins = origins._replace(entries=lists.entries.view(np.recarray))  # Python names fields of no other records
         for s, k, j in np.ndindex(2, 7, len(captures)):
             back = going_back(heard, captures[j][0], issue_s[k], max_age_s=max_age_s, partial=partial, to=to, own=own)
             since = [[a for a in of_unit if heard[a].captured_s >= since_s] for of_unit in back]
