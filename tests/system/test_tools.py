@@ -25,10 +25,18 @@ sys.path.insert(0, str(ROOT / "tools"))
 
 import bench  # noqa: E402
 import calibrate_tc016d  # noqa: E402
+import knows_first  # noqa: E402
 import lidar_visibility  # noqa: E402
 import make_logs  # noqa: E402
 import paper  # noqa: E402
 from benches import common, fit, fusion, long, memory, peers, reading, scaling  # noqa: E402
+
+
+def test_no_fusion_of_a_sample_knows_first() -> None:
+    rows, sooner, unknown_s = knows_first.count_sooner(knows_first.fused_by_each(ROOT / "logs/crossing.mcap", 1))
+    assert rows > 0
+    assert sooner == dict.fromkeys(("gnn", "nms", "union", "tracker", "echo"), 0)
+    assert unknown_s["echo"] == unknown_s["union"]
 
 
 def test_rank_correlation_and_area_under_the_curve_by_hand() -> None:
