@@ -212,3 +212,39 @@ def test_ideal_fusion_lists_what_the_lists_hold_that_arrive(
         if np.isfinite(arrives_s) and object_ix != log.scene.ego_ix:
             k = int(np.searchsorted(fused.common_arrives_s + 1e-6, arrives_s))
             assert (object_ix, k) in held
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_who_is_always_listed_is_confirmed_at_the_list_at_which_the_ideal_confirms(
+    tmp_path_factory: pytest.TempPathFactory, seed: int
+) -> None:
+    """People who stand far apart, detection that is certain: nothing but turns can make a difference."""
+    rng = np.random.default_rng(seed)
+    on_s = rng.uniform(-1, 2, 5).clip(0)
+    frames = [
+        (k / 10, [Obj(id=1, x=-30.0)] + [pedestrian(o + 2, 10.0 * o, 5.0) for o in range(5) if on_s[o] <= k / 10])
+        for k in range(41)
+    ]
+    path = write_recording(tmp_path_factory.mktemp("drawn") / "scene.mcap", frames, host=1)
+    plan = draw_experiment(path, rng, recorded=False).model_dump(mode="json", exclude_unset=True)
+    hits, of = [(2, 2), (2, 3), (3, 5)][rng.integers(3)]
+    couple = {
+        "detection": {"kind": "constant", "probability": 1.0},
+        "error": {"kind": "gaussian", "covariance_m2": [[0.01, 0], [0, 0.01]]},
+    }
+    plan["pems"] = {name: {"couples": [couple]} for name in plan["pems"]}
+    for unit in plan["units"].values():
+        for key in ("sends", "outages", "placed", "clock"):  # a clock that is off moves what an entry states
+            unit.pop(key, None)
+        if "rate_hz" in unit:
+            unit["phase_s"] = float(rng.choice([0, 0.03, 0.07]))
+    plan["configurations"] = {name: plan["configurations"][name] for name in ("ideal", "gnn", "nms", "union")}
+    plan["measure"] |= {"confirm": {"hits": hits, "of": of}}
+    experiment = Experiment.model_validate(plan)
+    recordings, refused = read_logs(experiment, [path], None)
+    assert not refused, refused
+    known = run_experiment(experiment, recordings).table.set_index(["object_id", "episode", "run", "configuration"])
+    detection_s = known["detection_s"].unstack()
+    for name in ("gnn", "nms", "union"):
+        np.testing.assert_allclose(detection_s[name], detection_s["ideal"], rtol=0, atol=1e-9, err_msg=name)
