@@ -94,6 +94,7 @@ RULES: Final = {
         "with a class name that says nothing ({which}): read as other; "
         "`read: {{classes: {{NAME: car}}}}` says what it is",
     ),
+    "class other": Rule("object state", "of a class that is no road user's ({which}): read as other", changes=False),
     "no id": Rule(_STATE, "without an id: skipped"),
     "stands": Rule(_STATE, "of what stands, not sent again: where it was"),
     "jump": Rule(

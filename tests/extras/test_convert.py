@@ -191,11 +191,9 @@ def test_csv_degrees_wrap_and_what_is_not_given_is_said(run: Runner) -> None:
         (f"{HEADER},vx_mps,vy_mps\n{CAR},1,", "t.csv:2: vy_mps: expected a number beside the other, found nothing"),
         (f"{HEADER}\n{CAR},9", "t.csv:2: expected 8 cells, as in the header, found 9"),
         (f"{HEADER}\n{CAR}\n0.1,1,car,a,0,0,4,2", "t.csv:3: x_m: expected a number, found 'a'"),
-        (f"{HEADER}\n0,1,car,0,nan,0,4,2", "t.csv:2: y_m: expected a number, found 'nan'"),
-        (f"{HEADER}\n0,1,car,0,0,0,-4,2", "t.csv:2: length_m: expected a number above 0, found '-4'"),
         (f"{HEADER}\n-1,1,car,0,0,0,4,2", "t.csv:2: time_s: expected a time of 0 to 4000000000 s, found '-1'"),
         (f"{HEADER}\n1e99999,1,car,0,0,0,4,2", "t.csv:2: time_s: expected a time"),
-        (f"{HEADER}\n0,1,lorry,0,0,0,4,2", "t.csv:2: class: expected one of car, van, truck"),
+        (f"{HEADER}\n0,1,,0,0,0,4,2", "t.csv:2: class: expected one of car, van, truck"),
         (f"{HEADER}\n0,,car,0,0,0,4,2", "t.csv:2: id: expected a name or number, found nothing"),
         (f"{HEADER}\n{CAR}\n{CAR}", "t.csv:3: id: expected each object once at a time, found 1 in line 2"),
         (f"{HEADER},host\n{CAR},1\n0,2,car,9,0,0,4,2,1", "t.csv:3: host: expected one object, found '2' besides '1'"),
@@ -447,7 +445,8 @@ def test_commonroad_what_is_skipped_is_said(run: Runner) -> None:
         "1 obstacle with a polygon as shape: the box around it taken",
         "1 state with a region as position: its centre taken",
         "1 state without orientation: 0 taken",
-        "1 obstacle of the unknown type 'dragon': taken as other",
+        "1 obstacle of the class name 'dragon', which says nothing: taken as other; --class 'dragon=car' says what it "
+        "is",
         "1 state without a point as position: skipped",
         "1 obstacle with another shape than one rectangle, circle or polygon (rectangle, rectangle): skipped",
         "1 obstacle with an occupancySet: only its initial state taken",
@@ -551,6 +550,43 @@ def test_commonroad_lanelets_are_lanes_and_crosswalks_are_areas(run: Runner) -> 
 )
 def test_commonroad_refuses(run: Runner, text: str, line: str) -> None:
     assert line in run.refused("commonroad", run.file("s.xml", text))
+
+
+SKIPPED = "1 object state with a number that is none: skipped"
+NO_SIZE = "1 object state without a size, or with one that is none: that of its class taken"
+
+
+@pytest.mark.parametrize("none", ["nan", "inf", "-inf", "1e308"])
+@pytest.mark.parametrize(
+    ("column", "note"), [("x_m", SKIPPED), ("y_m", SKIPPED), ("yaw_deg", SKIPPED), ("length_m", NO_SIZE)]
+)
+def test_csv_a_number_that_is_none_is_left_out_or_completed(run: Runner, none: str, column: str, note: str) -> None:
+    cells = dict(zip(HEADER.split(","), ["0.2", "2", "car", "5", "0", "0", "4", "2"], strict=True)) | {column: none}
+    found = run("csv", run.file("t.csv", f"{HEADER}\n{CAR}\n{','.join(cells.values())}\n"))
+    assert f"note: {note}\n" in found.printed
+    if note == NO_SIZE:
+        assert found.values("2", "length_m", "width_m") == [[4.5, 2.0]]
+    else:
+        assert set(found.recording.scene.object_ids) == {"1"}
+
+
+def test_csv_sizes_and_names_by_the_rules_of_all_that_is_read(run: Runner) -> None:
+    table = f"{HEADER}\n0,1,Zorb,0,0,0,-4,2\n0,2,fire_truck,9,0,0,0,2\n0,3,bicycle_rack,9,9,0,4,2\n"
+    found = run("csv", run.file("t.csv", table), "--class", "Zorb=van")
+    assert [found.class_of(ident) for ident in "123"] == ["van", "truck", "other"]
+    assert found.values("1", "length_m") == [[4.0]]
+    assert found.values("2", "length_m") == [[8.0]]  # typical of a truck
+    assert not found.moves("3")
+    assert "note: 1 object state with a negative size: its amount taken\n" in found.printed
+    assert "note: 1 object state without a size, or with one that is none: that of its class taken\n" in found.printed
+    assert "Zorb" not in found.printed
+
+
+@pytest.mark.parametrize("word", ["Zorb", "=car", "Zorb=zorb"])
+def test_a_class_that_cannot_be_given(run: Runner, word: str) -> None:
+    line = run.refused("csv", run.file("t.csv", f"{HEADER}\n{CAR}\n"), "--class", word)
+    assert "--class: expected NAME=CLASS with a class of car, van, " in line
+    assert line.endswith(f"found {word!r}")
 
 
 # What all share ---------------------------------------------------------------------------------------------

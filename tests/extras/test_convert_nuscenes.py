@@ -98,7 +98,7 @@ def test_key_frames_in_the_frame_of_the_map(run: Runner) -> None:
     (cone,) = found.messages[1].stationary_object
     assert cone.classification.type == StationaryObject.Classification.TYPE_CONSTRUCTION_SITE_ELEMENT
     assert not any(moving.base.HasField("velocity") for message in found.messages for moving in message.moving_object)
-    assert "note: 1 object state of the unknown category 'hovercraft': taken as other" in found.printed
+    assert "note: 1 object state of the class name 'hovercraft', which says nothing: taken as other; " in found.printed
     assert "interpolated" not in found.printed
 
 

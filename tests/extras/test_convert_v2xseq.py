@@ -74,13 +74,13 @@ def test_rotations_of_labels_and_of_the_vehicle_add_up(run: Runner) -> None:
     folder = write(run.folder / "set")
     put(
         folder / "cooperative/label/000020.json",
-        [label(7, 0, 0, rotation=-1.0), label(7, 1, 0), label(8, 5, 5, type="Cow")],
+        [label(7, 0, 0, rotation=-1.0), label(7, 1, 0), label(8, 5, 5, type="Zorb")],
     )
     found = run("v2xseq", folder, "--only", "0001", "--ego-size-m", "5", "2", "1.4")
     assert found.values(found.id_of("7"), "yaw_rad")[0][0] == pytest.approx(math.pi / 2 - 1)
     assert found.values("1", "z_m", "length_m")[0] == pytest.approx([40.5, 5])
     assert "1 label of an object that the frame has already: skipped" in found.printed
-    assert "1 object state of the unknown type 'Cow': taken as other" in found.printed
+    assert "1 object state of the class name 'Zorb', which says nothing: taken as other; " in found.printed
 
 
 def test_each_sequence_is_a_recording(run: Runner) -> None:

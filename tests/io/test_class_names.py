@@ -17,16 +17,18 @@ MEANT = {
     "vehicle.gazelle.omafiets",
     "motorcycle": "MotorcyleRider motor_cycle moped powered_two_wheeler vehicle.vespa.zx125 "
     "vehicle.harley-davidson.low_rider motorcycle",
-    "car": "SUV Hatchback passengerCar police_car TYPE_MEDIUM_CAR vehicle.tesla.model3 taxi station_wagon",
+    "car": "SUV Hatchback passengerCar police_car TYPE_MEDIUM_CAR vehicle.tesla.model3 taxi station_wagon "
+    "REGULAR_VEHICLE",
     "van": "Van TYPE_DELIVERY_VAN minivan",
     "truck": "BoxTruck BOX_TRUCK fire_truck FireTruck lorries Semi-truck TRUCK_CAB TYPE_SEMITRACTOR ConcreteTruck "
     "heavyTruck vehicle.carlamotors.firetruck construction_vehicle",
     "bus": "ARTICULATED_BUS SCHOOL_BUS truck_bus vehicle.bus.rigid",
-    "trailer": "vehicle.trailer semitrailer",
+    "trailer": "vehicle.trailer semitrailer MESSAGE_BOARD_TRAILER TRAFFIC_LIGHT_TRAILER",
     "animal": "DOG deer large_animal",
     "other": "bicycle_rack STOP_SIGN MOBILE_PEDESTRIAN_CROSSING_SIGN bus_stop car_door Pylons Trafficcone TYPE_SIGN "
-    "train_car UNKNOWN_MOVABLE static_object.bicycle_rack roadSideUnit construction_cone TrafficLight",
-    "vehicle": "REGULAR_VEHICLE other_vehicle light_vehicle",
+    "train_car UNKNOWN_MOVABLE static_object.bicycle_rack roadSideUnit construction_cone TrafficLight "
+    "RAILED_VEHICLE roadBoundary pillar CONSTRUCTION_BARREL",
+    "vehicle": "priorityVehicle other_vehicle light_vehicle",
 }
 
 
@@ -51,11 +53,13 @@ def test_every_class_has_its_own_name() -> None:
 def test_names_that_say_nothing_are_told_of_and_can_be_given_a_class(tmp_path: Path) -> None:
     def lists(t: float) -> dict:
         box = {"track": {"id": 1}, "pos": [t, 0, 0.5], "dims": [1, 1, 1], "rot": 0, "label": "Zorb"}
-        return {"header": {"t": {"sec": 0, "nanosec": round(t * 1e9)}, "frame": "map"}, "boxes": [box]}
+        rack = {**box, "track": {"id": 2}, "pos": [9, 9, 0.5], "label": "bicycle_rack"}
+        return {"header": {"t": {"sec": 0, "nanosec": round(t * 1e9)}, "frame": "map"}, "boxes": [box, rack]}
 
     path = write_mcap(tmp_path / "a.mcap", [json_topic("/boxes", [(t, lists(t)) for t in TIMES])])
     plain = read_log(path, name="log", topic="/boxes", fields=fields())
     line = "11 object states with a class name that says nothing (Zorb 11): read as other; "
     assert f"{line}`read: {{classes: {{NAME: car}}}}` says what it is" in plain.notes
+    assert "11 object states of a class that is no road user's (bicycle_rack 11): read as other" in plain.notes
     said = read_log(path, name="log", topic="/boxes", fields=fields(), classes={"Zorb": "bicycle"})
     assert CLASSES[said.scene.object_class[0]] == "bicycle"

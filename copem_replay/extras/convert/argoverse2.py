@@ -39,38 +39,6 @@ _CITY: Final = re.compile(r"____([A-Z]{3})_city_")
 _EGO: Final = "EGO_VEHICLE"
 _POSE: Final = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 _SIZE: Final = ("length_m", "width_m", "height_m")
-_KIND: Final = {
-    "ANIMAL": "animal",
-    "ARTICULATED_BUS": "bus",
-    "BICYCLE": "bicycle",
-    "BICYCLIST": "bicycle",
-    "BOLLARD": "pole",
-    "BOX_TRUCK": "truck",
-    "BUS": "bus",
-    "CONSTRUCTION_BARREL": "cone",
-    "CONSTRUCTION_CONE": "cone",
-    "DOG": "animal",
-    "LARGE_VEHICLE": "truck",
-    "MESSAGE_BOARD_TRAILER": "trailer",
-    "MOBILE_PEDESTRIAN_CROSSING_SIGN": "static",
-    "MOTORCYCLE": "motorcycle",
-    "MOTORCYCLIST": "motorcycle",
-    "OFFICIAL_SIGNALER": "pedestrian",
-    "PEDESTRIAN": "pedestrian",
-    "RAILED_VEHICLE": "tram",
-    "REGULAR_VEHICLE": "car",
-    "SCHOOL_BUS": "bus",
-    "SIGN": "static",
-    "STOP_SIGN": "static",
-    "STROLLER": "other",
-    "TRAFFIC_LIGHT_TRAILER": "trailer",
-    "TRUCK": "truck",
-    "TRUCK_CAB": "tractor",
-    "VEHICULAR_TRAILER": "trailer",
-    "WHEELCHAIR": "wheelchair",
-    "WHEELED_DEVICE": "scooter",
-    "WHEELED_RIDER": "pedestrian",
-}
 
 
 def frames(
@@ -108,14 +76,11 @@ def frames(
             if boxes["category"][k] == _EGO:
                 report.count("row", f"of category {_EGO}: replaced by the ego pose")
                 continue
-            category = str(boxes["category"][k])
-            if category not in _KIND:
-                report.count("object state", f"of the unknown category {category}: taken as other")
             length, width, height = (float(boxes[name][k]) for name in _SIZE)
             frame_boxes.append(
                 Box(
                     id=ids[boxes["track_uuid"][k]],
-                    kind=KINDS[_KIND.get(category, "other")],
+                    kind=report.find_kind(str(boxes["category"][k])),
                     at_m=_move(R, ego_t_object[k], t),
                     yaw_rad=_yaw_of_matrix(R @ ego_R_object[k]),
                     size_m=(length, width, height),

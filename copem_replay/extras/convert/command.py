@@ -22,6 +22,10 @@ OutFolder = Annotated[
     Path, typer.Option(metavar="DIR", help="Folder of the recordings; for a single one its file (.mcap).")
 ]
 Only = Annotated[str | None, typer.Option(metavar="NAME", help="Only the recording of this name [all].")]
+Classes = Annotated[
+    list[str] | None,
+    typer.Option("--class", metavar="NAME=CLASS", help="Class of a name; may be given several times."),
+]
 Metres = tuple[float, float, float]
 _MOST_HZ = 1000.0
 
@@ -39,6 +43,7 @@ def argoverse2(
     source: Source,
     out: Out,
     overwrite: Overwrite = False,
+    classes: Classes = None,
     ego_size_m: Annotated[
         Metres | None, typer.Option(metavar="LENGTH WIDTH HEIGHT", help="Size of the ego vehicle [4.877 2 1.473].")
     ] = None,
@@ -54,7 +59,7 @@ def argoverse2(
     if centre_from_rear_axle_m is not None:
         name = "--centre-from-rear-axle-m"
         options["centre_from_rear_axle_m"] = tuple(_check_finite(value, name) for value in centre_from_rear_axle_m)
-    return _convert_sources("argoverse2", source, out, overwrite, **options)
+    return _convert_sources("argoverse2", source, out, overwrite, classes=classes, **options)
 
 
 @app.command()
@@ -63,6 +68,7 @@ def nuscenes(
     out: OutFolder,
     overwrite: Overwrite = False,
     only: Only = None,
+    classes: Classes = None,
     rate_hz: Annotated[
         float | None, typer.Option(metavar="HZ", help="Rate of the frames between key frames, interpolated [10].")
     ] = None,
@@ -84,7 +90,7 @@ def nuscenes(
         options["ego_size_m"] = tuple(_check_positive(value, "--ego-size-m") for value in ego_size_m)
     if ego_centre_m is not None:
         options["ego_centre_m"] = _check_finite(ego_centre_m, "--ego-centre-m")
-    return _convert_sources("nuscenes", source, out, overwrite, only, **options)
+    return _convert_sources("nuscenes", source, out, overwrite, only, classes=classes, **options)
 
 
 @app.command()
@@ -93,6 +99,7 @@ def opv2v(
     out: OutFolder,
     overwrite: Overwrite = False,
     only: Only = None,
+    classes: Classes = None,
     host: Annotated[
         str | None, typer.Option(metavar="AGENT", help="Agent that is the host [the first vehicle].")
     ] = None,
@@ -110,7 +117,7 @@ def opv2v(
         raise InputError(f"--axes: expected left or right, found {axes!r}")
     rate_hz = None if rate_hz is None else _check_rate(rate_hz)
     options = {"host": host, "infrastructure": infrastructure or (), "rate_hz": rate_hz, "axes": axes}
-    return _convert_sources("opv2v", source, out, overwrite, only, **options)
+    return _convert_sources("opv2v", source, out, overwrite, only, classes=classes, **options)
 
 
 @app.command()
@@ -119,6 +126,7 @@ def v2xseq(
     out: OutFolder,
     overwrite: Overwrite = False,
     only: Only = None,
+    classes: Classes = None,
     ego_size_m: Annotated[
         Metres | None, typer.Option(metavar="LENGTH WIDTH HEIGHT", help="Size of the vehicle [4.9 1.9 1.5].")
     ] = None,
@@ -127,7 +135,7 @@ def v2xseq(
     options: dict[str, Any] = {}
     if ego_size_m is not None:
         options["ego_size_m"] = tuple(_check_positive(value, "--ego-size-m") for value in ego_size_m)
-    return _convert_sources("v2xseq", source, out, overwrite, only, **options)
+    return _convert_sources("v2xseq", source, out, overwrite, only, classes=classes, **options)
 
 
 @app.command()
@@ -135,6 +143,7 @@ def openlabel(
     source: Source,
     out: Out,
     overwrite: Overwrite = False,
+    classes: Classes = None,
     rate_hz: Annotated[float | None, typer.Option(metavar="HZ", help="Rate of frames without time stamps.")] = None,
     from_system: Annotated[
         str | None, typer.Option("--from", metavar="SYSTEM", help="Coordinate system of cuboids that name none.")
@@ -145,13 +154,14 @@ def openlabel(
 ) -> int:
     """OpenLABEL (KITTI, TUMTraf, …): a JSON file, or a folder."""
     rate_hz = None if rate_hz is None else _check_positive(rate_hz, "--rate-hz")
-    return _convert_sources("openlabel", source, out, overwrite, rate_hz=rate_hz, source=from_system, target=to_system)
+    options = {"rate_hz": rate_hz, "source": from_system, "target": to_system}
+    return _convert_sources("openlabel", source, out, overwrite, classes=classes, **options)
 
 
 @app.command()
-def commonroad(source: Source, out: Out, overwrite: Overwrite = False) -> int:
+def commonroad(source: Source, out: Out, overwrite: Overwrite = False, classes: Classes = None) -> int:
     """CommonRoad 2018b or 2020a: an XML file."""
-    return _convert_sources("commonroad", source, out, overwrite)
+    return _convert_sources("commonroad", source, out, overwrite, classes=classes)
 
 
 @app.command()
@@ -169,9 +179,9 @@ def sumo(
 
 
 @app.command()
-def csv(source: Source, out: Out, overwrite: Overwrite = False) -> int:
+def csv(source: Source, out: Out, overwrite: Overwrite = False, classes: Classes = None) -> int:
     """CSV: a table with units in the names of its columns."""
-    return _convert_sources("csv", source, out, overwrite)
+    return _convert_sources("csv", source, out, overwrite, classes=classes)
 
 
 def _check_positive(value: float, option: str) -> float:
@@ -192,16 +202,35 @@ def _check_rate(rate_hz: float) -> float:
     return rate_hz
 
 
+def _read_classes(words: list[str]) -> dict[str, str]:
+    """Kinds by name, of `NAME=CLASS`. Raises InputError."""
+    from copem_replay.extras.convert.conversion import KINDS
+
+    pairs = [(name, kind, word) for word in words for name, _, kind in [word.rpartition("=")]]
+    for name, kind, word in pairs:
+        if not name or kind not in KINDS:
+            raise InputError(f"--class: expected NAME=CLASS with a class of {', '.join(KINDS)}, found {word!r}")
+    return {name: kind for name, kind, _ in pairs}
+
+
 def _convert_sources(
-    format: str, source: Path, out: Path, overwrite: bool, only: str | None = None, /, **options: Any
+    format: str,
+    source: Path,
+    out: Path,
+    overwrite: bool,
+    only: str | None = None,
+    /,
+    *,
+    classes: list[str] | None = None,
+    **options: Any,
 ) -> int:
     """Convert, then print a line per recording and the notes. Raises InputError with all problems at once."""
     from copem_replay.extras.convert.conversion import Conversion, convert_all, plan_outputs
 
-    conversion = Conversion()
+    conversion, meant = Conversion(), _read_classes(classes or [])
     outputs = plan_outputs(source, out, format=format, overwrite=overwrite, only=only)
     tidy_outputs(outputs)
-    for line in convert_all(outputs, conversion, format=format, options=options):
+    for line in convert_all(outputs, conversion, format=format, options=options, classes=meant):
         print(escape_unprintable(line))
     for note in conversion.note_lines():
         print(escape_unprintable(f"note: {note}"))

@@ -137,25 +137,6 @@ class _ParserHandlers:
         raise InputError(f"{self.path}:{line}: expected no DOCTYPE, found one: refused, it could expand without end")
 
 
-_KIND: Final = {
-    "bicycle": "bicycle",
-    "building": "building",
-    "bus": "bus",
-    "car": "car",
-    "constructionZone": "static",
-    "medianStrip": "static",
-    "median_strip": "static",
-    "motorcycle": "motorcycle",
-    "parkedVehicle": "car",
-    "pedestrian": "pedestrian",
-    "pillar": "pole",
-    "priorityVehicle": "car",
-    "roadBoundary": "barrier",
-    "taxi": "car",
-    "train": "train",
-    "truck": "truck",
-    "unknown": "other",
-}
 _LANE_KIND: Final[dict[str, LaneKind]] = {  # of `laneletType`; others, and lanelets without a type, are driven
     "bicycleLane": "bicycle",
     "border": "other",
@@ -280,9 +261,7 @@ def _read_id(node: XmlNode, path: Path) -> int:
 def _map_kind(node: XmlNode, path: Path, report: ConversionReport, *, moving: bool) -> OsiKind:
     type_node = node.find("type")
     name = type_node.text.strip() if type_node is not None else ""
-    if name not in _KIND:
-        report.count("obstacle", f"of the unknown type {quote_value(name)}: taken as other")
-    kind = KINDS[_KIND.get(name, "other")]
+    kind = report.find_kind(name, "obstacle")
     if moving == kind.moving:
         return kind
     if moving:

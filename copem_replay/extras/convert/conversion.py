@@ -23,11 +23,13 @@ from osi3.osi_object_pb2 import MovingObject, StationaryObject
 from copem_replay.core.errors import InputError, OutputError, count_noun, quote_value, unknown_name_message
 from copem_replay.core.frame import SaidPlace
 from copem_replay.core.site_map import SiteMap
-from copem_replay.core.tracks import Float
-from copem_replay.io.findings import HEIGHTS_M
+from copem_replay.core.tracks import CLASSES, Float
+from copem_replay.io.class_names import class_from_name, stands
+from copem_replay.io.findings import FARTHEST_M, HEIGHTS_M, LENGTH, LONGEST_M, RULES, as_finding, complete_sizes
+from copem_replay.io.schemas.osi_ground_truth import osi_class_index
 from copem_replay.io.write.osi import NANOS_PER_SECOND, OsiTrace, add_road, empty_ground_truth, write_osi_trace
 
-# Kinds of objects in OSI. Each format maps its own names onto these.
+# Kinds of objects in OSI. The names of formats are mapped onto these by the one table of class names.
 
 Vehicle = MovingObject.VehicleClassification
 Static = StationaryObject.Classification
@@ -42,6 +44,11 @@ class OsiKind:
     type: int  # MovingObject.Type, or StationaryObject.Classification.Type
     vehicle: int | None = None
     like: str = "vehicle"  # the class whose typical height it has
+
+    @property
+    def class_name(self) -> str:
+        """The class as which it is read."""
+        return CLASSES[osi_class_index(self.type, self.vehicle)]
 
     @property
     def height_m(self) -> float:
@@ -80,6 +87,21 @@ KINDS: Final[dict[str, OsiKind]] = {
     **{name: OsiKind(name, False, number, like="other") for name, number in _STATIC.items()},
 }
 """By name; the last five never move."""
+
+
+def kind_from_name(name: str) -> OsiKind | None:
+    """The kind that a name of a source means, by the table of class names; None: it says nothing.
+
+    Of the kinds of a class that whose own name is in it: a `SEMITRACTOR` is a tractor, a `traffic_cone` a cone.
+    """
+    if name in KINDS:
+        return KINDS[name]
+    if (meant := class_from_name(name)) is None:
+        return None
+    within, moves = name.lower().replace("_", " "), not stands(name)
+    alike = [kind for kind in KINDS.values() if kind.moving == moves and kind.name in within]
+    default = KINDS[meant if moves else "static"]
+    return next((kind for kind in alike if not moves or kind.class_name == meant), default)
 
 
 # Rotations as matrices, (…, 3, 3), and the yaw of one.
@@ -123,13 +145,19 @@ _LARGEST_ID: Final = 2**63 - 1  # OSI ids have 64 bits, which many readers keep 
 
 def parse_number(text: object, where: str) -> float:
     """Return a finite number. Raises InputError, `where: expected a number, found …`."""
-    try:
-        value = float(text) if isinstance(text, str | int | float) and not isinstance(text, bool) else math.nan
-    except (ValueError, OverflowError):
-        value = math.nan
-    if not math.isfinite(value):
+    if not math.isfinite(value := parse_number_or_none(text, where)):
         raise InputError(f"{where}: expected a number, found {quote_value(text)}")
     return value
+
+
+def parse_number_or_none(text: object, where: str) -> float:
+    """Return a number; NaN or infinite where that is said. Raises InputError: a text that is none."""
+    try:
+        if isinstance(text, str | int | float) and not isinstance(text, bool):
+            return float(text)
+    except (ValueError, OverflowError):
+        pass
+    raise InputError(f"{where}: expected a number, found {quote_value(text)}")
 
 
 def parse_positive(text: object, where: str) -> float:
@@ -214,8 +242,12 @@ class ConvertedFrame:
 
 @dataclass
 class ConversionReport:
-    """What was skipped, assumed or corrected in a conversion, and the names of the objects in the source."""
+    """What was skipped, assumed or corrected in a conversion, and the names of the objects in the source.
 
+    `classes`: kinds by names of the source, beside those that are known.
+    """
+
+    classes: Mapping[str, str] = field(default_factory=dict)
     counts: Counter[tuple[str, str]] = field(default_factory=Counter)
     assumed: dict[str, None] = field(default_factory=dict)  # a line each, in order
     names: dict[int, str] = field(default_factory=dict)  # by OSI id
@@ -227,6 +259,14 @@ class ConversionReport:
         """Count states to be noted as `number noun what`."""
         if number:
             self.counts[noun, what] += number
+
+    def find_kind(self, name: str, noun: str = "object state", otherwise: str = "other") -> OsiKind:
+        """The kind that a name of the source means; one that says nothing is counted, and `otherwise`."""
+        kind = KINDS[self.classes[name]] if name in self.classes else kind_from_name(name)
+        if kind is None:
+            said = f"taken as {otherwise}; --class '{name}=car' says what it is" if name else f"taken as {otherwise}"
+            self.count(noun, f"of the class name {quote_value(name)}, which says nothing: {said}")
+        return kind or KINDS[otherwise]
 
     def assume(self, line: str) -> None:
         """Add a note on an assumption, once."""
@@ -283,24 +323,34 @@ def _encode_message(frame: ConvertedFrame, report: ConversionReport) -> GroundTr
         offset.yaw = frame.place.yaw_rad
     add_road(osi, frame.lines, frame.site or SiteMap())
     for box in frame.boxes:
-        if not all(map(math.isfinite, (*box.at_m, box.yaw_rad, *box.size_m))):
+        if not all(abs(value) <= FARTHEST_M for value in (*box.at_m, box.yaw_rad)):
             report.count("object state", "with a number that is none: skipped")
-            continue
-        if min(box.size_m) <= 0.0:
-            report.count("object state", "without a size above 0: skipped")
             continue
         if (key := (box.kind.moving, box.id)) not in report.seen:
             report.seen.add(key)
             report.objects[box.kind.name] += 1
-        _add_box(osi, box)
+        _add_box(osi, box, _complete_size(box, report))
     return osi
 
 
-def _add_box(osi: Any, box: Box) -> None:
+def _complete_size(box: Box, report: ConversionReport) -> tuple[float, float, float]:
+    """Length, width, height, by the rules of all that is read: typical of the class where none is said."""
+    if all(0.0 < size <= LONGEST_M for size in box.size_m):
+        return box.size_m
+    findings = list[str]()
+    values = np.array([[0.0] * LENGTH + [*box.size_m]])
+    values = complete_sizes(values, np.array([CLASSES.index(box.kind.like)]), None, findings)
+    for finding in map(as_finding, findings):
+        report.count("object state", RULES[finding.rule].words)
+    length, width, height = values[0, LENGTH:].tolist()
+    return length, width, height
+
+
+def _add_box(osi: Any, box: Box, size_m: tuple[float, float, float]) -> None:
     new = (osi.moving_object if box.kind.moving else osi.stationary_object).add()
     new.id.value = box.id
     base = new.base
-    base.dimension.length, base.dimension.width, base.dimension.height = box.size_m
+    base.dimension.length, base.dimension.width, base.dimension.height = size_m
     base.position.x, base.position.y, base.position.z = box.at_m
     base.orientation.roll, base.orientation.pitch, base.orientation.yaw = 0.0, 0.0, box.yaw_rad
     if not box.kind.moving:
@@ -342,15 +392,20 @@ class PlannedRecording:
 
 
 def convert_source(
-    source: Path, out: Path, *, format: str, options: Mapping[str, Any] | None = None
+    source: Path,
+    out: Path,
+    *,
+    format: str,
+    options: Mapping[str, Any] | None = None,
+    classes: Mapping[str, str] | None = None,
 ) -> ConversionReport:
     """Convert one recording to the file `out`.
 
-    `options`: keyword arguments of the format's `frames`. Raises InputError: unknown format, or a source that cannot be
-    converted; OutputError.
+    `options`: keyword arguments of the format's `frames`. `classes`: kinds by names of the source, beside those that
+    are known. Raises InputError: unknown format, or a source that cannot be converted; OutputError.
     """
     frames: Callable[..., Iterator[ConvertedFrame]] = _import_format(format).frames
-    report = ConversionReport()
+    report = ConversionReport(classes or {})
     write_recording(out, frames(source, report, **(options or {})), report, source=source, format_name=format)
     return report
 
@@ -439,6 +494,7 @@ def convert_all(
     *,
     format: str,
     options: Mapping[str, Any] | None = None,
+    classes: Mapping[str, str] | None = None,
 ) -> Iterator[str]:
     """Convert every source of `asked` to its output and yield a line per recording, as soon as it is written.
 
@@ -448,9 +504,8 @@ def convert_all(
     conversion.asked = len(asked)
     for output, planned in asked.items():
         try:
-            report = convert_source(
-                planned.source, output, format=format, options={**(options or {}), **planned.options}
-            )
+            given = {**(options or {}), **planned.options}
+            report = convert_source(planned.source, output, format=format, options=given, classes=classes)
         except InputError as error:
             # Recordings of one folder may share what is wrong: it is said once.
             conversion.wrong += [line for line in error.problems if line not in conversion.wrong]

@@ -17,13 +17,15 @@ from copem_replay.extras.convert.conversion import (
     ConvertedFrame,
     OsiKind,
     number_names,
-    parse_number,
-    parse_positive,
+    parse_number_or_none,
     parse_seconds_as_ns,
     wrap_yaw,
 )
+from copem_replay.io.findings import LONGEST_M
 
 REQUIRED: Final = ("time_s", "id", "class", "x_m", "y_m", "length_m", "width_m")
+_NUMBERS: Final = ("x_m", "y_m", "length_m", "width_m")
+_MOST_RAD: Final = 1e4  # a larger angle is none
 YAW: Final = ("yaw_deg", "yaw_rad")  # one of them
 OPTIONAL: Final = ("z_m", "height_m", "vx_mps", "vy_mps", "moving", "host")
 _YES_NO: Final = {"1": True, "true": True, "0": False, "false": False}
@@ -49,7 +51,7 @@ class _BoxRow:
 
 def frames(path: Path, report: ConversionReport) -> Iterator[ConvertedFrame]:
     """All instants in order of time. Raises InputError."""
-    rows = list(_read_rows(path))
+    rows = list(_read_rows(path, report))
     ids = number_names(row.name for row in rows)
     report.names |= {ident: name for name, ident in ids.items()}
     hosts = {row.name: row.line for row in rows if row.host}
@@ -87,11 +89,12 @@ def _make_box(row: _BoxRow, ident: int, report: ConversionReport, *, moves: bool
         report.count("row", "without height_m: the typical height of the class taken")
     if row.z_m is None:
         report.count("row", "without z_m: stood on z = 0")
-    z_m = height_m / 2 if row.z_m is None else row.z_m
+    said_m = abs(height_m) if 0.0 < abs(height_m) <= LONGEST_M else kind.height_m
+    z_m = said_m / 2 if row.z_m is None else row.z_m
     return Box(ident, kind, (*row.at_m, z_m), row.yaw_rad, (*row.size_m, height_m), row.velocity_mps)
 
 
-def _read_rows(path: Path) -> Iterator[_BoxRow]:
+def _read_rows(path: Path, report: ConversionReport) -> Iterator[_BoxRow]:
     try:
         with path.open(encoding="utf-8-sig", newline="") as stream:
             lines = csv.reader(stream, strict=True)
@@ -105,7 +108,7 @@ def _read_rows(path: Path) -> Iterator[_BoxRow]:
                         f"{path}:{lines.line_num}: expected {len(header)} cells, as in the header, found {len(cells)}"
                     )
                 named = {name: cell.strip() for name, cell in zip(header, cells, strict=True)}
-                yield _parse_row(named, f"{path}:{lines.line_num}", lines.line_num)
+                yield _parse_row(named, f"{path}:{lines.line_num}", lines.line_num, report)
     except OSError as error:
         raise InputError(f"{path}: cannot be opened: {error.strerror}") from None
     except (UnicodeDecodeError, csv.Error) as error:
@@ -131,11 +134,16 @@ def _check_header(header: list[str], path: Path) -> None:
         raise InputError(f"{where}: expected both vx_mps and vy_mps or none, found one")
 
 
-def _parse_row(cells: dict[str, str], where: str, line: int) -> _BoxRow:
+def _wrap_known(yaw_rad: float) -> float:
+    """The angle in [−π, π]; NaN of a number that is none."""
+    return wrap_yaw(yaw_rad) if abs(yaw_rad) <= _MOST_RAD else math.nan
+
+
+def _parse_row(cells: dict[str, str], where: str, line: int, report: ConversionReport) -> _BoxRow:
     """Parse a row. An empty cell of an optional column counts as no such column."""
 
     def given(name: str) -> float | None:
-        return parse_number(cells[name], f"{where}: {name}") if cells.get(name) else None
+        return parse_number_or_none(cells[name], f"{where}: {name}") if cells.get(name) else None
 
     def flag(name: str, otherwise: bool) -> bool:
         if not cells.get(name):
@@ -144,12 +152,14 @@ def _parse_row(cells: dict[str, str], where: str, line: int) -> _BoxRow:
             raise InputError(f"{where}: {name}: expected 0, 1, false or true, found {quote_value(cells[name])}")
         return value
 
-    if (kind := KINDS.get(cells["class"])) is None:
-        raise InputError(f"{where}: class: expected one of {', '.join(KINDS)}, found {quote_value(cells['class'])}")
+    if not cells["class"]:
+        raise InputError(f"{where}: class: expected one of {', '.join(KINDS)}, found nothing")
+    kind = report.find_kind(cells["class"], "row")
     if not cells["id"]:
         raise InputError(f"{where}: id: expected a name or number, found nothing")
     yaw = next(name for name in YAW if name in cells)
-    yaw_value = parse_number(cells[yaw], f"{where}: {yaw}")
+    numbers = (parse_number_or_none(cells[name], f"{where}: {name}") for name in (yaw, *_NUMBERS))
+    yaw_value, x_m, y_m, length_m, width_m = numbers
     vx, vy = given("vx_mps"), given("vy_mps")
     if (vx is None) != (vy is None):
         raise InputError(
@@ -160,14 +170,11 @@ def _parse_row(cells: dict[str, str], where: str, line: int) -> _BoxRow:
         stamp_ns=parse_seconds_as_ns(cells["time_s"], f"{where}: time_s"),
         name=cells["id"],
         kind=kind,
-        at_m=(parse_number(cells["x_m"], f"{where}: x_m"), parse_number(cells["y_m"], f"{where}: y_m")),
+        at_m=(x_m, y_m),
         z_m=given("z_m"),
-        yaw_rad=wrap_yaw(math.radians(yaw_value) if yaw == "yaw_deg" else yaw_value),
-        size_m=(
-            parse_positive(cells["length_m"], f"{where}: length_m"),
-            parse_positive(cells["width_m"], f"{where}: width_m"),
-        ),
-        height_m=parse_positive(cells["height_m"], f"{where}: height_m") if cells.get("height_m") else None,
+        yaw_rad=_wrap_known(math.radians(yaw_value) if yaw == "yaw_deg" else yaw_value),
+        size_m=(length_m, width_m),
+        height_m=given("height_m"),
         velocity_mps=None if vx is None or vy is None else (vx, vy),
         moving=flag("moving", kind.moving),
         host=flag("host", False),

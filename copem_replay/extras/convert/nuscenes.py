@@ -48,57 +48,6 @@ RATE_HZ: Final = 10.0
 _EGO: Final = "ego"
 _LONGEST_NS: Final = 1_050_000_000  # between key frames that are interpolated: one of 2 Hz may be missing
 _NEAR_M: Final = 100.0  # lanes within this distance of the ego's path
-_KIND: Final = {  # by category or its beginning; the longest that fits counts
-    "animal": "animal",
-    "human.pedestrian": "pedestrian",
-    "human.pedestrian.personal_mobility": "scooter",
-    "human.pedestrian.stroller": "other",
-    "human.pedestrian.wheelchair": "wheelchair",
-    "movable_object": "static",
-    "movable_object.barrier": "barrier",
-    "movable_object.trafficcone": "cone",
-    "static_object": "static",
-    "vehicle": "vehicle",
-    "vehicle.bicycle": "bicycle",
-    "vehicle.bus": "bus",
-    "vehicle.car": "car",
-    "vehicle.construction": "work machine",
-    "vehicle.emergency.ambulance": "van",
-    "vehicle.emergency.police": "car",
-    "vehicle.motorcycle": "motorcycle",
-    "vehicle.trailer": "trailer",
-    "vehicle.truck": "truck",
-    # T4, where names stand alone.
-    "ambulance": "van",
-    "bicycle": "bicycle",
-    "bus": "bus",
-    "car": "car",
-    "construction_vehicle": "work machine",
-    "construction_worker": "pedestrian",
-    "fire_truck": "truck",
-    "forklift": "work machine",
-    "kart": "vehicle",
-    "motorcycle": "motorcycle",
-    "other_pedestrian": "pedestrian",
-    "other_vehicle": "vehicle",
-    "pedestrian": "pedestrian",
-    "personal_mobility": "scooter",
-    "police_car": "car",
-    "police_officer": "pedestrian",
-    "semi_trailer": "trailer",
-    "stroller": "other",
-    "tractor_unit": "tractor",
-    "traffic_cone": "cone",
-    "trailer": "trailer",
-    "truck": "truck",
-    "wheelchair": "wheelchair",
-}
-
-
-def find_kind(category: str) -> str | None:
-    """The kind of a category of nuScenes or T4, None: it is not known."""
-    parts = category.lower().split(".")
-    return next((_KIND[name] for n in range(len(parts), 0, -1) if (name := ".".join(parts[:n])) in _KIND), None)
 
 
 # Tables: lists of rows. The largest has 2.6 million, a GB of text: rows are taken one by one, and those not used go.
@@ -346,12 +295,9 @@ def _place_objects(
     boxes = tables.boxes.get(sample.token, [])
     yaws = _find_yaws(np.array([values[6:] for _, values in boxes]).reshape(-1, 4))
     for (instance, values), yaw_rad in zip(boxes, yaws, strict=True):
-        category = tables.category[instance]
-        if (kind := find_kind(category)) is None:
-            report.count("object state", f"of the unknown category {quote_value(category)}: taken as other")
         width, length, height = values[3:6]
         pose = np.array([*values[:3], yaw_rad, length, width, height])
-        objects[ids.setdefault(instance, len(ids) + 1)] = _Pose(KINDS[kind or "other"], pose)
+        objects[ids.setdefault(instance, len(ids) + 1)] = _Pose(report.find_kind(tables.category[instance]), pose)
     return objects
 
 

@@ -20,7 +20,6 @@ from copem_replay.core.errors import InputError, quote_value
 from copem_replay.core.files import parse_json
 from copem_replay.core.tracks import Float
 from copem_replay.extras.convert.conversion import (
-    KINDS,
     Box,
     ConversionReport,
     ConvertedFrame,
@@ -119,25 +118,6 @@ def _read_numbers(values: Any, count: int, where: str) -> Float:
 
 
 _NOWHERE_M: Final = -1000.0  # KITTI's position of an object without one
-_KIND: Final = {  # lower case, without spaces and underscores
-    "animal": "animal",
-    "bicycle": "bicycle",
-    "bus": "bus",
-    "car": "car",
-    "cyclist": "bicycle",
-    "emergencyvehicle": "van",
-    "misc": "other",
-    "motorcycle": "motorcycle",
-    "other": "other",
-    "pedestrian": "pedestrian",
-    "person": "pedestrian",
-    "personsitting": "pedestrian",
-    "trailer": "trailer",
-    "tram": "tram",
-    "truck": "truck",
-    "van": "van",
-    "vehicle": "vehicle",
-}
 
 
 @dataclass(frozen=True)
@@ -251,12 +231,12 @@ def _make_box(
     kind_name = str(data.get("type") or frame.types.get(name) or "")
     values = _read_values(cuboid.get("val"), where)
     at_m, size_m = values[:3], values[-3:]
-    if kind_name == "DontCare" or min(size_m) <= 0.0 or _NOWHERE_M in at_m:
-        report.count("object", "without a place or size (DontCare) in a frame: skipped")
+    if kind_name == "DontCare" or _NOWHERE_M in at_m:
+        report.count("object", "without a place (DontCare) in a frame: skipped")
         return None
     system = cuboid.get("coordinate_system") or data.get("coordinate_system") or source
     matrix = _transform_to_target(str(system) if system else None, frame, where, report)
-    return _upright_box(ident, _map_kind(kind_name, report), at_m, _read_rotation(values), size_m, matrix)
+    return _upright_box(ident, report.find_kind(kind_name), at_m, _read_rotation(values), size_m, matrix)
 
 
 def _read_values(val: Any, where: str) -> list[float]:
@@ -299,10 +279,3 @@ def _upright_box(
     x, y, z = (matrix @ np.array([*at_m, 1.0]))[:3].tolist()
     yaw_rad = float(np.arctan2(axes[1, along], axes[0, along]))
     return Box(ident, kind, (x, y, z), yaw_rad, (size_m[along], size_m[across], size_m[up]))
-
-
-def _map_kind(name: str, report: ConversionReport) -> OsiKind:
-    kind = _KIND.get(name.lower().replace("_", "").replace(" ", ""))
-    if kind is None:
-        report.count("object state", f"of the unknown type {quote_value(name)}: taken as other")
-    return KINDS[kind or "other"]

@@ -27,6 +27,7 @@ from copem_replay.extras.convert.conversion import (
     Box,
     ConversionReport,
     ConvertedFrame,
+    OsiKind,
     PlannedRecording,
     number_names,
     parse_number,
@@ -35,6 +36,7 @@ from copem_replay.extras.convert.conversion import (
     rotation_from_euler,
     wrap_yaw,
 )
+from copem_replay.io.class_names import class_from_name
 
 RATE_HZ: Final = 10
 """Frames a second where nothing says how long a step is: so all these data sets are published."""
@@ -45,25 +47,6 @@ _APART_M: Final = 0.5  # labels of one object by two agents that differ by more 
 _SHORT_M: Final = 1.2  # an object without a class that is no longer stands on two legs
 _PROTOCOL: Final = "data_protocol.yaml"
 _USED: Final = ("vehicles", "objects", "lidar_pose", "true_ego_pos", "RSU")
-_KIND: Final = {  # `obj_type` of V2X-Real, in lower case
-    "bicyclerider": "bicycle",
-    "bus": "bus",
-    "car": "car",
-    "child": "pedestrian",
-    "concretetruck": "truck",
-    "longvehicle": "truck",
-    "motorcycle": "motorcycle",
-    "motorcyclerider": "motorcycle",
-    "motorcylerider": "motorcycle",
-    "pedestrian": "pedestrian",
-    "policecar": "car",
-    "roadworker": "pedestrian",
-    "scooter": "scooter",
-    "scooterrider": "scooter",
-    "trashcan": "static",
-    "truck": "truck",
-    "van": "van",
-}
 
 
 @dataclass(frozen=True)
@@ -150,7 +133,7 @@ def _read_frame(path: Path) -> _AgentFrame:
     if not isinstance(objects or {}, dict) or ("vehicles" not in data and "objects" not in data):
         raise InputError(f"{path}: vehicles: expected an object of objects, found {quote_value(objects)}")
     labels = {str(name): _read_label(one, f"{path}: vehicle {name}") for name, one in (objects or {}).items()}
-    right_handed = is_matrix or any(label.kind.lower() in _KIND for label in labels.values())
+    right_handed = is_matrix or any(_is_plain_class(label.kind) for label in labels.values())
     return _AgentFrame(pose, lidar, on_roof, data.get("RSU") is True, labels, right_handed)
 
 
@@ -259,7 +242,7 @@ def _unite_labels(agents: Scenario, number: int, report: ConversionReport) -> di
 class _Body:
     """The box of an agent: its kind, size, and centre from its pose, ahead, to the left of the source's y, up."""
 
-    kind: str
+    kind: OsiKind
     size_m: tuple[float, float, float]
     offset_m: Float
 
@@ -272,7 +255,9 @@ class _Body:
         )
 
 
-def _find_body(name: str, agents: Scenario, own_label: str | None, united: UnitedLabels) -> _Body:
+def _find_body(
+    name: str, agents: Scenario, own_label: str | None, united: UnitedLabels, report: ConversionReport
+) -> _Body:
     """The box of an agent, from what others label as it; else of the size of a car."""
     offsets, labels = [], list[_Label]()
     for number, frame in agents[name].items():
@@ -283,21 +268,22 @@ def _find_body(name: str, agents: Scenario, own_label: str | None, united: Unite
             offsets.append([cos * dx + sin * dy, cos * dy - sin * dx, dz])
             labels.append(label)
     if labels:
-        return _Body(_name_kind(labels[0]), labels[0].size_m, np.median(offsets, axis=0))
+        return _Body(
+            _name_kind(labels[0], ConversionReport(report.classes)), labels[0].size_m, np.median(offsets, axis=0)
+        )
     up_m = _SIZE_M[2] / 2
-    return _Body("car", _SIZE_M, np.array([0, 0, -up_m if next(iter(agents[name].values())).on_roof else up_m]))
+    return _Body(KINDS["car"], _SIZE_M, np.array([0, 0, -up_m if next(iter(agents[name].values())).on_roof else up_m]))
 
 
-def _name_kind(label: _Label, report: ConversionReport | None = None) -> str:
-    """The kind of an object, by `obj_type`, by CARLA's `bp_id`, or by its length."""
-    word = label.kind.lower()
-    if word in _KIND:
-        return _KIND[word]
-    if word.startswith("walker."):
-        return "pedestrian"
-    if word and report is not None and not word.startswith("vehicle."):
-        report.count("object state", f"of the unknown type {quote_value(label.kind)}: by its length")
-    return "pedestrian" if label.size_m[0] <= _SHORT_M else "vehicle"
+def _is_plain_class(name: str) -> bool:
+    """Whether it is an `obj_type` of a real recording, not CARLA's `vehicle.tesla.model3`."""
+    return "." not in name and class_from_name(name) is not None
+
+
+def _name_kind(label: _Label, report: ConversionReport) -> OsiKind:
+    """The kind of an object, by its `obj_type`, CARLA's `bp_id`, or its length."""
+    by_length = "pedestrian" if label.size_m[0] <= _SHORT_M else "vehicle"
+    return report.find_kind(label.kind, otherwise=by_length) if label.kind else KINDS[by_length]
 
 
 # Frames.
@@ -334,12 +320,12 @@ def frames(
     step_s = _find_step_s(source, numbers, rate_hz)
     united = {number: _unite_labels(agents, number, report) for number in numbers}
     own_labels = _find_own_labels(agents, vehicles, united)
-    bodies = {name: _find_body(name, agents, own_labels.get(name), united) for name in vehicles}
+    bodies = {name: _find_body(name, agents, own_labels.get(name), united, report) for name in vehicles}
     ids, name_of = _number_objects(agents, vehicles, own_labels)
     report.names |= {number: name for name, number in ids.items()}
     _say_what_is_assumed(report, agents, fixed, own_labels, step_s, right_handed)
     for number in numbers:
-        placed: dict[str, tuple[str, Float, tuple[float, float, float]]] = {}
+        placed: dict[str, tuple[OsiKind, Float, tuple[float, float, float]]] = {}
         for ident, label in united[number].items():
             placed[ident] = _name_kind(label, report), label.pose, label.size_m
         for name in vehicles:
@@ -351,10 +337,10 @@ def frames(
         yield ConvertedFrame(stamp_ns, boxes, host=None if host is None else ids[name_of[host]])
 
 
-def _make_box(number: int, kind: str, pose: Float, size_m: tuple[float, float, float], right_handed: bool) -> Box:
+def _make_box(number: int, kind: OsiKind, pose: Float, size_m: tuple[float, float, float], right_handed: bool) -> Box:
     x, y, z, yaw_rad = pose.tolist()
     sign = 1.0 if right_handed else -1.0
-    return Box(number, KINDS[kind], (x, sign * y, z), wrap_yaw(sign * yaw_rad), size_m)
+    return Box(number, kind, (x, sign * y, z), wrap_yaw(sign * yaw_rad), size_m)
 
 
 def _number_objects(

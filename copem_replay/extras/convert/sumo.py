@@ -21,6 +21,7 @@ from copem_replay.extras.convert.conversion import (
     ConversionReport,
     ConvertedFrame,
     OsiKind,
+    kind_from_name,
     parse_number,
     parse_positive,
     parse_seconds_as_ns,
@@ -30,27 +31,27 @@ from copem_replay.extras.convert.conversion import (
 # Sizes and kinds of SUMO's vehicle types, which its FCD output only names. Defaults of the classes are SUMO's own
 # (sumo.dlr.de, Vehicle Type Parameter Defaults; its source of 2025), since SUMO placed the front bumper with them.
 
-_CLASSES: Final = {  # vClass: kind, length, width, height in m
-    "passenger": ("car", 5.0, 1.8, 1.5),
-    "pedestrian": ("pedestrian", 0.215, 0.478, 1.719),
-    "wheelchair": ("wheelchair", 5.0, 0.8, 1.5),  # no length of its own in SUMO, nor has the scooter
-    "bicycle": ("bicycle", 1.6, 0.65, 1.7),
-    "scooter": ("scooter", 5.0, 0.5, 1.7),
-    "moped": ("motorcycle", 2.1, 0.78, 1.7),
-    "motorcycle": ("motorcycle", 2.2, 0.9, 1.5),
-    "truck": ("truck", 7.1, 2.4, 2.4),
-    "trailer": ("truck", 16.5, 2.55, 4.0),  # a truck with a trailer, one rigid box
-    "bus": ("bus", 12.0, 2.5, 3.4),
-    "coach": ("bus", 14.0, 2.6, 4.0),
-    "delivery": ("van", 6.5, 2.16, 2.86),
-    "emergency": ("van", 6.5, 2.16, 2.86),
-    "tram": ("tram", 22.0, 2.4, 3.2),
-    "rail_urban": ("train", 109.5, 3.0, 3.6),
-    "subway": ("train", 109.5, 3.0, 3.6),
-    "rail": ("train", 135.0, 2.84, 3.75),
-    "rail_electric": ("train", 200.0, 2.95, 3.89),
-    "rail_fast": ("train", 200.0, 2.95, 3.89),
-    "ship": ("other", 17.0, 4.0, 4.0),
+_CLASSES: Final = {  # vClass: length, width, height in m
+    "passenger": (5.0, 1.8, 1.5),
+    "pedestrian": (0.215, 0.478, 1.719),
+    "wheelchair": (5.0, 0.8, 1.5),  # no length of its own in SUMO, nor has the scooter
+    "bicycle": (1.6, 0.65, 1.7),
+    "scooter": (5.0, 0.5, 1.7),
+    "moped": (2.1, 0.78, 1.7),
+    "motorcycle": (2.2, 0.9, 1.5),
+    "truck": (7.1, 2.4, 2.4),
+    "trailer": (16.5, 2.55, 4.0),  # a truck with a trailer, one rigid box
+    "bus": (12.0, 2.5, 3.4),
+    "coach": (14.0, 2.6, 4.0),
+    "delivery": (6.5, 2.16, 2.86),
+    "emergency": (6.5, 2.16, 2.86),
+    "tram": (22.0, 2.4, 3.2),
+    "rail_urban": (109.5, 3.0, 3.6),
+    "subway": (109.5, 3.0, 3.6),
+    "rail": (135.0, 2.84, 3.75),
+    "rail_electric": (200.0, 2.95, 3.89),
+    "rail_fast": (200.0, 2.95, 3.89),
+    "ship": (17.0, 4.0, 4.0),
 }
 _LIKE_CARS: Final = ("private", "vip", "hov", "taxi", "evehicle", "custom1", "custom2", "ignoring", "authority", "army")
 
@@ -65,8 +66,9 @@ class VehicleType:
 
 def class_defaults(name: str) -> VehicleType | None:
     """Return the defaults of a vClass; None: not known."""
-    default = _CLASSES.get("passenger" if name in _LIKE_CARS else name)
-    return None if default is None else VehicleType(KINDS[default[0]], default[1:])
+    name = "passenger" if name in _LIKE_CARS else name
+    kind = KINDS["truck"] if name == "trailer" else kind_from_name(name)
+    return VehicleType(kind, _CLASSES[name]) if name in _CLASSES and kind is not None else None
 
 
 def _built_in_types() -> Iterator[tuple[str, VehicleType]]:

@@ -39,18 +39,6 @@ EGO_SIZE_M: Final = (4.9, 1.9, 1.5)
 _EGO: Final = "ego"
 _PAIRS: Final = "cooperative/data_info.json"
 _FRAMES: Final = "vehicle-side/data_info.json"
-_KIND: Final = {  # lower case
-    "barrowlist": "other",
-    "bus": "bus",
-    "car": "car",
-    "cyclist": "bicycle",
-    "motorcyclist": "motorcycle",
-    "pedestrian": "pedestrian",
-    "trafficcone": "cone",
-    "tricyclist": "motorcycle",
-    "truck": "truck",
-    "van": "van",
-}
 
 
 @dataclass(frozen=True)
@@ -116,16 +104,14 @@ def _make_box(label: Any, ids: dict[str, int], R: Float, t: Float, where: str, r
             f"{where}: expected a track_id, found {quote_value(track)}: V2X-Seq has them, DAIR-V2X-C has none "
             "and cannot be replayed"
         )
-    kind = _KIND.get(str(label.get("type")).lower())
-    if kind is None:
-        report.count("object state", f"of the unknown type {quote_value(label.get('type'))}: taken as other")
+    kind = report.find_kind(str(label.get("type") or ""))
     at_m = R @ _read_named(label.get("3d_location"), "xyz", f"{where}: 3d_location") + t
     length, width, height = _read_named(label.get("3d_dimensions"), "lwh", f"{where}: 3d_dimensions").tolist()
     yaw_rad = parse_number(label.get("rotation"), f"{where}: rotation")
     ahead = R @ np.array([math.cos(yaw_rad), math.sin(yaw_rad), 0.0])
     x, y, z = at_m.tolist()
     ident = ids.setdefault(str(track), len(ids) + 1)
-    return Box(ident, KINDS[kind or "other"], (x, y, z), math.atan2(ahead[1], ahead[0]), (length, width, height))
+    return Box(ident, kind, (x, y, z), math.atan2(ahead[1], ahead[0]), (length, width, height))
 
 
 def _say_where_infrastructure_is(source: Path, frame: str, report: ConversionReport) -> None:

@@ -332,7 +332,7 @@ class _BatchReader:
             names = [known_as.get(word) or class_from_name(word) for word in texts.words]
             of_word = np.array([CLASSES.index(name or "other") for name in names] + [-1])
             code = of_word[texts.code]
-            self._note_unknown_names(texts, names)
+            self._note_other_names(texts, ["" if w in known_as else class_from_name(w) for w in texts.words])
             share = np.ones(len(code))
             if class_field.probability is not None:
                 share = self._found.levels[list_level(self._wanted.path(class_field.probability))].numbers[
@@ -358,13 +358,13 @@ class _BatchReader:
         normed: Float = probability / probability.sum(axis=1, keepdims=True)
         return normed
 
-    def _note_unknown_names(self, texts: DistinctTexts, names: Sequence[str | None]) -> None:
-        """Note the names of classes that say nothing, the most frequent first."""
-        counts = np.bincount(texts.code[texts.code >= 0], minlength=len(texts.words))
-        unknown = [(-int(counts[k]), word) for k, word in enumerate(texts.words) if names[k] is None and word.strip()]
-        which = ", ".join(f"{word} {-number}" for number, word in sorted(unknown)[:_SHOWN] if number)
-        if which:
-            self._notes += find("class name", sum(-number for number, _ in unknown), which=which)
+    def _note_other_names(self, texts: DistinctTexts, names: Sequence[str | None]) -> None:
+        """Note the names of classes that are read as other, the most frequent first: what says nothing, what stands."""
+        counts = np.bincount(texts.code[texts.code >= 0], minlength=len(texts.words)).tolist()
+        for rule, meant in (("class name", None), ("class other", "other")):
+            found = [(-counts[k], word) for k, word in enumerate(texts.words) if names[k] == meant and word.strip()]
+            which = ", ".join(f"{word} {-number}" for number, word in sorted(found)[:_SHOWN] if number)
+            self._notes += find(rule, sum(-number for number, _ in found), which=which)
 
     def _by_name(self, path: str, meant: Mapping[str, str]) -> Mapping[str, str]:
         """The class of each value, for values of an enumeration also by their names."""
