@@ -2,7 +2,7 @@
 
 A frame is placed by the transforms and the odometry in the recording. Between two samples positions are interpolated
 linearly and rotations along the short arc; a frame has no place before the first sample, after the last one, and in a
-gap longer than `MAX_GAP_S`. A transform with a single sample, or on a topic of static ones, holds for ever.
+gap longer than `max_gap_s`. A transform with a single sample, or on a topic of static ones, holds for ever.
 
 OSI's messages need none of this, they are in the world: `io/schemas/osi_ground_truth.py`. Lists of all other formats
 are decoded by a description of their fields (`io/schemas/object_lists.py`).
@@ -62,6 +62,7 @@ class PoseTrack:
     position_m: Float
     rotation: Float
     velocity_mps: Float
+    max_gap_s: float = MAX_GAP_S  # nothing is interpolated over a longer gap
 
     def at(self, stamp_ns: Int, *, forever: bool = False) -> SampledPoses:
         """The pose at instants (K,); `forever`: the last sample holds at all instants."""
@@ -73,7 +74,7 @@ class PoseTrack:
         apart = self.stamp_ns[after] - self.stamp_ns[before]
         share = ((stamp_ns - self.stamp_ns[before]) / apart)[:, None]
         exact = (stamp_ns == self.stamp_ns[before]) | (stamp_ns == self.stamp_ns[after])
-        covered = (share[:, 0] >= 0) & (share[:, 0] <= 1) & ((apart <= MAX_GAP_S * 1e9) | exact)
+        covered = (share[:, 0] >= 0) & (share[:, 0] <= 1) & ((apart <= self.max_gap_s * 1e9) | exact)
         a, b = self.rotation[before], self.rotation[after]
         b = np.where((a * b).sum(axis=1, keepdims=True) < 0, -b, b)
         mixed = (1 - share) * a + share * b  # samples are near each other: on the short arc this is the rotation
@@ -84,7 +85,7 @@ class PoseTrack:
         )
 
 
-def make_pose_track(poses: Poses, chosen: Bool | None = None) -> PoseTrack | None:
+def make_pose_track(poses: Poses, chosen: Bool | None = None, max_gap_s: float = MAX_GAP_S) -> PoseTrack | None:
     """The `chosen` samples in order of time, of several at one instant the first; None: there is no sample."""
     rows = np.arange(len(poses.stamp_ns)) if chosen is None else np.flatnonzero(chosen)
     if not len(rows):
@@ -92,7 +93,7 @@ def make_pose_track(poses: Poses, chosen: Bool | None = None) -> PoseTrack | Non
     stamps, first = np.unique(poses.stamp_ns[rows], return_index=True)
     rows = rows[first]
     return PoseTrack(
-        poses.frame[rows[0]], stamps, poses.position_m[rows], poses.rotation[rows], poses.velocity_mps[rows]
+        poses.frame[rows[0]], stamps, poses.position_m[rows], poses.rotation[rows], poses.velocity_mps[rows], max_gap_s
     )
 
 
@@ -102,6 +103,7 @@ class FrameTree:
 
     pose_tracks: dict[str, PoseTrack] = field(default_factory=dict)
     static: set[str] = field(default_factory=set)
+    max_gap_s: float = MAX_GAP_S
 
     def add(self, poses: Poses, *, static: bool = False) -> None:
         """Add transforms; a frame that has a parent already keeps it. `static`: they hold for ever."""
@@ -113,7 +115,7 @@ class FrameTree:
             if static:  # as in tf2 the last one that was sent holds
                 rows = np.flatnonzero(chosen)
                 chosen = np.arange(len(chosen)) == rows[np.argsort(poses.log_time_ns[rows], kind="stable")[-1]]
-            course = make_pose_track(poses, chosen)
+            course = make_pose_track(poses, chosen, self.max_gap_s)
             if course is not None and course.parent != child:
                 self.pose_tracks[child] = course
                 if static:
@@ -185,7 +187,7 @@ def ego_channel(log: Log, channels: Sequence[Channel], asked: EgoTopic | None, s
     return odometry[0] if seek_ego and len(odometry) == 1 else None
 
 
-def ego_course(log: Log, topic: str, poses: Poses, asked: EgoTopic | None) -> PoseTrack:
+def ego_course(log: Log, topic: str, poses: Poses, asked: EgoTopic | None, max_gap_s: float) -> PoseTrack:
     """The ego's poses, of the frame that is asked for. Raises EgoError: no pose, or poses of several frames."""
     child = asked.frame if asked is not None else None
     picked = None if child is None else np.array([name == child.lstrip("/") for name in poses.child], dtype=bool)
@@ -194,7 +196,7 @@ def ego_course(log: Log, topic: str, poses: Poses, asked: EgoTopic | None) -> Po
         raise EgoError(
             f"{topic} has poses of several frames; choose with `frame`: {', '.join(children[:_SHOWN])}", path=log.path
         )
-    course = make_pose_track(poses, picked)
+    course = make_pose_track(poses, picked, max_gap_s)
     if course is None:
         of = f" of frame {child!r}" if child else ""
         raise EgoError(f"no pose on topic {topic!r}{of}{window_hint(log)}", path=log.path)
@@ -305,14 +307,14 @@ class LogContext:
         return self.ego.parent if self.ego is not None else self.frames.world_of(frame)
 
 
-def read_log_context(log: Log, asked: EgoTopic | None, *, seek_ego: bool) -> LogContext:
+def read_log_context(log: Log, asked: EgoTopic | None, *, seek_ego: bool, max_gap_s: float = MAX_GAP_S) -> LogContext:
     """The frames and the ego of a recording; `seek_ego`: the only odometry is the ego's, if nothing is `asked`.
 
     Raises RecordingError: no such topic; BrokenIndexError.
     """
     channels = [c for c in log.channels if is_pose(c) and c.messages]
     messages = gather_messages(log, frozenset(c.number for c in channels))
-    frames, notes = FrameTree(), list(messages.notes())
+    frames, notes = FrameTree(max_gap_s=max_gap_s), list(messages.notes())
     of_channel: dict[int, Poses] = {}
     for channel in channels:
         if not messages.payloads[channel.number]:  # none in the window
@@ -347,7 +349,7 @@ def read_log_context(log: Log, asked: EgoTopic | None, *, seek_ego: bool) -> Log
         return LogContext(frames, None, asked, tuple(notes), own)
     if asked is not None and asked.frame is not None:
         asked = asked.model_copy(update={"frame": own.get((chosen.part, asked.frame.lstrip("/")), asked.frame)})
-    course = ego_course(log, chosen.topic, of_channel[chosen.number], asked)
+    course = ego_course(log, chosen.topic, of_channel[chosen.number], asked, max_gap_s)
     return LogContext(frames, course, asked, (*notes, *ego_notes(chosen, asked)), own, chosen.topic, missing)
 
 

@@ -223,7 +223,7 @@ def assemble_truth(
     row, object_ix = row[order], object_ix[order]
     time_s = (stamp_ns[frame[row]] - stamp_ns[0]) * np.float64(1e-9)
     ids = tuple(columns.object_ids[k] for k in first_seen)
-    rows = TrackRows(ids, object_ix, time_s, columns.class_ix[row], values[row], columns.moving[first_seen])
+    rows = TrackRows(ids, object_ix, time_s, columns.class_ix[row], values[row], columns.moving[first_seen], max_gap_s)
     rows, states = check_truth(rows, _are_places(columns), notes)
     row, object_ix, values = row[states], rows.object_ix, rows.values
     object_class = _most_frequent_class(object_ix, columns.class_ix[row], notes)

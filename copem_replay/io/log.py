@@ -34,7 +34,7 @@ from copem_replay.io.containers.mcap_records import (
     read_summary,
 )
 from copem_replay.io.decoded_size import DecodeAllowance, OversizeError
-from copem_replay.io.window import ALWAYS, Span, Window, WindowSeconds, describe_window, is_kept
+from copem_replay.io.window import ALWAYS, POSE_MARGIN_NS, Span, Window, WindowSeconds, describe_window, is_kept
 
 # Files that are not read: what they are by their first bytes and their names, and what to do about it.
 
@@ -378,9 +378,10 @@ _NEAR_END_NS = 10_000_000_000
 """Time before the end in which the last message is sought first; if there is none, the whole recording is read."""
 
 
-def cut_window(log: Log, topic: str, window_s: WindowSeconds) -> Log:
+def cut_window(log: Log, topic: str, window_s: WindowSeconds, max_gap_s: float = 0.0) -> Log:
     """The log restricted to `window_s`, in seconds since the first message on the `topic` of its truth was logged.
 
+    `max_gap_s`: poses are interpolated over such gaps.
     Raises EmptyWindowError: the topic has no message in it; BrokenIndexError.
     """
     if window_s is None or window_s == (None, None) or log.window is not None:
@@ -394,6 +395,7 @@ def cut_window(log: Log, topic: str, window_s: WindowSeconds) -> Log:
     window = Window(
         ALWAYS[0] if from_s is None else first_ns + round(from_s * 1e9),
         ALWAYS[1] if to_s is None else first_ns + round(to_s * 1e9),
+        max(POSE_MARGIN_NS, round(max_gap_s * 1e9)),
     )
     cut = log.within(window)
     if next(cut.payloads(numbers), None) is None:

@@ -280,7 +280,7 @@ def _shift_window(window: Window | None, ahead_ns: int) -> Window | None:
     from_ns, to_ns = (
         edge if edge in ALWAYS else min(max(edge + ahead_ns, 0), ALWAYS[1]) for edge in (window.from_ns, window.to_ns)
     )
-    return Window(from_ns, to_ns)
+    return replace(window, from_ns=from_ns, to_ns=to_ns)
 
 
 def _read_moved(part: JoinedRecording, numbers: Mapping[int, int]) -> Iterator[Message]:

@@ -134,7 +134,8 @@ def read_log(
     messages hold what, None where the schema is known. `beside`: topics that recorded units read.
     `window_s`: read only what was logged from one instant to another, both included, in seconds since the first message
     on the topic of the truth was logged; None: from the beginning, to the end. `max_gap_s`: velocities that messages do
-    not state are derived across no longer gap. `classes`: of names, beside those that are known.
+    not state are derived, and poses interpolated, across no longer gap. `classes`: of names, beside
+    those that are known.
     Raises RecordingError, one line: no such file, no MCAP file, no truth, no usable object, no such ego, no such topic,
     or several, a file that changes while it is read; EmptyWindowError.
     """
@@ -179,11 +180,15 @@ def _read(
     asked = None if isinstance(ego, str) else ego
     topic, ignored = choose_topic(log, topic, beside, fields, asked)
     try:
-        log = cut_window(log, topic, window_s)
-        columns, around, world = _decode_world(log, topic, fields, asked, classes, seek_ego=ego is None)
+        log = cut_window(log, topic, window_s, max_gap_s)
+        columns, around, world = _decode_world(
+            log, topic, fields, asked, classes, seek_ego=ego is None, max_gap_s=max_gap_s
+        )
     except BrokenIndexError as error:
-        log = cut_window(log.from_start(error), topic, window_s)
-        columns, around, world = _decode_world(log, topic, fields, asked, classes, seek_ego=ego is None)
+        log = cut_window(log.from_start(error), topic, window_s, max_gap_s)
+        columns, around, world = _decode_world(
+            log, topic, fields, asked, classes, seek_ego=ego is None, max_gap_s=max_gap_s
+        )
     refuse_second_run(columns.stamp_ns, columns.log_time_ns, partial(list_contents, columns), log.path, topic)
     try:
         scene, truth, truth_notes = assemble_truth(columns, name, max_gap_s)
@@ -332,7 +337,14 @@ def _describe_ignored(
 
 
 def _decode_world(
-    log: Log, topic: str, fields: Fields | None, asked: EgoTopic | None, classes: Mapping[str, str], *, seek_ego: bool
+    log: Log,
+    topic: str,
+    fields: Fields | None,
+    asked: EgoTopic | None,
+    classes: Mapping[str, str],
+    *,
+    seek_ego: bool,
+    max_gap_s: float,
 ) -> tuple[DecodedObjects, LogContext | None, str]:
     """The objects on a topic and the ego in the world, the frames of the log, and the name of the world's frame.
 
@@ -352,11 +364,11 @@ def _decode_world(
             return columns, None, ""
         from copem_replay.io.frames import add_ego, read_log_context
 
-        around = read_log_context(log, asked, seek_ego=False)
+        around = read_log_context(log, asked, seek_ego=False, max_gap_s=max_gap_s)
         return _add_notes(add_ego(columns, around.ego, around.asked, around.ego_topic), around), around, ""
     from copem_replay.io.frames import add_ego, read_decoded_lists, read_log_context, transform_to_world
 
-    around = read_log_context(log, asked, seek_ego=seek_ego)
+    around = read_log_context(log, asked, seek_ego=seek_ego, max_gap_s=max_gap_s)
     same_schema = [c for c in channels if (c.schema, c.encoding) == (channels[0].schema, channels[0].encoding)]
     around = replace(around, classes=classes)
     lists = read_decoded_lists(log, same_schema, fields, classes)

@@ -42,6 +42,7 @@ class TrackRows:
     class_ix: NDArray[np.int8]
     values: Float  # (P, V)
     moving: Bool  # (N,)
+    max_gap_s: float = 0.5  # over a longer one nothing is known of an object
 
 
 class HeadingUnitError(ValueError):
@@ -123,7 +124,7 @@ def _find_jumps(rows: TrackRows, same: Bool, apart_s: Float) -> Bool:
 
 def _find_reuse(rows: TrackRows, apart_s: Float) -> Bool:
     """(P − 1,) gaps behind which the id is that of another class."""
-    reuse: Bool = (apart_s > 0.5) & ~AGREE[rows.class_ix[:-1], rows.class_ix[1:]]
+    reuse: Bool = (apart_s > rows.max_gap_s) & ~AGREE[rows.class_ix[:-1], rows.class_ix[1:]]
     return reuse
 
 

@@ -15,7 +15,7 @@ WindowSeconds = tuple[float | None, float | None] | None
 ALWAYS: Span = (0, 2**64 - 1)
 POSE_MARGIN_NS = 2_000_000_000
 """Margin to both sides of the window in which poses are read: they are interpolated, and may be logged later than they
-are stamped. Four times the longest gap that is interpolated over."""
+are stamped. Longer where a longer gap is interpolated over."""
 
 
 @dataclass(frozen=True)
@@ -24,6 +24,7 @@ class Window:
 
     from_ns: int = ALWAYS[0]
     to_ns: int = ALWAYS[1]
+    margin_ns: int = POSE_MARGIN_NS
 
     def span(self, channel: Channel) -> Span:
         """The log time that is read of a channel: with a margin of poses, without limits of static transforms."""
@@ -31,7 +32,7 @@ class Window:
             return self.from_ns, self.to_ns
         if is_static(channel):
             return ALWAYS
-        return self.from_ns - POSE_MARGIN_NS, self.to_ns + POSE_MARGIN_NS
+        return self.from_ns - self.margin_ns, self.to_ns + self.margin_ns
 
 
 def is_kept(spans: Mapping[int, Span], number: int, log_time_ns: int) -> bool:

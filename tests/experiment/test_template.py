@@ -96,6 +96,16 @@ def test_the_host_of_the_log_is_the_ego(tmp_path: Path, replayed: Callable[..., 
     )
 
 
+@pytest.mark.parametrize(("rate_hz", "line"), [(10.0, None), (2.0, "max_gap_s: 0.8 "), (1.0, "max_gap_s: 1.5 ")])
+def test_the_longest_gap_is_that_of_the_recording(
+    tmp_path: Path, replayed: Callable[..., Any], rate_hz: float, line: str | None
+) -> None:
+    """Half a list to spare: of lists every 0.5 s a gap of 0.75 s, to whole tenths of a second."""
+    frames = [(t / rate_hz, [Obj(1, 6.0 * t / rate_hz, 0.0), pedestrian(7, 30.0, 3.0)]) for t in range(12)]
+    made = replayed(write_recording(tmp_path / "a.mcap", frames, host=1))
+    assert made.get("max_gap_s") == (None if line is None else float(line.split()[1]))
+
+
 def test_the_mast_stands_beside_whom_it_looks_at(tmp_path: Path) -> None:
     """Pedestrian 7 is at (30, 6), all drive along y = 0 and −4: 10 m to his north-east nobody else is nearer."""
     write_recording(tmp_path / "log.mcap", street(), host=1)

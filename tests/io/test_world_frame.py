@@ -125,6 +125,22 @@ class TestEgo:
         assert [n for n in found.notes if "no size is said" in n and "gaps are null" in n]
         assert [n for n in found.notes if "centre_from_rear_axle_m" in n]
 
+    @pytest.mark.parametrize("window_s", [None, (2.5, 4.0)])
+    def test_poses_that_come_seldom_are_interpolated_over_the_gap_of_the_experiment(
+        self, tmp_path: Path, window_s: tuple[float, float] | None
+    ) -> None:
+        """Every 5 s; a window may lie between two of them."""
+        poses = topic("/odom", "nav_msgs/msg/Odometry", [(t, odometry(t, 10 * t, 0.0, 0.0, 10.0)) for t in (0, 5, 10)])
+        lists = json_topic("/boxes", [(k / 10, own(k / 10)) for k in range(101)])
+        path = write_mcap(tmp_path / "a.mcap", [lists, poses], profile="ros2")
+        found = read_log(path, name="a", topic="/boxes", fields=fields(), max_gap_s=6.0, window_s=window_s)
+        rows = found.truth.x_m[0, found.truth.row_object_ix == found.scene.ego_ix]
+        expected = np.arange(25, 41) if window_s else np.arange(101)
+        assert rows == pytest.approx(expected)
+        if window_s is None:
+            short = read_log(path, name="a", topic="/boxes", fields=fields())
+            assert (short.truth.row_object_ix == short.scene.ego_ix).sum() == 3
+
     def test_its_size_and_its_centre(self, tmp_path: Path) -> None:
         asked = EgoTopic(topic="/odom", size_m=(4.6, 1.9, 1.5), centre_from_rear_axle_m=1.4)
         found = read_log(self.drive(tmp_path), name="a", topic="/boxes", fields=fields(), ego=asked)
