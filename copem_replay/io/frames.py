@@ -36,7 +36,7 @@ from copem_replay.io.schemas.object_lists import (
     decode_lists,
 )
 from copem_replay.io.schemas.poses import ODOMETRY, Poses, decode_poses, is_pose, is_static
-from copem_replay.io.schemas.registry import describe_channel
+from copem_replay.io.schemas.registry import describe_channel, may_stay
 from copem_replay.io.stamps import find_runs
 from copem_replay.io.window import Window
 
@@ -402,15 +402,17 @@ def read_decoded_lists(
     log: Log, channels: Sequence[Channel], fields: Fields | None, classes: Mapping[str, str]
 ) -> DecodedLists:
     """The lists on channels of one topic and schema. Raises RecordingError, BrokenIndexError."""
-    messages = gather_messages(log, frozenset(c.number for c in channels))
+    of, channel, since_ns = frozenset(c.number for c in channels), channels[0], 0
+    if log.window is not None and log.window.from_ns > 0 and may_stay(channel):
+        since_ns, log = log.window.from_ns, log.within(replace(log.window, from_ns=0))
+    messages = gather_messages(log, of)
     payloads = [p for c in channels for p in messages.payloads[c.number]]
     times = np.array([t for c in channels for t in messages.log_time_ns[c.number]], dtype=np.int64)
-    channel = channels[0]
     try:
         definition = make_definition(channel, payloads)
         description = Description(fields) if fields is not None else describe_channel(channel, definition.offers())
         description = _add_classes(description, classes)
-        lists = decode_lists(definition, description, payloads, times, channel.ahead_ns)
+        lists = decode_lists(definition, description, payloads, times, channel.ahead_ns, since_ns)
     except (DefinitionError, FieldsError) as error:
         raise RecordingError(str(error), path=log.path, topic=channel.topic) from None
     columns = replace(lists.columns, notes=(*lists.columns.notes, *messages.notes()))

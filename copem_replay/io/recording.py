@@ -405,18 +405,20 @@ def _decode_topic(log: Log, topic: str) -> DecodedObjects:
 def _find_earlier(log: Log, channels: Mapping[int, Channel]) -> Iterator[tuple[int, bytes]]:
     """Channel number and payload of messages before the window: simulators write the road, and what stands, once.
 
-    After the first one they are read where that has things that stand, and the window begins without.
+    Those after the first are read where the window begins without things that stand, as far as they can be.
     """
     if log.window is None or log.window.from_ns <= 0:
         return
     numbers, before = frozenset(channels), log.within(Window(to_ns=log.window.from_ns - 1))
-    earlier = ((number, payload) for number, _, payload in before.payloads(numbers))
-    if (first := next(earlier, None)) is not None:
-        yield first
-        _, _, begins = next(log.payloads(numbers), (*first[:1], 0, first[1]))
-        schema = channels[first[0]].schema
-        if osi.sends_standing(first[1], schema) and not osi.sends_standing(begins, schema):
-            yield from earlier
+    begins = next(log.payloads(numbers), None)
+    all_sent = begins is not None and osi.sends_standing(begins[2], channels[begins[0]].schema)
+    try:
+        for number, _, payload in before.payloads(numbers):
+            yield number, payload
+            if all_sent:
+                return
+    except BrokenIndexError:  # what is damaged outside of the window is not its damage
+        return
 
 
 def _describe_damage(log: Log, topic: str, end_s: float | None) -> str | None:

@@ -389,12 +389,13 @@ def test_markers() -> None:
 
     markers = [marker("", 0, 0, 3), marker("car", 1, 1, 0), marker("pedestrian", 1, 1, 0), marker("car", 2, 9, 0)]
     found = written("visualization_msgs/msg/MarkerArray", text, {"markers": markers}, {"markers": []})
-    assert ids(found) == ["car/1", "pedestrian/1"]
-    assert classes(found) == ["car", "pedestrian"]
-    assert found.columns.rows.tolist() == [2, 0]
+    assert ids(found) == ["car/1", "pedestrian/1"] * 2  # they stay until they are deleted
+    assert classes(found) == ["car", "pedestrian"] * 2
+    assert found.columns.rows.tolist() == [2, 2]
     assert found.columns.stamp_ns.tolist() == [STAMP, STAMP + 1]  # as it was logged, by the clock of the other
     assert found.columns.stamped.tolist() == [True, False]
-    assert values(found, "length_m") == [4, 4]
+    assert values(found, "length_m") == [4, 4] * 2
+    assert noted(found) == ("2 object states of what stands, not sent again: where it was",)
 
 
 # ------------------------------------------------------------------------------------------------ SceneUpdate
@@ -447,7 +448,7 @@ def in_protobuf() -> tuple[Definition, list[bytes]]:
             ParseDict({k: v for k, v in entity.items() if k not in ("timestamp", "lifetime")}, said)
             said.timestamp.FromNanoseconds(STAMP)
         for deletion in message["deletions"]:
-            update.deletions.add(id=deletion["id"])
+            update.deletions.add(id=deletion["id"], type=deletion["type"])
         payloads.append(update.SerializeToString())
     return ProtobufDefinition(made.name, made), payloads
 
@@ -490,27 +491,44 @@ def test_the_largest_cube_of_an_entity() -> None:
     assert noted(found) == ("4 cubes beside a larger one of the same entity: left out",)
 
 
-REPEATED = "in between that no message repeats: not taken, a list holds what its message says"
+STANDS = "of what stands, not sent again: where it was"
+UNSAID = "in between that no message repeats: not taken, a list holds what its message says"
 
 
 @pytest.mark.parametrize(
-    ("messages", "notes"),
+    ("messages", "held", "notes"),
     [
-        (["a b", "a b", "a b"], ()),  # as most do
-        (["a b", "a", "a"], ()),  # b has left, or stands: the messages between are not between two of it
-        (["a", "b", "b", "a"], (f"2 states {REPEATED}",)),
-        (["b a", "b", "a", "", "b a"], (f"4 states {REPEATED}",)),  # a in two, b in two, one of them empty
+        # An entity and its x; `-` deletes it, `*` all; `~` ends by itself.
+        ("a0 b0|a0 b0|a0 b0", "ab|ab|ab", ()),  # as most do
+        ("a0 b0|a0|a0", "ab|ab|ab", (f"2 object states {STANDS}",)),
+        ("a0|b9|b9|a0", "a|ab|ab|ab", (f"3 object states {STANDS}",)),
+        ("a0 b0|a0 -b|a0|a0 b0", "ab|a|a|ab", ()),
+        ("a0 b0|*|b5|", "ab||b|b", (f"1 object state {STANDS}",)),
+        ("a0 b0|* a1|a2", "ab|a|a", ()),  # all are deleted before those of the message come
+        ("a0|a5||a10|", "a|a||a|", (f"1 state {UNSAID}",)),  # it drives: where it is between is not said, nor after
+        ("a0|a5||a5||a5|-a|", "a|a|a|a|a|a||", (f"2 object states {STANDS}",)),
+        ("~a0||b0", "a||b", ()),
     ],
 )
-def test_entities_that_are_not_said_again(messages: list[str], notes: tuple[str, ...]) -> None:
+def test_entities_that_are_not_said_again(messages: str, held: str, notes: tuple[str, ...]) -> None:
     said = []
-    for k, text in enumerate(messages):
-        entities = [{"id": name, "timestamp": {"sec": k, "nsec": 0}, "cubes": [body(1)]} for name in text.split()]
-        said.append(json.dumps({"entities": entities}).encode())
+    for k, message in enumerate(messages.split("|")):
+        entities, deletions = [], []
+        for text in message.split():
+            name, stamp = text.strip("-~*0123456789"), {"sec": k, "nsec": 0}
+            if text[0] in "-*":
+                deletions.append({"timestamp": stamp, "type": int(text[0] == "*"), "id": name})
+                continue
+            lasts = {"sec": 0, "nsec": int(text[0] == "~")}
+            cubes = [body(1, float(text.strip("~ab")))]
+            entities.append({"id": name, "timestamp": stamp, "lifetime": lasts, "cubes": cubes})
+        said.append(json.dumps({"entities": entities, "deletions": deletions}).encode())
     definition = JsonDefinition(said)
     logged = np.arange(len(said)) * 10**9
     found = decode_lists(definition, description(definition.offers()), said, logged)
-    assert found.columns.rows.tolist() == [len(text.split()) for text in messages]
+    ends = np.cumsum(found.columns.rows)[:-1]
+    names = np.array([found.columns.object_ids[k] for k in found.columns.object_ix])
+    assert "|".join("".join(sorted(of)) for of in np.split(names, ends)) == held
     assert noted(found) == notes
 
 

@@ -31,7 +31,17 @@ from copem_replay.io.open import open_log
 from copem_replay.io.recording import Recording, read_log
 from copem_replay.pipeline.run import run_experiment
 from tests.helpers.experiments import changed
-from tests.helpers.recordings import SHARED, Obj, Topic, ns, pedestrian, truth_topic, write_mcap, write_recording
+from tests.helpers.recordings import (
+    SHARED,
+    Obj,
+    Topic,
+    ground_truth,
+    ns,
+    pedestrian,
+    truth_topic,
+    write_mcap,
+    write_recording,
+)
 from tests.helpers.ros2 import header, made, odometry, pose, topic, transform
 from tests.io.test_osi_trace import packed
 from tests.io.test_recorded_units import car, list_of
@@ -299,11 +309,18 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return begun
 
 
-def test_other_chunks_are_not_decompressed(tmp_path: Path, watched: list[int]) -> None:
-    """One message a chunk: the first, by which seconds are counted, and those of the window."""
-    path = drive(tmp_path / "a.mcap", chunk_size=1)
+@pytest.mark.parametrize("standing", [True, False])
+def test_other_chunks_are_not_decompressed(tmp_path: Path, watched: list[int], standing: bool) -> None:
+    """One message a chunk: the first, by which seconds are counted, and those of the window.
+
+    Of a truth whose messages do not all have what stands, those before may have, and are read.
+    """
+    wall = [Obj(id=9, x=40, stationary=True)] if standing else []
+    frames = [(START_S + k / 10, [Obj(id=1, x=0.2 * k), *wall]) for k in range(101)]
+    path = write_recording(tmp_path / "a.mcap", frames, chunk_size=1)
     read_log(path, name="a", window_s=(3.0, 3.4))
-    assert {round(t / 1e9 - START_S, 3) for t in watched} == {0.0, 3.0, 3.1, 3.2, 3.3, 3.4}
+    before = [0.0] if standing else [k / 10 for k in range(30)]
+    assert {round(t / 1e9 - START_S, 3) for t in watched} == {*before, 3.0, 3.1, 3.2, 3.3, 3.4}
 
 
 def spoilt(path: Path, first: int, last: int) -> None:
@@ -562,3 +579,49 @@ def test_a_recorded_drive() -> None:
     assert 0 < len(cut.truth.stamp_ns) < len(whole.truth.stamp_ns)
     kept = np.isin(whole.truth.stamp_ns[whole.truth.frame_ix], cut.truth.stamp_ns)
     assert int(kept.sum()) == len(cut.truth.frame_ix)
+
+
+@pytest.mark.parametrize("kind", ["osi", "osi trace", "scene", "markers"])
+def test_what_is_sent_once_before_the_window_stands_in_it(tmp_path: Path, kind: str) -> None:
+    """A car drives, a wall is sent at 0.5 s alone."""
+    times = [k / 10 for k in range(31)]
+
+    def scene(t: float) -> dict[str, Any]:
+        def entity(name: str, x: float) -> dict[str, Any]:
+            at = {"position": {"x": x, "y": 0, "z": 1}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}
+            cube = {"pose": at, "size": {"x": 4, "y": 2, "z": 2}}
+            return {"id": name, "timestamp": {"sec": int(t), "nsec": ns(t) % 10**9}, "frame_id": "map", "cubes": [cube]}
+
+        return {"entities": [entity("car", 5 * t), *([entity("wall", 40.0)] if t == 0.5 else [])]}
+
+    def markers(t: float) -> bytes:
+        def marker(name: str, x: float) -> Any:
+            type_ = "visualization_msgs/msg/Marker"
+            size, at = _vector(4.0, 2.0, 2.0), pose(x, 0, 1)
+            return made(type_, header=header(t, "map"), ns=name, id=1, type=1, pose=at, scale=size)
+
+        boxes = [marker("car", 5 * t), *([marker("wall", 40.0)] if t == 0.5 else [])]
+        return made("visualization_msgs/msg/MarkerArray", markers=boxes)
+
+    frames = [(t, [Obj(id=1, x=5 * t)] + [Obj(id=9, x=40, stationary=True)] * (t == 0.5)) for t in times]
+    if kind == "osi trace":
+        path = tmp_path / "a_gt_.osi"
+        path.write_bytes(packed([ground_truth(t, objects).SerializeToString() for t, objects in frames]))
+    elif kind == "osi":
+        path = write_recording(tmp_path / "a.mcap", frames)
+    else:
+        topics = {
+            "scene": lambda: json_topic("/scene", [(t, scene(t)) for t in times], schema="foxglove.SceneUpdate"),
+            "markers": lambda: topic("/boxes", "visualization_msgs/msg/MarkerArray", [(t, markers(t)) for t in times]),
+        }
+        path = write_mcap(tmp_path / "a.mcap", [topics[kind]()])
+
+    def wall(window_s: tuple[float | None, float | None] | None) -> list[float]:
+        found = read_log(path, name="a", window_s=window_s)
+        of = next(k for k, name in enumerate(found.scene.object_ids) if name in ("9", "wall", "wall/1"))
+        at_s = found.truth.row_captured_s[found.truth.row_object_ix == of] + found.scene.t0_ns * 1e-9
+        return at_s.round(3).tolist()
+
+    assert wall(None) == times[5:]
+    assert wall((1.0, 2.0)) == times[10:21]
+    assert wall((0.3, None)) == times[5:]

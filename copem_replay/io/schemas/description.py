@@ -97,13 +97,28 @@ class SolidField:
 
 
 @dataclass(frozen=True)
+class StaysField:
+    """Paths, from the message, of what ends a thing: its `lifetime` (0: none does), and removals.
+
+    `kind`: that of a removal, of one thing by its value in `one`, of all in `all`; `id`: of what it removes, None: it
+    is an object of the list itself.
+    """
+
+    lifetime: str
+    kind: str
+    id: str | None
+    one: tuple[str, ...]
+    all: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class Description:
     """A format: its fields, the values of paths that select objects (`only`), and the path an id is unique `within`.
 
     `said`: paths of numbers that are 0 where an object does not state its `yaw`, `velocity`, `covariance`. `footprint`:
     the points of an object's outline, with x and y along its axes, for objects without length and width. `solid`: the
     fields of its shape. `largest_of`: the list of things that may have several bodies, of which the largest counts.
-    `stays`: the path of the ids of things that exist until a message removes them.
+    `stays`: how things end that exist until a message removes them.
     """
 
     fields: Fields
@@ -113,4 +128,4 @@ class Description:
     footprint: str | None = None
     solid: SolidField | None = None
     largest_of: str | None = None
-    stays: str | None = None
+    stays: StaysField | None = None

@@ -15,6 +15,7 @@ from copem_replay.io.schemas.description import (
     Description,
     Fields,
     SolidField,
+    StaysField,
     Yaw,
 )
 
@@ -156,9 +157,11 @@ def markers(offers: Collection[str]) -> Description:
         ),
         only={"type": ("1",), "action": ("0",)},  # CUBE; ADD, which is MODIFY too
         within="ns",
+        stays=StaysField("markers[].lifetime", "markers[].action", None, ("2",), ("3",)),
     )
 
 
+_MATCHING = ("0", "MATCHING_ID", "")
 _KEYS = ("class", "category", "category_name", "classification", "label", "object_class", "type")
 
 
@@ -187,5 +190,5 @@ def description(offers: Collection[str]) -> Description:
             }
         ),
         largest_of="entities[]",
-        stays="entities[].id" if "entities[].id" in offers else None,
+        stays=StaysField("entities[].lifetime", "deletions[].type", "deletions[].id", _MATCHING, ("1", "ALL")),
     )

@@ -138,8 +138,13 @@ class WantedPaths:
         if described.solid is not None:
             numbers += [self._of_object("length_m", described.solid.kind)]
             numbers += [self._of_object("length_m", f"{described.solid.dimensions}[{k}]") for k in range(2)]
-        if described.stays is not None:
-            texts.append(described.stays)
+        self.lifetime: list[str] = []
+        self.removal: list[str] = []
+        if (stays := described.stays) is not None:
+            self.lifetime = find_stamp_paths(self._offers, stays.lifetime)
+            paths = [path for path in (stays.kind, stays.id) if path is not None]
+            self.removal = paths if {*paths} <= {*self._offers} else []
+            texts += self.lifetime + self.removal
         texts += self.stamp
         return numbers, texts
 
@@ -207,6 +212,41 @@ def find_largest(values: Float, meant: Bool, found: ShreddedMessages, objects: s
     return chosen
 
 
+# What stays until a message removes it.
+
+_STOOD_M = 0.1
+"""An object that was sent twice no farther apart stood."""
+
+
+def find_standing(
+    number: Int, rank: Int, at_m: Float, forever: Bool, removed: Int, removed_rank: Int, lists: int
+) -> tuple[Int, Int, int]:
+    """Rows (R,) of objects that stand, the lists (R,) that do not repeat them, and how many states move unsaid.
+
+    Rows (P,): objects `number` in the lists `rank`, of `lists` in order of time, at `at_m (P, 2)`; those that are not
+    there `forever` end by themselves. `removed`: objects, −1: all, from the list `removed_rank` on.
+    """
+    order = np.lexsort((rank, number))
+    number, rank, at_m, forever = number[order], rank[order], at_m[order], forever[order]
+    same = np.diff(number) == 0
+    until = np.append(np.where(same, rank[1:], lists), lists)
+    key = number * lists + rank
+    for rows, mine in ((removed >= 0, key), (removed < 0, rank)):
+        ends = np.unique(np.where(removed[rows] < 0, 0, removed[rows]) * lists + removed_rank[rows])
+        ends = np.append(ends, (number.max() + 1) * lists)
+        until = np.minimum(until, rank + ends[np.searchsorted(ends, mine, side="right")] - mine)
+    same &= until[:-1] == rank[1:]  # what was removed and comes again is another thing
+    stood = same & (np.hypot(*np.diff(at_m, axis=0).T) <= _STOOD_M)
+    last, alone = np.append(~same, True), np.append(~same, True) & np.append(True, ~same)
+    stands = np.where(last, alone | np.append(False, stood), np.append(stood, False)) & forever
+    gaps = until - rank - 1
+    unsaid = int(gaps[~stands & ~last & forever].sum())
+    gaps = np.where(stands, gaps, 0)
+    check_objects(int(gaps.sum()) // max(lists, 1))
+    step = np.arange(gaps.sum()) - np.repeat(np.cumsum(gaps) - gaps, gaps)
+    return np.repeat(order, gaps), np.repeat(rank + 1, gaps) + step, unsaid
+
+
 # Decoding.
 
 __all__ = ["ClassField", "DecodedLists", "Description", "Fields", "FieldsError", "Stamp", "Yaw", "decode_lists"]
@@ -231,14 +271,20 @@ class DecodedLists:
 
 
 def decode_lists(
-    definition: Definition, description: Description, payloads: Sequence[bytes], log_time_ns: Int, ahead_ns: int = 0
+    definition: Definition,
+    description: Description,
+    payloads: Sequence[bytes],
+    log_time_ns: Int,
+    ahead_ns: int = 0,
+    since_ns: int = 0,
 ) -> DecodedLists:
     """The lists in messages that were logged at `log_time_ns (F,)`; `ahead_ns`: their clock against that of log times.
 
+    `since_ns`: of messages logged before only what stays is taken.
     Raises FieldsError, OversizeError.
     """
     with np.errstate(over="ignore", invalid="ignore"):  # states that are not finite are left out later
-        return _BatchReader(definition, description, payloads).listed(log_time_ns, ahead_ns)
+        return _BatchReader(definition, description, payloads).listed(log_time_ns, ahead_ns, since_ns)
 
 
 class _BatchReader:
@@ -470,16 +516,47 @@ class _BatchReader:
         covariance[~self._said("covariance")[keep]] = np.nan
         return covariance
 
-    def _unsaid(self) -> int:
-        """Number of states that messages leave out between the first and the last one with a thing that stays."""
-        if (path := self._description.stays) is None:
-            return 0
-        level = list_level(path)
-        code, message = self._found.levels[level].texts[path].code, ancestor_rows(self._found, level, "")
-        code, message = np.unique(np.stack([code, message])[:, code >= 0], axis=1)
-        return int((np.diff(message) - 1)[np.diff(code) == 0].sum())
+    def _with_standing(
+        self, keep: Int, message: Int, ids: DistinctTexts | None, in_time: Int, values: Float
+    ) -> tuple[Int, Int]:
+        """Rows of objects and the message of each, with what stands in those of `in_time` that do not repeat it."""
+        stays, paths, at = self._description.stays, self._wanted.lifetime, message[keep]
+        if stays is None or ids is None or not len(keep):
+            return keep, at
+        forever = np.ones(len(keep), dtype=bool)
+        if paths:
+            level = list_level(paths[0])
+            stated_ns, _, _ = parse_nanoseconds([self._found.levels[level].texts[path] for path in paths], "s")
+            forever = stated_ns[ancestor_rows(self._found, self._fields.objects, level)][keep] == 0
+        rank = np.full(self._messages, -1)
+        rank[in_time] = np.arange(len(in_time))
+        removed, since = self._removals(ids)
+        more, until, unsaid = find_standing(
+            ids.code[keep], rank[at], values[keep, :2], forever, removed, rank[since], len(in_time)
+        )
+        self._notes += find("stays unsaid", unsaid)
+        self._notes += find("stands", len(more))
+        keep, at = np.append(keep, keep[more]), np.append(at, in_time[until])
+        order = np.argsort(at, kind="stable")
+        return keep[order], at[order]
 
-    def listed(self, log_time_ns: Int, ahead_ns: int) -> DecodedLists:
+    def _removals(self, ids: DistinctTexts) -> tuple[Int, Int]:
+        """Things that messages remove, −1: all, and the message of each removal."""
+        stays = self._description.stays
+        if stays is None or not self._wanted.removal:
+            return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+        level = list_level(stays.kind)
+        texts, message = self._found.levels[level].texts, ancestor_rows(self._found, level, "")
+        kinds = [*texts[stays.kind].words, ""]
+        one, every = (np.array([word in of for word in kinds])[texts[stays.kind].code] for of in (stays.one, stays.all))
+        code = ids.code
+        if stays.id is not None:
+            known = {word: number for number, word in enumerate(ids.words)}
+            code = np.array([*(known.get(word, -2) for word in texts[stays.id].words), -2])[texts[stays.id].code]
+        chosen = every | (one & (code >= 0))
+        return np.where(every, -1, code)[chosen], message[chosen]
+
+    def listed(self, log_time_ns: Int, ahead_ns: int, since_ns: int) -> DecodedLists:
         """The columns of the objects that are kept. The order of the steps is that of the notes."""
         found, meant = self._found, self._meant()
         self._notes += find("undecoded", int((~found.decoded).sum()))
@@ -490,15 +567,20 @@ class _BatchReader:
         keep = self._kept(meant, ids)
         message = found.levels[""].parent[ancestor_rows(found, self._fields.objects, "")]
         keep = keep[np.isin(message[keep], kept_message)]
+        keep, message = self._with_standing(
+            keep, message, ids, kept_message[np.argsort(stamp_ns, kind="stable")], values
+        )
+        late = log_time_ns[kept_message] >= since_ns
+        kept_message, stamp_ns, stamped = kept_message[late], stamp_ns[late], stamped[late]
+        keep, message = (rows[np.isin(message, kept_message)] for rows in (keep, message))
         number = np.arange(len(keep)) if ids is None else ids.code[keep]
         names = tuple(str(k) for k in range(len(keep))) if ids is None else ids.words
         probability = self._classes()[keep]
-        self._notes += find("stays unsaid", self._unsaid())
         columns = DecodedObjects(
             stamp_ns=stamp_ns,
             stamped=stamped,
             log_time_ns=log_time_ns[kept_message],
-            rows=np.bincount(message[keep], minlength=self._messages)[kept_message],
+            rows=np.bincount(message, minlength=self._messages)[kept_message],
             object_ids=names,
             moving=np.ones(len(names), dtype=bool),
             object_ix=number.astype(np.int64),

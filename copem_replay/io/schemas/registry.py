@@ -29,12 +29,13 @@ class ListSchema:
     `name`: that of the schema; ROS 2 types with their `/msg/`. `describe`: `package.module:function`, imported when a
     recording has such lists. The function takes the paths that the messages offer, since definitions differ between
     releases, and returns a `Description`. `has_ids`: whether an object keeps its id from list to list, so that the
-    lists can be the truth.
+    lists can be the truth. `stays`: whether what a message holds may stay until another removes it.
     """
 
     name: str
     describe: str
     has_ids: bool = True
+    stays: bool = False
 
     def description(self, offers: Collection[str]) -> Description:
         """The description of messages that offer these paths.
@@ -68,9 +69,9 @@ _ROWS: Final = (
     *(ListSchema(f"{package}/msg/DetectedObjects", f"{_FORMATS}:autoware", has_ids=False) for package in _AUTOWARE),
     ListSchema("vision_msgs/msg/Detection3DArray", f"{_FORMATS}:detection3d"),
     ListSchema("derived_object_msgs/msg/ObjectArray", f"{_FORMATS}:derived"),
-    ListSchema("visualization_msgs/msg/MarkerArray", f"{_FORMATS}:markers"),
-    ListSchema("foxglove.SceneUpdate", f"{_FORMATS}:description"),
-    ListSchema("foxglove_msgs/msg/SceneUpdate", f"{_FORMATS}:description"),
+    ListSchema("visualization_msgs/msg/MarkerArray", f"{_FORMATS}:markers", stays=True),
+    ListSchema("foxglove.SceneUpdate", f"{_FORMATS}:description", stays=True),
+    ListSchema("foxglove_msgs/msg/SceneUpdate", f"{_FORMATS}:description", stays=True),
 )
 SCHEMAS: Final = {schema.name: schema for schema in _ROWS}
 GROUP: Final = "copem_replay.list_schema"
@@ -96,6 +97,12 @@ def names_objects(channel: Channel) -> bool:
     """Whether the objects on the channel have ids, so that it can be the truth."""
     schema = list_schema(channel)
     return schema is not None and schema.has_ids
+
+
+def may_stay(channel: Channel) -> bool:
+    """Whether what a message of the channel holds may stay until another removes it."""
+    schema = list_schema(channel)
+    return schema is not None and schema.stays
 
 
 def known_lists(channels: Iterable[Channel]) -> list[Channel]:
