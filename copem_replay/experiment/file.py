@@ -397,6 +397,8 @@ def _explain_unasked(source: ExperimentSource, k: int, pattern: str | None) -> s
     if pattern is None:
         elsewhere = filter(is_url, source.data["logs"][k]["together"])
         return next((f"expected recordings on this machine, found {strip_credentials(url)}" for url in elsewhere), None)
+    if _searches_everything(source_folder(source) / pattern):
+        return f"expected a folder before `**`, found {pattern!r}, which searches all of this machine"
     why = source.listed.get(pattern)
     return why.problems[0] if isinstance(why, InputError) else None
 
@@ -552,7 +554,15 @@ def match_files(pattern: str, folder: Path, listed: Listed | None = None) -> lis
         return [] if isinstance(files, InputError) else files
     if place_exists(folder / pattern) or not glob.has_magic(pattern):
         return [folder / pattern]
+    if _searches_everything(folder / pattern):
+        return []
     return [folder / name for name in sorted(glob.glob(pattern, root_dir=folder, recursive=True))]
+
+
+def _searches_everything(pattern: Path) -> bool:
+    """Whether a pattern searches all folders from the root of the file system on, which does not end."""
+    parts = pattern.parts
+    return "**" in parts and os.path.realpath(Path(*parts[: parts.index("**")])) == os.path.realpath("/")
 
 
 def place_exists(place: Place) -> bool:

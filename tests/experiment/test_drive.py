@@ -158,6 +158,11 @@ def test_latencies_of_absent_units_go_with_them(folder: Path) -> None:
             "2: logs[0]: expected one of `file: <recording>` and `together: [<recording>, <recording>]`",
         ),
         ("[{file: nix.mcap, ego: 1}, 'n*x']", "2: logs[1]: no file matches 'n*x'"),
+        ("['/**']", "2: logs[0]: expected a folder before `**`, found '/**', which searches all of this machine"),
+        (
+            "['/**/*.mcap']",
+            "2: logs[0]: expected a folder before `**`, found '/**/*.mcap', which searches all of this machine",
+        ),
         (
             "[{file: '*.mcap', name: x}]",
             "2: logs[0].name: a name goes with one recording; '*.mcap' matches 3",

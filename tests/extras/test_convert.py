@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import os
 import re
 import shlex
@@ -269,6 +270,17 @@ def test_sumo_front_bumper_and_angle(run: Runner) -> None:
     ]
     assert found.class_of("4") == "pedestrian"
     assert found.recording.host_id is None
+
+
+def test_sumo_packed(run: Runner) -> None:
+    step = '<vehicle id="a" x="5" y="0" angle="90" type="t" speed="1"/>'
+    plain = run("sumo", run.file("fcd.xml", fcd(step)))
+    packed = gzip.compress(fcd(step).encode())
+    found = run("sumo", run.file("fcd.xml.gz", packed))
+    assert found.values("1", "x_m", "y_m") == plain.values("1", "x_m", "y_m")
+    for content in (packed[:-12], b"<fcd-export/>", packed[:15] + b"zzzz" + packed[19:]):
+        line = run.refused("sumo", run.file("fcd.xml.gz", content))
+        assert "fcd.xml.gz: expected a file that gzip has packed, found something else or its end: " in line
 
 
 def test_sumo_types_and_host(run: Runner) -> None:

@@ -83,6 +83,14 @@ def test_rotations_of_labels_and_of_the_vehicle_add_up(run: Runner) -> None:
     assert "1 object state of the class name 'Zorb', which says nothing: taken as other; " in found.printed
 
 
+def test_a_missing_file_of_labels_is_a_gap(run: Runner) -> None:
+    folder = write(run.folder / "set")
+    (folder / "cooperative/label/000010.json").unlink()
+    found = run("v2xseq", folder, "--only", "0000")
+    assert found.stamps_ns == [1000 * (T0_US + 100_000)]
+    assert "note: 1 frame without its file of labels: a gap\n" in found.printed
+
+
 def test_each_sequence_is_a_recording(run: Runner) -> None:
     assert convert("v2xseq", write(run.folder / "set"), "--out", run.folder / "out") == 0
     assert sorted(path.name for path in (run.folder / "out").iterdir()) == ["0000.mcap", "0001.mcap"]
@@ -103,7 +111,7 @@ def test_each_sequence_is_a_recording(run: Runner) -> None:
             '[{"cooperative_label_path": "x"}]',
             "expected V2X-Seq, found DAIR-V2X-C, whose",
         ),
-        ("cooperative/label/000010.json", None, "000010.json: no such file"),
+        ("vehicle-side/calib/novatel_to_world/000010.json", None, "000010.json: no such file"),
         ("cooperative/label/000010.json", "[{}]", "label 1: expected a track_id, found nothing: V2X-Seq has them"),
         (
             "cooperative/label/000010.json",

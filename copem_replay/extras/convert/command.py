@@ -174,7 +174,7 @@ def sumo(
     ] = None,
     host: Annotated[str | None, typer.Option(metavar="ID", help="Vehicle that is the host.")] = None,
 ) -> int:
-    """SUMO: the XML file of --fcd-output."""
+    """SUMO: the XML file of --fcd-output, or packed as .xml.gz."""
     return _convert_sources("sumo", source, out, overwrite, type_files=types or (), host=host)
 
 

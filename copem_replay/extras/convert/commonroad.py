@@ -7,7 +7,9 @@ gives no host vehicle. Velocities are speeds along the orientation.
 
 from __future__ import annotations
 
+import gzip
 import math
+import zlib
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -75,12 +77,16 @@ def read_parts(path: Path, root_tags: tuple[str, ...], *, most_elements: int | N
     """
     reading = _ParserHandlers(path, root_tags, most_elements)
     try:
-        with path.open("rb") as stream:
+        with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as stream:
             while block := stream.read(_BLOCK_BYTES):
                 reading.parser.Parse(block, False)
                 while reading.done:
                     yield reading.done.popleft()
             reading.parser.Parse(b"", True)
+    except (gzip.BadGzipFile, EOFError, zlib.error) as error:
+        raise InputError(
+            f"{path}: expected a file that gzip has packed, found something else or its end: {error}"
+        ) from None
     except OSError as error:
         raise InputError(f"{path}: cannot be opened: {error.strerror}") from None
     except expat.ExpatError as error:

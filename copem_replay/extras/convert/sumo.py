@@ -1,4 +1,4 @@
-"""SUMO floating car data (`--fcd-output fcd.xml`), with `<vehicle>` and `<person>`.
+"""SUMO floating car data (`--fcd-output fcd.xml`, or `fcd.xml.gz`), with `<vehicle>` and `<person>`.
 
 x and y of a vehicle are the centre of its front bumper, of a person they are taken as the centre. `angle` is in degrees
 clockwise from north. Sizes are not in the file: they are those of the types that route and additional files define.

@@ -80,10 +80,14 @@ def frames(
     )
     _say_where_infrastructure_is(source, sequences[sequence][0].infrastructure, report)
     for pair in sequences[sequence]:
+        path = source / f"cooperative/label/{pair.vehicle}.json"
+        if not path.is_file():
+            report.count("frame", "without its file of labels: a gap")
+            continue
         R, t = _read_pose(source / "vehicle-side/calib", ("novatel_to_world", "lidar_to_novatel"), pair.vehicle)
         x, y, z = t.tolist()
         boxes = [Box(1, KINDS["car"], (x, y, z - ego_size_m[2] / 2), math.atan2(R[1, 0], R[0, 0]), ego_size_m)]
-        path, seen = source / f"cooperative/label/{pair.vehicle}.json", set[int]()
+        seen = set[int]()
         for number, label in enumerate(_read_list(path), start=1):
             box = _make_box(label, ids, R, t, f"{path}: label {number}", report)
             if box.id in seen:
