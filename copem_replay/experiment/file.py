@@ -24,7 +24,7 @@ from copem_replay.core.errors import (
     strip_credentials,
 )
 from copem_replay.core.yaml import AliasesError, Key, NotYamlError, parse_yaml
-from copem_replay.experiment.schema import Experiment, LogSettings
+from copem_replay.experiment.schema import Experiment, LogEntry, LogSettings
 from copem_replay.io.open import DriveRecordings, File, Place, first_recording, name_log
 
 # Problems of shape in the words of the file: the key, what was expected, what was found.
@@ -386,10 +386,26 @@ def list_named_paths(source: ExperimentSource) -> Iterator[tuple[str, Place]]:
 def _find_places(source: ExperimentSource, k: int, pattern: str | None) -> list[Place]:
     """The places that an entry of `logs` names: the files that match, or several recordings as one."""
     if pattern is not None:
-        return list(match_files(pattern, source_folder(source), source.listed))
+        files = match_files(pattern, source_folder(source), source.listed)
+        return [_part_of(file, source.data["logs"], k) for file in files]
     entry = source.data["logs"][k]
     offsets = entry.get("clock_offset_s")
     return [combine_recordings(entry["together"], offsets if isinstance(offsets, dict) else {}, source_folder(source))]
+
+
+def _part_of(file: File, entries: Sequence[object], k: int) -> Place:
+    """The place of an entry of `logs`: the file, or a log of its own by name and window where others name it, too."""
+    whole = [entry.model_dump() if isinstance(entry, LogSettings) else entry for entry in entries]
+    named = [entry.get("file") if isinstance(entry, dict) else entry for entry in whole]
+    entry = whole[k]
+    if isinstance(file, RemoteFile) or named.count(named[k]) < 2 or not isinstance(entry, dict):
+        return file
+    name, window_s = entry.get("name"), entry.get("window_s")
+    ends = [
+        float(end) if isinstance(end, int | float) else end
+        for end in (window_s if isinstance(window_s, list | tuple) else ())
+    ]
+    return DriveRecordings((file,), (0.0,), f"{name} {ends}") if name or ends else file
 
 
 def _explain_unasked(source: ExperimentSource, k: int, pattern: str | None) -> str | None:
@@ -452,17 +468,20 @@ def relocate_settings(
     entry: LogSettings, place: Place, called: Callable[[File], str] = recording_address
 ) -> LogSettings:
     """The settings of an entry for the recording or recordings at `place`, named by `called`."""
-    if not isinstance(place, DriveRecordings):
-        return entry.model_copy(update={"file": called(place)})
+    if not isinstance(place, DriveRecordings) or len(place.paths) == 1:
+        return entry.model_copy(update={"file": called(first_recording(place))})
     names = tuple(called(path) for path in place.paths)
     offsets = {name: ahead_s for name, ahead_s in zip(names, place.ahead_s, strict=True) if ahead_s}
     return entry.model_copy(update={"together": names} | ({"clock_offset_s": offsets} if offsets else {}))
 
 
-def settings_places(entry: LogSettings, folder: Path, listed: Listed | None = None) -> list[Place]:
-    """The places of the recordings that settings are for."""
+def settings_places(entries: Sequence[LogEntry], k: int, folder: Path, listed: Listed | None = None) -> list[Place]:
+    """The places of the recordings that the settings of an entry are for."""
+    entry = entries[k]
+    if isinstance(entry, str):
+        return []
     if entry.file is not None:
-        return list(match_files(entry.file, folder, listed))
+        return [_part_of(file, entries, k) for file in match_files(entry.file, folder, listed)]
     return [combine_recordings(entry.together or (), entry.clock_offset_s, folder)]
 
 
@@ -470,9 +489,9 @@ def place_identity(place: Place) -> str:
     """A text that identifies a recording, or several as one, whatever path or link leads there."""
     if isinstance(place, RemoteFile):
         return place.url
-    paths = [place] if isinstance(place, Path) else place.paths
+    paths, part = ([place], "") if isinstance(place, Path) else (place.paths, place.part)
     try:
-        return "\n".join(map(os.path.realpath, paths))
+        return "\n".join([*map(os.path.realpath, paths), *([part] if part else [])])
     except UnicodeEncodeError:  # half a character: no file has such a name
         return "\n".join(map(str, paths))
 
@@ -491,13 +510,14 @@ def replace_logs(source: ExperimentSource, paths: Sequence[str], option: str = "
     entries: list[object] = []
     for path in paths:
         real = path if is_url(path) else os.path.realpath(path)
-        matching = (
+        matching = [
             entry
             for entry, pattern in patterns
             if isinstance(pattern, str)
             and any(place_identity(found) == real for found in match_files(pattern, source.path.parent, source.listed))
-        )
-        entries.append({**entry, "file": path} if (entry := next(matching, None)) is not None else path)
+        ]
+        alike = [entry for entry in matching if entry.get("file") == matching[0].get("file")]  # several logs of it
+        entries += [{**entry, "file": path} for entry in alike] or [path]
     options = dict(source.options) | ({("logs",): option} if option != "--log" else {})
     data = _without_shown(source, _names_of(entries, Path(), source.listed)) | {"logs": entries}
     return replace(source, data=data, logs=tuple(paths), options=options)

@@ -300,7 +300,7 @@ def settings_by_place(experiment: Experiment, source: ExperimentSource | None) -
         place_identity(place): (k, entry)
         for k, entry in enumerate(experiment.logs)
         if isinstance(entry, LogSettings)
-        for place in settings_places(entry, folder, listed)
+        for place in settings_places(experiment.logs, k, folder, listed)
     }
 
 

@@ -32,10 +32,14 @@ from copem_replay.io.window import ALWAYS, Window
 
 @dataclass(frozen=True)
 class DriveRecordings:
-    """Recordings that are read as one; `ahead_s`: how far each clock is ahead of the first one, 0 of the first."""
+    """Recordings that are read as one; `ahead_s`: how far each clock is ahead of the first one, 0 of the first.
+
+    `part`: tells logs apart that are of the same recordings, which may be a single one; "": there is no other.
+    """
 
     paths: tuple[Path, ...]
     ahead_s: tuple[float, ...]
+    part: str = ""
 
     def __str__(self) -> str:
         return " + ".join(map(str, self.paths))
@@ -317,7 +321,9 @@ CONTAINERS: Final = (
 
 def open_log(place: Local) -> Log:
     """The log of a recording, or of several as one. Raises RecordingError: nothing in one of them can be read."""
-    return open_joined(place, _open_one) if isinstance(place, DriveRecordings) else _open_one(place)
+    if isinstance(place, DriveRecordings) and len(place.paths) > 1:
+        return open_joined(place, _open_one)
+    return _open_one(first_recording(place))
 
 
 def find_drive_recordings(log: Log) -> DriveRecordings | None:

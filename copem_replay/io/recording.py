@@ -161,7 +161,7 @@ def read_log(
         check_files_unchanged(stamps or ())  # for this is why
         raise
     check_files_unchanged(stamps or ())
-    return replace(recording, stamps=stamps)
+    return replace(recording, stamps=stamps, together=place if isinstance(place, DriveRecordings) else None)
 
 
 @np.errstate(over="ignore", invalid="ignore")  # a state that is not finite is left out later, with a note

@@ -361,10 +361,11 @@ class Results:
     def log_place(self, log: str) -> Place:
         """The place where the recording of a log, or the several that it is made of, are expected."""
         base = self.place if self.study is None else Path()
-        entry = self.experiment.logs[[file.name for file in self.provenance.logs].index(log)]
+        number = [file.name for file in self.provenance.logs].index(log)
+        entry = self.experiment.logs[number]
         if isinstance(entry, str):
             return RemoteFile(entry) if is_url(entry) else base / entry
-        return settings_places(entry, base)[0]
+        return settings_places(self.experiment.logs, number, base)[0]
 
     def recording(self, log: str, experiment: Experiment) -> Recording:
         """The recording of a log, read again as an experiment, this one or one made of it, has it.

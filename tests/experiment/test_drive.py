@@ -70,6 +70,37 @@ def test_each_log_comes_out_as_if_the_experiment_were_written_for_it_alone(folde
     assert_frame_equal(together[together["log"] == log].reset_index(drop=True), alone, check_dtype=False)
 
 
+WINDOWS = ("{file: drive.mcap, name: one, window_s: [0, 2]}", "{file: drive.mcap, name: other, window_s: [0, 2.5]}")
+
+
+def test_two_windows_of_one_drive_are_two_logs(folder: Path) -> None:
+    """Each as alone; results are read again, `--log` asks for both, and a part that is named twice is one log."""
+    together = run(folder, changed(), f"[{', '.join(WINDOWS)}]")
+    assert together["log"].unique().tolist() == ["one", "other"]
+    for name, entry in zip(("one", "other"), WINDOWS, strict=True):
+        alone = run(folder, changed(), f"[{entry}]")
+        assert len(alone)
+        assert_frame_equal(together[together["log"] == name].reset_index(drop=True), alone, check_dtype=False)
+    (folder / "experiment.yaml").write_text(changed().replace("[drive.mcap]", f"[{', '.join(WINDOWS)}, {WINDOWS[0]}]"))
+    found = CliRunner().invoke(app, ["run", f"{folder / 'experiment.yaml'}", "--out", f"{folder / 'out'}"])
+    assert found.exit_code == 0
+    assert pd.read_parquet(folder / "out/detections.parquet")["log"].unique().tolist() == ["one", "other"]
+    again = cr.run(folder / "out" / "experiment.yaml", jobs=1).detections
+    assert_frame_equal(again, together, check_dtype=False)
+    words = ["check", f"{folder / 'experiment.yaml'}", "--log", f"{folder / 'drive.mcap'}"]
+    assert "logs: one, other" in CliRunner().invoke(app, words).output
+
+
+def test_windows_of_one_drive_need_names(folder: Path) -> None:
+    (folder / "experiment.yaml").write_text(
+        changed().replace(
+            "[drive.mcap]", "[{file: drive.mcap, window_s: [0, 2]}, {file: drive.mcap, window_s: [2, 4]}]"
+        )
+    )
+    with pytest.raises(cr.InputError, match=r"expected a name of its own, found .* of another log, too"):
+        cr.run(folder / "experiment.yaml", jobs=1)
+
+
 def test_a_configuration_without_any_of_its_units_is_left_out_of_that_log_alone(folder: Path) -> None:
     text = changed("  PEM: {units: [mast]}")
     table = run(folder, text, "[{file: drive.mcap, units: {mast: null}}, two.mcap]")
