@@ -213,37 +213,22 @@ def sift_states(values: Float, kept: Bool, findings: list[str]) -> tuple[Float, 
 
 # Sizes: those of a class where none is said.
 
-SIZES_M = {
-    "pedestrian": (0.5, 0.6),
-    "bicycle": (1.8, 0.6),
-    "motorcycle": (2.1, 0.8),
-    "car": (4.5, 1.8),
-    "van": (5.2, 2.0),
-    "truck": (8.0, 2.5),
-    "bus": (12.0, 2.55),
-    "trailer": (8.0, 2.5),
-    "animal": (1.0, 0.4),
-    "other": (0.5, 0.5),
-    "vehicle": (4.5, 1.8),
+BODIES_M = {
+    "pedestrian": (0.5, 0.6, 1.75, 0.8),
+    "bicycle": (1.8, 0.6, 1.7, 0.8),
+    "motorcycle": (2.1, 0.8, 1.6, 0.8),
+    "car": (4.5, 1.8, 1.5, 1.0),
+    "van": (5.2, 2.0, 2.0, 1.4),
+    "truck": (8.0, 2.5, 3.2, 1.5),
+    "bus": (12.0, 2.55, 3.0, 2.0),
+    "trailer": (8.0, 2.5, 3.0, 0.5),
+    "animal": (1.0, 0.4, 0.7, 0.2),
+    "other": (0.5, 0.5, 1.0, 0.05),
+    "vehicle": (4.5, 1.8, 1.5, 0.5),
 }
-"""The typical length and width of each class, in m, rounded from those of real road users."""
-HEIGHTS_M = {
-    "pedestrian": (0.8, 1.75),
-    "bicycle": (0.8, 1.7),
-    "motorcycle": (0.8, 1.6),
-    "car": (1.0, 1.5),
-    "van": (1.4, 2.0),
-    "truck": (1.5, 3.2),
-    "bus": (2.0, 3.0),
-    "trailer": (0.5, 3.0),
-    "animal": (0.2, 0.7),
-    "other": (0.05, 1.0),
-    "vehicle": (0.5, 1.5),
-}
-"""The least plausible height and the typical one of each class, in m, rounded from those of real road users."""
-LEAST_HEIGHT_M = np.array([HEIGHTS_M[name][0] for name in CLASSES])
-TYPICAL_M = np.array([(*SIZES_M[name], HEIGHTS_M[name][1]) for name in CLASSES])
-"""(C, 3) the typical length, width and height of each class."""
+"""The typical length, width and height of each class, and the least plausible height, in m, rounded from real ones."""
+TYPICAL_M = np.array([BODIES_M[name][:3] for name in CLASSES])
+LEAST_HEIGHT_M = np.array([BODIES_M[name][3] for name in CLASSES])
 
 
 @np.errstate(invalid="ignore", over="ignore")

@@ -30,8 +30,8 @@ from copem_replay.core.tracks import (
     Tracks,
 )
 from copem_replay.io.findings import (
+    BODIES_M,
     FASTEST_MPS,
-    HEIGHTS_M,
     LEAST_HEIGHT_M,
     TYPICAL_M,
     Finding,
@@ -194,7 +194,7 @@ def _count_by_class(object_ix: Int, object_class: Int, rows: Bool) -> str:
     _, first = np.unique(object_ix[rows], return_index=True)
     counts = np.bincount(object_class[rows][first], minlength=len(CLASSES))
     return ", ".join(
-        f"{number} {name} ({HEIGHTS_M[name][1]:g} m taken)"
+        f"{number} {name} ({BODIES_M[name][2]:g} m taken)"
         for number, name in zip(counts.tolist(), CLASSES, strict=True)
         if number
     )

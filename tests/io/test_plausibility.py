@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from copem_replay.core.tracks import CLASSES
-from copem_replay.io.findings import HEIGHTS_M
+from copem_replay.io.findings import BODIES_M
 from copem_replay.io.ground_truth import correct_heights, correct_velocities
 
 NAN = float("nan")
@@ -176,8 +176,8 @@ def test_no_height_is_a_box_that_stands_where_it_is():
 
 
 def test_every_class_has_a_height_that_is_plausible():
-    assert tuple(HEIGHTS_M) == CLASSES
-    assert all(least < typical for least, typical in HEIGHTS_M.values())
+    assert tuple(BODIES_M) == CLASSES
+    assert all(least < typical for _, _, typical, least in BODIES_M.values())
 
 
 def test_a_flat_log_is_stood_on_the_ground():

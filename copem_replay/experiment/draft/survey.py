@@ -24,9 +24,9 @@ from copem_replay.experiment.draft.findings import (
     UnitFound,
     suggest_experiment,
 )
+from copem_replay.experiment.draft.frame_fit import FIXES, fit_fixes
 from copem_replay.io.channel import Channel, schema_name
 from copem_replay.io.findings import find_rule
-from copem_replay.io.frame_fit import FIXES, fit_fixes
 from copem_replay.io.ground_truth import MAX_GAP_S
 from copem_replay.io.log import Log
 from copem_replay.io.open import Local, first_recording, label_files, name_log, open_log

@@ -25,7 +25,7 @@ from copem_replay.core.frame import SaidPlace
 from copem_replay.core.site_map import SiteMap
 from copem_replay.core.tracks import CLASSES, Float
 from copem_replay.io.class_names import class_from_name, stands
-from copem_replay.io.findings import FARTHEST_M, HEIGHTS_M, LENGTH, LONGEST_M, RULES, as_finding, complete_sizes
+from copem_replay.io.findings import BODIES_M, FARTHEST_M, LENGTH, LONGEST_M, RULES, as_finding, complete_sizes
 from copem_replay.io.schemas.osi_ground_truth import osi_class_index
 from copem_replay.io.write.osi import NANOS_PER_SECOND, OsiTrace, add_road, empty_ground_truth, write_osi_trace
 
@@ -53,7 +53,7 @@ class OsiKind:
     @property
     def height_m(self) -> float:
         """Typical height, for sources without heights."""
-        return HEIGHTS_M[self.like][1]
+        return BODIES_M[self.like][2]
 
 
 _VEHICLES = {  # name: (vehicle classification, class whose height is typical)

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from copem_replay.cli.main import app
 from copem_replay.core.frame import Frame
-from copem_replay.io.frame_fit import FIXES, FrameFit, fit_fixes, fit_frame
+from copem_replay.experiment.draft.frame_fit import FIXES, FrameFit, fit_fixes, fit_frame
 from copem_replay.io.open import open_log
 from copem_replay.io.recording import read_log
 from tests.helpers import ros2
