@@ -151,7 +151,7 @@ def print_first_notes(lines: Sequence[str]) -> None:
     """Print the first notes on stderr, and where the others are."""
     print_notes(lines[:MOST_NOTES])
     if len(lines) > MOST_NOTES:
-        print_notes(["further notes: `copem-replay info LOG`, and provenance.json of the results"])
+        print_notes(["further notes: `copem-replay info LOG`, and read.csv of the results"])
 
 
 def print_verdicts(verdicts: Judgement) -> None:

@@ -296,6 +296,15 @@ _LOGS = (
     Column("state", "text", "`done`, or `skipped`: unreadable (`--skip-unreadable`)"),
     Column("reason", "text", "why it is skipped"),
 )
+_READ = (
+    Column("log", "text", "name of the recording"),
+    Column("topic", "text", "topic of its truth"),
+    Column("frames", "whole numbers", "lists of the truth that are replayed"),
+    Column("entries", "whole numbers", "object states of the truth and of recorded lists that are replayed"),
+    Column("number", "whole numbers", "how many were left out or mended; 0: none was"),
+    Column("what", "text", "what they are, why, and what was done"),
+    Column("changes", "text", "`yes`: figures may depend on it"),
+)
 _PROVENANCE = (
     Column("format", "whole number", "version of the folder's format"),
     Column("copem_replay", "text", "version of the package"),
@@ -361,6 +370,8 @@ TABLES = {
     "bands.csv": Table(
         f"One row per configuration and band; what a band's kind does not have is empty. {_FAR_OFF}.", _BANDS),
     "logs.csv": Table("One row per recording that the experiment names.", _LOGS),
+    "read.csv": Table(
+        "One row per kind of thing that was left out or mended when a recording was read; one for one without.", _READ),
     "provenance.json": Table(
         "What made the results, key by key. [Where it is used](../guide/results.md).", _PROVENANCE),
 }  # fmt: skip

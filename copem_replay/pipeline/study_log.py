@@ -112,6 +112,12 @@ class StudyLog:
         survey = self.recording.survey
         return self.recording.object_states if survey is None else int(survey.said["states"])
 
+    @property
+    def frames(self) -> int:
+        """Number of lists of the truth."""
+        survey = self.recording.survey
+        return len(self.recording.truth.stamp_ns) if survey is None else int(survey.said["frames"])
+
     @cached_property
     def identity(self) -> dict[str, Any]:
         """What of the log is in the recipes of its parts: its name, by which draws are addressed, and its content."""
@@ -140,7 +146,8 @@ class StudyLog:
         notes = [as_finding(note).as_json() for note in recording.notes]
         said = {
             "scene": scene_as_json(recording.scene), "topic": recording.topic, "notes": notes,
-            "host": recording.host_id, **self.digests, "states": self.object_states, "facts": facts.as_json(),
+            "host": recording.host_id, **self.digests, "states": self.object_states, "frames": self.frames,
+            "facts": facts.as_json(),
         }  # fmt: skip
         self.parts.keep(about, said)
         return facts
@@ -162,7 +169,8 @@ def read_content_digest(recording: Recording) -> str:
 
 def drop_content(recording: Recording, read: Callable[[], Recording]) -> Recording:
     """A recording without its truth and its lists, which `read` reads again where they are needed."""
-    survey = StoredSurvey(compute_log_digests(recording) | {"states": recording.object_states}, read)
+    said = {"states": recording.object_states, "frames": len(recording.truth.stamp_ns)}
+    survey = StoredSurvey(compute_log_digests(recording) | said, read)
     return replace(recording, truth=_empty_tracks(), lists={}, around=None, lane_boundaries=(), lanes=(), survey=survey)
 
 
@@ -186,7 +194,7 @@ def survey_key(place: Place, experiment: Experiment, seen: Sequence[Stamp] | Non
 @cache_last_experiment
 def _survey_parts(experiment: Experiment) -> tuple[str, list[Component | MapFile]]:
     data = {key: value for key, value in experiment.as_written().items() if key not in _NOT_OF_A_SURVEY}
-    of_all = recipe_key(canonical_json({"survey": 5, "fingerprint": take_fingerprint(), "experiment": data}))
+    of_all = recipe_key(canonical_json({"survey": 6, "fingerprint": take_fingerprint(), "experiment": data}))
     return of_all, own_components(experiment)
 
 

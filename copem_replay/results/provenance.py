@@ -197,7 +197,7 @@ def build_provenance(
         "logs": [
             {"log": log.name, "topic": log.recording.topic, **{n: log.digests[n] for n in ("sha256", "truth")}}
             | ({"tags": dict(log.recording.scene.tags)} if log.recording.scene.tags else {})
-            | ({"read": found} if (found := _list_read(log.recording)) else {})
+            | ({"read": found} if (found := list_read(log.recording)) else {})
             for log in study.logs
         ],
         "logs_skipped": [{"log": escape_name(path.name), "reason": reason} for path, reason in skipped],
@@ -216,7 +216,7 @@ def build_provenance(
     }  # fmt: skip
 
 
-def _list_read(recording: Recording) -> list[dict[str, object]]:
+def list_read(recording: Recording) -> list[dict[str, object]]:
     """What was left out or mended of a recording: how many, and the line that says what and why."""
     return [
         {"number": note.number, "what": str(note), "changes": note.changes}

@@ -48,7 +48,7 @@ from copem_replay.pipeline.one_run import (
 from copem_replay.pipeline.run import StudyTables
 from copem_replay.pipeline.sweep import list_points, resolve_sweep
 from copem_replay.results.folder import EXPERIMENT, MARK, ResultsPlace, check_names
-from copem_replay.results.provenance import build_provenance, escape_name, log_entries, recording_name
+from copem_replay.results.provenance import build_provenance, escape_name, list_read, log_entries, recording_name
 from copem_replay.results.table_files import MANY_ROWS, TableFile, table_file, write_csv, write_parquet
 from copem_replay.results.truth_scene import draw_truth
 
@@ -176,7 +176,7 @@ def list_results(
 
     `tables`: the files of those tables that are a folder where they have many rows.
     """
-    files = [EXPERIMENT, MARK, "summary.csv", "logs.csv", *tables]
+    files = [EXPERIMENT, MARK, "summary.csv", "logs.csv", "read.csv", *tables]
     files += ["exact.parquet"] * experiment.measure.exact + ["sweep.csv"] * any(True for _ in list_points(experiment))
     files += ["summary_by.csv"] * bool(experiment.measure.by)
     files += [name for name in COMPARED_FILES if experiment.measure.accuracy]
@@ -218,6 +218,7 @@ def _write_files(place: ResultsPlace, study: StudyTables) -> None:
     (scratch / EXPERIMENT).write_text(dump_yaml(data), encoding="utf-8")
     _write_rows(study, scratch)
     write_csv(study.summary, scratch / "summary.csv")
+    write_csv(_read_table(study), scratch / "read.csv")
     if study.exact is not None:
         write_parquet(study.exact, scratch / "exact.parquet")
     for name, table in (("summary_by.csv", study.summary_by), ("bands.csv", study.bands), ("sweep.csv", study.sweep)):
@@ -277,6 +278,24 @@ def _logs_table(folder: Path, study: StudyTables, skipped: Sequence[tuple[File, 
         for path, why in skipped
     ]
     return TABLES["logs.csv"].frame(rows)
+
+
+def _read_table(study: StudyTables) -> pd.DataFrame:
+    """The rows of `read.csv`: what was left out or mended of each log, what changes figures first."""
+    none: dict[str, object] = {"number": 0, "what": "nothing was left out or mended", "changes": False}
+    rows = [
+        {
+            "log": log.name,
+            "topic": log.recording.topic,
+            "frames": log.frames,
+            "entries": log.object_states,
+            **found,
+            "changes": "yes" if found["changes"] else "no",
+        }
+        for log in study.logs
+        for found in sorted(list_read(log.recording) or [none], key=lambda one: not one["changes"])
+    ]
+    return TABLES["read.csv"].frame(rows)
 
 
 def _make_run_to_export(log: str, shown: ShownRun, study: StudyTables) -> RunToExport:

@@ -744,7 +744,8 @@ def test_the_run_that_is_shown_has_its_own_units(
     folder = tmp_path / "out" / "e"
     names = {path.name for path in folder.iterdir()}
     assert names == {
-        "experiment.yaml", "provenance.json", "detections.parquet", "tally.parquet", "logs.csv", "summary.csv",
+        "experiment.yaml", "provenance.json", "detections.parquet", "tally.parquet", "logs.csv", "read.csv",
+        "summary.csv",
         "exact.parquet", "replay.mcap", "replay.rrd", "bands.csv", "lists.parquet", "thresholds.parquet",
         "accuracy.parquet", "instants.parquet",
     }  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +63,8 @@ def test_the_folder_of_several_logs(two_logs: list[Path], tmp_path: Path) -> Non
     folder = save_run(tmp_path / "out", chosen, recordings)
     names = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
     assert names == {
-        "experiment.yaml", "provenance.json", "detections.parquet", "tally.parquet", "logs.csv", "summary.csv",
+        "experiment.yaml", "provenance.json", "detections.parquet", "tally.parquet", "logs.csv", "read.csv",
+        "summary.csv",
         "replay/near/drive.mcap", "replay/near/drive.rrd", "replay/far/drive.mcap", "replay/far/drive.rrd",
         *OF_ACCURACY,
     }  # fmt: skip
@@ -100,10 +102,34 @@ def test_without_accuracy_nothing_tells_of_it(two_logs: list[Path], tmp_path: Pa
     recordings, _ = read_logs(chosen, two_logs, None)
     folder = save_run(tmp_path / "out", chosen, recordings)
     assert {path.name for path in folder.iterdir()} == {
-        "experiment.yaml", "provenance.json", "detections.parquet", "tally.parquet", "logs.csv", "summary.csv",
+        "experiment.yaml", "provenance.json", "detections.parquet", "tally.parquet", "logs.csv", "read.csv",
+        "summary.csv",
     }  # fmt: skip
     assert parquet.read_table(folder / "detections.parquet").column_names == list(TABLES["detections.parquet"].kinds())
     assert list(pd.read_csv(folder / "summary.csv")) == list(TABLES["summary.csv"].kinds())
+
+
+def test_what_was_left_out_of_each_log_is_a_table(tmp_path: Path) -> None:
+    """Two of 61 lists have a car that is nowhere, one a size that is none; the other log is as it should be."""
+    for name in ("odd", "sound"):
+        cars = [Obj(id=2, x=100.0 - k, vx=-10.0) for k in range(61)]
+        if name == "odd":
+            cars[3] = cars[4] = Obj(id=2, x=math.nan)
+            cars[9] = Obj(id=2, x=91.0, vx=-10.0, length=math.nan)
+        frames = [(k / 10, [Obj(id=1, x=0.0), car]) for k, car in enumerate(cars)]
+        write_recording(tmp_path / f"{name}.mcap", frames, host=1)
+    chosen = plan(show=None, measure={"accuracy": False})
+    recordings, _ = read_logs(chosen, [tmp_path / "odd.mcap", tmp_path / "sound.mcap"], None)
+    folder = save_run(tmp_path / "out", chosen, recordings)
+    rows = pd.read_csv(folder / "read.csv").to_dict("records")
+    assert [(row["log"], row["frames"], row["entries"], row["number"], row["changes"]) for row in rows] == [
+        ("odd", 61, 120, 2, "yes"), ("odd", 61, 120, 1, "yes"), ("sound", 61, 122, 0, "no"),
+    ]  # fmt: skip
+    assert [row["what"] for row in rows] == [
+        "2 object states without a position, or with one that is no number: skipped",
+        "1 object state whose size is none: that of the same object at other times taken",
+        "nothing was left out or mended",
+    ]
 
 
 NOISY = [

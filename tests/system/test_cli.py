@@ -471,7 +471,8 @@ class TestRun:
         assert re.search(r"\nresults in out/e\nnext: copem-replay report out/e\n\n[A-Z].*\.\n$", ended.out)
         assert sorted(written(here / "out" / "e")) == [
             "accuracy.parquet", "bands.csv", "detections.parquet", "experiment.yaml", "instants.parquet",
-            "lists.parquet", "logs.csv", "provenance.json", "summary.csv", "tally.parquet", "thresholds.parquet",
+            "lists.parquet", "logs.csv", "provenance.json", "read.csv", "summary.csv", "tally.parquet",
+            "thresholds.parquet",
         ]  # fmt: skip
         assert os.listdir(here / "out") == ["e"]
         assert set(table(here / "out" / "e")["configuration"]) == {"GT", "PEM", "coPEM"}
