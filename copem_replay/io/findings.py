@@ -95,6 +95,7 @@ RULES: Final = {
         "`read: {{classes: {{NAME: car}}}}` says what it is",
     ),
     "class other": Rule("object state", "of a class that is no road user's ({which}): read as other", changes=False),
+    "class unsaid": Rule(_STATE, "whose class, or kind of vehicle, is not said: taken as unknown"),
     "no id": Rule(_STATE, "without an id: skipped"),
     "stands": Rule(_STATE, "of what stands, not sent again: where it was"),
     "jump": Rule(

@@ -293,10 +293,10 @@ def _class_probabilities(item: Any, rows: _EntryRows) -> dict[int, float]:
     for candidate in getattr(item, "candidate", ()):
         if not hasattr(candidate, "vehicle_classification"):  # a stationary object's
             continue
-        vehicle = candidate.vehicle_classification
-        kind = osi.osi_class_index(
-            candidate.type, vehicle.type if candidate.HasField("vehicle_classification") else None
-        )
+        vehicle = candidate.vehicle_classification if candidate.HasField("vehicle_classification") else None
+        kind = osi.osi_class_index(candidate.type, None if vehicle is None else vehicle.type)
+        saying = [candidate, *([vehicle] if kind == osi.VEHICLE and vehicle is not None else [])]
+        rows.rules["class unsaid"] += not all(of.HasField("type") for of in saying)
         stated = candidate.HasField("probability")
         share = candidate.probability if stated else 1.0
         if not stated and any(other.HasField("probability") for other in item.candidate):

@@ -364,8 +364,8 @@ class _BatchReader:
         yaw: Float = np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)  # of any usual length
         return np.where(np.hypot(np.hypot(x, y), np.hypot(z, w)) <= _LONGEST_QUATERNION, yaw, np.nan)
 
-    def _classes(self) -> Float:
-        """(P, C) probability of each class, sums to 1."""
+    def _classes(self, keep: Int) -> Float:
+        """(K, C) probability of each class of the objects `keep`, sums to 1."""
         rows = self.rows(self._fields.objects)
         class_field = self._wanted.class_
         probability = np.zeros((rows, len(CLASSES)))
@@ -376,7 +376,10 @@ class _BatchReader:
             texts = self._found.levels[level].texts[whole]
             known_as = self._by_name(any_item_path(whole), class_field.map)
             names = [known_as.get(word) or class_from_name(word) for word in texts.words]
-            of_word = np.array([CLASSES.index(name or "other") for name in names] + [-1])
+            of_word = np.array(
+                [CLASSES.index(n or "other") if w.strip() else -1 for n, w in zip(names, texts.words, strict=True)]
+                + [-1]
+            )
             code = of_word[texts.code]
             self._note_other_names(texts, ["" if w in known_as else class_from_name(w) for w in texts.words])
             share = np.ones(len(code))
@@ -399,7 +402,9 @@ class _BatchReader:
             claimed = np.zeros((self.rows(shared), len(CLASSES)))
             np.add.at(claimed, (owner[counted], code[counted]), share[counted])
             probability = claimed[ancestor_rows(self._found, self._fields.objects, shared)]
+        probability = probability[keep]
         none = probability.sum(axis=1) <= 0
+        self._notes += find("class unsaid", 0 if none.all() else int(none.sum()))
         probability[none, CLASSES.index("other")] = 1.0
         normed: Float = probability / probability.sum(axis=1, keepdims=True)
         return normed
@@ -575,7 +580,7 @@ class _BatchReader:
         keep, message = (rows[np.isin(message, kept_message)] for rows in (keep, message))
         number = np.arange(len(keep)) if ids is None else ids.code[keep]
         names = tuple(str(k) for k in range(len(keep))) if ids is None else ids.words
-        probability = self._classes()[keep]
+        probability = self._classes(keep)
         columns = DecodedObjects(
             stamp_ns=stamp_ns,
             stamped=stamped,
