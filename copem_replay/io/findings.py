@@ -70,6 +70,7 @@ RULES: Final = {
     "no ground truth": Rule("message", "without global_ground_truth: skipped"),
     "polygon": Rule("stationary object", "whose base_polygon is no simple polygon: its box taken"),
     "prism": Rule("stationary object", "with a base_polygon: hides as that prism, and is no object", changes=False),
+    "border point": Rule("point", "of borders of lanes with a number that is none: left out", changes=False),
     "undecoded": Rule("message", "cannot be decoded: skipped"),
     "cube": Rule("cube", "beside a larger one of the same entity: left out", changes=False),
     "stays unsaid": Rule("state", "in between that no message repeats: not taken, a list holds what its message says"),

@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -45,7 +46,7 @@ from copem_replay.io.schemas import osi_ground_truth as osi
 from copem_replay.io.schemas.object_lists import DecodedLists
 from copem_replay.io.schemas.osi_ground_truth import SENSOR_DATA, check_osi, load_message_class, osi_id
 from copem_replay.io.schemas.registry import DETAIL_SCHEMA, known_lists
-from copem_replay.io.stamps import settle_stamps
+from copem_replay.io.stamps import refuse_second_run, settle_stamps
 from copem_replay.io.window import Window
 
 _LARGEST_ID = 2**63 - 1
@@ -150,7 +151,7 @@ def read_recorded(path: Local, topic: str, scene: Scene, window: Window | None =
         probability / probability.sum(axis=1, keepdims=True),
         np.array(rows.track, dtype=np.int64),
     )
-    return _make_recorded(entries, times, topic, scene, findings)
+    return _make_recorded(entries, times, open_log(path).path, topic, scene, findings)
 
 
 @dataclass(frozen=True)
@@ -166,9 +167,15 @@ class _Entries:
 
 
 def _make_recorded(
-    entries: _Entries, times: _ListTimes, topic: str, scene: Scene, findings: list[str]
+    entries: _Entries, times: _ListTimes, path: Path, topic: str, scene: Scene, findings: list[str]
 ) -> RecordedLists:
-    """The lists as tracks, with what is none left out or completed, which `findings` get."""
+    """The lists as tracks, with what is none left out or completed, which `findings` get. Raises RecordingError."""
+
+    def list_contents() -> list[bytes]:
+        ends = np.searchsorted(entries.frame, np.arange(1, len(times.logged_ns)))
+        return [rows.tobytes() for rows in np.split(entries.values, ends)]
+
+    refuse_second_run(times.stamps_ns[:, 1], times.logged_ns, list_contents, path, topic)
     by_time, frame = order_by_time(times.stamps_ns[:, 1], entries.frame)
     values, usable = sift_states(entries.values, np.ones(len(frame), dtype=bool), findings)
     order = np.flatnonzero(usable)[np.argsort(frame[usable], kind="stable")]
@@ -415,7 +422,7 @@ def _read_described(log: Log, topic: str, scene: Scene, around: LogContext | Non
         raise RecordingError("holds no list in the window", path=log.path, topic=topic)
     around = around or read_log_context(log, None, seek_ego=False)
     lists = transform_to_world(read_decoded_lists(log, same_schema, None, around.classes), around, log.path, topic)
-    return _make_recorded_lists(lists, _read_details(log, topic), topic, scene)
+    return _make_recorded_lists(lists, _read_details(log, topic), log.path, topic, scene)
 
 
 def _read_details(log: Log, topic: str) -> dict[int, dict[str, Any]]:
@@ -474,7 +481,7 @@ def _get_number(item: Any, name: str, otherwise: float) -> float:
 
 
 def _make_recorded_lists(
-    lists: DecodedLists, details: Mapping[int, Mapping[str, Any]], topic: str, scene: Scene
+    lists: DecodedLists, details: Mapping[int, Mapping[str, Any]], path: Path, topic: str, scene: Scene
 ) -> RecordedLists:
     lists, variances = _add_details(lists, details)
     columns, findings = lists.columns, list[str]()
@@ -492,5 +499,5 @@ def _make_recorded_lists(
     times = _ListTimes(
         np.stack([captured, columns.stamp_ns], axis=1), capture_said, columns.stamped, columns.log_time_ns
     )
-    made = _make_recorded(entries, times, topic, scene, findings)
+    made = _make_recorded(entries, times, path, topic, scene, findings)
     return replace(made, notes=(*(n for n in columns.notes if isinstance(n, Finding)), *made.notes))

@@ -84,7 +84,10 @@ def test_lanes_without_borders_are_left_out_and_said() -> None:
     add_lane(truth, 13, [5], [2])
     road = read_road(truth)
     assert [lane.id for lane in road.lanes] == ["8", "9"]
-    assert road.notes == ["3 lanes without a left and a right border: left out"]
+    assert road.notes == [
+        "2 points of borders of lanes with a number that is none: left out",
+        "3 lanes without a left and a right border: left out",
+    ]
     assert not OsiRoad()
     assert OsiRoad(notes=road.notes)
 

@@ -10,11 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from copem_replay.core.errors import RecordingError
+from copem_replay.io.recorded_units import read_as_recorded
 from copem_replay.io.recording import read_log
 from copem_replay.io.stamps import find_runs, settle_stamps
 from tests.helpers.recordings import Obj, Topic, ground_truth, ns, write_mcap, write_recording
 from tests.helpers.ros2 import odometry, topic
 from tests.io.test_findings import markers
+from tests.io.test_recorded_units import car, list_of
 
 WALL = Obj(id=9, x=20, y=9, stationary=True, length=8, width=1, height=3)
 
@@ -93,6 +95,45 @@ def test_two_runs_are_refused_with_their_windows_and_each_can_be_read(tmp_path: 
         truth = read_log(path, name="log", window_s=window).truth
         assert len(truth.stamp_ns) == 20
         assert (truth.y_m == y).all()
+
+
+def test_a_trace_of_two_runs_is_refused_and_each_can_be_read(tmp_path: Path) -> None:
+    """It has no log times: the second run is taken as logged 2 s after the first."""
+    payloads = [payload for _, payload in (*run_of(5, 0, 0), *run_of(5.05, 0, 40))]
+    path = tmp_path / "a.osi"
+    path.write_bytes(b"".join(len(payload).to_bytes(4, "little") + payload for payload in payloads))
+    with pytest.raises(RecordingError, match=r"2 runs.*window_s: \[0, 1.9\].*window_s: \[3.9, 5.8\]"):
+        read_log(path, name="log")
+    for window, y in (((0, 1.9), 0), ((3.9, 5.8), 40)):
+        truth = read_log(path, name="log", window_s=window).truth
+        assert len(truth.stamp_ns) == 20
+        assert (truth.y_m == y).all()
+
+
+def test_one_late_message_of_a_trace_is_no_reset(tmp_path: Path) -> None:
+    payloads = [payload for _, payload in run_of(5, 0, 0)]
+    payloads.insert(18, payloads.pop(2))
+    path = tmp_path / "a.osi"
+    path.write_bytes(b"".join(len(payload).to_bytes(4, "little") + payload for payload in payloads))
+    recording = read_log(path, name="log")
+    assert recording.truth.captured_s.tolist() == pytest.approx([k / 10 for k in range(20)])
+
+
+@pytest.mark.parametrize("osi", [True, False])
+def test_lists_of_a_unit_of_two_runs_are_refused(tmp_path: Path, osi: bool) -> None:
+    times, kind = [k / 10 for k in range(20)], "visualization_msgs/msg/MarkerArray"
+    logged = [*((5 + t, 100 + t) for t in times), *((5.05 + t, 103 + t) for t in times)]
+    if osi:
+        sent = [(ns(log_s), list_of(t, car(t, vx=1.0))[1]) for t, log_s in logged]
+        unit = Topic("unit", "osi3.SensorData", sent)
+    else:
+        unit = topic("unit", kind, [(log_s, markers(t)) for t, log_s in logged])
+    truth = Topic("truth", "osi3.GroundTruth", [*run_of(5, 100, 0), *run_of(8, 103, 0)])
+    recording = read_log(write_mcap(tmp_path / "a.mcap", [truth, unit]), name="log")
+    with pytest.raises(RecordingError, match=r"unit: time goes back once, so it holds 2 runs"):
+        read_as_recorded(recording, "unit")
+    first = read_log(recording.path, name="log", window_s=(0, 1.95))
+    assert len(read_as_recorded(first, "unit").tracks.stamp_ns) == 20
 
 
 def test_what_is_played_twice_is_one_run(tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from google.protobuf.message import DecodeError
 from mcap.records import Message
 
 from copem_replay.core.errors import RecordingError, count_noun
+from copem_replay.core.tracks import Int
 from copem_replay.io.channel import LAST_NS, Channel
 from copem_replay.io.containers.mcap_records import CHUNK_LIMIT_BYTES, MAGIC
 from copem_replay.io.decoded_size import OversizeError
@@ -34,6 +35,7 @@ from copem_replay.io.schemas.osi_ground_truth import (
     check_osi,
     load_message_class,
 )
+from copem_replay.io.stamps import SLACK_NS
 
 _LENGTH_BYTES = 4
 _TRIED = 10  # messages by which the kind is told; more make opening slower
@@ -54,7 +56,8 @@ _NOT_READ = {
 class TraceLog(Log):
     """The log of a trace: one channel, whose topic is the name of its messages (`GroundTruth`).
 
-    Log times are the messages' time stamps. In their order: offsets and lengths of the messages in the file, and times.
+    Log times are the messages' time stamps, which no reset sets back. In their order: offsets and lengths of the
+    messages in the file, and times.
     """
 
     osi_version: str = ""  # as the first message states it
@@ -113,7 +116,8 @@ def open_trace(path: Path) -> TraceLog:
         raise RecordingError(
             f"{'damaged, and ' if cut else ''}no message of {schema} can be read ({reason})", path=path
         )
-    order = np.argsort(np.array(times_ns), kind="stable")
+    logged_ns = _make_log_times(np.array(times_ns))
+    order = np.argsort(logged_ns, kind="stable")
     expected = int(name["frames"]) if name and cut else None
     topic = schema.removeprefix("osi3.")
     return TraceLog(
@@ -122,14 +126,23 @@ def open_trace(path: Path) -> TraceLog:
         indexed=False,
         damage=cut[0] if cut else None,
         complete=not cut,
-        start_ns=min(times_ns),
-        end_ns=max(times_ns),
+        start_ns=int(logged_ns.min()),
+        end_ns=int(logged_ns.max()),
         notes=tuple(notes),
         osi_version=release,
         offsets=np.array(offsets)[order].tolist(),
         lengths=np.array(lengths)[order].tolist(),
-        times_ns=np.array(times_ns)[order].tolist(),
+        times_ns=logged_ns[order].tolist(),
     )
+
+
+def _make_log_times(stamp_ns: Int) -> Int:
+    """(F,) log times of messages in the order of the file: their stamps, but after a reset on and on."""
+    shift_ns = np.zeros(len(stamp_ns))
+    falls = np.flatnonzero((np.diff(stamp_ns)[:-1] < -SLACK_NS) & (stamp_ns[2:] - stamp_ns[:-2] < -SLACK_NS))
+    shift_ns[falls + 1] = stamp_ns[falls] - stamp_ns[falls + 1] + 2 * SLACK_NS  # one late message is no reset
+    later_ns = stamp_ns + np.cumsum(shift_ns).clip(max=LAST_NS).astype(np.int64)
+    return later_ns if later_ns.max() <= LAST_NS else stamp_ns
 
 
 def _read_payloads(file: IO[bytes], cut: list[str]) -> Iterator[tuple[int, bytes]]:

@@ -375,28 +375,23 @@ class _BatchReader:
             shared = common_level(level, self._fields.objects)
             texts = self._found.levels[level].texts[whole]
             known_as = self._by_name(any_item_path(whole), class_field.map)
-            names = [known_as.get(word) or class_from_name(word) for word in texts.words]
-            of_word = np.array(
-                [CLASSES.index(n or "other") if w.strip() else -1 for n, w in zip(names, texts.words, strict=True)]
-                + [-1]
-            )
+            names = [word.strip() and (known_as.get(word) or class_from_name(word) or "other") for word in texts.words]
+            of_word = np.array([CLASSES.index(name) if name else -1 for name in names] + [-1])
             code = of_word[texts.code]
             self._note_other_names(texts, ["" if w in known_as else class_from_name(w) for w in texts.words])
             share = np.ones(len(code))
             if class_field.probability is not None:
-                share = self._found.levels[list_level(self._wanted.path(class_field.probability))].numbers[
-                    self._wanted.path(class_field.probability)
-                ]
-                share = share[ancestor_rows(self._found, level, list_level(self._wanted.path(class_field.probability)))]
+                of_share = self._wanted.path(class_field.probability)
+                share = self._found.levels[list_level(of_share)].numbers[of_share]
+                share = share[ancestor_rows(self._found, level, list_level(of_share))]
                 # A class with probability 0 or none is still stated; more than 1 counts as 1.
                 share = sift_shares(share, "class share", self._notes, most=MOST_SHARE)
                 share = np.clip(np.where(np.isnan(share), 0.0, share), 1e-9, 1.0)
             counted = code >= 0
             if class_field.key is not None:
-                keys = self._found.levels[list_level(self._wanted.path(class_field.key))].texts[
-                    self._wanted.path(class_field.key)
-                ]
-                key = keys.code[ancestor_rows(self._found, level, list_level(self._wanted.path(class_field.key)))]
+                of_key = self._wanted.path(class_field.key)
+                keys = self._found.levels[list_level(of_key)].texts[of_key]
+                key = keys.code[ancestor_rows(self._found, level, list_level(of_key))]
                 counted &= np.array([word.lower() in class_field.keys for word in keys.words] + [False])[key]
             owner = ancestor_rows(self._found, level, shared)
             claimed = np.zeros((self.rows(shared), len(CLASSES)))

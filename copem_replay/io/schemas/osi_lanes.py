@@ -17,7 +17,7 @@ import numpy as np
 from copem_replay.core.errors import count_noun
 from copem_replay.core.site_map import Lane, LaneKind, make_area
 from copem_replay.core.tracks import Area, Float
-from copem_replay.io.findings import FARTHEST_M
+from copem_replay.io.findings import FARTHEST_M, find
 
 INTERSECTION: Final = 4  # osi_lane.proto, Lane.Classification.Type
 DRIVING: Final = 2
@@ -53,6 +53,8 @@ def read_road(truth: Any) -> OsiRoad:
     drawn = [line for _, line in of_physical]
     drawn += [line[:, :3] for of, line in of_logical if not any(i.value in physical for i in of.physical_boundary_id)]
     road = OsiRoad([line for line in drawn if len(line) > 1])
+    stated = sum(len(of.boundary_line) for of in (*truth.lane_boundary, *truth.logical_lane_boundary))
+    road.notes += find("border point", stated - sum(len(line) for _, line in (*of_physical, *of_logical)))
     found = [_read_logical_lane(lane, logical) for lane in truth.logical_lane]
     if not any(found):
         with_borders = (lane for lane in truth.lane if lane.classification.type != INTERSECTION)

@@ -50,26 +50,14 @@ _ROS = {
         inside="transforms[].",
     ),
 }  # fmt: skip
-
-
 _TRANSFORM = PoseFields("timestamp", "parent_frame_id", "translation", "rotation", "child_frame_id")
-
-
-_TRANSFORMS = PoseFields(
-    "timestamp", "parent_frame_id", "translation", "rotation", "child_frame_id", inside="transforms[]."
-)
-
-
+_TRANSFORMS = replace(_TRANSFORM, inside="transforms[].")
 _POSE = PoseFields("timestamp", "frame_id", "pose.position", "pose.orientation")
-
-
 POSES = _ROS | {
     f"{package}{name}": where
     for package in ("foxglove.", "foxglove_msgs/msg/")
     for name, where in (("FrameTransform", _TRANSFORM), ("FrameTransforms", _TRANSFORMS), ("PoseInFrame", _POSE))
 }
-
-
 ODOMETRY = "nav_msgs/msg/Odometry"
 
 
