@@ -582,6 +582,32 @@ def test_csv_a_number_that_is_none_is_left_out_or_completed(run: Runner, none: s
         assert set(found.recording.scene.object_ids) == {"1"}
 
 
+@pytest.mark.parametrize("none", ["nan", "inf", "-inf", "1e308"])
+@pytest.mark.parametrize("leaf", ["x", "y", "angle", "z"])
+def test_sumo_a_number_that_is_none_is_left_out(run: Runner, none: str, leaf: str) -> None:
+    cells = {"x": "10", "y": "2", "angle": "90", "z": "0"}
+    one, other = ('<vehicle id="{}" x="{x}" y="{y}" angle="{angle}" z="{z}"/>'.format(ident, **of)
+                  for ident, of in (("a", cells), ("b", cells | {leaf: none})))  # fmt: skip
+    found = run("sumo", run.file("f.xml", fcd(one + other)))
+    assert f"note: {SKIPPED}\n" in found.printed
+    assert set(found.names.values()) >= {"vehicle a"}
+    assert len(found.recording.scene.object_ids) == 1
+
+
+@pytest.mark.parametrize("none", ["nan", "inf", "-inf", "1e308"])
+@pytest.mark.parametrize("leaf", ["x", "y", "turned", "speed"])
+def test_commonroad_a_number_that_is_none_is_left_out_or_not_said(run: Runner, none: str, leaf: str) -> None:
+    cells = {"x": "3", "y": "2", "turned": "0", "speed": "1"} | {leaf: none}
+    speed = f"<velocity><exact>{cells['speed']}</exact></velocity>"
+    turned = f"<exact>{cells['turned']}</exact>"
+    odd = state("state", "<exact>1</exact>", cells["x"], cells["y"], speed, turned)
+    text = scenario(obstacle("dynamicObstacle", "1", "car", BOX, f"{AT_0}<trajectory>{odd}</trajectory>"))
+    found = run("commonroad", run.file("s.xml", text))
+    assert (f"note: {SKIPPED}\n" in found.printed) == (leaf != "speed")
+    assert len(found.values("1", "x_m")) == (2 if leaf == "speed" else 1)
+    assert not any(m.moving_object[0].base.HasField("velocity") for m in found.messages if m.moving_object)
+
+
 def test_csv_sizes_and_names_by_the_rules_of_all_that_is_read(run: Runner) -> None:
     table = f"{HEADER}\n0,1,Zorb,0,0,0,-4,2\n0,2,fire_truck,9,0,0,0,2\n0,3,bicycle_rack,9,9,0,4,2\n"
     found = run("csv", run.file("t.csv", table), "--class", "Zorb=van")

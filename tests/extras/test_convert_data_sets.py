@@ -337,6 +337,21 @@ def cuboid(val: Any, **more: Any) -> str:
     return labels({"0": frame})
 
 
+@pytest.mark.parametrize("none", [math.nan, math.inf, -math.inf, 1e308])
+@pytest.mark.parametrize("leaf", range(9))
+def test_openlabel_a_number_that_is_none_is_left_out_or_completed(run: Runner, none: float, leaf: int) -> None:
+    """Of an object by its type; a size that is none is that of its class, "other" here."""
+    sound = [3.0, 2.0, 1.0, 0.0, 0.0, 0.1, 4.0, 2.0, 1.5]
+    odd = [*sound[:leaf], none, *sound[leaf + 1 :]]
+    objects = {str(k): {"object_data": {"cuboid": [{"val": val}]}} for k, val in ((1, sound), (2, odd))}
+    text = labels({"0": {"frame_properties": {"timestamp": 1}, "objects": objects}})
+    found = run("openlabel", run.file("t.json", text))
+    skipped = "note: 1 object state with a number that is none: skipped\n" in found.printed
+    assert skipped == (leaf < 6)
+    assert len(found.recording.scene.object_ids) == 2 - skipped
+    assert ("without a size, or with one that is none" in found.printed) != skipped
+
+
 @pytest.mark.parametrize(
     ("text", "line"),
     [

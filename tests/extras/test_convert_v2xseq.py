@@ -83,6 +83,20 @@ def test_rotations_of_labels_and_of_the_vehicle_add_up(run: Runner) -> None:
     assert "1 object state of the class name 'Zorb', which says nothing: taken as other; " in found.printed
 
 
+@pytest.mark.parametrize("none", [math.nan, math.inf, -math.inf, 1e308])
+def test_a_number_of_a_label_that_is_none_is_left_out_or_completed(run: Runner, none: float) -> None:
+    sound = label(7, 0, 0)
+    odd = [label(8, none, 0), label(9, 0, none), label(10, 5, 5, rotation=none)]
+    unsized = label(11, 9, 9, **{"3d_dimensions": {"h": 1.6, "w": 1.9, "l": none}})
+    folder = write(run.folder / "set")
+    put(folder / "cooperative/label/000020.json", [sound, *odd, unsized])
+    found = run("v2xseq", folder, "--only", "0001")
+    assert "note: 3 object states with a number that is none: skipped\n" in found.printed
+    assert {found.names[ident] for ident in found.recording.scene.object_ids} >= {"7", "11"}
+    assert len(found.recording.scene.object_ids) == 3
+    assert found.values(found.id_of("11"), "length_m") == [[4.5]]
+
+
 def test_a_missing_file_of_labels_is_a_gap(run: Runner) -> None:
     folder = write(run.folder / "set")
     (folder / "cooperative/label/000010.json").unlink()

@@ -11,7 +11,7 @@ import gzip
 import math
 import zlib
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -30,6 +30,7 @@ from copem_replay.extras.convert.conversion import (
     OsiKind,
     check_size,
     parse_number,
+    parse_number_or_none,
     parse_positive,
     parse_seconds_as_ns,
     wrap_yaw,
@@ -345,7 +346,7 @@ def _make_box(
     if point is None:
         report.count("state", "without a point as position: skipped")
         return None
-    x, y = _read_point(point, path)
+    x, y = _read_point(point, path, parse_number_or_none)
     turned, speed = state.find("orientation"), state.find("velocity")
     if turned is None:
         report.count("state", "without orientation: 0 taken")
@@ -366,12 +367,12 @@ def _read_value(node: XmlNode, path: Path, report: ConversionReport) -> float:
     low, high, exact = node.find("intervalStart"), node.find("intervalEnd"), node.find("exact")
     if low is not None and high is not None:
         report.count("value", f"of {node.tag} given as an interval: the middle taken")
-        return (parse_number(low.text, where) + parse_number(high.text, where)) / 2
-    return parse_number((node if exact is None else exact).text.strip(), where)
+        return (parse_number_or_none(low.text, where) + parse_number_or_none(high.text, where)) / 2
+    return parse_number_or_none((node if exact is None else exact).text.strip(), where)
 
 
-def _read_point(node: XmlNode, path: Path) -> tuple[float, float]:
-    x, y = (parse_number(_read_text(node, path, axis), f"{path}:{node.line}: {axis}") for axis in "xy")
+def _read_point(node: XmlNode, path: Path, parse: Callable[[object, str], float] = parse_number) -> tuple[float, float]:
+    x, y = (parse(_read_text(node, path, axis), f"{path}:{node.line}: {axis}") for axis in "xy")
     return x, y
 
 

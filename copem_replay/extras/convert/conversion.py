@@ -132,26 +132,34 @@ def rotation_from_euler(roll: float, pitch: float, yaw: float) -> Float:
 
 
 def wrap_yaw(yaw_rad: float) -> float:
-    """The angle of this direction in [−π, π]."""
-    return math.remainder(yaw_rad, math.tau)
+    """The angle of this direction in [−π, π]; NaN of a number that is none."""
+    return math.remainder(yaw_rad, math.tau) if abs(yaw_rad) <= _MOST_RAD else math.nan
 
 
 # Numbers, times and ids from texts. Errors name the place.
 
 LARGEST_M: Final = 1e8  # places and sizes beyond it are none
+_MOST_RAD: Final = 1e4  # a larger angle is none
 LAST_SECOND: Final = 4_000_000_000  # Unix time of 2096; reading takes no later stamp (`LAST_NS`)
 _LARGEST_ID: Final = 2**63 - 1  # OSI ids have 64 bits, which many readers keep in a signed integer
 
 
 def parse_number(text: object, where: str) -> float:
     """Return a finite number. Raises InputError, `where: expected a number, found …`."""
-    if not math.isfinite(value := parse_number_or_none(text, where)):
+    if not math.isfinite(value := _parse_float(text, where)):
         raise InputError(f"{where}: expected a number, found {quote_value(text)}")
     return value
 
 
 def parse_number_or_none(text: object, where: str) -> float:
-    """Return a number; NaN or infinite where that is said. Raises InputError: a text that is none."""
+    """Return a number of an object's state, NaN where it is none: the state is left out or completed, and counted.
+
+    Raises InputError: a text that is none.
+    """
+    return value if abs(value := _parse_float(text, where)) <= LARGEST_M else math.nan
+
+
+def _parse_float(text: object, where: str) -> float:
     try:
         if isinstance(text, str | int | float) and not isinstance(text, bool):
             return float(text)

@@ -25,7 +25,6 @@ from copem_replay.io.findings import LONGEST_M
 
 REQUIRED: Final = ("time_s", "id", "class", "x_m", "y_m", "length_m", "width_m")
 _NUMBERS: Final = ("x_m", "y_m", "length_m", "width_m")
-_MOST_RAD: Final = 1e4  # a larger angle is none
 YAW: Final = ("yaw_deg", "yaw_rad")  # one of them
 OPTIONAL: Final = ("z_m", "height_m", "vx_mps", "vy_mps", "moving", "host")
 _YES_NO: Final = {"1": True, "true": True, "0": False, "false": False}
@@ -134,11 +133,6 @@ def _check_header(header: list[str], path: Path) -> None:
         raise InputError(f"{where}: expected both vx_mps and vy_mps or none, found one")
 
 
-def _wrap_known(yaw_rad: float) -> float:
-    """The angle in [−π, π]; NaN of a number that is none."""
-    return wrap_yaw(yaw_rad) if abs(yaw_rad) <= _MOST_RAD else math.nan
-
-
 def _parse_row(cells: dict[str, str], where: str, line: int, report: ConversionReport) -> _BoxRow:
     """Parse a row. An empty cell of an optional column counts as no such column."""
 
@@ -172,7 +166,7 @@ def _parse_row(cells: dict[str, str], where: str, line: int, report: ConversionR
         kind=kind,
         at_m=(x_m, y_m),
         z_m=given("z_m"),
-        yaw_rad=_wrap_known(math.radians(yaw_value) if yaw == "yaw_deg" else yaw_value),
+        yaw_rad=wrap_yaw(math.radians(yaw_value) if yaw == "yaw_deg" else yaw_value),
         size_m=(length_m, width_m),
         height_m=given("height_m"),
         velocity_mps=None if vx is None or vy is None else (vx, vy),

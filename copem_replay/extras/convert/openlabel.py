@@ -26,6 +26,7 @@ from copem_replay.extras.convert.conversion import (
     OsiKind,
     number_names,
     parse_number,
+    parse_number_or_none,
     parse_seconds_as_ns,
     rotation_from_euler,
     rotation_from_quaternion,
@@ -242,7 +243,7 @@ def _make_box(
 def _read_values(val: Any, where: str) -> list[float]:
     if not isinstance(val, list) or len(val) not in (9, 10):
         raise InputError(f"{where}: expected a cuboid of 9 or 10 numbers, found {quote_value(val)}")
-    return [parse_number(value, f"{where}: cuboid") for value in val]
+    return [parse_number_or_none(value, f"{where}: cuboid") for value in val]
 
 
 def _read_rotation(values: list[float]) -> Float:

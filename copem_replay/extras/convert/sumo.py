@@ -22,7 +22,7 @@ from copem_replay.extras.convert.conversion import (
     ConvertedFrame,
     OsiKind,
     kind_from_name,
-    parse_number,
+    parse_number_or_none,
     parse_positive,
     parse_seconds_as_ns,
     wrap_yaw,
@@ -164,9 +164,9 @@ def _find_type(node: XmlNode, types: dict[str, VehicleType], report: ConversionR
 
 def _make_box(ident: int, node: XmlNode, kind: VehicleType, path: Path, report: ConversionReport) -> Box:
     x, y, angle_deg = (
-        parse_number(node.attribute(name, path), f"{path}:{node.line}: {name}") for name in ("x", "y", "angle")
+        parse_number_or_none(node.attribute(name, path), f"{path}:{node.line}: {name}") for name in ("x", "y", "angle")
     )
-    ground_m = parse_number(node.attributes.get("z", 0.0), f"{path}:{node.line}: z")
+    ground_m = parse_number_or_none(node.attributes.get("z", 0.0), f"{path}:{node.line}: z")
     if "z" not in node.attributes:
         report.assume("no z: the ground is z = 0")
     length_m, _, height_m = kind.size_m
@@ -175,7 +175,7 @@ def _make_box(ident: int, node: XmlNode, kind: VehicleType, path: Path, report: 
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     velocity = None
     if "speed" in node.attributes:
-        speed_mps = parse_number(node.attributes["speed"], f"{path}:{node.line}: speed")
+        speed_mps = parse_number_or_none(node.attributes["speed"], f"{path}:{node.line}: speed")
         velocity = (speed_mps * cos, speed_mps * sin)
     at_m = (x - back_m * cos, y - back_m * sin, ground_m + height_m / 2)
     return Box(ident, kind.kind, at_m, wrap_yaw(yaw_rad), kind.size_m, velocity)

@@ -30,6 +30,7 @@ from copem_replay.extras.convert.conversion import (
     PlannedRecording,
     check_size,
     parse_number,
+    parse_number_or_none,
     sign_files,
 )
 
@@ -111,7 +112,7 @@ def _make_box(label: Any, ids: dict[str, int], R: Float, t: Float, where: str, r
     kind = report.find_kind(str(label.get("type") or ""))
     at_m = R @ _read_named(label.get("3d_location"), "xyz", f"{where}: 3d_location") + t
     length, width, height = _read_named(label.get("3d_dimensions"), "lwh", f"{where}: 3d_dimensions").tolist()
-    yaw_rad = parse_number(label.get("rotation"), f"{where}: rotation")
+    yaw_rad = parse_number_or_none(label.get("rotation"), f"{where}: rotation")
     ahead = R @ np.array([math.cos(yaw_rad), math.sin(yaw_rad), 0.0])
     x, y, z = at_m.tolist()
     ident = ids.setdefault(str(track), len(ids) + 1)
@@ -219,4 +220,4 @@ def _read_numbers(value: Any, count: int, where: str) -> Float:
 def _read_named(value: Any, names: str, where: str) -> Float:
     if not isinstance(value, dict):
         raise InputError(f"{where}: expected {', '.join(names)}, found {quote_value(value)}")
-    return check_size(np.array([parse_number(value.get(name), f"{where}: {name}") for name in names]), where)
+    return np.array([parse_number_or_none(value.get(name), f"{where}: {name}") for name in names])
