@@ -222,7 +222,10 @@ class TestNumbers:
     def test_provenance_is_all_there(self, read: Page, made: Path) -> None:
         data = json.loads((made / "provenance.json").read_text(encoding="utf-8"))
         cells = {row[0]: row[1] for id_ in ("parameters", "libraries") for row in read.rows[id_]}
-        assert read.rows["logs"][1] == ["drive", "truth", data["logs"][0]["sha256"]]
+        (first, *_) = csv.DictReader((made / "read.csv").read_text(encoding="utf-8").splitlines())
+        counts = [first["frames"], first["entries"]]
+        assert all(int(count) > 0 for count in counts)
+        assert read.rows["logs"][1] == ["drive", "truth", *counts, data["logs"][0]["sha256"]]
         assert {name: cells[name] for name in data["libraries"]} == data["libraries"]
         expected = {
             "seed": "1",

@@ -17,6 +17,7 @@ from copem_replay.report.html.tables import row_head
 
 if TYPE_CHECKING:
     from copem_replay.report.html.study import ReportData
+    from copem_replay.results.read import Results
 
 
 # Provenance: recordings, notes, parameters, versions.
@@ -24,12 +25,13 @@ if TYPE_CHECKING:
 
 def provenance_tables(study: ReportData) -> Html:
     """The content of `provenance.json` as tables."""
-    data = study.provenance
+    data, read = study.provenance, _count_read(study.results)
     logs = [
         make_tag(
             "tr",
             make_tag("th", str(log["log"]), scope="row"),
             make_tag("td", str(log.get("topic") or "–"), class_="text"),
+            *(make_tag("td", number) for number in read.get(str(log["log"]), ("–", "–"))),
             make_tag("td", make_tag("code", str(log["sha256"])), class_="text"),
         )
         for log in data["logs"]
@@ -45,7 +47,10 @@ def provenance_tables(study: ReportData) -> Html:
         [
             make_tag("h3", "Recordings"),
             make_table(
-                ["log", "topic of the truth", "SHA-256"], logs, caption="Recordings that were replayed", id_="logs"
+                ["log", "topic of the truth", "frames", "entries", "SHA-256"],
+                logs,
+                caption="Recordings that were replayed",
+                id_="logs",
             ),
             *_read_table(data["logs"]),
             make_tag("p", "Skipped, and not in any figure:" if skipped else "No recording was skipped."),
@@ -56,6 +61,14 @@ def provenance_tables(study: ReportData) -> Html:
             fold_parts("Libraries", _pairs_table(data.get("libraries", {}), "Versions of libraries", "libraries")),
         ]
     )
+
+
+def _count_read(results: Results) -> dict[str, tuple[str, str]]:
+    """Frames and entries that were replayed, by log; empty where results have no `read.csv`."""
+    if results.folder is None or not results.has("read.csv"):
+        return {}
+    table = results.frame("read.csv")
+    return {str(one.log): (str(one.frames), str(one.entries)) for one in table.itertuples()}
 
 
 def _read_table(logs: Sequence[Any]) -> Iterator[Html]:
