@@ -58,8 +58,9 @@ class OriginLists:
         """What these lists hold, for fused lists that are available at `issue_s (K,)`."""
         lists, arrives_s = self.lists, self.lists.common_arrives_s
         way_s = find_longest_way_s(lists)
-        # Those before the first row, in a time chunk, hold nobody.
-        since_s = self.rows.row_captured_s.min(initial=np.inf)
+        # Those before the first row, in a time chunk, hold nobody; where nothing is known of origin, each counts.
+        unknown = self.goes_back == GoesBack.UNKNOWN
+        since_s = -np.inf if unknown else self.rows.row_captured_s.min(initial=np.inf)
         frame = np.flatnonzero(
             (lists.captured_s >= since_s) & (arrives_s <= issue_s.max(initial=-np.inf) + SAME_INSTANT_S)
         )
