@@ -3,7 +3,7 @@
     nice -n 10 python tools/coverage.py            # all rows, 2,000 studies each: minutes on one core
 
 A study has K logs with 1, 5 or 30 objects each, or unequal ones (lognormal, σ = 1, at least one), and its intervals are
-those of the package (`metrics/intervals.py`). *Shares*: of each log drawn from a Beta distribution of so much between
+those of the package (`metrics/limits.py`). *Shares*: of each log drawn from a Beta distribution of so much between
 logs (a + b: 2, 10, 40) and mean .5 or .9, or .95, and .2 in one log of ten; of its objects so many are detected. *Other
 figures*: means over objects of a part of the log and one of the object, both of the named distribution, variances 1 : 4
 (a correlation of .2); where it is zero but for a tenth, or bad in one log of ten, the object's part is normal. *RMST*:
@@ -36,7 +36,7 @@ import numpy as np
 import pandas as pd
 
 from copem_replay.core.tracks import Float, Int
-from copem_replay.metrics.intervals import alike_limits, limit_figure, limit_share
+from copem_replay.metrics.limits import alike_limits, limit_figure, limit_share
 from copem_replay.metrics.summary import format_table
 from copem_replay.metrics.survival import (
     CENSORED,

@@ -18,7 +18,7 @@ import pandas as pd
 from copem_replay.core.errors import InputError, count_noun
 from copem_replay.core.tracks import SAME_INSTANT_S
 from copem_replay.metrics.columns import COMPARISON
-from copem_replay.metrics.intervals import (
+from copem_replay.metrics.limits import (
     CONFIDENCE,
     FEWEST_CLUSTERS,
     FEWEST_LOGS,
@@ -59,6 +59,7 @@ from copem_replay.results.compare.metrics import (
     ghost_totals,
     list_tables,
     notes_on_equal_ghosts,
+    total_counts,
 )
 from copem_replay.results.compare.pairing import (
     PairingGrid,
@@ -94,16 +95,16 @@ class AllLogs:
         """Add a log with its regrets. `more`: there are other logs. `over_runs`: intervals are over runs."""
         self.alone.append((int((first.there & ~second.there).sum()), int((second.there & ~first.there).sum())))
         for regret in regrets:
-            # Runs stay apart for a single object: they are the clusters if no log has another.
-            runs = over_runs or regret.objects[0] <= 1
+            # Runs and passes stay apart for a single object: they are the clusters if no log has another.
+            runs = over_runs or regret.counts[0][0] <= 1
             figure = regret.figure.condensed(runs=runs) if more else regret.figure
             self._regrets.setdefault(regret.metric, []).append(replace(regret, figure=figure))
 
     @property
-    def objects(self) -> tuple[int, ...]:
-        """By log, the number of objects of which both sides have rows."""
+    def counts(self) -> tuple[int, int, int]:
+        """How many logs, objects and passes both sides have rows of."""
         of_logs = next(iter(self._regrets.values()), [])
-        return tuple(number for regret in of_logs for number in regret.objects)
+        return total_counts(counts for regret in of_logs for counts in regret.counts)
 
     def count_better(self, metric: str) -> int:
         """The number of logs whose own difference is for the better."""
@@ -193,14 +194,14 @@ def notes_on_frames(table: pd.DataFrame) -> Iterator[str]:
 
 
 _FEW_HAVE_IT = (
-    f"fewer than {FEWEST_LOGS} logs, {FEWEST_CLUSTERS} objects of one log, or {FEWEST_CLUSTERS} runs of one object "
+    f"fewer than {FEWEST_LOGS} logs, {FEWEST_CLUSTERS} objects of one log, or passes or runs of one object, "
     "have it, or too few for its limits"
 )
 
 
 def notes_on_rows(table: pd.DataFrame, pairs: Iterable[AllLogs], asked: float | None) -> Iterator[str]:
     """Notes on missing intervals, on decisive logs, and on configurations with fewer ghosts than `asked` a minute."""
-    counts = [(sum(number > 0 for number in of.objects), sum(of.objects)) for of in pairs]
+    counts = [of.counts for of in pairs]
     none = [count for count in counts if count[0] and choose_over(*count) is None]
     why = f"{explain_no_clusters(*none[0])}; {NOT_ENOUGH}" if none else None
     overall = table.drop_duplicates(["configuration", "metric"])

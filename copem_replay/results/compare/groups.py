@@ -17,7 +17,7 @@ import pandas as pd
 from copem_replay.core.errors import count_noun
 from copem_replay.core.tracks import SAME_INSTANT_S, Bool
 from copem_replay.metrics.config import BEGAN_BY, Slice
-from copem_replay.metrics.intervals import CONFIDENCE
+from copem_replay.metrics.limits import CONFIDENCE, TRAFFIC
 from copem_replay.metrics.slices import number_groups
 from copem_replay.metrics.summary import EPISODE
 from copem_replay.results.slices import read_slices
@@ -64,7 +64,7 @@ class EpisodeGroups:
 
 def without_limits_over_runs(row: dict[str, object]) -> dict[str, object]:
     """A row of a comparison, without limits over the runs of a single object: they tell of no group."""
-    if row.get("interval_over") in ("logs", "objects"):
+    if row.get("interval_over") in TRAFFIC:
         return row
     return {name: value for name, value in row.items() if name not in _LIMITS}
 

@@ -12,7 +12,7 @@ import pandas as pd
 from copem_replay.core.errors import OutputError, escape_unprintable, wrap_line
 from copem_replay.core.files import atomic_file
 from copem_replay.metrics.columns import TABLES
-from copem_replay.metrics.intervals import ALL_ALIKE, EXACT, NOTHING_DRAWN, describe_absent, describe_clusters
+from copem_replay.metrics.limits import ALL_ALIKE, EXACT, NOTHING_DRAWN, describe_absent, describe_clusters
 from copem_replay.metrics.summary import describe_mean, format_table
 from copem_replay.metrics.summary_metrics import COMPARED
 from copem_replay.results.compare.groups import describe_group_chance
