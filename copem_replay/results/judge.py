@@ -25,6 +25,7 @@ from copem_replay.experiment.criteria import Criterion, choose_judged
 from copem_replay.metrics.config import BEGAN_BY, Slice, parse_slice
 from copem_replay.metrics.limits import (
     ALL_ALIKE,
+    BOUNDED,
     NOTHING_DRAWN,
     Clusters,
     LimitedFigure,
@@ -442,7 +443,7 @@ class _JudgedStudy:
         rows = table[(table["configuration"] == configuration) & (table["metric"] == criterion.metric)]
         if not len(rows):
             return replace(_NO_ROW, why="nothing that both sides have")
-        return _difference_of(rows.iloc[0], of_runs=criterion.of_runs)
+        return _difference_of(rows.iloc[0], criterion)
 
     def _compare(self, criterion: Criterion, other: str, group: _JudgedGroup, *, of_before: bool) -> pd.DataFrame:
         """The overall rows of a comparison with a configuration, in all metrics that are asked of this group.
@@ -470,8 +471,9 @@ class _JudgedStudy:
         return comparison.overall.assign(configuration=comparison.overall["configuration"].map(labels))
 
 
-def _difference_of(row: pd.Series, *, of_runs: bool) -> JudgedFigure:
-    n = int(row["n"])
+def _difference_of(row: pd.Series, criterion: Criterion) -> JudgedFigure:
+    """The difference of a row of a comparison; on the side on which it is met its limits are those between bounds."""
+    n, of_runs = int(row["n"]), criterion.of_runs
     if pd.isna(row["difference"]):
         return replace(_NO_ROW, n=n, why="no pair has it")
     value, kind = float(row["difference"]), None if pd.isna(row["interval"]) else str(row["interval"])
@@ -480,12 +482,17 @@ def _difference_of(row: pd.Series, *, of_runs: bool) -> JudgedFigure:
         return JudgedFigure(LimitedFigure(value, value, value, kind), n=n)
     if over == "runs" and not of_runs:
         return JudgedFigure(LimitedFigure(value), n=n, why=_ONE_OBJECT)
-    if kind == ALL_ALIKE:
+    met_by = "high_bounded" if criterion.direction == "at_most" else "low_bounded"
+    bounded = None if pd.isna(row[met_by]) else float(row[met_by])
+    if kind == ALL_ALIKE and bounded is None:
         return JudgedFigure(LimitedFigure(value, kind=kind), "runs" if of_runs else None, n=n)
     if kind is None or kind == NOTHING_DRAWN:
         return JudgedFigure(LimitedFigure(value), n=n, why=_TOO_FEW)
-    low = -math.inf if pd.isna(row["low"]) else float(row["low"])
-    high = math.inf if pd.isna(row["high"]) else float(row["high"])
+    alike = kind == ALL_ALIKE  # of no spread Student's t has the value itself as limits
+    low = value if alike else -math.inf if pd.isna(row["low"]) else float(row["low"])
+    high = value if alike else math.inf if pd.isna(row["high"]) else float(row["high"])
+    if bounded is not None:
+        low, high, kind = (low, bounded, BOUNDED) if met_by == "high_bounded" else (bounded, high, BOUNDED)
     return JudgedFigure(LimitedFigure(value, low, high, kind), over, int(row["clusters"]), n)
 
 

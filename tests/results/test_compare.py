@@ -121,7 +121,7 @@ def test_unknown_until_the_detection_or_the_end_of_the_episode(tmp_path):
         row("late", 6.5, 20.0, object_id="8", onset_s=2.0, ended_s=6.0),
         row("late", 2.5, 20.0, object_id="9", onset_s=2.0, ended_s=3.0),
     ]
-    unknown = of(compared(tmp_path, rows, measure={"horizon_s": 6.0}), "unknown_to_horizon_s")
+    unknown = of(compared(tmp_path, rows, measure={"horizon_used_s": 6.0}), "unknown_to_horizon_s")
     assert unknown["baseline_value"] == pytest.approx((1 + 4 + 0) / 3)
     assert unknown["value"] == pytest.approx((6 + 4 + 0.5) / 3)
     assert unknown["difference"] == pytest.approx((5 + 0 + 0.5) / 3)
@@ -334,7 +334,7 @@ def test_the_same_rows_in_another_folder_differ_in_nothing(tmp_path):
     for metric, limit in (("detected_share", 1 - 0.025 ** (1.6 / 12)), ("pass_share", 1 - 0.025 ** (1.4 / 9))):
         assert tuple(table.loc[metric, ["low", "high"]]) == pytest.approx((-limit, limit), abs=1e-6)
         assert table.loc[metric, "interval"] == "exact"
-    others = table.loc[["ttd_rmst_s", "ttd_both_s", "unknown_s", "dad_median_m"]]
+    others = table.loc[["ttd_rmst_s", "ttd_both_s", "unknown_to_horizon_s", "dad_median_m"]]
     assert (others["interval"] == "all clusters alike").all()
     assert others[["low", "high", "interval_over"]].isna().all(axis=None)
 
@@ -354,7 +354,10 @@ def test_rows_are_in_the_order_of_logs_configurations_and_metrics(tmp_path):
     table = compared(tmp_path, random_rows(["ideal", "z", "b"])).table
     assert table["log"].drop_duplicates().tolist() == ["all", "log0", "log1"]
     assert table["configuration"].drop_duplicates().tolist() == ["z", "b"]
-    assert table["metric"].tolist() == ["detected_share", "ttd_rmst_s", "ttd_both_s", "unknown_s", "dad_median_m"] * 6
+    assert (
+        table["metric"].tolist()
+        == ["detected_share", "ttd_rmst_s", "ttd_both_s", "unknown_to_horizon_s", "dad_median_m"] * 6
+    )
     assert (table["baseline"] == "ideal").all()
 
 

@@ -85,9 +85,12 @@ def test_differences_are_those_of_compare(several: Path, metric: str) -> None:
     found = judged(several, metric=metric, at_most=0.0, against="half")
     assert found
     for configuration, verdict in found.items():
-        row = table.loc[configuration]
-        numbers = [None if pd.isna(row[name]) else float(row[name]) for name in ("difference", "low", "high")]
+        row = table.loc[configuration]  # met by the wider limits of a mean between bounds alone
+        high = "high" if metric in ("dad_median_m", "position_rmse_held_m") else "high_bounded"
+        numbers = [None if pd.isna(row[name]) else float(row[name]) for name in ("difference", "low", high)]
         assert [verdict.estimate, verdict.low, verdict.high] == numbers
+        if verdict.high is not None and high == "high_bounded":
+            assert verdict.interval == "bounded"
 
 
 def test_a_group_is_judged_by_its_rows_alone(several: Path) -> None:
@@ -167,6 +170,23 @@ def test_identical_results_are_not_refuted(several: Path, tmp_path: Path) -> Non
         found = judged(again, before=several, metric=metric, at_most=0.0, against="before")
         assert found
         assert {name: (one.passes, one.estimate) for name, one in found.items()} == dict.fromkeys(found, (True, 0.0))
+
+
+def test_a_difference_is_met_by_the_limits_between_bounds_and_not_met_by_students(several: Path) -> None:
+    """`late` is later than `half` in each of three logs: how much later another may be, three do not tell."""
+    results = read_results(several)
+    table = compare_folders([several], baseline="half").overall.set_index(["configuration", "metric"])
+    row = table.loc[("late", "unknown_to_horizon_s")]
+    horizon_s = float(results.summary["ttd_rmst_horizon_s"].iloc[0])
+    asked: dict[str, Any] = {"metric": "unknown_to_horizon_s", "configurations": ["late"], "against": "half"}
+    assert row["high_bounded"] > max(row["high"] if pd.notna(row["high"]) else row["difference"], row["difference"])
+    for bound, word in ((horizon_s, MET), (float(row["high_bounded"]) - 0.01, UNDECIDED)):
+        one = judged(several, at_most=bound, **asked)["late"]
+        assert (one.verdict, one.high) == (word, row["high_bounded"])
+        other = judged(several, at_least=-bound, **asked)["late"]
+        assert other.low == row["low_bounded"]
+    far = judged(several, at_most=-horizon_s, **asked)["late"]
+    assert far.verdict == NOT_MET
 
 
 def test_the_same_twice(several: Path) -> None:

@@ -20,6 +20,7 @@ from copem_replay.metrics.config import BEGAN_BY, Slice
 from copem_replay.metrics.limits import CONFIDENCE, TRAFFIC
 from copem_replay.metrics.slices import number_groups
 from copem_replay.metrics.summary import EPISODE
+from copem_replay.results.compare.limits import STAR
 from copem_replay.results.slices import read_slices
 
 if TYPE_CHECKING:
@@ -69,7 +70,7 @@ def without_limits_over_runs(row: dict[str, object]) -> dict[str, object]:
     return {name: value for name, value in row.items() if name not in _LIMITS}
 
 
-_LIMITS = ("low", "high", "interval", "interval_over", "clusters")
+_LIMITS = ("low", "high", "low_bounded", "high_bounded", "interval", "interval_over", "clusters")
 
 
 def describe_group_chance(table: pd.DataFrame) -> list[str]:
@@ -79,10 +80,11 @@ def describe_group_chance(table: pd.DataFrame) -> list[str]:
     lines = []
     for by, rows in table.groupby("by", sort=False):
         limited = rows[rows["interval_over"].notna()]
-        apart = int(((limited["low"] > 0) | (limited["high"] < 0)).sum())
+        apart = int(limited["star"].notna().sum())
         lines.append(
             f"by {by}: {count_noun(rows['group'].nunique(), 'group')} looked at; of "
             f"{count_noun(len(limited), 'interval')} {apart} exclude 0, by chance alone at least "
-            f"{(1 - CONFIDENCE) * len(limited):.2g} would"
+            f"{(1 - CONFIDENCE) * len(limited):.2g} would; {int((limited['star'] == STAR).sum())} with a {STAR}, all "
+            "groups held at 95 % together"
         )
     return lines

@@ -42,6 +42,7 @@ from copem_replay.metrics.limits import (
     limit_ranked_quantile,
 )
 from copem_replay.metrics.survival import (
+    CENSORED,
     cumulative_incidence,
     quantile_with_never,
     restricted_mean,
@@ -214,6 +215,11 @@ class PairStatistic(ABC):
         """The least and the most that the difference can be."""
         return -math.inf, math.inf
 
+    @property
+    def followed(self) -> float:
+        """The share of the pairs whose values are known up to the bounds."""
+        return 1.0
+
     def limits(self, difference: float, clusters: ClusterIndex, confidence: float = CONFIDENCE) -> LimitedFigure:
         """The difference with its limits; none: without some cluster there is no difference."""
         of = clusters.grouped
@@ -225,15 +231,26 @@ class PairStatistic(ABC):
             difference, *alike_limits(difference, weights * objects / weights.sum(), confidence), EXACT
         )  # fmt: skip
 
+    def limit_by_bounds(
+        self, difference: float, clusters: ClusterIndex, confidence: float = CONFIDENCE
+    ) -> LimitedFigure:
+        """The difference with the limits of a mean between bounds, of which a criterion is met; else without."""
+        if not np.isfinite(self.bounds).all() or not self.followed:
+            return LimitedFigure(difference)
+        of, each = clusters.grouped, self.weights(clusters)
+        unseen = float((each**2).sum() / each.sum()) / self.followed
+        return limit_left_out(difference, self.without_each(of), self.weights(of), self.bounds, confidence, unseen)
+
 
 @dataclass(frozen=True, kw_only=True)
 class SumStatistic(PairStatistic):
     """A function `of` sums (…, m) that gives the figure of either side: shares, means, their roots.
 
-    Items: `sums`; the third is what the figure averages over.
+    Items: `sums`; the third is what the figure averages over. `most`: as far apart both sides can be.
     """
 
     of: Callable[[Float], tuple[Float, Float]]
+    most: float = math.inf
 
     def values(self) -> tuple[float, float, float]:
         """Of the first, of the second, and their difference."""
@@ -270,7 +287,7 @@ class SumStatistic(PairStatistic):
     @property
     def bounds(self) -> tuple[float, float]:
         """−1 and 1 for a difference of shares."""
-        return (-1.0, 1.0) if self.share else super().bounds
+        return -self.most, self.most
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -351,6 +368,12 @@ class TimeStatistic(PairStatistic):
         earliest = min((float(part["time_s"].min(initial=0.0)) for part in self.parts), default=0.0)
         return min(earliest, self.horizon_s) - self.horizon_s, self.horizon_s - min(earliest, self.horizon_s)
 
+    @property
+    def followed(self) -> float:
+        """The share of the pairs that is detected, departed or watched to the horizon, on the side that has fewer."""
+        known = [(of["ending"] != CENSORED) | (of["time_s"] >= self.horizon_s - _SAME) for of in self.parts]
+        return min(float(of["n"][kept].sum() / of["n"].sum()) for of, kept in zip(self.parts, known, strict=True))
+
 
 def _count_items(items: StatisticItems, clusters: ClusterIndex) -> Float:
     """(K,) how many pairs the items of each cluster stand for."""
@@ -393,7 +416,8 @@ def difference_limits(
     fixed: bool,
     confidence: float = CONFIDENCE,
 ) -> dict[str, object]:
-    """The columns `low`, `high`, `interval`, `interval_over` and `clusters` of a difference, as far as they exist.
+    """The columns `low`, `high`, `low_bounded`, `high_bounded`, `interval`, `interval_over` and `clusters` of a
+    difference, as far as they exist.
 
     `over`: the kind of cluster, None: none. `fixed`: the figure is equal in every run, on either side.
     """
@@ -405,13 +429,56 @@ def difference_limits(
     if clusters is None or not (figure.by_object or over not in ("objects", "passes")):
         return {}
     found = figure.limits(difference, clusters, confidence)
+    bounded = LimitedFigure(difference) if over == "runs" else figure.limit_by_bounds(difference, clusters, confidence)
+    limits = {"low_bounded": bounded.low, "high_bounded": bounded.high} if bounded.kind else {}
     if found.kind == ALL_ALIKE:
-        return {"interval": found.kind}
+        return {"interval": found.kind, **limits, **({"clusters": len(clusters.names)} if limits else {})}
     if not (math.isfinite(found.low) or math.isfinite(found.high)):
         return {}
-    limits = {"low": found.low, "high": found.high}
+    limits |= {"low": found.low, "high": found.high}
     return {name: limit if math.isfinite(limit) else None for name, limit in limits.items()} | {
         "interval": found.kind,
         "interval_over": over,
         "clusters": len(clusters.names),
     }
+
+
+# Stars of a table.
+
+STAR, ALONE = "*", "°"
+"""Marks of differences: one that stands in a whole table, and one whose own interval alone excludes 0."""
+BETTER, WORSE, ALIKE, OPEN = "better", "worse", "alike", "open"
+"""What a difference is in words, held against the least one that matters."""
+
+
+def is_off_zero(limits: Mapping[str, Any]) -> bool:
+    """Whether an interval with the columns of `difference_limits` excludes 0."""
+    low, high = limits.get("low"), limits.get("high")
+    return bool((low is not None and low > _SAME) or (high is not None and high < -_SAME))
+
+
+def find_stars(number: int, limit: Sequence[Callable[[float], Mapping[str, object]]]) -> set[int]:
+    """Which differences exclude 0 together: Holm's procedure by sets. `number`: how many differences a table has.
+
+    `limit`: of each that may, its limits at a confidence. Those whose limits at 1 − .05/`number` exclude 0 are held;
+    the rest is asked anew at 1 − .05 over as many as are left, until none is added: under no difference at all at most
+    one table in twenty has any.
+
+    Source: S. Holm, "A simple sequentially rejective multiple test procedure", Scand. J. Statist. 6 (1979) 65–70.
+    """
+    held: set[int] = set()
+    while len(held) < number:
+        level = 1.0 - (1.0 - CONFIDENCE) / (number - len(held))
+        more = {k for k, at in enumerate(limit) if k not in held and is_off_zero(at(level))}
+        if not more:
+            break
+        held |= more
+    return held
+
+
+def describe_difference(row: Mapping[str, Any], better: int, least: float) -> str:
+    """The word of a row with its star: `alike` where its interval is within ± `least`, what matters."""
+    if row.get("star") == STAR:
+        return BETTER if row["difference"] * better > 0 else WORSE
+    low, high = row.get("low"), row.get("high")
+    return ALIKE if low is not None and high is not None and max(-low, high) <= least else OPEN

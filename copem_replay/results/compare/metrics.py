@@ -23,7 +23,7 @@ other, as between two points of a ROC curve. Intervals keep the thresholds and t
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property, reduce
 from typing import TYPE_CHECKING, Any
 
@@ -362,7 +362,7 @@ def _means(pair: _Pair, values: Callable[[Columns], NDArray[Any]]) -> SumStatist
 def _shares(pair: _Pair, cells: Int, first: Bool, second: Bool) -> SumStatistic:
     only = np.stack([first & ~second, second & ~first], axis=1).astype(np.int64)
     sums = np.stack([first, second, np.ones(len(cells))], axis=1)
-    return SumStatistic(parts=(pair.items(cells, only=only, sums=sums),), of=_divide_mean, share=True)
+    return SumStatistic(parts=(pair.items(cells, only=only, sums=sums),), of=_divide_mean, share=True, most=1.0)
 
 
 def _passes(pair: _Pair) -> SumStatistic | None:
@@ -392,7 +392,7 @@ def _means_unknown(pair: _Pair) -> SumStatistic:
         found = compute_unknown_s(rows["detection_s"] - rows["onset_s"], rows["ended_s"] - rows["onset_s"])
         return np.minimum(found, pair.setting.horizon_s)
 
-    return _means(pair, unknown_s)
+    return replace(_means(pair, unknown_s), most=pair.setting.horizon_s)
 
 
 def _means_at_equal_ghosts(pair: _Pair) -> TimeStatistic | None:
