@@ -57,6 +57,7 @@ def used_s() -> float:
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     """Append the time of a test, with what it sets up and takes down."""
+    _watch_calls()
     begun_s = used_s()
     result = yield
     if path := os.environ.get(_TIMES):
@@ -65,8 +66,8 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     return result
 
 
-def pytest_sessionstart() -> None:
-    """Watch the calls of functions, where rooms are asked for."""
+def _watch_calls() -> None:
+    """Watch the calls of functions, where rooms are asked for: for each test anew, as an error takes the hook out."""
     if _ROOMS in os.environ:
         sys.setprofile(_watch)
         threading.setprofile(_watch)

@@ -25,12 +25,12 @@ LONGEST_M = 1000.0
 """A longer, wider or higher object is an error of the recording: no wall, train or building is."""
 _WIDEST_M2 = 1e8
 """A larger variance of a position (10 km) says that nothing is known: drivers write 1e9, or the largest number."""
-_TURNS_RAD = 1e4
+MOST_RAD = 1e4
 """A larger angle is none: at the latest then its fraction of a turn means nothing."""
 
 X, Y, Z, YAW, VX, VY, LENGTH, WIDTH, HEIGHT = range(len(VALUES))
 """Columns of states, in the order of `tracks.VALUES`."""
-_MOST = np.array([FARTHEST_M] * 3 + [_TURNS_RAD] + [np.finfo(float).max] * 2 + [LONGEST_M] * 3)
+_MOST = np.array([FARTHEST_M] * 3 + [MOST_RAD] + [np.finfo(float).max] * 2 + [LONGEST_M] * 3)
 """The largest number of each column that is one. Of velocities any is: those above `FASTEST_MPS` are told apart."""
 
 # The table of findings.

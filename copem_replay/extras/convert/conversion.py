@@ -25,7 +25,16 @@ from copem_replay.core.frame import SaidPlace
 from copem_replay.core.site_map import SiteMap
 from copem_replay.core.tracks import CLASSES, Float
 from copem_replay.io.class_names import class_from_name, stands
-from copem_replay.io.findings import BODIES_M, FARTHEST_M, LENGTH, LONGEST_M, RULES, as_finding, complete_sizes
+from copem_replay.io.findings import (
+    BODIES_M,
+    FARTHEST_M,
+    LENGTH,
+    LONGEST_M,
+    MOST_RAD,
+    RULES,
+    as_finding,
+    complete_sizes,
+)
 from copem_replay.io.schemas.osi_ground_truth import osi_class_index
 from copem_replay.io.write.osi import NANOS_PER_SECOND, OsiTrace, add_road, empty_ground_truth, write_osi_trace
 
@@ -133,13 +142,12 @@ def rotation_from_euler(roll: float, pitch: float, yaw: float) -> Float:
 
 def wrap_yaw(yaw_rad: float) -> float:
     """The angle of this direction in [−π, π]; NaN of a number that is none."""
-    return math.remainder(yaw_rad, math.tau) if abs(yaw_rad) <= _MOST_RAD else math.nan
+    return math.remainder(yaw_rad, math.tau) if abs(yaw_rad) <= MOST_RAD else math.nan
 
 
 # Numbers, times and ids from texts. Errors name the place.
 
 LARGEST_M: Final = 1e8  # places and sizes beyond it are none
-_MOST_RAD: Final = 1e4  # a larger angle is none
 LAST_SECOND: Final = 4_000_000_000  # Unix time of 2096; reading takes no later stamp (`LAST_NS`)
 _LARGEST_ID: Final = 2**63 - 1  # OSI ids have 64 bits, which many readers keep in a signed integer
 
