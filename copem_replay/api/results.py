@@ -42,6 +42,8 @@ def compare(
     baseline: str | None = None,
     false_positives_per_min: float | None = None,
     by: Sequence[str] | None = None,
+    decide: str | None = None,
+    matters: Mapping[str, float] | None = None,
 ) -> Comparison:
     """Compare configurations with a baseline, paired by log, object and run, within or across results folders.
 
@@ -49,7 +51,9 @@ def compare(
     inputs, else the first that is not the truth. `false_positives_per_min`: false positives per minute at which times
     to detection are compared once more; None: those of the baseline. `by`: entries by which rows are grouped, each
     group compared for itself, in `groups` of the result: `["class", "log*class"]`. Its `table` has a row per log,
-    configuration and metric: `difference` with the limits `low` and `high` of its 95 % interval.
+    configuration and metric: `difference` with the limits `low` and `high` of its 95 % interval. `decide`: the one
+    metric that was named to decide, of which alone there are stars; None: all, held together. `matters`: by metric the
+    least difference that matters, by which each is better, worse, alike or open.
 
     Raises InputError with every reason why the results are unreadable or not comparable.
 
@@ -67,6 +71,8 @@ def compare(
         baseline=baseline,
         false_positives_per_min=false_positives_per_min,
         by=by,
+        decide=decide,
+        matters=matters,
     )
 
 

@@ -50,6 +50,13 @@ def compare(
     log: Annotated[
         str | None, typer.Option(metavar="NAME", help="Log in that recording [as in that replay.rrd].")
     ] = None,
+    decide: Annotated[
+        str | None, typer.Option(metavar="METRIC", help="The one metric that decides: no other has a star [all].")
+    ] = None,
+    matters: Annotated[
+        list[str] | None,
+        typer.Option(metavar="METRIC=N", help="Least difference that matters: better, worse, alike or open."),
+    ] = None,
     fail_on: Annotated[
         list[str] | None,
         typer.Option(metavar="'METRIC > N'", help="Exit with 1 if the first folder is shown to be worse by so much."),
@@ -75,6 +82,8 @@ def compare(
         baseline=baseline,
         false_positives_per_min=false_positives_per_min,
         by=split_entries(by),
+        decide=decide,
+        matters=dict(map(_parse_matters, matters or ())),
     )
     notes = list(comparison.notes)
     if rrd is not None:
@@ -97,6 +106,14 @@ def compare(
     code = _judge_differences(conditions, folders)
     print_answer(decision.sentence)
     return code
+
+
+def _parse_matters(text: str) -> tuple[str, float]:
+    name, _, number = text.partition("=")
+    try:
+        return name.strip(), float(number)
+    except ValueError:
+        raise InputError(f"--matters: expected METRIC=N, such as ttd_rmst_s=0.25, found {text!r}") from None
 
 
 def _check_fail_on(

@@ -17,7 +17,7 @@ from copem_replay.core.components import Frozen, Id, Number
 from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import CLASS_GROUPS, TRUTH
 from copem_replay.metrics.config import parse_slices
-from copem_replay.metrics.intervals import CONFIDENCE, choose_over, explain_no_clusters
+from copem_replay.metrics.limits import CONFIDENCE, TRAFFIC, choose_over, explain_no_clusters
 from copem_replay.perception.pem.condition import ClassNames
 
 BEFORE = "before"
@@ -162,7 +162,7 @@ def note_undecidable(criteria: Mapping[str, Criterion], counted: Sequence[int]) 
     """A note on criteria that no number of runs decides. `counted`: by log how many episodes count."""
     asked = [name for name, one in criteria.items() if not one.of_runs]
     logs = sum(number > 0 for number in counted)
-    if asked and choose_over(logs, sum(counted)) not in ("logs", "objects"):
+    if asked and choose_over(logs, sum(counted), 1) not in TRAFFIC:
         yield (
             f"criteria {', '.join(asked)}: such traffic is not measured by {explain_no_clusters(logs, sum(counted))}, "
             "whatever the runs; `population: these_logs` asks about these recordings"

@@ -25,8 +25,8 @@ from copem_replay.experiment.file import (
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.ground_truth import MAX_GAP_S
 from copem_replay.metrics.config import BEGAN_BY, CLASS, LONGEST_CHAIN, onset_requirement
-from copem_replay.metrics.figure_limits import JUDGED, PER_MINUTE, SUMMED
 from copem_replay.metrics.onset import BEGAN, Requires
+from copem_replay.metrics.row_figures import JUDGED, PER_MINUTE, SUMMED
 from copem_replay.metrics.summary_metrics import COMPARED, METRICS_OF
 
 NO_EGO = "none"

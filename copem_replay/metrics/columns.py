@@ -402,7 +402,7 @@ COMPARISON = Table(
         Column("interval", "text or null",
                "kind of the limits, or why there are none, [here](../guide/metrics.md#intervals)"),
         Column("interval_over", "text or null",
-               "what the limits are over: logs, objects of one log, runs of one object"),
+               "what the limits are over: logs, objects of one log, passes or runs of one object"),
         Column("n", "whole numbers", "rows that both have and that count; of what is held, pairs or frames"),
         Column("p_value", "numbers", "of a share: McNemar's exact test"),
         Column("only_configuration", "whole numbers",
@@ -423,6 +423,12 @@ COMPARISON = Table(
         Column("baseline_no_list_share", "numbers", "the same of the baseline"),
         Column("without_truth", "whole numbers", "held entries whose object has no truth at the frame"),
         Column("baseline_without_truth", "whole numbers", "the same of the baseline"),
+        Column("low_bounded", "numbers",
+               "lower limit with one cluster that was not seen at the far end: a criterion is met by it alone"),
+        Column("high_bounded", "numbers", "upper limit so"),
+        Column("star", "text or null",
+               "`*`: differs from 0 with the whole table held at 95 %; `°`: its own interval alone excludes 0"),
+        Column("word", "text or null", "better, worse, alike or open, by the least difference that matters"),
     ),
 )  # fmt: skip
 """The table of a comparison, which is in no folder."""

@@ -23,7 +23,7 @@ from copem_replay.core.errors import count_noun
 from copem_replay.core.tracks import CLASSES, Bool, Float, Int
 from copem_replay.metrics.accuracy.statistics import EXISTENCE, OBJECT, RUN, AccuracySettings, AccuracyTotal
 from copem_replay.metrics.config import AREA, BEGAN_BY, CLASS, LOG, RANGE, TAGS, Dimension, Slice
-from copem_replay.metrics.intervals import CONFIDENCE, choose_over, explain_no_clusters
+from copem_replay.metrics.limits import CONFIDENCE, TRAFFIC, choose_over, count_clusters, explain_no_clusters
 from copem_replay.metrics.metric import (
     LINK,
     OUTPUT,
@@ -356,7 +356,7 @@ def summarise_groups(study: StudyRows, slices: Sequence[Slice]) -> pd.DataFrame:
 
     Before them `by`, `group`, `configuration`, `logs` and `objects` that count, `apart` (whether the interval of
     `detected_share` excludes the share of all groups) and `note`: why there is no interval, or that few episodes last
-    as long as the horizon. An interval is over logs or objects: over the runs of one object it tells of no group.
+    as long as the horizon. No interval is over the runs of one object: it tells of no group.
     """
     metrics = (*(metric for metric in METRICS if metric.name not in _NOT_OF_GROUPS), *own_metrics(study.settings.own))
     rows = list[dict[str, Any]]()
@@ -378,10 +378,10 @@ def _summarise_group(
     for name, share in shares.items():
         inputs = group.rows.inputs(name)
         figures = evaluate_metrics(metrics, inputs)
-        logs, objects = _count_clusters(inputs.rows)
-        notes = _leave_out_limits(figures, "detected_share", "", (logs, objects))
+        logs, objects, passes = count_clusters(inputs.rows)
+        notes = _leave_out_limits(figures, "detected_share", "", (logs, objects, passes))
         if "pass_share" in figures:
-            counts = _count_clusters(inputs.rows[inputs.rows["in_conflict"]])
+            counts = count_clusters(inputs.rows[inputs.rows["in_conflict"]])
             notes += _leave_out_limits(figures, "pass_share", "pass_", counts)
         yield {
             "by": group.by.label,
@@ -395,9 +395,9 @@ def _summarise_group(
         }
 
 
-def _leave_out_limits(figures: dict[str, Any], share: str, prefix: str, counts: tuple[int, int]) -> list[str]:
-    """Leave out limits that are over neither logs nor objects, and say why. `counts`: logs, and objects in them."""
-    if choose_over(*counts) in ("logs", "objects"):
+def _leave_out_limits(figures: dict[str, Any], share: str, prefix: str, counts: tuple[int, int, int]) -> list[str]:
+    """Leave out limits that are over runs, and say why. `counts`: logs, objects in them, passes of these."""
+    if choose_over(*counts) in TRAFFIC:
         return []
     kinds = (f"{prefix}interval", f"{prefix}interval_over", f"{prefix}interval_clusters")
     figures |= dict.fromkeys((f"{share}_low", f"{share}_high", *kinds))
@@ -412,12 +412,6 @@ def _is_apart(figures: Mapping[str, Any], share: float | None) -> bool | None:
     if low is None or share is None or share in (0.0, 1.0):
         return None
     return bool(not low <= share <= high)
-
-
-def _count_clusters(rows: pd.DataFrame) -> tuple[int, int]:
-    """How many logs, and objects of them, have rows."""
-    objects = rows[["log", "object_id"]].drop_duplicates()
-    return objects["log"].nunique(), len(objects)
 
 
 def describe_chance(table: pd.DataFrame) -> list[str]:

@@ -17,10 +17,11 @@ from copem_replay.core.errors import count_noun, wrap_line
 from copem_replay.core.tracks import SAME_INSTANT_S, Int
 from copem_replay.metrics.accuracy.metrics import beyond_gate_share
 from copem_replay.metrics.accuracy.statistics import AccuracyTotal
-from copem_replay.metrics.intervals import (
+from copem_replay.metrics.limits import (
     NOT_ENOUGH,
     NOTHING_DRAWN,
     choose_over,
+    count_clusters,
     describe_absent,
     explain_no_clusters,
     interval_words,
@@ -280,9 +281,8 @@ def _note_no_interval(detections: pd.DataFrame) -> list[str]:
     conflicts = detections[detections["in_conflict"]] if "in_conflict" in detections else detections.iloc[:0]
     notes = []
     for share, rows in (("detected", detections), ("pass", conflicts)):
-        logs, objects = rows["log"].nunique(), rows.groupby(["log", "object_id"], sort=False).ngroups
-        if len(rows) and choose_over(logs, objects) is None:
-            notes.append(f"no interval of the {share} share: {explain_no_clusters(logs, objects)}; {NOT_ENOUGH}")
+        if (counts := count_clusters(rows))[0] and choose_over(*counts) is None:
+            notes.append(f"no interval of the {share} share: {explain_no_clusters(*counts)}; {NOT_ENOUGH}")
     return notes
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from operator import attrgetter, itemgetter
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,15 @@ from numpy.typing import NDArray
 from copem_replay.core.tracks import Bool, Float
 from copem_replay.metrics.accuracy.metrics import ACCURACY
 from copem_replay.metrics.braking.driver import UNRESOLVED
-from copem_replay.metrics.intervals import CLUSTERS, EXACT, NOTHING_DRAWN, choose_clusters, exact_limits, limit_share
+from copem_replay.metrics.limits import (
+    CLUSTERS,
+    CONFIDENCE,
+    EXACT,
+    NOTHING_DRAWN,
+    count_clusters,
+    exact_limits,
+    find_clusters,
+)
 from copem_replay.metrics.metric import LINK, OUTPUT, Compared, Metric, MetricInputs, compared_metric
 from copem_replay.metrics.survival import (
     CENSORED,
@@ -121,22 +129,18 @@ class ShareEstimate:
 
 def _estimate_share(part: pd.DataFrame, successes: NDArray[np.int64], *, fixed: bool) -> ShareEstimate:
     """The share of `successes (n,)` among the runs of the tally's rows (n,). `fixed`: equal in every run."""
-    import pandas as pd
-
     n, total = int(part["runs"].sum()), int(successes.sum())
     share = total / n if n else None
-    over, cluster = choose_clusters(part)
-    if over is None or not n:
+    clusters = find_clusters(part)
+    if clusters is None or not n:
         return ShareEstimate(n, share)
-    if over == "runs":
-        if fixed:
-            return ShareEstimate(n, share, NOTHING_DRAWN)
-        return ShareEstimate(n, share, EXACT, over, n, *map(float, exact_limits(total, n)))
-    columns = pd.DataFrame({"sum": successes, "count": part["runs"].to_numpy()})
-    counted = columns.groupby(cluster.to_numpy(), sort=True).sum()
-    objects = part.groupby(["log", "object_id"], sort=False).ngroups
-    limits = limit_share(counted["sum"].to_numpy(dtype=float), counted["count"].to_numpy(dtype=float), objects)
-    return ShareEstimate(n, share, EXACT, over, len(counted), *map(float, limits))
+    if not clusters.by_run:
+        low, high = clusters.limit_share(successes.astype(float), part["runs"].to_numpy(dtype=float), CONFIDENCE)
+        return ShareEstimate(n, share, EXACT, clusters.over, clusters.count, low, high)
+    if fixed:
+        return ShareEstimate(n, share, NOTHING_DRAWN)
+    runs = n // count_clusters(part)[2]  # passes of a run may be one and the same: a run counts once
+    return ShareEstimate(n, share, EXACT, clusters.over, runs, *map(float, exact_limits(total / n * runs, runs)))
 
 
 def estimate_detected_share(inputs: MetricInputs) -> ShareEstimate:
@@ -150,16 +154,18 @@ class UnknownTimes:
     """How long objects are unknown, and what became of those that are never detected.
 
     `mean_s`: mean seconds from the onset to the detection or to the end of the episode, 0 where the object was known
-    before. `left_share`: of the rows, those whose object left undetected; `open_share`: those still undetected when the
-    ego or the log ended, of which what would have come later is not known. All None without rows.
+    before; `to_horizon_s`: mean of the lesser of these and the horizon. `left_share`: of the rows, those whose object
+    left undetected; `open_share`: those still undetected when the ego or the log ended, of which what would have come
+    later is not known. All None without rows.
     """
 
     mean_s: float | None = None
+    to_horizon_s: float | None = None
     left_share: float | None = None
     open_share: float | None = None
 
 
-def _measure_unknown(rows: pd.DataFrame, known: Bool, weight: Float) -> UnknownTimes:
+def _measure_unknown(rows: pd.DataFrame, known: Bool, weight: Float, horizon_s: float | None) -> UnknownTimes:
     """Of rows (n,) that count by their `weight (n,)`; `known (n,)`: which are detected."""
     total = float(weight.sum())
     if not total:
@@ -169,6 +175,7 @@ def _measure_unknown(rows: pd.DataFrame, known: Bool, weight: Float) -> UnknownT
     left = is_competing(rows["ended_by"]) & ~known
     return UnknownTimes(
         float(weight @ unknown_s) / total,
+        None if horizon_s is None else float(weight @ np.minimum(unknown_s, horizon_s)) / total,
         float(weight[left].sum()) / total,
         float(weight[~known & ~left].sum()) / total,
     )
@@ -181,7 +188,8 @@ def compute_unknown_s(time_s: Float, length_s: Float) -> Float:
 
 def measure_unknown(inputs: MetricInputs) -> UnknownTimes:
     """How long objects are unknown in the rows of the tally."""
-    return _measure_unknown(inputs.rows, _is_known(inputs.rows), inputs.rows["runs"].to_numpy(dtype=float))
+    weight = inputs.rows["runs"].to_numpy(dtype=float)
+    return _measure_unknown(inputs.rows, _is_known(inputs.rows), weight, inputs.horizon_s)
 
 
 def estimate_foreseen_share(inputs: MetricInputs) -> float | None:
@@ -227,7 +235,8 @@ def summarise_exact(inputs: MetricInputs) -> ExactStatistics | None:
     weight = part["probability"].to_numpy(dtype=float)
     known = part["detection_s"].notna().to_numpy()
     times = _detection_statistics(part, known, weight, inputs.horizon_s, 1 / int(inputs.rows["runs"].sum()))
-    return ExactStatistics(weight[known].sum() / weight.sum(), times, _measure_unknown(part, known, weight), missed)
+    unknown = _measure_unknown(part, known, weight, inputs.horizon_s)
+    return ExactStatistics(weight[known].sum() / weight.sum(), times, unknown, missed)
 
 
 def _summarise_missed(never: pd.DataFrame) -> dict[str, float | None]:
@@ -278,14 +287,10 @@ def _limit_metrics(
         row(f"{prefix}interval", value=attrgetter("kind"), kind="text",
             help=f"kind of the limits of {of}, or why there are none"),
         row(f"{prefix}interval_over", value=attrgetter("over"), kind="text", among=tuple(CLUSTERS),
-            help=f"what the limits of {of} are over: logs, objects of one log or runs of one object"),
+            help=f"what the limits of {of} are over: logs, objects of one log, passes or runs of one object"),
         row(f"{prefix}interval_clusters", value=attrgetter("clusters"),
             help=f"how many of these the limits of {of} are over"),
     )  # fmt: skip
-
-
-def _seconds_unknown(rows: Any) -> Float:
-    return compute_unknown_s(rows["detection_s"] - rows["onset_s"], rows["ended_s"] - rows["onset_s"])
 
 
 _MEAN = "mean of min(time to detection, horizon), never detected counting as the horizon"
@@ -314,8 +319,11 @@ _DETECTION_METRICS = (
     Metric("ttd_rmst_horizon_s", summarise_detections, lambda of: of.horizon_s, 0, "the horizon of ttd_rmst_s"),
     Metric("unknown_s", measure_unknown, lambda of: of.mean_s, -1,
            "mean seconds from the onset to the detection or the end of the episode; needs no horizon", "summary",
-           "mean time unknown, s",
-           Compared("mean seconds unknown, to the detection or the end of the episode", _seconds_unknown)),
+           "mean time unknown, s"),
+    Metric("unknown_to_horizon_s", measure_unknown, lambda of: of.to_horizon_s, -1,
+           "mean of min(time unknown, horizon): what criteria and stars judge, for one long episode decides no mean",
+           "summary", "mean time unknown up to the horizon, s",
+           Compared("mean of min(seconds unknown, horizon)", "times unknown")),
     Metric("left_undetected_share", measure_unknown, lambda of: of.left_share, -1,
            "share of the rows whose object left undetected: never detected", "undetected", "left undetected, %"),
     Metric("open_share", measure_unknown, lambda of: of.open_share, 0,
@@ -371,6 +379,7 @@ _EXACT_METRICS = (
     _exact_metric("ttd_p95_s", lambda of: of.times.quantile_s(0.95), -1),
     _exact_metric("ttd_rmst_s", lambda of: of.times.mean_s(), -1),
     _exact_metric("unknown_s", lambda of: of.unknown.mean_s, -1),
+    _exact_metric("unknown_to_horizon_s", lambda of: of.unknown.to_horizon_s, -1),
     _exact_metric("dad_median_m", lambda of: of.times.distance_quantile_m(0.5), 1),
     _exact_metric("dad_p5_m", lambda of: of.times.distance_quantile_m(0.05), 1),
     _exact_missed("miss_log10", "log₁₀ of the mean probability that an episode misses its object"),

@@ -8,7 +8,7 @@ later.
 censor: F may stay below 1 for ever, and a quantile above its last value does not exist (None).
 *Restricted mean* at a horizon h: the mean of min(T, h), in which never counts as h.
 *Distance at detection*: far is good, so a row that was never detected ranks below every distance.
-Intervals: metrics/intervals.py. No function here draws a random number.
+Intervals: metrics/limits.py. No function here draws a random number.
 
 Letters of the shapes: n rows, M distinct times of detection, K clusters of rows, G instants.
 """

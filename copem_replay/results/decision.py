@@ -21,6 +21,7 @@ from copem_replay.core.errors import count_noun
 from copem_replay.core.tracks import SAME_INSTANT_S, TRUTH
 from copem_replay.experiment.schema import Experiment
 from copem_replay.results.compare import Comparison, compare_folders
+from copem_replay.results.compare.limits import ALIKE, BETTER, WORSE
 from copem_replay.results.compare.tables import NOTHING
 from copem_replay.results.verdicts import NOT_MET, Judgement
 
@@ -38,7 +39,6 @@ DECIDED_BY = ("ttd_rmst_s", "pass_share")
 """Metrics that a decision is about."""
 _NAMED = 4
 """Most configurations that are named with their figures: more make a sentence hard to read."""
-BETTER, ALIKE, WORSE = "better", "alike", "worse"
 
 
 @dataclass(frozen=True)

@@ -23,23 +23,24 @@ from copem_replay.core.errors import InputError, count_noun, unknown_name_messag
 from copem_replay.core.tracks import Bool, Float
 from copem_replay.experiment.criteria import Criterion, choose_judged
 from copem_replay.metrics.config import BEGAN_BY, Slice, parse_slice
-from copem_replay.metrics.figure_limits import (
+from copem_replay.metrics.limits import (
+    ALL_ALIKE,
+    BOUNDED,
+    NOTHING_DRAWN,
+    Clusters,
+    LimitedFigure,
+    count_clusters,
+    explain_no_clusters,
+    find_clusters,
+)
+from copem_replay.metrics.onset import select_counted
+from copem_replay.metrics.row_figures import (
     JUDGED,
     PER_MINUTE,
     SUMMED,
     FigureRows,
-    LimitedFigure,
-    RowClusters,
     limit_sums,
 )
-from copem_replay.metrics.intervals import (
-    ALL_ALIKE,
-    NOTHING_DRAWN,
-    choose_clusters,
-    choose_over,
-    explain_no_clusters,
-)
-from copem_replay.metrics.onset import select_counted
 from copem_replay.metrics.slices import Group, StudyRows, sum_episodes
 from copem_replay.metrics.summary import CONFLICT, list_runs
 from copem_replay.results.compare.compare import PairsAsked, compare_folders
@@ -107,7 +108,8 @@ def judge_own_criteria(results: Results) -> Judgement | None:
 
 def find_population(results: Results) -> str:
     """Of what population `compare` has intervals: those over the runs of a single object are of these logs."""
-    return "these_logs" if choose_clusters(results.known)[0] == "runs" else "such_traffic"
+    clusters = find_clusters(results.known)
+    return "these_logs" if clusters is not None and clusters.by_run else "such_traffic"
 
 
 def _make_verdict(name: str, criterion: Criterion, configuration: str, group: str, found: JudgedFigure) -> Verdict:
@@ -163,6 +165,7 @@ def _find_verdict(criterion: Criterion, found: JudgedFigure) -> tuple[str, str]:
 _MORE = {
     "logs": "more logs would decide ({number} now)",
     "objects": "other drives would decide; {number} objects of one drive now",
+    "passes": "more passes would decide; {number} of one object now",
     "runs": "more runs would decide ({number} now)",
 }
 _LEVELS = {"p5": 0.05, "median": 0.5, "p95": 0.95}
@@ -339,12 +342,12 @@ class _JudgedStudy:
         if of_runs and (exact or configuration in fixed):
             known = LimitedFigure(None, kind=CLOSED_FORM if exact else NOTHING_DRAWN)
             return FigureRows(table, weight, None), JudgedFigure(known, n=n)
-        clusters, why = find_clusters(table, of_runs=of_runs)
+        clusters, why = find_judged_clusters(table, of_runs=of_runs)
         runs = float(self.results.provenance.runs)
         least = 1.0 / max(n * runs, 1.0) if exact else 1e-12
         about = JudgedFigure(LimitedFigure(None), n=n, why=why)
         if clusters is not None:
-            about = replace(about, over=clusters.over, clusters=len(clusters.weights))
+            about = replace(about, over=clusters.over, clusters=clusters.count)
         return FigureRows(table, weight, clusters, least), about
 
     def _split_table(self, group: _JudgedGroup, kind: str) -> dict[str, pd.DataFrame]:
@@ -384,9 +387,8 @@ class _JudgedStudy:
             return math.nan if value is None else float(value)
 
         of = of_own if ratio is None else ratio.value_of
-        return self._limit_sums(
-            criterion, configuration, sums, columns, of, least=-math.inf if ratio is None else ratio.least
-        )
+        least = -math.inf if ratio is None else ratio.least
+        return self._limit_sums(criterion, configuration, sums, columns, of, over, least)
 
     def _limit_sums(
         self,
@@ -395,20 +397,20 @@ class _JudgedStudy:
         rows: pd.DataFrame,
         columns: Sequence[str],
         of: Any,
-        weighed_by: int | None = None,
+        over: str,
         least: float = 0.0,
     ) -> JudgedFigure:
         clusters, why = None, ""
         fixed = criterion.of_runs and configuration in self.traffic.settings.fixed
         if not fixed:
-            clusters, why = find_clusters(rows, of_runs=criterion.of_runs)
-        values = rows[list(columns)].to_numpy(dtype=float)
-        figure = limit_sums(values, of, clusters, criterion.confidence, weighed_by, least)
+            clusters, why = find_judged_clusters(rows, of_runs=criterion.of_runs)
+        values, weight = rows[list(columns)].to_numpy(dtype=float), rows[over].to_numpy(dtype=float)
+        figure = limit_sums(values, of, clusters, weight, criterion.confidence, least)
         if fixed and figure.value is not None:
             figure = LimitedFigure(figure.value, figure.value, figure.value, NOTHING_DRAWN)
         if clusters is None:
             return JudgedFigure(figure, n=len(rows), why=why)
-        return JudgedFigure(figure, clusters.over, len(clusters.weights), len(rows), why)
+        return JudgedFigure(figure, clusters.over, clusters.count, len(rows), why)
 
     def _measure_lists(self, criterion: Criterion, configuration: str, group: _JudgedGroup) -> JudgedFigure:
         """False entries per minute, which belong to whole logs."""
@@ -420,7 +422,7 @@ class _JudgedStudy:
         if not len(lists):
             return _NO_ROW
         columns = (PER_MINUTE[criterion.metric], "minutes")
-        return self._limit_sums(criterion, configuration, lists, columns, lambda of: of[..., 0] / of[..., 1], 1)
+        return self._limit_sums(criterion, configuration, lists, columns, lambda of: of[..., 0] / of[..., 1], "minutes")
 
     # Differences.
 
@@ -441,7 +443,7 @@ class _JudgedStudy:
         rows = table[(table["configuration"] == configuration) & (table["metric"] == criterion.metric)]
         if not len(rows):
             return replace(_NO_ROW, why="nothing that both sides have")
-        return _difference_of(rows.iloc[0], of_runs=criterion.of_runs)
+        return _difference_of(rows.iloc[0], criterion)
 
     def _compare(self, criterion: Criterion, other: str, group: _JudgedGroup, *, of_before: bool) -> pd.DataFrame:
         """The overall rows of a comparison with a configuration, in all metrics that are asked of this group.
@@ -469,8 +471,9 @@ class _JudgedStudy:
         return comparison.overall.assign(configuration=comparison.overall["configuration"].map(labels))
 
 
-def _difference_of(row: pd.Series, *, of_runs: bool) -> JudgedFigure:
-    n = int(row["n"])
+def _difference_of(row: pd.Series, criterion: Criterion) -> JudgedFigure:
+    """The difference of a row of a comparison; on the side on which it is met its limits are those between bounds."""
+    n, of_runs = int(row["n"]), criterion.of_runs
     if pd.isna(row["difference"]):
         return replace(_NO_ROW, n=n, why="no pair has it")
     value, kind = float(row["difference"]), None if pd.isna(row["interval"]) else str(row["interval"])
@@ -479,12 +482,17 @@ def _difference_of(row: pd.Series, *, of_runs: bool) -> JudgedFigure:
         return JudgedFigure(LimitedFigure(value, value, value, kind), n=n)
     if over == "runs" and not of_runs:
         return JudgedFigure(LimitedFigure(value), n=n, why=_ONE_OBJECT)
-    if kind == ALL_ALIKE:
+    met_by = "high_bounded" if criterion.direction == "at_most" else "low_bounded"
+    bounded = None if pd.isna(row[met_by]) else float(row[met_by])
+    if kind == ALL_ALIKE and bounded is None:
         return JudgedFigure(LimitedFigure(value, kind=kind), "runs" if of_runs else None, n=n)
     if kind is None or kind == NOTHING_DRAWN:
         return JudgedFigure(LimitedFigure(value), n=n, why=_TOO_FEW)
-    low = -math.inf if pd.isna(row["low"]) else float(row["low"])
-    high = math.inf if pd.isna(row["high"]) else float(row["high"])
+    alike = kind == ALL_ALIKE  # of no spread Student's t has the value itself as limits
+    low = value if alike else -math.inf if pd.isna(row["low"]) else float(row["low"])
+    high = value if alike else math.inf if pd.isna(row["high"]) else float(row["high"])
+    if bounded is not None:
+        low, high, kind = (low, bounded, BOUNDED) if met_by == "high_bounded" else (bounded, high, BOUNDED)
     return JudgedFigure(LimitedFigure(value, low, high, kind), over, int(row["clusters"]), n)
 
 
@@ -501,23 +509,18 @@ def _list_episodes(rows: StudyRows, *, whole: bool) -> dict[str, frozenset[tuple
     return kept
 
 
-def find_clusters(table: pd.DataFrame, *, of_runs: bool) -> tuple[RowClusters | None, str]:
+def find_judged_clusters(table: pd.DataFrame, *, of_runs: bool) -> tuple[Clusters | None, str]:
     """What an interval of rows is over, or why there is none; `of_runs`: the runs, else as `choose_over` has it."""
-    log_ix, logs = pd.factorize(table["log"])
-    object_ix, objects = pd.factorize(table["object_id"])
-    episode = log_ix * max(len(objects), 1) + object_ix
-    number = len(pd.unique(episode))
+    counts = count_clusters(table)
     if of_runs:
         runs = table["run"].nunique()
-        if runs < FEWEST_RUNS and (number > 1 or runs < 2):
+        if runs < FEWEST_RUNS and (counts[1] > 1 or runs < 2):
             return None, f"{count_noun(runs, 'run')}, fewer than {FEWEST_RUNS}: `runs: {FEWEST_RUNS}` or more"
-        return RowClusters("runs", table["run"].to_numpy(), episode), ""
-    over = choose_over(len(logs), number)
-    if over is None:
-        return None, f"{explain_no_clusters(len(logs), number)}; {_RATHER}"
-    if over == "runs":
-        return None, _ONE_OBJECT
-    return RowClusters(over, table["log" if over == "logs" else "object_id"].to_numpy(), episode), ""
+        return find_clusters(table, of_runs=True), ""
+    clusters = find_clusters(table)
+    if clusters is None:
+        return None, f"{explain_no_clusters(*counts)}; {_RATHER}"
+    return (None, _ONE_OBJECT) if clusters.by_run else (clusters, "")
 
 
 _RATHER = "more runs do not tell how drives differ; `population: these_logs` asks about these recordings"

@@ -36,7 +36,7 @@ from copem_replay.experiment.schema import Experiment
 from copem_replay.io.open import File, Place
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.columns import COMPARED_FILES, TABLES
-from copem_replay.metrics.intervals import choose_clusters
+from copem_replay.metrics.limits import find_clusters
 from copem_replay.metrics.onset import COUNTS_BY, select_counted
 from copem_replay.metrics.summary import DETECTED
 from copem_replay.pipeline.sweep import resolve_sweep
@@ -285,7 +285,8 @@ class Results:
     def known(self) -> pd.DataFrame:
         """The tally of detections that count; for a single object a row per run, as runs are then the clusters."""
         tally = self.counted(self.tally[self.tally["event"] == DETECTED])
-        if not len(tally) or choose_clusters(tally)[0] != "runs":
+        clusters = find_clusters(tally)
+        if clusters is None or not clusters.by_run:
             return tally
         columns = [name for name in TABLES["tally.parquet"].kinds() if name not in ("log", "event", "runs")]
         (rows,) = self.each(*columns, "run", log=str(tally["log"].iloc[0]))

@@ -15,7 +15,7 @@ import pandas as pd
 from copem_replay.core.errors import InputError, wrap_line
 from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.metrics.config import AREA, NO_AREAS, Slice, find_range_problem, parse_slices
-from copem_replay.metrics.intervals import describe_clusters
+from copem_replay.metrics.limits import describe_clusters
 from copem_replay.metrics.slices import (
     KEYS,
     SUMMED_COLUMNS,

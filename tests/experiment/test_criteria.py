@@ -12,7 +12,7 @@ from copem_replay.core.errors import ExperimentError, InputError
 from copem_replay.experiment.criteria import Criterion, choose_judged, note_undecidable, parse_fail_on
 from copem_replay.experiment.cross_references import read_criteria
 from copem_replay.experiment.schema import Configuration
-from copem_replay.metrics.figure_limits import JUDGED, PER_MINUTE, SUMMED
+from copem_replay.metrics.row_figures import JUDGED, PER_MINUTE, SUMMED
 from copem_replay.metrics.summary_metrics import METRIC
 
 STUDY: dict[str, Any] = {"configurations": {"GT": {"units": "truth"}, "gnn": {}, "late": {}}}
@@ -45,7 +45,7 @@ REFUSED = {
     "metric: unknown_s, at_most: 1, at_least: 0": "expected one of `at_most` and `at_least`, found both",
     "metric: unknown_s, at_most: soon": "at_most: expected a number, found 'soon'",
     "metric: unknown_s, at_most: 1, configurations: [gnm]": "found gnm: no configuration is named 'gnm'",
-    "metric: unknown_s, at_most: 1, against: gnm": "against: expected names of configurations, found gnm",
+    "metric: ttd_rmst_s, at_most: 1, against: gnm": "against: expected names of configurations, found gnm",
     "metric: unknown_s, at_most: 1, each: clas": "each: no slice is named 'clas'; did you mean class?",
     "metric: unknown_s, at_most: 1, each: class, by: {class: car}": "expected either `by`, one group, or `each`",
     "metric: unknown_s, at_most: 1, by: {clas: car}": "by: no slice is named 'clas'; did you mean class?",

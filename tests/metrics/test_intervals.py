@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binomtest
 
-from copem_replay.metrics.intervals import (
+from copem_replay.metrics.limits import (
     MOST_GROUPS,
     absent_share,
     alike_limits,
@@ -20,6 +20,7 @@ from copem_replay.metrics.intervals import (
     exact_limits,
     figure_variance,
     group_clusters,
+    limit_bounded_mean,
     limit_figure,
     limit_quantile,
     limit_share,
@@ -193,6 +194,45 @@ def test_many_clusters_make_groups_of_neighbours():
     assert set(np.bincount(many).tolist()) == {5, 6}
 
 
+# ------------------------------------------------------------------------------------ means between bounds
+
+
+@given(st.integers(3, 60).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))), st.sampled_from([0.9, 0.95]))
+def test_a_mean_of_values_0_and_1_has_the_limits_of_clopper_and_pearson(trials: tuple[int, int], confidence: float):
+    k, n = trials
+    values = np.array([1.0] * k + [0.0] * (n - k))
+    found = pair(limit_bounded_mean(k / n, (k - values) / (n - 1), np.ones(n), (0.0, 1.0), confidence=confidence))
+    expected = binomtest(k, n).proportion_ci(confidence, method="exact")
+    assert found == pytest.approx((expected.low, expected.high), abs=1e-9)
+
+
+def test_five_objects_that_are_all_known_at_once_exclude_little():
+    """Five at 0 of a horizon of 5 s: as none of five, up to 1 − .025^(1/5) = .5218 of such objects may be at 5 s."""
+    low, high = pair(limit_bounded_mean(0.0, np.zeros(5), np.ones(5), (0.0, 5.0)))
+    assert (low, high) == (0.0, pytest.approx(5 * (1 - 0.025**0.2)))
+    # Half of the weight is followed: the object not seen weighs two, and two of seven parts are drawn beyond.
+    assert pair(limit_bounded_mean(0.0, np.zeros(5), np.ones(5), (0.0, 5.0), 0.5))[1] > high
+
+
+some_means = st.lists(st.tuples(st.floats(0, 5), st.integers(1, 60)), min_size=2, max_size=30)
+
+
+@given(some_means, st.floats(0.05, 1), st.sampled_from([0.8, 0.95, 0.99]))
+def test_limits_of_means_between_bounds_are_those_of_the_plain_formula(
+    clusters: list[tuple[float, int]], followed: float, confidence: float
+):
+    values, weights = np.array(clusters).T
+    value = float(values @ weights / weights.sum())
+    without = (value * weights.sum() - values * weights) / (weights.sum() - weights)
+    low, high = pair(limit_bounded_mean(value, without, weights, (0.0, 5.0), followed, confidence))
+    expected = oracle.bounded(value, without.tolist(), weights.tolist(), 0.0, 5.0, followed, confidence)
+    assert (low, high) == pytest.approx(expected, abs=1e-9)
+    assert 0 <= low <= value + 1e-9
+    assert value - 1e-9 <= high <= 5
+    mirrored = pair(limit_bounded_mean(5 - value, 5 - without, weights, (0.0, 5.0), followed, confidence))
+    assert mirrored == pytest.approx((5 - high, 5 - low), abs=1e-7)
+
+
 # ------------------------------------------------------------------------------------ quantiles
 
 
@@ -260,6 +300,7 @@ def test_an_interval_says_what_it_is_over():
     assert describe_clusters("objects", 12).startswith("12 objects of this drive: ")
     assert "nothing about other drives" in describe_clusters("objects")
     assert describe_clusters("runs", 1).startswith("1 run of this one object: ")
+    assert describe_clusters("passes", 9).startswith("9 passes of this one object: how far other passes of this object")
 
 
 # ------------------------------------------------------------------------------------ the summary
@@ -325,3 +366,22 @@ def test_one_object_has_the_binomial_interval_of_its_runs() -> None:
     expected = binomtest(15, 20).proportion_ci(0.95, method="exact")
     assert (row["detected_share_low"], row["detected_share_high"]) == pytest.approx((expected.low, expected.high))
     assert (row["interval"], row["interval_over"], row["interval_clusters"]) == ("exact", "runs", 20)
+
+
+def passes(shares: list[float], runs: int) -> pd.DataFrame:
+    """Episodes of one object."""
+    rows = rows_of([[r < share * runs for r in range(runs)] for share in shares])
+    return rows.assign(episode=rows["object_id"].astype(int), object_id="rtk")
+
+
+def test_passes_of_one_object_are_the_clusters_and_runs_are_never_more_than_there_are() -> None:
+    """9 of 10 passes known in 20 runs each are ten trials, not 200; of 4 passes 20 runs are 20 trials, not 80."""
+    runs = binomtest(15, 20).proportion_ci(0.95, method="exact")
+    for shares, over, clusters, limits in (
+        ([1.0] * 9 + [0.0], "passes", 10, oracle.share([(1.0, 1.0)] * 9 + [(0.0, 1.0)])),
+        ([1.0] * 3 + [0.0], "runs", 20, (runs.low, runs.high)),
+    ):
+        table, _ = summarise_rows(passes(shares, 20), ["c"], {"c": 10.0}, horizon_s=2.0)
+        (row,) = table.to_dict("records")
+        assert (row["detected_share_low"], row["detected_share_high"]) == pytest.approx(limits)
+        assert (row["interval_over"], row["interval_clusters"]) == (over, clusters)

@@ -47,6 +47,40 @@ def figure(value: float, without: Sequence[float], weights: Sequence[float]) -> 
     return value - half, value + half
 
 
+def bounded(
+    value: float,
+    without: Sequence[float],
+    weights: Sequence[float],
+    least: float,
+    most: float,
+    followed: float = 1.0,
+    confidence: float = 0.95,
+) -> tuple[float, float]:
+    """Limits of a mean between `least` and `most`: one cluster that was not seen, added at the one end and the other.
+
+    Each limit is a quantile of Σ E·w·z / Σ E·w, E exponential, by a beta distribution with its mean and its variance.
+    """
+    n = sum(weights)
+    own = [value + (n / w - 1) * (value - rest) for w, rest in zip(weights, without, strict=True)]
+    unseen = sum(w * w for w in weights) / n / followed
+    limits = []
+    for edge, q in ((least, (1 - confidence) / 2), (most, 1 - (1 - confidence) / 2)):
+        pairs = [*zip(own, weights, strict=True), (edge, unseen)]
+        total = sum(w for _, w in pairs)
+        mean = sum(w * z for z, w in pairs) / total
+        spread = sum((w / total) ** 2 * (z - mean) ** 2 for z, w in pairs) / (
+            1 + sum((w / total) ** 2 for _, w in pairs)
+        )
+        low, high = min(z for z, _ in pairs), max(z for z, _ in pairs)
+        if high - low <= 1e-9:
+            limits.append(mean)
+            continue
+        p, v = (mean - low) / (high - low), spread / (high - low) ** 2
+        size = p * (1 - p) / v - 1
+        limits.append(low + (high - low) * float(stats.beta.ppf(q, p * size, (1 - p) * size)))
+    return max(limits[0], least), min(limits[1], most)
+
+
 def left_out(
     clusters: dict[str, list[Any]], of: Callable[[list[Any]], float], weights: dict[str, float]
 ) -> tuple[float, float]:

@@ -26,20 +26,22 @@ def figures(rows: pd.DataFrame, horizon_s: float, prefix: str = "") -> dict[str,
         f"{prefix}ttd_rmst_s": restricted_mean(*incidence, horizon_s),
     }
     if not prefix:
-        found |= unknown(rows)
+        found |= unknown(rows, horizon_s)
     for name, q in (("dad_median_m", 0.5), ("dad_p5_m", 0.05)):
         if placed.any() and (not prefix or q == 0.5):
             found[prefix + name] = quantile_with_never(away_m[placed], known[placed], q)
     return found
 
 
-def unknown(rows: pd.DataFrame) -> dict[str, float | None]:
+def unknown(rows: pd.DataFrame, horizon_s: float) -> dict[str, float | None]:
     """How long objects are unknown, row by row, and what became of those that are never detected."""
-    unknown_s, left, still_there = 0.0, 0, 0
+    unknown_s, to_horizon_s, left, still_there = 0.0, 0.0, 0, 0
     for row in rows.itertuples():
         until_s = min(row.detection_s, row.ended_s) if row.detected else row.ended_s
         unknown_s += max(until_s - row.onset_s, 0.0)
+        to_horizon_s += min(max(until_s - row.onset_s, 0.0), horizon_s)
         left += not row.detected and CODES[row.ended_by] == 2
         still_there += not row.detected and CODES[row.ended_by] == 0
-    return {"unknown_s": unknown_s / len(rows), "left_undetected_share": left / len(rows),
-            "open_share": still_there / len(rows)}  # fmt: skip
+    sums = {"unknown_s": unknown_s, "unknown_to_horizon_s": to_horizon_s, "left_undetected_share": left,
+            "open_share": still_there}  # fmt: skip
+    return {name: total / len(rows) for name, total in sums.items()}

@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from copem_replay.core.colours import configuration_colours
 from copem_replay.core.errors import InputError
-from copem_replay.metrics.figure_limits import RowClusters, mean_limits
+from copem_replay.metrics.limits import Clusters
+from copem_replay.metrics.row_figures import FigureRows
 from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_incidence, restricted_mean
 from copem_replay.report.figures import FIGURES, Selection
 from copem_replay.report.figures.answer import answer_figure
@@ -114,14 +115,14 @@ class TestAnswer:
             limits = [100 * summary.loc[name, f"pass_share_{end}"] for end in ("low", "high")]
             assert [low, high] == pytest.approx(limits)
 
-    def test_what_is_the_same_in_every_run_has_no_interval_and_that_is_said_first(self, results: Results) -> None:
-        figure = answer_figure(results)
-        (times, _) = figure.axes
-        assert set(intervals(times)) == {"half"}
-        assert {name: filled for name, (_, filled) in dots(times).items()} == {
-            "half": True, "late": False, "hit": False,
-        }  # fmt: skip
-        assert note(figure).startswith("No interval of the mean time of late, hit (hollow): all runs alike. ")
+    def test_what_is_the_same_in_every_run_has_the_limits_of_as_many_runs(self, results: Results) -> None:
+        """Of S runs none is another: 1 − .025^(1/S) of all may be, as far off as never."""
+        (times, _) = answer_figure(results).axes
+        assert {name: filled for name, (_, filled) in dots(times).items()} == dict.fromkeys(
+            ("half", "late", "hit"), True
+        )
+        value, other = dots(times)["late"][0], 1 - 0.025 ** (1 / results.experiment.runs)
+        assert intervals(times)["late"] == pytest.approx((value * (1 - other), value + other * (4.5 - value)))
 
     def test_two_objects_have_no_interval_at_all(self, two: Results) -> None:
         figure = answer_figure(two)
@@ -145,18 +146,25 @@ class TestMeanLimits:
         codes = st.sampled_from([CENSORED, DETECTED, LEFT] if data.draw(st.booleans()) else [DETECTED, LEFT])
         ending = np.array(data.draw(st.lists(codes, min_size=count, max_size=count)))
         of = np.array([*range(4), *data.draw(st.lists(st.integers(0, 3), min_size=count - 4, max_size=count - 4))])
-        clusters = RowClusters("logs", [f"c{k}" for k in of], [f"object {k}" for k in range(count)])
-        found = mean_limits(time_s, ending, clusters, 2.5)
+        known, by = ending == DETECTED, {CENSORED: "log_end", LEFT: "object_left", DETECTED: "log_end"}
+        table = pd.DataFrame(
+            {"time_to_detection_s": np.where(known, time_s, np.nan), "onset_s": 0.0, "ended_s": time_s}
+        )
+        table["ended_by"] = [by[code] for code in ending.tolist()]
+        rows = FigureRows(table, np.ones(count), Clusters("logs", of, np.arange(count)))
+        found = rows.limit_mean_time(2.5, 0.95)
 
         def mean_s(kept: NDArray[np.bool_]) -> float:
             return restricted_mean(*cumulative_incidence(time_s[kept], ending[kept]), 2.5)
 
         value, without = mean_s(of >= 0), [mean_s(of != k) for k in range(4)]
-        if max(abs(one - value) for one in without) < 1e-9:
-            assert found is None
+        assert found.value == pytest.approx(value)
+        followed = float(((ending != CENSORED) | (time_s >= 2.5)).mean())
+        if not followed:
+            assert found.kind is None
             return
-        limits = oracle.figure(value, without, np.bincount(of).tolist())
-        assert found == pytest.approx((max(limits[0], 0.0), min(limits[1], 2.5)), abs=1e-9)
+        expected = oracle.bounded(value, without, np.bincount(of).tolist(), 0.0, 2.5, followed)
+        assert (found.low, found.high) == pytest.approx(expected, abs=1e-9)
 
 
 class TestDifferences:

@@ -14,7 +14,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
@@ -31,8 +31,8 @@ from copem_replay.core.errors import InputError
 from copem_replay.experiment.file import log_paths, read_experiment_file
 from copem_replay.experiment.validate import find_problems, read_logs
 from copem_replay.metrics.columns import TABLES
-from copem_replay.metrics.figure_limits import RowClusters, incidence_limits
-from copem_replay.metrics.intervals import choose_clusters
+from copem_replay.metrics.limits import Clusters
+from copem_replay.metrics.row_figures import FigureRows
 from copem_replay.metrics.survival import DETECTED, LEFT, cumulative_incidence
 from copem_replay.report.figures.detection_curves import curves_figure
 from copem_replay.report.figures.distances import FAIL, KINDS, NEUTRAL, PASS, Strip, distances_figure
@@ -587,13 +587,24 @@ class TestCurves:
         assert "Dashed: the exact share" in note(figure)
 
 
+def bands(
+    time_s: Any, ending: Any, over: str, names: Sequence[Any], units: Sequence[Any], at_s: list[float]
+) -> tuple[Any, Any]:
+    """Limits of the incidence of rows that are detected, or whose object left."""
+    known = np.asarray(ending) == DETECTED
+    table = pd.DataFrame({"time_to_detection_s": np.where(known, time_s, np.nan), "onset_s": 0.0, "ended_s": time_s})
+    number, unit = (pd.factorize(np.array(of), sort=True)[0] for of in (names, units))
+    rows = FigureRows(table.assign(ended_by="object_left"), np.ones(len(table)), Clusters(over, number, unit))
+    return rows.limit_incidence(at_s, 0.95)
+
+
 class TestBands:
     def test_clusters_stay_whole(self) -> None:
         # Each of five objects is always or never known, in any of its runs.
         time_s = np.repeat([1.0, 1.0, 1.0, 5.0, 5.0], 20)
         ending = np.repeat([DETECTED, DETECTED, DETECTED, LEFT, LEFT], 20)
         names = list(np.repeat(list("abcde"), 20))
-        low, high = incidence_limits(time_s, ending, RowClusters("objects", names, names), np.array([0.5, 1.0]))
+        low, high = bands(time_s, ending, "objects", names, names, [0.5, 1.0])
         # None known by then: none of five, 1 − 0.025^(1/5). Then three of five, whose spread tells of four.
         assert (low[0], high[0]) == (0, pytest.approx(0.521824, abs=1e-6))
         assert (low[1], high[1]) == pytest.approx(oracle.exact(0.6, 4.0))
@@ -608,31 +619,15 @@ class TestBands:
             rows += [(f"log {log}", f"{log} {thing}", DETECTED if run < n else LEFT)
                      for thing, n in enumerate(known) for run in range(20)]  # fmt: skip
         logs, things, ending = zip(*rows, strict=True)
-        of = RowClusters("logs", logs, things)
-        low, high = incidence_limits(np.ones(len(rows)), np.array(ending), of, np.array([1.0]))
+        low, high = bands(np.ones(len(rows)), ending, "logs", logs, things, [1.0])
         assert (low[0], high[0]) == pytest.approx(oracle.share(clusters), abs=1e-8)
 
     def test_bands_of_runs_are_binomial(self) -> None:
-        runs = RowClusters("runs", [str(k) for k in range(10)], ["a"] * 10)
         ending = np.array([DETECTED] * 7 + [LEFT] * 3)
-        low, high = incidence_limits(np.arange(10.0), ending, runs, np.array([2.0, 9.0]))
+        low, high = bands(np.arange(10.0), ending, "runs", range(10), ["a"] * 10, [2.0, 9.0])
         assert [(low[0], high[0]), (low[1], high[1])] == [
             pytest.approx(oracle.exact(k / 10, 10)) for k in (3, 7)
         ]  # fmt: skip
-
-    def test_which_clusters(self) -> None:
-        def rows(logs: int, things: int, runs: int = 2) -> pd.DataFrame:
-            index = pd.MultiIndex.from_product(
-                [range(logs), range(things), range(runs)], names=["log", "object_id", "run"]
-            )
-            return index.to_frame(index=False)
-
-        assert choose_clusters(rows(1, 1))[0] == "runs"
-        assert choose_clusters(rows(1, 1))[1].nunique() == 2
-        assert choose_clusters(rows(1, 4))[0] is None
-        assert choose_clusters(rows(1, 5))[0] == "objects"
-        assert choose_clusters(rows(2, 5))[0] is None
-        assert choose_clusters(rows(3, 1))[0] == "logs"
 
 
 class TestSweeps:

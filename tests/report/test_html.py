@@ -130,7 +130,7 @@ class TestNumbers:
                         assert (cell.low or "") == rows[name][f"{column}_low"]
                         assert (cell.high or "") == rows[name][f"{column}_high"]
                     checked += 1
-        assert checked == len(NAMES) * (7 + 2 + 1 + 11)
+        assert checked == len(NAMES) * (8 + 2 + 1 + 11)
 
     def test_cells_have_two_decimals_and_shares_one_in_per_cent(self, read: Page, made: Path) -> None:
         rows = summary_rows(made)
@@ -156,7 +156,7 @@ class TestNumbers:
                         expected += f" [{', '.join(limits)}]"
                     assert cell.text == expected, (name, column)
                     seen += 1
-        assert seen == len(NAMES) * 21
+        assert seen == len(NAMES) * 22
 
     def test_columns_that_are_the_same_for_all_are_said_once(self, read: Page) -> None:
         assert "6 rows, 10 fused lists per second for each configuration.\n" in read.words
@@ -168,7 +168,8 @@ class TestNumbers:
     def test_times_come_first_and_headers_have_units(self, read: Page) -> None:
         assert read.rows["summary"][0] == [
             "configuration", "mean time to detection, s", "median time to detection, s", "95 % detected by, s",
-            "detected, %", "mean time unknown, s", "median distance at detection, m", "95 % detected beyond, m",
+            "detected, %", "mean time unknown, s", "mean time unknown up to the horizon, s",
+            "median distance at detection, m", "95 % detected beyond, m",
         ]  # fmt: skip
         assert read.rows["regret"][0][1:3] == ["mean time to detection, s", "detected, percentage points"]
         assert read.rows["regret-lists"][0][1:] == [

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from copem_replay.metrics.figure_limits import cluster_rows, detection_endings, mean_limits
-from copem_replay.metrics.intervals import choose_clusters
+from copem_replay.metrics.limits import find_clusters
+from copem_replay.metrics.row_figures import FigureRows
 from copem_replay.metrics.summary import DETECTED, tally_rows
 from copem_replay.pipeline.expansion import find_facts
 from copem_replay.report import write_html_report
@@ -137,21 +137,19 @@ def test_counts_say_what_rows_say(rows: pd.DataFrame) -> None:
     counted = found[found["event"] == DETECTED]
     each = rows.assign(runs=1)
     assert counted["runs"].sum() == len(rows)
-    over = choose_clusters(counted)[0]
-    banded = over in ("logs", "objects")
-    # Of one object runs are the clusters, for which the tally is not taken.
-    clusters = [cluster_rows(of, str(over), choose_clusters(of)[1]) if banded else None for of in (counted, each)]
+    clusters = [find_clusters(of) for of in (counted, each)]
+    banded = clusters[0] is not None and not clusters[0].by_run
+    if not banded:  # of one object runs are the clusters, for which the tally is not taken
+        clusters = [None, None]
     one, all_ = (build_curve(*of) for of in zip((counted, each), clusters, strict=True))
     for name in ("times_s", "share", *(("low", "high") if banded and len(one.times_s) else ())):
         np.testing.assert_array_equal(getattr(one, name), getattr(all_, name))
     if banded:
         limits = []
         for of, its in zip((counted, each), clusters, strict=True):
-            (time_s, ending), runs = detection_endings(of), of["runs"].to_numpy()
-            assert its is not None
-            limits.append(mean_limits(time_s, ending, its, 4.0, runs))
-        assert (limits[0] is None) == (limits[1] is None)
-        assert limits[0] is None or limits[0] == pytest.approx(limits[1], abs=1e-9)
+            found_s = FigureRows(of, of["runs"].to_numpy(dtype=float), its).limit_mean_time(4.0, 0.95)
+            limits.append((found_s.low, found_s.high))
+        assert limits[0] == pytest.approx(limits[1], abs=1e-9, nan_ok=True)
     columns = ["log", "object_id", "missed", "runs", "ended_s", "ended_by"]
     by_name = [
         count_misses(of)[columns].sort_values(["log", "object_id"]).to_numpy().tolist() for of in (counted, each)

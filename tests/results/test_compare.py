@@ -112,7 +112,7 @@ def test_times_of_both_are_of_those_that_both_detect_and_say_who_is_missing(tmp_
 
 
 def test_unknown_until_the_detection_or_the_end_of_the_episode(tmp_path):
-    """Episodes from 2 to 10, 2 to 6 and 2 to 3 s, whatever ends them; one is known before, one after the end."""
+    """Episodes from 2 to 10, 2 to 6 and 2 to 3 s, up to a horizon of 6 s; one is known before, one after the end."""
     rows = [
         row("ideal", 3.0, 30.0, onset_s=2.0),
         row("ideal", None, object_id="8", onset_s=2.0, ended_s=6.0),
@@ -121,10 +121,10 @@ def test_unknown_until_the_detection_or_the_end_of_the_episode(tmp_path):
         row("late", 6.5, 20.0, object_id="8", onset_s=2.0, ended_s=6.0),
         row("late", 2.5, 20.0, object_id="9", onset_s=2.0, ended_s=3.0),
     ]
-    unknown = of(compared(tmp_path, rows, measure={"horizon_s": 0.5}), "unknown_s")
+    unknown = of(compared(tmp_path, rows, measure={"horizon_used_s": 6.0}), "unknown_to_horizon_s")
     assert unknown["baseline_value"] == pytest.approx((1 + 4 + 0) / 3)
-    assert unknown["value"] == pytest.approx((8 + 4 + 0.5) / 3)
-    assert unknown["difference"] == pytest.approx((7 + 0 + 0.5) / 3)
+    assert unknown["value"] == pytest.approx((6 + 4 + 0.5) / 3)
+    assert unknown["difference"] == pytest.approx((5 + 0 + 0.5) / 3)
     assert unknown["n"] == 3
 
 
@@ -247,12 +247,12 @@ def test_shares_that_differ_alike_in_five_objects_have_exact_limits(tmp_path):
         assert (share["interval"], share["interval_over"]) == ("exact", "objects")
 
 
-def test_exact_limits_count_objects_and_no_runs(tmp_path):
-    """One object in 20 runs, four in one each: five objects."""
+def test_exact_limits_count_objects_by_what_they_weigh(tmp_path):
+    """One object in 20 runs, four in one each: w = 20/4.8, 4 · 1/4.8, m = Σw²/5 = 3.507, 5/(1 + .2 · 2.507) objects."""
     rows = [row(name, 1.0, 30.0, object_id="0", run=run) for run in range(20) for name in ("ideal", "late")]
     rows += [row(name, 1.0, 30.0, object_id=str(k)) for k in range(1, 5) for name in ("ideal", "late")]
     share = of(compared(tmp_path, rows), "detected_share")
-    limit = 1 - 0.025 ** (1 / 5)
+    limit = 1 - 0.025 ** ((1 + 0.2 * (404 / 4.8**2 / 5 - 1)) / 5)
     assert (share["low"], share["high"]) == pytest.approx((-limit, limit))
 
 
@@ -279,7 +279,7 @@ def test_few_objects_have_no_interval_and_that_is_said(tmp_path):
     assert comparison.table["low"].isna().all()
     assert comparison.table["interval_over"].isna().all()
     assert any(
-        "no interval of detected_share, ttd_rmst_s, ttd_both_s, unknown_s, dad_median_m" in note
+        "no interval of detected_share, ttd_rmst_s, ttd_both_s, unknown_to_horizon_s, dad_median_m" in note
         for note in comparison.notes
     )
 
@@ -326,7 +326,7 @@ def test_the_same_rows_in_another_folder_differ_in_nothing(tmp_path):
     folders = [write_folder(tmp_path / name, rows, braking=BRAKING) for name in ("first", "second")]
     table = compare_folders(folders, baseline="first:x").table
     assert set(table["metric"]) == {
-        "detected_share", "ttd_rmst_s", "ttd_both_s", "unknown_s", "dad_median_m", "pass_share",
+        "detected_share", "ttd_rmst_s", "ttd_both_s", "unknown_to_horizon_s", "dad_median_m", "pass_share",
     }  # fmt: skip
     assert (table["difference"] == 0.0).all()
     table = table[table["log"] == "all"].set_index("metric")
@@ -334,7 +334,7 @@ def test_the_same_rows_in_another_folder_differ_in_nothing(tmp_path):
     for metric, limit in (("detected_share", 1 - 0.025 ** (1.6 / 12)), ("pass_share", 1 - 0.025 ** (1.4 / 9))):
         assert tuple(table.loc[metric, ["low", "high"]]) == pytest.approx((-limit, limit), abs=1e-6)
         assert table.loc[metric, "interval"] == "exact"
-    others = table.loc[["ttd_rmst_s", "ttd_both_s", "unknown_s", "dad_median_m"]]
+    others = table.loc[["ttd_rmst_s", "ttd_both_s", "unknown_to_horizon_s", "dad_median_m"]]
     assert (others["interval"] == "all clusters alike").all()
     assert others[["low", "high", "interval_over"]].isna().all(axis=None)
 
@@ -354,7 +354,10 @@ def test_rows_are_in_the_order_of_logs_configurations_and_metrics(tmp_path):
     table = compared(tmp_path, random_rows(["ideal", "z", "b"])).table
     assert table["log"].drop_duplicates().tolist() == ["all", "log0", "log1"]
     assert table["configuration"].drop_duplicates().tolist() == ["z", "b"]
-    assert table["metric"].tolist() == ["detected_share", "ttd_rmst_s", "ttd_both_s", "unknown_s", "dad_median_m"] * 6
+    assert (
+        table["metric"].tolist()
+        == ["detected_share", "ttd_rmst_s", "ttd_both_s", "unknown_to_horizon_s", "dad_median_m"] * 6
+    )
     assert (table["baseline"] == "ideal").all()
 
 

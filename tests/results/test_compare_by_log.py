@@ -21,6 +21,9 @@ from tests.oracles import compare as oracle
 from tests.oracles import intervals
 
 OF_INTERVALS = (
+    "low_bounded",
+    "high_bounded",
+    "star",
     "low",
     "high",
     "interval",

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from scipy.stats import binomtest
 
 import copem_replay as cr
-from copem_replay.metrics.figure_limits import JUDGED, PER_MINUTE, SUMMED, FigureRows, RowClusters
-from copem_replay.metrics.intervals import limit_share_of_runs
+from copem_replay.metrics.limits import Clusters, limit_share_of_runs
+from copem_replay.metrics.row_figures import JUDGED, PER_MINUTE, SUMMED, FigureRows
 from copem_replay.results.compare import compare_folders
-from copem_replay.results.judge import find_clusters
+from copem_replay.results.judge import find_judged_clusters
 from copem_replay.results.read import Results, read_results
 from copem_replay.results.verdicts import (
     MET,
@@ -30,6 +30,7 @@ from copem_replay.results.verdicts import (
     verdicts_jsonl,
 )
 from tests.helpers.report_pages import changed, replayed
+from tests.oracles import intervals as oracle
 
 LOGS = "logs: [drive.mcap]"
 
@@ -84,9 +85,12 @@ def test_differences_are_those_of_compare(several: Path, metric: str) -> None:
     found = judged(several, metric=metric, at_most=0.0, against="half")
     assert found
     for configuration, verdict in found.items():
-        row = table.loc[configuration]
-        numbers = [None if pd.isna(row[name]) else float(row[name]) for name in ("difference", "low", "high")]
+        row = table.loc[configuration]  # met by the wider limits of a mean between bounds alone
+        high = "high" if metric in ("dad_median_m", "position_rmse_held_m") else "high_bounded"
+        numbers = [None if pd.isna(row[name]) else float(row[name]) for name in ("difference", "low", high)]
         assert [verdict.estimate, verdict.low, verdict.high] == numbers
+        if verdict.high is not None and high == "high_bounded":
+            assert verdict.interval == "bounded"
 
 
 def test_a_group_is_judged_by_its_rows_alone(several: Path) -> None:
@@ -147,21 +151,42 @@ def test_objects_and_logs_together_are_the_objects_of_these_logs(several: Path) 
         assert judged(several, **asked, **narrowed)["half"].n == rows
 
 
-def test_what_is_the_same_in_all_logs_may_be_refuted_and_is_never_shown(several: Path) -> None:
-    """In three equal logs all are known half a second after the onset: how logs differ is not seen."""
-    for bound, word in ((0.6, UNDECIDED), (0.4, NOT_MET)):
-        one = judged(several, metric="unknown_s", at_most=bound, configurations=["late"])["late"]
-        assert one.estimate == pytest.approx(0.5)
-        assert (one.verdict, one.passes, one.why) == (word, False, "the same throughout, so how it varies is not known")
+def test_what_is_the_same_in_all_logs_has_limits_by_a_log_that_was_not_seen(several: Path) -> None:
+    """In three equal logs all are known half a second after the onset; another may have any time up to the horizon."""
+    results = read_results(several)
+    horizon_s = float(results.summary["ttd_rmst_horizon_s"].iloc[0])
+    for metric in ("unknown_to_horizon_s", "ttd_rmst_s"):
+        expected = oracle.bounded(0.5, [0.5] * 3, [12.0] * 3, 0.0, horizon_s)
+        for bound, word in ((horizon_s, MET), (0.6, UNDECIDED), (0.4, UNDECIDED)):
+            one = judged(several, metric=metric, at_most=bound, configurations=["late"])["late"]
+            assert (one.estimate, one.low, one.high) == pytest.approx((0.5, *expected), abs=1e-9)
+            assert (one.verdict, one.interval, one.over) == (word, "bounded", "logs")
 
 
 def test_identical_results_are_not_refuted(several: Path, tmp_path: Path) -> None:
     logs = [f"drive{k}.mcap" for k in range(3)]
     again = replayed(tmp_path, changed((LOGS, f"logs: [{', '.join(logs)}]")), *logs)
-    for metric in ("ttd_rmst_s", "detected_share", "unknown_s"):  # of six objects a median has no limits
+    for metric in ("ttd_rmst_s", "detected_share", "unknown_to_horizon_s"):  # of six objects a median has no limits
         found = judged(again, before=several, metric=metric, at_most=0.0, against="before")
         assert found
         assert {name: (one.passes, one.estimate) for name, one in found.items()} == dict.fromkeys(found, (True, 0.0))
+
+
+def test_a_difference_is_met_by_the_limits_between_bounds_and_not_met_by_students(several: Path) -> None:
+    """`late` is later than `half` in each of three logs: how much later another may be, three do not tell."""
+    results = read_results(several)
+    table = compare_folders([several], baseline="half").overall.set_index(["configuration", "metric"])
+    row = table.loc[("late", "unknown_to_horizon_s")]
+    horizon_s = float(results.summary["ttd_rmst_horizon_s"].iloc[0])
+    asked: dict[str, Any] = {"metric": "unknown_to_horizon_s", "configurations": ["late"], "against": "half"}
+    assert row["high_bounded"] > max(row["high"] if pd.notna(row["high"]) else row["difference"], row["difference"])
+    for bound, word in ((horizon_s, MET), (float(row["high_bounded"]) - 0.01, UNDECIDED)):
+        one = judged(several, at_most=bound, **asked)["late"]
+        assert (one.verdict, one.high) == (word, row["high_bounded"])
+        other = judged(several, at_least=-bound, **asked)["late"]
+        assert other.low == row["low_bounded"]
+    far = judged(several, at_most=-horizon_s, **asked)["late"]
+    assert far.verdict == NOT_MET
 
 
 def test_the_same_twice(several: Path) -> None:
@@ -182,7 +207,7 @@ UNKNOWN = {
 @pytest.mark.parametrize("says", UNKNOWN)
 def test_what_does_not_exist_is_said(several: Path, says: str) -> None:
     with pytest.raises(cr.InputError) as caught:
-        cr.judge(several, {"it": {"metric": "unknown_s", "at_most": 1.0} | UNKNOWN[says]})
+        cr.judge(several, {"it": {"metric": "ttd_rmst_s", "at_most": 1.0} | UNKNOWN[says]})
     assert says in str(caught.value)
 
 
@@ -200,8 +225,8 @@ def rows_of(times_s: list[float | None], clusters: list[str], over: str = "logs"
             "distance_at_detection_m": [math.nan if t is None else 100.0 - 10.0 * t for t in times_s],
         }
     )
-    objects = [0] * len(times_s) if over == "runs" else list(range(len(times_s)))
-    return FigureRows(table, np.ones(len(table)), RowClusters(over, clusters, objects))
+    units = np.zeros(len(times_s), dtype=int) if over == "runs" else np.arange(len(times_s))
+    return FigureRows(table, np.ones(len(table)), Clusters(over, pd.factorize(np.array(clusters), sort=True)[0], units))
 
 
 def test_a_share_over_runs_of_one_object_is_that_of_clopper_and_pearson() -> None:
@@ -256,11 +281,11 @@ def test_a_quantile_is_judged_as_a_share() -> None:
 def test_thirty_runs_of_several_objects_or_two_of_one_have_an_interval(runs: int, objects: int, why: str) -> None:
     pairs = [(run, str(one)) for run in range(runs) for one in range(objects)]
     table = pd.DataFrame(pairs, columns=["run", "object_id"]).assign(log="drive")
-    clusters, said = find_clusters(table, of_runs=True)
+    clusters, said = find_judged_clusters(table, of_runs=True)
     assert said == why
     assert (clusters is None) == bool(why)
     if clusters is not None:
-        assert (clusters.over, len(clusters.weights), clusters.looks) == ("runs", runs, objects)
+        assert (clusters.over, clusters.count, clusters.units) == ("runs", runs, objects)
 
 
 def test_who_is_known_at_the_very_bound_is_known_by_it() -> None:

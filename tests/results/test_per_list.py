@@ -425,7 +425,8 @@ def test_the_same_folder_again_differs_in_nothing(tmp_path):
     folders = [write_folder(tmp_path / name, rows, lists=lists, steps=steps) for name in ("first", "second")]
     comparison = compare_folders(folders, baseline="first:x")
     assert comparison.table["metric"].tolist() == [
-        "detected_share", "ttd_rmst_s", "ttd_both_s", "unknown_s", "ttd_rmst_s_equal_ghosts", "dad_median_m",
+        "detected_share", "ttd_rmst_s", "ttd_both_s", "unknown_to_horizon_s", "ttd_rmst_s_equal_ghosts",
+        "dad_median_m",
         "position_rmse_held_m", "gospa_held_m", "false_positives_per_min",
     ]  # fmt: skip
     assert (comparison.table["difference"] == 0.0).all()

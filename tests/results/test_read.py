@@ -83,7 +83,9 @@ def summary(**columns: list[object]) -> str:
 
 SUMMARIES = {
     summary(ttd_p5_s=["1.0:", 2.0]): "column ttd_p5_s: expected numbers, found text",
-    summary(interval_over=["2", "runs"]): "column interval_over: expected one of logs, objects, runs, found '2'",
+    summary(
+        interval_over=["2", "runs"]
+    ): "column interval_over: expected one of logs, objects, passes, runs, found '2'",
     summary(nees=["-inf", 2.0]): "column nees: expected numbers from -1e+100 to 1e+100, found -inf",
     summary(ttd_p5_s=[1e200, 2.0]): "column ttd_p5_s: expected numbers from -1e+10 to 1e+10, found 1e+200",
     summary(mine=["a", 2.0]): "column mine: expected numbers, found text",

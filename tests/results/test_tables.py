@@ -221,7 +221,7 @@ def test_the_table_has_signs_and_intervals(tmp_path):
         "detected_share",
         "ttd_rmst_s",
         "ttd_both_s",
-        "unknown_s",
+        "unknown_to_horizon_s",
         "dad_median_m",
     ]
     by_name = {line.split()[0]: line for line in lines[1:4]}
@@ -257,8 +257,10 @@ def test_who_is_better_beyond_the_interval_is_said(tmp_path):
     rows = [row("ideal", 1.0, 30.0, object_id=str(k)) for k in range(6)]
     rows += [row("fast", 0.75 - k / 100, 32.5 + k, object_id=str(k)) for k in range(6)]
     lines = comparison_text(compare_folders([write_folder(tmp_path / "study", rows)])).splitlines()
-    metrics = "ttd_rmst_s, ttd_both_s, unknown_s, dad_median_m"
-    assert lines[-1] == f"better than ideal in {metrics}, the interval excluding 0: fast"
+    assert lines[-1] == "better than ideal in ttd_rmst_s, ttd_both_s, unknown_to_horizon_s (*): fast"
+    assert "*: the interval excludes 0, the 5 differences of this table together held at 95 %" in lines
+    # At 1 − .05/5 six objects have no limit of a median.
+    assert "°: its own interval alone excludes 0; of 5 such 1 in 20 does by chance" in lines
 
 
 def four_logs(tmp_path, gains_s):
@@ -278,8 +280,42 @@ def test_over_logs_it_is_said_in_how_many_a_configuration_gains(tmp_path):
         "logs that gain: ttd_rmst_s fast 4 of 4",
         "whatever the interval, a kind of drive that makes up to 53 % of such traffic can be absent",  # 1 − .05^(1/4)
     ]
-    assert lines[-1] == "better than ideal in ttd_rmst_s, the interval excluding 0: fast (4 of 4 logs gain)"
+    assert lines[-1] == "better than ideal in ttd_rmst_s (*): fast (4 of 4 logs gain)"
     assert not any("hangs on" in note for note in comparison.notes)
+
+
+def three_logs(tmp_path: Path, **asked: Any) -> Comparison:
+    """`fast` is sooner by 1, 1.25 and 1.5 s, and so is `also`: 1.25 ± 4.302653 · .25/√3, [.629, 1.871]."""
+    rows = [row("ideal", 5.0, 30.0, log=f"log {k}") for k in range(3)]
+    rows += [row(name, 4.0 - k / 4, 30.0, log=f"log {k}") for k in range(3) for name in ("fast", "also")]
+    return compare_folders([write_folder(tmp_path / "study", rows)], **asked)
+
+
+def test_stars_are_held_over_the_table_or_over_the_metric_that_was_named(tmp_path: Path) -> None:
+    # Of three logs t = 1.25/(.25/√3) = 8.66, two-sided p = .01307: above .05/10 of a table, below .05/2 of a metric.
+    whole = three_logs(tmp_path).overall
+    times = whole[whole["metric"].isin(["ttd_rmst_s", "ttd_both_s", "unknown_to_horizon_s"])]
+    assert whole["difference"].notna().sum() == 10
+    assert times["star"].tolist() == ["°"] * 6
+    lines = comparison_text(three_logs(tmp_path / "a")).splitlines()
+    assert any(line.startswith("three drives cannot star a table; name one figure (--decide METRIC)") for line in lines)
+    decided = three_logs(tmp_path / "b", decide="ttd_rmst_s").overall
+    assert set(decided.loc[decided["metric"] == "ttd_rmst_s", "star"]) == {"*"}
+    assert "*" not in set(decided.loc[decided["metric"] != "ttd_rmst_s", "star"])
+    said = comparison_text(three_logs(tmp_path / "c", decide="ttd_rmst_s"))
+    assert "decided by ttd_rmst_s, named beforehand: no other column has a *" in said
+    assert problem(tmp_path / "c" / "study", decide="ttd_rmst") == (
+        "--decide: no metric is named 'ttd_rmst'; did you mean ttd_rmst_s?"
+    )
+
+
+def test_words_by_the_least_difference_that_matters(tmp_path: Path) -> None:
+    for k, (least, decide, word) in enumerate(
+        ((1.9, None, "alike"), (0.5, None, "open"), (0.5, "ttd_rmst_s", "better"))
+    ):
+        found = three_logs(tmp_path / str(k), decide=decide, matters={"ttd_rmst_s": least}).overall
+        assert set(found.loc[found["metric"] == "ttd_rmst_s", "word"]) == {word}
+        assert found.loc[found["metric"] != "ttd_rmst_s", "word"].isna().all()
 
 
 def test_a_difference_that_hangs_on_one_log_names_it(tmp_path):
@@ -305,7 +341,10 @@ def test_without_an_interval_nothing_is_claimed(tmp_path):
 def test_markdown_has_the_same_content(tmp_path):
     comparison = six_objects(tmp_path)
     text, markdown = comparison_text(comparison).splitlines(), comparison_markdown(comparison).splitlines()
-    assert markdown[0] == "| configuration | detected_share | ttd_rmst_s | ttd_both_s | unknown_s | dad_median_m |"
+    assert (
+        markdown[0]
+        == "| configuration | detected_share | ttd_rmst_s | ttd_both_s | unknown_to_horizon_s | dad_median_m |"
+    )
     assert markdown[1] == "| --- | --- | --- | --- | --- | --- |"
     cells = [line.replace("\\|", "\0").strip("| ").split(" | ") for line in markdown[2:5]]
     assert [c[0] for c in cells] == ["same", "fast", "a\0worse"]
@@ -367,9 +406,9 @@ def test_csv_has_a_row_for_each_log_configuration_and_metric(tmp_path):
         "baseline_existence",
         "ghosts_kept_per_min", "baseline_ghosts_kept_per_min", "clusters", "logs_better", "hangs_on",
         "difference_without_it", "frames", "age_s", "baseline_age_s", "no_list_share", "baseline_no_list_share",
-        "without_truth", "baseline_without_truth",
+        "without_truth", "baseline_without_truth", "low_bounded", "high_bounded", "star", "word",
     ]  # fmt: skip
-    metrics = ["detected_share", "ttd_rmst_s", "ttd_both_s", "unknown_s", "dad_median_m"]
+    metrics = ["detected_share", "ttd_rmst_s", "ttd_both_s", "unknown_to_horizon_s", "dad_median_m"]
     assert [(r["log"], r["configuration"], r["metric"]) for r in read[5:10]] == [("all", "fast", m) for m in metrics]
     fast, share = read[6], read[10]
     assert (fast["value"], fast["baseline_value"], fast["difference"], fast["n"]) == ("0.75", "1", "-0.25", "6")

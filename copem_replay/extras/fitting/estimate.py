@@ -12,7 +12,7 @@ import numpy as np
 
 from copem_replay.core.tracks import Bool, Float, Int
 from copem_replay.core.yaml import CommentedValue
-from copem_replay.metrics.intervals import figure_variance
+from copem_replay.metrics.limits import figure_variance
 
 PER_ROW = "per row"
 """Metadata of a field with a value for each row of the data, which is not reported as an estimate."""

@@ -211,7 +211,7 @@ def estimate_nodes(entries: PooledRows, rows: NodeWeights, fit: TableFit) -> lis
 
     These are the rows that touch the node, or what the information is worth there, over rows per effective row. Where
     PASSES_ALONE passes touch it there are no more than θ(1 − θ)/V · (t of n − 1 / t of K − 1)² as for shares over logs
-    (`metrics/intervals.py`), V the variance by the scores of whole passes.
+    (`metrics/limits.py`), V the variance by the scores of whole passes.
     """
     theta, placed = fit.theta, entries.placed
     inside, dense = theta * (1 - theta), placed.dense()

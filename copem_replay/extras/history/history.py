@@ -308,7 +308,7 @@ def _difference_rows(new: Results, old: Results) -> Iterator[tuple[str, list[pd.
             continue
         comparison = compare_folders(
             [new, old], configurations=[labels[new, name]], baseline=labels[old, name],
-            metrics=("detected_share", "ttd_rmst_s", "unknown_s", "pass_share"),
+            metrics=("detected_share", "ttd_rmst_s", "unknown_to_horizon_s", "pass_share"),
         )  # fmt: skip
         yield name, [row for _, row in comparison.overall.iterrows()]
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from copem_replay.metrics.figure_limits import cluster_rows, detection_endings, mean_limits
-from copem_replay.metrics.intervals import choose_clusters
+from copem_replay.metrics.limits import ALL_ALIKE, CONFIDENCE, find_clusters
+from copem_replay.metrics.row_figures import FigureRows
 from copem_replay.report.figures.style import (
     RANKED_BY,
     ROW_IN,
@@ -94,7 +94,7 @@ def _name_rows(axes: Axes, names: Sequence[str]) -> None:
 def _time_dots(results: Results, names: Sequence[str]) -> tuple[list[Dot], list[str]]:
     """A dot per configuration, and sentences on those without an interval."""
     rows = results.summary.set_index("configuration")
-    over, cluster = choose_clusters(results.known)
+    clusters = find_clusters(results.known)
     dots: list[Dot] = []
     without: dict[str, list[str]] = {}
     for name in names:
@@ -105,21 +105,20 @@ def _time_dots(results: Results, names: Sequence[str]) -> tuple[list[Dot], list[
         if rows.loc[name, "detected_share"] == 0:
             dots.append(Dot(None, None, None, f"never (counts as {format_three_digits(horizon_s)} s)"))
             continue
-        limits = None
-        reason = explain_no_intervals(results) if over is None else "every run is the same"
-        if over is not None and not (over == "runs" and results.facts[name].fixed):
-            rows_of_name = results.known["configuration"] == name
-            of_name = results.known[rows_of_name]
-            (time_s, ending), runs = detection_endings(of_name), of_name["runs"].to_numpy()
-            clusters = cluster_rows(of_name, over, cluster[rows_of_name])
-            limits = mean_limits(np.round(time_s, 9), ending, clusters, horizon_s, runs)
-            reason = f"all {over} alike"
-        if limits is None:
+        found = None
+        reason = explain_no_intervals(results) if clusters is None else "every run is the same"
+        if clusters is not None and not (clusters.by_run and results.facts[name].fixed):
+            kept = (results.known["configuration"] == name).to_numpy()
+            of_name = results.known[kept]
+            rows_of_name = FigureRows(of_name, of_name["runs"].to_numpy(dtype=float), clusters.select(kept))
+            found = rows_of_name.limit_mean_time(horizon_s, CONFIDENCE)
+            reason = f"all {clusters.over} alike" if found.kind == ALL_ALIKE else "no object is followed to the horizon"
+        if found is None or np.isnan(found.low):
             without.setdefault(reason, []).append(name)
             dots.append(Dot(mean_s, None, None, format_two_decimals(mean_s)))
         else:
-            low, high = map(format_two_decimals, limits)
-            dots.append(Dot(mean_s, *limits, f"{format_two_decimals(mean_s)} [{low}, {high}]"))
+            low, high = map(format_two_decimals, (found.low, found.high))
+            dots.append(Dot(mean_s, found.low, found.high, f"{format_two_decimals(mean_s)} [{low}, {high}]"))
     return dots, [_explain_without(reason, lacking, names) for reason, lacking in without.items()]
 
 

@@ -3,7 +3,7 @@
 The curves are what cumulative incidences of detection (Aalen–Johansen, departure competing: `metrics/survival.py`)
 leave of 100 %: objects that are never detected keep them above 0.
 
-Bands are those of `metrics/figure_limits.py`. Letters of the shapes: n rows, M steps of a curve.
+Bands are those of `metrics/row_figures.py`. Letters of the shapes: n rows, M steps of a curve.
 """
 
 from __future__ import annotations
@@ -17,9 +17,8 @@ import numpy as np
 import pandas as pd
 
 from copem_replay.core.tracks import Float
-from copem_replay.metrics.figure_limits import RowClusters, cluster_rows, detection_endings, incidence_limits
-from copem_replay.metrics.intervals import NOTHING_DRAWN, choose_clusters
-from copem_replay.metrics.survival import cumulative_incidence
+from copem_replay.metrics.limits import CONFIDENCE, NOTHING_DRAWN, Clusters, find_clusters
+from copem_replay.metrics.row_figures import FigureRows
 from copem_replay.report.figures.selection import describe_left_out, find_differing
 from copem_replay.report.figures.style import (
     Appearance,
@@ -92,29 +91,27 @@ def build_curves(
     results: Results, names: Sequence[str], *, bands: bool = True
 ) -> tuple[str | None, dict[str, DetectionCurve]]:
     """The kind of clusters (None, or `NOTHING_DRAWN`), and the curves, with bands if there are clusters."""
-    over, cluster = choose_clusters(results.known)
-    fixed = [name for name in names if over == "runs" and results.facts[name].fixed]
-    over = NOTHING_DRAWN if fixed and len(fixed) == len(names) else over
+    clusters = find_clusters(results.known)
+    fixed = [name for name in names if clusters is not None and clusters.by_run and results.facts[name].fixed]
     curves = {}
     for name in names:
-        rows = results.known["configuration"] == name
-        banded = bands and over is not None and name not in fixed
-        of_name = results.known[rows]
-        clusters = cluster_rows(of_name, over, cluster[rows]) if banded and over is not None else None
-        curves[name] = build_curve(of_name, clusters)
-    return over, curves
+        kept = (results.known["configuration"] == name).to_numpy()
+        banded = bands and clusters is not None and name not in fixed
+        curves[name] = build_curve(results.known[kept], clusters.select(kept) if banded and clusters else None)
+    over = None if clusters is None else clusters.over
+    return (NOTHING_DRAWN if fixed and len(fixed) == len(names) else over), curves
 
 
-def build_curve(rows: pd.DataFrame, clusters: RowClusters | None) -> DetectionCurve:
+def build_curve(rows: pd.DataFrame, clusters: Clusters | None) -> DetectionCurve:
     """The curve of one configuration's rows (n,), with a band over their clusters if there are any."""
     if not len(rows):
         return DetectionCurve(np.empty(0), np.empty(0))
-    (time_s, ending), runs = detection_endings(rows), rows["runs"].to_numpy()
-    times_s, share = cumulative_incidence(time_s, ending, runs.astype(float))
+    figures = FigureRows(rows, rows["runs"].to_numpy(dtype=float), clusters)
+    times_s, share = figures.curve
     if clusters is None or not len(times_s):
         return DetectionCurve(times_s, share)
     steps = np.unique(np.linspace(0, len(times_s) - 1, min(len(times_s), _INSTANTS)).astype(int))
-    low, high = incidence_limits(time_s, ending, clusters, times_s[steps], runs)
+    low, high = figures.limit_incidence(times_s[steps], CONFIDENCE)
     step_ix = np.searchsorted(steps, np.arange(len(times_s)), side="right") - 1
     return DetectionCurve(times_s, share, low[step_ix], high[step_ix])
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from copem_replay.core.errors import InputError
-from copem_replay.metrics.intervals import ALL_ALIKE, NOTHING_DRAWN, choose_clusters
+from copem_replay.metrics.limits import ALL_ALIKE, CLUSTERS, NOTHING_DRAWN, find_clusters
 from copem_replay.report.figures.style import (
     INK,
     RANKED_BY,
@@ -150,9 +150,9 @@ def _explain_without(
     compared = [rows[name, metric] for metric in metrics for name in names if (name, metric) in rows]
     if any(not pd.isna(row.interval_over) for row in compared):
         return []
-    over = choose_clusters(results.known)[0]
+    clusters = find_clusters(results.known)
     kinds = {row.interval for row in compared}
-    words = {ALL_ALIKE: f"each difference is the same in every {over[:-1] if over else 'object'}",
+    words = {ALL_ALIKE: f"each difference is the same in every {CLUSTERS[clusters.over][0] if clusters else 'object'}",
              NOTHING_DRAWN: "nothing is drawn, every run is the same"}  # fmt: skip
     reasons = [said for kind, said in words.items() if kind in kinds]
     return [f"No intervals: {' or '.join(reasons) or explain_no_intervals(results) or 'too few differ'}"]

@@ -22,7 +22,13 @@ import pandas as pd
 
 from copem_replay.core.colours import Rgb, configuration_colours, group_families
 from copem_replay.core.errors import InputError, count_noun
-from copem_replay.metrics.intervals import choose_clusters, describe_absent, describe_clusters, explain_no_clusters
+from copem_replay.metrics.limits import (
+    count_clusters,
+    describe_absent,
+    describe_clusters,
+    explain_no_clusters,
+    find_clusters,
+)
 from copem_replay.results.table_files import AGAIN
 
 if TYPE_CHECKING:
@@ -327,20 +333,18 @@ def format_two_decimals(value: float) -> str:
 
 def describe_over(results: Results) -> str:
     """What intervals of the results are over, what that tells and cannot exclude; empty where there are none."""
-    over, cluster = choose_clusters(results.known)
-    if over is None:
+    clusters = find_clusters(results.known)
+    if clusters is None:
         return ""
-    number = results.experiment.runs if over == "runs" else cluster.nunique()
-    absent = f"; whatever the interval, {describe_absent(number)}" if over == "logs" else ""
-    return describe_clusters(over, number) + absent
+    number = results.experiment.runs if clusters.by_run else clusters.count
+    absent = f"; whatever the interval, {describe_absent(number)}" if clusters.over == "logs" else ""
+    return describe_clusters(clusters.over, number) + absent
 
 
 def explain_no_intervals(results: Results) -> str:
     """Why there are no intervals, such as `2 logs, fewer than 3: …`; empty where there are."""
     known = results.known
-    if choose_clusters(known)[0] is not None:
-        return ""
-    return explain_no_clusters(known["log"].nunique(), known.groupby(["log", "object_id"]).ngroups)
+    return "" if find_clusters(known) is not None else explain_no_clusters(*count_clusters(known))
 
 
 # Files of figures, of equal bytes every time.

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from copem_replay.core.errors import count_noun
-from copem_replay.metrics.intervals import ALL_ALIKE, NOT_ENOUGH, NOTHING_DRAWN
+from copem_replay.metrics.limits import ALL_ALIKE, NOT_ENOUGH, NOTHING_DRAWN
 from copem_replay.report.figures.style import (
     RANKED_BY,
     describe_over,

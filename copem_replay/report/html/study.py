@@ -12,7 +12,7 @@ import pandas as pd
 
 from copem_replay.core.errors import InputError, unknown_name_message
 from copem_replay.core.tracks import SAME_INSTANT_S
-from copem_replay.metrics.intervals import ALL_ALIKE, NOTHING_DRAWN, choose_clusters
+from copem_replay.metrics.limits import ALL_ALIKE, CLUSTERS, NOTHING_DRAWN, find_clusters
 from copem_replay.report.figures.selection import pivot_by_run
 from copem_replay.report.figures.style import (
     RANKED_BY,
@@ -49,11 +49,11 @@ def detects_at_onset(study: ReportData) -> bool:
 
 def explain_missing_interval(study: ReportData, rows: pd.DataFrame) -> str:
     """Why differences to the best have no interval: `2 objects`, `each is the same in every run`."""
-    over = choose_clusters(study.results.known)[0]
+    clusters = find_clusters(study.results.known)
     kinds = list(rows["interval"].dropna().unique()) if "interval" in rows else []
     reasons = []
     if ALL_ALIKE in kinds:
-        reasons.append(f"each is the same in every {over[:-1] if over else 'object'}")
+        reasons.append(f"each is the same in every {CLUSTERS[clusters.over][0] if clusters else 'object'}")
     if NOTHING_DRAWN in kinds:
         reasons.append("nothing is drawn, every run is the same")
     if not reasons:

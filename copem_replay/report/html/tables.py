@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from copem_replay.core.errors import count_noun
-from copem_replay.metrics.intervals import NOT_ENOUGH
+from copem_replay.metrics.limits import NOT_ENOUGH
 from copem_replay.metrics.metric import own_metrics
 from copem_replay.metrics.summary import SETUP, describe_intervals, format_cell, has_undetected
 from copem_replay.metrics.summary_metrics import COMPARED, METRIC, METRICS, PARTS

@@ -8,17 +8,19 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from copem_replay.core.errors import InputError, count_noun
+from copem_replay.core.errors import InputError, count_noun, unknown_name_message
 from copem_replay.core.tracks import SAME_INSTANT_S
 from copem_replay.metrics.columns import COMPARISON
-from copem_replay.metrics.intervals import (
+from copem_replay.metrics.limits import (
     CONFIDENCE,
     FEWEST_CLUSTERS,
     FEWEST_LOGS,
@@ -43,9 +45,14 @@ from copem_replay.results.compare.labels import (
     rename_logs,
 )
 from copem_replay.results.compare.limits import (
+    ALONE,
+    STAR,
     ClusterNames,
+    describe_difference,
     difference_limits,
     find_decisive_log,
+    find_stars,
+    is_off_zero,
     mcnemar_p_value,
 )
 from copem_replay.results.compare.metrics import (
@@ -59,6 +66,7 @@ from copem_replay.results.compare.metrics import (
     ghost_totals,
     list_tables,
     notes_on_equal_ghosts,
+    total_counts,
 )
 from copem_replay.results.compare.pairing import (
     PairingGrid,
@@ -94,16 +102,16 @@ class AllLogs:
         """Add a log with its regrets. `more`: there are other logs. `over_runs`: intervals are over runs."""
         self.alone.append((int((first.there & ~second.there).sum()), int((second.there & ~first.there).sum())))
         for regret in regrets:
-            # Runs stay apart for a single object: they are the clusters if no log has another.
-            runs = over_runs or regret.objects[0] <= 1
+            # Runs and passes stay apart for a single object: they are the clusters if no log has another.
+            runs = over_runs or regret.counts[0][0] <= 1
             figure = regret.figure.condensed(runs=runs) if more else regret.figure
             self._regrets.setdefault(regret.metric, []).append(replace(regret, figure=figure))
 
     @property
-    def objects(self) -> tuple[int, ...]:
-        """By log, the number of objects of which both sides have rows."""
+    def counts(self) -> tuple[int, int, int]:
+        """How many logs, objects and passes both sides have rows of."""
         of_logs = next(iter(self._regrets.values()), [])
-        return tuple(number for regret in of_logs for number in regret.objects)
+        return total_counts(counts for regret in of_logs for counts in regret.counts)
 
     def count_better(self, metric: str) -> int:
         """The number of logs whose own difference is for the better."""
@@ -193,14 +201,14 @@ def notes_on_frames(table: pd.DataFrame) -> Iterator[str]:
 
 
 _FEW_HAVE_IT = (
-    f"fewer than {FEWEST_LOGS} logs, {FEWEST_CLUSTERS} objects of one log, or {FEWEST_CLUSTERS} runs of one object "
+    f"fewer than {FEWEST_LOGS} logs, {FEWEST_CLUSTERS} objects of one log, or passes or runs of one object, "
     "have it, or too few for its limits"
 )
 
 
 def notes_on_rows(table: pd.DataFrame, pairs: Iterable[AllLogs], asked: float | None) -> Iterator[str]:
     """Notes on missing intervals, on decisive logs, and on configurations with fewer ghosts than `asked` a minute."""
-    counts = [(sum(number > 0 for number in of.objects), sum(of.objects)) for of in pairs]
+    counts = [of.counts for of in pairs]
     none = [count for count in counts if count[0] and choose_over(*count) is None]
     why = f"{explain_no_clusters(*none[0])}; {NOT_ENOUGH}" if none else None
     overall = table.drop_duplicates(["configuration", "metric"])
@@ -240,7 +248,8 @@ class Comparison:
     What the columns of `table` mean: docs/reference/columns.md; null where there is none. Times are up to `horizon_s`,
     those at equal ghosts at `false_positives_per_min`. `baseline_why`: why it is the baseline, None if it was asked
     for. `notes`: what has to be said, a line each. `groups`: a row per group, configuration and metric, with `by` and
-    `group` in place of the log; None: not asked for. `truths`: labels of the ground truth.
+    `group` in place of the log; None: not asked for. `truths`: labels of the ground truth. `decide`: the one metric
+    that was named to decide; None: all. `matters`: by metric the least difference that matters.
 
     >>> comparison = cr.compare("out/tc016d", baseline="PEM")
     >>> comparison.baseline, comparison.configurations
@@ -256,6 +265,8 @@ class Comparison:
     notes: tuple[str, ...]
     groups: pd.DataFrame | None = None
     truths: tuple[str, ...] = ()
+    decide: str | None = None
+    matters: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def overall(self) -> pd.DataFrame:
@@ -272,16 +283,20 @@ def compare_folders(
     metrics: Sequence[str] | None = None,
     by: Sequence[str] | None = None,
     asked: PairsAsked = PairsAsked(),
+    decide: str | None = None,
+    matters: Mapping[str, float] | None = None,
 ) -> Comparison:
     """Compare configurations (None: all) with a baseline, pair by pair, in some metrics (None: all).
 
-    `by`: entries by which each group is compared for itself, too.
+    `by`: entries by which each group is compared for itself, too. `decide`: only this metric is to have a star.
+    `matters`: by metric the least difference that matters, which gives each a word.
 
     `baseline`: None: the configuration named `ideal`, else the ideal fusion of the same inputs, else the first that is
     not the truth. `false_positives_per_min`: at which times to detection are compared once more; None: as many as the
     baseline has. Raises InputError, a line for every reason why something cannot be read or compared.
     """
     _check_rate(false_positives_per_min)
+    _check_named(decide, matters or {})
     read = read_folders(folders)
     check_comparable(read)
     read, renames = rename_logs(read)
@@ -301,7 +316,8 @@ def compare_folders(
     groups = EpisodeGroups(read[0], by or ())
     names = ClusterNames(logs, [], runs)
     remembering = find_remembering(known, against, others) if baseline is None else {}
-    pairs, rows, of_groups = _compare_each_log(against, settings, names, metrics, groups, asked, remembering)
+    stars = Stars(decide, matters or {})
+    pairs, rows, of_groups = _compare_each_log(against, settings, names, metrics, groups, asked, remembering, stars)
     table = COMPARISON.frame(rows)
     return Comparison(
         table=table,
@@ -310,7 +326,9 @@ def compare_folders(
         configurations=tuple(labelled.label for labelled in others),
         horizon_s=setting.horizon_s,
         false_positives_per_min=false_positives_per_min,
-        groups=_tabulate_groups(against, remembering, of_groups, names, groups) if by else None,
+        groups=_tabulate_groups(against, remembering, of_groups, names, groups, stars) if by else None,
+        decide=decide,
+        matters=matters or {},
         truths=tuple(labelled.label for labelled in (against, *others) if labelled.facts.truth),
         notes=(
             *notes_on_folders(used),
@@ -332,6 +350,39 @@ def _check_rate(false_positives_per_min: float | None) -> None:
         raise InputError(
             f"--false-positives-per-min: expected a number of at least 0, found {false_positives_per_min:g}"
         )
+
+
+def _check_named(decide: str | None, matters: Mapping[str, float]) -> None:
+    """Raise InputError where a metric is not compared, or a least difference is none."""
+    for option, name in (("--decide", decide), *(("--matters", name) for name in matters)):
+        if name is not None and name not in COMPARED:
+            raise InputError(f"{option}: {unknown_name_message('metric', name, COMPARED)}")
+    for name, least in matters.items():
+        if not 0 < least < math.inf:
+            raise InputError(f"--matters: {name}: expected a number above 0, found {least:g}")
+
+
+@dataclass(frozen=True)
+class Stars:
+    """How the stars of a table are held: over all its differences, or those of the metric that was named to `decide`.
+
+    `matters`: by metric the least difference that matters.
+    """
+
+    decide: str | None
+    matters: Mapping[str, float]
+
+    def mark(self, rows: Sequence[dict[str, Any]], limit: Sequence[Callable[[float], Mapping[str, object]]]) -> None:
+        """Give rows, of one table, the columns `star` and `word`; `limit`: of each its limits at a confidence."""
+        asked = [k for k, row in enumerate(rows) if self.decide in (None, row["metric"])]
+        number = sum(rows[k]["difference"] is not None for k in asked)
+        alone = {k for k, row in enumerate(rows) if is_off_zero(row)}
+        may = [k for k in asked if k in alone]
+        held = {may[k] for k in find_stars(number, [limit[k] for k in may])}
+        for k, row in enumerate(rows):
+            row["star"] = STAR if k in held else ALONE if k in alone else None
+            if row["metric"] in self.matters and row["difference"] is not None:
+                row["word"] = describe_difference(row, COMPARED[row["metric"]].better, self.matters[row["metric"]])
 
 
 def _settle_ghosts(
@@ -364,6 +415,7 @@ def _compare_each_log(
     groups: EpisodeGroups,
     asked: PairsAsked,
     remembering: Remembering,
+    stars: Stars,
 ) -> tuple[dict[LabelledConfiguration, AllLogs], list[dict[str, object]], GroupPairs]:
     """The sums of each pair over the logs of `names`; rows of all logs, then of each log where there are several; the
     sums of each group.
@@ -403,7 +455,9 @@ def _compare_each_log(
                 regrets = _compute_regrets(one, other, held, grid, settings[labelled], metrics)
                 of_pair = of_groups.setdefault(group, {}).setdefault(labelled, AllLogs())
                 of_pair.add(one, other, regrets, more=len(logs) > 1)
-    return pairs, [*_overall_rows(against, remembering, pairs, names, asked), *rows], of_groups
+    overall, limit = _overall_rows(against, remembering, pairs, names, asked)
+    stars.mark(overall, limit)
+    return pairs, [*overall, *rows], of_groups
 
 
 Remembering = Mapping[LabelledConfiguration, LabelledConfiguration]
@@ -444,13 +498,18 @@ def _tabulate_groups(
     of_groups: GroupPairs,
     names: ClusterNames,
     groups: EpisodeGroups,
+    stars: Stars,
 ) -> pd.DataFrame:
-    """The rows of `Comparison.groups`."""
-    rows = [
-        {"by": by.label, "group": group, **without_limits_over_runs(row)}
-        for k, (by, group) in enumerate(groups.named)
-        for row in _overall_rows(against, remembering, of_groups.get(k, {}), names)
-    ]
+    """The rows of `Comparison.groups`; those of an entry are one table."""
+    rows: list[dict[str, Any]] = []
+    limit: list[Callable[[float], Mapping[str, object]]] = []
+    for k, (by, group) in enumerate(groups.named):
+        found, of_found = _overall_rows(against, remembering, of_groups.get(k, {}), names)
+        rows += [{"by": by.label, "group": group, **without_limits_over_runs(row)} for row in found]
+        limit += of_found
+    for label in {row["by"] for row in rows}:
+        of_entry = [k for k, row in enumerate(rows) if row["by"] == label]
+        stars.mark([rows[k] for k in of_entry], [limit[k] for k in of_entry])
     table = COMPARISON.frame(rows).drop(columns="log")
     for place, name in enumerate(("by", "group")):
         table.insert(place, name, pd.Series([row[name] for row in rows], dtype=object))
@@ -463,18 +522,40 @@ def _overall_rows(
     pairs: Mapping[LabelledConfiguration, AllLogs],
     names: ClusterNames,
     asked: PairsAsked = PairsAsked(),
-) -> Iterator[dict[str, object]]:
-    """The rows of all logs. Of intervals over logs: how many logs are better, and on which the difference hangs."""
+) -> tuple[list[dict[str, Any]], list[Callable[[float], Mapping[str, object]]]]:
+    """The rows of all logs, and of each its limits at a confidence.
+
+    Of intervals over logs: how many logs are better, and on which the difference hangs.
+    """
+    rows: list[dict[str, Any]] = []
+    limit: list[Callable[[float], Mapping[str, object]]] = []
     for labelled, pair in pairs.items():
         for regret in pair.regrets():
             values = regret.figure.values()
             baseline = _baseline_of(regret.metric, labelled, against, remembering)
-            row = {"log": ALL, **_make_row(regret, values, labelled, baseline, names, asked)}
+            row: dict[str, Any] = {"log": ALL, **_make_row(regret, values, labelled, baseline, names, asked)}
             if row.get("interval_over") == "logs":
                 row["logs_better"] = pair.count_better(regret.metric)
                 if (decisive := find_decisive_log(regret.figure, values[2], names)) is not None:
                     row["hangs_on"], row["difference_without_it"] = decisive[0], _number_or_none(decisive[1])
-            yield row
+            rows.append(row)
+            limit.append(partial(_limit_difference, regret, values[2], (labelled, baseline), names, asked))
+    return rows, limit
+
+
+def _limit_difference(
+    regret: Regret,
+    difference: float,
+    sides: tuple[LabelledConfiguration, LabelledConfiguration],
+    names: ClusterNames,
+    asked: PairsAsked,
+    confidence: float,
+) -> dict[str, object]:
+    """The columns of a difference's limits at a confidence."""
+    over = "runs" if asked.over_runs else regret.over
+    what = "fixed_verdicts" if regret.metric == "pass_share" else "fixed"
+    fixed = all(getattr(side.facts, what) for side in sides)
+    return difference_limits(regret.figure, difference, over, names, fixed=fixed, confidence=confidence)
 
 
 def _settle_horizon(folders: Sequence[Results]) -> tuple[float, list[str]]:
@@ -543,17 +624,14 @@ def _make_row(
 ) -> dict[str, object]:
     """The row of a regret with its `values`, of one log or all."""
     figure, (value, baseline_value, difference) = regret.figure, values
-    over = "runs" if asked.over_runs else regret.over
     row: dict[str, object] = {"configuration": labelled.label, "baseline": against.label, "metric": regret.metric}
     row |= {
         "value": _number_or_none(value),
         "baseline_value": _number_or_none(baseline_value),
         "n": int(figure.items["n"].sum()),
     }
-    row["difference"] = _number_or_none(difference)
-    what = "fixed_verdicts" if regret.metric == "pass_share" else "fixed"
-    fixed = all(getattr(side.facts, what) for side in (labelled, against))
-    row |= difference_limits(figure, difference, over, names, fixed=fixed, confidence=asked.confidence)
+    row |= {"difference": _number_or_none(difference), "star": None, "word": None}
+    row |= _limit_difference(regret, difference, (labelled, against), names, asked, asked.confidence)
     if "only" in figure.items.columns:
         only = figure.items["only"].sum(axis=0)
         row |= {"only_configuration": int(only[0]), "only_baseline": int(only[1])}

@@ -17,9 +17,10 @@ import pandas as pd
 from copem_replay.core.errors import count_noun
 from copem_replay.core.tracks import SAME_INSTANT_S, Bool
 from copem_replay.metrics.config import BEGAN_BY, Slice
-from copem_replay.metrics.intervals import CONFIDENCE
+from copem_replay.metrics.limits import CONFIDENCE, TRAFFIC
 from copem_replay.metrics.slices import number_groups
 from copem_replay.metrics.summary import EPISODE
+from copem_replay.results.compare.limits import STAR
 from copem_replay.results.slices import read_slices
 
 if TYPE_CHECKING:
@@ -64,12 +65,12 @@ class EpisodeGroups:
 
 def without_limits_over_runs(row: dict[str, object]) -> dict[str, object]:
     """A row of a comparison, without limits over the runs of a single object: they tell of no group."""
-    if row.get("interval_over") in ("logs", "objects"):
+    if row.get("interval_over") in TRAFFIC:
         return row
     return {name: value for name, value in row.items() if name not in _LIMITS}
 
 
-_LIMITS = ("low", "high", "interval", "interval_over", "clusters")
+_LIMITS = ("low", "high", "low_bounded", "high_bounded", "interval", "interval_over", "clusters")
 
 
 def describe_group_chance(table: pd.DataFrame) -> list[str]:
@@ -79,10 +80,11 @@ def describe_group_chance(table: pd.DataFrame) -> list[str]:
     lines = []
     for by, rows in table.groupby("by", sort=False):
         limited = rows[rows["interval_over"].notna()]
-        apart = int(((limited["low"] > 0) | (limited["high"] < 0)).sum())
+        apart = int(limited["star"].notna().sum())
         lines.append(
             f"by {by}: {count_noun(rows['group'].nunique(), 'group')} looked at; of "
             f"{count_noun(len(limited), 'interval')} {apart} exclude 0, by chance alone at least "
-            f"{(1 - CONFIDENCE) * len(limited):.2g} would"
+            f"{(1 - CONFIDENCE) * len(limited):.2g} would; {int((limited['star'] == STAR).sum())} with a {STAR}, all "
+            "groups held at 95 % together"
         )
     return lines

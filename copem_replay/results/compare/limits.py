@@ -7,8 +7,8 @@
 have in common cancels, as it does in the difference.
 *Median*: the smallest value that at least half of the weight is at or below: the value of some pair.
 
-Clusters are those of `summary.csv` (`metrics/intervals.py`), and have the weight of what the figure averages: as many
-objects as have it; lists in GOSPA, minutes in ghosts per minute, runs where there is one object.
+Clusters are those of `summary.csv` (`metrics/limits.py`), and have the weight of what the figure averages: rows; pairs
+of what both hold, lists in GOSPA, minutes in ghosts per minute.
 
 Letters of the shapes: i items, K clusters, m sums, G values.
 """
@@ -26,22 +26,23 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from copem_replay.core.tracks import Float, Int
-from copem_replay.metrics.intervals import (
+from copem_replay.metrics.limits import (
     ALL_ALIKE,
     CONFIDENCE,
     EXACT,
     FEWEST_CLUSTERS,
     FEWEST_LOGS,
     INVERTED,
-    JACKKNIFE,
     MOST_GROUPS,
     NOTHING_DRAWN,
+    LimitedFigure,
     alike_limits,
     group_clusters,
-    limit_figure,
+    limit_left_out,
     limit_ranked_quantile,
 )
 from copem_replay.metrics.survival import (
+    CENSORED,
     cumulative_incidence,
     quantile_with_never,
     restricted_mean,
@@ -56,7 +57,8 @@ _SUMMED = ("n", "only", "sums")
 
 @dataclass(frozen=True)
 class StatisticItems:
-    """The items of a figure, by columns (i, …): `logs`, `objects` (−1: none in particular), `runs` (−1: all).
+    """The items of a figure, by columns (i, …): `logs`, `objects` (−1: none in particular), `passes`, episodes of a log
+    (−1: any), `runs` (−1: all).
 
     These count in the lists of `ClusterNames`. `n`: number of pairs (rows, lists) that an item stands for.
     """
@@ -67,8 +69,10 @@ class StatisticItems:
         return self.columns[name]
 
     def condensed(self, *, runs: bool) -> StatisticItems:
-        """The items with equal ones joined. `runs`: items of several runs stay apart."""
-        columns = {**self.columns, "runs": self["runs"] if runs else np.full_like(self["runs"], -1)}
+        """The items with equal ones joined. `runs`: items of several runs and passes stay apart."""
+        columns = dict(self.columns)
+        for name in ("runs", "passes"):
+            columns[name] = self[name] if runs else np.full_like(self[name], -1)
         group = np.zeros(len(self["n"]), dtype=np.int64)
         for name in columns.keys() - {*_SUMMED}:
             number, known = pd.factorize(columns[name])
@@ -92,7 +96,7 @@ def _sum_groups(values: NDArray[Any], group: Int) -> NDArray[Any]:
 
 @dataclass(frozen=True)
 class ClusterNames:
-    """The names that logs, objects and runs of items count in."""
+    """The names that logs, objects and runs of items count in; passes are numbers."""
 
     logs: Sequence[str]
     objects: list[str]  # log and id, separated by a line feed
@@ -101,9 +105,9 @@ class ClusterNames:
 
 @dataclass(frozen=True)
 class ClusterIndex:
-    """K clusters: sorted `names`, and the `number` of each log, object or run among them (−1: in none, always there).
+    """K clusters: sorted `names`, and the `number` of each log, object, pass or run (−1: in none, always there).
 
-    Clusters are logs, objects or runs (`over`), or groups of neighbours where there are many.
+    Clusters are what `over` says, or groups of neighbours where there are many.
     """
 
     over: str
@@ -125,16 +129,17 @@ class ClusterIndex:
         return replace(self, names=names, number=np.where(self.number >= 0, group[self.number], -1))
 
     def count_objects(self, items: StatisticItems) -> Float:
-        """(K,) objects with items in each cluster; runs where clusters are runs."""
-        cluster, by = self.of(items), "objects" if self.over != "runs" else "runs"
+        """(K,) objects with items in each cluster; passes or runs where clusters are these."""
+        cluster, by = self.of(items), self.over if self.over in ("passes", "runs") else "objects"
         counted = (cluster >= 0) & (items[by] >= 0)
         pairs = np.unique(np.stack([cluster[counted], items[by][counted]]), axis=1)
         return np.bincount(pairs[0], minlength=len(self.names)).astype(float)
 
 
 def index_clusters(items: StatisticItems, over: str, names: ClusterNames) -> ClusterIndex | None:
-    """The logs, objects or runs with items, in the order of their names; None: too few have the figure."""
-    all_names = {"logs": names.logs, "objects": names.objects, "runs": [str(run) for run in range(names.runs)]}[over]
+    """The logs, objects, passes or runs with items, in the order of their names; None: too few have the figure."""
+    numbers = [str(k) for k in range(max(names.runs, int(items["passes"].max(initial=-1)) + 1))]
+    all_names = {"logs": names.logs, "objects": names.objects}.get(over, numbers)
     present = sorted(np.unique(items[over][items[over] >= 0]).tolist(), key=lambda k: all_names[k])
     if len(present) < (FEWEST_LOGS if over == "logs" else FEWEST_CLUSTERS):
         return None
@@ -171,8 +176,8 @@ def mcnemar_p_value(only_first: int, only_second: int) -> float:
 class PairStatistic(ABC):
     """A figure of two configurations. Items may have `only (i, 2)`: whether only the first, or second, succeeded.
 
-    `by_object`: whether the items are known by object, so that objects can be clusters. `share`: whether the figure is
-    a share of the items, which then have `only`.
+    `by_object`: whether the items are known by object, so that objects or passes can be clusters. `share`: whether the
+    figure is a share of the items, which then have `only`.
     """
 
     parts: tuple[StatisticItems, ...]
@@ -202,39 +207,50 @@ class PairStatistic(ABC):
         """(K,) differences without the items of each cluster."""
 
     def weights(self, clusters: ClusterIndex) -> Float:
-        """(K,) how much of what the figure averages each cluster has: objects with items, or runs of one."""
-        return clusters.count_objects(self.items)
+        """(K,) how much of what the figure averages each cluster has: as many items."""
+        return _count_items(self.items, clusters)
 
     @property
     def bounds(self) -> tuple[float, float]:
         """The least and the most that the difference can be."""
         return -math.inf, math.inf
 
-    def limits(
-        self, difference: float, clusters: ClusterIndex, confidence: float = CONFIDENCE
-    ) -> tuple[str, float, float]:
-        """The kind of the limits, and both; NaN: without some cluster there is no difference, and so no limits."""
+    @property
+    def followed(self) -> float:
+        """The share of the pairs whose values are known up to the bounds."""
+        return 1.0
+
+    def limits(self, difference: float, clusters: ClusterIndex, confidence: float = CONFIDENCE) -> LimitedFigure:
+        """The difference with its limits; none: without some cluster there is no difference."""
         of = clusters.grouped
-        without, weights = self.without_each(of), self.weights(of)
-        if not np.isfinite(without).all():
-            return JACKKNIFE, math.nan, math.nan
-        if np.abs(without - difference).max() > _SAME:
-            low, high = limit_figure(difference, without, weights, self.bounds, confidence)
-            return JACKKNIFE, float(low), float(high)
-        if not self.share:
-            return ALL_ALIKE, math.nan, math.nan
-        return EXACT, *alike_limits(difference, self.weights(clusters), confidence)
+        found = limit_left_out(difference, self.without_each(of), self.weights(of), self.bounds, confidence)
+        if found.kind != ALL_ALIKE or not self.share:
+            return found
+        weights, objects = self.weights(clusters), clusters.count_objects(self.items).sum()
+        return LimitedFigure(
+            difference, *alike_limits(difference, weights * objects / weights.sum(), confidence), EXACT
+        )  # fmt: skip
+
+    def limit_by_bounds(
+        self, difference: float, clusters: ClusterIndex, confidence: float = CONFIDENCE
+    ) -> LimitedFigure:
+        """The difference with the limits of a mean between bounds, of which a criterion is met; else without."""
+        if not np.isfinite(self.bounds).all() or not self.followed:
+            return LimitedFigure(difference)
+        of, each = clusters.grouped, self.weights(clusters)
+        unseen = float((each**2).sum() / each.sum()) / self.followed
+        return limit_left_out(difference, self.without_each(of), self.weights(of), self.bounds, confidence, unseen)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SumStatistic(PairStatistic):
-    """A function `of` sums (…, m) that gives the figure of either side: shares, means, their roots. Items: `sums`.
+    """A function `of` sums (…, m) that gives the figure of either side: shares, means, their roots.
 
-    `weighed_by`: the sum that the figure averages over, where it is no number of objects.
+    Items: `sums`; the third is what the figure averages over. `most`: as far apart both sides can be.
     """
 
     of: Callable[[Float], tuple[Float, Float]]
-    weighed_by: int | None = None
+    most: float = math.inf
 
     def values(self) -> tuple[float, float, float]:
         """Of the first, of the second, and their difference."""
@@ -263,17 +279,15 @@ class SumStatistic(PairStatistic):
         return difference
 
     def weights(self, clusters: ClusterIndex) -> Float:
-        """(K,) the sum `weighed_by` of each cluster; objects where there is none, or where it is not by cluster."""
+        """(K,) what the figure averages over in each cluster; objects where some of it is in none."""
         by_cluster, always = self._sums_by_cluster(clusters)
-        if self.weighed_by is None or always.any():
-            return clusters.count_objects(self.items)
-        weights: Float = by_cluster[:, self.weighed_by]
+        weights: Float = clusters.count_objects(self.items) if always.any() else by_cluster[:, 2]
         return weights
 
     @property
     def bounds(self) -> tuple[float, float]:
         """−1 and 1 for a difference of shares."""
-        return (-1.0, 1.0) if self.share else super().bounds
+        return -self.most, self.most
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -303,16 +317,16 @@ class MedianStatistic(PairStatistic):
         ]
         return np.array(medians)
 
-    def limits(
-        self, difference: float, clusters: ClusterIndex, confidence: float = CONFIDENCE
-    ) -> tuple[str, float, float]:
+    def limits(self, difference: float, clusters: ClusterIndex, confidence: float = CONFIDENCE) -> LimitedFigure:
         """Limits of the share of differences at or below a value, inverted."""
         cluster, n = clusters.of(self.items), self.items["n"].astype(float)
         objects = None if clusters.over == "runs" else clusters.count_objects(self.items).sum()
         least, most = limit_ranked_quantile(
             self.differences, n, cluster, len(clusters.names), objects, confidence=confidence
         )
-        return (ALL_ALIKE, math.nan, math.nan) if most - least <= _SAME else (INVERTED, least, most)
+        if most - least <= _SAME:
+            return LimitedFigure(difference, kind=ALL_ALIKE)
+        return LimitedFigure(difference, least, most, INVERTED)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -354,6 +368,19 @@ class TimeStatistic(PairStatistic):
         earliest = min((float(part["time_s"].min(initial=0.0)) for part in self.parts), default=0.0)
         return min(earliest, self.horizon_s) - self.horizon_s, self.horizon_s - min(earliest, self.horizon_s)
 
+    @property
+    def followed(self) -> float:
+        """The share of the pairs that is detected, departed or watched to the horizon, on the side that has fewer."""
+        known = [(of["ending"] != CENSORED) | (of["time_s"] >= self.horizon_s - _SAME) for of in self.parts]
+        return min(float(of["n"][kept].sum() / of["n"].sum()) for of, kept in zip(self.parts, known, strict=True))
+
+
+def _count_items(items: StatisticItems, clusters: ClusterIndex) -> Float:
+    """(K,) how many pairs the items of each cluster stand for."""
+    cluster = clusters.of(items)
+    within = cluster >= 0
+    return np.bincount(cluster[within], items["n"][within], len(clusters.names)).astype(float)
+
 
 def _weighted_median(values: Float, weight: Float) -> float:
     if not len(values):
@@ -389,7 +416,8 @@ def difference_limits(
     fixed: bool,
     confidence: float = CONFIDENCE,
 ) -> dict[str, object]:
-    """The columns `low`, `high`, `interval`, `interval_over` and `clusters` of a difference, as far as they exist.
+    """The columns `low`, `high`, `low_bounded`, `high_bounded`, `interval`, `interval_over` and `clusters` of a
+    difference, as far as they exist.
 
     `over`: the kind of cluster, None: none. `fixed`: the figure is equal in every run, on either side.
     """
@@ -398,16 +426,59 @@ def difference_limits(
     if over == "runs" and fixed:
         return {"interval": NOTHING_DRAWN}
     clusters = index_clusters(figure.items, over, names)
-    if clusters is None or not (figure.by_object or over != "objects"):
+    if clusters is None or not (figure.by_object or over not in ("objects", "passes")):
         return {}
-    kind, low, high = figure.limits(difference, clusters, confidence)
-    if kind == ALL_ALIKE:
-        return {"interval": kind}
-    if not (math.isfinite(low) or math.isfinite(high)):
+    found = figure.limits(difference, clusters, confidence)
+    bounded = LimitedFigure(difference) if over == "runs" else figure.limit_by_bounds(difference, clusters, confidence)
+    limits = {"low_bounded": bounded.low, "high_bounded": bounded.high} if bounded.kind else {}
+    if found.kind == ALL_ALIKE:
+        return {"interval": found.kind, **limits, **({"clusters": len(clusters.names)} if limits else {})}
+    if not (math.isfinite(found.low) or math.isfinite(found.high)):
         return {}
-    limits = {"low": low, "high": high}
+    limits |= {"low": found.low, "high": found.high}
     return {name: limit if math.isfinite(limit) else None for name, limit in limits.items()} | {
-        "interval": kind,
+        "interval": found.kind,
         "interval_over": over,
         "clusters": len(clusters.names),
     }
+
+
+# Stars of a table.
+
+STAR, ALONE = "*", "°"
+"""Marks of differences: one that stands in a whole table, and one whose own interval alone excludes 0."""
+BETTER, WORSE, ALIKE, OPEN = "better", "worse", "alike", "open"
+"""What a difference is in words, held against the least one that matters."""
+
+
+def is_off_zero(limits: Mapping[str, Any]) -> bool:
+    """Whether an interval with the columns of `difference_limits` excludes 0."""
+    low, high = limits.get("low"), limits.get("high")
+    return bool((low is not None and low > _SAME) or (high is not None and high < -_SAME))
+
+
+def find_stars(number: int, limit: Sequence[Callable[[float], Mapping[str, object]]]) -> set[int]:
+    """Which differences exclude 0 together: Holm's procedure by sets. `number`: how many differences a table has.
+
+    `limit`: of each that may, its limits at a confidence. Those whose limits at 1 − .05/`number` exclude 0 are held;
+    the rest is asked anew at 1 − .05 over as many as are left, until none is added: under no difference at all at most
+    one table in twenty has any.
+
+    Source: S. Holm, "A simple sequentially rejective multiple test procedure", Scand. J. Statist. 6 (1979) 65–70.
+    """
+    held: set[int] = set()
+    while len(held) < number:
+        level = 1.0 - (1.0 - CONFIDENCE) / (number - len(held))
+        more = {k for k, at in enumerate(limit) if k not in held and is_off_zero(at(level))}
+        if not more:
+            break
+        held |= more
+    return held
+
+
+def describe_difference(row: Mapping[str, Any], better: int, least: float) -> str:
+    """The word of a row with its star: `alike` where its interval is within ± `least`, what matters."""
+    if row.get("star") == STAR:
+        return BETTER if row["difference"] * better > 0 else WORSE
+    low, high = row.get("low"), row.get("high")
+    return ALIKE if low is not None and high is not None and max(-low, high) <= least else OPEN

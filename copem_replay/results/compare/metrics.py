@@ -22,8 +22,8 @@ other, as between two points of a ROC curve. Intervals keep the thresholds and t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import cached_property, reduce
 from typing import TYPE_CHECKING, Any
 
@@ -32,8 +32,8 @@ from numpy.typing import NDArray
 
 from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import Bool, Float, Int
-from copem_replay.metrics.intervals import choose_over
-from copem_replay.metrics.summary_metrics import COMPARED
+from copem_replay.metrics.limits import choose_over
+from copem_replay.metrics.summary_metrics import COMPARED, compute_unknown_s
 from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT
 from copem_replay.results.compare.labels import LabelledConfiguration
 from copem_replay.results.compare.limits import (
@@ -246,21 +246,21 @@ class HeldCounts:
 
 @dataclass(frozen=True)
 class Regret:
-    """A metric of a pair; `objects`: by log the number of objects of which both sides have rows.
+    """A metric of a pair; `counts`: by log the numbers of objects and of passes of which both sides have rows.
 
     `kept`: operating points of the first and the second, for times at equal ghosts. `held`: beside what both hold.
     """
 
     metric: str
     figure: PairStatistic
-    objects: tuple[int, ...]
+    counts: tuple[tuple[int, int], ...]
     kept: tuple[OperatingPoint, OperatingPoint] | None = None
     held: HeldCounts | None = None
 
     @property
     def over(self) -> str | None:
         """The clusters of its interval; None: there are too few."""
-        return choose_over(sum(number > 0 for number in self.objects), sum(self.objects))
+        return choose_over(*total_counts(self.counts))
 
     @staticmethod
     def joined(of_logs: Sequence[Regret]) -> Regret:
@@ -269,10 +269,16 @@ class Regret:
         return Regret(
             of_logs[0].metric,
             type(figures[0]).joined(figures),
-            tuple(number for regret in of_logs for number in regret.objects),
+            tuple(counts for regret in of_logs for counts in regret.counts),
             of_logs[0].kept,
             reduce(HeldCounts.__add__, held) if held else None,
         )
+
+
+def total_counts(counts: Iterable[tuple[int, int]]) -> tuple[int, int, int]:
+    """How many logs have objects, and how many objects and passes there are, from those of each log."""
+    some = [of_log for of_log in counts if of_log[0]]
+    return len(some), sum(objects for objects, _ in some), sum(passes for _, passes in some)
 
 
 @dataclass(frozen=True)
@@ -310,7 +316,8 @@ class _Pair:
         """An item for each of `cells`; −1 − r stands for run r and no object."""
         objects = np.where(cells < 0, -1, self.grid.object_of(cells) + self.grid.before)
         runs = np.where(cells < 0, -1 - cells, cells % self.grid.runs)
-        numbers = {"logs": np.full(len(cells), self.grid.log_ix), "objects": objects, "runs": runs}
+        passes = np.where(cells < 0, -1, cells // self.grid.runs)
+        numbers = {"logs": np.full(len(cells), self.grid.log_ix), "objects": objects, "passes": passes, "runs": runs}
         n = {"n": np.ones(len(cells), dtype=np.int64)}
         return StatisticItems({name: of.astype(np.int32) for name, of in numbers.items()} | n | columns)
 
@@ -329,17 +336,18 @@ def compute_regrets(
     pairs = []
     for there in (first.there & second.there, first.counted & second.counted):
         pair = _Pair(first, second, grid, np.flatnonzero(there), setting)
-        pairs.append((pair, (len(np.unique(grid.object_of(pair.cells))),)))
+        counts = len(np.unique(grid.object_of(pair.cells))), len(np.unique(pair.cells // grid.runs))
+        pairs.append((pair, counts))
     for metric in COMPARED.values():
         of = metric.compared
         if of is None or (only is not None and metric.name not in only):
             continue
-        pair, objects = pairs[0 if metric.part == "lists" else 1]
+        pair, counts = pairs[0 if metric.part == "lists" else 1]
         figure = FIGURES[of.figure](pair) if isinstance(of.figure, str) else _means(pair, of.figure)
         if figure is not None:
             held = pair.held_counts if FIGURES.get(of.figure) in (_held_errors, _held_gospa) else None
             kept = pair.setting.kept if FIGURES.get(of.figure) is _means_at_equal_ghosts else None
-            yield Regret(metric.name, figure, objects, kept, held)
+            yield Regret(metric.name, figure, (counts,), kept, held)
 
 
 def _means(pair: _Pair, values: Callable[[Columns], NDArray[Any]]) -> SumStatistic:
@@ -354,7 +362,7 @@ def _means(pair: _Pair, values: Callable[[Columns], NDArray[Any]]) -> SumStatist
 def _shares(pair: _Pair, cells: Int, first: Bool, second: Bool) -> SumStatistic:
     only = np.stack([first & ~second, second & ~first], axis=1).astype(np.int64)
     sums = np.stack([first, second, np.ones(len(cells))], axis=1)
-    return SumStatistic(parts=(pair.items(cells, only=only, sums=sums),), of=_divide_mean, share=True)
+    return SumStatistic(parts=(pair.items(cells, only=only, sums=sums),), of=_divide_mean, share=True, most=1.0)
 
 
 def _passes(pair: _Pair) -> SumStatistic | None:
@@ -374,7 +382,17 @@ def _means_where_both_detect(pair: _Pair) -> SumStatistic:
     sums = np.stack([*(np.where(both, time_s, 0.0) for time_s in times_s), both.astype(float)], axis=1)
     only = np.stack([first & ~second, second & ~first], axis=1).astype(np.int64)
     items = pair.items(pair.cells, n=both.astype(np.int64), only=only, sums=sums)
-    return SumStatistic(parts=(items,), of=_divide_mean, weighed_by=2)
+    return SumStatistic(parts=(items,), of=_divide_mean)
+
+
+def _means_unknown(pair: _Pair) -> SumStatistic:
+    """Means of min(seconds unknown, horizon)."""
+
+    def unknown_s(rows: Columns) -> Float:
+        found = compute_unknown_s(rows["detection_s"] - rows["onset_s"], rows["ended_s"] - rows["onset_s"])
+        return np.minimum(found, pair.setting.horizon_s)
+
+    return replace(_means(pair, unknown_s), most=pair.setting.horizon_s)
 
 
 def _means_at_equal_ghosts(pair: _Pair) -> TimeStatistic | None:
@@ -445,7 +463,7 @@ def _held_gospa(pair: _Pair) -> SumStatistic | None:
     measured = both.measured > 0
     parts = np.concatenate([both.gospa, np.zeros((len(pair.cells), 1))], axis=1)[measured]
     items = _append_run_items(pair, pair.cells[measured], parts, np.outer(both.frames, [0.0, 0.0, 1.0]), both.frames)
-    return SumStatistic(parts=(items,), of=_make_power_mean(pair.setting.power), weighed_by=2)
+    return SumStatistic(parts=(items,), of=_make_power_mean(pair.setting.power))
 
 
 def _ghost_rates(pair: _Pair) -> SumStatistic | None:
@@ -463,7 +481,7 @@ def _ghost_rates(pair: _Pair) -> SumStatistic | None:
         nearest[:, k] = accuracy_of_side.ghosts[cells]
         rest[:, k] -= np.bincount(runs, nearest[:, k], minlength=len(rest))
     items = _append_run_items(pair, cells, nearest, rest, present.astype(np.int64))
-    return SumStatistic(parts=(items,), by_object=len(accuracy) == 2, of=_divide_rates, weighed_by=2)
+    return SumStatistic(parts=(items,), by_object=len(accuracy) == 2, of=_divide_rates)
 
 
 def _append_run_items(pair: _Pair, cells: Int, of_cells: Float, of_runs: Float, n: Int) -> StatisticItems:
@@ -494,6 +512,7 @@ FIGURES: Mapping[Any, Callable[[_Pair], PairStatistic | None]] = {
         pair, [((1.0, side.rows["detection_s"]),) for side in pair.sides]
     ),
     "means where both detect": _means_where_both_detect,
+    "times unknown": _means_unknown,
     "restricted means at equal ghosts": _means_at_equal_ghosts,
     "distances": _distances,
     "held errors": _held_errors,

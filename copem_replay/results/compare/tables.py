@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from copem_replay.core.errors import OutputError, escape_unprintable, wrap_line
+from copem_replay.core.errors import OutputError, count_noun, escape_unprintable, wrap_line
 from copem_replay.core.files import atomic_file
 from copem_replay.metrics.columns import TABLES
-from copem_replay.metrics.intervals import ALL_ALIKE, EXACT, NOTHING_DRAWN, describe_absent, describe_clusters
+from copem_replay.metrics.limits import ALL_ALIKE, EXACT, FEWEST_LOGS, NOTHING_DRAWN, describe_absent, describe_clusters
 from copem_replay.metrics.summary import describe_mean, format_table
 from copem_replay.metrics.summary_metrics import COMPARED
 from copem_replay.results.compare.groups import describe_group_chance
+from copem_replay.results.compare.limits import ALONE, STAR
 from copem_replay.results.folder import add_to_made_list
 from copem_replay.results.table_files import write_csv
 
@@ -26,8 +27,6 @@ if TYPE_CHECKING:
 _SUFFIXES = (".csv", ".md")
 NOTHING = 1e-9
 """Differences closer to 0 are 0: far below what any of the metrics resolves."""
-APART = "*"
-"""Marks a difference whose interval excludes 0."""
 _WITHOUT = {ALL_ALIKE: "all alike", NOTHING_DRAWN: NOTHING_DRAWN}
 """Words in a cell without an interval, by the reason."""
 
@@ -136,12 +135,8 @@ def _format_cell(row: Any) -> str:
     if pd.isna(row.interval_over):
         return " ".join([format_signed(row.difference), *(f"({why})" for why in explain_no_interval(row))])
     low, high = ("–" if pd.isna(limit) else format_limit(limit) for limit in (row.low, row.high))
-    return f"{format_signed(row.difference)} [{low}, {high}]{f' {APART}' if _excludes_0(row.low, row.high) else ''}"
-
-
-def _excludes_0(low: float, high: float) -> bool:
-    """Whether an interval excludes 0."""
-    return bool(low > NOTHING or high < -NOTHING)
+    marks = (mark for mark in (row.star, row.word) if not pd.isna(mark))
+    return " ".join([f"{format_signed(row.difference)} [{low}, {high}]", *marks])
 
 
 def explain_no_interval(row: Any) -> list[str]:
@@ -173,8 +168,7 @@ def comparison_lines(comparison: Comparison) -> Iterator[str]:
     if kinds:
         yield f"[95 %]: over {'; '.join(kinds)}"
     yield from _describe_logs(limited[limited["interval_over"] == "logs"])
-    if any(_excludes_0(low, high) for low, high in zip(overall["low"], overall["high"], strict=True)):
-        yield f"{APART}: the interval excludes 0"
+    yield from _describe_stars(comparison, overall)
     yield from _describe_intervals(overall)
     yield f"ttd_rmst_s: {describe_mean(comparison.horizon_s, censored=True)}"
     if "ttd_rmst_s_equal_ghosts" in shown:
@@ -187,17 +181,39 @@ def comparison_lines(comparison: Comparison) -> Iterator[str]:
     yield from _describe_better(comparison)
 
 
+def _describe_stars(comparison: Comparison, rows: pd.DataFrame) -> Iterator[str]:
+    """Lines on the marks of a table, on what decides, and on what matters."""
+    number = int(rows["difference"].notna().sum())
+    decide = comparison.decide
+    asked = number if decide is None else int(rows.loc[rows["metric"] == decide, "difference"].notna().sum())
+    whole = f"the {count_noun(asked, 'difference')} of {'this table' if decide is None else decide} together"
+    if decide is not None:
+        yield f"decided by {decide}, named beforehand: no other column has a {STAR}"
+    if (rows["star"] == STAR).any():
+        yield f"{STAR}: the interval excludes 0, {whole} held at 95 %"
+    if (rows["star"] == ALONE).any():
+        yield f"{ALONE}: its own interval alone excludes 0; of {number} such 1 in 20 does by chance"
+    over_logs = rows.loc[rows["interval_over"] == "logs", "clusters"]
+    if len(over_logs) and over_logs.max() == FEWEST_LOGS and asked > 1:
+        yield "three drives cannot star a table; name one figure (--decide METRIC), or record eight"
+    for metric, least in comparison.matters.items():
+        yield (
+            f"{metric}: better or worse with a {STAR}; alike: the interval is within ±{format_limit(least)}, the least "
+            "difference that matters; else open"
+        )
+
+
 def _describe_better(comparison: Comparison) -> Iterator[str]:
     """Lines on the configurations that are better than the baseline; metrics with the same ones share a line."""
     metrics: dict[tuple[str, str], list[str]] = {}
     for metric, row in COMPARED.items():
         of_metric = comparison.overall[comparison.overall["metric"] == metric]
-        beyond = of_metric["low"] > NOTHING if row.better > 0 else of_metric["high"] < -NOTHING
+        beyond = (of_metric["star"] == STAR) & (of_metric["difference"] * row.better > 0)
         for baseline, rows in of_metric[beyond].groupby("baseline", sort=False):
             names = ", ".join(map(_name_with_logs, rows.itertuples(index=False)))
             metrics.setdefault((names, str(baseline)), []).append(metric)
     for (names, baseline), of_names in metrics.items():
-        yield f"better than {baseline} in {', '.join(of_names)}, the interval excluding 0: {names}"
+        yield f"better than {baseline} in {', '.join(of_names)} ({STAR}): {names}"
 
 
 def _describe_logs(limited: pd.DataFrame) -> Iterator[str]:

@@ -1,27 +1,33 @@
-"""Intervals: how far a figure may be from that of all such traffic, by the drives at hand.
+"""Limits: how far a figure may be from that of all such traffic, by the drives at hand; one engine for all figures.
 
-*Cluster*: rows that hang together. Logs, from `FEWEST_LOGS` on; in a single log its objects, from `FEWEST_CLUSTERS` on;
-of a single object its runs. Of two logs there is no interval: how drives differ cannot be told from two, and objects of
-several logs are never taken as independent (`choose_over`).
+*Cluster*: rows that hang together (`choose_over`). Logs, from `FEWEST_LOGS` on; in a single log its objects, from
+`FEWEST_CLUSTERS` on; of a single object its passes (episodes), from as many on; of fewer its runs, counted as runs. Of
+two logs there is no interval: how drives differ cannot be told from two, and objects of several logs are never taken as
+independent. A cluster weighs what the figure averages: rows, pairs, minutes.
 *Share*: exact limits (Clopper–Pearson) of p·n of n trials, n an effective number of objects: no more than there are
 once objects of one log hang together by `WITHIN_LOG`, nor than the spread between logs tells (`limit_share`).
+*Mean between bounds*: one more cluster that was not seen, at the far end (`limit_bounded_mean`).
 *Any other figure*: value ± t·√V, from the figure without each cluster (`limit_figure`), at most `MOST_GROUPS` times.
 *Quantile*: all values at which the limits of the share at or below them hold the quantile's level (`limit_quantile`).
 *Nothing drawn*: where no random number is behind a result it is equal in every run, and an interval over runs tells
 nothing.
 
 Limits are at 95 % unless a function is given another `confidence`. What they hold, and what not: tools/coverage.py,
-docs/guide/metrics.md. Functions of arrays take any leading axes (…). Letters of the shapes: K clusters, G values.
+docs/guide/metrics.md. Functions of arrays take any leading axes (…). Letters of the shapes: n rows, K clusters, G
+values.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from copem_replay.core.errors import count_noun
-from copem_replay.core.tracks import Float, Int
+from copem_replay.core.tracks import Bool, Float, Int
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -29,45 +35,135 @@ if TYPE_CHECKING:
 FEWEST_LOGS = 3
 """From so many logs on intervals are over logs."""
 FEWEST_CLUSTERS = 5
-"""Over fewer objects of one log, or runs of one object, there is no interval of a figure."""
+"""Over fewer objects of one log, or passes of one object, there is no interval of a figure."""
 MOST_GROUPS = 200
 """More clusters are joined to so many groups before a figure is computed without each."""
 WITHIN_LOG = 0.2
 """Correlation of two objects of a log that few logs cannot refute; on recorded drives .02 to .10."""
 CONFIDENCE = 0.95
 _ROUNDING = 1e-9
-"""Numbers of trials, and figures, that differ by less differ by rounding only."""
+"""Numbers of trials, and figures, that differ by less differ by rounding only; times are whole nanoseconds."""
 
 # What an interval is over.
 
 _TELLS = {
     "logs": "how far other drives of this kind may differ",
     "objects": "how far other objects of this drive may differ; nothing about other drives",
+    "passes": "how far other passes of this object may differ; nothing about other objects or days",
     "runs": "how far other draws of the same models may differ for this one object; nothing about other traffic",
 }
-CLUSTERS = {"logs": ("log", ""), "objects": ("object", " of this drive"), "runs": ("run", " of this one object")}
+CLUSTERS = {
+    "logs": ("log", ""), "objects": ("object", " of this drive"), "passes": ("pass", " of this one object"),
+    "runs": ("run", " of this one object"),
+}  # fmt: skip
+"""Words for what intervals are over: of one, and whose."""
+TRAFFIC = ("logs", "objects", "passes")
+"""What intervals that tell of more than other draws are over."""
 
 
-def choose_over(logs: int, objects: int) -> str | None:
-    """What an interval is over: `logs`, `objects` or `runs`; None: nothing. `logs`, `objects`: how many have rows."""
+def choose_over(logs: int, objects: int, passes: int) -> str | None:
+    """What an interval is over: `logs`, `objects`, `passes` or `runs`; None: nothing.
+
+    `logs`, `objects`, `passes` (episodes): how many have rows.
+    """
     if logs >= FEWEST_LOGS:
         return "logs"
     if logs != 1:
         return None
-    return "runs" if objects == 1 else "objects" if objects >= FEWEST_CLUSTERS else None
+    if objects == 1:
+        return "passes" if passes >= FEWEST_CLUSTERS else "runs"
+    return "objects" if objects >= FEWEST_CLUSTERS else None
 
 
-def choose_clusters(table: pd.DataFrame) -> tuple[str | None, pd.Series]:
-    """What an interval of a table's rows is over, as by `choose_over`, and each row's cluster (n,).
+def count_clusters(table: pd.DataFrame) -> tuple[int, int, int]:
+    """How many logs, objects of them and episodes of these have rows."""
+    keys = [name for name in ("log", "object_id", "episode") if name in table]
+    logs, objects, passes = (len(table[keys[:k]].drop_duplicates()) for k in (1, 2, 3))
+    return logs, objects, passes
 
-    Rows of a tally stand for several runs: where the interval is over runs they form one cluster.
+
+@dataclass(frozen=True, eq=False)
+class Clusters:
+    """What an interval of rows (n,) is over: the `number` of each row's cluster, 0 … K − 1, and the `unit` it is about.
+
+    A unit is an object of a log; a pass, where clusters are passes or runs.
     """
-    log = table["log"].astype(str)
-    episode = log + "\n" + table["object_id"].astype(str)
-    over = choose_over(log.nunique(), episode.nunique())
-    if over == "runs" and "run" in table:
-        return over, table["run"].astype(str)
-    return over, log if over == "logs" else episode
+
+    over: str
+    number: Int
+    unit: Int
+
+    @cached_property
+    def count(self) -> int:
+        """K."""
+        return int(self.number.max(initial=-1)) + 1
+
+    @cached_property
+    def units(self) -> int:
+        """How many objects, or passes, the rows are about; where clusters are runs, how many each looks at."""
+        import pandas as pd
+
+        return len(pd.unique(self.unit))
+
+    @property
+    def by_run(self) -> bool:
+        """Whether clusters are runs."""
+        return self.over == "runs"
+
+    @cached_property
+    def group(self) -> Int:
+        """(n,) the group of each row's cluster that is left out with its neighbours where there are many."""
+        group: Int = self.grouped[self.number]
+        return group
+
+    @cached_property
+    def grouped(self) -> Int:
+        """(K,) the group of each cluster."""
+        return group_clusters(self.count)
+
+    def select(self, kept: Bool) -> Clusters:
+        """The clusters of some of the rows, `kept (n,)`."""
+        return replace(self, number=np.unique(self.number[kept], return_inverse=True)[1], unit=self.unit[kept])
+
+    def weigh(self, weight: Float) -> Float:
+        """(K,) sums of `weight (n,)`."""
+        return np.bincount(self.number, weight, self.count).astype(float)
+
+    def weigh_units(self, weight: Float) -> Float:
+        """(K,) how many units each cluster is worth by the `weight (n,)` of its rows; runs count one each."""
+        sums = self.weigh(weight)
+        units: Float = sums * (self.count if self.by_run else self.units) / sums.sum()
+        return units
+
+    def limit_share(self, successes: Float, weight: Float, confidence: float) -> tuple[float, float]:
+        """Limits of Σ successes / Σ weight, of rows (n,)."""
+        sums, counts = self.weigh(successes), self.weigh(weight)
+        if self.by_run:
+            share = sums.sum() / counts.sum()
+            low, high = limit_share_of_runs(np.asarray(share), sums - share * counts, self.units, confidence)
+        else:
+            low, high = limit_share(sums, counts, self.units, confidence)
+        return float(low), float(high)
+
+
+def find_clusters(table: pd.DataFrame, *, of_runs: bool = False) -> Clusters | None:
+    """What an interval of a table's rows (n,) is over, as by `choose_over`; None: nothing.
+
+    `of_runs`: it is over runs. Rows of a tally stand for several runs: they then form one cluster.
+    """
+    import pandas as pd
+
+    log, logs = pd.factorize(table["log"].astype(str), sort=True)
+    name, names = pd.factorize(table["object_id"].astype(str), sort=True)
+    unit, units = pd.factorize(log * max(len(names), 1) + name, sort=True)
+    episode, episodes = pd.factorize(table["episode"].to_numpy() if "episode" in table else np.zeros(len(table), int))
+    one, passes = pd.factorize(unit * max(len(episodes), 1) + episode)
+    over = "runs" if of_runs else choose_over(len(logs), len(units), len(passes))
+    if over is None:
+        return None
+    run: Any = pd.factorize(table["run"], sort=True)[0] if "run" in table else np.zeros(len(table), dtype=np.int64)
+    number = {"logs": log, "objects": unit, "passes": one, "runs": run}[over]
+    return Clusters(over, number, one if over in ("passes", "runs") else unit)
 
 
 def describe_clusters(over: str, number: int | None = None, fewest: int | None = None) -> str:
@@ -76,7 +172,7 @@ def describe_clusters(over: str, number: int | None = None, fewest: int | None =
     `fewest`: where intervals are over different numbers of clusters, up to `number`.
     """
     noun, whose = CLUSTERS[over]
-    counted = f"{noun}s" if number is None else count_noun(number, noun)
+    counted = over if number is None else count_noun(number, noun, over)
     up_to = "" if fewest is None or fewest == number else f"{fewest} to "
     return f"{up_to}{counted}{whose}: {_TELLS[over]}"
 
@@ -85,7 +181,7 @@ NOT_ENOUGH = "neither more runs nor objects of several logs together tell how ot
 """What is said beside the reason why there is no interval."""
 
 
-def explain_no_clusters(logs: int, objects: int) -> str:
+def explain_no_clusters(logs: int, objects: int, *_: int) -> str:
     """Why there is no interval, where `choose_over` says so: `2 logs, fewer than 3`."""
     if logs == 1:
         return f"{count_noun(objects, 'object')} of one drive, fewer than {FEWEST_CLUSTERS}"
@@ -261,13 +357,105 @@ def limit_figure(
 
 def alike_run_limits(
     value: float, bounds: tuple[float, float], runs: int, confidence: float = CONFIDENCE
-) -> tuple[float, float]:
+) -> tuple[float | Float, float | Float]:
     """Bound a mean between `bounds` that is the same in so many independent runs: (low, high).
 
     In a share of runs at most, by exact limits of none of them, it is another, as far as the bounds allow.
     """
     other = float(exact_limits(0.0, float(runs), confidence)[1])
     return value - other * (value - bounds[0]), value + other * (bounds[1] - value)
+
+
+def limit_bounded_mean(
+    value: float | Float,
+    without: Float,
+    weights: Float,
+    bounds: tuple[float | Float, float | Float],
+    followed: float | Float = 1.0,
+    confidence: float = CONFIDENCE,
+    unseen: float | Float | None = None,
+) -> tuple[Float, Float]:
+    """Bound a mean of values between `bounds`, from the mean without each cluster (…, K): (low, high), (…).
+
+    To the K clusters' means one more is added that was not seen, at the far end, once for each limit, and they weigh at
+    random: the limit is the quantile of a beta distribution between the least and the most of them, with the mean and
+    the variance of that sum. Of values 0 and 1 it is exact. `weights (…, K)`: of what the mean averages. `followed`:
+    share of the weight whose value is known (not censored), `unseen`: the weight of the cluster not seen; None: that
+    of an average row's cluster, Σw²/Σw, over `followed`.
+
+    Source: N. Gaffke, "Three test statistics for a nonparametric one-sided hypothesis on the mean of a nonnegative
+    variable", Math. Methods of Statistics 14 (2005) 451–467, whose limits it approximates by their two moments.
+    """
+    value, without = np.asarray(value, dtype=float)[..., None], np.asarray(without, dtype=float)
+    w = np.asarray(weights, dtype=float)
+    n = w.sum(axis=-1, keepdims=True)
+    points = value + (n / np.where(w > 0, w, n) - 1.0) * (value - without)
+    average = (w**2).sum(axis=-1) / n[..., 0] / followed
+    added = np.broadcast_to(average if unseen is None else np.asarray(unseen, dtype=float), average.shape)
+    tail = (1.0 - confidence) / 2
+    low = _weighted_at_random(points, w, np.broadcast_to(bounds[0], added.shape), added, tail)
+    high = _weighted_at_random(points, w, np.broadcast_to(bounds[1], added.shape), added, 1.0 - tail)
+    return np.maximum(low, bounds[0]), np.minimum(high, bounds[1])
+
+
+def _weighted_at_random(points: Float, weights: Float, edge: Float, added: Float, q: float) -> Float:
+    """(…) the q-quantile of Σ E·w·z / Σ E·w with independent exponential E, over `points (…, K)` and the `edge`."""
+    from scipy.special import betaincinv
+
+    z, w = np.concatenate([points, edge[..., None]], axis=-1), np.concatenate([weights, added[..., None]], axis=-1)
+    u = w / w.sum(axis=-1, keepdims=True)
+    mean = (u * z).sum(axis=-1)
+    variance = ((u * (z - mean[..., None])) ** 2).sum(axis=-1) / (1.0 + (u**2).sum(axis=-1))
+    least, span = z.min(axis=-1), np.ptp(z, axis=-1)
+    flat = (span <= _ROUNDING) | (variance <= 0)
+    width = np.where(flat, 1.0, span)
+    p = np.clip((mean - least) / width, 1e-12, 1.0 - 1e-12)
+    size = np.maximum(p * (1.0 - p) * width**2 / np.where(flat, 1.0, variance) - 1.0, _ROUNDING)
+    found: Float = np.where(flat, mean, least + width * betaincinv(p * size, (1.0 - p) * size, q))
+    return found
+
+
+@dataclass(frozen=True)
+class LimitedFigure:
+    """A figure with its limits, and the `kind` of these or why there are none; `value` None: there is no row.
+
+    Of a time the value may be ∞, never, of a distance −∞; a limit that is infinite says that there is none.
+    `share`: of a quantile, the limits of the share at or below the bound it is held against.
+    """
+
+    value: float | None
+    low: float = math.nan
+    high: float = math.nan
+    kind: str | None = None
+    share: tuple[float, float] | None = None
+
+
+def limit_left_out(
+    value: float,
+    without: Float,
+    weights: Float,
+    bounds: tuple[float, float] = (-math.inf, math.inf),
+    confidence: float = CONFIDENCE,
+    unseen: float | None = None,
+    runs: int = 0,
+) -> LimitedFigure:
+    """A figure with its limits, from the figure without each of K clusters.
+
+    `unseen`: the weight of the cluster that was not seen, of a mean between `bounds`; None: Student's t. `runs`: how
+    many, where clusters are runs: of a mean that is the same in all their number tells something.
+    """
+    if len(weights) < 2 or not np.isfinite(without).all():
+        return LimitedFigure(value)
+    limits: tuple[float | Float, float | Float]
+    if unseen is not None:
+        limits, kind = limit_bounded_mean(value, without, weights, bounds, 1.0, confidence, unseen), BOUNDED
+    elif np.abs(without - value).max() > _ROUNDING:
+        limits, kind = limit_figure(value, without, weights, bounds, confidence), JACKKNIFE
+    elif runs and np.isfinite(bounds).all():
+        limits, kind = alike_run_limits(value, bounds, runs, confidence), JACKKNIFE
+    else:
+        return LimitedFigure(value, kind=ALL_ALIKE)
+    return LimitedFigure(value, float(limits[0]), float(limits[1]), kind)
 
 
 # Quantiles.
@@ -323,6 +511,8 @@ EXACT = "exact"
 """The kind of an interval by exact binomial limits, of a share or of a difference of shares that all clusters have."""
 JACKKNIFE = "jackknife"
 """The kind of an interval by Student's t from the figure without each cluster."""
+BOUNDED = "bounded"
+"""The kind of an interval of a mean between bounds, by one more cluster that was not seen."""
 INVERTED = "inverted"
 """The kind of an interval of a median, from the limits of shares."""
 ALL_ALIKE = "all clusters alike"
@@ -331,7 +521,10 @@ ALL_ALIKE = "all clusters alike"
 
 def interval_words(kind: str, over: str, number: int | None = None) -> str:
     """What limits are, by the columns `interval` and `interval_over`: `over 8 logs: how far …`."""
-    method = {EXACT: "exact binomial limits", JACKKNIFE: "Student's t", INVERTED: "of medians"}.get(kind, kind)
+    method = {
+        EXACT: "exact binomial limits", JACKKNIFE: "Student's t", INVERTED: "of medians",
+        BOUNDED: "one that was not seen added at the far end",
+    }.get(kind, kind)  # fmt: skip
     return f"{method} over {describe_clusters(over, number)}"
 
 

@@ -1,0 +1,354 @@
+"""Figures of a configuration's rows with their limits (`metrics/limits.py`): drawn as bands, and held against bounds.
+
+A share at an instant has the limits of a share: its variance is from the curves without each cluster, as with censoring
+a curve is no ratio of sums. A quantile has the limits of the shares at or below each value, inverted, so that it is
+within them wherever its share is.
+
+Letters of the shapes: n rows, K clusters, G instants, m sums.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+
+from copem_replay.core.tracks import Bool, Float, Int
+from copem_replay.metrics.limits import (
+    EXACT,
+    INVERTED,
+    WITHIN_LOG,
+    Clusters,
+    LimitedFigure,
+    limit_left_out,
+    limit_quantile,
+    limit_ranked_quantile,
+    limit_share_of_runs,
+    share_variance,
+    spread_share,
+)
+from copem_replay.metrics.summary_metrics import compute_unknown_s
+from copem_replay.metrics.survival import (
+    CENSORED,
+    DETECTED,
+    LEFT,
+    cumulative_incidence,
+    incidences_without,
+    is_competing,
+    quantile_time,
+    quantile_with_never,
+    restricted_mean,
+    restricted_means_without,
+)
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_SAME = 1e-9
+"""Times this close are equal: they are whole nanoseconds."""
+
+
+def detection_endings(rows: pd.DataFrame) -> tuple[Float, Int]:
+    """Time (n,) from onset to detection or end of the episode, and kind of ending (n,).
+
+    `rows`: of `Results.known`, or of the tally.
+    """
+    detected = rows["time_to_detection_s"].notna().to_numpy()
+    looked_s = (rows["ended_s"] - rows["onset_s"]).to_numpy(dtype=float)
+    time_s = np.where(detected, rows["time_to_detection_s"].to_numpy(dtype=float), looked_s)
+    ending = np.where(detected, DETECTED, np.where(is_competing(rows["ended_by"]), LEFT, CENSORED))
+    return time_s, ending
+
+
+_INSTANTS = 1000
+"""Most instants at which limits of a quantile are sought."""
+
+
+@dataclass(frozen=True)
+class FigureRows:
+    """Rows (n,) of a configuration: `table` has the columns of the tally, each row counts by its `weight`.
+
+    `least`: as for `cumulative_incidence`. `clusters`: None: no limits.
+    """
+
+    table: pd.DataFrame
+    weight: Float
+    clusters: Clusters | None
+    least: float = 1e-12
+
+    @cached_property
+    def known(self) -> Bool:
+        """(n,) whether a row is for an instant, not for never."""
+        known: Bool = self.table["time_to_detection_s"].notna().to_numpy(dtype=bool)
+        return known
+
+    @cached_property
+    def endings(self) -> tuple[Float, Int]:
+        """(n,) times, and how they end."""
+        time_s, ending = detection_endings(self.table)
+        return np.round(time_s, 9), ending
+
+    @cached_property
+    def curve(self) -> tuple[Float, Float]:
+        """The cumulative incidence: its times and values."""
+        return cumulative_incidence(*self.endings, self.weight, least=self.least)
+
+    def limit_share(self, successes: Float, confidence: float) -> LimitedFigure:
+        """The share of `successes (n,)`, weights of rows or parts of them."""
+        value = float(successes.sum()) / float(self.weight.sum())
+        if self.clusters is None:
+            return LimitedFigure(value)
+        return LimitedFigure(value, *self.clusters.limit_share(successes, self.weight, confidence), EXACT)
+
+    def limit_mean_time(self, horizon_s: float, confidence: float) -> LimitedFigure:
+        """The restricted mean; without limits where no row is followed to its detection, departure or the horizon."""
+        value, of = restricted_mean(*self.curve, horizon_s), self.clusters
+        time_s, ending = self.endings
+        followed = float(self.weight[(ending != CENSORED) | (time_s >= horizon_s - _SAME)].sum() / self.weight.sum())
+        if of is None or not followed:
+            return LimitedFigure(value)
+        groups = int(of.group.max()) + 1
+        without = restricted_means_without(
+            time_s, ending, self.weight, of.group, groups, horizon_s, least=self.least
+        )  # fmt: skip
+        return self._limit_mean(of, value, without, (min(0.0, float(time_s.min())), horizon_s), confidence, followed)
+
+    def limit_mean(self, values: Float, most: float, confidence: float) -> LimitedFigure:
+        """The mean of values (n,), from 0 to `most`."""
+        total = float(self.weight.sum())
+        value, of = float(self.weight @ values) / total, self.clusters
+        if of is None:
+            return LimitedFigure(value)
+        sums, rows = (np.bincount(of.group, self.weight * column) for column in (values, np.ones(len(values))))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            without = (sums.sum() - sums) / (total - rows)
+        return self._limit_mean(of, value, without, (0.0, most), confidence)
+
+    def _limit_mean(
+        self,
+        of: Clusters,
+        value: float,
+        without: Float,
+        bounds: tuple[float, float],
+        confidence: float,
+        followed: float = 1.0,
+    ) -> LimitedFigure:
+        """A mean between `bounds`, from those without each group of clusters."""
+        rows, groups = of.weigh(self.weight), np.bincount(of.group, self.weight).astype(float)
+        unseen = None if of.by_run else float((rows**2).sum() / rows.sum()) / followed
+        return limit_left_out(value, without, groups, bounds, confidence, unseen, of.count if of.by_run else 0)
+
+    @cached_property
+    def _quantile_limits(self) -> dict[float, tuple[Float, Float, Float, Int]]:
+        return {}
+
+    def limit_time_quantile(self, q: float, confidence: float, bound: float | None = None) -> LimitedFigure:
+        """The time by which a share q is detected; ∞: a smaller share ever is."""
+        found = quantile_time(*self.curve, q)
+        value = math.inf if found is None else found
+        if self.clusters is None:
+            return LimitedFigure(value)
+        if confidence not in self._quantile_limits:
+            self._quantile_limits[confidence] = self._limit_curve(confidence)
+        times_s, low, high, steps = self._quantile_limits[confidence]
+        least, most = limit_quantile(np.append(-np.inf, times_s[steps]), low, high, q)
+        if math.isfinite(least) and (k := int(np.searchsorted(times_s[steps], least))) > 0:
+            least = float(times_s[steps[k - 1] + 1])  # between two instants limits are not known
+        share = None if bound is None else tuple(float(of[0]) for of in self.limit_incidence([bound], confidence))
+        return LimitedFigure(value, least, most, INVERTED, share)  # type: ignore[arg-type]
+
+    def _limit_curve(self, confidence: float) -> tuple[Float, Float, Float, Int]:
+        times_s = self.curve[0]
+        steps = np.unique(np.linspace(0, len(times_s) - 1, min(len(times_s), _INSTANTS)).astype(int))
+        before = [min([0.0, *times_s[:1]]) - 1.0]
+        return times_s, *self.limit_incidence(np.append(before, times_s[steps]), confidence), steps
+
+    def limit_incidence(self, at_s: Sequence[float] | Float, confidence: float) -> tuple[Float, Float]:
+        """Lower and upper limits (G,) of the cumulative incidence at instants (G,), ascending; there are clusters."""
+        assert self.clusters is not None
+        of, at_s, times_s = self.clusters, np.asarray(at_s, dtype=float), self.curve[0]
+        share = np.append(0.0, self.curve[1])[np.searchsorted(times_s, at_s, side="right")]
+        if of.by_run and of.units <= 1:
+            return limit_share_of_runs(share, np.zeros((len(share), of.count)), 1, confidence)
+        units = of.weigh_units(self.weight)
+        of_group = np.bincount(of.grouped, units)
+        without = incidences_without(
+            *self.endings, self.weight, of.group, len(of_group), at_s, least=self.least
+        ).T  # fmt: skip
+        residual = (of_group.sum() - of_group) * (share[:, None] - without)
+        variance = share_variance(residual, np.broadcast_to(of_group, residual.shape))
+        within = np.where(variance > _SAME**2, 0.0, 1.0) if of.by_run else WITHIN_LOG
+        units = np.broadcast_to(units * (of.units if of.by_run else 1.0), (len(share), of.count))
+        return spread_share(share, variance, units, confidence, within)
+
+    def limit_distance_quantile(self, q: float, confidence: float, bound: float | None = None) -> LimitedFigure:
+        """The distance beyond which a share 1 − q is detected; −∞: a smaller share ever is."""
+        distance_m = self.table["distance_at_detection_m"].to_numpy(dtype=float)
+        placed = ~self.known | ~np.isnan(distance_m)
+        weight, ranked = self.weight[placed], np.where(self.known, distance_m, -np.inf)[placed]
+        if not placed.any():
+            return LimitedFigure(None)
+        found = quantile_with_never(ranked, self.known[placed], q, weight)
+        value = -math.inf if found is None else found
+        if self.clusters is None:
+            return LimitedFigure(value)
+        kept = self.clusters.select(placed)
+        units = None if kept.by_run else kept.units
+        low, high = limit_ranked_quantile(ranked, weight, kept.number, kept.count, units, q, confidence)
+        if bound is None:
+            return LimitedFigure(value, low, high, INVERTED)
+        share = kept.limit_share(np.where(ranked >= bound, weight, 0.0), weight, confidence)
+        return LimitedFigure(value, low, high, INVERTED, share)
+
+
+def limit_sums(
+    sums: Float,
+    of: Callable[[Float], Any],
+    clusters: Clusters | None,
+    weight: Float,
+    confidence: float,
+    least: float = -math.inf,
+) -> LimitedFigure:
+    """A figure `of` sums (…, m) over rows, from `sums (n, m)`; `weight (n,)`: what it averages over; `least`: that it
+    can be.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        total = sums.sum(axis=0)
+        value = float(of(total))
+        if not math.isfinite(value):
+            return LimitedFigure(None)
+        if clusters is None:
+            return LimitedFigure(value)
+        by_group = np.stack([np.bincount(clusters.group, column) for column in sums.T], axis=1).astype(np.float64)
+        without = np.array([float(of(total - one)) for one in by_group])
+    weights = np.bincount(clusters.group, weight).astype(float)
+    return limit_left_out(value, without, weights, (least, math.inf), confidence)
+
+
+# Metrics of the summary that are held against bounds.
+
+
+class JudgedMetric(NamedTuple):
+    """How a metric is taken of rows. `rows`: of which: detections, implied collisions (`conflict`), those in conflict
+    (`braking`), closed forms (`exact`, `exact braking`). `limit`: the figure, from rows, horizon, confidence, bound.
+    """
+
+    rows: Literal["detected", "conflict", "braking", "exact", "exact braking"]
+    limit: Callable[[FigureRows, float, float, float], LimitedFigure]
+
+
+def _quantile_s(q: float) -> Callable[[FigureRows, float, float, float], LimitedFigure]:
+    return lambda rows, _, confidence, bound: rows.limit_time_quantile(q, confidence, bound)
+
+
+def _quantile_m(q: float) -> Callable[[FigureRows, float, float, float], LimitedFigure]:
+    return lambda rows, _, confidence, bound: rows.limit_distance_quantile(q, confidence, bound)
+
+
+def _share_of(
+    successes: Callable[[FigureRows], Float | Bool],
+) -> Callable[[FigureRows, float, float, float], LimitedFigure]:
+    return lambda rows, _, confidence, __: rows.limit_share(rows.weight * successes(rows), confidence)
+
+
+def _mean_time(rows: FigureRows, horizon_s: float, confidence: float, _: float) -> LimitedFigure:
+    return rows.limit_mean_time(horizon_s, confidence)
+
+
+def _mean_unknown(rows: FigureRows, _: float, confidence: float, __: float) -> LimitedFigure:
+    unknown_s, length_s = _unknown_s(rows)
+    return rows.limit_mean(unknown_s, float(length_s.max()), confidence)
+
+
+def _mean_unknown_to_horizon(rows: FigureRows, horizon_s: float, confidence: float, _: float) -> LimitedFigure:
+    return rows.limit_mean(np.minimum(_unknown_s(rows)[0], horizon_s), horizon_s, confidence)
+
+
+def _unknown_s(rows: FigureRows) -> tuple[Float, Float]:
+    """(n,) seconds unknown, and lengths of the episodes."""
+    length_s = (rows.table["ended_s"] - rows.table["onset_s"]).to_numpy(dtype=float)
+    return compute_unknown_s(rows.table["time_to_detection_s"].to_numpy(dtype=float), length_s), length_s
+
+
+def _left(rows: FigureRows) -> Bool:
+    still: Bool = ~rows.known & (rows.endings[1] == LEFT)
+    return still
+
+
+def _open(rows: FigureRows) -> Bool:
+    still: Bool = ~rows.known & (rows.endings[1] == CENSORED)
+    return still
+
+
+def _column(name: str) -> Callable[[FigureRows], Float]:
+    return lambda rows: np.nan_to_num(rows.table[name].to_numpy(dtype=float))
+
+
+_OF_DETECTION = {
+    "detected_share": _share_of(lambda rows: rows.known),
+    "ttd_p5_s": _quantile_s(0.05),
+    "ttd_median_s": _quantile_s(0.5),
+    "ttd_p95_s": _quantile_s(0.95),
+    "ttd_rmst_s": _mean_time,
+    "unknown_s": _mean_unknown,
+    "unknown_to_horizon_s": _mean_unknown_to_horizon,
+    "dad_median_m": _quantile_m(0.5),
+    "dad_p5_m": _quantile_m(0.05),
+}
+JUDGED = {
+    **{name: JudgedMetric("detected", limit) for name, limit in _OF_DETECTION.items()},
+    "left_undetected_share": JudgedMetric("detected", _share_of(_left)),
+    "open_share": JudgedMetric("detected", _share_of(_open)),
+    "conflict_detected_share": JudgedMetric("conflict", _share_of(lambda rows: rows.known)),
+    "conflict_ttd_median_s": JudgedMetric("conflict", _quantile_s(0.5)),
+    "conflict_ttd_p95_s": JudgedMetric("conflict", _quantile_s(0.95)),
+    "conflict_ttd_rmst_s": JudgedMetric("conflict", _mean_time),
+    "conflict_dad_median_m": JudgedMetric("conflict", _quantile_m(0.5)),
+    "pass_share": JudgedMetric("braking", lambda rows, _, level, __: rows.limit_share(_column("passed")(rows), level)),
+    **{f"{name}_exact": JudgedMetric("exact", limit) for name, limit in _OF_DETECTION.items()},
+    "pass_share_exact": JudgedMetric("exact braking", _share_of(_column("pass_probability"))),
+    "fail_share_exact": JudgedMetric("exact braking", _share_of(_column("fail_probability"))),
+}
+"""Metrics of rows of the tally and of `exact.parquet`, by name."""
+
+
+class SummedMetric(NamedTuple):
+    """A ratio of two of the sums by episode of `metrics/slices.py`; `root`: of squares."""
+
+    sum: str
+    over: str
+    root: bool = False
+
+    @property
+    def least(self) -> float:
+        """The least that it can be: a bias has a sign."""
+        return -math.inf if self.sum.endswith(("east_m", "north_m")) else 0.0
+
+    def value_of(self, sums: Float) -> Any:
+        """The metric of both sums (…, 2)."""
+        mean = sums[..., 0] / sums[..., 1]
+        return np.sqrt(mean) if self.root else mean
+
+
+SUMMED = {
+    "position_rmse_m": SummedMetric("square_m2", "placed", root=True),
+    "position_rmse_captured_m": SummedMetric("square_then_m2", "pairs", root=True),
+    "bias_east_m": SummedMetric("east_m", "placed"),
+    "bias_north_m": SummedMetric("north_m", "placed"),
+    "velocity_rmse_mps": SummedMetric("velocity_square_m2ps2", "placed", root=True),
+    "age_of_information_s": SummedMetric("age_of_information_s", "pairs"),
+    "nees": SummedMetric("nees", "pairs"),
+    "identity_switches": SummedMetric("switches", "tracked_rows"),
+    "longest_gap_s": SummedMetric("longest_gap_s", "rows"),
+}
+"""Metrics of accuracy, by name."""
+PER_MINUTE = {
+    "false_positives_per_min": "ghosts",
+    "stale_false_positives_per_min": "stale_ghosts",
+    "duplicates_per_min": "duplicates",
+}
+"""Metrics of `lists.parquet`, and the columns that are counted."""
