@@ -1,24 +1,19 @@
-"""How often intervals over logs hold the truth, how wide they are, and how often a `*` is false.
+"""How often intervals hold the truth, how often verdicts at the truth are wrong, and how often a table has a false `*`.
 
-    nice -n 10 python tools/coverage.py            # all rows, 2,000 studies each: minutes on one core
+    nice -n 10 python tools/coverage.py                  # 2,000 studies a row: two to five minutes on one core
+    python tools/coverage.py --csv --studies 10000       # every row of the table
 
-A study has K logs with 1, 5 or 30 objects each, or unequal ones (lognormal, σ = 1, at least one), and its intervals are
-those of the package (`metrics/limits.py`). *Shares*: of each log drawn from a Beta distribution of so much between
-logs (a + b: 2, 10, 40) and mean .5 or .9, or .95, and .2 in one log of ten; of its objects so many are detected. *Other
-figures*: means over objects of a part of the log and one of the object, both of the named distribution, variances 1 : 4
-(a correlation of .2); where it is zero but for a tenth, or bad in one log of ten, the object's part is normal. *RMST*:
-restricted means of exponential times at 3 times their mean, of which a sixth are censored, from logs whose mean
-times are gamma distributed, with the limits of means between bounds. *False `*`*: of the difference of two such
-configurations on the same logs, truly 0, how often the interval excludes 0: a difference of shares that all logs have
-alike has exact limits.
+A study is a drive, several drives, or passes of one object, drawn from a *design*; its limits are those of the package
+(`metrics/limits.py`), its truth that of all such traffic. A criterion is *wrongly met* where it is met although the
+truth is beyond its bound by a hair, *wrongly not met* where it is not met although the truth keeps it by a hair;
+`at_least` for shares, else `at_most`. *Objects* of one drive have times up to the horizon of any distribution; *logs*
+have objects of their own share detected and their own median time, unrelated to their number, or bad logs that are also
+*busy*. *Followed* rows begin, leave and are censored, and go through the figures of a criterion, study by study
+(`metrics/row_figures.py`): a quarter as many. *Stars*: of four configurations and a baseline that are all alike, eight
+metrics, one of them without limits; over the whole table (Holm), and of one metric that is named before.
 
-*Wrong*: verdicts of a criterion whose bound is the truth (`results/verdicts.py`): how often it is met though the truth
-is beyond the bound by a hair, or not met though it keeps it by a hair, the more frequent of both; of the figure, and of
-the difference of two configurations, truly 0. At most 3.5 % and three standard errors for shares of Beta designs,
-restricted means and for differences, which are symmetric, of shares and of normal and uniform figures; in other rows it
-stands beside the coverage.
-
-Gates are those of the guide, less two standard errors; a row beyond a gate makes the exit code 1.
+Gates: coverage of at least .93, at most .04 wrongly met, .06 of tables starred, with two standard errors. A *line* is a
+row of the table in docs/guide/metrics.md; one that is beyond a gate is named there, in bold, else the exit code is 1.
 """
 
 from __future__ import annotations
@@ -29,49 +24,203 @@ if __name__ == "coverage":  # numba looks for the package of that name, and with
 import argparse
 import math
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Final
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import pandas as pd
+from scipy.special import ndtr, ndtri
 
-from copem_replay.core.tracks import Float, Int
-from copem_replay.metrics.limits import alike_limits, limit_bounded_mean, limit_figure, limit_share
+from copem_replay.core.tracks import Bool, Float, Int
+from copem_replay.metrics.limits import Clusters, limit_bounded_mean, limit_figure, limit_left_out, limit_share
+from copem_replay.metrics.row_figures import JUDGED, FigureRows
 from copem_replay.metrics.summary import format_table
-from copem_replay.metrics.survival import (
-    CENSORED,
-    DETECTED,
-    cumulative_incidence,
-    restricted_mean,
-    restricted_means_without,
-)
-from copem_replay.results.verdicts import MET, NOT_MET, judge_limits
+from copem_replay.results.compare.limits import find_stars
 
-LOGS: Final = (3, 4, 5, 8, 12, 20)
-OBJECTS: Final = (1, 5, 30)
-_SAME: Final = 1e-9
+HORIZON_S: Final = 5.0
+CLUSTERS: Final = (3, 4, 5, 8, 13, 20, 60)
+COVERAGE, WRONG, STARRED = 0.93, 0.04, 0.06
+"""The gates: the least coverage, the most that is wrongly met, the most tables with a false `*`."""
+GUIDE: Final = Path(__file__).parents[1] / "docs" / "guide" / "metrics.md"
+_ROUNDING: Final = 1e-9
+Generator = np.random.Generator
+Draw = Callable[[Float], Float]
 
 
-@dataclass(frozen=True)
-class Design:
-    """A kind of study: `study(rng, w)` gives sums over the objects (S, K) of logs with `w (S, K)` objects.
+class Row(NamedTuple):
+    """The limits (S,) of studies, NaN: none, and the truth; `hair`: as far off it may be."""
 
-    `truth`: the mean over objects of all such logs. `gate(K)`: the least coverage; None: printed only.
-    """
-
-    name: str
-    kind: str
+    line: str
+    design: str
+    figure: str
+    over: str
+    clusters: int
+    low: Float
+    high: Float
     truth: float
-    study: Callable[[np.random.Generator, Int], Float]
-    gate: Callable[[int], float | None]
+    hair: float = _ROUNDING
+
+    def tell(self, guide: str) -> dict[str, object]:
+        """The row of the table, and whether it fails. A difference is judged by other limits than those printed."""
+        given = ~np.isnan(self.low)
+        low, high = self.low[given], self.high[given]
+        above, below = high < self.truth - self.hair, low > self.truth + self.hair
+        met, not_met = (below, above) if "share" in self.figure else (above, below)
+        n, held, wrong = len(low), int((~above & ~below).sum()), float(met.mean())
+        named = self.line if f"**{self.line}**" in guide else ""
+        few = held / n < COVERAGE - allowance(COVERAGE, n) and not self.figure.endswith("at_most")
+        often = wrong > WRONG + allowance(WRONG, n) and self.figure != "difference"
+        return {
+            "line": self.line, "design": self.design, "figure": self.figure, "over": self.over,
+            "clusters": self.clusters, "held": held, "of": n, "wrongly met": wrong,
+            "wrongly not met": float(not_met.mean()), "median width": float(np.median(high - low)), "named": named,
+            "fails": (few or often) and not named,
+        }  # fmt: skip
 
 
-def draw_sizes(rng: np.random.Generator, studies: int, logs: int, objects: int, *, equal: bool) -> Int:
+def allowance(gate: float, n: int) -> float:
+    """What chance may add to a share of `n` studies: two standard errors."""
+    return 2 * math.sqrt(gate * (1 - gate) / n)
+
+
+def limit_means(values: Float, weights: Float, bounds: tuple[float, float] | None) -> tuple[Float, Float]:
+    """Limits (S,) of means of clusters' `values (S, K)` with `weights`; between `bounds`, None: by Student's t."""
+    n = weights.sum(axis=-1, keepdims=True)
+    mean = (weights * values).sum(axis=-1, keepdims=True) / n
+    without = (n * mean - weights * values) / (n - weights)
+    if bounds is None:
+        return limit_figure(mean[..., 0], without, weights)
+    return limit_bounded_mean(mean[..., 0], without, weights, bounds)
+
+
+# Objects of one drive: times up to the horizon, as quantile functions.
+
+
+def mix(*parts: tuple[float, Draw | float]) -> Draw:
+    """Quantiles of a mixture: shares, and of each a quantile function or a value."""
+    ends = np.cumsum([share for share, _ in parts])
+
+    def quantile(u: Float) -> Float:
+        drawn = [
+            np.full_like(u, of) if isinstance(of, float) else of(np.clip((u - end) / share + 1, 1e-12, 1 - 1e-12))
+            for (share, of), end in zip(parts, ends, strict=True)
+        ]
+        return np.clip(np.select([u < end for end in ends], drawn, drawn[-1]), 0.0, HORIZON_S)
+
+    return quantile
+
+
+def lognormal(median: float, sigma: float) -> Draw:
+    return lambda u: median * np.exp(sigma * ndtri(u))
+
+
+def exponential(mean: float) -> Draw:
+    return lambda u: -mean * np.log1p(-u)
+
+
+def normal(mean: float, deviation: float) -> Draw:
+    return lambda u: mean + deviation * ndtri(u)
+
+
+def beta(a: float, b: float) -> Draw:
+    from scipy.special import betaincinv
+
+    return lambda u: HORIZON_S * betaincinv(a, b, u)
+
+
+_SHARES: Final = (0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
+OBJECTS: Final[Mapping[str, Draw]] = {
+    **{f"two points: {c:g}, {q:g} never": mix((1 - q, c), (q, HORIZON_S)) for c in (0.0, 0.6, 2.0) for q in _SHARES},
+    **{f"three points: 0, .6, {q:g} never": mix(((1 - q) / 2, 0.0), ((1 - q) / 2, 0.6), (q, HORIZON_S))
+       for q in (0.02, 0.05, 0.1, 0.2, 0.4)},
+    **{f"normal and never: .5 ± .1, {q:g} never": mix((1 - q, normal(0.5, 0.1)), (q, HORIZON_S))
+       for q in (0.02, 0.05, 0.1, 0.2, 0.4)},
+    **{f"beta: {a:g}, {b:g}": mix((1.0, beta(a, b)))
+       for a, b in ((0.1, 0.9), (0.3, 2.0), (0.05, 1.0), (0.5, 0.5), (2.0, 8.0), (8.0, 2.0))},
+    **{f"lognormal and never: σ {s:g}, {q:g} never": mix((1 - q, lognormal(0.6, math.hypot(s, 0.4))), (q, HORIZON_S))
+       for s, q in ((1.0, 0.145), (1.5, 0.145), (0.5, 0.0595))},
+    "zero and a tail: .7 at 0": mix((0.7, 0.0), (0.3, exponential(1.0))),
+    "zero and a tail: .95 at 0": mix((0.95, 0.0), (0.05, exponential(2.0))),
+    "cut at the horizon: lognormal": mix((1.0, lognormal(0.4, 2.0))),
+    "cut at the horizon: 1/u": mix((1.0, lambda u: 0.2 / (1 - u))),
+    "exponential": mix((1.0, exponential(1.0))),
+    "normal": mix((1.0, normal(1.5, 0.4))),
+    "uniform": mix((1.0, lambda u: 2.0 * u)),
+}  # fmt: skip
+_GRID: Final = (np.arange(200_000) + 0.5) / 200_000
+
+
+def object_rows(rng: Generator, studies: int) -> Iterator[Row]:
+    """Means of times up to the horizon of the objects of one drive."""
+    for name, draw in OBJECTS.items():
+        truth = float(draw(_GRID).mean())
+        for K in CLUSTERS:
+            limits = limit_means(draw(rng.random((studies, K))), np.ones((studies, K)), (0.0, HORIZON_S))
+            yield Row("times, objects of one drive", name, "unknown_to_horizon_s", "objects", K, *limits, truth, 1e-4)
+
+
+# Logs: objects that are detected with the share of their log, after times about its median.
+
+
+class Logs(NamedTuple):
+    """Logs of a kind (…): which are bad, the share detected, the median time in seconds; σ of its logarithm."""
+
+    bad: Bool
+    share: Float
+    median_s: Float
+    sigma: float
+
+    def expected_s(self) -> Float:
+        """(…) the mean of min(time, horizon) of each log."""
+        far = (math.log(HORIZON_S) - np.log(self.median_s)) / self.sigma
+        until = self.median_s * math.exp(self.sigma**2 / 2) * ndtr(far - self.sigma) + HORIZON_S * ndtr(-far)
+        return self.share * until + (1 - self.share) * HORIZON_S
+
+
+def draw_logs(kind: str, rng: Generator, shape: tuple[int, ...]) -> Logs:
+    """Logs of a kind."""
+    bad, known, soon = rng.random(shape) < 0.1, np.ones(shape), np.full(shape, 1e-9)
+    if kind == "rare bad":
+        return Logs(bad, np.where(bad, 0.2, 0.97), np.where(bad, 4.0, 0.6), 0.5)
+    if kind == "all or nothing":
+        return Logs(bad, np.where(bad, 0.0, 1.0), soon, 0.1)
+    if kind == "zero and a tail":
+        late = np.where(rng.random(shape) < 0.6, soon, rng.exponential(1.0, shape))
+        return Logs(bad, 0.98 * known, late, 0.3)
+    if kind == "alike":
+        return Logs(bad, 0.97 * known, 0.6 * known, 0.5)
+    bad = rng.random(shape) < 0.3
+    if kind == "mild":
+        return Logs(bad, rng.beta(8.1, 0.9, shape), rng.gamma(5.0, 0.16, shape), 1.0)
+    if kind == "correlated by a half":
+        return Logs(bad, rng.beta(0.8, 0.2, shape), 0.5 * rng.lognormal(0.0, 1.0, shape), 0.6)
+    between, mean = map(float, kind.removeprefix("Beta ").split(" at "))
+    return Logs(bad, rng.beta(between * mean, between * (1 - mean), shape), soon, 0.1)
+
+
+KINDS: Final = (
+    "rare bad", "mild", "correlated by a half", "all or nothing", "zero and a tail", "alike",
+    *(f"Beta {between} at {mean}" for between in (2, 10, 40) for mean in (0.5, 0.9)),
+)  # fmt: skip
+SIZES: Final = ("5 each", "20 each", "unequal", "60 among 3")
+BUSY: Final = KINDS[:4]
+_FAR_APART: Final = ("rare bad", "correlated by a half", "all or nothing")
+
+
+_MANY: Final = 500_000
+"""Logs, or objects, of which a truth is the mean."""
+
+
+def draw_sizes(size: str, bad: Bool, rng: Generator) -> Int:
     """(S, K) objects of each log."""
-    if equal:
-        return np.full((studies, logs), objects)
-    return np.maximum(1, np.rint(objects * rng.lognormal(0.0, 1.0, (studies, logs)))).astype(np.int64)
+    if size == "unequal":
+        return np.maximum(1, np.rint(6 * rng.lognormal(0.0, 1.2, bad.shape))).astype(np.int64)
+    if size == "60 among 3":
+        return np.where(np.arange(bad.shape[1]) == rng.integers(bad.shape[1], size=(len(bad), 1)), 60, 3)
+    return np.where(bad, 25, 5) if size == "busy" else np.full(bad.shape, int(size.split()[0]))
 
 
 def sum_objects(values: Float, w: Int) -> Float:
@@ -79,228 +228,420 @@ def sum_objects(values: Float, w: Int) -> Float:
     return np.add.reduceat(values, np.append(0, np.cumsum(w.ravel())[:-1])).reshape(w.shape)
 
 
-# Shares.
+def log_rows(rng: Generator, studies: int) -> Iterator[Row]:
+    """Means of times and shares over logs."""
+    for kind, size in [*((k, s) for k in KINDS for s in SIZES), *((k, "busy") for k in BUSY)]:
+        many = draw_logs(kind, np.random.default_rng(5), (_MANY,))
+        weight = np.where(many.bad & (size == "busy"), 25.0, 5.0)
+        expected_s, share = (
+            (many_of @ weight / weight.sum(), many_of.mean()) for many_of in (many.expected_s(), many.share)
+        )
+        design = f"{kind}: {size}"
+        busy = ", bad logs that are busy" if size == "busy" else ""
+        apart = busy or (", logs far apart" if kind in _FAR_APART else ", logs")
+        for K in CLUSTERS:
+            logs = draw_logs(kind, rng, (studies, K))
+            w = draw_sizes(size, logs.bad, rng)
+            known = rng.random(int(w.sum())) < np.repeat(logs.share, w.ravel())
+            time_s = np.repeat(logs.median_s, w.ravel()) * np.exp(logs.sigma * rng.normal(size=len(known)))
+            unknown_s = sum_objects(np.where(known, np.minimum(time_s, HORIZON_S), HORIZON_S), w) / w
+            found = sum_objects(known.astype(float), w)
+            row = partial(Row, over="logs", clusters=K, hair=0.003)
+            limits = limit_means(unknown_s, w.astype(float), (0.0, HORIZON_S))
+            yield row(f"times{busy or ', logs'}", design, "unknown_to_horizon_s", low=limits[0], high=limits[1],
+                      truth=expected_s[0])  # fmt: skip
+            limits = limit_share(found, w, w.sum(axis=-1))
+            yield row(f"shares{apart}", design, "detected_share", low=limits[0], high=limits[1], truth=share[0])
+            for what, figure, values, most, truth in (
+                ("times", "unknown_to_horizon_s", unknown_s, HORIZON_S, expected_s[1]),
+                ("shares", "detected_share", found / w, 1.0, share[1]),
+            ):
+                low, high = limit_means(values, np.ones(w.shape), (0.0, most))
+                yield row(f"{what}, each drive once", design, figure, low=low, high=high, truth=truth)
 
 
-def _beta_share(mean: float, between: float) -> Design:
-    def study(rng: np.random.Generator, w: Int) -> Float:
-        p = rng.beta(between * mean, between * (1 - mean), w.shape)
-        return rng.binomial(w, p).astype(float)
-
-    return Design(f"Beta({between:g}) at {mean:g}", "share", mean, study, lambda logs: 0.93)
-
-
-def _bad_share(rng: np.random.Generator, w: Int) -> Float:
-    return rng.binomial(w, np.where(rng.random(w.shape) < 0.1, 0.2, 0.95)).astype(float)
-
-
-# Other figures.
-
-
-def _mean_of(
-    name: str, draw: Callable[[np.random.Generator, tuple[int, ...]], Float], gate: Callable[[int], float | None]
-) -> Design:
-    """Means of objects with a part of the log and their own; `draw`: a distribution of mean 0 and variance 1."""
-
-    def study(rng: np.random.Generator, w: Int) -> Float:
-        own = sum_objects(draw(rng, (int(w.sum()),)), w)
-        return math.sqrt(0.2) * w * draw(rng, w.shape) + math.sqrt(0.8) * own
-
-    return Design(name, "mean", 0.0, study, gate)
-
-
-def _seldom(name: str, draw: Callable[[np.random.Generator, tuple[int, ...]], Float]) -> Design:
-    """Means of objects that are otherwise in a tenth of the logs, normal about that."""
-
-    def study(rng: np.random.Generator, w: Int) -> Float:
-        return w * draw(rng, w.shape) + sum_objects(rng.normal(0.0, 1.0, int(w.sum())), w)
-
-    return Design(name, "mean", 0.0, study, lambda logs: None)
-
+# Figures without a bound: means of a part of the log and one of the object, correlated by .2 in a log, by Student's t.
 
 _E: Final = math.e
-DESIGNS: Final = (
-    *(_beta_share(mean, between) for between in (2, 10, 40) for mean in (0.5, 0.9)),
-    Design("one bad log in ten", "share", 0.1 * 0.2 + 0.9 * 0.95, _bad_share, lambda logs: 0.93 if logs <= 8 else 0.85),
-    _mean_of("normal", lambda rng, n: rng.normal(0.0, 1.0, n), lambda logs: 0.93),
-    _mean_of("uniform", lambda rng, n: rng.uniform(-math.sqrt(3), math.sqrt(3), n), lambda logs: 0.93),
-    _mean_of("exponential", lambda rng, n: rng.exponential(1.0, n) - 1.0, lambda logs: 0.90),
-    _mean_of(
-        "lognormal",
-        lambda rng, n: (rng.lognormal(0.0, 1.0, n) - math.sqrt(_E)) / math.sqrt(_E * (_E - 1)),
-        lambda logs: 0.85,
+UNBOUNDED: Final[Mapping[str, Callable[[Generator, Any], Float]]] = {
+    "normal": lambda rng, n: rng.normal(0.0, 1.0, n),
+    "uniform": lambda rng, n: rng.uniform(-math.sqrt(3), math.sqrt(3), n),
+    "exponential": lambda rng, n: rng.exponential(1.0, n) - 1.0,
+    "lognormal": lambda rng, n: (rng.lognormal(0.0, 1.0, n) - math.sqrt(_E)) / math.sqrt(_E * (_E - 1)),
+    "zero in nine logs of ten": lambda rng, n: np.where(rng.random(n) < 0.9, 0.0, rng.exponential(5.0, n)) - 0.5,
+    "one bad log in ten": lambda rng, n: np.where(rng.random(n) < 0.1, 5.0, 0.0) - 0.5,
+}
+
+
+def unbounded_rows(rng: Generator, studies: int) -> Iterator[Row]:
+    """Means that have no bound."""
+    for name, draw in UNBOUNDED.items():
+        seldom = "ten" in name  # a tenth of the logs is otherwise, normal about that
+        for size in ("1 each", "30 each", "unequal"):
+            for K in CLUSTERS:
+                w = draw_sizes(size, np.zeros((studies, K), dtype=bool), rng)
+                parts = (1.0, 1.0) if seldom else (math.sqrt(0.2), math.sqrt(0.8))
+                own = (rng.normal(0.0, 1.0, int(w.sum()))) if seldom else draw(rng, int(w.sum()))
+                values = parts[0] * draw(rng, w.shape) + parts[1] * sum_objects(own, w) / w
+                limits = limit_means(values, w.astype(float), None)
+                yield Row(f"other figures, {name}", f"{name}: {size}", "nees", "logs", K, *limits, 0.0)
+
+
+# Passes of one object, in several runs each.
+
+
+PASSES: Final = (5, 8, 20)
+
+
+def pass_rows(rng: Generator, studies: int) -> Iterator[Row]:
+    """Shares and means over passes; of passes of one day what other days would have; of one object with many."""
+    for share, P, runs, alike in product((0.9, 0.7), PASSES, (1, 20), (0.0, 0.3, 0.7, 1.0)):
+        shape, other = (studies, P), (1 - alike) / alike if 0 < alike < 1 else 0.0
+        q = np.full(shape, share) if alike == 0 else (rng.random(shape) < share) * 1.0
+        q = rng.beta(share * other, (1 - share) * other, shape) if other else q
+        found = rng.binomial(runs, q).astype(float)
+        name = f"passes of {runs} runs: {share:g}, correlated by {alike:g}"
+        rows = np.full(shape, float(runs))
+        limits = limit_share(found, rows, np.full(studies, P))
+        yield Row("shares, passes", name, "detected_share", "passes", P, *limits, share)
+        limits = limit_means(HORIZON_S * (1 - found / runs), rows, (0.0, HORIZON_S))
+        truth = HORIZON_S * (1 - share)
+        yield Row("times, passes", name, "unknown_to_horizon_s", "passes", P, *limits, truth)
+    for alike, P in product((0.1, 0.3, 0.5), PASSES):
+        day, own = rng.normal(size=(studies, 1)), rng.normal(size=(studies, P))
+        limits = limit_means(math.sqrt(alike) * day + math.sqrt(1 - alike) * own, np.ones((studies, P)), None)
+        line = "other figures, passes of one day for other days"
+        yield Row(line, f"one day: correlated by {alike:g}", "nees", "passes", P, *limits, 0.0)
+        for k in range(1, P):
+            own[:, k] = alike * own[:, k - 1] + math.sqrt(1 - alike**2) * own[:, k]
+        limits = limit_means(own, np.ones((studies, P)), None)
+        yield Row(line, f"one day: neighbours correlated by {alike:g}", "nees", "passes", P, *limits, 0.0)
+    for K in CLUSTERS:
+        rows = np.where(np.arange(K) == 0, 10.0, np.ones((studies, K)))
+        limits = limit_means(rng.normal(size=rows.shape) + rng.normal(size=rows.shape) / np.sqrt(rows), rows, None)
+        line = "other figures, one object with ten episodes"
+        yield Row(line, "one object with ten episodes", "nees", "objects", K, *limits, 0.0)
+
+
+# Differences of two configurations, pair by pair.
+
+
+def two_sides(lost: tuple[float, float], noise: float, shift: float, sigma: float) -> Callable[..., Float]:
+    """Differences of times: a common one, a share lost on either side, a shift of the first, noise on both."""
+
+    def draw(rng: Generator, shape: tuple[int, int]) -> Float:
+        common = 0.6 * np.exp(rng.normal(0, sigma, shape))
+        sides = [np.where(rng.random(shape) < share, HORIZON_S,
+                          np.minimum(common * np.exp(rng.normal(by, noise, shape)), HORIZON_S))
+                 for share, by in zip(lost, (shift, 0.0), strict=True)]  # fmt: skip
+        return sides[0] - sides[1]
+
+    return draw
+
+
+def lose(share: float, sign: float = 1.0) -> Callable[..., Float]:
+    return lambda rng, shape: sign * np.where(rng.random(shape) < share, HORIZON_S, 0.0)
+
+
+_LOSSES: Final = "one loses more"
+DIFFERENCES: Final[Mapping[str, Callable[..., Float]]] = {
+    "no difference: σ .4, .05 lost": two_sides((0.05, 0.05), 0.4, 0.0, 1.0),
+    "no difference: σ .1, .01 lost": two_sides((0.01, 0.01), 0.1, 0.0, 0.5),
+    "no difference: .05 lost": two_sides((0.05, 0.05), 0.0, 0.0, 0.5),
+    "no difference: σ .4": two_sides((0.0, 0.0), 0.4, 0.0, 1.0),
+    "later by 42 %: σ .4, .05 lost": two_sides((0.05, 0.05), 0.4, 0.35, 1.0),
+    f"{_LOSSES}: .03, σ .1": two_sides((0.03, 0.0), 0.1, 0.0, 0.5),
+    f"{_LOSSES}: .1, σ .4": two_sides((0.12, 0.02), 0.4, 0.0, 1.0),
+    **{f"{_LOSSES}: {q:g}, else equal": lose(q) for q in (0.02, 0.05, 0.1, 0.3)},
+    f"{_LOSSES}: .05 of the baseline": lose(0.05, -1.0),
+    f"{_LOSSES}: .02, else sooner": lambda rng, n: np.where(
+        rng.random(n) < 0.02, HORIZON_S - 0.6, rng.normal(-0.1, 0.05, n)
     ),
-    _seldom("zero-inflated", lambda rng, n: np.where(rng.random(n) < 0.9, 0.0, rng.exponential(5.0, n)) - 0.5),
-    _seldom("one bad log in ten", lambda rng, n: np.where(rng.random(n) < 0.1, 5.0, 0.0) - 0.5),
+}
+
+
+def difference_rows(rng: Generator, studies: int) -> Iterator[Row]:
+    """Differences: their intervals, by Student's t; and criteria, that are met by limits between bounds."""
+    for name, draw in DIFFERENCES.items():
+        same = name.startswith("no difference")
+        truth = 0.0 if same else float(np.mean([draw(np.random.default_rng(k), (1, 400_000)).mean() for k in range(8)]))
+        for K in CLUSTERS:
+            values, ones = draw(rng, (studies, K)), np.ones((studies, K))
+            low, high = limit_means(values, ones, None)
+            _, most = limit_means(values, ones, (-HORIZON_S, HORIZON_S))
+            alike = np.ptp(values, axis=1) <= _ROUNDING  # no interval, and not met beyond the value itself
+            row = partial(Row, design=name, over="objects", clusters=K, truth=truth, hair=0.003)
+            given = [np.where(alike, np.nan, of) for of in (low, high)]
+            line = f"differences, {_LOSSES}" if name.startswith(_LOSSES) else "differences"
+            yield row(line, figure="difference", low=given[0], high=given[1])
+            yield row("differences, at_most", figure="difference, at_most", low=low, high=most)
+
+
+# Rows that are followed until the object leaves or the log ends, through the figures of criteria.
+
+
+class Traffic(NamedTuple):
+    """Rows (n,) of a study, with their logs or objects: times to detection, until departure, until the log ends."""
+
+    cluster: Int
+    time_s: Float
+    leaves_s: Float
+    ends_s: Float
+
+
+def _objects(never: float, time: Callable[[Generator, int], Float], leaves: Any, ends: Any) -> Callable[..., Traffic]:
+    def draw(rng: Generator, n: int) -> Traffic:
+        time_s = np.where(rng.random(n) < never, np.inf, time(rng, n))
+        return Traffic(np.arange(n), time_s, leaves(rng, n), ends(rng, n))
+
+    return draw
+
+
+def _uniform(low: float, high: float) -> Callable[[Generator, int], Float]:
+    return lambda rng, n: rng.uniform(low, high, n)
+
+
+def _about(median: float, sigma: float) -> Callable[[Generator, int], Float]:
+    return lambda rng, n: median * rng.lognormal(0.0, sigma, n)
+
+
+def _exponential(mean: float) -> Callable[[Generator, int], Float]:
+    return lambda rng, n: rng.exponential(mean, n)
+
+
+_LEAVES, _ENDS = _uniform(1, 14), _uniform(2, 16)
+FOLLOWED_OBJECTS: Final[Mapping[str, Callable[..., Traffic]]] = {
+    "followed: σ 1, .145 never": _objects(0.145, _about(0.6, math.hypot(1, 0.4)), _LEAVES, _ENDS),
+    "followed: σ .5, .06 never": _objects(0.0595, _about(0.6, math.hypot(0.5, 0.4)), _LEAVES, _ENDS),
+    "followed: .1 never, censored early": _objects(0.1, _uniform(0.1, 0.1), _uniform(1, 30), _uniform(0.2, 8)),
+    "followed: exponential, half censored": _objects(0.0, _exponential(1.5), _uniform(2, 20), _exponential(1.5)),
+    "followed: exponential, a quarter censored": _objects(0.0, _exponential(1.5), _uniform(2, 20), _exponential(4.5)),
+    "followed: short and long": _objects(
+        0.1, _about(0.5, 0.5),
+        lambda rng, n: np.where(rng.random(n) < 0.1, rng.uniform(20, 60, n), rng.uniform(1, 6, n)), _uniform(99, 99)),
+    "followed: zero and a tail": _objects(
+        0.03, lambda rng, n: np.where(rng.random(n) < 0.7, 0.0, rng.exponential(1.0, n)), _LEAVES, _ENDS),
+    "followed: .02 never, long": _objects(0.02, _about(0.4, 0.4), _about(5.0, 0.8), _uniform(300, 300)),
+}  # fmt: skip
+
+
+def _of_logs(kind: str, size: str, ends: Callable[[Generator, int], Float]) -> Callable[..., Traffic]:
+    def draw(rng: Generator, K: int) -> Traffic:
+        logs = draw_logs(kind, rng, (1, K))
+        w = draw_sizes(size, logs.bad, rng)[0]
+        log = np.repeat(np.arange(K), w)
+        time_s = logs.median_s[0, log] * rng.lognormal(0.0, logs.sigma, len(log))
+        time_s = np.where(rng.random(len(log)) > logs.share[0, log], np.inf, time_s)
+        return Traffic(log, time_s, _LEAVES(rng, len(log)), ends(rng, len(log)))
+
+    return draw
+
+
+_HALF: Final = _exponential(4.0)
+FOLLOWED_LOGS: Final[Mapping[str, Callable[..., Traffic]]] = {
+    f"followed logs: {kind}, {size}{', half censored' if ends is _HALF else ''}": _of_logs(kind, size, ends)
+    for kind, size, ends in (
+        ("mild", "5 each", _ENDS), ("mild", "unequal", _HALF), ("rare bad", "5 each", _ENDS),
+        ("rare bad", "unequal", _HALF), ("correlated by a half", "unequal", _ENDS),
+        ("zero and a tail", "unequal", _HALF),
+    )
+}  # fmt: skip
+FOLLOWED: Final = ("ttd_rmst_s", "unknown_s", "unknown_to_horizon_s", "detected_share")
+
+
+def rows_of(traffic: Traffic) -> pd.DataFrame:
+    """The rows of a study as the tally has them; objects are detected at tenths of a second."""
+    time_s, leaves_s, ends_s = np.round(traffic.time_s, 1), traffic.leaves_s, traffic.ends_s
+    ended_s = np.minimum(leaves_s, ends_s)
+    return pd.DataFrame({
+        "onset_s": 0.0, "ended_s": ended_s, "ended_by": np.where(leaves_s <= ends_s, "object_left", "log_end"),
+        "time_to_detection_s": np.where(time_s <= ended_s, time_s, np.nan),
+    })  # fmt: skip
+
+
+def true_figures(table: pd.DataFrame, time_s: Float, leaves_s: Float) -> dict[str, float]:
+    """The figures of very many rows. Of `ttd_rmst_s` as if none were censored: what is censored fares like the rest."""
+    known = table["time_to_detection_s"].notna().to_numpy()
+    unknown_s = np.where(known, table["time_to_detection_s"], table["ended_s"]).astype(float)
+    time_s = np.round(time_s, 1)
+    means = {
+        "ttd_rmst_s": np.minimum(np.where(time_s <= leaves_s, time_s, np.inf), HORIZON_S),
+        "unknown_s": unknown_s,
+        "unknown_to_horizon_s": np.minimum(unknown_s, HORIZON_S),
+        "detected_share": known,
+    }
+    return {name: float(of.mean()) for name, of in means.items()}
+
+
+def followed_rows(rng: Generator, studies: int) -> Iterator[Row]:
+    """Figures of rows that are followed, over objects and over logs."""
+    named = [*((of, "objects") for of in FOLLOWED_OBJECTS.items()), *((of, "logs") for of in FOLLOWED_LOGS.items())]
+    for (name, draw), over in named:
+        many = draw(np.random.default_rng(5), 4 * _MANY if over == "objects" else _MANY)
+        truth = true_figures(rows_of(many), many.time_s, many.leaves_s)
+        for K in [K for K in CLUSTERS if K not in ((3, 4, 13) if over == "objects" else (5, 13))]:
+            limits = np.full((len(FOLLOWED), 2, studies), np.nan)
+            for k in range(studies):
+                traffic = draw(rng, K)
+                table = rows_of(traffic)
+                clusters = Clusters(over, traffic.cluster, np.arange(len(table)))
+                rows = FigureRows(table, np.ones(len(table)), clusters)
+                for j, figure in enumerate(FOLLOWED):
+                    found = JUDGED[figure].limit(rows, HORIZON_S, 0.95, math.nan)
+                    limits[j, :, k] = found.low, found.high
+            for j, figure in enumerate(FOLLOWED):
+                line = f"{'shares' if figure == 'detected_share' else 'times'}, followed {over}"
+                yield Row(line, name, figure, over, K, limits[j, 0], limits[j, 1], truth[figure], 0.005)
+
+
+# Stars of tables of four configurations against a baseline, truly alike.
+
+METRICS: Final = 8
+"""Metrics of a table; of the last there are no limits."""
+NULLS: Final = (
+    ("mild", "5 each"),
+    ("rare bad", "unequal"),
+    ("correlated by a half", "busy"),
+    ("zero and a tail", "unequal"),
 )
-RMST: Final = "censored RMST"
-HORIZON_S: Final = 3.0
+Cell = tuple[Float, Float, Float]
 
 
-def mean_limits(sums: Float, w: Int) -> tuple[Float, Float, Float]:
-    """The mean of each study (S,), without each log (S, K), and its limits: (mean, low, high)."""
-    total, n = sums.sum(axis=-1, keepdims=True), w.sum(axis=-1, keepdims=True)
-    mean = (total / n)[..., 0]
-    low, high = limit_figure(mean, (total - sums) / (n - w), w.astype(float))
-    return mean, low, high
+def draw_table(kind: str, size: str, rng: Generator, shape: tuple[int, int]) -> list[list[Cell]]:
+    """By configuration and metric: differences (S,), without each log (S, K), and weights."""
+    logs = draw_logs(kind, rng, shape)
+    w = draw_sizes(size, logs.bad, rng)
+    of, frames = np.repeat(np.arange(w.size), w.ravel()), rng.integers(80, 200, shape).astype(float)
+    common = logs.median_s.ravel()[of] * rng.lognormal(0.0, logs.sigma, len(of))
+    never, end_s = rng.random(len(of)) > logs.share.ravel()[of], np.minimum(_LEAVES(rng, len(of)), _ENDS(rng, len(of)))
+    hard, sides = rng.lognormal(0.0, 0.5, shape), []
+    for _ in range(5):
+        lost = never | (rng.random(len(of)) < 0.05)
+        time_s = np.where(lost, np.inf, np.round(common * rng.lognormal(0.0, 0.4, len(of)), 1))
+        square = rng.gamma(1.0, 0.5, len(of)) * hard.ravel()[of]
+        ghosts = rng.poisson(frames / 100 * hard).astype(float)
+        sides.append((time_s, time_s <= end_s, square, 2 * frames * hard * rng.gamma(20.0, 0.05, shape), ghosts))
+    return [_cells(side, sides[0], end_s, w, frames) for side in sides[1:]]
 
 
-def difference_limits(sums: Float, w: Int) -> tuple[Float, Float]:
-    """The interval of a mean difference of each study."""
-    difference, low, high = mean_limits(sums, w)
-    for k in np.flatnonzero(np.ptp(sums / w, axis=-1) <= _SAME):
-        low[k], high[k] = alike_limits(float(difference[k]), w[k])
-    return low, high
+def _cells(side: Any, baseline: Any, end_s: Float, w: Int, frames: Float) -> list[Cell]:
+    both, size = side[1] & baseline[1], w.astype(float)
+    known = sum_objects(both.astype(float), w)
+    columns: list[tuple[Float, Float, Float]] = []  # sums of either side, and what they average over
+    for values, n in (
+        (lambda of: of[1].astype(float), size),
+        (lambda of: np.minimum(of[0], HORIZON_S), size),
+        (lambda of: np.where(of[1], of[0], end_s), size),
+        (lambda of: np.where(both, of[0], 0.0), known),
+        (lambda of: of[2], size),
+    ):
+        columns.append((*(sum_objects(values(of), w) for of in (side, baseline)), n))
+    columns += [(side[k], baseline[k], frames) for k in (3, 4)]
+    return [_leave_out(*column, root=k in (4, 5)) for k, column in enumerate(columns)]
 
 
-def wrong_verdicts(low: Float, high: Float, truth: float) -> float:
-    """How often a criterion whose bound is the truth is met, or how often not met; the larger of both."""
-    limits = zip(low.tolist(), high.tolist(), strict=True)
-    words = [judge_limits(*one, truth, "at_most") for one in limits]
-    return max(words.count(MET), words.count(NOT_MET)) / len(words)
+def _leave_out(first: Float, second: Float, n: Float, *, root: bool) -> Cell:
+    """A difference of means, or of their roots: of all logs, without each, and weights."""
+
+    def figure(sums: Float, over: Float) -> Float:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.sqrt(np.maximum(sums, 0.0) / over) if root else sums / over
+
+    total, rest = (of.sum(axis=-1, keepdims=True) for of in (first, n))
+    value = figure(total, rest) - figure(second.sum(axis=-1, keepdims=True), rest)
+    without = figure(total - first, rest - n) - figure(second.sum(axis=-1, keepdims=True) - second, rest - n)
+    return value[..., 0], without, n
 
 
-def draw_times(rng: np.random.Generator, w: Int) -> tuple[Float, Int, Int]:
-    """Times to detection of all objects of one study, how they end, and their logs; `w (K,)`."""
-    log = np.repeat(np.arange(len(w)), w)
-    time_s = rng.exponential(1.0, len(log)) * rng.gamma(5.0, 0.2, len(w))[log]
-    ended_s = rng.uniform(0.3, 5.0, len(log))
-    ending = np.where(time_s <= ended_s, DETECTED, CENSORED)
-    return np.round(np.minimum(time_s, ended_s), 9), ending, log
+def star_shares(rng: Generator, kind: str, size: str, K: int, tables: int) -> tuple[float, list[float], float]:
+    """Shares of tables with a false star: held over the table, of each named metric, and by intervals alone."""
+    cells = draw_table(kind, size, rng, (tables, K))
+    alone = np.zeros((len(cells), METRICS, tables), dtype=bool)
+    for c, row in enumerate(cells):
+        for m, (value, without, weights) in enumerate(row):
+            given = np.isfinite(without).all(axis=-1) & (weights > 0).all(axis=-1)
+            given &= np.abs(without - value[..., None]).max(axis=-1) > _ROUNDING
+            if given.any():
+                low, high = limit_figure(value[given], without[given], weights[given])
+                alone[c, m, given] = (low > _ROUNDING) | (high < -_ROUNDING)
+
+    def limit(c: int, m: int, k: int, confidence: float) -> Mapping[str, object]:
+        value, without, weights = cells[c][m]
+        found = limit_left_out(float(value[k]), without[k], weights[k], confidence=confidence)
+        return {"low": found.low, "high": found.high}
+
+    starred, named = np.zeros(tables, dtype=bool), np.zeros((METRICS - 1, tables), dtype=bool)
+    for k in np.flatnonzero(alone.any(axis=(0, 1))):
+        may = np.argwhere(alone[:, :, k])
+        starred[k] = bool(find_stars(4 * METRICS, [partial(limit, c, m, k) for c, m in may]))
+        for of in range(METRICS - 1):
+            named[of, k] = bool(find_stars(4, [partial(limit, c, m, k) for c, m in may if m == of]))
+    return float(starred.mean()), named.mean(axis=1).tolist(), float(alone.any(axis=(0, 1)).mean())
 
 
-def true_rmst_s() -> float:
-    """The mean of min(T, h), E[m(1 − e^(−h/m))], by the midpoint rule over quantiles of the logs' mean times m."""
-    from scipy.special import gammaincinv
-
-    mean_s = 0.2 * gammaincinv(5.0, (np.arange(200_000) + 0.5) / 200_000)
-    return float((mean_s * -np.expm1(-HORIZON_S / mean_s)).mean())
-
-
-def rmst_of(times: tuple[Float, Int, Int], logs: int) -> tuple[float, Float]:
-    """The restricted mean of a study, and without each log."""
-    time_s, ending, log = times
-    weight = np.ones(len(time_s))
-    value = restricted_mean(*cumulative_incidence(time_s, ending, weight), HORIZON_S)
-    return value, restricted_means_without(time_s, ending, weight, log, logs, HORIZON_S)
+def star_table(seed: int, tables: int) -> pd.DataFrame:
+    """A row per design and number of logs: how many of the tables have a false star."""
+    rows = []
+    for number, (kind, size) in enumerate(NULLS):
+        for K in (3, 4, 8, 20):
+            whole, named, alone = star_shares(np.random.default_rng([seed, 90 + number, K]), kind, size, K, tables)
+            fails = max(whole, *named) > STARRED + allowance(STARRED, tables)
+            rows.append({
+                "design": f"{kind}: {size}", "logs": K, "tables": tables, "by intervals alone": alone,
+                "over the table": whole, "one named metric, most": max(named), "fails": fails,
+            })  # fmt: skip
+    return pd.DataFrame(rows)
 
 
-def rmst_row(rng: np.random.Generator, w: Int) -> tuple[tuple[Float, Float], tuple[Float, Float]]:
-    """Limits (S,) of restricted means of studies, and those of differences."""
-    studies, logs = w.shape
-    value, without, followed = np.empty((2, studies)), np.empty((2, studies, logs)), np.empty(studies)
-    for k in range(studies):
-        for side in (0, 1):
-            times = draw_times(rng, w[k])
-            value[side, k], without[side, k] = rmst_of(times, logs)
-            if side == 0:  # at least one row is: else there is no interval, and no study of one
-                followed[k] = max(((times[1] == DETECTED) | (times[0] >= HORIZON_S)).mean(), 1 / len(times[0]))
-    weights = w.astype(float)
-    limits = limit_bounded_mean(value[0], without[0], weights, (0.0, HORIZON_S), followed)
-    return limits, limit_figure(value[0] - value[1], without[0] - without[1], weights, (-HORIZON_S, HORIZON_S))
+PARTS: Final[tuple[Callable[[Generator, int], Iterator[Row]], ...]] = (
+    object_rows, log_rows, unbounded_rows, pass_rows, difference_rows, followed_rows,
+)  # fmt: skip
 
 
-MOST_WRONG: Final = 0.035
-"""Most verdicts that are wrong at the bound, beside three standard errors, in rows that are held to it."""
+def coverage(studies: int, seed: int) -> pd.DataFrame:
+    """The table: a row per design, figure and number of clusters."""
+    guide = GUIDE.read_text(encoding="utf-8")
+    rows = []
+    for number, part in enumerate(PARTS):
+        few = max(studies // 4, 1) if part is followed_rows else studies
+        rows += [row.tell(guide) for row in part(np.random.default_rng([seed, number]), few)]
+    return pd.DataFrame(rows)
 
 
-def describe_row(
-    limits: tuple[Float, Float],
-    of_difference: tuple[Float, Float],
-    truth: float,
-    gate: float | None,
-    *,
-    judged: bool,
-    symmetric: bool,
-) -> dict[str, object]:
-    """Coverage, width, false `*` and wrong verdicts of a row of the table, its gate, and whether it fails.
-
-    `judged`: verdicts of the figure are held to `MOST_WRONG`; `symmetric`: those of the difference are.
-    """
-    (low, high), (least_of, most_of) = limits, of_difference
-    star = float(((least_of > _SAME) | (most_of < -_SAME)).mean())
-    wrong, wrong_difference = wrong_verdicts(low, high, truth), wrong_verdicts(least_of, most_of, 0.0)
-    most = MOST_WRONG + 3 * math.sqrt(MOST_WRONG * (1 - MOST_WRONG) / len(low))
-    held = float(((low <= truth + _SAME) & (truth - _SAME <= high)).mean())
-    least = None if gate is None else gate - 2 * math.sqrt(gate * (1 - gate) / len(low))
-    return {
-        "coverage": held,
-        "width": float((high - low).mean()),
-        "false *": star,
-        "wrong": wrong,
-        "wrong, difference": wrong_difference,
-        "gate": gate,
-        "fails": (least is not None and held < least)
-        or (judged and wrong > most)
-        or (symmetric and wrong_difference > most),
-    }
-
-
-def row_of(design: Design, rng: np.random.Generator, w: Int) -> dict[str, object]:
-    """A row of the table, of studies whose logs have `w (S, K)` objects."""
-    sums, others = design.study(rng, w), design.study(rng, w)
-    limits = limit_share(sums, w, w.sum(axis=-1)) if design.kind == "share" else mean_limits(sums, w)[1:]
-    beta, symmetric = design.name.startswith("Beta"), design.name in ("normal", "uniform")
-    return describe_row(
-        limits, difference_limits(sums - others, w), design.truth, design.gate(w.shape[1]),
-        judged=beta, symmetric=beta or symmetric,
-    )  # fmt: skip
-
-
-def table_rows(logs: Sequence[int], objects: Sequence[int], studies: int, seed: int) -> Iterator[dict[str, object]]:
-    """A row per design, number of logs and of objects, equal and unequal; random numbers by the row alone."""
-    rmst_s = true_rmst_s()
-    for number, name in enumerate([*range(len(DESIGNS)), RMST]):
-        for equal in (True, False):
-            for size in objects:
-                for K in logs:
-                    rng = np.random.default_rng([seed, number, equal, size, K])
-                    w = draw_sizes(rng, studies, K, size, equal=equal)
-                    row = {"kind": "mean", "design": RMST, "objects": size, "sizes": "equal" if equal else "unequal"}
-                    if name == RMST:
-                        found = describe_row(*rmst_row(rng, w), rmst_s, 0.93, judged=True, symmetric=False)
-                    else:
-                        design = DESIGNS[number]
-                        row |= {"kind": design.kind, "design": design.name}
-                        found = row_of(design, rng, w)
-                    yield row | {"logs": K} | found
-
-
-def coverage(
-    logs: Sequence[int] = LOGS, objects: Sequence[int] = OBJECTS, studies: int = 2000, seed: int = 1
-) -> pd.DataFrame:
-    """The table: a row per design, number of logs and of objects, equal and unequal."""
-    return pd.DataFrame(list(table_rows(logs, objects, studies, seed)))
-
-
-def worst(table: pd.DataFrame) -> pd.DataFrame:
-    """By design and number of logs: least coverage, mean width and most false `*` of all numbers of objects."""
-    of = table.groupby(["kind", "design", "logs"], sort=False)
-    columns = {
-        "coverage, least": of["coverage"].min(),
-        "width, mean": of["width"].mean(),
-        "false *, most": of["false *"].max(),
-        "wrong, most": of["wrong"].max(),
-        "wrong, difference, most": of["wrong, difference"].max(),
-    }
-    return pd.DataFrame(columns).reset_index()
+def sum_up(table: pd.DataFrame) -> list[str]:
+    """The lines of the guide's table: of each number of clusters the least coverage, and the median of the widths."""
+    kinds = list(dict.fromkeys(table["line"].str.partition(",")[0]))
+    lines = sorted(table["line"].unique(), key=lambda line: kinds.index(line.partition(",")[0]))
+    clusters = [str(K) for K in CLUSTERS]
+    printed = [["held · width", *clusters, "wrongly met"], ["---"] * (len(CLUSTERS) + 2)]
+    for line in lines:
+        rows = table[table["line"] == line]
+        cells = [f"**{line}**" if (rows["named"] != "").any() else line]
+        for K in CLUSTERS:
+            of = rows[rows["clusters"] == K]
+            held = "– · " if "at_most" in line else f"{(of['held'] / of['of']).min():.3f} · ".lstrip("0")
+            cells.append(f"{held}{of['median width'].median():.2g}" if len(of) else "")
+        wrong = "" if (rows["figure"] == "difference").all() else f"{rows['wrongly met'].max():.3f}".lstrip("0")
+        printed.append([*cells, wrong])
+    return [f"| {' | '.join(cells)} |" for cells in printed]
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description="Coverage, width and false * of intervals over logs.")
+    parser = argparse.ArgumentParser(description="Coverage, width, wrong verdicts and false * of intervals.")
     parser.add_argument("--studies", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--logs", type=int, nargs="+", default=list(LOGS))
-    parser.add_argument("--objects", type=int, nargs="+", default=list(OBJECTS))
+    parser.add_argument("--csv", action="store_true", help="every row, as CSV")
     asked = parser.parse_args()
-    table = coverage(asked.logs, asked.objects, asked.studies, asked.seed)
-    print(format_table(table.drop(columns="fails").round(3)))
-    print("\nOver all numbers of objects:")
-    print(format_table(worst(table).round(3)))
-    failing = table[table["fails"]]
-    print(f"\n{len(failing)} of {len(table)} rows are beyond a gate")
+    table, stars = coverage(asked.studies, asked.seed), star_table(asked.seed, asked.studies)
+    if asked.csv:
+        for of in (table.drop(columns="line"), stars):
+            print(of.drop(columns="fails").to_csv(index=False, float_format="%.4g"))
+    else:
+        print(*sum_up(table), "", format_table(stars.drop(columns="fails").round(3)), sep="\n")
+    failing = pd.concat([table[table["fails"]], stars[stars["fails"]]])
+    print(f"{len(failing)} of {len(table) + len(stars)} rows are beyond a gate and not named", file=sys.stderr)
     if len(failing):
-        print(format_table(failing.drop(columns="fails").round(3)))
+        print(failing.drop(columns="fails").to_csv(index=False, float_format="%.4g"), file=sys.stderr)
     return 1 if len(failing) else 0
 
 

@@ -129,7 +129,7 @@ def check(
 
     replays, warnings = prepare_study(study)
     counted = [count_counted(one.episodes.count_began(), study.experiment.measure.began) for one in replays]
-    undecided = note_undecidable(study.experiment.criteria, counted)
+    undecided = note_undecidable(study.experiment.criteria, counted, study.experiment.measure)
     print_first_notes(list_notes(study.recordings, replays, study.experiment, replayed=False))
     print_notes([*warnings, *undecided])
     for line in list_began(replays, study.experiment):

@@ -16,8 +16,9 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 from copem_replay.core.components import Frozen, Id, Number
 from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import CLASS_GROUPS, TRUTH
-from copem_replay.metrics.config import parse_slices
-from copem_replay.metrics.limits import CONFIDENCE, TRAFFIC, choose_over, explain_no_clusters
+from copem_replay.metrics.config import Measure, Weigh, parse_slices
+from copem_replay.metrics.limits import CONFIDENCE, DRIVES, TRAFFIC, choose_over, explain_no_clusters
+from copem_replay.metrics.needed import Known, count_at_best, find_enough_horizon
 from copem_replay.perception.pem.condition import ClassNames
 
 BEFORE = "before"
@@ -61,7 +62,8 @@ class Criterion(Frozen):
     configuration, pair by pair: of the same results, or `NAME@before` of those given by `--before`, where `before`
     alone is the same name. `population`: whether it is asked of all such traffic, or of the runs of these logs.
     `passes_when`: it is `shown` (by default of a bound), or `not_refuted` (by default of a difference). `if_absent`:
-    what becomes of it where nothing is measured.
+    what becomes of it where nothing is measured. `weigh`: what counts alike in the metric, every object or every drive;
+    None: as `measure.weigh`.
     """
 
     metric: Annotated[str, Field(min_length=1)]
@@ -77,6 +79,7 @@ class Criterion(Frozen):
     confidence: Annotated[float, Field(strict=True, ge=0.5, le=0.9999)] = CONFIDENCE
     passes_when: Literal["shown", "not_refuted"] | None = None
     if_absent: Literal["fail", "pass"] = "fail"
+    weigh: Weigh | None = Field(default=None, exclude_if=lambda weigh: weigh is None)
 
     @field_validator("each")
     @classmethod
@@ -158,15 +161,40 @@ def parse_fail_on(conditions: Sequence[str], against: str, names: Sequence[str] 
     return criteria
 
 
-def note_undecidable(criteria: Mapping[str, Criterion], counted: Sequence[int]) -> Iterator[str]:
-    """A note on criteria that no number of runs decides. `counted`: by log how many episodes count."""
+def note_undecidable(criteria: Mapping[str, Criterion], counted: Sequence[int], measure: Measure) -> Iterator[str]:
+    """Notes on criteria that no number of runs decides, or that so few cannot meet.
+
+    `counted`: by log how many episodes count.
+    """
     asked = [name for name, one in criteria.items() if not one.of_runs]
     logs = sum(number > 0 for number in counted)
-    if asked and choose_over(logs, sum(counted), 1) not in TRAFFIC:
+    over = choose_over(logs, sum(counted), 1)
+    if over in TRAFFIC:
+        for name in asked:
+            once = over == "logs" and (criteria[name].weigh or measure.weigh) == DRIVES
+            clusters = logs if over == "logs" else sum(counted)
+            known = Known(over, clusters, clusters if once else sum(counted))
+            if (line := _note_too_few(name, criteria[name], known, measure.horizon_s)) is not None:
+                yield line
+    elif asked:
         yield (
             f"criteria {', '.join(asked)}: such traffic is not measured by {explain_no_clusters(logs, sum(counted))}, "
             "whatever the runs; `population: these_logs` asks about these recordings"
         )
+
+
+def _note_too_few(name: str, criterion: Criterion, known: Known, horizon_s: float) -> str | None:
+    """A note on a criterion that so few cannot show to be met, as good as they may be; None: they can."""
+    if criterion.against is not None:
+        return None
+    metric, bound = criterion.metric, criterion.bound
+    needed = count_at_best(metric, criterion.direction, bound, horizon_s, known, criterion.confidence)
+    if needed is None:
+        return None
+    asked = f"{metric} ≤ {bound:g}" if criterion.direction == "at_most" else f"{metric} ≥ {bound:g}"
+    line = f"criteria {name}: {known.clusters} {known.over} cannot show {asked}, however good; at least {needed} can"
+    shorter_s = find_enough_horizon(metric, bound, known, criterion.confidence)
+    return line if shorter_s is None else f"{line}, or a horizon_s of {shorter_s:.2g}"
 
 
 def choose_judged(criterion: Criterion, configurations: Mapping[str, Any]) -> list[str]:

@@ -419,6 +419,11 @@ def check_criteria(source: ExperimentSource, study: Mapping[str, Any]) -> Iterat
         metric, against = criterion.get("metric"), criterion.get("against")
         if isinstance(metric, str) and (problem := _find_metric_problem(metric, against is not None, study)):
             yield source.at((*key, "metric"), problem)
+        if criterion.get("weigh") is not None and metric not in JUDGED and not (against and _is_of_rows(metric)):
+            message = (
+                f"expected `weigh` with a metric of detections, found {metric}, which is over pairs, lists or minutes"
+            )
+            yield source.at((*key, "weigh"), message)
         named = criterion.get("configurations")
         for k, one in enumerate(named if isinstance(named, list | tuple) else ()):
             if isinstance(one, str | int) and str(one) not in known:
@@ -429,6 +434,11 @@ def check_criteria(source: ExperimentSource, study: Mapping[str, Any]) -> Iterat
             if where != BEFORE or (other and "@" not in str(against)):
                 hint = f"; of the results given by --before: {against}@{BEFORE}, or {BEFORE} for the same name"
                 yield source.at((*key, "against"), _unknown_configuration(against, known) + hint)
+
+
+def _is_of_rows(metric: object) -> bool:
+    """Whether a compared metric is of rows of detections."""
+    return metric in COMPARED and COMPARED[str(metric)].part != "lists"
 
 
 def _check_group(source: ExperimentSource, key: Key, by: object) -> Iterator[str]:

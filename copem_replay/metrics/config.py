@@ -17,6 +17,7 @@ from copem_replay.core.components import Flag, Frozen, Id, NotNegative, Positive
 from copem_replay.core.errors import unknown_name_message
 from copem_replay.core.tracks import Bool, Float
 from copem_replay.metrics.braking.driver import DRIVERS, Driver
+from copem_replay.metrics.limits import OBJECTS
 from copem_replay.metrics.metric import RowMetric
 from copem_replay.metrics.onset import BEGAN, ONSETS, Began, InRange, Onset, Requires
 from copem_replay.perception.config import InPlane, OnEarthPolygon, PerceptionSetup, check_polygon
@@ -309,6 +310,10 @@ def _check_entry(value: object) -> object:
 SliceEntry = Annotated[str | tuple[str, ...], BeforeValidator(_check_entry)]
 
 
+Weigh = Literal["objects", "drives"]
+"""What counts alike in figures of rows."""
+
+
 class Measure(Frozen):
     """What is measured, and from which onset. `began`: which episodes count for times, shares and distances at
     detection, by how they began; everything else is measured of all. `accuracy`: also how far off the fused lists are.
@@ -316,6 +321,7 @@ class Measure(Frozen):
     `annotated`: the area in which entries at no true object are ghosts, by default everywhere. `metrics`: your own
     columns of the summary. `by`: what the summary is sliced by, once more for each entry: `log`, `class`, `began`,
     `range_at_onset` (`range_at_onset:20:40`: by edges of your own, in metres), `area`, `tags.NAME`; a list is a cross.
+    `weigh`: what counts alike in shares, times and distances of detection: every object, or every drive.
 
     >>> measure = cr.Measure(objects={"classes": ["vru"]}, onset={"kind": "in_range", "range_m": 30.0})
     >>> measure.onset.range_m, measure.confirm.hits
@@ -337,6 +343,7 @@ class Measure(Frozen):
     annotated: AnnotatedArea | None = Field(default=None, exclude_if=_is_none)
     metrics: Annotated[tuple[Annotated[RowMetric, Slot("metric", {})], ...], Field(exclude_if=operator.not_)] = ()
     by: Annotated[tuple[SliceEntry, ...], Field(exclude_if=operator.not_)] = ()
+    weigh: Annotated[Weigh, Field(exclude_if=lambda weigh: weigh == OBJECTS)] = "objects"
 
     @model_validator(mode="after")
     def _sliced(self) -> Self:

@@ -32,6 +32,8 @@ from copem_replay.core.tracks import Bool, Float, Int
 if TYPE_CHECKING:
     import pandas as pd
 
+OBJECTS, DRIVES = "objects", "drives"
+"""What weighs alike in figures of rows: every row; or every drive, however many objects it has."""
 FEWEST_LOGS = 3
 """From so many logs on intervals are over logs."""
 FEWEST_CLUSTERS = 5
@@ -46,17 +48,16 @@ _ROUNDING = 1e-9
 
 # What an interval is over.
 
-_TELLS = {
-    "logs": "how far other drives of this kind may differ",
-    "objects": "how far other objects of this drive may differ; nothing about other drives",
-    "passes": "how far other passes of this object may differ; nothing about other objects or days",
-    "runs": "how far other draws of the same models may differ for this one object; nothing about other traffic",
-}
 CLUSTERS = {
-    "logs": ("log", ""), "objects": ("object", " of this drive"), "passes": ("pass", " of this one object"),
-    "runs": ("run", " of this one object"),
+    "logs": ("log", "", "how far other drives of this kind may differ"),
+    "objects": ("object", " of this drive",
+                "how far other objects of this drive may differ; nothing about other drives"),
+    "passes": ("pass", " of this one object",
+               "how far other passes of this object may differ; nothing about other objects or days"),
+    "runs": ("run", " of this one object",
+             "how far other draws of the same models may differ for this one object; nothing about other traffic"),
 }  # fmt: skip
-"""Words for what intervals are over: of one, and whose."""
+"""Words for what intervals are over: of one, whose, and what they tell."""
 TRAFFIC = ("logs", "objects", "passes")
 """What intervals that tell of more than other draws are over."""
 
@@ -86,12 +87,14 @@ def count_clusters(table: pd.DataFrame) -> tuple[int, int, int]:
 class Clusters:
     """What an interval of rows (n,) is over: the `number` of each row's cluster, 0 … K − 1, and the `unit` it is about.
 
-    A unit is an object of a log; a pass, where clusters are passes or runs.
+    A unit is an object of a log; a pass, where clusters are passes or runs. `once`: clusters are drives that weigh
+    alike.
     """
 
     over: str
     number: Int
     unit: Int
+    once: bool = False
 
     @cached_property
     def count(self) -> int:
@@ -121,6 +124,11 @@ class Clusters:
         """(K,) the group of each cluster."""
         return group_clusters(self.count)
 
+    @property
+    def share_kind(self) -> str:
+        """The kind of the limits of a share."""
+        return BOUNDED if self.once else EXACT
+
     def select(self, kept: Bool) -> Clusters:
         """The clusters of some of the rows, `kept (n,)`."""
         return replace(self, number=np.unique(self.number[kept], return_inverse=True)[1], unit=self.unit[kept])
@@ -138,7 +146,9 @@ class Clusters:
     def limit_share(self, successes: Float, weight: Float, confidence: float) -> tuple[float, float]:
         """Limits of Σ successes / Σ weight, of rows (n,)."""
         sums, counts = self.weigh(successes), self.weigh(weight)
-        if self.by_run:
+        if self.once:
+            low, high = limit_share_once(sums, counts, confidence)
+        elif self.by_run:
             share = sums.sum() / counts.sum()
             low, high = limit_share_of_runs(np.asarray(share), sums - share * counts, self.units, confidence)
         else:
@@ -146,10 +156,26 @@ class Clusters:
         return float(low), float(high)
 
 
-def find_clusters(table: pd.DataFrame, *, of_runs: bool = False) -> Clusters | None:
+def weigh_rows(table: pd.DataFrame, column: str, weigh: str = OBJECTS) -> Float:
+    """(n,) how much each row counts: its runs, or its probability, by the `column`.
+
+    `weigh`: `drives`: each log counts as much as another, all together as much as before.
+    """
+    import pandas as pd
+
+    weight: Float = table[column].to_numpy(dtype=float)
+    if weigh == OBJECTS or not len(table):
+        return weight
+    log, logs = pd.factorize(table["log"])
+    scale: Float = (weight.sum() / len(logs) / np.bincount(log, weight))[log]
+    return weight * scale
+
+
+def find_clusters(table: pd.DataFrame, *, of_runs: bool = False, weigh: str = OBJECTS) -> Clusters | None:
     """What an interval of a table's rows (n,) is over, as by `choose_over`; None: nothing.
 
-    `of_runs`: it is over runs. Rows of a tally stand for several runs: they then form one cluster.
+    `of_runs`: it is over runs. Rows of a tally stand for several runs: they then form one cluster. `weigh`: as for
+    `weigh_rows`.
     """
     import pandas as pd
 
@@ -163,7 +189,7 @@ def find_clusters(table: pd.DataFrame, *, of_runs: bool = False) -> Clusters | N
         return None
     run: Any = pd.factorize(table["run"], sort=True)[0] if "run" in table else np.zeros(len(table), dtype=np.int64)
     number = {"logs": log, "objects": unit, "passes": one, "runs": run}[over]
-    return Clusters(over, number, one if over in ("passes", "runs") else unit)
+    return Clusters(over, number, one if over in ("passes", "runs") else unit, over == "logs" and weigh == DRIVES)
 
 
 def describe_clusters(over: str, number: int | None = None, fewest: int | None = None) -> str:
@@ -171,10 +197,10 @@ def describe_clusters(over: str, number: int | None = None, fewest: int | None =
 
     `fewest`: where intervals are over different numbers of clusters, up to `number`.
     """
-    noun, whose = CLUSTERS[over]
+    noun, whose, tells = CLUSTERS[over]
     counted = over if number is None else count_noun(number, noun, over)
     up_to = "" if fewest is None or fewest == number else f"{fewest} to "
-    return f"{up_to}{counted}{whose}: {_TELLS[over]}"
+    return f"{up_to}{counted}{whose}: {tells}"
 
 
 NOT_ENOUGH = "neither more runs nor objects of several logs together tell how other drives differ"
@@ -188,14 +214,10 @@ def explain_no_clusters(logs: int, objects: int, *_: int) -> str:
     return f"{count_noun(logs, 'log')}, fewer than {FEWEST_LOGS}"
 
 
-def absent_share(logs: int) -> float:
-    """The largest share of traffic that may be of a kind which none of so many logs has, at 95 %: 1 − .05^(1/K)."""
-    return float(1.0 - (1.0 - CONFIDENCE) ** (1.0 / logs))
-
-
 def describe_absent(logs: int) -> str:
-    """What so many logs cannot exclude, whatever the interval: a kind of drive that none of them is."""
-    return f"a kind of drive that makes up to {100 * absent_share(logs):.0f} % of such traffic can be absent"
+    """What so many logs cannot exclude, at 95 %, whatever the interval: a kind of drive that none is, 1 − .05^(1/K)."""
+    share = 1.0 - (1.0 - CONFIDENCE) ** (1.0 / logs)
+    return f"a kind of drive that makes up to {100 * share:.0f} % of such traffic can be absent"
 
 
 # Shares.
@@ -240,6 +262,14 @@ def limit_share(
     residual = (successes - share[..., None] * rows) * scale[..., None]
     weights = rows * scale[..., None]
     return spread_share(share, share_variance(residual, weights), weights, confidence, within)
+
+
+def limit_share_once(successes: Float | Int, rows: Float | Int, confidence: float = CONFIDENCE) -> tuple[Float, Float]:
+    """Bound the mean of K clusters' shares, `successes (…, K)` of `rows (…, K)`: (low, high), (…)."""
+    shares = successes / rows
+    K, value = shares.shape[-1], shares.mean(axis=-1)
+    without = (K * value[..., None] - shares) / (K - 1)
+    return limit_bounded_mean(value, without, np.ones_like(shares), (0.0, 1.0), confidence=confidence)
 
 
 def limit_share_of_runs(
@@ -420,14 +450,17 @@ class LimitedFigure:
     """A figure with its limits, and the `kind` of these or why there are none; `value` None: there is no row.
 
     Of a time the value may be ∞, never, of a distance −∞; a limit that is infinite says that there is none.
-    `share`: of a quantile, the limits of the share at or below the bound it is held against.
+    `share`: of a quantile, the share on the good side of the bound it is held against, between its limits. `bounds`,
+    `spread`: of a mean between bounds, and the standard deviation of its clusters' means.
     """
 
     value: float | None
     low: float = math.nan
     high: float = math.nan
     kind: str | None = None
-    share: tuple[float, float] | None = None
+    share: tuple[float, float, float] | None = None
+    bounds: tuple[float, float] | None = None
+    spread: float = math.nan
 
 
 def limit_left_out(
@@ -448,8 +481,12 @@ def limit_left_out(
         return LimitedFigure(value)
     limits: tuple[float | Float, float | Float]
     if unseen is not None:
-        limits, kind = limit_bounded_mean(value, without, weights, bounds, 1.0, confidence, unseen), BOUNDED
-    elif np.abs(without - value).max() > _ROUNDING:
+        low, high = limit_bounded_mean(value, without, weights, bounds, 1.0, confidence, unseen)
+        share = weights / weights.sum()
+        apart = np.where(share > 0, (1.0 / np.where(share > 0, share, 1.0) - 1.0) * (value - without), 0.0)
+        spread = math.sqrt(float(share @ apart**2) * len(share) / (len(share) - 1))
+        return LimitedFigure(value, float(low), float(high), BOUNDED, bounds=bounds, spread=spread)
+    if np.abs(without - value).max() > _ROUNDING:
         limits, kind = limit_figure(value, without, weights, bounds, confidence), JACKKNIFE
     elif runs and np.isfinite(bounds).all():
         limits, kind = alike_run_limits(value, bounds, runs, confidence), JACKKNIFE
@@ -485,10 +522,13 @@ def limit_ranked_quantile(
     objects: float | None,
     q: float = 0.5,
     confidence: float = CONFIDENCE,
+    *,
+    once: bool = False,
 ) -> tuple[float, float]:
     """Bound the q-quantile of values (n,), −∞ among them, that weigh `weight (n,)` and are in a `cluster (n,)`.
 
-    `objects`: how many the rows are about, as for `limit_share`; None: clusters are runs.
+    `objects`: how many the rows are about, as for `limit_share`; None: clusters are runs. `once`: clusters are drives
+    that weigh alike.
     """
     order = np.argsort(values, kind="stable")
     ranked = values[order]
@@ -498,7 +538,9 @@ def limit_ranked_quantile(
     place = np.searchsorted(last_of, np.arange(len(ranked)), side="left") * clusters + cluster[order]
     until = np.cumsum(np.bincount(place, weight[order], len(last_of) * clusters).reshape(-1, clusters), axis=0)
     until = np.concatenate([np.zeros((1, clusters)), until])
-    if objects is None:
+    if once:
+        low, high = limit_share_once(until, np.broadcast_to(until[-1], until.shape), confidence)
+    elif objects is None:
         share = until.sum(axis=1) / until[-1].sum()
         looks = until[-1].sum() / clusters
         low, high = limit_share_of_runs(share, until - share[:, None] * until[-1], looks, confidence)
@@ -517,6 +559,8 @@ INVERTED = "inverted"
 """The kind of an interval of a median, from the limits of shares."""
 ALL_ALIKE = "all clusters alike"
 """The kind of an interval that does not exist as the figure is the same in every cluster, a median in nearly all."""
+NOTHING_DRAWN = "nothing drawn"
+"""The kind of an interval that does not exist as all runs are equal."""
 
 
 def interval_words(kind: str, over: str, number: int | None = None) -> str:
@@ -528,7 +572,13 @@ def interval_words(kind: str, over: str, number: int | None = None) -> str:
     return f"{method} over {describe_clusters(over, number)}"
 
 
-# Outcomes that are equal in every run.
+def format_limit(value: float) -> str:
+    """A limit, or a difference, to three significant digits; a dash where there is none."""
+    if not math.isfinite(value):
+        return "–"
+    return "0" if abs(value) < _ROUNDING else f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
-NOTHING_DRAWN = "nothing drawn"
-"""The kind of an interval that does not exist as all runs are equal."""
+
+def format_limits(low: float, high: float) -> str:
+    """An interval as it is written everywhere: `[0.052, 4.39]`; a dash on a side without a limit."""
+    return f"[{format_limit(low)}, {format_limit(high)}]"

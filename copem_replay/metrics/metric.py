@@ -21,6 +21,7 @@ from pydantic import Field
 from copem_replay.communication.arrivals import find_out_of_sequence, find_overtaken_lists
 from copem_replay.core.components import Component, GivenError, ask_component
 from copem_replay.core.tracks import Float, Tracks
+from copem_replay.metrics.limits import OBJECTS
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -40,7 +41,8 @@ class MetricInputs:
     `rows`: its rows of `tally.parquet` for detections, log by log; `conflicts`: those for implied collisions, None
     where the experiment does not ask for them. `lists_fixed`, `reaction_fixed`: detections, and braking, are equal in
     every run. `accuracy`, `exact`: None where the experiment does not ask for it. `output`: times of a recorded output,
-    `link`: of the lists on links; None: the configuration has none. `own`: sums of own metrics, by name.
+    `link`: of the lists on links; None: the configuration has none. `own`: sums of own metrics, by name. `weigh`: what
+    weighs alike, objects or drives.
     """
 
     rows: pd.DataFrame
@@ -54,6 +56,7 @@ class MetricInputs:
     conflicts: pd.DataFrame | None = None
     link: LinkTimes | None = None
     own: Mapping[str, OwnSums] = field(default_factory=dict)
+    weigh: str = OBJECTS
 
 
 class Compared(NamedTuple):

@@ -19,11 +19,11 @@ import numpy as np
 
 from copem_replay.core.tracks import Bool, Float, Int
 from copem_replay.metrics.limits import (
-    EXACT,
     INVERTED,
     WITHIN_LOG,
     Clusters,
     LimitedFigure,
+    limit_bounded_mean,
     limit_left_out,
     limit_quantile,
     limit_ranked_quantile,
@@ -31,11 +31,11 @@ from copem_replay.metrics.limits import (
     share_variance,
     spread_share,
 )
-from copem_replay.metrics.summary_metrics import compute_unknown_s
 from copem_replay.metrics.survival import (
     CENSORED,
     DETECTED,
     LEFT,
+    compute_unknown_s,
     cumulative_incidence,
     incidences_without,
     is_competing,
@@ -86,6 +86,17 @@ class FigureRows:
         known: Bool = self.table["time_to_detection_s"].notna().to_numpy(dtype=bool)
         return known
 
+    @property
+    def length_s(self) -> Float:
+        """(n,) lengths of the episodes."""
+        length_s: Float = (self.table["ended_s"] - self.table["onset_s"]).to_numpy(dtype=float)
+        return length_s
+
+    @property
+    def unknown_s(self) -> Float:
+        """(n,) seconds unknown."""
+        return compute_unknown_s(self.table["time_to_detection_s"].to_numpy(dtype=float), self.length_s)
+
     @cached_property
     def endings(self) -> tuple[Float, Int]:
         """(n,) times, and how they end."""
@@ -102,7 +113,8 @@ class FigureRows:
         value = float(successes.sum()) / float(self.weight.sum())
         if self.clusters is None:
             return LimitedFigure(value)
-        return LimitedFigure(value, *self.clusters.limit_share(successes, self.weight, confidence), EXACT)
+        low, high = self.clusters.limit_share(successes, self.weight, confidence)
+        return LimitedFigure(value, low, high, self.clusters.share_kind)
 
     def limit_mean_time(self, horizon_s: float, confidence: float) -> LimitedFigure:
         """The restricted mean; without limits where no row is followed to its detection, departure or the horizon."""
@@ -158,8 +170,13 @@ class FigureRows:
         least, most = limit_quantile(np.append(-np.inf, times_s[steps]), low, high, q)
         if math.isfinite(least) and (k := int(np.searchsorted(times_s[steps], least))) > 0:
             least = float(times_s[steps[k - 1] + 1])  # between two instants limits are not known
-        share = None if bound is None else tuple(float(of[0]) for of in self.limit_incidence([bound], confidence))
-        return LimitedFigure(value, least, most, INVERTED, share)  # type: ignore[arg-type]
+        return LimitedFigure(value, least, most, INVERTED, None if bound is None else self._share_by(bound, confidence))
+
+    def _share_by(self, at_s: float, confidence: float) -> tuple[float, float, float]:
+        """The cumulative incidence at an instant between its limits."""
+        share = np.append(0.0, self.curve[1])[np.searchsorted(self.curve[0], at_s, side="right")]
+        low, high = self.limit_incidence([at_s], confidence)
+        return float(low[0]), float(share), float(high[0])
 
     def _limit_curve(self, confidence: float) -> tuple[Float, Float, Float, Int]:
         times_s = self.curve[0]
@@ -179,11 +196,25 @@ class FigureRows:
         without = incidences_without(
             *self.endings, self.weight, of.group, len(of_group), at_s, least=self.least
         ).T  # fmt: skip
+        if of.once:
+            return self._limit_incidence_once(of, at_s, share, without, confidence)
         residual = (of_group.sum() - of_group) * (share[:, None] - without)
         variance = share_variance(residual, np.broadcast_to(of_group, residual.shape))
         within = np.where(variance > _SAME**2, 0.0, 1.0) if of.by_run else WITHIN_LOG
         units = np.broadcast_to(units * (of.units if of.by_run else 1.0), (len(share), of.count))
         return spread_share(share, variance, units, confidence, within)
+
+    def _limit_incidence_once(
+        self, of: Clusters, at_s: Float, share: Float, without: Float, confidence: float
+    ) -> tuple[Float, Float]:
+        """The same where drives weigh alike: the mean of their shares, between 0 and 1."""
+        (time_s, ending), total = self.endings, float(self.weight.sum())
+        order = np.argsort(time_s, kind="stable")
+        lost = np.append(0.0, np.cumsum(np.where(ending == CENSORED, self.weight, 0.0)[order]))
+        followed = 1.0 - lost[np.searchsorted(time_s[order], at_s, side="left")] / total
+        groups = np.broadcast_to(np.bincount(of.group, self.weight).astype(float), without.shape)
+        unseen = total / of.count / np.maximum(followed, _SAME)
+        return limit_bounded_mean(share, without, groups, (0.0, 1.0), 1.0, confidence, unseen)
 
     def limit_distance_quantile(self, q: float, confidence: float, bound: float | None = None) -> LimitedFigure:
         """The distance beyond which a share 1 − q is detected; −∞: a smaller share ever is."""
@@ -198,11 +229,14 @@ class FigureRows:
             return LimitedFigure(value)
         kept = self.clusters.select(placed)
         units = None if kept.by_run else kept.units
-        low, high = limit_ranked_quantile(ranked, weight, kept.number, kept.count, units, q, confidence)
+        low, high = limit_ranked_quantile(
+            ranked, weight, kept.number, kept.count, units, q, confidence, once=kept.once
+        )  # fmt: skip
         if bound is None:
             return LimitedFigure(value, low, high, INVERTED)
-        share = kept.limit_share(np.where(ranked >= bound, weight, 0.0), weight, confidence)
-        return LimitedFigure(value, low, high, INVERTED, share)
+        beyond = np.where(ranked >= bound, weight, 0.0)
+        least, most = kept.limit_share(beyond, weight, confidence)
+        return LimitedFigure(value, low, high, INVERTED, (least, float(beyond.sum() / weight.sum()), most))
 
 
 def limit_sums(
@@ -240,6 +274,11 @@ class JudgedMetric(NamedTuple):
     rows: Literal["detected", "conflict", "braking", "exact", "exact braking"]
     limit: Callable[[FigureRows, float, float, float], LimitedFigure]
 
+    @property
+    def to_horizon(self) -> bool:
+        """Whether it is a mean up to the horizon."""
+        return self.limit in (_mean_time, _mean_unknown_to_horizon)
+
 
 def _quantile_s(q: float) -> Callable[[FigureRows, float, float, float], LimitedFigure]:
     return lambda rows, _, confidence, bound: rows.limit_time_quantile(q, confidence, bound)
@@ -260,18 +299,11 @@ def _mean_time(rows: FigureRows, horizon_s: float, confidence: float, _: float) 
 
 
 def _mean_unknown(rows: FigureRows, _: float, confidence: float, __: float) -> LimitedFigure:
-    unknown_s, length_s = _unknown_s(rows)
-    return rows.limit_mean(unknown_s, float(length_s.max()), confidence)
+    return rows.limit_mean(rows.unknown_s, float(rows.length_s.max()), confidence)
 
 
 def _mean_unknown_to_horizon(rows: FigureRows, horizon_s: float, confidence: float, _: float) -> LimitedFigure:
-    return rows.limit_mean(np.minimum(_unknown_s(rows)[0], horizon_s), horizon_s, confidence)
-
-
-def _unknown_s(rows: FigureRows) -> tuple[Float, Float]:
-    """(n,) seconds unknown, and lengths of the episodes."""
-    length_s = (rows.table["ended_s"] - rows.table["onset_s"]).to_numpy(dtype=float)
-    return compute_unknown_s(rows.table["time_to_detection_s"].to_numpy(dtype=float), length_s), length_s
+    return rows.limit_mean(np.minimum(rows.unknown_s, horizon_s), horizon_s, confidence)
 
 
 def _left(rows: FigureRows) -> Bool:

@@ -23,7 +23,7 @@ from copem_replay.core.errors import count_noun
 from copem_replay.core.tracks import CLASSES, Bool, Float, Int
 from copem_replay.metrics.accuracy.statistics import EXISTENCE, OBJECT, RUN, AccuracySettings, AccuracyTotal
 from copem_replay.metrics.config import AREA, BEGAN_BY, CLASS, LOG, RANGE, TAGS, Dimension, Slice
-from copem_replay.metrics.limits import CONFIDENCE, TRAFFIC, choose_over, count_clusters, explain_no_clusters
+from copem_replay.metrics.limits import CONFIDENCE, OBJECTS, TRAFFIC, choose_over, count_clusters, explain_no_clusters
 from copem_replay.metrics.metric import (
     LINK,
     OUTPUT,
@@ -205,6 +205,7 @@ class SliceSettings:
     conflicts: bool = False
     fixed: frozenset[str] = frozenset()
     fixed_verdicts: frozenset[str] = frozenset()
+    weigh: str = OBJECTS
 
 
 @dataclass(frozen=True)
@@ -294,6 +295,7 @@ class StudyRows:
             exact=None if self.exact is None else of(select_counted(self.exact, own.words)),
             conflicts=conflicts,
             own=self._own_sums(of(self.sums)),
+            weigh=own.weigh,
         )
 
     @staticmethod

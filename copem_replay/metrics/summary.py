@@ -18,12 +18,15 @@ from copem_replay.core.tracks import SAME_INSTANT_S, Int
 from copem_replay.metrics.accuracy.metrics import beyond_gate_share
 from copem_replay.metrics.accuracy.statistics import AccuracyTotal
 from copem_replay.metrics.limits import (
+    DRIVES,
     NOT_ENOUGH,
     NOTHING_DRAWN,
+    OBJECTS,
     choose_over,
     count_clusters,
     describe_absent,
     explain_no_clusters,
+    format_limits,
     interval_words,
 )
 from copem_replay.metrics.metric import (
@@ -208,6 +211,12 @@ def add_own_sums(sums: Sums, more: Sums) -> dict[str, dict[str, OwnSums]]:
     return result
 
 
+_EACH_DRIVE_ONCE = (
+    "weigh: drives: in shares, times and distances of detections each drive counts once, however many objects it has; "
+    "accuracy and rates are over pairs, lists and minutes"
+)
+
+
 def summarise_tally(
     tallied: pd.DataFrame,
     configurations: Sequence[str],
@@ -222,6 +231,7 @@ def summarise_tally(
     outputs: Mapping[str, OutputTimes] | None = None,
     conflicts_asked: bool = False,
     links: Mapping[str, LinkTimes] | None = None,
+    weigh: str = OBJECTS,
 ) -> tuple[pd.DataFrame, list[str]]:
     """The rows of `summary.csv`, and notes about them, from the rows of `tally.parquet`.
 
@@ -229,12 +239,13 @@ def summarise_tally(
     (`find_facts`), of which are read `fixed` and `fixed_verdicts`; None: nothing is known. `own`: the experiment's own
     metrics, whose columns come last; `sums`: their sums. `outputs`: ages of recorded outputs, by configuration;
     `links`: sums over lists on links, by configuration. `conflicts_asked`: whether the experiment measures when lists
-    imply a collision.
+    imply a collision. `weigh`: as `measure.weigh`.
     """
     detections, implying = (tallied[tallied["event"] == event] for event in (DETECTED, CONFLICT))
     detections_of, conflicts_of = _split_by_configuration(detections), _split_by_configuration(implying)
     exact_of = _split_by_configuration(exact) if exact is not None else {}
-    notes = [*_note_no_interval(detections), *_note_beyond_gate(accuracy or {}), *_note_unannotated(accuracy or {})]
+    notes = [_EACH_DRIVE_ONCE] * (weigh == DRIVES and detections["log"].nunique() > 1)
+    notes += [*_note_no_interval(detections), *_note_beyond_gate(accuracy or {}), *_note_unannotated(accuracy or {})]
     columns = (*METRICS, *own_metrics(own))
     rows = []
     for name in configurations:
@@ -250,6 +261,7 @@ def summarise_tally(
             conflicts=conflicts_of.get(name, implying.iloc[:0]) if conflicts_asked else None,
             own=(sums or {}).get(name, {}),
             link=(links or {}).get(name),
+            weigh=weigh,
         )
         rows.append({"configuration": name, **evaluate_metrics(columns, inputs)})
     return pd.DataFrame(rows), notes
@@ -386,7 +398,7 @@ def _is_alike(column: pd.Series) -> bool:
 
 def _interval_lines(summary: pd.DataFrame, share: str) -> list[str]:
     limits = zip(summary[f"{share}_low"], summary[f"{share}_high"], strict=True)
-    return [f"[{format_cell(low)}, {format_cell(high)}]" if pd.notna(low) else "–" for low, high in limits]
+    return [format_limits(low, high) if pd.notna(low) else "–" for low, high in limits]
 
 
 def describe_intervals(summary: pd.DataFrame, name: str) -> list[str]:

@@ -23,15 +23,19 @@ from copem_replay.metrics.limits import (
     CONFIDENCE,
     EXACT,
     NOTHING_DRAWN,
+    LimitedFigure,
     count_clusters,
     exact_limits,
     find_clusters,
+    weigh_rows,
 )
 from copem_replay.metrics.metric import LINK, OUTPUT, Compared, Metric, MetricInputs, compared_metric
+from copem_replay.metrics.row_figures import FigureRows
 from copem_replay.metrics.survival import (
     CENSORED,
     DETECTED,
     LEFT,
+    compute_unknown_s,
     cumulative_incidence,
     is_competing,
     quantile_time,
@@ -94,8 +98,8 @@ def _detection_statistics(
     )
 
 
-def _tally_statistics(rows: pd.DataFrame, horizon_s: float | None) -> DetectionStatistics:
-    return _detection_statistics(rows, _is_known(rows), rows["runs"].to_numpy(dtype=float), horizon_s)
+def _tally_statistics(rows: pd.DataFrame, inputs: MetricInputs) -> DetectionStatistics:
+    return _detection_statistics(rows, _is_known(rows), weigh_rows(rows, "runs", inputs.weigh), inputs.horizon_s)
 
 
 def _is_known(rows: pd.DataFrame) -> Bool:
@@ -106,12 +110,12 @@ def _is_known(rows: pd.DataFrame) -> Bool:
 
 def summarise_detections(inputs: MetricInputs) -> DetectionStatistics:
     """Statistics of the first list that confirms the object."""
-    return _tally_statistics(inputs.rows, inputs.horizon_s)
+    return _tally_statistics(inputs.rows, inputs)
 
 
 def summarise_conflicts(inputs: MetricInputs) -> DetectionStatistics | None:
     """Statistics of the first list that implies a collision; None where the experiment does not ask for it."""
-    return None if inputs.conflicts is None else _tally_statistics(inputs.conflicts, inputs.horizon_s)
+    return None if inputs.conflicts is None else _tally_statistics(inputs.conflicts, inputs)
 
 
 @dataclass(frozen=True)
@@ -127,16 +131,18 @@ class ShareEstimate:
     high: float | None = None
 
 
-def _estimate_share(part: pd.DataFrame, successes: NDArray[np.int64], *, fixed: bool) -> ShareEstimate:
+def _estimate_share(part: pd.DataFrame, successes: NDArray[np.int64], weigh: str, *, fixed: bool) -> ShareEstimate:
     """The share of `successes (n,)` among the runs of the tally's rows (n,). `fixed`: equal in every run."""
-    n, total = int(part["runs"].sum()), int(successes.sum())
+    n, weight = int(part["runs"].sum()), weigh_rows(part, "runs", weigh)
+    counted = successes * (weight / part["runs"].to_numpy(dtype=float))
+    total = float(counted.sum())
     share = total / n if n else None
-    clusters = find_clusters(part)
+    clusters = find_clusters(part, weigh=weigh)
     if clusters is None or not n:
         return ShareEstimate(n, share)
     if not clusters.by_run:
-        low, high = clusters.limit_share(successes.astype(float), part["runs"].to_numpy(dtype=float), CONFIDENCE)
-        return ShareEstimate(n, share, EXACT, clusters.over, clusters.count, low, high)
+        low, high = clusters.limit_share(counted, weight, CONFIDENCE)
+        return ShareEstimate(n, share, clusters.share_kind, clusters.over, clusters.count, low, high)
     if fixed:
         return ShareEstimate(n, share, NOTHING_DRAWN)
     runs = n // count_clusters(part)[2]  # passes of a run may be one and the same: a run counts once
@@ -146,7 +152,9 @@ def _estimate_share(part: pd.DataFrame, successes: NDArray[np.int64], *, fixed: 
 def estimate_detected_share(inputs: MetricInputs) -> ShareEstimate:
     """The share of the rows that are detected."""
     runs = inputs.rows["runs"].to_numpy()
-    return _estimate_share(inputs.rows, np.where(_is_known(inputs.rows), runs, 0), fixed=inputs.lists_fixed)
+    return _estimate_share(
+        inputs.rows, np.where(_is_known(inputs.rows), runs, 0), inputs.weigh, fixed=inputs.lists_fixed
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -181,23 +189,33 @@ def _measure_unknown(rows: pd.DataFrame, known: Bool, weight: Float, horizon_s: 
     )
 
 
-def compute_unknown_s(time_s: Float, length_s: Float) -> Float:
-    """(n,) seconds unknown: the time to detection, NaN for never, or the length of the episode; not below 0."""
-    return np.maximum(np.fmin(time_s, length_s), 0.0)
-
-
 def measure_unknown(inputs: MetricInputs) -> UnknownTimes:
     """How long objects are unknown in the rows of the tally."""
-    weight = inputs.rows["runs"].to_numpy(dtype=float)
+    weight = weigh_rows(inputs.rows, "runs", inputs.weigh)
     return _measure_unknown(inputs.rows, _is_known(inputs.rows), weight, inputs.horizon_s)
+
+
+def limit_means(inputs: MetricInputs) -> tuple[LimitedFigure, LimitedFigure]:
+    """The mean time to detection, and that of min(unknown, horizon), with their 95 % limits; over runs without."""
+    clusters = find_clusters(inputs.rows, weigh=inputs.weigh)
+    if not len(inputs.rows) or inputs.horizon_s is None or clusters is None or clusters.by_run:
+        return LimitedFigure(None), LimitedFigure(None)
+    rows = FigureRows(inputs.rows, weigh_rows(inputs.rows, "runs", inputs.weigh), clusters)
+    unknown_s = np.minimum(rows.unknown_s, inputs.horizon_s)
+    limited_s = rows.limit_mean(unknown_s, inputs.horizon_s, CONFIDENCE)
+    return rows.limit_mean_time(inputs.horizon_s, CONFIDENCE), limited_s
+
+
+def _end_of_mean(k: int, end: str) -> Callable[[tuple[LimitedFigure, ...]], float | None]:
+    return lambda of: _number_or_none(float(getattr(of[k], end)))
 
 
 def estimate_foreseen_share(inputs: MetricInputs) -> float | None:
     """The share of the rows in which a list implies a collision; NaN without rows."""
     if inputs.conflicts is None:
         return None
-    runs = inputs.conflicts["runs"].to_numpy()
-    return int(runs[_is_known(inputs.conflicts)].sum()) / int(runs.sum()) if len(runs) else np.nan
+    weight = weigh_rows(inputs.conflicts, "runs", inputs.weigh)
+    return float(weight[_is_known(inputs.conflicts)].sum() / weight.sum()) if len(weight) else np.nan
 
 
 def estimate_passed_share(inputs: MetricInputs) -> ShareEstimate | None:
@@ -205,7 +223,7 @@ def estimate_passed_share(inputs: MetricInputs) -> ShareEstimate | None:
     if "in_conflict" not in inputs.rows:
         return None
     part = inputs.rows[inputs.rows["in_conflict"]]
-    return _estimate_share(part, part["passed"].to_numpy(), fixed=inputs.reaction_fixed)
+    return _estimate_share(part, part["passed"].to_numpy(), inputs.weigh, fixed=inputs.reaction_fixed)
 
 
 @dataclass(frozen=True)
@@ -232,7 +250,7 @@ def summarise_exact(inputs: MetricInputs) -> ExactStatistics | None:
         times = _detection_statistics(part, np.empty(0, dtype=bool), np.empty(0), None)
         return ExactStatistics(None, times, UnknownTimes(), missed)
     part = part[part["probability"] > 0]
-    weight = part["probability"].to_numpy(dtype=float)
+    weight = weigh_rows(part, "probability", inputs.weigh)
     known = part["detection_s"].notna().to_numpy()
     times = _detection_statistics(part, known, weight, inputs.horizon_s, 1 / int(inputs.rows["runs"].sum()))
     unknown = _measure_unknown(part, known, weight, inputs.horizon_s)
@@ -265,7 +283,7 @@ def exact_verdict_shares(inputs: MetricInputs) -> tuple[float | None, float | No
     part = inputs.exact[inputs.exact["conflict"]]
     if not len(part):
         return None, None
-    weight = part["probability"].to_numpy(dtype=float)
+    weight = weigh_rows(part, "probability", inputs.weigh)
     passes, fails = (part[f"{name}_probability"].to_numpy(dtype=float) for name in ("pass", "fail"))
     share = float(weight @ np.nan_to_num(fails) / weight.sum())
     failed = None if share < UNRESOLVED and np.isnan(fails).any() else share
@@ -317,6 +335,8 @@ _DETECTION_METRICS = (
                     Compared("mean time to detection over the rows that both detect; beside it those that one alone "
                              "detects", "means where both detect")),
     Metric("ttd_rmst_horizon_s", summarise_detections, lambda of: of.horizon_s, 0, "the horizon of ttd_rmst_s"),
+    Metric("ttd_rmst_s_low", limit_means, _end_of_mean(0, "low"), 0, "lower limit of ttd_rmst_s, 95 %"),
+    Metric("ttd_rmst_s_high", limit_means, _end_of_mean(0, "high"), 0, "upper limit of ttd_rmst_s, 95 %"),
     Metric("unknown_s", measure_unknown, lambda of: of.mean_s, -1,
            "mean seconds from the onset to the detection or the end of the episode; needs no horizon", "summary",
            "mean time unknown, s"),
@@ -324,6 +344,10 @@ _DETECTION_METRICS = (
            "mean of min(time unknown, horizon): what criteria and stars judge, for one long episode decides no mean",
            "summary", "mean time unknown up to the horizon, s",
            Compared("mean of min(seconds unknown, horizon)", "times unknown")),
+    Metric("unknown_to_horizon_s_low", limit_means, _end_of_mean(1, "low"), 0,
+           "lower limit of unknown_to_horizon_s, 95 %"),
+    Metric("unknown_to_horizon_s_high", limit_means, _end_of_mean(1, "high"), 0,
+           "upper limit of unknown_to_horizon_s, 95 %"),
     Metric("left_undetected_share", measure_unknown, lambda of: of.left_share, -1,
            "share of the rows whose object left undetected: never detected", "undetected", "left undetected, %"),
     Metric("open_share", measure_unknown, lambda of: of.open_share, 0,

@@ -221,6 +221,11 @@ def incidences_without(
     return np.where(rest.total[:, None] > 0, np.minimum(shares, 1.0), np.nan)
 
 
+def compute_unknown_s(time_s: Float, length_s: Float) -> Float:
+    """(n,) seconds unknown: the time to detection, NaN for never, or the length of the episode; not below 0."""
+    return np.maximum(np.fmin(time_s, length_s), 0.0)
+
+
 def quantile_with_never(values: Float, detected: Bool, q: float, weight: Float | None = None) -> float | None:
     """Find the `q`-quantile of rows of which the never detected rank below every value; None: one of them.
 

@@ -456,6 +456,7 @@ def slice_settings(experiment: Experiment, facts: Mapping[str, ConfigurationFact
         measure.conflict is not None,
         frozenset(name for name, of in facts.items() if of.fixed),
         frozenset(name for name, of in facts.items() if of.fixed_verdicts),
+        measure.weigh,
     )
 
 
@@ -487,5 +488,6 @@ def _summarise(study: StudyTables, horizon_s: float) -> tuple[pd.DataFrame, list
         sums=study.own_sums,
         outputs={name: sum((of.outputs[name] for of in facts), OutputTimes()) for name in experiment.outputs},
         conflicts_asked=measure.conflict is not None,
+        weigh=measure.weigh,
         links={name: one.links for name, one in times.items() if one.links is not None},
     )

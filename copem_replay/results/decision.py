@@ -1,15 +1,15 @@
 """Decision: what results say, in one sentence for those who decide; the report begins with it, the terminal ends so.
 
 With criteria the sentence is their verdicts. Else it is by the share of conflicts that pass, where it differs, else by
-the mean time to detection: who is better than the baseline, who is worse, of whom no difference is shown. A difference
-is named if its 95 % interval excludes 0 and it is as large as `MATTERS_S`, or visible in whole per cents.
+the mean time to detection: who is better than the baseline, who is worse, of whom no difference is shown, each by the
+95 % interval of the difference over the rows of its own pair. Without an interval nothing is claimed.
 
 Of one object in one run, what would help the configuration that knows it last: a key of another one, or its units.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
@@ -20,8 +20,9 @@ import pandas as pd
 from copem_replay.core.errors import count_noun
 from copem_replay.core.tracks import SAME_INSTANT_S, TRUTH
 from copem_replay.experiment.schema import Experiment
+from copem_replay.metrics.limits import format_limit, format_limits
 from copem_replay.results.compare import Comparison, compare_folders
-from copem_replay.results.compare.limits import ALIKE, BETTER, WORSE
+from copem_replay.results.compare.limits import BETTER, OPEN, WORSE
 from copem_replay.results.compare.tables import NOTHING
 from copem_replay.results.verdicts import NOT_MET, Judgement
 
@@ -33,10 +34,12 @@ MATTERS_S = 0.05
 """Smaller differences of mean times name no winner: half of the time between two lists at 10 Hz."""
 MATTERS_SHARE = 0.005
 """Smaller differences of shares name no winner: half of a per cent."""
-Values = dict[str, float]
-"""Values of the metric that decides, by configuration."""
 DECIDED_BY = ("ttd_rmst_s", "pass_share")
 """Metrics that a decision is about."""
+_SAME = "same"
+"""The word of a pair whose figures are the same throughout, so that there is no interval."""
+_NEAR = "near"
+"""The word of a pair whose difference is shown, and shown to be smaller than what matters."""
 _NAMED = 4
 """Most configurations that are named with their figures: more make a sentence hard to read."""
 
@@ -106,6 +109,11 @@ class _Scale:
     def matters(self, difference: float) -> bool:
         return abs(difference) >= (MATTERS_SHARE if self.is_share else MATTERS_S)
 
+    @property
+    def least(self) -> str:
+        """The least difference that matters, in words."""
+        return f"{100 * MATTERS_SHARE:g} percentage points" if self.is_share else f"{MATTERS_S:g} s"
+
     def gain(self, difference: float) -> float:
         """A difference whose sign is that of the gain."""
         return difference if self.is_share else -difference
@@ -115,6 +123,16 @@ class _Scale:
         if not self.is_share:
             return f"{round(value, 2) + 0.0:.2f} s".replace("-", "−")
         return f"{100 * value:.0f} %" if 0.005 <= value < 0.995 or value in (0, 1) else _format_edge(value)
+
+    def tell_difference(self, pair: _JudgedPair) -> str:
+        """`by 0.12 s [0.05, 0.2]`; of one that is not shown, or has no interval, with its sign."""
+        times, unit = (100.0, " percentage points") if self.is_share else (1.0, " s")
+        size, limits = times * pair.difference, (times * pair.limits[0], times * pair.limits[1])
+        if pair.word in (BETTER, WORSE):
+            ends = sorted(map(abs, limits))
+            return f"by {format_limit(abs(size))}{unit} {format_limits(*ends)}"
+        shown = f"{'+' if size > 0 else ''}{format_limit(size)}{unit}"
+        return "" if pair.word == _SAME else shown if pair.word == "" else f"{shown} {format_limits(*limits)}"
 
     def say(self, value: float) -> str:
         """`85 % of conflicts pass`, `an object is known after 0.73 s on average`."""
@@ -139,18 +157,14 @@ def decide_compared(comparison: Comparison, experiment: Experiment | None = None
     rows = rows[rows["metric"] == scale.metric]
     if not len(rows) or comparison.baseline in comparison.truths:
         return Decision(f"There is no answer: nothing can be held against {comparison.baseline}.")
-    values = {str(row.configuration): float(row.value) for row in rows.itertuples(index=False)}
-    base = float(rows["baseline_value"].iloc[0])
-    words = {str(row.configuration): _judge_row(row, scale) for row in rows.itertuples(index=False)}
-    ranked = values | {comparison.baseline: base}
-    top = max(ranked.values(), key=scale.gain)
-    best = tuple(name for name, value in ranked.items() if not scale.matters(value - top))
-    if any(words.get(name) == ALIKE for name in best):
-        best = tuple(dict.fromkeys([*best, comparison.baseline]))
-    told = _tell_latencies(comparison.baseline, base, values, words, scale, experiment)
-    told = told or _tell_groups(comparison.baseline, base, values, words, scale)
-    unsure = rows["interval_over"].isna().all()
-    return Decision(f"{told}{', on these objects alone: there is no interval' if unsure else ''}.", best)
+    pairs = {str(row.configuration): _JudgedPair.of(row, scale) for row in rows.itertuples(index=False)}
+    top = max([0.0, *(scale.gain(pair.difference) for pair in pairs.values())])
+    ranked = {name: scale.gain(pair.difference) for name, pair in pairs.items()} | {comparison.baseline: 0.0}
+    best = [name for name, gain in ranked.items() if not scale.matters(top - gain)]
+    if any(name in pairs and pairs[name].word == OPEN for name in best):
+        best.append(comparison.baseline)
+    told = _tell_latencies(comparison.baseline, pairs, scale, experiment)
+    return Decision(f"{told or _tell_groups(comparison.baseline, pairs, scale)}.", tuple(dict.fromkeys(best)))
 
 
 def _choose_scale(rows: pd.DataFrame) -> _Scale:
@@ -159,42 +173,67 @@ def _choose_scale(rows: pd.DataFrame) -> _Scale:
     return _Scale("pass_share" if (differences.abs() > NOTHING).any() else "ttd_rmst_s")
 
 
-def _judge_row(row: object, scale: _Scale) -> str:
-    """Whether a configuration is better than the baseline; without an interval by its value."""
-    difference, low, high = (float(getattr(row, name)) for name in ("difference", "low", "high"))
-    limits = [difference] if np.isnan(low) or np.isnan(high) else [low, high]
-    gains = [scale.gain(limit) for limit in limits]
-    if not scale.matters(difference) or (min(gains) <= NOTHING and max(gains) >= -NOTHING):
-        return ALIKE
-    return BETTER if min(gains) > NOTHING else WORSE
+@dataclass(frozen=True)
+class _JudgedPair:
+    """A configuration held against the baseline over the rows of both: the values, their difference, its limits.
+
+    `word`: what the interval of this very difference shows; empty: there is none, and a difference.
+    """
+
+    value: float
+    base: float
+    difference: float
+    limits: tuple[float, float]
+    word: str
+
+    @staticmethod
+    def of(row: Any, scale: _Scale) -> _JudgedPair:
+        """The pair of a row of a comparison."""
+        limits = (float(row.low), float(row.high))
+        gains = [scale.gain(limit) for limit in limits]
+        word = OPEN if min(gains) <= NOTHING and max(gains) >= -NOTHING else BETTER if min(gains) > 0 else WORSE
+        if np.isnan(limits).any():
+            word = _SAME if abs(row.difference) < NOTHING else ""
+        elif word != OPEN and not scale.matters(max(gains, key=abs)):
+            word = _NEAR
+        return _JudgedPair(float(row.value), float(row.baseline_value), float(row.difference), limits, word)
 
 
-def _tell_groups(baseline: str, base: float, values: Values, words: dict[str, str], scale: _Scale) -> str:
-    """Who is better than the baseline, of whom no difference is shown, who is worse."""
-    of = {word: {name: value for name, value in values.items() if words[name] == word} for word in words.values()}
-    better, worse = ("better", "worse") if scale.is_share else ("sooner", "later")
-    held = f"{baseline} ({scale.say(base)})"
-    if set(of) == {ALIKE}:
-        return f"No difference to {held} is shown: {_list_values(values, scale)}"
-    first = f"{better.capitalize()} than {held}: {_list_values(of[BETTER], scale)}" if BETTER in of else (
-        f"Nothing is shown to be {better} than {held}"
-    )  # fmt: skip
-    others = {"no difference shown": of.get(ALIKE), worse: of.get(WORSE)}
-    return "; ".join([first, *(f"{word}: {_list_values(group, scale)}" for word, group in others.items() if group)])
+def _tell_groups(baseline: str, pairs: Mapping[str, _JudgedPair], scale: _Scale) -> str:
+    """Who is better than the baseline, who is worse, of whom no difference is shown, of whom nothing can be shown."""
+    better, worse = ("Better", "Worse") if scale.is_share else ("Sooner", "Later")
+    bases = [pair.base for pair in pairs.values()]
+    held = f"{baseline} ({scale.say(bases[0])})" if max(bases) - min(bases) <= NOTHING else baseline
+    heads = {
+        BETTER: f"{better} than {{}}: ",
+        WORSE: f"{worse} than {{}}: ",
+        _SAME: "The same as {}: ",
+        _NEAR: f"Apart from {{}} by less than {scale.least}: ",
+        OPEN: "No difference to {} is shown: ",
+        "": "No interval, so nothing is shown beyond these very objects, against {}: ",
+    }
+    parts: list[str] = []
+    for word, head in heads.items():
+        group = {name: pair for name, pair in pairs.items() if pair.word == word}
+        if group:
+            told = head.format(baseline if parts else held) + _list_pairs(group, scale)
+            parts.append(told if not parts else told[:1].lower() + told[1:])
+    return "; ".join(parts)
 
 
-def _list_values(values: Values, scale: _Scale) -> str:
-    """`A and B 96 %, C 92 %`, the best first; those of one number together, of many the first."""
-    by_number: dict[str, list[str]] = {}
-    for name, value in sorted(values.items(), key=lambda item: -scale.gain(item[1])):
-        by_number.setdefault(scale.number(value), []).append(name)
+def _list_pairs(pairs: Mapping[str, _JudgedPair], scale: _Scale) -> str:
+    """`A and B by 0.12 s [0.05, 0.2], C by …`, the best first; those of equal words together, of many the first."""
+    by_words: dict[str, list[str]] = {}
+    for name, pair in sorted(pairs.items(), key=lambda item: -scale.gain(item[1].difference)):
+        by_words.setdefault(scale.tell_difference(pair), []).append(name)
     shown, left = [], _NAMED
-    for number, names in by_number.items():
+    for words, names in by_words.items():
         kept = names[:left]
         left -= len(kept)
         if kept:
-            shown.append(f"{' and '.join([', '.join(kept[:-1])] * (len(kept) > 1) + kept[-1:])} {number}")
-    more = len(values) - _NAMED
+            listed = " and ".join([", ".join(kept[:-1])] * (len(kept) > 1) + kept[-1:])
+            shown.append(f"{listed} {words}".rstrip())
+    more = len(pairs) - _NAMED
     return ", ".join(shown) + (f" and {more} more" if more > 0 else "")
 
 
@@ -202,32 +241,37 @@ def _list_values(values: Values, scale: _Scale) -> str:
 
 
 def _tell_latencies(
-    baseline: str, base: float, values: Values, words: dict[str, str], scale: _Scale, experiment: Experiment | None
+    baseline: str, pairs: Mapping[str, _JudgedPair], scale: _Scale, experiment: Experiment | None
 ) -> str | None:
     """Up to which latency the others help, and from which on they are worse; None: they differ in more than that."""
-    found = None if experiment is None else _order_by_latency(experiment, baseline, list(values))
+    found = None if experiment is None else _order_by_latency(experiment, baseline, list(pairs))
     if found is None or experiment is None:
         return None
     latencies_s, units = found
-    names, judged = list(latencies_s), [words[name] for name in latencies_s]
-    if sorted(judged, key=[BETTER, ALIKE, WORSE].index) != judged:
-        return None  # not in the order of latencies: each has to be named
+    names, judged, order = list(latencies_s), [pairs[name].word for name in latencies_s], [BETTER, OPEN, WORSE]
+    bases = [pair.base for pair in pairs.values()]
+    if not {*judged} <= {*order} or sorted(judged, key=order.index) != judged or max(bases) - min(bases) > NOTHING:
+        return None  # not in the order of latencies, or not over the same rows: each has to be named
     cooperates = units > set(experiment.units_of(experiment.configurations[baseline]))
     what, none = ("cooperation", f"{baseline} alone") if cooperates else (names[0].partition(":")[0], baseline)
     parts: list[str] = []
-    for word, says in ((BETTER, "{what} helps"), (ALIKE, "no difference to {none} is shown")):
+    for word, says in ((BETTER, f"{what} helps"), (OPEN, f"no difference to {none} is shown")):
         if word in judged:
-            last = [name for name in names if words[name] == word][-1]
+            last = [name for name in names if pairs[name].word == word][-1]
             up_to = f"up to {latencies_s[last]:g} s of latency" if latencies_s[last] else "without latency"
-            against = "" if parts else f" against {scale.number(base)} with {none}"
-            parts.append(f"{up_to} {says.format(what=what, none=none)}: {scale.say(values[last])}{against}")
+            parts.append(f"{up_to} {says}: {_tell_against(pairs[last], scale, none, first=not parts)}")
     if WORSE in judged:
         first = names[judged.index(WORSE)]
-        against = "" if parts else f" against {scale.number(base)} with {none}"
-        figure = f"{scale.number(values[first])}{against}"
-        parts.append(f"from {latencies_s[first]:g} s of latency on {what} is worse than {none}: {figure}")
+        told = _tell_against(pairs[first], scale, none, first=not parts)
+        parts.append(f"from {latencies_s[first]:g} s of latency on {what} is worse than {none}: {told}")
     told = "; ".join(parts)
     return told[:1].upper() + told[1:]
+
+
+def _tell_against(pair: _JudgedPair, scale: _Scale, none: str, *, first: bool) -> str:
+    """`an object is known after 0.31 s on average against 0.73 s with PEM alone, by 0.42 s [0.39, 0.44]`."""
+    against = f" against {scale.number(pair.base)} with {none}" if first else ""
+    return f"{scale.say(pair.value) if first else scale.number(pair.value)}{against}, {scale.tell_difference(pair)}"
 
 
 def _order_by_latency(

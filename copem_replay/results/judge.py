@@ -27,12 +27,17 @@ from copem_replay.metrics.limits import (
     ALL_ALIKE,
     BOUNDED,
     NOTHING_DRAWN,
+    OBJECTS,
     Clusters,
     LimitedFigure,
     count_clusters,
     explain_no_clusters,
     find_clusters,
+    format_limit,
+    format_limits,
+    weigh_rows,
 )
+from copem_replay.metrics.needed import Known, count_deciding, find_level, find_spread
 from copem_replay.metrics.onset import select_counted
 from copem_replay.metrics.row_figures import (
     JUDGED,
@@ -57,13 +62,17 @@ FEWEST_RUNS = 30
 
 @dataclass(frozen=True)
 class JudgedFigure:
-    """A figure with its limits and what these are over: `clusters` of `over`, of `n` rows; `why` there are none."""
+    """A figure with its limits and what these are over: `clusters` of `over`, of `n` rows about so many `units`; `why`
+    there are none. `shorter`: what a shorter horizon would show.
+    """
 
     figure: LimitedFigure
     over: str | None = None
     clusters: int | None = None
     n: int = 0
     why: str = ""
+    units: int = 0
+    shorter: str = ""
 
 
 _NO_ROW = JudgedFigure(LimitedFigure(None), why="no row")
@@ -158,26 +167,25 @@ def _find_verdict(criterion: Criterion, found: JudgedFigure) -> tuple[str, str]:
     word = judge_limits(figure.low, figure.high, bound, direction)
     parts = [] if figure.share is None else [_describe_share(criterion, figure.share)]
     if word == UNDECIDED:
-        parts.append(_MORE[found.over or "logs"].format(number=found.clusters))
-    return word, "; ".join([*parts, *filter(None, [found.why])])
+        parts.append(_describe_deciding(criterion, found))
+    return word, "; ".join([*parts, *filter(None, [found.why, found.shorter if word == UNDECIDED else ""])])
 
 
-_MORE = {
-    "logs": "more logs would decide ({number} now)",
-    "objects": "other drives would decide; {number} objects of one drive now",
-    "passes": "more passes would decide; {number} of one object now",
-    "runs": "more runs would decide ({number} now)",
-}
-_LEVELS = {"p5": 0.05, "median": 0.5, "p95": 0.95}
+def _describe_deciding(criterion: Criterion, found: JudgedFigure) -> str:
+    """How many logs, objects, passes or runs would decide: `about 57 objects like these would decide, 13 now`."""
+    over, number = found.over or "logs", found.clusters or 0
+    known = Known(over, number, found.units)
+    needed = count_deciding(criterion.metric, found.figure, criterion.bound, known, criterion.confidence)
+    if needed is None:
+        return f"no number of {over} decides: it is at the bound ({number} now)"
+    return f"about {max(needed, number + 1)} {over} like these would decide ({number} now)"
 
 
-def _describe_share(criterion: Criterion, share: tuple[float, float]) -> str:
+def _describe_share(criterion: Criterion, share: tuple[float, float, float]) -> str:
     """What is known of the share that a quantile is held by: `93.1 … 97 % known by 0.5 s, 95 % wanted`."""
-    level = next(_LEVELS[part] for part in criterion.metric.split("_") if part in _LEVELS)
-    limits = f"{100 * share[0]:.3g} … {100 * share[1]:.3g} %"
-    if "dad" in criterion.metric:
-        return f"{limits} known at {criterion.bound:g} m or farther, {100 * (1 - level):g} % wanted"
-    return f"{limits} known by {criterion.bound:g} s, {100 * level:g} % wanted"
+    limits = f"{100 * share[0]:.3g} … {100 * share[2]:.3g} %"
+    by = f"at {criterion.bound:g} m or farther" if "dad" in criterion.metric else f"by {criterion.bound:g} s"
+    return f"{limits} known {by}, {100 * (find_level(criterion.metric) or 0.0):g} % wanted"
 
 
 # What is judged: rows of a study or of some of its episodes.
@@ -312,9 +320,10 @@ class _JudgedStudy:
     def _measure_rows(self, criterion: Criterion, configuration: str, group: _JudgedGroup) -> JudgedFigure:
         judged, settings = JUDGED[criterion.metric], group.rows.settings
         kind = judged.rows
-        key = kind, configuration
+        weigh = criterion.weigh or settings.weigh
+        key = kind, configuration, weigh
         if key not in group.made:
-            group.made[key] = self._make_figure_rows(group, kind, configuration, of_runs=criterion.of_runs)
+            group.made[key] = self._make_figure_rows(group, kind, configuration, weigh, of_runs=criterion.of_runs)
         made: tuple[FigureRows | None, JudgedFigure] = group.made[key]
         rows, about = made
         if rows is None:
@@ -322,10 +331,11 @@ class _JudgedStudy:
         figure = judged.limit(rows, settings.horizon_s, criterion.confidence, criterion.bound)
         if about.figure.kind is not None and figure.value is not None:  # it is known
             figure = LimitedFigure(figure.value, figure.value, figure.value, about.figure.kind)
-        return replace(about, figure=figure)
+        shorter = _find_shorter_horizon(criterion, rows, settings.horizon_s) if figure.bounds is not None else ""
+        return replace(about, figure=figure, shorter=shorter)
 
     def _make_figure_rows(
-        self, group: _JudgedGroup, kind: str, configuration: str, *, of_runs: bool
+        self, group: _JudgedGroup, kind: str, configuration: str, weigh: str, *, of_runs: bool
     ) -> tuple[FigureRows | None, JudgedFigure]:
         """The rows of a kind with their clusters; without rows None. What is known beforehand of their figures."""
         study, exact = group.rows, kind.startswith("exact")
@@ -336,18 +346,19 @@ class _JudgedStudy:
             table = table[table["conflict" if exact else "in_conflict"]]
         if not len(table):
             return None, replace(_NO_ROW, why="no object is in conflict")
-        weight = table["probability" if exact else "runs"].to_numpy(dtype=float)
+        weight = weigh_rows(table, "probability" if exact else "runs", weigh)
         n = round(float(weight.sum()))
         fixed = study.settings.fixed_verdicts if kind == "braking" else study.settings.fixed
         if of_runs and (exact or configuration in fixed):
             known = LimitedFigure(None, kind=CLOSED_FORM if exact else NOTHING_DRAWN)
             return FigureRows(table, weight, None), JudgedFigure(known, n=n)
-        clusters, why = find_judged_clusters(table, of_runs=of_runs)
+        clusters, why = find_judged_clusters(table, of_runs=of_runs, weigh=weigh)
         runs = float(self.results.provenance.runs)
         least = 1.0 / max(n * runs, 1.0) if exact else 1e-12
         about = JudgedFigure(LimitedFigure(None), n=n, why=why)
         if clusters is not None:
-            about = replace(about, over=clusters.over, clusters=clusters.count)
+            units = clusters.count if clusters.once else clusters.units
+            about = replace(about, over=clusters.over, clusters=clusters.count, units=units)
         return FigureRows(table, weight, clusters, least), about
 
     def _split_table(self, group: _JudgedGroup, kind: str) -> dict[str, pd.DataFrame]:
@@ -437,7 +448,7 @@ class _JudgedStudy:
         if of_before and self.before is not None and other not in self.before.facts:
             hint = unknown_name_message("configuration", other, self.before.facts)
             raise InputError(f"criteria.{name}.against: {self.before.place}: {hint}")
-        key = id(group), other, of_before, criterion.of_runs, criterion.confidence
+        key = id(group), other, of_before, criterion.of_runs, criterion.confidence, criterion.weigh
         if (table := self._pairs.get(key)) is None:
             table = self._pairs[key] = self._compare(criterion, other, group, of_before=of_before)
         rows = table[(table["configuration"] == configuration) & (table["metric"] == criterion.metric)]
@@ -454,6 +465,7 @@ class _JudgedStudy:
             one for one in self.criteria.values()
             if one.against is not None
             and (one.of_runs, one.confidence) == (criterion.of_runs, criterion.confidence)
+            and one.weigh == criterion.weigh
         ]  # fmt: skip
         metrics = sorted({one.metric for one in alike})
         folders = [self.results, *([self.before] if of_before and self.before is not None else [])]
@@ -464,11 +476,12 @@ class _JudgedStudy:
         baseline = labelled.get((folders[-1], other))
         if baseline is None or not (chosen := [label for label in labels if label != baseline]):
             return pd.DataFrame(columns=["configuration", "metric"])
-        asked = PairsAsked(group.episodes, group.every, criterion.of_runs, criterion.confidence)
+        asked = PairsAsked(group.episodes, group.every, criterion.of_runs, criterion.confidence, criterion.weigh)
         comparison = compare_folders(
             folders, configurations=chosen, baseline=baseline, metrics=metrics, asked=asked
         )  # fmt: skip
-        return comparison.overall.assign(configuration=comparison.overall["configuration"].map(labels))
+        overall = comparison.overall
+        return overall.assign(configuration=overall["configuration"].map(labels), horizon_s=comparison.horizon_s)
 
 
 def _difference_of(row: pd.Series, criterion: Criterion) -> JudgedFigure:
@@ -491,13 +504,31 @@ def _difference_of(row: pd.Series, criterion: Criterion) -> JudgedFigure:
     alike = kind == ALL_ALIKE  # of no spread Student's t has the value itself as limits
     low = value if alike else -math.inf if pd.isna(row["low"]) else float(row["low"])
     high = value if alike else math.inf if pd.isna(row["high"]) else float(row["high"])
-    if bounded is not None:
-        low, high, kind = (low, bounded, BOUNDED) if met_by == "high_bounded" else (bounded, high, BOUNDED)
-    return JudgedFigure(LimitedFigure(value, low, high, kind), over, int(row["clusters"]), n)
+    if bounded is None:
+        return JudgedFigure(LimitedFigure(value, low, high, kind), over, int(row["clusters"]), n)
+    clusters, most = int(row["clusters"]), 1.0 if "share" in criterion.metric else float(row["horizon_s"])
+    spread = find_spread(low, high, clusters, criterion.confidence)
+    low, high = (low, bounded) if met_by == "high_bounded" else (bounded, high)
+    return JudgedFigure(LimitedFigure(value, low, high, BOUNDED, None, (-most, most), spread), over, clusters, n)
 
 
 _ONE_OBJECT = "one object tells nothing of other traffic; `population: these_logs` asks about this recording"
 _TOO_FEW = "too few logs, objects of one log, or runs have it for an interval"
+
+
+_HORIZONS = (0.8, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1)
+"""Shares of the horizon that are tried where a mean up to it is undecided."""
+
+
+def _find_shorter_horizon(criterion: Criterion, rows: FigureRows, horizon_s: float) -> str:
+    """The longest of some shorter horizons by which these very rows meet a bound on a mean; empty: none."""
+    judged = JUDGED[criterion.metric]
+    for part in _HORIZONS if criterion.direction == "at_most" and judged.to_horizon else ():
+        figure = judged.limit(rows, part * horizon_s, criterion.confidence, criterion.bound)
+        if figure.kind is not None and figure.high <= criterion.bound < part * horizon_s:
+            limits = f"{format_limit(figure.value or 0.0)} {format_limits(figure.low, figure.high)}"
+            return f"up to a horizon_s of {part * horizon_s:.3g} these meet it: {limits}"
+    return ""
 
 
 def _list_episodes(rows: StudyRows, *, whole: bool) -> dict[str, frozenset[tuple[str, int]] | None]:
@@ -509,7 +540,7 @@ def _list_episodes(rows: StudyRows, *, whole: bool) -> dict[str, frozenset[tuple
     return kept
 
 
-def find_judged_clusters(table: pd.DataFrame, *, of_runs: bool) -> tuple[Clusters | None, str]:
+def find_judged_clusters(table: pd.DataFrame, *, of_runs: bool, weigh: str = OBJECTS) -> tuple[Clusters | None, str]:
     """What an interval of rows is over, or why there is none; `of_runs`: the runs, else as `choose_over` has it."""
     counts = count_clusters(table)
     if of_runs:
@@ -517,7 +548,7 @@ def find_judged_clusters(table: pd.DataFrame, *, of_runs: bool) -> tuple[Cluster
         if runs < FEWEST_RUNS and (counts[1] > 1 or runs < 2):
             return None, f"{count_noun(runs, 'run')}, fewer than {FEWEST_RUNS}: `runs: {FEWEST_RUNS}` or more"
         return find_clusters(table, of_runs=True), ""
-    clusters = find_clusters(table)
+    clusters = find_clusters(table, weigh=weigh)
     if clusters is None:
         return None, f"{explain_no_clusters(*counts)}; {_RATHER}"
     return (None, _ONE_OBJECT) if clusters.by_run else (clusters, "")

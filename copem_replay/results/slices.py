@@ -15,7 +15,7 @@ import pandas as pd
 from copem_replay.core.errors import InputError, wrap_line
 from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.metrics.config import AREA, NO_AREAS, Slice, find_range_problem, parse_slices
-from copem_replay.metrics.limits import describe_clusters
+from copem_replay.metrics.limits import describe_clusters, format_limits
 from copem_replay.metrics.slices import (
     KEYS,
     SUMMED_COLUMNS,
@@ -26,7 +26,7 @@ from copem_replay.metrics.slices import (
     sum_lists,
     summarise_groups,
 )
-from copem_replay.metrics.summary import format_cell, format_table
+from copem_replay.metrics.summary import format_table
 from copem_replay.pipeline.run import slice_settings
 
 if TYPE_CHECKING:
@@ -109,7 +109,7 @@ def groups_text(table: pd.DataFrame, width: int | None = None) -> str:
 
 
 def _format_limits(low: float, high: float, apart: bool) -> str:
-    return "–" if pd.isna(low) else f"[{format_cell(low)}, {format_cell(high)}]{' *' if apart else ''}"
+    return "–" if pd.isna(low) else f"{format_limits(low, high)}{' *' if apart else ''}"
 
 
 def describe_groups(rows: pd.DataFrame) -> list[str]:

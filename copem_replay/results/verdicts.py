@@ -20,6 +20,7 @@ import pandas as pd
 
 from copem_replay.core.errors import InputError, OutputError, count_noun, escape_unprintable
 from copem_replay.core.files import atomic_file, parse_json
+from copem_replay.metrics.limits import format_limits
 from copem_replay.metrics.summary import format_cell, format_table
 from copem_replay.results.compare.tables import escape_markdown
 from copem_replay.results.folder import MARK, add_to_made_list
@@ -91,7 +92,8 @@ class Verdict:
         """`[0.5, 0.6]`; a dash on a side where there is no limit."""
         if self.interval is None or (self.low is None and self.high is None):
             return "–"
-        return f"[{format_cell(self.low)}, {format_cell(self.high)}]"
+        low, high = (math.nan if limit is None else limit for limit in (self.low, self.high))
+        return format_limits(low, high)
 
     @property
     def result(self) -> str:

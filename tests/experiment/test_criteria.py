@@ -12,6 +12,7 @@ from copem_replay.core.errors import ExperimentError, InputError
 from copem_replay.experiment.criteria import Criterion, choose_judged, note_undecidable, parse_fail_on
 from copem_replay.experiment.cross_references import read_criteria
 from copem_replay.experiment.schema import Configuration
+from copem_replay.metrics.config import Measure
 from copem_replay.metrics.row_figures import JUDGED, PER_MINUTE, SUMMED
 from copem_replay.metrics.summary_metrics import METRIC
 
@@ -106,13 +107,38 @@ def test_a_bound_has_to_be_shown_and_a_difference_refuted() -> None:
 
 def test_what_no_number_of_runs_decides_is_noted() -> None:
     asked = {"a": Criterion(metric="unknown_s", at_most=1), "b": Criterion(metric="unknown_s", at_most=1)}
-    (note,) = note_undecidable(asked, [4])
+    (note,) = note_undecidable(asked, [4], Measure())
     assert note.startswith("criteria a, b: such traffic is not measured by 4 objects of one drive, fewer than 5")
-    assert "by 2 logs, fewer than 3" in next(note_undecidable(asked, [9, 0, 9]))
+    assert "by 2 logs, fewer than 3" in next(note_undecidable(asked, [9, 0, 9], Measure()))
     for counted in ([5], [1, 1, 1]):
-        assert not list(note_undecidable(asked, counted))
+        assert not list(note_undecidable(asked, counted, Measure()))
     of_runs = {"a": Criterion(metric="unknown_s", at_most=1, population="these_logs")}
-    assert not list(note_undecidable(of_runs, [1]))
+    assert not list(note_undecidable(of_runs, [1], Measure()))
+
+
+def test_what_so_few_cannot_show_is_noted() -> None:
+    """Thirteen objects, all at once: a share of .95 takes 72 of them, a mean of 1 s up to 5 s 17."""
+    asked = {
+        "share": Criterion(metric="detected_share", at_least=0.95),
+        "mean": Criterion(metric="ttd_rmst_s", at_most=1.0),
+        "median": Criterion(metric="ttd_median_s", at_most=1.0),
+        "paired": Criterion(metric="ttd_rmst_s", at_most=0.1, against="ideal"),
+    }
+    assert list(note_undecidable(asked, [13], Measure())) == [
+        "criteria share: 13 objects cannot show detected_share ≥ 0.95, however good; at least 72 can",
+        "criteria mean: 13 objects cannot show ttd_rmst_s ≤ 1, however good; at least 17 can, or a horizon_s of 4",
+    ]
+    once = {"share": Criterion(metric="detected_share", at_least=0.95, weigh="drives")}
+    assert "3 logs cannot show detected_share ≥ 0.95, however good; at least 72 can" in next(
+        note_undecidable(once, [20, 20, 20], Measure())
+    )
+
+
+def test_only_figures_of_detections_weigh_drives_alike(tmp_path: Path) -> None:
+    (problem,) = problems_of(
+        tmp_path, "criteria:\n  far: {metric: position_rmse_m, at_most: 1, weigh: drives}\n"
+    )  # fmt: skip
+    assert "2: criteria.far.weigh: expected `weigh` with a metric of detections, found position_rmse_m" in problem
 
 
 def test_conditions_of_fail_on() -> None:

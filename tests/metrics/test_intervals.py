@@ -13,7 +13,6 @@ from scipy.stats import binomtest
 
 from copem_replay.metrics.limits import (
     MOST_GROUPS,
-    absent_share,
     alike_limits,
     describe_absent,
     describe_clusters,
@@ -288,9 +287,9 @@ def test_a_little_more_of_a_difference_changes_its_limits_a_little(difference: f
 
 
 def test_what_a_sample_cannot_exclude():
-    assert absent_share(8) == pytest.approx(0.312344, abs=1e-6)  # .95 that eight have one: 1 − (1 − x)⁸
-    assert absent_share(3) == pytest.approx(0.631597, abs=1e-6)
+    # .95 that eight have one: 1 − (1 − x)⁸, x = .312344; of three .631597.
     assert describe_absent(8) == "a kind of drive that makes up to 31 % of such traffic can be absent"
+    assert describe_absent(3) == "a kind of drive that makes up to 63 % of such traffic can be absent"
 
 
 def test_an_interval_says_what_it_is_over():
@@ -325,7 +324,7 @@ def test_the_summary_of_five_objects_that_are_always_detected() -> None:
     assert (row["detected_share_low"], row["detected_share_high"]) == (pytest.approx(0.025**0.2), 1.0)
     assert (row["interval"], row["interval_over"], row["interval_clusters"], notes) == ("exact", "objects", 5, [])
     lines = format_summary(table).splitlines()
-    assert "[0.4782, 1]" in lines[1]
+    assert "[0.478, 1]" in lines[1]
     assert any(line.startswith("95 %: exact binomial limits over 5 objects of this drive: ") for line in lines)
     assert not any("absent" in line for line in lines)
 

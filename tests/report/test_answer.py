@@ -17,13 +17,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.axes import Axes
-from numpy.typing import NDArray
 
 from copem_replay.core.colours import configuration_colours
 from copem_replay.core.errors import InputError
-from copem_replay.metrics.limits import Clusters
-from copem_replay.metrics.row_figures import FigureRows
-from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_incidence, restricted_mean
 from copem_replay.report.figures import FIGURES, Selection
 from copem_replay.report.figures.answer import answer_figure
 from copem_replay.report.figures.detection_curves import curves_figure
@@ -55,7 +51,6 @@ from copem_replay.report.html.tables import (
 from copem_replay.results.compare import compare_folders
 from copem_replay.results.read import Results, read_results
 from tests.helpers.report_pages import ALONE, ONE, changed, eighteen, named, replayed, with_rows
-from tests.oracles import intervals as oracle
 
 
 @pytest.fixture(scope="module")
@@ -135,36 +130,6 @@ class TestAnswer:
         figure = answer_figure(results, configurations=["hit", "late"])
         assert rows(figure.axes[0]) == ["late", "hit"]
         assert not [line for line in figure.axes[0].get_lines() if line.get_label() == "GT"]
-
-
-class TestMeanLimits:
-    @given(st.data())
-    def test_they_come_of_the_means_without_each_log(self, data: st.DataObject) -> None:
-        """Of four logs, each left out row by row; some rows are censored."""
-        count = data.draw(st.integers(4, 14))
-        time_s = np.array(data.draw(st.lists(st.integers(0, 12), min_size=count, max_size=count))) / 4
-        codes = st.sampled_from([CENSORED, DETECTED, LEFT] if data.draw(st.booleans()) else [DETECTED, LEFT])
-        ending = np.array(data.draw(st.lists(codes, min_size=count, max_size=count)))
-        of = np.array([*range(4), *data.draw(st.lists(st.integers(0, 3), min_size=count - 4, max_size=count - 4))])
-        known, by = ending == DETECTED, {CENSORED: "log_end", LEFT: "object_left", DETECTED: "log_end"}
-        table = pd.DataFrame(
-            {"time_to_detection_s": np.where(known, time_s, np.nan), "onset_s": 0.0, "ended_s": time_s}
-        )
-        table["ended_by"] = [by[code] for code in ending.tolist()]
-        rows = FigureRows(table, np.ones(count), Clusters("logs", of, np.arange(count)))
-        found = rows.limit_mean_time(2.5, 0.95)
-
-        def mean_s(kept: NDArray[np.bool_]) -> float:
-            return restricted_mean(*cumulative_incidence(time_s[kept], ending[kept]), 2.5)
-
-        value, without = mean_s(of >= 0), [mean_s(of != k) for k in range(4)]
-        assert found.value == pytest.approx(value)
-        followed = float(((ending != CENSORED) | (time_s >= 2.5)).mean())
-        if not followed:
-            assert found.kind is None
-            return
-        expected = oracle.bounded(value, without, np.bincount(of).tolist(), 0.0, 2.5, followed)
-        assert (found.low, found.high) == pytest.approx(expected, abs=1e-9)
 
 
 class TestDifferences:

@@ -152,7 +152,7 @@ class TestNumbers:
                 for column, cell in cells.items():
                     expected = plainly(column, rows[name][column])
                     if column in ("detected_share", "pass_share") and rows[name][f"{column}_low"]:
-                        limits = [plainly(column, rows[name][f"{column}_{end}"]) for end in ("low", "high")]
+                        limits = [f"{100 * float(rows[name][f'{column}_{end}']):.3g}" for end in ("low", "high")]
                         expected += f" [{', '.join(limits)}]"
                     assert cell.text == expected, (name, column)
                     seen += 1
@@ -203,15 +203,17 @@ class TestNumbers:
             assert (pairs, frames) == (str(row["n"]), str(row["frames"]))
             assert only == f"{row['only_configuration']} / {row['only_baseline']}"
 
-    def test_differences_whose_interval_excludes_0_are_bold(self, read: Page, html: str) -> None:
+    def test_differences_that_stand_in_the_whole_table_are_bold(self, read: Page, html: str, made: Path) -> None:
+        overall = cr.compare(made).overall.set_index(["configuration", "metric"])
         for id_ in ("regret", "regret-lists"):
             for name, cells in read.tables[id_].items():
                 row = re.search(rf'<table id="{id_}">.*?<tr data-row="{name}">(.*?)</tr>', html, re.DOTALL)
                 assert row is not None
                 for column, cell in cells.items():
                     bold = re.search(rf'data-column="{column}"[^>]*><b>', row[1]) is not None
-                    sure = cell.low is not None and cell.high is not None and float(cell.low) * float(cell.high) > 0
-                    assert bold == sure, (name, column)
+                    star = overall["star"].get((name, column))
+                    assert bold == (star == "*"), (name, column)
+                    assert cell.text.endswith(" °") == (star == "°")
 
     def test_every_column_shown_is_explained(self, read: Page) -> None:
         tables = ("summary", "undetected", "braking", "accuracy", "lists", "regret", "regret-lists")
@@ -246,8 +248,8 @@ class TestWords:
         lines = lines_of(made)
         mean_s = float(summary_rows(made)["half"]["ttd_rmst_s"])
         assert lines[2] == (
-            "Nothing is shown to be better than late (100 % of conflicts pass); no difference shown: half 100 %; "
-            "worse: hit and never 0 %."
+            "Worse than late (100 % of conflicts pass): hit and never by 100 percentage points [54.1, 100]; no "
+            "difference to late is shown: half 0 percentage points [-45.9, 45.9]."
         )
         assert lines[4] == (
             f"half detects soonest, after {mean_s:.2f} s on average (an object that is never detected counts as "
@@ -274,7 +276,10 @@ class TestWords:
         )
         assert lines[5].startswith("Later, without an interval: late (+")
         assert "[" not in lines[5]
-        assert lines[2].endswith(", on these objects alone: there is no interval.")
+        assert lines[2] == (
+            "The same as late (100 % of conflicts pass): half; no interval, so nothing is shown beyond these very "
+            "objects, against late: hit and never -100 percentage points."
+        )
         assert "No interval: 2 objects of one drive, fewer than 5." in lines
         assert any(line.startswith("There are no intervals: 2 objects of one drive, fewer than 5. ") for line in lines)
         assert not any("excluding 0" in line for line in lines)
@@ -310,7 +315,7 @@ class TestWords:
         text = changed(ONE, ("  hit: {units: [ego], latency_s: 1.8}", "  hit: {units: [weak]}"), *ALONE[:2], ALONE[3])
         lines = lines_of(replayed(tmp_path, text))
         assert re.match(r"half and hit detect at the same times: after ", lines[4])
-        assert lines[2].startswith("No difference to half (an object is known after ")
+        assert lines[2].startswith("The same as half (an object is known after ")
         assert not any("No difference" in line or "includes 0" in line for line in lines[3:])
         assert "The same figures pick the winners, which flatters them a little." not in lines, "no loser"
 

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from pyarrow import compute, parquet
 
 from copem_replay.results.compare import compare_folders
+from copem_replay.results.compare.compare import PairsAsked
 from copem_replay.results.table_files import table_file
 from tests.helpers.compare_folders import BRAKING, Row, ghosts, limits_of, row, step, write_folder
 from tests.oracles import compare as oracle
@@ -164,6 +165,24 @@ def test_intervals_leave_out_whole_logs(seed, count):
                 assert row["difference_without_it"] == pytest.approx(left[row["hangs_on"]])
             elif min(signed.values()) > abs(row["difference"]) / 2 + 1e-9:
                 assert pd.isna(row["hangs_on"])
+
+
+@settings(max_examples=8)  # each writes folders and compares them
+@given(seeds, st.sampled_from([2, 3, 5]))
+def test_where_drives_weigh_alike_shares_are_means_of_the_drives_own(seed, count):
+    """What is over lists, pairs and minutes stays as it is."""
+    with TemporaryDirectory() as scratch:
+        folder = write_folder(Path(scratch) / "study", **study(seed, count, fewest=1))
+        once, rows = (compare_folders([folder], asked=PairsAsked(weigh=weigh)).table for weigh in ("drives", "objects"))
+    overall = once[once["log"] == "all"].set_index("metric")
+    for metric in ("detected_share", "pass_share", "unknown_to_horizon_s"):
+        of_logs = once.loc[(once["log"] != "all") & (once["metric"] == metric), ["value", "baseline_value"]].dropna()
+        wanted = of_logs.astype(float).mean().tolist()
+        assert overall.loc[metric, ["value", "baseline_value"]].tolist() == pytest.approx(wanted, nan_ok=True), metric
+    held = ["position_rmse_held_m", "gospa_held_m", "false_positives_per_min"]
+    as_before = (of[of["metric"].isin(held)].drop(columns="star") for of in (once, rows))  # of the whole table
+    pd.testing.assert_frame_equal(*as_before)
+    assert once["n"].tolist() == rows["n"].tolist()
 
 
 @settings(max_examples=6)  # each writes folders and compares them

@@ -57,8 +57,9 @@ class TestLatencies:
             cooperating(co0=0.0, co05=0.5, co1=1.0),
         )
         assert found.sentence == (
-            "Up to 0.5 s of latency cooperation helps: 96 % of conflicts pass against 84 % with PEM alone; from 1 s of "
-            "latency on cooperation is worse than PEM alone: 64 %."
+            "Up to 0.5 s of latency cooperation helps: 96 % of conflicts pass against 84 % with PEM alone, by 11.6 "
+            "percentage points [5, 15]; from 1 s of latency on cooperation is worse than PEM alone: 64 %, by 20.4 "
+            "percentage points [15, 25]."
         )
         assert found.best == ("co0",)
 
@@ -69,8 +70,8 @@ class TestLatencies:
         )
         assert found.sentence == (
             "Without latency cooperation helps: an object is known after 0.00 s on average against 0.70 s with PEM "
-            "alone; up to 1 s of latency no difference to PEM alone is shown: an object is known after 0.90 s on "
-            "average."
+            "alone, by 0.7 s [0.6, 0.8]; up to 1 s of latency no difference to PEM alone is shown: 0.90 s, +0.2 s "
+            "[-0.1, 0.5]."
         )
 
     def test_out_of_their_order_each_is_named(self) -> None:
@@ -79,7 +80,8 @@ class TestLatencies:
             cooperating(co0=0.0, co1=1.0),
         )
         assert found.sentence == (
-            "Sooner than PEM (an object is known after 0.70 s on average): co1 0.10 s; later: co0 0.90 s."
+            "Sooner than PEM (an object is known after 0.70 s on average): co1 by 0.6 s [0.5, 0.7]; later than PEM: "
+            "co0 by 0.2 s [0.1, 0.3]."
         )
 
 
@@ -96,41 +98,60 @@ class TestGroups:
             )
         )
         assert found == Decision(
-            "Better than PEM (50 % of conflicts pass): a 90 %; no difference shown: b 60 %; worse: c 20 %.", ("a",)
+            "Better than PEM (50 % of conflicts pass): a by 40 percentage points [30, 50]; worse than PEM: c by 30 "
+            "percentage points [20, 40]; no difference to PEM is shown: b +10 percentage points [-10, 30].",
+            ("a",),
         )
 
     @pytest.mark.parametrize(("apart_s", "crowned"), [(0.0002, False), (0.049, False), (0.051, True)])
     def test_nobody_is_crowned_by_a_hair(self, apart_s: float, crowned: bool) -> None:
         """All intervals exclude 0."""
         found = decide_compared(compared("ttd_rmst_s", ("a", 1 - apart_s, 1.0, -apart_s - 1e-5, -apart_s + 1e-5)))
-        assert found.sentence.startswith("Sooner than PEM" if crowned else "No difference to PEM")
+        assert found.sentence.startswith("Sooner than PEM" if crowned else "Apart from PEM (an object is known")
         assert found.best == (("a",) if crowned else ("a", "PEM"))
 
     def test_the_best_has_a_better_mean_than_all_and_no_interval_that_excludes_0(self) -> None:
         found = decide_compared(compared("ttd_rmst_s", ("a", 0.5, 1.0, -1.2, 0.2), ("b", 2.0, 1.0, 0.5, 1.5)))
-        assert found.sentence.startswith(
-            "Nothing is shown to be sooner than PEM (an object is known after 1.00 s on average)"
+        assert found.sentence == (
+            "Later than PEM (an object is known after 1.00 s on average): b by 1 s [0.5, 1.5]; no difference to PEM is "
+            "shown: a -0.5 s [-1.2, 0.2]."
         )
         assert set(found.best) == {"a", "PEM"}
 
     def test_without_intervals_it_says_so(self) -> None:
         found = decide_compared(compared("pass_share", ("a", 1.0, 0.0, None, None)))
         assert found.sentence == (
-            "Better than PEM (0 % of conflicts pass): a 100 %, on these objects alone: there is no interval."
+            "No interval, so nothing is shown beyond these very objects, against PEM (0 % of conflicts pass): a +100 "
+            "percentage points."
+        )
+
+    def test_each_is_held_against_the_rows_of_its_own_pair(self) -> None:
+        """Of b half of the logs have no units: the baseline is slower there, and no mean of all rows is compared."""
+        found = decide_compared(compared("ttd_rmst_s", ("a", 0.5, 1.0, -0.6, -0.4), ("b", 1.2, 1.5, -0.4, -0.2)))
+        assert found.sentence == "Sooner than PEM: a by 0.5 s [0.4, 0.6], b by 0.3 s [0.2, 0.4]."
+        assert found.best == ("a",)
+
+    def test_who_is_the_same_in_every_pair_is_said_to_be(self) -> None:
+        found = decide_compared(compared("ttd_rmst_s", ("a", 1.0, 1.0, None, None), ("b", 1.0, 1.0, -0.1, 0.1)))
+        assert found.sentence == (
+            "The same as PEM (an object is known after 1.00 s on average): a; no difference to PEM is shown: b 0 s "
+            "[-0.1, 0.1]."
         )
 
     def test_equal_figures_share_a_number_and_many_are_counted(self) -> None:
         rows = [(name, 1.0, 0.5, 0.4, 0.6) for name in "abcdef"]
         found = decide_compared(compared("pass_share", *rows))
-        assert found.sentence == "Better than PEM (50 % of conflicts pass): a, b, c and d 100 % and 2 more."
+        assert found.sentence == (
+            "Better than PEM (50 % of conflicts pass): a, b, c and d by 50 percentage points [40, 60] and 2 more."
+        )
 
     @pytest.mark.parametrize(
         ("share", "said"), [(0.994, "99 %"), (0.9951, "99.5 %"), (0.9996, "> 99.9 %"), (0.0004, "< 0.1 %")]
     )
     def test_all_and_none_are_all_and_none(self, share: float, said: str) -> None:
-        other = 0.5
-        low, high = sorted([share - other - 0.01, share - other + 0.01])
-        assert f"a {said}" in decide_compared(compared("pass_share", ("a", share, other, low, high))).sentence
+        low, high = sorted([0.5 - share - 0.01, 0.5 - share + 0.01])
+        found = decide_compared(compared("pass_share", ("a", 0.5, share, low, high)))
+        assert f"than PEM ({said} of conflicts pass)" in found.sentence
 
 
 def verdict(name: str, word: str) -> Verdict:

@@ -262,7 +262,7 @@ def test_a_quantile_is_judged_as_a_share() -> None:
     assert p95.value == 4.0
     assert p95.share is not None
     # The spread of logs that are all or nothing leaves 12 − 1 of 12 trials.
-    assert p95.share[0] < 0.95 < p95.share[1]
+    assert p95.share[0] < 0.95 < p95.share[2]
     assert judge_limits(p95.low, p95.high, 1.0, "at_most") == UNDECIDED
     assert (p95.low, p95.high) == (1.0, math.inf)
     median = rows.limit_time_quantile(0.5, 0.95, 1.0)
@@ -295,7 +295,7 @@ def test_who_is_known_at_the_very_bound_is_known_by_it() -> None:
     for within, bound in ((rows.limit_time_quantile, 1.0), (rows.limit_distance_quantile, 90.0)):
         found = within(0.5, 0.95, bound)
         assert found.value == bound
-        assert found.share == pytest.approx((share.low, share.high), abs=1e-9)
+        assert found.share == pytest.approx((share.low, share.value, share.high), abs=1e-9)
     nobody = rows.limit_distance_quantile(0.5, 0.95, 90.0 + 1e-6).share
     assert nobody is not None
     assert nobody[0] == 0.0

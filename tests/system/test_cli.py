@@ -513,7 +513,7 @@ class TestRun:
         assert len(found) == 0
         assert found.dtypes["onset_s"].kind == "f"
         assert list(pd.read_csv(here / "out/e/summary.csv")["n"]) == [0, 0, 0]
-        assert ended.out.splitlines()[1].split() == ["GT", "–", "–", "–", "–", "–", "–", "–", "–"]
+        assert ended.out.splitlines()[1].split() == ["GT", *["–"] * 9]
         assert "all configurations: n 0, list_rate_hz 10" in ended.out.splitlines()
         refused = call("compare", "out/e", "--baseline", "PEM")
         assert (refused.code, refused.lines) == (

@@ -276,9 +276,6 @@ def _tabulate_rungs(
 
 # A number of several logs: its mean, and how far it scatters between them.
 
-FEWEST_LOGS = 3
-"""Logs from which on a scatter between them is estimated: of two it would have one degree of freedom."""
-
 
 @dataclass(frozen=True)
 class LogPool:

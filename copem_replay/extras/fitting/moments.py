@@ -16,7 +16,8 @@ from scipy.stats import chi2, t
 from copem_replay.core.tracks import CLASSES, Bool, Float, Int
 from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.extras.fitting.error_memory import MemoryShares, ResidualSeries, sum_correlations
-from copem_replay.extras.fitting.estimate import FEWEST_LOGS, PASSES_ALONE, PER_ROW, Estimate, pool_logs
+from copem_replay.extras.fitting.estimate import PASSES_ALONE, PER_ROW, Estimate, pool_logs
+from copem_replay.metrics.limits import FEWEST_LOGS
 
 EFFECTIVE_ROWS = 20
 """Independent rows that a bin holds at least: a standard deviation is then known to about 16 %."""

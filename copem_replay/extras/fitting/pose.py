@@ -15,12 +15,13 @@ from scipy.stats import chi2, t
 
 from copem_replay.core.tracks import CLASSES, Float, Int
 from copem_replay.extras.fitting.error_memory import LastingPart
-from copem_replay.extras.fitting.estimate import FEWEST_LOGS, Estimate, LogPool, pool_logs
+from copem_replay.extras.fitting.estimate import Estimate, LogPool, pool_logs
 from copem_replay.extras.fitting.rows import FitLists, FitRows
 from copem_replay.io.clock_offset import TimeOffset
 from copem_replay.io.recorded_lists import RecordedLists
 from copem_replay.io.recorded_units import delay_words, estimate_delay
 from copem_replay.io.recording import Recording
+from copem_replay.metrics.limits import FEWEST_LOGS
 
 FEWEST_LISTS = 50
 """Lists with two listed objects or more below which no pose is fitted."""

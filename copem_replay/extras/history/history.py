@@ -7,6 +7,7 @@ in which they are given.
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ import pandas as pd
 
 from copem_replay.core.errors import InputError, count_noun
 from copem_replay.core.files import atomic_file
+from copem_replay.metrics.limits import format_limit, format_limits
 from copem_replay.metrics.summary import format_cell
 from copem_replay.metrics.summary_metrics import COMPARED
 from copem_replay.report.html.markup import Html, allow_breaks, fold_parts, join_html, make_list, make_table, make_tag
@@ -316,7 +318,7 @@ def _difference_rows(new: Results, old: Results) -> Iterator[tuple[str, list[pd.
 def _difference_words(row: pd.Series | None) -> Html:
     if row is None or pd.isna(row["difference"]):
         return make_tag("td", "–")
-    limits = [format_cell(None if pd.isna(row[end]) else float(row[end])) for end in ("low", "high")]
-    shown = format_cell(float(row["difference"]))
-    between = make_tag("span", f"[{', '.join(limits)}]", class_="interval") if limits != ["–", "–"] else Html("")
+    limits = format_limits(*(math.nan if pd.isna(row[end]) else float(row[end]) for end in ("low", "high")))
+    shown = format_limit(float(row["difference"]))
+    between = make_tag("span", limits, class_="interval") if limits != "[–, –]" else Html("")
     return make_tag("td", shown, " ", between)

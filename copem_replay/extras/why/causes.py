@@ -29,7 +29,7 @@ from copem_replay.fusion.interface import IdealFusion
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.config import Confirm
 from copem_replay.metrics.onset import select_counted
-from copem_replay.metrics.summary_metrics import compute_unknown_s
+from copem_replay.metrics.survival import compute_unknown_s
 from copem_replay.perception.pem.condition import Couple
 from copem_replay.perception.pem.detection import DetectionModel
 from copem_replay.perception.pem.model import Pem

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from copem_replay.metrics.limits import ALL_ALIKE, CONFIDENCE, find_clusters
+from copem_replay.metrics.limits import ALL_ALIKE, CONFIDENCE, find_clusters, weigh_rows
 from copem_replay.metrics.row_figures import FigureRows
 from copem_replay.report.figures.style import (
     RANKED_BY,
@@ -29,6 +29,7 @@ from copem_replay.report.figures.style import (
     new_figure,
     shorten_names,
     sort_soonest_first,
+    write_limits,
 )
 
 if TYPE_CHECKING:
@@ -94,7 +95,8 @@ def _name_rows(axes: Axes, names: Sequence[str]) -> None:
 def _time_dots(results: Results, names: Sequence[str]) -> tuple[list[Dot], list[str]]:
     """A dot per configuration, and sentences on those without an interval."""
     rows = results.summary.set_index("configuration")
-    clusters = find_clusters(results.known)
+    weigh = results.experiment.measure.weigh
+    clusters = find_clusters(results.known, weigh=weigh)
     dots: list[Dot] = []
     without: dict[str, list[str]] = {}
     for name in names:
@@ -110,15 +112,15 @@ def _time_dots(results: Results, names: Sequence[str]) -> tuple[list[Dot], list[
         if clusters is not None and not (clusters.by_run and results.facts[name].fixed):
             kept = (results.known["configuration"] == name).to_numpy()
             of_name = results.known[kept]
-            rows_of_name = FigureRows(of_name, of_name["runs"].to_numpy(dtype=float), clusters.select(kept))
+            rows_of_name = FigureRows(of_name, weigh_rows(of_name, "runs", weigh), clusters.select(kept))
             found = rows_of_name.limit_mean_time(horizon_s, CONFIDENCE)
             reason = f"all {clusters.over} alike" if found.kind == ALL_ALIKE else "no object is followed to the horizon"
         if found is None or np.isnan(found.low):
             without.setdefault(reason, []).append(name)
             dots.append(Dot(mean_s, None, None, format_two_decimals(mean_s)))
         else:
-            low, high = map(format_two_decimals, (found.low, found.high))
-            dots.append(Dot(mean_s, found.low, found.high, f"{format_two_decimals(mean_s)} [{low}, {high}]"))
+            words = f"{format_two_decimals(mean_s)} {write_limits(found.low, found.high)}"
+            dots.append(Dot(mean_s, found.low, found.high, words))
     return dots, [_explain_without(reason, lacking, names) for reason, lacking in without.items()]
 
 
@@ -147,7 +149,7 @@ def _share_dot(row: Any, share: str) -> Dot:
         100 * value,
         100 * low,
         100 * high,
-        f"{format_aligned_per_cent(value)} [{format_aligned_per_cent(low)}, {format_aligned_per_cent(high)}]",
+        f"{format_aligned_per_cent(value)} {write_limits(100 * low, 100 * high)}",
     )
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 
 from copem_replay.core.tracks import Float
-from copem_replay.metrics.limits import CONFIDENCE, NOTHING_DRAWN, Clusters, find_clusters
+from copem_replay.metrics.limits import CONFIDENCE, NOTHING_DRAWN, OBJECTS, Clusters, find_clusters, weigh_rows
 from copem_replay.metrics.row_figures import FigureRows
 from copem_replay.report.figures.selection import describe_left_out, find_differing
 from copem_replay.report.figures.style import (
@@ -80,7 +80,8 @@ def curves_figure(results: Results, *, configurations: Sequence[str] | None = No
     names = find_differing(results, chosen)
     over, curves = build_curves(results, names, bands=len(names) <= MOST_BANDS)
     counted = None if results.exact is None else results.counted(results.exact)
-    exact = {} if counted is None else {name: exact_curve(counted, name) for name in names}
+    weigh = results.experiment.measure.weigh
+    exact = {} if counted is None else {name: exact_curve(counted, name, weigh) for name in names}
     with figure_style():
         figure = _draw_curves(curves, exact, choose_appearances(results, configurations))
         _add_caption(figure, results, names, over, curves, bool(exact), describe_left_out(chosen, names))
@@ -91,22 +92,26 @@ def build_curves(
     results: Results, names: Sequence[str], *, bands: bool = True
 ) -> tuple[str | None, dict[str, DetectionCurve]]:
     """The kind of clusters (None, or `NOTHING_DRAWN`), and the curves, with bands if there are clusters."""
-    clusters = find_clusters(results.known)
+    weigh = results.experiment.measure.weigh
+    clusters = find_clusters(results.known, weigh=weigh)
     fixed = [name for name in names if clusters is not None and clusters.by_run and results.facts[name].fixed]
     curves = {}
     for name in names:
         kept = (results.known["configuration"] == name).to_numpy()
         banded = bands and clusters is not None and name not in fixed
-        curves[name] = build_curve(results.known[kept], clusters.select(kept) if banded and clusters else None)
+        chosen = clusters.select(kept) if banded and clusters else None
+        curves[name] = build_curve(results.known[kept], chosen, weigh)
     over = None if clusters is None else clusters.over
     return (NOTHING_DRAWN if fixed and len(fixed) == len(names) else over), curves
 
 
-def build_curve(rows: pd.DataFrame, clusters: Clusters | None) -> DetectionCurve:
-    """The curve of one configuration's rows (n,), with a band over their clusters if there are any."""
+def build_curve(rows: pd.DataFrame, clusters: Clusters | None, weigh: str = OBJECTS) -> DetectionCurve:
+    """The curve of one configuration's rows (n,), with a band over their clusters if there are any. `weigh`: as for
+    `weigh_rows`.
+    """
     if not len(rows):
         return DetectionCurve(np.empty(0), np.empty(0))
-    figures = FigureRows(rows, rows["runs"].to_numpy(dtype=float), clusters)
+    figures = FigureRows(rows, weigh_rows(rows, "runs", weigh), clusters)
     times_s, share = figures.curve
     if clusters is None or not len(times_s):
         return DetectionCurve(times_s, share)
@@ -116,16 +121,17 @@ def build_curve(rows: pd.DataFrame, clusters: Clusters | None) -> DetectionCurve
     return DetectionCurve(times_s, share, low[step_ix], high[step_ix])
 
 
-def exact_curve(exact: pd.DataFrame, name: str) -> DetectionCurve:
-    """The exact probability of being detected by then, averaged over logs and objects.
+def exact_curve(exact: pd.DataFrame, name: str, weigh: str = OBJECTS) -> DetectionCurve:
+    """The exact probability of being detected by then, averaged over objects, or drives, by `weigh`.
 
     It differs from the estimator of the runs' curves, which hands the weight of censored rows on to all remaining ones,
     even to an ending with a probability of a millionth, which no run has.
     """
     rows = exact[exact["configuration"] == name]
-    detections = rows[rows["time_to_detection_s"].notna() & (rows["probability"] > 0)]
+    found = (rows["time_to_detection_s"].notna() & (rows["probability"] > 0)).to_numpy()
+    detections, weight = rows[found], weigh_rows(rows, "probability", weigh)[found]
     times_s, place = np.unique(detections["time_to_detection_s"].to_numpy(dtype=float), return_inverse=True)
-    mass = np.bincount(place, weights=detections["probability"].to_numpy(dtype=float), minlength=len(times_s))
+    mass = np.bincount(place, weights=weight, minlength=len(times_s))
     return DetectionCurve(times_s, np.cumsum(mass) / max(rows.groupby(["log", "object_id", "episode"]).ngroups, 1))
 
 

@@ -23,9 +23,9 @@ from copem_replay.report.figures.style import (
     figure_style,
     find_truths,
     format_signed_decimals,
-    format_two_decimals,
     new_figure,
     sort_soonest_first,
+    write_limits,
 )
 from copem_replay.results.compare.labels import find_baseline
 from copem_replay.results.compare.tables import NOTHING, describe_gain, explain_no_interval
@@ -122,9 +122,7 @@ def _make_dot(row: Any, metric: str) -> Dot:
     words = format_signed_decimals(value)
     if pd.isna(row.interval_over) or low is None or high is None:
         return Dot(value, None, None, " ".join([words, *(f"({why})" for why in explain_no_interval(row))]))
-    return Dot(
-        value, low, high, f"{words} [{format_two_decimals(low)}, {format_two_decimals(high)}]", sure=excludes_0(row)
-    )
+    return Dot(value, low, high, f"{words} {write_limits(low, high)}", sure=excludes_0(row))
 
 
 def _centre_on_zero(axes: Axes, dots: Sequence[Dot], metric: str, baseline: str) -> None:

@@ -28,6 +28,7 @@ from copem_replay.metrics.limits import (
     describe_clusters,
     explain_no_clusters,
     find_clusters,
+    format_limits,
 )
 from copem_replay.results.table_files import AGAIN
 
@@ -329,6 +330,11 @@ def format_two_decimals(value: float) -> str:
         return "< 0.01" if value > 0 else "> −0.01"
     shown = "0.00" if abs(value) < 1e-9 else f"{value:.0f}" if abs(value) >= 1000 else f"{value:.2f}"
     return shown.replace("-", "−")
+
+
+def write_limits(low: float, high: float) -> str:
+    """An interval as it is written everywhere, with the sign of minus."""
+    return format_limits(low, high).replace("-", "−")
 
 
 def describe_over(results: Results) -> str:

@@ -21,6 +21,7 @@ from copem_replay.report.figures.style import (
     format_signed_decimals,
     format_three_digits,
     format_two_decimals,
+    write_limits,
 )
 from copem_replay.report.html.markup import Html, escape_text, fold_parts, join_html, make_list, make_tag
 from copem_replay.report.html.setup import join_names, shorten_list
@@ -212,7 +213,7 @@ def _format_difference(row: Any, unit: str = " s") -> str:
     if pd.isna(row.interval_over) or pd.isna(row.low) or pd.isna(row.high):
         return shown
     logs = "" if pd.isna(row.logs_better) else f", {describe_gain(row)}"
-    return f"{shown} [{format_two_decimals(row.low)}, {format_two_decimals(row.high)}]{logs}"
+    return f"{shown} {write_limits(row.low, row.high)}{logs}"
 
 
 def _format_unsure(row: Any) -> str:
@@ -276,7 +277,7 @@ def _pass_sentences(study: ReportData) -> Iterator[str]:
 def _format_share(row: Any) -> str:
     low, high = row["pass_share_low"], row["pass_share_high"]
     shown = f"{format_per_cent(float(row['pass_share']))} %"
-    return shown if pd.isna(low) else f"{shown} [{format_per_cent(float(low))}, {format_per_cent(float(high))}]"
+    return shown if pd.isna(low) else f"{shown} {write_limits(100 * float(low), 100 * float(high))}"
 
 
 def _truth_sentences(study: ReportData) -> Iterator[str]:

@@ -67,7 +67,7 @@ def _figure_cell(row: dict[str, Any], name: str) -> Html:
     low, high = (row.get(f"{name}_{end}") for end in ("low", "high"))
     parts = [Html(format_value(name, value))]
     if pd.notna(low) and pd.notna(high):
-        parts.append(interval_markup(*(format_value(name, float(limit)) for limit in (low, high))))  # type: ignore[arg-type]
+        parts.append(interval_markup(*(100.0 * limit for limit in (low or 0.0, high or 0.0))))
     if name == "detected_share" and row["apart"] is not None and row["apart"] == True:  # noqa: E712
         parts.append(Html(" *"))
     return make_tag("td", *parts, data_column=name, data_value=full_number(row[name]))

@@ -18,13 +18,13 @@ from copem_replay.metrics.metric import own_metrics
 from copem_replay.metrics.summary import SETUP, describe_intervals, format_cell, has_undetected
 from copem_replay.metrics.summary_metrics import COMPARED, METRIC, METRICS, PARTS
 from copem_replay.metrics.survival import EndReason
-from copem_replay.report.figures.differences import excludes_0
 from copem_replay.report.figures.latency_breakdown import STAGES, count_detected, mean_stages_by_configuration
 from copem_replay.report.figures.style import (
     format_aligned_per_cent,
     format_signed_decimals,
     format_three_digits,
     format_two_decimals,
+    write_limits,
 )
 from copem_replay.report.html.markup import (
     Html,
@@ -36,6 +36,7 @@ from copem_replay.report.html.markup import (
     make_table,
     make_tag,
 )
+from copem_replay.results.compare.limits import STAR
 from copem_replay.results.compare.tables import comparison_lines, explain_no_interval, held_cells
 from copem_replay.results.verdicts import MET, NOT_MEASURED, NOT_MET, UNDECIDED, Judgement, Verdict
 
@@ -95,11 +96,6 @@ def format_value(name: str, value: float) -> str:
 def difference_column_header(name: str) -> str:
     """The header of a column of differences, in percentage points for shares."""
     return column_header(name).removesuffix(", %") + ", percentage points" if is_share(name) else column_header(name)
-
-
-def format_difference(name: str, value: float) -> str:
-    """A limit of a difference, in the unit of its column."""
-    return format_two_decimals(value * (100 if is_share(name) else 1))
 
 
 def format_signed_difference(name: str, value: float) -> str:
@@ -169,7 +165,7 @@ def _summary_cell(row: dict[str, Any], name: str) -> Html:
     parts = [Html(format_value(name, value))]
     low, high = (row.get(f"{name}_{end}") if name in _INTERVALS else None for end in ("low", "high"))
     if low is not None and high is not None and pd.notna(low) and pd.notna(high):
-        parts.append(interval_markup(format_value(name, float(low)), format_value(name, float(high))))
+        parts.append(interval_markup(100 * float(low), 100 * float(high)))
     return make_tag(
         "td",
         *parts,
@@ -180,9 +176,9 @@ def _summary_cell(row: dict[str, Any], name: str) -> Html:
     )
 
 
-def interval_markup(low: str, high: str) -> Html:
+def interval_markup(low: float, high: float) -> Html:
     """Limits of an interval, which may wrap below their value."""
-    return join_html([" ", make_tag("span", f"[{low}, {high}]", class_="interval")])
+    return join_html([" ", make_tag("span", write_limits(low, high), class_="interval")])
 
 
 def full_number(value: Any) -> str | None:
@@ -284,12 +280,12 @@ def _difference_cell(row: Any, metric: str) -> Html:
         return make_tag("td", "–", data_column=metric)
     limits = row.low, row.high
     shown: list[str] = [format_signed_difference(metric, row.difference)]
-    if excludes_0(row):
+    if row.star == STAR:
         shown = [make_tag("b", *shown)]
     if pd.notna(row.interval_over):
-        shown.append(
-            interval_markup(*("–" if pd.isna(limit) else format_difference(metric, limit) for limit in limits))
-        )
+        times = 100.0 if is_share(metric) else 1.0
+        shown.append(interval_markup(*(math.nan if pd.isna(limit) else times * float(limit) for limit in limits)))
+    shown += [] if pd.isna(row.star) else [f" {row.star}"]
     shown += [f" ({why})" for why in explain_no_interval(row)]
     low, high = map(full_number, limits)
     return make_tag(

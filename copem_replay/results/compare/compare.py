@@ -22,9 +22,11 @@ from copem_replay.core.tracks import SAME_INSTANT_S
 from copem_replay.metrics.columns import COMPARISON
 from copem_replay.metrics.limits import (
     CONFIDENCE,
+    DRIVES,
     FEWEST_CLUSTERS,
     FEWEST_LOGS,
     NOT_ENOUGH,
+    OBJECTS,
     choose_over,
     explain_no_clusters,
 )
@@ -117,22 +119,26 @@ class AllLogs:
         """The number of logs whose own difference is for the better."""
         return sum(COMPARED[metric].better * difference > 0 for difference in self.differences.get(metric, ()))
 
-    def regrets(self) -> Iterator[Regret]:
-        """The regret of every metric over all logs."""
-        return map(Regret.joined, self._regrets.values())
+    def regrets(self, weigh: str | None) -> Iterator[Regret]:
+        """The regret of every metric over all logs. `weigh`: `drives`: each log counts as much as another."""
+        for of_logs in self._regrets.values():
+            regret = Regret.joined(of_logs)
+            once = weigh == DRIVES and len(of_logs) > 1 and COMPARED[regret.metric].part != "lists"
+            yield replace(regret, figure=regret.figure.each_drive_once()) if once else regret
 
 
 @dataclass(frozen=True)
 class PairsAsked:
     """Of which rows differences are asked, and their intervals. `episodes`: by log the object and episode of each that
     is meant, or all of a log (None); no logs but these; None: all logs. `every`: all of these count, however they
-    began. `over_runs`: intervals are over runs of the logs.
+    began. `over_runs`: intervals are over runs of the logs. `weigh`: what counts alike; None: as `measure.weigh`.
     """
 
     episodes: Mapping[str, Collection[tuple[str, int]] | None] | None = None
     every: bool = False
     over_runs: bool = False
     confidence: float = CONFIDENCE
+    weigh: str | None = None
 
     def restrict(self, log: str, grid: PairingGrid, side: PairSide) -> PairSide:
         """A side of a pair with the cells that are asked for alone; ghosts belong to whole logs."""
@@ -314,6 +320,7 @@ def compare_folders(
     setting = PairSettings(horizon_s, float(read[0].provenance.measure["gospa"]["power"]))
     settings, reasons = _settle_ghosts(setting, against, others, totals, false_positives_per_min, asked=not own_rate)
     groups = EpisodeGroups(read[0], by or ())
+    asked = replace(asked, weigh=asked.weigh or read[0].provenance.measure.get("weigh", OBJECTS))
     names = ClusterNames(logs, [], runs)
     remembering = find_remembering(known, against, others) if baseline is None else {}
     stars = Stars(decide, matters or {})
@@ -326,7 +333,7 @@ def compare_folders(
         configurations=tuple(labelled.label for labelled in others),
         horizon_s=setting.horizon_s,
         false_positives_per_min=false_positives_per_min,
-        groups=_tabulate_groups(against, remembering, of_groups, names, groups, stars) if by else None,
+        groups=_tabulate_groups(against, remembering, of_groups, names, groups, stars, asked.weigh) if by else None,
         decide=decide,
         matters=matters or {},
         truths=tuple(labelled.label for labelled in (against, *others) if labelled.facts.truth),
@@ -499,12 +506,13 @@ def _tabulate_groups(
     names: ClusterNames,
     groups: EpisodeGroups,
     stars: Stars,
+    weigh: str | None,
 ) -> pd.DataFrame:
     """The rows of `Comparison.groups`; those of an entry are one table."""
     rows: list[dict[str, Any]] = []
     limit: list[Callable[[float], Mapping[str, object]]] = []
     for k, (by, group) in enumerate(groups.named):
-        found, of_found = _overall_rows(against, remembering, of_groups.get(k, {}), names)
+        found, of_found = _overall_rows(against, remembering, of_groups.get(k, {}), names, PairsAsked(weigh=weigh))
         rows += [{"by": by.label, "group": group, **without_limits_over_runs(row)} for row in found]
         limit += of_found
     for label in {row["by"] for row in rows}:
@@ -521,7 +529,7 @@ def _overall_rows(
     remembering: Remembering,
     pairs: Mapping[LabelledConfiguration, AllLogs],
     names: ClusterNames,
-    asked: PairsAsked = PairsAsked(),
+    asked: PairsAsked,
 ) -> tuple[list[dict[str, Any]], list[Callable[[float], Mapping[str, object]]]]:
     """The rows of all logs, and of each its limits at a confidence.
 
@@ -530,7 +538,7 @@ def _overall_rows(
     rows: list[dict[str, Any]] = []
     limit: list[Callable[[float], Mapping[str, object]]] = []
     for labelled, pair in pairs.items():
-        for regret in pair.regrets():
+        for regret in pair.regrets(asked.weigh):
             values = regret.figure.values()
             baseline = _baseline_of(regret.metric, labelled, against, remembering)
             row: dict[str, Any] = {"log": ALL, **_make_row(regret, values, labelled, baseline, names, asked)}

@@ -148,7 +148,18 @@ def _rates_by_configuration(results: Results) -> dict[str, float]:
 
 # What folders must have in common to be compared.
 
-_MEASURE = ("objects", "onset", "began", "count_earlier", "confirm", "match", "distance_to", "gospa", "annotated")
+_MEASURE = (
+    "objects",
+    "onset",
+    "began",
+    "count_earlier",
+    "confirm",
+    "match",
+    "distance_to",
+    "gospa",
+    "annotated",
+    "weigh",
+)
 """Keys of `measure` that the compared metrics depend on."""
 
 

@@ -82,6 +82,20 @@ class StatisticItems:
             {name: _sum_groups(of, group) if name in _SUMMED else of[first] for name, of in columns.items()}
         )
 
+    @property
+    def weight(self) -> Float:
+        """(i,) what an item counts in means and medians: its pairs, where no drive is to count as much as another."""
+        return self.columns.get("weight", self["n"]).astype(float)
+
+    def each_drive_once(self) -> StatisticItems:
+        """The items with a weight by which each log counts as much as another."""
+        sums = self.columns.get("sums")
+        averaged = self["n"].astype(float) if sums is None else sums[:, 2]
+        of_log = np.bincount(self["logs"], averaged)
+        scale = averaged.sum() / max(np.count_nonzero(of_log), 1) / np.where(of_log > 0, of_log, np.inf)[self["logs"]]
+        scaled = {"weight": self["n"] * scale} | ({} if sums is None else {"sums": sums * scale[:, None]})
+        return StatisticItems({**self.columns, **scaled})
+
     @staticmethod
     def joined(parts: Sequence[StatisticItems]) -> StatisticItems:
         """The items of several logs together."""
@@ -198,6 +212,10 @@ class PairStatistic(ABC):
         """The figure of several logs."""
         return replace(logs[0], parts=tuple(map(StatisticItems.joined, zip(*(log.parts for log in logs), strict=True))))
 
+    def each_drive_once(self) -> Self:
+        """The figure in which each log counts as much as another."""
+        return replace(self, parts=tuple(part.each_drive_once() for part in self.parts))
+
     @abstractmethod
     def values(self) -> tuple[float, float, float]:
         """The figure of the first, of the second, and their difference; NaN or infinite: there is none."""
@@ -207,8 +225,9 @@ class PairStatistic(ABC):
         """(K,) differences without the items of each cluster."""
 
     def weights(self, clusters: ClusterIndex) -> Float:
-        """(K,) how much of what the figure averages each cluster has: as many items."""
-        return _count_items(self.items, clusters)
+        """(K,) how much of what the figure averages each cluster has: as many pairs."""
+        cluster, n = clusters.of(self.items), self.items.weight
+        return np.bincount(cluster[cluster >= 0], n[cluster >= 0], len(clusters.names)).astype(float)
 
     @property
     def bounds(self) -> tuple[float, float]:
@@ -226,10 +245,9 @@ class PairStatistic(ABC):
         found = limit_left_out(difference, self.without_each(of), self.weights(of), self.bounds, confidence)
         if found.kind != ALL_ALIKE or not self.share:
             return found
-        weights, objects = self.weights(clusters), clusters.count_objects(self.items).sum()
-        return LimitedFigure(
-            difference, *alike_limits(difference, weights * objects / weights.sum(), confidence), EXACT
-        )  # fmt: skip
+        weights = self.weights(clusters)
+        objects = weights * clusters.count_objects(self.items).sum() / weights.sum()
+        return LimitedFigure(difference, *alike_limits(difference, objects, confidence), EXACT)
 
     def limit_by_bounds(
         self, difference: float, clusters: ClusterIndex, confidence: float = CONFIDENCE
@@ -303,7 +321,7 @@ class MedianStatistic(PairStatistic):
 
     def values(self) -> tuple[float, float, float]:
         """Median of the first, of the second, and of the differences."""
-        weight = self.items["n"].astype(float)
+        weight = self.items.weight
         first, second, difference = (
             _weighted_median(of, weight) for of in (self.items["first"], self.items["second"], self.differences)
         )
@@ -311,7 +329,7 @@ class MedianStatistic(PairStatistic):
 
     def without_each(self, clusters: ClusterIndex) -> Float:
         """(K,) medians of the differences."""
-        cluster, n = clusters.of(self.items), self.items["n"].astype(float)
+        cluster, n = clusters.of(self.items), self.items.weight
         medians = [
             _weighted_median(self.differences[cluster != k], n[cluster != k]) for k in range(len(clusters.names))
         ]
@@ -319,10 +337,11 @@ class MedianStatistic(PairStatistic):
 
     def limits(self, difference: float, clusters: ClusterIndex, confidence: float = CONFIDENCE) -> LimitedFigure:
         """Limits of the share of differences at or below a value, inverted."""
-        cluster, n = clusters.of(self.items), self.items["n"].astype(float)
+        cluster, n = clusters.of(self.items), self.items.weight
         objects = None if clusters.over == "runs" else clusters.count_objects(self.items).sum()
+        once = clusters.over == "logs" and "weight" in self.items.columns
         least, most = limit_ranked_quantile(
-            self.differences, n, cluster, len(clusters.names), objects, confidence=confidence
+            self.differences, n, cluster, len(clusters.names), objects, confidence=confidence, once=once
         )
         if most - least <= _SAME:
             return LimitedFigure(difference, kind=ALL_ALIKE)
@@ -346,7 +365,7 @@ class TimeStatistic(PairStatistic):
             return math.nan, math.nan, math.nan
         sides = [0.0, 0.0]
         for share, part in zip(self.shares, self.parts, strict=True):
-            steps = cumulative_incidence(part["time_s"], part["ending"], part["n"].astype(float))
+            steps = cumulative_incidence(part["time_s"], part["ending"], part.weight)
             sides[share < 0] += abs(share) * restricted_mean(*steps, self.horizon_s)
         return sides[0], sides[1], sides[0] - sides[1]
 
@@ -354,10 +373,9 @@ class TimeStatistic(PairStatistic):
         """(K,) differences."""
         K, sides = len(clusters.names), np.zeros((2, len(clusters.names)))
         for share, part in zip(self.shares, self.parts, strict=True):
-            n = part["n"].astype(float)
             means = restricted_means_without(
-                part["time_s"], part["ending"], n, clusters.of(part), K, self.horizon_s
-            )  # fmt: skip
+                part["time_s"], part["ending"], part.weight, clusters.of(part), K, self.horizon_s
+            )
             sides[int(share < 0)] += abs(share) * means
         difference: Float = sides[0] - sides[1]
         return difference
@@ -372,14 +390,7 @@ class TimeStatistic(PairStatistic):
     def followed(self) -> float:
         """The share of the pairs that is detected, departed or watched to the horizon, on the side that has fewer."""
         known = [(of["ending"] != CENSORED) | (of["time_s"] >= self.horizon_s - _SAME) for of in self.parts]
-        return min(float(of["n"][kept].sum() / of["n"].sum()) for of, kept in zip(self.parts, known, strict=True))
-
-
-def _count_items(items: StatisticItems, clusters: ClusterIndex) -> Float:
-    """(K,) how many pairs the items of each cluster stand for."""
-    cluster = clusters.of(items)
-    within = cluster >= 0
-    return np.bincount(cluster[within], items["n"][within], len(clusters.names)).astype(float)
+        return min(float(of.weight[kept].sum() / of.weight.sum()) for of, kept in zip(self.parts, known, strict=True))
 
 
 def _weighted_median(values: Float, weight: Float) -> float:

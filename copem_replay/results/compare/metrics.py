@@ -33,8 +33,8 @@ from numpy.typing import NDArray
 from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import Bool, Float, Int
 from copem_replay.metrics.limits import choose_over
-from copem_replay.metrics.summary_metrics import COMPARED, compute_unknown_s
-from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT
+from copem_replay.metrics.summary_metrics import COMPARED
+from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, compute_unknown_s
 from copem_replay.results.compare.labels import LabelledConfiguration
 from copem_replay.results.compare.limits import (
     MedianStatistic,

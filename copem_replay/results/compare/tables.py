@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -12,7 +13,16 @@ import pandas as pd
 from copem_replay.core.errors import OutputError, count_noun, escape_unprintable, wrap_line
 from copem_replay.core.files import atomic_file
 from copem_replay.metrics.columns import TABLES
-from copem_replay.metrics.limits import ALL_ALIKE, EXACT, FEWEST_LOGS, NOTHING_DRAWN, describe_absent, describe_clusters
+from copem_replay.metrics.limits import (
+    ALL_ALIKE,
+    EXACT,
+    FEWEST_LOGS,
+    NOTHING_DRAWN,
+    describe_absent,
+    describe_clusters,
+    format_limit,
+    format_limits,
+)
 from copem_replay.metrics.summary import describe_mean, format_table
 from copem_replay.metrics.summary_metrics import COMPARED
 from copem_replay.results.compare.groups import describe_group_chance
@@ -134,9 +144,9 @@ def _format_cell(row: Any) -> str:
         return "–"
     if pd.isna(row.interval_over):
         return " ".join([format_signed(row.difference), *(f"({why})" for why in explain_no_interval(row))])
-    low, high = ("–" if pd.isna(limit) else format_limit(limit) for limit in (row.low, row.high))
+    low, high = (math.nan if pd.isna(limit) else float(limit) for limit in (row.low, row.high))
     marks = (mark for mark in (row.star, row.word) if not pd.isna(mark))
-    return " ".join([f"{format_signed(row.difference)} [{low}, {high}]", *marks])
+    return " ".join([f"{format_signed(row.difference)} {format_limits(low, high)}", *marks])
 
 
 def explain_no_interval(row: Any) -> list[str]:
@@ -147,11 +157,6 @@ def explain_no_interval(row: Any) -> list[str]:
 def format_signed(value: float) -> str:
     """A difference to three significant digits, with its sign."""
     return "±0" if abs(value) < NOTHING else ("+" if value > 0 else "") + format_limit(value)
-
-
-def format_limit(value: float) -> str:
-    """A limit to three significant digits."""
-    return "0" if abs(value) < NOTHING else f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 
 def comparison_lines(comparison: Comparison) -> Iterator[str]:
