@@ -6,10 +6,10 @@ Half of the moments are numbered steps (a file opened, a folder made, a name giv
 Python tells its audit hooks of), half random times. After each kill, the results folder is either what it was or what
 it was going to be, and a file of the user's is in it; a page that was made of the old results is there with them and
 gone with them. A run after that gives the same bytes as ever, and leaves nothing beside the folder. The .rrd, whose
-bytes differ from run to run, has to be there. `--two-steps`: as where folders cannot be exchanged; then, for an
-instant, nothing has the folder's name, and the next run puts it back. A fit is such a folder. Of `convert`, `plot` and
-`report` the recording, the folder of figures and the page are what they were or what they were going to be. Of
-`cluster` (`run --cluster local:2`) no process stays longer than a minute.
+bytes differ from run to run, has to be there. For an instant, between two renames, nothing has the folder's name, and
+the next run puts it back. A fit is such a folder. Of `convert`, `plot` and `report` the recording, the folder of
+figures and the page are what they were or what they were going to be. Of `cluster` (`run --cluster local:2`) no process
+stays longer than a minute.
 """
 
 from __future__ import annotations
@@ -76,8 +76,7 @@ class Command:
 class Trial:
     """A command in a folder of its own, called by forks of this process, which has loaded what they need."""
 
-    def __init__(self, here: Path, command: Command, *, two_steps: bool) -> None:
-        self.two_steps = two_steps
+    def __init__(self, here: Path, command: Command) -> None:
         self.here, self.command, self.out = here, command, command.out
         self.expected: dict[int, Files] = {}
         self.beside: list[str] = []
@@ -93,10 +92,7 @@ class Trial:
             return child
         try:
             from copem_replay.cli import main as cli
-            from copem_replay.results import folder as place
 
-            if self.two_steps:
-                place.exchange_folders = lambda *_: False
             nothing = os.open(os.devnull, os.O_RDWR)
             for fd in (1, 2):
                 os.dup2(nothing, fd)
@@ -165,7 +161,7 @@ class Trial:
         found.leftovers += bool(set(names) - {*self.beside, self.out.name})
         before, seed = seeds
         files = self.files()
-        if not files and (before is None or self.two_steps):
+        if not files:
             found.nothing += before is None
             found.gaps += before is not None
             return
@@ -326,9 +322,7 @@ def commands_of(here: Path, experiment: Path) -> dict[str, Callable[[], Command]
     }  # fmt: skip
 
 
-def kill(
-    here: Path, command: Command, kills: int, seed: int = 1, *, two_steps: bool = False, progress: bool = False
-) -> Found:
+def kill(here: Path, command: Command, kills: int, seed: int = 1, *, progress: bool = False) -> Found:
     """Kill a command so many times: half at steps spread over all there are, half after random times.
 
     Every tenth time there is no output yet.
@@ -336,7 +330,7 @@ def kill(
     command.load()
     command.out.parent.mkdir(exist_ok=True)
     rng = random.Random(seed)
-    trial, found = Trial(here, command, two_steps=two_steps), Found()
+    trial, found = Trial(here, command), Found()
     for number in (1, 2):
         trial.run(number)
         trial.expected[number] = trial.files()
@@ -383,7 +377,6 @@ def main() -> None:
     parser.add_argument("command", nargs="?", default="run", choices=COMMANDS)
     parser.add_argument("--kills", type=int, default=300)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--two-steps", action="store_true")
     parser.add_argument("--verbose", action="store_true")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
@@ -392,10 +385,7 @@ def main() -> None:
         (here / "e.yaml").write_text(changed("show: {run: 0}"))
         begin = time.perf_counter()
         command = commands_of(here, here / "e.yaml")[arguments.command]()
-        found = kill(
-            here, command, arguments.kills, arguments.seed, two_steps=arguments.two_steps,
-            progress=arguments.verbose,
-        )  # fmt: skip
+        found = kill(here, command, arguments.kills, arguments.seed, progress=arguments.verbose)
         print(f"{found}; {time.perf_counter() - begin:.0f} s")
         print("\n".join(found.wrong), end="")
         sys.exit(bool(found.wrong))

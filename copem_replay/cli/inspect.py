@@ -23,7 +23,6 @@ from copem_replay.cli.terminal import (
     print_line,
     print_notes,
     print_problems,
-    tidy_leftovers,
     width_of,
 )
 from copem_replay.core.errors import InputError
@@ -208,7 +207,6 @@ def samples(
     with atomic_files(folder, names) as scratch:
         for name in names:
             shutil.copyfile(_SAMPLES / name, scratch / name)
-    tidy_leftovers(folder)
     print_line(f"{len(names)} files in {folder}")
     print_line(f"next: copem-replay run {folder / 'tc016d.yaml'}")
     return 0

@@ -22,6 +22,7 @@ try:  # an interrupt during the imports, too, ends without a traceback
     import typer.core
 
     from copem_replay.cli import inspect, results, run
+    from copem_replay.cli.guard import guard_outputs
     from copem_replay.cli.terminal import print_problems
     from copem_replay.core.compiled import call_in_room
     from copem_replay.core.errors import CopemError, InputError
@@ -91,9 +92,11 @@ def _add_extra(name: str) -> None:
             load_extra("command", name)
 
     elif isinstance(found := load_extra("command", name), typer.Typer):
+        for each in found.registered_commands:
+            each.callback = each.callback and guard_outputs(each.callback)
         app.add_typer(found, name=name)
     else:
-        app.command(name)(found)
+        app.command(name)(guard_outputs(found))
 
 
 _OF_NO_GROUP = tuple(name for name in EXTRAS["command"] if name not in chain(*GROUPS.values()))
@@ -102,7 +105,7 @@ for commands_of_group in (*GROUPS.values(), _OF_NO_GROUP):
         if isinstance(command, str):
             _add_extra(command)
         else:
-            app.command()(command)
+            app.command()(guard_outputs(command))
 
 
 def main() -> None:

@@ -20,7 +20,6 @@ from copem_replay.cli.terminal import (
     print_verdicts,
     split_entries,
     split_names,
-    tidy_leftovers,
     width_of,
 )
 from copem_replay.core.errors import InputError
@@ -157,7 +156,6 @@ def _check_rrd_options(rrd: Path | None, run: int | None, log: str | None) -> No
 def _print_written(*files: Path | None) -> None:
     for file in files:
         if file is not None:
-            tidy_leftovers(file)
             print_line(f"written to {file}")
 
 
@@ -193,7 +191,7 @@ def verdict(
         print_verdicts(verdicts)
     for form, path in files.items():
         if path is not None:
-            tidy_leftovers(write_verdicts(verdicts, path, form))
+            write_verdicts(verdicts, path, form)
             if not printed:
                 print_line(f"{'verdicts' if form == 'jsonl' else form} in {path}")
     return 0 if verdicts.passes else 1
@@ -227,9 +225,6 @@ def plot(
         folder, out, configurations=names, log=log, object_id=object, run=run, by=split_entries(by)
     )
     print_notes(notes)
-    figures = out or folder / "figures"
-    tidy_leftovers(figures, figures)
-    tidy_leftovers(figures)
     print_blocks([[str(file) for file in files]])
     return 0
 
@@ -247,7 +242,6 @@ def report(
     from copem_replay.api.results import write_report
 
     path = write_report(folder, out, baseline=baseline, by=split_entries(by))
-    tidy_leftovers(path)
     print_line(f"report in {path}")
     return 0
 

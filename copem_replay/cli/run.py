@@ -31,7 +31,7 @@ from copem_replay.cli.terminal import (
     split_entries,
     width_of,
 )
-from copem_replay.core.errors import InputError
+from copem_replay.core.errors import InputError, is_url
 from copem_replay.core.extras import load_extra
 
 if TYPE_CHECKING:
@@ -89,6 +89,7 @@ def run(
     from copem_replay.pipeline.parts import PartCache
     from copem_replay.results.decision import describe_verdicts
     from copem_replay.results.folder import take_place
+    from copem_replay.results.outputs import check_outputs
 
     source = override_source(
         experiment, {"ego": ego, "runs": runs, "seed": seed}, log or (), (from_s, to_s), split_entries(by)
@@ -97,6 +98,7 @@ def run(
     if cluster is not None:
         load_extra("workers", "address")(cluster)
         pieces = pieces or f"{out}.pieces"
+    check_outputs({"--out": out, "--pieces": None if pieces is None or is_url(pieces) else Path(pieces)})
     with take_place(out, overwrite=overwrite) as place:
         print_notes(place.notes)
         place.notes.clear()

@@ -161,27 +161,6 @@ def print_verdicts(verdicts: Judgement) -> None:
     print_blocks([verdicts_text(verdicts, width_of(sys.stdout)).splitlines()])
 
 
-def tidy_leftovers(path: Path, place: Path | None = None) -> None:
-    """Remove and note the scratch files of a file or folder that killed commands left beside it, or in `place`."""
-    from copem_replay.core.files import remove_leftovers
-
-    print_notes(remove_leftovers(path, place))
-
-
-def tidy_outputs(paths: Iterable[Path]) -> None:
-    """Remove and note the scratch files of many files, each folder being looked through once."""
-    from copem_replay.core.files import find_scratch_names, hidden_name
-
-    by_folder: dict[Path, list[Path]] = {}
-    for path in paths:
-        by_folder.setdefault(path.parent, []).append(path)
-    for folder, files in by_folder.items():
-        left = find_scratch_names(folder)
-        for file in files if left else ():
-            if any(name.startswith(f"{hidden_name(file.name)}.") for name in left):
-                tidy_leftovers(file)
-
-
 # Progress on stderr: a bar in a terminal; elsewhere a line a minute, from the first minute on.
 
 T = TypeVar("T")

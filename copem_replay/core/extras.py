@@ -32,7 +32,7 @@ EXTRAS: Final[Mapping[str, Mapping[str, str]]] = {
         "play": "player.player:write_section",
         "why": "why.report:write_section",
     },
-    "reader": {"map": "maps.registry:read_map"},
+    "reader": {"map": "maps.registry:read_map", "map format": "maps.registry:find_format"},
     "preview": {"fit": "fitting.fit:preview_fit"},
     "workers": {
         "executor": "cluster.crew:gather_crew",

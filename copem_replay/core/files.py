@@ -1,10 +1,10 @@
-"""Files that are complete under their name, or not there: they are written in a scratch folder and then moved.
+"""Files and folders that are complete under their name, or not there: written beside it, and then renamed.
 
 What is read again of them is JSON, and may be damaged or a stranger's: `parse_json`.
 
-A scratch folder is `.NAME.xxxxxxxx.tmp` beside NAME, locked as long as its process lives, with a list of what is in it.
-When its process is killed it stays, its lock free; `remove_leftovers` then removes what its list names, and only that:
-docs/develop/decisions/0020-results-folder.md.
+A file is written as `.NAME.xxxxxxxx.tmp`, a folder as `new` in a folder of that name, with a list of what may be
+removed; both are locked as long as their process lives. When it is killed they stay, their lock free, and
+`remove_leftovers` removes them: docs/develop/decisions/0080-one-gate-for-outputs.md.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import hashlib
 import json
 import os
 import re
+import secrets
 import stat
-import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,24 +30,18 @@ except ImportError:  # not on Windows
     fcntl = None  # type: ignore[assignment]
 
 IS_WINDOWS = os.name == "nt"
-"""Where open files cannot be removed, and folders cannot be flushed."""
+"""Where open files cannot be renamed or removed, and folders cannot be flushed."""
 NO_LINK = sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC", "O_BINARY"))
 """Flags to open a file as it is: no link is followed, no pipe waited for; those that the system has."""
+_NEW_FILE = os.O_RDWR | os.O_CREAT | os.O_EXCL | NO_LINK
 _LOCKED_BYTE = 1 << 30
 """The byte of a file that is locked on Windows: far behind its content, which others could not read otherwise."""
-
 MANIFEST = "files.json"
 """In a scratch folder: its list, and its lock."""
-OLD = "old"
-"""In a scratch folder: what was under the final name, where folders cannot be exchanged in one step."""
-_NEW = "new"
-"""In a scratch folder of several files: the folder that is exchanged."""
-_RANDOM = r"\.[a-z0-9_]{8}\.tmp"
+_RANDOM = r"\.[a-z0-9_]{8}\.tmp(\.\w{1,10})?"
 _TEMPORARY = re.compile(r"\..+" + _RANDOM, re.DOTALL)
 _LONGEST = 200
 """Bytes of the longest name that the names made of it keep whole: a name has 255 at most, and they are longer."""
-
-
 DEEPEST_JSON = 64
 """Most values within values of what is read as JSON: what is written has ten."""
 
@@ -69,124 +63,99 @@ def parse_json(text: bytes | str) -> Any:
     raise ValueError(f"more than {DEEPEST_JSON} values within values")
 
 
-@contextmanager
-def atomic_file(path: Path) -> Iterator[Path]:
-    """The path to write `path` at: it gets its name when all went well, and is removed when anything did not.
+# Names.
 
-    Missing folders are made. Raises OutputError when it cannot be written.
+_REFUSED = re.compile(r'[<>:"\\|?*%\x00-\x1f]|[. ]$')
+_DEVICES = re.compile(r"(con|prn|aux|nul|(com|lpt)[0-9¹²³])(\..*)?", re.IGNORECASE | re.DOTALL)
+
+
+def portable_name(name: str) -> str:
+    """The path of a file called by any name, as every system takes it: `a:b` is `a%3Ab`, and `aux` is `%61ux`.
+
+    Characters, ends and names of devices that Windows refuses are written as in URLs; `/` divides folders.
     """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with make_scratch_folder(path) as scratch:
-            scratch.will_hold([path.name])
-            yield scratch.path / path.name
-            flush_file(scratch.path / path.name)
-            os.replace(scratch.path / path.name, path)
-            flush_file(path.parent)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
+    return "/".join(avoid_device_name(_REFUSED.sub(_encode, part)) for part in name.split("/"))
 
 
-@contextmanager
-def atomic_files(folder: Path, names: Sequence[str], *, way_out: str = "") -> Iterator[Path]:
-    """A folder to write files of these names in. They replace those in `folder` when all went well, and none before.
+def avoid_device_name(name: str) -> str:
+    """The name of a file, its first character as in URLs where Windows takes the name for that of a device."""
+    return f"%{ord(name[0]):02X}{name[1:]}" if _DEVICES.fullmatch(name) else name
 
-    The folder is exchanged with the new one in one step, its other files linked into it. Where it cannot be (it has
-    folders in it, belongs to another user, is a mount point or a process's working folder, or cannot have links), its
-    files are replaced one by one. A name that is not written in the end goes from `folder`, too. Missing folders are
-    made. `way_out`: the end of the message where nothing can be written. Raises OutputError.
+
+def _encode(found: re.Match[str]) -> str:
+    return f"%{ord(found[0]):02X}"
+
+
+def hidden_name(name: str) -> str:
+    """`.NAME`, the beginning of names of temporary files beside NAME; of a very long name its start and its digest."""
+    encoded = os.fsencode(name)
+    if len(encoded) <= _LONGEST:
+        return f".{name}"
+    return f".{os.fsdecode(encoded[:100])}~{hashlib.sha256(encoded).hexdigest()[:16]}"
+
+
+def is_temporary(name: str) -> bool:
+    """Whether a file or folder has a name that is given until it is complete."""
+    return _TEMPORARY.fullmatch(name) is not None
+
+
+def find_scratch_names(folder: Path) -> list[str]:
+    """Names of all temporary files and scratch folders in a folder, in order; none where it cannot be read."""
+    with suppress(OSError):
+        return sorted(filter(is_temporary, os.listdir(folder)))
+    return []
+
+
+def list_names(folder: Path, at: str = "") -> Iterator[str]:
+    """Files, links and empty folders in a folder, by names relative to it; `at` comes before them. Raises OSError.
+
+    Temporary files are left out: they are of commands that run now, or were killed.
     """
-    try:
-        if folder.exists() and not folder.is_dir():
-            raise OutputError(f"{folder}: cannot be written: expected a folder, found a file{way_out}")
-        place = Path(os.path.realpath(folder))  # what a link leads to is replaced, not the link
-        place.parent.mkdir(parents=True, exist_ok=True)
-        beside = not place.exists() or os.access(place.parent, os.W_OK | os.X_OK)
-        with make_scratch_folder(place, place.parent if beside else place) as scratch:
-            scratch.will_hold(f"{_NEW}/{name}" for name in names)
-            new = scratch.path / _NEW
-            new.mkdir()
-            yield new
-            flush_all(new)
-            if not (beside and _replace_folder(scratch, place, names)):
-                _replace_each(new, place, names)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be written: {error.strerror or error}{way_out}") from error
-
-
-def _replace_folder(scratch: ScratchFolder, folder: Path, names: Sequence[str]) -> bool:
-    """Put the new folder in the place of `folder`, with its files of other names; False where it cannot be."""
-    new, old = scratch.path / _NEW, scratch.path / OLD
-    if not folder.exists():
-        os.rename(new, folder)
-        flush_file(folder.parent)
-        return True
-    others = {entry.name for entry in os.scandir(folder)}.difference(names)
-    scratch.will_hold(f"{at}/{name}" for at in (_NEW, OLD) for name in names)
-    try:
-        state, here = folder.stat(), Path.cwd()
-        if os.path.ismount(folder) or folder in (here, *here.parents) or state.st_uid != new.stat().st_uid:
-            return False
-        for name in others:
-            os.link(folder / name, new / name, follow_symlinks=False)
-        new.chmod(stat.S_IMODE(state.st_mode))
-    except OSError:  # a folder among them, or a file system without links
-        return False
-    flush_file(new)
-    if exchange_folders(new, folder):
-        old = new
-    else:
-        exchange_in_two_steps(new, folder, old)
-    flush_file(folder.parent)
-    for late in [entry for entry in os.scandir(old) if entry.name not in others.union(names)]:
-        with suppress(OSError):
-            os.rename(late.path, folder / late.name)
-    return True
-
-
-def _replace_each(new: Path, folder: Path, names: Sequence[str]) -> None:
-    folder.mkdir(exist_ok=True)
-    for name in names:
-        if (new / name).exists():
-            os.replace(new / name, folder / name)
+    entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
+    if at and not entries:
+        yield at.removesuffix("/")
+    for entry in entries:
+        if _is_unfinished(entry):
+            continue
+        if not entry.is_dir(follow_symlinks=False):
+            yield at + entry.name
+        elif os.path.ismount(entry.path):
+            raise OutputError(f"{entry.path}: a mount point cannot be replaced; choose another folder with --out")
         else:
-            (folder / name).unlink(missing_ok=True)
+            yield from list_names(Path(entry.path), f"{at}{entry.name}/")
 
 
-# The exchange of two names in one step, where the system has it (Linux, most of its file systems).
-
-_AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # fcntl.h, linux/fs.h
-_CANNOT = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EPERM)
-"""Errors of an old kernel, of a file system without the exchange, and of containers that refuse unknown calls."""
+def _is_unfinished(entry: os.DirEntry[str]) -> bool:
+    whole = entry.is_symlink() or (entry.is_dir() and not os.path.lexists(os.path.join(entry.path, MANIFEST)))
+    return is_temporary(entry.name) and not whole
 
 
-def exchange_folders(first: Path, second: Path) -> bool:
-    """Exchange two names of one file system by renameat2(2); neither is missing at any instant. Raises OSError.
-
-    False: the system has no such exchange.
-    """
-    import ctypes
-
-    function = None if IS_WINDOWS else getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
-    if function is None:
-        return False
-    if function(_AT_FDCWD, os.fsencode(first), _AT_FDCWD, os.fsencode(second), ctypes.c_uint(_RENAME_EXCHANGE)) == 0:
-        return True
-    code = ctypes.get_errno()
-    if code in _CANNOT:
-        return False
-    raise OSError(code, os.strerror(code), str(second))
-
-
-def exchange_in_two_steps(new: Path, name: Path, old: Path) -> None:
-    """Move the folder `name` to `old` and `new` to `name`. A process killed between: `remove_leftovers` repairs it."""
-    os.rename(name, old)
+def check_parent(path: Path, look: Callable[[Path], object] = os.lstat) -> None:
+    """Raise OutputError where a path cannot be written, as far as the folder shows it that it is, or would be, in."""
     try:
-        os.rename(new, name)
-    except BaseException:
-        with suppress(OSError):
-            os.rename(old, name)
-        raise
+        parent = next((place for place in Path(os.path.abspath(path)).parents if place.exists()), Path("/"))
+        with suppress(FileNotFoundError, NotADirectoryError):
+            look(path)
+        os.fsencode(os.path.abspath(path)).decode()
+    except UnicodeDecodeError:
+        raise OutputError(
+            f"{path}: cannot be written: expected a path in UTF-8, found other bytes; choose another with --out"
+        ) from None
+    except OSError as error:  # a loop of links, a name that is too long
+        raise OutputError(f"{path}: cannot be written: {error.strerror}") from None
+    if not parent.is_dir():
+        raise OutputError(f"{path}: cannot be written: {parent} is a file")
+    if not os.access(parent, os.W_OK | os.X_OK):
+        raise OutputError(f"{path}: cannot be written: no permission to write in {parent}")
+
+
+def may_be_moved(folder: Path) -> bool:
+    """Whether another folder may take the name of this one: no mount point, and not where this process works."""
+    here = Path.cwd()
+    return not os.path.ismount(folder) and folder not in (here, *here.parents)
+
+
+# Locks.
 
 
 def try_lock(fd: int) -> bool | None:
@@ -221,45 +190,62 @@ def overwrite_file(fd: int, content: bytes) -> None:
     os.ftruncate(fd, len(content))
 
 
-_REFUSED = re.compile(r'[<>:"\\|?*%\x00-\x1f]|[. ]$')
-_DEVICES = re.compile(r"(con|prn|aux|nul|(com|lpt)[0-9¹²³])(\..*)?", re.IGNORECASE | re.DOTALL)
+def is_still(path: Path, fd: int) -> bool:
+    """Whether an open file is still the one of this name."""
+    with suppress(FileNotFoundError):
+        return os.path.samestat(os.fstat(fd), os.lstat(path))
+    return False
 
 
-def portable_name(name: str) -> str:
-    """The path of a file called by any name, as every system takes it: `a:b` is `a%3Ab`, and `aux` is `%61ux`.
+def _create_locked(prefix: Path, suffix: str = "", *, folder: bool = False) -> tuple[Path, int]:
+    """A new temporary file, or scratch folder, and the open file that locks it. Raises OSError."""
+    while True:
+        path = prefix.with_name(f"{prefix.name}.{secrets.token_hex(4)}.tmp{suffix}")
+        try:
+            if folder:
+                path.mkdir(0o700)
+            lock = path / MANIFEST if folder else path
+            fd = os.open(lock, _NEW_FILE, 0o666)
+        except (FileExistsError, FileNotFoundError):  # a name twice; or taken for a leftover before it had its lock
+            if not prefix.parent.is_dir():
+                raise
+            continue
+        if try_lock(fd) is not False and is_still(lock, fd):
+            return path, fd
+        os.close(fd)
 
-    Characters, ends and names of devices that Windows refuses are written as in URLs; `/` divides folders.
+
+# One file.
+
+
+@contextmanager
+def atomic_file(path: Path, *, flush: bool = True) -> Iterator[Path]:
+    """The path to write `path` at: it gets its name when all went well, and is removed when anything did not.
+
+    Missing folders are made. `flush`: it is on the disk before it has its name. Raises OutputError when it cannot be
+    written.
     """
-    return "/".join(avoid_device_name(_REFUSED.sub(_encode, part)) for part in name.split("/"))
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        suffix = path.suffix if re.fullmatch(r"\.\w{1,10}", path.suffix) else ""  # some writers go by it
+        scratch, fd = _create_locked(path.with_name(hidden_name(path.name)), suffix)
+        try:
+            with open(fd, "rb") as lock:
+                yield scratch
+                if flush:
+                    flush_file(scratch)
+                if IS_WINDOWS:
+                    lock.close()
+                os.replace(scratch, path)
+                if flush:
+                    flush_file(path.parent)
+        finally:
+            scratch.unlink(missing_ok=True)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
-def avoid_device_name(name: str) -> str:
-    """The name of a file, its first character as in URLs where Windows takes the name for that of a device."""
-    return f"%{ord(name[0]):02X}{name[1:]}" if _DEVICES.fullmatch(name) else name
-
-
-def _encode(found: re.Match[str]) -> str:
-    return f"%{ord(found[0]):02X}"
-
-
-def hidden_name(name: str) -> str:
-    """`.NAME`, the beginning of names of temporary files beside NAME; of a very long name its start and its digest."""
-    encoded = os.fsencode(name)
-    if len(encoded) <= _LONGEST:
-        return f".{name}"
-    return f".{os.fsdecode(encoded[:100])}~{hashlib.sha256(encoded).hexdigest()[:16]}"
-
-
-def is_scratch(folder: Path) -> bool:
-    """Whether a folder is a scratch folder, of this process, of another, or of one that was killed."""
-    return _TEMPORARY.fullmatch(folder.name) is not None and os.path.lexists(folder / MANIFEST)
-
-
-def find_scratch_names(folder: Path) -> list[str]:
-    """Names of all scratch folders in a folder, in order; none where it cannot be read."""
-    with suppress(OSError):
-        return sorted(name for name in os.listdir(folder) if _TEMPORARY.fullmatch(name))
-    return []
+# A folder.
 
 
 @dataclass(frozen=True)
@@ -269,9 +255,20 @@ class ScratchFolder:
     path: Path
     fd: int
 
-    def will_hold(self, files: Iterable[str]) -> None:
-        """Note the names of files in it that may be removed, before they are there: so a killed process leaves nothing
-        unknown. Beside these, links to files of the folder that it replaces may be removed.
+    @property
+    def new(self) -> Path:
+        """The folder to fill."""
+        return self.path / "new"
+
+    @property
+    def old(self) -> Path:
+        """What was under the final name, once it is replaced."""
+        return self.path / "old"
+
+    def may_remove(self, files: Iterable[str]) -> None:
+        """List the names of files, in the new or the old folder, that may be removed, before they are there.
+
+        So a killed process leaves nothing unknown. Beside these, links to files of the final folder may be removed.
         """
         overwrite_file(self.fd, json.dumps({"files": sorted(files)}).encode())
 
@@ -279,28 +276,116 @@ class ScratchFolder:
 @contextmanager
 def make_scratch_folder(path: Path, place: Path | None = None) -> Iterator[ScratchFolder]:
     """A scratch folder for what is to become `path`, beside it or in `place`; removed in the end. Raises OSError."""
-    scratch = _create_scratch(place or path.parent, hidden_name(path.name))
+    scratch = ScratchFolder(*_create_locked((place or path.parent) / hidden_name(path.name), folder=True))
     try:
+        scratch.new.mkdir()
         yield scratch
     finally:
         if IS_WINDOWS:
             os.close(scratch.fd)
         with suppress(OSError):
-            _remove_listed(scratch.path, path)
+            _clear(scratch.path, path)
         if not IS_WINDOWS:  # locked until all is gone
             os.close(scratch.fd)
 
 
-def _create_scratch(place: Path, prefix: str) -> ScratchFolder:
-    while True:
-        path = Path(tempfile.mkdtemp(dir=place, prefix=f"{prefix}.", suffix=".tmp"))
+def replace_folder(
+    scratch: ScratchFolder, folder: Path, list_others: Callable[[Path], Collection[str]], seen: os.stat_result
+) -> list[str] | None:
+    """Put the new folder in the place of `folder`, with the files of it that `list_others` names: the user's own.
+
+    They are linked into the new folder before it has its name; those that cannot be, or come meanwhile, are moved after
+    that. Between two renames there is no folder of the name: of a process that is killed there, `remove_leftovers` puts
+    the old one back. Returns a line for each file that stays in the scratch folder; None: nothing is replaced, because
+    the folder is no longer the one `seen`. Raises OSError.
+    """
+    new, old, linked = scratch.new, scratch.old, list(list_others(folder))
+    for name in linked:
+        with suppress(OSError):
+            _move_over(name, folder, new, lambda source, target: os.link(source, target, follow_symlinks=False))
+    new.chmod(stat.S_IMODE(seen.st_mode))
+    flush_all(new)
+    os.rename(folder, old)
+    try:
+        if same := os.path.samestat(old.stat(), seen):
+            os.rename(new, folder)
+    except BaseException:
+        os.rename(old, folder)
+        raise
+    if not same:
+        os.rename(old, folder)
+        return None
+    flush_file(folder.parent)
+    stay = {}
+    for name in list_others(old):
         try:
-            fd = os.open(path / MANIFEST, os.O_RDWR | os.O_CREAT | os.O_EXCL | NO_LINK, 0o600)
-        except FileNotFoundError:  # taken for a leftover before it had its lock
-            continue
-        if try_lock(fd) is not False and (path / MANIFEST).exists():
-            return ScratchFolder(path, fd)
-        os.close(fd)
+            _move_over(name, old, folder, os.rename)
+        except OSError as error:
+            stay[name] = f"{name}: cannot be moved over ({error.strerror}); it is in {old}"
+    scratch.may_remove(set(list_names(old)).difference(stay))
+    return list(stay.values())
+
+
+def _move_over(name: str, old: Path, new: Path, move: Callable[[Path, Path], None]) -> None:
+    """Link or rename, by `move`, a file or an empty folder of `old` to the same name in `new`. Raises OSError."""
+    source, target = old / name, new / name
+    if os.path.lexists(target):
+        return
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if source.is_dir() and not source.is_symlink():
+        target.mkdir()
+    else:
+        move(source, target)
+
+
+@contextmanager
+def atomic_files(folder: Path, names: Sequence[str], *, way_out: str = "") -> Iterator[Path]:
+    """A folder to write files of these names in. They replace those in `folder` when all went well, and none before.
+
+    The whole folder is replaced, with its other files. Where it cannot be (it has folders in it, belongs to another
+    user, is a mount point or a process's working folder), its files are replaced one by one. A name that is not written
+    in the end goes from `folder`, too, and what killed processes left of it. Missing folders are made. `way_out`: the
+    end of the message where nothing can be written. Raises OutputError.
+    """
+    try:
+        if folder.exists() and not folder.is_dir():
+            raise OutputError(f"{folder}: cannot be written: expected a folder, found a file{way_out}")
+        place = Path(os.path.realpath(folder))  # what a link leads to is replaced, not the link
+        place.parent.mkdir(parents=True, exist_ok=True)
+        beside = not place.exists() or os.access(place.parent, os.W_OK | os.X_OK)
+        with make_scratch_folder(place, place.parent if beside else place) as scratch:
+            scratch.may_remove(names)
+            yield scratch.new
+            if not place.exists():
+                flush_all(scratch.new)
+                os.rename(scratch.new, place)
+                flush_file(place.parent)
+            elif not (beside and _replace_whole(scratch, place, names)):
+                flush_all(scratch.new)
+                _replace_each(scratch.new, place, names)
+        for where in (place.parent, place):
+            remove_leftovers(place, where)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written: {error.strerror or error}{way_out}") from error
+
+
+def _replace_whole(scratch: ScratchFolder, folder: Path, names: Sequence[str]) -> bool:
+    """Replace a folder but for its files of other names; False where it cannot be."""
+    seen = folder.stat()
+    if not may_be_moved(folder) or seen.st_uid != scratch.new.stat().st_uid or any(map(Path.is_dir, folder.iterdir())):
+        return False
+    return replace_folder(scratch, folder, lambda at: set(list_names(at)).difference(names), seen) is not None
+
+
+def _replace_each(new: Path, folder: Path, names: Sequence[str]) -> None:
+    for name in names:
+        if (new / name).exists():
+            os.replace(new / name, folder / name)
+        else:
+            (folder / name).unlink(missing_ok=True)
+
+
+# What killed processes left.
 
 
 def remove_leftovers(path: Path, place: Path | None = None) -> list[str]:
@@ -309,36 +394,34 @@ def remove_leftovers(path: Path, place: Path | None = None) -> list[str]:
     A folder that one of them had moved away, to put another in its place, gets its name back.
     """
     notes = []
-    pattern = re.compile(re.escape(hidden_name(path.name)) + _RANDOM, re.DOTALL)
-    with suppress(OSError):
-        leftovers = sorted(each for each in (place or path.parent).iterdir() if pattern.fullmatch(each.name))
-        for leftover in leftovers:
+    pattern, place = re.compile(re.escape(hidden_name(path.name)) + _RANDOM, re.DOTALL), place or path.parent
+    for name in find_scratch_names(place):
+        if pattern.fullmatch(name):
             with suppress(OSError):
-                notes += _remove_leftover(leftover, path)
+                notes += _remove_leftover(place / name, path)
     return notes
 
 
 def _remove_leftover(left: Path, path: Path) -> list[str]:
-    """Remove one folder that may have been left; returns notes for the user. Raises OSError."""
-    if left.is_symlink() or not left.is_dir():
-        return []
+    """Remove a file or folder that may have been left; returns notes for the user. Raises OSError."""
     notes = []
     with _hold_lock(left) as free:
         if not free:
             return []
-        if (left / OLD).is_dir() and not os.path.lexists(path):
-            os.rename(left / OLD, path)
+        if (left / "old").is_dir() and not os.path.lexists(path):
+            os.rename(left / "old", path)
             notes.append(f"{path}: put back, as a run was killed that was about to replace it")
-        if _remove_listed(left, path):
+        if _clear(left, path):
             return [*notes, f"{left}: removed, left by a process that was killed"]
     return [*notes, f"{left}: left by a process that was killed, and not removed: it holds what is not ours"]
 
 
 @contextmanager
-def _hold_lock(scratch: Path) -> Iterator[bool]:
-    """Hold the lock of a scratch folder, if it is free. One that has none yet is free."""
+def _hold_lock(left: Path) -> Iterator[bool]:
+    """Hold the lock of a temporary file or scratch folder, if it is free. A folder that has none yet is free."""
+    is_folder = left.is_dir() and not left.is_symlink()
     try:
-        fd = os.open(scratch / MANIFEST, os.O_RDWR | NO_LINK)
+        fd = os.open(left / MANIFEST if is_folder else left, os.O_RDWR | NO_LINK)
     except FileNotFoundError:
         yield True
         return
@@ -352,42 +435,30 @@ def _hold_lock(scratch: Path) -> Iterator[bool]:
             os.close(fd)
 
 
-def _remove_listed(scratch: Path, path: Path | None = None) -> bool:
-    """Remove what the list of a scratch folder names, and links to files in `path`; True where nothing is left.
-
-    Raises OSError.
+def _clear(left: Path, path: Path) -> bool:
+    """Remove a temporary file; of a scratch folder what its list names, links to files in `path`, and what killed
+    processes left in it. True where nothing is left. Raises OSError.
     """
-    if not os.path.lexists(scratch / MANIFEST):  # killed before it had a list, or about to get one
+    if left.is_file():
+        left.unlink()
+        return True
+    if not os.path.lexists(left / MANIFEST):  # killed before it had a list, or about to get one
         with suppress(OSError):
-            scratch.rmdir()
-        return not scratch.exists()
-    files = _read_scratch_list(scratch)
-
-    def cleared(folder: Path) -> bool:
-        kept = [entry.name for entry in sorted(os.scandir(folder), key=lambda entry: entry.name) if not gone(entry)]
-        return kept in ([], [MANIFEST]) if folder == scratch else not kept
-
-    def gone(entry: os.DirEntry[str]) -> bool:
-        place = Path(entry.path)
-        inside = place.relative_to(scratch).as_posix()
-        if entry.is_dir(follow_symlinks=False):
-            if is_scratch(place):  # that of a file in it
-                with _hold_lock(place) as free:
-                    return free and _remove_listed(place)
-            if not cleared(place):
-                return False
-            place.rmdir()
-            return True
-        if inside in files or (path is not None and is_hard_link(place, path / inside.partition("/")[2])):
-            place.unlink()
-            return True
-        return False
-
-    if not cleared(scratch):
-        return False
-    (scratch / MANIFEST).unlink()
-    scratch.rmdir()
-    return True
+            left.rmdir()
+        return not left.exists()
+    listed = _read_scratch_list(left)
+    for place, folders, files in os.walk(left, topdown=False):
+        for each in (Path(place, name) for name in (*files, *folders)):
+            inside = "/".join(each.relative_to(left).parts[1:])
+            if each.is_dir() and not each.is_symlink():
+                with suppress(OSError):
+                    _remove_leftover(each, path) if os.path.lexists(each / MANIFEST) else each.rmdir()
+            elif inside and (inside in listed or is_temporary(each.name) or _are_links(each, path / inside)):
+                each.unlink()
+    if os.listdir(left) == [MANIFEST]:
+        (left / MANIFEST).unlink()
+        left.rmdir()
+    return not left.exists()
 
 
 def _read_scratch_list(scratch: Path) -> set[str]:
@@ -398,9 +469,9 @@ def _read_scratch_list(scratch: Path) -> set[str]:
         return set()
 
 
-def is_hard_link(place: Path, other: Path) -> bool:
+def _are_links(place: Path, other: Path) -> bool:
     """Whether two names are there and of one file. Raises OSError."""
-    return os.path.lexists(place) and os.path.lexists(other) and os.path.samestat(os.lstat(place), os.lstat(other))
+    return os.path.lexists(other) and os.path.samestat(os.lstat(place), os.lstat(other))
 
 
 def flush_all(folder: Path) -> None:

@@ -45,9 +45,9 @@ _LOOKED_AT = 64  # bytes by which a file is told
 _SHOWN_BYTES = 16
 _CONVERTED = (".csv", ".tsv", ".json", ".xml")  # suffixes of files that `copem-replay convert` may read
 _MADE = "; docs/guide/data-sets.md says what makes a recording of such files"
-_ROS1 = b"#ROSBAG"
+ROS1 = b"#ROSBAG"
 _NEWER = "`rosbags-convert --src FILE --dst FOLDER --dst-storage mcap` makes a folder of it that is"
-_SQLITE = b"SQLite format 3\0"
+SQLITE = b"SQLite format 3\0"
 
 
 def check_magic(path: Path, file: IO[bytes]) -> None:
@@ -74,9 +74,9 @@ def _describe_file(expected: str, path: Path, start: bytes) -> str:
         return "the file is empty"
     if start.startswith(_LFS_POINTER):
         return "a git-lfs pointer, not the recording itself (`git lfs pull` fetches it)"
-    if start.startswith(_SQLITE):
+    if start.startswith(SQLITE):
         return f"a SQLite file, which is not read; of a rosbag2 folder, {CONVERT}"
-    if start.startswith(_ROS1):
+    if start.startswith(ROS1):
         return f"a bag of ROS 1, which is not read; {_NEWER}"
     if advice := unpacking_advice(path):
         return advice

@@ -273,7 +273,7 @@ def check_exact(ready: Sequence[Replay], experiment: Experiment) -> None:
     _check_truth_ids(experiment)
     hits = experiment.measure.confirm.hits
     for replay in ready:
-        units = replay.expanded.with_(resolve_for_log(experiment, replay.scene.log))
+        units = replay.expand(resolve_for_log(experiment, replay.scene.log))
         for name in units.configurations:
             lasts = bool(_find_processes(units, name, hits))
             if hits == 1 and not lasts and not units.arrivals_differ:
@@ -287,7 +287,7 @@ def check_exact(ready: Sequence[Replay], experiment: Experiment) -> None:
 
 def compute_distributions(replay: Replay, experiment: Experiment, name: str) -> list[FirstKnown]:
     """For each episode the distribution of the instant at which its object is first known."""
-    units, episodes, confirm = replay.expanded.with_(experiment), replay.episodes, experiment.measure.confirm
+    units, episodes, confirm = replay.expand(experiment), replay.episodes, experiment.measure.confirm
     configuration = units.configurations[name]
     received, reception = receive_without_loss(replay, units, name, confirm.hits)
     # A model of the user's own may be above 1 by rounding.

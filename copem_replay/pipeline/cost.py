@@ -93,9 +93,9 @@ Size: TypeAlias = tuple[int, int]
 
 def estimate_size(replay: Replay) -> Size:
     """The rows that one run of a log gives, and how often units look at measured objects."""
-    written, measured = replay.expanded.written, replay.episodes.object_ix
+    experiment, measured = replay.expanded, replay.episodes.object_ix
     states = int(np.diff(replay.truth.start)[np.isin(replay.truth.object_ix, measured)].sum())
-    return len(measured) * len(written.configurations), states * len(replay.expanded.modelled)
+    return len(measured) * len(experiment.configurations), states * len(experiment.modelled)
 
 
 def memory_notes(ready: Sequence[Replay], experiment: Experiment, others: Sequence[Size] = ()) -> list[str]:

@@ -10,11 +10,10 @@ What a configuration is, by truth id, fixed, or regretted to which ideal, is dec
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
+from pydantic import ConfigDict, Field
 
 from copem_replay.communication.latency import LatencyModel
 from copem_replay.communication.link import UnitLinks
@@ -24,13 +23,10 @@ from copem_replay.core.random import CounterRng, RandomKey, object_words
 from copem_replay.core.tracks import TRUTH, Bool, Float, Int, Scene, class_indices
 from copem_replay.experiment.schema import Configuration, Experiment, Unit, output_unit
 from copem_replay.fusion.interface import IdealFusion, ListFusion, PredictedFusion, RecordedFusion
-from copem_replay.io.config import RecordedOutput, RecordedTopic
+from copem_replay.io.config import RecordedOutput
 from copem_replay.metrics.braking.driver import ConstantReaction
-from copem_replay.metrics.config import Braking, Measure, OwnArea
 from copem_replay.metrics.onset import Requires
-from copem_replay.perception.config import Carriers, Obstacle
-from copem_replay.perception.pem.model import Pem
-from copem_replay.perception.visibility import VisibilityModel
+from copem_replay.perception.config import Carriers
 
 # What configurations are.
 
@@ -143,93 +139,24 @@ def _list_inputs(experiment: Experiment, configuration: Configuration) -> tuple[
 # An experiment over one log.
 
 
-@dataclass(frozen=True)
-class ExpandedExperiment:
+class ExpandedExperiment(Experiment):
     """An experiment over one log, with a unit for every object that may carry one. U units.
 
-    `written`: the experiment before. `named (U,)`: the name that each unit has there. `carrier (U,)`: id of the object
-    that may carry the unit, else empty. `share (U,)`: the probability that the unit is there, 1 without a carrier.
+    `given`: the units before. `named (U,)`: the name that each unit has there. `carrier (U,)`: id of the object that
+    may carry the unit, else empty. `share (U,)`: the probability that the unit is there, 1 without. `facts`: what
+    each configuration is. `ways`: configurations of which the way of lists is measured (`has_way`), of the study: also
+    in a log without a carrier. `unit_links`: the links of each.
     """
 
-    written: Experiment
-    _expanded: Experiment
-    named: tuple[str, ...]
-    carrier: tuple[str, ...]
-    share: Float
+    model_config = ConfigDict(arbitrary_types_allowed=True, defer_build=True)  # it is made of a valid experiment
 
-    @property
-    def units(self) -> dict[str, Unit]:
-        """(U,) all units by name, each on one object or at one place."""
-        return self._expanded.units
-
-    @property
-    def modelled(self) -> dict[str, Unit]:
-        """The units that have a PEM."""
-        return self._expanded.modelled
-
-    @property
-    def recorded(self) -> dict[str, RecordedTopic]:
-        """The units whose lists are recorded in the log."""
-        return self._expanded.recorded
-
-    @property
-    def configurations(self) -> dict[str, Configuration]:
-        """The configurations, which name these units."""
-        return self._expanded.configurations
-
-    @cached_property
-    def facts(self) -> dict[str, ConfigurationFacts]:
-        """What each of the configurations is."""
-        return find_facts(self.written)
-
-    def units_of(self, configuration: Configuration) -> tuple[str, ...]:
-        """Names of the units of one of these configurations, in order; none for the truth."""
-        return self._expanded.units_of(configuration)
-
-    @property
-    def pems(self) -> dict[str, Pem]:
-        """Perception error models by name."""
-        return self.written.pems
-
-    @property
-    def obstacles(self) -> tuple[Obstacle, ...]:
-        """Static obstacles beside those of the log."""
-        return self.written.obstacles
-
-    @property
-    def visibility(self) -> VisibilityModel:
-        """The model of visible shares."""
-        return self.written.visibility
-
-    @property
-    def max_gap_s(self) -> float:
-        """States further apart than this (s) are not interpolated between."""
-        return self.written.max_gap_s
-
-    @property
-    def seed(self) -> int:
-        """The seed of all draws."""
-        return self.written.seed
-
-    @property
-    def measure(self) -> Measure:
-        """What is measured."""
-        return self.written.measure
-
-    @property
-    def areas(self) -> Mapping[str, OwnArea]:
-        """Areas of one's own, by name."""
-        return self.written.areas
-
-    @property
-    def has_areas(self) -> bool:
-        """Whether the study has areas, its own or of maps."""
-        return self.written.has_areas
-
-    @property
-    def braking(self) -> Braking | None:
-        """The driver of which verdicts are asked for; None: no verdicts."""
-        return self.written.braking
+    given: dict[str, Unit] = Field(exclude=True)
+    named: tuple[str, ...] = Field(exclude=True)
+    carrier: tuple[str, ...] = Field(exclude=True)
+    share: Float = Field(exclude=True)
+    facts: dict[str, ConfigurationFacts] = Field(exclude=True)
+    ways: frozenset[str] = Field(exclude=True)
+    unit_links: dict[str, list[UnitLinks]] = Field(exclude=True)
 
     @property
     def same_in_all_runs(self) -> bool:
@@ -257,19 +184,19 @@ class ExpandedExperiment:
         return [name for name, sends in self.sends.items() if sends.partial]
 
     def links_of(self, name: str) -> list[UnitLinks]:
-        """The links of one of these configurations."""
-        return self._links[name]
+        """The links of a configuration."""
+        return self.unit_links[name]
 
-    @cached_property
-    def _links(self) -> dict[str, list[UnitLinks]]:
-        return {name: self._expanded.links_of(name) for name in self.configurations}
+    def has_way(self, name: str) -> bool:
+        """Whether lists of a configuration come by a link, or of a unit with `ready` or `sends`, in the study."""
+        return name in self.ways
 
     def linked(self, name: str) -> list[str]:
         """The units that send by a link in one of these configurations; TRUTH stands for the truth."""
         configuration = self.configurations[name]
         return [unit for unit in self.units_of(configuration) or (TRUTH,) if configuration.link_of(unit) is not None]
 
-    @cached_property
+    @property
     def arrivals_differ(self) -> bool:
         """Whether lists, or their arrivals, differ from run to run: each run then has receiver instants of its own."""
         return (
@@ -294,17 +221,6 @@ class ExpandedExperiment:
         """Whether a PEM draws more than states: ghosts, classes, scores or track ids."""
         return any(self.pems[str(unit.pem)].draws_claims for unit in self.modelled.values())
 
-    def with_(self, experiment: Experiment) -> ExpandedExperiment:
-        """These units in another experiment, which differs in its configurations or in what is measured.
-
-        Raises ValueError where it has other units.
-        """
-        if experiment is self.written:
-            return self
-        if experiment.units != self.written.units:
-            raise ValueError("expected an experiment with the units that the log was prepared for")
-        return _replace_units(experiment, self.units, self.named, self.carrier, self.share)
-
     def equipped(self, log: str, runs: Int) -> Bool | None:
         """(S, U) which units there are in each of the runs (S,); None: all units in all runs."""
         if self.same_in_all_runs:
@@ -324,7 +240,7 @@ def expand_experiment(experiment: Experiment, scene: Scene) -> ExpandedExperimen
     fleet = _expand_carriers(experiment, scene)
     if not experiment.outputs:
         return fleet
-    units = dict(fleet.units)
+    units = fleet.units.copy()
     for name, output in experiment.outputs.items():
         unit = output_unit(name)
         if unit in units:
@@ -362,19 +278,37 @@ def _expand_carriers(experiment: Experiment, scene: Scene) -> ExpandedExperiment
     return _replace_units(experiment, units, tuple(named), tuple(carriers), np.array(share))
 
 
+def expand_alike(experiment: Experiment, other: ExpandedExperiment) -> ExpandedExperiment:
+    """An experiment with the units of another over one log, from which it differs in its configurations or in what is
+    measured. Raises ValueError where it has other units.
+    """
+    if isinstance(experiment, ExpandedExperiment):
+        return experiment
+    if experiment.units != other.given:
+        raise ValueError("expected an experiment with the units that the log was prepared for")
+    return _replace_units(experiment, other.units, other.named, other.carrier, other.share)
+
+
 def _replace_units(
     experiment: Experiment, units: dict[str, Unit], named: tuple[str, ...], carrier: tuple[str, ...], share: Float
 ) -> ExpandedExperiment:
     """An experiment with these units instead of its own, in `units` and in the configurations."""
-    if units.keys() == experiment.units.keys():
-        return ExpandedExperiment(experiment, experiment, named, carrier, share)
-    members = {name: [unit for unit, of in zip(units, named, strict=True) if of == name] for name in experiment.units}
-    configurations = _replace_members(experiment.configurations, members)
-    for name, output in experiment.outputs.items():
-        if output_unit(name) in units:
-            configurations[name] = _relay_unit(configurations[name], name, output)
-    changed = {"units": units, "configurations": configurations}
-    return ExpandedExperiment(experiment, experiment.model_copy(update=changed), named, carrier, share)
+    expanded = experiment
+    if units.keys() != experiment.units.keys():
+        members = {n: [unit for unit, of in zip(units, named, strict=True) if of == n] for n in experiment.units}
+        configurations = _replace_members(experiment.configurations, members)
+        for name, output in experiment.outputs.items():
+            if output_unit(name) in units:
+                configurations[name] = _relay_unit(configurations[name], name, output)
+        expanded = experiment.model_copy(update={"units": units, "configurations": configurations})
+    configurations = expanded.configurations
+    result = ExpandedExperiment.model_construct(
+        expanded.model_fields_set, **dict(expanded), given=experiment.units, named=named, carrier=carrier, share=share,
+        facts=find_facts(experiment), ways=frozenset(filter(experiment.has_way, configurations)),
+        unit_links={name: expanded.links_of(name) for name in configurations},
+    )  # fmt: skip
+    result._has_areas = experiment.has_areas
+    return result
 
 
 def _relay_unit(configuration: Configuration, name: str, output: RecordedOutput) -> Configuration:

@@ -87,9 +87,9 @@ def measure_list_rates(replay: Replay, experiment: Experiment) -> dict[str, List
 
     Units that only some runs have count as there in all.
     """
-    units, rates = replay.expanded.with_(experiment), dict[str, list[ListRate]]()
+    units, rates = replay.expand(experiment), dict[str, list[ListRate]]()
     for run in range(experiment.runs if units.arrivals_differ else 1):
-        lists = Transmission(replay, experiment, RunGroup.of_all_units(units, np.array([run])))
+        lists = Transmission(replay, units, RunGroup.of_all_units(units, np.array([run])))
         for name in units.configurations:
             rates.setdefault(name, []).append(_measure_rate(lists, name))
     return {name: join_list_rates(runs) for name, runs in rates.items()}
@@ -298,7 +298,7 @@ _DRAWS = (1e-9, 0.5, 1 - 1e-9)
 
 def _find_dead_links(replay: Replay, experiment: Experiment) -> Iterator[str]:
     """Links that lose all lists of a unit, whatever is drawn."""
-    units = replay.expanded.with_(experiment)
+    units = replay.expand(experiment)
     best_of: dict[tuple[str, str], float] = {}
     for name, configuration in units.configurations.items():
         members = units.units_of(configuration) or (TRUTH,)

@@ -60,9 +60,9 @@ class RunTracks:
 
     def _compute(self) -> Iterator[dict[str, FusedTracks]]:
         replay, measure = self.replay, self.experiment.measure
-        units = replay.expanded.with_(self.experiment)
+        units = replay.expand(self.experiment)
         [group] = group_runs(units, replay.scene.log, np.array([self.run]))
-        receivers = Receivers(Transmission(replay, self.experiment, group))
+        receivers = Receivers(Transmission(replay, units, group))
         for world in receivers.worlds():
             truth_cache, result = replay.truth_cache_of(world.chunk), {}
             for name in units.configurations:

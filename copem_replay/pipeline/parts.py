@@ -14,10 +14,8 @@ from __future__ import annotations
 import hashlib
 import inspect
 import json
-import os
 import platform
 import sys
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache, cached_property
 from importlib.metadata import version
@@ -39,7 +37,7 @@ from copem_replay.core.errors import (
     reraise_in_one_line,
     strip_credentials,
 )
-from copem_replay.core.files import parse_json
+from copem_replay.core.files import atomic_file, parse_json
 from copem_replay.core.waiting import await_server
 from copem_replay.experiment.drive import RecordedLatency, cache_last_experiment
 from copem_replay.experiment.maps import MapFile
@@ -86,19 +84,8 @@ class FolderStore:
 
     def write(self, name: str, content: bytes) -> None:
         """Write a file: complete, or not at all. Raises OutputError."""
-        place = self.root / name
-        try:
-            place.parent.mkdir(exist_ok=True)
-            with tempfile.NamedTemporaryFile(dir=place.parent, prefix=f".{place.name}.", delete=False) as file:
-                try:
-                    file.write(content)  # not synced: the seal of a file that a crash damages is wrong
-                    file.close()
-                    os.replace(file.name, place)
-                except BaseException:
-                    Path(file.name).unlink(missing_ok=True)
-                    raise
-        except OSError as error:
-            raise OutputError(f"{place}: cannot be written: {error.strerror or error}") from error
+        with atomic_file(self.root / name, flush=False) as scratch:  # the seal of a file that a crash damages is wrong
+            scratch.write_bytes(content)
 
     def refresh(self) -> None:
         """Nothing to do: files are looked up when they are asked for."""

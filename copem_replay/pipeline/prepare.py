@@ -51,7 +51,7 @@ from copem_replay.metrics.episodes import (
 )
 from copem_replay.perception.observation import KeptShares, Observations, join_observations, observe_objects
 from copem_replay.perception.sensor_poses import SensorPoses, list_instants, place_units
-from copem_replay.pipeline.expansion import ExpandedExperiment, expand_experiment
+from copem_replay.pipeline.expansion import ExpandedExperiment, expand_alike, expand_experiment
 
 T = TypeVar("T")
 
@@ -191,6 +191,10 @@ class Replay:
     paths_of: Replay | None = None  # the log with bodies between a unit and the ego; None: this one
     kept_draws: KeptDraws = field(init=False, default_factory=KeptDraws)  # what links drew for the lists of this log
     _shares: KeptShares = field(init=False, default_factory=KeptShares)
+
+    def expand(self, experiment: Experiment) -> ExpandedExperiment:
+        """An experiment with the units of this log. Raises ValueError where it has others."""
+        return expand_alike(experiment, self.expanded)
 
     @cached_property
     def ego(self) -> EgoPath:

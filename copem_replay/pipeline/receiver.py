@@ -59,7 +59,6 @@ from copem_replay.metrics.origin import (
     find_earliest_origin_s,
     find_longest_way_s,
 )
-from copem_replay.perception.ghosts import GhostRows
 from copem_replay.perception.perceive import EntryClaims, clock_errors_s
 from copem_replay.pipeline.expansion import ExpandedExperiment
 from copem_replay.pipeline.world import States, Transmission, WorldChunk
@@ -275,9 +274,9 @@ class ReceiverOutput:
     sent: Tracks
     instants: FusionSchedule
     origin: OriginLists
-    fused_tracks: FusedTracks | None
     scene: Scene
-    fused: ObjectLists | None
+    fused_tracks: FusedTracks | None = None
+    fused: ObjectLists | None = None
     tells_of: TellsOf = "capture"
     whole: bool = True
     stated: StatedCaptures | None = None
@@ -366,33 +365,44 @@ class Receivers:
         Raises InputError where a fusion of the user's own fails.
         """
         configuration = world.experiment.configurations[name]
-        fusion, states, faults = configuration.fusion, states_needed(configuration), None
+        states = states_needed(configuration)
         sent = world.truth if states is None else world.sent(states)
-        if states is not None:
-            faults = _find_faults(world, sent, None if states == "expected" else world.ghosts)
-        if isinstance(fusion, IdealFusion) and faults is not None:
-            faults = replace(faults, ghosts=faults.ghosts[:0])  # ideal fusion leaves ghosts out
         received = self._lists.receive(sent, name)
-        if faults is not None:  # what came in before the chunk is told of in an earlier list
-            earlier_s = self.issue_s(name)[: np.searchsorted(self.issue_s(name), world.chunk.from_s)]
-            came_s = received.common_arrives_s[received.frame_ix[faults.ghosts]] - SAME_INSTANT_S
-            faults = replace(faults, ghosts=faults.ghosts[came_s > earlier_s.max(initial=-np.inf)])
         output = ReceiverOutput(
-            received=received, sent=sent,
+            received=received,
+            sent=sent,
             instants=self._schedules[name].between(world.chunk.from_s, world.chunk.until_s),
-            origin=self._find_origin(world, name, received, sent), fused_tracks=None, scene=world.scene, fused=None,
-            whole=len(world.log.chunks) == 1, faults=faults,
-        )  # fmt: skip
-        if isinstance(fusion, ListFusion):
-            return self._fuse_lists(world, name, fusion, output)
-        fused_tracks, fused_once = self._fuse_by_truth_id(world, name, output)
-        if isinstance(fusion, IdealFusion) and fusion.memory is not None:
-            fused = remember_states(received, fused_tracks.fused, fusion.memory)
-            return replace(output, fused_tracks=replace(fused_tracks, fused=fused), tells_of=fusion.tells_of)
-        if states == "expected":
-            fused_tracks = draw_posterior(fused_tracks, world.scene, world.experiment.seed, world.group.runs)
-            return replace(output, fused_tracks=fused_tracks)
-        return replace(output, fused_tracks=fused_tracks, fused_once=fused_once)
+            origin=self._find_origin(world, name, received, sent),
+            scene=world.scene,
+            whole=len(world.log.chunks) == 1,
+            faults=None if states is None else self._find_faults(world, name, received, sent),
+        )
+        if isinstance(configuration.fusion, ListFusion):
+            return self._fuse_lists(world, name, configuration.fusion, output)
+        return self._fuse_by_truth_id(world, name, output)
+
+    # The steps around a fusion: ghosts and lists that are not made, the lists that entries go back to, stated captures,
+    # entries that partial messages leave out, what lists of equal captures share.
+
+    def _find_faults(self, world: WorldChunk, name: str, received: Tracks, sent: Tracks) -> UnitFaults | None:
+        """Rows of ghosts and lists that outages leave out, in one run; None: no unit has ghosts or outages.
+
+        Ghosts are those that are fused, without those that came in before the chunk: these are told of in an earlier
+        list.
+        """
+        configuration = world.experiment.configurations[name]
+        ghosts = None if states_needed(configuration) == "expected" else world.ghosts
+        if ghosts is None and not world.experiment.outages:
+            return None
+        not_made = np.isinf(sent.common_arrives_s)
+        if world.sending is not None:
+            not_made &= world.sending.lists  # a list that is held back is made
+        if ghosts is None or isinstance(configuration.fusion, IdealFusion):  # which leaves ghosts out
+            return UnitFaults(np.arange(0), not_made)
+        rows = len(world.observations.tracks.frame_ix) + np.arange(len(ghosts.words))
+        earlier_s = self.issue_s(name)[: np.searchsorted(self.issue_s(name), world.chunk.from_s)]
+        came_s = received.common_arrives_s[received.frame_ix[rows]] - SAME_INSTANT_S
+        return UnitFaults(rows[came_s > earlier_s.max(initial=-np.inf)], not_made)
 
     def _find_origin(self, world: WorldChunk, name: str, received: Tracks, sent: Tracks) -> OriginLists:
         """The lists that entries of a configuration may go back to: those that it receives, of a stack its inputs."""
@@ -411,16 +421,13 @@ class Receivers:
 
     def _fuse_lists(self, world: WorldChunk, name: str, fusion: ListFusion, output: ReceiverOutput) -> ReceiverOutput:
         """Fusion of lists without truth ids, told of the captures that units state."""
-        experiment, received, instants = world.experiment, output.received, output.instants
-        max_age_s = experiment.configurations[name].max_age_s
+        received, instants, max_age_s = output.received, output.instants, output.origin.max_age_s
         lists, same = remove_truth_ids(world)
-        stated = self._state_captures(received)
+        stated, captured_s = self._state_captures(received), None
         if stated is not None:
-            lists = stated.as_told(lists)
-        captured_s = None if stated is None else stated.stated_s
+            lists, captured_s = stated.as_told(lists), stated.stated_s
         inputs = make_inputs(received, lists, max_age_s=max_age_s, instants=instants, captured_s=captured_s)
-        partial = _mark_partial(experiment, received)
-        if partial.any():
+        if (partial := output.origin.partial).any():
             sent = SentEntries(lists.start[0], same)
             kept = keep_entries(received, sent, partial, self._schedules[name], instants, max_age_s=max_age_s)
             inputs = add_kept_entries(inputs, kept, partial, max_age_s)
@@ -449,30 +456,35 @@ class Receivers:
             state_captures(self._lists.log.scene, received, experiment, int(runs[0])) if experiment.runs_apart else None
         )
 
-    def _fuse_by_truth_id(self, world: WorldChunk, name: str, output: ReceiverOutput) -> tuple[FusedTracks, FusedOnce]:
-        """Ideal fusion, or the truth itself, at the instants of the configuration.
-
-        Later lists of the same captures, as in a sweep, are fused once.
-        """
-        max_age_s = world.experiment.configurations[name].max_age_s
-        received, instants, kept = output.received, output.instants, None
-        partial = _mark_partial(world.experiment, received)
-        if partial.any():
-            kept = keep_by_object(received, partial, self._schedules[name], instants, max_age_s=max_age_s)
-        parts = (
-            instants.newest,
-            *find_lists_beside_newest(received, instants, kept),
-            *(() if kept is None else [kept.entry]),
-        )
-        captures, last = b"".join(part.tobytes() for part in parts), self._last_fused
-        if last is None or last.sent is not output.sent or last.captures != captures:
-            own, asked = world.scene.ego_ix, instants
-            fused = fuse_ideal(received, max_age_s=max_age_s, without_object_ix=own, instants=asked, kept=kept)
-            self._last_fused = last = FusedOnce(output.sent, captures, replace(fused, scene=world.scene))
-        fused_tracks = last.fused_tracks.arriving(received, instants.issue_s)
+    def _fuse_by_truth_id(self, world: WorldChunk, name: str, output: ReceiverOutput) -> ReceiverOutput:
+        """Ideal fusion, or the truth itself, at the instants of the configuration."""
+        fusion, received = world.experiment.configurations[name].fusion, output.received
+        fused_once = self._fuse_once(name, output)
+        fused_tracks = fused_once.fused_tracks.arriving(received, output.instants.issue_s)
         if output.sent is not world.truth and world.recorded is None:
             fused_tracks = replace(fused_tracks, view=world.observations.view)
-        return fused_tracks, last
+        if isinstance(fusion, IdealFusion) and fusion.memory is not None:
+            fused = remember_states(received, fused_tracks.fused, fusion.memory)
+            return replace(output, fused_tracks=replace(fused_tracks, fused=fused), tells_of=fusion.tells_of)
+        if states_needed(world.experiment.configurations[name]) == "expected":
+            fused_tracks = draw_posterior(fused_tracks, world.scene, world.experiment.seed, world.group.runs)
+            return replace(output, fused_tracks=fused_tracks)
+        return replace(output, fused_tracks=fused_tracks, fused_once=fused_once)
+
+    def _fuse_once(self, name: str, output: ReceiverOutput) -> FusedOnce:
+        """What ideal fusion makes of lists. Later lists of the same captures, as in a sweep, are fused once."""
+        received, instants, max_age_s = output.received, output.instants, output.origin.max_age_s
+        partial, kept = output.origin.partial, None
+        if partial.any():
+            kept = keep_by_object(received, partial, self._schedules[name], instants, max_age_s=max_age_s)
+        beside = find_lists_beside_newest(received, instants, kept)
+        parts = (instants.newest, *beside, *(() if kept is None else [kept.entry]))
+        captures, last = b"".join(part.tobytes() for part in parts), self._last_fused
+        if last is None or last.sent is not output.sent or last.captures != captures:
+            own = output.scene.ego_ix
+            fused = fuse_ideal(received, max_age_s=max_age_s, without_object_ix=own, instants=instants, kept=kept)
+            self._last_fused = last = FusedOnce(output.sent, captures, replace(fused, scene=output.scene))
+        return last
 
 
 def _mark_partial(experiment: ExpandedExperiment, received: Tracks) -> Bool:
@@ -530,18 +542,6 @@ class Reach:
             if arrived:
                 earliest_s = min(earliest_s, float(needed_s[arrived - 1]))
         return earliest_s
-
-
-def _find_faults(world: WorldChunk, seen: Tracks, ghosts: GhostRows | None) -> UnitFaults | None:
-    """Rows of ghosts and lists that outages leave out, in one run; None: no unit has ghosts or outages."""
-    if ghosts is None and not world.experiment.outages:
-        return None
-    first = len(world.observations.tracks.frame_ix)
-    rows = np.arange(first, first + (0 if ghosts is None else len(ghosts.words)))
-    not_made = np.isinf(seen.common_arrives_s)
-    if world.sending is not None:
-        not_made &= world.sending.lists  # a list that is held back is made
-    return UnitFaults(rows, not_made)
 
 
 def remove_truth_ids(world: WorldChunk) -> tuple[ObjectLists, Int]:

@@ -79,7 +79,7 @@ class BlockOutcome:
 def cut_blocks(replay: Replay, experiment: Experiment, jobs: int, runs: tuple[int, int] | None = None) -> list[Int]:
     """All runs, or those of a range, cut into blocks that are small enough for memory and enough for the workers."""
     begin, end = runs or (0, experiment.runs)
-    units = replay.expanded.with_(experiment)
+    units = replay.expand(experiment)
     rows, room = ROWS_A_CHUNK, CHUNK_BYTES
     if len(replay.chunks) == 1:
         room = BLOCK_BYTES
@@ -126,11 +126,11 @@ def replay_block(replay: Replay, experiment: Experiment, runs: Int) -> pd.DataFr
 
 def replay_outcomes(replay: Replay, experiment: Experiment, runs: Int) -> list[BlockOutcome]:
     """What one block of runs (S,) gives; in several parts where not all runs have the same lists."""
-    began_s, units, measure = time.perf_counter(), replay.expanded.with_(experiment), experiment.measure
+    began_s, units, measure = time.perf_counter(), replay.expand(experiment), experiment.measure
     # Which lists there are decides which hits are consecutive.
     by_entry = measure.confirm.of == 1 and measure.conflict is None and not _needs_lists(units)
     groups = group_runs(units, replay.scene.log, runs, entries_alone=by_entry)
-    known = [replay_runs(replay, experiment, group) for group in groups]
+    known = [replay_runs(replay, units, group) for group in groups]
     # The table of all runs at once: made for each alone it takes longer than their replay.
     together = np.concatenate([group.runs for group in groups])
     events = stack_events([one.events for one in known], [len(group.runs) for group in groups])
@@ -162,15 +162,15 @@ class GroupOutcome(NamedTuple):
 
 def replay_runs(log: Replay, experiment: Experiment, group: RunGroup) -> GroupOutcome:
     """What every configuration knows of every object, in the runs (S,) of a group, which have the same lists."""
-    units, measure = log.expanded.with_(experiment), experiment.measure
+    units, measure = log.expand(experiment), experiment.measure
     # For detection by truth id alone is drawn which rows are listed; else states as well, for matches of all rows.
     matched = _needs_lists(units)
     fused = list(units.configurations) if matched or measure.conflict is not None else []
     states: States = next(filter(None, (states_needed(units.configurations[name]) for name in fused)), "true")
 
-    lists = Transmission(log, experiment, group, complete=_needs_all_rows(units), states=states)
+    lists = Transmission(log, units, group, complete=_needs_all_rows(units), states=states)
     receivers, sightings = Receivers(lists, fused), list[Tracks]()
-    judges = {name: Judge(log, experiment, name, receivers.issue_s(name), matches=matched) for name in fused}
+    judges = {name: Judge(log, units, name, receivers.issue_s(name), matches=matched) for name in fused}
     began_s = time.perf_counter()
     for world in receivers.worlds():
         seen = world.sightings(lists.states)  # perceive
@@ -211,7 +211,7 @@ def find_events(lists: Transmission, name: str, listed: Tracks, known: FirstDete
     )  # fmt: skip
     in_sight_s = earliest_sight_s(log.first_sights_s, units, names, lists.group.listing)
     way = None
-    if units.written.has_way(name):
+    if units.has_way(name):
         informing = find_informing_list(received, detections)
         way = Way(
             first_listed_s(listed, log.episodes, names or (TRUTH,), count_earlier=measure.count_earlier),

@@ -168,7 +168,7 @@ class Transmission:
     def __init__(
         self, log: Replay, experiment: Experiment, group: RunGroup, *, complete: bool = True, states: States = "true"
     ) -> None:
-        self.log, self.experiment, self.group = log, log.expanded.with_(experiment), group
+        self.log, self.experiment, self.group = log, log.expand(experiment), group
         self.states: States = "sampled" if self.experiment.sends else states  # what is sent depends on errors
         self._complete = complete
         self._whole: WorldChunk | None = None

@@ -1,7 +1,7 @@
-"""The place of a results folder during a run: checked, locked, tidied up, and in the end exchanged with the new one.
+"""The place of a results folder during a run: checked, locked, tidied up, and in the end replaced by the new one.
 
 A folder lists the files of its results in `provenance.json`, and those that commands made of them in `made.jsonl`; both
-go when new results take its place, the user's own files stay. See docs/develop/decisions/0020-results-folder.md.
+go when new results take its place, the user's own files stay. See docs/develop/decisions/0080-one-gate-for-outputs.md.
 """
 
 from __future__ import annotations
@@ -12,10 +12,9 @@ import os
 import platform
 import stat
 import traceback
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,19 +22,19 @@ from copem_replay.core.errors import CopemError, InputError, OutputError
 from copem_replay.core.files import (
     IS_WINDOWS,
     NO_LINK,
-    OLD,
     ScratchFolder,
-    exchange_folders,
-    exchange_in_two_steps,
+    check_parent,
     flush_all,
     flush_file,
     hidden_name,
-    is_hard_link,
-    is_scratch,
+    is_still,
+    list_names,
     make_scratch_folder,
+    may_be_moved,
     overwrite_file,
     parse_json,
     remove_leftovers,
+    replace_folder,
     try_lock,
 )
 
@@ -54,21 +53,25 @@ class FolderFiles:
     """The files of a results folder, by names relative to it.
 
     `results`: those of the results, None where the folder does not list them (an older version). `made`: those that
-    commands made of the results afterwards.
+    commands made of the results afterwards. They are only compared with names of existing files, never opened: a list
+    may hold any text.
     """
 
     results: frozenset[str] | None
     made: frozenset[str]
-    every: tuple[str, ...]  # files, links, empty folders
 
-    def others(self, written: Collection[str]) -> list[str]:
-        """The user's own files. `written`: new results, which stand for those of a folder without a list."""
+    def is_ours(self, name: str) -> bool:
+        """Whether a file, or one in the folder of this name, is listed."""
+        return any(one == name or one.startswith(f"{name}/") for one in (self.results or frozenset()) | self.made)
+
+    def list_others(self, folder: Path, written: Collection[str]) -> list[str]:
+        """The user's own files in the folder. `written`: new results, for those of a folder without a list."""
         ours = (self.results if self.results is not None else frozenset(written)) | self.made
-        return [name for name in self.every if name not in ours]
+        return [name for name in list_names(folder) if name not in ours]
 
 
 def list_belongings(folder: Path) -> FolderFiles | None:
-    """The files of a results folder; None: it is not one. Raises OSError, OutputError for a mount point in it."""
+    """The files of a results folder; None: it is not one."""
     try:
         provenance: Any = parse_json((folder / MARK).read_bytes())
     except (OSError, ValueError):
@@ -77,22 +80,15 @@ def list_belongings(folder: Path) -> FolderFiles | None:
         return None
     listed = provenance.get("files")
     results = frozenset(map(str, listed)) if isinstance(listed, list) else None
-    return FolderFiles(results, read_made_names(folder), tuple(list_names(folder)))
+    return FolderFiles(results, read_made_names(folder))
 
 
 def read_made_names(folder: Path) -> frozenset[str]:
-    """The names listed as made of the results of a folder, and that of the list itself.
-
-    They are only compared with names of existing files, never opened: a list may hold any text.
-    """
+    """The names listed as made of the results of a folder, and that of the list itself."""
     names = {MADE}
     for line in _read_made_list(folder).splitlines():
-        try:
-            name = parse_json(line)
-        except ValueError:
-            continue
-        if isinstance(name, str):
-            names.add(name)
+        with suppress(ValueError):
+            names.add(str(parse_json(line)))
     return frozenset(names)
 
 
@@ -112,11 +108,10 @@ def add_to_made_list(folder: Path, files: Iterable[Path]) -> None:
     text = "\n" * cut_off + "".join(f"{json.dumps(name)}\n" for name in new)
     try:
         fd = os.open(folder / MADE, os.O_WRONLY | os.O_CREAT | os.O_APPEND | NO_LINK, 0o666)
-        try:
-            os.write(fd, text.encode())
+        with open(fd, "ab") as file:
+            file.write(text.encode())
+            file.flush()
             os.fsync(fd)
-        finally:
-            os.close(fd)
     except OSError as error:
         raise OutputError(f"{folder / MADE}: cannot be written: {error.strerror or error}") from None
 
@@ -141,40 +136,6 @@ def check_unchanged(folder: Path, seen: os.stat_result) -> None:
         raise InputError(f"{folder}: other results took its place while it was read; run the command again")
 
 
-def list_names(folder: Path, at: str = "") -> Iterator[str]:
-    """Files, links and empty folders in a folder, by names relative to it; `at` comes before them. Raises OSError."""
-    entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
-    if at and not entries:
-        yield at.removesuffix("/")
-    for entry in entries:
-        if not entry.is_dir(follow_symlinks=False):
-            yield at + entry.name
-        elif os.path.ismount(entry.path):
-            raise OutputError(f"{entry.path}: a mount point cannot be replaced; choose another folder with --out")
-        elif not is_scratch(Path(entry.path)):  # a figure that is being written, or was when its process was killed
-            yield from list_names(Path(entry.path), f"{at}{entry.name}/")
-
-
-def _make_folder(folder: Path, old: Path, new: Path) -> None:
-    """Make a folder below `new` and those above it, with the modes of those below `old`. Raises OSError."""
-    if not folder.exists():
-        _make_folder(folder.parent, old, new)
-        folder.mkdir()
-        folder.chmod((old / folder.relative_to(new)).stat().st_mode & 0o777 | 0o700)
-
-
-def _move_over(name: str, old: Path, new: Path, move: Callable[[Path, Path], None]) -> None:
-    """Link or rename, by `move`, a file or an empty folder of `old` to the same name in `new`. Raises OSError."""
-    source, target = old / name, new / name
-    if os.path.lexists(target):
-        return
-    if source.is_dir() and not source.is_symlink():
-        _make_folder(target, old, new)
-        return
-    _make_folder(target.parent, old, new)
-    move(source, target)
-
-
 # The lock: one process at a time writes to a place.
 
 _TRIES = 100
@@ -195,13 +156,12 @@ def lock_folder(folder: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        if locked:  # while it is locked: a waiting process would lock a file without a name
-            with suppress(OSError):
-                path.unlink()
-        os.close(fd)
-        if not locked or IS_WINDOWS:
-            with suppress(OSError):
-                path.unlink()
+        if IS_WINDOWS:
+            os.close(fd)
+        with suppress(OSError):  # while it is locked: a waiting process would lock a file without a name
+            path.unlink()
+        if not IS_WINDOWS:
+            os.close(fd)
 
 
 def _try_lock(path: Path, folder: Path) -> tuple[int, bool]:
@@ -209,18 +169,16 @@ def _try_lock(path: Path, folder: Path) -> tuple[int, bool]:
     for _ in range(_TRIES):
         fd = _open_lock(path)
         locked = try_lock(fd)
-        if locked is None or (locked and _is_still(path, fd)):
+        if locked is None or (locked and is_still(path, fd)):
             return fd, bool(locked)
-        try:
-            if locked is False:
-                os.lseek(fd, 0, os.SEEK_SET)
-                name = os.read(fd, 200).decode(errors="replace").strip()
-                raise OutputError(
-                    f"{folder}: another run ({name or 'just started'}) is writing its results there; wait until it has "
-                    "ended, or choose another folder with --out"
-                )
-        finally:
-            os.close(fd)
+        os.lseek(fd, 0, os.SEEK_SET)
+        name = os.read(fd, 200).decode(errors="replace").strip()
+        os.close(fd)
+        if not locked:
+            raise OutputError(
+                f"{folder}: another run ({name or 'just started'}) is writing its results there; wait until it has "
+                "ended, or choose another folder with --out"
+            )
     raise OutputError(
         f"{folder}: cannot be written: {path} is created and removed again and again; choose another folder with --out"
     )
@@ -233,17 +191,9 @@ def _open_lock(path: Path) -> int:
         return os.open(path, os.O_RDONLY | NO_LINK)
 
 
-def _is_still(path: Path, fd: int) -> bool:
-    """Whether an open file is still the one of this name."""
-    with suppress(FileNotFoundError):
-        return os.path.samestat(os.fstat(fd), os.lstat(path))
-    return False
-
-
 # The place of the results of one run.
 
 EXPERIMENT = "experiment.yaml"
-_NEW = "results"
 _OTHERS = "other content came there during the run and is kept"
 _PATH_BYTES = 32_767
 """Length of the longest path where the system does not say it: on Windows, where long paths are enabled."""
@@ -274,11 +224,7 @@ class ResultsPlace:
     @property
     def new(self) -> Path:
         """The folder to fill."""
-        return self.scratch.path / _NEW
-
-    def will_hold(self, files: Sequence[str]) -> None:
-        """Declare the files of the results, before any is written. Raises OSError."""
-        self.scratch.will_hold(f"{_NEW}/{name}" for name in files)
+        return self.scratch.new
 
     @contextmanager
     def may_fail(self, names: Sequence[str]) -> Iterator[None]:
@@ -316,61 +262,34 @@ class ResultsPlace:
         """Give the new folder its name; an old one goes when all of the new one is on the disk. Raises OSError."""
         flush_all(self.new)
         state = _stat_folder(self.folder)
-        why: str | None = _OTHERS
         if state is None:
-            why = None if _try_rename(self.new, self.folder) else _OTHERS
-        elif self.before is not None and os.path.samestat(state, self.before):
-            why = self._replace(files)
-        if why is not None:
-            self._elsewhere(why)
+            done = _try_rename(self.new, self.folder)
+        else:
+            done = self.before is not None and os.path.samestat(state, self.before) and self._replace(files, state)
+        if not done:
+            self._put_elsewhere()
         flush_file(self.folder.parent)
 
-    def _replace(self, files: Sequence[str]) -> str | None:
-        """Put the new folder in the place of the old one, with the user's own files. Returns why not; None: done.
-
-        They are linked into the new folder before it has its name; where links cannot be made, moved after that.
-        """
+    def _replace(self, files: Sequence[str], seen: os.stat_result) -> bool:
+        """Put the new folder in the place of the old one, with the user's own files. False: it cannot be."""
         held = list_belongings(self.folder)
-        if held is None or find_taken(held.others(files), files):
-            return _OTHERS
-        self._list_ours(_NEW, held, files)
-        for name in held.others(files):
-            with suppress(OSError):
-                _move_over(name, self.folder, self.new, partial(os.link, follow_symlinks=False))
-        flush_all(self.new)
-        assert self.before is not None
-        old = self.new
-        if not exchange_folders(self.new, self.folder):
-            old = self.scratch.path / OLD
-            exchange_in_two_steps(self.new, self.folder, old)
-        elif not os.path.samestat(self.new.stat(), self.before):
-            exchange_folders(self.new, self.folder)
-            for name in set(held.others(files)).difference(files):
+        if held is None or find_taken(held.list_others(self.folder, files), files):
+            return False
+        others = held.list_others(self.folder, files)
+        self.scratch.may_remove({*list_names(self.folder), *files}.difference(others))
+
+        def list_others(folder: Path) -> list[str]:  # more may come, and more be made, meanwhile
+            return (list_belongings(folder) or held).list_others(folder, files)
+
+        stay = replace_folder(self.scratch, self.folder, list_others, seen)
+        self.notes += [f"{self.asked}/{line}" for line in stay or ()]
+        if stay is None:
+            for name in set(others).difference(files):
                 with suppress(OSError):
                     (self.new / name).unlink()
-            return _OTHERS
-        after = list_belongings(old) or held  # more may have come meanwhile
-        self._list_ours(old.name, after, files)
-        for name in after.others(files):
-            try:
-                _move_over(name, old, self.folder, os.rename)
-            except OSError as error:
-                self.notes.append(f"{self.asked}/{name}: cannot be moved over ({error.strerror}); it is in {old}")
-        # What is in both goes from here, also where a command then writes another file of that name.
-        both = [name for name in after.others(files) if is_hard_link(old / name, self.folder / name)]
-        self._list_ours(old.name, after, files, both)
-        return None
+        return stay is not None
 
-    def _list_ours(self, where: str, held: FolderFiles, files: Sequence[str], both: Sequence[str] = ()) -> None:
-        """List what may be removed of the scratch folder, in which the old results come to lie as `where`.
-
-        `both`: the user's own files of them that the new results have, too.
-        """
-        ours = {*held.every}.difference(held.others(files)).union(files)
-        listed = {f"{at}/{name}" for at in {_NEW, OLD, where} for name in ours}
-        self.scratch.will_hold(listed.union(f"{where}/{name}" for name in both))
-
-    def _elsewhere(self, why: str) -> None:
+    def _put_elsewhere(self) -> None:
         """Give the new folder another name."""
         number = 2
         while True:
@@ -378,7 +297,7 @@ class ResultsPlace:
             if not os.path.lexists(other) and _try_rename(self.new, other):
                 break
             number += 1
-        self.notes.append(f"{self.asked}: {why}; the results of this run are in {other}")
+        self.notes.append(f"{self.asked}: {_OTHERS}; the results of this run are in {other}")
         self.folder = other
 
 
@@ -423,9 +342,7 @@ def take_place(folder: Path, *, overwrite: bool) -> Iterator[ResultsPlace]:
             notes = remove_leftovers(path)
             check_target(folder, overwrite=overwrite)
             scratch = stack.enter_context(make_scratch_folder(path))
-            scratch.will_hold([])
             place = ResultsPlace(path, folder, path, scratch, _stat_folder(path), notes)
-            place.new.mkdir()
         except OSError as error:
             raise OutputError(f"{folder}: cannot be written: {error.strerror or error}") from None
         yield place
@@ -440,40 +357,25 @@ def _remove_empty(folders: Sequence[Path]) -> None:
 
 def check_target(folder: Path, *, overwrite: bool) -> None:
     """Raise OutputError where a results folder may not be written."""
-    try:
-        parent = next((place for place in Path(os.path.abspath(folder)).parents if place.exists()), Path("/"))
-        exists = _folder_exists(folder)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be written: {error.strerror}") from None
-    if not parent.is_dir():
-        raise OutputError(f"{folder}: cannot be written: {parent} is a file")
-    try:
-        os.fsencode(os.path.abspath(folder)).decode()
-    except UnicodeDecodeError:
-        raise OutputError(
-            f"{folder}: cannot be written: expected a path in UTF-8, found other bytes; choose another with --out"
-        ) from None
-    if not os.access(parent, os.W_OK | os.X_OK):
-        raise OutputError(f"{folder}: cannot be written: no permission to write in {parent}")
-    if not exists:
+    check_parent(folder, os.stat)
+    if not folder.exists():
         return
     if not folder.is_dir():
         raise OutputError(f"{folder}: expected a folder for the results, found a file")
     if not os.access(folder, os.R_OK | os.W_OK | os.X_OK):
         raise OutputError(f"{folder}: cannot be written: no permission to replace what is in it")
-    empty = not any(folder.iterdir())
-    try:
-        held = None if empty else list_belongings(folder)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be replaced: {error.filename}: {error.strerror}") from None
-    if not empty and held is None:
-        raise OutputError(f"{folder}: not empty and no results folder; choose another with --out")
-    if not empty and not overwrite:
-        raise OutputError(
-            f"{folder}: results are there already; --overwrite replaces them, --out chooses another folder"
-        )
-    place = folder.resolve()
-    if place.is_mount() or place in (Path.cwd(), *Path.cwd().parents):
+    if any(folder.iterdir()):
+        if list_belongings(folder) is None:
+            raise OutputError(f"{folder}: not empty and no results folder; choose another with --out")
+        try:
+            list(list_names(folder))
+        except OSError as error:
+            raise OutputError(f"{folder}: cannot be replaced: {error.filename}: {error.strerror}") from None
+        if not overwrite:
+            raise OutputError(
+                f"{folder}: results are there already; --overwrite replaces them, --out chooses another folder"
+            )
+    if not may_be_moved(folder.resolve()):
         raise OutputError(f"{folder}: cannot be replaced, being in use or a mount point; choose a folder in it")
 
 
@@ -487,31 +389,21 @@ def find_taken(others: Iterable[str], files: Collection[str]) -> list[str]:
 def check_names(place: ResultsPlace, files: Sequence[str]) -> None:
     """Raise OutputError, before the replay, where a file of the user's own has a name that the results need."""
     held = None if place.before is None else list_belongings(place.folder)
-    if held is not None and held.results is not None and (taken := find_taken(held.others(files), files)):
+    if held is None or held.results is None:
+        return
+    if taken := find_taken(held.list_others(place.folder, files), files):
         out = "move it elsewhere, or choose another folder with --out"
         raise OutputError(f"{place.asked}/{taken[0]}: the results will have a file of that name; {out}")
 
 
-def _folder_exists(folder: Path) -> bool:
-    """Whether a path exists. Raises OSError for an impossible one: a loop of links, a name that is too long."""
-    try:
-        os.stat(folder)
-    except (FileNotFoundError, NotADirectoryError):
-        return False
-    return True
-
-
 def check_inputs(place: ResultsPlace, inputs: Sequence[Path]) -> None:
     """Raise OutputError where an input of the run would go with the folder that is replaced."""
-    if place.before is None:
-        return
-    held = list_belongings(place.folder)
-    ours = None if held is None or held.results is None else held.results | held.made
-    for path in inputs:
+    held = None if place.before is None else list_belongings(place.folder)
+    for path in inputs if place.before is not None else ():
         if not path.resolve().is_relative_to(place.folder):
             continue
         name = path.resolve().relative_to(place.folder).as_posix()
-        goes = ours is None or any(one == name or one.startswith(f"{name}/") for one in ours)
+        goes = held is None or held.results is None or held.is_ours(name)
         if goes and name != EXPERIMENT:
             raise OutputError(
                 f"{place.asked}: {path} is in this folder and would be removed; choose another folder with --out"

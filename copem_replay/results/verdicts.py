@@ -18,12 +18,12 @@ from xml.etree import ElementTree
 
 import pandas as pd
 
-from copem_replay.core.errors import InputError, OutputError, count_noun, escape_unprintable
-from copem_replay.core.files import atomic_file, parse_json
+from copem_replay.core.errors import InputError, count_noun, escape_unprintable
+from copem_replay.core.files import parse_json
 from copem_replay.metrics.limits import format_limits
 from copem_replay.metrics.summary import format_cell, format_table
 from copem_replay.results.compare.tables import escape_markdown
-from copem_replay.results.folder import MARK, add_to_made_list
+from copem_replay.results.outputs import check_output, check_outputs, made_file
 from copem_replay.results.table_files import AGAIN
 
 MET, NOT_MET, UNDECIDED, NOT_MEASURED = "met", "not met", "undecided", "not measured"
@@ -253,19 +253,17 @@ FORMS: dict[str, Callable[[Judgement], str]] = {
 
 
 def check_verdict_files(files: Mapping[str, Path | None]) -> None:
-    """Raise OutputError for files, by their forms, that cannot be written, before anything is judged."""
-    for form, path in files.items():
-        if path is not None and path.is_dir():
-            raise OutputError(f"--{form}: expected a name for a file, found the folder {path}")
+    """Raise OutputError for files, by their forms, that may not be written, before anything is judged."""
+    check_outputs({f"--{form}": path for form, path in files.items()})
+    for path in files.values():
+        if path is not None:
+            check_output(path)
 
 
 def write_verdicts(verdicts: Judgement, path: Path, form: str = "jsonl") -> Path:
     """Write verdicts as a file, complete or not at all; an existing one is replaced. Raises OutputError."""
-    with atomic_file(path) as scratch:
+    with made_file(path, path.parent.resolve()) as scratch:
         scratch.write_text(FORMS[form](verdicts), encoding="utf-8", newline="\n")
-        folder = path.parent.resolve()
-        if (folder / MARK).is_file():
-            add_to_made_list(folder, [path])
     return path
 
 

@@ -144,7 +144,7 @@ def fill_place(
     tables += _table_files("tally.parquet", dict(study.tally["log"].value_counts(sort=False)))
     files = list_results(study.experiment, study.recordings, exporters, tables)
     try:
-        place.will_hold(files)
+        place.scratch.may_remove(files)
         _write_files(place, study)
         notes = [*study.notes, *_export(place, study, exporters)]
         files = [name for name in files if name not in place.left_out]

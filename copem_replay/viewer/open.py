@@ -26,7 +26,7 @@ from pathlib import Path
 from urllib.parse import quote, unquote, urlsplit
 
 from copem_replay.core.errors import CopemError, OutputError
-from copem_replay.core.files import portable_name
+from copem_replay.core.files import is_temporary, portable_name
 from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.results.read import Results, open_results
 from copem_replay.results.shown_objects import BEFORE_S
@@ -48,7 +48,7 @@ def list_rrd_files(folder: Path) -> list[Path]:
     found = (
         path for pattern in _PATTERNS for path in sorted(place.glob(pattern), key=lambda path: path.with_suffix(""))
     )
-    return list(dict.fromkeys(path for path in found if path.is_file()))
+    return list(dict.fromkeys(path for path in found if path.is_file() and not is_temporary(path.name)))
 
 
 @dataclass(frozen=True)

@@ -15,12 +15,13 @@ import pandas as pd
 
 from copem_replay.communication.link import LinkModel
 from copem_replay.core.errors import InputError, OutputError
+from copem_replay.core.files import remove_leftovers
 from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.experiment.schema import Configuration, Experiment, Unit
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.perception.pem.model import Pem
-from copem_replay.pipeline.one_run import STEM, ReplayedRun
+from copem_replay.pipeline.one_run import ReplayedRun
 from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.results.again import replay_again
 from copem_replay.results.compare.compare import read_folders
@@ -31,6 +32,7 @@ from copem_replay.results.compare.labels import (
     label_configurations,
 )
 from copem_replay.results.folder import add_to_made_list
+from copem_replay.results.outputs import check_output
 from copem_replay.results.read import Results, check_complete
 from copem_replay.viewer.sink import split_into_files
 
@@ -115,12 +117,10 @@ class _Side:
 
 
 def check_side_by_side(path: Path) -> None:
-    """Raise OutputError for a path that is no .rrd, or belongs to the recordings of a results folder."""
+    """Raise OutputError for a path that is no .rrd, or may not be written."""
     if path.suffix.lower() != ".rrd":
         raise OutputError(f"{path}: expected a name that ends with .rrd, found {path.name}")
-    of_results = path.name == f"{STEM}.rrd" or path.name.startswith(f"{STEM}_")
-    if of_results and (path.parent / "provenance.json").exists():
-        raise OutputError(f"{path}: expected another name, found that of a recording of the results in that folder")
+    check_output(path)
 
 
 def write_side_by_side(
@@ -155,8 +155,12 @@ def write_side_by_side(
     recording = _reread_truth(sides, log, experiment)
     run_tracks = {side.labels[name]: fused for side in sides for name, fused in side.one.run_tracks.whole().items()}
     table = pd.concat([side.rows.assign(configuration=side.rows["configuration"].map(side.labels)) for side in sides])
+    files = [part.path(path) for part in split_into_files(labels, labels[0])]
+    for file in files:
+        check_output(file)
+        remove_leftovers(file)
     for folder in folders:
-        add_to_made_list(folder, [part.path(path) for part in split_into_files(labels, labels[0])])
+        add_to_made_list(folder, files)
     write_rrd(
         path,
         prepare_log(recording, experiment, onsets_of=resolve_for_log(sides[0].results.experiment, log)),

@@ -285,6 +285,8 @@ def test_geojson(tmp_path: Path) -> None:
     found = replayed(experiment(tmp_path, **keys), tmp_path / "out")
     done = CliRunner().invoke(app, ["export", str(tmp_path / "out"), "--geojson"])
     assert done.exit_code == 0, done.output
+    again = CliRunner().invoke(app, ["export", str(tmp_path / "out"), "--geojson"])
+    assert again.exit_code == 0, "an earlier export is replaced, though it could be read as a map"
     files = {path.stem: json.loads(path.read_text()) for path in (tmp_path / "out" / "geojson").iterdir()}
     assert sorted(files) == ["episodes", "site", "units"]
     point, field = files["units"]["features"]

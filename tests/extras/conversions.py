@@ -15,8 +15,8 @@ from osi3.osi_groundtruth_pb2 import GroundTruth
 
 from copem_replay.cli import main as cli
 from copem_replay.core.tracks import CLASSES
-from copem_replay.extras.convert.conversion import RECORD
 from copem_replay.io.recording import Recording, read_log
+from copem_replay.results.outputs import CONVERSION
 
 ROOT = Path(__file__).parents[2]
 
@@ -86,9 +86,9 @@ class Runner:
             reader = make_reader(stream, validate_crcs=True)
             messages = [GroundTruth.FromString(message.data) for *_, message in reader.iter_messages()]
             records = {record.name: record.metadata for record in reader.iter_metadata()}
-        assert set(records) == {"net.asam.osi.trace", RECORD}
+        assert set(records) == {"net.asam.osi.trace", CONVERSION}
         assert list(self.output.parent.iterdir()) == [self.output]
-        return Converted(read_log(self.output, name="converted"), messages, records[RECORD], printed.out)
+        return Converted(read_log(self.output, name="converted"), messages, records[CONVERSION], printed.out)
 
     def refused(self, kind: str, source: Path, *options: str | Path) -> str:
         """Return the one line on stderr."""

@@ -130,6 +130,7 @@ def write_folder(
     names = list(dict.fromkeys(r["log"] for r in rows))
     logs = logs or {name: f"content of {name}" for name in names}
     said = {
+        "copem_replay": "0",
         "format": 5,
         "seed": 1,
         "runs": max(r["run"] for r in rows) + 1,

@@ -24,8 +24,8 @@ from copem_replay.results.read import Results
 
 def transmitted(replay: Replay, plan: Experiment, runs: Sequence[int] | Int = (0,), **how: bool) -> Transmission:
     """The lists of a log on their way, with all units in these runs."""
-    units = replay.expanded.with_(plan)
-    return Transmission(replay, plan, RunGroup.of_all_units(units, np.asarray(runs)), **how)  # type: ignore[arg-type]
+    units = replay.expand(plan)
+    return Transmission(replay, units, RunGroup.of_all_units(units, np.asarray(runs)), **how)  # type: ignore[arg-type]
 
 
 def world_of(replay: Replay, plan: Experiment, runs: Sequence[int] | Int = (0,)) -> WorldChunk:

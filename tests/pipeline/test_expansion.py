@@ -30,7 +30,7 @@ from copem_replay.io.recording import Recording
 from copem_replay.metrics.detections_table import build_frame
 from copem_replay.perception.config import Carriers
 from copem_replay.pipeline.closed_form import compute_distributions, exact_table
-from copem_replay.pipeline.expansion import ExpandedExperiment, expand_experiment, resolve_for_run
+from copem_replay.pipeline.expansion import ExpandedExperiment, expand_alike, expand_experiment, resolve_for_run
 from copem_replay.pipeline.notes import measure_list_rates
 from copem_replay.pipeline.prepare import Replay, prepare_log
 from copem_replay.pipeline.replay import replay_outcomes
@@ -169,14 +169,15 @@ class TestExpansion:
             plan({"fleet": some(0.5), "ego": EGO}, configurations=late),
         )
         found, expected = (
-            expand_experiment(first, street().scene).with_(other),
+            expand_alike(other, expand_experiment(first, street().scene)),
             expand_experiment(other, street().scene),
         )
         assert found.configurations == expected.configurations
         assert found.units == expected.units
-        assert found.written is other
+        assert (found.named, found.facts) == (expected.named, expected.facts)
+        assert expand_alike(found, expected) is found, "resolved once"
         with pytest.raises(ValueError, match="the units that the log was prepared for"):
-            found.with_(plan({"fleet": some(0.6), "ego": EGO}))
+            expand_alike(plan({"fleet": some(0.6), "ego": EGO}), found)
 
     def test_no_carrier_in_the_log(self) -> None:
         """As if there were no such unit."""

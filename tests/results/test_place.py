@@ -63,6 +63,18 @@ def raises(error: int) -> Callable[..., None]:
     return fail
 
 
+def before_it_is_replaced(monkeypatch: pytest.MonkeyPatch, folder: Path, do: Callable[[], object]) -> None:
+    """Do something at the last instant before a folder loses its name."""
+    rename = os.rename
+
+    def renamed(source: Path, target: Path) -> None:
+        if source == folder:
+            do()
+        rename(source, target)
+
+    monkeypatch.setattr(os, "rename", renamed)
+
+
 class TestOthers:
     """What is not ours stays, and what is goes."""
 
@@ -75,14 +87,9 @@ class TestOthers:
             assert json.loads((here / "out/e/provenance.json").read_text())["files"] == names
 
     @pytest.mark.parametrize("links", [True, False])
-    @pytest.mark.parametrize("in_one_step", [True, False])
-    def test_stays(
-        self, old: Path, call: Call, monkeypatch: pytest.MonkeyPatch, links: bool, in_one_step: bool
-    ) -> None:
+    def test_stays(self, old: Path, call: Call, monkeypatch: pytest.MonkeyPatch, links: bool) -> None:
         if not links:
             monkeypatch.setattr(os, "link", raises(errno.EPERM))
-        if not in_one_step:
-            monkeypatch.setattr(place, "exchange_folders", lambda *_: False)
         before = written(old)
         inode = (old / "notes.txt").stat().st_ino
         assert again(call).lines == []
@@ -93,10 +100,9 @@ class TestOthers:
         assert written(old)["provenance.json"] != before["provenance.json"]
         assert os.listdir(old.parent) == ["e"]
 
-    @pytest.mark.parametrize("in_one_step", [True, False])
     @pytest.mark.parametrize("text", [None, '"verdic', "null"])
     def test_with_a_damaged_list_of_what_was_made_leaves_nothing_behind(
-        self, here: Path, call: Call, monkeypatch: pytest.MonkeyPatch, text: str | None, in_one_step: bool
+        self, here: Path, call: Call, text: str | None
     ) -> None:
         """The verdicts of before count as the user's then, and are replaced by those of the new results."""
         (here / "e.yaml").write_text(changed("criteria: {known: {metric: detected_share, at_least: 0}}"))
@@ -106,8 +112,6 @@ class TestOthers:
         made.unlink()
         if text is not None:
             made.write_text(text)
-        if not in_one_step:
-            monkeypatch.setattr(place, "exchange_folders", lambda *_: False)
         again(call)
         assert (os.listdir(here / "out"), made.read_text()) == (["e"], '"verdicts.jsonl"\n')
 
@@ -155,7 +159,7 @@ class TestOthers:
         monkeypatch.setattr(os, "rename", refused)
         (line,) = again(call).lines
         (left,) = old.parent.glob(".e.*.tmp")
-        said = f"note: out/e/figures/more/mine.svg: cannot be moved over (Permission denied); it is in {left}/results"
+        said = f"note: out/e/figures/more/mine.svg: cannot be moved over (Permission denied); it is in {left}/old"
         assert line == said
         assert {path.name for path in left.rglob("*.*")} == {"mine.svg", "files.json"}
         assert (old / "notes.txt").read_text() == "mine\n"
@@ -164,13 +168,7 @@ class TestOthers:
     def test_that_came_while_the_folder_was_exchanged(
         self, old: Path, call: Call, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        exchange = place.exchange_folders
-
-        def late(one: Path, other: Path) -> bool:
-            (other / "late.txt").write_text("late\n")
-            return exchange(one, other)
-
-        monkeypatch.setattr(place, "exchange_folders", late)
+        before_it_is_replaced(monkeypatch, old, lambda: (old / "late.txt").write_text("late\n"))
         assert again(call).code == 0
         assert (old / "late.txt").read_text() == "late\n"
         assert os.listdir(old.parent) == ["e"]
@@ -318,14 +316,11 @@ class TestMade:
     def test_what_is_made_while_the_folder_is_exchanged_goes_with_the_old_results(
         self, old: Path, call: Call, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        exchange = place.exchange_folders
+        def late() -> None:
+            belongings.add_to_made_list(old, [old / "late.html"])
+            (old / "late.html").write_text("of the old results")
 
-        def late(one: Path, other: Path) -> bool:
-            belongings.add_to_made_list(other, [other / "late.html"])
-            (other / "late.html").write_text("of the old results")
-            return exchange(one, other)
-
-        monkeypatch.setattr(place, "exchange_folders", late)
+        before_it_is_replaced(monkeypatch, old, late)
         assert again(call).lines == []
         assert set(belongings.list_names(old)) == MINE | set(json.loads((old / "provenance.json").read_text())["files"])
         assert os.listdir(old.parent) == ["e"]
@@ -414,15 +409,13 @@ class TestOneWriter:
         self, old: Path, call: Call, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(fcntl, "flock", raises(errno.ENOLCK))
-        exchange = place.exchange_folders
         count = iter(range(9))
 
-        def meanwhile(one: Path, other: Path) -> bool:
+        def meanwhile() -> None:
             if next(count) == 0:  # at the last instant
                 assert again(call).code == 0
-            return exchange(one, other)
 
-        monkeypatch.setattr(place, "exchange_folders", meanwhile)
+        before_it_is_replaced(monkeypatch, old, meanwhile)
         assert call("run", "e.yaml", "--seed", "6", "--overwrite").code == 0
         seeds = {path.name: json.loads((path / "provenance.json").read_text())["seed"] for path in old.parent.iterdir()}
         assert seeds == {"e": 5, "e-2": 6}
@@ -478,22 +471,22 @@ class TestFlushed:
     ) -> None:
         (old.parents[1] / "e.yaml").write_text(SHOWN)
         flushed: set[tuple[int, int]] = set()
-        fsync, exchange = os.fsync, place.exchange_folders
+        fsync, rename = os.fsync, os.rename
 
         def noted(fd: int) -> None:
             found = os.fstat(fd)
             flushed.add((found.st_dev, found.st_ino))
             fsync(fd)
 
-        def ready(new: Path, other: Path) -> bool:
+        def ready(new: Path, name: Path) -> None:
             every = [new, *new.rglob("*")]
             here = {(p.lstat().st_dev, p.lstat().st_ino) for p in every if not p.is_symlink()}
             assert len(every) > 15
             assert here <= flushed
-            return exchange(new, other)
+            rename(new, name)
 
         monkeypatch.setattr(os, "fsync", noted)
-        monkeypatch.setattr(place, "exchange_folders", ready)
+        monkeypatch.setattr(os, "rename", lambda new, name: (ready if name == old else rename)(new, name))
         assert again(call).code == 0
         assert (old.parent.stat().st_dev, old.parent.stat().st_ino) in flushed
 
@@ -525,7 +518,7 @@ class TestLeftovers:
         return f"note: {path}: left by a process that was killed, and not removed: it holds what is not ours"
 
     def test_go_and_it_is_said(self, here: Path, call: Call) -> None:
-        path = self.left(here / "out/e", ["results/summary.csv", "results/replay/a.rrd"], ["results/replay/a.rrd"])
+        path = self.left(here / "out/e", ["summary.csv", "replay/a.rrd"], ["new/replay/a.rrd"])
         assert call("run", "e.yaml").lines == [self.removed(path)]
         assert os.listdir(here / "out") == ["e"]
 
@@ -537,36 +530,36 @@ class TestLeftovers:
         assert ended.lines[0] == self.removed(path)
 
     def test_with_a_file_that_is_in_no_list_stay(self, here: Path, call: Call) -> None:
-        path = self.left(here / "out/e", ["results/a"], ["results/a", "results/thesis.tex", "results/files.json"])
+        path = self.left(here / "out/e", ["a"], ["new/a", "new/thesis.tex", "new/files.json"])
         for _ in range(2):
             assert call("run", "e.yaml", "--overwrite").lines == [self.kept(path)]
-            assert {p.name for p in (path / "results").iterdir()} == {"thesis.tex", "files.json"}
+            assert {p.name for p in (path / "new").iterdir()} == {"thesis.tex", "files.json"}
 
     @pytest.mark.parametrize("text", [None, "", "{", "[]", '{"files": 3}', '{"files": [[]]}'])
     def test_without_a_list_stay_unless_they_are_empty(self, here: Path, call: Call, text: str | None) -> None:
-        path = self.left(here / "out/e", [], ["results/summary.csv"])
+        path = self.left(here / "out/e", [], ["new/summary.csv"])
         if text is None:
             (path / scratch.MANIFEST).unlink()
         else:
             (path / scratch.MANIFEST).write_text(text)
         assert call("run", "e.yaml").lines == [self.kept(path)]
-        assert (path / "results/summary.csv").exists()
-        shutil.rmtree(path / "results")
+        assert (path / "new/summary.csv").exists()
+        shutil.rmtree(path / "new")
         assert call("run", "e.yaml", "--overwrite").lines == [self.removed(path)]
 
     def test_of_a_process_that_lives_stay(self, here: Path, call: Call) -> None:
-        path = self.left(here / "out/e", ["results/a"], ["results/a"])
+        path = self.left(here / "out/e", ["a"], ["new/a"])
         with (path / scratch.MANIFEST).open() as file:
             fcntl.flock(file, fcntl.LOCK_EX)
             assert call("run", "e.yaml").lines == []
-            assert (path / "results/a").exists()
+            assert (path / "new/a").exists()
         assert call("run", "e.yaml", "--overwrite").lines == [self.removed(path)]
 
     def test_stay_where_there_are_no_locks(self, here: Path, call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
-        path = self.left(here / "out/e", ["results/a"], ["results/a"])
+        path = self.left(here / "out/e", ["a"], ["new/a"])
         monkeypatch.setattr(fcntl, "flock", raises(errno.ENOLCK))
         assert call("run", "e.yaml").lines == []
-        assert (path / "results/a").exists()
+        assert (path / "new/a").exists()
 
     def test_of_other_places_stay(self, here: Path, call: Call) -> None:
         other = self.left(here / "out/e.x", [], [])
@@ -580,11 +573,11 @@ class TestLeftovers:
     def test_with_a_file_of_the_users_go_where_it_is_in_the_results(self, old: Path, call: Call, equal: bool) -> None:
         """After the exchange the old folder, with links to what stays, is still there."""
         path = self.left(old, [], [])
-        (path / "results").mkdir()
+        (path / "new").mkdir()
         if equal:
-            os.link(old / "notes.txt", path / "results/notes.txt")
+            os.link(old / "notes.txt", path / "new/notes.txt")
         else:
-            (path / "results/notes.txt").write_text("mine\n")
+            (path / "new/notes.txt").write_text("mine\n")
         assert again(call).lines == [self.removed(path) if equal else self.kept(path)]
         assert (old / "notes.txt").read_text() == "mine\n"
 
@@ -594,15 +587,15 @@ class TestLeftovers:
         path = self.left(old, [], [])
         (here / "theirs").mkdir()
         (here / "theirs/notes.txt").write_text("mine\n")
-        (path / "results").mkdir()
+        (path / "new").mkdir()
         (old / "theirs").symlink_to(here / "theirs")
-        os.link(old / "theirs", path / "results/theirs", follow_symlinks=False)
+        os.link(old / "theirs", path / "new/theirs", follow_symlinks=False)
         assert again(call).lines == [self.removed(path)]
         assert (here / "theirs/notes.txt").read_text() == "mine\n"
 
     def test_a_folder_that_was_moved_away_is_put_back(self, old: Path, call: Call) -> None:
         before = written(old)
-        path = self.left(old, [f"{at}/{name}" for at in ("old", "results") for name in before], ["results/summary.csv"])
+        path = self.left(old, list(before), ["new/summary.csv"])
         os.rename(old, path / "old")
         ended = call("run", "e.yaml", "--seed", "5")
         assert ended.code == 2
@@ -612,25 +605,22 @@ class TestLeftovers:
         assert written(old) == before
 
     def test_of_a_file_in_them_go_with_them(self, here: Path, call: Call) -> None:
-        path = self.left(here / "out/e", ["results/replay.rrd"], [])
-        self.left(path / "results/replay.rrd", ["replay.rrd"], ["replay.rrd"])
+        path = self.left(here / "out/e", ["replay.rrd"], [])
+        (path / "new").mkdir()
+        (path / "new/.replay.rrd.abcd_124.tmp.rrd").write_text("half")
         assert call("run", "e.yaml").lines == [self.removed(path)]
 
     def test_of_figures_pages_and_tables(self, old: Path, call: Call) -> None:
         for file in (old / "report.html", old / "figures", old.parent / "c.csv"):
-            self.left(file, [file.name, "runs.png"], ["runs.png"])
+            self.left(file, ["runs.png"], ["new/runs.png"])
         inside = old / "figures/.figures.abcd_124.tmp"
         shutil.copytree(old / ".figures.abcd_123.tmp", inside)
-        assert call("report", "out/e").lines == [
-            "note: out/e/.report.html.abcd_123.tmp: removed, left by a process that was killed"
-        ]
-        assert call("compare", "out/e", "--baseline", "GT", "--out", "out/c.csv").lines[-1] == (
-            "note: out/.c.csv.abcd_123.tmp: removed, left by a process that was killed"
-        )
-        assert call("plot", "out/e").lines[-2:] == [
-            "note: out/e/figures/.figures.abcd_124.tmp: removed, left by a process that was killed",
-            "note: out/e/.figures.abcd_123.tmp: removed, left by a process that was killed",
-        ]
+        (old.parent / ".c.csv.abcd_125.tmp.csv").write_text("half")
+        assert call("report", "out/e").code == 0
+        assert call("compare", "out/e", "--baseline", "GT", "--out", "out/c.csv").code == 0
+        assert call("plot", "out/e").code == 0
+        assert not list(old.parent.rglob(".*.tmp*"))
+        assert not inside.exists()
 
 
 @pytest.mark.parametrize("command", ["plot", "report"])
@@ -678,11 +668,10 @@ def test_tables_of_old_and_new_results_are_not_read_as_one(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("two_steps", [False, True])
-def test_killed_at_any_moment(two_steps: bool) -> None:
+def test_killed_at_any_moment() -> None:
     """Nothing half-written, nothing of the user's gone, nothing piling up, the next run as if there had been none."""
     tool = [sys.executable, ROOT / "tools/kill_runs.py", "--kills", "6"]
-    ended = subprocess.run([*tool, *["--two-steps"] * two_steps], capture_output=True, text=True, timeout=600)
+    ended = subprocess.run(tool, capture_output=True, text=True, timeout=600)
     assert ended.returncode == 0, ended.stdout + ended.stderr
     assert ended.stdout.startswith("6 kills, ")
     assert "wrong: 0;" in ended.stdout

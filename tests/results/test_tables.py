@@ -433,7 +433,7 @@ def test_the_files_name_says_what_is_written(tmp_path):
 
 def test_results_are_not_overwritten_with_their_comparison(tmp_path):
     folder = study(tmp_path, "a", "ideal", "GT")
-    with pytest.raises(OutputError, match=r"summary\.csv: expected another name, found that of a table of the results"):
+    with pytest.raises(OutputError, match=r"summary\.csv: expected another name, found that of a file of the results"):
         check_out(folder / "summary.csv")
     check_out(folder / "regret.csv")
     check_out(tmp_path / "summary.csv")

@@ -197,7 +197,7 @@ class TestRefusals:
         [
             (["--rrd", "ab.html"], "ab.html: expected a name that ends with .rrd, found ab.html"),
             (["--rrd", "a/replay.rrd"],
-             "a/replay.rrd: expected another name, found that of a recording of the results in that folder"),
+             "a/replay.rrd: expected another name, found that of a recording of the results in a"),
             (["--run", "1"], "--run: expected --rrd FILE with it, found none"),
             (["--log", "drive"], "--log: expected --rrd FILE with it, found none"),
             (["--rrd", "ab.rrd", "--run", "2"], "--run: expected 0 to 1, the runs that all folders have, found 2"),

@@ -7,7 +7,6 @@ from typing import Annotated, Any
 
 import typer
 
-from copem_replay.cli.terminal import tidy_outputs
 from copem_replay.core.errors import InputError, escape_unprintable
 
 app = typer.Typer(
@@ -229,7 +228,6 @@ def _convert_sources(
 
     conversion, meant = Conversion(), _read_classes(classes or [])
     outputs = plan_outputs(source, out, format=format, overwrite=overwrite, only=only)
-    tidy_outputs(outputs)
     for line in convert_all(outputs, conversion, format=format, options=options, classes=meant):
         print(escape_unprintable(line))
     for note in conversion.note_lines():

@@ -21,6 +21,7 @@ from osi3.osi_groundtruth_pb2 import GroundTruth
 from osi3.osi_object_pb2 import MovingObject, StationaryObject
 
 from copem_replay.core.errors import InputError, OutputError, count_noun, quote_value, unknown_name_message
+from copem_replay.core.files import find_scratch_names, remove_leftovers
 from copem_replay.core.frame import SaidPlace
 from copem_replay.core.site_map import SiteMap
 from copem_replay.core.tracks import CLASSES, Float
@@ -37,6 +38,7 @@ from copem_replay.io.findings import (
 )
 from copem_replay.io.schemas.osi_ground_truth import osi_class_index
 from copem_replay.io.write.osi import NANOS_PER_SECOND, OsiTrace, add_road, empty_ground_truth, write_osi_trace
+from copem_replay.results.outputs import CONVERSION, check_output, check_outputs, is_converted
 
 # Kinds of objects in OSI. The names of formats are mapped onto these by the one table of class names.
 
@@ -227,8 +229,6 @@ def sign_files(paths: Iterable[Path]) -> tuple[tuple[str, int, int], ...]:
 # A recording of osi3.GroundTruth from boxes: the last step of every converter.
 
 TOPIC: Final = "ground_truth"
-RECORD: Final = "copem_replay.conversion"
-"""Metadata record of the file: format, the source's ids by OSI id, and the notes."""
 
 
 @dataclass(frozen=True)
@@ -303,7 +303,7 @@ def write_recording(
         topics={TOPIC: "osi3.GroundTruth: all objects of the source"},
         messages=_encode_messages(frames, report, source, format_name, record),
         source=f"{format_name}: {source.name} (copem-replay convert)",
-        records={RECORD: record},
+        records={CONVERSION: record},
     )
     write_osi_trace(trace, path)
 
@@ -438,7 +438,8 @@ def plan_outputs(
 ) -> dict[Path, PlannedRecording]:
     """What each recording to write is made of: one, or one for each that the format's `list_recordings` finds.
 
-    `only`: one of these. Raises InputError: the source does not exist or has no recording, or an output exists already.
+    `only`: one of these. Raises InputError: the source does not exist or has no recording, or an output exists already;
+    OutputError: one may not be written.
     """
     if not source.exists():
         raise InputError(f"{source}: no such file or folder")
@@ -457,6 +458,13 @@ def plan_outputs(
         if out.suffix == ".mcap" or out.is_file():
             raise InputError(f"{out}: expected a folder for the recordings of one, found a file's name")
         asked = {out / f"{name}.mcap": part for name, part in found.items()}
+    for path in asked:
+        check_outputs({"--out": path}, [source])
+        check_output(path, is_converted)
+    for folder in {path.parent for path in asked}:
+        if find_scratch_names(folder):  # of conversions that were killed
+            for path in asked:
+                remove_leftovers(path, folder)
     existing = [path for path in asked if path.is_file()]
     if existing and not overwrite:
         more = f", and {count_noun(len(existing) - 1, 'other')}" if len(existing) > 1 else ""
@@ -488,10 +496,10 @@ class Conversion:
         lines = [f"{line} ({count_noun(n, 'recording')})" if many else line for line, n in self.assumed.items()]
         if len(lines) > _MOST_LINES:
             more = len(lines) - _MOST_LINES
-            lines[_MOST_LINES:] = [f"… and {more} more; the metadata record {RECORD} of each has all"]
+            lines[_MOST_LINES:] = [f"… and {more} more; the metadata record {CONVERSION} of each has all"]
         lines += [f"{count_noun(number, noun)} {what}" for (noun, what), number in self.notes.items()]
         if self.numbered:
-            lines.append(f"objects are numbered; the file's metadata record {RECORD} has their names")
+            lines.append(f"objects are numbered; the file's metadata record {CONVERSION} has their names")
         return lines
 
     def problem_lines(self) -> list[str]:

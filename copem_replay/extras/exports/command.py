@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from copem_replay.cli.terminal import ResultsFolder, print_blocks, print_notes, tidy_leftovers
+from copem_replay.cli.terminal import ResultsFolder, print_blocks, print_notes
 from copem_replay.core.errors import InputError
 
 
@@ -44,7 +44,5 @@ def export(
     else:
         files, notes = (write_trackeval if trackeval else write_nuscenes)(folder, out, run=run)
     print_notes(notes)
-    for place in dict.fromkeys(file.parent for file in files):
-        tidy_leftovers(place, place)
     print_blocks([[str(file) for file in files]])
     return 0

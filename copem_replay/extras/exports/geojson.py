@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,14 +16,14 @@ import numpy as np
 import pandas as pd
 
 from copem_replay.core.errors import InputError, RecordingError
-from copem_replay.core.files import atomic_files
+from copem_replay.core.files import parse_json
 from copem_replay.core.frame import Frame
 from copem_replay.core.tracks import CLASSES, Float
 from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.experiment.schema import Experiment, Unit
 from copem_replay.io.recording import Recording
 from copem_replay.perception.sensor_poses import couple_outlines
-from copem_replay.results.folder import add_to_made_list
+from copem_replay.results.outputs import made_files
 from copem_replay.results.read import Results, open_results
 
 FILES: Final = ("units.geojson", "episodes.geojson", "site.geojson")
@@ -58,12 +59,19 @@ def write_geojson(results: Results | Path, out: Path | None = None) -> tuple[lis
         raise InputError("\n".join([f"{results.place}: no log can be placed on earth", *notes]).splitlines())
     folder = out or results.place / "geojson"
     files = [folder / name for name in FILES]
-    with atomic_files(folder, FILES) as scratch:
+    with made_files(folder, FILES, results.place, is_own=_is_exported) as scratch:
         for name, of_file in features.items():
             text = {"type": "FeatureCollection", **({"licence": [*licences]} if licences else {}), "features": of_file}
             (scratch / name).write_text(json.dumps(text, ensure_ascii=False) + "\n", encoding="utf-8")
-        add_to_made_list(results.place, files)
     return files, notes
+
+
+def _is_exported(path: Path) -> bool:
+    """Whether a file is an earlier export: every feature says its log, and what or which object it is."""
+    with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
+        said = [feature["properties"].keys() for feature in parse_json(path.read_bytes())["features"]]
+        return all("log" in keys and keys & {"what", "object_id"} for keys in said)
+    return False
 
 
 def _make_feature(geometry: str, coordinates: Any, **properties: Any) -> dict[str, Any]:

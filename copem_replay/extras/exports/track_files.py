@@ -21,12 +21,12 @@ import numpy as np
 import pandas as pd
 
 from copem_replay.core.errors import InputError, count_noun
-from copem_replay.core.files import atomic_files, avoid_device_name
+from copem_replay.core.files import avoid_device_name
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import CLASSES, SAME_INSTANT_S, Float, Int, Scene, Tracks
 from copem_replay.metrics.accuracy.held import find_newest_lists, thin_frames
 from copem_replay.results.again import replay_again
-from copem_replay.results.folder import add_to_made_list
+from copem_replay.results.outputs import made_files
 from copem_replay.results.read import Results, open_results
 
 BENCHMARK: Final = "copem"
@@ -118,10 +118,9 @@ def _write_texts(results: Results, folder: Path, texts: dict[str, str]) -> list[
     files = [folder / name for name in texts]
     for place in dict.fromkeys(file.parent for file in files):
         here = {file.name: text for file, text in zip(files, texts.values(), strict=True) if file.parent == place}
-        with atomic_files(place, list(here)) as scratch:
+        with made_files(place, list(here), results.place) as scratch:
             for name, text in here.items():
                 (scratch / name).write_text(text, encoding="utf-8")
-            add_to_made_list(results.place, [place / name for name in here])
     return files
 
 

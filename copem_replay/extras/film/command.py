@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from copem_replay.cli.terminal import ResultsFolder, print_line, split_names, tidy_leftovers
+from copem_replay.cli.terminal import ResultsFolder, print_line, split_names
 
 
 def film(
@@ -28,6 +28,5 @@ def film(
 
     names = split_names(configurations)
     path = write_film(folder, out, configurations=names, log=log, object_id=object, run=run)
-    tidy_leftovers(path)
     print_line(f"film in {path}")
     return 0

@@ -22,7 +22,6 @@ import pandas as pd
 from copem_replay.api.results import AnyResults, take_results
 from copem_replay.core.colours import Rgb, configuration_colours
 from copem_replay.core.errors import InputError
-from copem_replay.core.files import atomic_file
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.interpolation import interpolate_states
 from copem_replay.core.tracks import CLASSES, SAME_INSTANT_NS, TRUTH, Bool, Float, Int
@@ -31,7 +30,7 @@ from copem_replay.perception.visibility import rectangle_corners
 from copem_replay.pipeline.one_run import ReplayedRun
 from copem_replay.report.figures.selection import Selection, choose_object_and_run
 from copem_replay.results.again import replay_again
-from copem_replay.results.folder import add_to_made_list
+from copem_replay.results.outputs import check_output, made_file
 from copem_replay.viewer.line_of_sight import Sight, compute_sight
 from copem_replay.viewer.sink import ABSENT, HIDDEN, KNOWN, elapsed_ns, short_ids, to_nanoseconds
 from copem_replay.viewer.status import (
@@ -128,9 +127,10 @@ def write_film(
 
 
 def check_film(path: Path, configurations: Sequence[str] | None) -> None:
-    """Raises InputError for a name that is no GIF, and for more configurations than fit."""
+    """Raises InputError for a name that is no GIF, and for more configurations than fit, OutputError."""
     if path.suffix.lower() != ".gif":
         raise InputError(f"{path}: expected a name that ends with .gif")
+    check_output(path)
     if (asked := len(set(configurations or ()))) > MOST_PLANS:
         raise InputError(f"configurations: expected at most {MOST_PLANS} in a film, found {asked}")
 
@@ -146,13 +146,12 @@ def draw_film(
     from matplotlib.animation import PillowWriter
 
     plot = _prepare_plot(replayed, table, object_id, colours)
-    with _plain_style(), atomic_file(path) as scratch:
+    with _plain_style(), made_file(path, folder) as scratch:
         figure = _new_figure()
         writer = PillowWriter(fps=FRAMES_PER_S)
         with writer.saving(figure, str(scratch), _DPI):
             for _ in _draw_frames(figure, plot):
                 writer.grab_frame()
-        add_to_made_list(folder, [path])
     return path
 
 

@@ -207,7 +207,7 @@ def fill_fit(place: ResultsPlace, fit: Fit, experiment: Experiment, recordings: 
         "notes": list(fit.said),
     }
     try:
-        place.will_hold(files)
+        place.scratch.may_remove(files)
         new = place.new
         (new / PEM).write_text(pem_text(fit, experiment), encoding="utf-8")
         names = {recording.scene.log for recording in replayed}

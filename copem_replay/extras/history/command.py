@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from copem_replay.cli.terminal import print_line, tidy_leftovers
+from copem_replay.cli.terminal import print_line
 
 
 def history(
@@ -21,6 +21,5 @@ def history(
     from copem_replay.extras.history.history import write_history
 
     path = write_history(folders, out)
-    tidy_leftovers(path)
     print_line(f"history in {path}")
     return 0

@@ -18,7 +18,6 @@ from urllib.parse import quote
 import pandas as pd
 
 from copem_replay.core.errors import InputError, count_noun
-from copem_replay.core.files import atomic_file
 from copem_replay.metrics.limits import format_limit, format_limits
 from copem_replay.metrics.summary import format_cell
 from copem_replay.metrics.summary_metrics import COMPARED
@@ -27,6 +26,7 @@ from copem_replay.report.html.page import REPORT, check_report, section_links, w
 from copem_replay.report.html.tables import VERDICT_SIGNS, verdict_mark
 from copem_replay.results.compare import compare_folders
 from copem_replay.results.compare.labels import label_configurations
+from copem_replay.results.outputs import made_file
 from copem_replay.results.read import Results, open_results
 from copem_replay.results.verdicts import (
     FILE,
@@ -95,7 +95,7 @@ def write_history(folders: Sequence[str | PathLike[str]], file: str | PathLike[s
     if not places:
         raise InputError("history: expected results folders, found none")
     html = history_page(read_history(places, page))
-    with atomic_file(page) as scratch:
+    with made_file(page) as scratch:
         scratch.write_text(html, encoding="utf-8", newline="\n")
     return page
 

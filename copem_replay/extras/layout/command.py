@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from copem_replay.cli.terminal import print_line, split_names, tidy_leftovers
+from copem_replay.cli.terminal import print_line, split_names
 from copem_replay.core.errors import InputError
 
 
@@ -25,9 +25,9 @@ def layout(
 
     It shows the configurations side by side over the truth, with linked cameras, and when each knows an object.
     """
-    from copem_replay.core.files import atomic_file
     from copem_replay.extras.layout.layout import build_layout, list_replays
-    from copem_replay.results.folder import MARK, add_to_made_list
+    from copem_replay.results.folder import MARK
+    from copem_replay.results.outputs import made_file
 
     replays = list_replays(folder)
     if out is not None and len(replays) > 1:
@@ -36,9 +36,7 @@ def layout(
     for replay, foxglove_layout in zip(replays, layouts, strict=True):
         path = out or replay.with_suffix(".foxglove.json")
         results_folder = next((place for place in replay.absolute().parents if (place / MARK).is_file()), replay.parent)
-        with atomic_file(path) as scratch:
+        with made_file(path, results_folder) as scratch:
             scratch.write_text(json.dumps(foxglove_layout, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-            add_to_made_list(results_folder, [path])
-        tidy_leftovers(path)
         print_line(f"layout in {path}")
     return 0

@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 
 from copem_replay.core.colours import configuration_colours
 from copem_replay.core.errors import InputError, unknown_name_message
-from copem_replay.core.files import parse_json
+from copem_replay.core.files import is_temporary, parse_json
 from copem_replay.core.tracks import TRUTH
 from copem_replay.core.yaml import NotYamlError, parse_yaml
 from copem_replay.io.containers.mcap_records import DAMAGE
@@ -100,7 +100,8 @@ def list_replays(place: Path) -> list[Path]:
     """The replays of a results folder, `replay.mcap` or one for each shown log, or the one that is named."""
     if not place.is_dir() or (place / "replay.mcap").is_file():
         return [place / "replay.mcap" if place.is_dir() else place]
-    return sorted((place / "replay").rglob("*.mcap")) or [place / "replay.mcap"]
+    found = sorted(path for path in (place / "replay").rglob("*.mcap") if not is_temporary(path.name))
+    return found or [place / "replay.mcap"]
 
 
 def build_layout(replay: Path, compare: Sequence[str] = ()) -> dict[str, Any]:

@@ -57,22 +57,36 @@ _MOST_BYTES: Final = 64_000_000
 
 def read_map(path: Path, heights_m: Mapping[str, float] = DEFAULT_HEIGHTS_M) -> SiteMap:
     """Read a map of any format, with heights by kind where it does not say. Raises InputError: no file, or no map."""
-    try:
-        with path.open("rb") as stream:
-            head = stream.read(4096)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be opened: {error.strerror}") from None
-    if b"OSMHeader" in head[:64]:
+    file = _open_candidate(path)
+    if b"OSMHeader" in file.head[:64]:
         line = "osmium extract -b WEST,SOUTH,EAST,NORTH"
         raise InputError(f"{path}: expected XML of OpenStreetMap, found PBF; cut it: `{line} {path.name} -o site.osm`")
-    parsed = read_json(path) if head.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] in (b"{", b"[") else None
-    file = _Candidate(path, head, parsed if isinstance(parsed, dict) else None)
     for is_format, function in FORMATS.values():
         if is_format(file):
             module, _, name = function.partition(":")
             read: Callable[..., SiteMap] = getattr(import_module(module), name)
             return read(path, *([file.content] if file.content is not None else []), heights_m)
     raise InputError(f"{path}: expected a map of {', '.join(FORMATS)}, found none of them")
+
+
+def find_format(path: Path) -> str | None:
+    """The name of the format of a map; None: the file is none, or cannot be read."""
+    try:
+        file = _open_candidate(path)
+        return next((name for name, (is_format, _) in FORMATS.items() if is_format(file)), None)
+    except InputError:
+        return None
+
+
+def _open_candidate(path: Path) -> _Candidate:
+    """A file as formats are told by it. Raises InputError: it cannot be read, or begins as JSON and is none."""
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(4096)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be opened: {error.strerror}") from None
+    parsed = read_json(path) if head.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] in (b"{", b"[") else None
+    return _Candidate(path, head, parsed if isinstance(parsed, dict) else None)
 
 
 def read_json(path: Path) -> Any:

@@ -11,7 +11,6 @@ import pandas as pd
 
 from copem_replay.api.study import AnyExperiment, AnyPath, AnyRecordings, check_any_counted, make_study
 from copem_replay.core.errors import ExperimentError, InputError, count_noun, unknown_name_message
-from copem_replay.core.files import atomic_files
 from copem_replay.core.tracks import TRUTH
 from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.experiment.schema import Experiment
@@ -64,13 +63,12 @@ class Explanation:
 
         In a results folder they go when its results go.
         """
-        from copem_replay.results.folder import add_to_made_list
+        from copem_replay.results.outputs import made_files
 
         place = Path(folder)
-        with atomic_files(place, list(self.files)) as scratch:
+        with made_files(place, list(self.files), place.parent) as scratch:
             for name, table in self.files.items():
                 table.to_csv(scratch / name, index=False, lineterminator="\n")
-            add_to_made_list(place.parent, [place / name for name in self.files])
         return [place / name for name in self.files]
 
     def blocks(self, width: int | None = None) -> Iterator[list[str]]:

@@ -15,7 +15,6 @@ from copem_replay.cli.terminal import (
     print_notes,
     show_progress,
     split_names,
-    tidy_outputs,
     width_of,
 )
 
@@ -65,6 +64,5 @@ def why(
     print_notes(found.notes)
     print_blocks(list(found.blocks(width_of(sys.stdout))))
     written = found.save(folder)
-    tidy_outputs(written)
     print_line(f"{', '.join(path.name for path in written)} in {folder}")
     return 0

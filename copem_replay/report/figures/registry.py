@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from copem_replay.core.errors import RecordingError
-from copem_replay.core.files import atomic_files
 from copem_replay.report.figures.answer import answer_figure
 from copem_replay.report.figures.detection_curves import curves_figure
 from copem_replay.report.figures.differences import differences_figure, no_differences
@@ -23,7 +22,7 @@ from copem_replay.report.figures.slices import slices_figure
 from copem_replay.report.figures.style import METADATA, check_summary, render_figure
 from copem_replay.report.figures.sweeps import sweeps_figure
 from copem_replay.report.figures.trade_off import no_trade_off, trade_off_figure
-from copem_replay.results.folder import add_to_made_list
+from copem_replay.results.outputs import made_files
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -167,7 +166,7 @@ def write_figure_files(results: Results, folder: Path | None, selection: Selecti
     notes: list[str] = []
     files: list[str] = []
     names = [f"{name}{suffix}" for name in FIGURES for suffix in METADATA]
-    with atomic_files(folder, names, way_out="; choose another with --out") as scratch:
+    with made_files(folder, names, results.place, way_out="; choose another with --out") as scratch:
         for name, kind in FIGURES.items():
             reason = kind.missing(results, selection)
             if reason is not None:
@@ -183,5 +182,4 @@ def write_figure_files(results: Results, folder: Path | None, selection: Selecti
                 (scratch / f"{name}{suffix}").write_bytes(data)
                 files.append(f"{name}{suffix}")
         results.check_unchanged()
-        add_to_made_list(results.place, [folder / file for file in files])
     return [folder / file for file in files], notes

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 from copem_replay.core.errors import OutputError, RecordingError
 from copem_replay.core.extras import EXTRAS, has_extra, load_extra
-from copem_replay.core.files import atomic_file
 from copem_replay.report.figures.answer import answer_figure
 from copem_replay.report.figures.registry import FIGURES
 from copem_replay.report.figures.selection import Selection
@@ -45,7 +44,7 @@ from copem_replay.report.html.tables import (
     summary_tables,
     verdicts_table,
 )
-from copem_replay.results.folder import add_to_made_list
+from copem_replay.results.outputs import check_output, made_file
 from copem_replay.results.read import Results
 
 if TYPE_CHECKING:
@@ -87,10 +86,11 @@ _SUFFIXES = (".html", ".htm")
 
 
 def check_report(path: Path) -> None:
-    """Raise OutputError for a folder, or a name without the suffix of a page."""
+    """Raise OutputError for a folder, a name without the suffix of a page, or a file that may not be written."""
     if path.suffix.lower() not in _SUFFIXES or path.is_dir():
         found = "a folder" if path.is_dir() else path.name
         raise OutputError(f"{path}: expected a name that ends with {' or '.join(_SUFFIXES)}, found {found}")
+    check_output(path)
 
 
 def write_html_report(
@@ -105,10 +105,9 @@ def write_html_report(
     check_report(path)
     study = load_study(given, baseline, by)
     html = build_page(study)
-    with atomic_file(path) as scratch:
+    with made_file(path, study.results.place) as scratch:
         scratch.write_text(html, encoding="utf-8", newline="\n")
         study.results.check_unchanged()
-        add_to_made_list(study.results.place, [path])
     return path
 
 

@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from copem_replay.core.errors import OutputError, count_noun, escape_unprintable, wrap_line
-from copem_replay.core.files import atomic_file
-from copem_replay.metrics.columns import TABLES
 from copem_replay.metrics.limits import (
     ALL_ALIKE,
     EXACT,
@@ -27,7 +25,7 @@ from copem_replay.metrics.summary import describe_mean, format_table
 from copem_replay.metrics.summary_metrics import COMPARED
 from copem_replay.results.compare.groups import describe_group_chance
 from copem_replay.results.compare.limits import ALONE, STAR
-from copem_replay.results.folder import add_to_made_list
+from copem_replay.results.outputs import check_output, made_file
 from copem_replay.results.table_files import write_csv
 
 if TYPE_CHECKING:
@@ -91,11 +89,10 @@ def _markdown_rows(cells: pd.DataFrame) -> Iterator[str]:
 
 
 def check_out(path: Path) -> None:
-    """Raise OutputError where the file's name has another suffix, or is that of a table of results."""
+    """Raise OutputError where the file's name has another suffix, or it may not be written."""
     if path.suffix.lower() not in _SUFFIXES:
         raise OutputError(f"{path}: expected a name that ends with {' or '.join(_SUFFIXES)}, found {path.name}")
-    if path.name in TABLES and (path.parent / "provenance.json").exists():
-        raise OutputError(f"{path}: expected another name, found that of a table of the results in that folder")
+    check_output(path)
 
 
 def write_comparison(comparison: Comparison, path: Path, folders: Sequence[Path] = ()) -> None:
@@ -104,14 +101,12 @@ def write_comparison(comparison: Comparison, path: Path, folders: Sequence[Path]
     `folders`: of the compared results, which list the file if it lies in them.
     """
     check_out(path)
-    with atomic_file(path) as scratch:
+    with made_file(path, *folders) as scratch:
         if path.suffix.lower() == ".csv":
             groups = [] if comparison.groups is None else [comparison.groups]
             write_csv(pd.concat([comparison.table, *groups], ignore_index=True), scratch)
         else:
             scratch.write_text(comparison_markdown(comparison), encoding="utf-8")
-        for folder in folders:
-            add_to_made_list(folder, [path])
 
 
 def _format_cells(comparison: Comparison) -> pd.DataFrame:
