@@ -19,7 +19,8 @@ from typing import Any
 
 KNOWN: dict[str, tuple[str, ...]] = {
     "*.pieces/*": ("*",),  # their names and contents say which code made them, and when logs were looked at
-    "*provenance.json": ("copem_replay", "python", "libraries", "format", "configurations"),  # versions; facts
+    # versions; facts; seals
+    "*provenance.json": ("copem_replay", "python", "libraries", "format", "configurations", "sha256"),
     "printed_*.txt": (r"note: (?:accuracy|replaying) took .*\n", r"\w+: \d+ (?:%,|of \d+ ).*\n"),  # where it took long
     "*.rrd": ("rerun.controls.RowId", "log_time", "copem_replay", "rerun_sdk"),  # when it was written, versions
 }

@@ -9,6 +9,8 @@ from typing import Any, Final, get_args, get_type_hints
 
 from typer.models import ArgumentInfo, OptionInfo
 
+from copem_replay.core.errors import OutputError
+
 INPUTS: Final = ("log", "maps", "criteria", "before", "types")
 """Options that name files or folders to read: all others that name one are outputs."""
 _PATHS: Final = ("FILE", "FOLDER", "DIR")
@@ -60,9 +62,12 @@ def _check_outputs(command: Callable[..., int], given: dict[str, Any], values: d
             value = values.get(name) or []
             read += [Path(path) for path in (value if isinstance(value, list | tuple) else [value])]
     flags = {name: (options[name].param_decls or (f"--{name.replace('_', '-')}",))[0] for name in outputs}
-    check_outputs({flags[name]: path for name, path in outputs.items()}, read)
-    for name, path in outputs.items():
-        if options[name].metavar == "FILE" or path.is_file():
-            check_output(path, *([is_converted] if "overwrite" in values else []))
-        else:
-            check_output_folder(path)
+    try:
+        check_outputs({flags[name]: path for name, path in outputs.items()}, read)
+        for name, path in outputs.items():
+            if options[name].metavar == "FILE" or path.is_file():
+                check_output(path, *([is_converted] if "overwrite" in values else []))
+            else:
+                check_output_folder(path)
+    except OSError as error:
+        raise OutputError(f"{error.filename}: cannot be written: {error.strerror}") from None

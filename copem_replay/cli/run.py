@@ -107,8 +107,8 @@ def run(
         url = _check_viewer(study.experiment, viewer) if live or viewer is not None else None
         result, advice = _replay_study(study, jobs, cache, threads=cluster is None)
         decision = _write_results(place, study, result, advice, cache, url, label)
-        if by is not None and result.summary_by is not None:
-            _print_groups(result.summary_by, split_entries(by) or ())
+        if by is not None and result.study is not None and result.study.summary_by is not None:
+            _print_groups(result.study.summary_by, split_entries(by) or ())
         verdicts = _judge_results(place.shown, study.experiment)
         if report:
             from copem_replay.api.results import write_report
@@ -191,13 +191,14 @@ def _write_results(
         print_notes(sorted(cache.damaged))
         print_problems([f"pieces: {cache.computed} computed, {cache.found} found in {cache.store.where}"])
     skipped = [f"{path}: skipped: {reason}" for path, reason in study.skipped]
-    costs = () if result.study is None else result.study.costs
+    assert result.study is not None
     print_notes([*place.notes, *skipped])
     print_first_notes(notes)
-    print_notes([*costs, *advice])
+    print_notes([*result.study.costs, *advice])
     print_problems(place.failed)
     decision = decide(result)
-    print_table(format_summary(result.summary, width_of(sys.stdout)), decision.best)
+    summary = result.study.summary  # as it was computed: nine digits are on the edge of a rounding where it is not
+    print_table(format_summary(summary, width_of(sys.stdout)), decision.best)
     configurations = study.experiment.configurations
     if len(result.tally):
         modelled = (name for name, one in configurations.items() if one.units != TRUTH)

@@ -333,6 +333,9 @@ _PROVENANCE = (
     Column("notes", "list", "what `run` noted"),
     Column("files", "list", "names of the files that are the results', which `--overwrite` may replace"),
     Column("label", "text", "what the results are called in a history, with `run --label`", "label"),
+    Column("sha256", "by name",
+           "by file of the results its SHA-256, but of recordings for Rerun, whose bytes are others each time; of "
+           "`provenance.json` that of the rest of its content"),
 )  # fmt: skip
 
 _FAR_OFF = "[Definitions](../guide/metrics.md#how-far-off)"

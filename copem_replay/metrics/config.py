@@ -343,7 +343,7 @@ class Measure(Frozen):
     annotated: AnnotatedArea | None = Field(default=None, exclude_if=_is_none)
     metrics: Annotated[tuple[Annotated[RowMetric, Slot("metric", {})], ...], Field(exclude_if=operator.not_)] = ()
     by: Annotated[tuple[SliceEntry, ...], Field(exclude_if=operator.not_)] = ()
-    weigh: Annotated[Weigh, Field(exclude_if=OBJECTS.__eq__)] = "objects"
+    weigh: Annotated[Weigh, Field(exclude_if=lambda weigh: weigh == OBJECTS)] = "objects"
 
     @model_validator(mode="after")
     def _sliced(self) -> Self:

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import groupby
 from operator import attrgetter
-from typing import IO, Any, NamedTuple
+from typing import IO, NamedTuple
 
 import pandas as pd
 import pyarrow as pa
@@ -28,7 +28,6 @@ from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.accuracy.statistics import AccuracyTotal, join_totals
-from copem_replay.metrics.columns import COMPARED_FILES
 from copem_replay.metrics.config import parse_slices
 from copem_replay.metrics.detections_table import WAY
 from copem_replay.metrics.metric import OutputTimes, OwnSums
@@ -194,8 +193,6 @@ def _is_long(log: StudyLog) -> bool:
 
 # The tables of a study.
 
-HELD_BYTES = 32_000_000
-"""Bytes of parts that are held in memory; further ones are in a temporary file. No result depends on it."""
 BATCH_ROWS, BATCH_BYTES = 100_000, 16_000_000
 """Rows and bytes that are put together at a time, at least: what is done once per batch then costs nothing."""
 
@@ -204,7 +201,7 @@ BATCH_ROWS, BATCH_BYTES = 100_000, 16_000_000
 class StudyTables:
     """What a study gives: the tables of its results, and what is said beside them.
 
-    Rows come in part by part, in memory or in a file without a name, by log, configuration and runs; `kept`: they are
+    Rows come in part by part, and are in a file without a name, by log, configuration and runs; `kept`: they are
     needed again, not only counted. The other tables and the notes are made of all of them. None: not asked for.
     """
 
@@ -230,7 +227,6 @@ class StudyTables:
     costs: tuple[str, ...] = ()
     """Notes for the terminal alone: no two runs take the same time."""
     _parts: dict[str, dict[str, list[Callable[[], PartTables]]]] = field(default_factory=dict)
-    _bytes: int = 0
     _schema: pa.Schema = field(default_factory=lambda: pa.schema([]))
     _file: IO[bytes] | None = None
 
@@ -248,16 +244,6 @@ class StudyTables:
     def replays(self) -> tuple[Replay, ...]:
         """The logs that are prepared and in memory."""
         return tuple(log.ready for log in self.logs if log.ready is not None)
-
-    def find_table(self, name: str) -> Any:
-        """A table of pandas or Arrow by the name of its file; None: there is none."""
-        if name in COMPARED_FILES:
-            return self.accuracy.get(name)
-        return self.table if name == "detections.parquet" else getattr(self, name.partition(".")[0])
-
-    def has_table(self, name: str) -> bool:
-        """Whether there is a table, by the name of its file; none is made for that."""
-        return self.bands is not None if name in COMPARED_FILES else self.find_table(name) is not None
 
     def find_log(self, name: str) -> StudyLog:
         """A log by its name."""
@@ -279,9 +265,7 @@ class StudyTables:
             self._schema = pa.unify_schemas([self._schema, part.rows.schema], promote_options="permissive")
         if not self.kept:
             return
-        self._bytes += part.size_bytes
-        held = (lambda: part) if self._bytes <= HELD_BYTES else self._store(part)
-        self._parts.setdefault(part.log, {}).setdefault(part.configuration, []).append(held)
+        self._parts.setdefault(part.log, {}).setdefault(part.configuration, []).append(self._store(part))
 
     def _store(self, part: PartTables) -> Callable[[], PartTables]:
         try:

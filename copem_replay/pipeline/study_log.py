@@ -158,10 +158,21 @@ def compute_log_digests(recording: Recording) -> dict[str, Any]:
     return {"sha256": read_content_digest(recording), "truth": truth_digest(recording.scene, recording.truth)}
 
 
+def is_made(recording: Recording) -> bool:
+    """Whether a recording was made in memory, so that there is no file of it."""
+    known = recording.stamps is not None or recording.sha256 is not None or recording.survey is not None
+    return not known and isinstance(recording.local, Path) and not recording.local.exists()
+
+
 def read_content_digest(recording: Recording) -> str:
-    """SHA-256 of the content that was read. Raises RecordingError where the files have changed since."""
+    """SHA-256 of the content that was read; of a recording made in memory that of its truth.
+
+    Raises RecordingError where the files have changed since.
+    """
     if recording.sha256 is not None:
         return recording.sha256
+    if is_made(recording):
+        return truth_digest(recording.scene, recording.truth)
     digest = sha256_of(recording.local)
     check_files_unchanged(recording.stamps or ())
     return digest

@@ -31,6 +31,7 @@ from copem_replay.pipeline.one_run import choose_logs, select_shown_runs
 from copem_replay.pipeline.run import StudyTables
 from copem_replay.pipeline.study_log import compute_log_digests, read_content_digest
 from copem_replay.results.folder import MARK
+from copem_replay.results.seals import read_seals
 from copem_replay.results.table_files import AGAIN
 
 FORMAT = 5
@@ -40,6 +41,9 @@ _LIBRARIES = (
     "foxglove-schemas-protobuf", "mcap", "numba", "numpy", "osi-python", "pandas", "protobuf", "pyarrow", "rerun-sdk",
     "scipy", "shapely",
 )  # fmt: skip
+
+
+_WAYS_OUT = "put the log back (a link to it does), or run the experiment again"
 
 
 @dataclass(frozen=True)
@@ -59,8 +63,7 @@ class RecordedLog:
         """Raise RecordingError where a recording is another than the one that was replayed."""
         if digest != self.sha256:
             raise RecordingError(
-                f"expected the log that was replayed, SHA-256 {self.sha256[:12]}…, found {digest[:12]}…; "
-                "put that log back, or run the experiment again",
+                f"expected the log that was replayed, SHA-256 {self.sha256[:12]}…, found {digest[:12]}…; " + _WAYS_OUT,
                 path=path,
             )
 
@@ -80,6 +83,7 @@ class Provenance:
     horizon_used_s: float
     run_shown: dict[str, int]  # by log
     facts: dict[str, ConfigurationFacts]  # by configuration
+    seals: dict[str, str]  # by file of the results; empty: an older version's
     data: dict[str, Any]
 
     def kinds(self, name: str, *, compared: bool = False) -> dict[str, str]:
@@ -139,6 +143,7 @@ def parse_provenance(data: Any, place: Path) -> Provenance:
         horizon_used_s=used_s,
         run_shown={str(log): int(run) for log, run in run_shown.items() if run is not None},
         facts={str(name): ConfigurationFacts(**of) for name, of in dict(data["configurations"]).items()},
+        seals=read_seals(data),
         data=data,
     )
 
@@ -169,7 +174,7 @@ def reread_recording(log: RecordedLog, place: Place, experiment: Experiment) -> 
         with fetch_place(place) as here:
             stamps, digest = read_file_stamps(here), sha256_of(here)
     except InputError as error:
-        raise RecordingError(f"{error}; put the log back to draw its runs") from None
+        raise RecordingError(f"{error}; {_WAYS_OUT}") from None
     log.check_same(digest, first_recording(place))
     recordings, refused = read_logs(experiment, [place], None)
     if refused:
@@ -245,7 +250,15 @@ def log_entries(logs: Sequence[Any], recordings: Sequence[Recording], folder: Pa
 
 def recording_name(file: File, folder: Path) -> str:
     """The name of a recording in results: its path relative to the folder, or its URL without user and query."""
-    return str(file) if isinstance(file, RemoteFile) else os.path.relpath(resolve_place(file), folder)
+    return str(file) if isinstance(file, RemoteFile) else relative_path(resolve_place(file), folder)
+
+
+def relative_path(path: str | Path, folder: Path) -> str:
+    """A path from a folder; the whole path where there is none, being on another drive of Windows."""
+    try:
+        return os.path.relpath(path, folder)
+    except ValueError:
+        return os.path.abspath(path)
 
 
 def list_versions() -> dict[str, object]:

@@ -1,4 +1,6 @@
-"""Results: what a run gave, in memory or read back from its folder, for figures, reports, recordings and comparisons.
+"""Results: what a run gave, read from its folder, for figures, reports, recordings and comparisons.
+
+What `cr.run` gives is in a scratch folder until it is saved, and read from there: there is one way to results.
 
 Comparisons read log by log (`results/table_files.py`): of a table of any size only the rows of one log are in memory.
 """
@@ -27,7 +29,6 @@ from copem_replay.core.errors import (
 from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.experiment.file import (
     ExperimentSource,
-    make_plain_source,
     parse_experiment,
     read_experiment_file,
     settings_places,
@@ -39,15 +40,13 @@ from copem_replay.metrics.columns import COMPARED_FILES, TABLES
 from copem_replay.metrics.limits import find_clusters
 from copem_replay.metrics.onset import COUNTS_BY, select_counted
 from copem_replay.metrics.summary import DETECTED
-from copem_replay.pipeline.sweep import resolve_sweep
 from copem_replay.results.folder import EXPERIMENT, MARK, check_inputs, check_unchanged, take_place
 from copem_replay.results.provenance import (
     Provenance,
-    build_provenance,
-    parse_provenance,
     read_provenance,
     reread_recording,
 )
+from copem_replay.results.seals import check_sealed
 from copem_replay.results.table_files import (
     AGAIN,
     LogRows,
@@ -57,7 +56,6 @@ from copem_replay.results.table_files import (
     read_frame,
     read_log_rows,
     read_parquet,
-    slice_log_rows,
     table_file,
 )
 
@@ -76,7 +74,7 @@ _NUMBERS = itertools.count(1)
 
 @dataclass(eq=False, repr=False)
 class Results:
-    """What an experiment gave, just computed or read from a folder: pandas tables, as a results folder has them.
+    """What an experiment gave, read from a folder, which `run` makes too: pandas tables, as a results folder has them.
 
     `detections`: a row per log, configuration, run and measured object; of many rows `each` gives those of a log at a
     time. `summary`: a row per configuration. `summary_by`, `exact`, `sweep`, `accuracy`, `bands`: None where the
@@ -95,16 +93,21 @@ class Results:
     folder: Path | None = None
     """The results folder; None: they are not saved."""
     study: StudyTables | None = None
-    """What the pipeline gave; None: they were read."""
+    """What was run, to be saved; None: they were read."""
     exporters: Callable[[str | None], Sequence[Exporter]] | None = None
     """How single runs are written, by the address of a Rerun viewer that also gets them; None: they are written."""
 
     def __post_init__(self) -> None:
         self._called = self.folder or Path(f"run {next(_NUMBERS)}")
         self._read_last: tuple[tuple[str, Experiment], Recording] | None = None
-        if self.study is None:
-            self._seen = os.stat(self._called)
+        if self.study is not None:
+            self.__dict__["experiment"] = self.study.experiment  # with components of classes that no name leads to
+        else:
+            self._read_from(self._called)
             self.__dict__["provenance"] = read_provenance(self._called / MARK)
+
+    def _read_from(self, folder: Path) -> None:
+        self.__dict__["_files_at"], self._seen = folder, os.stat(folder)
 
     def __repr__(self) -> str:
         logs, runs = count_noun(len(self.provenance.logs), "log"), count_noun(self.provenance.runs, "run")
@@ -122,17 +125,24 @@ class Results:
         return self.place.resolve().name
 
     @cached_property
+    def _files_at(self) -> Path:
+        """The folder that files are read from; of a run that is not saved one that goes with it, made when needed."""
+        from copem_replay.results.write import make_scratch_results
+
+        assert self.study is not None
+        self._read_from(folder := make_scratch_results(self.study))
+        return folder
+
+    @cached_property
     def provenance(self) -> Provenance:
         """Versions, logs, seed, metric parameters."""
-        assert self.study is not None
-        return parse_provenance(build_provenance(self.study, (), self.study.notes), self.place)
+        return read_provenance(self._files_at / MARK)
 
     @cached_property
     def source(self) -> ExperimentSource:
         """The experiment as plain data."""
-        if self.study is not None:
-            return make_plain_source(resolve_sweep(self.experiment).as_written())
-        file = self.place / EXPERIMENT
+        self._check_sealed(EXPERIMENT)
+        file = self._files_at / EXPERIMENT
         try:
             source = read_experiment_file(file)
         except ExperimentError as error:
@@ -144,8 +154,6 @@ class Results:
     @cached_property
     def experiment(self) -> Experiment:
         """The experiment, with components of the user's own."""
-        if self.study is not None:
-            return self.study.experiment
         experiment, problems = parse_experiment(self.source)
         if experiment is None or problems:
             raise InputError(problems)
@@ -153,40 +161,42 @@ class Results:
 
     def check_unchanged(self) -> None:
         """Raise InputError where other results have taken the place of the folder."""
-        if self.study is None:
-            check_unchanged(self.place, self._seen)
+        check_unchanged(self._files_at, self._seen)
 
     # Tables, by the names of their files.
 
     def has(self, name: str) -> bool:
         """Whether there is a table, by the name of its file."""
-        if self.study is not None:
-            return self.study.has_table(name)
-        return _exists(self.place, name)
+        return _exists(self._files_at, name)
 
     def frame(self, name: str) -> pd.DataFrame:
         """A whole table, by the name of its file. Raises InputError where it is damaged."""
-        if self.study is not None:
-            found = self.study.find_table(name)
-            return found if isinstance(found, pd.DataFrame) else found.to_pandas()
+        self._check_sealed(name)
         reader = read_csv if name.endswith(".csv") else partial(read_parquet, files=self._files(name))
-        table = read_frame(self.place / name, reader, self.provenance.kinds(name))
+        table = read_frame(self._files_at / name, reader, self.provenance.kinds(name))
         self.check_unchanged()
         return table
 
     def log_rows(self, name: str) -> LogRows:
         """A table log by log, which has at least the columns that comparisons read. Raises InputError."""
-        if self.study is not None:
-            return slice_log_rows(self.place / name, self.study.find_table(name))
-        rows = read_log_rows(self.place / name, self.provenance.kinds(name, compared=True), self._files(name))
+        self._check_sealed(name)
+        rows = read_log_rows(self._files_at / name, self.provenance.kinds(name, compared=True), self._files(name))
         self.check_unchanged()
         return rows
 
+    def _check_sealed(self, name: str) -> None:
+        """Raise InputError where a file is not what was written, or other results have taken its place."""
+        try:
+            check_sealed(self._files_at, name, self.provenance.seals)
+        except InputError:
+            self.check_unchanged()
+            raise
+
     def _files(self, name: str) -> list[Path]:
         """The files of a table that is a folder, in the order of the logs; empty: the table is a file."""
-        if not (self.place / name).is_dir():
+        if not (self._files_at / name).is_dir():
             return []
-        files = (table_file(self.place / name, log.name) for log in self.provenance.logs)
+        files = (table_file(self._files_at / name, log.name) for log in self.provenance.logs)
         return [file for file in files if file.is_file()]
 
     def require_folder(self) -> Path:
@@ -234,6 +244,8 @@ class Results:
         study, exporters = self._require_study()
         notes = fill_place(place, study, exporters=exporters(viewer), skipped=skipped, label=label)
         self.folder = place.shown
+        self._read_from(place.folder)
+        vars(self).pop("provenance", None)
         return notes
 
     def _require_study(self) -> tuple[StudyTables, Callable[[str | None], Sequence[Exporter]]]:
@@ -272,13 +284,12 @@ class Results:
     def tally(self) -> pd.DataFrame:
         """`tally.parquet`, which counts the rows of `detections.parquet`. Raises InputError where it counts others."""
         tally = self.frame("tally.parquet")
-        if self.study is None:
-            of = tally[tally["event"] == DETECTED]
-            if (counts := of.groupby(["log", "configuration"])["runs"].sum()).to_dict() != self.rows.counts:
-                raise InputError(
-                    f"{self.place}/tally.parquet: expected the {sum(self.rows.counts.values())} rows of "
-                    f"detections.parquet counted, found {int(counts.sum())}; {AGAIN}"
-                )
+        of = tally[tally["event"] == DETECTED]
+        if (counts := of.groupby(["log", "configuration"])["runs"].sum()).to_dict() != self.rows.counts:
+            raise InputError(
+                f"{self.place}/tally.parquet: expected the {sum(self.rows.counts.values())} rows of "
+                f"detections.parquet counted, found {int(counts.sum())}; {AGAIN}"
+            )
         return tally
 
     @cached_property
@@ -340,7 +351,7 @@ class Results:
 
     @cached_property
     def by_log(self) -> Mapping[str, LogRows]:
-        """By file name the tables that comparisons read, those that exist, each opened when it is first asked for."""
+        """By file name the tables that comparisons read, those that exist."""
         rows = self.rows
         if not rows.counts:
             raise InputError(f"{self.place}: nothing can be compared: no measured object has an onset")
@@ -351,7 +362,9 @@ class Results:
         ):
             if unknown:
                 raise InputError(f"{rows.place}: expected the {what} of provenance.json, found {min(unknown)!r}")
-        return _OpenedTables(self, [rows.place.name, *filter(self.has, COMPARED_FILES)])
+        names = [rows.place.name, *filter(self.has, COMPARED_FILES)]
+        kinds = {name: TABLES[name].kinds("braking", "fleet", compared=True) for name in names}
+        return {name: (rows if name == rows.place.name else self.log_rows(name)).only(kinds[name]) for name in names}
 
     def rows_of(self, log: str, names: Collection[str] | None = None) -> dict[str, pa.Table]:
         """A log's rows of the named tables (None: all) of those that comparisons read."""
@@ -441,8 +454,6 @@ def read_results(folder: Path | str, *, rowless: bool = False) -> Results:
 
 def check_complete(results: Results, *, rowless: bool = False) -> Results:
     """The results, with rows checked against the experiment and every other table read. Raises InputError."""
-    if results.study is not None:
-        return results
     _check_exists(results.place, "summary.csv", "tally.parquet")
     experiment, rows = results.experiment, results.rows
     check_columns(rows.place, results.provenance.kinds(rows.place.name), rows.kinds)
@@ -459,25 +470,3 @@ def check_complete(results: Results, *, rowless: bool = False) -> Results:
     for name in ("tally", "summary", "summary_by", "exact", "sweep"):
         getattr(results, name)
     return results
-
-
-class _OpenedTables(Mapping[str, LogRows]):
-    """The tables that comparisons read, log by log; those of a run in memory are large, and made when asked for."""
-
-    def __init__(self, results: Results, names: Sequence[str]) -> None:
-        self._results, self._opened = results, dict[str, LogRows | None].fromkeys(names)
-
-    def __getitem__(self, name: str) -> LogRows:
-        if (rows := self._opened[name]) is None:
-            kinds = TABLES[name].kinds("braking", "fleet", compared=True)
-            rows = self._opened[name] = self._results.log_rows(name).only(kinds)
-        return rows
-
-    def __contains__(self, name: object) -> bool:  # of a mapping it would open the table
-        return name in self._opened
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._opened)
-
-    def __len__(self) -> int:
-        return len(self._opened)

@@ -257,22 +257,6 @@ def check_configurations(rows: LogRows, names: Collection[str]) -> None:
         )
 
 
-def slice_log_rows(place: Path, table: Any) -> LogRows:
-    """A table in memory, of pandas or Arrow, log by log. `place`: what it is called."""
-    if isinstance(table, pd.DataFrame):
-        table = pa.Table.from_pandas(table, preserve_index=False)
-    table = table.replace_schema_metadata(None)
-    kinds = {column.name: column.kind for column in TABLES[place.name].columns if column.name in table.column_names}
-    where: dict[str, list[pa.Table]] = {}
-    for log, begin, end in _find_stretches(table["log"].combine_chunks()) if len(table) else ():
-        where.setdefault(log, []).append(table.slice(begin, end - begin))
-
-    def read(log: str, columns: Sequence[str]) -> list[pa.Table]:
-        return [rows.select(columns) for rows in where.get(log, ())]
-
-    return LogRows(place, kinds, _count_rows(table), table.schema.empty_table(), read)
-
-
 def _count_rows(table: pa.Table) -> dict[tuple[str, str], int]:
     """Rows by log and configuration."""
     keys = ["log", "configuration"]

@@ -7,18 +7,20 @@ seed give equal bytes in all files but the .rrd.
 from __future__ import annotations
 
 import json
-import os
+import shutil
+import weakref
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from tempfile import gettempdir, mkdtemp
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
 from copem_replay.core.colours import configuration_colours
-from copem_replay.core.errors import RecordingError
+from copem_replay.core.errors import OutputError, RecordingError
 from copem_replay.core.files import portable_name
 from copem_replay.core.tracks import TRUTH
 from copem_replay.core.yaml import dump_yaml
@@ -46,9 +48,18 @@ from copem_replay.pipeline.one_run import (
     select_shown_runs,
 )
 from copem_replay.pipeline.run import StudyTables
+from copem_replay.pipeline.study_log import is_made
 from copem_replay.pipeline.sweep import list_points, resolve_sweep
 from copem_replay.results.folder import EXPERIMENT, MARK, ResultsPlace, check_names
-from copem_replay.results.provenance import build_provenance, escape_name, list_read, log_entries, recording_name
+from copem_replay.results.provenance import (
+    build_provenance,
+    escape_name,
+    list_read,
+    log_entries,
+    recording_name,
+    relative_path,
+)
+from copem_replay.results.seals import seal_results
 from copem_replay.results.table_files import MANY_ROWS, TableFile, table_file, write_csv, write_parquet
 from copem_replay.results.truth_scene import draw_truth
 
@@ -140,22 +151,38 @@ def fill_place(
     out, and why. The place's `folder` and `notes` may change; `failed` has the exporters' files that could not be
     written.
     """
-    tables = _table_files("detections.parquet", study.counts)
-    tables += _table_files("tally.parquet", dict(study.tally["log"].value_counts(sort=False)))
-    files = list_results(study.experiment, study.recordings, exporters, tables)
+    for recording in study.recordings:
+        if is_made(recording):
+            raise RecordingError("cannot be opened: No such file or directory", path=first_recording(recording.place))
+    files = list_results(study.experiment, study.recordings, exporters, _list_row_files(study))
     try:
         place.scratch.may_remove(files)
-        _write_files(place, study)
+        _write_files(place.new, place.folder, study, skipped)
         notes = [*study.notes, *_export(place, study, exporters)]
         files = [name for name in files if name not in place.left_out]
-        write_csv(_logs_table(place.folder, study, skipped), place.new / "logs.csv")
-        provenance = build_provenance(study, skipped, notes) | {"files": files}
-        provenance |= {"label": label} if label is not None else {}
-        (place.new / MARK).write_text(json.dumps(provenance, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        more = {"files": files} | ({"label": label} if label is not None else {})
+        _write_provenance(place.new, build_provenance(study, skipped, notes) | more, files)
         place.finish(files)
     except OSError as error:
         raise place.cannot_be_written(error) from error
     return notes
+
+
+def make_scratch_results(study: StudyTables) -> Path:
+    """The results of a study, without replays, in a scratch folder that goes with the study.
+
+    Raises OutputError: no room on the disk.
+    """
+    files = list_results(study.experiment, study.recordings, (), _list_row_files(study))
+    try:
+        folder = Path(mkdtemp(prefix="copem-replay-"))
+        weakref.finalize(study, shutil.rmtree, folder, ignore_errors=True)
+        _write_files(folder, folder, study)
+        _write_provenance(folder, build_provenance(study, (), study.notes) | {"files": files}, files)
+    except OSError as error:
+        why = f"{error.strerror or error}; set TMPDIR to a folder with room"
+        raise OutputError(f"{gettempdir()}: cannot be written: {why}") from None
+    return folder
 
 
 def check_own_files(
@@ -206,24 +233,37 @@ def _place_stem(stem: str, log: str, logs: Sequence[object]) -> str:
     return stem if len(logs) == 1 else f"{stem}/{portable_name(log)}"
 
 
-def _write_files(place: ResultsPlace, study: StudyTables) -> None:
-    """Write the experiment and all tables except `logs.csv`."""
+def _list_row_files(study: StudyTables) -> list[str]:
+    """The files of the tables of rows and of the tally."""
+    tally = dict(study.tally["log"].value_counts(sort=False))
+    return _table_files("detections.parquet", study.counts) + _table_files("tally.parquet", tally)
+
+
+def _write_files(scratch: Path, folder: Path, study: StudyTables, skipped: Sequence[tuple[File, str]] = ()) -> None:
+    """Write the experiment and all tables, with paths as they are from a folder."""
     experiment = study.experiment
-    data, scratch = resolve_sweep(experiment).as_written(), place.new
-    data["logs"] = log_entries(experiment.logs, study.recordings, place.folder)
+    data = resolve_sweep(experiment).as_written()
+    data["logs"] = log_entries(experiment.logs, study.recordings, folder)
     for latency in _find_recorded_latencies(data):
-        latency["file"] = os.path.relpath(latency["file"], place.folder)
+        latency["file"] = relative_path(latency["file"], folder)
     for site in (one for entry in (data, *data["logs"]) if isinstance(entry, dict) for one in entry.get("maps") or ()):
-        site["file"] = os.path.relpath(site["file"], place.folder)
+        site["file"] = relative_path(site["file"], folder)
     (scratch / EXPERIMENT).write_text(dump_yaml(data), encoding="utf-8")
     _write_rows(study, scratch)
     write_csv(study.summary, scratch / "summary.csv")
     write_csv(_read_table(study), scratch / "read.csv")
+    write_csv(_logs_table(folder, study, skipped), scratch / "logs.csv")
     if study.exact is not None:
         write_parquet(study.exact, scratch / "exact.parquet")
     for name, table in (("summary_by.csv", study.summary_by), ("bands.csv", study.bands), ("sweep.csv", study.sweep)):
         if table is not None:
             write_csv(table, scratch / name)
+
+
+def _write_provenance(folder: Path, said: Mapping[str, object], files: Iterable[str]) -> None:
+    """Write `provenance.json` of a folder that is complete but for it, with the seals of its files."""
+    text = json.dumps(seal_results(folder, files, said), indent=1, ensure_ascii=False)
+    (folder / MARK).write_text(f"{text}\n", encoding="utf-8")
 
 
 def _export(place: ResultsPlace, study: StudyTables, exporters: Sequence[Exporter]) -> list[str]:

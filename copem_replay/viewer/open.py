@@ -25,7 +25,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from urllib.parse import quote, unquote, urlsplit
 
-from copem_replay.core.errors import CopemError, OutputError
+from copem_replay.core.errors import OutputError
 from copem_replay.core.files import is_temporary, portable_name
 from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.results.read import Results, open_results
@@ -101,8 +101,8 @@ def _find_onsets_s(folder: Path, files: Sequence[Path], sought: Sought) -> dict[
             onset_s = of_run.loc[of_run["object_id"] == sought.object_id, "onset_s"]
             if len(onset_s):
                 instants_s[path] = max(0.0, float(onset_s.min()) - BEFORE_S)
-    except (CopemError, KeyError, TypeError, AttributeError, ValueError, OverflowError):
-        return {}  # tables that cannot be read have no object
+    except (KeyError, TypeError, AttributeError, ValueError, OverflowError):
+        return {}  # of an older version
     return instants_s
 
 

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 import copem_replay as cr
 from copem_replay.extras.history.history import draw_strip, find_turns
 from copem_replay.results.verdicts import FILE, MET, NOT_MET, UNDECIDED, WORDS, write_verdicts
+from tests.helpers.compare_folders import unseal
 from tests.helpers.report_pages import changed, replayed
 from tests.results.test_verdicts import verdict
 
@@ -35,7 +36,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 
 def label_of(folder: Path, label: str) -> None:
-    path = folder / "provenance.json"
+    path = unseal(folder) / "provenance.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"label": label}))
 
 

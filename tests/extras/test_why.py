@@ -63,7 +63,7 @@ def test_only_what_is_asked_for_is_written(call) -> None:  # type: ignore[no-unt
         (("--configuration", "coPEM", "--units", "--unit", "mats"),
          "no unit is named 'mats'; did you mean mast?"),
         (("--unit", "mats"), "no unit is named 'mats'; did you mean mast?"),
-        (("--out", "drive.mcap"), "drive.mcap: cannot be written: expected a folder, found a file"),
+        (("--out", "drive.mcap"), "drive.mcap: expected another name, found a recording"),
     ],
 )  # fmt: skip
 def test_wrong_input_is_a_line(call, words: tuple[str, ...], line: str) -> None:  # type: ignore[no-untyped-def]

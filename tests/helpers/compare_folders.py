@@ -173,3 +173,12 @@ def _write(path: Path, rows: Sequence[Row], *asked: str) -> None:
     """The columns that comparisons read."""
     kinds = TABLES[path.name].kinds(*asked, compared=True)
     parquet.write_table(pa.table({n: pa.array([r.get(n) for r in rows], _TYPES[k]) for n, k in kinds.items()}), path)
+
+
+def unseal(folder: Path) -> Path:
+    """Results as older versions wrote them, without seals: tests of a reader may change their files."""
+    file = folder / "provenance.json"
+    said = json.loads(file.read_text())
+    said.pop("sha256", None)
+    file.write_text(json.dumps(said))
+    return folder

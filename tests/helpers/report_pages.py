@@ -23,6 +23,7 @@ from copem_replay.experiment.validate import find_problems, read_logs
 from copem_replay.metrics.summary import tally_rows
 from copem_replay.results.read import Results, read_results
 from copem_replay.results.table_files import write_parquet
+from tests.helpers.compare_folders import unseal
 from tests.helpers.recordings import Obj, pedestrian, write_recording
 from tests.helpers.replays import save_run
 
@@ -101,7 +102,7 @@ def with_rows(results: Results, table: pd.DataFrame, folder: Path) -> Results:
     shutil.copytree(results.folder, folder)
     write_parquet(table, folder / "detections.parquet")
     write_parquet(tally_rows(table), folder / "tally.parquet")
-    return read_results(folder)
+    return read_results(unseal(folder))
 
 
 @dataclass

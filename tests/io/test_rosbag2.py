@@ -421,5 +421,5 @@ def test_results_are_not_written_over_a_folder(bag, monkeypatch, capsys):
     Path("bag.yaml").write_text(changed(ALL_COUNT, "logs: [drive.2026]"))
     before = sorted(os.listdir(bag))
     assert run("run", "bag.yaml", "--out", "drive.2026", "--overwrite", monkeypatch=monkeypatch) == 2
-    assert "not empty and no results folder" in capsys.readouterr().err
+    assert "expected another folder, found a recording (rosbag2)" in capsys.readouterr().err
     assert sorted(os.listdir(bag)) == before

@@ -517,12 +517,10 @@ def cases(draw: st.DrawFn) -> Case:
     bend = st.just(0.0) | st.floats(1 / 60, 1 / 8) | st.floats(-1 / 8, -1 / 60)
     slowing = draw(st.booleans())
     leaves_s = draw(st.just(math.inf) | st.floats(0.5, 5))
-    # Which way is straight on, where it stopped in a bend, is known to a decimetre of the path only.
-    open_end = slowing and (constant_speed or leaves_s < math.inf)
     ego = Drive(
         draw(st.just(0.0) | st.floats(3, 20)),
         heading_rad=draw(st.just(0.0) | st.floats(-4, 4)),
-        curvature=0.0 if open_end else draw(bend),
+        curvature=draw(bend),
         slows_s=draw(st.floats(0, 4)) if slowing else math.inf,
         deceleration=draw(st.floats(1, 7)) if slowing else 0.0,
     )
@@ -620,8 +618,27 @@ def agree(case: Case, driver: ConstantDeceleration, margin_m: float, brake_s: Fl
     return True
 
 
+# It turns at 3 m/s, a little less than a decimetre from frame to frame, and leaves after an odd number of steps: its
+# last frame alone says where it heads then. Metres and radians to six digits, on paper.
+IN_A_BEND = Case(
+    Drive(3.0, curvature=1 / 16), Drive(0.0), "truck", 5.0, 1e9 / 33_333_333, 1.5, (math.inf, math.inf), None, True
+)
+BESIDE_ITS_END = replace(IN_A_BEND, other=Drive(0.0, (10.532843, -0.534792), heading_rad=0.5625))
+AHEAD_OF_ITS_END = replace(IN_A_BEND, other=Drive(0.0, (12.906220, 1.292978), heading_rad=0.75))
+JUST_MISSED = replace(
+    IN_A_BEND,
+    ego=Drive(3.0, curvature=0.0576725),
+    other=Drive(11.982801, (8.891452, 0.326633), 3.5, 0.614111, slows_s=1.41785, deceleration=7.0),
+    kind="pedestrian",
+    ego_leaves_s=1.45,
+)
+
+
 @pytest.mark.long
 @settings(SOME, max_examples=examples(100))  # each judges a log several times
+@example(case=BESIDE_ITS_END, a_max=1.0, build_up_s=0.0, margin_m=0.0, begins_s=[0.0, 0.0])
+@example(case=AHEAD_OF_ITS_END, a_max=1.0, build_up_s=0.0, margin_m=0.0, begins_s=[0.0, 0.0])
+@example(case=JUST_MISSED, a_max=1.0, build_up_s=0.0, margin_m=0.0, begins_s=[0.0, 0.0])
 @given(
     case=cases(),
     a_max=st.floats(1, 10),
@@ -634,6 +651,45 @@ def test_verdicts_as_the_oracle_says(
 ) -> None:
     driver = ConstantDeceleration(a_max_mps2=a_max, build_up_s=build_up_s)
     agree(case, driver, margin_m, np.array([*begins_s, case.until_s + 1, NEVER]))
+
+
+def test_an_ego_that_leaves_in_a_bend() -> None:
+    """Its last frame, at 1.5 s, is 4.5 m along an arc of 16 m: at (4.440908, 0.628652) it heads 0.28125 rad."""
+    driver, begins_s = ConstantDeceleration(a_max_mps2=1.0), np.array([0.0, NEVER])
+    # With 1 m/s² from 3 m/s it stops after 4.5 m, just there; its front right corner is at (6.639882, 0.223055), in the
+    # frame of the truck at (−2.888988, 2.717210), beside the 8 m × 2.5 m: 2.717210 − 1.25.
+    beside = in_conflict(BESIDE_ITS_END.log(), BESIDE_ITS_END.plan(driver, 0.0))
+    assert judge_braking(beside, driver, begins_s).min_distance_m[0] == pytest.approx(2.717210 - 1.25, abs=1e-4)
+    # Straight on that corner starts 3.488529 m beside the truck's middle line and nears it with 1.355316 m/s.
+    ahead = in_conflict(AHEAD_OF_ITS_END.log(), AHEAD_OF_ITS_END.plan(driver, 0.0))
+    touch_s = 1.5 + (3.488529 - 1.25) / 1.355316
+    assert judge_braking(ahead, driver, begins_s).impact_s[1] == pytest.approx(touch_s, abs=1e-4)
+    # From (4.256060, 0.530455), after 4.3 m, it drives on at 0.247992 rad. The walker has stopped by 3.13 s, his centre
+    # 1.335385 m to the right of that line; turned against it by 0.366119 rad he reaches 0.322930 m towards the ego.
+    missed = in_conflict(JUST_MISSED.log(), JUST_MISSED.plan(driver, 0.5))
+    near_m = 1.335385 - 1 - 0.322930
+    assert judge_braking(missed, driver, begins_s).min_distance_m[1] == pytest.approx(near_m, abs=1e-4)
+    assert meeting(JUST_MISSED.log(), JUST_MISSED.plan(driver, 0.0)) is None
+
+
+@pytest.mark.parametrize("reverses", [False, True])
+@pytest.mark.parametrize("frames_per_s", [30, 50, 75, 110])  # from frame to frame 10 cm, 6 cm, 4 cm, 27 mm
+@pytest.mark.parametrize("ego", ["recorded", "constant_speed"])
+def test_straight_on_is_as_the_last_frame_heads(ego: str, frames_per_s: int, reverses: bool) -> None:
+    """It leaves at 1 s, 3 m along an arc of 8 m. The walker stands 6 m on, his near side 0.3 m beside its way."""
+    drive = Drive(3.0, curvature=1 / 8)
+    (x, y), yaw = drive.at(1.0), 3 / 8
+    beside = 1.0 + 0.25 + 0.3
+    place = (x + 6 * math.cos(yaw) + beside * math.sin(yaw), y + 6 * math.sin(yaw) - beside * math.cos(yaw))
+    walker = Drive(0.0, place, heading_rad=yaw)
+    log = two(drive, walker, "pedestrian", until_s=4.0, rate_hz=frames_per_s, ego_there=lambda t: t <= 1.0 + 1e-9)
+    if reverses:  # the same way, its back ahead
+        turned = log.truth.yaw_rad + np.where(log.truth.row_object_ix == 0, -np.pi, 0.0)
+        log = replace(log, truth=replace(log.truth, yaw_rad=turned))
+    encounter = in_conflict(log, plan(ego=ego, margin_m=5.0))  # at 1 s he is 3.75 m ahead
+    # With 0.5 m/s² from 1 s on it stops after 9 m more, past him.
+    found = judge_braking(encounter, ConstantDeceleration(a_max_mps2=0.5), np.array([1.0]))
+    assert found.min_distance_m == pytest.approx(0.3, abs=1e-3)
 
 
 def test_named_encounters_as_the_oracle_says() -> None:

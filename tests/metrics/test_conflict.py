@@ -707,6 +707,22 @@ class TestRecordedEgo:
         # Straight pieces of 2 m, heading ahead, stick out by less than 0.4 m.
         assert shapely.difference(found, shapely.buffer(swept_there, 0.4)).area < 1e-9
 
+    def test_straight_on_in_a_bend(self) -> None:
+        """It turns along a circle of 16 m at 3 m/s, just less than 10 cm from frame to frame, and leaves after 4.5 m,
+        at (4.4409, 0.6287), heading 0.28125 rad: so its corridor heads."""
+
+        def turns(t: float) -> tuple[float, float]:
+            return 16 * math.sin(3 * t / 16), 16 - 16 * math.cos(3 * t / 16)
+
+        ego = Thing("ego", "car", turns, there=lambda t: t < 1.51)
+        log = recording([ego, Thing("walker", "pedestrian", standing(9, 9))], until_s=2.0, rate_hz=30.0)
+        log = with_columns(log, "ego", yaw_rad=lambda t: 3 * t / 16)
+        ready = prepare_log(log, plan())
+        pieces, _ = build_corridors(EgoPath(ready.scene, ready.truth, 0.5), np.array([1.5]), Conflict())
+        x, y, yaw = pieces.T[:3]
+        np.testing.assert_allclose(yaw, 0.28125, atol=1e-6)
+        np.testing.assert_allclose(y - 0.6287, (x - 4.4409) * math.tan(0.28125), atol=1e-3)
+
     def test_stopping_with_a_jitter(self) -> None:
         """It stops after 10 m; long after, its recorded place moves 2 µm to the left. "Straight on" is still ahead: who
         stands 12 m to the left of where it stops is in nobody's way, who stands 15 m ahead of there is."""

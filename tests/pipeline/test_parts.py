@@ -254,7 +254,7 @@ _FLEET = study(FLEET, "sweep: {penetration_rate: [0, 0.3]}")
 def test_few_parts_are_in_memory_at_a_time(
     text: str, many: bool, kept: str | None, here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where they are too many they wait in a file to be written: the same bytes, of row groups, too."""
+    """They wait in a file to be written: the same bytes however many are taken at a time, of row groups, too."""
     monkeypatch.setattr(table_files, "ROWS_A_GROUP", 100)
     if many:
         monkeypatch.setattr(results_write, "MANY_ROWS", 10)
@@ -264,7 +264,7 @@ def test_few_parts_are_in_memory_at_a_time(
     plain, _, _ = replayed(text, "plain", None)
     assert len([name for name in plain if name.startswith("detections.parquet")]) == (4 if many else 1)
     monkeypatch.setattr(parts_module, "MOST_RUNS", 16)
-    for name, value in {"HELD_BYTES": 100, "BATCH_ROWS": 1, "BATCH_BYTES": 1}.items():
+    for name, value in {"BATCH_ROWS": 1, "BATCH_BYTES": 1}.items():
         monkeypatch.setattr(study_tables, name, value)
     packed, read, most = [], [], [0]
     pack, unpack = study_tables.pack_part, study_tables.unpack_part

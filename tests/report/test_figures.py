@@ -43,6 +43,7 @@ from copem_replay.report.figures.single_runs import StoryEvent, last_instant, ru
 from copem_replay.report.figures.style import choose_appearances, format_share, shorten_names
 from copem_replay.report.figures.sweeps import sweeps_figure
 from copem_replay.results.read import Results, read_results
+from tests.helpers.compare_folders import unseal
 from tests.helpers.recordings import Obj, pedestrian, write_recording
 from tests.helpers.replays import save_run
 from tests.helpers.report_pages import named, with_rows
@@ -118,7 +119,7 @@ def results(made: Path) -> Results:
 def mine(made: Path, tmp_path: Path) -> Path:
     """A copy of them, with its recording."""
     shutil.copytree(made.parent, tmp_path / "mine")
-    return tmp_path / "mine" / "results"
+    return unseal(tmp_path / "mine" / "results")
 
 
 class Ended(NamedTuple):
@@ -319,7 +320,7 @@ class TestCommand:
     ) -> None:
         ended = call(mine, "--out", mine / "summary.csv")
         assert ended.code == 2
-        assert ended.lines[0].endswith("expected a folder, found a file; choose another with --out")
+        assert ended.lines[0].endswith("expected another name, found that of a file of the results in results")
         write = Path.write_bytes
 
         def full(path: Path, content: bytes) -> int:

@@ -10,9 +10,9 @@ import pandas as pd
 import pytest
 
 import copem_replay as cr
-from copem_replay.pipeline.run import StudyTables
 from copem_replay.results.compare import Comparison
 from copem_replay.results.decision import Decision, decide, decide_compared, describe_verdicts, tell_what_helps
+from copem_replay.results.table_files import LogRows
 from copem_replay.results.verdicts import MET, NOT_MET, UNDECIDED, Judgement, Verdict
 from tests.helpers.recordings import Obj, pedestrian, write_recording
 from tests.helpers.scenes import experiment
@@ -177,10 +177,8 @@ def test_criteria_are_the_sentence() -> None:
     )
 
 
-def test_results_in_memory_are_decided_on_without_tables_of_accuracy(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of an hour they take half a gigabyte, and no decision is about them; a comparison of all metrics makes them."""
+def test_results_are_decided_on_without_rows_of_accuracy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of an hour they take half a gigabyte, and no decision is about them; a comparison of all metrics reads them."""
     frames = [(0.1 * k, [Obj(id=1, x=1.0 * k), pedestrian(id=2, x=60.0, y=-2)]) for k in range(31)]
     write_recording(tmp_path / "drive.mcap", frames, host=1)
     (tmp_path / "plan.yaml").write_text(
@@ -188,19 +186,19 @@ def test_results_in_memory_are_decided_on_without_tables_of_accuracy(
         "units: {ego: {on: ego, height_m: 1.8, pem: p}}\n"
         "configurations: {ideal: {units: all}, late: {units: all, latency_s: 0.3}}\n"
     )
-    asked: list[int] = []
-    made = StudyTables.accuracy_of
+    read: list[str] = []
+    of = LogRows.of
 
-    def counted(self: StudyTables, *of: Any) -> Any:
-        asked.append(1)
-        return made(self, *of)
+    def watched(self: LogRows, log: str) -> Any:
+        read.append(self.place.name)
+        return of(self, log)
 
-    monkeypatch.setattr(StudyTables, "accuracy_of", counted)
+    monkeypatch.setattr(LogRows, "of", watched)
     result = cr.run(tmp_path / "plan.yaml")
     assert "late" in decide(result).sentence
-    assert not asked
+    assert set(read) == {"detections.parquet"}
     cr.compare(result)
-    assert asked == [1]
+    assert {"accuracy.parquet", "instants.parquet"} <= set(read)
 
 
 # ------------------------------------------------------------------------------- what would help with one object

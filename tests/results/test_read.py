@@ -17,7 +17,7 @@ from copem_replay.core.errors import InputError
 from copem_replay.metrics.columns import TABLES
 from copem_replay.results.read import open_results, read_results
 from copem_replay.results.table_files import read_csv, read_frame, read_parquet, write_parquet
-from tests.helpers.compare_folders import row, write_folder
+from tests.helpers.compare_folders import row, unseal, write_folder
 from tests.helpers.experiments import changed, drive
 
 
@@ -193,7 +193,7 @@ def test_objects_that_the_recording_does_not_have_are_refused(
     monkeypatch.chdir(tmp_path)
     drive(Path("drive.mcap"))
     Path("e.yaml").write_text(changed("show: null"))
-    cr.run("e.yaml").save("out")
+    unseal(cr.run("e.yaml").save("out"))
     table = parquet.read_table(f"out/{name}")
     k = table.column_names.index("object_id")
     parquet.write_table(table.set_column(k, "object_id", pa.array(["-1"] * len(table))), f"out/{name}")

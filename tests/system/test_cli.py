@@ -512,7 +512,7 @@ class TestRun:
         assert len(found) == 0
         assert found.dtypes["onset_s"].kind == "f"
         assert list(pd.read_csv(here / "out/e/summary.csv")["n"]) == [0, 0, 0]
-        assert ended.out.splitlines()[1].split() == ["GT", "–", "–", "–", "–", "–", "–", "–", "–"]
+        assert ended.out.splitlines()[1].split() == ["GT", *["–"] * 9]
         assert "all configurations: n 0, list_rate_hz 10" in ended.out.splitlines()
         refused = call("compare", "out/e", "--baseline", "PEM")
         assert (refused.code, refused.lines) == (
@@ -714,7 +714,10 @@ class TestOptions:
         (here / "sub").mkdir()
         os.chdir(here / "sub")
         assert call("run", "../e.yaml", "--skip-unreadable", "--out", "../again").code == 1
-        assert written(here / "again")["provenance.json"] == written(here / "out/e")["provenance.json"]
+        again, before = (
+            json.loads((here / name / "provenance.json").read_text()) | {"sha256": None} for name in ("again", "out/e")
+        )
+        assert again == before
 
     def test_skip_unreadable_with_nothing_to_skip(self, here: Path, call: Call) -> None:
         assert call("run", "e.yaml", "--skip-unreadable").code == 0
@@ -979,7 +982,7 @@ class TestTarget:
     @pytest.mark.parametrize(
         ("out", "said"),
         [
-            ("e.yaml", "e.yaml: expected a folder for the results, found a file"),
+            ("e.yaml", "--out: expected another name, found that of an input of this command: e.yaml"),
             ("e.yaml/x", "e.yaml/x: cannot be written: {here}/e.yaml is a file"),
             ("e.yaml/x/y", "e.yaml/x/y: cannot be written: {here}/e.yaml is a file"),
             (".", ".: not empty and no results folder; choose another with --out"),
@@ -1020,7 +1023,7 @@ class TestTarget:
 
     def test_a_mount_point(self, here: Path, call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
         (here / "out").mkdir()
-        monkeypatch.setattr(Path, "is_mount", lambda path: path == here / "out")
+        monkeypatch.setattr(os.path, "ismount", lambda path: Path(path) == here / "out")
         ended = call("run", "e.yaml", "--out", "out")
         assert ended.lines == ["out: cannot be replaced, being in use or a mount point; choose a folder in it"]
         assert call("run", "e.yaml", "--out", "out/e").code == 0
@@ -1169,7 +1172,14 @@ class TestFailure:
         self, here: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         """`nohup copem-replay run …`."""
-        monkeypatch.setattr(results, "write_csv", lambda *_: os.kill(os.getpid(), signal.SIGHUP))
+
+        write = results.write_csv
+
+        def go(table: pd.DataFrame, path: Path) -> None:
+            write(table, path)
+            os.kill(os.getpid(), signal.SIGHUP)
+
+        monkeypatch.setattr(results, "write_csv", go)
         previous = signal.signal(signal.SIGHUP, signal.SIG_IGN)
         try:
             with pytest.raises(SystemExit) as ended:

@@ -20,6 +20,7 @@ from copem_replay.cli import main as cli
 from copem_replay.experiment.schema import Experiment
 from copem_replay.viewer.side_by_side import ComparedExperiment, join_experiments
 from copem_replay.viewer.sink import ELAPSED
+from tests.helpers.compare_folders import unseal
 from tests.helpers.experiments import changed, drive
 from tests.helpers.recordings import Obj, pedestrian, write_recording
 from tests.viewer.test_rrd import at, rows, static
@@ -228,7 +229,7 @@ class TestRefusals:
         assert not (tmp_path / "ab.rrd").exists()
 
     def test_results_that_do_not_come_out_again(self, call: Compare, tmp_path: Path) -> None:
-        table = pd.read_parquet("a/detections.parquet")
+        table = pd.read_parquet(unseal(Path("a")) / "detections.parquet")
         table.loc[table["configuration"] == "PEM", "detection_s"] += 0.1
         table.to_parquet("a/detections.parquet")
         code, (line,) = call("compare", "a", "b", "--baseline", "b:PEM", "--rrd", "ab.rrd")

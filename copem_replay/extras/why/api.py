@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -16,6 +17,7 @@ from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.summary import format_table
+from copem_replay.results.read import Results, open_results
 
 if TYPE_CHECKING:
     from copem_replay.extras.why.causes import CauseShares, Counterfactuals
@@ -97,7 +99,7 @@ class Explanation:
 
 
 def why(
-    experiment: AnyExperiment,
+    experiment: AnyExperiment | Results,
     recordings: AnyRecordings | None = None,
     *,
     configurations: Sequence[str] | None = None,
@@ -107,13 +109,15 @@ def why(
 ) -> Explanation:
     """Explain the time that objects are unknown, `unknown_s`, by replays on the same draws.
 
-    `experiment`, `recordings`: as `cr.run` takes them. `configurations`: only these; None: all that have units.
+    `experiment`, `recordings`: as `cr.run` takes them; or results, or their folder, alone: of the logs that were
+    replayed. `configurations`: only these; None: all that have units.
     `parts`: of `causes`, `units`, `triage`, `sensitivity`; None: all, where they apply. `units`: those whose worth is
     asked for, the others are given; None: all but the ego's. `progress(done, total)` is called after each
     configuration.
 
     Raises InputError: a configuration or unit that is not there, or a part that is asked for of a configuration by
-    name, which cannot have it, with the reason. What is not named is left out then, with a note.
+    name, which cannot have it, with the reason. What is not named is left out then, with a note. RecordingError
+    where a log of results is gone, or not the one that was replayed.
 
     >>> explained = cr.why("logs/tc016d.yaml", configurations=["PEM"], parts=["causes"])
     >>> explained.causes["cause"].tolist()
@@ -122,11 +126,25 @@ def why(
     for part in parts or ():
         if part not in PARTS:
             raise InputError(f"parts: expected some of {', '.join(PARTS)}, found {part!r}")
-    study = make_study(experiment, recordings)
-    check_any_counted(study)
-    logs = [(one, resolve_for_log(study.experiment, one.scene.log)) for one in study.recordings]
-    _check_names(study.experiment, configurations or (), units or ())
+    whole, logs = _load_logs(experiment, recordings)
+    _check_names(whole, configurations or (), units or ())
     return _explain(logs, _Question(configurations, parts, units), progress or (lambda _done, _total: None))
+
+
+def _load_logs(
+    given: AnyExperiment | Results, recordings: AnyRecordings | None
+) -> tuple[Experiment, list[tuple[Recording, Experiment]]]:
+    """An experiment, and its recordings with the experiment of each; of results those that were replayed."""
+    if isinstance(given, str | PathLike) and Path(given).is_dir():
+        given = open_results(Path(given))
+    if isinstance(given, Results):
+        if recordings is not None:
+            raise InputError(f"{given.place}: expected its own recordings, found others; an experiment takes them")
+        of = [(one.name, resolve_for_log(given.experiment, one.name)) for one in given.provenance.logs]
+        return given.experiment, [(given.recording(name, alone), alone) for name, alone in of]
+    study = make_study(given, recordings)
+    check_any_counted(study)
+    return study.experiment, [(one, resolve_for_log(study.experiment, one.scene.log)) for one in study.recordings]
 
 
 def _check_names(experiment: Experiment, configurations: Sequence[str], units: Sequence[str]) -> None:

@@ -47,7 +47,7 @@ def why(
 
     folder = out or Path("out") / f"{experiment.stem}_why"
     if experiment.is_dir():
-        folder, experiment = out or experiment / "why", experiment / "experiment.yaml"
+        folder = out or experiment / "why"
     asked = [part for part, on in zip(PARTS, (causes, units, triage, sensitivity), strict=True) if on]
     if asked and unit is not None and "units" not in asked:
         asked.append("units")

@@ -5,8 +5,8 @@ ego, not braking, comes within the margin of the object's true motion after the 
 `NODE_S` apart and at every frame; between them both move on straight lines.
 
 The ego's path is made of its recorded places that are at least `STRIDE_M` apart, so that the jitter of a standing
-vehicle is no way; it turns back only where the ego goes back by `REVERSAL_M`. It goes straight on where the recording
-ends (backwards where the ego was in reverse).
+vehicle is no way; it turns back only where the ego goes back by `REVERSAL_M`. It ends with the ego's last place, if
+that is not behind, and goes straight on from there as the ego heads then (backwards where the ego was in reverse).
 
 Letters as in core/geometry.py: T instants, V path vertices, R courses of the ego.
 """
@@ -117,7 +117,8 @@ def _choose_vertices(x_m: Float, y_m: Float, yaw_rad: Float, stride_m: float, re
     """Indices (V,) of the places that make the path, and whether it ends in reverse.
 
     The first place, and each that is a stride away from the vertex before in the direction of travel, or a reversal
-    away against it, which turns that direction round.
+    away against it, which turns that direction round. The last place, if ahead of the last vertex by less than a
+    stride, is a vertex instead of that: in a bend the ego heads elsewhere a decimetre before.
     """
     kept = np.empty(len(x_m), dtype=np.int64)
     kept[0] = 0
@@ -129,6 +130,10 @@ def _choose_vertices(x_m: Float, y_m: Float, yaw_rad: Float, stride_m: float, re
             kept[n] = k
             n += 1
             backwards = backwards != against
+        elif k == len(x_m) - 1 and n > 1 and not against:
+            dx, dy = x_m[k] - x_m[kept[n - 2]], y_m[k] - y_m[kept[n - 2]]
+            if np.hypot(dx, dy) >= stride_m:
+                kept[n - 1] = k
     return kept[:n].copy(), backwards
 
 

@@ -65,8 +65,6 @@ def provenance_tables(study: ReportData) -> Html:
 
 def _count_read(results: Results) -> dict[str, tuple[str, str]]:
     """Frames and entries that were replayed, by log; empty where a folder has no `read.csv`."""
-    if results.study is not None:
-        return {log.name: (str(log.frames), str(log.object_states)) for log in results.study.logs}
     if not results.has("read.csv"):
         return {}
     table = results.frame("read.csv")

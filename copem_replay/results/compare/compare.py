@@ -181,8 +181,7 @@ def read_folders(given: Sequence[Path | Results]) -> list[Results]:
 def _read_folder(folder: Path | Results) -> Results:
     results = folder if isinstance(folder, Results) else open_results(folder)
     results.source  # noqa: B018
-    if results.study is None:  # damage is found here
-        dict(results.by_log)
+    results.by_log  # noqa: B018  # damage is found here
     return results
 
 

@@ -1,0 +1,77 @@
+"""Seals: `provenance.json` has the SHA-256 of every file of the results, and one of itself; readers check them.
+
+A file is read from end to end once for that, which takes less time than to decode it. Not sealed are recordings for
+Rerun, whose bytes are others in each writing: no command reads a figure from them. A file that is gone is no damage
+here: who needs it says so. Results of older versions have no seals.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from copem_replay.core.errors import InputError
+from copem_replay.results.folder import MARK
+from copem_replay.results.table_files import AGAIN
+
+SEALS = "sha256"
+"""The key of `provenance.json` that has the seals, by the name of the file."""
+_UNSEALED = ".rrd"
+
+
+def seal_results(folder: Path, names: Iterable[str], said: Mapping[str, object]) -> dict[str, object]:
+    """What `provenance.json` says, with the seals of the named files in a folder, and of itself. Raises OSError."""
+    seals = {name: _digest_file(folder / name) for name in names if name != MARK and not name.endswith(_UNSEALED)}
+    sealed = {**said, SEALS: seals}
+    return {**sealed, SEALS: seals | {MARK: _digest_said(sealed)}}
+
+
+def read_seals(said: Mapping[str, Any]) -> dict[str, str]:
+    """The seals of files; empty in results of older versions. Raises ValueError where what is said is not sealed."""
+    if SEALS not in said:
+        return {}
+    seals = dict(said[SEALS])
+    own = seals.pop(MARK, None)
+    if _digest_said({**said, SEALS: seals}) != own:
+        raise ValueError("its content is not what was written (SHA-256)")
+    return seals
+
+
+def check_sealed(folder: Path, name: str, seals: Mapping[str, str]) -> None:
+    """Raise InputError where a file of results, or one of a table that is a folder, is not what was written."""
+    named = [one for one in seals if one == name or one.startswith(f"{name}/")]
+    if seals and not named and (folder / name).exists():
+        raise InputError(f"{folder / name}: expected no such file among these results, found one; give it another name")
+    for one in named:
+        try:
+            found = _digest_file(folder / one)
+        except OSError as error:
+            raise InputError(
+                f"{folder / one}: expected a file of the results, found {error.strerror}; {AGAIN}"
+            ) from None
+        if found != seals[one]:
+            raise InputError(
+                f"{folder / one}: expected the file that was written, SHA-256 {seals[one][:12]}…, "
+                f"found {found[:12]}…; put it back, or {AGAIN}"
+            )
+
+
+def _digest_said(said: Mapping[str, object]) -> str:
+    return hashlib.sha256(json.dumps(said).encode()).hexdigest()
+
+
+_DIGESTS: dict[tuple[int, ...], str] = {}
+
+
+def _digest_file(path: Path) -> str:
+    """The SHA-256 of a file, taken once in a process as long as the file stays the same. Raises OSError."""
+    with path.open("rb") as file:
+        seen = os.fstat(file.fileno())
+        key = (seen.st_dev, seen.st_ino, seen.st_size, seen.st_mtime_ns, seen.st_ctime_ns)
+        if key not in _DIGESTS:
+            _DIGESTS[key] = hashlib.file_digest(file, "sha256").hexdigest()
+    return _DIGESTS[key]
