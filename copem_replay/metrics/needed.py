@@ -26,6 +26,8 @@ def count_for_share(share: float, bound: float, confidence: float = CONFIDENCE) 
 
     Without a single one on the other side: ln τ / ln B, exact; else by the normal approximation of exact limits.
     """
+    if not 0.0 <= bound <= 1.0:
+        return math.inf
     if share < bound:
         share, bound = 1.0 - share, 1.0 - bound
     tail = (1.0 - confidence) / 2
@@ -101,16 +103,25 @@ class Known(NamedTuple):
 
 
 def count_deciding(
-    metric: str, figure: LimitedFigure, bound: float, known: Known, confidence: float = CONFIDENCE
+    metric: str,
+    figure: LimitedFigure,
+    bound: float,
+    known: Known,
+    confidence: float = CONFIDENCE,
+    *,
+    paired: bool = False,
 ) -> int | None:
-    """How many of what its interval is over would decide a figure; None: no number, the figure is at its bound."""
+    """How many of what its interval is over would decide a figure; None: no number, the figure is at its bound.
+
+    `paired`: it is a difference.
+    """
     value = figure.value if figure.value is not None else math.nan
     level = find_level(metric)
     if figure.share is not None and level is not None:
         found = count_in_logs(count_for_share(figure.share[1], level, confidence), known)
     elif figure.bounds is not None and not math.isnan(figure.spread):
         found = count_for_mean(value, bound, figure.bounds, figure.spread, confidence)
-    elif "share" in metric:
+    elif "share" in metric and not paired:
         found = count_in_logs(count_for_share(value, bound, confidence), known)
     else:
         half = (figure.high - figure.low) / 2

@@ -175,7 +175,14 @@ def _describe_deciding(criterion: Criterion, found: JudgedFigure) -> str:
     """How many logs, objects, passes or runs would decide: `about 57 objects like these would decide, 13 now`."""
     over, number = found.over or "logs", found.clusters or 0
     known = Known(over, number, found.units)
-    needed = count_deciding(criterion.metric, found.figure, criterion.bound, known, criterion.confidence)
+    needed = count_deciding(
+        criterion.metric,
+        found.figure,
+        criterion.bound,
+        known,
+        criterion.confidence,
+        paired=criterion.against is not None,
+    )
     if needed is None:
         return f"no number of {over} decides: it is at the bound ({number} now)"
     return f"about {max(needed, number + 1)} {over} like these would decide ({number} now)"

@@ -89,6 +89,10 @@ def test_each_kind_of_figure_is_asked_by_its_own_limits() -> None:
     other = LimitedFigure(1.0, 0.0, 2.0, JACKKNIFE)
     assert count_deciding("nees", other, 2.0, known) == math.ceil(count_for_figure(1.0, 2.0, 1.0, 13))
     assert count_deciding("nees", other, 1.0, known) is None
+    paired = LimitedFigure(-0.02, -0.1, 0.06, EXACT)  # of shares, with a bound that no share has
+    found = count_deciding("pass_share", paired, -0.05, known, paired=True)
+    assert found == math.ceil(count_for_figure(-0.02, -0.05, 0.08, 13))
+    assert count_for_share(0.5, -0.1) == count_for_share(1.0, 1.5) == math.inf
 
 
 def test_what_no_one_can_show_is_told_before_the_run() -> None:

@@ -27,6 +27,8 @@ from tests.helpers.experiments import changed, drive
 from tests.helpers.recordings import Obj, write_recording
 from tests.system.test_cli import Call, call, run_in
 
+pytestmark = pytest.mark.extras  # readers that are extras are asked, too
+
 __all__ = ["call", "run_in"]  # fixtures
 
 PLAN = changed(

@@ -115,6 +115,7 @@ def test_a_folder_of_a_recording_is_no_output(
     assert content_of(protected) == before
 
 
+@pytest.mark.extras
 def test_an_input_of_any_kind_is_no_output(ran: Path, call: Call) -> None:
     here = ran.parents[1]
     (here / "criteria").write_text("criteria: {a: {metric: detected_share, at_least: 0}}\n")

@@ -91,7 +91,7 @@ def test_the_summary_has_the_numbers_of_the_file(opened: Browser, folder: Path) 
     assert [name for name, _ in shown] == ["GT", "half", NAMES[1], "hit", "never"], "the soonest first, as in figures"
     by_name = {row["configuration"]: row for row in rows}
     for configuration, cells in shown:
-        assert len(cells) == 7
+        assert len(cells) == 8
         assert cells == {name: by_name[configuration][name] for name in cells}
 
 
