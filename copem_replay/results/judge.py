@@ -171,6 +171,10 @@ def _find_verdict(criterion: Criterion, found: JudgedFigure) -> tuple[str, str]:
     return word, "; ".join([*parts, *filter(None, [found.why, found.shorter if word == UNDECIDED else ""])])
 
 
+_AT_BOUND = 1e-9
+"""A figure this close to its bound is at it."""
+
+
 def _describe_deciding(criterion: Criterion, found: JudgedFigure) -> str:
     """How many logs, objects, passes or runs would decide: `about 57 objects like these would decide, 13 now`."""
     over, number = found.over or "logs", found.clusters or 0
@@ -183,8 +187,10 @@ def _describe_deciding(criterion: Criterion, found: JudgedFigure) -> str:
         criterion.confidence,
         paired=criterion.against is not None,
     )
-    if needed is None:
+    if needed is None and abs((found.figure.value or 0.0) - criterion.bound) <= _AT_BOUND:
         return f"no number of {over} decides: it is at the bound ({number} now)"
+    if needed is None:
+        return f"more {over} would decide, how many is not known ({number} now)"
     return f"about {max(needed, number + 1)} {over} like these would decide ({number} now)"
 
 
