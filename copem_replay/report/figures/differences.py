@@ -28,6 +28,7 @@ from copem_replay.report.figures.style import (
     write_limits,
 )
 from copem_replay.results.compare.labels import find_baseline
+from copem_replay.results.compare.limits import STAR
 from copem_replay.results.compare.tables import NOTHING, describe_gain, explain_no_interval
 
 if TYPE_CHECKING:
@@ -104,13 +105,6 @@ def _choose_metrics(rows: dict[tuple[str, str], Any], names: Sequence[str]) -> l
     return [RANKED_BY, *shares[:1]]
 
 
-def excludes_0(row: Any) -> bool:
-    """Whether a difference has an interval that excludes 0."""
-    if pd.isna(row.interval_over) or pd.isna(row.low) or pd.isna(row.high):
-        return False
-    return bool(row.low > NOTHING or row.high < -NOTHING)
-
-
 def _make_dot(row: Any, metric: str) -> Dot:
     if row is None or pd.isna(row.difference):
         return Dot(None, None, None, "–")
@@ -122,7 +116,7 @@ def _make_dot(row: Any, metric: str) -> Dot:
     words = format_signed_decimals(value)
     if pd.isna(row.interval_over) or low is None or high is None:
         return Dot(value, None, None, " ".join([words, *(f"({why})" for why in explain_no_interval(row))]))
-    return Dot(value, low, high, f"{words} {write_limits(low, high)}", sure=excludes_0(row))
+    return Dot(value, low, high, f"{words} {write_limits(low, high)}", sure=row.star == STAR)
 
 
 def _centre_on_zero(axes: Axes, dots: Sequence[Dot], metric: str, baseline: str) -> None:
@@ -165,7 +159,7 @@ def _note_sentences(results: Results, comparison: Comparison, names: Sequence[st
     ]
     if len(limited):
         sentences.append(
-            f"Lines: 95 % intervals over {describe_over(results)}; bold: the interval excludes 0; hollow: no interval"
+            f"Lines: 95 % intervals over {describe_over(results)}; bold: it has a {STAR}; hollow: no interval"
         )
     gains = [
         f"{row.configuration} {describe_gain(row)}" for row in limited.itertuples() if not pd.isna(row.logs_better)

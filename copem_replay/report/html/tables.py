@@ -36,7 +36,7 @@ from copem_replay.report.html.markup import (
     make_table,
     make_tag,
 )
-from copem_replay.results.compare.limits import STAR
+from copem_replay.results.compare.limits import ALONE, STAR
 from copem_replay.results.compare.tables import comparison_lines, explain_no_interval, held_cells
 from copem_replay.results.verdicts import MET, NOT_MEASURED, NOT_MET, UNDECIDED, Judgement, Verdict
 
@@ -239,12 +239,17 @@ def regret_table(study: ReportData) -> Html:
     return join_html(
         [
             *tables,
-            make_tag("p", "Bold: the interval excludes 0.", class_="below"),
+            make_tag(
+                "p",
+                f"Bold, {STAR}: the interval excludes 0, these tables together held at 95 %; {ALONE}: "
+                "its own interval alone excludes 0.",
+                class_="below",
+            ),
             _held_table(study, regret),
             fold_parts(
                 "What the columns mean, and how they are made",
                 _column_meanings(words, difference_column_header),
-                make_list(_replace_metric_names(line) for line in comparison_lines(regret) if not line.startswith("*")),
+                make_list(_replace_metric_names(line) for line in comparison_lines(regret)),
             ),
         ]
     )
