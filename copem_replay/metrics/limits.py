@@ -573,10 +573,12 @@ def interval_words(kind: str, over: str, number: int | None = None) -> str:
 
 
 def format_limit(value: float) -> str:
-    """A limit, or a difference, to three significant digits; a dash where there is none."""
+    """A limit, or a difference, to three significant digits, without an exponent; a dash where there is none."""
     if not math.isfinite(value):
         return "–"
-    return "0" if abs(value) < _ROUNDING else f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+    if abs(value) < _ROUNDING:
+        return "0"
+    return f"{value:.0f}" if abs(value) >= 1000 else np.format_float_positional(float(f"{value:.3g}"), trim="-")
 
 
 def format_limits(low: float, high: float) -> str:

@@ -18,6 +18,7 @@ from copem_replay.metrics.limits import (
     describe_clusters,
     exact_limits,
     figure_variance,
+    format_limits,
     group_clusters,
     limit_bounded_mean,
     limit_figure,
@@ -384,3 +385,11 @@ def test_passes_of_one_object_are_the_clusters_and_runs_are_never_more_than_ther
         (row,) = table.to_dict("records")
         assert (row["detected_share_low"], row["detected_share_high"]) == pytest.approx(limits)
         assert (row["interval_over"], row["interval_clusters"]) == (over, clusters)
+
+
+def test_limits_have_three_digits_and_no_exponent():
+    assert format_limits(5.4217e-05, 1.4349) == "[0.0000542, 1.43]"
+    assert format_limits(-0.1, 100.0) == "[-0.1, 100]"
+    assert format_limits(-1234.5, 999.6) == "[-1234, 1000]"
+    assert format_limits(-math.inf, 1e-12) == "[–, 0]"
+    assert format_limits(math.nan, 0.99962) == "[–, 1]"
