@@ -48,7 +48,7 @@ from copem_replay.experiment.maps import MapFile
 from copem_replay.fusion import FUSIONS
 from copem_replay.fusion.interface import Fusion, IdealFusion
 from copem_replay.io.config import Ego, HowRead, RecordedOutput, RecordedTopic, TruthTopic, WindowOf
-from copem_replay.metrics.config import AREA, Braking, Measure, OwnArea, parse_slices
+from copem_replay.metrics.config import AREA, Braking, Measure, Needless, OwnArea, parse_slices
 from copem_replay.perception.config import Carriers, Obstacle, Placement, Rate
 from copem_replay.perception.pem.model import MeanNumber, Pem
 from copem_replay.perception.visibility import Surface, Visibility
@@ -485,6 +485,11 @@ class Experiment(Frozen):
     @classmethod
     def _ideals(cls, configurations: dict[str, Configuration]) -> dict[str, Configuration]:
         return _add_ideals(configurations)
+
+    @property
+    def needless(self) -> Needless | None:
+        """When braking is for nothing; None: not measured, as without a driver, or without accuracy."""
+        return self.braking.needless if self.braking is not None and self.measure.accuracy else None
 
     @property
     def modelled(self) -> dict[str, Unit]:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import pandas as pd
 import pyarrow as pa
 
+from copem_replay.metrics.config import CAUSES
 from copem_replay.metrics.summary_metrics import METRIC, METRICS_OF
 
 _IN_PANDAS = {"text": "object", "numbers": "float64", "whole numbers": "Int64", "true or false": "boolean"}
@@ -39,10 +40,10 @@ class Column:
     """A column of a file, or a key of `provenance.json`.
 
     `kind`: text, text or null, numbers, whole numbers, true or false, or lists of these. `when`: what an experiment
-    has to ask for (`braking`, `conflict`, `accuracy`, `areas`; `link`: a link, `ready` or `sends`; `fleet`: units that
-    only some runs have); empty: it is always there. `compared`: whether comparisons read it. `single`: in single
-    precision. `full`: no row is without it. `infinite`: numbers may be infinite. `among`: the words it may have; empty:
-    any.
+    has to ask for (`braking`, `conflict`, `needless`, `accuracy`, `areas`; `link`: a link, `ready` or `sends`; `fleet`:
+    units that only some runs have); empty: it is always there. `compared`: whether comparisons read it. `single`: in
+    single precision. `full`: no row is without it. `infinite`: numbers may be infinite. `among`: the words it may have;
+    empty: any.
     """
 
     name: str
@@ -265,6 +266,30 @@ _LISTS = (
            compared=True),
     Column("without_truth", "whole numbers",
            "held entries, over all frames, whose measured object has no truth at the frame", compared=True),
+    Column("driving_s", "numbers", "seconds in which the ego drives, by its own frames: the same in all configurations",
+           "needless", compared=True),
+    Column("needless_brakes", "whole numbers",
+           "how often the driver [brakes for nothing](../guide/metrics.md#braking-for-nothing)", "needless",
+           compared=True),
+    Column("needless_s", "numbers", "for how long, in all", "needless", compared=True),
+    Column("needless_s_at", "lists of numbers", "the same with entries of at least that existence alone", "needless"),
+    Column("speed_lost_mps", "numbers", "the most speed that braking for nothing takes at once", "needless"),
+    Column("must_brake_s", "numbers", "seconds in which the driver must brake by the truth", "needless"),
+    Column("must_brake_missed_s", "numbers", "of these, seconds in which he does not brake by the lists", "needless"),
+)  # fmt: skip
+_NEEDLESS = (
+    *_LOG, _RUN,
+    Column("begins_s", "numbers", "when it begins: the list for which the driver brakes is available", full=True),
+    Column("lasts_s", "numbers", "how long it lasts, with pauses of `merge_s` or less"),
+    Column("speed_lost_mps", "numbers", "the speed that the driver's deceleration takes in its needless time"),
+    Column("cause", "text",
+           "whose entry it is: `ghost`, at no object; `duplicate` of another entry; `late`: true at its capture; else "
+           "`misplaced`", among=CAUSES),
+    Column("object_id", "text or null", "id of the true object that the entry is about; null for none"),
+    Column("object_class", "text", "class of the entry"),
+    Column("track_id", "whole numbers", "track of the entry; null where the fusion names none"),
+    Column("x_m", "numbers", "listed place of the entry, east"),
+    Column("y_m", "numbers", "listed place of the entry, north"),
 )  # fmt: skip
 _THRESHOLDS = (
     *_LOG, _RUN, _OBJECT, _EPISODE,
@@ -370,6 +395,9 @@ TABLES = {
     "lists.parquet": Table(f"One row per log, configuration and run. {_FAR_OFF}.", _LISTS),
     "thresholds.parquet": Table(
         f"One row per log, configuration, run, object and step of existence. {_FAR_OFF}.", _THRESHOLDS),
+    "needless.parquet": Table(
+        "One row per log, configuration, run and time that the driver brakes for nothing. "
+        "[Definitions](../guide/metrics.md#braking-for-nothing).", _NEEDLESS),
     "bands.csv": Table(
         f"One row per configuration and band; what a band's kind does not have is empty. {_FAR_OFF}.", _BANDS),
     "logs.csv": Table("One row per recording that the experiment names.", _LOGS),
@@ -381,6 +409,7 @@ TABLES = {
 """The files of a results folder, beside the experiment and the replays."""
 COMPARED_FILES = ("accuracy.parquet", "instants.parquet", "lists.parquet", "thresholds.parquet")
 """Optional files that comparisons read."""
+NEEDLESS = "needless.parquet"
 
 
 def find_columns(name: str) -> dict[str, Column]:

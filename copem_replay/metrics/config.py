@@ -379,17 +379,53 @@ def find_range_problem(onset: Onset, slices: Sequence[Slice]) -> str | None:
     )
 
 
+GHOST_ENTRY, DUPLICATE_ENTRY, MISPLACED, LATE = "ghost", "duplicate", "misplaced", "late"
+CAUSES = (GHOST_ENTRY, DUPLICATE_ENTRY, MISPLACED, LATE)
+"""Whose entry a driver brakes for who brakes for nothing."""
+PositiveShare = Annotated[float, Field(strict=True, gt=0, le=1)]
+
+
+class Needless(Frozen):
+    """When the driver brakes for an entry of a list, and when the truth gives a reason to.
+
+    Braking with less than the share `brakes_at` of the driver's deceleration does not keep the ego `margin_m` clear of
+    the entry. The truth gives a reason where, within `around_s` of the list, less than `needed_at` does not keep it
+    `wider_m` clear of a true object. An ego slower than `slower_mps` does not drive. Needless braking that pauses for
+    `merge_s` or less is one event.
+    """
+
+    brakes_at: PositiveShare = 0.6
+    needed_at: PositiveShare = 0.3
+    margin_m: Margin = 0.0
+    wider_m: Margin = 0.5
+    around_s: Annotated[float, Field(strict=True, ge=0, le=60)] = 0.5
+    slower_mps: Positive = 1.0
+    merge_s: Annotated[float, Field(strict=True, ge=0, le=60)] = 1.0
+
+    @model_validator(mode="after")
+    def _tolerant(self) -> Self:
+        if self.needed_at > self.brakes_at:
+            raise ValueError(
+                f"expected needed_at ≤ brakes_at, found {self.needed_at:g} and {self.brakes_at:g}: the truth is asked "
+                "with tolerance"
+            )
+        if self.wider_m < self.margin_m:
+            raise ValueError(f"expected wider_m ≥ margin_m, found {self.wider_m:g} and {self.margin_m:g}")
+        return self
+
+
 class Braking(Frozen):
     """What the ego's driver does when an object is known (`brakes_for: object`) or a list implies a collision.
 
     `ego`: until it brakes, the ego drives as recorded, or with constant speed from the onset (the recorded driver may
-    have braked already).
+    have braked already). `needless`: when braking is for nothing, of all entries of the lists; null: not measured.
     """
 
     driver: Annotated[Driver, Slot("driver", DRIVERS)]
     margin_m: Margin = 0.5
     ego: Literal["recorded", "constant_speed"] = "recorded"
     brakes_for: Literal["object", "conflict"] = "object"
+    needless: Needless | None = Needless()
 
 
 class MetricsSetup(PerceptionSetup, Protocol):

@@ -41,7 +41,8 @@ class MetricInputs:
     `rows`: its rows of `tally.parquet` for detections, log by log; `conflicts`: those for implied collisions, None
     where the experiment does not ask for them. `lists_fixed`, `reaction_fixed`: detections, and braking, are equal in
     every run. `accuracy`, `exact`: None where the experiment does not ask for it. `output`: times of a recorded output,
-    `link`: of the lists on links; None: the configuration has none. `own`: sums of own metrics, by name. `weigh`: what
+    `link`: of the lists on links; None: the configuration has none. `driving`: rows of `lists.parquet`, or of
+    `sum_lists`; None: without accuracy. `own`: sums of own metrics, by name. `weigh`: what
     weighs alike, objects or drives.
     """
 
@@ -57,6 +58,7 @@ class MetricInputs:
     link: LinkTimes | None = None
     own: Mapping[str, OwnSums] = field(default_factory=dict)
     weigh: str = OBJECTS
+    driving: pd.DataFrame | None = None
 
 
 class Compared(NamedTuple):

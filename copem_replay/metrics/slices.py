@@ -179,13 +179,21 @@ def _own_columns(rows: pd.DataFrame, own: Sequence[RowMetric]) -> dict[str, Floa
 
 
 def sum_lists(rows: pd.DataFrame) -> pd.DataFrame:
-    """Sums by log and configuration over the runs in rows of `lists.parquet`: `lists`, `minutes`, and false entries."""
-    return rows.groupby(["log", "configuration"], sort=False)[[*_OF_LISTS]].sum().reset_index()
+    """Sums by log and configuration over the `runs` in rows of `lists.parquet`: `lists`, `minutes`, false entries, and
+    needless braking; of `speed_lost_mps` the most.
+    """
+    rows = rows if "runs" in rows else rows.assign(runs=1)
+    names = [name for name in ("runs", *_OF_LISTS, *OF_DRIVING) if name in rows]
+    how = {name: "max" if name == "speed_lost_mps" else "sum" for name in names}
+    return rows.groupby(["log", "configuration"], sort=False).agg(how).reset_index()
 
 
 _OF_LISTS = ("lists", "minutes", "ghosts", "stale_ghosts", "duplicates")
-LISTS_COLUMNS = ("log", "configuration", *_OF_LISTS)
-"""Columns of `lists.parquet` that `sum_lists` needs."""
+OF_DRIVING = (
+    "driving_s", "needless_brakes", "needless_s", "speed_lost_mps", "must_brake_s", "must_brake_missed_s",
+)  # fmt: skip
+LISTS_COLUMNS = ("log", "configuration", "run", *_OF_LISTS, *OF_DRIVING)
+"""Columns of `lists.parquet` that figures are of."""
 
 # Rows of a study, or of a group.
 
@@ -296,6 +304,7 @@ class StudyRows:
             conflicts=conflicts,
             own=self._own_sums(of(self.sums)),
             weigh=own.weigh,
+            driving=None if self.lists is None else of(self.lists),
         )
 
     @staticmethod

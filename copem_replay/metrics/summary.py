@@ -232,6 +232,7 @@ def summarise_tally(
     conflicts_asked: bool = False,
     links: Mapping[str, LinkTimes] | None = None,
     weigh: str = OBJECTS,
+    driving: pd.DataFrame | None = None,
 ) -> tuple[pd.DataFrame, list[str]]:
     """The rows of `summary.csv`, and notes about them, from the rows of `tally.parquet`.
 
@@ -239,14 +240,14 @@ def summarise_tally(
     (`find_facts`), of which are read `fixed` and `fixed_verdicts`; None: nothing is known. `own`: the experiment's own
     metrics, whose columns come last; `sums`: their sums. `outputs`: ages of recorded outputs, by configuration;
     `links`: sums over lists on links, by configuration. `conflicts_asked`: whether the experiment measures when lists
-    imply a collision. `weigh`: as `measure.weigh`.
+    imply a collision. `weigh`: as `measure.weigh`. `driving`: columns of `lists.parquet` about needless braking.
     """
     detections, implying = (tallied[tallied["event"] == event] for event in (DETECTED, CONFLICT))
     detections_of, conflicts_of = _split_by_configuration(detections), _split_by_configuration(implying)
     exact_of = _split_by_configuration(exact) if exact is not None else {}
     notes = [_EACH_DRIVE_ONCE] * (weigh == DRIVES and detections["log"].nunique() > 1)
     notes += [*_note_no_interval(detections), *_note_beyond_gate(accuracy or {}), *_note_unannotated(accuracy or {})]
-    columns = (*METRICS, *own_metrics(own))
+    columns, driving_of = (*METRICS, *own_metrics(own)), {} if driving is None else _split_by_configuration(driving)
     rows = []
     for name in configurations:
         inputs = MetricInputs(
@@ -262,6 +263,7 @@ def summarise_tally(
             own=(sums or {}).get(name, {}),
             link=(links or {}).get(name),
             weigh=weigh,
+            driving=driving_of.get(name),
         )
         rows.append({"configuration": name, **evaluate_metrics(columns, inputs)})
     return pd.DataFrame(rows), notes

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from copem_replay.core.tracks import Bool, Float
 from copem_replay.metrics.accuracy.metrics import ACCURACY
 from copem_replay.metrics.braking.driver import UNRESOLVED
+from copem_replay.metrics.braking.driving import DRIVING
 from copem_replay.metrics.limits import (
     CLUSTERS,
     CONFIDENCE,
@@ -428,7 +429,8 @@ _EXACT_METRICS = (
 )
 
 _ALL = {
-    "": _DETECTION_METRICS, "conflict": _CONFLICT_METRICS, "braking": _BRAKING_METRICS, "accuracy": ACCURACY,
+    "": _DETECTION_METRICS, "conflict": _CONFLICT_METRICS, "braking": _BRAKING_METRICS, "needless": DRIVING,
+    "accuracy": ACCURACY,
     "output": OUTPUT, "link": LINK, "exact": _EXACT_METRICS,
 }  # fmt: skip
 METRICS_OF: dict[str, tuple[Metric, ...]] = {what: tuple(m for m in of if m.help) for what, of in _ALL.items()}
@@ -436,7 +438,10 @@ METRICS_OF: dict[str, tuple[Metric, ...]] = {what: tuple(m for m in of if m.help
 METRICS: tuple[Metric, ...] = tuple(metric for of in METRICS_OF.values() for metric in of)
 METRIC: dict[str, Metric] = {metric.name: metric for metric in METRICS}
 COMPARED: dict[str, Metric] = {
-    metric.name: metric for what in ("", "accuracy", "braking") for metric in _ALL[what] if metric.compared is not None
+    metric.name: metric
+    for what in ("", "accuracy", "braking", "needless")
+    for metric in _ALL[what]
+    if metric.compared is not None
 }
 """The metrics that `compare` holds against a baseline, in its order."""
 
@@ -444,6 +449,7 @@ PARTS = {
     "summary": "When, and how far away",
     "undetected": "What became of those never detected",
     "braking": "Braking in time",
+    "needless": "Braking for nothing",
     "conflict": "When a collision was foreseen",
     "accuracy": "How far off",
     "lists": "Contents of the lists",

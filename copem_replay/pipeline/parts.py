@@ -218,7 +218,7 @@ def _recipe_parts(experiment: Experiment, name: str) -> tuple[dict[str, Any], li
     pems = [pem for unit in units if (pem := experiment.units[unit].pem) is not None]
     links = [link for unit in members if isinstance(link := configuration.link_of(unit), str)]
     of_part = {
-        "part": 2,
+        "part": 3,
         "fingerprint": take_fingerprint(),
         "configuration": data["configurations"][name] | ({"units": members} if members else {}),
         "units": [(unit, data["units"][unit]) for unit in units],  # in the experiment's order, which decides ties

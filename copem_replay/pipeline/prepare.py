@@ -37,7 +37,9 @@ from copem_replay.fusion.interface import IdealFusion, ListFusion
 from copem_replay.io.recorded_units import RecordedUnits, join_recorded_units
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.accuracy.held import HeldFrames, make_held_frames
+from copem_replay.metrics.braking.demand import BrakingEgo
 from copem_replay.metrics.braking.encounter import EgoPath, Encounter, find_encounters
+from copem_replay.metrics.braking.needless import TruthDemand, find_truth_demand
 from copem_replay.metrics.braking.verdict import find_passing_intervals
 from copem_replay.metrics.config import Measure, MetricsSetup
 from copem_replay.metrics.detection.conflict import keep_episodes_within
@@ -200,6 +202,15 @@ class Replay:
     def ego(self) -> EgoPath:
         """The ego's way through the log, which must have an ego."""
         return EgoPath(self.scene, self.truth, self.expanded.max_gap_s)
+
+    @cached_property
+    def truth_demand(self) -> TruthDemand | None:
+        """When the truth gives the driver a reason to brake; None: it is not asked whether lists do without one."""
+        braking, needless = self.expanded.braking, self.expanded.needless
+        if braking is None or needless is None:
+            return None
+        ego = BrakingEgo(self.ego, braking.driver, needless.slower_mps)
+        return find_truth_demand(ego, needless, self.scene, self.truth, self.expanded.max_gap_s)
 
     @cached_property
     def passing_s(self) -> dict[int, Float]:

@@ -34,6 +34,7 @@ from copem_replay.metrics.metric import OutputTimes, OwnSums
 from copem_replay.metrics.onset import select_counted
 from copem_replay.metrics.slices import (
     LISTS_COLUMNS,
+    OF_DRIVING,
     SliceSettings,
     StudyRows,
     sum_episodes,
@@ -217,6 +218,8 @@ class StudyTables:
     """Sums of own metrics."""
     sliced: tuple[pd.DataFrame, pd.DataFrame | None] | None = None
     """What slices are made of: sums by episode, and of lists; None: not asked for."""
+    driving: pd.DataFrame | None = None
+    """Columns of `lists.parquet` about needless braking; None: not asked for."""
     exact: pd.DataFrame | None = None
     horizon_s: float = 0.0
     summary: pd.DataFrame = field(default_factory=pd.DataFrame)
@@ -393,13 +396,16 @@ def _gather_study(logs: Sequence[StudyLog], experiment: Experiment, gatherer: Ga
     nodes = dict[tuple[str, str], list[tuple[int, AccuracyTotal]]]()
     tallies, batch, last = list[pd.DataFrame](), list[PartTables](), logs[-1].name
     episodes, lists, sliced = list[pd.DataFrame](), list[pd.DataFrame](), bool(kept and measure.by)
+    driving, columns = list[pd.DataFrame](), LISTS_COLUMNS[: None if experiment.needless else -len(OF_DRIVING)]
     for log, parts in groupby(gatherer.each(logs, experiment), key=attrgetter("log")):
         for part in parts:
             batch.append(replace(part, beside=None, runs=None))
             study.add(part)
             if part.total is not None and part.runs is not None:
                 nodes.setdefault((log, part.configuration), []).append((len(part.runs), part.total))
-                lists += [sum_lists(part.runs.select([*LISTS_COLUMNS]).to_pandas())] if sliced else []
+                of_lists = part.runs.select([*columns] if sliced or experiment.needless else []).to_pandas()
+                lists += [sum_lists(of_lists)] if sliced else []
+                driving += [of_lists[["log", "configuration", "run", *OF_DRIVING]]] if experiment.needless else []
         if log != last and sum(len(part.rows) for part in batch) < BATCH_ROWS:
             continue
         rows = study.frame(batch)
@@ -413,6 +419,7 @@ def _gather_study(logs: Sequence[StudyLog], experiment: Experiment, gatherer: Ga
         return_memory()
     study.totals = {key: join_totals(of_log) for key, of_log in nodes.items()}
     study.tally = pd.concat(tallies, ignore_index=True)
+    study.driving = pd.concat(driving, ignore_index=True) if driving else None
     if sliced:
         study.sliced = pd.concat(episodes, ignore_index=True), sum_lists(pd.concat(lists)) if lists else None
     return study
@@ -473,5 +480,6 @@ def _summarise(study: StudyTables, horizon_s: float) -> tuple[pd.DataFrame, list
         outputs={name: sum((of.outputs[name] for of in facts), OutputTimes()) for name in experiment.outputs},
         conflicts_asked=measure.conflict is not None,
         weigh=measure.weigh,
+        driving=study.driving,
         links={name: one.links for name, one in times.items() if one.links is not None},
     )

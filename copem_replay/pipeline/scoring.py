@@ -17,6 +17,7 @@ from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.accuracy.aggregator import Aggregator
 from copem_replay.metrics.accuracy.held import HeldAccuracy, HeldErrors
 from copem_replay.metrics.accuracy.statistics import Accuracy, AccuracySettings, repeat_for_runs
+from copem_replay.metrics.braking.needless import NeedlessBraking, NeedlessDetector
 from copem_replay.metrics.config import AnnotatedArea, Measure
 from copem_replay.metrics.detection.by_match import DetectionSteps, FirstMatches
 from copem_replay.metrics.detection.by_truth_id import FirstDetections
@@ -32,7 +33,7 @@ class ConfigurationScores:
     """The scores of one configuration in the runs (S,), or in the one that stands for all.
 
     `issue_s (K,)`: when each list is available. `detections`, `steps`: by match, whatever the fusion. `held`: with
-    `accuracy`.
+    `accuracy`; `needless`: with it where a driver is asked.
     """
 
     issue_s: Float
@@ -40,6 +41,7 @@ class ConfigurationScores:
     steps: DetectionSteps
     accuracy: Accuracy | None
     held: HeldAccuracy | None = None
+    needless: NeedlessBraking | None = None
 
 
 def match_lists(around: TruthCache, output: ReceiverOutput, measure: Measure) -> Matches:
@@ -92,6 +94,7 @@ class Judge:
         self._known: list[FirstMatches] = []
         self._aggregator: Aggregator | None = None
         self._held: HeldErrors | None = None
+        self._needless: NeedlessDetector | None = None
         self._conflicts: ConflictDetector | None = None
         if measure.conflict is not None:
             self._conflicts = ConflictDetector(
@@ -127,6 +130,10 @@ class Judge:
                 self.accuracy_s += time.perf_counter() - began_s
             if len(object_ix := output.origins.own_ix):  # known by truth ids, however far off
                 matches = replace(matches, object_ix=object_ix, role=np.full(len(object_ix), MATCH, dtype=np.int8))
+            if self._needless is not None:
+                began_s = time.perf_counter()
+                self._needless.add(lists, matches, output.tells_of)
+                self.accuracy_s += time.perf_counter() - began_s
             for known in self._known:
                 known.add(lists, matches, issue_s, output.origins)
         if self._conflicts is not None:
@@ -151,6 +158,10 @@ class Judge:
         self._held = HeldErrors(
             self._log.held_frames, issue_s, self._max_age_s, scene, firsts, classes, settings=settings, runs=runs
         )
+        if (truth := self._log.truth_demand) is not None:
+            self._needless = NeedlessDetector(
+                truth, issue_s, reference, settings, confirm=measure.confirm, max_age_s=self._max_age_s, runs=runs
+            )
 
     def conflict_known_s(self) -> Float | None:
         """(S | 1, M) when a list first implied a collision, NaN: never; None: it is not asked for."""
@@ -163,7 +174,8 @@ class Judge:
         detections, steps = self._join_known()
         accuracy = None if self._aggregator is None else repeat_for_runs(self._aggregator.result(), runs)
         held = None if self._held is None else self._held.result().repeated(runs)
-        return ConfigurationScores(self._issue_s, detections, steps, accuracy, held)
+        needless = None if self._needless is None else self._needless.result().repeated(runs)
+        return ConfigurationScores(self._issue_s, detections, steps, accuracy, held, needless)
 
     def _join_known(self) -> tuple[FirstDetections, DetectionSteps]:
         """The detections of all episodes, and their steps in the order of runs and episodes."""

@@ -5,6 +5,7 @@
 | `accuracy` | as `detections`: position error and part of GOSPAᵖ by list of the stay, and as held by frame; ghosts |
 | `instants` | log × configuration, and run where runs differ in them: when lists are available, which are held |
 | `lists` | log × configuration × run: lists, ghosts, stale ones, and how many of the others from which existence on |
+| `needless` | log × configuration × run × time that the driver brakes for nothing: when, how long, by whose entry |
 | `thresholds` | log × configuration × run × object × step: when it is detected if more existence is asked for |
 | `bands` | configuration × distance, time (by log) or existence: from, to, and the figures in between |
 """
@@ -23,7 +24,7 @@ import pyarrow.compute as pc
 from pyarrow import ipc
 
 from copem_replay.core.files import parse_json
-from copem_replay.core.tracks import Bool, Float, Int
+from copem_replay.core.tracks import CLASSES, Bool, Float, Int
 from copem_replay.metrics.accuracy.statistics import (
     BAND,
     EXISTENCE,
@@ -34,11 +35,12 @@ from copem_replay.metrics.accuracy.statistics import (
     AccuracyTotal,
     sum_accuracy,
 )
-from copem_replay.metrics.columns import COMPARED_FILES, TABLES
+from copem_replay.metrics.columns import COMPARED_FILES, NEEDLESS, TABLES
 from copem_replay.metrics.detections_table import WAY, build_frame, concatenate_columns
 
 if TYPE_CHECKING:
     from copem_replay.experiment.schema import Experiment
+    from copem_replay.metrics.braking.needless import NeedlessBraking
     from copem_replay.pipeline.replay import BlockOutcome
     from copem_replay.pipeline.scoring import ConfigurationScores
 
@@ -118,7 +120,10 @@ def accuracy_tables(parts: Iterable[PartTables], rows: pd.DataFrame, *, same_ins
     for column in _STEPS:
         thresholds = thresholds.append_column(column.name, pc.list_flatten(beside[column.name]))
     instants, lists = _build_instants(runs, same_instants), runs.drop_columns(_INSTANTS)
-    return dict(zip(COMPARED_FILES, (per_list, instants, lists, thresholds), strict=True))
+    needless = [part.needless for part in parts if part.needless is not None]
+    lists = lists if needless else lists.drop_columns(_DRIVING)
+    tables = dict(zip(COMPARED_FILES, (per_list, instants, lists, thresholds), strict=True))
+    return tables | ({NEEDLESS: pa.concat_tables(needless)} if needless else {})
 
 
 def _build_instants(runs: pa.Table, same: bool) -> pa.Table:
@@ -180,6 +185,8 @@ _BY_LIST, _AT, _, _STEPS = (
     [column for column in TABLES[name].columns if column.name not in _KEYS] for name in COMPARED_FILES
 )
 _INSTANTS = [column.name for column in _AT]
+_DRIVING = [column.name for column in TABLES["lists.parquet"].columns if column.when == "needless"]
+_EVENTS = pa.schema([(column.name, column.arrow) for column in TABLES[NEEDLESS].columns])
 _RUNS = pa.schema([(column.name, column.arrow) for column in (*TABLES["lists.parquet"].columns, *_AT)])
 _BESIDE = pa.schema([*((c.name, c.arrow) for c in _BY_LIST), *((c.name, pa.large_list(c.arrow)) for c in _STEPS)])
 
@@ -191,6 +198,7 @@ class PartTables:
     `beside` has the rows of `rows`: the columns of `accuracy.parquet`, and in lists the steps of
     `thresholds.parquet`. `runs` has a row per run: the columns of `lists.parquet`, and those of `instants.parquet`;
     null: as in the row before. `total`: sums of accuracy over the runs. All three are None without accuracy.
+    `needless`: rows of `needless.parquet`; None: not asked for.
     """
 
     log: str
@@ -199,11 +207,17 @@ class PartTables:
     beside: pa.Table | None = None
     runs: pa.Table | None = None
     total: AccuracyTotal | None = None
+    needless: pa.Table | None = None
 
     @property
     def size_bytes(self) -> int:
         """Bytes of its tables in memory."""
-        return sum(table.nbytes for table in (self.rows, self.beside, self.runs) if table is not None)
+        return sum(table.nbytes for table in self.tables if table is not None)
+
+    @property
+    def tables(self) -> tuple[pa.Table | None, ...]:
+        """Its tables, those that it has first."""
+        return self.rows, self.beside, self.runs, self.needless
 
 
 def build_parts(log: str, outcomes: Sequence[BlockOutcome], experiment: Experiment) -> list[PartTables]:
@@ -222,6 +236,8 @@ def build_parts(log: str, outcomes: Sequence[BlockOutcome], experiment: Experime
             beside, runs = _build_beside(outcomes, name).take(pa.array(order)), _build_runs(outcomes, name)
             accuracies = [accuracy for _, accuracy in sorted(_split_by_runs(outcomes, name), key=lambda one: one[0])]
             part = replace(part, beside=beside, runs=runs, total=sum_accuracy(accuracies))
+        if experiment.needless is not None:
+            part = replace(part, needless=_tabulate_needless(outcomes, name))
         parts.append(part)
     return parts
 
@@ -315,6 +331,7 @@ def _build_runs(outcomes: Sequence[BlockOutcome], name: str) -> pa.Table:
                     "existence": list(accuracy.settings.existence_thresholds),
                     "ghosts_at": accuracy.ghosts_at[s].tolist(),
                     "without_truth": int(held.without_truth[s]),
+                    **_driving_columns(scores.needless, s),
                     **instants,
                 }
             )
@@ -326,6 +343,41 @@ def _build_runs(outcomes: Sequence[BlockOutcome], name: str) -> pa.Table:
         if before is not None and (before is issue_s or np.array_equal(before, issue_s)):
             row |= dict.fromkeys(_INSTANTS)
     return pa.Table.from_pylist(rows, _RUNS)
+
+
+def _driving_columns(needless: NeedlessBraking | None, s: int) -> dict[str, Any]:
+    """The columns of `lists.parquet` about needless braking in one run."""
+    if needless is None:
+        return {}
+    values = (
+        needless.driving_s, int(needless.brakes[s]), float(needless.needless_s[s]), needless.needless_s_at[s].tolist(),
+        float(needless.speed_lost_mps[s]), needless.must_brake_s, float(needless.missed_s[s]),
+    )  # fmt: skip
+    return dict(zip(_DRIVING, values, strict=True))
+
+
+def _tabulate_needless(outcomes: Sequence[BlockOutcome], name: str) -> pa.Table:
+    """`PartTables.needless` of a configuration, by run and begin."""
+    parts = []
+    for outcome in outcomes:
+        found = outcome.all_scores[name].needless
+        assert found is not None
+        track_id = found.entries["track_id"]
+        columns = {
+            "run": outcome.runs[found.run_ix],
+            "begins_s": found.begins_s,
+            "lasts_s": found.lasts_s,
+            "speed_lost_mps": found.lost_mps,
+            "cause": found.cause,
+            "object_id": found.object_id,
+            "object_class": np.array(CLASSES, dtype=object)[found.class_ix],
+            "track_id": pa.array(track_id, mask=track_id < 0),
+            "x_m": found.entries["x_m"],
+            "y_m": found.entries["y_m"],
+        }
+        log, whose = [outcome.log] * len(found.run_ix), [name] * len(found.run_ix)
+        parts.append(pa.table({"log": log, "configuration": whose, **columns}, schema=_EVENTS))
+    return pa.concat_tables(parts).sort_by([("run", "ascending"), ("begins_s", "ascending")])
 
 
 # Parts as bytes: streams of Arrow, one after the other.
@@ -341,7 +393,7 @@ def pack_part(part: PartTables, about: str = "") -> bytes:
     total = None if part.total is None else _total_as_json(part.total)
     metadata: dict[bytes, bytes] | None = {b"about": about.encode(), b"total": json.dumps(total).encode()}
     stream = pa.BufferOutputStream()
-    for table in (part.rows, part.beside, part.runs):
+    for table in part.tables:
         if table is not None:
             table = table.drop_columns([name for name in _WHOSE if name in table.column_names]).combine_chunks()
             schema = table.schema.with_metadata(metadata)
@@ -361,12 +413,13 @@ def unpack_part(content: bytes, log: str, configuration: str, about: str = "") -
     if metadata[b"about"] != about.encode():
         raise ValueError("another recipe")
     total = parse_json(metadata[b"total"])
-    for k in (0, 2)[: len(tables)]:
+    for k in (place for place in (0, 2, 3) if place < len(tables)):
         for at, (name, value) in enumerate(zip(_WHOSE, (log, configuration), strict=True)):
             column = pa.repeat(pa.scalar(value, pa.string()), len(tables[k]))
             tables[k] = tables[k].replace_schema_metadata(None).add_column(at, name, column)
-    rows, beside, runs = (*tables, None, None)[:3]
-    return PartTables(log, configuration, rows, beside, runs, None if total is None else _total_from_json(total))
+    rows, beside, runs, needless = (*tables, None, None, None)[:4]
+    of_runs = None if total is None else _total_from_json(total)
+    return PartTables(log, configuration, rows, beside, runs, of_runs, needless)
 
 
 def _total_as_json(total: AccuracyTotal) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from copem_replay.core.components import ask_component
 from copem_replay.core.errors import InputError, count_noun, unknown_name_message
 from copem_replay.core.tracks import Bool, Float
 from copem_replay.experiment.criteria import Criterion, choose_judged
+from copem_replay.metrics.braking.driving import RATE, SHARE, sum_drives
 from copem_replay.metrics.config import BEGAN_BY, Slice, parse_slice
 from copem_replay.metrics.limits import (
     ALL_ALIKE,
@@ -230,7 +231,7 @@ class _JudgedStudy:
     @property
     def _of_rows(self) -> bool:
         """Whether a criterion needs more than the tally has."""
-        known = (*JUDGED, *PER_MINUTE)
+        known = (*JUDGED, *PER_MINUTE, RATE, SHARE)
         return any(one.against is None and one.metric not in known for one in self.criteria.values())
 
     @cached_property
@@ -328,6 +329,8 @@ class _JudgedStudy:
             return self._measure_rows(criterion, configuration, group)
         if metric in PER_MINUTE:
             return self._measure_lists(criterion, configuration, group)
+        if metric in (RATE, SHARE):
+            return self._measure_driving(criterion, configuration, group)
         return self._measure_sums(criterion, configuration, group)
 
     def _measure_rows(self, criterion: Criterion, configuration: str, group: _JudgedGroup) -> JudgedFigure:
@@ -448,6 +451,22 @@ class _JudgedStudy:
         columns = (PER_MINUTE[criterion.metric], "minutes")
         return self._limit_sums(criterion, configuration, lists, columns, lambda of: of[..., 0] / of[..., 1], "minutes")
 
+    def _measure_driving(self, criterion: Criterion, configuration: str, group: _JudgedGroup) -> JudgedFigure:
+        """Needless braking, which belongs to whole logs."""
+        lists = group.rows.lists
+        if lists is None:
+            why = "accuracy is not measured" if self.traffic.lists is None else "needless braking is of whole logs"
+            return replace(_NO_ROW, why=why)
+        drives = sum_drives(lists[lists["configuration"] == configuration], of_runs=criterion.of_runs)
+        if drives is None or not drives.hours.sum() > 0:
+            return replace(_NO_ROW, why="the ego does not drive")
+        figure, number = drives.limit(criterion.metric, criterion.confidence), len(drives.hours)
+        if drives.over == "runs" and not criterion.of_runs:
+            return JudgedFigure(LimitedFigure(figure.value), n=number, why=_ONE_DRIVE)
+        if drives.over is None:
+            return JudgedFigure(LimitedFigure(figure.value), n=number, why=f"{count_noun(number, 'log')}; {_RATHER}")
+        return JudgedFigure(figure, drives.over, number, number, units=number)
+
     # Differences.
 
     def _measure_difference(
@@ -526,6 +545,7 @@ def _difference_of(row: pd.Series, criterion: Criterion) -> JudgedFigure:
 
 
 _ONE_OBJECT = "one object tells nothing of other traffic; `population: these_logs` asks about this recording"
+_ONE_DRIVE = "one drive tells nothing of other driving; `population: these_logs` asks about this recording"
 _TOO_FEW = "too few logs, objects of one log, or runs have it for an interval"
 
 

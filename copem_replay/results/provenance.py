@@ -88,7 +88,8 @@ class Provenance:
 
     def kinds(self, name: str, *, compared: bool = False) -> dict[str, str]:
         """Kinds of the columns that a table has to have, all or only those that comparisons read."""
-        asked = {"braking": self.braking, "conflict": self.measure["conflict"]}
+        needless = self.braking and self.braking.get("needless") if self.measure["accuracy"] else None
+        asked = {"braking": self.braking, "conflict": self.measure["conflict"], "needless": needless}
         return TABLES[name].kinds(*(key for key, of in asked.items() if of is not None), compared=compared)
 
 

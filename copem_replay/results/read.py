@@ -363,7 +363,7 @@ class Results:
             if unknown:
                 raise InputError(f"{rows.place}: expected the {what} of provenance.json, found {min(unknown)!r}")
         names = [rows.place.name, *filter(self.has, COMPARED_FILES)]
-        kinds = {name: TABLES[name].kinds("braking", "fleet", compared=True) for name in names}
+        kinds = {name: TABLES[name].kinds("braking", "fleet", "needless", compared=True) for name in names}
         return {name: (rows if name == rows.place.name else self.log_rows(name)).only(kinds[name]) for name in names}
 
     def rows_of(self, log: str, names: Collection[str] | None = None) -> dict[str, pa.Table]:

@@ -36,7 +36,7 @@ from copem_replay.io.open import (
     sha256_of,
 )
 from copem_replay.io.recording import Recording
-from copem_replay.metrics.columns import COMPARED_FILES, TABLES
+from copem_replay.metrics.columns import COMPARED_FILES, NEEDLESS, TABLES
 from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.pipeline.cost import return_memory
 from copem_replay.pipeline.one_run import (
@@ -207,7 +207,7 @@ def list_results(
     files += ["exact.parquet"] * experiment.measure.exact + ["sweep.csv"] * any(True for _ in list_points(experiment))
     files += ["summary_by.csv"] * bool(experiment.measure.by)
     files += [name for name in COMPARED_FILES if experiment.measure.accuracy]
-    files += ["bands.csv"] * experiment.measure.accuracy
+    files += ["bands.csv"] * experiment.measure.accuracy + [NEEDLESS] * (experiment.needless is not None)
     for log in choose_logs(experiment, [recording.scene.log for recording in recordings]):
         for stem in list_stems(experiment):
             place, shown_count = _place_stem(stem, log, recordings), _count_with_views(experiment)

@@ -85,6 +85,13 @@ class EgoPath:
         speed = np.interp(time_s, self.frame_s, self.frame_mps)
         return Course(np.where(present, bound, np.nan), bound, speed, last_s + SAME_INSTANT_S)
 
+    def locate(self, along_m: Float) -> tuple[Float, Float]:
+        """Places (K,) so far along the path, straight on beyond its ends."""
+        path = self.path
+        k = np.clip(np.searchsorted(path[:, 0], along_m) - 1, 0, len(path) - 2)
+        f = (along_m - path[k, 0]) / (path[k + 1, 0] - path[k, 0])
+        return path[k, 1] + f * (path[k + 1, 1] - path[k, 1]), path[k, 2] + f * (path[k + 1, 2] - path[k, 2])
+
     def states(self, object_ix: int, time_s: Float) -> tuple[dict[str, Float], Bool]:
         """The states of an object at instants (T,), and whether it is in the log then."""
         which = np.full(len(time_s), object_ix)
@@ -293,18 +300,11 @@ def _may_meet(
     rows, bound_m = rows[shared], course.bound_m[shared]
     if not len(rows):
         return False
-    x, y = _locate_on_path(ego.path, bound_m)
+    x, y = ego.locate(bound_m)
     dx, dy = truth.x_m[0, rows] - x, truth.y_m[0, rows] - y
     radii = (np.hypot(*ego.size_m) + np.hypot(truth.length_m[0, rows[0]], truth.width_m[0, rows[0]])) / 2
     step = np.hypot(np.diff(dx), np.diff(dy)).max(initial=0.0)
     return bool((np.hypot(dx, dy) - radii - step).min() <= margin_m)
-
-
-def _locate_on_path(path: Float, along_m: Float) -> tuple[Float, Float]:
-    """Places (K,) on a path, straight on beyond its ends."""
-    k = np.clip(np.searchsorted(path[:, 0], along_m) - 1, 0, len(path) - 2)
-    f = (along_m - path[k, 0]) / (path[k + 1, 0] - path[k, 0])
-    return path[k, 1] + f * (path[k + 1, 1] - path[k, 1]), path[k, 2] + f * (path[k + 1, 2] - path[k, 2])
 
 
 def _find_encounter(

@@ -59,6 +59,7 @@ from copem_replay.results.compare.limits import (
 )
 from copem_replay.results.compare.metrics import (
     HELD_METRICS,
+    OF_LISTS,
     GhostTotals,
     PairSettings,
     Regret,
@@ -105,7 +106,7 @@ class AllLogs:
         self.alone.append((int((first.there & ~second.there).sum()), int((second.there & ~first.there).sum())))
         for regret in regrets:
             # Runs and passes stay apart for a single object: they are the clusters if no log has another.
-            runs = over_runs or regret.counts[0][0] <= 1
+            runs = over_runs or regret.counts[0][0] <= 1 or regret.figure.by_drive
             figure = regret.figure.condensed(runs=runs) if more else regret.figure
             self._regrets.setdefault(regret.metric, []).append(replace(regret, figure=figure))
 
@@ -123,7 +124,7 @@ class AllLogs:
         """The regret of every metric over all logs. `weigh`: `drives`: each log counts as much as another."""
         for of_logs in self._regrets.values():
             regret = Regret.joined(of_logs)
-            once = weigh == DRIVES and len(of_logs) > 1 and COMPARED[regret.metric].part != "lists"
+            once = weigh == DRIVES and len(of_logs) > 1 and COMPARED[regret.metric].part not in OF_LISTS
             yield replace(regret, figure=regret.figure.each_drive_once()) if once else regret
 
 

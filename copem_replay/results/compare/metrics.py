@@ -260,7 +260,8 @@ class Regret:
     @property
     def over(self) -> str | None:
         """The clusters of its interval; None: there are too few."""
-        return choose_over(*total_counts(self.counts))
+        logs, *_ = counts = total_counts(self.counts)
+        return "runs" if self.figure.by_drive and logs == 1 else choose_over(*counts)
 
     @staticmethod
     def joined(of_logs: Sequence[Regret]) -> Regret:
@@ -342,7 +343,7 @@ def compute_regrets(
         of = metric.compared
         if of is None or (only is not None and metric.name not in only):
             continue
-        pair, counts = pairs[0 if metric.part == "lists" else 1]
+        pair, counts = pairs[0 if metric.part in OF_LISTS else 1]
         figure = FIGURES[of.figure](pair) if isinstance(of.figure, str) else _means(pair, of.figure)
         if figure is not None:
             held = pair.held_counts if FIGURES.get(of.figure) in (_held_errors, _held_gospa) else None
@@ -484,6 +485,21 @@ def _ghost_rates(pair: _Pair) -> SumStatistic | None:
     return SumStatistic(parts=(items,), by_object=len(accuracy) == 2, of=_divide_rates)
 
 
+def _needless_rates(name: str, scale: float, most: float) -> Callable[[_Pair], SumStatistic | None]:
+    """Needless brakes, or seconds of them, per unit of driving; they belong to runs only."""
+
+    def of(pair: _Pair) -> SumStatistic | None:
+        first, second = pair.first.lists, pair.second.lists
+        if first is None or second is None or name not in first or name not in second:
+            return None
+        present = first["there"] & second["there"]
+        sums = np.stack([first[name], second[name], first["driving_s"] / scale], axis=1).astype(float)
+        items = pair.items(-1 - np.flatnonzero(present), sums=sums[present])
+        return SumStatistic(parts=(items,), by_object=False, by_drive=True, of=_divide_mean, most=most)
+
+    return of
+
+
 def _append_run_items(pair: _Pair, cells: Int, of_cells: Float, of_runs: Float, n: Int) -> StatisticItems:
     """Items of cells, then of the runs with `n (S,)` above 0."""
     runs = np.flatnonzero(n)
@@ -507,6 +523,8 @@ def _divide_rates(sums: Float) -> tuple[Float, Float]:
     return sums[..., 0] / sums[..., 2], sums[..., 1] / sums[..., 3]
 
 
+OF_LISTS = ("lists", "needless")
+"""Parts of metrics that are of whole lists, and of driving: whatever rows count."""
 FIGURES: Mapping[Any, Callable[[_Pair], PairStatistic | None]] = {
     "restricted means": lambda pair: _restricted_means(
         pair, [((1.0, side.rows["detection_s"]),) for side in pair.sides]
@@ -519,6 +537,8 @@ FIGURES: Mapping[Any, Callable[[_Pair], PairStatistic | None]] = {
     "held GOSPA": _held_gospa,
     "ghosts": _ghost_rates,
     "passes": _passes,
+    "needless brakes": _needless_rates("needless_brakes", 3600.0, np.inf),
+    "needless time": _needless_rates("needless_s", 1.0, 1.0),
 }
 """Figures of pairs by the names that metrics compared by them give; None: a side has no data."""
 
