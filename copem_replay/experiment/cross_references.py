@@ -24,10 +24,11 @@ from copem_replay.experiment.file import (
 )
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.ground_truth import MAX_GAP_S
+from copem_replay.metrics.braking.driving import JUDGED_DRIVING
 from copem_replay.metrics.config import BEGAN_BY, CLASS, LONGEST_CHAIN, onset_requirement
 from copem_replay.metrics.onset import BEGAN, Requires
 from copem_replay.metrics.row_figures import JUDGED, PER_MINUTE, SUMMED
-from copem_replay.metrics.summary_metrics import COMPARED, METRICS_OF
+from copem_replay.metrics.summary_metrics import COMPARED, METRICS_OF, OF_LISTS
 
 NO_EGO = "none"
 """The value of `ego: none`: the study has no ego."""
@@ -391,6 +392,10 @@ def _is_name(value: object) -> bool:
 _ASKED: dict[str, tuple[Callable[[Mapping[str, Any]], bool], str]] = {
     "braking": (lambda data: data.get("braking") is not None, "`braking: {driver: …}`"),
     "conflict": (lambda data: _measure_data(data).get("conflict") is not None, "`measure: {conflict: {}}`"),
+    "needless": (
+        lambda data: isinstance(of := data.get("braking"), Mapping) and of.get("needless", {}) is not None,
+        "`braking: {driver: …}`",
+    ),
     "accuracy": (lambda data: _measure_data(data).get("accuracy", True) is not False, "`measure: {accuracy: true}`"),
     "exact": (lambda data: _measure_data(data).get("exact") is True, "`measure: {exact: true}`"),
 }
@@ -438,7 +443,7 @@ def check_criteria(source: ExperimentSource, study: Mapping[str, Any]) -> Iterat
 
 def _is_of_rows(metric: object) -> bool:
     """Whether a compared metric is of rows of detections."""
-    return metric in COMPARED and COMPARED[str(metric)].part != "lists"
+    return metric in COMPARED and COMPARED[str(metric)].part not in OF_LISTS
 
 
 def _check_group(source: ExperimentSource, key: Key, by: object) -> Iterator[str]:
@@ -462,13 +467,13 @@ def _find_metric_problem(metric: str, paired: bool, study: Mapping[str, Any]) ->
     if paired and metric not in COMPARED:
         listed = ", ".join(COMPARED)
         return f"expected a metric that `compare` pairs, as there is `against`, found {metric}; there are {listed}"
-    judged = (*JUDGED, *SUMMED, *PER_MINUTE, *own)
+    judged = (*JUDGED, *SUMMED, *PER_MINUTE, *JUDGED_DRIVING, *own)
     if not paired and metric not in judged:
         if metric in COMPARED:
             return f"{metric} is a difference of two configurations; say `against: <configuration>`"
         return f"expected a metric that has an interval over logs or runs, found {metric}{_judged_instead(metric)}"
     needs = [of.get(metric, "")] + ["braking"] * (metric in JUDGED and "braking" in JUDGED[metric].rows)
-    if metric in COMPARED and COMPARED[metric].compared and (COMPARED[metric].compared or (0, 0, ()))[2]:
+    if "needless" in needs or (metric in COMPARED and (COMPARED[metric].compared or (0, 0, ()))[2]):
         needs.append("accuracy")
     for what in needs:
         if what in _ASKED and not _ASKED[what][0](study):
@@ -479,7 +484,8 @@ def _find_metric_problem(metric: str, paired: bool, study: Mapping[str, Any]) ->
 def _judged_instead(metric: str) -> str:
     if f"{metric.removesuffix('_m')}_held_m" in COMPARED:
         return f"; with `against`, {metric.removesuffix('_m')}_held_m has one"
-    return f"; there are {', '.join(name for name in (*JUDGED, *SUMMED, *PER_MINUTE) if not name.endswith('_exact'))}"
+    names = (name for name in (*JUDGED, *SUMMED, *PER_MINUTE, *JUDGED_DRIVING) if not name.endswith("_exact"))
+    return f"; there are {', '.join(names)}"
 
 
 def read_criteria(given: Path | Mapping[str, Any], study: Mapping[str, Any]) -> dict[str, Criterion]:

@@ -17,6 +17,7 @@ from copem_replay.core.errors import count_noun, wrap_line
 from copem_replay.core.tracks import SAME_INSTANT_S, Int
 from copem_replay.metrics.accuracy.metrics import beyond_gate_share
 from copem_replay.metrics.accuracy.statistics import AccuracyTotal
+from copem_replay.metrics.braking.driving import RATE, SHARE
 from copem_replay.metrics.limits import (
     DRIVES,
     NOT_ENOUGH,
@@ -25,9 +26,11 @@ from copem_replay.metrics.limits import (
     choose_over,
     count_clusters,
     describe_absent,
+    describe_clusters,
     explain_no_clusters,
     format_limits,
     interval_words,
+    limit_rate,
 )
 from copem_replay.metrics.metric import (
     LinkTimes,
@@ -331,7 +334,7 @@ def _split_by_configuration(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
 # Tables as plain text, nothing cut off: whole in a pipe, in blocks that fit the width of a terminal.
 
 _GAP = "  "
-SETUP = ("n", "list_rate_hz", "n_conflict")
+SETUP = ("n", "list_rate_hz", "n_conflict", "driving_h", "must_brake_s")
 """Columns of the set-up, not of results: written once, below the table, where all configurations are alike."""
 
 
@@ -373,6 +376,8 @@ def format_summary(summary: pd.DataFrame, width: int | None = None) -> str:
         lines += ["", *_part_lines(summary, "braking", width, "pass_share")]
         lines += describe_intervals(summary, "pass_interval")
         lines.append("pass_share: share of conflicts that the configured driver avoids when braking after detection")
+    if SHARE in summary:
+        lines += ["", *_describe_needless(summary, width)]
     if "output_latency_s" in summary:
         lines += ["", *_part_lines(summary[summary["output_delay_s"].notna()], "output", width)]
         lines.append("output_latency_s: available − the stamp of the state; output_delay_s: that stamp − the state")
@@ -380,6 +385,20 @@ def format_summary(summary: pd.DataFrame, width: int | None = None) -> str:
     if own:
         lines += ["", format_table(summary[["configuration", *own]], width)]
     return "\n".join(part for line in lines for part in (wrap_line(line, width) if "\n" not in line else [line]))
+
+
+def _describe_needless(summary: pd.DataFrame, width: int | None) -> list[str]:
+    """Braking for nothing: a table where there is any, else how rare it is at most."""
+    driving_h, rate = float(summary["driving_h"].max()), summary[RATE].dropna()
+    if not driving_h > 0:
+        return ["braking for nothing: not known, for the ego does not drive"]
+    if not rate.any():
+        below = limit_rate(np.zeros(1), np.full(1, driving_h))[1]
+        return [f"braking for nothing: none in {format_cell(3600 * driving_h)} s of driving: below {below:.3g} an hour"]
+    over = summary["needless_interval_over"].dropna()
+    lines = _part_lines(summary, "needless", width, RATE)
+    lines += [f"95 %: Poisson limits over {describe_clusters(str(over.iloc[0]))}"] if len(over) else []
+    return [*lines, "needless_*: the driver would have to brake for an entry of a list, and the truth gives no reason"]
 
 
 def _part_lines(summary: pd.DataFrame, part: str, width: int | None, share: str = "") -> list[str]:

@@ -445,6 +445,8 @@ COMPARED: dict[str, Metric] = {
 }
 """The metrics that `compare` holds against a baseline, in its order."""
 
+OF_LISTS = ("lists", "needless")
+"""Parts of metrics that are of whole lists, or of driving: of all rows, whichever count for times."""
 PARTS = {
     "summary": "When, and how far away",
     "undetected": "What became of those never detected",

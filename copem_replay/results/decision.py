@@ -2,7 +2,8 @@
 
 With criteria the sentence is their verdicts. Else it is by the share of conflicts that pass, where it differs, else by
 the mean time to detection: who is better than the baseline, who is worse, of whom no difference is shown, each by the
-95 % interval of the difference over the rows of its own pair. Without an interval nothing is claimed.
+95 % interval of the difference over the rows of its own pair. Without an interval nothing is claimed. Whoever brakes
+for nothing for longer than the baseline is named after that, and is never among the best.
 
 Of one object in one run, what would help the configuration that knows it last: a key of another one, or its units.
 """
@@ -20,6 +21,7 @@ import pandas as pd
 from copem_replay.core.errors import count_noun
 from copem_replay.core.tracks import SAME_INSTANT_S, TRUTH
 from copem_replay.experiment.schema import Experiment
+from copem_replay.metrics.braking.driving import SHARE
 from copem_replay.metrics.limits import format_limit, format_limits
 from copem_replay.results.compare import Comparison, compare_folders
 from copem_replay.results.compare.limits import BETTER, OPEN, WORSE
@@ -36,6 +38,8 @@ MATTERS_SHARE = 0.005
 """Smaller differences of shares name no winner: half of a per cent."""
 DECIDED_BY = ("ttd_rmst_s", "pass_share")
 """Metrics that a decision is about."""
+MATTERS_DRIVING = 0.001
+"""Braking for nothing in a smaller share of the driving time is not told: 3.6 s an hour."""
 _SAME = "same"
 """The word of a pair whose figures are the same throughout, so that there is no interval."""
 _NEAR = "near"
@@ -67,8 +71,8 @@ def decide(results: Results, comparison: Comparison | None = None, verdicts: Jud
     elif len(names) == 1:
         found = _describe_alone(results, names[0])
     else:
-        comparison = comparison or compare_folders([results], metrics=DECIDED_BY)
-        found = decide_compared(comparison, results.experiment)
+        comparison = comparison or compare_folders([results], metrics=(*DECIDED_BY, SHARE))
+        found = decide_compared(comparison, results)
     return found if verdicts is None else Decision(describe_verdicts(verdicts), found.best)
 
 
@@ -146,8 +150,8 @@ def _format_edge(share: float) -> str:
     return "< 0.1 %" if share < 0.5 else "> 99.9 %"
 
 
-def decide_compared(comparison: Comparison, experiment: Experiment | None = None) -> Decision:
-    """The decision on a comparison. `experiment`: of the one folder that is compared, whose latencies it may be about.
+def decide_compared(comparison: Comparison, results: Results | None = None) -> Decision:
+    """The decision on a comparison. `results`: the one folder that is compared, whose latencies it may be about.
 
     The ground truth is no choice.
     """
@@ -163,8 +167,10 @@ def decide_compared(comparison: Comparison, experiment: Experiment | None = None
     best = [name for name, gain in ranked.items() if not scale.matters(top - gain)]
     if any(name in pairs and pairs[name].word == OPEN for name in best):
         best.append(comparison.baseline)
-    told = _tell_latencies(comparison.baseline, pairs, scale, experiment)
-    return Decision(f"{told or _tell_groups(comparison.baseline, pairs, scale)}.", tuple(dict.fromkeys(best)))
+    told = _tell_latencies(comparison.baseline, pairs, scale, None if results is None else results.experiment)
+    brakers, sentence = _tell_needless(comparison, None if results is None else results.summary)
+    best = [name for name in dict.fromkeys(best) if name not in brakers]
+    return Decision(f"{told or _tell_groups(comparison.baseline, pairs, scale)}.{sentence}", tuple(best))
 
 
 def _choose_scale(rows: pd.DataFrame) -> _Scale:
@@ -235,6 +241,45 @@ def _list_pairs(pairs: Mapping[str, _JudgedPair], scale: _Scale) -> str:
             shown.append(f"{listed} {words}".rstrip())
     more = len(pairs) - _NAMED
     return ", ".join(shown) + (f" and {more} more" if more > 0 else "")
+
+
+# Who brakes for nothing.
+
+
+def _tell_needless(comparison: Comparison, summary: pd.DataFrame | None) -> tuple[set[str], str]:
+    """Who brakes for nothing for longer than the baseline, or if that does than another; and a sentence, “” of nobody.
+
+    Shown by the interval of the difference; where there is none, of these drives.
+    """
+    rows = comparison.overall[comparison.overall["metric"] == SHARE]
+    rows = rows[~rows["configuration"].isin(comparison.truths) & rows["difference"].notna()]
+    shown = rows["low"].isna() | (rows["low"] > NOTHING) | (rows["high"] < -NOTHING)
+    apart = rows[shown & (rows["difference"].abs() >= MATTERS_DRIVING)].sort_values("value", ascending=False)
+    longer, shorter = apart[apart["difference"] > 0], apart[apart["difference"] < 0]
+    brakers = {str(row.configuration): float(row.value) for row in longer.itertuples(index=False)}
+    against, least = comparison.baseline, float(apart["baseline_value"].min()) if len(apart) else 0.0
+    if len(shorter):
+        brakers[comparison.baseline] = float(shorter["baseline_value"].max())
+        against, least = str(shorter["configuration"].iloc[-1]), float(shorter["value"].iloc[-1])
+    if not brakers:
+        return set(), ""
+    names = sorted(brakers, key=lambda name: -brakers[name])
+    others = [f", with {name} in {_format_share(brakers[name])}" for name in names[1:_NAMED]]
+    told = (
+        f" But with {names[0]} the driver brakes for nothing in {_format_share(brakers[names[0]])} of the driving time"
+    )
+    told += "".join(others) + (f" and with {len(names) - _NAMED} more" if len(names) > _NAMED else "")
+    of = None if summary is None else summary.set_index("configuration")
+    driving_s = None if of is None else 3600 * float(of["driving_h"].max())
+    here = "" if driving_s is None else f" in these {driving_s:.3g} s"
+    told += f" ({against}: {f'never{here}' if least == 0 else _format_share(least)})"
+    if of is not None:
+        told += f", losing up to {of.loc[names, 'needless_speed_lost_max_mps'].max():.3g} m/s at a time"
+    return set(brakers), f"{told}."
+
+
+def _format_share(share: float) -> str:
+    return f"{100 * share:.0f} %" if 0.095 <= share < 0.995 or share == 1 else f"{100 * share:.2g} %"
 
 
 # Of configurations that differ in nothing but their latency.

@@ -22,7 +22,7 @@ from copem_replay.core.components import ask_component
 from copem_replay.core.errors import InputError, count_noun, unknown_name_message
 from copem_replay.core.tracks import Bool, Float
 from copem_replay.experiment.criteria import Criterion, choose_judged
-from copem_replay.metrics.braking.driving import RATE, SHARE, sum_drives
+from copem_replay.metrics.braking.driving import JUDGED_DRIVING, sum_drives
 from copem_replay.metrics.config import BEGAN_BY, Slice, parse_slice
 from copem_replay.metrics.limits import (
     ALL_ALIKE,
@@ -231,7 +231,7 @@ class _JudgedStudy:
     @property
     def _of_rows(self) -> bool:
         """Whether a criterion needs more than the tally has."""
-        known = (*JUDGED, *PER_MINUTE, RATE, SHARE)
+        known = (*JUDGED, *PER_MINUTE, *JUDGED_DRIVING)
         return any(one.against is None and one.metric not in known for one in self.criteria.values())
 
     @cached_property
@@ -329,7 +329,7 @@ class _JudgedStudy:
             return self._measure_rows(criterion, configuration, group)
         if metric in PER_MINUTE:
             return self._measure_lists(criterion, configuration, group)
-        if metric in (RATE, SHARE):
+        if metric in JUDGED_DRIVING:
             return self._measure_driving(criterion, configuration, group)
         return self._measure_sums(criterion, configuration, group)
 

@@ -20,7 +20,7 @@ from copem_replay.metrics.metric import Compared, Metric, MetricInputs
 if TYPE_CHECKING:
     import pandas as pd
 
-RATE, SHARE = "needless_brakes_per_h", "needless_brake_share"
+JUDGED_DRIVING = RATE, SHARE = "needless_brakes_per_h", "needless_brake_share"
 """Metrics that are held against bounds."""
 
 
@@ -112,19 +112,17 @@ def _if_driving(name: str) -> Callable[[Drives], float | None]:
     return lambda of: getattr(of, name) if of.hours.sum() > 0 else None
 
 
-_COMPARED = ("lists.parquet",)
 DRIVING = (
     Metric("driving_h", _measure, _hours, 0, "hours in which the ego drives, at `slower_mps` or faster", "needless",
            "hours of driving"),
     Metric(RATE, _measure, _end(Drives.limit_rate, "value"), -1,
-           "how often the driver brakes for nothing, per hour of driving", "needless", "brakes for nothing per hour",
-           Compared("needless brakes per hour of driving", "needless brakes", _COMPARED)),
+           "how often the driver brakes for nothing, per hour of driving", "needless", "brakes for nothing per hour"),
     Metric(f"{RATE}_low", _measure, _end(Drives.limit_rate, "low"), 0, f"lower limit of {RATE}, 95 %"),
     Metric(f"{RATE}_high", _measure, _end(Drives.limit_rate, "high"), 0, f"upper limit of {RATE}, 95 %"),
     Metric(SHARE, _measure, _end(Drives.limit_share, "value"), -1,
            "share of the driving time in which the driver brakes for nothing", "needless",
            "time braking for nothing, %",
-           Compared("share of the driving time with needless braking", "needless time", _COMPARED)),
+           Compared("share of the driving time with needless braking", "needless time", ("lists.parquet",))),
     Metric(f"{SHARE}_low", _measure, _end(Drives.limit_share, "low"), 0, f"lower limit of {SHARE}, 95 %"),
     Metric(f"{SHARE}_high", _measure, _end(Drives.limit_share, "high"), 0, f"upper limit of {SHARE}, 95 %"),
     Metric("needless_interval_over", _measure, lambda of: of.over, 0,

@@ -30,7 +30,7 @@ from copem_replay.metrics.limits import (
     choose_over,
     explain_no_clusters,
 )
-from copem_replay.metrics.summary_metrics import COMPARED
+from copem_replay.metrics.summary_metrics import COMPARED, OF_LISTS
 from copem_replay.results.compare.groups import EpisodeGroups, without_limits_over_runs
 from copem_replay.results.compare.labels import (
     LabelledConfiguration,
@@ -59,7 +59,6 @@ from copem_replay.results.compare.limits import (
 )
 from copem_replay.results.compare.metrics import (
     HELD_METRICS,
-    OF_LISTS,
     GhostTotals,
     PairSettings,
     Regret,

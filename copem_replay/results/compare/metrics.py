@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import Bool, Float, Int
 from copem_replay.metrics.limits import choose_over
-from copem_replay.metrics.summary_metrics import COMPARED
+from copem_replay.metrics.summary_metrics import COMPARED, OF_LISTS
 from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, compute_unknown_s
 from copem_replay.results.compare.labels import LabelledConfiguration
 from copem_replay.results.compare.limits import (
@@ -485,19 +485,15 @@ def _ghost_rates(pair: _Pair) -> SumStatistic | None:
     return SumStatistic(parts=(items,), by_object=len(accuracy) == 2, of=_divide_rates)
 
 
-def _needless_rates(name: str, scale: float, most: float) -> Callable[[_Pair], SumStatistic | None]:
-    """Needless brakes, or seconds of them, per unit of driving; they belong to runs only."""
-
-    def of(pair: _Pair) -> SumStatistic | None:
-        first, second = pair.first.lists, pair.second.lists
-        if first is None or second is None or name not in first or name not in second:
-            return None
-        present = first["there"] & second["there"]
-        sums = np.stack([first[name], second[name], first["driving_s"] / scale], axis=1).astype(float)
-        items = pair.items(-1 - np.flatnonzero(present), sums=sums[present])
-        return SumStatistic(parts=(items,), by_object=False, by_drive=True, of=_divide_mean, most=most)
-
-    return of
+def _needless_time(pair: _Pair) -> SumStatistic | None:
+    """Shares of the driving time with needless braking, which belongs to runs only."""
+    first, second = pair.first.lists, pair.second.lists
+    if first is None or second is None or "needless_s" not in first or "needless_s" not in second:
+        return None
+    runs = np.flatnonzero(first["there"] & second["there"])
+    sums = np.stack([first["needless_s"], second["needless_s"], first["driving_s"]], axis=1)[runs]
+    items = pair.items(-1 - runs, sums=sums)
+    return SumStatistic(parts=(items,), by_object=False, by_drive=True, of=_divide_mean, most=1.0)
 
 
 def _append_run_items(pair: _Pair, cells: Int, of_cells: Float, of_runs: Float, n: Int) -> StatisticItems:
@@ -523,8 +519,6 @@ def _divide_rates(sums: Float) -> tuple[Float, Float]:
     return sums[..., 0] / sums[..., 2], sums[..., 1] / sums[..., 3]
 
 
-OF_LISTS = ("lists", "needless")
-"""Parts of metrics that are of whole lists, and of driving: whatever rows count."""
 FIGURES: Mapping[Any, Callable[[_Pair], PairStatistic | None]] = {
     "restricted means": lambda pair: _restricted_means(
         pair, [((1.0, side.rows["detection_s"]),) for side in pair.sides]
@@ -537,8 +531,7 @@ FIGURES: Mapping[Any, Callable[[_Pair], PairStatistic | None]] = {
     "held GOSPA": _held_gospa,
     "ghosts": _ghost_rates,
     "passes": _passes,
-    "needless brakes": _needless_rates("needless_brakes", 3600.0, np.inf),
-    "needless time": _needless_rates("needless_s", 1.0, 1.0),
+    "needless time": _needless_time,
 }
 """Figures of pairs by the names that metrics compared by them give; None: a side has no data."""
 

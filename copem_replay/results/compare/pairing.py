@@ -186,7 +186,7 @@ def lay_out_configuration(labelled: LabelledConfiguration, tables: dict[str, pa.
 
 def _read_columns(place: Path, rows: pa.Table) -> Columns:
     """(n,) the columns that comparisons read and that are no keys of rows, nor text or lists."""
-    kinds = TABLES[place.name].kinds("braking", compared=True)
+    kinds = TABLES[place.name].kinds("braking", "needless", compared=True)
     return {
         name: _READ[kind](rows[name])
         for name, kind in kinds.items()

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from copem_replay.core.errors import OutputError, count_noun, escape_unprintable, wrap_line
+from copem_replay.metrics.braking.driving import SHARE
 from copem_replay.metrics.limits import (
     ALL_ALIKE,
     EXACT,
@@ -112,6 +113,8 @@ def write_comparison(comparison: Comparison, path: Path, folders: Sequence[Path]
 def _format_cells(comparison: Comparison) -> pd.DataFrame:
     rows = {(row.configuration, row.metric): row for row in comparison.overall.itertuples(index=False)}
     metrics = [metric for metric in COMPARED if any((name, metric) in rows for name in comparison.configurations)]
+    if not any(row.value or row.baseline_value for (_, metric), row in rows.items() if metric == SHARE):
+        metrics = [metric for metric in metrics if metric != SHARE]  # nobody brakes for nothing
     columns: dict[str, list[str]] = {"configuration": list(comparison.configurations)}
     for metric in metrics:
         columns[metric] = [_format_cell(rows.get((name, metric))) for name in comparison.configurations]
@@ -204,16 +207,20 @@ def _describe_stars(comparison: Comparison, rows: pd.DataFrame) -> Iterator[str]
 
 
 def _describe_better(comparison: Comparison) -> Iterator[str]:
-    """Lines on the configurations that are better than the baseline; metrics with the same ones share a line."""
-    metrics: dict[tuple[str, str], list[str]] = {}
+    """Lines on the configurations that are better than the baseline, or worse in braking for nothing; metrics with the
+    same ones share a line.
+    """
+    metrics: dict[tuple[str, str, str], list[str]] = {}
     for metric, row in COMPARED.items():
         of_metric = comparison.overall[comparison.overall["metric"] == metric]
-        beyond = (of_metric["star"] == STAR) & (of_metric["difference"] * row.better > 0)
-        for baseline, rows in of_metric[beyond].groupby("baseline", sort=False):
-            names = ", ".join(map(_name_with_logs, rows.itertuples(index=False)))
-            metrics.setdefault((names, str(baseline)), []).append(metric)
-    for (names, baseline), of_names in metrics.items():
-        yield f"better than {baseline} in {', '.join(of_names)} ({STAR}): {names}"
+        gain = of_metric["difference"] * row.better
+        for word, beyond in (("better", gain > 0), ("worse", (gain < 0) & (row.part == "needless"))):
+            rows_beyond = of_metric[beyond & (of_metric["star"] == STAR)]
+            for baseline, rows in rows_beyond.groupby("baseline", sort=False):
+                names = ", ".join(map(_name_with_logs, rows.itertuples(index=False)))
+                metrics.setdefault((word, names, str(baseline)), []).append(metric)
+    for (word, names, baseline), of_names in metrics.items():
+        yield f"{word} than {baseline} in {', '.join(of_names)} ({STAR}): {names}"
 
 
 def _describe_logs(limited: pd.DataFrame) -> Iterator[str]:
