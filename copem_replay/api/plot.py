@@ -24,6 +24,7 @@ __all__ = [
     "detection_curves",
     "differences",
     "distances",
+    "false_positives",
     "late_paths",
     "latency_breakdown",
     "single_runs",
@@ -163,20 +164,33 @@ def sweeps(results: AnyResults, *, configurations: Sequence[str] | None = None) 
     return sweeps_figure(take_results(results), configurations=configurations)
 
 
-def trade_off(results: AnyResults, *, configurations: Sequence[str] | None = None) -> Figure:
+def false_positives(results: AnyResults, *, configurations: Sequence[str] | None = None) -> Figure:
     """False positives per minute over the position error (RMSE) in metres: a mark per configuration.
 
     Raises InputError for a configuration that is not among the results, and where fewer than two have both figures.
 
-    >>> cr.plot.trade_off("out/tc016d")
+    >>> cr.plot.false_positives("out/tc016d")
     Traceback (most recent call last):
-    copem_replay.core.errors.InputError: out/tc016d: no figure of trade_off: ...
+    copem_replay.core.errors.InputError: out/tc016d: no figure of false_positives: ...
+    """
+    return _draw("false_positives", results, configurations)
+
+
+def trade_off(results: AnyResults, *, configurations: Sequence[str] | None = None) -> Figure:
+    """Seconds sooner than the car alone against the share of the driving time with needless braking: a mark per
+    configuration, a line where entries of more existence alone would be listed.
+
+    Raises InputError for a configuration that is not among the results, and where fewer than two have both figures.
+
+    >>> len(cr.plot.trade_off("out/tc016d").axes)
+    1
     """
     return _draw("trade_off", results, configurations)
 
 
 _LACKING = {
-    "trade_off": "fewer than two configurations have both false positives and position errors",
+    "trade_off": "no driver is asked when he brakes for nothing, or fewer than two configurations have lists",
+    "false_positives": "fewer than two configurations have both false positives and position errors",
     "late_paths": "of the truth alone nothing is late",
 }
 """Why a figure cannot be drawn, where `plot` leaves it out without a word."""

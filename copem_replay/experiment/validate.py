@@ -105,6 +105,7 @@ def check_against_log(
         elif unit.on is not None and unit.on not in scene.object_number:
             yield ("units", name, "on"), f"no object {unit.on!r} in the log; there are {moving_ids(scene)}"
     yield from _check_units_in_solids(experiment, recording)
+    yield from _check_velocities(experiment, recording)
     onset = experiment.measure.onset
     if onset.requires is not Requires.UNIT_ON_EGO or known:
         return
@@ -126,6 +127,23 @@ def _check_units_in_solids(experiment: Experiment, recording: Recording) -> Iter
                 f"{name} stands {depth_m:.2g} m inside {solid.name} (z {solid.bottom_m:.4g} … {solid.top_m:.4g} m): it "
                 "would look through it; expected a place beside it, or `height_m` above its top",
             )
+
+
+def _check_velocities(experiment: Experiment, recording: Recording) -> Iterator[tuple[Key, str]]:
+    """Lists without velocities cannot say whether the driver must brake, unless their fusion remembers places."""
+    used = {
+        unit
+        for name, configuration in experiment.configurations.items()
+        if not getattr(configuration.fusion, "remembers", False)
+        for unit in (*experiment.units_of(configuration), output_unit(name))
+    }
+    silent = [name for name, of in recording.lists.items() if not of.velocity_said and len(of.tracks.frame_ix)]
+    if experiment.needless is not None and (named := [name for name in silent if name in used]):
+        yield (
+            ("braking", "needless"),
+            f"the lists of {', '.join(named)} state no velocity, so all would stand in the way; expected a fusion that "
+            "remembers (tracker), or `braking: {needless: null}`",
+        )
 
 
 def _describe_host(recording: Recording) -> str:

@@ -31,6 +31,8 @@ from copem_replay.io.encodings import make_definition
 from copem_replay.io.encodings.columns import DefinitionError, shred_messages
 from copem_replay.io.findings import (
     MOST_SHARE,
+    VX,
+    VY,
     Finding,
     complete_entries,
     complete_sizes,
@@ -115,6 +117,7 @@ class RecordedLists:
     `existence` is NaN where the list does not state it; `class_probability (P, C)` sums to 1. `spread_said`: whether
     the list states the covariance of the position, else it is 0. `capture_said (F,)`: whether the list states its
     capture, `stamped (F,)`: whether it has a time stamp, `logged_ns (F,)`: the log time of its message.
+    `velocity_said`: whether any entry states its velocity, else it is 0.
     """
 
     tracks: Tracks
@@ -125,6 +128,7 @@ class RecordedLists:
     capture_said: Bool
     stamped: Bool
     logged_ns: Int
+    velocity_said: bool
     notes: tuple[str, ...]  # entries that were left out or completed
 
 
@@ -194,6 +198,7 @@ def _make_recorded(
         times.capture_said[by_time],
         times.stamped[by_time],
         times.logged_ns[by_time],
+        bool(np.isfinite(values[:, VX : VY + 1]).any()),
         tuple(findings),
     )  # fmt: skip
 

@@ -395,9 +395,12 @@ def _describe_needless(summary: pd.DataFrame, width: int | None) -> list[str]:
     if not rate.any():
         below = limit_rate(np.zeros(1), np.full(1, driving_h))[1]
         return [f"braking for nothing: none in {format_cell(3600 * driving_h)} s of driving: below {below:.3g} an hour"]
-    over = summary["needless_interval_over"].dropna()
+    over = {*summary["needless_interval_over"].dropna()}
     lines = _part_lines(summary, "needless", width, RATE)
-    lines += [f"95 %: Poisson limits over {describe_clusters(str(over.iloc[0]))}"] if len(over) else []
+    lines += (
+        [f"95 %: Poisson limits over logs; {describe_clusters('logs').partition(': ')[2]}"] if "logs" in over else []
+    )
+    lines += ["95 %: Poisson limits over runs: how far other draws may differ on this drive"] if "runs" in over else []
     return [*lines, "needless_*: the driver would have to brake for an entry of a list, and the truth gives no reason"]
 
 

@@ -38,8 +38,6 @@ MATTERS_SHARE = 0.005
 """Smaller differences of shares name no winner: half of a per cent."""
 DECIDED_BY = ("ttd_rmst_s", "pass_share")
 """Metrics that a decision is about."""
-MATTERS_DRIVING = 0.001
-"""Braking for nothing in a smaller share of the driving time is not told: 3.6 s an hour."""
 _SAME = "same"
 """The word of a pair whose figures are the same throughout, so that there is no interval."""
 _NEAR = "near"
@@ -254,28 +252,37 @@ def _tell_needless(comparison: Comparison, summary: pd.DataFrame | None) -> tupl
     rows = comparison.overall[comparison.overall["metric"] == SHARE]
     rows = rows[~rows["configuration"].isin(comparison.truths) & rows["difference"].notna()]
     shown = rows["low"].isna() | (rows["low"] > NOTHING) | (rows["high"] < -NOTHING)
-    apart = rows[shown & (rows["difference"].abs() >= MATTERS_DRIVING)].sort_values("value", ascending=False)
-    longer, shorter = apart[apart["difference"] > 0], apart[apart["difference"] < 0]
-    brakers = {str(row.configuration): float(row.value) for row in longer.itertuples(index=False)}
-    against, least = comparison.baseline, float(apart["baseline_value"].min()) if len(apart) else 0.0
-    if len(shorter):
+    apart = rows[shown & (rows["difference"].abs() >= MATTERS_SHARE)]
+    shorter, against = apart[apart["difference"] < 0], comparison.baseline
+    brakers = dict(zip(rows["configuration"], rows["value"].astype(float), strict=True))
+    if len(shorter):  # the baseline brakes, and with it whoever is not shown to brake less
+        best = shorter.loc[shorter["value"].idxmin()]
+        against, least = str(best["configuration"]), float(best["value"])
         brakers[comparison.baseline] = float(shorter["baseline_value"].max())
-        against, least = str(shorter["configuration"].iloc[-1]), float(shorter["value"].iloc[-1])
+        for name in shorter["configuration"]:
+            del brakers[name]
+        brakers = {name: share for name, share in brakers.items() if share - least >= MATTERS_SHARE}
+    else:
+        least = float(rows["baseline_value"].min()) if len(rows) else 0.0
+        longer = set(apart["configuration"])
+        brakers = {name: share for name, share in brakers.items() if name in longer}
     if not brakers:
         return set(), ""
-    names = sorted(brakers, key=lambda name: -brakers[name])
-    others = [f", with {name} in {_format_share(brakers[name])}" for name in names[1:_NAMED]]
-    told = (
-        f" But with {names[0]} the driver brakes for nothing in {_format_share(brakers[names[0]])} of the driving time"
-    )
-    told += "".join(others) + (f" and with {len(names) - _NAMED} more" if len(names) > _NAMED else "")
-    of = None if summary is None else summary.set_index("configuration")
-    driving_s = None if of is None else 3600 * float(of["driving_h"].max())
-    here = "" if driving_s is None else f" in these {driving_s:.3g} s"
-    told += f" ({against}: {f'never{here}' if least == 0 else _format_share(least)})"
+    names, of = sorted(brakers, key=lambda name: -brakers[name]), None
+    if summary is not None:
+        of = summary.set_index("configuration")
+    driving = "the driving time" if of is None else _describe_driving(float(of["driving_h"].max()))
+    told = f" But with {names[0]} the driver brakes for nothing in {_format_share(brakers[names[0]])} of {driving}"
+    told += "".join(f", with {name} in {_format_share(brakers[name])}" for name in names[1:_NAMED])
+    told += f" and with {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    told += f" ({against}: {'never' if least == 0 else _format_share(least)})"
     if of is not None:
         told += f", losing up to {of.loc[names, 'needless_speed_lost_max_mps'].max():.3g} m/s at a time"
     return set(brakers), f"{told}."
+
+
+def _describe_driving(hours: float) -> str:
+    return f"these {3600 * hours:.3g} s of driving" if hours < 0.25 else f"these {hours:.3g} h of driving"
 
 
 def _format_share(share: float) -> str:

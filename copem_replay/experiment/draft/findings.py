@@ -45,6 +45,7 @@ class UnitFound:
     rate_hz: float | None = None  # median
     covariances_said: bool = False  # whether by every entry
     captures_said: bool = False  # whether by every list
+    velocities_said: bool = True  # whether by any entry
     problem: str | None = None
     delay_s: float | None = None  # by the best fit to the truth, of lists that do not state their capture
     delay_interval_s: list[float] | None = None  # 95 %

@@ -145,6 +145,7 @@ def _survey_unit(topic: str, recorded: RecordedLists, known: dict[str, Any]) -> 
         rate_hz=round(1.0 / float(np.median(between_s)), 3) if len(between_s) else None,
         covariances_said=bool(recorded.spread_said.all()),
         captures_said=bool(recorded.capture_said.all()),
+        velocities_said=recorded.velocity_said or not len(recorded.tracks.frame_ix),
         problem=None if lists else "holds no list",
         **known,
     )

@@ -83,6 +83,7 @@ def format_draft(*surveys: RecordingSurvey) -> str:
         *_draft_outputs(outputs, [name for name, _ in recorded]),
         "",
         *_draft_measure(_merge_measured(drives), ego=ego),
+        *_draft_braking(drives, ego=ego),
         *_draft_gap(drives),
         "show: {run: 0}   # the run that replay.mcap and replay.rrd show; {run: null} writes none",
     ]
@@ -364,6 +365,25 @@ def _draft_measure(guess: Suggestion, *, ego: bool) -> Iterator[str]:
     if not ego:
         yield "  distance_to: roadside   # there is no ego: ranges and distances are from here"
     yield "  confirm: {hits: 1, of: 1}   # known when so many of the last lists hold it"
+
+
+_DRIVER = "{kind: constant_deceleration, a_max_mps2: 7.59, build_up_s: 0.6, reaction: {kind: constant, delay_s: 1.15}}"
+
+
+def _draft_braking(drives: Sequence[_Drive], *, ego: bool) -> Iterator[str]:
+    """A driver, where each log has an ego of known size; without velocities in lists he is not asked when he brakes for
+    nothing.
+    """
+    if not ego:
+        return
+    behind = "" if all(drive.has_ego and not isinstance(drive.guess.ego, dict) for drive in drives) else "# "
+    silent = any(unit.problem is None and not unit.velocities_said for drive in drives for unit in drive.truth.units)
+    yield f"{behind}braking:   # who brakes for what lists say: the careful and competent driver of UN R157" + (
+        "; needs an ego and its size" if behind else ""
+    )
+    yield f"{behind}  driver: {_DRIVER}"
+    if silent:
+        yield f"{behind}  needless: null   # recorded lists state no velocity: braking for nothing cannot be told"
 
 
 def _draft_gap(drives: Sequence[_Drive]) -> Iterator[str]:

@@ -15,6 +15,7 @@ from copem_replay.report.figures.answer import answer_figure
 from copem_replay.report.figures.detection_curves import curves_figure
 from copem_replay.report.figures.differences import differences_figure, no_differences
 from copem_replay.report.figures.distances import distances_about, distances_figure
+from copem_replay.report.figures.false_positives import false_positives_figure, no_false_positives
 from copem_replay.report.figures.latency_breakdown import latency_breakdown_figure, no_stages
 from copem_replay.report.figures.paths import late_paths_figure, no_late_paths
 from copem_replay.report.figures.selection import Selection, choose_object_and_run
@@ -84,10 +85,20 @@ FIGURES: dict[str, FigureKind] = {
         missing=_no_differences,
     ),
     "trade_off": FigureKind(
-        "False positives against position error",
-        "false positives per minute over the position error, a mark per configuration",
+        "Sooner, and at what price",
+        "seconds sooner than the car alone against the time braking for nothing, a mark per configuration",
         lambda results, of: trade_off_figure(results, configurations=of.configurations),
         missing=lambda results, of: no_trade_off(results, results.chosen(of.configurations)),
+        about=lambda results: (
+            "The driver brakes for nothing where he would have to brake for an entry of a list, and the truth gives no "
+            "reason. Whoever reports more detects sooner, and makes him brake more often.",
+        ),
+    ),
+    "false_positives": FigureKind(
+        "False positives against position error",
+        "false positives per minute over the position error, a mark per configuration",
+        lambda results, of: false_positives_figure(results, configurations=of.configurations),
+        missing=lambda results, of: no_false_positives(results, results.chosen(of.configurations)),
         about=lambda results: (
             "A false positive is an entry of a fused list at no object. A fusion that keeps more entries detects "
             "sooner, and keeps more false positives.",

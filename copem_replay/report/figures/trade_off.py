@@ -1,7 +1,9 @@
-"""Figure of the trade-off between false positives per minute and position error, a mark per configuration.
+"""Figure of the trade-off between knowing sooner and braking for nothing, a mark per configuration.
 
-Marks near the origin are better in both. A fusion that keeps more entries detects sooner, and keeps more false
-positives.
+Seconds sooner than the car alone, over the rows of each pair as in the table of differences, against the share of the
+driving time in which the driver brakes for nothing. Better is lower and farther to the right. Where entries claim
+different existences, a line leads to what would be if only entries of more existence were listed: from
+`thresholds.parquet` and `needless_s_at`, without another replay.
 """
 
 from __future__ import annotations
@@ -10,9 +12,14 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 
 from copem_replay.core.tracks import Float
+from copem_replay.metrics.braking.driving import SHARE
+from copem_replay.metrics.row_figures import detection_endings
+from copem_replay.metrics.survival import cumulative_incidence, restricted_mean
 from copem_replay.report.figures.style import (
+    RANKED_BY,
     add_note,
     choose_appearances,
     describe_results,
@@ -22,6 +29,8 @@ from copem_replay.report.figures.style import (
     new_figure,
     shorten_names,
 )
+from copem_replay.results.compare import compare_folders
+from copem_replay.results.compare.labels import find_alone
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,70 +39,94 @@ if TYPE_CHECKING:
     from copem_replay.results.read import Results
 
 
-_ERROR, _FALSE = "position_rmse_m", "false_positives_per_min"
 _WIDE_IN, _HIGH_IN = 8.0, 4.0
-_FAR = 20.0
-"""Ratio of largest to smallest rate from which the axis is logarithmic, so that small rates stay apart."""
 _MARK_PT = 7.0
+_MOST_ROWS = 200_000
+"""Of more rows no lines are drawn: they would take longer than all other figures."""
+_KEYS = ["run", "object_id", "episode"]
 
 
 def no_trade_off(results: Results, names: Sequence[str]) -> str | None:
     """The reason why the figure cannot be drawn, "" if it need not be given; None if it can."""
-    if all(results.facts[name].by_truth_id for name in names):
+    if SHARE not in results.summary or not results.summary[SHARE].notna().any():
         return ""
-    return None if len(_contenders_with_both(results, names)) > 1 else ""
-
-
-def _contenders_with_both(results: Results, names: Sequence[str]) -> list[str]:
-    """Contenders with both metrics."""
-    rows = results.summary.set_index("configuration")
-    if _ERROR not in rows or _FALSE not in rows:
-        return []
-    has_both = rows[[_ERROR, _FALSE]].notna().all(axis=1)
-    return [name for name in find_contenders(results, names) if has_both[name]]
+    return None if len(find_contenders(results, names)) > 1 else ""
 
 
 def trade_off_figure(results: Results, *, configurations: Sequence[str] | None = None) -> Figure:
-    """False positives per minute over the position error (RMSE) of each configuration; lower left is better."""
-    asked = results.chosen(configurations)
-    names = _contenders_with_both(results, asked)
-    rows = results.summary.set_index("configuration")
-    error_m, rate = (rows.loc[names, key].to_numpy(dtype=float) for key in (_ERROR, _FALSE))
+    """Seconds sooner than the car alone against the time braking for nothing; lower right is better."""
+    names = list(find_contenders(results, results.chosen(configurations)))
+    alone = find_alone(results, names)
+    compared = compare_folders([results], configurations=names, baseline=alone, metrics=[RANKED_BY]).overall
+    sooner_s = {alone: 0.0} | dict(zip(compared["configuration"], -compared["difference"].astype(float), strict=True))
+    share = 100 * results.summary.set_index("configuration")[SHARE].astype(float)
+    names = [name for name in names if np.isfinite(sooner_s.get(name, np.nan)) and np.isfinite(share[name])]
     looks, short = choose_appearances(results, configurations), shorten_names(names)
+    lines = {name: _sweep_existence(results, name) for name in names}
     with figure_style():
         figure = new_figure(_WIDE_IN, _HIGH_IN + 0.06 * max(len(names) - 8, 0))
         axes = figure.subplots()
-        _set_scales(axes, error_m, rate)
-        for k, name in enumerate(names):
+        for name in names:
             look = looks[name]
             with mark_configuration(list(looks).index(name), axes):
+                if (line := lines[name]) is not None:
+                    axes.plot(sooner_s[name] + line[0], line[1], color=look.colour, linewidth=1, zorder=2)
                 axes.scatter(
-                    [error_m[k]], [rate[k]], s=_MARK_PT**2, marker=look.marker, facecolor=look.colour, zorder=3,
-                    label=name, clip_on=False,
+                    [sooner_s[name]], [share[name]], s=_MARK_PT**2, marker=look.marker, facecolor=look.colour,
+                    zorder=3, label=name, clip_on=False,
                 )  # fmt: skip
-        axes.set_xlabel("Position error, RMSE (m)")
-        axes.set_ylabel("False positives per minute")
-        left = [short_name for name, short_name in shorten_names(asked).items() if name not in names]
+        _set_scales(axes, share[names].to_numpy())
+        axes.set_xlabel(f"Known sooner than with {shorten_names([alone])[alone]} (s)")
+        axes.set_ylabel("Time braking for nothing (%)")
+        swept = any(line is not None for line in lines.values())
         add_note(
             figure,
             [
                 describe_results(results, names),
-                "Better towards the lower left. Without intervals: those of the differences are in the table",
-                f"Not drawn, for they have no such metrics or are the ground truth: {', '.join(left)}" if left else "",
+                "Better towards the lower right. Intervals of the differences are in the table",
+                "Lines: entries of less and less existence left out" if swept else "",
             ],
         )
         figure.legend(axes.collections, [short[name] for name in names], loc="outside right upper")
     return figure
 
 
-def _set_scales(axes: Axes, error_m: Float, rate: Float) -> None:
-    """Set the axes: error from 0 if marks stay apart, else from near the smallest; rates far apart logarithmic."""
-    span = float(np.ptp(error_m))
-    low = 0.0 if span > 0.3 * error_m.max() else max(0.0, error_m.min() - 0.3 * (span or error_m.max() or 1.0))
-    axes.set_xlim(low, error_m.max() + 0.25 * (error_m.max() - low or 1.0))
-    if rate.min() > 0 and rate.max() / rate.min() > _FAR:
-        axes.set_yscale("log")
-        axes.set_ylim(rate.min() / 1.6, rate.max() * 1.6)
+def _set_scales(axes: Axes, share: Float) -> None:
+    """Shares far apart logarithmically, with 0 at the foot."""
+    above = share[share > 0]
+    if len(above) and above.max() > 20 * above.min():
+        axes.set_yscale("symlog", linthresh=float(above.min()), linscale=0.3)
         axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    else:
-        axes.set_ylim(0.0, 1.12 * rate.max() or 1.0)
+    axes.set_ylim(0.0, 1.3 * float(share.max(initial=0.0)) or 1.0)
+
+
+def _sweep_existence(results: Results, name: str) -> tuple[Float, Float] | None:
+    """(T,) seconds sooner than with all entries, and (T,) time braking for nothing (%), by ascending existence; None:
+    no threshold changes anything.
+    """
+    if results.rows.counts and sum(results.rows.counts.values()) > _MOST_ROWS * len(results.experiment.configurations):
+        return None
+    lists = results.frame("lists.parquet")
+    lists = lists[lists["configuration"] == name]
+    existence, share = np.array(lists["existence"].iloc[0]), np.stack(lists["needless_s_at"].to_list()).sum(axis=0)
+    share = 100 * share / float(lists["driving_s"].sum())
+    steps = results.frame("thresholds.parquet")
+    steps = steps[steps["configuration"] == name]
+    horizon_s = results.provenance.horizon_used_s
+    mean_s = np.array([_mean_time_s(results, name, steps[steps["existence"] >= at], horizon_s) for at in existence])
+    new = np.concatenate([[True], (np.diff(mean_s) != 0) | (np.diff(share) != 0)])
+    return (mean_s[0] - mean_s[new], share[new]) if new.sum() > 1 and share.any() else None
+
+
+def _mean_time_s(results: Results, name: str, steps: pd.DataFrame, horizon_s: float) -> float:
+    """The restricted mean time to detection of the rows that count, by these steps of existence alone."""
+    times, endings = list[Float](), list[np.ndarray]()
+    for log in results.rows.logs:
+        (rows,) = results.each("configuration", *_KEYS, "onset_s", "ended_s", "ended_by", log=log)
+        rows = rows[rows["configuration"] == name]
+        first_s = steps[steps["log"] == log].groupby(_KEYS, sort=False)["detection_s"].min()
+        known_s = first_s.reindex(pd.MultiIndex.from_frame(rows[_KEYS])).to_numpy(dtype=float)
+        time_s, ending = detection_endings(rows.assign(time_to_detection_s=known_s - rows["onset_s"].to_numpy()))
+        times.append(np.round(time_s, 9))
+        endings.append(ending)
+    return restricted_mean(*cumulative_incidence(np.concatenate(times), np.concatenate(endings)), horizon_s)

@@ -142,6 +142,8 @@ def figure_element(name: str, figure: Figure, title: str, shows: str, looks: Ite
 _ANSWER, _DIFFERENCES = "answer", "differences"
 _ALONE = ("runs",)
 """Figures that `plot` draws alone: stories show single runs here."""
+_FIRST = ("late_paths", "trade_off", "false_positives")
+"""Figures above the summary."""
 _BELOW = {"latency_breakdown": stage_table, "slices": group_tables}
 """Elements below figures."""
 
@@ -160,7 +162,7 @@ def build_page(study: ReportData) -> str:
         *_verdict_sections(study),
         _Section("differences-of-it", "Differences", _difference_parts(study)),
         *_extra_sections(study),
-        *_figure_sections(study, ("late_paths", "trade_off")),
+        *_figure_sections(study, _FIRST),
         _Section(
             "configurations-of-it",
             "What is compared",
@@ -169,9 +171,7 @@ def build_page(study: ReportData) -> str:
         _Section("table", "Summary", [summary_tables(study)]),
     ]
     if measured:
-        sections += _figure_sections(
-            study, [name for name in FIGURES if name not in (_ANSWER, _DIFFERENCES, "late_paths", "trade_off")]
-        )
+        sections += _figure_sections(study, [name for name in FIGURES if name not in (_ANSWER, _DIFFERENCES, *_FIRST)])
         sections.append(_Section("missed", "Never detected", [never_detected(study), exact_misses(study)]))
     sections.append(_Section("provenance", "Where this comes from", [provenance_tables(study)]))
     title = f"When was it known? {', '.join(file.name for file in study.results.provenance.logs)}"

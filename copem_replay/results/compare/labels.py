@@ -281,6 +281,17 @@ def find_baseline(facts: Mapping[str, ConfigurationFacts], names: Sequence[str])
     return Baseline(2, fused[0], "the first that is not the truth") if fused else Baseline(2, names[0], "the first")
 
 
+def find_alone(results: Results, names: Sequence[str]) -> str:
+    """Of `names` the configuration of the car alone: with units on the ego only, a real fusion rather than an ideal
+    one; where there is none the first.
+    """
+    experiment = results.experiment
+    on_ego = {unit for unit, of in experiment.units.items() if of.on == "ego"}
+    units_of = {name: set(experiment.units_of(experiment.configurations[name])) for name in names}
+    own = [name for name, units in units_of.items() if units and units <= on_ego]
+    return (*(name for name in own if not results.facts[name].by_truth_id), *own, *names)[0]
+
+
 def notes_on_output_baseline(baseline: LabelledConfiguration, others: Sequence[LabelledConfiguration]) -> Iterator[str]:
     """Notes on recorded outputs whose difference to the baseline is no regret."""
     for labelled in (labelled for labelled in others if labelled.facts.recorded):
