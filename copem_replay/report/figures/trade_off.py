@@ -113,6 +113,10 @@ def _sweep_existence(results: Results, name: str) -> tuple[Float, Float] | None:
     steps = results.frame("thresholds.parquet")
     steps = steps[steps["configuration"] == name]
     horizon_s = results.provenance.horizon_used_s
+    some = existence <= steps["existence"].max()  # beyond, nothing is listed
+    existence, share = existence[some], share[some]
+    if len(existence) < 2:
+        return None
     mean_s = np.array([_mean_time_s(results, name, steps[steps["existence"] >= at], horizon_s) for at in existence])
     new = np.concatenate([[True], (np.diff(mean_s) != 0) | (np.diff(share) != 0)])
     return (mean_s[0] - mean_s[new], share[new]) if new.sum() > 1 and share.any() else None
