@@ -75,8 +75,9 @@ class RunToExport:
     """One run of one log, in the configurations that are shown.
 
     `one`: the replayed run. `every`: all configurations of the experiment, whose order determines colours. `table`: the
-    rows of `detections.parquet` of this log and run, of the first episode of each object. `summary`: over all logs and
-    runs. `manifest`: the provenance that the file states.
+    rows of `detections.parquet` of this log and run, of the first episode of each object. `needless`: those of
+    `needless.parquet`, None: not asked for. `summary`: over all logs and runs. `manifest`: the provenance that the file
+    states.
     """
 
     recording: Recording
@@ -86,6 +87,7 @@ class RunToExport:
     table: pd.DataFrame
     summary: pd.DataFrame
     manifest: dict[str, str]
+    needless: pd.DataFrame | None = None
 
 
 @dataclass(frozen=True)
@@ -361,6 +363,7 @@ def _make_run_to_export(log: str, shown: ShownRun, study: StudyTables) -> RunToE
         first_episodes(rows[rows["configuration"].isin(names)]),
         study.summary[study.summary["configuration"].isin(names)],
         manifest,
+        study.needless_of(log, shown.run),
     )
 
 

@@ -64,6 +64,48 @@ def write_event_texts(out: RecordingSink, scene: Scene, name: str, part: pd.Data
     out.columns(["events", configuration_part(name)], to_nanoseconds([time_s for time_s, _, _ in events]), columns)
 
 
+_BRAKES_FOR = {
+    "ghost": "nothing there", "duplicate": "a second entry of {}", "late": "where {} was",
+    "misplaced": "a misplaced entry of {}",
+}  # fmt: skip
+"""What the driver brakes for who brakes for nothing, by the cause."""
+
+
+def write_needless_braking(
+    out: RecordingSink, replay: Replay, name: str, needless: pd.DataFrame, colour: Rgb
+) -> None:  # fmt: skip
+    """Write an event for each time that the driver brakes for nothing, and a mark where he brakes for, while it lasts.
+
+    `needless`: rows of `needless.parquet` of one configuration in one run.
+    """
+    import rerun as rr
+
+    rows, ids = table_rows(needless), short_ids(replay.scene)
+    course = replay.ego.course(needless["begins_s"].to_numpy(dtype=float))
+    x_m, y_m = replay.ego.locate(course.along_m)
+    away_m = np.hypot(needless["x_m"] - x_m, needless["y_m"] - y_m).to_numpy(dtype=float)
+    words, labels = [], []
+    for row, away in zip(rows, away_m.tolist(), strict=True):
+        about = "" if pd.isna(row.object_id) else ids[replay.scene.object_number[row.object_id]]
+        what = _BRAKES_FOR[row.cause].format(about)
+        labels.append(f"brakes for {what}")
+        words.append(f"{labels[-1]}: {row.object_class}, {away:.0f} m away, for {row.lasts_s:.2f} s")
+    lost = [f"; loses up to {row.speed_lost_mps:.1f} m/s" for row in rows]
+    begins_s = needless["begins_s"].to_numpy(dtype=float)
+    ends_s = begins_s + needless["lasts_s"].to_numpy(dtype=float)
+    text = [f"{name}: {said}{more}" for said, more in zip(words, lost, strict=True)]
+    columns = rr.TextLog.columns(text=text, level=["WARN"] * len(text))
+    out.columns(["events", configuration_part(name), "needless"], to_nanoseconds(begins_s), columns)
+    path = ["world", configuration_part(name), "needless"]
+    states, _ = replay.ego.states(replay.scene.ego_ix, begins_s)
+    place = stack_float32(needless["x_m"], needless["y_m"], states["z_m"])
+    instants, counts = np.stack([begins_s, ends_s], axis=1).ravel(), np.tile([1, 0], len(rows))
+    marks = rr.Points3D.columns(positions=place, labels=labels).partition(counts)
+    out.columns(path, to_nanoseconds(instants), marks)
+    size = rr.Radius.ui_points(8)
+    out.static(path, rr.Points3D.from_fields(colors=[colour], radii=size, show_labels=True))
+
+
 def _name_object(episode: Any, scene: Scene) -> str:
     return f"{short_ids(scene)[scene.object_number[episode.object_id]]} {episode.object_class}"
 

@@ -45,6 +45,7 @@ from copem_replay.viewer.events import (
     write_difference_text,
     write_event_texts,
     write_legend_text,
+    write_needless_braking,
     write_onset_texts,
     write_summary_text,
 )
@@ -88,6 +89,7 @@ def write_rrd(
     run_is: str = "",
     baseline: str | None = None,
     of_one: bool = True,
+    needless: pd.DataFrame | None = None,
     viewer: str | None = None,
 ) -> list[str]:
     """Write one run of one log to a file and, with an address, to a viewer. Returns notes. Raises OutputError.
@@ -100,6 +102,7 @@ def write_rrd(
     list (one unit, values (1, P)). `table`: the rows of `detections.parquet` of this log and run. `summary`: over all
     logs and runs. `run_is`: why this run is shown, part of the recording's name. `baseline`: the configuration to which
     differences are marked. `of_one`: all configurations are of one experiment, so that nothing but their keys differs.
+    `needless`: rows of `needless.parquet` of this log and run.
     """
     later_chunks = iter(run_tracks)
     first = next(later_chunks)
@@ -128,6 +131,8 @@ def write_rrd(
                 compared = {name: first[name] for name in file.colours}
                 write_differences(file.out, replay, experiment, compared, table, baseline, objects, file.colours)
         chunks = chain(iter([first]), later_chunks)
+        for file in files:
+            _write_needless(file, replay, needless)
         del first  # so that only one chunk is held at a time
         _write_chunks(files, chunks, replay, experiment, collector)
         for file in files:
@@ -249,6 +254,15 @@ def _begin_file(file: _RecordingFile, summary: pd.DataFrame, run: int, run_is: s
         write_list_fates(out, name, content.lists[name])
     if len(replay.episodes.object_ix):
         curves.write_known_count(out, replay, "truth", replay.truth)
+
+
+def _write_needless(file: _RecordingFile, replay: Replay, needless: pd.DataFrame | None) -> None:
+    """Write when the driver brakes for nothing, of each configuration."""
+    if needless is None:
+        return
+    for name, rows in needless.groupby("configuration", sort=False):
+        if (colour := file.colours.get(str(name))) is not None:
+            write_needless_braking(file.out, replay, str(name), rows, colour)
 
 
 def _send_layout(file: _RecordingFile) -> None:
@@ -379,6 +393,7 @@ def make_rrd_exporter(viewer: str | None) -> Exporter:
             run.summary,
             run.shown.run,
             run_is=run.shown.why,
+            needless=run.needless,
             viewer=viewer,
         )
 
