@@ -286,7 +286,7 @@ _NEEDLESS = (
            "`misplaced`", among=CAUSES),
     Column("object_id", "text or null", "id of the true object that the entry is about; null for none"),
     Column("object_class", "text", "class of the entry"),
-    Column("track_id", "whole numbers", "track of the entry; null where the fusion names none"),
+    Column("track_id", "text or null", "track of the entry; null where the fusion names none"),
     Column("x_m", "numbers", "listed place of the entry, east"),
     Column("y_m", "numbers", "listed place of the entry, north"),
 )  # fmt: skip

@@ -362,7 +362,6 @@ def _tabulate_needless(outcomes: Sequence[BlockOutcome], name: str) -> pa.Table:
     for outcome in outcomes:
         found = outcome.all_scores[name].needless
         assert found is not None
-        track_id = found.entries["track_id"]
         columns = {
             "run": outcome.runs[found.run_ix],
             "begins_s": found.begins_s,
@@ -371,7 +370,7 @@ def _tabulate_needless(outcomes: Sequence[BlockOutcome], name: str) -> pa.Table:
             "cause": found.cause,
             "object_id": found.object_id,
             "object_class": np.array(CLASSES, dtype=object)[found.class_ix],
-            "track_id": pa.array(track_id, mask=track_id < 0),
+            "track_id": [str(k) if k >= 0 else None for k in found.entries["track_id"].tolist()],
             "x_m": found.entries["x_m"],
             "y_m": found.entries["y_m"],
         }

@@ -25,6 +25,7 @@ from copem_replay.experiment.draft.findings import (
     UnitFound,
 )
 from copem_replay.io.ground_truth import MAX_GAP_S
+from copem_replay.metrics.braking.driver import R157
 
 _WORDS = ("null", "true", "false")
 _UNIT = "[[0.5, 0.0], [0.0, 0.5]]"
@@ -367,9 +368,6 @@ def _draft_measure(guess: Suggestion, *, ego: bool) -> Iterator[str]:
     yield "  confirm: {hits: 1, of: 1}   # known when so many of the last lists hold it"
 
 
-_DRIVER = "{kind: constant_deceleration, a_max_mps2: 7.59, build_up_s: 0.6, reaction: {kind: constant, delay_s: 1.15}}"
-
-
 def _draft_braking(drives: Sequence[_Drive], *, ego: bool) -> Iterator[str]:
     """A driver, where each log has an ego of known size; without velocities in lists he is not asked when he brakes for
     nothing.
@@ -381,7 +379,7 @@ def _draft_braking(drives: Sequence[_Drive], *, ego: bool) -> Iterator[str]:
     yield f"{behind}braking:   # who brakes for what lists say: the careful and competent driver of UN R157" + (
         "; needs an ego and its size" if behind else ""
     )
-    yield f"{behind}  driver: {_DRIVER}"
+    yield f"{behind}  driver: {dump_on_one_line(R157)}"
     if silent:
         yield f"{behind}  needless: null   # recorded lists state no velocity: braking for nothing cannot be told"
 

@@ -164,6 +164,7 @@ def read_study_to_fit(source: ExperimentSource, unit: str) -> LoadedStudy:
 def fit_study(study: LoadedStudy, unit: str, options: Any) -> FittedPem:
     """Fit a unit of a study, with its replay check. Raises ExperimentError without a recording, InputError as `fit`."""
     from copem_replay.extras.fitting.fit import add_replay_check, fit_unit
+    from copem_replay.extras.fitting.needless_check import check_needless
 
     if not study.recordings:
         raise ExperimentError(study.source.at(("logs",), "expected at least one recording, found none"))
@@ -172,6 +173,8 @@ def fit_study(study: LoadedStudy, unit: str, options: Any) -> FittedPem:
     # Digests are taken now, while the files are still what was read.
     recordings = tuple(replace(recording, sha256=read_content_digest(recording)) for recording in study.recordings)
     fit_of_unit = add_replay_check(fit_unit(study.experiment, recordings, unit, options))
+    needless = check_needless(fit_of_unit, study.experiment, recordings)
+    fit_of_unit = replace(fit_of_unit, needless="" if needless is None else needless.line())
     return FittedPem(study.experiment, recordings, fit_of_unit)
 
 

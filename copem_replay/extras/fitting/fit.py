@@ -181,6 +181,7 @@ class Fit:
     gates: tuple[str, ...]  # lines on estimates that another gate moves
     notes: tuple[str, ...]
     checks: ReplayChecks | None = None
+    needless: str = ""  # what braking for nothing on logs held out is, in a line; empty: none is held out
 
     @property
     def said(self) -> tuple[str, ...]:

@@ -70,6 +70,7 @@ def fit_page(fit: Fit) -> str:
         make_tag("h1", f"The perception of {fit.unit}"),
         make_tag("p", judge_use(fit), class_="question"),
         make_tag("p", lead, class_="lead"),
+        *([make_tag("p", f"{fit.needless}.")] if fit.needless else []),
         make_list(fit.said),
         section_links((id_, title) for id_, title, _ in sections),
     )
@@ -274,6 +275,7 @@ def describe_estimates(fit: Fit) -> dict[str, Any]:
         "estimates": {name: to_plain_data(one) for name, one in list_estimates(fit)},
         "parts": to_plain_data(fit.parts),
         "replay_check": to_plain_data(fit.checks),
+        "needless": fit.needless,
         "notes": list(fit.said),
     }
 
@@ -326,7 +328,8 @@ def table_lines(fit: Fit) -> list[str]:
     lines = [judge_use(fit), *(f"{describe_name(fit, name)}: {one.words()}" for name, one in list_estimates(fit))]
     lines += [f"not fitted: {line}" for line in _list_untold(fit)]
     lines += [f"{what}, {rung.words()}" for what, rungs in _list_ladders(fit).items() for rung in rungs]
-    return lines + ([] if fit.checks is None else list(fit.checks.lines()))
+    lines += [] if fit.checks is None else list(fit.checks.lines())
+    return lines + ([fit.needless] if fit.needless else [])
 
 
 # Places for the viewer: errors and misses of a fitted unit, all at once and list by list.

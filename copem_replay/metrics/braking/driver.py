@@ -166,6 +166,12 @@ class ConstantDeceleration(Driver):
         return result
 
 
+R157: dict[str, object] = {
+    "kind": "constant_deceleration", "a_max_mps2": 7.59, "build_up_s": 0.6,
+    "reaction": {"kind": "constant", "delay_s": 1.15},
+}  # fmt: skip
+"""The careful and competent driver of UN R157, as implemented in esmini: .4 s to see the risk and .75 s to react, then
+.774 g within .6 s (docs/guide/metrics.md). The keys of `braking.driver` in a draft."""
 DRIVERS = {"constant_deceleration": "copem_replay.metrics.braking.driver:ConstantDeceleration"}
 
 
