@@ -18,6 +18,7 @@ from urllib.parse import quote
 import pandas as pd
 
 from copem_replay.core.errors import InputError, count_noun
+from copem_replay.metrics.braking.driving import SHARE
 from copem_replay.metrics.limits import format_limit, format_limits
 from copem_replay.metrics.summary import format_cell
 from copem_replay.metrics.summary_metrics import COMPARED
@@ -240,7 +241,7 @@ def _folders_table(folders: Sequence[JudgedFolder]) -> Html:
     return join_html([make_table(head, lines, id_="all-folders"), make_tag("p", said, class_="below")])
 
 
-_FIGURES = ("ttd_rmst_s", "ttd_p95_s", "detected_share", "pass_share")
+_FIGURES = ("ttd_rmst_s", "ttd_p95_s", "detected_share", "pass_share", SHARE)
 
 
 def _summaries_table(folders: Sequence[JudgedFolder]) -> Html:
@@ -310,7 +311,7 @@ def _difference_rows(new: Results, old: Results) -> Iterator[tuple[str, list[pd.
             continue
         comparison = compare_folders(
             [new, old], configurations=[labels[new, name]], baseline=labels[old, name],
-            metrics=("detected_share", "ttd_rmst_s", "unknown_to_horizon_s", "pass_share"),
+            metrics=("detected_share", "ttd_rmst_s", "unknown_to_horizon_s", "pass_share", SHARE),
         )  # fmt: skip
         yield name, [row for _, row in comparison.overall.iterrows()]
 

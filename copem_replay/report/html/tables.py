@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from copem_replay.core.errors import count_noun
+from copem_replay.metrics.braking.driving import JUDGED_DRIVING
 from copem_replay.metrics.limits import NOT_ENOUGH
 from copem_replay.metrics.metric import own_metrics
 from copem_replay.metrics.summary import SETUP, describe_intervals, format_cell, has_undetected
@@ -163,9 +164,10 @@ def row_head(study: ReportData, name: str) -> Html:
 def _summary_cell(row: dict[str, Any], name: str) -> Html:
     value = float("nan") if pd.isna(row[name]) else float(row[name])
     parts = [Html(format_value(name, value))]
-    low, high = (row.get(f"{name}_{end}") if name in _INTERVALS else None for end in ("low", "high"))
+    with_limits, scale = name in (*_INTERVALS, *JUDGED_DRIVING), 100 if is_share(name) else 1
+    low, high = (row.get(f"{name}_{end}") if with_limits else None for end in ("low", "high"))
     if low is not None and high is not None and pd.notna(low) and pd.notna(high):
-        parts.append(interval_markup(100 * float(low), 100 * float(high)))
+        parts.append(interval_markup(scale * float(low), scale * float(high)))
     return make_tag(
         "td",
         *parts,
