@@ -182,14 +182,15 @@ def trade_off(results: AnyResults, *, configurations: Sequence[str] | None = Non
 
     Raises InputError for a configuration that is not among the results, and where fewer than two have both figures.
 
-    >>> len(cr.plot.trade_off("out/tc016d").axes)
-    1
+    >>> cr.plot.trade_off("out/tc016d")
+    Traceback (most recent call last):
+    copem_replay.core.errors.InputError: out/tc016d: no figure of trade_off: ...
     """
     return _draw("trade_off", results, configurations)
 
 
 _LACKING = {
-    "trade_off": "no driver is asked when he brakes for nothing, or fewer than two configurations have lists",
+    "trade_off": "nobody brakes for nothing, or no driver is asked",
     "false_positives": "fewer than two configurations have both false positives and position errors",
     "late_paths": "of the truth alone nothing is late",
 }

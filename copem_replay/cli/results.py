@@ -90,7 +90,9 @@ def compare(
 
         notes += write_side_by_side(rrd, folders, configurations=names, baseline=baseline, log=log, run=run)
     print_notes(notes)
-    decision = decide_compared(comparison, open_results(folders[0]) if len(folders) == 1 else None)
+    alone = open_results(folders[0]) if len(folders) == 1 else None
+    of = (None, None) if alone is None else (alone.experiment, alone.summary)
+    decision = decide_compared(comparison, *of)
     print_table(comparison_text(comparison, width_of(sys.stdout)), decision.best)
     if by is not None and len(folders) == 1:
         from copem_replay.results.slices import groups_text, summarise_slices

@@ -69,8 +69,9 @@ def decide(results: Results, comparison: Comparison | None = None, verdicts: Jud
     elif len(names) == 1:
         found = _describe_alone(results, names[0])
     else:
-        comparison = comparison or compare_folders([results], metrics=(*DECIDED_BY, SHARE))
-        found = decide_compared(comparison, results)
+        driven = (SHARE,) if SHARE in results.summary else ()
+        comparison = comparison or compare_folders([results], metrics=(*DECIDED_BY, *driven))
+        found = decide_compared(comparison, results.experiment, results.summary)
     return found if verdicts is None else Decision(describe_verdicts(verdicts), found.best)
 
 
@@ -148,8 +149,11 @@ def _format_edge(share: float) -> str:
     return "< 0.1 %" if share < 0.5 else "> 99.9 %"
 
 
-def decide_compared(comparison: Comparison, results: Results | None = None) -> Decision:
-    """The decision on a comparison. `results`: the one folder that is compared, whose latencies it may be about.
+def decide_compared(
+    comparison: Comparison, experiment: Experiment | None = None, summary: pd.DataFrame | None = None
+) -> Decision:
+    """The decision on a comparison. `experiment`, `summary`: of the one folder that is compared, whose latencies it may
+    be about.
 
     The ground truth is no choice.
     """
@@ -165,8 +169,8 @@ def decide_compared(comparison: Comparison, results: Results | None = None) -> D
     best = [name for name, gain in ranked.items() if not scale.matters(top - gain)]
     if any(name in pairs and pairs[name].word == OPEN for name in best):
         best.append(comparison.baseline)
-    told = _tell_latencies(comparison.baseline, pairs, scale, None if results is None else results.experiment)
-    brakers, sentence = _tell_needless(comparison, None if results is None else results.summary)
+    told = _tell_latencies(comparison.baseline, pairs, scale, experiment)
+    brakers, sentence = _tell_needless(comparison, summary)
     best = [name for name in dict.fromkeys(best) if name not in brakers]
     return Decision(f"{told or _tell_groups(comparison.baseline, pairs, scale)}.{sentence}", tuple(best))
 

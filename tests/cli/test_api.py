@@ -426,7 +426,11 @@ class TestShownShortly:
 
     def test_a_figure_that_results_lack_is_refused_with_the_reason(self, here: Path) -> None:
         result = cr.run("e.yaml")
-        with pytest.raises(cr.InputError, match="no figure of trade_off: fewer than two configurations have both"):
+        with pytest.raises(
+            cr.InputError, match="no figure of false_positives: fewer than two configurations have both"
+        ):
+            cr.plot.false_positives(result)
+        with pytest.raises(cr.InputError, match="no figure of trade_off: "):
             cr.plot.trade_off(result)
         with pytest.raises(cr.InputError, match="no slices"):
             cr.plot.slices(result)

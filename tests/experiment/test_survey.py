@@ -103,6 +103,7 @@ def test_survey(path):
                         "rate_hz": 4.0,
                         "covariances_said": True,
                         "captures_said": False,
+                        "velocities_said": True,
                         "problem": None,
                         "delay_s": None,
                         "delay_interval_s": None,

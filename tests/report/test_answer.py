@@ -24,6 +24,7 @@ from copem_replay.report.figures import FIGURES, Selection
 from copem_replay.report.figures.answer import answer_figure
 from copem_replay.report.figures.detection_curves import curves_figure
 from copem_replay.report.figures.differences import differences_figure
+from copem_replay.report.figures.false_positives import false_positives_figure
 from copem_replay.report.figures.selection import choose_object_and_run, find_differing, find_most_telling
 from copem_replay.report.figures.style import (
     DARK,
@@ -36,7 +37,6 @@ from copem_replay.report.figures.style import (
     lay_out,
     render_figure,
 )
-from copem_replay.report.figures.trade_off import trade_off_figure
 from copem_replay.report.html.markup import INK, PAPER, line_swatch, page_colours, replace_colours, replace_greys
 from copem_replay.report.html.page import build_page as report_page
 from copem_replay.report.html.study import load_study
@@ -167,9 +167,9 @@ class TestDifferences:
         assert note(differences_figure(two)).startswith("No intervals: 2 objects of one drive, fewer than 5")
 
 
-class TestTradeOff:
+class TestFalsePositives:
     def test_a_mark_and_a_name_each(self, many: Results) -> None:
-        figure = trade_off_figure(many)
+        figure = false_positives_figure(many)
         (axes,), (legend,) = figure.axes, figure.legends
         summary = many.summary.set_index("configuration")
         marks = {str(c.get_label()): tuple(c.get_offsets()[0]) for c in axes.collections}
@@ -180,8 +180,8 @@ class TestTradeOff:
         assert sorted(text.get_text() for text in legend.get_texts()) == sorted(known.index)
 
     def test_of_ideal_fusion_alone_there_is_none(self, results: Results, many: Results) -> None:
-        assert FIGURES["trade_off"].missing(results, Selection()) == ""
-        assert FIGURES["trade_off"].missing(many, Selection()) is None
+        assert FIGURES["false_positives"].missing(results, Selection()) == ""
+        assert FIGURES["false_positives"].missing(many, Selection()) is None
 
 
 class TestEighteen:

@@ -217,7 +217,7 @@ class TestNumbers:
                     assert cell.text.endswith(" °") == (star == "°")
 
     def test_every_column_shown_is_explained(self, read: Page) -> None:
-        tables = ("summary", "undetected", "braking", "accuracy", "lists", "regret", "regret-lists")
+        tables = ("summary", "undetected", "braking", "needless", "accuracy", "lists", "regret", "regret-lists")
         shown = {name for id_ in tables for name in read.rows[id_][0][1:]}
         terms = re.findall(r"<dt>([^<]*?)</dt><dd>(.+?) <code>(\w+)</code></dd>", read.html)
         assert shown == {name for name, _, _ in terms}

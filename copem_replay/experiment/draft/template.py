@@ -25,7 +25,6 @@ from copem_replay.experiment.draft.findings import (
     UnitFound,
 )
 from copem_replay.io.ground_truth import MAX_GAP_S
-from copem_replay.metrics.braking.driver import R157
 
 _WORDS = ("null", "true", "false")
 _UNIT = "[[0.5, 0.0], [0.0, 0.5]]"
@@ -374,6 +373,8 @@ def _draft_braking(drives: Sequence[_Drive], *, ego: bool) -> Iterator[str]:
     """
     if not ego:
         return
+    from copem_replay.metrics.braking.driver import R157  # a survey alone loads no models
+
     behind = "" if all(drive.has_ego and not isinstance(drive.guess.ego, dict) for drive in drives) else "# "
     silent = any(unit.problem is None and not unit.velocities_said for drive in drives for unit in drive.truth.units)
     yield f"{behind}braking:   # who brakes for what lists say: the careful and competent driver of UN R157" + (

@@ -48,8 +48,8 @@ _KEYS = ["run", "object_id", "episode"]
 
 def no_trade_off(results: Results, names: Sequence[str]) -> str | None:
     """The reason why the figure cannot be drawn, "" if it need not be given; None if it can."""
-    if SHARE not in results.summary or not results.summary[SHARE].notna().any():
-        return ""
+    if SHARE not in results.summary or not results.summary[SHARE].any():
+        return ""  # nobody brakes for nothing
     return None if len(find_contenders(results, names)) > 1 else ""
 
 

@@ -238,7 +238,9 @@ def notes_on_folders(folders: Sequence[Results]) -> Iterator[str]:
         yield f"other numbers of runs ({has}): the first {min(runs.values())} are compared"
     for folder in folders:
         missing = [name for name in COMPARED_FILES if name not in folder.by_log]
-        metrics = [m.name for m in of_lists_first if m.compared and {*m.compared.files} & {*missing}]
+        asked = "needless_s" in folder.provenance.kinds("lists.parquet")
+        compared = (m for m in of_lists_first if m.compared and (m.part != "needless" or asked))
+        metrics = [m.name for m in compared if m.compared and {*m.compared.files} & {*missing}]
         if metrics:
             yield (
                 f"{folder.place}: no {', '.join(missing)} (without accuracy, or of "
