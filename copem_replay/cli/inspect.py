@@ -120,8 +120,9 @@ def check(
     what `fit` would say.
     """
     from copem_replay.api.study import prepare_study, read_study
+    from copem_replay.experiment.file import read_experiment_file
 
-    study = read_study(override_source(experiment, {"ego": ego}, log or (), (from_s, to_s)))
+    study = read_study(override_source(read_experiment_file(experiment), {"ego": ego}, log or (), (from_s, to_s)))
     from copem_replay.experiment.criteria import note_undecidable
     from copem_replay.metrics.onset import count_counted
     from copem_replay.pipeline.notes import list_began, list_notes
@@ -153,21 +154,20 @@ def schema() -> int:
 
 
 def override_source(
-    path: Path,
+    source: ExperimentSource,
     changes: Mapping[str, object],
     logs: Sequence[str],
     window_s: tuple[float | None, float | None],
     by: Sequence[str] | None = None,
 ) -> ExperimentSource:
-    """The experiment file with command-line options in place of its keys; None and empty `logs` leave its values.
+    """An experiment with command-line options in place of its keys; None and empty `logs` leave its values.
 
-    `by`: entries of `measure.by` in addition to those of the file.
+    `by`: entries of `measure.by` in addition to its own.
     """
     from dataclasses import replace
 
-    from copem_replay.experiment.file import drop_settings, read_experiment_file, replace_logs
+    from copem_replay.experiment.file import drop_settings, replace_logs
 
-    source = read_experiment_file(path)
     values = {name: value for name, value in changes.items() if value is not None}
     options: dict[Key, str] = {(name,): f"--{name}" for name in values}
     ends = {k: option for k, option in enumerate(("--from", "--to")) if window_s[k] is not None}

@@ -16,7 +16,6 @@ from copem_replay.cli.inspect import override_source
 from copem_replay.cli.terminal import (
     By,
     Ego,
-    ExperimentFile,
     FromS,
     Logs,
     ToS,
@@ -62,7 +61,12 @@ ADVICE_AFTER_S, ADVICE_CORES = 60.0, 4
 
 
 def run(
-    experiment: ExperimentFile,
+    experiment: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="EXPERIMENT", help="Experiment file (YAML); or recordings, which `init` drafts one for."
+        ),
+    ],
     log: Logs = None,
     ego: Ego = None,
     from_s: FromS = None,
@@ -85,16 +89,20 @@ def run(
     live: Annotated[bool, typer.Option("--live", help="Also show the replay in a running Rerun viewer.")] = False,
     viewer: Annotated[str | None, typer.Option(metavar="URL", help="Address of that viewer [on this machine].")] = None,
 ) -> int:
-    """Replay an experiment, write its results, print the summary."""
+    """Replay an experiment, write its results, print the summary.
+
+    For recordings the draft that `init` would print is replayed; it is experiment.yaml in the results folder.
+    """
     from copem_replay.pipeline.parts import PartCache
     from copem_replay.results.decision import describe_verdicts
-    from copem_replay.results.folder import take_place
+    from copem_replay.results.folder import EXPERIMENT, take_place
     from copem_replay.results.outputs import check_outputs
 
+    source = _read_source(experiment)
     source = override_source(
-        experiment, {"ego": ego, "runs": runs, "seed": seed}, log or (), (from_s, to_s), split_entries(by)
+        source, {"ego": ego, "runs": runs, "seed": seed}, log or (), (from_s, to_s), split_entries(by)
     )
-    out = out or Path("out") / experiment.stem
+    out = out or Path("out") / (experiment[0].stem if len(experiment) == 1 else "drives")
     if cluster is not None:
         load_extra("workers", "address")(cluster)
         pieces = pieces or f"{out}.pieces"
@@ -114,9 +122,27 @@ def run(
             from copem_replay.api.results import write_report
 
             print_line(f"report in {write_report(place.shown)}")
+    if source.path not in experiment:
+        print_line(f"drafted as by copem-replay init: {place.shown / EXPERIMENT}")
     _print_next(place.shown)
     print_answer(decision.sentence if verdicts is None else describe_verdicts(verdicts))
     return 1 if study.skipped or place.failed or not (verdicts is None or verdicts.passes) else 0
+
+
+def _read_source(paths: Sequence[Path]) -> ExperimentSource:
+    """The experiment of a file, or the draft for recordings. Raises InputError, RecordingError."""
+    from copem_replay.experiment.file import is_recording, read_experiment_file, read_experiment_text
+
+    if not all(map(is_recording, paths)):
+        if len(paths) > 1:
+            raise InputError(f"expected one experiment, or recordings, found {', '.join(map(str, paths))}")
+        return read_experiment_file(paths[0])
+    from copem_replay.api.recordings import draft_drives, explain_undrafted
+
+    text, surveys = draft_drives(paths)
+    if text is None:
+        raise InputError(explain_undrafted(surveys))
+    return read_experiment_text(Path(f"draft of {', '.join(map(str, paths))}"), text)
 
 
 def _judge_results(folder: Path, experiment: Experiment) -> Judgement | None:
@@ -142,8 +168,8 @@ def _judge_results(folder: Path, experiment: Experiment) -> Judgement | None:
 
 
 def _read_study(
-    place: ResultsPlace, file: Path, source: ExperimentSource, skip_unreadable: bool, cache: PartCache | None,
-    cluster: str | None,
+    place: ResultsPlace, given: Sequence[Path], source: ExperimentSource, skip_unreadable: bool,
+    cache: PartCache | None, cluster: str | None,
 ) -> LoadedStudy:  # fmt: skip
     """The experiment and its recordings; with `cluster` every part is computed when this returns."""
     from copem_replay.api.run import list_exporters
@@ -156,7 +182,7 @@ def _read_study(
 
         def read() -> LoadedStudy:
             study = read_study(source, skip_unreadable=skip_unreadable, survey=LogSurvey(cache), crew=crew)
-            check_inputs(place, [file, *(path for recording in study.recordings for path in recording.paths)])
+            check_inputs(place, [*given, *(path for recording in study.recordings for path in recording.paths)])
             check_own_files(place, study.experiment, study.recordings, list_exporters())
             return study
 

@@ -295,6 +295,11 @@ def format_key(key: Key) -> str:
 _RECORDINGS = (".mcap", ".osi", ".db3")
 
 
+def is_recording(path: Path) -> bool:
+    """Whether a path is that of a recording, by its suffix, or of a folder of rosbag2."""
+    return path.suffix in _RECORDINGS or os.path.isfile(path / "metadata.yaml")  # False for a name that is too long
+
+
 def _recording_hint(path: Path) -> str:
     return f"; `copem-replay init {shlex.quote(str(path))} > experiment.yaml` makes one that replays it"
 
@@ -306,10 +311,10 @@ def read_experiment_file(path: Path) -> ExperimentSource:
     except FileNotFoundError:
         raise ExperimentError(f"{path}: no such file") from None
     except IsADirectoryError:
-        hint = _recording_hint(path) if (path / "metadata.yaml").is_file() else ""
+        hint = _recording_hint(path) if is_recording(path) else ""
         raise ExperimentError(f"{path}: is a folder; expected an experiment file (YAML){hint}") from None
     except UnicodeDecodeError as error:
-        if path.suffix in _RECORDINGS:
+        if is_recording(path):
             raise ExperimentError(
                 f"{path}: expected an experiment file (YAML), found a recording{_recording_hint(path)}"
             ) from None
@@ -317,6 +322,11 @@ def read_experiment_file(path: Path) -> ExperimentSource:
         raise ExperimentError(f"{path}:{line}: expected YAML text in UTF-8, found byte {byte:#x}") from None
     except OSError as error:
         raise ExperimentError(f"{path}: cannot be read: {error.strerror}") from None
+    return read_experiment_text(path, text)
+
+
+def read_experiment_text(path: Path, text: str) -> ExperimentSource:
+    """The text of an experiment file as plain data. Raises ExperimentError when it is not YAML."""
     try:
         data, lines, problems = parse_yaml(text)
     except AliasesError as error:

@@ -404,8 +404,29 @@ class TestCheck:
         ],
     )
     def test_no_experiment(self, here: Path, call: Call, name: str, said: str) -> None:
-        for command in ("check", "run"):
+        for command in ("check", "run") if name != "drive.mcap" else ("check",):
             assert call(command, name) == (2, "", [said])
+
+    def test_run_takes_recordings_by_their_drafts(self, here: Path, call: Call) -> None:
+        """The same as `init` and `run`; the draft is in the folder, and runs from there."""
+        ended = call("run", "drive.mcap", "--runs", "2")
+        assert ended.code == 0
+        assert "drafted as by copem-replay init: out/drive/experiment.yaml" in ended.out.replace("\n", " ")
+        (here / "draft.yaml").write_text(call("init", "drive.mcap").out)
+        assert call("run", "draft.yaml", "--runs", "2").code == 0
+        for file in ("summary.csv", "tally.parquet"):
+            assert (here / "out/drive" / file).read_bytes() == (here / "out/draft" / file).read_bytes()
+        assert call("check", "out/drive/experiment.yaml").code == 0
+
+    def test_run_of_several_recordings_is_one_study(self, here: Path, call: Call) -> None:
+        shutil.copy(here / "drive.mcap", here / "second.mcap")
+        assert call("run", "drive.mcap", "second.mcap", "--runs", "2").code == 0
+        assert set(pd.read_csv(here / "out/drives/logs.csv")["log"]) == {"drive", "second"}
+
+    def test_run_takes_either_an_experiment_or_recordings(self, here: Path, call: Call) -> None:
+        said = "expected one experiment, or recordings, found e.yaml, drive.mcap"
+        assert call("run", "e.yaml", "drive.mcap") == (2, "", [said])
+        assert call("run", "none.mcap") == (2, "", ["none.mcap: no such file"])
 
     def test_what_can_hardly_be_meant_is_said_as_run_says_it(self, here: Path, call: Call) -> None:
         (here / "e.yaml").write_text(
