@@ -136,7 +136,9 @@ def write_report(
 
 
 def view(results: AnyResults, *, web: bool = False, object_id: str | None = None, log: str | None = None) -> None:
-    """Open the recordings of a results folder in the Rerun viewer, just before the first onset, and wait until it ends.
+    """Open the recordings of a results folder, or one `.rrd` file, in the Rerun viewer, and wait until it ends.
+
+    Each opens just before the first onset.
 
     `object_id`: only recordings with this measured object, just before its onset; `log`: only those of this log.
 
@@ -150,10 +152,16 @@ def view(results: AnyResults, *, web: bool = False, object_id: str | None = None
     Traceback (most recent call last):
     copem_replay.core.errors.InputError: out/nowhere: no such folder
     """
+    from copem_replay.experiment.file import is_recording
     from copem_replay.results.provenance import check_format
-    from copem_replay.viewer.open import Sought, list_rrd_files, open_viewer, opening_s
+    from copem_replay.viewer.open import Sought, list_rrd_files, opening_s
 
     folder = results.require_folder() if isinstance(results, Results) else Path(results)
+    if folder.is_file() and folder.suffix == ".rrd" and object_id is None and log is None:
+        files, folder = [folder.absolute()], folder.absolute().parent
+        return _open_files(folder, files, opening_s(folder, files), web=web)
+    if is_recording(folder):
+        raise InputError(f"{folder}: expected results, found a recording; `copem-replay run {folder}` makes some of it")
     files = list_rrd_files(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
@@ -168,6 +176,13 @@ def view(results: AnyResults, *, web: bool = False, object_id: str | None = None
         if not files:
             where = "" if log is None else f" of log {log}"
             raise InputError(f"{folder}: no recording{where} has the measured object {object_id!r}")
+    return _open_files(folder, files, instants_s, web=web)
+
+
+def _open_files(folder: Path, files: Sequence[Path], instants_s: Mapping[Path, float], *, web: bool) -> None:
+    """Open recordings at their instants, here or in a browser. Raises OutputError where the viewer does not open."""
+    from copem_replay.viewer.open import open_viewer
+
     if web:
         _serve_recordings(folder, files, instants_s)
     elif code := open_viewer(files, instants_s):

@@ -48,6 +48,19 @@ def test_all_parts_of_all_configurations_with_units(call) -> None:  # type: igno
     assert head == f"coPEM: objects are unknown for {late['added_s'].sum():.2f} s in the mean"
 
 
+def test_a_configuration_that_only_some_logs_have_is_explained_by_these(call) -> None:  # type: ignore[no-untyped-def]
+    drive(Path("second.mcap"))
+    logs = "logs: [{file: second.mcap, units: {mast: null}}, drive.mcap]"
+    text = TEXT.replace("PEM: {units: [ego]}", "PEM: {units: [mast]}")
+    Path("e.yaml").write_text(text)
+    Path("two.yaml").write_text(text.replace("logs: [drive.mcap]", logs))
+    code, _, notes = call("two.yaml", "--causes", "--configuration", "PEM", "--out", "two")
+    assert code == 0
+    assert "note: PEM: of drive alone; other logs lack its units" in notes
+    assert call("e.yaml", "--causes", "--configuration", "PEM", "--out", "one")[0] == 0
+    assert Path("two/why.csv").read_bytes() == Path("one/why.csv").read_bytes()
+
+
 def test_only_what_is_asked_for_is_written(call) -> None:  # type: ignore[no-untyped-def]
     code, said, _ = call("e.yaml", "--causes", "--configuration", "PEM", "--out", "there")
     assert code == 0

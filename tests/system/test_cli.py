@@ -1284,6 +1284,11 @@ class TestView:
         assert call("view", ".").code == 0
         assert json.loads(viewer.read_text())[4:] == [str(tmp_path / f"{name}.rrd") for name in reversed(names)]
 
+    def test_opens_a_file(self, tmp_path: Path, call: Call, viewer: Path) -> None:
+        (tmp_path / "any.rrd").touch()
+        assert call("view", "any.rrd") == (0, "", [])
+        assert json.loads(viewer.read_text())[4:] == [str(tmp_path / "any.rrd")]
+
     def test_viewer_that_fails(self, tmp_path: Path, call: Call, viewer: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (tmp_path / "replay.rrd").touch()
         monkeypatch.setenv("VIEWER_ENDS", "3")
@@ -1298,6 +1303,10 @@ class TestView:
             (".", ".: no replay.rrd in this folder; `show: {run: 0}` in an experiment writes one"),
             ("none", "none: no such folder"),
             ("file", "file: no such folder"),
+            (
+                "drive.mcap",
+                "drive.mcap: expected results, found a recording; `copem-replay run drive.mcap` makes some of it",
+            ),
         ],
     )
     def test_nothing_to_open(self, tmp_path: Path, call: Call, viewer: Path, folder: str, said: str) -> None:

@@ -128,7 +128,8 @@ def why(
             raise InputError(f"parts: expected some of {', '.join(PARTS)}, found {part!r}")
     whole, logs = _load_logs(experiment, recordings)
     _check_names(whole, configurations or (), units or ())
-    return _explain(logs, _Question(configurations, parts, units), progress or (lambda _done, _total: None))
+    question = _Question(configurations, parts, units)
+    return _explain(whole, logs, question, progress or (lambda _done, _total: None))
 
 
 def _load_logs(
@@ -183,11 +184,14 @@ class _Question:
 
 
 def _explain(
-    logs: Sequence[tuple[Recording, Experiment]], question: _Question, progress: Callable[[int, int], None]
+    experiment: Experiment,
+    logs: Sequence[tuple[Recording, Experiment]],
+    question: _Question,
+    progress: Callable[[int, int], None],
 ) -> Explanation:
+    """`experiment`: over all logs; those that lack a configuration's units have no part in it."""
     notes, tables = list[str](), {part: list[pd.DataFrame]() for part in (*PARTS, "late")}
     known: dict[str, pd.DataFrame] = {}
-    experiment = logs[0][1]
     beside: dict[int, Counterfactuals] = {}
     names, parts = question.select(experiment), question.parts
     if experiment.runs < _FEW_RUNS:
@@ -195,7 +199,11 @@ def _explain(
         notes.append(f"{few}: with {_FEW_RUNS} standard errors of causes are about 2 % of the time unknown")
     steps = len(names) + ("sensitivity" in parts)
     for k, name in enumerate(names):
-        found = _explain_configuration(name, logs, question, beside)
+        having = _select_logs(logs, [name])
+        if 0 < len(having) < len(logs):
+            of = ", ".join(recording.scene.log for recording, _ in having.values())
+            notes.append(f"{name}: of {of} alone; other logs lack its units")
+        found = _explain_configuration(name, having, question, beside)
         for part, table in found.tables.items():
             tables[part].append(table.assign(configuration=name)[["configuration", *table.columns]])
         for part, error in found.errors.items():
@@ -204,13 +212,21 @@ def _explain(
             known[name] = found.rows
         progress(k + 1, steps)
     joined = {part: pd.concat(of, ignore_index=True) for part, of in tables.items() if of}
-    varied, orders, why_not = _vary(logs, names, known) if "sensitivity" in parts else (None, None, [])
+    common = list(_select_logs(logs, names).values())
+    varied, orders, why_not = _vary(common, names, known) if common and "sensitivity" in parts else (None, None, [])
     notes += question.note("sensitivity", why_not, bool(joined))
     progress(steps, steps)
     if not joined and varied is None:
         raise ExperimentError(notes[-1] if notes else "expected a configuration with units, found none")
     causes, units, triage, late = (joined.get(part) for part in ("causes", "units", "triage", "late"))
     return Explanation(causes, units, triage, late, varied, orders, tuple(dict.fromkeys(notes)))
+
+
+def _select_logs(
+    logs: Sequence[tuple[Recording, Experiment]], names: Sequence[str]
+) -> dict[int, tuple[Recording, Experiment]]:
+    """By their numbers the logs that have all of these configurations."""
+    return {k: log for k, log in enumerate(logs) if {*names} <= log[1].configurations.keys()}
 
 
 def _vary(
@@ -235,9 +251,9 @@ class _PartTables(NamedTuple):
 
 
 def _explain_configuration(
-    name: str, logs: Sequence[tuple[Recording, Experiment]], question: _Question, beside: dict[int, Counterfactuals]
+    name: str, logs: Mapping[int, tuple[Recording, Experiment]], question: _Question, beside: dict[int, Counterfactuals]
 ) -> _PartTables:
-    """`beside`: by number of log the replays of the configuration before, which is replaced."""
+    """`logs`: by number; `beside`: likewise the replays of the configuration before, which are replaced."""
     from copem_replay.extras.why.causes import Counterfactuals, share_lateness, tabulate_causes
     from copem_replay.extras.why.triage import group_late_episodes, list_late_episodes, rank_groups
     from copem_replay.extras.why.worth import compute_unit_worths
@@ -246,7 +262,7 @@ def _explain_configuration(
     if {"causes", "triage"} & set(parts):
         shares: list[tuple[Counterfactuals, list[CauseShares]]] = []
         try:
-            for k, (recording, experiment) in enumerate(logs):
+            for k, (recording, experiment) in logs.items():
                 beside[k] = replays = Counterfactuals(recording, experiment, name, beside.get(k))
                 shares.append((replays, share_lateness(replays)))
         except ExperimentError as error:
@@ -262,7 +278,7 @@ def _explain_configuration(
                 found.tables["late"] = pd.concat([list_late_episodes(of) for of in episodes], ignore_index=True)
     if "units" in parts:
         try:
-            found.tables["units"] = compute_unit_worths(logs, name, question.units).table
+            found.tables["units"] = compute_unit_worths(list(logs.values()), name, question.units).table
         except ExperimentError as error:
             found.errors["units"] = error
     return found
