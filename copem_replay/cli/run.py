@@ -24,6 +24,7 @@ from copem_replay.cli.terminal import (
     print_line,
     print_notes,
     print_problems,
+    print_rows,
     print_table,
     print_verdicts,
     show_progress,
@@ -86,6 +87,7 @@ def run(
     cluster: Cluster = None,
     report: Annotated[bool, typer.Option("--report", help="Also write report.html.")] = False,
     label: Annotated[str | None, typer.Option(metavar="TEXT", help="Name of these results in a history.")] = None,
+    explain: Annotated[bool, typer.Option("--explain", help="Print every figure, and what it means.")] = False,
     live: Annotated[bool, typer.Option("--live", help="Also show the replay in a running Rerun viewer.")] = False,
     viewer: Annotated[str | None, typer.Option(metavar="URL", help="Address of that viewer [on this machine].")] = None,
 ) -> int:
@@ -115,6 +117,7 @@ def run(
         url = _check_viewer(study.experiment, viewer) if live or viewer is not None else None
         result, advice = _replay_study(study, jobs, cache, threads=cluster is None)
         decision = _write_results(place, study, result, advice, cache, url, label)
+        _print_results(study.experiment, result, decision, explain=explain)
         if by is not None and result.study is not None and result.study.summary_by is not None:
             _print_groups(result.study.summary_by, split_entries(by) or ())
         verdicts = _judge_results(place.shown, study.experiment)
@@ -122,8 +125,8 @@ def run(
             from copem_replay.api.results import write_report
 
             print_line(f"report in {write_report(place.shown)}")
-    if source.path not in experiment:
-        print_line(f"drafted as by copem-replay init: {place.shown / EXPERIMENT}")
+    drafted = "" if source.path in experiment else f", drafted as by init ({EXPERIMENT})"
+    print_line(f"results in {place.shown}{drafted}{'' if explain else '; every figure: --explain'}")
     _print_next(place.shown)
     print_answer(decision.sentence if verdicts is None else describe_verdicts(verdicts))
     return 1 if study.skipped or place.failed or not (verdicts is None or verdicts.passes) else 0
@@ -207,9 +210,7 @@ def _write_results(
     place: ResultsPlace, study: LoadedStudy, result: Results, advice: list[str], cache: PartCache | None,
     viewer: str | None, label: str | None,
 ) -> Decision:  # fmt: skip
-    """Fill the results folder, then print notes, problems and the summary. Returns what is decided."""
-    from copem_replay.core.tracks import TRUTH
-    from copem_replay.metrics.summary import describe_began, format_summary
+    """Fill the results folder, then print notes and problems. Returns what is decided."""
     from copem_replay.results.decision import decide
 
     notes = result.fill(place, skipped=study.skipped, viewer=viewer, label=label)
@@ -222,19 +223,36 @@ def _write_results(
     print_first_notes(notes)
     print_notes([*result.study.costs, *advice])
     print_problems(place.failed)
-    decision = decide(result)
+    return decide(result)
+
+
+def _print_results(experiment: Experiment, result: Results, decision: Decision, *, explain: bool) -> None:
+    """Print the summary: what fits a screen, or every figure and what it means."""
+    from copem_replay.results.screen import format_screen
+
+    assert result.study is not None
     summary = result.study.summary  # as it was computed: nine digits are on the edge of a rounding where it is not
+    if explain:
+        _print_summary(experiment, result, summary, decision)
+    else:
+        lines, marked = format_screen(result, summary, decision.best)
+        print_rows(lines, marked)
+    if result.sweep is not None:
+        print_line(f"sweep of {', '.join(dict.fromkeys(result.sweep['sweep']))} in {result.place / 'sweep.csv'}")
+
+
+def _print_summary(experiment: Experiment, result: Results, summary: pd.DataFrame, decision: Decision) -> None:
+    """Print every figure of the summary, what it means, and what later commands hold the others against."""
+    from copem_replay.core.tracks import TRUTH
+    from copem_replay.metrics.summary import describe_began, format_summary
+
     print_table(format_summary(summary, width_of(sys.stdout)), decision.best)
-    configurations = study.experiment.configurations
+    configurations = experiment.configurations
     if len(result.tally):
         modelled = (name for name, one in configurations.items() if one.units != TRUTH)
-        reference, words = next(modelled, next(iter(configurations))), study.experiment.measure.began
+        reference, words = next(modelled, next(iter(configurations))), experiment.measure.began
         print_line(describe_began(result.tally, reference, result.provenance.horizon_used_s, words))
-    if result.sweep is not None:
-        print_line(f"sweep of {', '.join(dict.fromkeys(result.sweep['sweep']))} in {place.shown / 'sweep.csv'}")
-    _print_baseline(study.experiment)
-    print_line(f"results in {place.shown}")
-    return decision
+    _print_baseline(experiment)
 
 
 def _print_groups(table: pd.DataFrame, entries: Sequence[str]) -> None:

@@ -122,6 +122,14 @@ def print_table(text: str, bold: Collection[str] = ()) -> None:
         print(f"\x1b[1m{fitted}\x1b[0m" if width is not None and line.split("  ")[0] in bold else fitted)
 
 
+def print_rows(lines: Iterable[str], bold: Collection[str] = ()) -> None:
+    """Print lines on stdout; in a terminal, those in `bold` are bold."""
+    width = width_of(sys.stdout)
+    for line in lines:
+        fitted = _fit_line(line, width)
+        print(f"\x1b[1m{fitted}\x1b[0m" if width is not None and line in bold else fitted)
+
+
 def print_answer(sentence: str) -> None:
     """Print the answer, the last paragraph of a command."""
     print_blocks([["", sentence]])

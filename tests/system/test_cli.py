@@ -202,9 +202,12 @@ class TestInstalled:
         done = installed("run", "e.yaml", folder=here)
         assert done.returncode == 0
         assert done.stderr == ""
-        assert done.stdout.splitlines()[0].startswith("configuration  detected_share  95 %")
-        assert [line.split()[0] for line in done.stdout.splitlines()[1:4]] == ["GT", "PEM", "coPEM"]
-        assert re.search(r"\nresults in out/e\nnext: copem-replay report out/e\n\n[A-Z].*\.\n$", done.stdout)
+        lines = done.stdout.splitlines()
+        assert lines[:3] == ["drive: 1 object counts, 4 runs", lines[1], ""]
+        assert lines[1].startswith("! One object says nothing about other traffic")
+        assert lines[4].split() == ["mean", "median", "95", "%", "by", "median", "detected"]
+        assert [line.split()[0] for line in lines[5:7]] == ["PEM", "coPEM"]
+        assert re.search(END, done.stdout)
         assert table(here / "out" / "e").shape[0] == 12
 
     def test_wrong_input(self, here: Path, call: Call) -> None:
@@ -411,7 +414,7 @@ class TestCheck:
         """The same as `init` and `run`; the draft is in the folder, and runs from there."""
         ended = call("run", "drive.mcap", "--runs", "2")
         assert ended.code == 0
-        assert "drafted as by copem-replay init: out/drive/experiment.yaml" in ended.out.replace("\n", " ")
+        assert "results in out/drive, drafted as by init (experiment.yaml)" in ended.out
         (here / "draft.yaml").write_text(call("init", "drive.mcap").out)
         assert call("run", "draft.yaml", "--runs", "2").code == 0
         for file in ("summary.csv", "tally.parquet"):
@@ -483,12 +486,21 @@ class TestCheck:
         assert ended == (0, f"{BEGAN}../e.yaml: no problem found; logs: drive\n", [])
 
 
+END = r"\nresults in out/e; every figure: --explain\nnext: copem-replay report out/e\n\n[A-Z].*\.\n$"
+
+
 class TestRun:
+    def test_every_figure_where_it_is_asked_for(self, here: Path, call: Call) -> None:
+        lines = call("run", "e.yaml", "--explain").out.splitlines()
+        assert lines[0].startswith("configuration  detected_share  95 %")
+        assert [line.split()[0] for line in lines[1:4]] == ["GT", "PEM", "coPEM"]
+        assert any(line.startswith("baseline of compare and report: ") for line in lines)
+
     def test_results(self, here: Path, call: Call) -> None:
         ended = call("run", "e.yaml")
         assert ended.code == 0
         assert ended.lines == []
-        assert re.search(r"\nresults in out/e\nnext: copem-replay report out/e\n\n[A-Z].*\.\n$", ended.out)
+        assert re.search(END, ended.out)
         assert sorted(written(here / "out" / "e")) == [
             "accuracy.parquet", "bands.csv", "detections.parquet", "experiment.yaml", "instants.parquet",
             "lists.parquet", "logs.csv", "provenance.json", "read.csv", "summary.csv", "tally.parquet",
@@ -533,8 +545,8 @@ class TestRun:
         assert len(found) == 0
         assert found.dtypes["onset_s"].kind == "f"
         assert list(pd.read_csv(here / "out/e/summary.csv")["n"]) == [0, 0, 0]
-        assert ended.out.splitlines()[1].split() == ["GT", *["–"] * 9]
-        assert "all configurations: n 0, list_rate_hz 10" in ended.out.splitlines()
+        assert ended.out.splitlines()[0] == "drive: 0 objects count, 4 runs"
+        assert ended.out.splitlines()[-1] == "There is no answer: no measured object has an onset."
         refused = call("compare", "out/e", "--baseline", "PEM")
         assert (refused.code, refused.lines) == (
             2, ["out/e: nothing can be compared: no measured object has an onset"],
@@ -574,7 +586,7 @@ class TestRun:
     def test_nothing_is_cut_off_or_wrapped(self, here: Path, call: Call) -> None:
         name = "a very long name of a configuration " * 5
         (here / "e.yaml").write_text(TEXT.replace("  PEM:", f"  '{name}':"))
-        ended = call("run", "e.yaml")
+        ended = call("run", "e.yaml", "--explain")
         assert ended.code == 0
         lines = ended.out.splitlines()
         assert len(lines[0]) > 250

@@ -1,0 +1,162 @@
+"""Screen: what a run says on a terminal of 80 columns and 24 lines. `--explain` has every column and what it means.
+
+A table in the words that a person says, units once; what makes the results worthless stands above it. Rows that say the
+same are one, zeros of the truth and columns that nobody has are left out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+
+from copem_replay.core.errors import count_noun
+from copem_replay.metrics.braking.driving import SHARE
+from copem_replay.metrics.limits import FEWEST_CLUSTERS, count_clusters
+from copem_replay.metrics.onset import has_frame_after
+
+if TYPE_CHECKING:
+    from copem_replay.results.read import Results
+
+_MOST_ROWS = 12
+"""More configurations are in `summary.csv`."""
+_NAMES = 26
+"""Most characters of the names of configurations that share a row."""
+
+
+def _seconds(value: float) -> str:
+    return f"{value:.2f}"
+
+
+def _metres(value: float) -> str:
+    return f"{value:.1f}"
+
+
+def _per_cent(value: float) -> str:
+    return f"{100 * value:.3g} %"
+
+
+@dataclass(frozen=True)
+class _Column:
+    """`group`: words above neighbouring columns."""
+
+    group: str
+    header: str
+    metric: str
+    format: Callable[[float], str]
+    never: str = "–"
+
+
+_COLUMNS = (
+    _Column("known after, s", "mean", "ttd_rmst_s", _seconds, "never"),
+    _Column("known after, s", "median", "ttd_median_s", _seconds, "never"),
+    _Column("known after, s", "95 % by", "ttd_p95_s", _seconds, "never"),
+    _Column("at distance, m", "median", "dad_median_m", _metres),
+    _Column("", "detected", "detected_share", _per_cent),
+    _Column("braking", "in time", "pass_share", _per_cent),
+    _Column("braking", "for nothing", SHARE, _per_cent),
+)
+
+
+def format_screen(results: Results, summary: pd.DataFrame, best: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The lines of the screen but for the answer, and those of its rows that have one of the `best`.
+
+    `summary`: as it was computed.
+    """
+    if not len(results.known):
+        return [*_describe_rows(results)][:1], []
+    shown = summary[[not _is_trivial(results, row) for _, row in summary.iterrows()]]
+    columns = [column for column in _COLUMNS if column.metric in shown and _is_told(shown[column.metric], column)]
+    rows: dict[tuple[str, ...], list[str]] = {}
+    for _, row in shown.iterrows():
+        cells = tuple(_format_cell(row, column) for column in columns)
+        rows.setdefault(cells, []).append(str(row["configuration"]))
+    names = {cells: _join_names(of) for cells, of in rows.items()}
+    kept = list(rows)[:_MOST_ROWS]
+    lines = _format_table(columns, [(names[cells], *cells) for cells in kept])
+    marked = [line for line, cells in zip(lines[2:], kept, strict=True) if {*rows[cells]} & {*best}]
+    left = sum(len(rows[cells]) for cells in list(rows)[_MOST_ROWS:])
+    more = [f"and {left} more in summary.csv"] if left else []
+    return [*_describe_rows(results), *lines, *more, ""], marked
+
+
+def _is_trivial(results: Results, row: Any) -> bool:
+    """Whether a row is of the truth, which knows all at once."""
+    return bool(results.facts[str(row["configuration"])].truth) and len(results.facts) > 1 and row["ttd_rmst_s"] == 0
+
+
+def _is_told(values: pd.Series, column: _Column) -> bool:
+    """Whether a column is shown: somebody has it, and of braking for nothing, somebody does."""
+    return bool(values.notna().any()) and (column.metric != SHARE or bool(values.any()))
+
+
+def _format_cell(row: Any, column: _Column) -> str:
+    value = row[column.metric]
+    return column.never if value is None or pd.isna(value) else column.format(float(value))
+
+
+def _join_names(names: Sequence[str]) -> str:
+    """`gnn, union`; `gnn and 3 more` where they do not fit."""
+    whole = ", ".join(names)
+    return whole if len(whole) <= _NAMES or len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
+
+
+def _format_table(columns: Sequence[_Column], rows: Sequence[tuple[str, ...]]) -> list[str]:
+    """Two lines of headers, then the rows; numbers to the right."""
+    headers = ["", *(column.header for column in columns)]
+    widths = [max(map(len, cells)) for cells in zip(headers, *rows, strict=True)]
+    groups, k = [" " * widths[0]], 0
+    while k < len(columns):
+        after = k
+        while after < len(columns) and columns[after].group == columns[k].group:
+            after += 1
+        width = sum(widths[k + 1 : after + 1]) + 2 * (after - k - 1)
+        if (grow := len(columns[k].group) - width) > 0:
+            widths[k + 1] += grow
+            width += grow
+        groups.append(columns[k].group.rjust(width))
+        k = after
+    body = [
+        "  ".join([row[0].ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(row[1:], widths[1:], strict=True))])
+        for row in (headers, *rows)
+    ]
+    return ["  ".join(groups).rstrip(), *(line.rstrip() for line in body)]
+
+
+def _describe_rows(results: Results) -> Iterator[str]:
+    """What counts, over what, and what makes it worthless."""
+    logs, objects, passes = count_clusters(results.known)
+    runs, names = results.provenance.runs, [log.name for log in results.provenance.logs]
+    where = names[0] if len(names) == 1 else count_noun(len(names), "log")
+    counted = count_noun(objects, "object") + (
+        f" in {count_noun(passes, 'pass', 'passes')}" if passes > objects else ""
+    )
+    verb = "counts" if objects == 1 else "count"
+    yield f"{where}: {counted} {verb}, {count_noun(runs, 'run')}{_describe_left_out(results)}"
+    if objects == 1 and passes < FEWEST_CLUSTERS:
+        yield "! One object says nothing about other traffic; `check` says who else is there."
+    elif logs == 1 and objects < FEWEST_CLUSTERS:
+        yield f"! {objects} objects of one drive are too few for an interval."
+    elif logs == 2:
+        yield "! Two logs tell no interval; three do."
+    horizon_s, asked_s = results.provenance.horizon_used_s, results.experiment.measure.horizon_s
+    if not math.isclose(horizon_s, asked_s):
+        yield f"Few are in range for {asked_s:g} s: means are up to {horizon_s:.3g} s."
+    yield ""
+
+
+def _describe_left_out(results: Results) -> str:
+    """Who does not count: `; not 9 more there at the start`."""
+    rows = results.tally.drop_duplicates(["log", "object_id", "episode"])
+    rows = rows[has_frame_after(rows)]
+    words = set(results.provenance.measure["began"])
+    parts = {"log_start": "there at the start", "appeared": "that appeared in range", "crossed": "that came into range"}
+    told = [
+        f"not {number} more {said}"
+        for word, said in parts.items()
+        if word not in words and (number := int((rows["began"] == word).sum()))
+    ]
+    return "".join(f"; {one}" for one in told)

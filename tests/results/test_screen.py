@@ -1,0 +1,109 @@
+"""What a run says on a screen: the table in a person's words, and what makes it worthless above it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import copem_replay as cr
+from copem_replay.results.decision import decide
+from copem_replay.results.read import Results
+from copem_replay.results.screen import format_screen
+from tests.helpers.recordings import Obj, pedestrian, write_recording
+
+PEM = {"p": [{"detection": {"kind": "constant", "probability": 0.6}}]}
+UNITS = {"ego": {"on": "ego", "height_m": 1.8, "pem": "p"}, "mast": {"at": [30.0, 9.0], "height_m": 6.0, "pem": "p"}}
+CONFIGURATIONS: dict[str, Any] = {
+    "GT": {"units": "truth"},
+    "ideal": {"units": "all"},
+    "same": {"units": "all"},
+    "alone": {"units": ["ego"], "fusion": {"kind": "gnn"}},
+    "late": {"units": "all", "latency_s": 0.5, "fusion": {"kind": "gnn"}},
+}
+
+
+def replay(folder: Path, walkers: int, *, logs: int = 1, **more: Any) -> Results:
+    """The ego comes nearer to some pedestrians, four metres apart."""
+    for k in range(logs):
+        frames = [
+            (0.1 * t, [Obj(id=1, x=0.8 * t), *(pedestrian(id=2 + w, x=62.0 + 4 * w, y=6.0) for w in range(walkers))])
+            for t in range(60)
+        ]
+        write_recording(folder / f"drive{k}.mcap", frames, host=1)
+    plan = {
+        "version": 1, "runs": 5, "pems": PEM, "units": UNITS, "configurations": CONFIGURATIONS, "show": None,
+        "measure": {"onset": {"kind": "in_range", "range_m": 60}, "horizon_s": 1},
+    }  # fmt: skip
+    return cr.run(plan | more, [folder / f"drive{k}.mcap" for k in range(logs)])
+
+
+def screen(results: Results) -> list[str]:
+    return format_screen(results, results.summary, decide(results).best)[0]
+
+
+def test_fits_and_says_what_a_person_says(tmp_path: Path) -> None:
+    results = replay(tmp_path, 5)
+    lines = screen(results)
+    assert lines[:2] == ["drive0: 5 objects count, 5 runs", ""]
+    assert lines[2].split("  ")[-1] == "at distance, m"
+    assert lines[3].split() == ["mean", "median", "95", "%", "by", "median", "detected"]
+    assert [line.split("  ")[0] for line in lines[4:7]] == ["ideal, same", "alone", "late"]
+    row = results.summary.set_index("configuration").loc["late"]
+    times = [f"{row[name]:.2f}" for name in ("ttd_rmst_s", "ttd_median_s", "ttd_p95_s")]
+    assert lines[6].split()[1:5] == [*times, f"{row['dad_median_m']:.1f}"]
+    assert max(map(len, lines)) <= 80
+    assert len(lines) <= 24
+
+
+def test_rows_of_the_best_are_marked(tmp_path: Path) -> None:
+    results = replay(tmp_path, 5)
+    lines, marked = format_screen(results, results.summary, ["same"])
+    assert marked == [lines[4]]
+
+
+@pytest.mark.parametrize(
+    ("walkers", "logs", "said"),
+    [
+        (1, 1, "! One object says nothing about other traffic; `check` says who else is there."),
+        (3, 1, "! 3 objects of one drive are too few for an interval."),
+        (3, 2, "! Two logs tell no interval; three do."),
+    ],
+)
+def test_what_makes_it_worthless_stands_above(tmp_path: Path, walkers: int, logs: int, said: str) -> None:
+    lines = screen(replay(tmp_path, walkers, logs=logs))
+    assert lines[1] == said
+
+
+def test_three_logs_need_no_warning(tmp_path: Path) -> None:
+    lines = screen(replay(tmp_path, 2, logs=3))
+    assert lines[:2] == ["3 logs: 6 objects count, 5 runs", ""]
+
+
+def test_who_does_not_count_is_said(tmp_path: Path) -> None:
+    measure = {"onset": {"kind": "in_range", "range_m": 72}, "horizon_s": 1}
+    assert screen(replay(tmp_path, 5, measure=measure))[0] == (
+        "drive0: 2 objects count, 5 runs; not 3 more there at the start"
+    )
+
+
+def test_a_horizon_that_few_last_is_said(tmp_path: Path) -> None:
+    results = replay(tmp_path, 5, measure={"onset": {"kind": "in_range", "range_m": 60}, "horizon_s": 50})
+    used_s = results.provenance.horizon_used_s
+    assert used_s < 50
+    assert f"Few are in range for 50 s: means are up to {used_s:.3g} s." in screen(results)
+
+
+def test_of_nobody_there_is_no_table(tmp_path: Path) -> None:
+    results = replay(tmp_path, 2, measure={"onset": {"kind": "in_range", "range_m": 1}})
+    assert screen(results) == ["drive0: 0 objects count, 5 runs"]
+
+
+def test_eighteen_configurations_fit(tmp_path: Path) -> None:
+    many = {"GT": {"units": "truth"}} | {
+        f"late {k}": {"units": ["ego"], "latency_s": 0.1 * k, "fusion": {"kind": "gnn"}} for k in range(18)
+    }
+    lines = screen(replay(tmp_path, 5, configurations=many))
+    assert "and 6 more in summary.csv" in lines
+    assert len(lines) <= 24
