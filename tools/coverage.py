@@ -9,8 +9,9 @@ truth is beyond its bound by a hair, *wrongly not met* where it is not met altho
 `at_least` for shares, else `at_most`. *Objects* of one drive have times up to the horizon of any distribution; *logs*
 have objects of their own share detected and their own median time, unrelated to their number, or bad logs that are also
 *busy*. *Followed* rows begin, leave and are censored, and go through the figures of a criterion, study by study
-(`metrics/row_figures.py`): a quarter as many. *Stars*: of four configurations and a baseline that are all alike, eight
-metrics, one of them without limits; over the whole table (Holm), and of one metric that is named before.
+(`metrics/row_figures.py`): a quarter as many. *Rates* are of events in drives, each of which has its own. *Stars*: of
+four configurations and a baseline that are all alike, eight metrics, one of them without limits; over the whole table
+(Holm), and of one metric that is named before.
 
 Gates: coverage of at least .93, at most .04 wrongly met, .06 of tables starred, with two standard errors. A *line* is a
 row of the table in docs/guide/metrics.md; one that is beyond a gate is named there, in bold, else the exit code is 1.
@@ -35,7 +36,14 @@ import pandas as pd
 from scipy.special import ndtr, ndtri
 
 from copem_replay.core.tracks import Bool, Float, Int
-from copem_replay.metrics.limits import Clusters, limit_bounded_mean, limit_figure, limit_left_out, limit_share
+from copem_replay.metrics.limits import (
+    Clusters,
+    limit_bounded_mean,
+    limit_figure,
+    limit_left_out,
+    limit_rate,
+    limit_share,
+)
 from copem_replay.metrics.row_figures import JUDGED, FigureRows
 from copem_replay.metrics.summary import format_table
 from copem_replay.results.compare.limits import find_stars
@@ -323,6 +331,21 @@ def pass_rows(rng: Generator, studies: int) -> Iterator[Row]:
         yield Row(line, "one object with ten episodes", "nees", "objects", K, *limits, 0.0)
 
 
+# Rates: events of drives of half an hour to an hour and a half, whose own rates are gamma distributed.
+
+
+def rate_rows(rng: Generator, studies: int) -> Iterator[Row]:
+    """Needless brakes per hour, by the coefficient of variation of the rates between drives, and events a drive."""
+    for cv, events, K in product((0.0, 0.5, 1.0, 2.0), (0.3, 2.0), CLUSTERS):
+        hours = rng.uniform(0.5, 1.5, (studies, K))
+        own = rng.gamma(1 / cv**2, cv**2, hours.shape) if cv else np.ones(hours.shape)
+        found = rng.poisson(events * own * hours).astype(float)
+        low, high = np.transpose([limit_rate(*drives) for drives in zip(found, hours, strict=True)])
+        apart = {1.0: " that differ", 2.0: " far apart"}.get(cv, "")
+        design = f"{events:g} a drive, coefficient of variation {cv:g}"
+        yield Row(f"rates, drives{apart}", design, "needless_brakes_per_h", "logs", K, low, high, events)
+
+
 # Differences of two configurations, pair by pair.
 
 
@@ -594,7 +617,7 @@ def star_table(seed: int, tables: int) -> pd.DataFrame:
 
 
 PARTS: Final[tuple[Callable[[Generator, int], Iterator[Row]], ...]] = (
-    object_rows, log_rows, unbounded_rows, pass_rows, difference_rows, followed_rows,
+    object_rows, log_rows, unbounded_rows, pass_rows, difference_rows, followed_rows, rate_rows,
 )  # fmt: skip
 
 

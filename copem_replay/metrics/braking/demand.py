@@ -62,10 +62,6 @@ class BrakingEgo:
         driving: Bool = ~np.isnan(course.along_m) & (course.speed_mps >= self.slower_mps)
         return driving
 
-    def decelerate(self, elapsed_s: Float, speed_mps: Float) -> Float:
-        """(K,) the driver's deceleration so long after braking began at these speeds (K,)."""
-        return driver_deceleration(self.driver, elapsed_s[:, None], speed_mps[:, None])[:, 0]
-
     def must_brake(self, time_s: Float, which: Int, states: Float, *, margin_m: float, share: float) -> Bool:
         """(N,) whether the driver must brake for states (N, 8 or more) that are listed at instants `which (N,)` of
         `time_s (K,)`; −1: at none.
@@ -78,18 +74,20 @@ class BrakingEgo:
         row_of = np.full(len(time_s), -1)
         for begin in range(0, len(driving), _LISTS):
             block = driving[begin : begin + _LISTS]
-            deceleration, stands_s = self._brake(course.speed_mps[block], share)
+            deceleration, instants = self._brake(course.speed_mps[block], share)
             row_of[:] = -1
             row_of[block] = np.arange(len(block))
             _mark_demands(
                 self.path.path, self.path.size_m, course.along_m[block], course.speed_mps[block], deceleration,
-                stands_s, self._reaction_s, row_of, which, states, margin_m, share,
-                np.empty((deceleration.shape[1], 3)), out,
+                instants, self._reaction_s, row_of, which, states, margin_m, share,
+                np.empty((len(block), instants.max(), 3)), out,
             )  # fmt: skip
         return out
 
-    def _brake(self, speed_mps: Float, share: float) -> tuple[Float, Float]:
-        """(K, J) deceleration in each step, and (K,) when an ego stands that brakes with a share of it."""
+    def _brake(self, speed_mps: Float, share: float) -> tuple[Float, Int]:
+        """(K, J) deceleration in each step, and (K,) how many instants it takes until an ego stands that brakes with a
+        share of it, with the first.
+        """
         most = round(_LONGEST_S / STEP_S)
         steps = 64
         while True:
@@ -104,29 +102,26 @@ class BrakingEgo:
             if slower.any(axis=1).all() or steps == most:
                 break
             steps *= 2
-        stands_s = np.where(slower.any(axis=1), end_s[np.argmax(slower, axis=1)], end_s[-1])
-        return np.ascontiguousarray(deceleration), stands_s
+        instants = np.where(slower.any(axis=1), np.argmax(slower, axis=1) + 2, steps + 1)
+        return np.ascontiguousarray(deceleration), instants
 
 
 @borrowing_kernel
 def _mark_demands(
-    path: Float, size: Float, along: Float, speed: Float, deceleration: Float, stands_s: Float, reaction_s: float,
+    path: Float, size: Float, along: Float, speed: Float, deceleration: Float, instants: Int, reaction_s: float,
     row_of: Int, which: Int, states: Float, margin_m: float, share: float, poses: Float, out: Bool,
 ) -> None:  # fmt: skip
-    """Out: `out (N,)`. `row_of (K,)`: the row of `along`, `speed`, …, −1: none. `poses (J, 3)`: scratch."""
-    last, steps = -1, 0
+    """Out: `out (N,)`. `row_of (K,)`: the row of `along`, `speed`, …, −1: none. `poses (K, J + 1, 3)`: scratch."""
+    for k in range(len(along)):
+        for j in range(instants[k]):
+            poses[k, j, 0], poses[k, j, 1], poses[k, j, 2] = pose_on_path(path, along[k] + speed[k] * j * STEP_S)
     for n in range(len(which)):
         k = row_of[which[n]] if which[n] >= 0 else -1
-        if k < 0:
-            continue
-        if k != last:
-            last, steps = k, int(np.ceil(stands_s[k] / STEP_S - 1e-9)) + 1
-            for j in range(min(steps, len(poses))):
-                poses[j, 0], poses[j, 1], poses[j, 2] = pose_on_path(path, along[k] + speed[k] * j * STEP_S)
-            steps = min(steps, len(poses))
-        out[n] = _must_brake(
-            path, size, along[k], speed[k], deceleration[k], reaction_s, states[n], margin_m, share, poses, steps
-        )
+        if k >= 0:
+            out[n] = _must_brake(
+                path, size, along[k], speed[k], deceleration[k], reaction_s, states[n], margin_m, share, poses[k],
+                instants[k],
+            )  # fmt: skip
 
 
 @borrowing

@@ -1,8 +1,9 @@
 """What false alarms cost over drives: how often the driver brakes for nothing, for how much of the time, how hard.
 
 From rows of `lists.parquet` (`metrics/braking/needless.py` defines their columns). Runs add draws and no driving: the
-events of a drive are the mean over its runs, its hours count once. Limits are over logs, from three on; over the runs
-of a single one, where they tell of other draws alone; of two logs there are none.
+events of a drive are the mean over its runs, its hours count once. A log in which the ego does not drive is no drive.
+Limits are over logs, from three on; over the runs of a single one, where they tell of other draws alone; of two logs
+there are none.
 """
 
 from __future__ import annotations
@@ -54,16 +55,14 @@ class Drives:
         total = float(self.hours.sum())
         if not total > 0:
             return LimitedFigure(None)
-        value, driving = float(self.needless_h.sum()) / total, self.hours > 0
-        if self.over is None or driving.sum() < 2:
+        value = float(self.needless_h.sum()) / total
+        if self.over is None:
             return LimitedFigure(value)
-        hours, needless_h = self.hours[driving], self.needless_h[driving]
-        without = (needless_h.sum() - needless_h) / (total - hours)
+        without = (self.needless_h.sum() - self.needless_h) / (total - self.hours)
         by_run = self.over == "runs"
-        unseen = None if by_run else float((hours**2).sum() / total)
-        return limit_left_out(
-            value, without, hours, (0.0, 1.0), confidence, unseen, len(hours) if by_run else 0
-        )  # fmt: skip
+        unseen = None if by_run else float((self.hours**2).sum() / total)
+        runs = len(self.hours) if by_run else 0
+        return limit_left_out(value, without, self.hours, (0.0, 1.0), confidence, unseen, runs)
 
     def limit(self, metric: str, confidence: float) -> LimitedFigure:
         """The limits of `RATE` or `SHARE`."""
@@ -78,7 +77,7 @@ def sum_drives(rows: pd.DataFrame | None, *, of_runs: bool = False) -> Drives | 
     """
     if rows is None or "needless_brakes" not in rows:
         return None
-    rows = rows if "runs" in rows else rows.assign(runs=1)
+    rows = (rows if "runs" in rows else rows.assign(runs=1))[rows["driving_s"] > 0]
     names = ["runs", "driving_s", "needless_brakes", "needless_s", "must_brake_s", "must_brake_missed_s"]
     by_log = rows.groupby("log", sort=False)[names].sum()
     over = "logs" if len(by_log) >= FEWEST_LOGS else None

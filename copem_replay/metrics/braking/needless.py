@@ -3,8 +3,8 @@
 The driver *brakes* at a list when he must (`metrics/braking/demand.py`) for any entry of it, of whatever class,
 measured or not, in `hits` of the last `of` lists (`measure.confirm`). Braking is *needed* where the truth gives a
 reason at any tenth of a second of the log that is within `around_s` of the list: he must brake for a true object,
-standing ones too, with the margin `wider_m` and the share `needed_at`. Braking that is not needed is *needless*, from
-its list to the next, for `max_age_s` at most, and to the ego's last frame. An event is a stretch of it, with pauses of
+standing ones too, with the margin `wider_m` and the share `needed_at`. Braking that is not needed is *needless*, as
+long as he drives, from its list to the next, for `max_age_s` at most. An event is a stretch of it, with pauses of
 `merge_s` or less.
 
 The speed that an event loses is that of the driver's deceleration over its needless time, at most the speed at its
@@ -30,6 +30,7 @@ from copem_replay.core.object_list import Entries, ObjectLists, TellsOf, join_en
 from copem_replay.core.tracks import SAME_INSTANT_S, VALUES, Bool, Float, Int, Scene, Tracks
 from copem_replay.metrics.accuracy.statistics import AccuracySettings
 from copem_replay.metrics.braking.demand import BrakingEgo
+from copem_replay.metrics.braking.driver import driver_deceleration
 from copem_replay.metrics.config import DUPLICATE_ENTRY, GHOST_ENTRY, LATE, MISPLACED, Confirm, Needless
 from copem_replay.metrics.episodes import Reference
 from copem_replay.metrics.matching import DUPLICATE, GHOST, Matches
@@ -43,7 +44,7 @@ _ROWS = 500_000
 @dataclass(frozen=True)
 class TruthDemand:
     """When the truth gives a reason to brake: at instants `time_s (G,)` whether the driver must, and whether he must
-    with tolerance (`needed`); `driving_s`: seconds of driving in the log.
+    with tolerance (`needed`); `driven_s (F,)`: seconds of driving before each of the ego's frames.
     """
 
     braking: BrakingEgo
@@ -54,7 +55,17 @@ class TruthDemand:
     time_s: Float
     must: Bool
     needed: Bool
-    driving_s: float
+    driven_s: Float
+
+    @property
+    def driving_s(self) -> float:
+        """Seconds of driving in the log."""
+        return float(self.driven_s[-1])
+
+    def drive_between(self, begins_s: Float, ends_s: Float) -> Float:
+        """(K,) seconds of driving between instants (K,)."""
+        before, after = (np.interp(time_s, self.braking.path.frame_s, self.driven_s) for time_s in (begins_s, ends_s))
+        return np.asarray(after - before)
 
     def is_needed(self, time_s: Float) -> Bool:
         """(K,) whether braking is needed within `around_s` of instants (K,), half a tenth more for their distance."""
@@ -86,8 +97,8 @@ def find_truth_demand(
         needed[which[soft]] = True
         hard = braking.must_brake(time_s, which, rows, margin_m=asked.margin_m, share=asked.brakes_at)
         must[which[hard]] = True
-    driving_s = _measure_driving_s(braking, max_gap_s)
-    return TruthDemand(braking, asked, scene, truth, max_gap_s, time_s, must, needed, driving_s)
+    driven_s = _add_up_driving(braking, max_gap_s)
+    return TruthDemand(braking, asked, scene, truth, max_gap_s, time_s, must, needed, driven_s)
 
 
 def _stack_states(states: dict[str, Float]) -> Float:
@@ -95,10 +106,9 @@ def _stack_states(states: dict[str, Float]) -> Float:
     return np.ascontiguousarray(np.stack([states[name] for name in VALUES[:8]], axis=1))
 
 
-def _measure_driving_s(braking: BrakingEgo, max_gap_s: float) -> float:
-    frame_s = braking.path.frame_s
-    after_s, driving = np.diff(frame_s), braking.path.frame_mps[:-1] >= braking.slower_mps
-    return float(after_s[driving & (after_s <= max_gap_s + SAME_INSTANT_S)].sum())
+def _add_up_driving(braking: BrakingEgo, max_gap_s: float) -> Float:
+    after_s, driving = np.diff(braking.path.frame_s), braking.path.frame_mps[:-1] >= braking.slower_mps
+    return np.append(0.0, np.cumsum(np.where(driving & (after_s <= max_gap_s + SAME_INSTANT_S), after_s, 0.0)))
 
 
 @dataclass(frozen=True)
@@ -158,6 +168,8 @@ class NeedlessDetector:
         self._confirm, self._max_age_s = confirm, max_age_s
         self._added = 0
         self._tells_of: TellsOf = "now"
+        ego = truth.braking.path
+        self._ego_x_m, self._ego_y_m = ego.locate(ego.course(issue_s).bound_m)
         self._existence = np.full((runs, len(issue_s)), -1.0, dtype=np.float32)
         """Of the surest entry of each list that demands braking; −1: none does."""
         self._parts: list[tuple[Int, Int, Entries, Int, Int, Int]] = []
@@ -169,10 +181,12 @@ class NeedlessDetector:
         count = lists.start.shape[1] - 1
         which = np.full(len(lists.entries), -1)
         for start in lists.start:
-            which[start[0] : start[-1]] = np.repeat(np.arange(count), np.diff(start)) + self._added
+            which[start[0] : start[-1]] = np.repeat(np.arange(count), np.diff(start))
+        issue_s = self._issue_s[self._added : self._added + count]
         demands = braking.must_brake(
-            self._issue_s, which, view_as_numbers(lists.entries), margin_m=asked.margin_m, share=asked.brakes_at
+            issue_s, which, view_as_numbers(lists.entries), margin_m=asked.margin_m, share=asked.brakes_at
         )
+        which += self._added
         rows = np.flatnonzero(demands & (matches.object_ix != self._truth.scene.ego_ix))
         rows = rows[self._is_annotated(lists.entries[rows], which[rows])]
         run_ix = np.searchsorted(lists.start[:, 0], rows, side="right") - 1
@@ -196,20 +210,19 @@ class NeedlessDetector:
 
     def _choose_surest(self, entries: Entries, rows: Int, run_ix: Int, which: Int) -> tuple[Int, Int]:
         """Of each run and list one row: of the highest existence the nearest to the ego."""
-        course = self._truth.braking.path.course(self._issue_s[which[rows]])
-        x_m, y_m = self._truth.braking.path.locate(course.along_m)
-        away_m = np.hypot(entries["x_m"][rows] - x_m, entries["y_m"][rows] - y_m)
-        order = np.lexsort((away_m, -entries["existence"][rows], which[rows], run_ix))
+        k = which[rows]
+        away_m = np.hypot(entries["x_m"][rows] - self._ego_x_m[k], entries["y_m"][rows] - self._ego_y_m[k])
+        order = np.lexsort((away_m, -entries["existence"][rows], k, run_ix))
         first = np.ones(len(order), dtype=bool)
-        first[1:] = (np.diff(run_ix[order]) != 0) | (np.diff(which[rows][order]) != 0)
+        first[1:] = (np.diff(run_ix[order]) != 0) | (np.diff(k[order]) != 0)
         return rows[order[first]], run_ix[order[first]]
 
     def result(self) -> NeedlessBraking:
         """The needless braking of all lists."""
         truth, runs = self._truth, len(self._existence)
-        driving = truth.braking.is_driving(self._issue_s) & ~truth.is_needed(self._issue_s)
-        brakes = self._confirmed(self._existence >= 0.0)
-        lasts_s = self._list_lasts_s()
+        brakes, held_s = self._confirmed(self._existence >= 0.0), self._list_lasts_s()
+        lasts_s = truth.drive_between(self._issue_s, self._issue_s + held_s)
+        driving = truth.braking.is_driving(self._issue_s) & ~truth.is_needed(self._issue_s) & (lasts_s > 0.0)
         needless = brakes & driving
         run_ix, k = np.nonzero(needless)
         first, after = _join_events(run_ix, self._issue_s[k], lasts_s[k], truth.asked.merge_s)
@@ -225,7 +238,7 @@ class NeedlessDetector:
             brakes=np.bincount(begin_run, minlength=runs),
             needless_s=_add_up(needless, lasts_s),
             speed_lost_mps=speed_lost,
-            missed_s=self._miss(brakes, lasts_s),
+            missed_s=self._miss(brakes, held_s),
             needless_s_at=self._find_by_existence(driving, lasts_s),
             run_ix=begin_run,
             begins_s=self._issue_s[begin_k],
@@ -258,11 +271,9 @@ class NeedlessDetector:
         """(E,) m/s that the driver's deceleration takes in the needless time of events."""
         braking = self._truth.braking
         speed = braking.path.course(begins_s).speed_mps
-        lost = np.zeros(len(begins_s))
-        steps = 20
-        for step in range(steps):  # by the middles of twentieths
-            lost += braking.decelerate((step + 0.5) / steps * needless_s, speed) * needless_s / steps
-        return np.minimum(lost, speed)
+        middles_s = needless_s[:, None] * (np.arange(20) + 0.5) / 20
+        lost_mps: Float = driver_deceleration(braking.driver, middles_s, speed[:, None]).mean(axis=1) * needless_s
+        return np.minimum(lost_mps, speed)
 
     def _find_by_existence(self, driving: Bool, lasts_s: Float) -> Float:
         """(S, T) needless seconds with entries of at least each existence."""

@@ -105,7 +105,7 @@ class AllLogs:
         self.alone.append((int((first.there & ~second.there).sum()), int((second.there & ~first.there).sum())))
         for regret in regrets:
             # Runs and passes stay apart for a single object: they are the clusters if no log has another.
-            runs = over_runs or regret.counts[0][0] <= 1 or regret.figure.by_drive
+            runs = over_runs or regret.counts[0][0] <= 1
             figure = regret.figure.condensed(runs=runs) if more else regret.figure
             self._regrets.setdefault(regret.metric, []).append(replace(regret, figure=figure))
 

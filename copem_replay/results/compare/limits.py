@@ -190,14 +190,12 @@ def mcnemar_p_value(only_first: int, only_second: int) -> float:
 class PairStatistic(ABC):
     """A figure of two configurations. Items may have `only (i, 2)`: whether only the first, or second, succeeded.
 
-    `by_object`: whether the items are known by object, so that objects or passes can be clusters. `by_drive`: whether
-    they are of whole drives, so that a single log has runs for clusters. `share`: whether the
+    `by_object`: whether the items are known by object, so that objects or passes can be clusters. `share`: whether the
     figure is a share of the items, which then have `only`.
     """
 
     parts: tuple[StatisticItems, ...]
     by_object: bool = True
-    by_drive: bool = False
     share: bool = False
 
     @property

@@ -260,8 +260,7 @@ class Regret:
     @property
     def over(self) -> str | None:
         """The clusters of its interval; None: there are too few."""
-        logs, *_ = counts = total_counts(self.counts)
-        return "runs" if self.figure.by_drive and logs == 1 else choose_over(*counts)
+        return choose_over(*total_counts(self.counts))
 
     @staticmethod
     def joined(of_logs: Sequence[Regret]) -> Regret:
@@ -348,6 +347,7 @@ def compute_regrets(
         if figure is not None:
             held = pair.held_counts if FIGURES.get(of.figure) in (_held_errors, _held_gospa) else None
             kept = pair.setting.kept if FIGURES.get(of.figure) is _means_at_equal_ghosts else None
+            counts = (1, 1) if metric.part == "needless" else counts  # a drive is one, whatever objects it has
             yield Regret(metric.name, figure, (counts,), kept, held)
 
 
@@ -490,10 +490,12 @@ def _needless_time(pair: _Pair) -> SumStatistic | None:
     first, second = pair.first.lists, pair.second.lists
     if first is None or second is None or "needless_s" not in first or "needless_s" not in second:
         return None
-    runs = np.flatnonzero(first["there"] & second["there"])
+    runs = np.flatnonzero(first["there"] & second["there"] & (first["driving_s"] > 0))
+    if not len(runs):
+        return None  # who stands does not drive
     sums = np.stack([first["needless_s"], second["needless_s"], first["driving_s"]], axis=1)[runs]
     items = pair.items(-1 - runs, sums=sums)
-    return SumStatistic(parts=(items,), by_object=False, by_drive=True, of=_divide_mean, most=1.0)
+    return SumStatistic(parts=(items,), by_object=False, of=_divide_mean, most=1.0)
 
 
 def _append_run_items(pair: _Pair, cells: Int, of_cells: Float, of_runs: Float, n: Int) -> StatisticItems:
