@@ -109,6 +109,27 @@ def test_few_studies_may_miss_a_gate_by_chance(tool: ModuleType) -> None:
     assert tool.Row("means", "a", "difference", "logs", 3, low, high, 1.0).tell("")["fails"] is True
 
 
+def test_rates_of_drives_have_the_mean_and_the_spread_that_they_claim(
+    tool: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Events in hours, as the limits see them: of 0.3 and 2 an hour, with their coefficient of variation."""
+    seen = list[tuple[np.ndarray, np.ndarray]]()
+    monkeypatch.setattr(tool, "CLUSTERS", (20,))
+    monkeypatch.setattr(tool, "limit_rate", lambda *drives: seen.append(drives) or (0.0, 1.0))
+    rows = list(tool.rate_rows(np.random.default_rng(2), 2000))
+    assert [row.truth for row in rows] == [0.3, 2.0] * 4
+    assert [row.line for row in rows[::2]] == [
+        "rates, drives", "rates, drives", "rates, drives that differ", "rates, drives far apart",
+    ]  # fmt: skip
+    for k, row in enumerate(rows):
+        events, hours = (np.concatenate([one[of] for one in seen[k * 2000 : (k + 1) * 2000]]) for of in (0, 1))
+        assert hours.mean() == pytest.approx(1.0, abs=0.01)
+        assert events.sum() / hours.sum() == pytest.approx(row.truth, rel=0.05)
+        cv = (0.0, 0.5, 1.0, 2.0)[k // 2]
+        beyond = ((events - row.truth * hours) ** 2 - events).sum() / (row.truth**2 * (hours**2).sum())
+        assert beyond == pytest.approx(cv**2, abs=0.1 + 0.1 * cv**2)
+
+
 def test_no_row_of_a_short_table_is_beyond_a_gate(tool: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tool, "CLUSTERS", (3, 8, 20))
     monkeypatch.setattr(tool, "_MANY", 100_000)
