@@ -394,7 +394,7 @@ _ASKED: dict[str, tuple[Callable[[Mapping[str, Any]], bool], str]] = {
     "conflict": (lambda data: _measure_data(data).get("conflict") is not None, "`measure: {conflict: {}}`"),
     "needless": (
         lambda data: isinstance(of := data.get("braking"), Mapping) and of.get("needless", {}) is not None,
-        "`braking: {driver: …}`",
+        "`braking: {driver: …, needless: {}}`",
     ),
     "accuracy": (lambda data: _measure_data(data).get("accuracy", True) is not False, "`measure: {accuracy: true}`"),
     "exact": (lambda data: _measure_data(data).get("exact") is True, "`measure: {exact: true}`"),

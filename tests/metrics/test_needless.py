@@ -40,7 +40,6 @@ from copem_replay.metrics.braking.needless import (
 )
 from copem_replay.metrics.config import Confirm, Needless
 from copem_replay.metrics.episodes import Reference
-from copem_replay.metrics.limits import ALL_ALIKE
 from copem_replay.metrics.matching import DUPLICATE, GHOST, MATCH, Matches
 from copem_replay.pipeline import prepare as chunking
 from copem_replay.pipeline.prepare import prepare_log
@@ -770,6 +769,15 @@ class TestStudies:
             assert pd.isna(summary[f"needless_{name}"]), name
         assert pd.isna(summary["must_brake_missed_s"])
 
+    def test_who_never_has_a_list_misses_all(self) -> None:
+        late = {"units": ["u_clean"], "latency_s": 100.0}
+        plan = study(
+            {"clean": [SEES]}, runs=1, configurations={"late": late, "gnn": late | {"fusion": {"kind": "gnn"}}}
+        )
+        for row in run_experiment(plan, [SAMPLE]).accuracy["lists.parquet"].to_pylist():
+            assert (row["lists"], row["needless_brakes"], row["needless_s"], row["driving_s"]) == (0, 0, 0, 8)
+            assert row["must_brake_missed_s"] == row["must_brake_s"] == pytest.approx(1.2)
+
     @pytest.mark.parametrize("changes", [{"braking": None}, {"braking": BRAKING_8 | {"needless": None}}])
     def test_not_asked_for(self, changes: dict[str, Any]) -> None:
         found = run_experiment(study({"clean": [SEES]}, runs=1, **changes), [SAMPLE])
@@ -807,21 +815,20 @@ class TestDecisions:
         plan = study(pems, runs=6, logs=[f"{log.scene.log}.mcap" for log in logs], measure=self.MEASURE)
         return cr.run(plan, list(logs))
 
-    def compared(self, made: Any) -> tuple[pd.Series, pd.Series, pd.Series]:
-        """Of ghosts: the row of the summary, and the rows of the comparison of rate and share."""
+    def compared(self, made: Any) -> tuple[pd.Series, pd.Series]:
+        """Of ghosts: the row of the summary, and that of the comparison."""
         overall = cr.compare(made, baseline="clean").overall.set_index("metric")
-        summary = made.study.summary.set_index("configuration").loc["ghosts"]
-        return summary, overall.loc["needless_brakes_per_h"], overall.loc["needless_brake_share"]
+        assert "needless_brakes_per_h" not in overall.index, "the share decides"
+        return made.study.summary.set_index("configuration").loc["ghosts"], overall.loc["needless_brake_share"]
 
     def test_over_drives(self) -> None:
         """One has no measured object, and is a drive all the same; one stands, and is none."""
         made = self.made(drive_of("a", 10), drive_of("b", 8), drive_of("c", 6, car=False), drive_of("d", 0))
-        summary, rate, share = self.compared(made)
+        summary, share = self.compared(made)
         assert summary["driving_h"] == pytest.approx(12 / 3600)
-        for row, name in ((rate, "needless_brakes_per_h"), (share, "needless_brake_share")):
-            assert row["value"] == pytest.approx(summary[name])
-            assert row["baseline_value"] == 0
-            assert (row["interval_over"], row["clusters"]) == ("logs", 3)
+        assert share["value"] == pytest.approx(summary["needless_brake_share"])
+        assert share["baseline_value"] == 0
+        assert (share["interval_over"], share["clusters"]) == ("logs", 3)
         found = {(of.criterion, of.configuration): of for of in cr.judge(made, self.CRITERIA).all}
         rate_of = found["rate", "ghosts"]
         assert (rate_of.verdict, rate_of.over, rate_of.clusters) == ("not met", "logs", 3)
@@ -839,11 +846,11 @@ class TestDecisions:
     def test_of_two_drives_there_is_no_interval(self, logs: Sequence[float], over: str | None) -> None:
         """Over two drives none; of one over its runs."""
         made = self.made(*(drive_of("abc"[k], speed) for k, speed in enumerate(logs)))
-        summary, rate, _ = self.compared(made)
+        summary, share = self.compared(made)
         assert (summary["needless_interval_over"] or None) == over
-        assert rate["value"] == pytest.approx(summary["needless_brakes_per_h"])
-        assert pd.isna(rate["low"])  # in all runs alike, or of two drives
-        assert (rate["interval"] if over else None) == (ALL_ALIKE if over else None)
+        assert share["value"] == pytest.approx(summary["needless_brake_share"])
+        assert pd.isna(share["low"]) == (over is None)
+        assert share["interval_over"] == over or over is None
         for of in cr.judge(made, {"rate": self.CRITERIA["rate"]}).all:
             assert of.verdict == "not measured"
             assert of.why is not None
