@@ -16,6 +16,7 @@ from copem_replay.cli.terminal import (
     print_blocks,
     print_line,
     print_notes,
+    print_rows,
     print_table,
     print_verdicts,
     split_entries,
@@ -39,6 +40,7 @@ def compare(
         float | None,
         typer.Option(metavar="N", min=0, help="Ghosts per minute at which times are compared [the baseline's]."),
     ] = None,
+    explain: Annotated[bool, typer.Option("--explain", help="Print every figure, and what it means.")] = False,
     rrd: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Write one run of all configurations as a Rerun recording (.rrd)."),
@@ -93,7 +95,13 @@ def compare(
     alone = open_results(folders[0]) if len(folders) == 1 else None
     of = (None, None) if alone is None else (alone.experiment, alone.summary)
     decision = decide_compared(comparison, *of)
-    print_table(comparison_text(comparison, width_of(sys.stdout)), decision.best)
+    if explain or by is not None or matters or decide:
+        print_table(comparison_text(comparison, width_of(sys.stdout)), decision.best)
+    else:
+        from copem_replay.results.screen import format_comparison
+
+        print_rows(*format_comparison(comparison, decision.best))
+        print_line("every figure: --explain")
     if by is not None and len(folders) == 1:
         from copem_replay.results.slices import groups_text, summarise_slices
 

@@ -1,4 +1,4 @@
-"""Screen: what a run says on a terminal of 80 columns and 24 lines. `--explain` has every column and what it means.
+"""Screens: what `run` and `compare` say on 80 columns and 24 lines. `--explain` has every column and what it means.
 
 A table in the words that a person says, units once; what makes the results worthless stands above it. Rows that say the
 same are one, zeros of the truth and columns that nobody has are left out.
@@ -15,10 +15,14 @@ import pandas as pd
 
 from copem_replay.core.errors import count_noun
 from copem_replay.metrics.braking.driving import SHARE
-from copem_replay.metrics.limits import FEWEST_CLUSTERS, count_clusters
+from copem_replay.metrics.limits import FEWEST_CLUSTERS, count_clusters, describe_clusters, format_limits
 from copem_replay.metrics.onset import has_frame_after
+from copem_replay.results.compare.limits import STAR
+from copem_replay.results.compare.tables import NOTHING
+from copem_replay.results.decision import MATTERS_S, MATTERS_SHARE
 
 if TYPE_CHECKING:
+    from copem_replay.results.compare import Comparison
     from copem_replay.results.read import Results
 
 _MOST_ROWS = 12
@@ -160,3 +164,76 @@ def _describe_left_out(results: Results) -> str:
         if word not in words and (number := int((rows["began"] == word).sum()))
     ]
     return "".join(f"; {one}" for one in told)
+
+
+# The screen of a comparison.
+
+_WIDE = 80
+_COMPARED = {
+    "ttd_rmst_s": "known", "pass_share": "brakes in time", SHARE: "brakes for nothing",
+    "position_rmse_held_m": "position error, m", "false_positives_per_min": "false per minute",
+}  # fmt: skip
+"""Metrics of a comparison that are shown while they fit, and their headers."""
+
+
+def format_comparison(comparison: Comparison, best: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The lines of a comparison but for the answer, and those of its rows that have one of the `best`."""
+    overall = comparison.overall
+    rows = {(row.configuration, row.metric): row for row in overall.itertuples(index=False)}
+    least = {SHARE: MATTERS_SHARE}
+    names = [name for name in comparison.configurations if name not in comparison.truths] or comparison.configurations
+    overall = overall[overall["configuration"].isin(names)]
+    cells = {
+        metric: [_tell_difference(metric, rows.get((name, metric))) for name in names]
+        for metric in _COMPARED
+        if overall.loc[overall["metric"] == metric, "difference"].abs().gt(least.get(metric, NOTHING)).any()
+    }
+    kept, width = list[str](), min(_NAMES, max(map(len, names)))
+    for metric, of_metric in cells.items():
+        width += 2 + max(map(len, [_COMPARED[metric], *of_metric]))
+        if width <= _WIDE or not kept:
+            kept.append(metric)
+    grouped: dict[tuple[str, ...], list[str]] = {}
+    for k, name in enumerate(names):
+        grouped.setdefault(tuple(cells[metric][k] for metric in kept), []).append(name)
+    shown = list(grouped)[:_MOST_ROWS]
+    table = [("", *(_COMPARED[metric] for metric in kept)), *((_join_names(grouped[of]), *of) for of in shown)]
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    lines = ["  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip() for row in table]
+    marked = [line for line, of in zip(lines[1:], shown, strict=True) if {*grouped[of]} & {*best}]
+    left = sum(len(grouped[of]) for of in list(grouped)[_MOST_ROWS:])
+    more = [f"and {left} more: --explain"] if left else []
+    same = ["nothing differs"] if not kept else []
+    return [*_describe_pairs(comparison), *(lines if kept else []), *same, *more], marked
+
+
+def _describe_pairs(comparison: Comparison) -> Iterator[str]:
+    """What it is held against, and what the intervals are over."""
+    limited = comparison.overall.dropna(subset="interval_over")
+    limited = limited[limited["metric"] != SHARE]  # which is of drives
+    over = [describe_clusters(str(kind), int(of["clusters"].max())) for kind, of in limited.groupby("interval_over")]
+    why = "" if comparison.baseline_why is None else f" ({comparison.baseline_why})"
+    yield f"against {comparison.baseline}{why}; --baseline names another"
+    for words in over:
+        yield f"[95 %]: over {words}"
+    if (comparison.overall["star"] == STAR).any():
+        yield f"{STAR}: the interval excludes 0, all differences together held at 95 %"
+    yield ""
+
+
+def _tell_difference(metric: str, row: Any) -> str:
+    """`0.53 s later [0.454, 0.606] *`; `as soon` where it cannot matter; of other metrics with a sign."""
+    if row is None or pd.isna(row.difference):
+        return "–"
+    size, limits = float(row.difference), (row.low, row.high)
+    known = not (pd.isna(row.low) or pd.isna(row.high))
+    if metric == "ttd_rmst_s":
+        if abs(size) < MATTERS_S and (not known or max(abs(row.low), abs(row.high)) < MATTERS_S):
+            return "as soon"
+        told = f"{abs(size):.2f} s {'later' if size > 0 else 'sooner'}"
+        limits = limits if size > 0 else (-row.high, -row.low) if known else limits
+    else:
+        size, limits = (100 * size, (100 * row.low, 100 * row.high)) if "share" in metric else (size, limits)
+        told = "±0" if abs(size) < NOTHING else f"{size:+.3g}" + (" points" if "share" in metric else "")
+    marks = [STAR] if row.star == STAR else []
+    return " ".join([told, *([format_limits(*limits)] if known and told != "±0" else []), *marks])

@@ -10,7 +10,7 @@ import pytest
 import copem_replay as cr
 from copem_replay.results.decision import decide
 from copem_replay.results.read import Results
-from copem_replay.results.screen import format_screen
+from copem_replay.results.screen import format_comparison, format_screen
 from tests.helpers.recordings import Obj, pedestrian, write_recording
 
 PEM = {"p": [{"detection": {"kind": "constant", "probability": 0.6}}]}
@@ -107,3 +107,25 @@ def test_eighteen_configurations_fit(tmp_path: Path) -> None:
     lines = screen(replay(tmp_path, 5, configurations=many))
     assert "and 6 more in summary.csv" in lines
     assert len(lines) <= 24
+
+
+def test_a_comparison_says_sooner_and_later(tmp_path: Path) -> None:
+    results = replay(tmp_path, 5)
+    compared = cr.compare(results)
+    lines, marked = format_comparison(compared, ["alone"])
+    assert lines[0] == "against ideal (by its name); --baseline names another"
+    assert lines[1].startswith("[95 %]: over 5 objects of this drive")
+    table = lines[lines.index("") + 1 :]
+    assert table[0].split()[0] == "known"
+    assert [line.split("  ")[0] for line in table[1:]] == ["same", "alone", "late"], "the truth is none"
+    assert table[1].split("  ")[1].strip().startswith("as soon")
+    row = compared.overall.set_index(["configuration", "metric"]).loc[("late", "ttd_rmst_s")]
+    assert f"{row['difference']:.2f} s later" in table[3]
+    assert max(map(len, lines[: lines.index("")])) < 200
+    assert max(map(len, table)) <= 80
+    assert marked == [line for line in table if line.startswith("alone")]
+
+
+def test_a_comparison_with_an_equal_has_no_table(tmp_path: Path) -> None:
+    results = replay(tmp_path, 5, configurations={"ideal": {"units": "all"}, "same": {"units": "all"}})
+    assert format_comparison(cr.compare(results), [])[0][-1] == "nothing differs"

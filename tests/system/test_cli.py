@@ -882,7 +882,7 @@ class TestCompare:
     def test_prints_what_the_library_finds(self, fused: Path, call: Call) -> None:
         found = compare_folders([fused / "out/e"], baseline="coPEM")
         assert found.configurations == ("GT", "PEM")
-        ended = call("compare", "out/e", "--baseline", "coPEM")
+        ended = call("compare", "out/e", "--baseline", "coPEM", "--explain")
         assert ended.code == 0
         words = comparison_text(found).split()
         assert ended.out.split()[: len(words)] == words  # then the answer, in a sentence
@@ -906,7 +906,8 @@ class TestCompare:
 
     def test_of_two_folders(self, fused: Path, call: Call) -> None:
         assert call("run", "e.yaml", "--seed", "2", "--out", "other").code == 0
-        ended = call("compare", "out/e", "other", "--baseline", "e:coPEM", "--configurations", "e:PEM, other:PEM")
+        options = ["--baseline", "e:coPEM", "--configurations", "e:PEM, other:PEM", "--explain"]
+        ended = call("compare", "out/e", "other", *options)
         assert ended.code == 0
         first, other = ([line.split()[1:] for line in ended.out.splitlines() if line.startswith(name)]
                         for name in ("e:PEM ", "other:PEM "))  # fmt: skip
