@@ -377,7 +377,8 @@ def format_summary(summary: pd.DataFrame, width: int | None = None) -> str:
         lines += describe_intervals(summary, "pass_interval")
         lines.append("pass_share: share of conflicts that the configured driver avoids when braking after detection")
     if SHARE in summary:
-        lines += ["", *_describe_needless(summary, width)]
+        none = describe_no_needless(summary)
+        lines += ["", *(_needless_lines(summary, width) if none is None else [none])]
     if "output_latency_s" in summary:
         lines += ["", *_part_lines(summary[summary["output_delay_s"].notna()], "output", width)]
         lines.append("output_latency_s: available − the stamp of the state; output_delay_s: that stamp − the state")
@@ -387,14 +388,19 @@ def format_summary(summary: pd.DataFrame, width: int | None = None) -> str:
     return "\n".join(part for line in lines for part in (wrap_line(line, width) if "\n" not in line else [line]))
 
 
-def _describe_needless(summary: pd.DataFrame, width: int | None) -> list[str]:
-    """Braking for nothing: a table where there is any, else how rare it is at most."""
-    driving_h, rate = float(summary["driving_h"].max()), summary[RATE].dropna()
+def describe_no_needless(summary: pd.DataFrame) -> str | None:
+    """How rare braking for nothing is at most where nobody does, or that it cannot be known; None: somebody does."""
+    driving_h = float(summary["driving_h"].max())
     if not driving_h > 0:
-        return ["braking for nothing: not known, for the ego does not drive"]
-    if not rate.any():
-        below = limit_rate(np.zeros(1), np.full(1, driving_h))[1]
-        return [f"braking for nothing: none in {format_cell(3600 * driving_h)} s of driving: below {below:.3g} an hour"]
+        return "braking for nothing: not known, for the ego does not drive"
+    if summary[RATE].any():
+        return None
+    below = limit_rate(np.zeros(1), np.full(1, driving_h))[1]
+    return f"braking for nothing: none in {3600 * driving_h:.3g} s of driving: below {below:.3g} an hour"
+
+
+def _needless_lines(summary: pd.DataFrame, width: int | None) -> list[str]:
+    """The table of braking for nothing, and what it means."""
     over = {*summary["needless_interval_over"].dropna()}
     lines = _part_lines(summary, "needless", width, RATE)
     lines += (

@@ -17,6 +17,7 @@ from copem_replay.core.errors import count_noun
 from copem_replay.metrics.braking.driving import SHARE
 from copem_replay.metrics.limits import FEWEST_CLUSTERS, count_clusters, describe_clusters, format_limits
 from copem_replay.metrics.onset import has_frame_after
+from copem_replay.metrics.summary import describe_no_needless
 from copem_replay.results.compare.limits import STAR
 from copem_replay.results.compare.tables import NOTHING
 from copem_replay.results.decision import MATTERS_S, MATTERS_SHARE
@@ -84,6 +85,8 @@ def format_screen(results: Results, summary: pd.DataFrame, best: Sequence[str]) 
     marked = [line for line, cells in zip(lines[2:], kept, strict=True) if {*rows[cells]} & {*best}]
     left = sum(len(rows[cells]) for cells in list(rows)[_MOST_ROWS:])
     more = [f"and {left} more in summary.csv"] if left else []
+    none = describe_no_needless(summary) if SHARE in summary else None
+    more += [none] if none is not None else []
     return [*_describe_rows(results), *lines, *more, ""], marked
 
 

@@ -901,6 +901,23 @@ class TestSame:
             for found, of in zip(tables, expected[1], strict=True):
                 assert found.equals(of)
 
+    def test_runs_that_differ_in_their_units(self) -> None:
+        """Their lists come at other instants. Fewer runs are the first of many."""
+        on_cars = {"on": {"classes": ["car"], "penetration_rate": 0.4}, "pem": "clean"}
+        units = {"u_ghosts": {"on": "ego", "height_m": 1.8, "pem": "ghosts"}, "others": on_cars}
+        log, tables = cr.read_recording(LOGS / "crossing.mcap"), []
+        for runs, jobs in ((3, 1), (2, 2)):
+            plan = study(
+                {name: GHOSTS[name] for name in ("clean", "ghosts")}, runs=runs, logs=["crossing.mcap"], units=units,
+                configurations={"all": {"units": ["u_ghosts", "others"], "fusion": {"kind": "gnn"}}},
+                measure={"onset": {"kind": "in_range", "range_m": 60}},
+            )  # fmt: skip
+            found = run_experiment(plan, [log], jobs=jobs).accuracy
+            tables.append([found[name].to_pandas() for name in ("lists.parquet", "needless.parquet")])
+        for many, few in zip(*tables, strict=True):
+            pd.testing.assert_frame_equal(many[many["run"] < 2].reset_index(drop=True), few, check_exact=True)
+        assert (tables[0][0]["needless_brakes"] > 0).all()
+
     def test_kept_parts(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.chdir(tmp_path)
         for runs in (4, 6, 6):

@@ -8,7 +8,7 @@ share β, when all of this holds:
 1. v is at least `slower_mps`, and the entry does not overlap the ego: it is the ego itself, or too late.
 2. If the ego does not brake, the two come within m of each other before a braking ego (f = β) would stand; and the
    entry's centre is then ahead of the ego's. Who runs into its back is no reason to brake.
-3. The same holds for every f of β/12, 2β/12, …, β. A contact while the ego stands does not count.
+3. They meet for every f of β/12, 2β/12, …, β, too. A contact while the ego stands does not count.
 
 So a share below β of the driver's braking does not keep it clear. An entry nearer than m already is judged by touching.
 Places are compared every `STEP_S`, and at the instant the ego stands.
