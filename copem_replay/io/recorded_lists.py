@@ -45,7 +45,7 @@ from copem_replay.io.open import Local, open_log
 from copem_replay.io.schemas import osi_ground_truth as osi
 from copem_replay.io.schemas.object_lists import DecodedLists
 from copem_replay.io.schemas.osi_ground_truth import SENSOR_DATA, check_osi, load_message_class, osi_id
-from copem_replay.io.schemas.registry import DETAIL_SCHEMA, known_lists
+from copem_replay.io.schemas.registry import DETAIL_SCHEMA, STRING, known_lists
 from copem_replay.io.stamps import refuse_second_run, settle_stamps
 from copem_replay.io.window import Window
 
@@ -428,8 +428,6 @@ def _read_described(log: Log, topic: str, scene: Scene, around: LogContext | Non
 def _read_details(log: Log, topic: str) -> dict[int, dict[str, Any]]:
     """The content of the topic `…/detail` beside a topic, by the time in ns at which each list was available."""
     beside = f"{topic.removesuffix('/objects')}/detail"
-    from copem_replay.io.write.ros2 import STRING
-
     channels = [c for c in log.channels if c.topic == beside and c.messages and schema_name(c) == STRING]
     details: dict[int, dict[str, Any]] = {}
     for channel in channels:

@@ -182,6 +182,11 @@ _FIELDS: dict[str, tuple[str, ...]] = {
 _RULE = "=" * 80
 
 
+def list_fields(name: str) -> list[tuple[str, str]]:
+    """The type and the name of each field of a type (`package/Type`), without constants."""
+    return [(kind, field) for kind, field, *_ in map(str.split, (f for f in _FIELDS[name] if "=" not in f))]
+
+
 def message_definition(name: str) -> bytes:
     """The definition of a message type (`package/msg/Type`) with those of all types in it."""
     types = [name.replace("/msg/", "/")]

@@ -29,6 +29,7 @@ from copem_replay.core.site_map import SiteMap, outline_crosswalks
 from copem_replay.core.tracks import CLASSES, NO_CAPTURE_NS, Float, Int, Scene
 from copem_replay.io.encodings.column_bytes import (
     Content,
+    Instants,
     RepeatedMessages,
     encode_messages,
     expand_ranges,
@@ -203,10 +204,10 @@ class SensorDataWriter:
             captured_ns = self._fused_tracks.fused.stamp_ns[first:last]
             content: dict[str, Any] = {
                 "version": version,
-                "timestamp": _encode_stamp(available_ns[first:last]),
+                "timestamp": Instants(available_ns[first:last]),
                 "mounting_position": {"position": {}, "orientation": {}},
                 "last_measurement_time": optional_message(
-                    captured_ns != NO_CAPTURE_NS, _encode_stamp(captured_ns[captured_ns != NO_CAPTURE_NS])
+                    captured_ns != NO_CAPTURE_NS, Instants(captured_ns[captured_ns != NO_CAPTURE_NS])
                 ),
             }
             frame = np.repeat(np.arange(len(lists)), lists)
@@ -283,8 +284,3 @@ def _standard_deviation(variance: Float | None, rows: Int) -> Float:
     """Standard deviations of `rows`, 0 where the state is exact."""
     result: Float = np.zeros(len(rows)) if variance is None else np.sqrt(np.nan_to_num(variance[0, rows]))
     return result
-
-
-def _encode_stamp(time_ns: Int) -> Content:
-    seconds, nanos = np.divmod(time_ns, 1_000_000_000)
-    return {"seconds": seconds, "nanos": nanos}
