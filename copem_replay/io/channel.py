@@ -33,6 +33,10 @@ class Channel:
     part: str = ""  # the recording it comes from, of several of one drive
 
 
+class DefinitionError(ValueError):
+    """A definition of messages that cannot be used, and why."""
+
+
 def schema_name(channel: Channel) -> str:
     """The schema as tables name it; ROS 2 types that are written without `/msg` get it."""
     name = channel.schema

@@ -25,10 +25,10 @@ from copem_replay.core.errors import RecordingError
 from copem_replay.core.files import parse_json
 from copem_replay.core.interpolation import wrap_angles
 from copem_replay.core.tracks import CLASSES, UNCERTAINTIES, VALUES, Bool, Float, Int, Scene, Tracks
-from copem_replay.io.channel import LAST_NS, schema_name
+from copem_replay.io.channel import LAST_NS, DefinitionError, schema_name
 from copem_replay.io.decoded_size import DecodeAllowance, OversizeError, check_objects
 from copem_replay.io.encodings import make_definition
-from copem_replay.io.encodings.columns import DefinitionError, shred_messages
+from copem_replay.io.encodings.columns import shred_messages
 from copem_replay.io.findings import (
     MOST_SHARE,
     Finding,

@@ -8,8 +8,7 @@ stops at bytes that are no message. Wire format: protobuf.dev/programming-guides
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from itertools import pairwise
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,20 +18,16 @@ from numpy.typing import NDArray
 
 from copem_replay.core.compiled import callee, kernel
 from copem_replay.core.tracks import Bool, Int
+from copem_replay.io.channel import DefinitionError
 from copem_replay.io.decoded_size import MESSAGE_LIMIT_BYTES, check_decoded_bytes
 from copem_replay.io.encodings.columns import (
-    COLUMN_BYTES,
     Definition,
-    DefinitionError,
-    RawColumn,
     ShreddedMessages,
     ValueKind,
-    join_arrays,
     list_level,
     list_levels,
-    parent_level,
-    shred_columns,
     split_batches,
+    walk_columns,
 )
 
 # The kernel.
@@ -116,13 +111,10 @@ def walk_protobuf(
     data: NDArray[np.uint8], bounds: Int, fields: Int, node_first: Int, node_level: Int, blank: Int, blank_first: Int,
     first: Int, room: Int, bits: Any, lengths: Int, said: Bool, parent: Int,
 ) -> Int:  # fmt: skip
-    """(L,) number of rows of each level. `room (L,)`: rows there is room for; those beyond are counted and not kept.
+    """As `Walk`. A message of kind n has `fields[node_first[n]:node_first[n + 1]]` and is of level `node_level[n]`.
 
-    Message m is `data[bounds[m]:bounds[m + 1]]`. A message of kind n has `fields[node_first[n]:node_first[n + 1]]` and
-    is of level `node_level[n]`; where it is present, its columns `blank[blank_first[n]:blank_first[n + 1]]` are 0 or
-    empty, as all are before, unless it states another value. The value of column c in row r of its level goes to
-    `bits[first[c] + r]`, with `said` and, of a text, `lengths`. `parent[l, r]` is the parent of row r of level l; level
-    0 is the message.
+    Where it is present, its columns `blank[blank_first[n]:blank_first[n + 1]]` are 0 or empty, as all are before,
+    unless it states another value.
     """
     rows = np.zeros(len(room), dtype=np.int64)
     ends = np.zeros(DEEPEST, dtype=np.int64)
@@ -361,28 +353,15 @@ class ProtobufDefinition(Definition):
     def shred(self, payloads: Sequence[bytes], numbers: Iterable[str], texts: Iterable[str]) -> ShreddedMessages:
         """The columns of messages. Raises KeyError for a path that is not offered; OversizeError."""
         numbers, texts = tuple(numbers), tuple(texts)
-        wanted = self._known((*numbers, *texts))
-        table = FieldTable(self._root, wanted)
-        columns = [RawColumn(table.kinds[path]) for path in wanted]
-        rows = np.zeros(len(table.levels), dtype=np.int64)
-        parents: list[list[Int]] = [[] for _ in table.levels]
-        decoded = np.zeros(len(payloads), dtype=bool)
-        for batch in split_batches(payloads):
-            whole = [self._canonical(payload, table.closed) for payload in payloads[batch]]
-            good = batch.start + np.flatnonzero([p is not None for p in whole])
-            decoded[good] = True
-            kept = [p for p in whole if p is not None]
-            data, bounds = b"".join(kept), np.cumsum([0, *map(len, kept)], dtype=np.int64)
-            batch_rows, taken, parent = _walk_messages(data, bounds, table)
-            for k, name in enumerate(table.levels):
-                of = parent[k, : batch_rows[k]]
-                parents[k].append(of + rows[table.levels.index(parent_level(name))] if name else good[of])
-            for column, values in zip(columns, taken, strict=True):
-                column.add(data, *values)
-            rows += batch_rows
+        table = _FieldTable(self._root, self._known((*numbers, *texts)))
 
-        by_level = {name: join_arrays(parents[k], np.int64) for k, name in enumerate(table.levels)}
-        return shred_columns(by_level, dict(zip(wanted, columns, strict=True)), numbers, texts, decoded)
+        def canonical() -> Iterator[tuple[Int, list[bytes]]]:
+            for batch in split_batches(payloads):
+                whole = [self._canonical(payload, table.closed) for payload in payloads[batch]]
+                good = batch.start + np.flatnonzero([p is not None for p in whole])
+                yield good, [p for p in whole if p is not None]
+
+        return walk_columns(table.walk, canonical(), table.kinds, numbers, texts, len(payloads))
 
     def _canonical(self, payload: bytes, closed: bool) -> bytes | None:
         """The message with every known field once; None: no message. Raises OversizeError."""
@@ -415,18 +394,17 @@ class ProtobufDefinition(Definition):
             level = below
 
 
-class FieldTable:
+class _FieldTable:
     """The fields that lead to `wanted` paths, for the walk, by the kind of message they are in.
 
-    `levels`: all that lead to the paths, the outer ones first. `closed`: whether a column is of an enumeration of which
-    Google's parser takes other numbers as unknown fields, which may hide one that is known.
+    `closed`: whether a column is of an enumeration of which Google's parser takes other numbers as unknown fields,
+    which may hide one that is known.
     """
 
     def __init__(self, root: Any, wanted: Sequence[str]) -> None:
         self.kinds: dict[str, ValueKind] = {}
         self.closed = False
-        self.levels = list_levels(wanted)
-        self.level_ix = np.array([self.levels.index(list_level(path)) for path in wanted], dtype=np.int64)
+        levels = list_levels(wanted)
         nodes: list[tuple[Any, str]] = [(root, "")]
         node_of = {"": 0}
         fields: list[list[list[int]]] = [[]]
@@ -436,7 +414,7 @@ class FieldTable:
             for part in path.split("."):
                 here = f"{here}.{part}" if here else part
                 field = nodes[node][0].fields_by_name[part.removesuffix("[]")]
-                level = self.levels.index(here) if field.is_repeated else -1
+                level = levels.index(here) if field.is_repeated else -1
                 if field.message_type is None:
                     fields[node].append([field.number, _TYPES[field.type][0], column, level, -1])
                     if not field.is_repeated and not field.has_presence:
@@ -454,34 +432,18 @@ class FieldTable:
             self.closed |= field.enum_type is not None and field.enum_type.is_closed
         self.fields = np.array([row for rows in fields for row in rows], dtype=np.int64).reshape(-1, 5)
         self.node_first = np.cumsum([0, *map(len, fields)], dtype=np.int64)
-        self.node_level = np.array([self.levels.index(list_level(path)) for _, path in nodes], dtype=np.int64)
+        self.node_level = np.array([levels.index(list_level(path)) for _, path in nodes], dtype=np.int64)
         self.blank = np.array([column for columns in blank for column in columns], dtype=np.int64)
         self.blank_first = np.cumsum([0, *map(len, blank)], dtype=np.int64)
+
+    def walk(
+        self, data: NDArray[np.uint8], bounds: Int, first: Int, room: Int, bits: Any, lengths: Int, said: Bool,
+        parent: Int,
+    ) -> Int:  # fmt: skip
+        """The walk through messages as Google's parser has written them."""
+        plan = (self.fields, self.node_first, self.node_level, self.blank, self.blank_first)
+        return walk_protobuf(data, bounds, *plan, first, room, bits, lengths, said, parent)
 
 
 def _enum_names(field: Any) -> dict[int, str]:
     return {v.number: v.name for v in field.enum_type.values}
-
-
-def _walk_messages(data: bytes, bounds: Int, table: FieldTable) -> tuple[Int, list[tuple[Any, Int, Bool]], Int]:
-    """Rows of each level; of each column bits of numbers or places of texts, lengths, and whether it is there; parents.
-
-    The messages, as Google's parser has written them, lie one after the other in `data`. Raises OversizeError.
-    """
-    octets, levels = np.frombuffer(data, dtype=np.uint8), len(table.levels)
-    plan = (table.fields, table.node_first, table.node_level, table.blank, table.blank_first)
-    first = np.zeros(len(table.level_ix) + 1, dtype=np.int64)
-
-    def walk(room: Int, size: int, most: int) -> tuple[Int, Any, Int, Bool, Int]:
-        bits, lengths = np.zeros(size, dtype=np.uint64), np.zeros(size, dtype=np.int64)
-        said, parent = np.zeros(size, dtype=bool), np.empty((levels, most), dtype=np.int64)
-        rows = walk_protobuf(octets, bounds, *plan, first, room, bits, lengths, said, parent)
-        return rows, bits, lengths, said, parent
-
-    rows = walk(np.zeros(levels, dtype=np.int64), 0, 0)[0]
-    most = int(rows.max(initial=0))
-    np.cumsum(rows[table.level_ix], out=first[1:])
-    check_decoded_bytes(COLUMN_BYTES * int(first[-1]) + 8 * levels * most)
-    _, bits, lengths, said, parent = walk(rows, int(first[-1]), most)
-    parts = [slice(*ends) for ends in pairwise(first.tolist())]
-    return rows, [(bits[p], lengths[p], said[p]) for p in parts], parent

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from copem_replay.io.encodings.columns import DefinitionError
+from copem_replay.io.channel import DefinitionError
 
 _COLOURED = "foxglove_msgs/Color color"
 _MESHED = (f"{_COLOURED}", "foxglove_msgs/Color[] colors", "uint32[] indices")
