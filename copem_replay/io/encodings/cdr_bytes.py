@@ -142,8 +142,8 @@ class _Program:
         if value is None:
             return np.zeros((1, 2), dtype=np.uint64)
         cells = np.stack([value.first + self._pooled, value.sizes], axis=1).astype(np.uint64)
-        self.pool.append(value.pool)
-        self._pooled += len(value.pool)
+        self.pool.append(value.source.pool)
+        self._pooled += len(value.source.pool)
         return cells
 
     def _add_list(self, base: str, value: RepeatedMessages | None) -> None:

@@ -116,32 +116,40 @@ class TextPool:
     """Texts to choose from: number k is `pool[first[k]:first[k] + lengths[k]]`."""
 
     def __init__(self, pool: bytes, first: Int, lengths: Int) -> None:
-        self._pool, self._first, self._lengths = np.frombuffer(pool, dtype=np.uint8), first, lengths
+        self.pool, self.first, self.lengths = np.frombuffer(pool, dtype=np.uint8), first, lengths
 
     @classmethod
-    def of(cls, texts: Sequence[bytes]) -> TextPool:
+    def of(cls, texts: Sequence[str | bytes]) -> TextPool:
         """A pool of these texts."""
-        lengths = np.fromiter(map(len, texts), dtype=np.int64, count=len(texts))
-        return cls(b"".join(texts), np.cumsum(lengths) - lengths, lengths)
+        encoded = [text.encode() if isinstance(text, str) else text for text in texts]
+        lengths = np.fromiter(map(len, encoded), dtype=np.int64, count=len(encoded))
+        return cls(b"".join(encoded), np.cumsum(lengths) - lengths, lengths)
 
     def at(self, which: Int | Bool) -> RowTexts:
         """The part that has the text `which[n]` in row n."""
-        places = np.asarray(which, dtype=np.int64)
-        return RowTexts(self._pool, self._first[places], self._lengths[places])
+        return RowTexts(self, np.asarray(which, dtype=np.int64))
+
+    @cached_property
+    def quoted(self) -> TextPool:
+        """The texts as JSON strings."""
+        whole, ends = self.pool.tobytes(), (self.first + self.lengths).tolist()
+        texts = [whole[begin:end].decode() for begin, end in zip(self.first.tolist(), ends, strict=True)]
+        return TextPool.of([orjson.dumps(text) for text in texts])
 
 
 class RowTexts:
     """A part that has a text of a pool in each row."""
 
-    def __init__(self, pool: Bytes, first: Int, lengths: Int) -> None:
-        self.pool, self.first, self.sizes = pool, first, lengths
+    def __init__(self, source: TextPool, which: Int) -> None:
+        self.source, self.which = source, which
+        self.first, self.sizes = source.first[which], source.lengths[which]
 
     def put(self, out: Bytes, offset: Int) -> None:
         """Put the bytes of every row at its place in `out`, `offset` (N,)."""
-        put_pieces(out, offset, self.pool, self.first, self.sizes)
+        put_pieces(out, offset, self.source.pool, self.first, self.sizes)
 
 
-def repeat_text(text: bytes, rows: int) -> RowTexts:
+def repeat_text(text: str | bytes, rows: int) -> RowTexts:
     """The part that has the same text in every row."""
     return TextPool.of([text]).at(np.zeros(rows, dtype=np.int64))
 
@@ -227,33 +235,6 @@ def encode_records(parts: Sequence[RecordPart], rows: int) -> list[bytes]:
     return [whole[first:last] for first, last in pairwise(cuts)]
 
 
-# JSON, as orjson writes it.
-
-_COMMA = TextPool.of([b",", b""])
-
-
-def encode_texts(values: Sequence[str]) -> TextPool:
-    """A pool of texts as JSON strings."""
-    return TextPool.of([orjson.dumps(value) for value in values])
-
-
-def encode_numbers(values: NDArray[Any] | None, rows: int) -> RowTexts:
-    """The part of numbers (N,); null where one is not finite, and in all rows if `values` is None."""
-    if values is None:
-        return repeat_text(b"null", rows)
-    text = orjson.dumps(np.ascontiguousarray(values), option=orjson.OPT_SERIALIZE_NUMPY)
-    commas = np.flatnonzero(np.frombuffer(text, dtype=np.uint8) == ord(","))
-    first = np.concatenate([[1], commas + 1])[:rows]
-    return TextPool(text, first, np.append(commas, len(text) - 1)[:rows] - first).at(np.arange(rows))
-
-
-def encode_arrays(start: Int, parts: Sequence[RecordPart]) -> list[RecordPart]:
-    """The parts of JSON arrays: array n has as items the rows `start[n]:start[n + 1]` of `parts`."""
-    rows, first = len(start) - 1, np.zeros(start[-1] + 1, dtype=bool)
-    first[start[:-1]] = True
-    return [repeat_text(b"[", rows), RowGroups(start, [_COMMA.at(first[:-1]), *parts]), repeat_text(b"]", rows)]
-
-
 # What messages hold, in any encoding.
 
 
@@ -286,10 +267,10 @@ class MessagePool:
 
 @dataclass(frozen=True)
 class RepeatedMessages:
-    """The messages of a repeated field: in row n those of rows `start[n]:start[n + 1]`, or of the pool's `which[n]`."""
+    """A repeated field: in row n the rows `start[n]:start[n + 1]` of its content, or of the pool's `which[n]`."""
 
     start: Int
-    content: Content | Instants
+    content: Any  # that of messages, or times; in JSON any value
     which: Int | None = None
     pool: MessagePool | None = None
 
@@ -347,3 +328,66 @@ def _encode_field(field: FieldDescriptor, value: Any, rows: int) -> RecordPart:
     wire, dtype = (_FIXED64, np.float64) if field.type == field.TYPE_DOUBLE else (_VARINT, np.int64)
     column = value if isinstance(value, np.ndarray) else np.full(rows, value, dtype=dtype)
     return NumberField(number | wire, column, always=field.has_presence)
+
+
+# JSON, as orjson writes it.
+
+_COMMA, _NULL = TextPool.of([b",", b""]), TextPool.of([b"null", b""])
+
+
+@dataclass(frozen=True)
+class StatedRows:
+    """A value in the rows `said` (N,) only, `values` of these rows alone; the others have null, or nothing."""
+
+    said: Bool
+    values: NDArray[Any]
+    null: bool = True
+
+
+JsonContent: TypeAlias = Mapping[str, Any]
+"""Values by name, in this order: those of `Content` but for times, `StatedRows`, and None, which is null."""
+
+
+def encode_json(content: JsonContent, rows: int) -> list[bytes]:
+    """One encoded object for each row."""
+    return encode_records(_encode_value(content, rows), rows)
+
+
+def _encode_value(value: Any, rows: int) -> list[RecordPart]:
+    """The parts of a value of JSON."""
+    if value is None:
+        return [repeat_text(b"null", rows)]
+    if isinstance(value, RowTexts):
+        return [value.source.quoted.at(value.which)]
+    if isinstance(value, StatedRows):
+        start = start_offsets(value.said)
+        return [RowGroups(start, _encode_value(value.values, int(start[-1]))), _NULL.at(value.said)]
+    if isinstance(value, RepeatedMessages):
+        return _encode_arrays(value.start, _encode_value(value.content, int(value.start[-1])))
+    if isinstance(value, Mapping):
+        parts: list[RecordPart] = []
+        for name, inner in value.items():
+            key = b"%s%s:" % (b"," if parts else b"{", orjson.dumps(name))
+            if isinstance(inner, StatedRows) and not inner.null:
+                there = int(inner.said.sum())
+                field = [repeat_text(key, there), *_encode_value(inner.values, there)]
+                parts.append(RowGroups(start_offsets(inner.said), field))
+            else:
+                parts += [repeat_text(key, rows), *_encode_value(inner, rows)]
+        return [*parts, repeat_text(b"}", rows)]
+    return [_encode_numbers(value, rows)]
+
+
+def _encode_numbers(values: NDArray[Any], rows: int) -> RowTexts:
+    """The part of numbers (N,); null where one is not finite."""
+    text = orjson.dumps(np.ascontiguousarray(values), option=orjson.OPT_SERIALIZE_NUMPY)
+    commas = np.flatnonzero(np.frombuffer(text, dtype=np.uint8) == ord(","))
+    first = np.concatenate([[1], commas + 1])[:rows]
+    return TextPool(text, first, np.append(commas, len(text) - 1)[:rows] - first).at(np.arange(rows))
+
+
+def _encode_arrays(start: Int, parts: Sequence[RecordPart]) -> list[RecordPart]:
+    """The parts of arrays: array n has as items the rows `start[n]:start[n + 1]` of `parts`."""
+    rows, first = len(start) - 1, np.zeros(start[-1] + 1, dtype=bool)
+    first[start[:-1]] = True
+    return [repeat_text(b"[", rows), RowGroups(start, [_COMMA.at(first[:-1]), *parts]), repeat_text(b"]", rows)]

@@ -20,7 +20,6 @@ from importlib import import_module
 from importlib.metadata import version
 from typing import Any, Protocol
 
-import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Header, Message, Metadata, Schema
 from mcap.writer import Writer
@@ -40,10 +39,8 @@ from copem_replay.io.containers.mcap_records import (
 )
 from copem_replay.io.encodings.cdr_bytes import HEAD, encode_cdr
 from copem_replay.io.encodings.column_bytes import (
-    Content,
     Instants,
     RepeatedMessages,
-    TextPool,
     encode_messages,
 )
 from copem_replay.io.encodings.ros2_types import message_definition
@@ -56,7 +53,6 @@ from copem_replay.io.write.detail import (
     DETAIL_JSON,
     STATUS_JSON,
     STATUS_SCHEMA,
-    STATUSES,
     DetailWriter,
     Event,
     Statuses,
@@ -410,24 +406,12 @@ class _Ros2Family(OpenedFamily):
         return [objects, _StringWriter(DetailWriter(self._scene, fused_tracks, events, sizes_of=objects.round))]
 
     def _statuses(self, statuses: Statuses) -> ListWriter:
-        return _Ros2StatusWriter(statuses)
+        return StatusWriter(statuses, _encode_ros2_statuses)
 
 
-class _Ros2StatusWriter:
-    """Statuses as copem_replay_msgs/Status."""
-
-    def __init__(self, statuses: Statuses) -> None:
-        self._statuses = statuses
-
-    def messages(self, available_ns: Int) -> Iterator[bytes]:
-        status, age_s = self._statuses.at(available_ns)
-        lists, objects = status.shape
-        names = TextPool.of([name.encode() for name in self._statuses.names])
-        words = TextPool.of([word.encode() for word in STATUSES])
-        each = {"id": names.at(np.tile(np.arange(objects), lists)), "status": words.at(status.ravel())}
-        of_objects = RepeatedMessages(np.arange(lists + 1) * objects, {**each, "age_s": age_s.ravel()})
-        content: Content = {"stamp": Instants(available_ns), "objects": of_objects}
-        yield from encode_cdr(_ROS2_TYPES["status"], content, lists)
+def _encode_ros2_statuses(available_ns: Int, objects: RepeatedMessages) -> list[bytes]:
+    """Messages of copem_replay_msgs/Status."""
+    return encode_cdr(_ROS2_TYPES["status"], {"stamp": Instants(available_ns), "objects": objects}, len(available_ns))
 
 
 class _StringWriter:

@@ -55,7 +55,7 @@ class DetectedObjectsWriter:
         self._class_ix = fused_tracks.class_of(scene)
         self.round = self._class_ix == CLASSES.index("pedestrian")
         """(P,) which objects are cylinders."""
-        self._frame_id = frame_id.encode()
+        self._frame_id = frame_id
 
     def messages(self, available_ns: Int) -> Iterator[bytes]:
         """The lists as they became available at these instants of the log's clock, (F,)."""

@@ -149,7 +149,7 @@ class UncertaintyWriter:
         )
         self._major, self._minor, self._yaw_rad = principal_axes(ee, en, nn)
         names, self._name = fused_tracks.names_of(scene)
-        self._names = TextPool.of([name.encode() for name in names])
+        self._names = TextPool.of(names)
 
     def messages(self, available_ns: Int) -> Iterator[bytes]:
         """The lists as they became available at these instants of the log's clock, (F,)."""
@@ -165,7 +165,7 @@ class UncertaintyWriter:
         fused = self._fused_tracks.fused
         age_s = np.fmax(0.0, available_s - self._fused_tracks.captured_s[0, rows])
         known = np.isfinite(age_s)
-        ages = TextPool.of([f"{age:.3f}".encode() for age in age_s[known].tolist()])
+        ages = TextPool.of([f"{age:.3f}" for age in age_s[known].tolist()])
         x, y, z, height = (getattr(fused, name)[0, rows] for name in ("x_m", "y_m", "z_m", "height_m"))
         alpha = FRESH_ALPHA + (OLDEST_ALPHA - FRESH_ALPHA) * np.minimum(age_s / FADES_S, 1.0)
         cylinder: Content = {
@@ -207,7 +207,7 @@ def draw_scenes(encode: Encode, frame_id: str, time_ns: Int, start: Int, entitie
     """`Draw` in a frame of reference: messages that delete all on their topic and draw anew."""
     drawn: Content = {
         "timestamp": Instants(np.repeat(time_ns, np.diff(start))),
-        "frame_id": repeat_text(frame_id.encode(), int(start[-1])),
+        "frame_id": repeat_text(frame_id, int(start[-1])),
         **entities,
     }
     deletion: Content = {"timestamp": Instants(time_ns), "type": 1}  # ALL
@@ -233,7 +233,7 @@ def shade_content(colour: Rgb, alpha: float | Float) -> Content:
 def _pool_metadata(metadata: Sequence[Mapping[str, str]]) -> MessagePool:
     """The metadata of entities, to choose from."""
     pairs = [pair for each in metadata for pair in each.items()]
-    keys, values = (TextPool.of([pair[k].encode() for pair in pairs]).at(np.arange(len(pairs))) for k in (0, 1))
+    keys, values = (TextPool.of([pair[k] for pair in pairs]).at(np.arange(len(pairs))) for k in (0, 1))
     return MessagePool(start_offsets(_count(metadata)), {"key": keys, "value": values})
 
 
@@ -247,7 +247,7 @@ class BoxWriter:
     def __init__(self, scene: Scene, fused_tracks: FusedTracks, configuration: str, colour: Rgb, draw: Draw) -> None:
         self._fused, self._rows, self._draw = fused_tracks.fused, fused_tracks.listed_rows, draw
         names, self._name = fused_tracks.names_of(scene)
-        self._names = TextPool.of([name.encode() for name in names])
+        self._names = TextPool.of(names)
         # Each pair of a name and a class has metadata, which a viewer shows for a selected box.
         keys, self._key = np.unique(self._name * len(CLASSES) + fused_tracks.class_of(scene), return_inverse=True)
         pairs = (divmod(key, len(CLASSES)) for key in keys.tolist())
@@ -290,7 +290,7 @@ class _Looks:
     """What entities look like, to choose from; elements of all looks are numbered, (E,)."""
 
     def __init__(self, looks: Sequence[Entity]) -> None:
-        self._names = TextPool.of([look.name.encode() for look in looks])
+        self._names = TextPool.of([look.name for look in looks])
         self._says = _pool_metadata([look.says for look in looks])
         self._first = {kind: start_offsets(_count([getattr(look, kind) for look in looks])) for kind in _ELEMENTS}
         self._lines = [line for look in looks for line in look.lines]
@@ -299,7 +299,7 @@ class _Looks:
         points = np.array([point for line in self._lines for point in line.points], dtype=float).reshape(-1, 3)
         first = start_offsets(_count([line.points for line in self._lines]))
         self._points = MessagePool(first, dict(zip("xyz", points.T, strict=True)))
-        self._words = TextPool.of([text.text.encode() for text in self._texts])
+        self._words = TextPool.of([text.text for text in self._texts])
 
     def content(self, moving: MovingEntities, rows: slice) -> Content:
         """The entities of some rows (P,)."""
@@ -361,7 +361,7 @@ def transform_content(parent: str, child: str, poses: Sequence[Pose], time_ns: I
     names = {"parent_frame_id": parent, "child_frame_id": child}
     return {
         "timestamp": Instants(time_ns),
-        **{key: repeat_text(name.encode(), len(poses)) for key, name in names.items()},
+        **{key: repeat_text(name, len(poses)) for key, name in names.items()},
         "translation": placed["position"],
         "rotation": placed["orientation"],
     }
