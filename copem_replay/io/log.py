@@ -161,16 +161,15 @@ class Log:
         for message in self.messages(numbers):
             yield message.channel_id, message.log_time, message.data
 
-    def messages(self, numbers: Set[int]) -> Iterator[Message]:
+    def messages(self, numbers: Set[int], *, sort: bool = False) -> Iterator[Message]:
         """Messages of some channels: by log time through the index, else as in the file, up to the damage.
 
-        Raises BrokenIndexError.
+        `sort`: those of a file without an index, too, are in order of log time. Raises BrokenIndexError.
         """
         spans = self.spans(numbers)
         with open_file(self.path) as file:
-            for message in self._by_index(file, spans) if self.indexed else RecordsFromStart(file):
-                if isinstance(message, Message) and is_kept(spans, message.channel_id, message.log_time):
-                    yield message
+            messages = self._by_index(file, spans) if self.indexed else _read_from_start(file, spans)
+            yield from sorted(messages, key=_log_time) if sort and not self.indexed else messages
 
     def from_start(self, error: BrokenIndexError) -> Log:
         """The recording opened without the index that turned out to be broken. Raises RecordingError."""
@@ -191,6 +190,16 @@ class Log:
                 raise ValueError(f"the index promises {promised} messages, and there are {count}")
         except DAMAGE as error:
             raise BrokenIndexError(self.path) from drop_traceback(error)
+
+
+def _read_from_start(file: IO[bytes], spans: Mapping[int, Span]) -> Iterator[Message]:
+    for record in RecordsFromStart(file):
+        if isinstance(record, Message) and is_kept(spans, record.channel_id, record.log_time):
+            yield record
+
+
+def _log_time(message: Message) -> int:
+    return message.log_time
 
 
 class _File(io.FileIO):
@@ -336,6 +345,7 @@ def _make_channel(number: int, channel: Any, schema: Any, messages: int, expecte
         schema_data=schema.data if schema is not None else b"",
         ahead_ns=_ahead_ns(channel.metadata.get(AHEAD, "")),
         part=channel.metadata.get(PART, ""),
+        metadata=dict(channel.metadata),
     )
 
 

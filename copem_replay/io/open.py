@@ -182,13 +182,13 @@ class JoinedLog(Log):
     place: DriveRecordings = field(default_factory=lambda: DriveRecordings((), ()))
     parts: tuple[JoinedRecording, ...] = ()
 
-    def messages(self, numbers: Set[int]) -> Iterator[Message]:
+    def messages(self, numbers: Set[int], *, sort: bool = False) -> Iterator[Message]:
         """Messages of some channels in order of log time. Raises BrokenIndexError."""
         streams: list[tuple[int, Callable[[], Iterator[Message]]]] = []
         for part in self.parts:
             numbers_in_log = {theirs: ours for theirs, ours in part.numbers.items() if ours in numbers}
             if numbers_in_log:
-                streams.append((part.log.start_ns - part.ahead_ns, partial(_read_moved, part, numbers_in_log)))
+                streams.append((part.log.start_ns - part.ahead_ns, partial(_read_moved, part, numbers_in_log, sort)))
         yield from merge_streams(streams)
 
     def file_bytes(self) -> int:
@@ -287,16 +287,11 @@ def _shift_window(window: Window | None, ahead_ns: int) -> Window | None:
     return replace(window, from_ns=from_ns, to_ns=to_ns)
 
 
-def _read_moved(part: JoinedRecording, numbers: Mapping[int, int]) -> Iterator[Message]:
-    for m in part.log.messages(numbers.keys()):
-        yield move_to_first_clock(m, numbers[m.channel_id], part.ahead_ns)
-
-
-def move_to_first_clock(message: Message, number: int, ahead_ns: int) -> Message:
-    """The message on channel `number`, with its times by the first clock."""
-    times = (max(t - ahead_ns, 0) for t in (message.log_time, message.publish_time))
-    log_time, publish_time = times
-    return Message(number, log_time, message.data, publish_time, message.sequence)
+def _read_moved(part: JoinedRecording, numbers: Mapping[int, int], sort: bool) -> Iterator[Message]:
+    """Messages with their times by the first clock."""
+    for m in part.log.messages(numbers.keys(), sort=sort):
+        log_time, publish_time = (max(t - part.ahead_ns, 0) for t in (m.log_time, m.publish_time))
+        yield Message(numbers[m.channel_id], log_time, m.data, publish_time, m.sequence)
 
 
 # Containers, and opening.

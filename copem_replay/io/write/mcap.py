@@ -40,20 +40,18 @@ from copem_replay.io.window import Window
 from copem_replay.io.write.detail import Event, Statuses
 from copem_replay.io.write.message_family import (
     OSI,
-    OSI_CHANNEL,
     RUN_RECORD,
     TRUTH_TOPICS,
-    Catalogue,
     Family,
     ListWriter,
     OpenedFamily,
     TruthWriter,
     list_extra_topics,
     list_topics,
-    osi_version,
 )
+from copem_replay.io.write.osi import OSI_VERSION
 from copem_replay.io.write.scene import MovingEntities, TruthScene, draw_moving, transform_content
-from copem_replay.io.write.source import RecordingSource, open_source
+from copem_replay.io.write.source import OSI_CHANNEL, Catalogue, RecordingSource, open_source
 
 OSI_RECORD = "net.asam.osi.trace"
 """The one metadata record of an OSI trace file (OSI 3.8, trace file formats)."""
@@ -150,7 +148,7 @@ def _add_records(writer: Writer, original: RecordingSource, osi: bool, manifest:
             writer.add_metadata(name, record)
     writer.add_metadata(RUN_RECORD, dict(sorted(manifest.items())))
     if osi:
-        writer.add_metadata(OSI_RECORD, _osi_record(original, osi_version(), version("protobuf")))
+        writer.add_metadata(OSI_RECORD, _osi_record(original, OSI_VERSION, version("protobuf")))
 
 
 def _encode_chunk(

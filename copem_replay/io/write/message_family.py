@@ -2,10 +2,6 @@
 
 OSI: osi3.SensorData, foxglove.SceneUpdate (protobuf), and JSON, for all recordings but those of ROS 2. ROS 2: CDR only,
 since a file of the profile `ros2` holds nothing else.
-
-An MCAP file is copied here, too: every channel, message, metadata record and attachment as it was. A window restricts
-messages only. A sound file is read in order of log time through its index; a damaged one from its start as far as it
-goes, and sorted.
 """
 
 from __future__ import annotations
@@ -13,30 +9,16 @@ from __future__ import annotations
 import json
 import struct
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib import import_module
 from importlib.metadata import version
 from typing import Any, Protocol
 
-from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Header, Message, Metadata, Schema
-from mcap.writer import Writer
-
 from copem_replay.core.colours import Rgb
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import TRUTH, Int, Scene
-from copem_replay.io.containers.mcap_records import (
-    DAMAGE,
-    MAGIC,
-    RecordsFromStart,
-    parse_record,
-    read_by_log_time,
-    read_record_at,
-    read_summary,
-    renumber_message,
-)
 from copem_replay.io.encodings.cdr_bytes import HEAD, encode_cdr
 from copem_replay.io.encodings.column_bytes import (
     Instants,
@@ -44,11 +26,9 @@ from copem_replay.io.encodings.column_bytes import (
     encode_messages,
 )
 from copem_replay.io.encodings.ros2_types import message_definition
-from copem_replay.io.log import Log, open_file
 from copem_replay.io.recording import Recording
 from copem_replay.io.schemas.osi_ground_truth import SENSOR_DATA, load_message_class
 from copem_replay.io.schemas.registry import DETAIL_SCHEMA, STRING
-from copem_replay.io.window import is_kept
 from copem_replay.io.write.detail import (
     DETAIL_JSON,
     STATUS_JSON,
@@ -61,140 +41,8 @@ from copem_replay.io.write.detail import (
 from copem_replay.io.write.osi import OSI_VERSION, SensorDataWriter
 from copem_replay.io.write.ros2 import DETECTED_OBJECTS, DetectedObjectsWriter
 from copem_replay.io.write.scene import FRAME_ID, BoxWriter, Draw, Encode, UncertaintyWriter, draw_scenes
+from copem_replay.io.write.source import OSI_CHANNEL, Catalogue
 
-
-class Catalogue:
-    """Schemas, channels and attachments of a file that is being written: equal ones are written once."""
-
-    def __init__(self, writer: Writer) -> None:
-        self.writer = writer
-        self._schemas: dict[tuple[str, str, bytes], int] = {}
-        self._channels: dict[tuple[object, ...], int] = {}
-        self._attached: set[tuple[object, ...]] = set()
-
-    def schema(self, name: str, encoding: str, data: bytes) -> int:
-        """The number of a schema, which is written if it is new."""
-        if (name, encoding, data) not in self._schemas:
-            self._schemas[name, encoding, data] = self.writer.register_schema(name, encoding, data)
-        return self._schemas[name, encoding, data]
-
-    def channel(self, topic: str, encoding: str, schema: int, metadata: dict[str, str]) -> int:
-        """The number of a channel, which is written if it is new."""
-        ordered = dict(sorted(metadata.items()))
-        key = (topic, encoding, schema, tuple(ordered.items()))
-        if key not in self._channels:
-            self._channels[key] = self.writer.register_channel(topic, encoding, schema, ordered)
-        return self._channels[key]
-
-    def attach(self, a: Attachment) -> None:
-        """Write an attachment if it is new."""
-        key = (a.create_time, a.log_time, a.name, a.media_type, a.data)
-        if key not in self._attached:
-            self._attached.add(key)
-            self.writer.add_attachment(*key)
-
-
-class OriginalMcap:
-    """An MCAP file to be copied: its channels and metadata, and its messages on demand.
-
-    `damage` says that not all of it can be copied, None where all can.
-    """
-
-    def __init__(self, log: Log) -> None:
-        self._log = log
-        self.damage: str | None = None
-        self.profile = ""
-        self.metadata: dict[str, dict[str, str]] = {}
-        self.channels: dict[int, Channel] = {}
-        self.attachments: list[Attachment] = []
-        self.start_ns = log.start_ns
-        self._schemas: dict[int, Schema] = {}
-        self._by_index = log.indexed and self._look_up()
-        if not self._by_index:
-            self._salvage()
-            if not log.complete or log.indexed:
-                self.damage = "damaged: its messages are copied as far as they can be read"
-
-    def _look_up(self) -> bool:
-        """Whether the file can be copied through its index; all that is copied is read once, since only that tells."""
-        try:
-            with open_file(self._log.path) as file:
-                summary = read_summary(file)
-                if summary is None:
-                    return False
-                header = parse_record(Opcode.HEADER, read_record_at(file, len(MAGIC), Opcode.HEADER))
-                metadata = [
-                    parse_record(Opcode.METADATA, read_record_at(file, index.offset, Opcode.METADATA))
-                    for index in summary.metadata_indexes
-                ]
-                attachments = [
-                    parse_record(Opcode.ATTACHMENT, read_record_at(file, index.offset, Opcode.ATTACHMENT))
-                    for index in summary.attachment_indexes
-                ]
-                for _message in read_by_log_time(file, summary, self._log.spans(summary.channels.keys())):
-                    pass
-        except DAMAGE:
-            return False
-        self.profile = header.profile if isinstance(header, Header) else ""
-        for record in metadata:
-            if isinstance(record, Metadata):
-                self._keep(record)
-        self.attachments = [record for record in attachments if isinstance(record, Attachment)]
-        self._schemas, self.channels = dict(summary.schemas), dict(summary.channels)
-        return True
-
-    def _salvage(self) -> None:
-        with open_file(self._log.path) as file:
-            stream = RecordsFromStart(file)
-            for record in stream:
-                if isinstance(record, Header):
-                    self.profile = record.profile
-                elif isinstance(record, Metadata):
-                    self._keep(record)
-                elif isinstance(record, Attachment):
-                    self.attachments.append(record)
-        self._schemas, self.channels = stream.schemas, stream.channels
-
-    def _keep(self, record: Metadata) -> None:
-        """Keep a metadata record, merged with others of its name: rosbag2 writes one name several times."""
-        self.metadata.setdefault(record.name, {}).update(record.metadata)
-
-    def register(self, catalogue: Catalogue, without: Collection[str] = ()) -> dict[int, int]:
-        """Put schemas, channels and attachments into the output. Returns the new number of each channel.
-
-        Channels of the topics `without` are left out, with their messages.
-        """
-        numbers: dict[int, int] = {}
-        for number, channel in sorted(self.channels.items()):
-            if channel.topic in without:
-                continue
-            schema = self._schemas.get(channel.schema_id)
-            schema_id = catalogue.schema(schema.name, schema.encoding, schema.data) if schema else 0
-            numbers[number] = catalogue.channel(
-                channel.topic, channel.message_encoding, schema_id, dict(channel.metadata)
-            )
-        for attachment in self.attachments:
-            catalogue.attach(attachment)
-        return numbers
-
-    def messages(self, numbers: Mapping[int, int]) -> Iterator[Message]:
-        """The messages in order of log time, with the channel numbers of the output."""
-        spans = self._log.spans(numbers.keys())
-        with open_file(self._log.path) as file:
-            if self._by_index and (summary := read_summary(file)) is not None:
-                messages = read_by_log_time(file, summary, spans)
-            else:
-                kept = (
-                    r
-                    for r in RecordsFromStart(file)
-                    if isinstance(r, Message) and is_kept(spans, r.channel_id, r.log_time)
-                )
-                messages = iter(sorted(kept, key=lambda message: message.log_time))
-            for message in messages:
-                yield renumber_message(message, numbers)
-
-
-OSI_CHANNEL = "net.asam.osi.trace.channel."
 _NAMELESS = "map"  # name of the world frame where none is given, after REP 105
 
 _FOREVER = "\n    sec: 9223372036\n    nsec: 854775807"
@@ -251,11 +99,6 @@ TRUTH_TOPICS = [f"copem/{TRUTH}/{kind}" for kind in ("scene", "static", "transfo
 """Topics of the truth's scene: moving objects, static ones, the ego's pose."""
 EGO_FRAME, MIDDLE_FRAME = "copem_ego", "copem_middle"
 """Frames of reference to follow: one moves with the ego, the other, without an ego, stands in the middle of objects."""
-
-
-def osi_version() -> str:
-    """The version of OSI that is written."""
-    return ".".join(map(str, OSI_VERSION))
 
 
 class OpenedFamily(ABC):
@@ -342,7 +185,7 @@ class _OsiFamily(OpenedFamily):
             return {}
         return {
             f"{OSI_CHANNEL}description": f"fused object list of configuration {configuration}",
-            f"{OSI_CHANNEL}osi_version": osi_version(),
+            f"{OSI_CHANNEL}osi_version": OSI_VERSION,
             f"{OSI_CHANNEL}protobuf_version": version("protobuf"),
         }
 

@@ -153,7 +153,8 @@ def _write_content(writer: Writer, trace: OsiTrace) -> None:
 
 # Fused lists.
 
-OSI_VERSION = (3, 8, 0)
+OSI_VERSION = "3.8.0"
+"""The version of OSI that is written."""
 
 # osi_object.proto: MovingObject.Type and MovingObject.VehicleClassification.Type by class; −1: not a vehicle
 _OSI_TYPE: dict[str, tuple[int, int]] = {
@@ -198,7 +199,9 @@ class SensorDataWriter:
     def messages(self, available_ns: Int) -> Iterator[bytes]:
         """The lists as they became available at these instants of the log's clock, (F,)."""
         rows, bounds = self._fused_tracks.listed_rows
-        version = dict(zip(("version_major", "version_minor", "version_patch"), OSI_VERSION, strict=True))
+        version = dict(
+            zip(("version_major", "version_minor", "version_patch"), map(int, OSI_VERSION.split(".")), strict=True)
+        )
         for first, last in split_into_blocks(bounds):
             listed, lists = rows[bounds[first] : bounds[last]], np.diff(bounds[first : last + 1])
             captured_ns = self._fused_tracks.fused.stamp_ns[first:last]
