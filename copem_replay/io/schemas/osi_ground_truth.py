@@ -17,10 +17,9 @@ from typing import Any
 
 import numpy as np
 from google.protobuf.message import DecodeError
-from numpy.typing import NDArray
 
 from copem_replay.core.frame import SaidPlace
-from copem_replay.core.tracks import CLASSES, VALUES, Float, Int, Solid
+from copem_replay.core.tracks import CLASSES, VALUES, Solid
 from copem_replay.io.channel import LAST_NS
 from copem_replay.io.decoded_size import DecodeAllowance, check_objects
 from copem_replay.io.findings import FARTHEST_M, find
@@ -104,41 +103,6 @@ _Place = tuple[int, int, int]
 """Of a note: the message, whether the object is stationary, its place in the list."""
 
 
-class _ObjectRows:
-    """Rows of objects message by message, of moving or of stationary ones."""
-
-    def __init__(self) -> None:
-        self.of_message = array("q")  # number of rows of each message
-        self.object_ix, self.class_ix, self.values = array("q"), array("b"), array("d")
-
-    @property
-    def number(self) -> int:
-        """Number of rows."""
-        return len(self.object_ix)
-
-    def columns(self) -> tuple[Int, Int, NDArray[np.int8], Float]:
-        """All rows: of each message their number, then columns (P,) and (P, len(VALUES))."""
-        return (
-            np.asarray(self.of_message, dtype=np.int64),  # without a copy
-            np.asarray(self.object_ix, dtype=np.int64),
-            np.asarray(self.class_ix, dtype=np.int8),
-            np.asarray(self.values, dtype=np.float64).reshape(-1, len(VALUES)),
-        )
-
-
-def _join_rows(moving: _ObjectRows, stationary: _ObjectRows) -> dict[str, Any]:
-    """The columns of both, moving objects first in each message."""
-    names = ("rows", "object_ix", "class_ix", "values")
-    columns: tuple[Any, ...] = moving.columns()
-    if stationary.number:
-        beside = stationary.columns()
-        of_rows = [np.repeat(np.arange(len(rows)), rows) for rows, *_ in (columns, beside)]
-        order = np.argsort(np.concatenate(of_rows), kind="stable")
-        pairs: Any = zip(columns[1:], beside[1:], strict=True)
-        columns = (columns[0] + beside[0], *(np.concatenate(pair)[order] for pair in pairs))
-    return dict(zip(names, columns, strict=True))
-
-
 class GroundTruthDecoder:
     """Collects messages of one topic: `add` each payload, then take `columns`.
 
@@ -154,7 +118,8 @@ class GroundTruthDecoder:
         self._hosts: list[str] = []
         self._moving_number: dict[int, int] = {}  # OSI id → number of the object
         self._stationary_number: dict[int, int] = {}
-        self._moving, self._stationary = _ObjectRows(), _ObjectRows()
+        self._rows = array("q")  # number of rows of each message
+        self._object_ix, self._class_ix, self._values = array("q"), array("b"), array("d")  # moving objects first
         self._road = OsiRoad()  # of the first message that has one: the lanes of one message are those of all
         self._place: SaidPlace | None = None
         self._earlier: list[tuple[OsiRoad, Any]] = []  # the first road or place on earth before the window
@@ -196,9 +161,11 @@ class GroundTruthDecoder:
             self._add_place(truth, self._stamp_ns[-1])
         self._road = self._road or read_road(truth)
         check_objects(len(truth.moving_object) + len(truth.stationary_object))
+        before = len(self._object_ix)
         self._add_moving(truth.moving_object)
         self._add_stationary(truth.stationary_object)
-        self._allowance.spend(0, self._moving.of_message[-1] + self._stationary.of_message[-1])
+        self._rows.append(len(self._object_ix) - before)
+        self._allowance.spend(0, self._rows[-1])
 
     def add_earlier(self, payload: bytes, schema: str) -> None:
         """Take what stays of a message before those that are read: its road, its place on earth, what stands.
@@ -238,7 +205,10 @@ class GroundTruthDecoder:
             log_time_ns=logged_ns,
             object_ids=ids,
             moving=np.array(moving, dtype=bool),
-            **_join_rows(self._moving, self._stationary),
+            rows=np.asarray(self._rows, dtype=np.int64),  # without a copy, as those that follow
+            object_ix=np.asarray(self._object_ix, dtype=np.int64),
+            class_ix=np.asarray(self._class_ix, dtype=np.int8),
+            values=np.asarray(self._values, dtype=np.float64).reshape(-1, len(VALUES)),
             lane_boundaries=tuple(self._road.lines),
             lanes=tuple(self._road.lanes),
             areas=tuple(self._road.crosswalks),
@@ -270,9 +240,8 @@ class GroundTruthDecoder:
 
     def _add_moving(self, objects: Any) -> None:
         """Add a row for each. Reading fields costs most: each is read once, its presence only where it is 0."""
-        number_of, next_number, before = self._moving_number, self._next_number, len(self._moving.object_ix)
-        add_object, add_class = self._moving.object_ix.append, self._moving.class_ix.append
-        add_values = self._moving.values.extend
+        number_of, next_number = self._moving_number, self._next_number
+        add_object, add_class, add_values = self._object_ix.append, self._class_ix.append, self._values.extend
         for k, moving in enumerate(objects):
             ident = moving.id.value
             if ident == 0 and not moving.HasField("id"):
@@ -295,7 +264,6 @@ class GroundTruthDecoder:
             number = number_of.get(ident)
             add_object(next_number(number_of, ident) if number is None else number)
             add_values((x, y, z, yaw, vx, vy, size.length, size.width, size.height))
-        self._moving.of_message.append(len(self._moving.object_ix) - before)
 
     def _add_stationary(self, objects: Any) -> None:
         """Add a row of class `other`, at rest, for each that stands; those with a base polygon become solids.
@@ -303,13 +271,12 @@ class GroundTruthDecoder:
         Many writers send them once. They stay until a message that repeats some of them leaves them out.
         """
         self._find_standing(objects)
-        number_of, rows = self._stationary_number, self._stationary
+        number_of = self._stationary_number
         for ident, values in self._standing.items():
             number = number_of.get(ident)
-            rows.object_ix.append(self._next_number(number_of, ident) if number is None else number)
-            rows.class_ix.append(OTHER)
-            rows.values.extend(values)
-        rows.of_message.append(len(self._standing))
+            self._object_ix.append(self._next_number(number_of, ident) if number is None else number)
+            self._class_ix.append(OTHER)
+            self._values.extend(values)
 
     def _find_standing(self, objects: Any, *, told: bool = True) -> None:
         """Take the stationary objects of a message, with findings if they are `told`."""
