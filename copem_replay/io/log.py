@@ -11,10 +11,10 @@ import io
 import re
 import struct
 from collections import Counter
-from collections.abc import Iterator, Mapping, Set
+from collections.abc import Callable, Iterator, Mapping, Set
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
 
 import zstandard
 from mcap.exceptions import EndOfFile
@@ -110,6 +110,9 @@ _READ_AT_ONCE = 1 << 16
 """Bytes of the buffer of a file: a call of Python for as many takes no time beside reading them."""
 
 
+Result = TypeVar("Result")
+
+
 class BrokenIndexError(Exception):
     """An index that seemed sound is wrong, or what it points at is damaged; `Log.from_start` reads without it."""
 
@@ -170,6 +173,15 @@ class Log:
         with open_file(self.path) as file:
             messages = self._by_index(file, spans) if self.indexed else _read_from_start(file, spans)
             yield from sorted(messages, key=_log_time) if sort and not self.indexed else messages
+
+    def attempt(self, read: Callable[[Log], Result]) -> Result:
+        """What `read` gives of the log, opened without indexes that turn out to be broken. Raises RecordingError."""
+        log = self
+        while True:  # of several files each may have one
+            try:
+                return read(log)
+            except BrokenIndexError as error:
+                log = log.from_start(error)
 
     def from_start(self, error: BrokenIndexError) -> Log:
         """The recording opened without the index that turned out to be broken. Raises RecordingError."""

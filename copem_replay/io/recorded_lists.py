@@ -40,7 +40,7 @@ from copem_replay.io.findings import (
     sift_states,
 )
 from copem_replay.io.frames import LogContext, read_decoded_lists, read_log_context, transform_to_world
-from copem_replay.io.log import BrokenIndexError, Log, gather_messages
+from copem_replay.io.log import Log, gather_messages
 from copem_replay.io.open import Local, open_log
 from copem_replay.io.schemas import osi_ground_truth as osi
 from copem_replay.io.schemas.object_lists import DecodedLists
@@ -200,11 +200,7 @@ def _make_recorded(
 
 def _read_rows(path: Local, topic: str, window: Window | None = None) -> tuple[_EntryRows, dict[int, dict[str, Any]]]:
     """Entries on `topic`, and details by the time in ns at which their list was available, then by object id."""
-    log = open_log(path).within(window)
-    try:
-        return _read_messages(log, topic)
-    except BrokenIndexError as error:
-        return _read_messages(log.from_start(error), topic)
+    return open_log(path).within(window).attempt(lambda log: _read_messages(log, topic))
 
 
 def _no_lists_message(log: Log, topic: str) -> str:
@@ -406,11 +402,7 @@ def read_described_lists(
 
     Raises RecordingError.
     """
-    log = open_log(path).within(window)
-    try:
-        return _read_described(log, topic, scene, around)
-    except BrokenIndexError as error:
-        return _read_described(log.from_start(error), topic, scene, around)
+    return open_log(path).within(window).attempt(lambda log: _read_described(log, topic, scene, around))
 
 
 def _read_described(log: Log, topic: str, scene: Scene, around: LogContext | None) -> RecordedLists | None:

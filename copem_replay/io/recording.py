@@ -179,16 +179,12 @@ def _read(
 ) -> Recording:
     asked = None if isinstance(ego, str) else ego
     topic, ignored = choose_topic(log, topic, beside, fields, asked)
-    try:
-        log = cut_window(log, topic, window_s, max_gap_s)
-        columns, around, world = _decode_world(
-            log, topic, fields, asked, classes, seek_ego=ego is None, max_gap_s=max_gap_s
-        )
-    except BrokenIndexError as error:
-        log = cut_window(log.from_start(error), topic, window_s, max_gap_s)
-        columns, around, world = _decode_world(
-            log, topic, fields, asked, classes, seek_ego=ego is None, max_gap_s=max_gap_s
-        )
+
+    def decode(log: Log) -> tuple[Log, tuple[DecodedObjects, LogContext | None, str]]:
+        cut = cut_window(log, topic, window_s, max_gap_s)
+        return cut, _decode_world(cut, topic, fields, asked, classes, seek_ego=ego is None, max_gap_s=max_gap_s)
+
+    log, (columns, around, world) = log.attempt(decode)
     refuse_second_run(columns.stamp_ns, columns.log_time_ns, partial(list_contents, columns), log.path, topic)
     try:
         scene, truth, truth_notes = assemble_truth(columns, name, max_gap_s)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from importlib.metadata import version
+from pathlib import Path
 
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Header, McapRecord, Message, Metadata
@@ -76,18 +77,9 @@ class RecordingSource:
     """
 
     def __init__(self, log: Log) -> None:
-        whole, broken = log, None
-        while True:
-            try:
-                records = {file.path: _read_records(file) for file in _list_files(whole)}
-                if any(file.indexed for file in _list_files(whole)):
-                    for _message in whole.messages({c.number for c in whole.channels}):
-                        pass
-                break
-            except BrokenIndexError as error:
-                broken, whole = error, whole.from_start(error)
-        self._log = whole
-        damaged = broken is not None or not whole.complete
+        self._log, records = log.attempt(_read_through)
+        whole = self._log
+        damaged = whole is not log or not whole.complete
         self.damage = "damaged: its messages are copied as far as they can be read" if damaged else None
         recordings = [part.log for part in whole.parts] if isinstance(whole, JoinedLog) else [whole]
         profiles = {_find_profile(records[next(_list_files(recording)).path]) for recording in recordings}
@@ -123,6 +115,15 @@ class RecordingSource:
 def open_source(path: Local, window: Window | None = None) -> RecordingSource:
     """The recording to be copied, or a window of it. Raises RecordingError: nothing can be read."""
     return RecordingSource(open_log(path).within(window))
+
+
+def _read_through(log: Log) -> tuple[Log, dict[Path, list[McapRecord]]]:
+    """The log, and the records of each file besides messages. Raises BrokenIndexError."""
+    records = {file.path: _read_records(file) for file in _list_files(log)}
+    if any(file.indexed for file in _list_files(log)):
+        for _message in log.messages({c.number for c in log.channels}):
+            pass
+    return log, records
 
 
 def _list_files(log: Log) -> Iterator[Log]:
