@@ -71,21 +71,16 @@ def varint_sizes(values: NDArray[np.uint64]) -> Int:
 
 
 @kernel
-def put_varints(out: Bytes, offset: Int, sizes: Int, tag: Any, values: NDArray[np.uint64]) -> None:
-    """Put tags and varints at places `offset` (N,), except where the size is 0."""
-    for k in range(len(offset)):
-        if sizes[k]:
-            _put_varint(out, _put_varint(out, offset[k], tag), values[k])
-
-
-@kernel
-def put_fixed(out: Bytes, offset: Int, sizes: Int, tag: Any, bits: NDArray[np.uint64]) -> None:
-    """Put tags and eight bytes each, the lowest first, except where the size is 0."""
+def put_numbers(out: Bytes, offset: Int, sizes: Int, tag: Any, bits: NDArray[np.uint64], fixed: bool) -> None:
+    """Put tags and numbers at places `offset` (N,), as varints or eight bytes each, except where the size is 0."""
     for k in range(len(offset)):
         if sizes[k]:
             place = _put_varint(out, offset[k], tag)
-            for i in range(8):
-                out[place + i] = np.uint8((bits[k] >> np.uint64(8 * i)) & np.uint64(255))
+            if fixed:
+                for i in range(8):
+                    out[place + i] = np.uint8(bits[k] >> np.uint64(8 * i))
+            else:
+                _put_varint(out, place, bits[k])
 
 
 @kernel
@@ -168,8 +163,7 @@ class NumberField:
 
     def put(self, out: Bytes, offset: Int) -> None:
         """Put the bytes of every row at its place in `out`, `offset` (N,)."""
-        fill = put_fixed if self._fixed else put_varints
-        fill(out, offset, self.sizes, self._tag, self._bits)
+        put_numbers(out, offset, self.sizes, self._tag, self._bits, self._fixed)
 
 
 class SizedField:
