@@ -37,6 +37,7 @@ from copem_replay.io.write.detail import (
     Event,
     Statuses,
     StatusWriter,
+    encode_statuses,
 )
 from copem_replay.io.write.osi import OSI_VERSION, SensorDataWriter
 from copem_replay.io.write.ros2 import DETECTED_OBJECTS, DetectedObjectsWriter
@@ -114,8 +115,8 @@ class OpenedFamily(ABC):
             self._schema(kind)
 
     @abstractmethod
-    def _schema(self, kind: str) -> tuple[str, int]:
-        """The encoding of a kind of message and the number of its schema, which is written if it is new."""
+    def _schema(self, kind: str, configuration: str = "") -> tuple[str, int, dict[str, str]]:
+        """What a channel of a kind of message has: encoding, number of the schema, which is written, metadata."""
 
     @abstractmethod
     def _encoder(self, kind: str) -> Encode:
@@ -125,18 +126,14 @@ class OpenedFamily(ABC):
     def _objects(self, fused_tracks: FusedTracks, events: Mapping[int, Sequence[Event]]) -> list[ListWriter]:
         """The writers of the lists, and of their details."""
 
+    @staticmethod
     @abstractmethod
-    def _statuses(self, statuses: Statuses) -> ListWriter:
-        """The writer of statuses."""
+    def encode_statuses(available_ns: Int, objects: RepeatedMessages) -> list[bytes]:
+        """Messages of the statuses at each instant."""
 
     def _channel(self, topic: str, kind: str, configuration: str = "") -> int:
         """The number of a channel."""
-        encoding, schema = self._schema(kind)
-        return self._catalogue.channel(topic, encoding, schema, self._metadata(kind, configuration))
-
-    @abstractmethod
-    def _metadata(self, kind: str, configuration: str) -> dict[str, str]:
-        """The metadata of a channel."""
+        return self._catalogue.channel(topic, *self._schema(kind, configuration))
 
     def channels(
         self, name: str, fused_tracks: FusedTracks, events: Mapping[int, Sequence[Event]], colour: Rgb
@@ -154,7 +151,7 @@ class OpenedFamily(ABC):
         status, uncertainty = list_extra_topics(name)
         ellipses = UncertaintyWriter(self._scene, fused_tracks, colour, self._draw)
         return {
-            self._channel(status, "status"): self._statuses(statuses),
+            self._channel(status, "status"): StatusWriter(statuses, self.encode_statuses),
             self._channel(uncertainty, "scene"): ellipses,
         }
 
@@ -170,24 +167,19 @@ class _OsiFamily(OpenedFamily):
     """osi3.SensorData; foxglove.SceneUpdate; details and statuses as JSON."""
 
     osi = True
+    encode_statuses = staticmethod(encode_statuses)
 
-    def _schema(self, kind: str) -> tuple[str, int]:
+    def _schema(self, kind: str, configuration: str = "") -> tuple[str, int, dict[str, str]]:
         if kind in ("detail", "status"):
             name, schema = (DETAIL_SCHEMA, DETAIL_JSON) if kind == "detail" else (STATUS_SCHEMA, STATUS_JSON)
-            return "json", self._catalogue.schema(name, "jsonschema", json.dumps(schema).encode())
-        message_class = _load_class(kind)
-        return "protobuf", self._catalogue.schema(
-            message_class.DESCRIPTOR.full_name, "protobuf", _describe_class(message_class)
-        )
-
-    def _metadata(self, kind: str, configuration: str) -> dict[str, str]:
-        if kind != "objects":
-            return {}
-        return {
+            return "json", self._catalogue.schema(name, "jsonschema", json.dumps(schema).encode()), {}
+        described = _load_class(kind).DESCRIPTOR.full_name, "protobuf", _describe_class(_load_class(kind))
+        about = {
             f"{OSI_CHANNEL}description": f"fused object list of configuration {configuration}",
             f"{OSI_CHANNEL}osi_version": OSI_VERSION,
             f"{OSI_CHANNEL}protobuf_version": version("protobuf"),
         }
+        return "protobuf", self._catalogue.schema(*described), about if kind == "objects" else {}
 
     def _encoder(self, kind: str) -> Encode:
         return partial(encode_messages, _load_class(kind).DESCRIPTOR)
@@ -195,9 +187,6 @@ class _OsiFamily(OpenedFamily):
     def _objects(self, fused_tracks: FusedTracks, events: Mapping[int, Sequence[Event]]) -> list[ListWriter]:
         scene = self._scene
         return [SensorDataWriter(scene, fused_tracks, self._units), DetailWriter(scene, fused_tracks, events)]
-
-    def _statuses(self, statuses: Statuses) -> ListWriter:
-        return StatusWriter(statuses)
 
 
 OSI: Family = _OsiFamily
@@ -234,12 +223,9 @@ class _Ros2Family(OpenedFamily):
 
     osi = False
 
-    def _schema(self, kind: str) -> tuple[str, int]:
-        name = _ROS2_TYPES[kind]
-        return "cdr", self._catalogue.schema(name, "ros2msg", message_definition(name))
-
-    def _metadata(self, kind: str, configuration: str) -> dict[str, str]:
-        return {"offered_qos_profiles": QOS}
+    def _schema(self, kind: str, configuration: str = "") -> tuple[str, int, dict[str, str]]:
+        described = _ROS2_TYPES[kind], "ros2msg", message_definition(_ROS2_TYPES[kind])
+        return "cdr", self._catalogue.schema(*described), {"offered_qos_profiles": QOS}
 
     def _encoder(self, kind: str) -> Encode:
         return partial(encode_cdr, _ROS2_TYPES[kind])
@@ -248,13 +234,12 @@ class _Ros2Family(OpenedFamily):
         objects = DetectedObjectsWriter(self._scene, fused_tracks, self._frame_id)
         return [objects, _StringWriter(DetailWriter(self._scene, fused_tracks, events, sizes_of=objects.round))]
 
-    def _statuses(self, statuses: Statuses) -> ListWriter:
-        return StatusWriter(statuses, _encode_ros2_statuses)
-
-
-def _encode_ros2_statuses(available_ns: Int, objects: RepeatedMessages) -> list[bytes]:
-    """Messages of copem_replay_msgs/Status."""
-    return encode_cdr(_ROS2_TYPES["status"], {"stamp": Instants(available_ns), "objects": objects}, len(available_ns))
+    @staticmethod
+    def encode_statuses(available_ns: Int, objects: RepeatedMessages) -> list[bytes]:
+        """Messages of copem_replay_msgs/Status."""
+        return encode_cdr(
+            _ROS2_TYPES["status"], {"stamp": Instants(available_ns), "objects": objects}, len(available_ns)
+        )
 
 
 class _StringWriter:
