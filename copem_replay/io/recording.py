@@ -139,17 +139,10 @@ def read_log(
     Raises RecordingError, one line: no such file, no MCAP file, no truth, no usable object, no such ego, no such topic,
     or several, a file that changes while it is read; EmptyWindowError.
     """
-    read = partial(
-        _read,
-        name=name,
-        ego=ego,
-        topic=topic,
-        fields=fields,
-        beside=beside,
-        window_s=window_s,
-        max_gap_s=max_gap_s,
-        classes=classes or {},
-    )
+
+    def read(log: Log) -> Recording:
+        return _read(log, name, ego, topic, fields, beside, window_s, max_gap_s, classes or {})
+
     if isinstance(source, Log):
         return read(source)
     place, stamps = Path(source) if isinstance(source, str) else source, None
@@ -167,7 +160,6 @@ def read_log(
 @np.errstate(over="ignore", invalid="ignore")  # a state that is not finite is left out later, with a note
 def _read(
     log: Log,
-    *,
     name: str,
     ego: str | EgoTopic | None,
     topic: str | None,
